@@ -20,7 +20,7 @@ from curves import draw_curves
 
 from depthpose.core.checkpoint import find_weights
 from depthpose.core.rigid import Rigid
-from depthpose.pose.config import ObjectsConfig, SensorConfig
+from depthpose.pose.config import ObjectsConfig, SyntheticSensorConfig
 from depthpose.pose.copies import SymmetricCopies, find_copies
 from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.pose.synthetic import Objects
@@ -54,7 +54,7 @@ def answers_of(name: str, number: int) -> Iterator[Answer | None]:
     for part, factor in enumerate(NOISES):
         config = ObjectsConfig(
             number=count, seed=SEED + part, views=None, resolution=(1.0, 1.0), occluded_share=0.7,
-            occlusion=(0.0, 0.6), sensor=SensorConfig(noise=(0.5 * factor, 1.5 * factor)),
+            occlusion=(0.0, 0.6), sensor=SyntheticSensorConfig(noise=(0.5 * factor, 1.5 * factor)),
         )  # fmt: skip
         views = Objects(weights.models, config, weights.cloud)
         for k in range(count):

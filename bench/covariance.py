@@ -25,7 +25,7 @@ from depthpose.core.loop import sample_generator
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid, cross_matrix
 from depthpose.pose.cloud import cloud_from_depth
-from depthpose.pose.config import IcpConfig, SensorConfig, SensorKind
+from depthpose.pose.config import IcpConfig, SensorKind, SyntheticSensorConfig
 from depthpose.pose.icp import refine_pose
 from depthpose.pose.mesh import drawn_triangles
 from depthpose.pose.surface import prepare_surface
@@ -59,7 +59,9 @@ def view_rows(
     mask = clean_m.isfinite()
     clean_m = torch.where(mask, clean_m, BEHIND_M).float()
     offs, squares, spreads = [], [], []
-    sensor = SensorConfig(kinds=(kind,), noise=(noise, noise), offset_m=(-offset_m, offset_m))
+    sensor = SyntheticSensorConfig(
+        kinds=(kind,), noise=(noise, noise), offset_m=(-offset_m, offset_m)
+    )
     icp = IcpConfig() if offset_m else IcpConfig(sensor_offset_m=0.0)
     for _ in range(repeats):
         depth_m = measure(clean_m, (FOCAL_PX, FOCAL_PX), sensor, generator)

@@ -86,7 +86,7 @@ class FpfhEstimator:
         if not len(found.correspondence_set):
             reason = "RANSAC found no pose that any correspondence of features agrees with"
             return PoseEstimate(
-                name=given.name, object=given.object, status="votes do not meet",
+                name=given.name, object=given.object, status="no pose found",
                 reason=reason, seconds=seconds,
             )  # fmt: skip
         T = torch.from_numpy(np.array(found.transformation))

@@ -34,7 +34,7 @@ from depthpose.depth.synthetic.dataset import Projector
 from depthpose.depth.synthetic.mesh import MeshBuilder, Surface
 from depthpose.depth.synthetic.scene import Markings, StreetScene, draw_weather
 from depthpose.depth.types import StereoInput
-from depthpose.pose.config import SensorConfig
+from depthpose.pose.config import SyntheticSensorConfig
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.metrics import SUCCESS_SHARE, adds_m
 from depthpose.pose.registration import Registration
@@ -223,7 +223,7 @@ def main() -> None:
         seconds = time.process_time() - began
         generator = torch.Generator().manual_seed(index)
         focal_px = float(scene.rig.K[0, 0])
-        sensor = SensorConfig(kinds=("active stereo",))
+        sensor = SyntheticSensorConfig(kinds=("active stereo",))
         sensed_m = measure(scene.depth_m.float(), (focal_px, focal_px), sensor, generator)
         for kind, depth_m in ((PAIR, pair_m), (SENSOR, sensed_m)):
             for name, mask in scene.masks.items():

@@ -20,7 +20,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from depthpose.core.files import read_depth_png, read_image
-from depthpose.pose.config import SensorConfig, SensorKind
+from depthpose.pose.config import SensorKind, SyntheticSensorConfig
 from depthpose.pose.synthetic.views import measure
 from depthpose.report.page import markdown_table
 
@@ -66,7 +66,7 @@ def synthetic_frame(kind: SensorKind, noise_correlation_px: float | None, like: 
     y, x = torch.arange(height)[:, None] - height / 2, torch.arange(width) - width / 2
     is_object = y.square() + x.square() < radius_px**2
     depth_m = torch.where(is_object, torch.tensor(distance_m - 0.05), depth_m)
-    config = SensorConfig(
+    config = SyntheticSensorConfig(
         kinds=(kind,),
         noise=(1.0, 1.0),
         missing=(0.0, 0.0),

@@ -29,7 +29,7 @@ from curves import draw_curves
 from fpfh import FpfhEstimator
 
 from depthpose.core.checkpoint import find_weights
-from depthpose.pose.config import EstimateConfig, ObjectsConfig, SensorConfig, SensorKind
+from depthpose.pose.config import EstimateConfig, ObjectsConfig, SensorKind, SyntheticSensorConfig
 from depthpose.pose.datasets.layouts import read_bop_models, read_models_info
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.metrics import add_m, adds_m
@@ -74,7 +74,7 @@ def synthetic_views(models: Sequence[ObjectModel], at: Condition, number: int) -
         number=number * len(models), seed=SEED, views=None,
         resolution=(at.resolution, at.resolution),
         occluded_share=1.0 if at.occlusion else 0.0, occlusion=(at.occlusion, at.occlusion),
-        sensor=SensorConfig(kinds=(at.sensor,), noise=(at.noise, at.noise)),
+        sensor=SyntheticSensorConfig(kinds=(at.sensor,), noise=(at.noise, at.noise)),
     )  # fmt: skip
     return Objects(models, config)
 

@@ -31,7 +31,7 @@ from depthpose.core.checkpoint import find_weights
 from depthpose.core.loop import sample_generator
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid, rotation_by
-from depthpose.pose.config import SensorConfig
+from depthpose.pose.config import SyntheticSensorConfig
 from depthpose.pose.mesh import drawn_triangles, sample_surface
 from depthpose.pose.metrics import add_m, adds_m
 from depthpose.pose.network_pose import GeoPoseNet
@@ -167,7 +167,7 @@ def sequence(
             cut = torch.inf if is_covered else float(some.quantile(HIDDEN))
             box = (column >= some.min() - 15) & (column <= min(cut, float(some.max()) + 15))
             depth_m = torch.where(box, float(own_m[shown].min()) - 0.08, depth_m)
-        measured_m = measure(depth_m, (FOCAL_PX, FOCAL_PX), SensorConfig(), generator)
+        measured_m = measure(depth_m, (FOCAL_PX, FOCAL_PX), SyntheticSensorConfig(), generator)
         view = ViewInput(
             name=f"{model.name}_{k:04d}", depth_m=measured_m.float(), K=K.float(),
             mask=torch.ones(HEIGHT, WIDTH, dtype=torch.bool), object=model.name,

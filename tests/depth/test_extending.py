@@ -29,7 +29,7 @@ from depthpose.depth.datasets.frames import Frame
 from depthpose.depth.datasets.layouts import LAYOUTS, Layout
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.export import TARGETS, Target, depth_export
-from depthpose.depth.losses import ADVERSARIAL_LOSSES, DISPARITY_LOSSES, adversarial_loss
+from depthpose.depth.losses import ADVERSARIAL_LOSSES, GENERATOR_DISPARITY_LOSSES, adversarial_loss
 from depthpose.depth.metrics import METRICS, Metric
 from depthpose.depth.stereo import StereoNetwork
 from depthpose.depth.synthesis import SelectionGenerator, UNetGenerator
@@ -234,7 +234,7 @@ def test_extending_losses(monkeypatch: pytest.MonkeyPatch) -> None:
 
     with pytest.raises(InputError, match=r"disparity_loss is 'ones'; .*'log'"):
         SelectTraining(disparity_loss="ones")
-    monkeypatch.setitem(DISPARITY_LOSSES, "ones", ones)
+    monkeypatch.setitem(GENERATOR_DISPARITY_LOSSES, "ones", ones)
     config = SelectTraining(
         disparity_loss="ones",
         generator=SelectionConfig(encoder_width=0.25, widths=(8, 8, 8, 8), planes=4),

@@ -9,7 +9,7 @@ import torch
 
 from depthpose.core.config import config_to_dict, read_config, write_config
 from depthpose.core.errors import InputError
-from depthpose.pose.config import ObjectsConfig, SensorConfig
+from depthpose.pose.config import ObjectsConfig, SyntheticSensorConfig
 from depthpose.pose.synthetic.views import (
     grow_mask,
     measure,
@@ -67,8 +67,8 @@ def test_a_mask_grows_and_shrinks_by_pixels() -> None:
     assert torch.equal(grow_mask(mask, 0), mask)
 
 
-def _sensor(kind: str, noise: float = 1.0, missing: float = 0.0) -> SensorConfig:
-    return SensorConfig(
+def _sensor(kind: str, noise: float = 1.0, missing: float = 0.0) -> SyntheticSensorConfig:
+    return SyntheticSensorConfig(
         kinds=(kind,),  # pyright: ignore[reportArgumentType]
         noise=(noise, noise),
         missing=(missing, missing),
@@ -251,5 +251,5 @@ def test_the_principal_point_is_that_of_the_image(tmp_path: Path) -> None:
 )
 def test_bad_settings_of_a_sensor_are_refused(values: dict, text: str) -> None:
     with pytest.raises(InputError) as error:
-        SensorConfig(**values)
+        SyntheticSensorConfig(**values)
     assert text in str(error.value)

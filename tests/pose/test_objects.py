@@ -10,7 +10,7 @@ import trimesh
 from depthpose.core.errors import InputError
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid
-from depthpose.pose.config import ObjectsConfig, SensorConfig
+from depthpose.pose.config import ObjectsConfig, SyntheticSensorConfig
 from depthpose.pose.datasets import check_bop, open_bop, write_bop_models, write_bop_scene
 from depthpose.pose.mesh import drawn_triangles, make_model
 from depthpose.pose.synthetic import Objects, make_frames, views
@@ -29,7 +29,7 @@ _CLEAN = {
     "with_background": False,
     "mask_error_px": 0,
     "mask_shift_px": 0,
-    "sensor": SensorConfig(kinds=("none",)),
+    "sensor": SyntheticSensorConfig(kinds=("none",)),
 }
 
 
@@ -218,7 +218,7 @@ _FRAME = ObjectsConfig(
     focal_px=(143.0, 143.0),
     centre_px=(81.0, 60.0),
     frame_objects=(3, 3),
-    sensor=SensorConfig(kinds=("none",)),
+    sensor=SyntheticSensorConfig(kinds=("none",)),
 )
 
 

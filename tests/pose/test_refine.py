@@ -13,7 +13,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid, cross_matrix, geodesic_rad, perturb
 from depthpose.pose.cloud import cloud_from_depth
-from depthpose.pose.config import IcpConfig, SensorConfig, SensorKind
+from depthpose.pose.config import IcpConfig, SensorKind, SyntheticSensorConfig
 from depthpose.pose.datasets import open_bop
 from depthpose.pose.icp import _covariance, refine_best, refine_pose
 from depthpose.pose.mesh import drawn_triangles, make_model, sample_surface
@@ -296,7 +296,7 @@ def test_its_covariance_covers_the_errors_of_sensors(kind: SensorKind) -> None:
         true = Rigid(R, at_m - R @ part.points_m.mean(0))
         clean_m = rasterize(true.apply(drawn_triangles(model).double()), K, 160, 120).depth_m
         mask, generator = clean_m.isfinite(), torch.Generator().manual_seed(seed)
-        sensor = SensorConfig(kinds=(kind,), noise=(1.0, 1.0), offset_m=(0.0, 0.0))
+        sensor = SyntheticSensorConfig(kinds=(kind,), noise=(1.0, 1.0), offset_m=(0.0, 0.0))
         by = torch.cat([-cross_matrix(at_m), torch.eye(3).double()], 1)
         for _ in range(2):
             depth_m = measure(clean_m.nan_to_num(0.8).float(), (400.0, 400.0), sensor, generator)

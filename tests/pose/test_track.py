@@ -12,7 +12,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, rotation_by
 from depthpose.pose.metrics import add_m
 from depthpose.pose.predictions import Prediction, parse_prediction, prediction_row
-from depthpose.pose.surface import compare_depths, prepare_surface
+from depthpose.pose.surface import prepare_surface
 from depthpose.pose.track import TrackedObject, track
 from depthpose.pose.types import Alternative, PoseEstimate
 
@@ -110,12 +110,8 @@ def test_it_is_followed_where_what_is_not_hidden_was_seen() -> None:
         _, mask = view_of(bracket(), pose)
         cut = column[mask].double().quantile(HIDDEN)
         hides = (column >= column[mask].min() - 5) & (column < cut)
+        assert (hides & mask).sum() > 0.5 * mask.sum(), "else nothing is tested"
         frames.append(torch.where(hides, torch.tensor(0.45), frame(pose, k)))
-    surface = prepare_surface(bracket())
-    scene_m = back_project(frames[0].double(), K).reshape(-1, 3)
-    agrees, _, before = compare_depths(scene_m, poses[0].double(), surface)
-    assert agrees < 0.35, "else nothing is tested"
-    assert before > 0.5
     found = list(oracle(poses).track(frames, CAMERA, first=poses[0]))
     assert [e.tracking for e in found] == ["tracked"] * 4
     assert max(error_of(e, p) for e, p in zip(found, poses, strict=True)) < 0.01
@@ -174,14 +170,6 @@ def test_in_clouds_of_the_scene_it_is_followed_again_where_it_was() -> None:
     found = list(oracle(poses).track(clouds, first=poses[0]))
     assert [e.tracking for e in found] == ["tracked", "tracked", "lost", "tracked", "tracked"]
     assert error_of(found[4], poses[4]) < 0.003
-
-
-def test_a_pose_about_the_camera_is_compared_in_few_cells() -> None:
-    surface = prepare_surface(bracket())
-    scene_m = back_project(frame(None).double(), K).reshape(-1, 3)
-    for z_m in (0.0, 0.03, 0.08):
-        pose = Rigid(torch.eye(3).double(), torch.tensor([0.0, 0, z_m]).double())
-        assert all(0 <= share <= 1 for share in compare_depths(scene_m, pose, surface))
 
 
 def test_what_else_it_may_be_moves_along() -> None:
@@ -275,22 +263,6 @@ def test_the_first_pose_may_be_a_matrix() -> None:
 def test_an_unknown_object_is_an_error() -> None:
     with pytest.raises(InputError, match="object 'spoon': the weights do not know it"):
         oracle(moving(1)).track([], CAMERA, "spoon")
-
-
-def test_depths_agree_with_the_true_pose_alone() -> None:
-    surface, truth = prepare_surface(bracket()), moving(1)[0]
-    scene_m = back_project(frame(truth).double(), K).reshape(-1, 3)
-    pose = Rigid(truth.R.double(), truth.t_m.double())
-    agrees, through, before = compare_depths(scene_m, pose, surface)
-    assert agrees > 0.85
-    assert before < 0.1
-    nearer = Rigid(pose.R, pose.t_m - torch.tensor([0.0, 0, 0.1]))
-    assert compare_depths(scene_m, nearer, surface)[1] > 0.9
-    farther = Rigid(pose.R, pose.t_m + torch.tensor([0.0, 0, 0.1]))
-    assert compare_depths(scene_m, farther, surface)[2] > 0.7
-    empty = torch.zeros(0, 3, dtype=torch.float64)
-    assert compare_depths(empty, pose, surface) == (0.0, 0.0, 0.0)
-    assert agrees + through + before == pytest.approx(1, abs=0.05)
 
 
 def test_files_say_how_an_estimate_came_about() -> None:

@@ -19,7 +19,7 @@ from depthpose.core.config import read_config
 from depthpose.core.errors import InputError
 from depthpose.core.loop import AdamConfig, LoopConfig, Run
 from depthpose.core.rigid import Rigid
-from depthpose.pose.config import CloudConfig, MeshConfig, ObjectsConfig, SensorConfig
+from depthpose.pose.config import CloudConfig, MeshConfig, ObjectsConfig, SyntheticSensorConfig
 from depthpose.pose.datasets import write_bop_models, write_bop_scene
 from depthpose.pose.network import ResUNet, ResUNetConfig, fold_norms
 from depthpose.pose.sparse import Voxels
@@ -182,7 +182,7 @@ def _frames_folder(folder: Path) -> Path:
         focal_px=(143.0, 143.0),
         centre_px=(81.0, 60.0),
         frame_clutter=(0, 0),
-        sensor=SensorConfig(kinds=("laser",), missing=(0.0, 0.0)),
+        sensor=SyntheticSensorConfig(kinds=("laser",), missing=(0.0, 0.0)),
     )
     write_bop_models(folder, models)
     write_bop_scene(folder, "train", 0, list(make_frames(models, config, 4)))

@@ -32,12 +32,12 @@ COMMANDS = {
     "serve": ("serve:serve", "depth and poses by a page in your browser, on this machine"),
     "pose predict": ("pose:predict", "a cloud, a masked depth image, or a data set, to poses"),
     "pose track": ("pose:track", "follow an object through depth images or clouds"),
-    "pose train": ("train:train_pose", "your CAD file, or a config, to a network that poses it"),
+    "pose train": ("train:pose_train", "your CAD file, or a config, to a network that poses it"),
     "pose evaluate": ("pose:evaluate", "measure poses on a BOP or LineMOD data set"),
     "depth match": ("depth:match", "a real stereo pair, or many, to metric depth"),
     "depth predict": ("depth:predict", "one image, or many, or a video, to metric depth"),
     "depth train": (
-        "train:train_depth", "stages view, select, stereo, finetune of generator, matcher"),
+        "train:depth_train", "stages view, select, stereo, finetune of generator, matcher"),
     "depth calibrate": ("train:calibrate", "set when an image is refused as out of distribution"),
     "depth evaluate": ("depth:evaluate", "measure predictions by a named protocol"),
     "data make streets": (

@@ -160,7 +160,7 @@ def make_objects(
     from depthpose.core.checkpoint import file_sha256
     from depthpose.core.config import config_to_dict
     from depthpose.core.run import claim_folder, note_result
-    from depthpose.pose.config import ObjectsConfig, SensorConfig
+    from depthpose.pose.config import ObjectsConfig, SyntheticSensorConfig
     from depthpose.pose.datasets import write_bop_models, write_bop_scene
     from depthpose.pose.mesh import read_model, refuse_one_name, with_found_symmetries
     from depthpose.pose.synthetic import make_frames
@@ -175,9 +175,13 @@ def make_objects(
     if not re.fullmatch(r"[\w-]+", split) or split == "models":
         raise InputError(f"--split {split}: a name of letters and digits, not 'models'")
     config = ObjectsConfig(
-        seed=seed, distance_m=distance, sensor=SensorConfig(kinds=(sensor,)), number=number,
-        frame_clutter=clutter, frame_pile=pile,
-    )  # fmt: skip
+        seed=seed,
+        distance_m=distance,
+        sensor=SyntheticSensorConfig(kinds=(sensor,)),
+        number=number,
+        frame_clutter=clutter,
+        frame_pile=pile,
+    )
     # What decides the frames; of another seed, other scenes: they may share the folder.
     settings = {k: v for k, v in config_to_dict(config).items() if k not in ("number", "seed")}
     settings |= {"unit": unit, "symmetries": symmetries, "cad": {

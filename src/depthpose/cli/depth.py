@@ -53,7 +53,7 @@ def predict(
         raise InputError(f"--camera-height {height_m:g}: give 0.1 to 20 metres")
     if tilt_deg is not None and not -45 <= tilt_deg <= 45:
         raise InputError(f"--camera-tilt {tilt_deg:g}: give -45 to 45 degrees")
-    method = work.MethodSource(
+    method = work.DepthMethodSource(
         weights=networks.weights,
         config=matching.config,
         with_right=False,
@@ -115,7 +115,7 @@ def match(
         with_left_right_check=matching.left_right_check,
         max_disparity_px=matching.max_disparity,
     )
-    method = work.MethodSource(weights=weights, config=config, with_right=True, use="pairs")
+    method = work.DepthMethodSource(weights=weights, config=config, with_right=True, use="pairs")
     method = method.packed() if engine.engine == "ray" else method
 
     work_of = partial(work.pair_work, camera, pairs, method)
@@ -159,7 +159,7 @@ def evaluate(
         measure,
         measure_shards,
         open_frames,
-        predict_all,
+        predict_dataset,
     )
     from depthpose.core.engine import PLAN
     from depthpose.core.files import stores
@@ -182,7 +182,7 @@ def evaluate(
     about |= {"protocol": comparison.protocol, "cap": list(comparison.cap)}
     files = [*table_files("rows", "frames", "confidence"), "report.html", "predictions"]
     claim_folder(out, {"command": "depth evaluate", **about}, files)
-    folders = [predict_all(dataset, method, rule, out / "predictions") for method in chosen]
+    folders = [predict_dataset(dataset, method, rule, out / "predictions") for method in chosen]
     name = comparison.protocol
     caps_m = comparison.cap
     predictions = methods.predictions

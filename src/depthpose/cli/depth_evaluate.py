@@ -12,7 +12,7 @@ from typing import Any, cast, get_args
 from tqdm import tqdm
 
 from depthpose.cli.depth_options import MethodOptions
-from depthpose.cli.depth_predict import Method, MethodSource
+from depthpose.cli.depth_predict import DepthMethodSource, Method
 from depthpose.core import engine
 from depthpose.core.errors import InputError
 from depthpose.core.run import environment, find_rank, read_settings, wait_for
@@ -50,7 +50,7 @@ def open_frames(data: Path, split: str | None) -> Dataset:
     return dataset
 
 
-def predict_all(dataset: Dataset, method: Method, rule: Protocol, folder: Path) -> Path:
+def predict_dataset(dataset: Dataset, method: Method, rule: Protocol, folder: Path) -> Path:
     """Predict every frame that has truth to compare with, and a right view if it is needed.
 
     Of several processes each predicts its share, and the first goes on when all files are there.
@@ -94,7 +94,7 @@ def choose_methods(options: MethodOptions, config: MatcherConfig, dataset: Datas
     chosen: list[Method] = []
     if options.matcher == "sgbm":
         is_filled = options.holes == "fill"
-        sgbm = MethodSource(weights=None, config=config, with_filled_holes=is_filled)
+        sgbm = DepthMethodSource(weights=None, config=config, with_filled_holes=is_filled)
         chosen.append(sgbm.build())
     chosen += [named_method(name, config) for name in options.weights]
     names = [method.name for method in chosen]
@@ -120,7 +120,9 @@ def choose_methods(options: MethodOptions, config: MatcherConfig, dataset: Datas
 def named_method(word: str, config: MatcherConfig) -> Method:
     """Build the method of a name: weights by file or name, perhaps with ``both:`` and the like."""
     prefix, _, name = word.rpartition(":")
-    source = MethodSource(weights=name, config=config, with_right=prefix not in get_args(Answer))
+    source = DepthMethodSource(
+        weights=name, config=config, with_right=prefix not in get_args(Answer)
+    )
     if prefix in get_args(Answer):  # what depth of one image comes from
         return replace(source, answer=cast("Answer", prefix)).build()
     if prefix == "both":
@@ -130,7 +132,7 @@ def named_method(word: str, config: MatcherConfig) -> Method:
         return method._replace(name=f"{method.name}-{prefix}")
     if prefix == "sgbm":
         return replace(source, with_right=False, matcher="sgbm").build()
-    return MethodSource(weights=word, config=config).build()
+    return DepthMethodSource(weights=word, config=config).build()
 
 
 def baseline_method(name: BaselineName, training: Dataset) -> Method:

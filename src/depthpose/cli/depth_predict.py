@@ -75,7 +75,7 @@ class Method(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MethodSource:
+class DepthMethodSource:
     """What a method is built from, in this process or by the workers of an engine."""
 
     weights: str | Weights | None  #: by name or file, or packed to travel; None: OpenCV's matcher
@@ -148,7 +148,7 @@ class MethodSource:
             facts["scales"] = list(net.synthesiser.scales)
         return Method(name, net, {**facts, **settings}, with_right)
 
-    def packed(self) -> "MethodSource":
+    def packed(self) -> "DepthMethodSource":
         """Give the same with the weights in memory."""
         if self.matcher not in (None, "sgbm"):
             raise InputError(
@@ -222,7 +222,7 @@ def image_work(
     lens: LensOptions,
     scale: ScaleOptions,
     output: PredictOutput,
-    method: MethodSource,
+    method: DepthMethodSource,
     sources: Sequence[Path],
 ) -> "DepthWork":
     """Describe the work on single images, whose EXIF may be the only source of their camera."""
@@ -231,7 +231,7 @@ def image_work(
 
 
 def pair_work(
-    camera: Path, pairs: PairNetworks, method: MethodSource, files: Sequence[Path]
+    camera: Path, pairs: PairNetworks, method: DepthMethodSource, files: Sequence[Path]
 ) -> "DepthWork":
     """Describe the work on pairs; the first gives the size if the camera's file has none."""
     rig = read_rig(camera, image_size(files[0]))
@@ -288,7 +288,7 @@ class DepthWork:
     ``camera``: what is known of that of the images, or the rig of pairs.
     """
 
-    method: MethodSource
+    method: DepthMethodSource
     camera: Camera | FieldOfView | float
     output: PredictOutput
     scale: ScaleOptions = field(default_factory=ScaleOptions)

@@ -12,8 +12,8 @@ from depthpose.pose.config import EstimateConfig, SymmetryRule
 
 def predict(
     out: NewPlace,
-    first: options.FirstOptions = options.FirstOptions(),
-    more: options.MoreOptions = options.MoreOptions(),
+    inputs: options.InputOptions = options.InputOptions(),
+    details: options.InputDetailOptions = options.InputDetailOptions(),
     pair: options.PairOptions = options.PairOptions(),
     dataset: options.DataSetOptions = options.DataSetOptions(),
     estimates: options.EstimateOptions = options.EstimateOptions(),
@@ -47,15 +47,9 @@ def predict(
     from depthpose.cli.pose_methods import source_of
     from depthpose.cli.pose_predict import predict_dataset, predict_files, predict_on_ray
 
-    inputs = options.OneObjectOptions(**vars(first), **vars(more))
-    register = options.RegisterOptions(
-        method=estimates.method,
-        cad=inputs.cad,
-        cad_unit=inputs.cad_unit,
-        symmetry=inputs.symmetry,
-    )
-    weights = estimates.weights
-    sources = (inputs.cloud, inputs.depth, pair.left, dataset.bop)
+    # One kind of input; a pair is matched first, to depth images.
+    pose_inputs = options.PoseInputs(**vars(inputs), **vars(details))
+    sources = (pose_inputs.cloud, pose_inputs.depth, pair.left, dataset.bop)
     count = sum(word is not None for word in sources)
     if count != 1:
         raise InputError(
@@ -65,31 +59,42 @@ def predict(
     if pair.left is not None:
         from depthpose.cli.pose_pairs import match_pairs
 
-        depth = match_pairs(pair, inputs.camera, estimates.device, Path(out))
-        inputs = replace(inputs, depth=str(depth))
-    source = source_of(
-        weights, register, inputs.unit, dataset, estimates.config, inputs.base_from_camera
+        depth = match_pairs(pair, pose_inputs.camera, estimates.device, Path(out))
+        pose_inputs = replace(pose_inputs, depth=str(depth))
+
+    # The estimator: a trained network, or registration of CAD files; a worker builds its own.
+    register = options.RegisterOptions(
+        method=estimates.method,
+        cad=pose_inputs.cad,
+        cad_unit=pose_inputs.cad_unit,
+        symmetry=pose_inputs.symmetry,
     )
-    if engine.engine == "ray":
-        return predict_on_ray(inputs, source, estimates.batch, out, engine)
-    method = source.build()
-    home = Path(out)
+    weights = estimates.weights
+    source = source_of(
+        weights, register, pose_inputs.unit, dataset, estimates.config, pose_inputs.base_from_camera
+    )
     batch = estimates.batch
+    if engine.engine == "ray":
+        return predict_on_ray(pose_inputs, source, batch, out, engine)
+    method = source.build()
+
+    # The run over the inputs: of a data set, of whole images, or of clouds and parts of images.
+    home = Path(out)
     if dataset.bop is not None:
-        if inputs.color is not None:
+        if pose_inputs.color is not None:
             raise InputError("--color is beside --depth; leave it out where --bop is given")
         if dataset.masks == "search":
-            return search_dataset(method, dataset, inputs.object, home)
-        return predict_dataset(method, dataset, inputs.object, source.config, home, batch)
-    if inputs.cloud is not None and not method.takes_clouds:
+            return search_dataset(method, dataset, pose_inputs.object, home)
+        return predict_dataset(method, dataset, pose_inputs.object, source.config, home, batch)
+    if pose_inputs.cloud is not None and not method.takes_clouds:
         raise InputError(
-            f"--cloud {inputs.cloud}: the weights {weights} need depth images; give --depth, "
+            f"--cloud {pose_inputs.cloud}: the weights {weights} need depth images; give --depth, "
             "--mask and --camera, or weights that vote"
         )
-    lens = inputs.camera or inputs.focal_px
-    if inputs.depth is not None and not inputs.has_regions and lens is not None:
-        return find_all(method, inputs, home)
-    return predict_files(method, inputs, home, batch)
+    lens = pose_inputs.camera or pose_inputs.focal_px
+    if pose_inputs.depth is not None and not pose_inputs.has_regions and lens is not None:
+        return find_all(method, pose_inputs, home)
+    return predict_files(method, pose_inputs, home, batch)
 
 
 def evaluate(
@@ -124,7 +129,7 @@ def evaluate(
         adds: ADD-S for declared symmetric objects (of LineMOD eggbox and glue), or for all.
     """
     from depthpose.cli.pose_evaluate import measure, open_instances
-    from depthpose.cli.pose_methods import find_masks, pose_methods, predict_all
+    from depthpose.cli.pose_methods import find_masks, pose_methods, predict_instances
     from depthpose.core.config import config_to_dict
     from depthpose.core.run import claim_folder
     from depthpose.pose.config import EvaluationConfig
@@ -140,7 +145,9 @@ def evaluate(
     claim_folder(out, {"command": "pose evaluate", **about}, files)
     methods = pose_methods(weights, estimates.estimate, tuple(dataset.objects.values()))
     shown = find_masks(estimates.masks, dataset, out, estimates.device) if methods else []
-    paths = [predict_all(dataset, method, masks, out) for method in methods for masks in shown]
+    paths = [
+        predict_instances(dataset, method, masks, out) for method in methods for masks in shown
+    ]
     return measure(dataset, [*paths, *csv, *predictions], rule, out)
 
 

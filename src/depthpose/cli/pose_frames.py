@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from depthpose.cli import pose_methods, pose_predict
 from depthpose.cli.pose_methods import PoseMethod
-from depthpose.cli.pose_options import DataSetOptions, OneObjectOptions, SequenceOptions
+from depthpose.cli.pose_options import DataSetOptions, PoseInputs, SequenceOptions
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_depth_png
 from depthpose.core.rigid import Rigid
@@ -122,7 +122,7 @@ def _search(
     return predictions, single_jobs
 
 
-def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
+def find_all(method: PoseMethod, inputs: PoseInputs, out: Path) -> int:
     """Find objects in every depth image, write the files of each, and give the exit code.
 
     Every object that is looked for has an entry, found or not: in an image NAME they are called
@@ -155,7 +155,7 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
     settings = {**method.settings, "find": sorted(objects), **facts}
     models = [model for model in method.models if model.name in objects]
     jobs = pose_predict.colored_jobs(jobs, inputs, models, out, settings)
-    pose_predict.claim(out, settings, jobs, pose_predict.is_result_of)
+    pose_predict.claim_for_jobs(out, settings, jobs, pose_predict.is_result_of)
     earlier = [p for p in earlier_predictions(out).values() if p.estimate.status != "unreadable"]
 
     def is_of_image(prediction: Prediction, image: str) -> bool:
@@ -163,7 +163,7 @@ def find_all(method: PoseMethod, inputs: OneObjectOptions, out: Path) -> int:
 
     results = SearchResults(out, [job.name for job in jobs], earlier, is_of_image)
     predictions, searched = _search(method, objects, jobs, results)
-    pose_predict.claim(out, settings, searched, pose_predict.is_result_of)
+    pose_predict.claim_for_jobs(out, settings, searched, pose_predict.is_result_of)
     pose_predict.write_files(predictions, searched, out, method, inputs=len(jobs))
     return pose_predict.print_result(predictions, out, len(jobs))
 
@@ -187,7 +187,7 @@ def search_dataset(
     numbers = {name: n for n, name in pose_methods.match_names(dataset, method.models).items()}
     settings = {**method.settings, **pose_methods.of_dataset(dataset), "masks": "search"}
     settings["find"] = sorted(numbers)
-    pose_predict.claim_bop(out, settings, dataset)
+    pose_predict.claim_for_dataset(out, settings, dataset)
     images = {(i.scene_id, i.image_id): i for i in dataset.instances}
     some_object = next(iter(numbers))
     jobs = [
@@ -254,7 +254,7 @@ def track_folder(method: PoseMethod, frames: SequenceOptions, out: Path) -> int:
         settings |= pose_predict.camera_facts(frames.camera)
     if frames.first is not None:
         settings |= {"first": pose_methods.named_file(frames.first)}
-    pose_predict.claim(out, settings, jobs)
+    pose_predict.claim_for_jobs(out, settings, jobs)
     return _finish(method, _followed(method, jobs, name, start), jobs, out)
 
 
@@ -269,7 +269,7 @@ def track_bop(method: PoseMethod, frames: SequenceOptions, out: Path) -> int:
         **pose_methods.of_dataset(dataset),
         "track": sorted(names.values()),
     }
-    pose_predict.claim_bop(out, settings, dataset)
+    pose_predict.claim_for_dataset(out, settings, dataset)
     # The first instance of an object in each image of a scene is followed.
     first_instances: dict[tuple[int, int], dict[int, Instance]] = {}
     for instance in sorted(dataset.instances, key=lambda i: (i.image_id, i.index)):

@@ -323,7 +323,7 @@ def _in_base(method: PoseMethod, base: Rigid) -> PoseMethod:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class MethodSource:
+class PoseMethodSource:
     """What an estimator is made from, in this process or by the workers of an engine.
 
     ``weights``: of a network, by name or file, or packed to travel; None: ``models`` are registered
@@ -358,7 +358,7 @@ def source_of(
     dataset: DataSetOptions | SequenceOptions,
     config: EstimateConfig,
     base: Sequence[str] = (),
-) -> MethodSource:
+) -> PoseMethodSource:
     """Say what the options of a command make an estimator from."""
     base_from_camera = read_base(base)
     # The unit of clouds is not that of CAD files that have their own.
@@ -372,17 +372,17 @@ def source_of(
             "a data set have the symmetries that they declare"
         )
     if not register.is_register:
-        return MethodSource(config=config, weights=weights, base_from_camera=base_from_camera)
+        return PoseMethodSource(config=config, weights=weights, base_from_camera=base_from_camera)
     if dataset.bop is not None:
         models = tuple(datasets.open_bop(dataset.bop, dataset.split).objects.values())
-        return MethodSource(config=config, models=models)
+        return PoseMethodSource(config=config, models=models)
     if not register.cad:
-        return MethodSource(config=config, base_from_camera=base_from_camera)
+        return PoseMethodSource(config=config, base_from_camera=base_from_camera)
     loaded = Registration.load(*register.cad, unit=cad_unit, symmetry=register.symmetry or None)
-    return MethodSource(config=config, models=loaded.models, base_from_camera=base_from_camera)
+    return PoseMethodSource(config=config, models=loaded.models, base_from_camera=base_from_camera)
 
 
-def predict_all(
+def predict_instances(
     dataset: datasets.BopDataset, method: PoseMethod, masks: Masks, out: Path, batch: int = 1
 ) -> Path:
     """Estimate every instance that is not estimated yet, and write ``poses.json`` and BOP's csv."""

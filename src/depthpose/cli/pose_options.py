@@ -67,7 +67,7 @@ class PoseTableOptions(PoseMeasureOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FirstOptions:
+class InputOptions:
     """What is looked for, and in what."""
 
     cad: tuple[Source, ...] = ()
@@ -92,7 +92,7 @@ class FirstOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MoreOptions:
+class InputDetailOptions:
     """More about the objects and the images."""
 
     detections: Source | None = None
@@ -128,8 +128,8 @@ class MoreOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class OneObjectOptions(FirstOptions, MoreOptions):
-    """A cloud or a depth image of known objects, and what is known of it."""
+class PoseInputs(InputOptions, InputDetailOptions):
+    """Clouds or depth images of known objects, and all that is known of them."""
 
     @property
     def has_regions(self) -> bool:

@@ -44,7 +44,7 @@ def match_pairs(pair: PairOptions, camera: Path | None, device: str, out: Path) 
     refuse_among_inputs(out, (pair.left, pair.right), [path for both in pairs for path in both])
     networks = PairNetworks(matcher=pair.matcher)
     weights = None if pair.matcher == "sgbm" else pair.matcher or "default"
-    method = work.MethodSource(
+    method = work.DepthMethodSource(
         weights=weights, config=MatcherConfig(device=device), with_right=True, use="pairs"
     )
     depth_work = work.pair_work(camera, networks, method, pairs[0])

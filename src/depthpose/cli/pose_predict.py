@@ -19,8 +19,8 @@ from tqdm import tqdm
 
 from depthpose.cli import pose_methods
 from depthpose.cli.engine import EngineOptions, Weights, print_shards
-from depthpose.cli.pose_methods import MethodSource, PoseMethod
-from depthpose.cli.pose_options import DataSetOptions, OneObjectOptions
+from depthpose.cli.pose_methods import PoseMethod, PoseMethodSource
+from depthpose.cli.pose_options import DataSetOptions, PoseInputs
 from depthpose.core import run
 from depthpose.core.camera import Camera, camera_of
 from depthpose.core.checkpoint import file_sha256, find_weights
@@ -99,7 +99,7 @@ certainty: the probability that the pose is right, up to the near-symmetries of 
 of this copy: that it is this very copy of a nearly symmetric model"""
 
 
-def claim(
+def claim_for_jobs(
     out: Path,
     settings: dict[str, Any],
     jobs: list[PoseJob[Any]],
@@ -107,10 +107,17 @@ def claim(
 ) -> None:
     """Claim a folder for the poses of clouds or depth images, whose jobs name their files.
 
-    ``is_result``: whether a result of the first name is of the input of the second.
+    Poses of an earlier run are deleted, to be estimated anew, if the record of the files that they
+    were estimated from is lost.
+
+    Args:
+        out: the folder.
+        settings: JSON values that decide the poses.
+        jobs: each with the files that it reads.
+        is_result: whether a result of the first name is of the input of the second.
     """
     run.claim_folder(out, settings, [POSES, _PAGE])
-    if run.find_rank().world == 1 and not run.read_sources(out):  # lost: of what the poses are
+    if run.find_rank().world == 1 and not run.read_sources(out):
         (out / POSES).unlink(missing_ok=True)
 
     def is_finished(name: str) -> bool:
@@ -131,7 +138,7 @@ def is_result_of(name: str, image: str) -> bool:
     return re.fullmatch(rf"{re.escape(image)}(_\d+)?", name) is not None
 
 
-def claim_bop(out: Path, settings: dict[str, Any], dataset: BopDataset) -> None:
+def claim_for_dataset(out: Path, settings: dict[str, Any], dataset: BopDataset) -> None:
     """Claim a folder for the poses of a data set."""
     images = sorted({(i.scene_id, i.image_id) for i in dataset.instances})
     pictures = [f"{scene:06d}_{image:06d}.{PICTURE}" for scene, image in images]
@@ -392,7 +399,7 @@ def frame_jobs(
 
 def colored_jobs(
     jobs: list[PoseJob[Any]],
-    inputs: OneObjectOptions,
+    inputs: PoseInputs,
     models: Sequence[ObjectModel],
     out: Path,
     settings: dict[str, Any],
@@ -465,7 +472,7 @@ def _refuse_one_name(files: Sequence[Path]) -> None:
             )
 
 
-def predict_files(method: PoseMethod, inputs: OneObjectOptions, out: Path, batch: int) -> int:
+def predict_files(method: PoseMethod, inputs: PoseInputs, out: Path, batch: int) -> int:
     """Pose clouds, or parts of depth images, in this process; give the exit code."""
     settings = dict(method.settings)
     unit = inputs.unit
@@ -479,8 +486,8 @@ def predict_files(method: PoseMethod, inputs: OneObjectOptions, out: Path, batch
     posed = {job.object for job in jobs}
     models = [model for model in method.models if model.name in posed]
     jobs = colored_jobs(jobs, inputs, models, out, settings)
-    claim(out, settings, jobs)
-    predictions = predict_all(method, jobs, out, settings, batch)
+    claim_for_jobs(out, settings, jobs)
+    predictions = estimate_jobs(method, jobs, out, settings, batch)
     if predictions is None:
         return 0
     write_files(predictions, jobs, out, method)
@@ -488,7 +495,7 @@ def predict_files(method: PoseMethod, inputs: OneObjectOptions, out: Path, batch
 
 
 def region_jobs(
-    method: PoseMethod, inputs: OneObjectOptions, out: Path, settings: dict[str, Any]
+    method: PoseMethod, inputs: PoseInputs, out: Path, settings: dict[str, Any]
 ) -> list[PoseJob[Any]]:
     """Take depth images and where objects are in them; add to the settings what decides that."""
     lens = inputs.camera or inputs.focal_px
@@ -554,15 +561,15 @@ def predict_dataset(
     settings |= {**pose_methods.of_dataset(dataset), "masks": masks.name, **masks.settings}
     if object is not None:
         settings["objects"] = sorted({i.object_id for i in dataset.instances})
-    claim_bop(out, settings, dataset)
-    predictions = predict_all(method, jobs, out, settings, batch)
+    claim_for_dataset(out, settings, dataset)
+    predictions = estimate_jobs(method, jobs, out, settings, batch)
     if predictions is None:
         return 0
     write_files(predictions, jobs, out, method, dataset)
     return print_result(predictions, out)
 
 
-def predict_all(
+def estimate_jobs(
     method: PoseMethod,
     jobs: list[PoseJob[Any]],
     out: Path,
@@ -576,32 +583,39 @@ def predict_all(
     process = run.find_rank()
     home = out if process.world == 1 else out / f"part-{process.rank}"
     by_name = earlier_predictions(out)
-    finished = {name for name, made in by_name.items() if made.estimate.status != "unreadable"}
+    unreadable = {name for name, p in by_name.items() if p.estimate.status == "unreadable"}
+    finished = by_name.keys() - unreadable
     unfinished = [job for job in process.share_of(jobs) if job.name not in finished]
     if unfinished:
-        made = predict(method.estimate_many, unfinished, home, settings, batch)
-        for prediction in tqdm(made, total=len(unfinished), disable=None, unit=" poses"):
+        written = predict(method.estimate_many, unfinished, home, settings, batch)
+        for prediction in tqdm(written, total=len(unfinished), disable=None, unit=" poses"):
             by_name[prediction.estimate.name] = prediction
+
+    # The first process puts the files of all together, with the inputs of earlier runs.
     if process.rank:
         return None
     if process.world > 1:
-        names_there: set[str] = set()
-        last_read_s = -math.inf
-
-        def is_there(name: str) -> bool:
-            nonlocal names_there, last_read_s
-            # Files of all parts are read for all names at once, every second.
-            if name not in names_there and time.monotonic() - last_read_s > 1:
-                names_there = set(earlier_predictions(out))
-                last_read_s = time.monotonic()
-            return name in names_there
-
-        run.wait_for([job.name for job in jobs], is_there)
+        _wait_for_predictions(out, jobs)
         by_name = earlier_predictions(out)
     predictions = [by_name.pop(job.name) for job in jobs]
-    # Inputs of earlier runs stay in the file.
     write_predictions(out, [*by_name.values(), *predictions])
     return predictions
+
+
+def _wait_for_predictions(out: Path, jobs: Sequence[PoseJob[Any]]) -> None:
+    """Wait until the files of all processes together hold a prediction of every job."""
+    names: set[str] = set()
+    last_read_s = -math.inf
+
+    def is_written(name: str) -> bool:
+        nonlocal names, last_read_s
+        # The files are read for all names at once, every second.
+        if name not in names and time.monotonic() - last_read_s > 1:
+            names = set(earlier_predictions(out))
+            last_read_s = time.monotonic()
+        return name in names
+
+    run.wait_for([job.name for job in jobs], is_written)
 
 
 def write_files(
@@ -807,7 +821,7 @@ class EntryFiles(Results[Any, PoseEstimate]):
 
 
 def start_files(
-    source: MethodSource, object: str, unit: Unit | None, camera: Camera | None
+    source: PoseMethodSource, object: str, unit: Unit | None, camera: Camera | None
 ) -> Function:
     """Build the estimator; clouds, or depth images and masks, to poses or the reasons for none."""
     method = source.build()
@@ -830,7 +844,7 @@ def start_files(
 
 
 def predict_on_ray(
-    options: OneObjectOptions, source: MethodSource, batch: int, out: str, engine: EngineOptions
+    options: PoseInputs, source: PoseMethodSource, batch: int, out: str, engine: EngineOptions
 ) -> int:
     """Pose clouds, depth images and masks, manifests or tar shards by the workers of an engine."""
     if options.depth is not None and (options.camera or options.focal_px) is None:

@@ -13,7 +13,7 @@ from depthpose.cli.pose_options import PoseDataOptions, PoseTableOptions
 from depthpose.core.errors import InputError
 
 if TYPE_CHECKING:
-    from depthpose.cli.depth_predict import Method, MethodSource
+    from depthpose.cli.depth_predict import DepthMethodSource, Method
     from depthpose.thesis.depth import PublishedTable
 
 
@@ -54,7 +54,7 @@ def reproduce(
         pictures: how many frames the page shows.
     """
     from depthpose.cli.depth_evaluate import baseline_method, open_frames, open_training
-    from depthpose.cli.depth_predict import MethodSource
+    from depthpose.cli.depth_predict import DepthMethodSource
     from depthpose.cli.thesis_depth import reproduce_table
     from depthpose.depth.evaluate import find_protocol
     from depthpose.thesis.depth import TABLES
@@ -70,7 +70,9 @@ def reproduce(
     _refuse_rows(published, weights, matcher, beside)
     dataset = open_frames(kitti, None if split == "all" else split)
 
-    source = MethodSource(weights=None, config=matching.config, with_right=published.with_right)
+    source = DepthMethodSource(
+        weights=None, config=matching.config, with_right=published.with_right
+    )
     methods = _build_methods(source, published, weights, matcher, beside)
     if train:
         training = open_training(train, train_without, dataset)
@@ -84,7 +86,7 @@ def reproduce(
 
 
 def _build_methods(
-    source: "MethodSource",
+    source: "DepthMethodSource",
     table: "PublishedTable",
     weights: Sequence[str],
     matcher: str | None,
@@ -170,7 +172,7 @@ def figure(
         split: choose among the frames of a split, such as eigen-test.
     """
     from depthpose.cli.depth_evaluate import open_frames
-    from depthpose.cli.depth_predict import MethodSource
+    from depthpose.cli.depth_predict import DepthMethodSource
     from depthpose.cli.thesis_depth import choose_frames, write_figure
 
     dataset = open_frames(kitti, split)
@@ -178,7 +180,7 @@ def figure(
         refuse_below(1, "--number", number, "4")
     chosen = choose_frames(dataset, frames, number or (1 if figure == "2-1" else 4))
     with_right = False if figure == "2-1" else None
-    source = MethodSource(weights=weights, config=matching.config, with_right=with_right)
+    source = DepthMethodSource(weights=weights, config=matching.config, with_right=with_right)
     return write_figure(figure, dataset, chosen, source.build(), out)
 
 

@@ -55,7 +55,7 @@ def reproduce_table(
     claim_folder(out, settings, (*results, "predictions", "figures"))
     rule = find_protocol(protocol)
     home = out / "predictions"
-    folders = [evaluation.predict_all(dataset, method, rule, home) for _, method in methods]
+    folders = [evaluation.predict_dataset(dataset, method, rule, home) for _, method in methods]
     if find_rank().rank > 0:
         return 0
     measured = evaluation.join(evaluation.measure_each(dataset, folders, protocol, caps_m))

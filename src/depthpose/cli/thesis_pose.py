@@ -133,7 +133,11 @@ def reproduce_by_object(
     results = (*page.table_files("rows", "all", "instances", "risk"), "report.md", "report.html")
     claim_folder(out, settings, (*results, "predictions", "detections", "figures"))
     shown = pose_methods.find_masks(options.masks, dataset, out, options.device) if methods else []
-    folders = [pose_methods.predict_all(dataset, m, masks, out) for m in methods for masks in shown]
+    folders = [
+        pose_methods.predict_instances(dataset, method, masks, out)
+        for method in methods
+        for masks in shown
+    ]
     measured = pose_evaluate.join(pose_evaluate.measure_each(dataset, [*folders, *csv], rule))
     rows = pose_tables.join_by_object(measured.rows, numbers, with_published=is_printed)
     every = [row.columns() for row in measured.rows]

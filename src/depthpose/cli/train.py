@@ -142,7 +142,7 @@ class Lines:
 _HELD_OUT = 20  # pairs of a folder that validate, by default
 
 
-def train_depth(
+def depth_train(
     stage: tyro.conf.Positional[Literal["view", "select", "stereo", "finetune"]],
     out: NewPath,
     config: Path | None = None,
@@ -253,7 +253,7 @@ _START = "parts"  # weights that ship, under a licence that allows any use
 _NO_START = "nothing"  # as --start: begin without weights
 
 
-def train_pose(
+def pose_train(
     out: NewPath,
     config: Path | None = None,
     cad: tuple[Source, ...] = (),

@@ -83,7 +83,7 @@ def _mean_of_images(error: Tensor, is_known: Tensor) -> Tensor:
     return means.sum() / (counts > 0).sum().clamp(min=1)
 
 
-DISPARITY_LOSSES: dict[str, Callable[[Tensor, Tensor, tuple[float, float]], Tensor]] = {
+GENERATOR_DISPARITY_LOSSES: dict[str, Callable[[Tensor, Tensor, tuple[float, float]], Tensor]] = {
     "log": log_disparity_loss,
 }
 """Losses of a generator that selects, by their names in configs: a new one is a function of the

@@ -243,7 +243,7 @@ OCCLUSIONS = "[0, 0.95]"  #: share of a silhouette that something may occlude
 
 
 @dataclass(frozen=True, kw_only=True)
-class SensorConfig(Settings):
+class SyntheticSensorConfig(Settings):
     """The errors of a depth sensor. Ranges are of what each sample draws."""
 
     kinds: tuple[SensorKind, ...] = ("structured light",)
@@ -323,7 +323,7 @@ class ObjectsConfig(Settings):
     mask_shift_px: Annotated[int, "[0, 20]"] = 2
     """And shifted by up to so many of them along each axis, as a predicted mask is."""
 
-    sensor: SensorConfig = SensorConfig()
+    sensor: SyntheticSensorConfig = SyntheticSensorConfig()
     """What measures the depth."""
 
     frame_objects: Annotated[tuple[int, int], "[1, inf)", ASCENDING] = (2, 6)

@@ -188,7 +188,7 @@ class Registration(PoseEstimator):
         seconds["icp"] = time.perf_counter() - began
         if float(refinement.refined.inlier_share) == 0:
             reason = "no pose lays the model near the points: another object, or too little of it"
-            return refused(given, Refusal(status="votes do not meet", reason=reason), seconds)
+            return refused(given, Refusal(status="no pose found", reason=reason), seconds)
 
         began = time.perf_counter()
         observation = observe(

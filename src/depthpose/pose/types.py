@@ -16,14 +16,17 @@ Status = Literal[
     "unreadable",
     "unusable input",
     "too few points",
+    "no pose found",
     "votes do not meet",
     "keypoints do not fit",
     "not observable",
     "doubtful",
 ]
 """An answer, or why there is none. Ambiguous: the pose fits, and so do others; it is given with
-them. Unreadable: no input came; it is tried again by the next run. Doubtful: the pose does not fit
-what the camera saw, or another size or the mirror image fits better than the sensor explains."""
+them. Unreadable: no input came; it is tried again by the next run. No pose found: registration
+leaves no point near the model. Votes do not meet, keypoints do not fit: of a network's keypoints.
+Doubtful: the pose does not fit what the camera saw, or another size or the mirror image fits better
+than the sensor explains."""
 
 POSED: tuple[Status, ...] = ("ok", "ambiguous")  #: with a pose
 

@@ -16,7 +16,7 @@ from depthpose.depth.config import (
     SelectionConfig,
     Settings,
 )
-from depthpose.depth.losses import ADVERSARIAL_LOSSES, DISPARITY_LOSSES
+from depthpose.depth.losses import ADVERSARIAL_LOSSES, GENERATOR_DISPARITY_LOSSES
 from depthpose.depth.weights import MATCHERS
 
 
@@ -87,7 +87,7 @@ class SelectTraining(Settings):
     """Learning rate of the encoder as a share of the decoder's."""
 
     disparity_loss: str = "log"
-    """log: error of disparity's logarithm; see ``losses.DISPARITY_LOSSES``."""
+    """log: error of disparity's logarithm; see ``losses.GENERATOR_DISPARITY_LOSSES``."""
 
     plane_weight: Annotated[float, "[0, inf)"] = 0.2
     """Weight of the cross entropy over sky and disparities."""
@@ -126,7 +126,7 @@ class SelectTraining(Settings):
     """How long."""
 
     def __post_init__(self) -> None:
-        refuse_unknown("disparity_loss", self.disparity_loss, DISPARITY_LOSSES)
+        refuse_unknown("disparity_loss", self.disparity_loss, GENERATOR_DISPARITY_LOSSES)
         super().__post_init__()
         for pairs in (self.pairs, self.more):
             augment = None if pairs is None else pairs.augment

@@ -366,7 +366,8 @@ class SelectTask:
         range_px = self.generator.config.disparity_px
         log_px = synthesis.read_logits(logits, planes)[0][:, None]
         log_px = F.interpolate(log_px, truth_px.shape[1:], mode="bilinear", align_corners=False)
-        loss = losses.DISPARITY_LOSSES[self.config.disparity_loss](log_px[:, 0], truth_px, range_px)
+        disparity_loss = losses.GENERATOR_DISPARITY_LOSSES[self.config.disparity_loss]
+        loss = disparity_loss(log_px[:, 0], truth_px, range_px)
         if not self.config.plane_weight:
             return loss
         # The nearest point of the four pixels that a logit stands for; unknown is -1.

@@ -26,7 +26,7 @@ from depthpose.core.loop import sample_generator
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import grow_mask, lift_sample, turn_axis_to
-from depthpose.pose.config import CloudConfig, ObjectsConfig, SensorConfig, SensorKind
+from depthpose.pose.config import CloudConfig, ObjectsConfig, SensorKind, SyntheticSensorConfig
 from depthpose.pose.mesh import drawn_triangles
 from depthpose.pose.types import CloudSample, ObjectModel, PoseTruth, ViewInput, ViewSample
 
@@ -118,7 +118,10 @@ def occlude(
 
 
 def measure(
-    depth_m: Depth, focal_px: tuple[float, float], config: SensorConfig, generator: torch.Generator
+    depth_m: Depth,
+    focal_px: tuple[float, float],
+    config: SyntheticSensorConfig,
+    generator: torch.Generator,
 ) -> Depth:
     """Measure a clean depth window as a sensor would.
 

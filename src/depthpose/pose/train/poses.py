@@ -113,35 +113,35 @@ class PoseTask(ViewsTask):
         cloud = voxelised_cloud(sample, number, config, chance)
         device = next(self.network.parameters()).device
         batch = TrainingClouds.collate([cloud])
-        seen = CloudBatch(*(part.to(device) for part in batch)).seen
-        vote = vote_ransac(seen.points_m, self.network.directions(seen).float())
+        points = CloudBatch(*(part.to(device) for part in batch)).seen
+        vote = vote_ransac(points.points_m, self.network.directions(points).float())
         fit = fit_pose(vote.keypoints_m.cpu(), vote.covariance_m2.cpu(), model.keypoints_m)
         return add_error(fit.camera_from_model, Rigid(cloud.R, cloud.t_m), model)
 
 
 def symmetric_copies(models: Sequence[ObjectModel], step_rad: float) -> Rigid:
     """``model_from_model`` of each object (classes, copies); the identity fills the shorter."""
-    every = [symmetry_transforms(model.symmetries, step_rad).double() for model in models]
-    most = max(len(copies.R) for copies in every)
+    of_models = [symmetry_transforms(model.symmetries, step_rad).double() for model in models]
+    most = max(len(copies.R) for copies in of_models)
     R = torch.eye(3).double().repeat(len(models), most, 1, 1)
     t_m = torch.zeros(len(models), most, 3).double()
-    for k, copies in enumerate(every):
+    for k, copies in enumerate(of_models):
         R[k, : len(copies.R)] = copies.R
         t_m[k, : len(copies.R)] = copies.t_m
     return Rigid(R, t_m)
 
 
-_TURNS_ON_CARD = 3  # turns of an object that look nearly alike, on a card
+_ROTATIONS_ON_CARD = 3  # rotations by which an object looks nearly alike, on a card
 
 
 def claim_run(config: Any, run: Run, files: Sequence[str] = ()) -> None:  # noqa: ANN401
-    """Make the folder this config's own."""
-    more: dict[str, Any] = {"sha256": [file_sha256(Path(path)) for path in files]}
+    """Make the folder this config's own, with the checksums of ``files`` and of its start."""
+    checksums: dict[str, Any] = {"sha256": [file_sha256(Path(path)) for path in files]}
     if config.start is not None:
-        more["start_sha256"] = file_sha256(find_weights(config.start))
+        checksums["start_sha256"] = file_sha256(find_weights(config.start))
         warn_of_terms(bound_facts({}, [config.start]))
     weights = ("pose", "pointnet", "depth-image", "segmentation")
-    run.claim(config, weights, more, without=("held_out", "calibration"))
+    run.claim(config, weights, checksums, without=("held_out", "calibration"))
 
 
 def packed(
@@ -217,8 +217,10 @@ class DepthImageTask(ViewsTask):
         self.config = config
         # Points of each surface; those of a sparse model of points come again.
         count = config.surface_points
-        every = [sample_surface(model, count)[0] for model in models]
-        self._points_m = torch.stack([some[torch.arange(count) % len(some)] for some in every])
+        surfaces_m = [sample_surface(model, count)[0] for model in models]
+        self._points_m = torch.stack([
+            points_m[torch.arange(count) % len(points_m)] for points_m in surfaces_m
+        ])  # fmt: skip
         self._copies = symmetric_copies(models, _IMAGE_SYMMETRY_STEP).float()
         self._diameter_m = torch.tensor([model.diameter_m for model in models])
 
@@ -260,65 +262,105 @@ def train_pose(config: PoseTraining | DepthImageTraining, run: Run) -> Path:
     """
     torch.manual_seed(config.loop.seed)
     models = read_models(config.models, run.on_message)
-    # The classes and keypoints are those of the objects, the inputs those of the cloud.
-    sizes = {"classes": len(models), "keypoints": len(models[0].keypoints_m)}
-    sizes["inputs"] = SHAPE_FEATURES if config.cloud.with_shape else 1
-    sizes = {name: size for name, size in sizes.items() if hasattr(config.network, name)}
-    config = dataclasses.replace(config, network=dataclasses.replace(config.network, **sizes))
-    if isinstance(config, DepthImageTraining):
-        word = "depth-image"
-        samples = TrainingCrops(models, config, config.loop.seed)
-        network = DepthImageNet(config.network)
-        task = DepthImageTask(network, models, config)
-    else:
-        samples = TrainingClouds(models, config, config.loop.seed)
-        if config.loop.workers > 1 and (config.frames is None or config.frames.share < 1):
-            samples.synthetic.draw_stored(config.loop.workers)
-        if isinstance(config.network, PointNetConfig):
-            word = "pointnet"
-            network = PointNet(config.network)
-        else:
-            word = "pose"
-            network = ResUNet(config.network)
-        task = PoseTask(network, models, config)
+    config = _with_sizes(config, models)
+    kind, task, samples = _build_training(config, models)
     if config.start is not None:
-        _start_from(network, config.start, samples)
+        _start_from(task.network, config.start, samples)
+    # Only now is the folder this config's: until here a setting may be refused.
     claim_run(config, run, config.models.cad)
+
     seconds = run.train(task, samples, config.loop)
-    path = run.folder / f"{word}.safetensors"
+    path = run.folder / f"{kind}.safetensors"
     if run.on_message is not None:
         run.on_message("trained; now it is measured on synthetic views: a minute or more")
     if find_rank().rank:
         return path  # statistics of batch norm are rank 0's, and so is the file
-    learnt = fold_norms(network) if isinstance(network, ResUNet) else network
-    write_pose_weights(path, packed(learnt, models, config), with_half=config.with_half)
+    network = task.network
+    inference_network = fold_norms(network) if isinstance(network, ResUNet) else network
+    packed_weights = packed(inference_network, models, config)
+    write_pose_weights(path, packed_weights, with_half=config.with_half)
+
     weights = read_pose_weights(path)  # as the file holds them: 16 bits round them
-    table = score_held_out(weights, config.objects, config.held_out)
-    write_json(path.with_suffix(".json"), {"held_out": table})
-    cad = [word for file in config.models.cad for word in ("--cad", file)]
-    unit = ["--unit", config.models.unit] if cad and config.models.unit else []
-    command = shlex.join(["pose", "train", "--what", word, *cad, *unit])
-    listing = ", ".join(f"{m.name} ({1000 * m.diameter_m:.0f} mm)" for m in weights.models)
-    alike = {model.name: near_symmetry_lines(model)[:_TURNS_ON_CARD] for model in weights.models}
-    near = "; ".join(f"{name}: {', '.join(some)}" for name, some in alike.items() if some)
-    facts = {"objects": listing} | ({"nearly_alike": near} if near else {}) | dict(weights.facts)
-    write_card(path, command, seconds, facts, table_text(table))
+    held_out_rows = score_held_out(weights, config.objects, config.held_out)
+    write_json(path.with_suffix(".json"), {"held_out": held_out_rows})
+    _write_pose_card(path, weights, config, seconds, table_text(held_out_rows))
     return path
 
 
+def _with_sizes(
+    config: PoseTraining | DepthImageTraining, models: Sequence[ObjectModel]
+) -> PoseTraining | DepthImageTraining:
+    """Give the network the classes and keypoints of the objects, and the inputs of the cloud."""
+    sizes = {
+        "classes": len(models),
+        "keypoints": len(models[0].keypoints_m),
+        "inputs": SHAPE_FEATURES if config.cloud.with_shape else 1,
+    }
+    own_sizes = {name: size for name, size in sizes.items() if hasattr(config.network, name)}
+    network = dataclasses.replace(config.network, **own_sizes)
+    return dataclasses.replace(config, network=network)
+
+
+def _build_training(
+    config: PoseTraining | DepthImageTraining, models: tuple[ObjectModel, ...]
+) -> tuple[str, PoseTask | DepthImageTask, TrainingClouds | TrainingCrops]:
+    """Give the kind of weights that a config trains, its task with a new network, and samples."""
+    if isinstance(config, DepthImageTraining):
+        crops = TrainingCrops(models, config, config.loop.seed)
+        return "depth-image", DepthImageTask(DepthImageNet(config.network), models, config), crops
+    clouds = TrainingClouds(models, config, config.loop.seed)
+    if config.loop.workers > 1 and (config.frames is None or config.frames.share < 1):
+        clouds.synthetic.draw_stored(config.loop.workers)
+    if isinstance(config.network, PointNetConfig):
+        return "pointnet", PoseTask(PointNet(config.network), models, config), clouds
+    return "pose", PoseTask(ResUNet(config.network), models, config), clouds
+
+
+def _write_pose_card(
+    path: Path,
+    weights: PoseWeights,
+    config: PoseTraining | DepthImageTraining,
+    seconds: float,
+    held_out: str,
+) -> None:
+    """Write the card beside weights: the command, the objects, and what was measured of them."""
+    cad_options = [word for file in config.models.cad for word in ("--cad", file)]
+    if cad_options and config.models.unit:
+        cad_options += ["--unit", config.models.unit]
+    command = shlex.join(["pose", "train", "--what", path.stem, *cad_options])
+    objects = ", ".join(f"{m.name} ({1000 * m.diameter_m:.0f} mm)" for m in weights.models)
+    facts = {"objects": objects}
+    rotations = {
+        model.name: near_symmetry_lines(model)[:_ROTATIONS_ON_CARD] for model in weights.models
+    }
+    near_symmetries = "; ".join(
+        f"{name}: {', '.join(lines)}" for name, lines in rotations.items() if lines
+    )
+    if near_symmetries:
+        facts["nearly_alike"] = near_symmetries
+    write_card(path, command, seconds, facts | dict(weights.facts), held_out)
+
+
 def _start_from(network: AnyNetwork, start: str, samples: TrainingViews[Any]) -> None:
-    """Copy weights; of other objects, all but the last layer, except of a depth image's."""
+    """Copy the weights of a file into a network that has the same settings.
+
+    Where the numbers of objects differ the last layer, which is theirs, stays as it is; a network
+    on depth images takes weights of the same number alone.
+
+    Raises:
+        InputError: the file is of other settings.
+    """
     path = find_weights(start)
     started = network_of(read_checkpoint(path), str(path))
     wanted = config_to_dict(network.config)
-    given = config_to_dict(started.config)
+    settings = config_to_dict(started.config)
     has_norms = isinstance(network, ResUNet) and network.config.norm == "batch"
     free = ("classes", "norm", "with_bias") if has_norms else ("classes",)
     free = () if isinstance(network, DepthImageNet) else free
     for name, value in wanted.items():
-        if name not in free and given.get(name) != value:
+        if name not in free and settings.get(name) != value:
             raise InputError(
-                f"{start}: was trained with {name} = {given.get(name)!r}, but the config says "
+                f"{start}: was trained with {name} = {settings.get(name)!r}, but the config says "
                 f"{value!r}. Give the config the weights' own."
             )
     # Written weights are folded: they have no norms, but biases; batch norm takes both up.
