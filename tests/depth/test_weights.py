@@ -1,11 +1,9 @@
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 
-from depthpose.cli import main
 from depthpose.core.checkpoint import Checkpoint, read_checkpoint, save_checkpoint
 from depthpose.core.errors import InputError
 from depthpose.depth.config import GeneratorConfig, PSMNetConfig, SelectionConfig
@@ -79,23 +77,6 @@ def test_one_network_alone_says_what_it_lacks(
         read_matcher(tmp_path / "g.safetensors")
     with pytest.raises(InputError, match="holds no generator, only a matcher"):
         read_generator(tmp_path / "s.safetensors")
-
-
-def test_retired_settings_are_not_shown(
-    networks: tuple[UNetGenerator, PSMNet], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    generator, matcher = networks
-    path = tmp_path / "old.safetensors"
-    write_depth_weights(path, generator=generator, matcher=matcher, facts=FACTS)
-    found = read_checkpoint(path)
-    config: dict[str, Any] = dict(found.config)
-    config["psmnet"] = {**config["psmnet"], "test_mode": "fast"}
-    save_checkpoint(path, replace(found, config=config))
-    assert main(["weights", "show", str(path)]) == 0
-    out = capsys.readouterr().out
-    assert "test_mode" not in out
-    assert "'pools': [2]" in out
-    assert "'virtual_focal_px': 100.0" in out
 
 
 @pytest.mark.parametrize(

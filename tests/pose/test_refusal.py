@@ -8,8 +8,6 @@ from bench.negatives import scaled
 from tests.pose.synthetic_objects import CAMERA, K, Oracle, bracket, pose_at, tiny_weights, view_of
 from torch import Tensor
 
-from depthpose.core.checkpoint import SHIPPED, read_checkpoint
-from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EstimateConfig, IcpConfig, RefusalConfig
@@ -116,17 +114,6 @@ def test_a_twin_with_a_boss_elsewhere_is_not_confirmed() -> None:
     assert found.identity is None or found.identity.status != "confirmed", found.identity
     if found.identity is not None and found.identity.status == "not excluded":
         assert found.identity.reason
-
-
-def test_settings_of_the_risk_of_before_are_left_out() -> None:
-    old = {"max_risk": 0.3, "slopes": {"far": 4.0}, "min_explained": 0.75, "min_hold": 0.1}
-    old |= {"min_agreement": 0.8, "max_beyond": 0.1, "min_found": 0.5, "candidate_slopes": {}}
-    assert config_from_dict(old, RefusalConfig, source="old") == RefusalConfig(
-        min_observability=0.1
-    )
-    for path in SHIPPED.glob("*.safetensors"):
-        refusal = read_checkpoint(path).config.get("refusal", {})
-        config_from_dict(refusal, RefusalConfig, source=path.name)
 
 
 @pytest.mark.parametrize(

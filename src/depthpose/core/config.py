@@ -119,9 +119,6 @@ def config_from_dict(
 ) -> ConfigT:
     """Build the dataclass ``kind`` from a mapping.
 
-    Names of settings of before (``RETIRED`` in their class) are left out; ``RENAMED`` gives today's
-    name of one that had another.
-
     Args:
         content: settings by name; what is left out has its default.
         kind: a dataclass.
@@ -136,9 +133,6 @@ def config_from_dict(
     defaults = {field.name: field.default for field in dataclasses.fields(kind)}
     values: dict[str, Any] = {}
     for key, value in content.items():
-        if key in getattr(kind, "RETIRED", ()):
-            continue
-        key = getattr(kind, "RENAMED", {}).get(key, key)  # noqa: PLW2901  today's name from here on
         if key not in defaults:
             raise InputError(
                 f"{source}: unknown key {prefix + str(key)!r:.{_LONGEST}}; "

@@ -51,8 +51,6 @@ MATCHERS = {
 
 BOTH = "fakestereo"
 _SELECTION = "selection"
-_FORMER = ("candidates", "encoder_kind", "scales", "test_mode", "with_agreement", "with_refinement")
-"""Settings of before, which weights files hold: networks have one value of each."""
 Use = Literal["images", "pairs"]
 """What networks are for: depth of single images, or of real pairs."""
 GENERATORS = {
@@ -126,14 +124,13 @@ def read_depth_weights(
 
 def _config_of(kind: str, settings: Mapping[str, Any], source: str) -> Any:  # noqa: ANN401
     """Make the config of a network from the metadata of its file."""
-    today = {name: value for name, value in settings.items() if name not in _FORMER}
-    return config_from_dict(today, {**GENERATORS, **MATCHERS}[kind].config, source=source)
+    return config_from_dict(settings, {**GENERATORS, **MATCHERS}[kind].config, source=source)
 
 
 def settings_of(checkpoint: checkpoints.Checkpoint, source: str) -> dict[str, Any]:
-    """Give the settings of a file's networks as they are used today, by kind where there are two.
+    """Give the settings of a file's networks, by kind where there are two.
 
-    Retired settings are left out; those that the file does not have are at their defaults.
+    Those that the file does not have are at their defaults.
 
     Raises:
         InputError: a setting is unknown, or has a value that is refused.

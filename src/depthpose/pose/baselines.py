@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Annotated, ClassVar, NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -44,9 +44,6 @@ class DepthImageConfig(Settings):
 @dataclass(frozen=True, kw_only=True)
 class PointNetConfig(Settings):
     """Size of a PointNet for segmentation (Qi et al. 2017) whose outputs are directions."""
-
-    RETIRED: ClassVar[frozenset[str]] = frozenset({"with_confidence", "with_transforms"})
-    """Settings of before, in older weights: no confidence is learnt, and T-Nets always turn."""
 
     classes: Annotated[int, "[1, inf)"] = 13
     """Objects that one network knows."""

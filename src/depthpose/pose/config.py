@@ -133,17 +133,6 @@ class IcpConfig(Settings):
 class RefusalConfig(Settings):
     """When an estimate is withheld."""
 
-    RETIRED: ClassVar[frozenset[str]] = frozenset(
-        {
-            "max_risk", "bias", "slopes", "means", "max_scale_error", "min_explained",
-            "min_agreement", "max_beyond", "min_found", "candidate_slopes",
-        }
-    )  # fmt: skip
-    """Settings in weights written before 2026-11-29, which are left out."""
-
-    RENAMED: ClassVar[dict[str, str]] = {"min_hold": "min_observability"}
-    """Names in weights written before 2026-11-28, and those of today."""
-
     min_probability: Annotated[float, "[0, 1]"] = 0.5
     """The best pose must be right with this probability, by what contradicts it in the image."""
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 import torch
 import torch.nn.functional as F
@@ -20,9 +20,6 @@ Widths = tuple[int, int, int, int]
 @dataclass(frozen=True, kw_only=True)
 class ResUNetConfig(Settings):
     """Size of the network (FCGF's ResUNetBN2C, Choy et al. ICCV 2019, figure 3-3 of the thesis)."""
-
-    RETIRED: ClassVar[frozenset[str]] = frozenset({"with_confidence", "descriptor"})
-    """Settings of before, in older weights: no confidence is learnt and no descriptor given."""
 
     classes: Annotated[int, "[1, inf)"] = 13
     """Objects that one network knows; the segmentation says which of them a cloud is."""

@@ -280,7 +280,7 @@ def read_pose_weights(path: Path) -> PoseWeights:
 def settings_of(checkpoint: Checkpoint, source: str) -> dict[str, Any]:
     """Give the settings of a file's network, clouds and refusal as they are used today.
 
-    Retired settings are left out; those that the file does not have are at their defaults.
+    Those that the file does not have are at their defaults.
 
     Raises:
         InputError: a setting is unknown, or has a value that is refused.

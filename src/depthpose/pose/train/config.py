@@ -2,7 +2,7 @@
 
 import dataclasses
 from dataclasses import dataclass, field
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 from depthpose.core.config import ASCENDING, Settings
 from depthpose.core.errors import InputError, refuse_unknown
@@ -121,9 +121,6 @@ class ViewsTraining(Settings):
 @dataclass(frozen=True, kw_only=True)
 class PoseTraining(ViewsTraining):
     """The direction network learns to point at keypoints."""
-
-    RETIRED: ClassVar[frozenset[str]] = frozenset({"calibration", "confidence_weight"})
-    """Settings of before: no risk is calibrated any more, and no confidence learnt."""
 
     first_alone: Annotated[int, "[0, inf)"] = 0
     """Synthetic views at the start that all show the first object. Several objects together take

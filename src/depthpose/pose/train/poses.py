@@ -141,7 +141,7 @@ def claim_run(config: Any, run: Run, files: Sequence[str] = ()) -> None:  # noqa
         checksums["start_sha256"] = file_sha256(find_weights(config.start))
         warn_of_terms(bound_facts({}, [config.start]))
     weights = ("pose", "pointnet", "depth-image", "segmentation")
-    run.claim(config, weights, checksums, without=("held_out", "calibration"))
+    run.claim(config, weights, checksums, without=("held_out",))
 
 
 def packed(
