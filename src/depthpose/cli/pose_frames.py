@@ -154,6 +154,7 @@ def find_all(method: PoseMethod, inputs: PoseInputs, out: Path) -> int:
     facts = pose_predict.camera_facts(lens) | ({} if unit is None else {"unit": unit})
     settings = {**method.settings, "find": sorted(objects), **facts}
     models = [model for model in method.models if model.name in objects]
+    jobs = pose_predict.background_jobs(jobs, inputs, settings)
     jobs = pose_predict.colored_jobs(jobs, inputs, models, out, settings)
     pose_predict.claim_for_jobs(out, settings, jobs, pose_predict.is_result_of)
     earlier = [p for p in earlier_predictions(out).values() if p.estimate.status != "unreadable"]

@@ -351,6 +351,15 @@ class PoseMethodSource:
             return _network(Path(name), Path(name).stem, config)
 
 
+def unit_of_cad(files: Sequence[str], cad_unit: Unit | None, unit: Unit | None) -> Unit | None:
+    """Give the unit of CAD files: their option, else that of clouds, unless each has its own."""
+    has_own = all(Path(path).suffix.lower() in FIXED_UNITS for path in files)
+    cad_unit = cad_unit or (None if has_own else unit)
+    for path in files:
+        unit_of(path, cad_unit)
+    return cad_unit
+
+
 def source_of(
     weights: str,
     register: RegisterOptions,
@@ -361,11 +370,7 @@ def source_of(
 ) -> PoseMethodSource:
     """Say what the options of a command make an estimator from."""
     base_from_camera = read_base(base)
-    # The unit of clouds is not that of CAD files that have their own.
-    has_own = all(Path(path).suffix.lower() in FIXED_UNITS for path in register.cad)
-    cad_unit = register.cad_unit or (None if has_own else unit)
-    for path in register.cad:
-        unit_of(path, cad_unit)
+    cad_unit = unit_of_cad(register.cad, register.cad_unit, unit)
     if register.symmetry and (not register.is_register or not register.cad):
         raise InputError(
             f"--symmetry {register.symmetry[0]}: is of --method register with --cad; a network and "
@@ -423,7 +428,12 @@ def match_names(dataset: datasets.BopDataset, models: Sequence[ObjectModel]) -> 
 
 
 def read_pose(path: Path, option: str = "--first", what: str = "camera_from_model") -> Rigid:
-    """Read the 4x4 matrix of a pose from a text file; brackets and commas do no harm."""
+    """Read a pose: that of a ``poses.json`` of one, or a 4x4 matrix in a text file.
+
+    Brackets and commas in it do no harm.
+    """
+    if path.suffix == ".json":
+        return _only_pose(path, option)
     try:
         text = path.read_text()
     except (OSError, ValueError) as error:
@@ -432,6 +442,19 @@ def read_pose(path: Path, option: str = "--first", what: str = "camera_from_mode
             f"{what} in metres"
         ) from error
     return _rigid_of(text, f"{option} {path}", what)
+
+
+def _only_pose(path: Path, option: str) -> Rigid:
+    """Read the pose of a ``poses.json`` that holds one."""
+    rows = enumerate(read_rows(path))
+    read = [predictions.parse_prediction(row, f"{path}: entry {i}") for i, row in rows]
+    poses = [p.estimate.camera_from_model for p in read if p.estimate.camera_from_model is not None]
+    if len(poses) != 1:
+        raise InputError(
+            f"{option} {path}: holds {len(poses)} poses; give a poses.json of one, or a text file "
+            "with the 4x4 matrix camera_from_model in metres"
+        )
+    return poses[0]
 
 
 def read_base(words: Sequence[str]) -> Rigid | None:

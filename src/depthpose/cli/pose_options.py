@@ -106,6 +106,14 @@ class InputDetailOptions:
     unit: Unit | None = None
     """unit of clouds (default m), of depth images whose camera file gives none, and of CAD files
     without --cad-unit."""
+    bin: Source | None = None
+    """CAD file of the bin, tray or table that holds the parts, in --cad-unit; with --bin-pose. What
+    lies on it is no part, and no part lies in it."""
+    bin_pose: Path | None = None
+    """where the bin is: text file with the 4x4 matrix camera_from_model, in metres, or the
+    poses.json of a run that posed it alone."""
+    empty_frame: Source | None = None
+    """in place of --bin: depth image of the bin or table without the parts, by the same camera."""
     symmetry: tuple[str, ...] = ()
     """of --cad: how a part looks alike, in place of what is found: z,18 after each of 18 equal
     turns about an axis along z, z,free after any, z,6+x,2 about two axes; or a JSON file with BOP's

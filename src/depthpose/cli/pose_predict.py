@@ -50,6 +50,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.core.run import is_whole, note_result
 from depthpose.core.runner import Job, Results, run_jobs
 from depthpose.core.units import Unit
+from depthpose.pose.background import AnyBackground, PosedBin, with_background
 from depthpose.pose.color_inputs import with_color
 from depthpose.pose.config import EstimateConfig
 from depthpose.pose.datasets import (
@@ -397,6 +398,51 @@ def frame_jobs(
     ]
 
 
+def background_jobs(
+    jobs: list[PoseJob[Any]], inputs: OneObjectOptions, settings: dict[str, Any]
+) -> list[PoseJob[Any]]:
+    """Give each depth image the known bin or empty frame, if any; add to the settings which."""
+    empty = inputs.empty_frame
+    if inputs.bin_pose is not None and inputs.bin is None:
+        raise InputError(f"--bin-pose {inputs.bin_pose}: is of --bin; give its CAD file too")
+    if inputs.bin is None and empty is None:
+        return jobs
+    if inputs.bin is not None and empty is not None:
+        raise InputError("--bin and --empty-frame say the same: what there is without the parts")
+    lens = inputs.camera or inputs.focal_px
+    if inputs.depth is None:
+        option = "--bin" if empty is None else "--empty-frame"
+        raise InputError(f"{option}: is beside --depth; a cloud is of a part alone")
+    background: AnyBackground
+    if inputs.bin is not None:
+        if inputs.bin_pose is None:
+            raise InputError(
+                f"--bin {inputs.bin}: where is it? Give --bin-pose, a text file with its 4x4 "
+                "matrix camera_from_model in metres, or --empty-frame in place of both"
+            )
+        pose = pose_methods.read_pose(inputs.bin_pose, "--bin-pose")
+        unit = pose_methods.unit_of_cad([inputs.bin], inputs.cad_unit, inputs.unit)
+        background = PosedBin.load(inputs.bin, pose, unit)
+        settings["bin"] = pose_methods.named_file(Path(inputs.bin))
+        settings["bin_pose"] = pose.matrix().tolist()
+    else:
+        background = Path(str(empty))
+        settings["empty_frame"] = pose_methods.named_file(background)
+    return [
+        replace(job, read=partial(_read_before, job.read, background, lens, inputs.unit))
+        for job in jobs
+    ]
+
+
+def _read_before(
+    read: Callable[[], ViewInput],
+    background: AnyBackground,
+    camera: Path | float | None,
+    unit: Unit | None,
+) -> ViewInput:
+    return with_background(read(), background, camera, unit)
+
+
 def colored_jobs(
     jobs: list[PoseJob[Any]],
     inputs: PoseInputs,
@@ -485,6 +531,7 @@ def predict_files(method: PoseMethod, inputs: PoseInputs, out: Path, batch: int)
         settings |= {} if unit is None else {"unit": unit}
     posed = {job.object for job in jobs}
     models = [model for model in method.models if model.name in posed]
+    jobs = background_jobs(jobs, inputs, settings)
     jobs = colored_jobs(jobs, inputs, models, out, settings)
     claim_for_jobs(out, settings, jobs)
     predictions = estimate_jobs(method, jobs, out, settings, batch)
@@ -851,6 +898,10 @@ def predict_on_ray(
         raise InputError("--depth needs --camera or --focal-px beside it")
     if options.color is not None:
         raise InputError("--color is read in this process alone; leave --engine ray out")
+    if options.bin is not None or options.empty_frame is not None:
+        raise InputError(
+            "--bin and --empty-frame are read in this process alone; leave --engine ray out"
+        )
     views = Files(roles=("depth", "mask"), suffixes=(*LISTED_SUFFIXES, ".json"))
     clouds = Files(roles=("cloud",), suffixes=tuple(CLOUD_READERS))
     files = clouds if options.depth is None else views

@@ -69,7 +69,10 @@ def prepare_cloud(
 ) -> ObjectCloud | Refusal:
     """Lift, thin, drop flying pixels, check, sample and put on the grid of the network."""
     if isinstance(given, ViewInput):
-        points_m = cloud_from_depth(given.depth_m, given.mask, given.K).float()
+        mask = given.mask
+        if given.background is not None:
+            mask = mask & ~given.background.is_seen
+        points_m = cloud_from_depth(given.depth_m, mask, given.K).float()
         nothing = nothing_seen(given) if len(points_m) == 0 else ""
     else:
         points_m = given.points_m.float()
@@ -105,6 +108,8 @@ def nothing_seen(view: ViewInput) -> str:
         return "the mask is empty: no pixel of it is the object"
     if not bool((view.depth_m > 0).any()):
         return "the depth image has no reading at all: every pixel is 0 or NaN"
+    if view.background is not None and bool((view.mask & view.background.is_seen).any()):
+        return "in the mask every reading lies on the background: nothing lies before it there"
     return f"none of the {masked} masked pixels has a depth reading"
 
 

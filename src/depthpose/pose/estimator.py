@@ -15,6 +15,7 @@ from depthpose.core.errors import InputError, full_memory, nearest_name
 from depthpose.core.files import Picture
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
+from depthpose.pose.background import AnyBackground, with_background
 from depthpose.pose.cloud import Refusal
 from depthpose.pose.color_inputs import with_color
 from depthpose.pose.config import EstimateConfig, RefusalConfig
@@ -148,6 +149,7 @@ class PoseEstimator:
         color: Picture | None = None,
         color_camera: AnyCamera | None = None,
         color_from_depth: Rigid | AnyArray | None = None,
+        background: AnyBackground | None = None,
     ) -> PoseEstimate:
         """Estimate one pose, from a cloud or from a depth image with a mask or a box.
 
@@ -168,6 +170,8 @@ class PoseEstimator:
                 that depth does not: RGB, of the depth camera's frame unless it has its own camera.
             color_camera: of the colour image; None: that of the depth image.
             color_from_depth: the depth camera in the colour camera's frame; None: at one place.
+            background: what the camera sees without the objects, none of which is taken for one: an
+                empty frame, as ``depth``, or a :class:`~depthpose.pose.background.PosedBin`.
 
         Raises:
             InputError: an unknown object, a file that cannot be read, shapes that do not fit. What
@@ -177,6 +181,7 @@ class PoseEstimator:
         of_view = {
             "depth": depth, "mask": mask, "box": box, "camera": camera, "focal_px": focal_px,
             "color": color, "color_camera": color_camera, "color_from_depth": color_from_depth,
+            "background": background,
         }  # fmt: skip
         unused = [f"{name}=" for name, value in of_view.items() if value is not None]
         if cloud is not None and unused:
@@ -196,6 +201,7 @@ class PoseEstimator:
             if box is not None:
                 pixels = box_mask(box, *given.depth_m.shape)
                 given = replace(given, mask=pixels, is_region=True)
+            given = with_background(given, background, lens, unit)
             models = self.models if object is None else [self._known(object).model]
             given = with_color(given, models, color, color_camera, color_from_depth)
         if object is not None or len(self.models) == 1:
@@ -248,6 +254,7 @@ class PoseEstimator:
         camera: AnyCamera,
         objects: Sequence[str] | str | None = None,
         unit: Unit | None = None,
+        background: AnyBackground | None = None,
     ) -> list[PoseEstimate]:
         """Find and pose known objects in a depth image without masks, the best answer first.
 
@@ -259,6 +266,7 @@ class PoseEstimator:
             camera: of the depth image.
             objects: which may be there, or which one; None: all that are known.
             unit: of the depth, where its camera says none.
+            background: as for :meth:`estimate`.
 
         Returns:
             Estimates that have a pose, ok or ambiguous; none where nothing was found.
@@ -271,6 +279,7 @@ class PoseEstimator:
         if not names:
             raise InputError("find: objects names none; give those that may be there, or omit it")
         view = view_input(depth, None, camera, names[0], _NAME, unit)
+        view = with_background(view, background, camera, unit)
         return [estimate for estimate in self.find_in(view, names) if estimate.is_posed]
 
     @torch.no_grad()

@@ -64,6 +64,7 @@ class Observation:
         depth_m: (h, w), NaN where there is no reading.
         is_masked: whether a mask says which pixels are of the object.
         is_object: (h, w) these pixels, without their border; none without a mask.
+        is_background: (h, w) pixels whose readings lie on a known background.
         K: intrinsic matrix of the window.
         noise: of readings on the object.
         step: every so many rows and columns of the image are used.
@@ -73,6 +74,7 @@ class Observation:
     depth_m: np.ndarray
     is_masked: bool
     is_object: np.ndarray
+    is_background: np.ndarray
     K: Float64[Tensor, "3 3"]
     noise: DepthNoise
     step: int = 1
@@ -123,6 +125,9 @@ def observe(
     else:
         depth_m = view.depth_m[top : top + height, left : left + width].double()
     depth_m = torch.where(depth_m.isfinite() & (depth_m > 0), depth_m, torch.nan)
+    is_background = torch.zeros_like(is_object)
+    if view is not None and view.background is not None:
+        is_background = view.background.is_seen[top : top + height, left : left + width]
     inner = grow_mask(is_object, -BORDER_PX)
     inner = inner if bool(inner.any()) else is_object  # thin things are all border
     noise = measure_noise(depth_m.numpy(), inner.numpy(), object_m)
@@ -137,6 +142,7 @@ def observe(
         depth_m=np.ascontiguousarray(depth_m.float().numpy()[::step, ::step]),
         is_masked=is_masked,
         is_object=np.ascontiguousarray(inner.numpy()[::step, ::step]) & is_masked,
+        is_background=np.ascontiguousarray(is_background.numpy()[::step, ::step]),
         K=window_K,
         noise=noise,
         step=step,
@@ -299,7 +305,7 @@ def _is_continued(
     At its silhouette an object ends: by a step in depth, or by an edge where it touches something.
     A box that is posed on the side of a larger one ends where the readings go on straight. Four
     readings on a line across the silhouette, one or two of them within it, are straight in
-    1 / depth where they are of one plane.
+    1 / depth where they are of one plane. Readings on a known background are of no object.
 
     Args:
         observation: its readings, (h, w).
@@ -330,7 +336,8 @@ def _is_continued(
     beside = np.stack(np.nonzero((distance > border) & (distance <= reach)))
     edge = nearest[:, beside[0], beside[1]]
     outward = beside - edge
-    inverse = 1 / observation.depth_m[rows, columns]
+    is_background = observation.is_background[rows, columns]
+    inverse = 1 / np.where(is_background, np.nan, observation.depth_m[rows, columns])
     across = []
     for times in _ACROSS:
         pixel = edge + np.rint(times * outward).astype(int)

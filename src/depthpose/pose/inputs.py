@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from depthpose.core.camera import (
@@ -54,15 +54,17 @@ def cloud_input(cloud: AnyCloud, unit: Unit, object: str, name: str) -> CloudInp
     )
 
 
-def view_input(
-    depth: AnyArray,
-    mask: AnyMask | None,
-    camera: AnyLens | None,
-    object: str,
-    name: str,
-    unit: Unit | None = None,
-) -> ViewInput:
-    """Take a depth image, a mask and a camera to a view in metres."""
+def depth_input(
+    depth: AnyArray, camera: AnyLens | None, name: str, unit: Unit | None = None
+) -> tuple[Float[Tensor, "h w"], AnyLens | None]:
+    """Take a depth image to metres, NaN where there is no reading; give it and its camera, read.
+
+    Args:
+        depth: whole numbers in the unit of the camera or ``unit``, or metres.
+        camera: of the image.
+        name: of the image in errors, where it is no file.
+        unit: where the camera says none.
+    """
     values = read_stored_depth(depth) if isinstance(depth, str | Path) else _tensor(depth)
     if values.ndim != 2:
         raise InputError(f"{name}: the depth is of shape {tuple(values.shape)}, not (h, w)")
@@ -87,6 +89,20 @@ def view_input(
             )
         values = values.double()
     depth_m = torch.where(values > 0, values * (given_m or 1.0), torch.nan).float()
+    return depth_m, lens
+
+
+def view_input(
+    depth: AnyArray,
+    mask: AnyMask | None,
+    camera: AnyLens | None,
+    object: str,
+    name: str,
+    unit: Unit | None = None,
+) -> ViewInput:
+    """Take a depth image, a mask and a camera to a view in metres."""
+    depth_m, lens = depth_input(depth, camera, name, unit)
+    height, width = depth_m.shape
     pixels = torch.ones(height, width).bool()
     if mask is not None:
         mask_name = str(mask) if isinstance(mask, str | Path) else name

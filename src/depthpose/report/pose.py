@@ -195,6 +195,7 @@ def grey_depth(depth_m: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
 
 _SEEN = (0.55, 0.55, 0.55)
 _AROUND = (0.7, 0.66, 0.6)
+_BACKGROUND = (0.45, 0.6, 0.75)
 _MASKED = (1.0, 0.85, 0.1)
 _AROUND_POINTS = 20_000
 _MARGIN = 0.6  # about an object in a close-up, in its own width
@@ -376,6 +377,11 @@ def pose_scene(
         around_m = take_evenly(around_m, _AROUND_POINTS)
         around = Cloud(points=around_m, color=torch.tensor(_AROUND).expand(len(around_m), 3))
         layers.append(Layer(name="all else", shape=around, is_shown=False))
+    if isinstance(pose_input, ViewInput) and (known := pose_input.background) is not None:
+        bin_m = cloud_from_depth(known.depth_m, known.depth_m > 0, pose_input.K).float()
+        bin_m = take_evenly(bin_m, _AROUND_POINTS)
+        drawn = Cloud(points=bin_m, color=torch.tensor(_BACKGROUND).expand(len(bin_m), 3))
+        layers.append(Layer(name="the known background", shape=drawn, is_shown=False))
     caption = "The cloud and the posed model" if pose is not None else "The cloud; there is no pose"
     return Scene(caption=caption, layers=layers)
 
