@@ -83,7 +83,7 @@ def predict(
     if dataset.bop is not None:
         if pose_inputs.color is not None:
             raise InputError("--color is beside --depth; leave it out where --bop is given")
-        if inputs.bin is not None or inputs.empty_frame is not None:
+        if pose_inputs.bin is not None or pose_inputs.empty_frame is not None:
             raise InputError(
                 "--bin and --empty-frame are beside --depth, not --bop; leave them out"
             )

@@ -399,7 +399,7 @@ def frame_jobs(
 
 
 def background_jobs(
-    jobs: list[PoseJob[Any]], inputs: OneObjectOptions, settings: dict[str, Any]
+    jobs: list[PoseJob[Any]], inputs: PoseInputs, settings: dict[str, Any]
 ) -> list[PoseJob[Any]]:
     """Give each depth image the known bin or empty frame, if any; add to the settings which."""
     empty = inputs.empty_frame
