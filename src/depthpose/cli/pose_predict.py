@@ -92,12 +92,14 @@ _MOST_PRINTED = 5  # inputs whose alternatives are printed; poses.json holds tho
 _MOST_ROWS = 1000  # of the answers, in the table of the page
 _PRINTED = ("input", "object", "status", "x, y, z [m]", "qx, qy, qz, qw", "base x, y, z [m]",
             "base qx, qy, qz, qw", "agreement", "certainty", "of this copy", "identity",
-            "tracking")  # fmt: skip
+            "visible", "pick rank", "tracking")  # fmt: skip
 """Columns on the terminal."""
 _BASE_COLUMNS = ("base_x_m", "base_y_m", "base_z_m")
 _FRAME = """camera_from_model: x right, y down, z forward
 certainty: the probability that the pose is right, up to the near-symmetries of the model
-of this copy: that it is this very copy of a nearly symmetric model"""
+of this copy: that it is this very copy of a nearly symmetric model
+visible: share of the surface that faces the camera on which readings lie"""
+_RANKED = "pick rank: what lies before another comes first, then what is surer and more visible"
 
 
 def claim_for_jobs(
@@ -737,12 +739,14 @@ def print_result(predictions: list[Prediction], out: Path, inputs: int | None = 
             row |= _pose_words(estimate.base_from_model, "base ")
             certain = {
                 key: value
-                for key in ("agreement", "certainty", "of this copy")
+                for key in ("agreement", "certainty", "of this copy", "visible")
                 if (value := row[key]) is not None
             }
             rows.append(row | {key: f"{value:.3f}" for key, value in certain.items()})
         print(plain_table(rows, _PRINTED), end="")
         print(_FRAME)
+        if any(estimate.pick_rank is not None for estimate in shown):
+            print(_RANKED)
 
     # Why there is no sure pose, and what else fits.
     if len(shown) == 1 and not shown[0].is_ok:
@@ -799,6 +803,8 @@ def _row(estimate: PoseEstimate) -> dict[str, Any]:
         "identity": None if identity is None else identity.status,
         "certainty": estimate.certainty,
         "of this copy": estimate.copy_certainty,
+        "visible": estimate.visible_share,
+        **({} if estimate.pick_rank is None else {"pick rank": estimate.pick_rank}),
         "alternatives": "; ".join(map(str, estimate.alternatives)),
         "reason": estimate.reason,
     }

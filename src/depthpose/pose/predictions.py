@@ -166,6 +166,8 @@ def prediction_row(prediction: Prediction) -> dict[str, Any]:
     for name in ("inlier_share", "residual_m", "certainty", "copy_certainty"):
         value: float | None = getattr(estimate, name)
         row[name] = value if value is not None and math.isfinite(value) else None
+    row["visible_share"] = estimate.visible_share
+    row["pick_rank"] = estimate.pick_rank
     for name in ("evidence", "identity"):
         answer = getattr(estimate, name)
         row[name] = None if answer is None else asdict(answer)
@@ -257,6 +259,7 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
         base_from_model=_pose(row, source, "base_from_model"),
         alternatives=tuple(alternatives),
         tracking=cast("Tracking | None", tracking),
+        pick_rank=None if row.get("pick_rank") is None else integer(row, "pick_rank", source),
         **values,
     )
     has_place = any(row.get(key) is not None for key in _PLACE)

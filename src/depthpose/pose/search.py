@@ -33,6 +33,7 @@ from depthpose.pose.frame import (
     share_behind,
 )
 from depthpose.pose.inputs import nothing_seen
+from depthpose.pose.picking import with_pick_ranks
 from depthpose.pose.propose.image import compare_with_image, propose_in_frame
 from depthpose.pose.surface import NEAR, Surface
 from depthpose.pose.types import (
@@ -182,6 +183,9 @@ def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
         replace(place.estimate, seconds={**place.estimate.seconds, "search": spent_s})
         for place in accepted
     ]
+    if not targets.is_single:
+        surfaces = {name: targets.object_of(name).surface for name in targets.names}
+        estimates = with_pick_ranks(estimates, view, surfaces)
     posed = {estimate.object for estimate in estimates}
     estimates += [
         nothing_found(whole, name, [miss for miss in misses if miss.object == name], spent_s)

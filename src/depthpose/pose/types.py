@@ -320,6 +320,9 @@ class PoseEstimate:
     tracking: Tracking | None = None  #: how it came about, in a sequence; None elsewhere
     #: the pose in the frame of a robot's base, by :meth:`in_base`; None where no base is known.
     base_from_model: Rigid | None = None
+    #: place in the order to pick what a search found, from 1: nothing that was found lies before
+    #: it, or what does has a smaller rank. None elsewhere.
+    pick_rank: int | None = None
 
     def __post_init__(self) -> None:
         # No default may look like success: an answer has a pose, all others have a reason.
@@ -335,6 +338,11 @@ class PoseEstimate:
     def is_posed(self) -> bool:
         """Whether there is a pose, ok or ambiguous."""
         return self.status in POSED
+
+    @property
+    def visible_share(self) -> float | None:
+        """Share of the surface that faces the camera on which readings lie, 0..1; None: unknown."""
+        return None if self.evidence is None else self.evidence.observed
 
     def in_base(self, base_from_camera: Rigid) -> "PoseEstimate":
         """Add ``base_from_model`` by a hand-eye calibration in metres; a refusal has none."""

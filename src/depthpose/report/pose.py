@@ -284,9 +284,11 @@ def pose_facts(
     if (evidence := estimate.evidence) is not None:
         facts += [
             ("agreement", f"{evidence.agreement:.1%} of what was compared supports the pose"),
-            ("observed", f"{evidence.observed:.0%} of the surface that faces the camera"),
+            ("visible", f"{evidence.observed:.0%} of the surface that faces the camera"),
             ("noise of the sensor there", f"{1000 * evidence.noise_m:.1f} mm"),
         ]
+    if estimate.pick_rank is not None:
+        facts.append(("pick rank", f"{estimate.pick_rank} of what was found in this image"))
     if estimate.identity is not None:
         identity = estimate.identity
         identity_text = identity.status + (f" ({identity.reason})" if identity.reason else "")

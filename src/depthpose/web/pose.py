@@ -90,13 +90,8 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
     folder.mkdir()
     best = shown_poses[0]
     agreeing = "votes that agree" if isinstance(target.net, GeoPoseNet) else "points near the model"
-    table = [["", "status", "x [m]", "y [m]", "z [m]", "certainty"]]
-    for shown_pose in shown_poses if len(shown_poses) > 1 else ():
-        pose = shown_pose.estimate.camera_from_model
-        certainty = shown_pose.estimate.certainty
-        place = [] if pose is None else [f"{v:.4f}" for v in pose.t_m.tolist()]
-        certainty_text = "" if certainty is None else f"{certainty:.3f}"
-        table.append([shown_pose.input.name, shown_pose.estimate.status, *place, certainty_text])
+    table = [["", "status", "x [m]", "y [m]", "z [m]", "certainty", "visible", "pick rank"]]
+    table += [[shown.input.name, *_row(shown.estimate)] for shown in shown_poses]
     pose_input = shown_poses[0].input
     estimate = shown_poses[0].estimate
     scene = report.pose_scene(
@@ -122,6 +117,16 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
         terms=net.terms if target.net is net else "",
         files={path.name: path.read_bytes() for path in sorted(folder.iterdir())},
     )
+
+
+def _row(estimate: PoseEstimate) -> list[str]:
+    """Give the row of an estimate in the table of an image; empty is what it does not have."""
+    pose = estimate.camera_from_model
+    place = [""] * 3 if pose is None else [f"{v:.4f}" for v in pose.t_m.tolist()]
+    shares = (estimate.certainty, estimate.visible_share)
+    numbers = ["" if share is None else f"{share:.3f}" for share in shares]
+    rank = "" if estimate.pick_rank is None else str(estimate.pick_rank)
+    return [estimate.status, *place, *numbers, rank]
 
 
 def _write(folder: Path, name: str, shown_poses: list[_Seen], model: ObjectModel) -> list[Shown]:
