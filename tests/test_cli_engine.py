@@ -6,6 +6,7 @@ What a real cluster does is in ``test_ray.py``.
 import json
 import shutil
 import tarfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,17 +15,21 @@ import torch
 from tests.core.engine.doubles import InProcessEngine, unpacked
 from tests.depth.small_training import write_tiny_weights
 from tests.pose.synthetic_objects import (
+    CAMERA,
     bottle,
     bracket,
     cloud_of,
     pose_at,
     tiny_weights,
+    view_of,
     write_part,
+    write_stl,
 )
 from tests.test_cli_depth import write_doubtful_pairs
 
 from depthpose.cli import engine, main
 from depthpose.cli.depth_predict import PAIRS
+from depthpose.core.camera import write_camera
 from depthpose.core.engine import find_items
 from depthpose.core.errors import InputError
 from depthpose.core.files import (
@@ -260,6 +265,26 @@ def test_clouds_have_the_poses_of_the_plain_command(
     }
     assert set(found) == set("012")
     for name, row in found.items():
+        assert {**row, "seconds": 0} == {**wanted[name], "seconds": 0}
+
+
+def test_a_box_is_that_of_every_depth_image(tmp_path: Path, double: InProcessEngine) -> None:
+    cad = write_stl(tmp_path / "bracket.stl", bracket())
+    for seed in (1, 2):
+        seen, mask = view_of(bracket(), pose_at(seed=seed))
+        depth_m = torch.where(mask, seen.float(), 1.2)
+        write_depth_png(tmp_path / "in" / f"{seed}.png", depth_m, 0.0001)
+    write_camera(tmp_path / "c.json", replace(CAMERA, depth_unit_m=0.0001))
+    words = ["pose", "predict", "--cad", str(cad), "--cad-unit", "mm", "--box", "90,50,230,190",
+             "--depth", str(tmp_path / "in"), "--camera", str(tmp_path / "c.json")]  # fmt: skip
+    assert main([*words, "--out", str(tmp_path / "plain")]) == 0
+    assert main([*words, "--out", str(tmp_path / "big"), *RAY]) == 0
+    wanted = {row["name"]: row for row in json.loads((tmp_path / "plain/poses.json").read_text())}
+    found = unpacked(tmp_path / "big")
+    assert set(found) == set(wanted) == {"1", "2"}
+    for name, files in found.items():
+        row = json.loads(files["pose.json"])
+        assert row["camera_from_model"] is not None
         assert {**row, "seconds": 0} == {**wanted[name], "seconds": 0}
 
 

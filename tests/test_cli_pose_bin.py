@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from tests.pose.synthetic_objects import CAMERA, bracket, view_of
+from tests.pose.synthetic_objects import CAMERA, bracket, view_of, write_stl
 from tests.pose.test_background import FIXTURE, TRUTH, empty_frame, full_frame, posed_bin
 
 from depthpose.cli import main
@@ -14,14 +14,7 @@ from depthpose.core.camera import write_camera
 from depthpose.core.files import write_depth_png
 from depthpose.core.rigid import Rigid
 from depthpose.pose.predictions import Prediction, write_predictions
-from depthpose.pose.types import ObjectModel, PoseEstimate
-
-
-def write_stl(path: Path, model: ObjectModel) -> Path:
-    import trimesh
-
-    trimesh.Trimesh(1000 * model.vertices_m.numpy(), model.faces.numpy()).export(path)
-    return path
+from depthpose.pose.types import PoseEstimate
 
 
 @pytest.fixture
@@ -67,10 +60,16 @@ def test_the_pose_of_a_bin_comes_from_the_run_that_posed_it(
     ("more", "reason"),
     [
         (["--bin", "bin.stl"], "where is it? Give --bin-pose"),
-        (["--bin-pose", "poses.json"], "is of --bin; give its CAD file too"),
+        (["--bin-pose", "poses.json"], "it is of --bin; give the CAD file of the bin too"),
         (["--bin", "bin.stl", "--bin-pose", "poses.json"], "holds 2 poses; give a poses.json of"),
-        (["--bin", "bin.stl", "--empty-frame", "empty.png"], "say the same"),
-        (["--bin", "bin.stl", "--bin-pose", "poses.json", "--engine", "ray"], "in this process"),
+        (
+            ["--bin", "bin.stl", "--empty-frame", "empty.png"],
+            "--empty-frame: has no effect here; --bin says",
+        ),
+        (
+            ["--bin", "bin.stl", "--bin-pose", "poses.json", "--engine", "ray"],
+            "workers do not read it",
+        ),
     ],
 )
 def test_options_that_do_not_fit_are_named(

@@ -21,7 +21,7 @@ from tests.pose.synthetic_objects import (
 
 from depthpose.cli import main, pose_methods
 from depthpose.core.camera import Camera, write_camera
-from depthpose.core.files import write_depth_png
+from depthpose.core.files import read_image, write_depth_png
 from depthpose.pose.datasets import encode_rle
 from depthpose.pose.datasets.masks import mask_box
 from depthpose.pose.search import nothing_found
@@ -75,6 +75,31 @@ def test_a_box_is_enough(scene: Scene, tmp_path: Path) -> None:
     assert_right(answers(tmp_path), {"000012": "bracket"})
     # Another box needs another folder, as every setting does.
     assert main([*words, "--box", "1,1,50,50", "--object", "bracket"]) == 2
+
+
+def test_a_box_is_drawn_beside_the_pose(scene: Scene, tmp_path: Path) -> None:
+    words, masks = scene
+    left, top, right, bottom = edges(masks["bracket"], 6)
+    box = f"{left},{top},{right},{bottom}"
+    assert main([*words, "--box", box, "--object", "bracket"]) == 0
+    picture = read_image(tmp_path / "out/000012.pose.png")
+    border = torch.cat([picture[:, top, left:right], picture[:, top:bottom, left]], 1)
+    red, green, blue = border.mean(1).tolist()
+    assert min(red, green) > 0.75, "yellow, but where the pose lies over it"
+    assert blue < 0.3
+    page = read_page(tmp_path / "out/report.html")
+    captions = page.texts["figcaption"]
+    assert any("the estimated pose blue, the box yellow" in caption for caption in captions)
+
+
+def test_boxes_are_those_of_every_image_of_a_folder(scene: Scene, tmp_path: Path) -> None:
+    words, masks = scene
+    depth = tmp_path / "depth"
+    (depth / "000013.png").write_bytes((depth / "000012.png").read_bytes())
+    words[-1] = str(depth)
+    box = ",".join(map(str, edges(masks["bracket"])))
+    assert main([*words, "--box", box, "--object", "bracket"]) == 0
+    assert_right(answers(tmp_path), {"000012": "bracket", "000013": "bracket"})
 
 
 def test_boxes_that_cannot_be_are_named(
@@ -187,7 +212,9 @@ def test_options_of_regions_are_refused_where_they_do_nothing(
         (["--labels", "1=bracket"], "--labels: has no effect here"),
         (["--box", "1,1,9,9", "--labels", "1=bracket"], "all boxes are of one object"),
         (["--box", "1,1,9,9", "--detections", str(file)], "say where objects are; give one"),
-        (["--box", "1,1,9,9", "--engine", "ray"], "workers take --mask"),
+        (["--box", "1,1,9,9", "2,2,9,9", "--engine", "ray"], "one pose for each depth image"),
+        (["--detections", str(file), "--engine", "ray"], "one pose for each depth image"),
+        (["--box", "1,1,9,9", "--mask", str(file), "--engine", "ray"], "give one of them"),
     ):
         assert main([*words, *more]) == 2
         assert reason in capsys.readouterr().err

@@ -174,6 +174,14 @@ class Oracle(GeoPoseNet):
         return torch.where(is_wrong[:, None, None], noise, directions + self.noise * noise)
 
 
+def write_stl(path: Path, model: ObjectModel) -> Path:
+    """Write a model as a CAD file in millimetres."""
+    import trimesh
+
+    trimesh.Trimesh(1000 * model.vertices_m.numpy(), model.faces.numpy()).export(path)
+    return path
+
+
 def write_part(name: str, folder: Path) -> Path:
     """Write a part as an STL file in millimetres, as a CAD program would; give the file."""
     import trimesh

@@ -23,7 +23,7 @@ from tests.pose.synthetic_objects import CAMERA, pose_at, view_of
 from tests.web.samples import PART, write_street, write_view
 
 from depthpose.core.camera import write_camera
-from depthpose.core.files import write_depth_png, write_image, write_map
+from depthpose.core.files import read_image, write_depth_png, write_image, write_map
 from depthpose.core.rigid import Rigid
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.stereo import CallableMatcher, LightMatcher
@@ -365,7 +365,7 @@ def test_a_depth_map_of_floats_has_the_limit_of_a_picture(
         assert refusal(response)[1].startswith(said)
 
 
-def assert_posed(page: TestClient, found: dict[str, Any], truth: Rigid, name: str) -> None:
+def assert_right(page: TestClient, found: dict[str, Any], truth: Rigid, name: str) -> None:
     assert found["ok"], found["said"]
     (row,) = json.loads(page.get("/" + found["folder"] + "poses.json").content)
     T = torch.tensor(row["camera_from_model"])
@@ -373,6 +373,10 @@ def assert_posed(page: TestClient, found: dict[str, Any], truth: Rigid, name: st
     off_m = adds_m(Rigid(T[:3, :3], T[:3, 3]), truth, model.vertices_m)
     assert float(off_m) < model.diameter_m / 20
     assert row["name"] == name
+
+
+def assert_posed(page: TestClient, found: dict[str, Any], truth: Rigid, name: str) -> None:
+    assert_right(page, found, truth, name)
     layers = {layer["name"]: layer for layer in found["scene"]["layers"]}
     assert layers["the object, as seen"]["count"] > 100
     assert layers["posed model"]["count"] > 1000
@@ -388,6 +392,44 @@ def test_a_depth_image_is_posed(page: TestClient, samples: Path, truth: Rigid) -
         "depth.pose.png",
         "poses.json",
     ]
+
+
+def test_boxes_of_a_detector_take_the_place_of_a_mask(
+    page: TestClient, samples: Path, truth: Rigid, tmp_path: Path
+) -> None:
+    rows, columns = (read_image(samples / "mask.png")[0] > 0.5).nonzero().unbind(1)
+    left, top = int(columns.min()) - 2, int(rows.min()) - 2
+    box = f"{left},{top},{int(columns.max()) + 3},{int(rows.max()) + 3}"
+    files = {"depth": "depth.png", "camera": "view.json"}
+    found = ask(page, "pose", samples, files, object=PART, box=box).json()
+    assert_right(page, found, truth, "depth")
+    (picture,) = found["pictures"]
+    assert picture["caption"] == "depth image, near bright, with the posed model, boxes yellow"
+    (tmp_path / "shown.png").write_bytes(page.get("/" + found["folder"] + picture["file"]).content)
+    red, green, blue = read_image(tmp_path / "shown.png")[:, top, left].tolist()
+    assert min(red, green) > 0.7, "the corner of the box is yellow"
+    assert blue < 0.3
+    both = ask(page, "pose", samples, files, object=PART, box=f"{box} 0,0,20,20").json()
+    _, *shown = both["tables"]["found in this image"]
+    assert [row[0] for row in shown] == ["depth_1", "depth_2"], "the refused one has a row"
+
+
+@pytest.mark.parametrize(
+    ("files", "box", "said"),
+    [
+        (VIEW, "1,2,30,40", "take it out where a mask or a cloud"),
+        ({"depth": "depth.png", "camera": "view.json"}, "1,2,3", "box '1,2,3' is not X0,Y0,X1,Y1"),
+        (
+            {"depth": "depth.png", "camera": "view.json"},
+            "900,1,990,50",
+            "lies outside of the image",
+        ),
+    ],
+)
+def test_boxes_that_cannot_be_say_why(
+    page: TestClient, samples: Path, files: dict[str, str], box: str, said: str
+) -> None:
+    assert said in ask(page, "pose", samples, files, object=PART, box=box).json()["error"]
 
 
 def test_a_cloud_in_millimetres_is_posed_by_a_cad_file_that_the_weights_know(

@@ -83,10 +83,6 @@ def predict(
     if dataset.bop is not None:
         if pose_inputs.color is not None:
             raise InputError("--color is beside --depth; leave it out where --bop is given")
-        if pose_inputs.bin is not None or pose_inputs.empty_frame is not None:
-            raise InputError(
-                "--bin and --empty-frame are beside --depth, not --bop; leave them out"
-            )
         if dataset.masks == "search":
             return search_dataset(method, dataset, pose_inputs.object, home)
         return predict_dataset(method, dataset, pose_inputs.object, source.config, home, batch)

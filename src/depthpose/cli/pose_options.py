@@ -85,7 +85,8 @@ class InputOptions:
     """picture, not black is the object, or .json with COCO's run lengths; or a folder of masks with
     the names of the depth images. Each number of a label map is an object (see --labels)."""
     box: Annotated[tuple[str, ...], shown_as(metavar="X0,Y0,X1,Y1 ...")] = ()
-    """where objects are in the depth image: left, top, right and bottom edge [px]."""
+    """where objects are in the depth image, or in each of a folder: left, top, right and bottom
+    edge [px]."""
     cloud: Source | None = None
     """points of one object (PLY, PCD, NPY, text), in the camera frame: x right, y down, z forward;
     or a folder of such files."""

@@ -22,7 +22,7 @@ from depthpose.cli.engine import EngineOptions, Weights, print_shards
 from depthpose.cli.pose_methods import PoseMethod, PoseMethodSource
 from depthpose.cli.pose_options import DataSetOptions, PoseInputs
 from depthpose.core import run
-from depthpose.core.camera import Camera, camera_of
+from depthpose.core.camera import AnyLens, Camera, camera_of
 from depthpose.core.checkpoint import file_sha256, find_weights
 from depthpose.core.config import config_to_dict
 from depthpose.core.engine import (
@@ -55,6 +55,7 @@ from depthpose.pose.color_inputs import with_color
 from depthpose.pose.config import EstimateConfig
 from depthpose.pose.datasets import (
     BopDataset,
+    Box,
     Detection,
     encode_rle,
     name_objects,
@@ -267,16 +268,16 @@ def box_jobs(
     unit: Unit | None,
     out: Path,
 ) -> list[PoseJob[Any]]:
-    """Make a job of each box in a depth image: NAME, or of several NAME_1, NAME_2, ..."""
+    """Make a job of each box in each depth image: NAME, or of several NAME_1, NAME_2, ..."""
     depths = _list_depths(depth)
     refuse_among_inputs(out, [depth], depths)
-    if len(depths) > 1:
-        raise InputError(
-            f"--box: {depth} holds {len(depths)} depth images, and a box is of one; name that one, "
-            "or give a file for each by --detections"
-        )
+    _refuse_one_name(depths)
     detections = [Detection(object=object, box=parse_box(text)) for text in boxes]
-    return _detection_jobs(depths[0], detections, (depths[0],), camera, unit)
+    jobs = [
+        job for path in depths for job in _detection_jobs(path, detections, (path,), camera, unit)
+    ]
+    _refuse_twice(jobs, depth)
+    return jobs
 
 
 def detection_jobs(
@@ -347,7 +348,7 @@ def _detection_jobs(
 
 
 def _read_detection(
-    path: Path, detection: Detection, camera: Path | float, name: str, unit: Unit | None
+    path: Path, detection: Detection, camera: AnyLens, name: str, unit: Unit | None
 ) -> ViewInput:
     """Read a depth image with the pixels of a detection."""
     assert detection.object is not None
@@ -404,17 +405,7 @@ def background_jobs(
     jobs: list[PoseJob[Any]], inputs: PoseInputs, settings: dict[str, Any]
 ) -> list[PoseJob[Any]]:
     """Give each depth image the known bin or empty frame, if any; add to the settings which."""
-    empty = inputs.empty_frame
-    if inputs.bin_pose is not None and inputs.bin is None:
-        raise InputError(f"--bin-pose {inputs.bin_pose}: is of --bin; give its CAD file too")
-    if inputs.bin is None and empty is None:
-        return jobs
-    if inputs.bin is not None and empty is not None:
-        raise InputError("--bin and --empty-frame say the same: what there is without the parts")
     lens = inputs.camera or inputs.focal_px
-    if inputs.depth is None:
-        option = "--bin" if empty is None else "--empty-frame"
-        raise InputError(f"{option}: is beside --depth; a cloud is of a part alone")
     background: AnyBackground
     if inputs.bin is not None:
         if inputs.bin_pose is None:
@@ -427,9 +418,11 @@ def background_jobs(
         background = PosedBin.load(inputs.bin, pose, unit)
         settings["bin"] = pose_methods.named_file(Path(inputs.bin))
         settings["bin_pose"] = pose.matrix().tolist()
-    else:
-        background = Path(str(empty))
+    elif inputs.empty_frame is not None:
+        background = Path(inputs.empty_frame)
         settings["empty_frame"] = pose_methods.named_file(background)
+    else:
+        return jobs
     return [
         replace(job, read=partial(_read_before, job.read, background, lens, inputs.unit))
         for job in jobs
@@ -713,9 +706,8 @@ def write_files(
         write_cloud(files[0], drawn.posed_cloud(points_m, pose.double(), model))
         if isinstance(view, ViewInput):
             files.append(out / f"{job.name}.{PICTURE}")
-            write_image(
-                files[1], drawn.draw_pose(drawn.grey_depth(view.depth_m), pose, model, view.K)
-            )
+            picture = drawn.draw_region(drawn.grey_depth(view.depth_m), view, pose)
+            write_image(files[1], drawn.draw_pose(picture, pose, model, view.K))
         note_result(out, job.name, files)
     _write_page(out, predictions, jobs, models, dataset, inputs)
 
@@ -874,15 +866,25 @@ class EntryFiles(Results[Any, PoseEstimate]):
 
 
 def start_files(
-    source: PoseMethodSource, object: str, unit: Unit | None, camera: Camera | None
+    source: PoseMethodSource,
+    object: str,
+    unit: Unit | None,
+    camera: Camera | None,
+    box: Box | None = None,
 ) -> Function:
-    """Build the estimator; clouds, or depth images and masks, to poses or the reasons for none."""
+    """Build the estimator; clouds or depth images to poses or the reasons for none.
+
+    Depth images have masks, or are all searched in one box.
+    """
     method = source.build()
 
     def job_of(sample: Sample) -> Job[Any]:
         if camera is None:
             cloud = sample.files[0]
             read = partial(cloud_input, cloud, unit or "m", object, sample.name)
+        elif box is not None:
+            detection = Detection(object=object, box=box)
+            read = partial(_read_detection, sample.files[0], detection, camera, sample.name, unit)
         else:
             depth, mask = sample.files
             read = partial(view_input, depth, mask, camera, object, sample.name, unit)
@@ -899,16 +901,15 @@ def start_files(
 def predict_on_ray(
     options: PoseInputs, source: PoseMethodSource, batch: int, out: str, engine: EngineOptions
 ) -> int:
-    """Pose clouds, depth images and masks, manifests or tar shards by the workers of an engine."""
+    """Pose clouds, depth images with masks or a box, manifests or tar shards by an engine."""
     if options.depth is not None and (options.camera or options.focal_px) is None:
         raise InputError("--depth needs --camera or --focal-px beside it")
-    if options.color is not None:
-        raise InputError("--color is read in this process alone; leave --engine ray out")
-    if options.bin is not None or options.empty_frame is not None:
-        raise InputError(
-            "--bin and --empty-frame are read in this process alone; leave --engine ray out"
-        )
+    if options.box and options.mask is not None:
+        raise InputError("--mask and --box say where objects are; give one of them")
+    box = parse_box(options.box[0]) if options.box else None
     views = Files(roles=("depth", "mask"), suffixes=(*LISTED_SUFFIXES, ".json"))
+    if box is not None:
+        views = Files(roles=("depth",), suffixes=LISTED_SUFFIXES)
     clouds = Files(roles=("cloud",), suffixes=tuple(CLOUD_READERS))
     files = clouds if options.depth is None else views
     words = [word for word in (options.cloud, options.depth, options.mask) if word is not None]
@@ -927,10 +928,10 @@ def predict_on_ray(
     with inputs.first() as first:
         lens = options.camera or options.focal_px
         camera = None if lens is None else camera_of(lens, image_size(first[0]))
-    start = partial(start_files, source, object, options.unit, camera)
+    start = partial(start_files, source, object, options.unit, camera, box)
     work = Work(start=start, files=files, endings=(ENDING,), batch=batch)
     settings = {**method.settings, "estimate": config_to_dict(source.config), "object": object}
-    settings |= {"unit": options.unit}
+    settings |= {"unit": options.unit} | ({} if box is None else {"box": box})
     if camera is not None:
         settings |= {"K": camera.K.tolist(), "depth_unit_m": camera.depth_unit_m}
     return print_shards(engine.run(work, inputs, out, settings), out, "inputs")

@@ -80,6 +80,21 @@ def draw_pose(
     return image
 
 
+def draw_region(
+    image: Float[Tensor, "3 h w"], view: ViewInput, pose: Rigid | None
+) -> Float[Tensor, "3 h w"]:
+    """Draw the border of where an object was looked for, in yellow: a box; without a pose a mask.
+
+    Args:
+        image: of the camera; it is not changed.
+        view: with its mask or box.
+        pose: that was estimated, if any.
+    """
+    if pose is None or view.is_region:
+        return draw_outline(image, view.mask, _MASKED)
+    return image
+
+
 def box_edges(model: ObjectModel) -> Float[Tensor, "12 2 3"]:
     """Give both ends of the edges of the model's box, along its axes [m]."""
     low = model.vertices_m.amin(0)
@@ -215,9 +230,10 @@ def pose_section(
 ) -> Section:
     """Show one estimate: sentence and numbers, the picture, the cloud with the model in 3D.
 
-    Pictures are of the whole view and of the object from near by, with the mask where there is no
-    pose. ``image`` is what the pose is drawn over, of the view's camera; None: its depth in grey.
-    ``text`` comes before the sentence, ``rows`` are those of a table.
+    Pictures are of the whole view and of the object from near by, with the box in which it was
+    looked for, and the mask where there is no pose. ``image`` is what the pose is drawn over, of
+    the view's camera; None: its depth in grey. ``text`` comes before the sentence,
+    ``rows`` are those of a table.
     """
     drawings: list[Drawing] = []
     if isinstance(pose_input, ViewInput):
@@ -226,10 +242,11 @@ def pose_section(
         K = pose_input.K
         what = "depth image, near bright" if image is None else "picture"
         image = grey_depth(pose_input.depth_m) if image is None else image
-        caption = f"{what}; the estimated pose blue"
-        if pose is None:
-            image = draw_outline(image, mask, _MASKED)
-            caption = f"{what}; the border of the mask yellow"
+        image = draw_region(image, pose_input, pose)
+        colors = [] if pose is None else ["the estimated pose blue"]
+        if pose is None or pose_input.is_region:
+            colors.append(f"the {'box' if pose_input.is_region else 'mask'} yellow")
+        caption = f"{what}; {', '.join(colors)}"
         caption += ", the box of the truth green and dashed" if truth is not None else ""
         whole = draw_pose(image, pose, model, K, truth)
         drawings.append(Drawing(image=whole, caption=caption))

@@ -11,6 +11,7 @@ from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.core.units import METRES, Unit
 from depthpose.pose import mesh
 from depthpose.pose.config import EstimateConfig, ObjectsConfig
+from depthpose.pose.datasets import box_mask, parse_box
 from depthpose.pose.datasets.dataset import write_mask
 from depthpose.pose.decide import with_status
 from depthpose.pose.inputs import cloud_input, view_input
@@ -61,7 +62,15 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
     pose_input = _input(form, target.model)
     name = pose_input.name
     voted = None
-    if "depth" in form.files and "mask" not in form.files:
+    boxes = _boxes(form, pose_input)
+    if boxes:
+        estimates = target.net.estimate_many(boxes)
+        shown_poses = [
+            _Seen(input=view, estimate=estimate)
+            for view, estimate in zip(boxes, estimates, strict=True)
+        ]
+        shown_poses.sort(key=lambda shown: -(shown.estimate.certainty or 0.0))
+    elif "depth" in form.files and "mask" not in form.files:
         assert isinstance(pose_input, ViewInput)
         shown_poses = []
         for estimate in target.net.find_in(pose_input, [target.model.name]):
@@ -119,6 +128,23 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
     )
 
 
+def _boxes(form: Form, pose_input: CloudInput | ViewInput) -> list[ViewInput]:
+    """Give a view for each box in the form: NAME, or of several NAME_1, NAME_2, ..."""
+    words = form.fields.get("box", "").split()
+    if words and ("mask" in form.files or not isinstance(pose_input, ViewInput)):
+        raise InputError(
+            "a box says where the object is in a depth image; take it out where a mask or a cloud "
+            "does"
+        )
+    views: list[ViewInput] = []
+    for number, word in enumerate(words, 1):
+        assert isinstance(pose_input, ViewInput)
+        mask = box_mask(parse_box(word), *pose_input.depth_m.shape)
+        name = pose_input.name + (f"_{number}" if len(words) > 1 else "")
+        views.append(replace(pose_input, name=name, mask=mask, is_region=True))
+    return views
+
+
 def _row(estimate: PoseEstimate) -> list[str]:
     """Give the row of an estimate in the table of an image; empty is what it does not have."""
     pose = estimate.camera_from_model
@@ -143,15 +169,17 @@ def _write(folder: Path, name: str, shown_poses: list[_Seen], model: ObjectModel
         return []
     picture = report.grey_depth(pose_input.depth_m)
     caption = "depth image, near bright"
-    poses = [
-        pose
-        for shown_pose in shown_poses
-        if (pose := shown_pose.estimate.camera_from_model) is not None
-    ]
-    for pose in poses:
-        picture = report.draw_pose(picture, pose, model, pose_input.K.double())
+    poses = 0
+    for shown_pose in shown_poses:
+        pose = shown_pose.estimate.camera_from_model
+        if isinstance(shown_pose.input, ViewInput) and shown_pose.input.is_region:
+            picture = report.draw_region(picture, shown_pose.input, pose)
+        picture = report.draw_pose(picture, pose, model, pose_input.K)
+        poses += pose is not None
     if poses:
-        caption += f", with the posed model{'s' * (len(poses) > 1)}"
+        caption += f", with the posed model{'s' * (poses > 1)}"
+    if pose_input.is_region:
+        caption += ", boxes yellow"
     files.write_image(folder / f"{name}.{PICTURE}", picture)
     return [Shown(file=f"{name}.{PICTURE}", caption=caption)]
 
