@@ -432,7 +432,7 @@ def read_pose(path: Path, option: str = "--first", what: str = "camera_from_mode
 
     Brackets and commas in it do no harm.
     """
-    if path.suffix == ".json":
+    if path.name == predictions.POSES:
         return _only_pose(path, option)
     try:
         text = path.read_text()
