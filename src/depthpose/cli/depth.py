@@ -102,8 +102,8 @@ def match(
         left: left image, a folder of them, or a quoted pattern such as 'left/*.png'; with --engine
             ray also a manifest with columns left and right, or tar shards of both, without RIGHT.
         right: right image, folder or pattern; paired by their names, or the numbers in them.
-        camera: JSON file: {"width", "height", "K": 3x3, "baseline_m"}, or that of KITTI,
-            Middlebury, ROS or OpenCV; for ROS and OpenCV also a folder with both cameras' files.
+        camera: JSON file: {"width", "height", "K": 3x3, "baseline_m"}, or a file of ROS, OpenCV,
+            KITTI and others; for ROS and OpenCV also a folder with both cameras' files.
         out: folder for the results.
     """
     from depthpose.cli import depth_predict as work

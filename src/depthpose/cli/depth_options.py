@@ -49,8 +49,8 @@ class LensOptions:
     """What is known of the camera of single images; without any of it their EXIF is read."""
 
     camera: Path | None = None
-    """JSON file: {"width", "height", "K": 3x3}, or that of KITTI, Middlebury, TUM RGB-D, BOP, ROS
-    or OpenCV. A baseline in it is ignored: one image has none."""
+    """JSON file: {"width", "height", "K": 3x3}, or a file of ROS, OpenCV, KITTI and others, which
+    the error of an unknown file lists. A baseline in it is ignored: one image has none."""
     focal_px: float | None = None
     """focal length in pixels, in place of a camera; its axis meets the centre of the image."""
     fov: float | None = None

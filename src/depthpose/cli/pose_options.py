@@ -79,8 +79,8 @@ class InputOptions:
     """16-bit PNG in the camera's depth_unit_m, or a folder of them. Without --mask, --box and
     --detections the whole image is searched for every object, or for --object alone."""
     camera: Path | None = None
-    """of the depth images; JSON file: {"width", "height", "K": 3x3, "depth_unit_m"}, or that of
-    BOP, TUM RGB-D, ROS, OpenCV, KITTI or Middlebury."""
+    """of the depth images; JSON file: {"width", "height", "K": 3x3, "depth_unit_m"}, or a file of
+    ROS, OpenCV, KITTI and others, which the error of an unknown file lists."""
     mask: Source | None = None
     """picture, not black is the object, or .json with COCO's run lengths; or a folder of masks with
     the names of the depth images. Each number of a label map is an object (see --labels)."""

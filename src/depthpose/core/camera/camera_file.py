@@ -1,7 +1,6 @@
 """Camera files of any known format to :class:`Camera` or :class:`StereoRig`; ours is written.
 
-Text and JSON (KITTI, Middlebury, TUM RGB-D, COLMAP, BOP, bare matrices, our own) are read here.
-What a caller has in place of a file, a matrix, a mapping or a focal length, is a camera too.
+Text and JSON are read here, files of ROS and OpenCV by ``stored_camera``. What a caller has in place of a file, a matrix, a mapping or a focal length, is a camera too.
 """
 
 import math
@@ -340,8 +339,8 @@ def naming(path: AnyPath) -> Iterator[None]:
 def read_camera(path: AnyPath, size: Size | None = None) -> Camera | StereoRig:
     """Read a camera; a :class:`StereoRig` where the file has a baseline.
 
-    The format is recognised by the content: our JSON, BOP, KITTI, Middlebury, TUM, ROS, OpenCV,
-    ORB-SLAM (``docs/conventions.md``). A folder may hold the two files of a pair.
+    The format, one of ``KNOWN_FILES``, is recognised by the content. A folder may hold the two
+    files of a pair.
 
     Args:
         path: the file, or the folder of a pair's two files.
