@@ -7,6 +7,7 @@ import pytest
 import torch
 import trimesh
 from tests.pose.synthetic_objects import bracket, cloud_of, pose_at
+from torch import Tensor
 
 from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError
@@ -15,7 +16,7 @@ from depthpose.core.rigid import Rigid, cross_matrix, geodesic_rad, perturb
 from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import IcpConfig, SensorKind, SyntheticSensorConfig
 from depthpose.pose.datasets import open_bop
-from depthpose.pose.icp import _covariance, refine_best, refine_pose
+from depthpose.pose.icp import _covariance, _NormalEquations, refine_best, refine_pose
 from depthpose.pose.mesh import drawn_triangles, make_model, sample_surface
 from depthpose.pose.mesh.models import turn_about
 from depthpose.pose.metrics import add_m
@@ -377,6 +378,15 @@ def test_nothing_and_no_numbers_are_refused() -> None:
                 refine(cloud, start, surface)
 
 
+def covariance_of(
+    cloud_m: Tensor, H: Tensor, J: Tensor, weight: Tensor, residual_m: Tensor, limit_m: float
+) -> Tensor:
+    gradient = (J.mT @ (weight * residual_m)[..., None]).squeeze(-1)
+    rms_m = (weight * residual_m.square()).sum(-1).div(weight.sum(-1)).sqrt()
+    equations = _NormalEquations(H, gradient, J, weight, residual_m, rms_m)
+    return _covariance(cloud_m, equations, limit_m, 0.2)
+
+
 def test_a_covariance_of_few_points_is_finite_and_symmetric() -> None:
     """Four points fix six directions to rounding alone, which a factorisation refused."""
     torch.manual_seed(11)
@@ -386,7 +396,7 @@ def test_a_covariance_of_few_points_is_finite_and_symmetric() -> None:
     H = (weight[..., None] * J).mT @ J
     size = H.diagonal(dim1=-2, dim2=-1).amax(-1)[..., None, None]
     H = H + 1e-9 * size * torch.eye(6).double()
-    found = _covariance(cloud_m, H, J, weight, residual_m, 0.01, 0.2)
+    found = covariance_of(cloud_m, H, J, weight, residual_m, 0.01)
     assert found.isfinite().all()
     assert torch.allclose(found, found.mT, rtol=1e-6, atol=0)
 
@@ -402,7 +412,7 @@ def test_a_covariance_is_of_as_many_residuals_as_are_free() -> None:
     residual_m = noise_m - root @ (root.mT @ noise_m)  # as a fit leaves them
     H = J.mT @ J
     weight = torch.ones(count).double()
-    found = _covariance(cloud_m, H, J, weight, residual_m, 10.0, 0.2)
+    found = covariance_of(cloud_m, H, J, weight, residual_m, 10.0)
     variance_m2 = residual_m.square().sum() / (count - 6)
     assert torch.allclose(found, variance_m2 * torch.linalg.inv(H), rtol=1e-3)
 
@@ -420,7 +430,7 @@ def test_a_covariance_is_of_the_slope_of_tukeys_residuals() -> None:
     J = torch.randn(count, 6).double()
     J = J - pull @ (pull.mT @ J) / pull.square().sum()  # at the best pose nothing pulls
     H = (weight[:, None] * J).mT @ J
-    found = _covariance(cloud_m, H, J, weight, residual_m, limit_m, 0.2)
+    found = covariance_of(cloud_m, H, J, weight, residual_m, limit_m)
     slope = root * (root - 4 * (residual_m / limit_m).square())
     variance_m2 = (weight * residual_m.square()).sum() / (weight.sum() - 6)
     expected = variance_m2 * torch.linalg.inv((slope[:, None] * J).mT @ J)

@@ -65,17 +65,20 @@ class Refusal:
 
 
 def prepare_cloud(
-    given: CloudInput | ViewInput, model: ObjectModel, cloud: CloudConfig, config: EstimateConfig
+    pose_input: CloudInput | ViewInput,
+    model: ObjectModel,
+    cloud: CloudConfig,
+    config: EstimateConfig,
 ) -> ObjectCloud | Refusal:
     """Lift, thin, drop flying pixels, check, sample and put on the grid of the network."""
-    if isinstance(given, ViewInput):
-        mask = given.mask
-        if given.background is not None:
-            mask = mask & ~given.background.is_seen
-        points_m = cloud_from_depth(given.depth_m, mask, given.K).float()
-        nothing = nothing_seen(given) if len(points_m) == 0 else ""
+    if isinstance(pose_input, ViewInput):
+        mask = pose_input.mask
+        if pose_input.background is not None:
+            mask = mask & ~pose_input.background.is_seen
+        points_m = cloud_from_depth(pose_input.depth_m, mask, pose_input.K).float()
+        nothing = nothing_seen(pose_input) if len(points_m) == 0 else ""
     else:
-        points_m = given.points_m.float()
+        points_m = pose_input.points_m.float()
         is_zero = bool((points_m == 0).all(-1).any())
         nothing = "the cloud has no point with finite coordinates"
         nothing = "the cloud is (0, 0, 0), no reading, in every point" if is_zero else nothing
@@ -86,14 +89,14 @@ def prepare_cloud(
     # What is far from the median is background at the mask's border.
     off_m = (points_m - points_m.median(0).values).norm(dim=-1)
     kept_m = points_m[~(off_m > cloud.max_offset_diameters * model.diameter_m)]
-    if (refusal := _refusal_of(given, points_m, kept_m, model, cloud)) is not None:
+    if (refusal := _refusal_of(pose_input, points_m, kept_m, model, cloud)) is not None:
         return refusal
     generator = torch.Generator().manual_seed(config.voting.seed)
     sampled_m = sample_points(kept_m, cloud.max_points, generator)
     voxels = voxelise(sampled_m, cloud)
-    view = given if isinstance(given, ViewInput) else given.view
+    view = pose_input if isinstance(pose_input, ViewInput) else pose_input.view
     return ObjectCloud(
-        name=given.name,
+        name=pose_input.name,
         cloud_m=kept_m,
         points_m=sampled_m[voxels.kept],
         voxels=voxels,
@@ -114,7 +117,7 @@ def nothing_seen(view: ViewInput) -> str:
 
 
 def _refusal_of(
-    given: CloudInput | ViewInput,
+    pose_input: CloudInput | ViewInput,
     points_m: Float[Tensor, "n 3"],
     kept_m: Float[Tensor, "m 3"],
     model: ObjectModel,
@@ -131,7 +134,7 @@ def _refusal_of(
     least_m = float(take_evenly(points_m[:, 2], 10_000).quantile(0.05))
     is_centred = is_about_origin and least_m < _BEFORE * model.diameter_m
     unusable = frame_advice(points_m)
-    if isinstance(given, CloudInput) and is_centred and advice is None:
+    if isinstance(pose_input, CloudInput) and is_centred and advice is None:
         unusable = (
             "the cloud lies about the origin, where the camera is: it was centred, or is in "
             "the frame of the model; give it in the camera's frame, as it was seen"
@@ -139,8 +142,8 @@ def _refusal_of(
     # Some background in the mask is not of another size.
     elif not unusable and advice and not (sized_m is kept_m and "larger than the model" in advice):
         hint = ""
-        if isinstance(given, ViewInput):  # what else changes the size of a cloud
-            mask = given.mask.float()
+        if isinstance(pose_input, ViewInput):  # what else changes the size of a cloud
+            mask = pose_input.mask.float()
             edge = torch.cat([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
             hint = (
                 "; a mask of more than it, or a K of another image size, changes the size of its "
@@ -160,7 +163,7 @@ def _refusal_of(
     if flat == 0:
         return None
     shape = {1: "in a plane", 2: "on a line", 3: "in one place"}[flat]
-    beside = isinstance(given, ViewInput) and flat == 1
+    beside = isinstance(pose_input, ViewInput) and flat == 1
     return Refusal(
         status="not observable",
         reason=f"the points lie {shape}, so that motions along it change nothing that is seen; "
@@ -206,9 +209,11 @@ def cloud_from_depth(
 
 def lift_sample(view: ViewSample, diameter_m: float, config: CloudConfig) -> CloudSample:
     """Lift a view of an object to its cloud, without flying pixels."""
-    given = view.input
-    points_m = cloud_from_depth(given.depth_m, given.mask, given.K, diameter_m, config)
-    cloud = CloudInput(name=given.name, points_m=points_m, object=given.object)
+    pose_input = view.input
+    points_m = cloud_from_depth(
+        pose_input.depth_m, pose_input.mask, pose_input.K, diameter_m, config
+    )
+    cloud = CloudInput(name=pose_input.name, points_m=points_m, object=pose_input.object)
     return CloudSample(input=cloud, truth=view.truth)
 
 

@@ -100,7 +100,7 @@ class PoseEstimator:
         del is_likely
         return each_in_threads(partial(unreadable_on_error, self._estimate), inputs, threads)
 
-    def _estimate(self, given: AnyInput) -> PoseEstimate:
+    def _estimate(self, pose_input: AnyInput) -> PoseEstimate:
         """Estimate one input; an estimator of many at once has its own :meth:`_each`."""
         raise NotImplementedError
 
@@ -190,23 +190,23 @@ class PoseEstimator:
                 "or omit cloud= and give depth=, camera= and one of mask= and box= together"
             )
         if cloud is not None:
-            given = cloud_input(cloud, unit or "m", which, _NAME)
+            pose_input = cloud_input(cloud, unit or "m", which, _NAME)
         else:
             lens = choose_lens(camera, focal_px)
             if depth is None or lens is None or (mask is None) == (box is None):
                 raise InputError(
                     "estimate: give cloud=, or depth=, camera= and one of mask= and box= together"
                 )
-            given = view_input(depth, mask, lens, which, _NAME, unit)
+            pose_input = view_input(depth, mask, lens, which, _NAME, unit)
             if box is not None:
-                pixels = box_mask(box, *given.depth_m.shape)
-                given = replace(given, mask=pixels, is_region=True)
-            given = with_background(given, background, lens, unit)
+                pixels = box_mask(box, *pose_input.depth_m.shape)
+                pose_input = replace(pose_input, mask=pixels, is_region=True)
+            pose_input = with_background(pose_input, background, lens, unit)
             models = self.models if object is None else [self._known(object).model]
-            given = with_color(given, models, color, color_camera, color_from_depth)
+            pose_input = with_color(pose_input, models, color, color_camera, color_from_depth)
         if object is not None or len(self.models) == 1:
-            return self._answers([given], is_likely=True)[0]
-        tried = [replace(given, object=name) for name in self.objects]
+            return self._answers([pose_input], is_likely=True)[0]
+        tried = [replace(pose_input, object=name) for name in self.objects]
         estimates = self._answers(tried, is_likely=False)
         return with_status(choose_object(estimates), self.config.min_certainty)
 
@@ -370,10 +370,10 @@ class PoseEstimator:
         In place of a frame that cannot be read there is an estimate that says so.
         """
 
-        def look(given: AnyInput) -> PoseEstimate:
-            if isinstance(given, CloudInput):
-                return self._answers([given], is_likely=False)[0]
-            return self.find_in(given, [object], is_single=True)[0]
+        def look(pose_input: AnyInput) -> PoseEstimate:
+            if isinstance(pose_input, CloudInput):
+                return self._answers([pose_input], is_likely=False)[0]
+            return self.find_in(pose_input, [object], is_single=True)[0]
 
         prepared = self._known(object)
         target = TrackedObject(
@@ -416,19 +416,21 @@ class PoseEstimator:
         return prepared
 
 
-def unreadable_on_error(work: Callable[[AnyInput], Made], given: AnyInput) -> Made | PoseEstimate:
+def unreadable_on_error(
+    work: Callable[[AnyInput], Made], pose_input: AnyInput
+) -> Made | PoseEstimate:
     """Give what work makes of an input; a refusal where it raises an error of the input."""
-    if not isinstance(given, AnyInput):
+    if not isinstance(pose_input, AnyInput):
         raise InputError(
             "estimate_many takes CloudInput and ViewInput of depthpose.pose.types, not a "
-            f"{type(given).__name__}; files and arrays go to estimate(), one at a time"
+            f"{type(pose_input).__name__}; files and arrays go to estimate(), one at a time"
         )
     try:
-        return work(given)
+        return work(pose_input)
     except InputError as error:
         reason = str(error)
     except (MemoryError, RuntimeError) as error:
         if (message := full_memory(error)) is None:
             raise
-        reason = f"{given.name}: {message}"
-    return refused(given, Refusal(status="unreadable", reason=reason), {})
+        reason = f"{pose_input.name}: {message}"
+    return refused(pose_input, Refusal(status="unreadable", reason=reason), {})

@@ -26,21 +26,21 @@ from depthpose.pose.surface import Surface, finite_array, look_along_rays
 _CONVERGED = 3e-4  # stop when a step turns [rad] and shifts [diameters] by less than this
 _TURN_RAD = math.radians(15)  # by how much further starts are turned
 _ROUGH_LIMITS = (3.0, 2.4, 2.0, 1.6, 1.4, 1.2, 1.0, 1.0, 1.0, 1.0)
-"""Of the starts, step by step, over the last limit of all: they begin farther off."""
+"""Limits of the rough steps, over the last limit of the exact ones: starts begin farther off."""
 _ROUGH_POINTS = 100  # points of the cloud that refine and compare starts
 _OCCLUDING_POINTS = 1000  # points of the cloud that show what a pose would occlude
-_UNSEEN = 0.3  # a surface that should be seen and is not: something may occlude it
+_UNOBSERVED_WEIGHT = 0.3  # of a score: below 1, for something may occlude what is not observed
 _OTHER = 0.1  # mean distance between the points of two poses, in diameters, from which they are two
-_MOST_OTHERS = 3  # poses beside the best at which starts ended, that are kept
+_MOST_OTHERS = 3  # local minima beside the best that are kept
 _TRUST = 0.02
-"""Another start must bring so large a share of the points nearer to the surface than the given one
-to be believed: a plane fits many places, and noise would choose among them. Where a start ended
-roughly must explain the cloud better by as much than where it ended exactly to be preferred."""
+"""How much better another pose must score than the first, in shares of the points near the surface:
+a plane fits many places, and noise would choose among them. A start's rough end must score better
+by as much than its exact end to be preferred."""
 
-_BLOCKS = (0.15, 0.2, 0.3, 0.4)  # sides of blocks of points whose errors may be alike, in diameters
-_REST = 0.03
-"""Of what holds a pose so much is always taken to be left where a block is left out: else a block
-that alone holds a direction would make it infinitely uncertain."""
+_BLOCKS = (0.15, 0.2, 0.3, 0.4)  # sides of the blocks of the jackknife, in diameters
+_LEAST_REMAINING = 0.03
+"""Share of the information that counts as remaining where a block is left out: else a block that
+alone constrains a direction would make it infinitely uncertain."""
 _LEAST_SLOPE = 0.25  # least information of the weighted residuals, over that of constant weights
 
 
@@ -62,8 +62,19 @@ class BestStart(NamedTuple):
     """The best of several refined poses."""
 
     refined: RefinedPose  #: it
-    start: int  #: number of the given pose that it began from
+    start: int  #: number of the initial pose that it began from
     others: Rigid  #: the best poses beside it, three at most, roughly refined
+
+
+class _NormalEquations(NamedTuple):
+    """Gauss-Newton step of poses: ``information @ motion = gradient``, and what it is made of."""
+
+    information: Float64[Tensor, "*batch 6 6"]
+    gradient: Float64[Tensor, "*batch 6"]
+    jacobian: Float64[Tensor, "*batch n 6"]  # of the residuals by (rotation, translation)
+    weight: Float64[Tensor, "*batch n"]
+    residual_m: Float64[Tensor, "*batch n"]
+    rms_m: Float64[Tensor, "*batch"]  # of the weighted residuals; infinite where no point counts
 
 
 def refine_pose(
@@ -101,27 +112,28 @@ def refine_pose(
     half = max(1, config.iterations // 2)
     shares = [start * (end / start) ** min(1.0, i / half) for i in range(config.iterations)]
     limits_m = [share * surface.diameter_m for share in (*shares, end)]
-    most = config.cloud_points
-    initial = initial.double()
-    pose, index = _iterated(points_m, most, initial, surface, limits_m, is_exact=True)
-    cloud = take_evenly(points_m.double(), most)
-    H, _, J, weight, residual_m, spread_m = _normal_equations(
-        cloud, pose, surface, limits_m[-1], index, ON_RAY
+    pose, index = _iterate(
+        points_m, config.cloud_points, initial.double(), surface, limits_m, is_exact=True
     )
-    local = _covariance(cloud, H, J, weight, residual_m, limits_m[-1], surface.diameter_m)
+
+    # Uncertainty about the middle of the cloud: of the residuals, and of an offset along the ray.
+    cloud = take_evenly(points_m.double(), config.cloud_points)
+    equations = _normal_equations(cloud, pose, surface, limits_m[-1], index, ON_RAY)
+    covariance = _covariance(cloud, equations, limits_m[-1], surface.diameter_m)
     middle_m = cloud.mean(0)
     ray = torch.nn.functional.normalize(middle_m, dim=0)
     offset_m = config.sensor_offset_m * torch.cat([torch.zeros(3), ray])
-    local = local + torch.outer(offset_m, offset_m)
+    covariance = covariance + torch.outer(offset_m, offset_m)
+
+    # About the camera: w x (p - c) + v = w x p + (v + c x w).
     eye = torch.eye(3, dtype=torch.float64)
     zero = torch.zeros(3, 3, dtype=torch.float64)
-    # w x (p - c) + v = w x p + (v + c x w)
     shift = torch.cat([torch.cat([eye, zero], 1), torch.cat([cross_matrix(middle_m), eye], 1)])
     return RefinedPose(
         camera_from_model=Rigid(pose.R.to(points_m), pose.t_m.to(points_m)),
-        covariance=(shift @ local @ shift.mT).to(points_m),
-        residual_m=spread_m.to(points_m),
-        inlier_share=(weight > 0).to(points_m).mean(-1),
+        covariance=(shift @ covariance @ shift.mT).to(points_m),
+        residual_m=equations.rms_m.to(points_m),
+        inlier_share=(equations.weight > 0).to(points_m).mean(-1),
     )
 
 
@@ -131,13 +143,12 @@ def refine_best(
     surface: Surface,
     config: IcpConfig | None = None,
 ) -> BestStart:
-    """Refine poses, and beside each ones turned from it; give what explains the cloud best.
+    """Refine poses, and rotations of each; give the one that explains the cloud best.
 
-    All begin with some of the points and a table of what lies near
-    (:class:`~depthpose.pose.surface.Boxes`); the best goes on exactly, in half of the steps, from
-    the given pose where it was that one. It is the one that leaves the most points near the
-    surface, less those that it would have occluded and some of the surface that it shows and nobody
-    saw.
+    All are refined roughly, with some of the points and a table of nearest samples
+    (:class:`~depthpose.pose.surface.Boxes`). Each is scored by the share of points near the
+    surface, less free-space violations and part of the unobserved surface. The best is refined
+    exactly, in half of the steps.
 
     Args:
         points_m: of the object, in the camera frame.
@@ -149,45 +160,63 @@ def refine_best(
         InputError: there is no point, or one is not finite.
     """
     config = IcpConfig() if config is None else config
-    given = Rigid(initial.R.reshape(-1, 3, 3), initial.t_m.reshape(-1, 3))
-    # The poses, then all of them turned once, twice ... about the middle of the object.
-    poses = given.double()
-    axes = torch.eye(3, dtype=torch.float64)
-    middle_m = poses.R @ surface.points_m.mean(0) + poses.t_m
-    axes = torch.cat([torch.zeros(1, 3).double(), axes, -axes])[: config.starts]
-    turns = rotation_by(_TURN_RAD * axes)[:, None]
-    turned_m = (turns @ (poses.t_m - middle_m)[..., None]).squeeze(-1) + middle_m
-    starts = Rigid((turns @ poses.R).flatten(0, 1), turned_m.flatten(0, 1))
-    tried = refine_roughly(points_m, starts, surface, config)
+    initial = Rigid(initial.R.reshape(-1, 3, 3), initial.t_m.reshape(-1, 3))
+    starts = _rotated_starts(initial.double(), surface, config.starts)
+    rough = refine_roughly(points_m, starts, surface, config)
     end_m = config.end_distance_diameters * surface.diameter_m
-    score = _score(points_m, tried, surface, end_m)
+    score = _score(points_m, rough, surface, end_m)
     best = int(score.argmax())
+
+    # Exactly from the initial pose, where the best began there: by the table a pose drifts along
+    # what little constrains. Not where that pose was farther off than exact steps reach.
     short = replace(config, iterations=(config.iterations + 1) // 2)
     refined = None
-    if best < len(given.R):  # the table is rough: where little holds a pose, starts drift by it
-        refined = refine_pose(points_m, given[best], surface, short)
+    if best < len(initial.R):
+        refined = refine_pose(points_m, initial[best], surface, short)
         exact = refined.camera_from_model.double()
-        rough = tried[best]
-        both = Rigid.stack([exact, rough])
-        if float(_score(points_m, both, surface, end_m).diff()) > 0:
-            refined = None  # it began farther off than exact steps reach
+        exact_and_rough = Rigid.stack([exact, rough[best]])
+        if float(_score(points_m, exact_and_rough, surface, end_m).diff()) > 0:
+            refined = None
     if refined is None:
         short = replace(short, start_distance_diameters=config.end_distance_diameters)
-        refined = refine_pose(points_m, tried[best], surface, short)
+        refined = refine_pose(points_m, rough[best], surface, short)
+
     pose = refined.camera_from_model.double()
-    # From the best down, those that carry the object elsewhere than any before, symmetries aside.
-    others: list[int] = []
-    own_m = surface.points_m[:: max(1, len(surface.points_m) // 50)]
-    copies_m = surface.symmetries.apply(own_m)
+    return BestStart(refined, best % len(initial.R), _distinct_poses(rough, score, pose, surface))
+
+
+def _rotated_starts(poses: Rigid, surface: Surface, number: int) -> Rigid:
+    """Give poses, then all of them rotated about the object's middle by each of the camera's axes.
+
+    ``number``: of starts from each pose, 1 to 7: it alone, then rotated one way and the other.
+    """
+    axes = torch.eye(3, dtype=torch.float64)
+    axes = torch.cat([torch.zeros(1, 3).double(), axes, -axes])[:number]
+    rotations = rotation_by(_TURN_RAD * axes)[:, None]
+    middle_m = poses.R @ surface.points_m.mean(0) + poses.t_m
+    t_m = (rotations @ (poses.t_m - middle_m)[..., None]).squeeze(-1) + middle_m
+    return Rigid((rotations @ poses.R).flatten(0, 1), t_m.flatten(0, 1))
+
+
+def _distinct_poses(
+    poses: Rigid, score: Float64[Tensor, " b"], best: Rigid, surface: Surface
+) -> Rigid:
+    """Give up to three poses, the best first, that differ from each other and from ``best``.
+
+    They differ where their surfaces lie apart: poses that differ by a symmetry are one.
+    """
+    chosen: list[int] = []
+    points_m = surface.points_m[:: max(1, len(surface.points_m) // 50)]
+    copies_m = surface.symmetries.apply(points_m)
     for k in score.argsort(descending=True).tolist():
-        if len(others) == _MOST_OTHERS or score[k] == -torch.inf:
+        if len(chosen) == _MOST_OTHERS or score[k] == -torch.inf:
             break
-        before = Rigid.stack([pose, *(tried[one] for one in others)])
-        moved_m = (before.inverse() @ tried[k]).apply(own_m)
+        better = Rigid.stack([best, *(poses[j] for j in chosen)])
+        moved_m = (better.inverse() @ poses[k]).apply(points_m)
         gap_m = (moved_m[:, None] - copies_m).norm(dim=-1).mean(-1)
         if float(gap_m.min()) > _OTHER * surface.diameter_m:
-            others.append(k)
-    return BestStart(refined, best % len(given.R), tried[others])
+            chosen.append(k)
+    return poses[chosen]
 
 
 def refine_roughly(
@@ -203,10 +232,10 @@ def refine_roughly(
     """
     end_m = config.end_distance_diameters * surface.diameter_m
     limits_m = [share * end_m for share in _ROUGH_LIMITS]
-    return _iterated(points_m, _ROUGH_POINTS, starts, surface, limits_m, is_exact=False)[0]
+    return _iterate(points_m, _ROUGH_POINTS, starts, surface, limits_m, is_exact=False)[0]
 
 
-def _iterated(
+def _iterate(
     points_m: Float[Tensor, "m 3"],
     most: int,
     pose: Rigid,
@@ -215,7 +244,7 @@ def _iterated(
     *,
     is_exact: bool,
 ) -> tuple[Rigid, Int64[Tensor, "*batch n"]]:
-    """Step to where a cloud of ``most`` points lies on the surface; give their samples, or -1."""
+    """Step until ``most`` of the points lie on the surface; give each one's sample, or -1."""
     if len(points_m) == 0 or not bool(points_m.isfinite().all()):
         raise InputError(
             f"ICP of {len(points_m)} points, {int((~points_m.isfinite().all(-1)).sum())} of them "
@@ -239,13 +268,15 @@ def _iterated(
     index = torch.full((*pose.t_m.shape[:-1], len(cloud)), -1)
     steps = len(limits_m) - 1
     for k, limit_m in enumerate(limits_m):
-        how = LOOKED_UP if not is_exact else SEARCHED if 2 * k < steps else ON_RAY
+        how = LOOKED_UP
+        if is_exact:
+            how = SEARCHED if 2 * k < steps else ON_RAY
         matches = match(cloud, pose, surface, limit_m, how, index)
         index = torch.where(moves > 0, matches, index)
         if k == steps:
             break
-        H, pull, *_ = _normal_equations(cloud, pose, surface, limit_m, index, how)
-        motion = torch.linalg.solve(H, pull) * moves
+        equations = _normal_equations(cloud, pose, surface, limit_m, index, how)
+        motion = torch.linalg.solve(equations.information, equations.gradient) * moves
         # About the middle itself: a turn by w about the camera, which is D away, with the shift
         # that makes it one about the object to first order would leave the object w^2 D / 2 off.
         turned = perturb(Rigid(pose.R, pose.t_m - cloud.mean(0)), motion)
@@ -260,16 +291,20 @@ def _iterated(
 def _score(
     points_m: Float[Tensor, "n 3"], poses: Rigid, surface: Surface, limit_m: float
 ) -> Float64[Tensor, " b"]:
-    """Score each pose: share of points near the surface, less distance and contradictions."""
+    """Score each pose: share of points near the surface, less distance and contradictions.
+
+    The first pose is trusted more.
+    """
     cloud = take_evenly(points_m.double(), _OCCLUDING_POINTS)
-    front, unseen = look_along_rays(cloud, poses, surface, every=4)
+    free_space_violation, unobserved = look_along_rays(cloud, poses, surface, every=4)
     few = take_evenly(cloud, _ROUGH_POINTS)
     index = match(few, poses, surface, limit_m, LOOKED_UP)
-    *_, weight, _, spread_m = _normal_equations(few, poses, surface, limit_m, index, LOOKED_UP)
-    near = (weight > 0).double().mean(-1)
+    equations = _normal_equations(few, poses, surface, limit_m, index, LOOKED_UP)
+    inlier_share = (equations.weight > 0).double().mean(-1)
     # Of equals, the nearer one.
-    score = near - spread_m / surface.diameter_m - front - _UNSEEN * unseen
-    score[0] += _TRUST  # the first pose is trusted more
+    closeness = inlier_share - equations.rms_m / surface.diameter_m
+    score = closeness - free_space_violation - _UNOBSERVED_WEIGHT * unobserved
+    score[0] += _TRUST
     return score
 
 
@@ -281,9 +316,9 @@ def match(
     how: int,
     before: Int64[Tensor, "*batch n"] | None = None,
 ) -> Int64[Tensor, "*batch n"]:
-    """Give for each point the number of a sample of the surface that the camera may see, or -1.
+    """Give for each point the number of a visible sample of the surface, or -1.
 
-    A sample is seen where its outer side faces the camera, or nearly; one without a known side
+    A sample is visible where its outer side faces the camera, or nearly; one without a known side
     always, and all where the camera is within a ball about the surface.
 
     Args:
@@ -300,42 +335,46 @@ def match(
     eyes_m = poses.inverse().t_m[:, None]
     if how == LOOKED_UP:
         index = surface.boxes.look_up(local_m)
-        index = torch.where(_is_seen(eyes_m, index, surface), index, surface.across[index])
-        is_good = (index >= 0) & _is_seen(eyes_m, index, surface)
+        is_facing = _is_visible(eyes_m, index, surface)
+        index = torch.where(is_facing, index, surface.across[index])
+        is_good = (index >= 0) & _is_visible(eyes_m, index, surface)
         return torch.where(is_good, index, -1).reshape(*pose.t_m.shape[:-1], -1)
     if how == ON_RAY and before is not None:
-        own = before.reshape(local_m.shape[:2])
+        sample = before.reshape(local_m.shape[:2])
         ray_m = local_m - eyes_m
-        normal = surface.normals[own]
-        point_m = surface.points_m[own]
+        normal = surface.normals[sample]
+        point_m = surface.points_m[sample]
         slope = (normal * ray_m).sum(-1, keepdim=True)
         share = (normal * (point_m - local_m)).sum(-1, keepdim=True) / slope
         is_met = slope.square() > GRAZING**2 * ray_m.square().sum(-1, keepdim=True)
         meet_m = torch.where(is_met, local_m + share * ray_m, point_m)
-        local_m = torch.where(own[..., None] >= 0, meet_m, local_m)
-    # Ask for ever more of the nearest samples until one is seen.
+        local_m = torch.where(sample[..., None] >= 0, meet_m, local_m)
+
+    # Ask for ever more of the nearest samples until one is visible.
     count = 1
     total = len(surface.points_m)
     index = torch.full(local_m.shape[:2], -1)
-    which, place = (index < 0).nonzero(as_tuple=True)
-    while len(which):
-        asked = local_m[which, place].numpy()
-        _, nearest = surface.tree.query(asked, k=range(1, count + 1), distance_upper_bound=limit_m)
+    of_pose, point = (index < 0).nonzero(as_tuple=True)
+    while len(of_pose):
+        queries_m = local_m[of_pose, point].numpy()
+        _, nearest = surface.tree.query(
+            queries_m, k=range(1, count + 1), distance_upper_bound=limit_m
+        )
         nearest = torch.from_numpy(nearest)
-        is_some = nearest < total  # the tree's word for none within the limit
+        is_within = nearest < total  # beyond the limit the tree gives the number of its points
         nearest = nearest.clamp(max=total - 1)
-        is_good = is_some & _is_seen(eyes_m[which, 0, None], nearest, surface)
+        is_good = is_within & _is_visible(eyes_m[of_pose, 0, None], nearest, surface)
         first = is_good.int().argmax(1)
         is_done = is_good.any(1)
-        index[which[is_done], place[is_done]] = nearest[is_done, first[is_done]]
-        is_left = ~is_done & is_some.all(1) & (count < total)
-        which = which[is_left]
-        place = place[is_left]
+        index[of_pose[is_done], point[is_done]] = nearest[is_done, first[is_done]]
+        is_open = ~is_done & is_within.all(1) & (count < total)
+        of_pose = of_pose[is_open]
+        point = point[is_open]
         count = min(8 * count, total)
     return index.reshape(*pose.t_m.shape[:-1], -1)
 
 
-def _is_seen(
+def _is_visible(
     eyes_m: Float64[Tensor, "b k 3"], index: Int64[Tensor, "b n"], surface: Surface
 ) -> Bool[Tensor, "b n"]:
     distance_m = (eyes_m - surface.ball_m[:3]).norm(dim=-1)
@@ -350,11 +389,11 @@ def _normal_equations(
     limit_m: float,
     index: Int64[Tensor, "*batch n"],
     how: int,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Linearise about the middle of the cloud, where turning and shifting hardly mix.
+) -> _NormalEquations:
+    """Linearise the residuals about the middle of the cloud, where the parameters hardly correlate.
 
-    Gives the information, its right side, the derivatives, weights and residuals of the points, and
-    the root mean square distance of those that count, infinite where none does.
+    ``index``: of each point's sample, -1 where it has none; ``how`` it was found, as
+    :func:`match` takes it.
     """
     # In the camera frame, where the covariance is wanted.
     normal = surface.normals[index] @ pose.R.mT
@@ -372,65 +411,109 @@ def _normal_equations(
     J = torch.cat([torch.linalg.cross(arm, normal), normal], -1)
     weighted = J.mT * weight[..., None, :]
     H = weighted @ J
-    # A direction that no point constrains stays where it was.
+    # Damped, so that a direction that no point constrains stays where it was.
     size = H.diagonal(dim1=-2, dim2=-1).amax(-1)[..., None, None].clamp(min=1e-6)
     H = H + 1e-9 * size * torch.eye(6, dtype=torch.float64)
-    pull = (weighted @ residual_m[..., None]).squeeze(-1)
     total = weight.sum(-1)
     mean_square = (weight * residual_m.square()).sum(-1) / total.clamp(min=1e-12)
-    return H, pull, J, weight, residual_m, torch.where(total > 0, mean_square, torch.inf).sqrt()
+    return _NormalEquations(
+        information=H,
+        gradient=(weighted @ residual_m[..., None]).squeeze(-1),
+        jacobian=J,
+        weight=weight,
+        residual_m=residual_m,
+        rms_m=torch.where(total > 0, mean_square, torch.inf).sqrt(),
+    )
 
 
 def _covariance(
-    cloud: Float64[Tensor, "n 3"],
-    H: Float64[Tensor, "*batch 6 6"],
-    J: Float64[Tensor, "*batch n 6"],
-    weight: Float64[Tensor, "*batch n"],
-    residual_m: Float64[Tensor, "*batch n"],
-    limit_m: float,
-    diameter_m: float,
+    cloud: Float64[Tensor, "n 3"], equations: _NormalEquations, limit_m: float, diameter_m: float
 ) -> Float64[Tensor, "*batch 6 6"]:
-    """Say how uncertain a motion about the middle of the cloud is, by the residuals.
+    """Give the covariance of a motion (rotation, translation) about the middle of the cloud.
 
-    Independent errors give ``s^2 / A``, where ``A`` has the slope of the weighted residual (Huber
-    1981): Tukey's weights hold less than they weigh. Neighbours may err alike, and the fit takes up
-    what few points alone hold: how far it moves where a block of the view is left out (MacKinnon
-    and White's jackknife) says both. Of several sizes of blocks that of the largest moves counts,
-    for nobody knows how far errors reach; there are few blocks, so each direction is as uncertain
-    as all are in the mean, over independent errors, or more.
+    That of an M-estimator (Huber 1981), ``s^2 A^-1``, assumes independent residuals; those of a
+    depth camera are correlated over many pixels. It is therefore inflated by a block jackknife
+    (MacKinnon and White 1985): leave out one square block of the view at a time, and measure how
+    far the pose moves. This is repeated for several block sizes, and the largest result counts,
+    because the correlation length is not known. With few blocks a direction can look certain by
+    chance, so no direction is inflated by less than the mean over all, or by less than 1.
     """
-    root = weight.sqrt()
-    slope = root * (root - 4 * (residual_m / limit_m).square())
-    half = torch.linalg.cholesky(H)
-    bent = torch.linalg.solve_triangular(half, J.mT * slope[..., None, :] @ J, upper=False)
-    bent = torch.linalg.solve_triangular(half, bent.mT, upper=False)
-    values, ways = torch.linalg.eigh(bent)
-    variance = (weight * residual_m.square()).sum(-1) / (weight.sum(-1) - 6).clamp(min=1)
-    # Of s^2 / A a root, and the root's inverse: A itself may be singular to rounding.
-    spread_m = variance.clamp(min=1e-20).sqrt()[..., None, None]
+    # The information A of the residuals, by the slope of the influence function w r (Tukey's).
+    root = equations.weight.sqrt()
+    slope = root * (root - 4 * (equations.residual_m / limit_m).square())
+    independent, whitening, spread_m = _independent_factor(equations, slope)
+    inflation, directions = _jackknife_inflation(
+        cloud, equations, slope, independent, whitening, spread_m, diameter_m
+    )
+    least = inflation.mean(-1, keepdim=True).clamp(min=1)
+    factor = independent @ directions
+    return (factor * torch.maximum(inflation, least)[..., None, :]) @ factor.mT
+
+
+def _independent_factor(
+    equations: _NormalEquations, slope: Float64[Tensor, "*batch n"]
+) -> tuple[
+    Float64[Tensor, "*batch 6 6"], Float64[Tensor, "*batch 6 6"], Float64[Tensor, "*batch 1 1"]
+]:
+    """Factor the covariance under independent residuals: ``F F^T = s^2 A^-1``.
+
+    Gives the factor ``F``, its inverse and ``s``. ``A`` may be singular to rounding: its
+    eigenvalues over those of the information are bounded below.
+    """
+    J = equations.jacobian
+    cholesky = torch.linalg.cholesky(equations.information)
+    relative = torch.linalg.solve_triangular(cholesky, J.mT * slope[..., None, :] @ J, upper=False)
+    relative = torch.linalg.solve_triangular(cholesky, relative.mT, upper=False)
+    values, vectors = torch.linalg.eigh(relative)
     size = values.clamp(min=_LEAST_SLOPE).sqrt()[..., None, :]
-    own = spread_m * torch.linalg.solve_triangular(half.mT, ways / size, upper=True)
-    from_own = (half @ ways * size).mT / spread_m
-    inverse = own @ own.mT / spread_m.square()
-    pulls = (weight * residual_m)[..., None] * J
-    shares = (slope[..., None] * J)[..., None] * J[..., None, :]
-    flat_m = cloud[:, :2] / cloud[:, 2:] * cloud[:, 2].mean()
+    weight = equations.weight
+    square_sum = (weight * equations.residual_m.square()).sum(-1)
+    variance = square_sum / (weight.sum(-1) - 6).clamp(min=1)
+    spread_m = variance.clamp(min=1e-20).sqrt()[..., None, None]
+    factor = spread_m * torch.linalg.solve_triangular(cholesky.mT, vectors / size, upper=True)
+    inverse_factor = (cholesky @ vectors * size).mT / spread_m
+    return factor, inverse_factor, spread_m
+
+
+def _jackknife_inflation(
+    cloud: Float64[Tensor, "n 3"],
+    equations: _NormalEquations,
+    slope: Float64[Tensor, "*batch n"],
+    independent: Float64[Tensor, "*batch 6 6"],
+    whitening: Float64[Tensor, "*batch 6 6"],
+    spread_m: Float64[Tensor, "*batch 1 1"],
+    diameter_m: float,
+) -> tuple[Float64[Tensor, "*batch 6"], Float64[Tensor, "*batch 6 6"]]:
+    """Give the variances of a block jackknife over the independent ones, and their directions.
+
+    Of several block sizes those with the largest sum; the independent ones (1 each) where no size
+    has a larger one. Directions are columns, in the coordinates of ``whitening``, the inverse of
+    the factor ``independent``.
+    """
+    inverse_information = independent @ independent.mT / spread_m.square()
+    J = equations.jacobian
+    gradients = (equations.weight * equations.residual_m)[..., None] * J
+    informations = (slope[..., None] * J)[..., None] * J[..., None, :]
+    view_m = cloud[:, :2] / cloud[:, 2:] * cloud[:, 2].mean()
     eye = torch.eye(6, dtype=torch.float64)
-    most = torch.ones_like(values)
-    ways = eye.expand_as(own)
+    inflation = torch.ones_like(independent[..., 0])
+    directions = eye.expand_as(independent)
     for side in _BLOCKS:
-        cells = (flat_m / (side * diameter_m)).floor() @ torch.tensor([1.0, 1e6]).double()
+        cells = (view_m / (side * diameter_m)).floor() @ torch.tensor([1.0, 1e6]).double()
         _, block = cells.unique(return_inverse=True)
         count = int(block.max()) + 1
-        pull = pulls.new_zeros(*pulls.shape[:-2], count, 6).index_add_(-2, block, pulls)
-        held = shares.new_zeros(*shares.shape[:-3], count, 6, 6).index_add_(-3, block, shares)
-        rest = eye * (1 + _REST) - held @ inverse[..., None, :, :]
-        moves = torch.linalg.solve(rest, pull[..., None]).squeeze(-1) @ inverse
-        moves = from_own @ moves.mT
-        values, axes = torch.linalg.eigh(moves @ moves.mT)
-        is_more = values.sum(-1, keepdim=True) > most.sum(-1, keepdim=True)
-        most = torch.where(is_more, values, most)
-        ways = torch.where(is_more[..., None], axes, ways)
-    least = most.mean(-1, keepdim=True).clamp(min=1)
-    spread = own @ ways
-    return (spread * torch.maximum(most, least)[..., None, :]) @ spread.mT
+        gradient = gradients.new_zeros(*gradients.shape[:-2], count, 6)
+        gradient = gradient.index_add_(-2, block, gradients)
+        information = informations.new_zeros(*informations.shape[:-3], count, 6, 6)
+        information = information.index_add_(-3, block, informations)
+
+        # One Gauss-Newton step without each block, in units of the independent deviations.
+        remaining = eye * (1 + _LEAST_REMAINING)
+        remaining = remaining - information @ inverse_information[..., None, :, :]
+        moves = torch.linalg.solve(remaining, gradient[..., None]).squeeze(-1)
+        moves = whitening @ (moves @ inverse_information).mT
+        values, vectors = torch.linalg.eigh(moves @ moves.mT)
+        is_larger = values.sum(-1, keepdim=True) > inflation.sum(-1, keepdim=True)
+        inflation = torch.where(is_larger, values, inflation)
+        directions = torch.where(is_larger[..., None], vectors, directions)
+    return inflation, directions

@@ -70,7 +70,7 @@ class CloudDirections(NamedTuple):
 class CloudToPose:
     """An input on its way: its object, its cloud, the seconds, and what the network says of it."""
 
-    given: AnyInput
+    pose_input: AnyInput
     prepared: PreparedObject
     cloud: ObjectCloud
     seconds: dict[str, float]
@@ -191,7 +191,9 @@ class GeoPoseNet(PoseEstimator):
 
     @torch.no_grad()
     @force_float32()
-    def estimate_with_votes(self, given: AnyInput) -> tuple[PoseEstimate, CloudDirections | None]:
+    def estimate_with_votes(
+        self, pose_input: AnyInput
+    ) -> tuple[PoseEstimate, CloudDirections | None]:
         """Estimate one pose, and give what the network said of each keypoint at each point.
 
         What the network doubts is not registered here.
@@ -203,25 +205,25 @@ class GeoPoseNet(PoseEstimator):
         Raises:
             InputError: an unknown object, or a mask that does not fit its depth image.
         """
-        with refused_memory(given.name):
-            job = self._prepare(given)
+        with refused_memory(pose_input.name):
+            job = self._prepare(pose_input)
             if isinstance(job, PoseEstimate):
                 return job, None
             self._ask_network([job])
-            voted = self._vote(given, job=job, is_likely=True)
+            voted = self._vote(pose_input, job=job, is_likely=True)
             return voted, CloudDirections(job.cloud, job.directions)
 
-    def _prepare(self, given: AnyInput) -> CloudToPose | PoseEstimate:
-        if isinstance(given, ViewInput) and given.is_region:
-            return self._estimate_in_region(given)
-        prepared = self._known(given.object)
+    def _prepare(self, pose_input: AnyInput) -> CloudToPose | PoseEstimate:
+        if isinstance(pose_input, ViewInput) and pose_input.is_region:
+            return self._estimate_in_region(pose_input)
+        prepared = self._known(pose_input.object)
         copies_of(prepared)  # in the seconds of no input
         start = time.perf_counter()
-        cloud = prepare_cloud(given, prepared.model, self.weights.cloud, self.config)
+        cloud = prepare_cloud(pose_input, prepared.model, self.weights.cloud, self.config)
         seconds = {"cloud": time.perf_counter() - start}
         if isinstance(cloud, Refusal):
-            return refused(given, cloud, seconds)
-        return CloudToPose(given=given, prepared=prepared, cloud=cloud, seconds=seconds)
+            return refused(pose_input, cloud, seconds)
+        return CloudToPose(pose_input=pose_input, prepared=prepared, cloud=cloud, seconds=seconds)
 
     def _ask_network(
         self, group: list[CloudToPose | PoseEstimate]
@@ -256,16 +258,18 @@ class GeoPoseNet(PoseEstimator):
         """Pose a cloud by its votes, or by registration where these are doubted."""
         if isinstance(job, PoseEstimate):
             return job
-        voted = unreadable_on_error(partial(self._vote, job=job, is_likely=is_likely), job.given)
+        voted = unreadable_on_error(
+            partial(self._vote, job=job, is_likely=is_likely), job.pose_input
+        )
         if not (self.config.register_refused and is_likely) or voted.status not in _DOUBTED:
             return voted
         start = time.perf_counter()
-        (registered,) = self._by_models().estimate_many([job.given])
+        (registered,) = self._by_models().estimate_many([job.pose_input])
         spent_s = time.perf_counter() - start
         best = registered if registered.is_posed else voted
         return replace(best, seconds={**voted.seconds, "registration": spent_s})
 
-    def _vote(self, given: AnyInput, *, job: CloudToPose, is_likely: bool) -> PoseEstimate:
+    def _vote(self, pose_input: AnyInput, *, job: CloudToPose, is_likely: bool) -> PoseEstimate:
         """Vote for the keypoints, fit the pose to them, refine it, and decide by the evidence."""
         config = self.config
         prepared = job.prepared
@@ -284,7 +288,7 @@ class GeoPoseNet(PoseEstimator):
         fits = fits_of(vote, prepared.model, config)
         seconds["proposal"] = time.perf_counter() - began
         if isinstance(fits, Refusal):
-            return refused(given, fits, seconds)
+            return refused(pose_input, fits, seconds)
 
         # Refine.
         began = time.perf_counter()
@@ -376,24 +380,24 @@ class DepthImageRegressor(PoseEstimator):
         del view, objects, is_single
         raise InputError(_NEEDS_MASK)
 
-    def _estimate(self, given: AnyInput) -> PoseEstimate:
-        prepared = self._known(given.object)
-        if not isinstance(given, ViewInput):
+    def _estimate(self, pose_input: AnyInput) -> PoseEstimate:
+        prepared = self._known(pose_input.object)
+        if not isinstance(pose_input, ViewInput):
             raise InputError(_NEEDS_MASK)
         config = self._network.config
         model = prepared.model
         began = time.perf_counter()
-        crop = cut_depth(given, config, model.diameter_m)
+        crop = cut_depth(pose_input, config, model.diameter_m)
         if crop is None:
             reason = f"fewer than {config.min_points} masked pixels have a depth"
-            return refused(given, Refusal(status="too few points", reason=reason), {})
+            return refused(pose_input, Refusal(status="too few points", reason=reason), {})
         batch = DepthCrop(*(part[None].to(self.config.device) for part in crop))
         numbers = torch.tensor([prepared.number], device=self.config.device)
         poses = poses_of(self._network(batch.image, numbers), batch)
         regressed = time.perf_counter()
         estimate = PoseEstimate(
-            name=given.name,
-            object=given.object,
+            name=pose_input.name,
+            object=pose_input.object,
             status="ok",
             camera_from_model=Rigid(poses.R[0].cpu().float(), poses.t_m[0].cpu().float()),
             seconds={"network": regressed - began},
@@ -401,7 +405,7 @@ class DepthImageRegressor(PoseEstimator):
         if not self.config.with_icp:
             return estimate
         points_m = cloud_from_depth(
-            given.depth_m, given.mask, given.K, model.diameter_m, self._cloud
+            pose_input.depth_m, pose_input.mask, pose_input.K, model.diameter_m, self._cloud
         ).float()
         if (few := refusal_of(points_m, self._cloud)) is not None:
             return replace(estimate, status="too few points", reason=few, camera_from_model=None)

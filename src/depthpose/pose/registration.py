@@ -147,35 +147,37 @@ class Registration(PoseEstimator):
         """Estimate objects of a search from the poses that were proposed for each."""
 
         def estimate(pair: tuple[CloudInput, Rigid]) -> PoseEstimate:
-            given, proposed = pair
-            return self._estimate_cloud(given, proposed, prior_odds)
+            pose_input, proposed = pair
+            return self._estimate_cloud(pose_input, proposed, prior_odds)
 
         pairs = zip(inputs, proposals, strict=True)
         return list(each_in_threads(estimate, pairs, torch.get_num_threads()))
 
-    def _estimate(self, given: AnyInput) -> PoseEstimate:
+    def _estimate(self, pose_input: AnyInput) -> PoseEstimate:
         """Estimate a pose from the points of a mask; from its region, if the mask does not fit."""
-        if isinstance(given, ViewInput) and given.is_region:
-            return self._estimate_in_region(given)
-        estimate = self._estimate_cloud(given, None, PRIOR_MASKED)
-        if estimate.status != "doubtful" or not isinstance(given, ViewInput):
+        if isinstance(pose_input, ViewInput) and pose_input.is_region:
+            return self._estimate_in_region(pose_input)
+        estimate = self._estimate_cloud(pose_input, None, PRIOR_MASKED)
+        if estimate.status != "doubtful" or not isinstance(pose_input, ViewInput):
             return estimate
-        in_region = self._estimate_in_region(replace(given, is_region=True))
+        in_region = self._estimate_in_region(replace(pose_input, is_region=True))
         if not in_region.is_posed:
             return estimate
         return replace(in_region, seconds={**estimate.seconds, **in_region.seconds})
 
     def _estimate_cloud(
-        self, given: AnyInput, proposals: Rigid | None, prior_odds: float
+        self, pose_input: AnyInput, proposals: Rigid | None, prior_odds: float
     ) -> PoseEstimate:
         """Estimate a pose from a mask's points, or from those at a pose that a search proposed."""
-        prepared = self._prepared(given.object)  # once for all inputs, and in the seconds of none
+        prepared = self._prepared(
+            pose_input.object
+        )  # once for all inputs, and in the seconds of none
         is_masked = proposals is None
         began = time.perf_counter()
-        cloud = self._cloud(given, prepared)
+        cloud = self._cloud(pose_input, prepared)
         seconds = {"cloud": time.perf_counter() - began}
         if isinstance(cloud, Refusal):
-            return refused(given, cloud, seconds)
+            return refused(pose_input, cloud, seconds)
 
         began = time.perf_counter()
         if proposals is None:
@@ -188,7 +190,7 @@ class Registration(PoseEstimator):
         seconds["icp"] = time.perf_counter() - began
         if float(refinement.refined.inlier_share) == 0:
             reason = "no pose lays the model near the points: another object, or too little of it"
-            return refused(given, Refusal(status="no pose found", reason=reason), seconds)
+            return refused(pose_input, Refusal(status="no pose found", reason=reason), seconds)
 
         began = time.perf_counter()
         observation = observe(
@@ -202,7 +204,7 @@ class Registration(PoseEstimator):
         if not is_masked and probability_right(first, prior_odds) < _HOPELESS:
             seconds["evidence"] = time.perf_counter() - began
             reason = contradiction(first, probability_right(first, prior_odds))
-            return refused(given, Refusal(status="doubtful", reason=reason), seconds)
+            return refused(pose_input, Refusal(status="doubtful", reason=reason), seconds)
         competition = compete(
             cloud.cloud_m.double(),
             refinement.refined,
@@ -224,11 +226,11 @@ class Registration(PoseEstimator):
             prior_odds,
         )
 
-    def _cloud(self, given: AnyInput, prepared: PreparedObject) -> ObjectCloud | Refusal:
+    def _cloud(self, pose_input: AnyInput, prepared: PreparedObject) -> ObjectCloud | Refusal:
         """Lift the input to a cloud, with voxels as far apart as the points that vote."""
         voxel_m = min(0.9, _VOXEL_DIAMETERS * prepared.model.diameter_m)
         config = CloudConfig(voxel_m=voxel_m, max_points=None)
-        return prepare_cloud(given, prepared.model, config, self.config)
+        return prepare_cloud(pose_input, prepared.model, config, self.config)
 
     def _propose(self, cloud: ObjectCloud, prepared: PreparedObject) -> Rigid:
         """Propose poses by the point pairs of a cloud."""

@@ -108,12 +108,12 @@ def import_resnet18(file: Path, out: Path) -> None:
         InputError: not the weights of such a network; nothing is written.
     """
     state = read_published(file, "ResNet-18")
-    given = {name.removeprefix("module."): value for name, value in state.items()}
-    given = {name: value for name, value in given.items() if not name.startswith("fc.")}
+    tensors = {name.removeprefix("module."): value for name, value in state.items()}
+    tensors = {name: value for name, value in tensors.items() if not name.startswith("fc.")}
     network = ResNet18()
     # The count of batches steers nothing at inference, and old files do not hold it.
     spare = {k: t for k, t in network.state_dict().items() if k.endswith("num_batches_tracked")}
-    held = Checkpoint(kind=ENCODER_KIND, config={}, state={**spare, **given})
+    held = Checkpoint(kind=ENCODER_KIND, config={}, state={**spare, **tensors})
     try:
         load_weights(network, held, ENCODER_KIND)
     except InputError as error:

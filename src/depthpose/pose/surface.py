@@ -310,8 +310,8 @@ def look_along_rays(
         from depthpose.pose.compiled.points import compare_rays
 
         points_m = surface.points_m[::every]
-        given = (finite_array(a.detach().numpy()) for a in (cloud_m, poses.R, poses.t_m, points_m))
-        front, unseen = compare_rays(*given, scale, *middle.tolist(), _REACH, limit_m)
+        arrays = (finite_array(a.detach().numpy()) for a in (cloud_m, poses.R, poses.t_m, points_m))
+        front, unseen = compare_rays(*arrays, scale, *middle.tolist(), _REACH, limit_m)
         return torch.from_numpy(front), torch.from_numpy(unseen)
     posed_m = poses.apply(surface.points_m[::every])
     depth_m = posed_m[..., 2]

@@ -51,28 +51,28 @@ _BESIDE = 1000  # points beside the object that show them
 _ON = 3.0  # standard deviations of a plane's points: nearer ones are of it
 
 
-def scene_about(given: AnyInput, poses: Rigid, surface: Surface) -> Float64[Tensor, "n 3"]:
+def scene_about(pose_input: AnyInput, poses: Rigid, surface: Surface) -> Float64[Tensor, "n 3"]:
     """Give all points in the direction of the object at one of several poses, and about it."""
     middles_m = (poses.R @ surface.points_m.mean(0)) + poses.t_m
     middle_m = middles_m.mean(0)
     radius_m = (0.5 + 2 * MARGIN) * surface.diameter_m
     radius_m += float((middles_m - middle_m).norm(dim=-1).max())
-    if isinstance(given, ViewInput):
+    if isinstance(pose_input, ViewInput):
         # The square about a ball, cut out of the view.
         z_m = float(middle_m[2])
-        K = given.K.double().clone()
+        K = pose_input.K.double().clone()
         near_m = max(z_m - radius_m, 0.1 * z_m)
         u, v = (K @ (middle_m / z_m))[:2].tolist()
         across, down = (float(K[k, k]) * radius_m / near_m for k in range(2))
-        height, width = given.depth_m.shape
+        height, width = pose_input.depth_m.shape
         left, right = (min(max(round(u + s * across), 0), width) for s in (-1, 1))
         top, bottom = (min(max(round(v + s * down), 0), height) for s in (-1, 1))
         part = (slice(top, bottom), slice(left, right))
         K[0, 2] -= left
         K[1, 2] -= top
-        points_m = cloud_from_depth(given.depth_m[part], given.mask[part], K).double()
+        points_m = cloud_from_depth(pose_input.depth_m[part], pose_input.mask[part], K).double()
         return take_evenly(points_m, _MOST_POINTS)
-    points_m = given.points_m.double()
+    points_m = pose_input.points_m.double()
     points_m = points_m[points_m.isfinite().all(-1) & (points_m[:, 2] > 0)]
     offset = points_m[:, :2] / points_m[:, 2:] - middle_m[:2] / middle_m[2]
     near = offset.abs().amax(-1) < radius_m / (middle_m[2] - radius_m).clamp(min=0.1 * middle_m[2])
@@ -120,13 +120,13 @@ def track(
         current = _Track(
             pose=first.double(), moved=None, log_odds=math.log(PRIOR_MASKED), origin=None
         )
-    for given in frames:
-        if isinstance(given, PoseEstimate):
-            yield given
+    for pose_input in frames:
+        if isinstance(pose_input, PoseEstimate):
+            yield pose_input
             continue
-        estimate, following = _next(given, current, target)
+        estimate, following = _next(pose_input, current, target)
         # In a cloud of a whole scene an object that is lost can be looked for only where it was.
-        is_scene = isinstance(given, CloudInput) and given.view is None
+        is_scene = isinstance(pose_input, CloudInput) and pose_input.view is None
         if following is None and is_scene and current is not None:
             following = replace(current, moved=None)
         current = following
@@ -134,26 +134,26 @@ def track(
 
 
 def _next(
-    given: AnyInput, current: _Track | None, target: TrackedObject
+    pose_input: AnyInput, current: _Track | None, target: TrackedObject
 ) -> tuple[PoseEstimate, _Track | None]:
     """Follow the object into a frame, or look for it there."""
     spent_s = 0.0
     if current is not None:
         began = time.perf_counter()
-        followed = _follow(given, current, target)
+        followed = _follow(pose_input, current, target)
         spent_s = time.perf_counter() - began
         if not isinstance(followed, Refusal):
             estimate, following = followed
-            return replace(estimate, name=given.name, seconds={"icp": spent_s}), following
-    looked = target.look(given)
+            return replace(estimate, name=pose_input.name, seconds={"icp": spent_s}), following
+    looked = target.look(pose_input)
     seconds = {**looked.seconds, "icp": looked.seconds.get("icp", 0.0) + spent_s}
     pose = looked.camera_from_model
     tracking = "lost" if pose is None else "found"
-    estimate = replace(looked, name=given.name, seconds=seconds, tracking=tracking)
+    estimate = replace(looked, name=pose_input.name, seconds=seconds, tracking=tracking)
     if pose is None:
         return estimate, None
     # A track that begins at something else stays there: what was searched for must be `ok`.
-    is_searched = isinstance(given, ViewInput) and looked.certainty is not None
+    is_searched = isinstance(pose_input, ViewInput) and looked.certainty is not None
     if is_searched and not looked.is_ok:
         return estimate, None
     certainty = min(max(looked.certainty or 0.0, _LEAST_CERTAINTY), 1 - _LEAST_CERTAINTY)
@@ -162,7 +162,7 @@ def _next(
 
 
 def _follow(
-    given: AnyInput, current: _Track, target: TrackedObject
+    pose_input: AnyInput, current: _Track, target: TrackedObject
 ) -> tuple[PoseEstimate, _Track] | Refusal:
     """Refine the last pose and the predicted one; weigh the better by the evidence of the frame."""
     surface = target.surface
@@ -171,7 +171,7 @@ def _follow(
         R = current.moved.R @ current.pose.R
         starts.insert(0, Rigid(R, current.pose.t_m + current.moved.t_m))
     poses = Rigid.stack(starts)
-    scene_m = scene_about(given, poses, surface)
+    scene_m = scene_about(pose_input, poses, surface)
     near = _is_near(scene_m, poses, surface, MARGIN)
     is_support = _is_support(scene_m, near, current.pose.apply(surface.points_m))
     cloud_m = scene_m[near & ~is_support]
@@ -191,7 +191,7 @@ def _follow(
         )
 
     # What the frame says: by itself, and together with the frames before.
-    view = given if isinstance(given, ViewInput) else given.view
+    view = pose_input if isinstance(pose_input, ViewInput) else pose_input.view
     observation = observe(
         object_points_m,
         view,

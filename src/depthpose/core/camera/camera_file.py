@@ -1,6 +1,7 @@
 """Camera files of any known format to :class:`Camera` or :class:`StereoRig`; ours is written.
 
-Text and JSON are read here, files of ROS and OpenCV by ``stored_camera``. What a caller has in place of a file, a matrix, a mapping or a focal length, is a camera too.
+Text and JSON are read here, files of ROS and OpenCV by ``stored_camera``. What a caller has in
+place of a file, a matrix, a mapping or a focal length, is a camera too.
 """
 
 import math
