@@ -362,6 +362,7 @@ class DepthWork:
         method = self.method.build()
 
         def estimate(samples: Sequence[Sample], out: Path) -> list[str]:
+            """Estimate a batch of a worker into a folder; give of each why it failed, or ""."""
             depth_run = DepthRun(work=self, method=method, out=out)
             jobs = [
                 Job(name=sample.name, read=partial(self.input_of, sample.name, *sample.files))

@@ -88,6 +88,10 @@ def look_at_all(paths: Sequence[Path]) -> int:
 
 
 def _read(path: Path, size: Size | None) -> FileFacts:
+    """Tell what a file holds, by its suffix: a camera, a map, a mesh, a cloud or a picture.
+
+    ``size``: width and height [px] of a picture beside it, for cameras that do not say theirs.
+    """
     suffix = path.suffix.lower()
     if path.is_dir() or suffix in cameras.CAMERA_SUFFIXES:
         return _read_words(path, size)
@@ -161,6 +165,10 @@ def _of_pose(path: Path) -> FileFacts | None:
 
 
 def _of_picture(path: Path) -> FileFacts:
+    """Tell whether a picture is a depth image, a mask or a photograph.
+
+    One of 16 bits is a depth image where many pixels have no value, or neighbours are alike.
+    """
     what = ""
     units = None
     with opened_image(path) as image:
@@ -185,6 +193,7 @@ def _of_picture(path: Path) -> FileFacts:
 
 
 def _of_mask(path: Path, mask: Tensor) -> FileFacts:
+    """Describe a mask: its share of the image, and whether it is empty or inverted."""
     height, width = mask.shape
     share = float(mask.float().mean())
     edge = torch.cat([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).float().mean()
@@ -216,6 +225,7 @@ def _of_depth(path: Path, units: Tensor) -> FileFacts:
 
 
 def _of_map(path: Path) -> FileFacts:
+    """Describe a map of numbers (``.npy``, ``.pfm``): depth, disparity, or rows of points."""
     if path.suffix.lower() == ".npy":
         stored = read_numbers(path)
         if stored.dtype.kind != "f" and stored.ndim == 2:
@@ -244,6 +254,7 @@ def _of_map(path: Path) -> FileFacts:
 
 
 def _of_points(path: Path, points: Tensor) -> FileFacts:
+    """Describe a cloud: the unit that its distance from the origin suggests, and its frame."""
     away = float(points.median(0).values.norm())
     unit = "metres" if away < _ONLY_MM else "centimetres" if away < _LEAST_MM else "millimetres"
     what = f"{len(points)} points, {away:.4g} from the origin: {unit}"

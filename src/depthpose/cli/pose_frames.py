@@ -339,6 +339,7 @@ def _followed(
     """Follow an object frame by frame; an unreadable frame gets an estimate that says so."""
 
     def frames() -> Iterator[AnyInput | PoseEstimate]:
+        """Read the frames one by one; one that cannot be read is an estimate that says so."""
         for job in tqdm(jobs, disable=None, unit=" frames"):
             try:
                 frame = job.read()

@@ -246,6 +246,7 @@ def pose_methods(
 
 
 def _register(name: str, models: Sequence[ObjectModel], config: EstimateConfig) -> PoseMethod:
+    """Make the method that registers models without training."""
     if not models:
         raise InputError(
             "--method register looks for CAD files: give --cad part.stl --unit mm, or --bop, whose "
@@ -272,6 +273,10 @@ def _register(name: str, models: Sequence[ObjectModel], config: EstimateConfig) 
 
 
 def _network(path: Path, name: str, config: EstimateConfig) -> PoseMethod:
+    """Make the method of a weights file: a network that votes, or the regressor.
+
+    Its name in tables says how it departs from the defaults.
+    """
     pose_weights = read_pose_weights(path)
     warn_of_terms(pose_weights.facts)
     is_regressor = isinstance(pose_weights.network, DepthImageNet)
@@ -341,6 +346,7 @@ class PoseMethodSource:
         return method if self.base_from_camera is None else _in_base(method, self.base_from_camera)
 
     def _build(self, device: str | None) -> PoseMethod:
+        """Build the estimator without what is added to its estimates."""
         config = self.config if device is None else replace(self.config, device=device)
         if self.weights is None or self.weights == REGISTER:
             return _register(REGISTER, self.models, config)
@@ -476,6 +482,7 @@ def read_base(words: Sequence[str]) -> Rigid | None:
 
 
 def _rigid_of(text: str, source: str, what: str) -> Rigid:
+    """Read the 16 numbers of a 4x4 matrix row by row; ``source`` and ``what`` name it in errors."""
     try:
         words = re.sub(r"[\[\],;]", " ", text).split()
         values = torch.tensor([float(word) for word in words], dtype=torch.float64)

@@ -338,6 +338,7 @@ def _detection_jobs(
     camera: Path | float,
     unit: Unit | None,
 ) -> list[PoseJob[Any]]:
+    """Make a job of each detection in a depth image: NAME, or of several NAME_1, NAME_2, ..."""
     jobs: list[PoseJob[Any]] = []
     for k, detection in enumerate(detections, 1):
         assert detection.object is not None
@@ -375,6 +376,7 @@ def _beside_depths(
 
 
 def _refuse_twice(jobs: Sequence[PoseJob[Any]], depth: Path) -> None:
+    """Refuse jobs of one name: their results would overwrite each other."""
     twice = [name for name, count in Counter(job.name for job in jobs).items() if count > 1]
     if twice:
         raise InputError(
@@ -650,6 +652,7 @@ def _wait_for_predictions(out: Path, jobs: Sequence[PoseJob[Any]]) -> None:
     last_read_s = -math.inf
 
     def is_written(name: str) -> bool:
+        """Whether a prediction of this name is in the files."""
         nonlocal names, last_read_s
         # The files are read for all names at once, every second.
         if name not in names and time.monotonic() - last_read_s > 1:
@@ -879,6 +882,7 @@ def start_files(
     method = source.build()
 
     def job_of(sample: Sample) -> Job[Any]:
+        """Make the job of a cloud, or of a depth image and its mask."""
         if camera is None:
             cloud = sample.files[0]
             read = partial(cloud_input, cloud, unit or "m", object, sample.name)

@@ -87,6 +87,7 @@ class TrainingOptions:
         with tqdm(unit=" steps", disable=None if is_first else True) as bar:
 
             def show(progress: "Progress") -> None:
+                """Move the bar, and print a line where one is due."""
                 if bar.total is None:
                     bar.reset(progress.steps)
                     bar.initial = bar.n = progress.step - 1

@@ -158,6 +158,14 @@ class Limit:
 def _row(
     case: str, output: str, output_values: np.ndarray, expected: np.ndarray, limit: Limit
 ) -> Row:
+    """Compare an output of the graph with that of PyTorch; give the row that proves they agree.
+
+    NaN must be in the same places. Of an output that may flip (a discrete choice on a rounding), a
+    share of ``limit.flips`` may differ by more than ``limit.value``.
+
+    Raises:
+        InputError: they do not agree, or there is nothing to compare.
+    """
     output_values, expected = (
         np.asarray(values, np.float64) for values in (output_values, expected)
     )

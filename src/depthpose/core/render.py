@@ -148,6 +148,7 @@ def barycentric_shares(
 
 
 def _check(triangles: Tensor, width: int, height: int) -> None:
+    """Refuse an empty picture, and corners that are not finite."""
     for name, size in (("width", width), ("height", height)):
         if size < 1:
             raise InputError(f"{name} is {size}, but a picture has a pixel at least; correct it")

@@ -74,6 +74,7 @@ def run_jobs(
     waiting: list[tuple[Job[Input], Input | InputError]] = []
 
     def finish_waiting() -> Generator[Outcome[Input, Result], None, None]:
+        """Estimate the inputs that were read, store the results, and yield the outcomes."""
         inputs = [data for _, data in waiting if not isinstance(data, InputError)]
         estimated = iter(estimate_many(inputs) if inputs else ())
         for job, data in waiting:

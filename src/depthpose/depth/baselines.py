@@ -170,6 +170,7 @@ def _thumbnail(image: View) -> Float[Tensor, " d"]:
 
 
 def _rig_of(pair: StereoInput) -> StereoRig:
+    """Give the rig of a pair, which a baseline needs."""
     if not isinstance(pair.camera, StereoRig):
         raise InputError(
             f"{pair.name}: has no rig, and a baseline is measured as disparity; give a camera with "

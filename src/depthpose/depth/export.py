@@ -388,7 +388,10 @@ def depth_export(weights: DepthWeights, what: str | None, facts: dict[str, Any])
 
 
 def _pair_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
+    """Describe the export of a matcher: its graph, and cases by which the graph is proven."""
+
     def cases() -> Iterator[Case]:
+        """Match synthetic pairs of several sizes by PyTorch."""
         assert weights.matcher is not None
         matcher = make_matcher(weights.matcher, _QUICK)
         if isinstance(matcher, NetworkMatcher):
@@ -421,7 +424,10 @@ def _pair_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
 
 
 def _image_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
+    """Describe the export of a generator: its graph, and cases by which the graph is proven."""
+
     def cases() -> Iterator[Case]:
+        """Estimate synthetic images of several sizes by PyTorch."""
         assert weights.generator is not None
         matcher = None if weights.matcher is None else make_matcher(weights.matcher, _QUICK)
         # The scenes of the proof need not be like the images that the weights were trained on.
@@ -469,6 +475,7 @@ TARGETS = {
 def _case(
     inputs: dict[str, np.ndarray], estimates: list[DepthEstimate], outputs: tuple[str, ...]
 ) -> Case:
+    """Make a case of inputs and of what PyTorch estimates from them."""
     expected = {
         name: torch.stack(
             [torch.as_tensor(getattr(estimate, name)) for estimate in estimates]

@@ -106,6 +106,7 @@ def color_agreement(
 
 
 def _thinned(colors: SurfaceColors, samples: int) -> SurfaceColors:
+    """Give at most so many of the coloured points, evenly taken."""
     return SurfaceColors(
         points_m=take_evenly(colors.points_m, samples),
         normals=take_evenly(colors.normals, samples),

@@ -351,6 +351,7 @@ class PoseEstimator:
             made = partial(view_input, mask=None, camera=camera, object=which, unit=unit)
 
         def read(number: int, frame: AnyArray | None) -> AnyInput | PoseEstimate:
+            """Read a frame; one that cannot be read is an estimate that says so."""
             name = f"{_NAME}_{number}"
             reason = f"{name}: there is no frame, a None in its place"
             if frame is not None:

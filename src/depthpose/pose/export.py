@@ -136,6 +136,7 @@ def pose_export(weights: PoseWeights, facts: dict[str, Any]) -> Export:
 
 
 def _cases(weights: PoseWeights, network: ResUNet) -> Iterator[Case]:
+    """Run the network on voxels of surfaces, of one cloud and of several, as the graph must."""
     for counts in _POINTS:
         clouds: list[Tensor] = []
         for k, count in enumerate(counts):  # voxels of an object's surface, in no order

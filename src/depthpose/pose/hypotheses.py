@@ -54,6 +54,7 @@ def compete(
     surface = prepared.surface
 
     def hypothesis(source: RefinedPose) -> Hypothesis:
+        """Compare a refined pose with all that was observed."""
         pose = source.camera_from_model.double()
         return Hypothesis(
             pose=pose,

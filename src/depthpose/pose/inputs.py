@@ -189,6 +189,7 @@ def labels_input(mask: AnyMask, name: str) -> Int64[Tensor, "_ _"]:
 
 
 def _tensor(values: Any) -> Tensor:  # noqa: ANN401  whatever a caller has
+    """Turn numbers of any library into a tensor on the CPU, of a type that torch computes with."""
     if isinstance(values, Tensor) and not values.is_complex():
         # Of unsigned numbers torch computes little but with bytes.
         is_odd = values.dtype in (torch.uint16, torch.uint32, torch.uint64)

@@ -214,6 +214,7 @@ class GeoPoseNet(PoseEstimator):
             return voted, CloudDirections(job.cloud, job.directions)
 
     def _prepare(self, pose_input: AnyInput) -> CloudToPose | PoseEstimate:
+        """Lift an input to the cloud that the network takes; estimate one of a region here."""
         if isinstance(pose_input, ViewInput) and pose_input.is_region:
             return self._estimate_in_region(pose_input)
         prepared = self._known(pose_input.object)
@@ -381,6 +382,7 @@ class DepthImageRegressor(PoseEstimator):
         raise InputError(_NEEDS_MASK)
 
     def _estimate(self, pose_input: AnyInput) -> PoseEstimate:
+        """Regress the pose from a crop of the depth image, and refine it by ICP."""
         prepared = self._known(pose_input.object)
         if not isinstance(pose_input, ViewInput):
             raise InputError(_NEEDS_MASK)

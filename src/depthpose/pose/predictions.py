@@ -268,6 +268,7 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
 
 
 def _pose(row: dict[str, Any], source: str, key: str = "camera_from_model") -> Rigid | None:
+    """Read a pose of ``poses.json``; None where the entry has none."""
     matrix = _table(row, key, 4, source, rows=4)
     if matrix is None:
         return None
@@ -352,6 +353,7 @@ class PoseResults(Results[Input, PoseEstimate]):
         self._keep(job, unreadable_estimate(job.name, job.object, error))
 
     def _keep(self, job: PoseJob[Input], estimate: PoseEstimate) -> None:
+        """Add an estimate to those that the file gets, and write it now and then."""
         timed = replace(estimate, seconds={**job.seconds, **estimate.seconds})
         self.predictions[job.name] = Prediction(estimate=timed, place=job.place)
         self._unsaved += 1

@@ -350,6 +350,7 @@ class _Convolution(torch.autograd.Function):
         ctx: Any,  # noqa: ANN401
         gradient: Tensor,
     ) -> tuple[Tensor | None, Tensor | None, None]:
+        """Give the gradients of the features and of the weight, where they are wanted."""
         x, weight = ctx.saved_tensors
         m: KernelMap = ctx.kernel_map
         gradient = gradient.contiguous()
@@ -375,6 +376,7 @@ class _Convolution(torch.autograd.Function):
 
 
 def _convolve(x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
+    """Convolve features by the way that is fastest for the size; see :func:`_way`."""
     way = _way(x, weight, m)
     near = m.neighbours
     if way == "table":

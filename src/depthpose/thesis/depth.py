@@ -242,6 +242,7 @@ def _depth(caption: str, pair: StereoInput, estimate: DepthEstimate) -> Drawing:
 
 
 def _lidar(pair: StereoInput, lidar_m: Float[Tensor, "h w"] | None) -> list[Drawing]:
+    """Draw the LiDAR points over the left image, where there are any."""
     if lidar_m is None:
         return []
     # Figures show frames at half their size, where a single pixel would fade: points are 5 wide.

@@ -213,6 +213,7 @@ def paced(receive: Receive) -> Receive:
     size = 0
 
     async def receive_in_time() -> MutableMapping[str, Any]:
+        """Receive a part of the request; refuse an upload that comes too slowly."""
         nonlocal size
         left_s = start + GRACE_S + size / LEAST_BYTES_S - time.monotonic()
         try:
@@ -394,6 +395,7 @@ class Pages:
         return Response(files[name], media_type=media_type, headers=headers)
 
     def _keep(self, answer: Answer) -> dict[str, Any]:
+        """Keep the files of an answer, the latest few alone; give what the page shows."""
         key = secrets.token_urlsafe(12)
         self._kept[key] = answer.files
         while len(self._kept) > _RESULTS:

@@ -145,6 +145,7 @@ def _input(form: Form) -> tuple[StereoInput, str]:
 def _pictures(
     pair: StereoInput, estimate: DepthEstimate, range_m: tuple[float, float]
 ) -> list[Shown]:
+    """List the pictures that the page shows of an estimate."""
     name = pair.name
     near_m, far_m = range_m
     grey = "grey: none" if estimate.is_sky is None else "grey: sky or no answer"
@@ -171,6 +172,7 @@ def _pictures(
 
 
 def _sentence(pair: StereoInput, estimate: DepthEstimate) -> str:
+    """Say in a sentence how much of the image has a depth, and how far half of it is."""
     assert estimate.depth_m is not None
     known_m = estimate.depth_m[estimate.depth_m.isfinite()]
     images = "one image" if pair.right is None else "both images"

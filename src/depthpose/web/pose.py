@@ -217,6 +217,7 @@ def _target(form: Form, net: GeoPoseNet) -> _Target:
 
 
 def _input(form: Form, model: ObjectModel) -> CloudInput | ViewInput:
+    """Read the cloud, or the depth image with its mask and camera, of a form."""
     if "cloud" in form.files:
         if "depth" in form.files or "mask" in form.files:
             raise InputError("a cloud and a depth image are both given; choose one of the two")

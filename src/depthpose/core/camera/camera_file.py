@@ -276,6 +276,7 @@ def _foreign_facts(content: object) -> CameraFacts | None:
 
 
 def _from_scene(images: dict[str, dict[str, Any]]) -> CameraFacts:
+    """Take the one camera of BOP's scene_camera.json, whose images must agree."""
     entries = list(images.values())
     first = entries[0]
     if any(e["cam_K"] != first["cam_K"] or _bop_unit_m(e) != _bop_unit_m(first) for e in entries):
@@ -300,6 +301,7 @@ def _bop_unit_m(keys: dict[str, Any]) -> float | None:
 
 
 def _size(keys: dict[str, Any]) -> Size:
+    """Take width and height [px] of a JSON file."""
     what = "a whole number of pixels"
     for key in ("width", "height"):
         value = _json_number(keys, key, what)
@@ -309,6 +311,7 @@ def _size(keys: dict[str, Any]) -> Size:
 
 
 def _json_number(keys: dict[str, Any], key: str, what: str = "a number") -> float:
+    """Take a number of a JSON file; ``what`` belongs there, for the error."""
     value = keys[key]
     # A whole number beyond 1e300 has no float.
     if type(value) not in (int, float) or not abs(value) < 1e300:
@@ -317,6 +320,7 @@ def _json_number(keys: dict[str, Any], key: str, what: str = "a number") -> floa
 
 
 def _matrix(value: object) -> Float[Tensor, "3 3"]:
+    """Take the 9 numbers of K, nested or flat."""
     try:
         return torch.from_numpy(np.array(value, dtype=np.float64).reshape(3, 3))
     except (TypeError, ValueError, OverflowError) as error:
@@ -405,6 +409,7 @@ def check_image_matches_camera(camera: Camera, width: int, height: int, name: st
 
 
 def _read_facts(path: AnyPath) -> CameraFacts:
+    """Recognise the format of a camera file by its content, and read it."""
     if Path(path).is_dir():
         return facts_from_folder(Path(path))
     if Path(path).name == "cameras.bin":

@@ -122,6 +122,7 @@ def _shown(key: str) -> str:
 
 
 def _refused(what: str, remedy: str) -> InputError:
+    """Make the error of a lens that is no pinhole and no equidistant fisheye."""
     return InputError(
         f"{what}, and only pinholes and the equidistant fisheye (Kannala and Brandt, cv2.fisheye) "
         f"are understood; {remedy}, and give the camera of the result, or calibrate it as one of "

@@ -354,6 +354,7 @@ def grey_of(image: Float[Tensor, "3 h w"]) -> Float[Tensor, "h w"]:
 
 
 def _grey(image: Float[Tensor, "3 h w"], pixels: int) -> Float[Tensor, "h2 w2"]:
+    """Bring an image to grey of at most so many pixels and a mean of 0."""
     grey = grey_of(image).float()
     scale = math.sqrt(pixels / grey.numel())
     if scale < 1:

@@ -153,6 +153,10 @@ def _off_axis_deg(t_m: Tensor) -> float:
 
 
 def _read(path: Path, unit_m: float, is_fisheye: bool | None) -> RawPair:
+    """Read the calibration of a pair: two files of ROS or OpenCV in a folder, or one file of both.
+
+    ``unit_m``: metres of the unit of its translations.
+    """
     if path.is_dir():
         first, second = read_two_files(path)
         if is_ros(first) and is_ros(second) and "p2" not in first | second:
@@ -249,6 +253,7 @@ def _kind(names: Names, is_fisheye: bool | None, owner: str = "its") -> bool:
 def _camera(
     K: np.ndarray | None, distortion: list[float] | None, is_fisheye: bool, owner: str
 ) -> RawCamera:
+    """Make one raw camera, whose coefficients must be as many as its lens model has."""
     if K is None:
         raise InputError(f"no camera matrix of 9 numbers of {owner}; write K1 and K2")
     if distortion is None:
@@ -269,6 +274,7 @@ def _camera(
 def _pair(
     left: RawCamera, right: RawCamera, motion: tuple[np.ndarray, np.ndarray], size: Size | None
 ) -> RawPair:
+    """Put two raw cameras and their motion (R, t [m], right from left) together as a pair."""
     if left.is_fisheye != right.is_fisheye:
         raise InputError("one lens is a fisheye and the other is none; calibrate both as one kind")
     left_fx = float(left.K[0, 0])

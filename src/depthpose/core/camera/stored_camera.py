@@ -106,6 +106,7 @@ class _Loader(YamlLoader):
 
 
 def _of_opencv(loader: Any, _suffix: str, node: yaml.Node) -> object:  # noqa: ANN401 - yaml's
+    """Construct a node of OpenCV's YAML, whatever its tag is, as a plain mapping, list or text."""
     kind = {
         yaml.MappingNode: loader.construct_mapping,
         yaml.SequenceNode: loader.construct_sequence,
@@ -160,6 +161,10 @@ def with_lens(facts: CameraFacts, *, is_fisheye: bool) -> CameraFacts:
 
 
 def _facts_without_lens(names: Names) -> CameraFacts | None:
+    """Take the camera that names and values describe; None where they describe none.
+
+    In this order: settings of ORB-SLAM, two projections, Q of stereoRectify, one projection, K.
+    """
     if "cam0" in names and "cam1" in names:
         raise InputError(
             "a camchain of Kalibr, whose images are not rectified; 'depthpose data rectify' "
@@ -281,6 +286,7 @@ def ros_pair(first: Names, second: Names) -> tuple[Names, Names]:
 
 
 def _from_intrinsics(names: Names, kind: str, distortion: tuple[float, ...]) -> CameraFacts | None:
+    """Take K, or fx, fy, cx and cy; with R and T of stereoCalibrate a rectified pair."""
     K = published(names, _K, 9)
     if K is None:
         is_realsense = "ppx" in names

@@ -247,6 +247,7 @@ class RayEngine:
                 ray.shutdown()
 
     def _connect(self, ray: Any) -> None:  # noqa: ANN401  Ray is loaded where it is used
+        """Connect to the cluster of ``address``, or start Ray on this machine."""
         options: dict[str, Any] = {}
         if self.address is None:
             cores = None if self.workers is None else max(1.0, self.workers * self.worker_cpus)

@@ -93,6 +93,7 @@ def find_items(words: Sequence[str], files: Files) -> list[Item]:
 
 
 def _read_manifest(url: str, roles: Sequence[str]) -> Iterator[Item]:
+    """Read the inputs of a CSV table: a column for each role, paths beside it or URLs."""
     try:
         text = io.StringIO(stores.read_from(url).decode("utf-8-sig"), newline="")
         rows = list(csv.DictReader(text, strict=True))

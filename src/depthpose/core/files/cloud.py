@@ -116,6 +116,10 @@ def read_points_bin(path: AnyPath, columns: int = 4) -> Float32[Tensor, "n colum
 
 
 def _from_columns(path: AnyPath, columns: Columns) -> Cloud:
+    """Make a cloud of columns x, y, z and perhaps colours; rows with NaN are left out.
+
+    Colours are packed as PCL packs them (``rgb``, ``rgba``), or a column each.
+    """
     missing = [name for name in "xyz" if name not in columns]
     if missing and columns:
         raise InputError(f"{path}: no {missing} among the columns {list(columns)}; name them x y z")
@@ -151,6 +155,7 @@ def _from_columns(path: AnyPath, columns: Columns) -> Cloud:
 
 
 def _from_rows(path: AnyPath, table: np.ndarray) -> Cloud:
+    """Make a cloud of a table without names, whose first column may number the rows."""
     if table.ndim != 2 or table.shape[1] < 3:
         raise InputError(f"{path}: points are rows of 3 numbers or more, got shape {table.shape}")
     if len(table) < 5 and table.shape[1] > _MOST_COLUMNS:
@@ -175,6 +180,7 @@ def _from_rows(path: AnyPath, table: np.ndarray) -> Cloud:
 
 
 def _read_text(path: AnyPath) -> Cloud:
+    """Read a cloud of text: rows of numbers, perhaps below names, a count or comments."""
     text = TextIOWrapper(BytesIO(read_bytes(path, MAX_TEXT_BYTES)), "utf-8-sig")
     noted: list[str] = []
     rows = _rows_of(text, noted)

@@ -312,6 +312,7 @@ def read_json(path: AnyPath) -> object:
     refuse_heavy(path, text.encode(), _OF_JSON)
 
     def once_each(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        """Make an object of JSON, in which no key may stand twice."""
         members: dict[str, Any] = {}
         for key, value in pairs:
             if key in members:

@@ -532,6 +532,7 @@ def _exif_focal(picture: Image.Image) -> tuple[tuple[float, str] | None, str]:
 
 
 def _positive(value: Any) -> float | None:  # noqa: ANN401  whatever a file holds
+    """Give a value of a file as a positive finite number, else None."""
     try:
         number = float(value)
     except (TypeError, ValueError, ZeroDivisionError):

@@ -270,6 +270,7 @@ def encode_ply(points: np.ndarray, color: np.ndarray | None) -> bytes:
 
 
 def _parse_header(path: AnyPath, lines: list[str]) -> tuple[str, list[_Element]]:
+    """Parse the header of a PLY file: byte order ("" for text) and elements with their fields."""
     order: str | None = None
     elements: list[_Element] = []
     for line in lines[1:]:

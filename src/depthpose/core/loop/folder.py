@@ -270,6 +270,7 @@ def restore_last(folder: Path, parts: Parts) -> tuple[Path, int, float]:
 
 
 def _read_state(path: Path) -> Mapping[str, Any]:
+    """Read a saved state of a training whose checksums are right and which has all parts."""
     with refused_as(path, "state of a training", "it is damaged"), ZipFile(path) as archive:
         if (part := archive.testzip()) is not None:  # torch reads over flipped bits
             raise ValueError(f"{part} is not as it was written")

@@ -140,6 +140,7 @@ def releases_folder(stage: Callable[[_Config, Run], Path]) -> Callable[[_Config,
 
     @wraps(stage)
     def run_stage(config: _Config, run: Run) -> Path:
+        """Run the stage, and release the folders that it claimed, also where it fails."""
         before = held_folders()
         try:
             return stage(config, run)
@@ -387,6 +388,7 @@ def stop_requests() -> Iterator[list[tuple[int, float]]]:
     requests: list[tuple[int, float]] = []
 
     def remember(number: int, _: FrameType | None) -> None:
+        """Note a signal and when it came; the loop looks after each step."""
         if not requests and number == signal.SIGINT:
             message = (
                 "\ndepthpose: stopping after this step. Press Ctrl-C again within 3 s to finish "

@@ -112,6 +112,10 @@ def _check_folder(folder: Path, frames: list[Frame]) -> Iterator[Problem]:
 
 
 def _check_images(frame: Frame, *, with_decoding: bool) -> Iterator[Problem]:
+    """Report views that are missing, unreadable, of two sizes or not rectified; then the truth.
+
+    ``with_decoding``: decode the images, and compare both views; else look at their sizes alone.
+    """
     size = None
     images: list[Tensor] = []
     for path in (frame.left, frame.right):

@@ -94,6 +94,7 @@ def read_split(name: str | Path) -> Split:
 
 @cache
 def _known(name: str) -> Split:
+    """Read a split that ships, or join those that it consists of."""
     if name in _JOINED:
         joined = {frame for part in _JOINED[name] for frame in _known(part).frames}
         return Split(name=name, frames=tuple(sorted(joined)))

@@ -111,6 +111,7 @@ def read_plain_calibration(path: Path, name: str, width: int, height: int) -> St
 
 
 def _rig(path: Path, facts: CameraFacts, size: Size | None) -> StereoRig:
+    """Make the rig of a calibration; the path names it in errors."""
     try:
         rig = camera_from_facts(facts, size)
     except InputError as error:

@@ -264,6 +264,7 @@ def _benchmark(folder: Path, left_name: str, right_name: str, ending: str) -> It
 
 
 def _middlebury(folder: Path) -> Iterable[Frame]:
+    """Find the scenes of a folder in Middlebury's layout, up to two folders deep."""
     for scene in [folder, *folder.glob("*"), *folder.glob("*/*")]:
         if not (scene / "calib.txt").is_file():
             continue
@@ -281,6 +282,7 @@ def _middlebury(folder: Path) -> Iterable[Frame]:
 
 
 def _pairs(folder: Path) -> Iterable[Frame]:
+    """Find the frames of a plain folder: left, right, lidar_depth, disp_occ and a calibration."""
     cameras = _by_stem(folder, (".json", ".yaml", ".yml"))
     camera = cameras.get("camera")
     text = folder / "calib.txt"

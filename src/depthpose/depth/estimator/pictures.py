@@ -85,6 +85,7 @@ class DepthPipeline:
     def _each(
         self, pictures: Iterable[Picture], lens: AnyLens | None, batch: int, timeout: float | None
     ) -> Iterator[dict[str, Any]]:
+        """Estimate pictures batch by batch; without a camera a phone's is assumed."""
         left = iter(pictures)
         while chunk := list(islice(left, batch)):
             inputs: list[StereoInput] = []

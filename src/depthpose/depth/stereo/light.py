@@ -357,6 +357,7 @@ class Aggregation(nn.Module):
         product = torch.Tensor.mul if torch.is_grad_enabled() else torch.Tensor.mul_
 
         def begin(left: Features, right: Features, guide: Volume) -> Volume:
+            """Make the cost volume of some rows, and weigh it by the guide."""
             near = unit_groups(left, self.groups)
             far = unit_groups(right, self.groups)
             volume = correlation_volume(near, far, bins, first)

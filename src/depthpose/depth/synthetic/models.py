@@ -88,6 +88,7 @@ def _unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
 
 @cache
 def _sphere(level: int) -> Float[np.ndarray, "n 3"]:
+    """Give corners of triangles on the unit sphere: an icosahedron, cut ``level`` times."""
     t = (1 + 5**0.5) / 2
     corners = [(-1, t, 0), (1, t, 0), (-1, -t, 0), (1, -t, 0), (0, -1, t), (0, 1, t),
                (0, -1, -t), (0, 1, -t), (t, 0, -1), (t, 0, 1), (-t, 0, -1), (-t, 0, 1)]  # fmt: skip
@@ -573,6 +574,7 @@ def rider(number: int) -> Mesh:
 def _add_upper_body(
     b: MeshBuilder, hip: np.ndarray, neck: np.ndarray, head: np.ndarray, coat: Surface
 ) -> None:
+    """Add a trunk with shoulders, sometimes a bag, a neck and a head with hair."""
     middle = (hip + neck) / 2
     b.tube(hip, middle, (0.17, 0.2), coat, 10)
     b.tube(middle, neck, (0.2, 0.16), coat, 10)

@@ -62,6 +62,7 @@ class StereoTask:
         self.optimizers = {"matcher": (make_adam(groups, config.adam), config.adam)}
 
     def _train(self) -> None:
+        """Set the matcher to training, but for norms and parts that stay as they are."""
         self.matcher.train()
         # Batch norm uses its stored statistics, whatever the mode: small batches spoil them.
         for module in self._with_fixed_norms:
@@ -334,6 +335,7 @@ class SelectTask:
         self.optimizers = {"generator": (make_adam(groups, config.adam), config.adam)}
 
     def _train(self) -> None:
+        """Set the generator to training, but for the norms of a frozen stem."""
         self.generator.train()
         if self.config.with_frozen_stem:
             # Batch norm uses its stored statistics, whatever the mode: small batches spoil them.

@@ -201,6 +201,7 @@ def _read_coco(path: Path) -> list[Detection]:
 
 
 def _read_yolo(path: Path, size: tuple[int, int] | None) -> list[Detection]:
+    """Read boxes of YOLO: a line each of class, centre, size (shares of ``size``) and score."""
     if size is None:
         raise InputError(
             f"{path}: its boxes are shares of an image whose size is not known here; give JSON, or "

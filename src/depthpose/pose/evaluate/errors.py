@@ -277,6 +277,7 @@ class _Change:
     scale: float = 1.0  # of translations
 
     def renumber(self, prediction: Prediction) -> Prediction:
+        """Change the numbers of image and object that a prediction is of."""
         place = prediction.place
         if place is None:
             return prediction
@@ -285,6 +286,7 @@ class _Change:
         return replace(prediction, place=Place(place.scene_id, image_id, object_id))
 
     def repose(self, prediction: Prediction) -> Prediction:
+        """Change the convention and the unit of a predicted pose."""
         pose = prediction.estimate.camera_from_model
         assert pose is not None
         pose = _CONVENTIONS[self.convention](pose.double())

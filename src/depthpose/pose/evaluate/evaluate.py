@@ -427,6 +427,7 @@ def evaluate(
 def _instance_row(
     instance: Instance, estimate: PoseEstimate | None, context: ErrorContext, stages: list[str]
 ) -> InstanceRow:
+    """Measure one instance; without a pose all its errors are those of a missed one."""
     pose = None if estimate is None else estimate.camera_from_model
     errors: dict[str, Errors] = {}
     for name, metric in METRICS.items():

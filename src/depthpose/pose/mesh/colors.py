@@ -256,6 +256,7 @@ def _files_beside(path: AnyPath) -> Any:  # noqa: ANN401  trimesh's classes carr
             self.lost: list[str] = []
 
         def get(self, name: str) -> bytes:
+            """Read a file beside the model; note the name of one that is missing."""
             try:
                 return super().get(name.replace("\\", "/"))
             except (OSError, ValueError):

@@ -243,6 +243,7 @@ def _read_obj(path: AnyPath) -> tuple[np.ndarray, Ragged]:
 
 
 def _read_glb(path: AnyPath) -> tuple[np.ndarray, np.ndarray]:
+    """Read vertices (n, 3) and faces (m, 3) of a binary GLB, all its nodes placed."""
     data = read_bytes(path)
     _refuse_scene(path, data)
     with refused_as(path, "model", "export it again"):

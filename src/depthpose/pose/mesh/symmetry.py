@@ -388,6 +388,7 @@ def mirror_deviation(model: ObjectModel) -> float:
 
 
 def _mirror_search(model: ObjectModel) -> float:
+    """Give the least deviation of a surface from its mirror images, in diameters."""
     surface = SurfaceDeviation(model)
     # Reflections, or reflections with a quarter turn or a half, that fit roughly: by 0, 90, 180
     # and 270 degrees about the normal n: cos (1 - nn') + sin [n] - nn'.
@@ -486,6 +487,11 @@ def true_symmetries(
 
 
 def _search(model: ObjectModel) -> dict[str, Any]:
+    """Search near-symmetries of a model, and which of its declared symmetries the surface has.
+
+    Gives JSON values, which are cached: ``near``, transforms with their deviations, the best first;
+    and ``alike``, flags of the discrete and the continuous symmetries.
+    """
     surface = SurfaceDeviation(model)
     # Which discrete symmetries, and which axes, have copies that lie on the surface.
     given = model.symmetries
@@ -529,6 +535,7 @@ def _search(model: ObjectModel) -> dict[str, Any]:
 
 
 def _deviations(turns: list[Rigid], surface: SurfaceDeviation) -> list[tuple[float, Rigid]]:
+    """Measure how far each transform moves the surface off itself, in diameters."""
     if not turns:
         return []
     R = torch.stack([t.R for t in turns])

@@ -177,6 +177,7 @@ def make_frames(
 def _make_frame(
     models: Sequence[ObjectModel], solids: Sequence[Solid], config: ObjectsConfig, index: int
 ) -> BopFrame:
+    """Render a frame: objects on a table before a blurred background, in colour and depth."""
     generator = sample_generator(index, config.seed + _FRAMES_SEED)
     if config.frame_pile:
         world = _piled(models, solids, config, generator)

@@ -360,6 +360,7 @@ def table_text(table: Table) -> str:
 
 
 def _posed(weights: PoseWeights, objects: Objects) -> tuple[list[PoseEstimate], list[float]]:
+    """Estimate views of objects; give the estimates and their errors (ADD or ADD-S) [diameters]."""
     is_regressed = isinstance(weights.network, DepthImageNet)
     net = DepthImageRegressor(weights) if is_regressed else GeoPoseNet(weights)
     estimates = []
