@@ -193,6 +193,8 @@ def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
     )
     frame = next(make_frames(tuple(models.values()), config, 1, first=_FRAME))
     assert frame.rgb is not None
+
+    # The frame as a data set, and one of its parts as files of a first command.
     write_bop_models(out / "parts", net.weights.models)
     write_bop_scene(out / "parts", "test", 0, [frame])
     dataset = open_bop(out / "parts")
@@ -203,6 +205,8 @@ def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
     write_camera(out / "part/camera.json", camera)
     write_depth_png(out / "part/depth.png", sample.depth_m, _UNIT_M)
     write_mask(out / "part/mask.png", sample.mask)
+
+    # The poses of all parts, and their errors.
     net.estimate_many(views)  # prepares the models: times below are those of further estimates
     estimates = net.estimate_many(views)
     predictions = [
@@ -212,6 +216,8 @@ def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
     folder = out / "geo-posenet"
     write_predictions(folder, predictions)
     rows = [_row(row.columns()) for row in evaluate(dataset, predictions).per_instance]
+
+    # Pictures, clouds and a scene of them.
     points_m = back_project(frame.depth_m, frame.K).reshape(-1, 3)
     is_seen = points_m.isfinite().all(-1) & (points_m[:, 2] > 0)
     color = frame.rgb.permute(1, 2, 0).reshape(-1, 3)[is_seen]

@@ -56,9 +56,10 @@ def _resized_map(values: Value, size: Value) -> Value:
 
 
 def _ratio(wide: Value, narrow: Value) -> Value:
-    """Give the ratio of two widths, by which disparities scale."""
-    many, few = (_side(size, 1).cast(np.float64) for size in (wide, narrow))
-    return (many / few).cast(np.float32)
+    """Give the ratio of the widths of two images, by which disparities scale."""
+    wide_px = _side(wide, 1).cast(np.float64)
+    narrow_px = _side(narrow, 1).cast(np.float64)
+    return (wide_px / narrow_px).cast(np.float32)
 
 
 Maps = Float[Tensor, "b rows columns"]

@@ -125,12 +125,23 @@ def _lower_points(
 def _fit_plane(
     rays: Float[Tensor, "n 3"], inverse: Float[Tensor, " n"]
 ) -> tuple[Float[Tensor, "3"], tuple[float, float, float]]:
-    """Fit ``plane @ ray = 1 / depth``; give its height [m], tilt and roll [degrees] too."""
-    weighed = rays / inverse[:, None]
-    plane = torch.linalg.lstsq(weighed, torch.ones_like(inverse)[:, None]).solution[:, 0]
+    """Fit a plane to points by least squares of their relative depth errors.
+
+    Args:
+        rays: through the points, with z = 1.
+        inverse: their inverse depths [1/m].
+
+    Returns:
+        The plane, with ``plane @ ray = 1 / depth``; and the camera's height over it [m], tilt and
+        roll [degrees].
+    """
+    points_m = rays / inverse[:, None]
+    plane = torch.linalg.lstsq(points_m, torch.ones_like(inverse)[:, None]).solution[:, 0]
     x, y, z = plane.tolist()
-    tilt_deg, roll_deg = (-math.degrees(math.atan2(across, y)) for across in (z, x))
-    return plane, (1 / math.hypot(x, y, z), tilt_deg, roll_deg)
+    height_m = 1 / math.hypot(x, y, z)
+    tilt_deg = -math.degrees(math.atan2(z, y))
+    roll_deg = -math.degrees(math.atan2(x, y))
+    return plane, (height_m, tilt_deg, roll_deg)
 
 
 @dataclass
@@ -292,6 +303,7 @@ def _over_image(plane: Float[Tensor, "3"], camera: Camera, example: Map) -> Map:
 
 
 def _plane(ground: Ground) -> Float[Tensor, "3"]:
+    """Give the plane of the ground, with ``plane @ ray = 1 / depth`` for rays with z = 1."""
     tilt, roll = (math.tan(math.radians(angle)) for angle in (ground.tilt_deg, ground.roll_deg))
     plane = torch.tensor([-roll, 1.0, -tilt], dtype=torch.float64)
     return plane / plane.norm() / ground.height_m

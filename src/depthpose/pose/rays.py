@@ -108,31 +108,40 @@ def ray_bend(depth_m: Float[Tensor, "h w"], K: Float[Tensor, "3 3"]) -> float | 
 def _planes(
     rays: Float64[Tensor, "n 3"], reading_m: Float64[Tensor, " n"], stretch: Float64[Tensor, " n"]
 ) -> list[Bool[Tensor, " n"]]:
-    """Find planes one after the other, where ``reading_m / stretch`` is depth along the axis."""
+    """Find planes one after the other by RANSAC; give which readings lie on each.
+
+    Args:
+        rays: of the readings, with z = 1.
+        reading_m: what the sensor gave.
+        stretch: what a reading is over the depth along the axis: 1, or the length of the ray.
+    """
     depth_m = reading_m / stretch
     points_m = rays * depth_m[:, None]
     tolerance = _TOLERANCE_M / depth_m + _TOLERANCE_PER_M * depth_m
     generator = torch.Generator().manual_seed(0)
-    is_left = torch.ones(len(rays), dtype=torch.bool)
+    is_free = torch.ones(len(rays), dtype=torch.bool)  # of no plane yet
     least = max(3, _LEAST_SHARE * len(rays))
     planes: list[Bool[Tensor, " n"]] = []
-    while len(planes) < _PLANES and int(is_left.sum()) >= least:
-        left = is_left.nonzero()[:, 0]
-        triples = points_m[left[torch.randint(len(left), (_HYPOTHESES, 3), generator=generator)]]
+    while len(planes) < _PLANES and int(is_free.sum()) >= least:
+        # Planes n . x = 1 through three readings each; the one with the most readings on it.
+        free = is_free.nonzero()[:, 0]
+        triples = points_m[free[torch.randint(len(free), (_HYPOTHESES, 3), generator=generator)]]
         is_good = torch.linalg.det(triples).abs() > 1e-9
         triples = triples[is_good]
         if len(triples) == 0:
             break
-        inverse = torch.linalg.solve(triples, torch.ones(len(triples), 3, 1, dtype=torch.float64))
-        off = (points_m @ inverse[..., 0].mT - 1).abs()
-        is_on = (off < tolerance[:, None]) & is_left[:, None]
-        on_plane = is_on[:, int(is_on.sum(0).argmax())]
+        normals = torch.linalg.solve(triples, torch.ones(len(triples), 3, 1, dtype=torch.float64))
+        off = (points_m @ normals[..., 0].mT - 1).abs()
+        is_on = (off < tolerance[:, None]) & is_free[:, None]
+        is_on_best = is_on[:, int(is_on.sum(0).argmax())]
+
+        # Fitted anew to all readings on it.
         for _ in range(_REFITS):
-            ones = torch.ones(int(on_plane.sum()), 1, dtype=torch.float64)
-            plane = torch.linalg.lstsq(points_m[on_plane], ones).solution[:, 0]
-            on_plane = is_left & ((points_m @ plane - 1).abs() < tolerance)
-        if int(on_plane.sum()) < least:
+            ones = torch.ones(int(is_on_best.sum()), 1, dtype=torch.float64)
+            normal = torch.linalg.lstsq(points_m[is_on_best], ones).solution[:, 0]
+            is_on_best = is_free & ((points_m @ normal - 1).abs() < tolerance)
+        if int(is_on_best.sum()) < least:
             break
-        planes.append(on_plane)
-        is_left &= ~on_plane
+        planes.append(is_on_best)
+        is_free &= ~is_on_best
     return planes

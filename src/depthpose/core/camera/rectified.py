@@ -320,11 +320,11 @@ def _report(
             "the two images (or both are mirrored: mirror them back)"
         )
     if report.is_rectified is False:
-        turn_deg, scale, left_px = _fit_rows(places_px, shift_px[:, 1])
+        turn_deg, scale, remaining_px = _fit_rows(places_px, shift_px[:, 1])
         turn = f", turned by {turn_deg:+.1f} degrees and scaled by {scale:.3f}"
         findings.append(
             f"rows do not agree: the right image lies {offset:+.1f} px lower, with a spread of "
-            f"{spread:.1f} px{turn if left_px < spread / 2 else ''} (at most "
+            f"{spread:.1f} px{turn if remaining_px < spread / 2 else ''} (at most "
             f"{most_offset:.3g} and {most_spread:.3g} are allowed); rectify the pair ('depthpose "
             "data rectify', with the calibration of both cameras)"
         )
@@ -333,7 +333,15 @@ def _report(
 
 
 def _fit_rows(places_px: Tensor, lower_px: Tensor) -> tuple[float, float, float]:
-    """Fit rotation [degrees] and scale of the right image; give the spread of the residuals too."""
+    """Fit how the right image is rotated and scaled, by robust least squares.
+
+    Args:
+        places_px: of matched corners, from the middle of the image (n, 2).
+        lower_px: how much lower each lies in the right image (n).
+
+    Returns:
+        Rotation [degrees], scale, and the deviation of the residuals [px].
+    """
     places_px = places_px.float()
     lower_px = lower_px.float()
     design = torch.cat([torch.ones_like(places_px[:, :1]), places_px], -1)
@@ -344,8 +352,9 @@ def _fit_rows(places_px: Tensor, lower_px: Tensor) -> tuple[float, float, float]
         fit = torch.linalg.lstsq(design[is_near], lower_px[is_near, None]).solution[:, 0]
         residual_px = (lower_px - design @ fit).abs()
         is_near = residual_px <= 2.5 * residual_px.median() + 1e-3
-    left = _MAD_TO_DEVIATION * float(residual_px.median())
-    return math.degrees(math.atan(float(fit[1]))), 1 + float(fit[2]), left
+    _, across, down = fit.tolist()
+    deviation_px = _MAD_TO_DEVIATION * float(residual_px.median())
+    return math.degrees(math.atan(across)), 1 + down, deviation_px
 
 
 def grey_of(image: Float[Tensor, "3 h w"]) -> Float[Tensor, "h w"]:

@@ -334,21 +334,23 @@ class Rectifier:
 def make_rectifier(pair: RawPair, size: Size, keep: float = 0.0) -> Rectifier:
     """Choose the rectified cameras (Bouguet's method, as OpenCV's ``stereoRectify`` has it).
 
-    ``size`` is that of the images [px], for calibrations that do not say it. ``keep`` 0 keeps what
-    both raw images show alone, 1 all that they show, with black borders.
+    ``size`` is width and height of the images [px], for calibrations without it. ``keep`` 0 crops
+    to what both raw images show, 1 keeps all that they show, with black borders.
 
     Raises:
-        InputError: ``keep`` is out of range, or the lens bends more than any can.
+        InputError: ``keep`` is out of range, or a distortion that no lens has.
         MissingExtraError: OpenCV is not installed.
     """
     cv2 = import_opencv("rectifying a pair")
     if not 0 <= keep <= 1:
         raise InputError(f"--keep {keep:g}: 0 keeps what both lenses show, 1 keeps all; take 0")
     size = pair.size or size
-    R, t = (part.numpy() for part in (pair.right_from_left.R, pair.right_from_left.t_m[:, None]))
-    left, right = (
-        (camera.K.numpy(), np.array(camera.distortion)) for camera in (pair.left, pair.right)
-    )
+    R = pair.right_from_left.R.numpy()
+    t = pair.right_from_left.t_m[:, None].numpy()
+    left = (pair.left.K.numpy(), np.array(pair.left.distortion))
+    right = (pair.right.K.numpy(), np.array(pair.right.distortion))
+
+    # OpenCV's rotations R1 and R2 to the rectified cameras, whose projections are P1 and P2.
     flags = cv2.CALIB_ZERO_DISPARITY
     make_maps = cv2.initUndistortRectifyMap
     if pair.left.is_fisheye:
@@ -361,10 +363,10 @@ def make_rectifier(pair: RawPair, size: Size, keep: float = 0.0) -> Rectifier:
     rig = camera_from_facts(facts_from_projections("the rectified pair", P1, P2, size), size)
     assert isinstance(rig, StereoRig), "two projections have a baseline"
     raw_px = float(pair.left.K[0, 0])
-    found_px = float(rig.K[0, 0])
-    if found_px > _MAX_ENLARGED * raw_px:
+    rectified_px = float(rig.K[0, 0])
+    if rectified_px > _MAX_ENLARGED * raw_px:
         raise InputError(
-            f"rectified, fx would be {found_px:.0f} px where the raw lens has {raw_px:.0f}: so "
+            f"rectified, fx would be {rectified_px:.0f} px where the raw lens has {raw_px:.0f}: so "
             f"much no lens bends; check the distortion {pair.left.distortion} and the rotation, or "
             "whether the lens is a fisheye (--fisheye)"
         )

@@ -119,11 +119,26 @@ class ConvNorm(nn.Sequential):
         super().__init__(OrderedDict(conv=conv, norm=norm(outputs)))
 
 
+def _folded(conv: Conv, norm: Norm) -> tuple[Tensor, Tensor]:
+    """Give weight and bias, in float64, of the one convolution that a convolution and norm are.
+
+    norm(conv(x)) = gain * (conv(x) - mean) + bias, with gain = weight / sqrt(var + eps).
+    """
+    assert norm.running_mean is not None
+    assert norm.running_var is not None
+    gain = norm.weight.double() / (norm.running_var.double() + norm.eps).sqrt()
+    bias = (norm.bias.double() - gain * norm.running_mean.double()).detach()
+    shape = [1] * conv.weight.ndim
+    output_axis = 1 if isinstance(conv, nn.ConvTranspose3d) else 0
+    shape[output_axis] = -1
+    return (conv.weight.double() * gain.view(shape)).detach(), bias
+
+
 def fold(network: ModuleT, example: Tensor) -> ModuleT:
-    """Fold every batch norm into the convolution before it, in place, in the type of ``like``.
+    """Fold every batch norm into the convolution before it, in place; give the network.
 
     In 3D, with a norm or without, convolutions become :class:`VolumeConv`; those that are one
-    already stay as they are.
+    already stay as they are. Parameters get the type and the device of ``example``.
     """
     for parent in list(network.modules()):
         for name, layer in list(parent.named_children()):
@@ -133,16 +148,8 @@ def fold(network: ModuleT, example: Tensor) -> ModuleT:
                 setattr(parent, name, VolumeConv(layer, layer.weight, bias, example))
             if not isinstance(norm, Norm):
                 continue
-            # norm(conv(x)) = gain * (conv(x) - mean) + bias with gain = weight / sqrt(var + eps),
-            # in float64.
             conv = cast("Conv", layer.conv)
-            assert norm.running_mean is not None
-            assert norm.running_var is not None
-            gain = norm.weight.double() / (norm.running_var.double() + norm.eps).sqrt()
-            bias = (norm.bias.double() - gain * norm.running_mean.double()).detach()
-            shape = [1] * conv.weight.ndim
-            shape[1 if isinstance(conv, nn.ConvTranspose3d) else 0] = -1  # the axis of outputs
-            weight = (conv.weight.double() * gain.view(shape)).detach()
+            weight, bias = _folded(conv, norm)
             if isinstance(norm, nn.BatchNorm3d):
                 setattr(parent, name, VolumeConv(conv, weight, bias, example))
                 continue
@@ -151,6 +158,8 @@ def fold(network: ModuleT, example: Tensor) -> ModuleT:
             layer.norm = nn.Identity()
             if isinstance(layer, ConvNorm):  # which then is its convolution
                 setattr(parent, name, conv)
+
+    # The order of memory in which convolutions are fast; no gradient is wanted any more.
     for module in network.modules():
         for parameter in () if isinstance(module, VolumeConv) else module.parameters(recurse=False):
             values = parameter.data.to(example)

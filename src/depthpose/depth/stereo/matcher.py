@@ -350,54 +350,17 @@ class NetworkMatcher(ABC):
         """
         for left, right in pairs:
             check_pair(left, right)
-        trained = network = self.network_config
-        views = pairs
+        views, network_config = self._working_views(pairs, camera, search)
         first_px = 0 if search is None else search.first_px
-        if search is not None:
-            network = replace(trained, max_disparity_px=search.max_disparity_px)
-            sizes = [_scaled_size(left, search.scale, camera) for left, _ in pairs]
-            views = [
-                tuple(disparity.resize_image(view, *size) for view in pair)
-                for pair, size in zip(pairs, sizes, strict=True)
-            ]
-        elif camera is not None and trained.work_focal_px is not None:
-            size = self.work_size(camera)
-            network = replace(trained, max_disparity_px=self.work_disparities(camera))
-            views = [tuple(disparity.resize_image(view, *size) for view in pair) for pair in pairs]
-        limit_bytes = self.config.max_memory_bytes
-        together = limit_bytes is None and len({left.shape for left, _ in views}) == 1
-        matches: list[Match] = []
-        for group in [views] if together else [[pair] for pair in views]:
-            left, right = (
-                normalise(torch.stack(side).to(self.device, torch.float32))
-                for side in zip(*group, strict=True)
-            )
-            sides = [(left, right)]
-            if self.config.with_left_right_check:
-                sides.append((right.flip(-1), left.flip(-1)))
-            h, w = left.shape[-2:]
-            crop = itemgetter((slice(-h, None), slice(w)))  # values[-h:, :w]
-            answers: list[list[Match]] = []
-            for side in sides:
-                padded = [pad_top_right(view, network) for view in side]
-                height, width = padded[0].shape[-2:]
-                rows = self._network.rows or height // 4
-                needed_bytes = 0
-                if limit_bytes is not None:
-                    needed_bytes = self.activation_bytes(network, height, width, self.dtype, rows)
-                if limit_bytes is not None and needed_bytes > limit_bytes:  # volumes are held whole
-                    quick = "" if network.work_focal_px is None else " or speed='quick'"
-                    raise InputError(
-                        f"max_memory_bytes={limit_bytes} is too small for images of "
-                        f"{height}x{width} (padded): this matcher takes {needed_bytes}; allow "
-                        f"that, take precision='bf16'{quick}, or match the pair at a smaller size"
-                    )
-                padded_matches = self.run(padded[0], padded[1], network, first_px)
-                answers.append([disparity.changed_match(match, crop) for match in padded_matches])
-            if len(answers) == 2:
-                other_px = (match.disparity_px.flip(-1) for match in answers[1])
-                answers[0] = list(map(lower_where_disagreeing, answers[0], other_px))
-            matches += answers[0]
+        is_one_size = len({left.shape for left, _ in views}) == 1
+        is_together = is_one_size and self.config.max_memory_bytes is None
+        groups = [views] if is_together else [[pair] for pair in views]
+        matches = [
+            match
+            for group in groups
+            for match in self._match_group(group, network_config, first_px)
+        ]
+        # Back to the size and the device of the images.
         home = pairs[0][0].device
         return [
             disparity.resized_match(
@@ -405,6 +368,82 @@ class NetworkMatcher(ABC):
             )
             for match, (left, _) in zip(matches, pairs, strict=True)
         ]
+
+    def _working_views(
+        self,
+        pairs: Sequence[tuple[Tensor, Tensor]],
+        camera: Camera | None,
+        search: Search | None,
+    ) -> tuple[Sequence[tuple[Tensor, ...]], Any]:
+        """Resize pairs to the size at which they are matched, with the settings for that size."""
+        trained = self.network_config
+        if search is not None:
+            sizes = [_scaled_size(left, search.scale, camera) for left, _ in pairs]
+            largest_px = search.max_disparity_px
+        elif camera is not None and trained.work_focal_px is not None:
+            sizes = [self.work_size(camera)] * len(pairs)
+            largest_px = self.work_disparities(camera)
+        else:
+            return pairs, trained
+        views = [
+            tuple(disparity.resize_image(view, *size) for view in pair)
+            for pair, size in zip(pairs, sizes, strict=True)
+        ]
+        return views, replace(trained, max_disparity_px=largest_px)
+
+    def _match_group(
+        self,
+        group: Sequence[tuple[Tensor, ...]],
+        network_config: Any,  # noqa: ANN401
+        first_px: int,
+    ) -> list[Match]:
+        """Match pairs of one size in one call of the network, or two with the left-right check."""
+        left, right = (
+            normalise(torch.stack(side).to(self.device, torch.float32))
+            for side in zip(*group, strict=True)
+        )
+        matches = self._match_padded(left, right, network_config, first_px)
+        if not self.config.with_left_right_check:
+            return matches
+        # Mirrored, the right view is a left one.
+        mirrored = self._match_padded(right.flip(-1), left.flip(-1), network_config, first_px)
+        right_px = (match.disparity_px.flip(-1) for match in mirrored)
+        return list(map(lower_where_disagreeing, matches, right_px))
+
+    def _match_padded(
+        self,
+        left: Views,
+        right: Views,
+        network_config: Any,  # noqa: ANN401
+        first_px: int,
+    ) -> list[Match]:
+        """Match pairs padded to sides that suit the network; give matches of their own size.
+
+        Raises:
+            InputError: the network needs more memory than the config allows.
+        """
+        height, width = left.shape[-2:]
+        padded_left = pad_top_right(left, network_config)
+        padded_right = pad_top_right(right, network_config)
+        self._refuse_memory(network_config, *padded_left.shape[-2:])
+        matches = self.run(padded_left, padded_right, network_config, first_px)
+        crop = itemgetter((slice(-height, None), slice(width)))  # values[-height:, :width]
+        return [disparity.changed_match(match, crop) for match in matches]
+
+    def _refuse_memory(self, network_config: Any, height: int, width: int) -> None:  # noqa: ANN401
+        """Refuse images whose matching takes more memory than the config allows."""
+        limit_bytes = self.config.max_memory_bytes
+        if limit_bytes is None:
+            return
+        rows = self._network.rows or height // 4
+        needed_bytes = self.activation_bytes(network_config, height, width, self.dtype, rows)
+        if needed_bytes > limit_bytes:  # volumes are held whole
+            quick = "" if network_config.work_focal_px is None else " or speed='quick'"
+            raise InputError(
+                f"max_memory_bytes={limit_bytes} is too small for images of "
+                f"{height}x{width} (padded): this matcher takes {needed_bytes}; allow "
+                f"that, take precision='bf16'{quick}, or match the pair at a smaller size"
+            )
 
     def work_size(self, camera: Camera) -> tuple[int, int]:
         """Rows and columns at which images of a camera are matched [px]."""

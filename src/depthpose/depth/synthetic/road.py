@@ -589,11 +589,14 @@ class Traffic:
         self.b.add(place(model, (x, 0, s), yaw, rng.uniform(0.96, 1.04, 3), tints))
 
     def add_people(self) -> None:
-        """People on foot, on the pavement and now and then the road, and on bicycles."""
+        """Add people on foot, mostly on the pavements, and cyclists at the edges of the road.
+
+        ``x`` is to the right and ``s`` along the road [m]; a figure faces along the road or across.
+        """
         rng = self.b.rng
         road = self.road
-        mean = {"city": 5.0, "suburb": 1.5, "avenue": 2.0}.get(road.place, 0.4)
-        for _ in range(int(rng.poisson(mean))):
+        mean_count = {"city": 5.0, "suburb": 1.5, "avenue": 2.0}.get(road.place, 0.4)
+        for _ in range(int(rng.poisson(mean_count))):
             side = int(rng.choice([-1, 1]))
             s = rng.uniform(5, 50)
             strip = road.verge_m + road.walk_m
@@ -607,7 +610,9 @@ class Traffic:
             yaw = float(turns) + rng.normal(0, 0.2) + (np.pi / 2 if on_road else 0)
             y = 0.0 if on_road else -road.curb_m
             self.b.add(place(models.walker(int(rng.integers(models.WALKERS))), (x, y, s), yaw))
-        for _ in range(int(rng.poisson(mean * 0.3))):
+
+        # Cyclists ride beside the parked cars, each in the direction of its side.
+        for _ in range(int(rng.poisson(mean_count * 0.3))):
             side = int(rng.choice([-1, 1]))
             x = road.edge_m[side] - side * (road.parking_m[(side + 1) // 2] + rng.uniform(0.3, 0.9))
             s = rng.uniform(6, 45)

@@ -295,16 +295,25 @@ class SelectionSamples:
         return len(self.sources[0])
 
     def __getitem__(self, sample_index: int) -> SelectionSample:
-        """Make the n-th sample."""
-        before = int(sample_index * self.more_share)
-        now = int((sample_index + 1) * self.more_share)
-        pair = self.sources[1][before] if now > before else self.sources[0][sample_index - before]
-        degraded = degrade(pair.left, self.config, sample_generator(sample_index, self.seed + 1))
-        left, right, left_px, right_px, _ = pair
-        has_right = torch.tensor(not torch.equal(left, right))
-        if not has_right:  # one image stands for both views
-            right_px = right_disparity_from_left(left_px)
-        return SelectionSample(degraded, left, right, left_px, right_px, has_right)
+        """Make the sample of an index, from the second source wherever its share is full again."""
+        from_second = int(sample_index * self.more_share)  # of the samples before
+        is_of_second = int((sample_index + 1) * self.more_share) > from_second
+        if is_of_second:
+            pair = self.sources[1][from_second]
+        else:
+            pair = self.sources[0][sample_index - from_second]
+        # Where one image stands for both views, the right one's truth follows from the left one's.
+        has_right = not torch.equal(pair.left, pair.right)
+        right_px = pair.right_px if has_right else right_disparity_from_left(pair.left_px)
+        generator = sample_generator(sample_index, self.seed + 1)
+        return SelectionSample(
+            observed=degrade(pair.left, self.config, generator),
+            left=pair.left,
+            right=pair.right,
+            left_px=pair.left_px,
+            right_px=right_px,
+            has_right=torch.tensor(has_right),
+        )
 
 
 _CAP_M = 80.0

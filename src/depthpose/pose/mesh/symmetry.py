@@ -396,14 +396,16 @@ def _mirror_search(model: ObjectModel) -> float:
     along = normals[:, :, None] * normals[:, None]
     across = _EYE - along
     crossed = torch.linalg.cross(normals[:, None], _EYE[None])
-    ways = ((1, 0), (0, 1), (-1, 0), (0, -1))
-    every = torch.cat([c * across + s * crossed - along for c, s in ways])
+    quarter_turns = ((1, 0), (0, 1), (-1, 0), (0, -1))  # cosine and sine
+    reflections = torch.cat([c * across + s * crossed - along for c, s in quarter_turns])
     starts: list[Float64[Tensor, "3 3"]] = []
-    for k in surface.rough_distance(every).argsort().tolist():
+    for k in surface.rough_distance(reflections).argsort().tolist():
         if len(starts) == _MIRROR_STARTS:
             break
-        if all(float(geodesic_rad(every[k], other)) > _APART_RAD for other in starts):
-            starts.append(every[k])
+        if all(float(geodesic_rad(reflections[k], start)) > _APART_RAD for start in starts):
+            starts.append(reflections[k])
+
+    # From each to where the mirror image fits best.
     turns = [refine_turn(surface, R @ _FLIP, _FLIP) for R in starts]
     R = torch.stack([t.R for t in turns]) @ _FLIP
     shift = torch.stack([t.t_m for t in turns])
@@ -413,10 +415,20 @@ def _mirror_search(model: ObjectModel) -> float:
 def refine_turn(
     surface: SurfaceDeviation, R: Float64[Tensor, "3 3"], flip: Float64[Tensor, "3 3"] | None = None
 ) -> Rigid:
-    """Refine the turn of a surface about the middle of its box onto itself (ICP)."""
+    """Refine a rotation that nearly maps a surface, or its mirror image, onto the surface (ICP).
+
+    Args:
+        surface: in units of the object's diameter.
+        R: the rotation to begin with, about the middle of the surface's box.
+        flip: the reflection that makes the mirror image; None: the surface itself.
+
+    Returns:
+        The motion of the surface, or of its mirror image.
+    """
     points = surface.many if flip is None else surface.many @ flip
+    linear = R if flip is None else R @ flip
     middle = (surface.points.amin(0) + surface.points.amax(0)) / 2
-    turn = Rigid(R, middle - (R if flip is None else R @ flip) @ middle)
+    turn = Rigid(R, middle - linear @ middle)
     for _ in range(_STEPS):
         moved = turn.apply(points)
         distance, index = surface.nearest(moved)
