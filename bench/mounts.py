@@ -289,34 +289,34 @@ def measured(view: View, net: FakestereoNet, mount: MountFilter) -> list[dict[st
     """Estimate a view once, and correct it by what is known of the mount."""
     camera = view.image.camera
     assert camera is not None
-    (judged,) = net.judge([view.image], net.virtual_sizes(view.image))
+    (unscaled,) = net.estimate_without_mount([view.image], net.virtual_sizes(view.image))
     assert net.synthesiser is not None
     rig = net.synthesiser.config
     assert isinstance(rig, SelectionConfig)
-    nothing = scale_by_mount(judged, view.image, None, rig)
+    nothing = scale_by_mount(unscaled, view.image, None, rig)
     rows: list[dict[str, Any]] = []
     for way in WAYS if view.drive else WAYS[:-1]:
         found = nothing
         asked = view.image
         if way == "map":
-            found = judged
+            found = unscaled
         elif way == "frames":
-            found = scale_by_mount(judged, asked, mount, rig)
+            found = scale_by_mount(unscaled, asked, mount, rig)
         elif way != "nothing" and view.mount is not None:
             height_m, tilt_deg = view.mount
             known = {"mount_height_m": height_m}
             known |= {"tilt_deg": tilt_deg} if way == "height and tilt" else {}
             asked = replace(asked, camera=replace(camera, **known))
             try:
-                found = scale_by_mount(judged, asked, None, rig)
+                found = scale_by_mount(unscaled, asked, None, rig)
             except InputError:
                 found = nothing
-        assert found.depth_m is not None and judged.depth_m is not None  # noqa: PT018
+        assert found.depth_m is not None and unscaled.depth_m is not None  # noqa: PT018
         row = {
             "camera": view.camera, "given": way, "drive": view.drive, "image": view.image.name,
             "road": nothing.ground is not None,
         } | errors(found.depth_m.numpy(), view.depth_m)  # fmt: skip
-        ground = fit_ground(judged.depth_m, camera) if way == "map" else found.ground
+        ground = fit_ground(unscaled.depth_m, camera) if way == "map" else found.ground
         if ground is not None and view.mount is not None:
             row["tilt_off_deg"] = ground.tilt_deg - view.mount[1]
             row["height_off"] = math.log(ground.height_m / view.mount[0])

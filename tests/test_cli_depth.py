@@ -282,7 +282,7 @@ def test_a_frame_of_a_video_that_is_refused_leaves_the_others(
     frames = [torch.full((3, 48, 64), 0.2 + 0.1 * k) for k in range(4)]
     write_video(tmp_path / "drive.avi", frames, 5.0)
     refused = InputError("drive_000001: a black frame")
-    judge = FakestereoNet.judge
+    judge = FakestereoNet.estimate_without_mount
 
     def refuse_one(
         net: FakestereoNet, images: list[StereoInput], sizes: list[tuple[int, int]]
@@ -292,7 +292,7 @@ def test_a_frame_of_a_video_that_is_refused_leaves_the_others(
         return judge(net, images, sizes)
 
     out = tmp_path / "out"
-    with patch.object(FakestereoNet, "judge", refuse_one):
+    with patch.object(FakestereoNet, "estimate_without_mount", refuse_one):
         assert predict(home, out, str(tmp_path / "drive.avi"), "--focal-px", "70") == 1
     assert "failed: drive_000001: a black frame" in capsys.readouterr().err
     assert len(list(out.glob("*.depth_m.npy"))) == 3
@@ -316,7 +316,7 @@ def roads() -> Iterator[None]:
             estimates.append(DepthEstimate(depth_m=depth_m, disparity_px=35 / depth_m))
         return estimates
 
-    with patch.object(FakestereoNet, "judge", judge):
+    with patch.object(FakestereoNet, "estimate_without_mount", judge):
         yield
 
 

@@ -47,8 +47,13 @@ from depthpose.depth.stereo import (
     move_views,
     moved_back,
 )
-from depthpose.depth.synthesis import SelectionGenerator, Synthesiser, make_synthesiser
-from depthpose.depth.types import DepthEstimate, Match, StereoInput
+from depthpose.depth.synthesis import (
+    SelectionGenerator,
+    SynthesisedViews,
+    Synthesiser,
+    make_synthesiser,
+)
+from depthpose.depth.types import DepthEstimate, Match, StereoInput, Views
 from depthpose.depth.weights import Use, make_matcher, read_depth_weights
 
 
@@ -111,6 +116,42 @@ def refuse_unrectified(pair: StereoInput, *, with_check: bool = True) -> str:
             "all the same.)"
         )
     return report.message if report.is_rectified is None else ""
+
+
+def _match_in_range(
+    matcher: NetworkMatcher, pair: StereoInput, apart_px: float
+) -> tuple[Match, str]:
+    """Measure which disparities a pair has, and search where they lie.
+
+    ``apart_px``: cx of the right camera less that of the left one [px]. Gives the match, and a
+    doubt about what lies beyond the search, or "".
+    """
+    assert pair.right is not None
+    left = pair.left
+    reach = measure_reach(matcher, left, pair.right, -apart_px)
+    window = choose_window(matcher, reach, left.shape[1:], pair.camera)
+    (match,) = matcher.match_many([(left, pair.right)], pair.camera, window.search)
+    if not matcher.config.with_left_right_check:
+        match = doubt_hidden(match, reach)
+    return doubt_outside(match, reach, window)
+
+
+def _match_from_infinity(matcher: Matcher, pair: StereoInput, apart_px: float) -> Match:
+    """Match a pair whose views are moved so that a disparity of 0 is infinitely far away."""
+    assert pair.right is not None
+    first_px = -math.ceil(apart_px)
+    left, right = move_views(pair.left, pair.right, first_px)
+    rig = pair.camera
+    if isinstance(rig, StereoRig) and first_px != 0:
+        K = rig.K.clone()
+        K[0, 2] += left.shape[2] - pair.left.shape[2]
+        moved_px = apart_px + first_px
+        rig = replace(rig, width=left.shape[2], K=K, cx_right_minus_left_px=moved_px)
+    if isinstance(matcher, CameraMatcher):
+        (match,) = matcher.match_many([(left, right)], rig)
+    else:
+        match = matcher.match(left, right)
+    return moved_back(match, first_px)
 
 
 DEFAULT = "default"
@@ -330,11 +371,10 @@ class FakestereoNet:
                 "of both."
             )
         warning = refuse_unrectified(pair, with_check=with_check)
-        left = pair.left
-        right = pair.right
-        rig = pair.camera
         width = pair.left.shape[2]
-        apart_px = rig.cx_right_minus_left_px if isinstance(rig, StereoRig) else 0.0
+        apart_px = 0.0
+        if isinstance(pair.camera, StereoRig):
+            apart_px = pair.camera.cx_right_minus_left_px
         if abs(math.ceil(apart_px)) >= width:
             raise InputError(
                 f"cx_right_minus_left_px is {apart_px:g}, and the images are {width} px wide: "
@@ -343,27 +383,10 @@ class FakestereoNet:
             )
         with refused_memory(pair.name):
             if isinstance(self.matcher, NetworkMatcher) and self.matcher.finds_range:
-                reach = measure_reach(self.matcher, left, right, -apart_px)
-                window = choose_window(self.matcher, reach, left.shape[1:], rig)
-                (match,) = self.matcher.match_many([(left, right)], rig, window.search)
-                if not self.matcher.config.with_left_right_check:
-                    match = doubt_hidden(match, reach)
-                match, doubt = doubt_outside(match, reach, window)
+                match, doubt = _match_in_range(self.matcher, pair, apart_px)
                 warning = "; ".join(text for text in (warning, doubt) if text)
-                return disparity.from_pair(pair, match, warning)
-            # Other matchers search from 0 on: the views are moved so that infinity is there.
-            first_px = -math.ceil(apart_px)
-            left, right = move_views(left, right, first_px)
-            if isinstance(rig, StereoRig) and first_px != 0:
-                K = rig.K.clone()
-                K[0, 2] += left.shape[2] - width
-                moved_px = apart_px + first_px
-                rig = replace(rig, width=left.shape[2], K=K, cx_right_minus_left_px=moved_px)
-            if isinstance(self.matcher, CameraMatcher):
-                (match,) = self.matcher.match_many([(left, right)], rig)
             else:
-                match = self.matcher.match(left, right)
-            match = moved_back(match, first_px)
+                match = _match_from_infinity(self.matcher, pair, apart_px)
             return disparity.from_pair(pair, match, warning)
 
     @force_float32()
@@ -513,17 +536,19 @@ class FakestereoNet:
         mount: MountFilter | None = None,
     ) -> list[DepthEstimate]:
         """Estimate single images of one virtual size together; with ``mount``, frames in order."""
-        judged = self.judge(images, sizes)
-        assert self.synthesiser is not None, "judge needs it"
+        estimates = self.estimate_without_mount(images, sizes)
+        assert self.synthesiser is not None, "estimate_without_mount needs it"
         rig = self.synthesiser.config
         rig = rig if isinstance(rig, SelectionConfig) else SelectionConfig()
         return [
             scale_by_mount(estimate, image, mount, rig)
-            for estimate, image in zip(judged, images, strict=True)
+            for estimate, image in zip(estimates, images, strict=True)
         ]
 
     @torch.no_grad()
-    def judge(self, images: list[StereoInput], sizes: list[tuple[int, int]]) -> list[DepthEstimate]:
+    def estimate_without_mount(
+        self, images: list[StereoInput], sizes: list[tuple[int, int]]
+    ) -> list[DepthEstimate]:
         """Estimate depth by the networks alone, before the camera's mount corrects it.
 
         Images are brought to the virtual rig, their right views drawn and matched.
@@ -543,46 +568,57 @@ class FakestereoNet:
                 for size in sizes
             )
             views = self.synthesiser.draw(left, *larger)
-            sky = views.is_sky
-            confidence = views.confidence
-            if rig.answer == "matched":
-                camera = camera_of(rig.virtual_focal_px, (left.shape[3], left.shape[2]))
-                pairs = list(zip(left, views.right, strict=True))
-                if isinstance(self.matcher, CameraMatcher):
-                    matches = self.matcher.match_many(pairs, camera)
-                else:
-                    assert self.matcher is not None, "__init__ checked it"
-                    matches = [self.matcher.match(*pair) for pair in pairs]
-            else:
-                assert views.disparity_px is not None, "it has an answer of its own"
-                assert confidence is not None
-                parts = zip(views.disparity_px, confidence, strict=True)
-                matches = [
-                    Match(disparity_px=px, confidence=pixel_confidence)
-                    for px, pixel_confidence in parts
-                ]
-            estimates = []
+            matches = self._match_virtual(left, views)
+            estimates: list[DepthEstimate] = []
             for n, (image, match) in enumerate(zip(images, matches, strict=True)):
-                match_with_sky = match if sky is None else replace(match, is_sky=sky[n])
-                estimate = disparity.from_virtual(image, rig, match_with_sky, views.right[n])
+                if views.is_sky is not None:
+                    match = replace(match, is_sky=views.is_sky[n])  # noqa: PLW2901
+                estimate = disparity.from_virtual(image, rig, match, views.right[n])
+                if views.confidence is not None:
+                    mean = views.confidence[n].mean() if views.street is None else views.street[n]
+                    warning = self._ood_warning(image.name, float(mean))
+                    estimate = replace(estimate, image_confidence=float(mean), warning=warning)
                 estimates.append(estimate)
-                if confidence is None:
-                    continue
-                mean = confidence[n].mean() if views.street is None else views.street[n]
-                image_confidence = float(mean)
-                warning = ""
-                if isinstance(rig, SelectionConfig) and image_confidence < rig.least_confidence:
-                    what = "probability of a street" if rig.with_street else "mean confidence"
-                    warning = (
-                        f"out of distribution for these weights ({what} "
-                        f"{image_confidence:.2f}, below "
-                        f"{rig.least_confidence:.2f}), so its depth is a guess"
-                    )
-                if warning and not self.allow_ood:
-                    raise InputError(
-                        f"{image.name}: {warning}. Check that it is upright and that the focal "
-                        "length is its own; --allow-ood (in Python, load(..., allow_ood=True)) "
-                        "answers it all the same."
-                    )
-                estimates[n] = replace(estimate, image_confidence=image_confidence, warning=warning)
         return estimates
+
+    def _match_virtual(self, left: Views, views: SynthesisedViews) -> list[Match]:
+        """Match images with their synthesised views, or take the synthesiser's own disparity."""
+        assert self.synthesiser is not None
+        rig = self.synthesiser.config
+        if rig.answer != "matched":
+            assert views.disparity_px is not None, "it has an answer of its own"
+            assert views.confidence is not None
+            return [
+                Match(disparity_px=disparity_px, confidence=confidence)
+                for disparity_px, confidence in zip(
+                    views.disparity_px, views.confidence, strict=True
+                )
+            ]
+        assert self.matcher is not None, "__init__ checked it"
+        camera = camera_of(rig.virtual_focal_px, (left.shape[3], left.shape[2]))
+        pairs = list(zip(left, views.right, strict=True))
+        if isinstance(self.matcher, CameraMatcher):
+            return self.matcher.match_many(pairs, camera)
+        return [self.matcher.match(*pair) for pair in pairs]
+
+    def _ood_warning(self, name: str, image_confidence: float) -> str:
+        """Warn of an image that is unlike what the weights know, or refuse it; "" of a usual one.
+
+        Raises:
+            InputError: it is unlike that, and such images are not to be answered.
+        """
+        assert self.synthesiser is not None
+        rig = self.synthesiser.config
+        if not isinstance(rig, SelectionConfig) or image_confidence >= rig.least_confidence:
+            return ""
+        what = "probability of a street" if rig.with_street else "mean confidence"
+        warning = (
+            f"out of distribution for these weights ({what} {image_confidence:.2f}, below "
+            f"{rig.least_confidence:.2f}), so its depth is a guess"
+        )
+        if not self.allow_ood:
+            raise InputError(
+                f"{name}: {warning}. Check that it is upright and that the focal length is its "
+                "own; --allow-ood (in Python, load(..., allow_ood=True)) answers it all the same."
+            )
+        return warning
