@@ -208,7 +208,7 @@ def test_the_handle_of_a_mug_decides_its_turn(handle: str) -> None:
     errors = [float(add_m(pose, truth, mug.vertices_m)) for pose in poses if pose is not None]
     assert errors == ([pytest.approx(0, abs=0.05 * mug.diameter_m)] if handle == "seen" else [])
     about = Rigid(rotation_by(torch.tensor([0.0, 0, 1.8])), torch.zeros(3))  # 103 degrees
-    prepared = Registration([mug])._prepared("mug")
+    prepared = Registration([mug])._prepared_object("mug")
     best = search._best_copy(prepare_frame(depth_m, K), (truth @ about).double(), prepared)
     off = math.degrees(float(geodesic_rad(best.R, truth.R.double())))
     assert off < (20 if handle == "seen" else 70), "hidden: anywhere behind the mug"
@@ -276,7 +276,7 @@ def test_a_hundred_models_take_bounded_time(net: Registration) -> None:
 
     known = SearchTargets(
         names=[f"part {k}" for k in range(100)],
-        object_of=lambda _: net._prepared("bracket"),
+        object_of=lambda _: net._prepared_object("bracket"),
         estimate_near=estimate_near,
         min_probability=0.5,
     )
@@ -378,7 +378,7 @@ def test_in_a_bin_of_many_each_is_as_likely_as_alone() -> None:
 
 def test_what_would_lie_in_the_wall_is_not_possible(net: Registration) -> None:
     """The wall hides no half of an object that is seen before it; a gap in the wall may."""
-    surface = net._prepared("bracket").surface
+    surface = net._prepared_object("bracket").surface
     pose = pose_at(0.0, 1.19, seed=1)  # the wall is 1.2 m away there
     seen, mask = view_of(bracket(), pose)
     wall = table()

@@ -106,7 +106,9 @@ class PoseEstimator:
 
     @torch.no_grad()
     @force_float32()
-    def _answers(self, inputs: Sequence[AnyInput], *, is_likely: bool) -> list[PoseEstimate]:
+    def _estimate_or_raise(
+        self, inputs: Sequence[AnyInput], *, is_likely: bool
+    ) -> list[PoseEstimate]:
         """Estimate inputs; raise the :class:`InputError` of one that could not be taken."""
         answers: list[PoseEstimate] = []
         for estimate in self._each(inputs, 1, is_likely=is_likely):
@@ -119,7 +121,7 @@ class PoseEstimator:
         """Estimate the one object that is somewhere in the mask of a view, as in a box."""
         targets = SearchTargets(
             names=[view.object],
-            object_of=self._prepared,
+            object_of=self._prepared_object,
             estimate_near=self._estimate_near,
             min_probability=self.refusal.min_probability,
             prior_odds=PRIOR_REGION,
@@ -177,7 +179,7 @@ class PoseEstimator:
             InputError: an unknown object, a file that cannot be read, shapes that do not fit. What
                 the data themselves lack is no error but a refusal.
         """
-        which = self.objects[0] if object is None else self._known(object).model.name
+        which = self.objects[0] if object is None else self._object(object).model.name
         of_view = {
             "depth": depth, "mask": mask, "box": box, "camera": camera, "focal_px": focal_px,
             "color": color, "color_camera": color_camera, "color_from_depth": color_from_depth,
@@ -202,12 +204,12 @@ class PoseEstimator:
                 pixels = box_mask(box, *pose_input.depth_m.shape)
                 pose_input = replace(pose_input, mask=pixels, is_region=True)
             pose_input = with_background(pose_input, background, lens, unit)
-            models = self.models if object is None else [self._known(object).model]
+            models = self.models if object is None else [self._object(object).model]
             pose_input = with_color(pose_input, models, color, color_camera, color_from_depth)
         if object is not None or len(self.models) == 1:
-            return self._answers([pose_input], is_likely=True)[0]
+            return self._estimate_or_raise([pose_input], is_likely=True)[0]
         tried = [replace(pose_input, object=name) for name in self.objects]
-        estimates = self._answers(tried, is_likely=False)
+        estimates = self._estimate_or_raise(tried, is_likely=False)
         return with_status(choose_object(estimates), self.config.min_certainty)
 
     @force_float32()
@@ -241,7 +243,7 @@ class PoseEstimator:
         if lens is None:
             raise InputError("estimate_instances: give camera= or focal_px=")
         labels = labels_input(mask, _NAME)
-        which = self._known(object).model.name
+        which = self._object(object).model.name
         view = view_input(depth, labels != 0, lens, which, _NAME, unit)
         pieces = split_instances(labels) or [view.mask]
         views = [replace(view, mask=m, name=f"{_NAME}_{k}") for k, m in enumerate(pieces)]
@@ -275,7 +277,7 @@ class PoseEstimator:
             InputError: as for :meth:`estimate`.
         """
         asked = [objects] if isinstance(objects, str) else objects
-        names = self.objects if asked is None else [self._known(name).model.name for name in asked]
+        names = self.objects if asked is None else [self._object(name).model.name for name in asked]
         if not names:
             raise InputError("find: objects names none; give those that may be there, or omit it")
         view = view_input(depth, None, camera, names[0], _NAME, unit)
@@ -298,7 +300,7 @@ class PoseEstimator:
         """
         targets = SearchTargets(
             names=objects,
-            object_of=self._prepared,
+            object_of=self._prepared_object,
             estimate_near=self._estimate_near,
             min_probability=self.refusal.min_probability,
             is_single=is_single,
@@ -339,7 +341,7 @@ class PoseEstimator:
         Raises:
             InputError: an unknown object, or a ``first`` that is no pose.
         """
-        which = self._known(object).model.name
+        which = self._object(object).model.name
         if isinstance(frames, str | Path):
             raise InputError(
                 f"track: frames is {str(frames)!r}, one path; give a list of files or arrays in "
@@ -373,10 +375,10 @@ class PoseEstimator:
 
         def look(pose_input: AnyInput) -> PoseEstimate:
             if isinstance(pose_input, CloudInput):
-                return self._answers([pose_input], is_likely=False)[0]
+                return self._estimate_or_raise([pose_input], is_likely=False)[0]
             return self.find_in(pose_input, [object], is_single=True)[0]
 
-        prepared = self._known(object)
+        prepared = self._object(object)
         target = TrackedObject(
             model=prepared.model,
             surface=prepared.surface,
@@ -386,7 +388,7 @@ class PoseEstimator:
         )
         return each_in_float32(track(frames, target, first))
 
-    def _known(self, name: str | None) -> PreparedObject:
+    def _object(self, name: str | None) -> PreparedObject:
         """Give an object by its name, with its surface; None where one alone is known."""
         names = self.objects
         if name is None:
@@ -408,9 +410,9 @@ class PoseEstimator:
             self._objects[name] = PreparedObject(number=number, model=model, surface=surface)
         return self._objects[name]
 
-    def _prepared(self, name: str) -> PreparedObject:
+    def _prepared_object(self, name: str) -> PreparedObject:
         """Give an object by its name, with its point pairs, near-symmetries and turns."""
-        prepared = self._known(name)
+        prepared = self._object(name)
         copies_of(prepared)
         if prepared.pairs is None:
             prepared.pairs = prepare_pairs(prepared.surface)

@@ -217,7 +217,7 @@ class GeoPoseNet(PoseEstimator):
         """Lift an input to the cloud that the network takes; estimate one of a region here."""
         if isinstance(pose_input, ViewInput) and pose_input.is_region:
             return self._estimate_in_region(pose_input)
-        prepared = self._known(pose_input.object)
+        prepared = self._object(pose_input.object)
         copies_of(prepared)  # in the seconds of no input
         start = time.perf_counter()
         cloud = prepare_cloud(pose_input, prepared.model, self.weights.cloud, self.config)
@@ -368,11 +368,13 @@ class DepthImageRegressor(PoseEstimator):
         self._network = weights.network.to(usable_device(self.config.device)).eval()
         self._cloud = weights.cloud
 
-    def _answers(self, inputs: Sequence[AnyInput], *, is_likely: bool) -> list[PoseEstimate]:
+    def _estimate_or_raise(
+        self, inputs: Sequence[AnyInput], *, is_likely: bool
+    ) -> list[PoseEstimate]:
         if len(inputs) > 1:
             names = ", ".join(item.object for item in inputs)
             raise InputError(f"object: say which of {names}; a regressor refuses none")
-        return super()._answers(inputs, is_likely=is_likely)
+        return super()._estimate_or_raise(inputs, is_likely=is_likely)
 
     def find_in(
         self, view: ViewInput, objects: Sequence[str], *, is_single: bool = False
@@ -383,7 +385,7 @@ class DepthImageRegressor(PoseEstimator):
 
     def _estimate(self, pose_input: AnyInput) -> PoseEstimate:
         """Regress the pose from a crop of the depth image, and refine it by ICP."""
-        prepared = self._known(pose_input.object)
+        prepared = self._object(pose_input.object)
         if not isinstance(pose_input, ViewInput):
             raise InputError(_NEEDS_MASK)
         config = self._network.config

@@ -139,7 +139,7 @@ class Registration(PoseEstimator):
     def prepare(self) -> None:
         """Prepare every model now, about a second each; else it is done when first asked for."""
         for name in self.objects:
-            self._prepared(name)
+            self._prepared_object(name)
 
     def _estimate_near(
         self, inputs: Sequence[CloudInput], proposals: Sequence[Rigid], prior_odds: float
@@ -169,9 +169,8 @@ class Registration(PoseEstimator):
         self, pose_input: AnyInput, proposals: Rigid | None, prior_odds: float
     ) -> PoseEstimate:
         """Estimate a pose from a mask's points, or from those at a pose that a search proposed."""
-        prepared = self._prepared(
-            pose_input.object
-        )  # once for all inputs, and in the seconds of none
+        # Prepared once for all inputs, and in the seconds of none.
+        prepared = self._prepared_object(pose_input.object)
         is_masked = proposals is None
         began = time.perf_counter()
         cloud = self._cloud(pose_input, prepared)
@@ -189,9 +188,10 @@ class Registration(PoseEstimator):
         refinement = refine_best(cloud.cloud_m.double(), proposals, prepared.surface, icp)
         seconds["icp"] = time.perf_counter() - began
         if float(refinement.refined.inlier_share) == 0:
-            reason = "no pose lays the model near the points: another object, or too little of it"
+            reason = "no pose brings the model near the points: another object, or too little of it"
             return refused(pose_input, Refusal(status="no pose found", reason=reason), seconds)
 
+        # A search proposes much: what the depth image plainly contradicts goes no further.
         began = time.perf_counter()
         observation = observe(
             cloud.cloud_m,
@@ -205,6 +205,8 @@ class Registration(PoseEstimator):
             seconds["evidence"] = time.perf_counter() - began
             reason = contradiction(first, probability_right(first, prior_odds))
             return refused(pose_input, Refusal(status="doubtful", reason=reason), seconds)
+        # The best pose against its near-symmetric copies, look-alikes and other local minima.
+        has_color = cloud.view is not None and cloud.view.color is not None
         competition = compete(
             cloud.cloud_m.double(),
             refinement.refined,
@@ -212,7 +214,7 @@ class Registration(PoseEstimator):
             prepared,
             observation,
             icp,
-            cloud.view if cloud.view is not None and cloud.view.color is not None else None,
+            cloud.view if has_color else None,
         )
         seconds["evidence"] = time.perf_counter() - began
         return decide(
@@ -234,7 +236,7 @@ class Registration(PoseEstimator):
 
     def _propose(self, cloud: ObjectCloud, prepared: PreparedObject) -> Rigid:
         """Propose poses by the point pairs of a cloud."""
-        assert prepared.pairs is not None, "_prepared computes them"
+        assert prepared.pairs is not None, "_prepared_object computes them"
         dense_m = take_evenly(cloud.cloud_m.double(), _SMOOTHED_POINTS)
         step_m = _VOXEL_DIAMETERS * prepared.surface.diameter_m
         voting_m = dense_m[thin(dense_m, torch.zeros_like(dense_m), step_m)]

@@ -58,7 +58,7 @@ def read_split(name: str | Path) -> Split:
         InputError: neither a name nor a file, or a line that cannot be understood.
     """
     if str(name) in SPLIT_NAMES:
-        return _known(str(name))
+        return _shipped_split(str(name))
     path = Path(name)
     try:
         is_there = path.is_file()
@@ -88,15 +88,15 @@ def read_split(name: str | Path) -> Split:
             f"{path}: names no frame. Each line is 'DATE/DRIVE FRAME l' or two images."
         )
     listed = tuple(sorted(frames))
-    same = [key for key in SPLIT_NAMES if _known(key).frames == listed]
+    same = [key for key in SPLIT_NAMES if _shipped_split(key).frames == listed]
     return Split(name=same[0] if same else path.name, frames=listed)
 
 
 @cache
-def _known(name: str) -> Split:
+def _shipped_split(name: str) -> Split:
     """Read a split that ships, or join those that it consists of."""
     if name in _JOINED:
-        joined = {frame for part in _JOINED[name] for frame in _known(part).frames}
+        joined = {frame for part in _JOINED[name] for frame in _shipped_split(part).frames}
         return Split(name=name, frames=tuple(sorted(joined)))
     text = resources.files("depthpose.depth.datasets").joinpath(f"lists/{name}.txt").read_text()
     frames = tuple(

@@ -244,9 +244,16 @@ class FakestereoNet:
         """
         if weights is None and matcher is None:
             weights = DEFAULT
-        main = other = None
+        main = None
         if weights is not None:
             main = read_depth_weights(find_weights(weights), use=use, answer=answer)
+        # Paths first: a Path has a method 'match' too, and would pass for a matcher.
+        beside = None
+        if isinstance(matcher, str | Path) and matcher != "sgbm":
+            beside = read_depth_weights(find_weights(matcher), use="pairs")
+        terms = join_terms(*(read.facts for read in (main, beside) if read is not None))
+        warn_of_terms({"terms": terms})
+
         generator = None if main is None else main.generator
         if answer is not None and isinstance(generator, SelectionGenerator):
             generator.config = replace(generator.config, answer=answer)
@@ -255,13 +262,9 @@ class FakestereoNet:
                 f"answer is {answer!r}, which takes the weights of a generator that selects; omit "
                 "it: these have no generator, or a U-Net, which estimates no disparity."
             )
-        # Paths first: a Path has a method 'match' too, and would pass for a matcher.
-        if isinstance(matcher, str | Path) and matcher != "sgbm":
-            other = read_depth_weights(find_weights(matcher), use="pairs")
-        terms = join_terms(*(read.facts for read in (main, other) if read is not None))
-        warn_of_terms({"terms": terms})
+        # A matcher: OpenCV's, the caller's own, that of the weights, or none.
         run = config if isinstance(config, MatcherConfig) else MatcherConfig()
-        holder = other or main
+        holder = beside or main
         if isinstance(config, SGBMConfig) and matcher != "sgbm":
             raise InputError(
                 f"config is of SGBM, but matcher is {matcher!r}; give matcher='sgbm' or a "
@@ -288,10 +291,12 @@ class FakestereoNet:
                 "a matcher become one file by 'depthpose weights pack G --matcher S --trained-on "
                 "DATA --licence L --out W'."
             )
-        names = " + ".join(str(name) for name, read in ((weights, main), (matcher, other)) if read)
+
         synthesiser = None
         if generator is not None:
             synthesiser = make_synthesiser(generator, run.device, run.speed)
+        files = ((weights, main), (matcher, beside))
+        names = " + ".join(str(name) for name, read in files if read is not None)
         return cls(chosen, synthesiser, terms=terms, weights=names, allow_ood=allow_ood)
 
     from_pretrained = load
