@@ -72,36 +72,43 @@ def prepare_cloud(
 ) -> ObjectCloud | Refusal:
     """Lift, thin, drop flying pixels, check, sample and put on the grid of the network."""
     if isinstance(pose_input, ViewInput):
-        mask = pose_input.mask
-        if pose_input.background is not None:
-            mask = mask & ~pose_input.background.is_seen
-        points_m = cloud_from_depth(pose_input.depth_m, mask, pose_input.K).float()
-        nothing = nothing_seen(pose_input) if len(points_m) == 0 else ""
+        view = pose_input
+        mask = view.mask if view.background is None else view.mask & ~view.background.is_seen
+        points_m = cloud_from_depth(view.depth_m, mask, view.K).float()
     else:
+        view = pose_input.view
         points_m = pose_input.points_m.float()
-        is_zero = bool((points_m == 0).all(-1).any())
-        nothing = "the cloud has no point with finite coordinates"
-        nothing = "the cloud is (0, 0, 0), no reading, in every point" if is_zero else nothing
-        nothing = "the cloud is empty" if len(points_m) == 0 else nothing
-    points_m = take_evenly(points_m[is_reading(points_m)], config.max_cloud_points)
-    if len(points_m) == 0:
-        return Refusal(status="too few points", reason=nothing)
+    readings_m = take_evenly(points_m[is_reading(points_m)], config.max_cloud_points)
+    if len(readings_m) == 0:
+        return Refusal(status="too few points", reason=_why_empty(pose_input))
+
     # What is far from the median is background at the mask's border.
-    off_m = (points_m - points_m.median(0).values).norm(dim=-1)
-    kept_m = points_m[~(off_m > cloud.max_offset_diameters * model.diameter_m)]
-    if (refusal := _refusal_of(pose_input, points_m, kept_m, model, cloud)) is not None:
+    off_m = (readings_m - readings_m.median(0).values).norm(dim=-1)
+    object_m = readings_m[~(off_m > cloud.max_offset_diameters * model.diameter_m)]
+    if (refusal := _refusal_of(pose_input, readings_m, object_m, model, cloud)) is not None:
         return refusal
+
     generator = torch.Generator().manual_seed(config.voting.seed)
-    sampled_m = sample_points(kept_m, cloud.max_points, generator)
+    sampled_m = sample_points(object_m, cloud.max_points, generator)
     voxels = voxelise(sampled_m, cloud)
-    view = pose_input if isinstance(pose_input, ViewInput) else pose_input.view
     return ObjectCloud(
         name=pose_input.name,
-        cloud_m=kept_m,
+        cloud_m=object_m,
         points_m=sampled_m[voxels.kept],
         voxels=voxels,
         view=view,
     )
+
+
+def _why_empty(pose_input: CloudInput | ViewInput) -> str:
+    """Say why an input has no reading at all."""
+    if isinstance(pose_input, ViewInput):
+        return nothing_seen(pose_input)
+    if len(pose_input.points_m) == 0:
+        return "the cloud is empty"
+    if bool((pose_input.points_m == 0).all(-1).any()):
+        return "the cloud is (0, 0, 0), no reading, in every point"
+    return "the cloud has no point with finite coordinates"
 
 
 def nothing_seen(view: ViewInput) -> str:
@@ -119,17 +126,18 @@ def nothing_seen(view: ViewInput) -> str:
 def _refusal_of(
     pose_input: CloudInput | ViewInput,
     points_m: Float[Tensor, "n 3"],
-    kept_m: Float[Tensor, "m 3"],
+    object_m: Float[Tensor, "m 3"],
     model: ObjectModel,
     cloud: CloudConfig,
 ) -> Refusal | None:
-    """Refuse a cloud by its place, its size and its shape; ``kept_m`` has no flying pixels."""
+    """Refuse a cloud by its place, its size and its shape; ``object_m``: without flying pixels."""
     if (few := refusal_of(points_m, cloud)) is not None:
         return Refusal(status="too few points", reason=few)
     # Of the object's size is what is left without flying pixels, if those are few.
-    sized_m = kept_m if len(kept_m) > _MOST * len(points_m) else points_m
+    sized_m = object_m if len(object_m) > _MOST * len(points_m) else points_m
     advice = unit_advice(model.diameter_m, sized_m)
-    # What was seen is wholly before the camera; a cloud about the origin is in no other axes.
+
+    # A camera sees only what lies before it: a cloud about the origin is in other axes.
     is_about_origin = float(points_m.median(0).values.norm()) < model.diameter_m / 2
     least_m = float(take_evenly(points_m[:, 2], 10_000).quantile(0.05))
     is_centred = is_about_origin and least_m < _BEFORE * model.diameter_m
@@ -140,7 +148,9 @@ def _refusal_of(
             "the frame of the model; give it in the camera's frame, as it was seen"
         )
     # Some background in the mask is not of another size.
-    elif not unusable and advice and not (sized_m is kept_m and "larger than the model" in advice):
+    elif (
+        not unusable and advice and not (sized_m is object_m and "larger than the model" in advice)
+    ):
         hint = ""
         if isinstance(pose_input, ViewInput):  # what else changes the size of a cloud
             mask = pose_input.mask.float()
@@ -155,9 +165,11 @@ def _refusal_of(
         unusable = f"{advice} (the object is {model.diameter_m:.3g} m long{hint})"
     if unusable is not None:
         return Refusal(status="unusable input", reason=unusable)
-    if (few := refusal_of(kept_m, cloud)) is not None:
+    if (few := refusal_of(object_m, cloud)) is not None:
         return Refusal(status="too few points", reason=few)
-    centred = kept_m.double() - kept_m.double().mean(0)
+
+    # A plane or a line can slide within itself.
+    centred = object_m.double() - object_m.double().mean(0)
     extent_m = torch.linalg.eigvalsh(centred.T @ centred / len(centred)).clamp(min=0).sqrt()
     flat = int((extent_m < _THIN * model.diameter_m).sum())
     if flat == 0:

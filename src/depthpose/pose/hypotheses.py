@@ -70,7 +70,7 @@ def compete(
     starts = Rigid.cat([others.double(), first @ copies.lookalikes])
     alike = Rigid.cat([copies.symmetries, copies.near_copies])
     leading = [hypothesis(refined)]
-    for candidate in _refined(cloud_m, refined, starts, surface, icp, _MOST_LEADING):
+    for candidate in _refine_competitors(cloud_m, refined, starts, surface, icp, _MOST_LEADING):
         before = Rigid.stack([h.pose for h in leading])
         pose = candidate.refined.camera_from_model
         if not bool(copies.is_same(pose, before, alike).any()):
@@ -82,31 +82,18 @@ def compete(
     others_shares = [(h, float(shares[k])) for k, h in enumerate(leading) if k != winner]
 
     # And which of its copies?
-    pose = leading[winner].pose
-    source = replace(
+    winning_pose = replace(
         refined,
-        camera_from_model=pose,
+        camera_from_model=leading[winner].pose,
         covariance=leading[winner].covariance,
         residual_m=refined.residual_m.new_tensor(leading[winner].residual_m),
     )
     group = [leading[winner]]
     if view is not None:
-        group = [replace(group[0], log_color=_log_color(pose, prepared, view))]
-    starts = pose @ copies.near_copies
-    if view is not None:  # print shows finer steps about an axis than shape does
-        starts = Rigid.cat([color_copies(pose, prepared.model, view), starts])
-    for candidate in _refined(cloud_m, source, starts, surface, icp, _MOST_COPIES):
-        before = Rigid.stack([h.pose for h in group])
-        # Refinement may slide a copy onto another, where nothing observed tells them apart: then
-        # it stays where the symmetry has it.
-        refined_copy = candidate.refined
-        if view is not None:
-            settled = settle_spin(refined_copy.camera_from_model, prepared.model, view)
-            refined_copy = replace(refined_copy, camera_from_model=settled)
-        for copy in (refined_copy, candidate.unrefined):
-            if not bool(copies.is_same(copy.camera_from_model, before, copies.symmetries).any()):
-                group.append(hypothesis(copy))
-                break
+        log_color = _log_color(leading[winner].pose, prepared, view)
+        group = [replace(leading[winner], log_color=log_color)]
+    for copy in _distinct_copies(cloud_m, winning_pose, prepared, icp, view):
+        group.append(hypothesis(copy))
     copy_shares = float(shares[winner]) * share_among_copies(group)
     best = int(copy_shares.argmax())
     return Competition(
@@ -117,6 +104,39 @@ def compete(
     )
 
 
+def _distinct_copies(
+    cloud_m: Float64[Tensor, "n 3"],
+    winning_pose: RefinedPose,
+    prepared: PreparedObject,
+    icp: IcpConfig | None,
+    view: ViewInput | None,
+) -> list[RefinedPose]:
+    """Refine the near-symmetric copies of a pose; give those that are no exact copies of others."""
+    copies = copies_of(prepared)
+    pose = winning_pose.camera_from_model
+    starts = pose @ copies.near_copies
+    if view is not None:  # print shows finer steps about an axis than shape does
+        starts = Rigid.cat([color_copies(pose, prepared.model, view), starts])
+    distinct: list[RefinedPose] = []
+    distinct_poses = [pose]
+    for candidate in _refine_competitors(
+        cloud_m, winning_pose, starts, prepared.surface, icp, _MOST_COPIES
+    ):
+        refined_copy = candidate.refined
+        if view is not None:
+            settled = settle_spin(refined_copy.camera_from_model, prepared.model, view)
+            refined_copy = replace(refined_copy, camera_from_model=settled)
+        # Refinement may slide a copy onto another, where nothing observed tells them apart: then
+        # it stays where the symmetry has it.
+        before = Rigid.stack(distinct_poses)
+        for copy in (refined_copy, candidate.unrefined):
+            if not bool(copies.is_same(copy.camera_from_model, before, copies.symmetries).any()):
+                distinct.append(copy)
+                distinct_poses.append(copy.camera_from_model.double())
+                break
+    return distinct
+
+
 def _by_best_print(
     leading: list[Hypothesis], prepared: PreparedObject, view: ViewInput, alike: Rigid
 ) -> list[Hypothesis]:
@@ -124,16 +144,16 @@ def _by_best_print(
 
     Poses whose best copies are one pose are copies of each other: the first stands for them.
     """
-    kept: list[Hypothesis] = []
+    distinct: list[Hypothesis] = []
     prints: list[Rigid] = []
     for hypothesis in leading:
         copies = color_copies(hypothesis.pose, prepared.model, view, turns=alike)
         likelihood = color_agreement(copies, prepared.model, view).log_likelihood
         best = copies[int(likelihood.argmax())]
-        if all(float(geodesic_rad(best.R, other.R)) > _SAME_PRINT_RAD for other in prints):
-            kept.append(replace(hypothesis, log_color=float(likelihood.max())))
+        if all(float(geodesic_rad(best.R, pose.R)) > _SAME_PRINT_RAD for pose in prints):
+            distinct.append(replace(hypothesis, log_color=float(likelihood.max())))
             prints.append(best)
-    return kept
+    return distinct
 
 
 class _Candidate(NamedTuple):
@@ -148,7 +168,7 @@ def _log_color(pose: Rigid, prepared: PreparedObject, view: ViewInput) -> float:
     return float(color_agreement(pose[None], prepared.model, view).log_likelihood[0])
 
 
-def _refined(
+def _refine_competitors(
     cloud_m: Float64[Tensor, "n 3"],
     leading: RefinedPose,
     starts: Rigid,
@@ -162,13 +182,15 @@ def _refined(
         return [_Candidate(candidate, candidate) for candidate in unrefined]
     if len(starts.R) == 0:
         return []
+    # Roughly, to drop those that leave too much of the cloud unexplained.
     rough = refine_roughly(cloud_m, starts, surface, icp)
-    every = Rigid.cat([leading.camera_from_model.double()[None], rough])
-    unexplained = _unexplained(cloud_m, every, surface)
+    leading_and_rough = Rigid.cat([leading.camera_from_model.double()[None], rough])
+    unexplained = _unexplained(cloud_m, leading_and_rough, surface)
     order = unexplained[1:].argsort(stable=True)[:most]
     order = order[unexplained[1:][order] <= unexplained[0] + _UNEXPLAINED_MORE]
     if len(order) == 0:
         return []
+    # Then exactly, a few steps for each.
     short = replace(
         icp,
         iterations=_STEPS,

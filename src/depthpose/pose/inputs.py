@@ -69,26 +69,28 @@ def depth_input(
     if values.ndim != 2:
         raise InputError(f"{name}: the depth is of shape {tuple(values.shape)}, not (h, w)")
     height, width = values.shape
-    is_said = isinstance(camera, str | Path | Mapping | float | int)
-    lens = camera_of(camera, (width, height)) if is_said else camera
-    said_m = lens.depth_unit_m if isinstance(lens, Camera) else None
-    file = str(depth) if isinstance(depth, str | Path) else name
-    given_m = None if unit is None else metres_of(unit)
+    is_described = isinstance(camera, str | Path | Mapping | float | int)
+    lens = camera_of(camera, (width, height)) if is_described else camera
+
+    # Metres: whole numbers have the unit of the option or of the camera; floats are metres.
+    camera_unit_m = lens.depth_unit_m if isinstance(lens, Camera) else None
+    unit_m = None if unit is None else metres_of(unit)
     if not values.is_floating_point():
-        if given_m is not None and said_m is not None and given_m != said_m:
+        file = str(depth) if isinstance(depth, str | Path) else name
+        if unit_m is not None and camera_unit_m is not None and unit_m != camera_unit_m:
             raise InputError(
-                f"{file}: unit {unit} is {given_m:g} m, but its camera says depth_unit_m "
-                f"{said_m:g}; omit one of the two (the unit of a CAD file is --cad-unit)"
+                f"{file}: unit {unit} is {unit_m:g} m, but its camera says depth_unit_m "
+                f"{camera_unit_m:g}; omit one of the two (the unit of a CAD file is --cad-unit)"
             )
-        given_m = said_m if given_m is None else given_m
-        if given_m is None:
+        unit_m = camera_unit_m if unit_m is None else unit_m
+        if unit_m is None:
             raise InputError(
                 f"{file}: its depth is in whole numbers, and nothing says of what; give a camera "
                 'with "depth_unit_m" (0.001 where they are millimetres, 0.0002 of TUM RGB-D, '
                 "0.00390625 of KITTI), --unit mm (in Python unit='mm'), or metres as floats"
             )
         values = values.double()
-    depth_m = torch.where(values > 0, values * (given_m or 1.0), torch.nan).float()
+    depth_m = torch.where(values > 0, values * (unit_m or 1.0), torch.nan).float()
     return depth_m, lens
 
 
@@ -103,6 +105,8 @@ def view_input(
     """Take a depth image, a mask and a camera to a view in metres."""
     depth_m, lens = depth_input(depth, camera, name, unit)
     height, width = depth_m.shape
+
+    # The mask, of this very image.
     pixels = torch.ones(height, width).bool()
     if mask is not None:
         mask_name = str(mask) if isinstance(mask, str | Path) else name
@@ -112,6 +116,8 @@ def view_input(
             f"{name}: the mask is of shape {tuple(pixels.shape)}, but the depth image of "
             f"{(height, width)}; give the mask of this very image"
         )
+
+    # The intrinsics, of an image of this size.
     if isinstance(lens, Camera):
         check_image_matches_camera(lens, width, height, name)
     K = lens.K if isinstance(lens, Camera) else intrinsics_of(lens)
