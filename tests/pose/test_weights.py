@@ -226,7 +226,7 @@ def broken(path: Path, change: str) -> Path:
         ("no models", "its config lists no 'models'"),
         ("no name", "model 0 has no 'name'"),
         ("no faces", "model 0 has no 'faces'"),
-        ("wild face", "a face of model 0 names vertex 10"),
+        ("wild face", "model 0: a face names vertex 10"),
         ("flat", "model 0 has tensors of shapes"),
         ("stray", "tensor 'models.1.faces' is unexpected"),
         ("lost weight", "final.bias is missing"),

@@ -20,7 +20,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import write_image
 from depthpose.core.run import claim_folder, environment
 from depthpose.pose.config import EvaluationConfig, ObjectsConfig
-from depthpose.pose.datasets import Instance
+from depthpose.pose.datasets import BopDataset, Instance
 from depthpose.pose.datasets.dataset import read_instance_mask
 from depthpose.pose.evaluate import frames_hash
 from depthpose.pose.network_pose import GeoPoseNet
@@ -108,6 +108,8 @@ def reproduce_by_object(
     refuse_below(0, "--pictures", options.pictures, "4")
     if data.folder is None:
         raise InputError(f"table {number}: give --linemod FOLDER, or --bop FOLDER.")
+
+    # The instances, the methods, and all that decides the numbers.
     dataset = pose_evaluate.open_instances(data.folder, data.split, data.objects, options.targets)
     models = tuple(dataset.objects.values())
     is_printed = number == "3.2"
@@ -132,6 +134,8 @@ def reproduce_by_object(
     }
     results = (*page.table_files("rows", "all", "instances", "risk"), "report.md", "report.html")
     claim_folder(out, settings, (*results, "predictions", "detections", "figures"))
+
+    # Predict what is missing, measure, and join with the published rows.
     shown = pose_methods.find_masks(options.masks, dataset, out, options.device) if methods else []
     folders = [
         pose_methods.predict_instances(dataset, method, masks, out)
@@ -140,39 +144,41 @@ def reproduce_by_object(
     ]
     measured = pose_evaluate.join(pose_evaluate.measure_each(dataset, [*folders, *csv], rule))
     rows = pose_tables.join_by_object(measured.rows, numbers, with_published=is_printed)
-    every = [row.columns() for row in measured.rows]
+    all_columns = [row.columns() for row in measured.rows]
     page.write_table(out, rows)
-    page.write_table(out, every, name="all")
-    sections: list[Section] = []
-    for folder in folders:
-        estimates = {p.estimate.name: p.estimate for p in read_predictions(folder)}
-        pictures: list[Picture] = []
-        for instance in (
-            dataset.instances[i] for i in page.spread_evenly(len(dataset), options.pictures)
-        ):
-            estimate = estimates.get(instance.name)
-            if estimate is None:  # of a detection: it bears no instance's name
-                continue
-            picture, K = close_up(picture_of(instance), read_instance_mask(instance), instance.K)
-            true = instance.camera_from_model
-            estimated = estimate.camera_from_model
-            model = dataset.objects[instance.object_id]
-            path = out / "figures" / folder.name / f"3-5_{instance.name}.jpg"
-            write_image(path, draw_pose(picture, estimated, model, K, true))
-            caption = instance.name if estimate.is_posed else f"{instance.name}: {estimate.reason}"
-            pictures.append(Picture(path=path, caption=caption))
-        if pictures:
-            title = f"Figure 3-5: {folder.name}"
-            sections.append(Section(title=title, text=_TEXTS["3-5"], pictures=pictures))
+    page.write_table(out, all_columns, name="all")
+
+    # The page: tables, then some instances of each method.
+    figures = [_figure_3_5(dataset, folder, out, options.pictures) for folder in folders]
     sections = [
         Section(title="Percent by object", text=f"{_HOW} {_DIFFERENCES[number]}", rows=rows),
-        Section(title="All numbers", text=pose_evaluate.HOW, rows=every),
-        *sections,
+        Section(title="All numbers", text=pose_evaluate.HOW, rows=all_columns),
+        *(figure for figure in figures if figure.pictures),
         *pose_evaluate.write_details(measured, out),
     ]
     title = f"{pose_tables.TITLES[number]}, on {dataset.folder.resolve().name}"
     write_report(title, sections, out)
     return 0
+
+
+def _figure_3_5(dataset: BopDataset, predictions: Path, out: Path, number: int) -> Section:
+    """Draw true and estimated poses of some instances that a method estimated."""
+    estimates = {p.estimate.name: p.estimate for p in read_predictions(predictions)}
+    pictures: list[Picture] = []
+    for index in page.spread_evenly(len(dataset), number):
+        instance = dataset.instances[index]
+        estimate = estimates.get(instance.name)
+        if estimate is None:  # of a detection: it bears no instance's name
+            continue
+        picture, K = close_up(picture_of(instance), read_instance_mask(instance), instance.K)
+        model = dataset.objects[instance.object_id]
+        drawn = draw_pose(picture, estimate.camera_from_model, model, K, instance.camera_from_model)
+        path = out / "figures" / predictions.name / f"3-5_{instance.name}.jpg"
+        write_image(path, drawn)
+        caption = instance.name if estimate.is_posed else f"{instance.name}: {estimate.reason}"
+        pictures.append(Picture(path=path, caption=caption))
+    title = f"Figure 3-5: {predictions.name}"
+    return Section(title=title, text=_TEXTS["3-5"], pictures=pictures)
 
 
 _HOW = (

@@ -196,10 +196,14 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
             f"{source}: version is {row['version']!r}, and this depthpose reads {VERSION}; read it "
             "with the depthpose that wrote it, or a newer one"
         )
+
+    # What it is of, and what became of it.
     name = row.get("name")
-    what = row.get("object")
-    if not isinstance(name, str) or not isinstance(what, str):
-        raise InputError(f"{source}: name and object are {name!r} and {what!r}; write two words")
+    object_name = row.get("object")
+    if not isinstance(name, str) or not isinstance(object_name, str):
+        raise InputError(
+            f"{source}: name and object are {name!r} and {object_name!r}; write two words"
+        )
     status = row.get("status")
     reason = row.get("reason", "")
     if status not in get_args(Status):
@@ -214,25 +218,8 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
             f"{source}: an estimate that is ok or ambiguous has a camera_from_model, a refused one "
             f"none; all but ok have a reason; its status is {status!r}"
         )
-    entries = row.get("alternatives", [])
-    alternatives = list[Alternative]()
-    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        raise InputError(f"{source}: alternatives are no list of poses; write [...] of them")
-    for k, entry in enumerate(entries):
-        where = f"{source}: alternative {k}"
-        other = _pose(entry, where)
-        if other is None:
-            raise InputError(f"{where}: has no camera_from_model; leave it out, or write it")
-        probability = number(entry, "probability", None, where)
-        words = str(entry.get("difference", ""))
-        alternatives.append(
-            Alternative(
-                camera_from_model=other,
-                probability=probability,
-                difference=words,
-                is_copy=bool(entry.get("is_copy", False)),
-            )
-        )
+
+    # The numbers that belong to it.
     values: dict[str, Any] = {
         "keypoints_m": _table(row, "keypoints_m", 3, source),
         "covariance": _table(row, "covariance", 6, source, rows=6),
@@ -252,12 +239,12 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
         values[key] = None if value is None else config_from_dict(value, kind, source=where)
     estimate = PoseEstimate(
         name=name,
-        object=what,
+        object=object_name,
         status=cast("Status", status),
         reason=str(reason),
         camera_from_model=pose,
         base_from_model=_pose(row, source, "base_from_model"),
-        alternatives=tuple(alternatives),
+        alternatives=_alternatives(row, source),
         tracking=cast("Tracking | None", tracking),
         pick_rank=None if row.get("pick_rank") is None else integer(row, "pick_rank", source),
         **values,
@@ -265,6 +252,28 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
     has_place = any(row.get(key) is not None for key in _PLACE)
     place = Place(*(integer(row, key, source) for key in _PLACE)) if has_place else None
     return Prediction(estimate=estimate, place=place)
+
+
+def _alternatives(row: dict[str, Any], source: str) -> tuple[Alternative, ...]:
+    """Read the other poses of an entry."""
+    entries = row.get("alternatives", [])
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise InputError(f"{source}: alternatives are no list of poses; write [...] of them")
+    alternatives: list[Alternative] = []
+    for k, entry in enumerate(entries):
+        where = f"{source}: alternative {k}"
+        pose = _pose(entry, where)
+        if pose is None:
+            raise InputError(f"{where}: has no camera_from_model; leave it out, or write it")
+        alternatives.append(
+            Alternative(
+                camera_from_model=pose,
+                probability=number(entry, "probability", None, where),
+                difference=str(entry.get("difference", "")),
+                is_copy=bool(entry.get("is_copy", False)),
+            )
+        )
+    return tuple(alternatives)
 
 
 def _pose(row: dict[str, Any], source: str, key: str = "camera_from_model") -> Rigid | None:

@@ -223,47 +223,21 @@ def read_pose_weights(path: Path) -> PoseWeights:
             f"in once: depthpose weights complete {word} --models FOLDER --out "
             f"{quote(path.stem + '-complete.safetensors')}, with the data set's folder."
         )
+
+    # The objects.
     parts = checkpoint.config
     records = parts.get("models")
     if not isinstance(records, list) or not records:
         raise InputError(f"{path}: its config lists no 'models', so nothing could be posed.")
+    models: list[ObjectModel] = []
     with refused_as(path, "file of pose weights", "it is damaged, or of another version"):
-        models: list[ObjectModel] = []
         for k, record in enumerate(records):
             prefix = f"models.{k}."
             stored = checkpoint.state.items()
             state = {n.removeprefix(prefix): t for n, t in stored if n.startswith(prefix)}
-            lost = [name for name in _TENSORS if name not in state]
-            lost += [name for name in ("name", "number", "diameter_m") if name not in record]
-            if lost:
-                raise InputError(
-                    f"{source}: model {k} has no {lost[0]!r}; the file is of another version."
-                )
-            vertices = state["vertices_m"]
-            faces = state["faces"].long()
-            shapes = {name: tuple(tensor.shape[1:]) for name, tensor in state.items()}
-            if set(shapes.values()) != {(3,)} or len(state["normals"]) != len(vertices):
-                raise InputError(
-                    f"{source}: model {k} has tensors of shapes {shapes}; each is (n, 3)."
-                )
-            if len(faces) and not 0 <= int(faces.min()) <= int(faces.max()) < len(vertices):
-                raise InputError(
-                    f"{source}: a face of model {k} names vertex {int(faces.max())} of "
-                    f"{len(vertices)}; the file is damaged."
-                )
-            models.append(
-                ObjectModel(
-                    name=str(record["name"]),
-                    number=int(record["number"]),
-                    vertices_m=vertices,
-                    faces=faces,
-                    normals=state["normals"],
-                    diameter_m=float(record["diameter_m"]),
-                    keypoints_m=state["keypoints_m"],
-                    symmetries=symmetries_from_bop(record, source=f"{source}: model {k}"),
-                    colors=_colors_of(state),
-                )
-            )
+            models.append(_model_of(record, state, f"{source}: model {k}"))
+
+    # No tensor but theirs and the network's.
     prefixes = ("network.", *(f"models.{k}." for k in range(len(models))))
     strays = [name for name in checkpoint.state if not name.startswith(prefixes)]
     if strays:
@@ -274,6 +248,35 @@ def read_pose_weights(path: Path) -> PoseWeights:
         cloud=config_from_dict(parts["cloud"], CloudConfig, source=source),
         refusal=config_from_dict(parts["refusal"], RefusalConfig, source=source),
         facts={name: fact for name, fact in checkpoint.facts.items() if name != "norm_mode"},
+    )
+
+
+def _model_of(record: Any, state: Mapping[str, Tensor], source: str) -> ObjectModel:  # noqa: ANN401
+    """Make an object of its entry in the config and its tensors; ``source`` is for errors."""
+    lost = [name for name in _TENSORS if name not in state]
+    lost += [name for name in ("name", "number", "diameter_m") if name not in record]
+    if lost:
+        raise InputError(f"{source} has no {lost[0]!r}; the file is of another version.")
+    vertices = state["vertices_m"]
+    faces = state["faces"].long()
+    shapes = {name: tuple(tensor.shape[1:]) for name, tensor in state.items()}
+    if set(shapes.values()) != {(3,)} or len(state["normals"]) != len(vertices):
+        raise InputError(f"{source} has tensors of shapes {shapes}; each is (n, 3).")
+    if len(faces) and not 0 <= int(faces.min()) <= int(faces.max()) < len(vertices):
+        raise InputError(
+            f"{source}: a face names vertex {int(faces.max())} of {len(vertices)}; the file is "
+            "damaged."
+        )
+    return ObjectModel(
+        name=str(record["name"]),
+        number=int(record["number"]),
+        vertices_m=vertices,
+        faces=faces,
+        normals=state["normals"],
+        diameter_m=float(record["diameter_m"]),
+        keypoints_m=state["keypoints_m"],
+        symmetries=symmetries_from_bop(record, source=source),
+        colors=_colors_of(state),
     )
 
 

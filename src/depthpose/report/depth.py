@@ -16,7 +16,7 @@ from depthpose.core.draw import (
 )
 from depthpose.core.files import Cloud
 from depthpose.depth.predictions import COLOR_RANGE_M
-from depthpose.depth.types import DepthError, DepthEstimate, StereoInput
+from depthpose.depth.types import DepthError, DepthEstimate, Map, StereoInput
 from depthpose.report.page import (
     Drawing,
     Layer,
@@ -52,22 +52,8 @@ def depth_section(
 
     The colours of depth go from bright to dark over ``range_m``.
     """
-    near_m, far_m = range_m
-    facts = depth_facts(pair, estimate)
+    _, far_m = range_m
     grey = "grey: none" if estimate.is_sky is None else "grey: sky or no answer"
-    true_m = None if error is None else error.true_depth_m
-    scenes: list[Scene] = []
-    if estimate.depth_m is not None and (camera := pair.camera) is not None:
-        scenes = [depth_scene(pair, estimate, far_m, f"{title}: the cloud")]
-        if true_m is not None:
-            points_m = back_project(true_m, camera.K).reshape(-1, 3).float()
-            points_m = points_m[points_m.isfinite().all(-1) & (points_m[:, 2] <= far_m)]
-            points_m = take_evenly(points_m, _TRUE_POINTS)
-            color = torch.tensor(_TRUE).expand(len(points_m), 3)
-            layer = Layer(name="true points", shape=Cloud(points=points_m, color=color))
-            caption = f"{scenes[0].caption}; the truth in green"
-            layers = [*scenes[0].layers, layer]
-            scenes = [Scene(caption=caption, layers=layers)]
     pictures = [Drawing(image=pair.left, caption="image")] if with_image else []
     if estimate.depth_m is None:
         disparity = Drawing(
@@ -84,32 +70,7 @@ def depth_section(
         )
         pictures.append(depth)
     if error is not None:
-        wrong = error.error
-        left = pair.left
-        is_sparse = float(wrong.isfinite().double().mean()) < _SPARSE
-        note = "over the dimmed image" if is_sparse else "grey: not compared"
-        if error.is_disparity:
-            top = WORST_PX
-            what = "disparity error"
-            scale = rising_scale("disparity error [px]", top, has_more=True)
-        else:
-            top = WORST_SHARE
-            what = "depth error as a share of the truth"
-            scale = rising_scale("depth error [%]", 100 * top, has_more=True)
-        if true_m is not None:
-            if is_sparse:
-                image = draw_points(left, true_m, far_m, _RADIUS_PX, near_m)
-            else:
-                image = draw_depth(true_m, near_m, far_m)
-            caption = f"true depth; {note}"
-            bar = depth_scale(near_m, far_m)
-            pictures.append(Drawing(image=image, caption=caption, scale=bar))
-        if is_sparse:
-            image = draw_error_points(left, wrong, top, _RADIUS_PX)
-        else:
-            image = draw_share(1 - wrong / top)
-        caption = f"{what}: dark is right, bright is wrong; {note}"
-        pictures.append(Drawing(image=image, caption=caption, scale=scale))
+        pictures += _error_drawings(pair, error, range_m)
     if estimate.confidence is not None:
         confidence = Drawing(
             image=draw_share(1 - estimate.confidence),
@@ -119,7 +80,62 @@ def depth_section(
         pictures.append(confidence)
     if estimate.right is not None:
         pictures.append(Drawing(image=estimate.right, caption="right view as drawn"))
+
+    scenes: list[Scene] = []
+    if estimate.depth_m is not None and pair.camera is not None:
+        scene = depth_scene(pair, estimate, far_m, f"{title}: the cloud")
+        if error is not None and error.true_depth_m is not None:
+            scene = _with_truth(scene, error.true_depth_m, pair.camera, far_m)
+        scenes.append(scene)
+    facts = depth_facts(pair, estimate)
     return Section(title=title, text=text, facts=facts, pictures=pictures, scenes=scenes)
+
+
+def _error_drawings(
+    pair: StereoInput, error: DepthError, range_m: tuple[float, float]
+) -> list[Drawing]:
+    """Draw the true depth, where it is known, and the error of each pixel.
+
+    Few pixels, as of LiDAR, are drawn as points over the dimmed image.
+    """
+    near_m, far_m = range_m
+    is_sparse = float(error.error.isfinite().double().mean()) < _SPARSE
+    note = "over the dimmed image" if is_sparse else "grey: not compared"
+    drawings: list[Drawing] = []
+    if error.true_depth_m is not None:
+        if is_sparse:
+            image = draw_points(pair.left, error.true_depth_m, far_m, _RADIUS_PX, near_m)
+        else:
+            image = draw_depth(error.true_depth_m, near_m, far_m)
+        scale = depth_scale(near_m, far_m)
+        drawings.append(Drawing(image=image, caption=f"true depth; {note}", scale=scale))
+
+    if error.is_disparity:
+        worst = WORST_PX
+        what = "disparity error"
+        scale = rising_scale("disparity error [px]", worst, has_more=True)
+    else:
+        worst = WORST_SHARE
+        what = "depth error as a share of the truth"
+        scale = rising_scale("depth error [%]", 100 * worst, has_more=True)
+    if is_sparse:
+        image = draw_error_points(pair.left, error.error, worst, _RADIUS_PX)
+    else:
+        image = draw_share(1 - error.error / worst)
+    caption = f"{what}: dark is right, bright is wrong; {note}"
+    drawings.append(Drawing(image=image, caption=caption, scale=scale))
+    return drawings
+
+
+def _with_truth(scene: Scene, true_m: Map, camera: Camera, far_m: float) -> Scene:
+    """Add the points of the true depth to a scene, in green, up to ``far_m``."""
+    points_m = back_project(true_m, camera.K).reshape(-1, 3).float()
+    points_m = points_m[points_m.isfinite().all(-1) & (points_m[:, 2] <= far_m)]
+    points_m = take_evenly(points_m, _TRUE_POINTS)
+    color = torch.tensor(_TRUE).expand(len(points_m), 3)
+    layer = Layer(name="true points", shape=Cloud(points=points_m, color=color))
+    caption = f"{scene.caption}; the truth in green"
+    return Scene(caption=caption, layers=[*scene.layers, layer])
 
 
 def depth_facts(
