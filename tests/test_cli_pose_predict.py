@@ -148,7 +148,7 @@ def test_a_depth_image_alone_is_searched(
     assert "\n2 inputs, 3 answers: 1 doubtful, 2 ok; " in capsys.readouterr().out
     rows = poses_of(out)
     assert sorted(rows) == ["two_0", "two_1", "wall"]
-    assert rows["wall"]["reason"].startswith("nothing beside the planes of the image is surely")
+    assert rows["wall"]["reason"].startswith("nothing before the background of the image is surely")
     for name in ("two_0", "two_1"):
         assert (out / f"{name}.pose.png").is_file()
         assert len(read_cloud(out / f"{name}.pose.ply").points) > 5000

@@ -309,16 +309,26 @@ def judged(
     )
 
 
+TARGETS = SearchTargets(
+    names=["a"], estimate_near=MagicMock(), min_probability=0.5,
+    object_of=MagicMock(**{"return_value.surface.middle_m": torch.zeros(3)}),
+)  # fmt: skip
+
+
 def test_what_may_be_either_of_two_objects_stays_unanswered_in_later_rounds() -> None:
     both = [judged("a", 2.0, slice(0, 10)), judged("b", 1.9, slice(0, 10))]
-    kept, taken = search._suppress(both, [])
+    kept, taken, misses = search._suppress(both, [], TARGETS)
     assert kept == []
-    assert search._suppress(both[:1], taken)[0] == []
+    assert {miss.object: miss.reason for miss in misses} == {
+        "a": "what lies there may be b as well",
+        "b": "what lies there is more likely a",
+    }
+    assert search._suppress(both[:1], taken, TARGETS)[0] == []
 
 
 def test_the_object_whose_pose_is_contradicted_less_is_answered() -> None:
     both = [judged("a", 4.0, slice(0, 10)), judged("b", -4.0, slice(0, 10), seen_through=12.0)]
-    (kept,), _ = search._suppress(both, [])
+    (kept,), _, _ = search._suppress(both, [], TARGETS)
     assert kept.object == "a"
     assert kept.estimate.certainty is not None
     assert 0.8 < kept.estimate.certainty < 1
@@ -331,13 +341,13 @@ def test_what_lies_on_something_surer_is_no_rival_of_what_is_beside_it() -> None
         judged("b", 4.0, slice(13, 33), 1),
         judged("c", 2.0, slice(20, 40), 2),
     ]
-    kept, _ = search._suppress(answers, [])
+    kept, _, _ = search._suppress(answers, [], TARGETS)
     assert [(place.object, place.estimate.object) for place in kept] == [("a", "a"), ("c", "c")]
 
 
 def test_poses_of_one_object_on_the_same_readings_are_one_answer() -> None:
     answers = [judged("a", 3.0, slice(0, 20)), judged("a", 2.0, slice(10, 24), 1)]
-    kept, _ = search._suppress(answers, [])
+    kept, _, _ = search._suppress(answers, [], TARGETS)
     assert [place.log_odds for place in kept] == [3.0]
 
 
@@ -348,12 +358,6 @@ def of_one_object(*log_odds: float) -> list["search._Judged"]:
         replace(place, estimate=replace(place.estimate, certainty=1 / (1 + math.exp(-odds))))
         for place, odds in zip(places, log_odds, strict=True)
     ]
-
-
-TARGETS = SearchTargets(
-    names=["a"], estimate_near=MagicMock(), min_probability=0.5,
-    object_of=MagicMock(**{"return_value.surface.middle_m": torch.zeros(3)}),
-)  # fmt: skip
 
 
 def test_a_second_place_needs_more_than_the_first() -> None:

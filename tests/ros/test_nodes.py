@@ -26,7 +26,8 @@ from depthpose.depth.synthetic import Streets
 from depthpose.depth.types import StereoSample
 from depthpose.pose.config import MeshConfig
 from depthpose.pose.mesh import make_model
-from depthpose.pose.types import Alternative, PoseEstimate
+from depthpose.pose.search import nothing_found
+from depthpose.pose.types import Alternative, PoseEstimate, ViewInput
 from depthpose_ros.messages import depth_of
 from depthpose_ros.work import DepthFromImage, DepthFromPair, Poses
 
@@ -177,12 +178,11 @@ class KnowsPose:
         other = Alternative(camera_from_model=turned, probability=0.04, difference="upside down")
         return PoseEstimate(
             name="input", object="cup", status="ok", camera_from_model=self.pose, certainty=0.95,
-            covariance=torch.eye(6) * 1e-6, alternatives=(other,),
+            covariance=torch.eye(6) * 1e-6, alternatives=(other,), pick_rank=1,
         )  # fmt: skip
 
-    def find(self, depth_m: np.ndarray, camera: Camera, objects: object) -> list[Any]:  # noqa: ARG002
-        self.asked = (depth_m.shape, objects)
-        return [self.answer()]
+    def find_in(self, view: ViewInput, objects: list[str]) -> list[Any]:
+        return [self.answer(), *(nothing_found(view, name, [], 0.0) for name in objects[1:])]
 
     def estimate(self, *, mask: np.ndarray, object: str, **_: object) -> Any:  # noqa: ANN401, ARG002
         if mask.any():
@@ -335,7 +335,8 @@ def test_the_service_answers_one_image(
     assert (found.missing, found.reasons) == ([], [])
     # What is asked for and not found has a row too.
     both = ask(objects=["cup", "plate"])
-    assert (both.ids, both.missing, len(both.reasons)) == (["cup"], ["plate"], 1)
+    assert (both.ids, both.missing, both.pick_ranks) == (["cup"], ["plate"], [1])
+    assert "is surely plate" in both.reasons[0]
     pixels = np.zeros((depth.height, depth.width), np.uint8)
     mask = SimpleNamespace(
         header=depth.header, height=depth.height, width=depth.width, encoding="mono8",

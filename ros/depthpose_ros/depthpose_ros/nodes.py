@@ -191,10 +191,7 @@ class PosesNode(WorkNode):
             return response
         header = messages.copied_header(request.depth)
         found = [one for one in estimates if one.camera_from_model is not None]
-        refused = {one.object: one.reason for one in estimates if one.camera_from_model is None}
-        there = {one.object for one in found}
-        asked = objects or ([self._poses.object] if self._poses.object else list(self._models))
-        missing = [name for name in asked if name not in there] if mask is None else [*refused]
+        refused = [one for one in estimates if one.camera_from_model is None]
         response.success = True
         response.ids = [one.object for one in found]
         response.scores = [score_of(one) for one in found]
@@ -203,11 +200,10 @@ class PosesNode(WorkNode):
             for one in found
             if one.camera_from_model is not None
         ]
-        response.missing = missing
-        response.reasons = [
-            refused.get(name, "the image was searched for it, and nothing that fits was found")
-            for name in missing
-        ]
+        response.visible_shares = [one.visible_share or 0.0 for one in found]
+        response.pick_ranks = [one.pick_rank or 0 for one in found]
+        response.missing = [one.object for one in refused]
+        response.reasons = [one.reason for one in refused]
         return response
 
 

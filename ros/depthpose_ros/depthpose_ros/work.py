@@ -8,6 +8,7 @@ from typing import Any
 from depthpose import FakestereoNet, GeoPoseNet, Registration
 from depthpose.core.errors import InputError
 from depthpose.pose.datasets import number_objects
+from depthpose.pose.inputs import view_input
 from depthpose.pose.types import PoseEstimate
 from depthpose_ros.messages import (
     Image,
@@ -94,7 +95,7 @@ class Poses:
         mask: Any = None,  # noqa: ANN401
         objects: Sequence[str] | None = None,
     ) -> list[PoseEstimate]:
-        """Estimate what is there, the surest first; with a mask also what is refused.
+        """Estimate what is there, the surest first, and say why of what is not found.
 
         A mask that numbers several objects (1, 2, ...) shows an instance of one object a number.
         ``objects``: which may be there, in place of that of the node.
@@ -105,7 +106,9 @@ class Poses:
         depth_m, camera = depth_of(depth), camera_of(info)
         wanted = ([] if self.object is None else [self.object]) if objects is None else [*objects]
         if mask is None:
-            return self.net.find(depth_m, camera, wanted or None)
+            names = wanted or [*self.net.objects]
+            view = view_input(depth_m, None, camera, names[0], "depth")
+            return self.net.find_in(view, names)
         if len(wanted) > 1:
             raise InputError(
                 f"a mask is of one object, and {', '.join(wanted)} are asked for; ask for one, or "

@@ -164,9 +164,11 @@ def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
         groups = _group(_propose(frame, is_unclaimed, names, targets), taken, frame, targets)
         judged, missed = _judge(groups, frame, view, targets)
         misses += missed
-        if targets.is_single:  # what lies mostly beside the region is something else
-            judged = [p for p in judged if float(is_unclaimed[p.explained].double().mean()) > 0.5]
-        more, taken = _suppress(judged, taken)
+        if targets.is_single:
+            judged, missed = _within(judged, is_unclaimed, targets)
+            misses += missed
+        more, taken, missed = _suppress(judged, taken, targets)
+        misses += missed
         accepted += more
         for place in more:
             is_unclaimed &= ~place.explained
@@ -367,19 +369,40 @@ def probability_of_instances(log_odds: Float64[Tensor, " n"]) -> Float64[Tensor,
     return many * by_itself + (1 - many) * none_or_one.softmax(0)[1:]
 
 
+def _within(
+    judged: Sequence[_Judged], is_region: Bool[Tensor, "h w"], targets: SearchTargets
+) -> tuple[list[_Judged], list[_Miss]]:
+    """Separate places that lie mostly beside a region: they are of something else."""
+    inside: list[_Judged] = []
+    misses: list[_Miss] = []
+    for place in judged:
+        if float(is_region[place.explained].double().mean()) > 0.5:
+            inside.append(place)
+        else:
+            reason = "most of it lies beside the box"
+            misses.append(_miss_at(place, place.estimate.evidence, reason, targets))
+    return inside, misses
+
+
 def _suppress(
-    judged: Sequence[_Judged], before: Sequence[_Judged]
-) -> tuple[list[_Judged], list[_Judged]]:
+    judged: Sequence[_Judged], before: Sequence[_Judged], targets: SearchTargets
+) -> tuple[list[_Judged], list[_Judged], list[_Miss]]:
     """Non-maximum suppression: in order of probability, keep what explains other readings.
 
     Returns:
-        What is kept; and all whose readings are taken, by what may be one of several objects too.
+        What is kept; all whose readings are taken, by what may be one of several objects too; and
+        places at which an object is not kept for the sake of another.
     """
     kept: list[_Judged] = []
+    misses: list[_Miss] = []
     taken = list(before)
     ranked = sorted(judged, key=lambda place: -place.log_odds)
     for number, place in enumerate(ranked):
-        if any(place.shared_with(other) > _SHARED for other in taken):
+        surer = next((other for other in taken if place.shared_with(other) > _SHARED), None)
+        if surer is not None:
+            if surer.object != place.object:
+                reason = f"what lies there is more likely {surer.object}"
+                misses.append(_miss_at(place, place.estimate.evidence, reason, targets))
             continue
         taken.append(place)
         rivals = {place.object: place}
@@ -387,9 +410,13 @@ def _suppress(
             if place.shared_with(other) > _RIVAL:
                 rivals.setdefault(other.object, other)
         estimate, share = choose_object_of_place(list(rivals.values()))
-        if share >= _LEAST_SHARE:  # else it may be another object
+        if share >= _LEAST_SHARE:
             kept.append(replace(place, estimate=estimate))
-    return kept, taken
+        else:
+            others = ", ".join(name for name in rivals if name != place.object)
+            reason = f"what lies there may be {others} as well"
+            misses.append(_miss_at(place, place.estimate.evidence, reason, targets))
+    return kept, taken, misses
 
 
 def explained_mask(image: Frame | ViewInput, pose: Rigid, surface: Surface) -> Bool[Tensor, "h w"]:
@@ -511,14 +538,19 @@ def nothing_found(
     if len(read_m) == 0:
         return PoseEstimate(status="too few points", reason=nothing_seen(view), **facts)
     reason = (
-        f"nothing beside the planes of the image is surely {object}; its depths are "
+        f"nothing before the background of the image is surely {object}; its depths are "
         f"{float(read_m.min()):.3g} to {float(read_m.max()):.3g} m: if they are right, give a "
         "mask, or look from nearer by"
     )
-    if misses:
+    if not misses:
+        reason += ". No place in it is enough like the object to be compared"
+    else:
         nearest = max(misses, key=lambda miss: miss.agreement)
         x, y, z = nearest.middle_m.tolist()
-        reason += f". The nearest miss, at ({x:.3f}, {y:.3f}, {z:.3f}) m: {nearest.reason}"
+        reason += (
+            f". Of {len(misses)} places that were compared the nearest miss, at ({x:.3f}, {y:.3f}, "
+            f"{z:.3f}) m: {nearest.reason}"
+        )
     return PoseEstimate(status="doubtful", reason=reason, **facts)
 
 
