@@ -175,8 +175,24 @@ def test_a_folder_of_yolo_s_text_is_posed(
     assert "no file of detections called '000013'" in capsys.readouterr().err
     (tmp_path / "labels" / "000013.txt").write_text("")
     assert main(words) == 0
-    assert "nothing is detected in 1 of 2 depth images: 000013" in capsys.readouterr().err
-    assert_right(answers(tmp_path), {"000012": "bracket"})
+    rows = answers(tmp_path)
+    missing = rows.pop("000013")
+    assert_right(rows, {"000012": "bracket"})
+    assert (missing["object"], missing["status"]) == ("bracket", "too few points")
+    assert "nothing of it is detected in this image" in missing["reason"]
+    page = read_page(tmp_path / "out/report.html")
+    assert any("nothing of it is detected" in cell for cell in page.texts["td"])
+
+
+def test_what_a_detector_did_not_find_has_a_row(scene: Scene, tmp_path: Path) -> None:
+    words, masks = scene
+    file = tmp_path / "found.json"
+    file.write_text(json.dumps(coco({"bracket": masks["bracket"]}, 12)))
+    words += ["--detections", str(file), "--labels", "1=bracket,2=bottle"]
+    assert main(words) == 0
+    rows = answers(tmp_path)
+    assert rows.pop("000012_2")["object"] == "bottle"
+    assert_right(rows, {"000012_1": "bracket"})
 
 
 def test_a_label_map_shows_several_objects(

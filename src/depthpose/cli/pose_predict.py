@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 from tqdm import tqdm
@@ -247,7 +248,8 @@ def _labelled_masks(
         )
     objects = {int(label): name for label, name in labels.items()}
     numbered = read_labels(mask, list(objects))
-    shown = [k for k in numbered[numbered != 0].unique().tolist() if objects[k]]
+    # What is asked for and is not there has an empty mask, and so a refusal.
+    shown = [k for k in sorted(objects) if objects[k]]
     return {
         f"_{k}": (objects[k], _run_lengths(numbered == k))
         for k in shown
@@ -285,13 +287,15 @@ def detection_jobs(
     detections: Path,
     camera: Path | float,
     objects: tuple[Mapping[str, str], Sequence[str], str | None],
+    asked: Sequence[str],
     unit: Unit | None,
     out: Path,
 ) -> list[PoseJob[Any]]:
     """Take what a detector found in depth images: NAME, or of several NAME_1 (the surest), ...
 
     ``detections``: a file, or a folder of files with the names of the images. ``objects``: labels,
-    known names and the wanted one, as :func:`name_objects` takes them.
+    known names and the wanted one, as :func:`name_objects` takes them. ``asked``: objects that have
+    a job in every image, whether they are detected there or not.
     """
     depths = _list_depths(depth)
     _refuse_one_name(depths)
@@ -315,17 +319,15 @@ def detection_jobs(
                 size = (width, height)
             by_image[path.stem] = read_detections(file, size)
     jobs: list[PoseJob[Any]] = []
-    empty: list[str] = []
+    is_any = False
     for path in depths:
         of_image = name_objects(by_image[path.stem], *objects, source=str(beside[path.stem]))
         of_image.sort(key=lambda detection: -detection.score)
-        jobs += _detection_jobs(path, of_image, (path, beside[path.stem]), camera, unit)
-        empty += [] if of_image else [path.stem]
-    if empty:
-        shown = ", ".join(empty[:_MOST_PRINTED]) + (", ..." if len(empty) > _MOST_PRINTED else "")
-        message = f"nothing is detected in {len(empty)} of {len(depths)} depth images: {shown}"
-        print(f"depthpose: {message}", file=sys.stderr)
-    if not jobs:
+        is_any |= bool(of_image)
+        detected = {detection.object for detection in of_image}
+        absent = [name for name in asked if name not in detected]
+        jobs += _detection_jobs(path, of_image, (path, beside[path.stem]), camera, unit, absent)
+    if not is_any:
         raise InputError(f"{detections}: holds no detection of what is asked for in {depth}")
     _refuse_twice(jobs, depth)
     return jobs
@@ -337,23 +339,35 @@ def _detection_jobs(
     files: tuple[Path, ...],
     camera: Path | float,
     unit: Unit | None,
+    absent: Sequence[str] = (),
 ) -> list[PoseJob[Any]]:
-    """Make a job of each detection in a depth image: NAME, or of several NAME_1, NAME_2, ..."""
+    """Make a job of each detection in a depth image: NAME, or of several NAME_1, NAME_2, ...
+
+    ``absent``: objects that are not detected there, which have one too.
+    """
     jobs: list[PoseJob[Any]] = []
-    for k, detection in enumerate(detections, 1):
-        assert detection.object is not None
-        name = path.stem + (f"_{k}" if len(detections) > 1 else "")
-        read = partial(_read_detection, path, detection, camera, name, unit)
-        jobs.append(PoseJob(name=name, read=read, object=detection.object, source=files))
+    every = [(detection.object, detection) for detection in detections]
+    every += [(object, None) for object in absent]
+    for k, (object, detection) in enumerate(every, 1):
+        assert object is not None
+        name = path.stem + (f"_{k}" if len(every) > 1 else "")
+        read = partial(_read_detection, path, object, detection, camera, name, unit)
+        jobs.append(PoseJob(name=name, read=read, object=object, source=files))
     return jobs
 
 
 def _read_detection(
-    path: Path, detection: Detection, camera: AnyLens, name: str, unit: Unit | None
+    path: Path,
+    object: str,
+    detection: Detection | None,
+    camera: AnyLens,
+    name: str,
+    unit: Unit | None,
 ) -> ViewInput:
-    """Read a depth image with the pixels of a detection."""
-    assert detection.object is not None
-    view = view_input(path, None, camera, detection.object, name, unit)
+    """Read a depth image with the pixels of a detection; with no pixel where there is none."""
+    view = view_input(path, None, camera, object, name, unit)
+    if detection is None:
+        return replace(view, mask=torch.zeros_like(view.mask), is_region=True)
     mask = detection.mask(*view.depth_m.shape)
     return replace(view, mask=mask, is_region=detection.box is not None)
 
@@ -564,7 +578,12 @@ def region_jobs(
     if inputs.detections is not None:
         settings["detections"] = str(Path(inputs.detections).resolve())
         objects = (labels or {}, known_names, wanted)
-        return detection_jobs(depth, Path(inputs.detections), lens, objects, unit, out)
+        asked = [] if method.holder == "weights" else known_names  # CAD files are asked for
+        asked = (
+            asked if labels is None else [name for name in dict.fromkeys(labels.values()) if name]
+        )
+        asked = asked if wanted is None else [wanted]
+        return detection_jobs(depth, Path(inputs.detections), lens, objects, asked, unit, out)
     if inputs.box:
         settings["box"] = list(inputs.box)
         name = object_named(inputs.object, method)
@@ -888,7 +907,9 @@ def start_files(
             read = partial(cloud_input, cloud, unit or "m", object, sample.name)
         elif box is not None:
             detection = Detection(object=object, box=box)
-            read = partial(_read_detection, sample.files[0], detection, camera, sample.name, unit)
+            read = partial(
+                _read_detection, sample.files[0], object, detection, camera, sample.name, unit
+            )
         else:
             depth, mask = sample.files
             read = partial(view_input, depth, mask, camera, object, sample.name, unit)

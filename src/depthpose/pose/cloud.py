@@ -114,6 +114,8 @@ def _why_empty(pose_input: CloudInput | ViewInput) -> str:
 def nothing_seen(view: ViewInput) -> str:
     """Say why no masked pixel of a view has a depth."""
     masked = int(view.mask.sum())
+    if masked == 0 and view.is_region:
+        return "nothing of it is detected in this image: there is no box or mask of it"
     if masked == 0:
         return "the mask is empty: no pixel of it is the object"
     if not bool((view.depth_m > 0).any()):
