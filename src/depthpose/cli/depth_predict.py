@@ -97,10 +97,12 @@ class DepthMethodSource:
         if isinstance(self.weights, Weights):
             with self.weights.unpacked() as file:
                 return replace(self, weights=file).build()
+
+        # Refused before anything is read; the precision that is recorded is the one computed in.
         device = device_of_process(self.config.device)
-        usable_device(device)  # refused before anything is read
+        usable_device(device)
         is_bf16 = usable_precision(self.config.precision, device) == "bf16"
-        precision = "bf16" if is_bf16 else "fp32"  # what is computed in is what is recorded
+        precision = "bf16" if is_bf16 else "fp32"
         config = replace(self.config, precision=precision, device=device)
         path = find_weights(self.weights)
         kind = read_checkpoint(path).kind
@@ -111,6 +113,8 @@ class DepthMethodSource:
                 f"{path}: matches pairs, but depth from one image is asked for. Give weights that "
                 "synthesise the right view."
             )
+
+        # Its name in tables, and what decides its results.
         facts: dict[str, Any] = {"matcher": kind, "weights": path.stem}
         facts["weights_sha256"] = file_sha256(path)
         if not is_matcher:
@@ -134,10 +138,15 @@ class DepthMethodSource:
                 facts["matcher_sha256"] = file_sha256(matcher)
             name = f"{path.stem}-{other}"
             facts["matcher"] = f"{kind} with {other}"
+
         net = FakestereoNet.load(
-            path, matcher=matcher, config=config, answer=answer, allow_ood=self.allow_ood,
+            path,
+            matcher=matcher,
+            config=config,
+            answer=answer,
+            allow_ood=self.allow_ood,
             use=self.use,
-        )  # fmt: skip
+        )
         if with_right and net.matcher is None:
             raise InputError(
                 f"{path}: answers depth of one image, and holds no matcher, which a pair needs. "
@@ -170,52 +179,61 @@ def read_lens(options: LensOptions, sources: Sequence[Path]) -> Camera | FieldOf
         raise InputError(f"--focal-px {focal_px}: not a focal length in pixels; KITTI's is 721.5.")
     if fov is not None:
         return FieldOfView(fov)
-    if options.camera is None and focal_px is None:  # what the EXIF of all images says
-        focal_of: dict[str, tuple[float, str]] = {}
-        for source in sources:
-            try:
-                focal = None if _is_video(source) else read_exif_focal(source)
-            except InputError:  # what cannot be read fails by itself, later
-                continue
-            if focal is None:
-                raise InputError(
-                    f"metres from one image need its focal length, and {source.name} has none in "
-                    "its EXIF: give --camera FILE, --focal-px, or --fov, the angle from left to "
-                    "right (a phone's main camera has about 0.75 times the image's width, or 67 "
-                    "degrees)"
-                )
-            focal_of[source.name] = focal
-        if not focal_of:
-            raise InputError(
-                "no image can be read; give --camera, --focal-px or --fov, and intact ones"
-            )
-        (first, (focal_px, tags)), *others = focal_of.items()
-        for other, (other_px, _) in others:
-            if abs(other_px / focal_px - 1) > _SAME_FOCAL:
-                raise InputError(
-                    f"the EXIF of {first} says a focal length of {focal_px:.0f} px and that of "
-                    f"{other} {other_px:.0f} px; predict them apart"
-                )
-        print(f"a focal length of {focal_px:.0f} px, by the EXIF of {first} ({tags}); of a cropped "
-              "picture it is another", file=sys.stderr)  # fmt: skip
     if options.camera is None:
-        assert focal_px is not None
-        return focal_px
-    size = None  # of the images, for a camera file that says none
+        return _exif_focal_px(sources) if focal_px is None else focal_px
+
+    camera = read_camera(options.camera, _size_of_first(sources))
+    if not isinstance(camera, StereoRig):
+        return camera
+    print("the camera's baseline is ignored: one image has none", file=sys.stderr)
+    keys = {key: getattr(camera, key) for key in ("mount_height_m", "tilt_deg")}
+    return Camera(width=camera.width, height=camera.height, K=camera.K, **keys)
+
+
+def _exif_focal_px(sources: Sequence[Path]) -> float:
+    """Give the focal length [px] on which the EXIF of all images agrees, and print it."""
+    focal_of: dict[str, tuple[float, str]] = {}
     for source in sources:
-        with suppress(InputError):  # an image that cannot be read fails by itself, later
-            if _is_video(source):
-                _, frame = next(iter(read_video(source)))
-                size = frame.shape[2], frame.shape[1]
-            else:
-                size = image_size(source)
-            break
-    read = read_camera(options.camera, size)
-    if isinstance(read, StereoRig):
-        print("the camera's baseline is ignored: one image has none", file=sys.stderr)
-        keys = {key: getattr(read, key) for key in ("mount_height_m", "tilt_deg")}
-        return Camera(width=read.width, height=read.height, K=read.K, **keys)
-    return read
+        try:
+            focal = None if _is_video(source) else read_exif_focal(source)
+        except InputError:  # what cannot be read fails by itself, later
+            continue
+        if focal is None:
+            raise InputError(
+                f"metres from one image need its focal length, and {source.name} has none in "
+                "its EXIF: give --camera FILE, --focal-px, or --fov, the angle from left to "
+                "right (a phone's main camera has about 0.75 times the image's width, or 67 "
+                "degrees)"
+            )
+        focal_of[source.name] = focal
+    if not focal_of:
+        raise InputError(
+            "no image can be read; give --camera, --focal-px or --fov, and intact ones"
+        )
+    (first, (focal_px, tags)), *others = focal_of.items()
+    for other, (other_px, _) in others:
+        if abs(other_px / focal_px - 1) > _SAME_FOCAL:
+            raise InputError(
+                f"the EXIF of {first} says a focal length of {focal_px:.0f} px and that of "
+                f"{other} {other_px:.0f} px; predict them apart"
+            )
+    print(
+        f"a focal length of {focal_px:.0f} px, by the EXIF of {first} ({tags}); of a cropped "
+        "picture it is another",
+        file=sys.stderr,
+    )
+    return focal_px
+
+
+def _size_of_first(sources: Sequence[Path]) -> tuple[int, int] | None:
+    """Give width and height [px] of the first image or video that can be read, None if none can."""
+    for source in sources:
+        with suppress(InputError):  # what cannot be read fails by itself, later
+            if not _is_video(source):
+                return image_size(source)
+            _, frame = next(iter(read_video(source)))
+            return (frame.shape[2], frame.shape[1])
+    return None
 
 
 def image_work(

@@ -71,12 +71,15 @@ def fit_ground(depth_m: Map, camera: Camera) -> Ground | None:
     rays, inverse, strips = _lower_points(depth_m, camera)
     if len(inverse) < 60:
         return None
+
+    # RANSAC: planes through three points, below the camera, and tilted and rolled as cameras of
+    # vehicles and hands are.
     chance = torch.Generator().manual_seed(0)
     drawn = torch.randint(len(inverse), (_DRAWS, 3), generator=chance)
     planes = torch.linalg.solve_ex(rays[drawn], inverse[drawn])[0]
-    # Below the camera, and tilted and rolled as cameras of vehicles and hands are.
     size = planes.norm(dim=1).clamp(min=1e-9)
-    tilt, roll = (planes[:, k].abs() / planes[:, 1] for k in (2, 0))
+    tilt = planes[:, 2].abs() / planes[:, 1]
+    roll = planes[:, 0].abs() / planes[:, 1]
     is_upright = (planes[:, 1] > 0) & (tilt < _MOST_TILT) & (roll < _MOST_ROLL)
     is_near = (size > 1 / _MOST_HEIGHT_M) & (size < 1 / _LEAST_HEIGHT_M)
     is_usable = planes.isfinite().all(1) & is_upright & is_near
@@ -84,6 +87,8 @@ def fit_ground(depth_m: Map, camera: Camera) -> Ground | None:
     if not len(errors):
         return None
     is_on = errors[int((errors < _INLIER).sum(1).argmax())] < _INLIER
+
+    # Least squares over the points on the best of them.
     plane, angles = _fit_plane(rays[is_on], inverse[is_on])
     for _ in range(3):
         plane, angles = _fit_plane(rays[is_on], inverse[is_on])
@@ -95,14 +100,21 @@ def fit_ground(depth_m: Map, camera: Camera) -> Ground | None:
     is_upright = abs(tilt_deg) <= _MOST_ROAD_TILT_DEG and abs(roll_deg) < _MOST_ROLL_DEG
     if share < _LEAST_SHARE or not (is_upright and _LEAST_HEIGHT_M < height_m < _MOST_HEIGHT_M):
         return None
-    selections = [k for k in (is_on & (strips != n) for n in range(_STRIPS)) if int(k.sum()) >= 30]
-    parts = torch.tensor([_fit_plane(rays[k], inverse[k])[1] for k in selections])
-    # The jackknife's deviation: how far the fit moves when a part of the columns is left out.
-    spread = ((len(parts) - 1) / len(parts) * ((parts - parts.mean(0)) ** 2).sum(0)).sqrt()
+
+    # The jackknife's deviation: how far the fit moves when a strip of columns is left out.
+    selections = [is_on & (strips != strip) for strip in range(_STRIPS)]
+    selections = [selection for selection in selections if int(selection.sum()) >= 30]
+    fits = torch.tensor([_fit_plane(rays[k], inverse[k])[1] for k in selections])
+    count = len(fits)
+    deviation = ((count - 1) / count * ((fits - fits.mean(0)) ** 2).sum(0)).sqrt()
     return Ground(
-        height_m=height_m, tilt_deg=tilt_deg, roll_deg=roll_deg, share=share,
-        height_std_m=float(spread[0]), tilt_std_deg=float(spread[1]),
-    )  # fmt: skip
+        height_m=height_m,
+        tilt_deg=tilt_deg,
+        roll_deg=roll_deg,
+        share=share,
+        height_std_m=float(deviation[0]),
+        tilt_std_deg=float(deviation[1]),
+    )
 
 
 def _lower_points(

@@ -117,14 +117,25 @@ class Discriminator(nn.Module):
 
     def __init__(self, kind: Literal["patch", "pixel"] = "patch", width: int = 64) -> None:
         super().__init__()
-        kernel, stride, padding = (4, 2, 1) if kind == "patch" else (1, 1, 0)
-        layers: list[nn.Module] = [nn.Conv2d(6, width, kernel, stride, padding), nn.LeakyReLU(0.2)]
-        steps = ((width, 2), (2 * width, 2), (4 * width, 1)) if kind == "patch" else ((width, 1),)
-        for inputs, stride in steps:
-            conv = nn.Conv2d(inputs, 2 * inputs, kernel, stride, padding, bias=False)
-            layers += [conv, nn.BatchNorm2d(2 * inputs), nn.LeakyReLU(0.2)]
-        last = 2 * steps[-1][0]
-        layers.append(nn.Conv2d(last, 1, kernel, 1, padding, bias=kind == "patch"))
+        # Strides of the inner layers, each of which doubles the channels.
+        if kind == "patch":
+            kernel = 4
+            padding = 1
+            strides = (2, 2, 2, 1)
+        else:
+            kernel = 1
+            padding = 0
+            strides = (1, 1)
+        layers: list[nn.Module] = [
+            nn.Conv2d(6, width, kernel, strides[0], padding),
+            nn.LeakyReLU(0.2),
+        ]
+        channels = width
+        for stride in strides[1:]:
+            conv = nn.Conv2d(channels, 2 * channels, kernel, stride, padding, bias=False)
+            channels *= 2
+            layers += [conv, nn.BatchNorm2d(channels), nn.LeakyReLU(0.2)]
+        layers.append(nn.Conv2d(channels, 1, kernel, 1, padding, bias=kind == "patch"))
         self.layers = nn.Sequential(*layers)
         self.apply(_initialise)
 

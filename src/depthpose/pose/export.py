@@ -25,19 +25,24 @@ class GraphConvolutions:
     """Writes sparse convolutions into a graph; each map of their kernels once."""
 
     def __init__(self, coordinates: Value) -> None:
+        """Number the cells of a box about all voxels; ``coordinates``: rows (cloud, x, y, z)."""
         self._graph = coordinates.graph
-        edge = np.array([1, *[1 << (LEVELS - 1)] * 3])
-        low = coordinates.op("ReduceMin", [0])
         # From a multiple of the coarsest step: coarse voxels are multiples of it in the whole grid.
-        self._places = coordinates - (low - low % edge)
+        coarsest = np.array([1, *[1 << (LEVELS - 1)] * 3])
+        low = coordinates.op("ReduceMin", [0])
+        self._places = coordinates - (low - low % coarsest)
+
+        # The number of a cell is its place times the strides of the box.
         sides = self._places.op("ReduceMax", [0], keepdims=0) + np.array([1, *[1 + 2 * MARGIN] * 3])
-        y, z = (sides.slice([axis], [axis + 1], [0]) for axis in (2, 3))
-        x = sides.slice([1], [2], [0])
+        x, y, z = (sides.slice([axis], [axis + 1], [0]) for axis in (1, 2, 3))
         self._strides = self._graph.op("Concat", x * y * z, y * z, z, [1], axis=0)
-        box = sides.op("ReduceProd", [0], keepdims=1)
+        cell_count = sides.op("ReduceProd", [0], keepdims=1)
+
+        # Of each level the cells of its voxels, the finest in the order of the points; and of each
+        # cell the row of its voxel, or one past all.
         self._level_cells: list[Value] = []
-        self._rows: list[Value] = []  # of each level: cell to the row of its voxel, or one past all
-        for level in range(LEVELS):  # the cell of each voxel; the finest keeps the order given
+        self._rows: list[Value] = []
+        for level in range(LEVELS):
             corner = self._places - self._places % np.array([1, *[1 << level] * 3])
             places = (corner + np.array([0, *[MARGIN] * 3])) * self._strides
             cells = places.op("ReduceSum", [1], keepdims=0)
@@ -45,7 +50,7 @@ class GraphConvolutions:
             self._level_cells.append(cells)
             count = cells.op("Shape")
             numbers = self._graph.op("Range", 0, count.op("Squeeze"), 1)
-            empty = count.op("Expand", box)
+            empty = count.op("Expand", cell_count)
             self._rows.append(empty.op("ScatterElements", cells, numbers, axis=0))
         self._maps: dict[tuple[int, int, int], Value] = {}
 

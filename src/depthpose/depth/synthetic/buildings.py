@@ -44,6 +44,7 @@ class Plot(NamedTuple):
 
 def add_house(b: MeshBuilder, plot: Plot, *, with_details: bool) -> None:
     """Add one house: its walls, of which the back and one end have no windows, and a roof."""
+    # What the walls are of, and how windows are set in them.
     kind = str(b.rng.choice(["brick", "plaster", "stone"], p=[0.24, 0.6, 0.16]))
     base = {"brick": (0.3, 0.12, 0.08), "stone": (0.3, 0.26, 0.22)}.get(
         kind, _PLASTERS[b.rng.integers(len(_PLASTERS))]
@@ -59,6 +60,8 @@ def add_house(b: MeshBuilder, plot: Plot, *, with_details: bool) -> None:
         frame=_FRAMES[b.rng.choice(3, p=[0.6, 0.2, 0.2])],
         with_details=with_details,
     )
+
+    # Four walls: the front, the near end, the far end and the back.
     b.thing += 1
     away = np.array([float(plot.side), 0, 0])
     length = plot.stop_m - plot.start_m
@@ -75,6 +78,8 @@ def add_house(b: MeshBuilder, plot: Plot, *, with_details: bool) -> None:
         else:
             face = _SQUARE * [size, plot.height_m]
             b.quads([wall.at(face)], [face], style.wall)
+
+    # A gable roof, or a flat one, at times with a structure on it.
     if b.rng.random() < 0.7:
         _add_gable_roof(b, plot, style)
     else:

@@ -468,12 +468,17 @@ def draw_scene(
 
 
 def _occluded(left: Sight, right: Sight, rig: StereoRig) -> Mask:
-    """Ask for each left point what the right camera sees where it should be."""
+    """Mark the left pixels that the right camera does not see: something nearer hides them there.
+
+    Those that lie outside of the right image are marked too.
+    """
     height, width = left.raster.primitive.shape
     primitive = left.raster.primitive.flatten()
     depth_m = left.raster.depth_m.flatten()
     occluded = torch.zeros(height * width, dtype=torch.bool)
     index = (primitive >= 0).nonzero()[:, 0]
+
+    # Where each point lies in the right image.
     pixels = torch.stack([index % width, index // width], 1).double()
     pixels[:, 0] -= disparity_from_depth(depth_m[None, index], rig)[0].double()
     pixels[:, 1] += right.K[1, 2] - left.K[1, 2]
@@ -481,11 +486,13 @@ def _occluded(left: Sight, right: Sight, rig: StereoRig) -> Mask:
     is_outside = (near[:, 0] < 0) | (near[:, 0] >= width)
     near = near[:, 1].clamp(0, height - 1) * width + near[:, 0].clamp(0, width - 1)
     candidates = neighbours(right.raster.primitive, near)
-    # Most see the same triangle there, and nothing else need be asked.
+
+    # Most show the same triangle there; of the others the right camera's nearest surface decides.
     is_same = (candidates[:, :1] == primitive[index, None])[:, 0] & ~is_outside
     undecided = (~is_same & ~is_outside).nonzero()[:, 0]
-    _, _, seen_m = nearest_at(right, candidates[undecided], [pixels[undecided]])[0]
-    occluded[index[undecided]] = seen_m < depth_m[index[undecided]] * (1 - _OCCLUSION_SHARE)
+    (nearest,) = nearest_at(right, candidates[undecided], [pixels[undecided]])
+    least_m = depth_m[index[undecided]] * (1 - _OCCLUSION_SHARE)
+    occluded[index[undecided]] = nearest.depth_m < least_m
     occluded[index[is_outside]] = True
     return occluded.reshape(height, width)
 

@@ -151,6 +151,7 @@ def bend(mesh: Mesh, road: Road) -> Mesh:
 
 def add_ground(b: MeshBuilder, road: Road) -> None:
     """Add the carriageway, pavements, verges and the land beside, side streets between them."""
+    # Surfaces of one colour each in a scene.
     rng = b.rng
     light = rng.uniform(0.7, 1.45)
     color = (0.105 * light, 0.105 * light, 0.107 * light)
@@ -162,11 +163,15 @@ def add_ground(b: MeshBuilder, road: Road) -> None:
     color = (0.2 * grey, 0.19 * grey, 0.18 * grey)
     walk = Surface("pavement", color, rng.uniform(1.6, 3.2), variants[1])
     grass = Surface("grass", (0.075 * green * warm, 0.088 * green, 0.02 * green), 3.0, variants[2])
+
+    # The carriageway, in pieces that grow longer with distance.
     b.thing += 1
     even = np.concatenate(
         [np.arange(-BEHIND_M, 60, 4), np.arange(60, 150, 10), np.arange(150, AHEAD_M + 1, 30)]
     )
     _strip(b, (road.edge_m[-1], road.edge_m[1]), (0.0, 0.0), asphalt, even)
+
+    # Beside it, on each side, side streets and what lies between them.
     land = walk if road.place == "city" and rng.random() < 0.7 else grass
     for side in (-1, 1):
         streets = [street for street in road.side_streets if side in street.sides]

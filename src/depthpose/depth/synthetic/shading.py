@@ -102,19 +102,30 @@ def _light_map(
     full_px: int,
     share: float,
 ) -> LightMap:
-    """Draw the depth along a light over a part of the scene before the camera."""
+    """Draw a shadow map: the depth along a light, over a part of the scene before the camera.
+
+    Args:
+        corners: of all triangles [m].
+        to_light: direction to the light.
+        half_m: the part reaches so far to the left and to the right.
+        reach_m: and from so far to so far ahead.
+        full_px: side of the map at full size.
+        share: of that size.
+    """
     side_px = round(full_px * share)
     away = F.normalize(-to_light, dim=0)
     aside = torch.tensor([1.0, 0, 0]) if abs(float(away[0])) < 0.9 else torch.tensor([0.0, 0, 1])
     x = F.normalize(torch.linalg.cross(aside, away), dim=0)
     rotation = torch.stack([x, torch.linalg.cross(away, x), away])
-    box = torch.tensor([[a, b, c] for a in (-half_m, half_m) for b in (1.7, -3) for c in reach_m])
-    within = (box @ rotation.T)[:, :2]
-    low = within.amin(0)
-    high = within.amax(0)
+
+    # The box about that part, from the ground to 3 m above the camera, fills the map.
+    box = torch.tensor([[x, y, z] for x in (-half_m, half_m) for y in (1.7, -3) for z in reach_m])
+    box_in_map = (box @ rotation.T)[:, :2]
+    low = box_in_map.amin(0)
+    high = box_in_map.amax(0)
     scale = (side_px - 1) / (high - low)
-    turned = corners @ rotation.T
-    placed = torch.cat([(turned[..., :2] - low) * scale, turned[..., 2:]], -1)
+    rotated = corners @ rotation.T
+    placed = torch.cat([(rotated[..., :2] - low) * scale, rotated[..., 2:]], -1)
     drawn = rasterize_orthographic(placed, side_px, side_px, with_barycentric=False)
     return LightMap(
         depth_m=drawn.depth_m.nan_to_num(nan=1e6),

@@ -62,11 +62,36 @@ def read_labels(
                 "name a list of BOP detections by --masks, beside --bop"
             )
         return decode_rle(*read_runs(entries[0], str(path))).long()
+    pixels = _mask_pixels(path, with_palette=labels is None)
+
+    # Each colour is a number.
+    values = pixels[..., 0]
+    if pixels.shape[2] > 1 and (pixels[..., :3] != values[..., None]).any():
+        colour = values.astype(np.int32)
+        for part in (pixels[..., 1], pixels[..., 2]):
+            colour = colour * 2**8 + part
+        colours = np.unique(colour)
+        # Not by the inverse of np.unique, which takes five times the memory.
+        values = np.searchsorted(colours, colour).astype(np.int32) + (colours[0] != 0)
+
+    # An alpha channel may be the mask: what is opaque, in a photograph or in one colour.
+    is_opaque = pixels[..., 3] > _HALF if pixels.shape[2] == 4 else values != 0
+    if pixels.shape[2] == 4 and 0 < is_opaque.sum() < is_opaque.size:
+        is_shape = len(np.unique(values[is_opaque])) not in range(2, _MOST_LABELS)
+        values = np.where(is_opaque, 1 if is_shape else values, 0)
+    return number_objects(values) if labels is None else _labelled(values, labels, path)
+
+
+def _mask_pixels(path: Path, *, with_palette: bool) -> np.ndarray:
+    """Read the pixels of a mask image (h, w, channels): 1 of numbers, 3 of colours, 4 with alpha.
+
+    ``with_palette``: take the colours of a palette; else its numbers.
+    """
     with opened_image(path) as image:
         if image.mode in ("LA", "PA", "RGBA", "RGBa", "La") or "transparency" in image.info:
             pixels = np.asarray(image.convert("RGBA"))
-        elif labels is not None and image.mode == "P":
-            pixels = np.asarray(image).astype(np.int32)[..., None]  # the palette is for the eye
+        elif not with_palette and image.mode == "P":
+            pixels = np.asarray(image).astype(np.int32)[..., None]
         elif image.mode in ("1", "L", "I", "F") or image.mode.startswith("I;16"):
             kind = np.int64 if image.mode == "F" else np.int32
             pixels = np.asarray(image).astype(kind)[..., None]
@@ -80,19 +105,7 @@ def read_labels(
                     "its compression; save masks as PNG"
                 )
             pixels = np.where(pixels > _HALF, 255, 0)
-    values = pixels[..., 0]
-    if pixels.shape[2] > 1 and (pixels[..., :3] != values[..., None]).any():
-        colour = values.astype(np.int32)
-        for part in (pixels[..., 1], pixels[..., 2]):
-            colour = colour * 2**8 + part
-        colours = np.unique(colour)
-        # Not by the inverse of np.unique, which takes five times the memory.
-        values = np.searchsorted(colours, colour).astype(np.int32) + (colours[0] != 0)
-    is_opaque = pixels[..., 3] > _HALF if pixels.shape[2] == 4 else values != 0
-    if pixels.shape[2] == 4 and 0 < is_opaque.sum() < is_opaque.size:
-        is_shape = len(np.unique(values[is_opaque])) not in range(2, _MOST_LABELS)
-        values = np.where(is_opaque, 1 if is_shape else values, 0)
-    return number_objects(values) if labels is None else _labelled(values, labels, path)
+    return pixels
 
 
 def _labelled(

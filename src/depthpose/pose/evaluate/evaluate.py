@@ -168,7 +168,13 @@ def object_row(name: str, rows: Sequence[InstanceRow]) -> ObjectRow:
 def mean_row(rows: Sequence[ObjectRow]) -> ObjectRow:
     """Average the rows of objects: each object counts the same, as in LineMOD's tables."""
     count = len(rows)
-    scores = {name: [row.scores[name] for row in rows] for name in rows[0].scores}
+    scores: dict[str, Number] = {}
+    for name in rows[0].scores:
+        values = [row.scores[name] for row in rows]
+        # A recall of some objects alone would pass for that of all; a median is of the estimates,
+        # and BOP's precision of the objects of which enough is visible somewhere.
+        may_lack = name in _PRECISIONS or name.endswith("_median")
+        scores[name] = _mean(values) if may_lack or None not in values else None
     return ObjectRow(
         object="mean",
         instances=sum(row.instances for row in rows),
@@ -177,13 +183,7 @@ def mean_row(rows: Sequence[ObjectRow]) -> ObjectRow:
         refused=sum(row.refused for row in rows) / count,
         wrong=sum(row.wrong for row in rows) / count,
         coverage=sum(row.coverage for row in rows) / count,
-        # A recall of some objects alone would pass for that of all; a median is of the answers,
-        # and BOP's precision of the objects of which enough is seen somewhere.
-        scores={
-            name: _mean(values) if None not in values or is_of_some else None
-            for name, values in scores.items()
-            for is_of_some in [name in _PRECISIONS or name.endswith("_median")]
-        },
+        scores=scores,
         ms={stage: _mean([row.ms[stage] for row in rows]) for stage in rows[0].ms},
     )
 
