@@ -24,6 +24,7 @@ from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.evaluate import (
     PROTOCOLS,
     Evaluation,
+    EvaluationRow,
     Measured,
     Protocol,
     evaluate,
@@ -177,6 +178,8 @@ def measure(
     measured = join([*evaluations, *ready])
     rows = [row.columns() for row in measured.rows]
     page.write_table(out, rows)
+
+    # Numbers of pairs without a calibration compare with no others.
     about = f"{protocol}: {PROTOCOLS[protocol].summary}."
     unknown = sum(frame.right is not None and not frame.calibration for frame in dataset.frames)
     if unknown:
@@ -187,38 +190,22 @@ def measure(
         )
         print(f"depthpose: {message}", file=sys.stderr)
         about += f" {message}."
-    places = {frame.name: i for i, frame in enumerate(dataset.frames)}
-    sections: list[Section] = []
+
+    # The page: the table, then the best and the worst frames of each method.
     shares = page.share_views(len(folders))
-    for folder, of_folder, most in zip(
-        folders, [evaluation.per_frame for evaluation in evaluations], shares, strict=True
-    ):
-        cap_m = of_folder[0].cap_m
-        of_cap = [row for row in of_folder if row.cap_m == cap_m and row.pixels]
-        metric = METRICS[RANKING["disparity" if cap_m is None else "depth"]]
-        sign = 1 if metric.better == "lower" else -1
-        cap = "" if cap_m is None else f", truth up to {cap_m:g} m"
-        errors = [sign * row.metrics[metric.name] for row in of_cap]
-        for role, k in page.choose_ranked(errors, most):
-            row = of_cap[k]
-            value = of_cap[k].metrics[metric.name]
-            frames = f"{len(of_cap)} frame{'' if len(of_cap) == 1 else 's'}"
-            text = f"The {role} of {frames} by {metric.name}: {value:.4f}{cap}."
-            index = places[row.frame or ""]
-            estimate, error = frame_result(dataset, index, folder, protocol, row.cap_m)
-            pair = dataset.read_input(index)
-            columns = {name: v for name, v in row.columns().items() if name not in _IN_THE_TABLE}
-            title = f"{folder.name}: {row.frame}, {role}"
-            sections.append(
-                replace(depth_section(title, pair, estimate, text, error=error), rows=[columns])
-            )
+    frame_sections = [
+        section
+        for folder, evaluation, most in zip(folders, evaluations, shares, strict=True)
+        for section in _frame_sections(dataset, folder, evaluation.per_frame, protocol, most)
+    ]
     sections = [
         Section(title="Mean over frames", text=about, rows=rows),
-        *sections,
+        *frame_sections,
         *write_details(measured, out),
     ]
     title = f"{protocol} on {dataset.name}"
     page.write_page(out / "report.html", title, sections, environment())
+
     metrics = [metric.name for metric in METRICS.values() if metric.is_printed]
     about_row = ["method", "weights", "speed", "cap_m", "frames", "coverage"]
     print(page.plain_table(rows, [*about_row, *metrics, "ause"]))  # files hold every column
@@ -227,6 +214,39 @@ def measure(
     print(f"{len(measured.skipped)} frames skipped")
     print(f"every column: {out / 'table.md'}, rows.csv; the page: {out / 'report.html'}")
     return 0
+
+
+def _frame_sections(
+    dataset: Dataset,
+    folder: Path,
+    per_frame: Sequence[EvaluationRow],
+    protocol: str,
+    most: int,
+) -> list[Section]:
+    """Show at most so many frames of a method, chosen by the metric that ranks them."""
+    cap_m = per_frame[0].cap_m
+    of_cap = [row for row in per_frame if row.cap_m == cap_m and row.pixels]
+    metric = METRICS[RANKING["disparity" if cap_m is None else "depth"]]
+    sign = 1 if metric.better == "lower" else -1
+    cap = "" if cap_m is None else f", truth up to {cap_m:g} m"
+    frames = f"{len(of_cap)} frame{'' if len(of_cap) == 1 else 's'}"
+    index_of = {frame.name: index for index, frame in enumerate(dataset.frames)}
+    sections: list[Section] = []
+    errors = [sign * row.metrics[metric.name] for row in of_cap]
+    for role, k in page.choose_ranked(errors, most):
+        row = of_cap[k]
+        index = index_of[row.frame or ""]
+        estimate, error = frame_result(dataset, index, folder, protocol, row.cap_m)
+        section = depth_section(
+            f"{folder.name}: {row.frame}, {role}",
+            dataset.read_input(index),
+            estimate,
+            f"The {role} of {frames} by {metric.name}: {row.metrics[metric.name]:.4f}{cap}.",
+            error=error,
+        )
+        columns = {name: v for name, v in row.columns().items() if name not in _IN_THE_TABLE}
+        sections.append(replace(section, rows=[columns]))
+    return sections
 
 
 def measure_each(

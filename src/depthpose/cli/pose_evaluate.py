@@ -130,6 +130,8 @@ def measure(
     rows = [row.columns() for row in measured.rows]
     text = HOW if measured.advice is None else f"{measured.advice}. {HOW}"
     page.write_table(out, rows)
+
+    # Success of each method and object, a column for each kind of masks.
     by_masks: dict[tuple[str, str], dict[str, Any]] = {}
     for row in measured.rows:
         assert row.origin is not None
@@ -137,43 +139,19 @@ def measure(
         masks = row.origin.masks
         entry = by_masks.setdefault((method, row.object), {"method": method, "object": row.object})
         entry[f"{masks or 'their'} masks"] = row.success
-    instances = {instance.name: instance for instance in dataset.instances}
-    sections: list[Section] = []
+
+    # The page: both tables, then some instances of each set of predictions.
     shares = page.share_views(len(predictions))
-    for path, of_path, most in zip(
-        predictions, [evaluation.per_instance for evaluation in evaluations], shares, strict=True
-    ):
-        if not most:
-            continue
-        estimates = match(dataset.instances, read_any(path), dataset.objects)
-        for role, row in _choose(of_path, most):
-            instance = instances[row.instance]
-            estimate = estimates[row.instance]
-            model = dataset.objects[instance.object_id]
-            truth = instance.camera_from_model
-            # Of copies that look alike the one nearest to the estimate.
-            if (pose := estimate.camera_from_model) is not None:
-                truth = nearest_copy(
-                    pose, truth, symmetry_transforms(model.symmetries), model.symmetries
-                )
-            title = f"{path.stem}: {row.object} in {row.instance}, {role}"
-            columns = row.columns()
-            metrics = {name: columns[name] for name in _MEASURED}
-            section = pose_section(
-                title,
-                dataset.view(instance).input,
-                estimate,
-                model,
-                _OF_TRUTH,
-                image=None if instance.rgb is None else read_image(instance.rgb),
-                truth=truth,
-                rows=[metrics],
-            )
-            sections.append(section)
+    instance_sections = [
+        section
+        for path, evaluation, most in zip(predictions, evaluations, shares, strict=True)
+        if most
+        for section in _instance_sections(dataset, path, evaluation.per_instance, most)
+    ]
     sections = [
         Section(title="Success by masks", text=text, rows=list(by_masks.values())),
         Section(title="All numbers", rows=rows),
-        *sections,
+        *instance_sections,
         *write_details(measured, out),
     ]
     title = f"Poses on {dataset.folder.resolve().name}, {dataset.split}"
@@ -181,6 +159,37 @@ def measure(
     print(page.plain_table(rows, _SHOWN))
     print(f"every column: {out / 'table.md'}, rows.csv; the page: {out / 'report.html'}")
     return 0
+
+
+def _instance_sections(
+    dataset: BopDataset, predictions: Path, rows: Sequence[InstanceRow], most: int
+) -> list[Section]:
+    """Show at most so many instances of a set of predictions, with their truth."""
+    instances = {instance.name: instance for instance in dataset.instances}
+    estimates = match(dataset.instances, read_any(predictions), dataset.objects)
+    sections: list[Section] = []
+    for role, row in _choose(rows, most):
+        instance = instances[row.instance]
+        estimate = estimates[row.instance]
+        model = dataset.objects[instance.object_id]
+        # Of copies that look alike the one nearest to the estimate.
+        truth = instance.camera_from_model
+        if (pose := estimate.camera_from_model) is not None:
+            symmetries = symmetry_transforms(model.symmetries)
+            truth = nearest_copy(pose, truth, symmetries, model.symmetries)
+        columns = row.columns()
+        section = pose_section(
+            f"{predictions.stem}: {row.object} in {row.instance}, {role}",
+            dataset.view(instance).input,
+            estimate,
+            model,
+            _OF_TRUTH,
+            image=None if instance.rgb is None else read_image(instance.rgb),
+            truth=truth,
+            rows=[{name: columns[name] for name in _MEASURED}],
+        )
+        sections.append(section)
+    return sections
 
 
 def write_details(measured: Evaluation, out: Path) -> list[Section]:

@@ -277,64 +277,77 @@ def summarise(
     Raises:
         InputError: no frame has truth.
     """
-    rule = find_protocol(protocol)
-    each = {frame.name: results[frame.name] for frame in dataset.frames}
-    skipped = {name: reason for name, reason in each.items() if isinstance(reason, str)}
+    outcomes = {frame.name: results[frame.name] for frame in dataset.frames}
+    skipped = {name: reason for name, reason in outcomes.items() if isinstance(reason, str)}
     measured = [
         frame_row
-        for outcome in each.values()
+        for outcome in outcomes.values()
         if not isinstance(outcome, str)
         for frame_row in outcome
     ]
-    if not measured and NO_PREDICTION in skipped.values():
-        name = next(name for name, reason in skipped.items() if reason == NO_PREDICTION)
-        raise InputError(
-            f"{dataset.name}: no frame has both truth and a prediction; {name!r} has the truth and "
-            f"{NO_PREDICTION}. Predictions are called {files.EXPECTED}"
-        )
     if not measured:
-        others = {n: r for n, r in PROTOCOLS.items() if r.truth != rule.truth}
-        fitting = [n for n, r in others.items() if any(has_truth(f, r) for f in dataset.frames)]
-        raise InputError(
-            f"{dataset.name}: none of its {len(dataset)} frames has the truth that protocol "
-            f"{protocol!r} needs ({rule.truth}). "
-            + (f"--protocol {' or '.join(fitting)} fits." if fitting else "Choose another folder.")
-        )
+        raise _nothing_measured(dataset, protocol, skipped)
+
     row = partial(EvaluationRow, protocol=protocol, dataset=dataset.name)
-    names = ("frame", "cap_m", "pixels", "coverage", "metrics")
+    columns = ("frame", "cap_m", "pixels", "coverage", "metrics")
     per_frame = [
-        row(**{name: getattr(frame_row, name) for name in names}) for frame_row in measured
+        row(**{name: getattr(frame_row, name) for name in columns}) for frame_row in measured
     ]
     evaluation = Evaluation(rows=[], per_frame=per_frame, deciles=[], skipped=skipped)
     for cap_m in dict.fromkeys(frame_row.cap_m for frame_row in measured):
         of_cap = [frame_row for frame_row in measured if frame_row.cap_m == cap_m]
-        answered = [frame_row for frame_row in of_cap if frame_row.pixels]
-        if not answered:
+
+        # Means over frames: coverage over all, metrics over those with a compared pixel.
+        compared = [frame_row for frame_row in of_cap if frame_row.pixels]
+        if not compared:
             raise InputError(f"{dataset.name}: no prediction has a pixel where there is truth")
         names = [
-            n for n in answered[0].metrics if all(n in frame_row.metrics for frame_row in answered)
+            name
+            for name in compared[0].metrics
+            if all(name in frame_row.metrics for frame_row in compared)
         ]
+        metrics = {
+            name: sum(frame_row.metrics[name] for frame_row in compared) / len(compared)
+            for name in names
+        }
+        coverage = sum(frame_row.coverage for frame_row in of_cap) / len(of_cap)
+        pixels = sum(frame_row.pixels for frame_row in of_cap)
         evaluation.rows.append(
-            row(
-                cap_m=cap_m,
-                frames=len(of_cap),
-                pixels=sum(frame_row.pixels for frame_row in of_cap),
-                coverage=sum(frame_row.coverage for frame_row in of_cap) / len(of_cap),
-                metrics={
-                    n: sum(frame_row.metrics[n] for frame_row in answered) / len(answered)
-                    for n in names
-                },
-            )
+            row(cap_m=cap_m, frames=len(of_cap), pixels=pixels, coverage=coverage, metrics=metrics)
         )
+
+        # Errors by tenths of the pixels, from the least sure to the surest.
         deciles = [frame_row.deciles for frame_row in of_cap if frame_row.deciles is not None]
         errors = torch.tensor(deciles, dtype=torch.float64).nanmean(0).tolist() if deciles else []
         ranked_by = RANKING["disparity" if cap_m is None else "depth"]
-        for n, error in enumerate(errors, 1):
+        for decile, error in enumerate(errors, 1):
             metrics = {ranked_by: error}
             evaluation.deciles.append(
-                row(cap_m=cap_m, frames=len(deciles), confidence_decile=n, metrics=metrics)
+                row(cap_m=cap_m, frames=len(deciles), confidence_decile=decile, metrics=metrics)
             )
     return evaluation
+
+
+def _nothing_measured(dataset: Dataset, protocol: str, skipped: Mapping[str, str]) -> InputError:
+    """Make the error of a dataset of which no frame could be measured, with the remedy."""
+    without = next((name for name, reason in skipped.items() if reason == NO_PREDICTION), None)
+    if without is not None:
+        return InputError(
+            f"{dataset.name}: no frame has both truth and a prediction; {without!r} has the truth "
+            f"and {NO_PREDICTION}. Predictions are called {files.EXPECTED}"
+        )
+    rule = find_protocol(protocol)
+    others = {name: other for name, other in PROTOCOLS.items() if other.truth != rule.truth}
+    fitting = [
+        name
+        for name, other in others.items()
+        if any(has_truth(frame, other) for frame in dataset.frames)
+    ]
+    remedy = f"--protocol {' or '.join(fitting)} fits." if fitting else "Choose another folder."
+    return InputError(
+        f"{dataset.name}: none of its {len(dataset)} frames has the truth that protocol "
+        f"{protocol!r} needs ({rule.truth}). {remedy}"
+    )
 
 
 def frame_result(
