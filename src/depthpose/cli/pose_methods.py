@@ -108,6 +108,7 @@ def _segmented(
 
     Other objects or images may be asked for next time: what is there stays, what lacks is added.
     """
+    # The numbers that the data set gives to the objects of the weights: by name, else by number.
     segmenter = Segmenter.load(path, device)
     names = datasets.object_names(dataset.folder)
     by_name = {name: number for number, name in names.items()}
@@ -127,6 +128,8 @@ def _segmented(
         )
     if lost:
         print(f"{path}: segments no objects {lost}; each is missing", file=sys.stderr)
+
+    # What an earlier run found, and in which images.
     home = out / "detections" / name
     claim_folder(home, {"weights_sha256": file_sha256(path), **of_dataset(dataset)})
     file = home.parent / f"{name}.json"
@@ -142,34 +145,40 @@ def _segmented(
             for row in rows
         }
         detections = [d for d in earlier if (d.scene_id, d.image_id) in done]
+
     images = {(i.scene_id, i.image_id): i for i in dataset.instances}
-    left = [images[place] for place in sorted(images.keys() - done)]
-    if left:
-        for shown in tqdm(left, "segmentation", disable=None, unit=" images"):
-            if shown.rgb is None:
-                raise InputError(f"{shown.name}: has no picture, and a segmentation needs pictures")
-            start = perf_counter()
-            objects = segmenter.segment(read_image(shown.rgb))
-            spent_s = perf_counter() - start
-            detections += [
-                datasets.Detection(
-                    scene_id=shown.scene_id,
-                    image_id=shown.image_id,
-                    object_id=numbers[object],
-                    score=score,
-                    segmentation=datasets.encode_rle(mask),
-                    seconds=spent_s,
-                )
-                for object in objects.masks
-                if object in numbers
-                for mask, score in zip(
-                    objects.masks[object], objects.scores[object].tolist(), strict=True
-                )
-            ]
+    unsegmented = [images[place] for place in sorted(images.keys() - done)]
+    if unsegmented:
+        for instance in tqdm(unsegmented, "segmentation", disable=None, unit=" images"):
+            detections += _segment_image(segmenter, instance, numbers)
         datasets.write_detections(file, detections)
         places = sorted(done | images.keys())
         write_json(record, [{"scene_id": scene, "im_id": image} for scene, image in places])
     return detections
+
+
+def _segment_image(
+    segmenter: Segmenter, instance: datasets.Instance, numbers: Mapping[str, int]
+) -> list[datasets.Detection]:
+    """Segment the image of an instance; ``numbers``: those of the objects by name."""
+    if instance.rgb is None:
+        raise InputError(f"{instance.name}: has no picture, and a segmentation needs pictures")
+    start = perf_counter()
+    objects = segmenter.segment(read_image(instance.rgb))
+    spent_s = perf_counter() - start
+    return [
+        datasets.Detection(
+            scene_id=instance.scene_id,
+            image_id=instance.image_id,
+            object_id=numbers[object],
+            score=score,
+            segmentation=datasets.encode_rle(mask),
+            seconds=spent_s,
+        )
+        for object in objects.masks
+        if object in numbers
+        for mask, score in zip(objects.masks[object], objects.scores[object].tolist(), strict=True)
+    ]
 
 
 def _file_names(words: Sequence[str], paths: Sequence[Path | None]) -> list[str]:

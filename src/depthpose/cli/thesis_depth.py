@@ -41,6 +41,7 @@ def reproduce_table(
     pictures: int,
 ) -> int:
     """Predict what is missing, measure, join with the published rows, and write everything."""
+    # All that decides the numbers.
     listed = "".join(f"{frame.left.resolve()}\n" for frame in dataset.frames)
     settings = {
         "table": table.number,
@@ -53,6 +54,8 @@ def reproduce_table(
     }
     results = (*page.table_files("rows", "frames", "confidence"), "report.md", "report.html")
     claim_folder(out, settings, (*results, "predictions", "figures"))
+
+    # Predict, in all processes; the first measures and joins.
     rule = find_protocol(protocol)
     home = out / "predictions"
     folders = [evaluation.predict_dataset(dataset, method, rule, home) for _, method in methods]
@@ -62,31 +65,22 @@ def reproduce_table(
     own_rows = [own_row for own_row, _ in methods for _ in caps_m]
     rows = join_published(table, list(zip(own_rows, measured.rows, strict=True)))
     page.write_table(out, rows)
+
+    # The page: the table, figures of some frames, the details, the settings.
     method_note = (
         f"Ours: {protocol}: {rule.summary}. The printed rows are of the 697 frames of "
         "eigen-test. Difference: ours minus the thesis's own row. A row of another protocol, or of "
         "other frames (see the columns), does not compare with the printed ones."
     )
-    sections: list[Section] = []
-    for _, method in methods if pictures > 0 else ():
-        folder, home = (out / kind / method.name for kind in ("predictions", "figures"))
-        frames = [f for f in dataset.frames if has_prediction(folder, f.name)]
-        shown = replace(dataset, frames=frames)
-        for place, index in enumerate(choose_frames(shown, (), pictures)):
-            pair = shown.read_input(index)
-            frame = frames[index]
-            lidar_m = lidar_truth(frame, "camera_z") if has_lidar(frame, "camera_z") else None
-            estimate = read_estimate(folder, pair.name, pair.camera)
-            figures = {"2-5": draw_figure_2_5(pair, lidar_m, estimate)}
-            if place == 0 and estimate.right is not None and pair.right is not None:
-                stereo = method.net.estimate_pair(pair)
-                figures["2-1"] = draw_figure_2_1(pair, lidar_m, estimate, stereo)
-            for figure, panels in figures.items():
-                title = f"Figure {figure}: {method.name}, {pair.name}"
-                sections.append(_panel_section(title, panels, home / f"{figure}_{pair.name}"))
+    figures = [
+        section
+        for _, method in methods
+        if pictures > 0
+        for section in _figures_of(method, dataset, out, pictures)
+    ]
     sections = [
         Section(title="Published rows, ours, and difference", text=method_note, rows=rows),
-        *sections,
+        *figures,
         *evaluation.write_details(measured, out),
         Section(
             title="Settings",
@@ -102,6 +96,28 @@ def reproduce_table(
         print(f"skipped: {name}: {reason}", file=sys.stderr)
     print(f"{len(measured.skipped)} frames skipped")
     return 0
+
+
+def _figures_of(method: Method, dataset: Dataset, out: Path, number: int) -> list[Section]:
+    """Draw figure 2-5 of some frames that a method predicted, and figure 2-1 of the first."""
+    predictions = out / "predictions" / method.name
+    home = out / "figures" / method.name
+    frames = [frame for frame in dataset.frames if has_prediction(predictions, frame.name)]
+    predicted = replace(dataset, frames=frames)
+    sections: list[Section] = []
+    for place, index in enumerate(choose_frames(predicted, (), number)):
+        pair = predicted.read_input(index)
+        frame = frames[index]
+        lidar_m = lidar_truth(frame, "camera_z") if has_lidar(frame, "camera_z") else None
+        estimate = read_estimate(predictions, pair.name, pair.camera)
+        figures = {"2-5": draw_figure_2_5(pair, lidar_m, estimate)}
+        if place == 0 and estimate.right is not None and pair.right is not None:
+            stereo = method.net.estimate_pair(pair)
+            figures["2-1"] = draw_figure_2_1(pair, lidar_m, estimate, stereo)
+        for figure, panels in figures.items():
+            title = f"Figure {figure}: {method.name}, {pair.name}"
+            sections.append(_panel_section(title, panels, home / f"{figure}_{pair.name}"))
+    return sections
 
 
 def write_report(title: str, sections: Sequence[Section], out: Path) -> None:

@@ -40,6 +40,8 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
     """Estimate depth for a form."""
     began = time.perf_counter()
     pair, focal = _input(form)
+
+    # Refuse what cannot be drawn or matched, and what would take too long.
     near_m, far_m = (
         default if (typed := form.number(end)) is None else typed
         for end, default in zip(("near_m", "far_m"), COLOR_RANGE_M, strict=True)
@@ -54,6 +56,34 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
             "the weights of this page take one image alone: remove the right image, or start "
             "'depthpose serve' with --weights that have a matcher"
         )
+    _refuse_large_work(pair, net)
+
+    estimate = net.estimate_pair(pair)
+    seconds = time.perf_counter() - began
+    assert estimate.depth_m is not None
+
+    # The files for download, and what the page shows.
+    folder = form.folder / "results"
+    folder.mkdir()
+    write_estimate(folder, pair, estimate, (near_m, far_m), far_m)
+    write_image(folder / f"{pair.name}.input.jpg", pair.left)
+    pictures = _pictures(pair, estimate, (near_m, far_m))
+    if estimate.confidence is not None:
+        write_image(folder / f"{pair.name}.confidence.png", draw_share(1 - estimate.confidence))
+    facts = [fact for fact in depth_facts(pair, estimate, focal) if fact[0] != "warning"]
+    return Answer(
+        is_ok=not estimate.warning,
+        said=_sentence(pair, estimate),
+        facts=[*facts, ("computed in", f"{seconds:.2f} s")],
+        pictures=pictures,
+        scene=depth_scene(pair, estimate, far_m),
+        terms=net.terms,
+        files={path.name: path.read_bytes() for path in sorted(folder.iterdir())},
+    )
+
+
+def _refuse_large_work(pair: StereoInput, net: FakestereoNet) -> None:
+    """Refuse images whose size at work, which follows from their focal length, is too large."""
     assert pair.camera is not None
     camera = pair.camera
     focal_px = float(pair.camera.K[0, 0])
@@ -80,26 +110,6 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
             f"would be resized to {columns}x{rows}, more than this page computes; is it in "
             f"millimetres? A phone's is about {_PHONE} widths"
         )
-    estimate = net.estimate_pair(pair)
-    seconds = time.perf_counter() - began
-    assert estimate.depth_m is not None
-    folder = form.folder / "results"
-    folder.mkdir()
-    write_estimate(folder, pair, estimate, (near_m, far_m), far_m)
-    write_image(folder / f"{pair.name}.input.jpg", pair.left)
-    pictures = _pictures(pair, estimate, (near_m, far_m))
-    if estimate.confidence is not None:
-        write_image(folder / f"{pair.name}.confidence.png", draw_share(1 - estimate.confidence))
-    facts = [fact for fact in depth_facts(pair, estimate, focal) if fact[0] != "warning"]
-    return Answer(
-        is_ok=not estimate.warning,
-        said=_sentence(pair, estimate),
-        facts=[*facts, ("computed in", f"{seconds:.2f} s")],
-        pictures=pictures,
-        scene=depth_scene(pair, estimate, far_m),
-        terms=net.terms,
-        files={path.name: path.read_bytes() for path in sorted(folder.iterdir())},
-    )
 
 
 def _input(form: Form) -> tuple[StereoInput, str]:

@@ -75,6 +75,29 @@ def run_job(job: ShardedJob, engine: Engine) -> list[Done]:
     stores.refuse_unsafe(out)
     claim(out, {**job.settings, "shards": "tar"})
     blocks = make_plan(out, job.items, job.tars, job.block)
+    done = _finished_shards(out, blocks)
+    unfinished = [block for block in blocks if block.shard not in done]
+    if unfinished:
+        new = engine(unfinished, job.work, out)
+        done |= {shard.shard.removesuffix(".tar"): shard for shard in new}
+    lost = [block.shard for block in blocks if block.shard not in done]
+    if lost:
+        raise InputError(
+            f"{out}: {len(lost)} of {len(blocks)} shards are missing, first {lost[0]}; start "
+            "again: what is finished is kept"
+        )
+    if (folder := stores.local_path(stores.join(out, SHARDS))) is not None:
+        remove_parts(folder)  # of killed workers: all have ended
+    shards = [done[block.shard] for block in blocks]
+    _write_manifest(out, shards)
+    return shards
+
+
+def _finished_shards(out: str, blocks: Sequence[Block]) -> dict[str, Done]:
+    """Find the blocks whose shards are whole and without failures; give their records by name.
+
+    The record of a shard that is not whole is removed.
+    """
     folder = stores.join(out, SHARDS)
     sizes = stores.list_sizes(folder)
     records = {shard.shard: shard for shard in read_results(out)}
@@ -98,23 +121,20 @@ def run_job(job: ShardedJob, engine: Engine) -> list[Done]:
         elif f"{block.shard}.json" in sizes:
             with file_system(record, "removed") as (fs, inner):
                 fs.rm_file(inner)
-    left = [block for block in blocks if block.shard not in done]
-    if left:
-        done |= {shard.shard.removesuffix(".tar"): shard for shard in engine(left, job.work, out)}
-    lost = [block.shard for block in blocks if block.shard not in done]
-    if lost:
-        raise InputError(
-            f"{out}: {len(lost)} of {len(blocks)} shards are missing, first {lost[0]}; start "
-            "again: what is finished is kept"
-        )
-    if (folder := stores.local_path(stores.join(out, SHARDS))) is not None:
-        remove_parts(folder)  # of killed workers: all have ended
+    return done
+
+
+def _write_manifest(out: str, shards: Sequence[Done]) -> None:
+    """Write ``manifest.csv``: each input with its shard, or the reason why it has no result.
+
+    Raises:
+        InputError: two results have one name.
+    """
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(["name", "shard", "reason"])
-    every = [done[block.shard] for block in blocks]
     shard_of: dict[str, str] = {}
-    for shard in every:
+    for shard in shards:
         for name, reason in shard.entries:
             if name in shard_of:
                 raise InputError(
@@ -125,7 +145,6 @@ def run_job(job: ShardedJob, engine: Engine) -> list[Done]:
             table.writerow([name, shard.shard, reason])
     manifest = text.getvalue().encode(errors="surrogateescape")
     stores.publish(manifest, stores.join(out, MANIFEST))
-    return every
 
 
 def claim(out: str, settings: Mapping[str, Any]) -> None:
