@@ -692,29 +692,51 @@ def write_files(
 ) -> None:
     """Write the files of poses, or of a data set's, and the page; ``inputs``: their number."""
     models = {model.name: model for model in method.models}
-    if dataset is not None:
-        write_bop_results(out / results_name(dataset), predictions)
-        if any(p.estimate.alternatives for p in predictions):
-            table = out / results_name(dataset, _WITH_ALTERNATIVES)
-            write_bop_results(table, predictions, with_alternatives=True)
-        image_of = {(i.scene_id, i.image_id): i for i in dataset.instances}
-        posed: dict[tuple[int, int], list[PoseEstimate]] = defaultdict(list)
-        for prediction in predictions:
-            if prediction.place is not None and prediction.estimate.is_posed:
-                posed[prediction.place[:2]].append(prediction.estimate)
-        for image, estimates in posed.items():
-            name = f"{image[0]:06d}_{image[1]:06d}.{PICTURE}"
-            if not is_whole(out, name, [name]):
-                picture = drawn.picture_of(image_of[image])
-                for estimate in estimates:
-                    assert estimate.camera_from_model is not None
-                    model = models[estimate.object]
-                    pose = estimate.camera_from_model
-                    K = image_of[image].K
-                    picture = drawn.draw_pose(picture, pose, model, K)
-                write_image(out / name, picture)
-                note_result(out, name, [out / name])
-    for prediction, job in zip(predictions, jobs, strict=True) if dataset is None else ():
+    if dataset is None:
+        _write_job_files(predictions, jobs, out, models)
+    else:
+        _write_dataset_files(predictions, dataset, out, models)
+    _write_page(out, predictions, jobs, models, dataset, inputs)
+
+
+def _write_dataset_files(
+    predictions: Sequence[Prediction],
+    dataset: BopDataset,
+    out: Path,
+    models: Mapping[str, ObjectModel],
+) -> None:
+    """Write BOP's csv of a data set's poses, and a picture of each image with its poses."""
+    write_bop_results(out / results_name(dataset), predictions)
+    if any(p.estimate.alternatives for p in predictions):
+        table = out / results_name(dataset, _WITH_ALTERNATIVES)
+        write_bop_results(table, predictions, with_alternatives=True)
+
+    image_of = {(i.scene_id, i.image_id): i for i in dataset.instances}
+    posed: dict[tuple[int, int], list[PoseEstimate]] = defaultdict(list)
+    for prediction in predictions:
+        if prediction.place is not None and prediction.estimate.is_posed:
+            posed[prediction.place[:2]].append(prediction.estimate)
+    for image, estimates in posed.items():
+        name = f"{image[0]:06d}_{image[1]:06d}.{PICTURE}"
+        if is_whole(out, name, [name]):
+            continue
+        picture = drawn.picture_of(image_of[image])
+        for estimate in estimates:
+            pose = estimate.camera_from_model
+            assert pose is not None
+            picture = drawn.draw_pose(picture, pose, models[estimate.object], image_of[image].K)
+        write_image(out / name, picture)
+        note_result(out, name, [out / name])
+
+
+def _write_job_files(
+    predictions: Sequence[Prediction],
+    jobs: Sequence[PoseJob[Any]],
+    out: Path,
+    models: Mapping[str, ObjectModel],
+) -> None:
+    """Write the posed model beside each cloud, and a picture of each depth image with its pose."""
+    for prediction, job in zip(predictions, jobs, strict=True):
         pose = prediction.estimate.camera_from_model
         if pose is None:
             continue
@@ -731,7 +753,6 @@ def write_files(
             picture = drawn.draw_region(drawn.grey_depth(view.depth_m), view, pose)
             write_image(files[1], drawn.draw_pose(picture, pose, model, view.K))
         note_result(out, job.name, files)
-    _write_page(out, predictions, jobs, models, dataset, inputs)
 
 
 def print_result(predictions: list[Prediction], out: Path, inputs: int | None = None) -> int:

@@ -419,6 +419,8 @@ def _prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) ->
         truth = shipped.disparity_px if is_stereo else shipped.depth_m
     assert truth is not None, "has_truth said so"
     height, width = truth.shape
+
+    # Depth that was predicted as such is compared as it is; else it follows from the disparity.
     rig = dataset.read_rig(index)
     depth_m = None
     has_disparity = files.has_prediction(predictions, frame.name, of_disparity=True)
@@ -432,28 +434,18 @@ def _prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) ->
             )
         K = torch.tensor([[width, 0, 0], [0, width, 0], [0, 0, 1]], dtype=torch.float64)
         rig = StereoRig(width=width, height=height, K=K, baseline_m=1.0)  # depth takes any
-    found_px = files.read_disparity(predictions, frame.name, rig, with_disparity_png=is_stereo)
+    stored_px = files.read_disparity(predictions, frame.name, rig, with_disparity_png=is_stereo)
     true_px = truth if is_stereo or rig is None else disparity.disparity_from_depth(truth, rig)
-    predicted_px = _at_size_of(true_px, found_px, predictions / frame.name)
+    predicted_px = _at_size_of(true_px, stored_px, predictions / frame.name)
     # With principal points apart, the disparity of far points is negative.
     apart_px = 0.0 if rig is None else rig.cx_right_minus_left_px
     advice = disparity.disparity_advice(predicted_px + apart_px, true_px + apart_px)
     if advice is not None:
         raise InputError(f"{predictions / frame.name}: {advice}")
+
     confidence = files.read_part(predictions, frame.name, "confidence.npy")
     if confidence is not None and confidence.shape != truth.shape:
         confidence = disparity.resized_map(confidence, height, width)
-    drawn = files.read_part(predictions, frame.name, "right.png")
-    view = {}
-    if drawn is not None and frame.right is not None:
-        real = read_image(frame.right)
-        if real.shape != drawn.shape:
-            raise InputError(
-                f"{predictions}: the drawn view of {frame.name} is "
-                f"{drawn.shape[2]}x{drawn.shape[1]}, but its right image is "
-                f"{real.shape[2]}x{real.shape[1]}; predict it again"
-            )
-        view = view_errors(drawn, real)
     return _Prepared(
         frame=frame,
         truth=truth,
@@ -461,44 +453,59 @@ def _prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) ->
         depth_m=depth_m if depth_m is not None and depth_m.shape == truth.shape else None,
         confidence=confidence,
         rig=rig,
-        view=view,
+        view=_drawn_view_errors(frame, predictions),
     )
 
 
-def _at_size_of(true_px: Map, found_px: Float[Tensor, "_ _"], path: Path) -> Map:
+def _drawn_view_errors(frame: Frame, predictions: Path) -> dict[str, float]:
+    """Compare the drawn right view of a frame with the real one, where there are both."""
+    drawn = files.read_part(predictions, frame.name, "right.png")
+    if drawn is None or frame.right is None:
+        return {}
+    real = read_image(frame.right)
+    if real.shape != drawn.shape:
+        raise InputError(
+            f"{predictions}: the drawn view of {frame.name} is "
+            f"{drawn.shape[2]}x{drawn.shape[1]}, but its right image is "
+            f"{real.shape[2]}x{real.shape[1]}; predict it again"
+        )
+    return view_errors(drawn, real)
+
+
+def _at_size_of(true_px: Map, stored_px: Float[Tensor, "_ _"], path: Path) -> Map:
     """Bring a prediction to the size of the truth.
 
     Networks that take squeezed images give maps of another aspect, which are stretched back, with a
     notice; a map that is turned, or a part of the image's, is refused.
     """
     height, width = true_px.shape
-    rows, columns = found_px.shape
-    stretched_px = disparity.resized_map(found_px, height, width) * (width / columns)
+    rows, columns = stored_px.shape
+    stretched_px = disparity.resized_map(stored_px, height, width) * (width / columns)
     aspect = columns * height / (rows * width)
     turned = rows * height / (columns * width)
     if 1 / _SAME_ASPECT < aspect < _SAME_ASPECT:
         return stretched_px
-    shown = f"{columns}x{rows}, and its truth {width}x{height}"
+    sizes = f"{columns}x{rows}, and its truth {width}x{height}"
     if 1 / _SAME_ASPECT < turned < _SAME_ASPECT:
-        raise InputError(f"{path}: is {shown}: it is transposed; save rows first, (H, W)")
+        raise InputError(f"{path}: is {sizes}: it is transposed; save rows first, (H, W)")
     if rows <= height and columns <= width:
         left = (width - columns) // 2
         errors_px = {}
         for top in ((height - rows) // 2, height - rows):  # from the middle, or as KITTI's 1216x352
             window = true_px[top : top + rows, left : left + columns]
-            errors_px[top] = float((found_px - window).abs().nanmedian())
+            errors_px[top] = float((stored_px - window).abs().nanmedian())
         top = min(errors_px, key=lambda row: errors_px[row])
         stretched = float((stretched_px - true_px).abs().nanmedian())
         if errors_px[top] < _CLEARLY * stretched:
             raise InputError(
-                f"{path}: is {shown}: it is a part of the image, cut out at column {left}, row "
+                f"{path}: is {sizes}: it is a part of the image, cut out at column {left}, row "
                 f"{top} (there the median error is {errors_px[top]:.2f} px, stretched to all of it "
                 f"{stretched:.2f} px); put it into a map of {width}x{height}, NaN around it"
             )
-    if shown not in _stretched:
-        _stretched.add(shown)  # of a whole data set once
+    if sizes not in _stretched:
+        _stretched.add(sizes)  # of a whole data set once
         message = (
-            f"{path}: is {shown}, of another aspect, so it is stretched: right where the image was "
+            f"{path}: is {sizes}, of another aspect, so it is stretched: right where the image was "
             "squeezed for it; what was cut out of the image is put into a map of its size, NaN "
             "around it"
         )

@@ -61,6 +61,8 @@ class TrainingPairs:
         self.seed = seed
         if not config.folders and config.streets is None:
             raise InputError("there is nothing to train on: name a folder of pairs (--data PATH).")
+
+        # Where the pairs are: rendered streets, and frames of folders.
         sources: list[list[_Place]] = []
         if config.streets is not None:
             streets = Streets(config.streets)
@@ -77,11 +79,15 @@ class TrainingPairs:
                 f"exclude names {sorted(excluded)}, which no folder holds; a misspelt name would "
                 "train on what should be left out"
             )
+
+        # At most so many of each source, at equal distances: neighbours in a drive look alike.
         self._places: list[_Place] = []
-        for places in sources:  # at equal distances: neighbours in a drive look alike
+        for places in sources:
             most = len(places) if config.limit is None else min(config.limit, len(places))
             last = len(places) - 1
             self._places += [places[round(k * last / max(most - 1, 1))] for k in range(most)]
+
+        # What they are called, and which truth each source has.
         numbered = ((source, number) for source, number, _ in self._places)
         self.frames = [source.frames[n] for source, n in numbered if isinstance(source, Dataset)]
         names = (
@@ -90,9 +96,11 @@ class TrainingPairs:
         )
         self.truths = tuple(dict.fromkeys(f"{name}: {truth}" for name, truth in names if truth))
         self._cache: dict[int, TrainingPair] = {}
-        if baseline_m is None:
-            return
-        # Every rig before any work: another baseline would change the metric scale.
+        if baseline_m is not None:
+            self._refuse_other_rigs(baseline_m)
+
+    def _refuse_other_rigs(self, baseline_m: float) -> None:
+        """Refuse pairs of another baseline, before any work: it would change the metric scale."""
         rigs = {
             source.frames[number].name: source.read_rig(number)
             for source, number, _ in self._places
