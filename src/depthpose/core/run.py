@@ -261,14 +261,14 @@ def claim_names(
     finished = {*results, *(_FRAME.sub("", stem) for stem in results)}
     wanted: dict[str, list[str]] = {}
     for name, files in sources.items():
-        every = [files] if isinstance(files, Path) else list(files)
+        files_of_name = [files] if isinstance(files, Path) else list(files)
         stamps: list[str] = []  # size and time, by which a change is noticed
-        for path in every:
+        for path in files_of_name:
             with suppress(OSError):
                 facts = path.stat()
                 if path.is_file():
                     stamps.append(f"{facts.st_size} bytes of {facts.st_mtime_ns}")
-        wanted[name] = [str(every[0].resolve()), ", ".join(stamps)]
+        wanted[name] = [str(files_of_name[0].resolve()), ", ".join(stamps)]
     for name, (path, stamp) in wanted.items():
         earlier, before = recorded.get(name, [path, stamp])
         if earlier != path:

@@ -92,8 +92,8 @@ def color_agreement(
     parts: list[ColorAgreement] = []
     at_once = max(1, _POINTS_AT_ONCE // len(surface.points_m))
     for first in range(0, len(poses.R), at_once):
-        some = poses[first : first + at_once].double()
-        seen = _look(some, surface, view, image, _NEAR * model.diameter_m)
+        of_chunk = poses[first : first + at_once].double()
+        seen = _look(of_chunk, surface, view, image, _NEAR * model.diameter_m)
         correlation = _correlation(seen)
         places = torch.where(correlation != 0, _independent_places(seen, surface), 0.0)
         visible = seen.weight[..., 0].sum(-1).long()
@@ -362,8 +362,8 @@ def _explained(
     shares: list[Tensor] = []
     at_once = max(1, _POINTS_AT_ONCE // len(surface.points_m))
     for first in range(0, len(poses.R), at_once):
-        some = poses[first : first + at_once]
-        seen = _look(some, surface, view, image, _NEAR * model.diameter_m)
+        of_chunk = poses[first : first + at_once]
+        seen = _look(of_chunk, surface, view, image, _NEAR * model.diameter_m)
         explained = _correlation(seen).clamp(0, _MOST).square()
         shares.append((-seen.weight.sum(1) * torch.log1p(-explained)).sum(-1))
     return torch.cat(shares)
@@ -409,14 +409,14 @@ def color_copies(
 
     # Of copies that a turn about an axis carries into each other one is swept.
     eye = Rigid(torch.eye(3).double(), torch.zeros(3).double())
-    kept = [eye]
+    distinct = [eye]
     for turn in tried:
-        is_swept = any(_is_spun(turn, other, axis) for axis in axes for other in kept)
-        apart_rad = [float(geodesic_rad(turn.R, other.R)) for other in kept]
+        is_swept = any(_is_spun(turn, other, axis) for axis in axes for other in distinct)
+        apart_rad = [float(geodesic_rad(turn.R, other.R)) for other in distinct]
         if not is_swept and min(apart_rad) > _ONE_TURN_RAD:
-            kept.append(turn)
+            distinct.append(turn)
     proposed: list[Rigid] = []
-    for base in (pose @ turn for turn in kept):
+    for base in (pose @ turn for turn in distinct):
         spun = [copies_about_axis(base, axis, model, view) for axis in axes]
         proposed += spun or [base[None]]
     every = Rigid.cat(proposed)

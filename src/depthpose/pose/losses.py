@@ -14,9 +14,9 @@ Directions = Float[Tensor, "points keypoints 3"]
 
 
 POINT_LOSSES: dict[str, Callable[[Directions, Directions], Float[Tensor, " points"]]] = {
-    "mse": lambda found, truth: (found - truth).square().mean((-2, -1)),
-    "cosine": lambda found, truth: (1 - F.cosine_similarity(found, truth, dim=-1)).mean(-1),
-    "l1": lambda found, truth: (found - truth).abs().mean((-2, -1)),
+    "mse": lambda predicted, truth: (predicted - truth).square().mean((-2, -1)),
+    "cosine": lambda predicted, truth: (1 - F.cosine_similarity(predicted, truth, dim=-1)).mean(-1),
+    "l1": lambda predicted, truth: (predicted - truth).abs().mean((-2, -1)),
 }
 """Losses of the raw directions of each point, averaged over keypoints; a training config's ``loss``
 names one, and a new one is one more entry. ``mse`` and ``l1`` pull to unit length too; ``cosine``
@@ -24,7 +24,7 @@ leaves the length alone."""
 
 
 def direction_loss(
-    found: Directions,
+    predicted: Directions,
     points_m: Float[Tensor, "points 3"],
     copies_m: Float[Tensor, "instances copies keypoints 3"],
     instance: Int[Tensor, " points"],
@@ -37,7 +37,7 @@ def direction_loss(
     the axis of symmetry.
 
     Args:
-        found: raw outputs of each point's own class.
+        predicted: raw outputs of each point's own class.
         points_m: where each point lies, in the frame of the keypoints.
         copies_m: keypoints of each instance under each of its object's symmetries; objects with
             fewer than others repeat a copy.
@@ -48,14 +48,14 @@ def direction_loss(
         InputError: there is no such loss.
     """
     refuse_unknown("loss", mode, POINT_LOSSES)
-    if not len(found):
-        return found.sum()
+    if not len(predicted):
+        return predicted.sum()
     points = torch.bincount(instance, minlength=len(copies_m))
 
     def means_of(truth_m: Float[Tensor, "instances keypoints 3"]) -> Float[Tensor, " instances"]:
         # 0 where a point lies on its keypoint.
         truth = F.normalize(truth_m[instance] - points_m[:, None], dim=-1, eps=1e-9)
-        losses = POINT_LOSSES[mode](found, truth)
+        losses = POINT_LOSSES[mode](predicted, truth)
         sums = losses.new_zeros(len(points)).index_add(0, instance, losses)
         return sums / points.clamp(min=1).to(losses.dtype)
 
@@ -66,14 +66,14 @@ def direction_loss(
 
 
 def model_point_loss(
-    found: Rigid, truth: Rigid, points_m: Float[Tensor, "b n 3"], copies: Rigid
+    predicted: Rigid, truth: Rigid, points_m: Float[Tensor, "b n 3"], copies: Rigid
 ) -> Float[Tensor, " b"]:
     """ADD [m] of each pose against the nearest symmetric copy of its truth.
 
     The mean distance of points of each one's model, differentiable in the found pose. Poses are
     ``camera_from_model``, copies ``model_from_model`` (b, c) with the identity among them.
     """
-    moved = found.apply(points_m)
+    moved = predicted.apply(points_m)
     # T_true S p for each symmetry S: (b, c, n, 3)
     every = points_m[:, None].expand(-1, copies.R.shape[1], -1, -1)
     true = Rigid(truth.R[:, None].expand_as(copies.R), truth.t_m[:, None].expand_as(copies.t_m))

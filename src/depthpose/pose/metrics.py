@@ -126,20 +126,21 @@ def vsd(
     y = (pixels[..., 1] - K[1, 2]) / K[1, 1]
     x = (pixels[..., 0] - K[0, 2] - K[0, 1] * y) / K[0, 0]
     rays = (x * x + y * y + 1).sqrt()
-    measured, found, known = (
+    measured, predicted, known = (
         image_m.double().nan_to_num(nan=0.0, posinf=0.0) * rays
         for image_m in (depth_m, render(estimated), render(true))
     )
     is_known, is_found = (
-        (model > 0) & ((model - measured <= delta_m) | (measured == 0)) for model in (known, found)
+        (model > 0) & ((model - measured <= delta_m) | (measured == 0))
+        for model in (known, predicted)
     )
-    is_found |= is_known & (found > 0)
+    is_found |= is_known & (predicted > 0)
     both = is_known & is_found
     either = is_known | is_found
     count = int(either.sum())
     if count == 0:
         return torch.ones(len(taus_m), dtype=torch.float64)
-    gap_m = (known[both] - found[both]).abs()
+    gap_m = (known[both] - predicted[both]).abs()
     alone = count - int(both.sum())
     bad = torch.stack([(gap_m >= tau).sum() for tau in taus_m])
     return (bad.double() + alone) / count

@@ -241,15 +241,15 @@ class GeoPoseNet(PoseEstimator):
         coordinates = torch.cat([grid.coordinates for grid in grids])
         points_m = [job.cloud.points_m @ job.cloud.voxels.grid_from_camera.mT for job in ready]
         device = self.config.device
-        seen = SeenPoints(
+        network_input = SeenPoints(
             points_m=torch.cat(points_m).to(device),
             coordinates=torch.cat([cloud_of_point[:, None], coordinates], 1).to(device),
             features=torch.cat([grid.features for grid in grids]).to(device),
             class_of_point=numbers[cloud_of_point].to(device),
         )
-        outputs = self._network.directions(seen).float().cpu().split(counts)
-        for job, some in zip(ready, outputs, strict=True):
-            job.directions = some @ job.cloud.voxels.grid_from_camera
+        outputs = self._network.directions(network_input).float().cpu().split(counts)
+        for job, of_cloud in zip(ready, outputs, strict=True):
+            job.directions = of_cloud @ job.cloud.voxels.grid_from_camera
         spent_s = time.perf_counter() - start
         for job, count in zip(ready, counts, strict=True):  # each has a share of the time
             job.seconds["network"] = spent_s * count / sum(counts)
@@ -336,9 +336,9 @@ class GeoPoseNet(PoseEstimator):
         copies_m = (pose @ copies_of(job.prepared).trained).apply(keypoints_m)
         points_m = job.cloud.points_m.double()
         directions = normalize(job.directions.double(), dim=-1)
-        every = max(1, len(points_m) // _COMPARED)
-        toward = normalize(copies_m[:, None] - points_m[::every, None], dim=-1)
-        best = int((directions[::every] * toward).sum(-1).mean((-2, -1)).argmax())
+        step = max(1, len(points_m) // _COMPARED)
+        toward = normalize(copies_m[:, None] - points_m[::step, None], dim=-1)
+        best = int((directions[::step] * toward).sum(-1).mean((-2, -1)).argmax())
         toward = normalize(copies_m[best] - points_m[:, None], dim=-1)
         return float((directions * toward).sum(-1).clamp(-1, 1).arccos().mean())
 

@@ -113,9 +113,9 @@ def import_resnet18(file: Path, out: Path) -> None:
     network = ResNet18()
     # The count of batches steers nothing at inference, and old files do not hold it.
     spare = {k: t for k, t in network.state_dict().items() if k.endswith("num_batches_tracked")}
-    held = Checkpoint(kind=ENCODER_KIND, config={}, state={**spare, **tensors})
+    checkpoint = Checkpoint(kind=ENCODER_KIND, config={}, state={**spare, **tensors})
     try:
-        load_weights(network, held, ENCODER_KIND)
+        load_weights(network, checkpoint, ENCODER_KIND)
     except InputError as error:
         raise InputError(f"{file}: not the published weights of a ResNet-18: {error}") from error
     facts = {
@@ -351,10 +351,10 @@ def label_parts(mask: Bool[Tensor, "h w"]) -> tuple[Int64[Tensor, "h w"], Int64[
 
 
 def count_overlap(
-    found: Int[Tensor, "*b h w"], truth: Int[Tensor, "*b h w"], classes: int
+    predicted: Int[Tensor, "*b h w"], truth: Int[Tensor, "*b h w"], classes: int
 ) -> Int64[Tensor, "classes classes"]:
     """Count the pixels of an image or a batch by true class (row) and found class (column)."""
-    pairs = (truth * classes + found).flatten().cpu()
+    pairs = (truth * classes + predicted).flatten().cpu()
     return torch.bincount(pairs, minlength=classes**2).view(classes, classes)
 
 

@@ -94,8 +94,8 @@ def write_pose_weights(
     learnt = half_state(network) if with_half else network.state_dict()
     state = {f"network.{name}": tensor for name, tensor in learnt.items()}
     for k, model in enumerate(weights.models):
-        kept = _TENSORS if with_meshes else ("keypoints_m",)
-        for name in kept:
+        tensor_names = _TENSORS if with_meshes else ("keypoints_m",)
+        for name in tensor_names:
             tensor = getattr(model, name)
             # A copy: two models may be made of one tensor, which safetensors refuses to write.
             stored = tensor.dtype if tensor.is_floating_point() else torch.int32

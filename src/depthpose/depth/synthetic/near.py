@@ -113,7 +113,7 @@ def draw_near(config: NearConfig, index: int) -> StreetFrame:
     In a share of the pairs both cameras see infrared, in grey; in a share of these a projector
     beside them adds dots. A share has black borders, whose truth is unknown.
     """
-    made = make_near(config, index)
+    near = make_near(config, index)
     rng = np.random.default_rng([78, config.seed, index])
     is_infrared = bool(rng.random() < config.infrared_share)
     projector = None
@@ -121,7 +121,7 @@ def draw_near(config: NearConfig, index: int) -> StreetFrame:
         projector = Projector(
             place_m=(float(rng.uniform(-0.5, 1.0)) * _DRAWN_BASELINE_M, 0.0, 0.0),
             # Three to ten pixels apart.
-            dots_per_radian=float(made.rig.K[0, 0]) / log_uniform(rng, 3, 10),
+            dots_per_radian=float(near.rig.K[0, 0]) / log_uniform(rng, 3, 10),
             strength=log_uniform(rng, 0.15, 4),
         )
     settings = StreetsConfig(
@@ -130,7 +130,7 @@ def draw_near(config: NearConfig, index: int) -> StreetFrame:
         rectification_error_px=config.rectification_error_px,
     )
     seed = (config.seed, index, 78)
-    frame = draw_scene(made.scene, made.rig, settings, seed, projector)
+    frame = draw_scene(near.scene, near.rig, settings, seed, projector)
 
     views = [frame.left, frame.right]
     if is_infrared:
@@ -146,14 +146,14 @@ def draw_near(config: NearConfig, index: int) -> StreetFrame:
             px.masked_fill(is_black, torch.nan)
             for px, is_black in zip((left_px, right_px), unknown, strict=True)
         )
-    true_rig = replace(frame.rig, baseline_m=frame.rig.baseline_m * made.metres_per_unit)
+    true_rig = replace(frame.rig, baseline_m=frame.rig.baseline_m * near.metres_per_unit)
     return replace(
         frame,
         left=(views[0] * 255).round() / 255,
         right=(views[1] * 255).round() / 255,
         disparity_px=left_px,
         right_disparity_px=right_px,
-        depth_m=frame.depth_m * made.metres_per_unit,
+        depth_m=frame.depth_m * near.metres_per_unit,
         rig=true_rig,
     )
 

@@ -226,42 +226,44 @@ def check_bop(
     return make_report(name, counts, problems)
 
 
-def _check_models(folder: Path, numbers: set[int], found: list[Problem]) -> dict[int, ObjectModel]:
-    """Read the models that can be read; what is wrong with them goes to ``found``."""
+def _check_models(
+    folder: Path, numbers: set[int], problems: list[Problem]
+) -> dict[int, ObjectModel]:
+    """Read the models that can be read; what is wrong with them goes to ``problems``."""
     models: dict[int, ObjectModel] = {}
     try:
         home, infos = read_models_info(folder)
     except InputError as error:
-        found.append(Problem(path=folder, kind="missing", message=str(error)))
+        problems.append(Problem(path=folder, kind="missing", message=str(error)))
         return models
     for number in sorted(numbers):
         named = (home / f"obj_{number:06d}.ply", home / f"obj_{number:02d}.ply")
         path = next((path for path in named if path.is_file()), None)
         if path is None:
             message = f"has no mesh of object {number}, which is annotated"
-            found.append(Problem(path=home, kind="missing", message=message))
+            problems.append(Problem(path=home, kind="missing", message=message))
             continue
         try:
             symmetries_from_bop(infos.get(number, {}), source=f"object {number}")
             models[number] = read_model(path, "mm", number=number)
         except InputError as error:
-            found.append(unreadable(path, error))
+            problems.append(unreadable(path, error))
             continue
         declared_mm = infos.get(number, {}).get("diameter")
         measured_mm = 1000 * exact_diameter(models[number].vertices_m)
         if not isinstance(declared_mm, int | float):
             message = "has no declared diameter; that of the mesh is taken"
-            found.append(Problem(path=path, kind="note", message=message))
+            problems.append(Problem(path=path, kind="note", message=message))
         elif abs(measured_mm - declared_mm) > _DIAMETER_SLACK * declared_mm:
             message = f"is {measured_mm:.1f} mm across, but models_info says {declared_mm:.1f} mm"
-            found.append(Problem(path=path, kind="mismatch", message=message))
+            problems.append(Problem(path=path, kind="mismatch", message=message))
     # Estimators know objects by name, and refuse two of one.
     names = object_names(folder, numbers)
     for name, count in sorted(Counter(names.values()).items()):
         if count > 1:
             of_name = " and ".join(str(n) for n in sorted(names) if names[n] == name)
             message = f"calls objects {of_name} {name!r}; rename all but one in models_info"
-            found.append(Problem(path=home, kind="mismatch", message=message))
+            problems.append(Problem(path=home, kind="mismatch", message=message))
     return models
 
 

@@ -259,27 +259,27 @@ def of_targets(dataset: BopDataset, targets: Sequence[BopTarget]) -> BopDataset:
     for instance in dataset.instances:
         of_place[place_of(instance)].append(instance)
         of_image[instance.scene_id, instance.image_id].append(instance)
-    kept: list[Instance] = []
+    chosen: list[Instance] = []
     for target in targets:
-        there = of_image[target.scene_id, target.image_id]
+        instances = of_image[target.scene_id, target.image_id]
         if target.object_id is not None:
             place = Place(target.scene_id, target.image_id, target.object_id)
-            there = sorted(of_place[place], key=lambda i: -(i.visible_fraction or 0.0))
-        if len(there) < (target.count or 0):
+            instances = sorted(of_place[place], key=lambda i: -(i.visible_fraction or 0.0))
+        if len(instances) < (target.count or 0):
             raise InputError(
                 f"{dataset.folder}: the targets ask for {target.count} of object "
                 f"{target.object_id} in scene {target.scene_id}, image {target.image_id}, but "
-                f"{len(there)} are annotated in split {dataset.split!r}; give the list of this "
+                f"{len(instances)} are annotated in split {dataset.split!r}; give the list of this "
                 "very split"
             )
-        kept += there[: target.count]
-    if not kept:
+        chosen += instances[: target.count]
+    if not chosen:
         raise InputError(
             f"{dataset.folder}: nothing that the {len(targets)} targets ask for is annotated in "
             f"split {dataset.split!r}; give the list of this very split"
         )
-    kept.sort(key=lambda i: (i.scene_id, i.image_id, i.index))
-    return replace(dataset, instances=kept)
+    chosen.sort(key=lambda i: (i.scene_id, i.image_id, i.index))
+    return replace(dataset, instances=chosen)
 
 
 PVNET_DIAMETERS_M = {

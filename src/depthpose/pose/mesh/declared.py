@@ -163,9 +163,9 @@ def symmetry_of_each(
     return declared
 
 
-def _refuse_other(name: str, names: Sequence[str], said: str) -> None:
+def _refuse_other(name: str, names: Sequence[str], message: str) -> None:
     if name not in names:
-        raise InputError(f"{said}: no object is called so; {nearest_name(name, names)}")
+        raise InputError(f"{message}: no object is called so; {nearest_name(name, names)}")
 
 
 def _entry_of(path: Path, model: ObjectModel) -> Mapping[str, Any]:

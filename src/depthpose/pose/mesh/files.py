@@ -288,7 +288,7 @@ def _refuse_scene(path: AnyPath, data: bytes) -> None:
         meshes = [node for node in scene.get("nodes", []) if "mesh" in node]
         needed += ["a skin" for node in meshes if "skin" in node]
         weights = [entry.get("weights", []) for entry in (*scene.get("meshes", []), *meshes)]
-        needed += ["morph targets" for some in weights if any(some)]
+        needed += ["morph targets" for entry_weights in weights if any(entry_weights)]
         links = [str(buffer.get("uri") or "data:") for buffer in scene.get("buffers", [])]
         outside = [link for link in links if not link.startswith("data:")]
     if outside:

@@ -135,8 +135,8 @@ class SurfaceDeviation:
         turn = Rigid(R, torch.zeros_like(R[..., 0]) if shift is None else shift)
         spacing = 2.0 / math.sqrt(len(self.points))
         farthest: list[Float[Tensor, "*batch"]] = []
-        for way in (turn, turn.inverse()):
-            moved = way.apply(points)
+        for motion in (turn, turn.inverse()):
+            moved = motion.apply(points)
             nearest = self._tree.query(moved.numpy(), k=near, workers=torch.get_num_threads())
             distance, index = (np.reshape(part, (*moved.shape[:-1], near)) for part in nearest)
             gap = moved.numpy()[..., None, :] - self.points.numpy()[index]
@@ -487,14 +487,14 @@ def true_symmetries(
 
     ``alike``: which discrete symmetries and which axes look so; None: as a search finds them.
     """
-    given = model.symmetries
-    if not given.is_found:
-        return given
+    declared = model.symmetries
+    if not declared.is_found:
+        return declared
     turns, axes = cached(model, _search, "near_symmetries")["alike"] if alike is None else alike
-    discrete = given.discrete
+    discrete = declared.discrete
     if discrete is not None:
         discrete = discrete[torch.tensor(turns)] if any(turns) else None
-    continuous = tuple(a for a, is_alike in zip(given.continuous, axes, strict=True) if is_alike)
+    continuous = tuple(a for a, is_alike in zip(declared.continuous, axes, strict=True) if is_alike)
     return Symmetries(discrete=discrete, continuous=continuous, is_found=True)
 
 
@@ -506,20 +506,22 @@ def _search(model: ObjectModel) -> dict[str, Any]:
     """
     surface = SurfaceDeviation(model)
     # Which discrete symmetries, and which axes, have copies that lie on the surface.
-    given = model.symmetries
+    declared = model.symmetries
     circle = torch.arange(1, 8, dtype=torch.float64) * (math.pi / 4)
-    turns = [_turns(axis.direction.double(), circle) for axis in given.continuous]
+    turns = [_turns(axis.direction.double(), circle) for axis in declared.continuous]
     axes = [float(surface.deviation(R, share=ALMOST_ALL).max()) <= ALIKE for R in turns]
     discrete = list[bool]()
-    if given.discrete is not None:
-        R = given.discrete.R.double()
+    if declared.discrete is not None:
+        R = declared.discrete.R.double()
         discrete = (surface.deviation(R, share=ALMOST_ALL) <= ALIKE).tolist()
     alike = (discrete, axes)
     same = symmetry_transforms(true_symmetries(model, alike), _FINE_STEP).R
     # Symmetries that were found, and turns refined to where they fit best: a scan whose points lie
     # denser on one side has its centre where no symmetry has it.
-    copies = symmetry_transforms(given, _STEP).R.double()[1:]
-    tried = [Rigid(R, torch.zeros(3).double()) for R in (copies if given.is_found else copies[:0])]
+    copies = symmetry_transforms(declared, _STEP).R.double()[1:]
+    tried = [
+        Rigid(R, torch.zeros(3).double()) for R in (copies if declared.is_found else copies[:0])
+    ]
     # From quarter turns about the principal axes, and the best of thousands of other turns.
     quarters = torch.arange(1, 4).double() * (math.pi / 2)
     starts = [R for axis in surface.axes for R in _turns(axis, quarters)]

@@ -202,7 +202,7 @@ def _make_frame(
     corners = [pose.apply(solid.triangles_m) for solid, pose in placed]
     raster = rasterize(torch.cat(corners), K, width, height)
     owner = torch.cat([torch.full((len(c),), i) for i, c in enumerate(corners)])
-    seen = torch.where(raster.primitive >= 0, owner[raster.primitive.clamp(min=0)], -1)
+    visible = torch.where(raster.primitive >= 0, owner[raster.primitive.clamp(min=0)], -1)
     # Behind the table blots of several sizes over a colour, out of focus.
     image = torch.rand(3, 1, 1, generator=generator) * torch.ones(1, height, width)
     for cells in (3, 8, 24):
@@ -240,7 +240,7 @@ def _make_frame(
                 BopObject(
                     number=solid.number,
                     camera_from_model=pose,
-                    visible=seen == i,
+                    visible=visible == i,
                     silhouette=silhouette,
                 )
             )

@@ -226,9 +226,9 @@ def _is_shadowed(depth_m: Depth, focal_px: float, baseline_m: float = _KINECT_BA
 def _displaced(depth_m: Depth, scale: float, generator: torch.Generator) -> Depth:
     """Read each pixel ``scale`` times some pixels away, alike its neighbours: edges wander."""
     height, width = depth_m.shape
-    ways = [1.2 * smooth_noise((height, width), 3.0 * scale, generator) for _ in range(2)]
+    shifts = [1.2 * smooth_noise((height, width), 3.0 * scale, generator) for _ in range(2)]
     farthest = _STEREO_WINDOW * scale
-    dy, dx = ((scale * way).clamp(-farthest, farthest).round().long() for way in ways)
+    dy, dx = ((scale * shift).clamp(-farthest, farthest).round().long() for shift in shifts)
     rows = (torch.arange(height)[:, None] + dy).clamp(0, height - 1)
     columns = (torch.arange(width) + dx).clamp(0, width - 1)
     return depth_m[rows, columns]

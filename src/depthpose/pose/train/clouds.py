@@ -203,9 +203,9 @@ def read_models(
         InputError: none is named, or of two kinds, CAD files without their unit, two have one name,
             or a file is damaged.
     """
-    given = [name for name in ("cad", "bop", "parts") if getattr(config, name)]
-    if len(given) > 1:
-        raise InputError(f"{' and '.join(given)} are given; take the models from one of them")
+    sources = [name for name in ("cad", "bop", "parts") if getattr(config, name)]
+    if len(sources) > 1:
+        raise InputError(f"{' and '.join(sources)} are given; take the models from one of them")
     if config.parts:
         return tuple(make_part(p, n, config.mesh) for n, p in enumerate(config.parts, start=1))
     if not config.bop and not config.cad:
@@ -216,8 +216,8 @@ def read_models(
         if not numbers:
             home, infos = read_models_info(folder)
             files = [path.stem.removeprefix("obj_") for path in home.glob("obj_*.ply")]
-            there = {int(name) for name in files if name.isdigit()} | set(infos)
-            numbers = tuple(sorted(there))
+            numbers_of_models = {int(name) for name in files if name.isdigit()} | set(infos)
+            numbers = tuple(sorted(numbers_of_models))
             if not numbers:
                 raise InputError(f"{home}: holds no obj_NNNNNN.ply; put the models there")
         models = tuple(read_bop_models(folder, numbers, config.mesh).values())
@@ -305,13 +305,13 @@ def held_out_objects(
     return Objects(models, config_here, cloud)
 
 
-def add_error(found: Rigid | None, truth: Rigid, model: ObjectModel) -> float:
+def add_error(estimated: Rigid | None, truth: Rigid, model: ObjectModel) -> float:
     """ADD to the nearest symmetric pose, in diameters; infinite where there is no answer."""
-    if found is None:
+    if estimated is None:
         return math.inf
     points_m = sample_surface(model, _SURFACE)[0]
     copies = symmetry_transforms(model.symmetries)
-    return float(add_of_nearest_m(found, truth, points_m, copies)) / model.diameter_m
+    return float(add_of_nearest_m(estimated, truth, points_m, copies)) / model.diameter_m
 
 
 _CLOUDS_AT_ONCE = 32

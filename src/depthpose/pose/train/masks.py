@@ -65,12 +65,12 @@ class AnnotatedImages:
         if not images:
             raise InputError(f"{config.folder}: split {config.split!r} has no picture (rgb)")
         if objects is None:
-            there = sorted({i.object_id for shown in images.values() for i in shown})
-            wanted = [n for n in there if not config.objects or n in config.objects]
+            shown_numbers = sorted({i.object_id for shown in images.values() for i in shown})
+            wanted = [n for n in shown_numbers if not config.objects or n in config.objects]
             if not wanted:
                 raise InputError(
                     f"{config.folder}: shows none of the objects {list(config.objects)}; it has "
-                    f"{there}"
+                    f"{shown_numbers}"
                 )
             objects = object_names(Path(config.folder), wanted)
         self.objects = objects  # names by number, in the order of the classes
@@ -138,17 +138,19 @@ class TrainingImages:
 
 
 def cut_window(
-    given: LabelledImage, scale: float, size: tuple[int, int], generator: torch.Generator
+    labelled: LabelledImage, scale: float, size: tuple[int, int], generator: torch.Generator
 ) -> LabelledImage:
     """Scale an image and cut a window out of it; what lies beside a small image is background.
 
     Half of the windows show the middle of an object: most of an image is background.
     """
-    rows, columns = (max(1, round(side * scale)) for side in given.image.shape[-2:])
-    image = F.interpolate(given.image[None], (rows, columns), mode="bilinear", antialias=scale < 1)[
-        0
-    ].clamp(0, 1)
-    labels = F.interpolate(given.labels[None, None].float(), (rows, columns), mode="nearest-exact")
+    rows, columns = (max(1, round(side * scale)) for side in labelled.image.shape[-2:])
+    image = F.interpolate(
+        labelled.image[None], (rows, columns), mode="bilinear", antialias=scale < 1
+    )[0].clamp(0, 1)
+    labels = F.interpolate(
+        labelled.labels[None, None].float(), (rows, columns), mode="nearest-exact"
+    )
     labels = labels[0, 0].long()
     bottom = max(0, size[0] - rows)
     right = max(0, size[1] - columns)
