@@ -461,9 +461,9 @@ def colored_jobs(
     out: Path,
     settings: dict[str, Any],
 ) -> list[PoseJob[Any]]:
-    """Give each depth image its colour picture, if any; add to the settings what decides that.
+    """Give each depth image the colour picture of its name, where such pictures are given.
 
-    ``models``: those that may be there.
+    What decides the colours is added to the settings. ``models``: those that may be there.
     """
     if inputs.color is None:
         if inputs.color_camera is not None or inputs.color_from_depth is not None:
@@ -477,21 +477,24 @@ def colored_jobs(
     refuse_among_inputs(out, [color], pictures)
     beside = _beside_depths(_list_depths(depth), pictures, depth, color, "colour picture")
     settings["color"] = str(color.resolve())
+
+    # The camera of the pictures, and where the depth camera is in its frame.
     camera = inputs.color_camera
-    moved = None
+    color_from_depth = None
     if camera is not None:
         settings["color_camera"] = pose_methods.named_file(camera)
     if inputs.color_from_depth is not None:
-        file = inputs.color_from_depth
-        what = "color_from_depth"
-        moved = pose_methods.read_pose(file, "--color-from-depth", what)
-        settings["color_from_depth"] = moved.matrix().tolist()
+        color_from_depth = pose_methods.read_pose(
+            inputs.color_from_depth, "--color-from-depth", "color_from_depth"
+        )
+        settings["color_from_depth"] = color_from_depth.matrix().tolist()
+
     colored: list[PoseJob[Any]] = []
     for job in jobs:
         sources = job.source if isinstance(job.source, tuple) else (job.source,)
         assert sources[0] is not None
         picture = beside[sources[0].stem]
-        read = partial(_read_colored, job.read, models, picture, camera, moved)
+        read = partial(_read_colored, job.read, models, picture, camera, color_from_depth)
         colored.append(replace(job, read=read, source=(*sources, picture)))
     return colored
 
@@ -501,9 +504,10 @@ def _read_colored(
     models: Sequence[ObjectModel],
     picture: Path,
     camera: Path | None,
-    moved: Rigid | None,
+    color_from_depth: Rigid | None,
 ) -> ViewInput:
-    return with_color(read(), models, picture, camera, moved)
+    """Read a depth image together with its colour picture."""
+    return with_color(read(), models, picture, camera, color_from_depth)
 
 
 def _list_depths(depth: Path) -> list[Path]:

@@ -180,6 +180,7 @@ def _rig_of(pair: StereoInput) -> StereoRig:
 
 
 def _nothing_to_learn(dataset: Dataset) -> InputError:
+    """Make the error of a dataset to which no baseline can be fitted."""
     return InputError(
         f"{dataset.name}: none of its {len(dataset)} frames has both truth and calibration; give "
         "--train a folder with lidar_depth, disp_occ or LiDAR scans"

@@ -438,19 +438,21 @@ def thin(
 
 
 def local_planes(
-    every_m: Float64[Tensor, "n 3"], some_m: Float64[Tensor, "m 3"]
+    cloud_m: Float64[Tensor, "n 3"], chosen_m: Float64[Tensor, "m 3"]
 ) -> tuple[Float64[Tensor, "m 3"], Float64[Tensor, "m 1"]]:
-    """Lay a plane through the 20 points nearest to each of some.
+    """Fit a plane to the 20 points of a cloud that are nearest to each of the chosen points.
 
     Returns:
-        The normal of each toward the camera; how bent the cloud is there, 0 (flat) to 1 (a ball).
+        The normal of each toward the camera; the curvature of the cloud there, from the least
+        eigenvalue of the neighbours' scatter: 0 (flat) to 1 (as wide in all directions).
     """
-    count = min(_NEIGHBOURS, len(every_m))
-    index = KDTree(every_m.numpy()).query(some_m.numpy(), k=count, workers=1)[1]
-    near_m = every_m[torch.as_tensor(index).reshape(len(some_m), count)]
+    count = min(_NEIGHBOURS, len(cloud_m))
+    index = KDTree(cloud_m.numpy()).query(chosen_m.numpy(), k=count, workers=1)[1]
+    near_m = cloud_m[torch.as_tensor(index).reshape(len(chosen_m), count)]
     near_m = near_m - near_m.mean(1, keepdim=True)
-    spread, axes = torch.linalg.eigh(near_m.mT @ near_m)
+    eigenvalues, axes = torch.linalg.eigh(near_m.mT @ near_m)
     normals = axes[:, :, 0]
-    is_behind = (normals * some_m).sum(-1, keepdim=True) > 0
-    bend = 3 * spread[:, :1].clamp(min=0) / spread.sum(1, keepdim=True).clamp(min=1e-30)
-    return torch.where(is_behind, -normals, normals), bend
+    is_behind = (normals * chosen_m).sum(-1, keepdim=True) > 0
+    total = eigenvalues.sum(1, keepdim=True).clamp(min=1e-30)
+    curvature = 3 * eigenvalues[:, :1].clamp(min=0) / total
+    return torch.where(is_behind, -normals, normals), curvature

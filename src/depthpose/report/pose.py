@@ -293,7 +293,7 @@ def pose_facts(
 ) -> list[tuple[str, str]]:
     """List the facts of an estimate besides its pose.
 
-    ``how``: by what it was found, if not empty; ``agreeing``: what its ``inlier_share`` is of.
+    ``method``: what estimated it, if not empty; ``agreeing``: what its ``inlier_share`` is of.
     """
     facts = [("object", f"{estimate.object}, {model.diameter_m:.4f} m long")]
     if method:

@@ -128,7 +128,7 @@ def check_rectified(
         places, matched, alike_count = _match(left_grey, right_grey, corners)
         if len(places) < _MIN_MATCHES:
             unlike = RectificationReport(corners=len(corners), matches=len(places), message="")
-            done = _what_was_done(left_grey, right_grey, corners)
+            done = _find_change(left_grey, right_grey, corners)
             if done is not None:
                 return replace(unlike, is_rectified=False, message=done)
             is_other = len(places) < _MIN_FOUND * len(corners) and alike_count < _MAX_ALIKE * len(
@@ -241,8 +241,11 @@ def _place_finely(
     return ((places - centre) / scale)[is_good], (shift / scale)[is_good]
 
 
-def _what_was_done(left: Grey, right: Grey, corners: Places) -> str | None:
-    """Find out whether the right image is mirrored, turned or scaled; None: by none of these."""
+def _find_change(left: Grey, right: Grey, corners: Places) -> str | None:
+    """Say by which change the right image would match: mirrored, rotated or scaled; None: by none.
+
+    ``corners``: of the left image, some of which are matched after each change.
+    """
     some_corners = corners[:_SOME_CORNERS]
     flips = {
         "mirrored": right.flip(1),

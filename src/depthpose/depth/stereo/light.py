@@ -116,8 +116,8 @@ class Refinement(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.compared = ConvNorm(nn.Conv2d, STEM, STEM)
-        seen = _GROUPS * len(_OFFSETS) + STEM + 4
-        widths = (seen, _REFINED, _REFINED)
+        input_width = _GROUPS * len(_OFFSETS) + STEM + 4
+        widths = (input_width, _REFINED, _REFINED)
         dilations = (1, 2, 1)
         self.layers = nn.ModuleList(
             ConvNorm(nn.Conv2d, width, _REFINED, dilation=dilation)
@@ -365,6 +365,7 @@ class Aggregation(nn.Module):
             return product(self.first(volume).relu_(), guide)
 
         def raised(up: nn.Module, volume: Volume, larger: Volume) -> Volume:
+            """Enlarge a volume, and add to the larger one of the way down."""
             return up(volume).add_(larger).relu_()
 
         def end(volume: Volume) -> Volume:

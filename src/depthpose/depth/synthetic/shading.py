@@ -162,7 +162,10 @@ def _sunlit_share(stage: Stage, points: Vectors, normals: Vectors) -> Numbers:
 
 
 def _open_share(light: LightMap, points: Vectors) -> Numbers:
-    """How open each point is to the sky above, from a few places around it."""
+    """Estimate how open each point is to the sky (ambient occlusion), 0 to 1.
+
+    Each of five places around it on the light map that is higher hides a part of the sky.
+    """
     column, row, depth_m = light.place(points)
     side = len(light.depth_m)
     is_inside = (column > 10) & (row > 10) & (column < side - 11) & (row < side - 11)
