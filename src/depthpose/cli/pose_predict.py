@@ -304,6 +304,8 @@ def detection_jobs(
         named = [p for p in detections.iterdir() if p.suffix.lower() in (".json", ".txt")]
         files = [p for p in named if not p.name.startswith(".")]
     refuse_among_inputs(out, [depth, detections], [*depths, *files])
+
+    # The detections of each image, from one file of all or from a file for each.
     by_image: dict[str, list[Detection]] = {}
     if len(files) == 1 and files[0].suffix.lower() == ".json":
         read = read_detections(files[0])
@@ -318,6 +320,8 @@ def detection_jobs(
                 height, width = read_stored_depth(path).shape
                 size = (width, height)
             by_image[path.stem] = read_detections(file, size)
+
+    # Those of the wanted objects, the surest first.
     jobs: list[PoseJob[Any]] = []
     is_any = False
     for path in depths:

@@ -70,12 +70,17 @@ def model_point_loss(
 ) -> Float[Tensor, " b"]:
     """ADD [m] of each pose against the nearest symmetric copy of its truth.
 
-    The mean distance of points of each one's model, differentiable in the found pose. Poses are
-    ``camera_from_model``, copies ``model_from_model`` (b, c) with the identity among them.
+    The mean distance of points of each object, differentiable in the predicted pose.
+
+    Args:
+        predicted: ``camera_from_model`` (b).
+        truth: the same.
+        points_m: of each object's surface.
+        copies: symmetries, ``model_from_model`` (b, c), the identity among them.
     """
-    moved = predicted.apply(points_m)
+    predicted_m = predicted.apply(points_m)
     # T_true S p for each symmetry S: (b, c, n, 3)
-    every = points_m[:, None].expand(-1, copies.R.shape[1], -1, -1)
     true = Rigid(truth.R[:, None].expand_as(copies.R), truth.t_m[:, None].expand_as(copies.t_m))
-    wanted = true.apply(copies.apply(every))
-    return (moved[:, None] - wanted).norm(dim=-1).mean(-1).amin(-1)
+    of_each_copy_m = points_m[:, None].expand(-1, copies.R.shape[1], -1, -1)
+    true_m = true.apply(copies.apply(of_each_copy_m))
+    return (predicted_m[:, None] - true_m).norm(dim=-1).mean(-1).amin(-1)

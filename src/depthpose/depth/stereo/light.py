@@ -259,16 +259,19 @@ class LightFeatures(nn.Module):
 
     def __init__(self, config: LightConfig) -> None:
         super().__init__()
-        w = config.width
+        # Down: a plain branch to 1/4 size for fine details, and an encoder to 1/32.
+        width = config.width
         self.stem = ConvNorm(nn.Conv2d, 3, STEM, stride=2)
         self.quarter = nn.ModuleList(
-            [ConvNorm(nn.Conv2d, STEM, w, stride=2), ConvNorm(nn.Conv2d, w, w)]
+            [ConvNorm(nn.Conv2d, STEM, width, stride=2), ConvNorm(nn.Conv2d, width, width)]
         )
         self.encoder = LiteEncoder(config.encoder_width, levels=4)
         self.top = ConvNorm(nn.Conv2d, self.encoder.channels[3], _DEEP, 1)
+
+        # Up: each level takes the one above, and the encoder's features of its size.
         quarter, eighth, sixteenth, _ = self.encoder.channels
-        skips = (sixteenth, eighth, quarter + w)
-        self.widths = (w, _DEEP // 2, _DEEP // 2, _DEEP)
+        skips = (sixteenth, eighth, quarter + width)
+        self.widths = (width, _DEEP // 2, _DEEP // 2, _DEEP)
         outputs = self.widths[-2::-1]
         above = self.widths[:0:-1]
         self.decoder = nn.ModuleList(

@@ -335,7 +335,9 @@ def _paint_road(
 ) -> Vectors:
     """Give the colour of the asphalt with what is painted on it, at places (x, s) of the road."""
     x, s = place_m.unbind(1)
-    # Far lines are narrower than a pixel: they cover it by the share of its footprint.
+
+    # Lines along the road and bars across it, each as a share of the pixel's footprint: far ones
+    # are narrower than a pixel.
     cover = torch.zeros_like(x)
     for at, half, period, dash in scene.markings.lines.tolist():
         line = _inside(x - at, half, width_m)
@@ -350,10 +352,14 @@ def _paint_road(
         cover = torch.maximum(cover, bar)
     wear = torch.sigmoid(3 * (_looked_up(surfaces.textures().stains, x * 0.13, s * 0.13) + 1.4))
     paint = (cover * scene.markings.brightness * (0.3 + 0.7 * wear))[:, None]
+
+    # Wheels darken two tracks in each lane.
     first, lane_m = scene.markings.wheel_tracks
     within = ((x - first) / lane_m) % 1
     left, right = (torch.exp(-(((within - at) / 0.09) ** 2)) for at in (0.25, 0.75))
     factor = 1 - 0.08 * (left + right)
+
+    # In some stretches a patch of new asphalt, or the cover of a manhole.
     cell = torch.floor(s / _PATCH_M)
     chance = torch.sin(cell * 12.9898 + 97 * scene.weather.shift[0]) * 43758.5453
     chance = chance - chance.floor()
@@ -363,6 +369,7 @@ def _paint_road(
     factor = torch.where(is_patch & (chance > 0.6), factor * (0.45 + 0.45 * chance), factor)
     is_cover = ((x - middle) ** 2 + (along - 2) ** 2 < 0.1) & (chance < 0.35)
     factor = torch.where(is_cover, factor * 0.5, factor)
+
     # Tar in the seams between lanes.
     seam = torch.exp(-(((within - 0.02 - 0.015 * torch.sin(s * 0.7)) / 0.012) ** 2))
     worn = albedo * (factor * (1 - 0.35 * seam * (scene.weather.shift[1] > 0.5)))[:, None]
