@@ -235,14 +235,24 @@ _CLEARER = 0.4  # the inner side is seen in at most so many times the directions
 def outer_sides(
     points: np.ndarray, normals: np.ndarray, cell: float, limit: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Turn normals to the side from which the surface is seen from afar.
+    """Turn normals to the side from which the surface is visible from afar.
 
-    What is thinner than half the distance of the samples, open sheets and what is never seen have
-    no outer side: their normals become 0. Given beside them is, for each sample, the number of the
-    nearest one of an opposite side within the limit, or -1, and which samples are never seen.
+    What is thinner than half the distance of the samples, open sheets and what is never visible
+    have no outer side: their normals become 0.
+
+    Args:
+        points: samples of the surface (n, 3).
+        normals: of either side (n, 3).
+        cell: side of the cells in which samples hide each other.
+        limit: farthest distance to a sample of an opposite side.
+
+    Returns:
+        The normals (n, 3); for each sample the number of the nearest one of an opposite side, or
+        -1; and which samples are never visible.
     """
-    seen = np.zeros((2, len(points)))
-    looked = np.full((2, len(points)), 1e-9)
+    # From many directions: how often each side faces the camera, and is in front then.
+    visible_count = np.zeros((2, len(points)))
+    facing_count = np.full((2, len(points)), 1e-9)
     for axis in fibonacci_directions(_SIDE_DIRECTIONS).numpy():
         across = np.linalg.svd(axis[None])[2][1:]
         flat = np.floor(points @ across.T / cell).astype(np.int64)
@@ -251,19 +261,23 @@ def outer_sides(
         slant = normals @ axis
         order = np.argsort(points @ axis)
         first = np.empty(place.max() + 1, np.int64)
-        for way in (1, -1):  # toward a camera in this direction, and in the other
-            first[place[order[::way]]] = order[::way]
+        for sign in (1, -1):  # toward a camera in this direction, and in the other
+            first[place[order[::sign]]] = order[::sign]
             front = first[place]
             off = ((points - points[front]) * normals[front]).sum(1)
-            is_seen = np.abs(off) < _SHEET / _SAMPLES_CELL * cell
+            is_in_front = np.abs(off) < _SHEET / _SAMPLES_CELL * cell
             for side in (0, 1):
-                facing = way * (1 - 2 * side) * slant > _SLANT
-                seen[side] += facing & is_seen
-                looked[side] += facing
-    share = seen / looked
+                is_facing = sign * (1 - 2 * side) * slant > _SLANT
+                visible_count[side] += is_facing & is_in_front
+                facing_count[side] += is_facing
+
+    # The outer side is visible from clearly more directions than the inner one.
+    share = visible_count / facing_count
     outer = share.argmax(0)
     is_clear = (share.max(0) > _SEEN_FROM) & (share.min(0) < _CLEARER * share.max(0))
     outward = normals * ((1 - 2 * outer) * is_clear)[:, None]
+
+    # The nearest sample that looks the other way, as through a thin wall.
     across = np.full(len(points), -1)
     nearest = np.full(len(points), np.inf)
     for column, sign in ((c, s) for c in range(3) for s in (1, -1)):
@@ -282,20 +296,20 @@ def outer_sides(
 def look_along_rays(
     cloud_m: Float64[Tensor, "n 3"], poses: Rigid, surface: Surface, every: int = 1
 ) -> tuple[Float64[Tensor, " b"], Float64[Tensor, " b"]]:
-    """Compare what a camera at the origin saw with what it would see of the posed surface.
+    """Compare what a camera at the origin observed with what it would observe of a posed surface.
 
     Rays are gathered in cells, each as wide, where the object is, as 1/24 of its diameter.
 
     Args:
-        cloud_m: what was seen, in the camera frame.
+        cloud_m: what was observed, in the camera frame.
         poses: a batch, ``camera_from_model``.
         surface: of the model.
         every: use each n-th point of the surface alone.
 
     Returns:
-        The share of the points that the posed surface would have occluded, and the share of the
-        cells of the posed surface in which nothing was seen; both 1 where the surface lies behind
-        the camera.
+        Free-space violation: the share of the points that the posed surface would have occluded.
+        And the unobserved ratio: the share of the cells of the posed surface in which nothing was
+        observed. Both 1 where the surface lies behind the camera.
     """
     median_m = float(cloud_m[:, 2].median())
     cloud_m = cloud_m[cloud_m[:, 2] > _FRONT * max(median_m, 0.0)]
@@ -303,34 +317,38 @@ def look_along_rays(
         none = torch.ones(len(poses.R), dtype=torch.float64)
         return none, none
     scale = median_m / (_CELL * surface.diameter_m)
-    seen = cloud_m[:, :2] / cloud_m[:, 2:] * scale
-    middle = seen.median(0).values.floor()
+    observed_rays = cloud_m[:, :2] / cloud_m[:, 2:] * scale
+    middle = observed_rays.median(0).values.floor()
     limit_m = 1.5 * NEAR * surface.diameter_m
     if use_numba(cloud_m, poses.R, poses.t_m):
         from depthpose.pose.compiled.points import compare_rays
 
         points_m = surface.points_m[::every]
         arrays = (finite_array(a.detach().numpy()) for a in (cloud_m, poses.R, poses.t_m, points_m))
-        front, unseen = compare_rays(*arrays, scale, *middle.tolist(), _REACH, limit_m)
-        return torch.from_numpy(front), torch.from_numpy(unseen)
+        violation, unobserved = compare_rays(*arrays, scale, *middle.tolist(), _REACH, limit_m)
+        return torch.from_numpy(violation), torch.from_numpy(unobserved)
+
+    # The cells of the rays, in a square about the middle one; what lies beyond is at its border.
     posed_m = poses.apply(surface.points_m[::every])
     depth_m = posed_m[..., 2]
-    posed = posed_m[..., :2] / depth_m.clamp(min=1e-6)[..., None] * scale
+    posed_rays = posed_m[..., :2] / depth_m.clamp(min=1e-6)[..., None] * scale
     width = 2 * _REACH + 1
-    cells = width**2
-    mine, theirs = (
-        ((ray - middle).floor().clamp(-_REACH, _REACH) + _REACH).long() for ray in (posed, seen)
+    posed_cell, observed_cell = (
+        ((rays - middle).floor().clamp(-_REACH, _REACH) + _REACH).long()
+        for rays in (posed_rays, observed_rays)
     )
-    mine = mine[..., 0] * width + mine[..., 1]
-    theirs = theirs[..., 0] * width + theirs[..., 1]
+    posed_cell = posed_cell[..., 0] * width + posed_cell[..., 1]
+    observed_cell = observed_cell[..., 0] * width + observed_cell[..., 1]
+
+    # The nearest point of the posed surface in each cell.
     depth_m = torch.where(depth_m > 0, depth_m, torch.inf)
-    nearest_m = depth_m.new_full((len(depth_m), cells), torch.inf)
-    nearest_m = nearest_m.scatter_reduce_(1, mine, depth_m, "amin")
-    occluded = nearest_m[:, theirs] < cloud_m[:, 2] - limit_m
-    is_seen = torch.zeros(cells, dtype=torch.bool)
-    is_seen[theirs] = True
+    nearest_m = depth_m.new_full((len(depth_m), width**2), torch.inf)
+    nearest_m = nearest_m.scatter_reduce_(1, posed_cell, depth_m, "amin")
+    is_occluded = nearest_m[:, observed_cell] < cloud_m[:, 2] - limit_m
+    is_observed = torch.zeros(width**2, dtype=torch.bool)
+    is_observed[observed_cell] = True
     is_posed = nearest_m.isfinite()
     total = is_posed.sum(1)
-    unseen = (is_posed & ~is_seen).sum(1).double() / total.clamp(min=1)
-    front = occluded.double().mean(1)
-    return torch.where(total > 0, front, 1.0), torch.where(total > 0, unseen, 1.0)
+    unobserved = (is_posed & ~is_observed).sum(1).double() / total.clamp(min=1)
+    violation = is_occluded.double().mean(1)
+    return torch.where(total > 0, violation, 1.0), torch.where(total > 0, unobserved, 1.0)

@@ -205,9 +205,9 @@ def _follow_surface(surface: SurfaceDeviation, R: Tensor) -> Tensor:
 
 
 def symmetries_from_proposals(proposals: list[SymmetryProposal]) -> Symmetries:
-    """Take the sure ones: turns that an axis of revolution does not already say, and the axes.
+    """Take the sure proposals: axes of revolution, and rotations that do not follow from an axis.
 
-    Without an axis the turns are completed to a group: two symmetries one after the other are one.
+    Without an axis the rotations are completed to a group: the product of two symmetries is one.
     """
     sure = [p for p in proposals if p.certainty >= SURE]
     lines = [
@@ -218,36 +218,37 @@ def symmetries_from_proposals(proposals: list[SymmetryProposal]) -> Symmetries:
         for p in sure
     ]
     axes = tuple(line for line, p in zip(lines, sure, strict=True) if p.kind == "continuous")
-    kept: list[Rigid] = []
+    turns: list[Rigid] = []
     for line, proposal in zip(lines, sure, strict=True):
         if proposal.angle_rad is None:
             continue
         angle_rad = torch.tensor(proposal.angle_rad, dtype=torch.float64)
         turn = turn_about(line.direction, line.point_m, angle_rad)
-        # A turn about an axis makes it one of those kept where both move the axis alike.
-        is_known = any(
-            float(geodesic_rad(turn.R, other.R)) < _SAME_RAD
+        # Two that move an axis of revolution alike differ by a rotation about that axis.
+        is_same = any(
+            float(geodesic_rad(turn.R, earlier.R)) < _SAME_RAD
             or any(
-                float((turn.R @ axis.direction - other.R @ axis.direction).norm()) < _SAME_RAD
+                float((turn.R @ axis.direction - earlier.R @ axis.direction).norm()) < _SAME_RAD
                 for axis in axes
             )
-            for other in kept
+            for earlier in turns
         )
-        if not is_known:
-            kept.append(turn)
-    if not kept:
+        if not is_same:
+            turns.append(turn)
+    if not turns:
         return Symmetries(continuous=axes)
-    every = list(kept)
-    for first in every if not axes else ():  # grows under way: products until there is no new one
-        for second in kept:
+
+    group = list(turns)
+    for first in group if not axes else ():  # grows under way: products until there is no new one
+        for second in turns:
             product = first @ second
-            rotations = [_EYE, *(turn.R for turn in every)]
+            rotations = [_EYE, *(turn.R for turn in group)]
             if all(float(geodesic_rad(product.R, R)) > _SAME_RAD for R in rotations):
-                every.append(product)
-        if len(every) > 60:  # what passes 60 was no group (an icosahedron's)
-            every = kept
+                group.append(product)
+        if len(group) > 60:  # what passes 60 was no group (an icosahedron's)
+            group = turns
             break
-    return Symmetries(discrete=Rigid.stack(every), continuous=axes)
+    return Symmetries(discrete=Rigid.stack(group), continuous=axes)
 
 
 def with_found_symmetries(
@@ -540,7 +541,7 @@ def _search(model: ObjectModel) -> dict[str, Any]:
         if len(near) == _MOST_NEAR or off > 2 * _TOLERANCE:
             break
         # New is what is far from the others and from all copies of them that look alike.
-        others = torch.cat([R @ same.double() for R in (_EYE, *(one.R for one, _ in near))])
+        others = torch.cat([R @ same.double() for R in (_EYE, *(motion.R for motion, _ in near))])
         apart_rad = float(geodesic_rad(turn.R.expand_as(others), others).min())
         if apart_rad > _NEAR_SUPPRESSION_RAD:  # from the surface's centre and unit to the model's
             shift_m = surface.centre_m - turn.R @ surface.centre_m + turn.t_m * model.diameter_m
