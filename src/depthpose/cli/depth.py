@@ -176,12 +176,16 @@ def evaluate(
     rule = find_protocol(comparison.protocol)
     dataset = open_frames(data, split)
     chosen = choose_methods(methods, matching.config, dataset)
+
+    # The folder is that of these frames and this protocol; methods may be added later.
     is_url = re.match(r"\w+:/", str(data)) is not None
     location = str(data if is_url else data.resolve())
     about = {"data": location, "split": None if split is None else str(split)}
     about |= {"protocol": comparison.protocol, "cap": list(comparison.cap)}
     files = [*table_files("rows", "frames", "confidence"), "report.html", "predictions"]
     claim_folder(out, {"command": "depth evaluate", **about}, files)
+
+    # Predict what is missing, then measure it with the predictions that are given.
     folders = [predict_dataset(dataset, method, rule, out / "predictions") for method in chosen]
     name = comparison.protocol
     caps_m = comparison.cap

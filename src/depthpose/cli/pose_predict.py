@@ -862,8 +862,7 @@ def _write_page(
     inputs: int | None,
 ) -> None:
     """Write a page with some of the predictions and the reason of every refusal."""
-    instances = () if dataset is None else dataset.instances
-    image_of = {(i.scene_id, i.image_id): i.rgb for i in instances}
+    # The table: refusals first, for they are what is looked for.
     estimates = [prediction.estimate for prediction in predictions]
     numbers = Counter(estimate.status for estimate in estimates)
     counts = ", ".join(f"{count} {status}" for status, count in sorted(numbers.items()))
@@ -871,6 +870,10 @@ def _write_page(
         _row(listed)
         for listed in sorted(estimates, key=lambda listed: listed.is_posed)[:_MOST_ROWS]
     ]
+
+    # Some inputs with their poses, and some that were refused.
+    instances = () if dataset is None else dataset.instances
+    image_of = {(i.scene_id, i.image_id): i.rgb for i in instances}
     readable = [k for k, listed in enumerate(estimates) if listed.status != "unreadable"]
     sections: list[Section] = []
     for k in choose_answers([predictions[k].estimate.is_posed for k in readable]):
@@ -888,6 +891,7 @@ def _write_page(
         image = None if rgb is None else read_image(rgb)
         section = drawn.pose_section(estimate.name, shown_input, estimate, model, image=image)
         sections.append(section)
+
     number = len(predictions)
     total = _count_inputs(predictions, inputs)
     text = f"{total}: {counts}. Shown below: {len(sections)}"

@@ -316,6 +316,8 @@ def camera_from_facts(facts: CameraFacts, size: Size | None) -> Camera:
             f"{facts.kind} with lens distortion{fisheye} ({coefficients}), and only images without "
             f"are understood; undistort them by {facts.undistort}, {next_step}"
         )
+
+    # A focal length and a centre in pixels of this image.
     camera = make_camera(facts, size)
     fx = float(camera.K[0, 0])
     shown = f"{camera.width}x{camera.height}"
@@ -327,11 +329,14 @@ def camera_from_facts(facts: CameraFacts, size: Size | None) -> Camera:
         raise InputError(f"K has fx {fx:g} for {shown} pixels, {what}")
     refuse_squeezed(camera.K)
     refuse_outside(camera.K, camera.width, camera.height)
+
+    # A baseline in metres, and a unit of depth images.
     if isinstance(camera, StereoRig):
-        way = 'written as ours: width, height, K, "baseline_m"'
-        way = "made in Python, as a StereoRig" if facts.is_metric else way
+        how = 'written as ours: width, height, K, "baseline_m"'
+        if facts.is_metric:
+            how = "made in Python, as a StereoRig"
         most_m = _FILE_BASELINE_M if facts.is_metric else WIDE_BASELINE_M
-        refuse_baseline(camera.baseline_m, f"a rig that is truly this wide is {way}", most_m)
+        refuse_baseline(camera.baseline_m, f"a rig that is truly this wide is {how}", most_m)
         if abs(camera.cx_right_minus_left_px) >= camera.width:
             raise InputError(
                 f"the principal points differ by {camera.cx_right_minus_left_px:g} px, more than "
@@ -343,6 +348,8 @@ def camera_from_facts(facts: CameraFacts, size: Size | None) -> Camera:
         if unit_m > 1:
             what = f"which looks like units a metre; it is metres a unit: write {1 / unit_m:g}"
         raise InputError(f"depth_unit_m is {unit_m:g}, {what}")
+
+    # A centre far off is of another resolution, unless the file names this very size.
     doubt = facts.doubt
     try:
         refuse_other_resolution(camera.K, camera.width, camera.height)

@@ -114,6 +114,7 @@ def check_rectified(
         finding = "left and right are the same picture; give the view of each camera"
         return RectificationReport(is_pair=False, message=finding)
     with torch.no_grad():
+        # Images without texture match nothing.
         left_grey, right_grey = (_grey(image, _COARSE_PIXELS) for image in (left, right))
         for side, grey in (("left", left_grey), ("right", right_grey)):
             deviation = float(grey.std(correction=0))
@@ -124,16 +125,17 @@ def check_rectified(
                     "needed); is the lens covered, or the file empty?"
                 )
                 return RectificationReport(is_pair=False, message=finding)
+
+        # Where few corners match: is one image changed, or of another scene?
         corners = _find_corners(left_grey)
         places, matched, alike_count = _match(left_grey, right_grey, corners)
         if len(places) < _MIN_MATCHES:
             unlike = RectificationReport(corners=len(corners), matches=len(places), message="")
-            done = _find_change(left_grey, right_grey, corners)
-            if done is not None:
-                return replace(unlike, is_rectified=False, message=done)
-            is_other = len(places) < _MIN_FOUND * len(corners) and alike_count < _MAX_ALIKE * len(
-                corners
-            )
+            change = _find_change(left_grey, right_grey, corners)
+            if change is not None:
+                return replace(unlike, is_rectified=False, message=change)
+            has_few_matches = len(places) < _MIN_FOUND * len(corners)
+            is_other = has_few_matches and alike_count < _MAX_ALIKE * len(corners)
             if is_other and len(corners) >= _MIN_TEXTURED:
                 finding = (
                     f"the images do not belong together: {len(places)} of {len(corners)} corners "
@@ -278,6 +280,7 @@ def _report(
     places_px: Tensor, shift_px: Tensor, corners: int, width: int, apart_px: float
 ) -> RectificationReport:
     """Summarise the matches; their places are counted from the centre [px]."""
+    # How far rows are off, robustly, and how many disparities are positive.
     matches = len(shift_px)
     disparity_px = apart_px - shift_px[:, 0]
     clear = disparity_px[disparity_px.abs() > 1]
@@ -287,6 +290,8 @@ def _report(
     if matches:
         offset = float(shift_px[:, 1].median())
         spread = _MAD_TO_DEVIATION * float((shift_px[:, 1] - offset).abs().median())
+
+    # Against limits that grow with the image.
     larger = max(1.0, width / _LIMITS_WIDTH)
     most_offset = larger * _MAX_OFFSET_PX
     most_spread = larger * _MAX_SPREAD_PX
@@ -304,6 +309,8 @@ def _report(
         is_swapped=share <= _MAX_SHARE_SWAPPED if len(clear) >= _MIN_MATCHES else None,
         message="",
     )
+
+    # In words.
     if not is_known:
         message = (
             f"only {matches} of the {_MIN_MATCHES} matches needed: cannot tell whether the pair is "

@@ -105,14 +105,15 @@ class StereoTask:
 def validate_pairs(
     matcher: StereoNetwork, held_out: TrainingPairs, generator: synthesis.Generator | None = None
 ) -> ValidationResult:
-    """Disparity error of a matcher on held-out pairs, or on right views that a generator draws.
+    """Measure a matcher on held-out pairs, or on right views that a generator draws.
 
-    What is taken for sky has a disparity of 0.
+    What is taken for sky has a disparity of 0. The numbers are means over pairs: end-point error
+    [px], share of bad pixels, and shares of the sky that is missed and of the rest taken for sky.
     """
-    errors = []
-    bad = []
-    missed = []
-    false = []
+    errors: list[float] = []
+    bad_shares: list[float] = []
+    missed_shares: list[float] = []
+    false_shares: list[float] = []
     pictures = {}
     device = next(matcher.parameters()).device
     for index in range(len(held_out)):
@@ -132,9 +133,9 @@ def validate_pairs(
         if is_sky is not None:
             predicted_px = torch.where(is_sky, 0.0, predicted_px)
             if bool(is_true_sky.any()):
-                missed.append(float((~is_sky[is_true_sky]).float().mean()))
+                missed_shares.append(float((~is_sky[is_true_sky]).float().mean()))
             if bool(is_known.any()):
-                false.append(float(is_sky[is_known].float().mean()))
+                false_shares.append(float(is_sky[is_known].float().mean()))
         if index == 0:
             views = [pair.left, right, draw_disparity(predicted_px)]
             pictures["left_right_disparity"] = torch.cat(views, 1)
@@ -142,10 +143,13 @@ def validate_pairs(
             continue
         metrics = measure("disparity", predicted_px[is_known], pair.left_px[is_known])
         errors.append(metrics["epe_px"])
-        bad.append(metrics["d1_all"])
-    named = {"epe_px": errors, "d1": bad}
-    named |= {name: v for name, v in (("sky_missed", missed), ("sky_false", false)) if v}
-    numbers = {f"held_out/{name}": sum(v) / max(len(v), 1) for name, v in named.items()}
+        bad_shares.append(metrics["d1_all"])
+    by_name = {"epe_px": errors, "d1": bad_shares}
+    of_sky = {"sky_missed": missed_shares, "sky_false": false_shares}
+    by_name |= {name: shares for name, shares in of_sky.items() if shares}
+    numbers = {
+        f"held_out/{name}": sum(values) / max(len(values), 1) for name, values in by_name.items()
+    }
     return ValidationResult(numbers=numbers, pictures=pictures)
 
 

@@ -423,6 +423,8 @@ class Objects:
             turn = self._gaze(number, stored.distance_m, K, generator)
             depth_m = stored.depth_m.float() + stored.distance_m
             clean = turn_view(replace(stored, depth_m=depth_m, distance_m=0.0), turn, shape, K)
+
+        # What lies behind the object, and what hides a part of it.
         silhouette = clean.depth_m.isfinite()
         depth_m = clean.depth_m
         visible = silhouette
@@ -431,21 +433,27 @@ class Objects:
         if uniform(generator, 0.0, 1.0) < self.config.occluded_share:
             share = uniform(generator, *self.config.occlusion)
             depth_m, visible = occlude(depth_m, silhouette, share, generator)
-        most = self.config.mask_error_px
-        grow_px = whole(generator, 2 * most + 1) - most
-        # Pixels of the full image.
-        scale = float(clean.K[0, 0]) / self.config.focal_px[0]
+
+        # A mask that is too large or too small, and what a sensor measures.
+        largest_px = self.config.mask_error_px
+        grow_px = whole(generator, 2 * largest_px + 1) - largest_px
+        scale = float(clean.K[0, 0]) / self.config.focal_px[0]  # to pixels of the full image
         mask = grow_mask(visible, round(grow_px * scale))
         focal_px = (float(clean.K[0, 0]), self.config.focal_px[0])
         measured_m = measure(depth_m, focal_px, self.config.sensor, generator)
-        most = self.config.mask_shift_px
-        rows, columns = (round((whole(generator, 2 * most + 1) - most) * scale) for _ in range(2))
+
+        # And shifted: what comes in at a border is not of the object.
+        largest_px = self.config.mask_shift_px
+        rows, columns = (
+            round((whole(generator, 2 * largest_px + 1) - largest_px) * scale) for _ in range(2)
+        )
         mask = mask.roll((rows, columns), (0, 1))
-        for axis, steps in enumerate((rows, columns)):  # what comes in is not of it
+        for axis, steps in enumerate((rows, columns)):
             if steps:
                 size = mask.shape[axis]
                 start = 0 if steps > 0 else max(0, size + steps)
                 mask.narrow(axis, start, min(abs(steps), size)).fill_(False)
+
         model = self.models[number]
         view = ViewInput(
             name=f"{model.name}_{self.config.seed}_{index:06d}",
