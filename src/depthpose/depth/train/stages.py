@@ -41,20 +41,23 @@ class StereoTask:
         self.config = config
         self.held_out = held_out
         self.matcher = matcher
+        # What stays as it is: norms, or all but the head of the sky.
         self._with_fixed_norms: list[nn.Module] = []
         if config.with_frozen_stem and matcher.encoder is not None:
             matcher.encoder.freeze_early()
             self._with_fixed_norms.append(matcher.encoder)
         if config.with_frozen_norms:
             self._with_fixed_norms.append(matcher)
-        self._alone = matcher.sky if config.sky_alone else None
-        if self._alone is not None:
+        self._trained_alone = matcher.sky if config.sky_alone else None
+        if self._trained_alone is not None:
             matcher.requires_grad_(False)
-            self._alone.requires_grad_(True)
+            self._trained_alone.requires_grad_(True)
         self._train()
         self.modules: dict[str, nn.Module] = {"matcher": matcher}
+
+        # What is learnt; an encoder at a share of the learning rate.
         groups = [{"params": [p for p in matcher.parameters() if p.requires_grad]}]
-        if self._alone is None and matcher.encoder is not None:
+        if self._trained_alone is None and matcher.encoder is not None:
             of_encoder = set(matcher.encoder.parameters())
             rest = [p for p in matcher.parameters() if p not in of_encoder]
             learnt = [p for p in matcher.encoder.parameters() if p.requires_grad]
@@ -69,9 +72,9 @@ class StereoTask:
             for part in module.modules():
                 if isinstance(part, nn.BatchNorm2d | nn.BatchNorm3d):
                     part.eval()
-        if self._alone is not None:
+        if self._trained_alone is not None:
             for part in self.matcher.children():
-                part.train(part is self._alone)
+                part.train(part is self._trained_alone)
 
     def step(self, batch: TrainingPair) -> Iterator[Update]:
         """One update: match and compare."""
