@@ -125,6 +125,19 @@ def test_a_pose_in_a_wave_of_the_floor_is_no_place() -> None:
     assert search._exclusion_by_background(frame, view, before, surface) == ""
 
 
+def test_a_plane_through_the_tops_of_parts_is_no_background_before_a_known_bin() -> None:
+    """Parts of one height that touch: where the bin is known, what lies before it is a part."""
+    wall_m = torch.full((240, 320), 1.2) + noise(1)
+    depth_m = wall_m.clone()
+    depth_m[40:200, 40:280] = 0.9 + noise(2)[40:200, 40:280]
+    view = view_input(depth_m, None, CAMERA, "bracket", "x")
+    known = with_background(view, wall_m).background
+    tops = prepare_frame(view.depth_m, view.K).background_limit_m[44:196, 44:276]
+    assert bool((tops > 0.15).all()), "of smaller parts it is taken for a table"
+    frame = prepare_frame(view.depth_m, view.K, None, known)
+    assert not bool(frame.background_limit_m[44:196, 44:276].any())
+
+
 def test_a_mask_that_takes_in_the_floor_is_reduced_to_the_part(net: Registration) -> None:
     _, mask = view_of(bracket(), TRUTH)
     loose = grow_mask(mask, 12)

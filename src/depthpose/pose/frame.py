@@ -131,13 +131,15 @@ def prepare_frame(
     points_m = back_project(depth_m, K)
     normals, is_smooth = _normals(depth_m, points_m, K)
     limit_m = torch.zeros_like(depth_m)
+    is_left = depth_m > 0
     backgrounds: list[Background] = []
-    if known is not None:
+    if known is not None:  # before it there are objects alone: a plane is that of several
         limit_m[known.is_seen[::step, ::step]] = torch.inf
         known_m = known.depth_m[::step, ::step].double().nan_to_num(torch.inf)
+        is_left &= ~known_m.isfinite()
         backgrounds.append(Background(depth_m=known_m, diameter_m=math.inf))
     rays = back_project(torch.ones_like(depth_m), K)
-    backgrounds += _wide_planes(depth_m, points_m, normals, rays, noise_per_m2, limit_m)
+    backgrounds += _wide_planes(depth_m, points_m, normals, rays, noise_per_m2, is_left, limit_m)
     nearest_m = -max_pool2d(-torch.where(depth_m > 0, depth_m, torch.inf)[None], 5, 1, 2)[0]
     return Frame(
         step=step, depth_m=depth_m, K=K, points_m=points_m, normals=normals, is_smooth=is_smooth,
@@ -209,9 +211,10 @@ def _wide_planes(
     normals: Float64[Tensor, "h w 3"],
     rays: Float64[Tensor, "h w 3"],
     noise_per_m2: float,
+    is_left: Bool[Tensor, "h w"],
     limit_m: Float64[Tensor, "h w"],
 ) -> list[Background]:
-    """Find wide planes by RANSAC in what is of no background yet; mark their pixels in limit_m.
+    """Find wide planes by RANSAC in the readings that are left; mark their pixels in limit_m.
 
     Args:
         depth_m: 0 where there is no reading.
@@ -219,9 +222,9 @@ def _wide_planes(
         normals: toward the camera.
         rays: points of the pixels at a depth of 1 m.
         noise_per_m2: as in :class:`Frame`.
+        is_left: readings that may be of a plane.
         limit_m: ``Frame.background_limit_m``, which is filled in.
     """
-    is_left = (depth_m > 0) & (limit_m == 0)
     planes: list[Background] = []
     least = max(_LEAST_POINTS, _LEAST_SHARE * int((depth_m > 0).sum()))
     generator = torch.Generator().manual_seed(0)
