@@ -30,7 +30,7 @@ from depthpose.pose.propose import meet_lines, vote_ransac
 from depthpose.pose.segmentation import FCN
 from depthpose.pose.sparse import Voxels
 from depthpose.pose.train import PoseTraining, SegmentationTraining
-from depthpose.pose.types import SeenPoints
+from depthpose.pose.types import VotingPoints
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 Diagram = tuple[list[Box], list[Arrow]]
@@ -276,9 +276,13 @@ def _answers(found: PoseNetworks) -> tuple[torch.Size, torch.Size]:
     features = torch.ones(len(plane), found.network.config.inputs)
     with torch.no_grad():
         voxels = Voxels.from_points(plane.int(), features)
-        seen = SeenPoints(points_m=plane[:, 1:].float(), coordinates=plane.int(), features=features,
-                          class_of_point=torch.zeros(len(plane), dtype=torch.long))  # fmt: skip
-        answers = found.network.directions(seen)
+        points = VotingPoints(
+            points_m=plane[:, 1:].float(),
+            coordinates=plane.int(),
+            features=features,
+            class_of_point=torch.zeros(len(plane), dtype=torch.long),
+        )
+        answers = found.network.directions(points)
         return found.network.features(voxels).at_points().shape, answers.shape
 
 

@@ -24,7 +24,7 @@ from depthpose.pose.baselines import (
 from depthpose.pose.cloud import turn_axis_to
 from depthpose.pose.losses import model_point_loss
 from depthpose.pose.mesh import drawn_triangles, sample_surface
-from depthpose.pose.types import SeenPoints, ViewInput
+from depthpose.pose.types import ViewInput, VotingPoints
 
 K = torch.tensor([[500.0, 0, 160], [0, 510.0, 120], [0, 0, 1]], dtype=torch.float64)
 SMALL = DepthImageConfig(classes=3, crop_px=32, widths=(4, 4, 8, 8))
@@ -231,7 +231,7 @@ def test_each_point_is_answered_for_its_class_about_its_clouds_mean() -> None:
     rows = torch.zeros(6, 4, dtype=torch.long)
     # Wherever the cloud is: only places about its mean are looked at.
     classes = torch.tensor([0, 1, 1, 0, 1, 0])
-    seen = SeenPoints(
+    seen = VotingPoints(
         points_m=points + 1.0,
         coordinates=rows,
         features=torch.ones(6, 1),

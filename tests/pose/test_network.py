@@ -17,7 +17,7 @@ from depthpose.pose.network import (
     unfold_norms,
 )
 from depthpose.pose.sparse import Voxels, unpack
-from depthpose.pose.types import SeenPoints
+from depthpose.pose.types import VotingPoints
 
 TINY = ResUNetConfig(
     classes=3, keypoints=4, first_kernel=3, encoder=(4, 6, 8, 10), decoder=(5, 6, 7, 8)
@@ -151,7 +151,7 @@ def test_one_class_alone_answers_as_among_all() -> None:
     features = network.features(voxels).at_points()
     rows = torch.arange(len(outputs))
     for classes in (rows * 0, rows * 0 + 1, rows * 0 + 2, rows % 3):
-        seen = SeenPoints(
+        seen = VotingPoints(
             points_m=torch.zeros(len(rows), 3),
             coordinates=surface(),
             features=torch.ones(len(rows), 1),

@@ -10,7 +10,7 @@ from depthpose.pose.network import ResUNet, ResUNetConfig
 from depthpose.pose.synthetic import make_part
 from depthpose.pose.train import PoseTask, PoseTraining
 from depthpose.pose.train.clouds import CloudBatch
-from depthpose.pose.types import SeenPoints
+from depthpose.pose.types import VotingPoints
 
 _SMALL = ResUNetConfig(classes=1, first_kernel=3, encoder=(4, 4, 8, 8), decoder=(4, 4, 4, 8))
 _STEP = 0.05
@@ -22,7 +22,7 @@ class _Stubborn(ResUNet):
 
     answer: torch.Tensor
 
-    def directions(self, seen: SeenPoints) -> torch.Tensor:  # noqa: ARG002
+    def directions(self, points: VotingPoints) -> torch.Tensor:  # noqa: ARG002
         return self.answer
 
 

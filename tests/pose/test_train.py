@@ -43,7 +43,7 @@ from depthpose.pose.train.clouds import (
     table_text,
 )
 from depthpose.pose.train.poses import packed
-from depthpose.pose.types import ObjectModel, PoseEstimate, SeenPoints, Symmetries
+from depthpose.pose.types import ObjectModel, PoseEstimate, Symmetries, VotingPoints
 from depthpose.pose.weights import (
     PoseWeights,
     network_of,
@@ -120,7 +120,7 @@ class _Oracle(ResUNet):
 
     truth: torch.Tensor
 
-    def directions(self, seen: SeenPoints) -> torch.Tensor:  # noqa: ARG002
+    def directions(self, points: VotingPoints) -> torch.Tensor:  # noqa: ARG002
         return self.truth
 
 

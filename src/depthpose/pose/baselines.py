@@ -15,7 +15,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import turn_axis_to
 from depthpose.pose.segmentation import ResNet18
 from depthpose.pose.sparse import RowNorm
-from depthpose.pose.types import SeenPoints, ViewInput
+from depthpose.pose.types import ViewInput, VotingPoints
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -203,15 +203,15 @@ class PointNet(nn.Module):
         outputs = self.final(self.head(torch.cat([x, whole[cloud]], 1)))
         return outputs.view(len(outputs), self.config.classes, self.config.keypoints, 3)
 
-    def directions(self, seen: SeenPoints) -> Float[Tensor, "points keypoints 3"]:
+    def directions(self, points: VotingPoints) -> Float[Tensor, "points keypoints 3"]:
         """Answer for each point's own class: what every network that votes offers."""
-        points_m = seen.points_m
-        cloud = seen.coordinates[:, 0].long()
+        points_m = points.points_m
+        cloud = points.coordinates[:, 0].long()
         sizes = torch.bincount(cloud)
         sums_m = points_m.new_zeros(len(sizes), 3).index_add(0, cloud, points_m)
         local_m = points_m - (sums_m / sizes[:, None])[cloud]
         rows = torch.arange(len(points_m), device=points_m.device)
-        return self(local_m, cloud)[rows, seen.class_of_point]
+        return self(local_m, cloud)[rows, points.class_of_point]
 
 
 class _Transform(nn.Module):

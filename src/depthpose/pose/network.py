@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from depthpose.core.config import Settings
 from depthpose.core.errors import InputError
 from depthpose.pose.sparse import RowNorm, SparseConv, SparseConvTranspose, Voxels
-from depthpose.pose.types import SeenPoints
+from depthpose.pose.types import VotingPoints
 
 Widths = tuple[int, int, int, int]
 
@@ -149,17 +149,17 @@ class ResUNet(nn.Module):
         c = self.config
         return outputs.view(len(outputs), c.classes, c.keypoints, 3)
 
-    def directions(self, seen: SeenPoints) -> Float[Tensor, "points keypoints 3"]:
+    def directions(self, points: VotingPoints) -> Float[Tensor, "points keypoints 3"]:
         """Answer for each point's own class: what every network that votes offers."""
-        voxels = Voxels.from_points(seen.coordinates, seen.features)
+        voxels = Voxels.from_points(points.coordinates, points.features)
         mixed = self.features(voxels)
         features = mixed.features[mixed.row_of_point]
         answers = features.new_empty(len(features), self.config.keypoints, 3)
         assert self.final.bias is not None
         size = self.config.keypoints * 3
-        for number in seen.class_of_point.unique().tolist():  # without the other classes
+        for number in points.class_of_point.unique().tolist():  # without the other classes
             assert 0 <= number < self.config.classes, f"class {number} of {self.config.classes}"
-            mine = seen.class_of_point == number
+            mine = points.class_of_point == number
             part = slice(number * size, (number + 1) * size)
             outputs = features[mine] @ self.final.weight[0, :, part] + self.final.bias[part]
             answers[mine] = outputs.view(len(outputs), self.config.keypoints, 3).to(answers)

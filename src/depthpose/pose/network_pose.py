@@ -47,9 +47,9 @@ from depthpose.pose.types import (
     AnyInput,
     CloudInput,
     PoseEstimate,
-    SeenPoints,
     Status,
     ViewInput,
+    VotingPoints,
 )
 from depthpose.pose.weights import PoseWeights, read_pose_weights
 
@@ -241,7 +241,7 @@ class GeoPoseNet(PoseEstimator):
         coordinates = torch.cat([grid.coordinates for grid in grids])
         points_m = [job.cloud.points_m @ job.cloud.voxels.grid_from_camera.mT for job in ready]
         device = self.config.device
-        network_input = SeenPoints(
+        network_input = VotingPoints(
             points_m=torch.cat(points_m).to(device),
             coordinates=torch.cat([cloud_of_point[:, None], coordinates], 1).to(device),
             features=torch.cat([grid.features for grid in grids]).to(device),

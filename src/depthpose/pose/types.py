@@ -49,7 +49,7 @@ class CloudInput:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class SeenPoints:
+class VotingPoints:
     """Input of a network whose points vote: one or several clouds, one after the other."""
 
     points_m: Float[Tensor, "points 3"]  #: one a voxel, in the axes of its grid about its camera

@@ -23,7 +23,7 @@ from depthpose.pose.metrics import SUCCESS_SHARE, add_m, adds_m
 from depthpose.pose.network import ResUNet
 from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.pose.propose import fit_pose, meet_lines, vote_ransac
-from depthpose.pose.types import ObjectModel, SeenPoints, ViewSample
+from depthpose.pose.types import ObjectModel, ViewSample, VotingPoints
 
 TITLES = {
     "3.1": "Table 3.1: comparison with baselines on LineMOD, ADD(-S)",
@@ -273,7 +273,7 @@ def voting_cases(
             continue
         grid = voxelise(points_m, net.weights.cloud)
         places = torch.nn.functional.pad(grid.coordinates, (1, 0))
-        seen_points = SeenPoints(
+        seen_points = VotingPoints(
             points_m=points_m[grid.kept],
             coordinates=places,
             features=grid.features,

@@ -33,8 +33,8 @@ from depthpose.pose.types import (
     CloudSample,
     ObjectModel,
     PoseEstimate,
-    SeenPoints,
     ViewSample,
+    VotingPoints,
 )
 from depthpose.pose.weights import PoseWeights
 
@@ -63,9 +63,9 @@ class CloudBatch(NamedTuple):
     t_m: Float[Tensor, "clouds 3"]  #: translation
 
     @property
-    def seen(self) -> SeenPoints:
+    def network_input(self) -> VotingPoints:
         """What the network is shown: everything but the truth."""
-        return SeenPoints(
+        return VotingPoints(
             points_m=self.points_m,
             coordinates=self.coordinates,
             features=self.features,

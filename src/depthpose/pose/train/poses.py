@@ -94,7 +94,7 @@ class PoseTask(ViewsTask):
 
     def step(self, batch: CloudBatch) -> Iterator[Update]:
         """One update: all clouds at once."""
-        directions = self.network.directions(batch.seen).float()
+        directions = self.network.directions(batch.network_input).float()
         copies = self._copies_m.to(batch.R)[batch.class_of]
         copies_m = copies @ batch.R.mT[:, None] + batch.t_m[:, None, None]
         instance = batch.coordinates[:, 0].long()
@@ -113,7 +113,7 @@ class PoseTask(ViewsTask):
         cloud = voxelised_cloud(sample, number, config, chance)
         device = next(self.network.parameters()).device
         batch = TrainingClouds.collate([cloud])
-        points = CloudBatch(*(part.to(device) for part in batch)).seen
+        points = CloudBatch(*(part.to(device) for part in batch)).network_input
         vote = vote_ransac(points.points_m, self.network.directions(points).float())
         fit = fit_pose(vote.keypoints_m.cpu(), vote.covariance_m2.cpu(), model.keypoints_m)
         return add_error(fit.camera_from_model, Rigid(cloud.R, cloud.t_m), model)
