@@ -13,7 +13,7 @@ from torch import Tensor
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import cloud_from_depth, grow_mask
-from depthpose.pose.evidence import Observation, compare, draw_surface, observe
+from depthpose.pose.evidence import Observation, _mean_depth, compare, draw_surface, observe
 from depthpose.pose.mesh import make_model, turn_about
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.synthetic.parts import make_part
@@ -320,3 +320,14 @@ def test_a_cloud_without_its_image_is_compared_as_well() -> None:
     assert right.rms < 1
     farther = Rigid(truth.R, truth.t_m + torch.tensor([0.0, 0.0, 0.03]))
     assert compare(observation, farther, surface).bulging > 0.5 * right.visible
+
+
+def test_means_of_readings_are_of_those_that_are_there() -> None:
+    """A drop-out stays one, and takes nothing from the mean of its neighbours."""
+    depth_m = np.full((9, 9), 2.0)
+    depth_m[4, 4] = np.nan
+    depth_m[4, 5] = 2.9
+    mean_m = _mean_depth(depth_m, 3)
+    assert np.isnan(mean_m[4, 4])
+    assert mean_m[4, 6] == pytest.approx(2.1)
+    assert mean_m[3, 4] == pytest.approx(2 + 0.9 / 8), "eight readings in nine pixels"

@@ -14,7 +14,7 @@ from depthpose.core.camera import Camera, back_project
 from depthpose.core.rigid import Rigid, geodesic_rad, rotation_by
 from depthpose.pose import search
 from depthpose.pose.cloud import cloud_from_depth, grow_mask
-from depthpose.pose.config import RefusalConfig
+from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.copies import find_copies
 from depthpose.pose.decide import PRIOR_PROPOSED
 from depthpose.pose.evidence import compare, observe
@@ -278,6 +278,7 @@ def test_a_hundred_models_take_bounded_time(net: Registration) -> None:
         names=[f"part {k}" for k in range(100)],
         object_of=lambda _: net._prepared_object("bracket"),
         estimate_near=estimate_near,
+        config=EstimateConfig(),
         min_probability=0.5,
     )
     began = time.process_time()
@@ -371,6 +372,16 @@ def test_a_second_place_needs_more_than_the_first() -> None:
     assert "beside" in misses[0].reason
 
 
+def test_a_box_holds_one() -> None:
+    """Of two places in a box that are as likely neither is; in a whole frame both may be right."""
+    places = of_one_object(math.log(20), math.log(20))
+    remaining, _ = search._weigh_instances(places, TARGETS)
+    assert len(remaining) == 2
+    remaining, misses = search._weigh_instances(places, replace(TARGETS, is_single=True))
+    assert not remaining
+    assert "49%" in misses[0].reason, "20 of 41"
+
+
 def test_in_a_bin_of_many_each_is_as_likely_as_alone() -> None:
     bin_of_six = of_one_object(5.0, 5.0, 5.0, 5.0, 5.0, math.log(2))
     remaining, misses = search._weigh_instances(bin_of_six, TARGETS)
@@ -397,6 +408,32 @@ def test_what_would_lie_in_the_wall_is_not_possible(net: Registration) -> None:
     assert search._exclusion_by_background(gap, view, pose.double(), surface) == ""
 
 
+def test_the_best_evidence_leads_a_place_not_the_first_proposal(net: Registration) -> None:
+    """Each proposal is refined on what it explains: a coarse right one passes a wrong one."""
+    prepared = net._prepared_object("bracket")
+    truth = pose_at()
+    depth_m, _ = view_of(prepared.model, truth)
+    view = view_input(depth_m.float(), None, CAMERA, "bracket", "x", None)
+    frame = prepare_frame(view.depth_m, view.K, prepared.surface.diameter_m)
+    half_turn = rotation_by(torch.tensor([0.0, 0.0, math.pi]).double())
+    coarse = Rigid(truth.R.double(), truth.t_m.double() + torch.tensor([0.002, 0.001, 0.003]))
+    wrong = Rigid(truth.R.double() @ half_turn, coarse.t_m)
+    places = [
+        search._Place(
+            object="bracket", pose=pose,
+            explained=search.explained_mask(frame, pose, prepared.surface),
+        )
+        for pose in (wrong, coarse)
+    ]  # fmt: skip
+    targets = replace(TARGETS, object_of=net._prepared_object, names=["bracket"])
+    likely, hopeless = search._refine(places, frame, view, targets)
+    assert float((likely[0].pose.t_m - truth.t_m).norm()) < 0.001, "refined"
+    assert float(geodesic_rad(likely[0].pose.R.float(), truth.R.float())) < 0.1
+    assert len(likely) + len(hopeless) == len(places)
+    leader = search._group(likely, frame, targets)[0][0]
+    assert float((leader.pose.t_m - truth.t_m).norm()) < 0.001
+
+
 def test_what_is_there_twice_is_searched_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two of ``a`` and one of ``b`` at first, then a third ``a``, the surest; then nothing."""
     small = torch.tensor([[300.0, 0, 20], [0, 300, 2], [0, 0, 1]]).double()
@@ -411,9 +448,9 @@ def test_what_is_there_twice_is_searched_for_again(monkeypatch: pytest.MonkeyPat
     searched = list[tuple[Sequence[str], int]]()
 
     def propose(
-        _: object, is_left: torch.Tensor, names: Sequence[str], targets: SearchTargets
+        _: object, is_left: torch.Tensor, names: Sequence[str], *rest: object
     ) -> list[object]:
-        del targets
+        del rest
         searched.append((list(names), int(is_left[0].sum())))
         return []
 
@@ -422,7 +459,7 @@ def test_what_is_there_twice_is_searched_for_again(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(search, "_judge", lambda *_: (rounds[len(searched) - 1], []))
     targets = SearchTargets(
         names=["a", "b"], object_of=MagicMock(**{"return_value.surface.diameter_m": 0.1}),
-        estimate_near=MagicMock(), min_probability=0.5,
+        estimate_near=MagicMock(), config=EstimateConfig(), min_probability=0.5,
     )  # fmt: skip
     found = find_objects(view, targets)
     assert searched == [(["a", "b"], 40), (["a"], 16), (["a"], 8)]

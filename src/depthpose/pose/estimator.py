@@ -123,6 +123,7 @@ class PoseEstimator:
             names=[view.object],
             object_of=self._prepared_object,
             estimate_near=self._estimate_near,
+            config=self.config,
             min_probability=self.refusal.min_probability,
             prior_odds=PRIOR_REGION,
             is_single=True,
@@ -302,6 +303,7 @@ class PoseEstimator:
             names=objects,
             object_of=self._prepared_object,
             estimate_near=self._estimate_near,
+            config=self.config,
             min_probability=self.refusal.min_probability,
             is_single=is_single,
         )

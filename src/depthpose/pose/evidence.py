@@ -23,7 +23,13 @@ from torch import Tensor
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import grow_mask
-from depthpose.pose.sensor import CORRELATION_PX, CORRELATION_RAD, DepthNoise, measure_noise
+from depthpose.pose.sensor import (
+    AVERAGED_PER_WHITE,
+    CORRELATION_PX,
+    CORRELATION_RAD,
+    DepthNoise,
+    measure_noise,
+)
 from depthpose.pose.surface import Surface
 from depthpose.pose.types import Evidence, ViewInput
 
@@ -39,7 +45,7 @@ _ACROSS = (-1.0, _WITHIN, 0.5, 1.0)
 """Where readings are compared across a silhouette: as shares of the way from it to a pixel. The
 nearest one within supports the pose; of thin things the next lies beyond."""
 _LEVEL_M = 0.0005  #: a surface is plane to so much
-_STRAIGHT = 2.0  #: deviations of the noise, by which readings are off their line at most
+_STRAIGHT = 2.0  #: deviations of the noise of means, by which these are off their line at most
 _LEAST_INNER = 0.25  # share of the silhouette that its borders may leave
 _DISK = 1.3  # radius of the disk drawn for a sample, in median distances of samples
 _OBJECT_PX = 8000  # pixels of an object that are compared; of larger ones every n-th
@@ -253,7 +259,7 @@ def compare(observation: Observation, pose: Rigid, surface: Surface) -> Evidence
     inner = _without_edges(drawn_m, is_drawn, surface.diameter_m, step)
 
     # Residuals in standard deviations of their mean over some neighbours.
-    side = max(3, 2 * round((AVERAGED_PX / step - 1) / 2) + 1)
+    side = _averaged_side(step)
     is_compared = is_read & inner
     residual_m = np.where(is_compared, depth_m - drawn_m, 0).astype(np.float32)
     filled = ndimage.uniform_filter(is_compared.astype(np.float32), side)
@@ -304,7 +310,7 @@ def _is_continued(
 
     At its silhouette an object ends: by a step in depth, or by an edge where it touches something.
     A box that is posed on the side of a larger one ends where the readings go on straight. Four
-    readings on a line across the silhouette, one or two of them within it, are straight in
+    means of readings on a line across the silhouette, one or two of them within it, are straight in
     1 / depth where they are of one plane. Readings on a known background are of no object.
 
     Args:
@@ -313,6 +319,7 @@ def _is_continued(
         is_supported: of these the ones on which readings lie.
         window: rows and columns of the drawing in the observation.
     """
+    # The silhouette, in a window with a margin.
     border = math.ceil(BORDER_PX / observation.step + observation.patch_px / 2)
     reach = border + max(1, round(observation.patch_px / 2))
     height, width = observation.depth_m.shape
@@ -336,8 +343,12 @@ def _is_continued(
     beside = np.stack(np.nonzero((distance > border) & (distance <= reach)))
     edge = nearest[:, beside[0], beside[1]]
     outward = beside - edge
+
+    # Means of readings on the line across it at each, and what these are off a straight line.
     is_background = observation.is_background[rows, columns]
-    inverse = 1 / np.where(is_background, np.nan, observation.depth_m[rows, columns])
+    depth_m = np.where(is_background, np.nan, observation.depth_m[rows, columns])
+    side = _averaged_side(observation.step)
+    inverse = 1 / _mean_depth(depth_m, side)
     across = []
     for times in _ACROSS:
         pixel = edge + np.rint(times * outward).astype(int)
@@ -347,11 +358,24 @@ def _is_continued(
             across[-1] = np.where(supports[row, column], across[-1], np.nan)
     values = np.stack(across)
     bend = np.abs(_OFF_LINE @ values).max(0)
-    noise_m = math.hypot(observation.noise.white_m, _LEVEL_M)
+    noise_m = math.hypot(AVERAGED_PER_WHITE * observation.noise.white_m, _LEVEL_M)
     is_straight = bend <= _STRAIGHT * noise_m * values[0] ** 2
     is_continued = np.zeros((height, width), bool)
     is_continued[rows, columns][tuple(beside)] = is_straight
     return ndimage.binary_closing(is_continued)
+
+
+def _averaged_side(step: int) -> int:
+    """Side of the squares over which readings are averaged, in pixels of the window."""
+    return max(3, 2 * round((AVERAGED_PX / step - 1) / 2) + 1)
+
+
+def _mean_depth(depth_m: np.ndarray, side: int) -> np.ndarray:
+    """Mean of the readings in a square about each pixel that has one; NaN where it has none."""
+    is_read = np.isfinite(depth_m)
+    filled = ndimage.uniform_filter(is_read.astype(np.float32), side)
+    mean_m = ndimage.uniform_filter(np.where(is_read, depth_m, 0).astype(np.float32), side)
+    return np.where(is_read, mean_m / np.maximum(filled, 1e-6), np.nan)
 
 
 def _without_edges(

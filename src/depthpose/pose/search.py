@@ -1,8 +1,9 @@
 """Known objects in a depth image without a mask: votes propose poses, the evidence decides.
 
-Point pairs of the whole image, or of a region of it, vote for poses of each object. Proposals that
-explain the same readings are one place; at each place the object is estimated from the readings
-that the best proposal explains. Places that explain the same readings compete.
+Point pairs of the whole image, or of a region of it, vote for poses of each object. Each proposal
+is refined on the readings that it explains, and compared with the image. Proposals that explain the
+same readings are one place; there the object is estimated from the readings that the best proposal
+explains. Places that explain the same readings compete.
 """
 
 import math
@@ -22,9 +23,17 @@ from depthpose.core.camera import back_project, project
 from depthpose.core.devices import each_in_threads
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import cloud_from_depth, grow_mask
+from depthpose.pose.config import EstimateConfig
 from depthpose.pose.copies import PreparedObject, copies_of
-from depthpose.pose.decide import LEAST_NAMED, PRIOR_MANY, PRIOR_PROPOSED, log_odds_right
-from depthpose.pose.evidence import BORDER_PX
+from depthpose.pose.decide import (
+    LEAST_NAMED,
+    PRIOR_MANY,
+    PRIOR_PROPOSED,
+    contradiction,
+    log_odds_right,
+    probability_right,
+)
+from depthpose.pose.evidence import BORDER_PX, compare, observe
 from depthpose.pose.frame import (
     Frame,
     is_on_plane,
@@ -32,6 +41,7 @@ from depthpose.pose.frame import (
     prepare_frame,
     share_behind,
 )
+from depthpose.pose.icp import refine_roughly
 from depthpose.pose.inputs import nothing_seen
 from depthpose.pose.picking import with_pick_ranks
 from depthpose.pose.propose.image import compare_with_image, propose_in_frame
@@ -49,6 +59,8 @@ _MOST_PLACES, _LEAST_PROPOSALS = 40, 4
 _ALIGNED, _CLEARLY = 0.7, 0.01
 """Cosine of the normals from which a reading and the surface are alike, and by how much more a
 copy must score to take the place of the pose that was proposed."""
+_HOPELESS = 0.02
+"""A refined proposal that is less likely is given up."""
 _ROUNDS = 4
 """So often an image is searched for an object that is there more than once, at most."""
 _MOST_TOGETHER = 8
@@ -81,6 +93,7 @@ class SearchTargets:
         names: of the objects.
         object_of: gives an object by its name, with its point pairs and copies.
         estimate_near: estimates objects from clouds and the poses that were proposed for them.
+        config: of ICP, and of what a real object is off from its model.
         min_probability: with which a pose must be right to be given.
         prior_odds: of the best pose at a place being right.
         is_single: search once, for one object.
@@ -89,6 +102,7 @@ class SearchTargets:
     names: Sequence[str]
     object_of: Callable[[str], PreparedObject]
     estimate_near: Callable[[Sequence[CloudInput], Sequence[Rigid], float], list[PoseEstimate]]
+    config: EstimateConfig
     min_probability: float
     prior_odds: float = PRIOR_PROPOSED
     is_single: bool = False
@@ -161,14 +175,15 @@ def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
     taken: list[_Judged] = []
     misses: list[_Miss] = []
     for _ in range(1 if targets.is_single else _ROUNDS):
-        groups = _group(_propose(frame, is_unclaimed, names, targets), taken, frame, targets)
-        judged, missed = _judge(groups, frame, view, targets)
-        misses += missed
+        proposed = _propose(frame, is_unclaimed, names, taken, targets)
+        likely, hopeless = _refine(proposed, frame, view, targets)
+        judged, refused = _judge(_group(likely, frame, targets), frame, view, targets)
+        misses += hopeless + refused
         if targets.is_single:
-            judged, missed = _within(judged, is_unclaimed, targets)
-            misses += missed
-        more, taken, missed = _suppress(judged, taken, targets)
-        misses += missed
+            judged, outside = _within(judged, is_unclaimed, targets)
+            misses += outside
+        more, taken, uncertain = _suppress(judged, taken, targets)
+        misses += uncertain
         accepted += more
         for place in more:
             is_unclaimed &= ~place.explained
@@ -200,9 +215,13 @@ def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
 
 
 def _propose(
-    frame: Frame, is_unclaimed: Bool[Tensor, "h w"], names: Sequence[str], targets: SearchTargets
+    frame: Frame,
+    is_unclaimed: Bool[Tensor, "h w"],
+    names: Sequence[str],
+    taken: Sequence[_Place],
+    targets: SearchTargets,
 ) -> list[_Place]:
-    """Propose poses of every object; keep the best of all, and some of each object."""
+    """Propose poses of every object: the best of all, and some of each, but where one is taken."""
 
     def propose(name: str) -> list[tuple[float, int, str, Rigid]]:
         pairs = targets.object_of(name).pairs
@@ -224,19 +243,57 @@ def _propose(
         if number >= _MOST_PLACES and rank >= _LEAST_PROPOSALS:
             continue
         explained = explained_mask(frame, pose, targets.object_of(name).surface)
-        if int(explained.sum()) * frame.step**2 >= _LEAST_PIXELS:
-            places.append(_Place(object=name, pose=pose, explained=explained))
+        place = _Place(object=name, pose=pose, explained=explained)
+        is_taken = any(place.shared_with(other) > _SHARED for other in taken)
+        if place.area_px * frame.step**2 >= _LEAST_PIXELS and not is_taken:
+            places.append(place)
     return places
 
 
-def _group(
-    places: Sequence[_Place], taken: Sequence[_Place], frame: Frame, targets: SearchTargets
-) -> list[list[_Place]]:
-    """Gather proposals of an object that explain the same readings, but for what is taken."""
+def _refine(
+    places: Sequence[_Place], frame: Frame, view: ViewInput, targets: SearchTargets
+) -> tuple[list[_Place], list[_Miss]]:
+    """Refine each proposal on the readings that it explains; rank them by their evidence.
+
+    Returns:
+        The proposals that may be right, the likeliest first; and the hopeless ones.
+    """
+    icp = targets.config.icp
+    object_m = targets.config.object_deviation_m
+
+    def refine(place: _Place) -> tuple[Rigid, Evidence]:
+        surface = targets.object_of(place.object).surface
+        cloud_m = _readings_of(place, frame, view)
+        pose = refine_roughly(cloud_m, place.pose[None], surface, icp)[0]
+        observation = observe(cloud_m, view, surface.diameter_m, object_m, is_masked=False)
+        return pose, compare(observation, pose, surface)
+
+    likely: list[tuple[float, _Place]] = []
+    hopeless: list[_Miss] = []
+    refined = each_in_threads(refine, places, torch.get_num_threads())
+    for place, (pose, evidence) in zip(places, refined, strict=True):
+        probability = probability_right(evidence, targets.prior_odds)
+        if probability < _HOPELESS:
+            reason = contradiction(evidence, probability)
+            hopeless.append(_miss_at(place, evidence, reason, targets))
+            continue
+        explained = explained_mask(frame, pose, targets.object_of(place.object).surface)
+        likely.append((probability, replace(place, pose=pose, explained=explained)))
+    likely.sort(key=lambda pair: -pair[0])
+    return [place for _, place in likely], hopeless
+
+
+def _readings_of(place: _Place, frame: Frame, view: ViewInput) -> Float[Tensor, "n 3"]:
+    """Give the readings that a place explains, of all pixels of the view, in the camera frame."""
+    height, width = view.depth_m.shape
+    mask = place.explained.repeat_interleave(frame.step, 0).repeat_interleave(frame.step, 1)
+    return cloud_from_depth(view.depth_m, mask[:height, :width], view.K)
+
+
+def _group(places: Sequence[_Place], frame: Frame, targets: SearchTargets) -> list[list[_Place]]:
+    """Gather proposals of an object that explain the same readings; the likeliest leads each."""
     groups: list[list[_Place]] = []
     for place in places:
-        if any(place.shared_with(other) > _SHARED for other in taken):
-            continue
         same = [group for group in groups if group[0].object == place.object]
         group = next((group for group in same if place.shared_with(group[0]) > _RIVAL), None)
         if group is None:
@@ -281,11 +338,8 @@ def _judge(
 ) -> tuple[list[_Judged], list[_Miss]]:
     """Estimate the object of each place from what its best pose explains; separate refusals."""
     inputs: list[CloudInput] = []
-    height, width = view.depth_m.shape
     for number, group in enumerate(groups):
-        mask = group[0].explained
-        mask = mask.repeat_interleave(frame.step, 0).repeat_interleave(frame.step, 1)
-        cloud_m = cloud_from_depth(view.depth_m, mask[:height, :width], view.K)
+        cloud_m = _readings_of(group[0], frame, view)
         name = f"{view.name}_{number}"
         inputs.append(CloudInput(name=name, points_m=cloud_m, object=group[0].object, view=view))
     proposals = [Rigid.stack([place.pose for place in group]) for group in groups]
@@ -338,7 +392,8 @@ def _weigh_instances(
     for name in dict.fromkeys(place.object for place in accepted):
         places = [place for place in accepted if place.object == name]
         log_odds = torch.tensor([place.log_odds for place in places], dtype=torch.float64)
-        probabilities = probability_of_instances(log_odds)
+        prior_many = 0.0 if targets.is_single else PRIOR_MANY
+        probabilities = probability_of_instances(log_odds, prior_many)
         shares = probabilities / log_odds.sigmoid()  # of the probability that each has by itself
         for k, place in enumerate(places):
             probability = float(probabilities[k])
@@ -353,7 +408,9 @@ def _weigh_instances(
     return remaining, misses
 
 
-def probability_of_instances(log_odds: Float64[Tensor, " n"]) -> Float64[Tensor, " n"]:
+def probability_of_instances(
+    log_odds: Float64[Tensor, " n"], prior_many: float
+) -> Float64[Tensor, " n"]:
     """Give the probability of each place of one object, of which there is one or any number.
 
     A table holds one of each object, a bin holds many: so a second place needs more evidence than
@@ -361,10 +418,13 @@ def probability_of_instances(log_odds: Float64[Tensor, " n"]) -> Float64[Tensor,
 
     Args:
         log_odds: of each place being right, by itself.
+        prior_many: odds of any number of instances, and not one at most; 0 in a detector's box.
     """
     by_itself = log_odds.sigmoid()
     none_or_one = torch.cat([log_odds.new_zeros(1), log_odds])
-    log_many = math.log(PRIOR_MANY) + softplus(log_odds).sum()  # of all choices of places
+    log_many = (
+        log_odds.new_tensor(prior_many).log() + softplus(log_odds).sum()
+    )  # of all choices of places
     many = (log_many - none_or_one.logsumexp(0)).sigmoid()
     return many * by_itself + (1 - many) * none_or_one.softmax(0)[1:]
 

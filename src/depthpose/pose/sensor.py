@@ -18,6 +18,10 @@ LAG_PX = 3
 SHARED_PER_WHITE = 2.5
 """Error that neighbours share, in deviations of the noise of one reading. Planes before a Kinect
 and a RealSense show 2 to 4 (``bench/sensors.py``); a laser scanner less."""
+AVERAGED_PER_WHITE = 0.55
+"""Deviation of means of five by five readings some ten pixels apart, in deviations of the noise of
+one reading: with half a millimetre beside it some four fifths of the means on planes before a
+Kinect and RealSenses are within two deviations of a straight line (``bench/sensors.py``)."""
 CORRELATION_PX = 10
 """Side of a square of readings that is one observation: noise that a Gaussian of 3 px smoothed, as
 a Kinect's, is as many independent readings as squares of 4 pi 3^2 pixels; a RealSense smooths by
