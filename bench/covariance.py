@@ -29,7 +29,7 @@ from depthpose.pose.config import IcpConfig, SensorKind, SyntheticSensorConfig
 from depthpose.pose.icp import refine_pose
 from depthpose.pose.mesh import drawn_triangles
 from depthpose.pose.surface import prepare_surface
-from depthpose.pose.synthetic.views import measure, random_rotation
+from depthpose.pose.synthetic.views import random_rotation, simulate_depth
 from depthpose.report.page import markdown_table
 
 KINDS: tuple[SensorKind, ...] = ("structured light", "active stereo", "time of flight", "laser")
@@ -64,7 +64,7 @@ def view_rows(
     )
     icp = IcpConfig() if offset_m else IcpConfig(sensor_offset_m=0.0)
     for _ in range(repeats):
-        depth_m = measure(clean_m, (FOCAL_PX, FOCAL_PX), sensor, generator)
+        depth_m = simulate_depth(clean_m, (FOCAL_PX, FOCAL_PX), sensor, generator)
         cloud_m = cloud_from_depth(depth_m, mask & depth_m.isfinite(), K.float())
         refined = refine_pose(cloud_m.double(), true, surface, icp)
         off = errors_of(refined.camera_from_model, true)

@@ -47,7 +47,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import thin
 from depthpose.pose.config import EvaluationConfig
 from depthpose.pose.datasets import Instance
-from depthpose.pose.evaluate import error_context, match
+from depthpose.pose.evaluate import error_context, match_instances
 from depthpose.pose.evaluate.errors import METRICS
 from depthpose.pose.frame import label_regions, prepare_frame
 from depthpose.pose.mesh import sample_surface
@@ -249,7 +249,7 @@ def recall_errors(frame: Frame, found: Sequence[PoseEstimate]) -> list[Row]:
         numbers = {model.name: number for number, model in models.items()}
         given = [Prediction(estimate=one, place=Place(0, 0, numbers[one.object]))
                  for one in found if one.object in numbers]  # fmt: skip
-        answers, rows = match(instances, given, models), list[Row]()
+        answers, rows = match_instances(instances, given, models), list[Row]()
         for instance in instances:
             model = models[instance.object_id]
             context = error_context(model, EvaluationConfig())

@@ -39,7 +39,7 @@ from depthpose.pose.mesh import sample_surface
 from depthpose.pose.metrics import SUCCESS_SHARE, adds_m
 from depthpose.pose.registration import Registration
 from depthpose.pose.synthetic.parts import PARTS, make_part
-from depthpose.pose.synthetic.views import draw_view, make_shape, measure, random_rotation
+from depthpose.pose.synthetic.views import draw_view, make_shape, random_rotation, simulate_depth
 from depthpose.pose.types import ViewInput
 from depthpose.report.page import markdown_table
 
@@ -224,7 +224,7 @@ def main() -> None:
         generator = torch.Generator().manual_seed(index)
         focal_px = float(scene.rig.K[0, 0])
         sensor = SyntheticSensorConfig(kinds=("active stereo",))
-        sensed_m = measure(scene.depth_m.float(), (focal_px, focal_px), sensor, generator)
+        sensed_m = simulate_depth(scene.depth_m.float(), (focal_px, focal_px), sensor, generator)
         for kind, depth_m in ((PAIR, pair_m), (SENSOR, sensed_m)):
             for name, mask in scene.masks.items():
                 view = ViewInput(

@@ -29,7 +29,7 @@ from depthpose.pose.config import SensorKind, SyntheticSensorConfig
 from depthpose.pose.evidence import _ACROSS, _LEVEL_M, _OFF_LINE, _STRAIGHT, _mean_depth
 from depthpose.pose.frame import prepare_frame
 from depthpose.pose.sensor import AVERAGED_PER_WHITE
-from depthpose.pose.synthetic.views import measure
+from depthpose.pose.synthetic.views import simulate_depth
 from depthpose.report.page import markdown_table
 
 _BASELINE_M = 0.075
@@ -83,7 +83,7 @@ def synthetic_frame(kind: SensorKind, noise_correlation_px: float | None, like: 
         else (noise_correlation_px, noise_correlation_px),
     )
     generator = torch.Generator().manual_seed(0)
-    read_m = measure(depth_m, (like.focal_px, like.focal_px), config, generator)
+    read_m = simulate_depth(depth_m, (like.focal_px, like.focal_px), config, generator)
     name = (
         kind if noise_correlation_px is None else f"{kind}, alike over {noise_correlation_px:g} px"
     )

@@ -161,7 +161,7 @@ def features(generator: SelectionGenerator, street: StereoInput) -> np.ndarray:
     seen: list[torch.Tensor] = []
     layer.register_forward_hook(lambda _module, given, _found: seen.append(given[0]))
     own, generator.street = generator.street, layer
-    generator.find_street(generator.encoder(pad_to_multiple(small, 32))[-1])
+    generator.street_probability(generator.encoder(pad_to_multiple(small, 32))[-1])
     generator.street = own
     return seen[0][0].numpy()
 

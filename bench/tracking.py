@@ -35,7 +35,7 @@ from depthpose.pose.config import SyntheticSensorConfig
 from depthpose.pose.mesh import drawn_triangles, sample_surface
 from depthpose.pose.metrics import add_m, adds_m
 from depthpose.pose.network_pose import GeoPoseNet
-from depthpose.pose.synthetic.views import measure, random_rotation
+from depthpose.pose.synthetic.views import random_rotation, simulate_depth
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 from depthpose.report.page import markdown_table
 
@@ -167,7 +167,9 @@ def sequence(
             cut = torch.inf if is_covered else float(some.quantile(HIDDEN))
             box = (column >= some.min() - 15) & (column <= min(cut, float(some.max()) + 15))
             depth_m = torch.where(box, float(own_m[shown].min()) - 0.08, depth_m)
-        measured_m = measure(depth_m, (FOCAL_PX, FOCAL_PX), SyntheticSensorConfig(), generator)
+        measured_m = simulate_depth(
+            depth_m, (FOCAL_PX, FOCAL_PX), SyntheticSensorConfig(), generator
+        )
         view = ViewInput(
             name=f"{model.name}_{k:04d}", depth_m=measured_m.float(), K=K.float(),
             mask=torch.ones(HEIGHT, WIDTH, dtype=torch.bool), object=model.name,

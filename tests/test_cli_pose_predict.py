@@ -26,7 +26,7 @@ from tests.pose.synthetic_objects import (
 )
 
 from depthpose.cli import main, pose_methods
-from depthpose.cli.pose_methods import chosen_objects
+from depthpose.cli.pose_methods import choose_objects
 from depthpose.core.camera import Camera, write_camera
 from depthpose.core.files import (
     CLOUD_READERS,
@@ -448,7 +448,7 @@ def test_of_a_data_set_one_object_is_posed_by_name_or_number(
 
 def test_the_name_of_the_weights_serves_where_the_data_set_has_none(synthetic: BopDataset) -> None:
     method = make_method([replace(bracket("part"), number=7)])
-    chosen = chosen_objects(synthetic, method, "part")
+    chosen = choose_objects(synthetic, method, "part")
     assert {instance.object_id for instance in chosen.instances} == {7}
 
 

@@ -14,7 +14,7 @@ from tests.synthetic_street import make_street
 
 from depthpose.cli import main
 from depthpose.cli.depth_evaluate import with_source
-from depthpose.cli.depth_predict import Method
+from depthpose.cli.depth_predict import DepthMethod
 from depthpose.cli.thesis_depth import reproduce_table, write_figure
 from depthpose.core.camera import StereoRig, write_camera
 from depthpose.core.errors import InputError
@@ -77,15 +77,17 @@ def reproduce(table: str, street: Path, out: Path, *more: str) -> int:
     return main([*given, *CAMERA_Z, *more])
 
 
-def write_table(number: str, street: Path, methods: list[tuple[str, Method]], out: Path) -> int:
+def write_table(
+    number: str, street: Path, methods: list[tuple[str, DepthMethod]], out: Path
+) -> int:
     caps_m, pictures = (80.0, 50.0), 1
     data = open_dataset(street)
     return reproduce_table(TABLES[number], data, methods, out, "eigen-raw-camera", caps_m, pictures)
 
 
-def mono(name: str, depth_m: float) -> Method:
+def mono(name: str, depth_m: float) -> DepthMethod:
     settings = {"matcher": "fakestereo", "weights": name, "weights_sha256": name * 8}
-    return Method(name, FlatMono(depth_m), settings, with_right=False)
+    return DepthMethod(name, FlatMono(depth_m), settings, with_right=False)
 
 
 def test_table_2_2_is_made_by_one_command(

@@ -22,7 +22,7 @@ from depthpose.depth.synthesis import (
     make_synthesiser,
     mix_shifts,
     read_logits,
-    shift_left,
+    warp_left_to_right,
 )
 
 TINY = SelectionConfig(
@@ -101,9 +101,9 @@ def test_an_even_distribution_is_no_confidence() -> None:
 
 def test_one_shift_a_pixel_looks_to_the_right_and_repeats_the_border() -> None:
     left = torch.arange(6.0).expand(1, 3, 1, 6)
-    drawn = shift_left(left, torch.full((1, 1, 6), 2.0))
+    drawn = warp_left_to_right(left, torch.full((1, 1, 6), 2.0))
     assert drawn[0, 0, 0].tolist() == pytest.approx([2, 3, 4, 5, 5, 5])
-    half = shift_left(left, torch.full((1, 1, 6), 0.5))
+    half = warp_left_to_right(left, torch.full((1, 1, 6), 0.5))
     assert half[0, 0, 0].tolist() == pytest.approx([0.5, 1.5, 2.5, 3.5, 4.5, 5.0])
 
 
@@ -113,7 +113,7 @@ def test_a_sure_mixture_is_one_shift(scale: float) -> None:
     left, classes = torch.rand(1, 3, 5, 20), torch.randint(0, 5, (5, 20))
     mixed = mix_shifts(left, one_hot(classes, 5), PLANES * scale)
     shifts = torch.cat([torch.zeros(1), PLANES * scale])[classes][None]
-    torch.testing.assert_close(mixed, shift_left(left, shifts), rtol=0, atol=1e-5)
+    torch.testing.assert_close(mixed, warp_left_to_right(left, shifts), rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("size", [(64, 96), (50, 70), (33, 31), (5, 7)])

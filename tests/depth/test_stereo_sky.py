@@ -15,7 +15,7 @@ from depthpose.core.draw import draw_disparity
 from depthpose.core.errors import InputError
 from depthpose.depth.augment import TrainingPair
 from depthpose.depth.config import LightConfig, MatcherConfig
-from depthpose.depth.disparity import from_pair, resized_match
+from depthpose.depth.disparity import estimate_from_pair, resized_match
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.export import depth_export
 from depthpose.depth.labels import LabelConfig, label_pair
@@ -190,13 +190,13 @@ def test_a_few_pixels_of_sky_are_none() -> None:
     is_sky = torch.zeros(100, 100, dtype=torch.bool)
     is_sky[0, :15] = True
     match = Match(disparity_px=torch.full((100, 100), 4.0), is_sky=is_sky)
-    found = from_pair(pair, match)
+    found = estimate_from_pair(pair, match)
     assert found.depth_m is not None
     assert bool(found.depth_m.isfinite().all())
     assert bool((found.disparity_px == 4).all())
     is_sky[:2] = True
-    assert from_pair(pair, match).is_sky is not None
-    assert torch.equal(from_pair(pair, match).is_sky, is_sky)  # pyright: ignore[reportArgumentType]
+    assert estimate_from_pair(pair, match).is_sky is not None
+    assert torch.equal(estimate_from_pair(pair, match).is_sky, is_sky)  # pyright: ignore[reportArgumentType]
 
 
 def test_without_a_rig_the_disparity_of_the_sky_is_next_to_nothing() -> None:

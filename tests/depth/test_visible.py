@@ -9,7 +9,7 @@ from torch import Tensor
 from depthpose import FakestereoNet
 from depthpose.core.camera import StereoRig
 from depthpose.depth.config import SelectionConfig
-from depthpose.depth.disparity import from_pair, from_virtual
+from depthpose.depth.disparity import estimate_from_pair, estimate_from_virtual
 from depthpose.depth.stereo import CallableMatcher
 from depthpose.depth.types import Match, StereoInput
 from depthpose.depth.visible import texture, without_picture
@@ -141,7 +141,7 @@ def test_the_confidence_of_a_plain_wall_and_of_what_the_right_view_lacks_is_0() 
     sky = torch.zeros(H, W, dtype=torch.bool)
     sky[20:70, 60:120] = True
     match = Match(disparity_px=torch.full((H, W), 8.0), confidence=torch.ones(H, W), is_sky=sky)
-    found = from_pair(StereoInput(name="x", left=left, right=right, camera=rig()), match)
+    found = estimate_from_pair(StereoInput(name="x", left=left, right=right, camera=rig()), match)
     assert found.confidence is not None
     assert float(found.confidence[30:60, 70:110].max()) == 0
     assert float(found.confidence[:10, 60:].min()) == 1
@@ -156,7 +156,7 @@ def test_plain_sky_of_one_image_may_be_a_wall_and_depth_beside_it_keeps_its_conf
     sky[:50] = True
     match = Match(disparity_px=torch.full((H, W), 8.0), confidence=torch.ones(H, W), is_sky=sky)
     seen = StereoInput(name="x", left=image, right=None, camera=rig())
-    found = from_virtual(seen, SelectionConfig(), match, image)
+    found = estimate_from_virtual(seen, SelectionConfig(), match, image)
     assert found.confidence is not None
     assert float(found.confidence[30:50, 70:110].max()) == 0
     assert float(found.confidence[:10].min()) == 1

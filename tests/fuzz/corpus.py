@@ -19,7 +19,7 @@ from tests.fuzz import damage
 from tests.pose.synthetic_frames import make_dataset
 from tests.pose.synthetic_objects import bracket, tiny_weights
 
-from depthpose.cli.doctor_files import look_at_all
+from depthpose.cli.doctor_files import describe_files
 from depthpose.core.camera import StereoRig, read_camera, read_raw_pair
 from depthpose.core.checkpoint import read_checkpoint, read_torch_file
 from depthpose.core.config import read_config
@@ -81,7 +81,7 @@ class Kind:
 def look(path: Path) -> object:
     """What ``depthpose doctor FILE`` does."""
     with contextlib.redirect_stdout(io.StringIO()):
-        return look_at_all([path])
+        return describe_files([path])
 
 
 def written(write: Callable[[Path], object], name: str) -> bytes:

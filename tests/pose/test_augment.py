@@ -12,10 +12,10 @@ from depthpose.core.errors import InputError
 from depthpose.pose.config import ObjectsConfig, SyntheticSensorConfig
 from depthpose.pose.synthetic.views import (
     grow_mask,
-    measure,
     occlude,
     random_levels,
     random_rotation,
+    simulate_depth,
     whole,
 )
 from depthpose.pose.train import PoseTraining
@@ -78,7 +78,7 @@ def _sensor(kind: str, noise: float = 1.0, missing: float = 0.0) -> SyntheticSen
 
 def test_structured_light_reads_whole_steps_of_disparity() -> None:
     wall_m = torch.full((50, 60), 1.1)
-    read_m = measure(wall_m, (572.0, 572.0), _sensor("structured light"), _generator())
+    read_m = simulate_depth(wall_m, (572.0, 572.0), _sensor("structured light"), _generator())
     steps = 8 * 572.0 * 0.075 / read_m
     assert torch.allclose(steps, steps.round(), atol=1e-3)
     assert len(torch.unique(read_m)) > 3
@@ -97,7 +97,7 @@ def test_noise_is_that_of_the_sensor(kind: str, at_1_m: float, at_2_m: float) ->
     for distance_m, sigma_m in ((1.0, at_1_m), (2.0, at_2_m)):
         wall_m = torch.full((200, 200), distance_m)
         # Fine steps of disparity, so that they add nothing to speak of.
-        read_m = measure(wall_m, (572.0, 1e6), _sensor(kind), _generator(3))
+        read_m = simulate_depth(wall_m, (572.0, 1e6), _sensor(kind), _generator(3))
         # Noise that neighbours share has fewer independent readings on the same wall.
         own = 0.25 if kind == "active stereo" else 0.03
         assert abs(float(read_m.std()) / sigma_m - 1) < own
@@ -106,13 +106,14 @@ def test_noise_is_that_of_the_sensor(kind: str, at_1_m: float, at_2_m: float) ->
 
 def test_noise_that_neighbours_share_falls_off_with_their_distance() -> None:
     config = dataclasses.replace(_sensor("time of flight"), noise_correlation_px=(4.0, 4.0))
-    noise_m = measure(torch.full((400, 400), 1.0), (286.0, 572.0), config, _generator(1)) - 1
+    noise_m = simulate_depth(torch.full((400, 400), 1.0), (286.0, 572.0), config, _generator(1)) - 1
     assert abs(float(noise_m.std()) / 0.003 - 1) < 0.1
     for lag in (1, 2, 4):  # the window shows half as many pixels: 2 for 4
         product = (noise_m[:, :-lag] * noise_m[:, lag:]).mean() / noise_m.var()
         assert abs(float(product) - math.exp(-((lag / 2.0) ** 2) / 4)) < 0.08
     alone = (
-        measure(torch.full((400, 400), 1.0), (286.0, 572.0), _sensor("laser"), _generator(1)) - 1
+        simulate_depth(torch.full((400, 400), 1.0), (286.0, 572.0), _sensor("laser"), _generator(1))
+        - 1
     )
     assert abs(float((alone[:, :-1] * alone[:, 1:]).mean() / alone.var())) < 0.02
 
@@ -120,7 +121,7 @@ def test_noise_that_neighbours_share_falls_off_with_their_distance() -> None:
 def test_active_stereo_moves_edges_and_shades_what_one_camera_sees() -> None:
     depth_m = torch.full((60, 200), 1.0)
     depth_m[:, 100:140] = 0.7
-    read_m = measure(depth_m, (572.0, 572.0), _sensor("active stereo", 0.0), _generator())
+    read_m = simulate_depth(depth_m, (572.0, 572.0), _sensor("active stereo", 0.0), _generator())
     lost = read_m.isnan()
     width = int(572.0 * 0.05 * (1 / 0.7 - 1))
     assert bool(lost[:, 100 - width + 2 : 98].all())
@@ -131,13 +132,15 @@ def test_active_stereo_moves_edges_and_shades_what_one_camera_sees() -> None:
 
 def test_no_sensor_changes_nothing() -> None:
     depth_m = torch.rand(9, 9) + 0.5
-    assert torch.equal(measure(depth_m, (50.0, 50.0), _sensor("none"), _generator()), depth_m)
+    assert torch.equal(
+        simulate_depth(depth_m, (50.0, 50.0), _sensor("none"), _generator()), depth_m
+    )
 
 
 def test_the_projector_leaves_a_shadow_beside_what_is_near() -> None:
     depth_m = torch.full((20, 200), 1.0)
     depth_m[:, 60:80] = 0.7
-    read_m = measure(depth_m, (572.0, 572.0), _sensor("structured light", 0.0), _generator())
+    read_m = simulate_depth(depth_m, (572.0, 572.0), _sensor("structured light", 0.0), _generator())
     lost = read_m.isnan()
     # f b (1/0.7 - 1/1.0) = 18.4 px, less the tolerance; where the step itself is is not counted.
     width = 572.0 * 0.075 * (1 / 0.7 - 1)
@@ -149,7 +152,7 @@ def test_the_projector_leaves_a_shadow_beside_what_is_near() -> None:
 def test_time_of_flight_mixes_depths_at_edges_alone() -> None:
     depth_m = torch.full((40, 40), 1.0)
     depth_m[:, 20:] = 2.0
-    read_m = measure(depth_m, (572.0, 572.0), _sensor("time of flight", 0.0), _generator())
+    read_m = simulate_depth(depth_m, (572.0, 572.0), _sensor("time of flight", 0.0), _generator())
     assert bool(((read_m[:, 19] > 1) & (read_m[:, 19] < 2)).all())
     assert torch.equal(read_m[:, :19], depth_m[:, :19])
     assert torch.equal(read_m[:, 20:], depth_m[:, 20:])
@@ -159,12 +162,14 @@ def test_grazing_surfaces_are_not_read_but_edges_are() -> None:
     # z grows by 20 mm a pixel of 1/572 m at 1 m: 85 degrees.
     ramp_m = 1.0 + 0.02 * torch.arange(1, 31.0).expand(10, 30)
     assert bool(
-        measure(ramp_m, (572.0, 572.0), _sensor("laser", 0.0), _generator()).isfinite().all()
+        simulate_depth(ramp_m, (572.0, 572.0), _sensor("laser", 0.0), _generator()).isfinite().all()
     )
-    lost = measure(ramp_m, (572.0, 572.0), _sensor("time of flight", 0.0), _generator()).isnan()
+    lost = simulate_depth(
+        ramp_m, (572.0, 572.0), _sensor("time of flight", 0.0), _generator()
+    ).isnan()
     assert bool(lost[:, 1:10].all())
     step_m = torch.where(torch.arange(30) < 15, 1.0, 1.5).expand(10, 30)
-    read_m = measure(step_m, (572.0, 572.0), _sensor("laser", 0.0), _generator())
+    read_m = simulate_depth(step_m, (572.0, 572.0), _sensor("laser", 0.0), _generator())
     assert torch.equal(read_m, step_m)
 
 
@@ -172,7 +177,7 @@ def test_readings_go_missing_at_about_the_share() -> None:
     wall_m = torch.full((400, 400), 1.0)
     shares = [
         float(
-            measure(wall_m, (572.0, 572.0), _sensor("laser", 1.0, 0.2), _generator(seed))
+            simulate_depth(wall_m, (572.0, 572.0), _sensor("laser", 1.0, 0.2), _generator(seed))
             .isnan()
             .float()
             .mean()

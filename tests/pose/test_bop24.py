@@ -12,7 +12,7 @@ from tests.pose.synthetic_frames import make_dataset, moved, predictions_of
 from depthpose.core.errors import InputError
 from depthpose.pose.config import EvaluationConfig
 from depthpose.pose.datasets import BopDataset, Instance, check_bop, open_bop, read_targets
-from depthpose.pose.evaluate import evaluate, of_targets
+from depthpose.pose.evaluate import evaluate, select_targets
 from depthpose.pose.metrics import average_precision
 from depthpose.pose.predictions import Prediction, place_of, results_name
 
@@ -173,7 +173,7 @@ def test_targets_of_detection_are_whole_images(synthetic: BopDataset, tmp_path: 
     rows = [{"scene_id": 1, "im_id": 2}, {"scene_id": 1, "im_id": 0}]
     (tmp_path / "test_targets_bop24.json").write_text(json.dumps(rows))
     targets = read_targets("test_targets_bop24.json", tmp_path)
-    chosen = of_targets(synthetic, targets)
+    chosen = select_targets(synthetic, targets)
     assert [(i.image_id, i.object_id) for i in chosen.instances] == [
         (0, 7),
         (0, 10),
@@ -181,4 +181,4 @@ def test_targets_of_detection_are_whole_images(synthetic: BopDataset, tmp_path: 
         (2, 10),
     ]
     with pytest.raises(InputError, match="nothing that the 1 targets ask for is annotated"):
-        of_targets(synthetic, [replace(targets[0], scene_id=8)])
+        select_targets(synthetic, [replace(targets[0], scene_id=8)])

@@ -13,8 +13,8 @@ from depthpose.pose.datasets import (
     Detection,
     box_mask,
     encode_rle,
+    group_by_image,
     name_objects,
-    of_images,
     parse_box,
     parse_labels,
     read_detections,
@@ -185,17 +185,17 @@ def test_detections_find_their_images() -> None:
     box = (0.0, 0.0, 1.0, 1.0)
     by_number = Detection(object="gear", box=box, image_id=12)
     by_name = Detection(object="gear", box=box, image="b")
-    found = of_images([by_number, by_name], ["000012", "b", "c"], "d.json")
+    found = group_by_image([by_number, by_name], ["000012", "b", "c"], "d.json")
     assert found == {"000012": [by_number], "b": [by_name], "c": []}
     # All are of one image, and there is one: its name does not matter.
-    assert of_images([by_number, by_number], ["x"], "d.json") == {"x": [by_number] * 2}
+    assert group_by_image([by_number, by_number], ["x"], "d.json") == {"x": [by_number] * 2}
     with pytest.raises(InputError, match=r"no detection is of 'x' or another image; .* of 12"):
-        of_images([by_number], ["x", "y"], "d.json")
+        group_by_image([by_number], ["x", "y"], "d.json")
     with pytest.raises(InputError, match="entry 0 does not say of which image it is"):
-        of_images([detection_of("gear")], ["x", "y"], "d.json")
+        group_by_image([detection_of("gear")], ["x", "y"], "d.json")
     scenes = [Detection(object="gear", box=box, scene_id=k, image_id=1) for k in (1, 2)]
     with pytest.raises(InputError, match="detections of several scenes; name the data set by --b"):
-        of_images(scenes, ["x"], "d.json")
+        group_by_image(scenes, ["x"], "d.json")
 
 
 def test_a_label_map_keeps_its_numbers(tmp_path: Path) -> None:

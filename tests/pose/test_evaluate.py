@@ -29,8 +29,8 @@ from depthpose.pose.evaluate import (
     evaluate,
     frames_hash,
     nearest_copy,
-    of_targets,
     read_any,
+    select_targets,
 )
 from depthpose.pose.mesh import symmetry_transforms, turn_about
 from depthpose.pose.metrics import add_m, adds_m, mspd_px
@@ -198,10 +198,12 @@ def test_targets_keep_the_most_visible(synthetic: BopDataset) -> None:
     hidden = replace(synthetic.instances[1], object_id=7, visible_fraction=0.2)
     some = replace(synthetic, instances=[hidden, *synthetic.instances])
     target = BopTarget(scene_id=1, image_id=0, object_id=7, count=1)
-    assert [i.name for i in of_targets(some, [target]).instances] == [synthetic.instances[0].name]
+    assert [i.name for i in select_targets(some, [target]).instances] == [
+        synthetic.instances[0].name
+    ]
     assert frames_hash(some.instances) != frames_hash(synthetic.instances)
     with pytest.raises(InputError, match="ask for 3 of object 7 in scene 1, image 0, but 2"):
-        of_targets(some, [replace(target, count=3)])
+        select_targets(some, [replace(target, count=3)])
 
 
 def test_an_estimate_that_belongs_elsewhere_answers_for_none(synthetic: BopDataset) -> None:

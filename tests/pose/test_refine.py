@@ -21,7 +21,7 @@ from depthpose.pose.mesh import drawn_triangles, make_model, sample_surface
 from depthpose.pose.mesh.models import turn_about
 from depthpose.pose.metrics import add_m
 from depthpose.pose.surface import Surface, prepare_surface
-from depthpose.pose.synthetic.views import measure
+from depthpose.pose.synthetic.views import simulate_depth
 from depthpose.pose.types import ObjectModel, Symmetries
 from depthpose.report.pose import object_points
 
@@ -300,7 +300,9 @@ def test_its_covariance_covers_the_errors_of_sensors(kind: SensorKind) -> None:
         sensor = SyntheticSensorConfig(kinds=(kind,), noise=(1.0, 1.0), offset_m=(0.0, 0.0))
         by = torch.cat([-cross_matrix(at_m), torch.eye(3).double()], 1)
         for _ in range(2):
-            depth_m = measure(clean_m.nan_to_num(0.8).float(), (400.0, 400.0), sensor, generator)
+            depth_m = simulate_depth(
+                clean_m.nan_to_num(0.8).float(), (400.0, 400.0), sensor, generator
+            )
             cloud_m = cloud_from_depth(depth_m, mask & depth_m.isfinite(), K.float()).double()
             found = refine_pose(cloud_m, true, part, IcpConfig(sensor_offset_m=0.0))
             middle_m = found.camera_from_model.apply(part.points_m.mean(0)[None])[0]

@@ -33,7 +33,7 @@ from depthpose.pose.train import (
     PoseTraining,
     TrainingClouds,
     read_models,
-    train_pose,
+    train_pose_network,
 )
 from depthpose.pose.train.clouds import (
     HELD_OUT_SEED,
@@ -261,7 +261,7 @@ def test_a_held_out_view_of_too_few_points_is_a_failure() -> None:
 
 
 def test_a_training_leaves_weights_a_card_and_its_config(tmp_path: Path) -> None:
-    path = train_pose(_training(), Run(folder=tmp_path / "run"))
+    path = train_pose_network(_training(), Run(folder=tmp_path / "run"))
     weights = read_pose_weights(path)
     assert isinstance(weights.network, ResUNet)
     assert weights.network.config.norm == "none"
@@ -280,20 +280,20 @@ def test_a_training_leaves_weights_a_card_and_its_config(tmp_path: Path) -> None
     again = read_config(tmp_path / "run" / "config.yaml", PoseTraining)
     assert again.network.classes == 1
     with pytest.raises(InputError, match="holds a training"):
-        train_pose(_training(), Run(folder=tmp_path / "run"))
+        train_pose_network(_training(), Run(folder=tmp_path / "run"))
 
 
 @pytest.mark.parametrize("with_meshes", [True, False])
 def test_a_training_begins_with_what_other_objects_taught(
     tmp_path: Path, with_meshes: bool
 ) -> None:
-    first = train_pose(_training(), Run(folder=tmp_path / "first"))
+    first = train_pose_network(_training(), Run(folder=tmp_path / "first"))
     write_pose_weights(first, read_pose_weights(first), with_meshes=with_meshes)
     loop = LoopConfig(steps=1, batch_size=16, device="cpu", log_every_steps=1)
     still = AdamConfig(learning_rate=1e-9)
     parts = ModelsConfig(parts=("bracket", "mug"))
     config = _training(models=parts, start=str(first), adam=still, loop=loop)
-    then = train_pose(config, Run(folder=tmp_path / "then"))
+    then = train_pose_network(config, Run(folder=tmp_path / "then"))
     networks = [network_of(read_checkpoint(path), str(path)) for path in (first, then)]
     cloud = TrainingClouds(_models(), PoseTraining(objects=_VIEWS, cloud=_CLOUD), seed=1)[0]
     voxels = Voxels.from_points(F.pad(cloud.coordinates, (1, 0)))
@@ -301,7 +301,7 @@ def test_a_training_begins_with_what_other_objects_taught(
     assert float((seen[1] - seen[0]).norm() / seen[0].norm()) < 0.1
     other = dataclasses.replace(_SMALL, keypoints=4)
     with pytest.raises(InputError, match="trained with keypoints = 8"):
-        train_pose(
+        train_pose_network(
             dataclasses.replace(config, network=other, models=_FOUR_KEYPOINTS),
             Run(folder=tmp_path / "other"),
         )
@@ -309,7 +309,7 @@ def test_a_training_begins_with_what_other_objects_taught(
 
 def test_terms_of_the_start_bind_what_comes_of_it(tmp_path: Path) -> None:
     bound = dataclasses.replace(_training().models, terms="For research alone.")
-    first = train_pose(_training(models=bound), Run(folder=tmp_path / "first"))
+    first = train_pose_network(_training(models=bound), Run(folder=tmp_path / "first"))
     for terms, expected in (
         ("", "For research alone."),
         ("Cite us.", "Cite us. For research alone."),
@@ -317,7 +317,7 @@ def test_terms_of_the_start_bind_what_comes_of_it(tmp_path: Path) -> None:
         models = dataclasses.replace(bound, terms=terms)
         config = _training(models=models, start=str(first))
         with pytest.warns(UserWarning, match="For research alone"):
-            then = train_pose(config, Run(folder=tmp_path / f"then{len(terms)}"))
+            then = train_pose_network(config, Run(folder=tmp_path / f"then{len(terms)}"))
         facts = read_pose_weights(then).facts
         assert facts["terms"] == expected
         assert facts["began_with"] == "pose"
@@ -325,10 +325,10 @@ def test_terms_of_the_start_bind_what_comes_of_it(tmp_path: Path) -> None:
 
 
 def test_a_start_with_other_voxel_features_is_refused(tmp_path: Path) -> None:
-    first = train_pose(_training(), Run(folder=tmp_path / "first"))
+    first = train_pose_network(_training(), Run(folder=tmp_path / "first"))
     cloud = dataclasses.replace(_CLOUD, with_shape=True)
     with pytest.raises(InputError, match="inputs = 1, but the config says 9"):
-        train_pose(_training(cloud=cloud, start=str(first)), Run(folder=tmp_path / "more"))
+        train_pose_network(_training(cloud=cloud, start=str(first)), Run(folder=tmp_path / "more"))
     with pytest.raises(InputError, match=r"takes 1 features of a voxel, .* clouds give 9\. Set"):
         dataclasses.replace(read_pose_weights(first), cloud=cloud)
 
@@ -340,24 +340,28 @@ def test_a_training_without_norms_begins_with_weights_that_have_its_biases(tmp_p
     write_pose_weights(path, packed(network, read_models(config.models), config))
     plain = dataclasses.replace(_SMALL, norm="none")
     with pytest.raises(InputError) as error:
-        train_pose(_training(start=str(path), network=plain), Run(folder=tmp_path / "plain"))
+        train_pose_network(
+            _training(start=str(path), network=plain), Run(folder=tmp_path / "plain")
+        )
     assert str(error.value) == (
         f"{path}: was trained with with_bias = True, but the config says False. Give the config "
         "the weights' own."
     )
     biased = dataclasses.replace(plain, with_bias=True)
     still = _training(start=str(path), network=biased, adam=AdamConfig(learning_rate=1e-12))
-    then = read_pose_weights(train_pose(still, Run(folder=tmp_path / "biased"))).network
+    then = read_pose_weights(train_pose_network(still, Run(folder=tmp_path / "biased"))).network
     for name, tensor in network.state_dict().items():
         assert torch.allclose(then.state_dict()[name], tensor, atol=1e-6), name
 
 
 def test_a_resumed_training_ends_as_one_that_nothing_stopped(tmp_path: Path) -> None:
-    whole = train_pose(_training(), Run(folder=tmp_path / "whole"))
+    whole = train_pose_network(_training(), Run(folder=tmp_path / "whole"))
     loop = LoopConfig(steps=3, batch_size=2, device="cpu", log_every_steps=1, save_every_steps=1)
     with pytest.raises(StoppedError):
-        train_pose(_training(loop=loop), Run(folder=tmp_path / "cut", on_step=stop_after(2)))
-    cut = train_pose(_training(loop=loop), Run(folder=tmp_path / "cut", resume=True))
+        train_pose_network(
+            _training(loop=loop), Run(folder=tmp_path / "cut", on_step=stop_after(2))
+        )
+    cut = train_pose_network(_training(loop=loop), Run(folder=tmp_path / "cut", resume=True))
     one, other = (read_pose_weights(path).network.state_dict() for path in (whole, cut))
     assert all(torch.equal(one[name], other[name]) for name in one)
 
@@ -372,7 +376,7 @@ def test_weights_are_measured_as_the_file_has_them(
         return {}
 
     monkeypatch.setattr("depthpose.pose.train.poses.score_held_out", counted)
-    path = train_pose(_training(with_half=True), Run(folder=tmp_path / "run"))
+    path = train_pose_network(_training(with_half=True), Run(folder=tmp_path / "run"))
     written = read_pose_weights(path)
     (measured,) = seen
     for name, tensor in written.network.state_dict().items():

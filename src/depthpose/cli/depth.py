@@ -66,7 +66,7 @@ def predict(
 
     work_of = partial(work.image_work, lens, scale, output, method)
     if engine.engine == "ray":
-        return work.estimate_by_engine(images, work.IMAGES, work_of, out, engine)
+        return work.predict_on_ray(images, work.IMAGES, work_of, out, engine)
     sources = work.find_sources(images, Path(out))
     depth_work = work_of(sources)
     built = method.build()
@@ -76,7 +76,7 @@ def predict(
             "--precision and --max-memory are for a matcher with weights, and none runs here; "
             "leave them out"
         )
-    return work.estimate_all([(path,) for path in sources], depth_work, built, Path(out))
+    return work.predict_files([(path,) for path in sources], depth_work, built, Path(out))
 
 
 def match(
@@ -121,14 +121,14 @@ def match(
     work_of = partial(work.pair_work, camera, pairs, method)
     if engine.engine == "ray":
         sides = [left] if right is None else [left, right]
-        return work.estimate_by_engine(sides, work.PAIRS, work_of, out, engine)
+        return work.predict_on_ray(sides, work.PAIRS, work_of, out, engine)
     if right is None:
         raise InputError(f"{left}: there is no right image beside it; give it second")
     files = work.list_pairs(left, right)
     refuse_among_inputs(Path(out), (left, right), [path for pair in files for path in pair])
     depth_work = work_of(files[0])
     built = method.build()
-    return work.estimate_all(files, depth_work, built, Path(out))
+    return work.predict_files(files, depth_work, built, Path(out))
 
 
 def evaluate(

@@ -12,7 +12,7 @@ from typing import Any, cast, get_args
 from tqdm import tqdm
 
 from depthpose.cli.depth_options import MethodOptions
-from depthpose.cli.depth_predict import DepthMethodSource, Method
+from depthpose.cli.depth_predict import DepthMethod, DepthMethodSource
 from depthpose.core import engine
 from depthpose.core.errors import InputError
 from depthpose.core.run import environment, find_rank, read_settings, wait_for
@@ -51,7 +51,7 @@ def open_frames(data: Path, split: str | None) -> Dataset:
     return dataset
 
 
-def predict_dataset(dataset: Dataset, method: Method, rule: Protocol, folder: Path) -> Path:
+def predict_dataset(dataset: Dataset, method: DepthMethod, rule: Protocol, folder: Path) -> Path:
     """Predict every frame that has truth to compare with, and a right view if it is needed.
 
     Of several processes each predicts its share, and the first goes on when all files are there.
@@ -90,9 +90,11 @@ class _Unchecked:
         return self.net.estimate_pair(pair, with_check=False)
 
 
-def choose_methods(options: MethodOptions, config: MatcherConfig, dataset: Dataset) -> list[Method]:
+def choose_methods(
+    options: MethodOptions, config: MatcherConfig, dataset: Dataset
+) -> list[DepthMethod]:
     """Build the methods that are measured: SGBM, weights and baselines, in this order."""
-    chosen: list[Method] = []
+    chosen: list[DepthMethod] = []
     if options.matcher == "sgbm":
         is_filled = options.holes == "fill"
         sgbm = DepthMethodSource(weights=None, config=config, with_filled_holes=is_filled)
@@ -118,7 +120,7 @@ def choose_methods(options: MethodOptions, config: MatcherConfig, dataset: Datas
     return chosen
 
 
-def named_method(word: str, config: MatcherConfig) -> Method:
+def named_method(word: str, config: MatcherConfig) -> DepthMethod:
     """Build the method of a name: weights by file or name, perhaps with ``both:`` and the like."""
     prefix, _, name = word.rpartition(":")
     source = DepthMethodSource(
@@ -136,7 +138,7 @@ def named_method(word: str, config: MatcherConfig) -> Method:
     return DepthMethodSource(weights=word, config=config).build()
 
 
-def baseline_method(name: BaselineName, training: Dataset) -> Method:
+def baseline_method(name: BaselineName, training: Dataset) -> DepthMethod:
     """Fit a baseline to the truth of training frames."""
     kinds = {"rows": RowDepthBaseline, "nearest": NearestImageBaseline}
     names = "\n".join(frame.name for frame in training.frames)
@@ -148,7 +150,9 @@ def baseline_method(name: BaselineName, training: Dataset) -> Method:
         "train_sha256": hashlib.sha256(names.encode()).hexdigest(),
     }
     show = partial(tqdm, desc=f"fit {name}", unit=" frames", disable=None)
-    return Method(f"baseline-{name}", kinds[name].fit(training, show), settings, with_right=False)
+    return DepthMethod(
+        f"baseline-{name}", kinds[name].fit(training, show), settings, with_right=False
+    )
 
 
 def open_training(folders: Sequence[Path], without: Sequence[str], measured: Dataset) -> Dataset:

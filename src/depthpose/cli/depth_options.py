@@ -75,8 +75,8 @@ class ScaleOptions:
     sets the scale of each image."""
 
     @property
-    def distance(self) -> tuple[float, float, float]:
-        """The known distance: column, row [px], metres."""
+    def measured_point(self) -> tuple[float, float, float]:
+        """The pixel of ``known_distance`` and its depth: column, row [px], metres."""
         assert self.known_distance is not None
         try:
             column, row, metres = (float(word) for word in self.known_distance.split(","))

@@ -62,7 +62,7 @@ _VIDEO = ".color.mp4"
 _SAME_FOCAL = 0.01
 
 
-class Method(NamedTuple):
+class DepthMethod(NamedTuple):
     """An estimator, what to call it, and the JSON values that decide its results.
 
     ``with_right`` says whether it is given the real right view.
@@ -87,13 +87,13 @@ class DepthMethodSource:
     use: Use | None = None  #: build what these take alone; None: all networks
     with_filled_holes: bool = False  #: of OpenCV's matcher: give every pixel an answer
 
-    def build(self) -> Method:
+    def build(self) -> DepthMethod:
         """Build the networks on the device of the config."""
         if self.weights is None:  # OpenCV's StereoSGBM with the settings of our tables
             sgbm = SGBMConfig(with_filled_holes=self.with_filled_holes)
             name = "sgbm-filled" if self.with_filled_holes else "sgbm"
             net = FakestereoNet.load(matcher="sgbm", config=sgbm)
-            return Method(name, net, {"matcher": "sgbm", **asdict(sgbm)})
+            return DepthMethod(name, net, {"matcher": "sgbm", **asdict(sgbm)})
         if isinstance(self.weights, Weights):
             with self.weights.unpacked() as file:
                 return replace(self, weights=file).build()
@@ -155,7 +155,7 @@ class DepthMethodSource:
         if not with_right and net.synthesiser is not None:
             facts["answer"] = net.synthesiser.config.answer
             facts["scales"] = list(net.synthesiser.scales)
-        return Method(name, net, {**facts, **settings}, with_right)
+        return DepthMethod(name, net, {**facts, **settings}, with_right)
 
     def packed(self) -> "DepthMethodSource":
         """Give the same with the weights in memory."""
@@ -352,7 +352,7 @@ class DepthWork:
         if isinstance(estimate, InputError):
             return estimate
         try:
-            return scale_by_distance(estimate, name, self.scale.distance)
+            return scale_by_distance(estimate, name, self.scale.measured_point)
         except InputError as error:
             return error
 
@@ -392,7 +392,7 @@ class DepthWork:
         return estimate
 
 
-def estimate_by_engine(
+def predict_on_ray(
     words: Sequence[str],
     files: Files,
     work_of: Callable[[Sequence[Path]], DepthWork],
@@ -420,8 +420,8 @@ def estimate_by_engine(
     return print_shards(engine.run(work, inputs, out, settings), out, what)
 
 
-def estimate_all(
-    sources: Sequence[tuple[Path, ...]], work: DepthWork, method: Method, out: Path
+def predict_files(
+    sources: Sequence[tuple[Path, ...]], work: DepthWork, method: DepthMethod, out: Path
 ) -> int:
     """Estimate what is not finished; an input that fails is named and stops no other.
 
@@ -516,7 +516,7 @@ class DepthRun:
     """Estimates of one process as files in ``out``, and its failures by the names of inputs."""
 
     work: DepthWork
-    method: Method
+    method: DepthMethod
     out: Path
     failures: dict[str, InputError] = field(default_factory=dict)
 

@@ -32,9 +32,9 @@ def doctor(files: tyro.conf.Positional[tuple[NewPath, ...]] = ()) -> int:
         files: images, cameras, clouds, ... of one job.
     """
     if files:
-        from depthpose.cli.doctor_files import look_at_all
+        from depthpose.cli.doctor_files import describe_files
 
-        return look_at_all(files)
+        return describe_files(files)
     from depthpose.core.checkpoint import SHIPPED, read_checkpoint
     from depthpose.core.run import environment
 

@@ -23,20 +23,18 @@ from depthpose.pose.mesh import MESH_READERS, exact_diameter, read_geometry
 Size = tuple[int, int]
 
 _UNITS_M = {"most sensors": 0.001, "TUM RGB-D": 0.0002, "KITTI": 1 / 256}
-_NEAR_M = 0.05
-_FAR_M = 100.0
-_ONLY_MM = 20.0
-_ONLY_M = 2.0
-_LEAST_MM = 150.0
-"""A part is no longer than 20 m, a scan no farther; no part is shorter than 2 mm, and no depth
-camera sees what is nearer than 15 cm."""
-_EIGHT_BIT = 255
-_FEW_UNKNOWN = 0.02
-_ROUGH = 0.012
-"""Of depth, pixels without a reading (sensors: 6 % and more) and the mean step between neighbours
-as a share of the range (dense depth: 0.004 at most, pictures: 0.024 at least)."""
-_SQUARE = 0.05
-_MOST = 0.5
+_MIN_DEPTH_M = 0.05
+_MAX_DEPTH_M = 100.0
+_MAX_LENGTH_M = 20.0  # of a part, and of the way to a scan
+_MIN_LENGTH_MM = 2.0  # of a part
+_MIN_DISTANCE_MM = 150.0  # no depth camera sees what is nearer
+_MAX_8_BIT = 255
+_MIN_UNKNOWN_SHARE = 0.02  # of depth images: of sensors 6 % and more has no reading
+_MAX_SMOOTH_STEP = 0.012
+"""Mean step between neighbours of a depth image, as a share of the range: of dense depth 0.004 at
+most, of pictures 0.024 at least."""
+_MAX_FOCAL_DIFFERENCE = 0.05  # of fx and fy, as a share
+_HALF = 0.5
 
 
 @dataclass(kw_only=True)
@@ -44,8 +42,8 @@ class FileFacts:
     """A file, what it is, what is odd, and what the others are compared with."""
 
     path: Path
-    what: str = ""
-    odd: list[str] = field(default_factory=list)
+    description: str = ""
+    oddities: list[str] = field(default_factory=list)
     size: Size | None = None
     image: Tensor | None = None
     depth_units: Tensor | None = None
@@ -55,98 +53,106 @@ class FileFacts:
     model: Tensor | None = None
 
 
-def look_at_all(paths: Sequence[Path]) -> int:
+def describe_files(paths: Sequence[Path]) -> int:
     """Print what each file is and what is odd about it; give the exit code."""
     # What has a size comes first: a camera file may need it.
-    words = cameras.CAMERA_SUFFIXES
-    ordered = sorted(paths, key=lambda path: path.is_dir() or path.suffix.lower() in words)
+    suffixes = cameras.CAMERA_SUFFIXES
+    ordered = sorted(paths, key=lambda path: path.is_dir() or path.suffix.lower() in suffixes)
     all_facts: list[FileFacts] = []
     for path in ordered:
         size = next((other.size for other in all_facts if other.size is not None), None)
         try:
-            all_facts.append(_read(path, size))
+            all_facts.append(_describe_file(path, size))
         except InputError as error:
-            all_facts.append(FileFacts(path=path, odd=[str(error).removeprefix(f"{path}: ")]))
-    for file_facts in all_facts:
-        file_facts.odd += _contradictions(file_facts, all_facts)
+            all_facts.append(FileFacts(path=path, oddities=[str(error).removeprefix(f"{path}: ")]))
+
+    # What each is, and where it contradicts another.
+    for facts in all_facts:
+        facts.oddities += _contradictions(facts, all_facts)
     for path in paths:
-        file_facts = next(s for s in all_facts if s.path == path)
-        print(f"{path}: {file_facts.what}" if file_facts.what else f"{path}: cannot be used")
-        for oddity in file_facts.odd:
+        facts = next(s for s in all_facts if s.path == path)
+        print(f"{path}: {facts.description}" if facts.description else f"{path}: cannot be used")
+        for oddity in facts.oddities:
             print(f"  odd: {oddity}")
-    is_odd = any(file_facts.odd for file_facts in all_facts)
-    pictures = [file_facts for file_facts in all_facts if file_facts.image is not None]
-    if len(pictures) == 2 and pictures[0].size == pictures[1].size:  # a pair, the left one first
-        left, right = (file_facts.image for file_facts in pictures)
+
+    # Two pictures may be a pair, the left one first.
+    is_odd = any(facts.oddities for facts in all_facts)
+    pictures = [facts for facts in all_facts if facts.image is not None]
+    if len(pictures) == 2 and pictures[0].size == pictures[1].size:
+        left, right = (facts.image for facts in pictures)
         assert left is not None
         assert right is not None
         report = cameras.check_rectified(left, right)
-        oddity = f"{chr(10)}  odd: {report.message}" if report.is_wrong else f": {report.message}"
+        oddity = f"\n  odd: {report.message}" if report.is_wrong else f": {report.message}"
         print(f"{pictures[0].path.name} and {pictures[1].path.name} as a pair{oddity}")
         is_odd = is_odd or report.is_wrong
     return 1 if is_odd else 0
 
 
-def _read(path: Path, size: Size | None) -> FileFacts:
+def _describe_file(path: Path, size: Size | None) -> FileFacts:
     """Tell what a file holds, by its suffix: a camera, a map, a mesh, a cloud or a picture.
 
     ``size``: width and height [px] of a picture beside it, for cameras that do not say theirs.
     """
     suffix = path.suffix.lower()
     if path.is_dir() or suffix in cameras.CAMERA_SUFFIXES:
-        return _read_words(path, size)
+        return _describe_text_file(path, size)
     if suffix in files.MAP_SUFFIXES:
-        return _of_map(path)
+        return _describe_map(path)
     if suffix in MESH_READERS:
         vertices, faces = read_geometry(path)
         points = torch.from_numpy(vertices)
         if not len(faces):
-            return _of_points(path, points)
+            return _describe_points(path, points)
         diameter = exact_diameter(points)
-        unit = "metres (--unit m)" if diameter < _ONLY_M else "metres, cm or mm; measure it"
-        unit = "millimetres (--unit mm)" if diameter > _ONLY_MM else unit
+        unit = "metres (--unit m)" if diameter < _MIN_LENGTH_MM else "metres, cm or mm; measure it"
+        unit = "millimetres (--unit mm)" if diameter > _MAX_LENGTH_M else unit
         # STL repeats the points of every face, and other files those at edges.
         count = len(np.unique(vertices, axis=0))
-        what = f"mesh of {count} points and {len(faces)} faces, {diameter:.4g} across: {unit}"
-        return FileFacts(path=path, what=what, model=points)
+        description = (
+            f"mesh of {count} points and {len(faces)} faces, {diameter:.4g} across: {unit}"
+        )
+        return FileFacts(path=path, description=description, model=points)
     if suffix in files.CLOUD_READERS:
-        return _of_points(path, files.read_cloud(path).points.double())
-    return _of_picture(path)
+        return _describe_points(path, files.read_cloud(path).points.double())
+    return _describe_picture(path)
 
 
-def _read_words(path: Path, size: Size | None) -> FileFacts:
+def _describe_text_file(path: Path, size: Size | None) -> FileFacts:
     """Read a text file as a camera, a pose, run lengths of a mask, or points."""
-    if (posed := _of_pose(path)) is not None:
+    if (posed := _describe_pose(path)) is not None:
         return posed
     if path.suffix.lower() == ".json":
         content = files.read_json(path)
         record = content[0] if isinstance(content, list) and len(content) == 1 else content
         if isinstance(record, dict) and {"counts", "segmentation"} & record.keys():
-            return _of_mask(path, decode_rle(*read_runs(record, str(path))))
+            return _describe_mask(path, decode_rle(*read_runs(record, str(path))))
     try:
         camera = cameras.read_camera(path, size)
     except InputError as error:
         if path.suffix.lower() != ".txt" or "no camera that is known" not in str(error):
             raise
-        return _of_points(path, files.read_cloud(path).points.double())
+        return _describe_points(path, files.read_cloud(path).points.double())
     fx = float(camera.K[0, 0])
     fy = float(camera.K[1, 1])
     wide = math.degrees(2 * math.atan(camera.width / (2 * fx)))
-    what = f"camera of {camera.width}x{camera.height}, fx {fx:.1f} px, {wide:.0f} degrees wide"
+    description = (
+        f"camera of {camera.width}x{camera.height}, fx {fx:.1f} px, {wide:.0f} degrees wide"
+    )
     if isinstance(camera, cameras.StereoRig):
-        what += f", baseline {camera.baseline_m:.4g} m"
+        description += f", baseline {camera.baseline_m:.4g} m"
     if camera.depth_unit_m is not None:
-        what += f", depth in units of {camera.depth_unit_m:.4g} m"
-    odd = [oddity] if (oddity := cameras.suspicious_centre(camera)) is not None else []
-    if abs(fx / fy - 1) > _SQUARE:
-        odd.append(
+        description += f", depth in units of {camera.depth_unit_m:.4g} m"
+    oddities = [oddity] if (oddity := cameras.suspicious_centre(camera)) is not None else []
+    if abs(fx / fy - 1) > _MAX_FOCAL_DIFFERENCE:
+        oddities.append(
             f"fx {fx:.1f} and fy {fy:.1f} differ by {abs(fx / fy - 1):.0%}, as of an image "
             "that was squeezed in one direction; was K scaled as the image was?"
         )
-    return FileFacts(path=path, what=what, odd=odd, camera=camera)
+    return FileFacts(path=path, description=description, oddities=oddities, camera=camera)
 
 
-def _of_pose(path: Path) -> FileFacts | None:
+def _describe_pose(path: Path) -> FileFacts | None:
     """A 4x4 matrix as ``pose track --first`` takes it; None where the file holds something else."""
     if path.is_dir():
         return None
@@ -156,20 +162,22 @@ def _of_pose(path: Path) -> FileFacts | None:
         return None
     turn = math.degrees(float(geodesic_rad(pose.R, torch.eye(3).to(pose.R))))
     away = float(pose.t_m.norm())
-    odd = []
-    if away > _ONLY_MM:
-        odd.append(f"it moves by {away:.4g}, taken as metres: is it in millimetres?")
+    oddities = []
+    if away > _MAX_LENGTH_M:
+        oddities.append(f"it moves by {away:.4g}, taken as metres: is it in millimetres?")
     return FileFacts(
-        path=path, what=f"pose, turned by {turn:.1f} degrees, {away:.4g} m away", odd=odd
+        path=path,
+        description=f"pose, turned by {turn:.1f} degrees, {away:.4g} m away",
+        oddities=oddities,
     )
 
 
-def _of_picture(path: Path) -> FileFacts:
+def _describe_picture(path: Path) -> FileFacts:
     """Tell whether a picture is a depth image, a mask or a photograph.
 
     One of 16 bits is a depth image where many pixels have no value, or neighbours are alike.
     """
-    what = ""
+    description = ""
     units = None
     with opened_image(path) as image:
         if image.mode == "I;16":
@@ -180,113 +188,117 @@ def _of_picture(path: Path) -> FileFacts:
         unknown = 1 - float(has_reading.float().mean())
         span = max(high - low, 1)
         rough = float((units[:, 1:] - units[:, :-1]).abs().mean()) / span
-        if unknown > _FEW_UNKNOWN or rough < _ROUGH:
-            return _of_depth(path, torch.where(has_reading, units, torch.nan))
-        what = f", 16 bits a value, from {low} to {high}"
+        if unknown > _MIN_UNKNOWN_SHARE or rough < _MAX_SMOOTH_STEP:
+            return _describe_depth(path, torch.where(has_reading, units, torch.nan))
+        description = f", 16 bits a value, from {low} to {high}"
     picture = files.read_image(path)
     size = (picture.shape[2], picture.shape[1])
-    what = f"picture of {size[0]}x{size[1]}{what}"
+    description = f"picture of {size[0]}x{size[1]}{description}"
     low, high = picture.aminmax()
     if all(bool(((row == low) | (row == high)).all()) for row in picture):
-        return _of_mask(path, picture[0] > 0)
-    return FileFacts(path=path, what=what, size=size, image=picture)
+        return _describe_mask(path, picture[0] > 0)
+    return FileFacts(path=path, description=description, size=size, image=picture)
 
 
-def _of_mask(path: Path, mask: Tensor) -> FileFacts:
+def _describe_mask(path: Path, mask: Tensor) -> FileFacts:
     """Describe a mask: its share of the image, and whether it is empty or inverted."""
     height, width = mask.shape
     share = float(mask.float().mean())
     edge = torch.cat([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).float().mean()
-    odd = ["it is empty: no pixel is the object"] if share == 0 else []
-    if share > _MOST and float(edge) > _MOST:
-        odd.append(f"it covers {share:.0%} of the image and its border: is it inverted?")
-    what = f"mask of {width}x{height}, {share:.1%} of the image"
-    return FileFacts(path=path, what=what, odd=odd, size=(width, height), mask=mask)
+    oddities = ["it is empty: no pixel is the object"] if share == 0 else []
+    if share > _HALF and float(edge) > _HALF:
+        oddities.append(f"it covers {share:.0%} of the image and its border: is it inverted?")
+    description = f"mask of {width}x{height}, {share:.1%} of the image"
+    return FileFacts(
+        path=path, description=description, oddities=oddities, size=(width, height), mask=mask
+    )
 
 
-def _of_depth(path: Path, units: Tensor) -> FileFacts:
+def _describe_depth(path: Path, units: Tensor) -> FileFacts:
     """Describe a 16-bit depth image, whose unit the file does not say."""
     height, width = units.shape
     readings = units[units.isfinite()]
-    file_facts = FileFacts(path=path, size=(width, height), depth_units=units)
-    file_facts.what = f"16-bit depth of {width}x{height}"
+    facts = FileFacts(path=path, size=(width, height), depth_units=units)
+    facts.description = f"16-bit depth of {width}x{height}"
     if len(readings) == 0:
-        file_facts.odd.append("every pixel is 0: no reading")
-        return file_facts
+        facts.oddities.append("every pixel is 0: no reading")
+        return facts
     median = float(readings.median())
     share = len(readings) / units.numel()
     maybe = ", ".join(f"{median * unit:.3g} m ({device})" for device, unit in _UNITS_M.items())
-    file_facts.what += f", {share:.0%} known, median {median:g} units: {maybe}"
+    facts.description += f", {share:.0%} known, median {median:g} units: {maybe}"
     if share == 1:
-        file_facts.what += "; or, as no pixel is 0, a picture of 16 bits"
-    if float(readings.max()) <= _EIGHT_BIT:
-        file_facts.odd.append("no value is above 255: a picture of depth, not the data?")
-    return file_facts
+        facts.description += "; or, as no pixel is 0, a picture of 16 bits"
+    if float(readings.max()) <= _MAX_8_BIT:
+        facts.oddities.append("no value is above 255: a picture of depth, not the data?")
+    return facts
 
 
-def _of_map(path: Path) -> FileFacts:
+def _describe_map(path: Path) -> FileFacts:
     """Describe a map of numbers (``.npy``, ``.pfm``): depth, disparity, or rows of points."""
     if path.suffix.lower() == ".npy":
         stored = read_numbers(path)
         if stored.dtype.kind != "f" and stored.ndim == 2:
             units = torch.from_numpy(stored.astype("float32"))
-            return _of_depth(path, torch.where(units > 0, units, torch.nan))
+            return _describe_depth(path, torch.where(units > 0, units, torch.nan))
         if stored.ndim != 2 or stored.shape[1] in (3, 4):
-            return _of_points(path, files.read_cloud(path).points.double())
+            return _describe_points(path, files.read_cloud(path).points.double())
     values = files.read_map(path)
     readings = values[values.isfinite()]
     height, width = values.shape
-    file_facts = FileFacts(path=path, what=f"map of {width}x{height}", size=(width, height))
+    facts = FileFacts(path=path, description=f"map of {width}x{height}", size=(width, height))
     if len(readings) == 0:
-        file_facts.odd.append("no value is known")
-        return file_facts
+        facts.oddities.append("no value is known")
+        return facts
     median = float(readings.median())
-    file_facts.what += f", {len(readings) / values.numel():.0%} known, median {median:.4g}"
-    if float((readings < 0).float().mean()) > _MOST:
-        file_facts.odd.append(
+    facts.description += f", {len(readings) / values.numel():.0%} known, median {median:.4g}"
+    if float((readings < 0).float().mean()) > _HALF:
+        facts.oddities.append(
             "most values are negative: disparity of exchanged views, or z backward?"
         )
-    elif median > 2 * _FAR_M:
-        file_facts.odd.append(
+    elif median > 2 * _MAX_DEPTH_M:
+        facts.oddities.append(
             f"as metres the median {median:.4g} is too far; is it in millimetres? Divide by 1000"
         )
-    return file_facts
+    return facts
 
 
-def _of_points(path: Path, points: Tensor) -> FileFacts:
+def _describe_points(path: Path, points: Tensor) -> FileFacts:
     """Describe a cloud: the unit that its distance from the origin suggests, and its frame."""
     away = float(points.median(0).values.norm())
-    unit = "metres" if away < _ONLY_MM else "centimetres" if away < _LEAST_MM else "millimetres"
-    what = f"{len(points)} points, {away:.4g} from the origin: {unit}"
-    odd = [oddity] if (oddity := frame_advice(points)) is not None else []
+    unit = (
+        "metres"
+        if away < _MAX_LENGTH_M
+        else "centimetres"
+        if away < _MIN_DISTANCE_MM
+        else "millimetres"
+    )
+    description = f"{len(points)} points, {away:.4g} from the origin: {unit}"
+    oddities = [oddity] if (oddity := frame_advice(points)) is not None else []
     if away < float((points - points.median(0).values).norm(dim=-1).median()):
-        odd = ["it lies about the origin: centred, or in a model's frame, not in the camera's"]
-    return FileFacts(path=path, what=what, odd=odd, cloud=points)
+        oddities = ["it lies about the origin: centred, or in a model's frame, not in the camera's"]
+    return FileFacts(path=path, description=description, oddities=oddities, cloud=points)
 
 
-def _contradictions(file_facts: FileFacts, all_facts: Sequence[FileFacts]) -> Iterator[str]:
+def _contradictions(facts: FileFacts, all_facts: Sequence[FileFacts]) -> Iterator[str]:
     """Say what of a file contradicts the others: sizes, units, the scale of a model."""
     for other in all_facts:
-        if (camera := other.camera) is not None and file_facts.size is not None:
+        if (camera := other.camera) is not None and facts.size is not None:
             try:
-                cameras.check_image_matches_camera(camera, *file_facts.size, "it")
+                cameras.check_image_matches_camera(camera, *facts.size, "it")
             except InputError as error:
                 yield f"beside {other.path.name}: {error}"
-        if (
-            camera is not None
-            and file_facts.depth_units is not None
-            and camera.depth_unit_m is not None
-        ):
-            median_m = float(file_facts.depth_units.nanmedian()) * camera.depth_unit_m
-            if not _NEAR_M < median_m < _FAR_M:
+        if camera is not None and facts.depth_units is not None and camera.depth_unit_m is not None:
+            median_m = float(facts.depth_units.nanmedian()) * camera.depth_unit_m
+            if not _MIN_DEPTH_M < median_m < _MAX_DEPTH_M:
                 yield (
                     f"beside {other.path.name}: its median is {median_m:.3g} m by the camera's "
                     f"depth_unit_m {camera.depth_unit_m:g}; 0.001 means millimetres"
                 )
         is_depth = other.depth_units is not None
-        if file_facts.mask is not None and is_depth and other.size != file_facts.size:
+        if facts.mask is not None and is_depth and other.size != facts.size:
             yield f"it is not of the size of {other.path.name}; give the mask of this very image"
-        if file_facts.model is not None and other.cloud is not None:
-            advice = unit_advice(exact_diameter(file_facts.model), other.cloud)
+        if facts.model is not None and other.cloud is not None:
+            advice = unit_advice(exact_diameter(facts.model), other.cloud)
             if advice is not None:
                 yield f"beside {other.path.name}: {advice}"

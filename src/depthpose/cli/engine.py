@@ -12,7 +12,7 @@ from depthpose.cli.arguments import shown_as
 from depthpose.core.errors import InputError
 
 if TYPE_CHECKING:  # --help imports this module and must answer at once
-    from depthpose.core.engine import Done, Inputs, RayEngine, Work
+    from depthpose.core.engine import Inputs, RayEngine, ShardRecord, Work
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +52,7 @@ class EngineOptions:
 
     def run(
         self, work: "Work", inputs: "Inputs", out: str, settings: dict[str, Any]
-    ) -> "Sequence[Done]":
+    ) -> "Sequence[ShardRecord]":
         """Do the work on all inputs, and give the records of its shards."""
         from depthpose.core.engine import ShardedJob, run_job
 
@@ -86,7 +86,7 @@ class Weights:
             yield str(path)
 
 
-def print_shards(shards: "Sequence[Done]", out: str, what: str) -> int:
+def print_shards(shards: "Sequence[ShardRecord]", out: str, what: str) -> int:
     """List what failed, print how much is done, and give the exit code."""
     failures = [failure for done in shards for failure in done.failures]
     for name, reason in failures[:20]:

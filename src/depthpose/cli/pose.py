@@ -43,7 +43,7 @@ def predict(
     Args:
         out: folder for the results.
     """
-    from depthpose.cli.pose_frames import find_all, search_dataset
+    from depthpose.cli.pose_frames import search_dataset, search_files
     from depthpose.cli.pose_methods import source_of
     from depthpose.cli.pose_predict import predict_dataset, predict_files, predict_on_ray
 
@@ -93,7 +93,7 @@ def predict(
         )
     lens = pose_inputs.camera or pose_inputs.focal_px
     if pose_inputs.depth is not None and not pose_inputs.has_regions and lens is not None:
-        return find_all(method, pose_inputs, home)
+        return search_files(method, pose_inputs, home)
     return predict_files(method, pose_inputs, home, batch)
 
 
@@ -143,7 +143,7 @@ def evaluate(
     # More objects, or all of the targets, may be asked for later.
     about = {"bop": str(bop.resolve()), "split": split, "rule": config_to_dict(rule)}
     claim_folder(out, {"command": "pose evaluate", **about}, files)
-    methods = pose_methods(weights, estimates.estimate, tuple(dataset.objects.values()))
+    methods = pose_methods(weights, estimates.config, tuple(dataset.objects.values()))
     shown = find_masks(estimates.masks, dataset, out, estimates.device) if methods else []
     paths = [
         predict_instances(dataset, method, masks, out) for method in methods for masks in shown
@@ -174,7 +174,7 @@ def track(
         out: folder for the results.
         weights: of a pose network, by name or file ('depthpose weights list').
     """
-    from depthpose.cli.pose_frames import track_bop, track_folder
+    from depthpose.cli.pose_frames import track_dataset, track_files
     from depthpose.cli.pose_methods import source_of
     from depthpose.core.run import find_rank
 
@@ -189,5 +189,5 @@ def track(
     method = source.build()
     if method.track is None:
         raise InputError(f"--weights {weights}: these need masked views; give weights that vote")
-    follow = track_folder if frames.bop is None else track_bop
+    follow = track_files if frames.bop is None else track_dataset
     return follow(method, frames, out)

@@ -10,7 +10,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from depthpose.cli.pose_methods import distinct_names, of_dataset
+from depthpose.cli.pose_methods import dataset_settings, distinct_names
 from depthpose.core.checkpoint import file_sha256
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image
@@ -22,10 +22,10 @@ from depthpose.pose.evaluate import (
     InstanceRow,
     Origin,
     evaluate,
-    match,
+    match_instances,
     nearest_copy,
-    of_targets,
     read_any,
+    select_targets,
 )
 from depthpose.pose.mesh import symmetry_transforms
 from depthpose.report import page
@@ -48,7 +48,7 @@ def open_instances(
     """Open the instances that are measured, and print what they are."""
     dataset = open_bop(bop, split)
     if targets is not None:
-        dataset = of_targets(dataset, read_targets(targets, bop))
+        dataset = select_targets(dataset, read_targets(targets, bop))
     if objects:
         dataset = dataset.of_objects(*objects)
     names = ", ".join(model.name for model in dataset.objects.values())
@@ -64,7 +64,7 @@ def measure_each(
     show = partial(tqdm, unit=" instances", disable=None)
     for path, origin in zip(predictions, describe(predictions), strict=True):
         settings = (read_settings(path) if path.is_dir() else None) or {}
-        for what, setting in of_dataset(dataset).items():
+        for what, setting in dataset_settings(dataset).items():
             predicted = settings.get(what, setting)
             if predicted != setting:
                 raise InputError(
@@ -166,7 +166,7 @@ def _instance_sections(
 ) -> list[Section]:
     """Show at most so many instances of a set of predictions, with their truth."""
     instances = {instance.name: instance for instance in dataset.instances}
-    estimates = match(dataset.instances, read_any(predictions), dataset.objects)
+    estimates = match_instances(dataset.instances, read_any(predictions), dataset.objects)
     sections: list[Section] = []
     for role, row in _choose(rows, most):
         instance = instances[row.instance]

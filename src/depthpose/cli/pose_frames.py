@@ -20,7 +20,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.core.run import find_rank
 from depthpose.core.runner import Job, Results, run_jobs
 from depthpose.pose.datasets import BopDataset, Instance, open_bop, read_targets
-from depthpose.pose.evaluate import of_targets
+from depthpose.pose.evaluate import select_targets
 from depthpose.pose.inputs import AnyInput
 from depthpose.pose.predictions import (
     Place,
@@ -116,13 +116,13 @@ def _search(
     single_jobs: list[PoseJob[Any]] = []
     for job in jobs:
         for prediction in results.by_image[job.name]:
-            read = partial(_explained, job, prediction, method)
+            read = partial(_read_explained, job, prediction, method)
             predictions.append(prediction)
             single_jobs.append(replace(job, name=prediction.estimate.name, read=read))
     return predictions, single_jobs
 
 
-def find_all(method: PoseMethod, inputs: PoseInputs, out: Path) -> int:
+def search_files(method: PoseMethod, inputs: PoseInputs, out: Path) -> int:
     """Find objects in every depth image, write the files of each, and give the exit code.
 
     Every object that is looked for has an entry, found or not: in an image NAME they are called
@@ -165,7 +165,7 @@ def find_all(method: PoseMethod, inputs: PoseInputs, out: Path) -> int:
     results = SearchResults(out, [job.name for job in jobs], earlier, is_of_image)
     predictions, searched = _search(method, objects, jobs, results)
     pose_predict.claim_for_jobs(out, settings, searched, pose_predict.is_result_of)
-    pose_predict.write_files(predictions, searched, out, method, inputs=len(jobs))
+    pose_predict.write_files(predictions, searched, out, method, input_count=len(jobs))
     return pose_predict.print_result(predictions, out, len(jobs))
 
 
@@ -183,10 +183,10 @@ def search_dataset(
         raise InputError("--masks search is done by one process; give other --masks, or start one")
     dataset = open_bop(options.bop, options.split)
     if options.targets is not None:
-        dataset = of_targets(dataset, read_targets(options.targets, options.bop))
-    dataset = pose_methods.chosen_objects(dataset, method, object)
+        dataset = select_targets(dataset, read_targets(options.targets, options.bop))
+    dataset = pose_methods.choose_objects(dataset, method, object)
     numbers = {name: n for n, name in pose_methods.match_names(dataset, method.models).items()}
-    settings = {**method.settings, **pose_methods.of_dataset(dataset), "masks": "search"}
+    settings = {**method.settings, **pose_methods.dataset_settings(dataset), "masks": "search"}
     settings["find"] = sorted(numbers)
     pose_predict.claim_for_dataset(out, settings, dataset)
     images = {(i.scene_id, i.image_id): i for i in dataset.instances}
@@ -206,7 +206,7 @@ def search_dataset(
     earlier = list(earlier_predictions(out).values())
     results = SearchResults(out, [job.name for job in jobs], earlier, is_of_image, numbers)
     predictions, searched = _search(method, list(numbers), jobs, results)
-    pose_predict.write_files(predictions, searched, out, method, dataset, inputs=len(images))
+    pose_predict.write_files(predictions, searched, out, method, dataset, input_count=len(images))
     return pose_predict.print_result(predictions, out, len(images))
 
 
@@ -222,7 +222,7 @@ def _image_name(place: tuple[int, int]) -> str:
     return f"{scene_id:06d}_{image_id:06d}"
 
 
-def _explained(job: PoseJob[Any], prediction: Prediction, method: PoseMethod) -> AnyInput:
+def _read_explained(job: PoseJob[Any], prediction: Prediction, method: PoseMethod) -> AnyInput:
     """Read a whole depth image with the mask of the pixels that a predicted pose explains."""
     view = job.read()
     pose = prediction.estimate.camera_from_model
@@ -240,7 +240,7 @@ def _explained(job: PoseJob[Any], prediction: Prediction, method: PoseMethod) ->
     return replace(view, name=prediction.estimate.name, mask=mask, object=model.name)
 
 
-def track_folder(method: PoseMethod, frames: SequenceOptions, out: Path) -> int:
+def track_files(method: PoseMethod, frames: SequenceOptions, out: Path) -> int:
     """Follow one object through depth images with a camera, or clouds; give the exit code."""
     unit = frames.unit
     start = None if frames.first is None else pose_methods.read_pose(frames.first)
@@ -254,20 +254,20 @@ def track_folder(method: PoseMethod, frames: SequenceOptions, out: Path) -> int:
         jobs = pose_predict.frame_jobs(frames.depth, frames.camera, name, unit, out)
         settings |= pose_predict.camera_facts(frames.camera)
     if frames.first is not None:
-        settings |= {"first": pose_methods.named_file(frames.first)}
+        settings |= {"first": pose_methods.name_with_checksum(frames.first)}
     pose_predict.claim_for_jobs(out, settings, jobs)
-    return _finish(method, _followed(method, jobs, name, start), jobs, out)
+    return _write_sequence(method, _follow(method, jobs, name, start), jobs, out)
 
 
-def track_bop(method: PoseMethod, frames: SequenceOptions, out: Path) -> int:
+def track_dataset(method: PoseMethod, frames: SequenceOptions, out: Path) -> int:
     """Follow each known object of each scene, or one; give the exit code."""
     assert frames.bop is not None
     dataset = open_bop(frames.bop, frames.split)
-    dataset = pose_methods.chosen_objects(dataset, method, frames.object)
+    dataset = pose_methods.choose_objects(dataset, method, frames.object)
     names = pose_methods.match_names(dataset, method.models)
     settings = {
         **method.settings,
-        **pose_methods.of_dataset(dataset),
+        **pose_methods.dataset_settings(dataset),
         "track": sorted(names.values()),
     }
     pose_predict.claim_for_dataset(out, settings, dataset)
@@ -284,9 +284,9 @@ def track_bop(method: PoseMethod, frames: SequenceOptions, out: Path) -> int:
     coming = (
         prediction
         for sequence in sequences
-        for prediction in _followed(method, sequence, str(sequence[0].object))
+        for prediction in _follow(method, sequence, str(sequence[0].object))
     )
-    return _finish(method, coming, jobs, out, dataset)
+    return _write_sequence(method, coming, jobs, out, dataset)
 
 
 def _whole_view(instance: Instance, object: str, name: str) -> ViewInput:
@@ -296,7 +296,7 @@ def _whole_view(instance: Instance, object: str, name: str) -> ViewInput:
     return ViewInput(name=name, depth_m=depth_m, mask=everywhere, K=instance.K, object=object)
 
 
-def _finish(
+def _write_sequence(
     method: PoseMethod,
     coming: Iterable[Prediction],
     jobs: Sequence[PoseJob[Any]],
@@ -322,7 +322,9 @@ def _finish(
     pairs = zip(predictions, jobs, strict=True)
     explained = [
         replace(
-            job, name=prediction.estimate.name, read=partial(_explained, job, prediction, method)
+            job,
+            name=prediction.estimate.name,
+            read=partial(_read_explained, job, prediction, method),
         )
         for prediction, job in pairs
     ]
@@ -333,7 +335,7 @@ def _finish(
     return code
 
 
-def _followed(
+def _follow(
     method: PoseMethod, jobs: Sequence[PoseJob[Any]], name: str, first: Rigid | None = None
 ) -> Iterator[Prediction]:
     """Follow an object frame by frame; an unreadable frame gets an estimate that says so."""

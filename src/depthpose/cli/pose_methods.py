@@ -84,7 +84,7 @@ def mask_path(kind: str) -> Path | None:
     return Path(kind) if kind.endswith(".json") else find_weights(kind)
 
 
-def named_file(path: Path) -> str:
+def name_with_checksum(path: Path) -> str:
     """Name a file with the start of its SHA-256, so that another file of that name differs."""
     try:
         return f"{path.name} {file_sha256(path)[:12]}"
@@ -92,7 +92,7 @@ def named_file(path: Path) -> str:
         raise InputError(f"{path}: cannot be read ({error.strerror}); give another file") from error
 
 
-def of_dataset(dataset: datasets.BopDataset) -> dict[str, Any]:
+def dataset_settings(dataset: datasets.BopDataset) -> dict[str, Any]:
     """Give the settings that identify a data set, wherever its folder lies."""
     return {
         "dataset": dataset.folder.resolve().name,
@@ -131,7 +131,7 @@ def _segmented(
 
     # What an earlier run found, and in which images.
     home = out / "detections" / name
-    claim_folder(home, {"weights_sha256": file_sha256(path), **of_dataset(dataset)})
+    claim_folder(home, {"weights_sha256": file_sha256(path), **dataset_settings(dataset)})
     file = home.parent / f"{name}.json"
     record = home / "images.json"
     done: set[tuple[int, int]] = set()
@@ -408,7 +408,12 @@ def predict_instances(
     """Estimate every instance that is not estimated yet, and write ``poses.json`` and BOP's csv."""
     jobs = masks.jobs(match_names(dataset, method.models))
     home = out / "predictions" / f"{method.name}_{masks.name}"
-    settings = {**method.settings, "masks": masks.name, **masks.settings, **of_dataset(dataset)}
+    settings = {
+        **method.settings,
+        "masks": masks.name,
+        **masks.settings,
+        **dataset_settings(dataset),
+    }
     written = predictions.predict(method.estimate_many, jobs, home, settings, batch)
     label = f"{method.name}, {masks.name} masks"
     for _ in tqdm(written, label, total=len(jobs), disable=None, unit=" instances"):
@@ -508,7 +513,7 @@ def _rigid_of(text: str, source: str, what: str) -> Rigid:
         raise InputError(f"{source}: {error}") from error
 
 
-def chosen_objects(
+def choose_objects(
     dataset: datasets.BopDataset, method: PoseMethod, object: str | None
 ) -> datasets.BopDataset:
     """Keep the objects of a data set that the weights know, or the one named; print the others."""

@@ -7,9 +7,11 @@ from typing import Annotated, Literal
 from depthpose.cli.arguments import Device, NewPath, Source, WeightsName, shown_as
 from depthpose.core.errors import InputError
 from depthpose.core.units import Unit
-from depthpose.pose.config import DiameterTable, EstimateConfig, VotingConfig
+from depthpose.pose.config import DiameterTable, EstimateConfig, VotingConfig, VotingMethod
 
 Voting = Literal["ransac", "least-squares"]
+_VOTING_METHODS: dict[Voting, VotingMethod] = {"ransac": "ransac", "least-squares": "least squares"}
+"""What the configs call each word of ``--voting``."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,9 +54,9 @@ class PoseMeasureOptions:
     device: Device = "cpu"
 
     @property
-    def estimate(self) -> EstimateConfig:
+    def config(self) -> EstimateConfig:
         """Settings of the estimators."""
-        voting = VotingConfig(method="ransac" if self.voting == "ransac" else "least squares")
+        voting = VotingConfig(method=_VOTING_METHODS[self.voting])
         return EstimateConfig(voting=voting, with_icp=self.icp, device=self.device)
 
 
@@ -213,9 +215,9 @@ class EstimateOptions:
 
         if self.batch < 1:
             raise InputError(f"--batch {self.batch}: at least 1 input in one call of the network")
-        method = "ransac" if self.voting == "ransac" else "least squares"
+        voting = VotingConfig(method=_VOTING_METHODS[self.voting], hypotheses=self.hypotheses)
         return EstimateConfig(
-            voting=VotingConfig(method=method, hypotheses=self.hypotheses),
+            voting=voting,
             with_icp=self.icp,
             min_certainty=self.min_certainty,
             object_deviation_m=self.object_deviation_mm / 1000,

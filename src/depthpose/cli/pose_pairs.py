@@ -49,7 +49,7 @@ def match_pairs(pair: PairOptions, camera: Path | None, device: str, out: Path) 
     )
     depth_work = work.pair_work(camera, networks, method, pairs[0])
     built = method.build()
-    work.estimate_all(pairs, depth_work, built, out / MATCHED)
+    work.predict_files(pairs, depth_work, built, out / MATCHED)
     rig = read_rig(camera, image_size(pairs[0][0]))
     for first, _ in pairs:
         _keep_sure(first.stem, rig, pair.min_confidence, out)

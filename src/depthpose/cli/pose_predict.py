@@ -59,8 +59,8 @@ from depthpose.pose.datasets import (
     Box,
     Detection,
     encode_rle,
+    group_by_image,
     name_objects,
-    of_images,
     open_bop,
     parse_box,
     parse_labels,
@@ -68,7 +68,7 @@ from depthpose.pose.datasets import (
     read_labels,
     read_targets,
 )
-from depthpose.pose.evaluate import of_targets
+from depthpose.pose.evaluate import select_targets
 from depthpose.pose.inputs import AnyMask, cloud_input, view_input
 from depthpose.pose.predictions import (
     CLOUD,
@@ -196,7 +196,7 @@ def cloud_jobs(cloud: Path, unit: Unit, object: str, out: Path) -> list[PoseJob[
     ]
 
 
-def view_jobs(
+def mask_jobs(
     depth: Path,
     mask: Path,
     camera: Path | float,
@@ -282,7 +282,7 @@ def box_jobs(
     return jobs
 
 
-def detection_jobs(
+def detection_file_jobs(
     depth: Path,
     detections: Path,
     camera: Path | float,
@@ -310,7 +310,7 @@ def detection_jobs(
     if len(files) == 1 and files[0].suffix.lower() == ".json":
         read = read_detections(files[0])
         beside = dict.fromkeys((path.stem for path in depths), files[0])
-        by_image = of_images(read, [path.stem for path in depths], str(files[0]))
+        by_image = group_by_image(read, [path.stem for path in depths], str(files[0]))
     else:
         beside = _beside_depths(depths, files, depth, detections, "file of detections")
         for path in depths:
@@ -436,20 +436,20 @@ def background_jobs(
         pose = pose_methods.read_pose(inputs.bin_pose, "--bin-pose")
         unit = pose_methods.unit_of_cad([inputs.bin], inputs.cad_unit, inputs.unit)
         background = PosedBin.load(inputs.bin, pose, unit)
-        settings["bin"] = pose_methods.named_file(Path(inputs.bin))
+        settings["bin"] = pose_methods.name_with_checksum(Path(inputs.bin))
         settings["bin_pose"] = pose.matrix().tolist()
     elif inputs.empty_frame is not None:
         background = Path(inputs.empty_frame)
-        settings["empty_frame"] = pose_methods.named_file(background)
+        settings["empty_frame"] = pose_methods.name_with_checksum(background)
     else:
         return jobs
     return [
-        replace(job, read=partial(_read_before, job.read, background, lens, inputs.unit))
+        replace(job, read=partial(_read_with_background, job.read, background, lens, inputs.unit))
         for job in jobs
     ]
 
 
-def _read_before(
+def _read_with_background(
     read: Callable[[], ViewInput],
     background: AnyBackground,
     camera: Path | float | None,
@@ -486,7 +486,7 @@ def colored_jobs(
     camera = inputs.color_camera
     color_from_depth = None
     if camera is not None:
-        settings["color_camera"] = pose_methods.named_file(camera)
+        settings["color_camera"] = pose_methods.name_with_checksum(camera)
     if inputs.color_from_depth is not None:
         color_from_depth = pose_methods.read_pose(
             inputs.color_from_depth, "--color-from-depth", "color_from_depth"
@@ -586,12 +586,13 @@ def region_jobs(
     if inputs.detections is not None:
         settings["detections"] = str(Path(inputs.detections).resolve())
         objects = (labels or {}, known_names, wanted)
-        asked = [] if method.holder == "weights" else known_names  # CAD files are asked for
-        asked = (
-            asked if labels is None else [name for name in dict.fromkeys(labels.values()) if name]
-        )
-        asked = asked if wanted is None else [wanted]
-        return detection_jobs(depth, Path(inputs.detections), lens, objects, asked, unit, out)
+        if wanted is not None:
+            asked = [wanted]
+        elif labels is not None:
+            asked = [name for name in dict.fromkeys(labels.values()) if name]
+        else:  # CAD files are asked for by being given, objects of weights are not
+            asked = [] if method.holder == "weights" else known_names
+        return detection_file_jobs(depth, Path(inputs.detections), lens, objects, asked, unit, out)
     if inputs.box:
         settings["box"] = list(inputs.box)
         name = object_named(inputs.object, method)
@@ -604,7 +605,7 @@ def region_jobs(
             f"the {method.holder} know {', '.join(known_names)}; say which by --object, or which "
             f"number of the mask is which by --labels 1={known_names[0]},2={known_names[1]}"
         )
-    return view_jobs(depth, mask, lens, wanted, unit, out, labels)
+    return mask_jobs(depth, mask, lens, wanted, unit, out, labels)
 
 
 def predict_dataset(
@@ -619,8 +620,8 @@ def predict_dataset(
     assert options.bop is not None
     dataset = open_bop(options.bop, options.split)
     if options.targets is not None:
-        dataset = of_targets(dataset, read_targets(options.targets, options.bop))
-    dataset = pose_methods.chosen_objects(dataset, method, object)
+        dataset = select_targets(dataset, read_targets(options.targets, options.bop))
+    dataset = pose_methods.choose_objects(dataset, method, object)
     (masks,) = pose_methods.find_masks([options.masks], dataset, out, config.device)
     names = pose_methods.match_names(dataset, method.models)
     jobs: list[PoseJob[Any]] = [
@@ -629,7 +630,7 @@ def predict_dataset(
         if job.place is not None
     ]
     settings = {**method.settings, "estimate": config_to_dict(config)}
-    settings |= {**pose_methods.of_dataset(dataset), "masks": masks.name, **masks.settings}
+    settings |= {**pose_methods.dataset_settings(dataset), "masks": masks.name, **masks.settings}
     if object is not None:
         settings["objects"] = sorted({i.object_id for i in dataset.instances})
     claim_for_dataset(out, settings, dataset)
@@ -696,15 +697,15 @@ def write_files(
     out: Path,
     method: PoseMethod,
     dataset: BopDataset | None = None,
-    inputs: int | None = None,
+    input_count: int | None = None,
 ) -> None:
-    """Write the files of poses, or of a data set's, and the page; ``inputs``: their number."""
+    """Write the page of poses, and the files of each input, or of a data set."""
     models = {model.name: model for model in method.models}
     if dataset is None:
         _write_job_files(predictions, jobs, out, models)
     else:
         _write_dataset_files(predictions, dataset, out, models)
-    _write_page(out, predictions, jobs, models, dataset, inputs)
+    _write_page(out, predictions, jobs, models, dataset, input_count)
 
 
 def _write_dataset_files(
@@ -763,10 +764,10 @@ def _write_job_files(
         note_result(out, job.name, files)
 
 
-def print_result(predictions: list[Prediction], out: Path, inputs: int | None = None) -> int:
+def print_result(predictions: list[Prediction], out: Path, input_count: int | None = None) -> int:
     """Print the poses, their alternatives and the reasons of refusals; give the exit code.
 
-    ``inputs``: their number, where an input may have several estimates; None: one each.
+    ``input_count``: where an input may have several estimates; None: one each.
     """
     failed = [p.estimate for p in predictions if p.estimate.status == "unreadable"]
     shown = [p.estimate for p in predictions if p.estimate.status != "unreadable"]
@@ -804,7 +805,7 @@ def print_result(predictions: list[Prediction], out: Path, inputs: int | None = 
 
     counts = Counter(estimate.status for estimate in shown)
     statuses = ", ".join(f"{count} {status}" for status, count in sorted(counts.items()))
-    total = _count_inputs(predictions, inputs)
+    total = _count_inputs(predictions, input_count)
     print(f"{total}: {statuses or 'none readable'}; {out / 'poses.json'}")
     return 1 if failed else 0
 
@@ -820,9 +821,9 @@ def _pose_words(pose: Rigid | None, before: str) -> dict[str, str]:
     }
 
 
-def _count_inputs(predictions: Sequence[Prediction], inputs: int | None) -> str:
+def _count_inputs(predictions: Sequence[Prediction], input_count: int | None) -> str:
     """Give the number of inputs, and that of estimates where it is another."""
-    count = len(predictions) if inputs is None else inputs
+    count = len(predictions) if input_count is None else input_count
     answers = len(predictions)
     total = f"{count} input{'s' * (count != 1)}"
     return total if count == answers else f"{total}, {answers} answer{'s' * (answers != 1)}"
@@ -859,7 +860,7 @@ def _write_page(
     jobs: Sequence[PoseJob[Any]],
     models: dict[str, ObjectModel],
     dataset: BopDataset | None,
-    inputs: int | None,
+    input_count: int | None,
 ) -> None:
     """Write a page with some of the predictions and the reason of every refusal."""
     # The table: refusals first, for they are what is looked for.
@@ -893,7 +894,7 @@ def _write_page(
         sections.append(section)
 
     number = len(predictions)
-    total = _count_inputs(predictions, inputs)
+    total = _count_inputs(predictions, input_count)
     text = f"{total}: {counts}. Shown below: {len(sections)}"
     text += "." if len(sections) == number else ", answers and refusals spread evenly."
     if number > _MOST_ROWS:

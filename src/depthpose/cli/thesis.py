@@ -13,7 +13,7 @@ from depthpose.cli.pose_options import PoseDataOptions, PoseTableOptions
 from depthpose.core.errors import InputError
 
 if TYPE_CHECKING:
-    from depthpose.cli.depth_predict import DepthMethodSource, Method
+    from depthpose.cli.depth_predict import DepthMethod, DepthMethodSource
     from depthpose.thesis.depth import PublishedTable
 
 
@@ -91,7 +91,7 @@ def _build_methods(
     weights: Sequence[str],
     matcher: str | None,
     beside: Sequence[str] | None,
-) -> list[tuple[str, "Method"]]:
+) -> list[tuple[str, "DepthMethod"]]:
     """Build each method, with the thesis's row that it reproduces; "" where it is only beside."""
     own_row = table.own_rows[0]
     row_names = table.own_rows if len(table.own_rows) > 1 else [own_row] * len(weights)

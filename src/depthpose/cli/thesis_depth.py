@@ -9,7 +9,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from depthpose.cli import depth_evaluate as evaluation
-from depthpose.cli.depth_predict import Method
+from depthpose.cli.depth_predict import DepthMethod
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import write_image
 from depthpose.core.run import claim_folder, environment, find_rank
@@ -34,7 +34,7 @@ _PICTURE_WIDTH_PX = 621
 def reproduce_table(
     table: PublishedTable,
     dataset: Dataset,
-    methods: Sequence[tuple[str, Method]],
+    methods: Sequence[tuple[str, DepthMethod]],
     out: Path,
     protocol: str,
     caps_m: Sequence[float],
@@ -98,7 +98,7 @@ def reproduce_table(
     return 0
 
 
-def _figures_of(method: Method, dataset: Dataset, out: Path, number: int) -> list[Section]:
+def _figures_of(method: DepthMethod, dataset: Dataset, out: Path, number: int) -> list[Section]:
     """Draw figure 2-5 of some frames that a method predicted, and figure 2-1 of the first."""
     predictions = out / "predictions" / method.name
     home = out / "figures" / method.name
@@ -148,7 +148,7 @@ def choose_frames(dataset: Dataset, names: Sequence[str], number: int) -> list[i
 
 
 def write_figure(
-    number: str, dataset: Dataset, indices: Sequence[int], method: Method, out: Path
+    number: str, dataset: Dataset, indices: Sequence[int], method: DepthMethod, out: Path
 ) -> int:
     """Estimate the frames, draw the figure, and write it with a page that explains it."""
     frames = [dataset.frames[index] for index in indices]

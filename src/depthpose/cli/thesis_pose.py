@@ -115,7 +115,7 @@ def reproduce_by_object(
     is_printed = number == "3.2"
     numbers = {model.name: pose_tables.linemod_number(model) if is_printed else model.number
                for model in models}  # fmt: skip
-    methods = pose_methods.pose_methods(weights, options.estimate, models)
+    methods = pose_methods.pose_methods(weights, options.config, models)
     rule = EvaluationConfig(diameters=options.diameters, with_vsd=options.vsd)
     settings = {
         "table": number,
@@ -127,10 +127,10 @@ def reproduce_by_object(
         "masks": [
             kind
             if (path := pose_methods.mask_path(kind)) is None
-            else pose_methods.named_file(path)
+            else pose_methods.name_with_checksum(path)
             for kind in (options.masks if methods else ())
         ],
-        "csv": [pose_methods.named_file(path) for path in csv],
+        "csv": [pose_methods.name_with_checksum(path) for path in csv],
     }
     results = (*page.table_files("rows", "all", "instances", "risk"), "report.md", "report.html")
     claim_folder(out, settings, (*results, "predictions", "detections", "figures"))

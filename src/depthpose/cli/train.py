@@ -48,24 +48,34 @@ class TrainingOptions:
     ) -> Any:  # noqa: ANN401 - an instance of kind
         """Read the config of a training, or take its defaults, and apply these options."""
         from depthpose.core.config import read_config
-        from depthpose.core.loop import AdamConfig
 
         config: Any = (default or kind()) if path is None else read_config(path, kind)
-        steps = config.loop.steps  # None: they follow from epochs
-        if steps is not None and not (self.resume or self.finish):
-            steps = max(steps, self.steps or 0)
-            for name, adam in vars(config).items():
-                if isinstance(adam, AdamConfig) and adam.warmup_steps > steps:
-                    raise InputError(
-                        f"{name}.warmup_steps is {adam.warmup_steps}, but loop.steps is {steps}, "
-                        "so the learning rate would never be reached; take at most "
-                        f"{steps}, or 0 for no warm-up"
-                    )
+        self._refuse_long_warmup(config)
         values = {"seed": self.seed, "device": self.device, "precision": self.precision}
         loop = changed(config.loop, workers=workers, **values)
         if self.steps is not None:
             loop = replace(loop, steps=self.steps, epochs=None)
         return replace(config, loop=loop)
+
+    def _refuse_long_warmup(self, config: Any) -> None:  # noqa: ANN401 - of any training
+        """Refuse a warm-up that is longer than the training, whose rate would never be reached.
+
+        A training of few steps in place of the config's (``--steps 20``) is a trial, and may end
+        within the warm-up; so may one that is resumed.
+        """
+        from depthpose.core.loop import AdamConfig
+
+        config_steps = config.loop.steps
+        if config_steps is None or self.resume or self.finish:  # None: they follow from epochs
+            return
+        steps = max(config_steps, self.steps or 0)
+        for name, adam in vars(config).items():
+            if isinstance(adam, AdamConfig) and adam.warmup_steps > steps:
+                raise InputError(
+                    f"{name}.warmup_steps is {adam.warmup_steps}, but loop.steps is {steps}, "
+                    "so the learning rate would never be reached; take at most "
+                    f"{steps}, or 0 for no warm-up"
+                )
 
     def run(
         self,

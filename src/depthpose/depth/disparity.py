@@ -229,7 +229,7 @@ def resized_map(
     return F.interpolate(values[None, None], (height, width), mode="bilinear")[0, 0]
 
 
-def from_pair(pair: StereoInput, match: Match, warning: str = "") -> DepthEstimate:
+def estimate_from_pair(pair: StereoInput, match: Match, warning: str = "") -> DepthEstimate:
     """Give what was found in a rectified pair: metres where its camera has a baseline.
 
     There is no answer where the left image has no picture. The confidence is 0 where the right one
@@ -268,7 +268,7 @@ def from_pair(pair: StereoInput, match: Match, warning: str = "") -> DepthEstima
     )
 
 
-def from_virtual(
+def estimate_from_virtual(
     image: StereoInput,
     rig: GeneratorConfig | SelectionConfig,
     match: Match,

@@ -438,8 +438,8 @@ def _prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) ->
     true_px = truth if is_stereo or rig is None else disparity.disparity_from_depth(truth, rig)
     predicted_px = _at_size_of(true_px, stored_px, predictions / frame.name)
     # With principal points apart, the disparity of far points is negative.
-    apart_px = 0.0 if rig is None else rig.cx_right_minus_left_px
-    advice = disparity.disparity_advice(predicted_px + apart_px, true_px + apart_px)
+    cx_difference_px = 0.0 if rig is None else rig.cx_right_minus_left_px
+    advice = disparity.disparity_advice(predicted_px + cx_difference_px, true_px + cx_difference_px)
     if advice is not None:
         raise InputError(f"{predictions / frame.name}: {advice}")
 

@@ -138,7 +138,7 @@ class DynamicSelection(_Dynamic):
         left, right = (
             read_logits(logits, self.network.planes) for logits in self.network.decode(features)
         )
-        street = self.network.find_street(features[-1])
+        street = self.network.street_probability(features[-1])
         return *left, *right[:2], *(() if street is None else (street,))
 
 
@@ -169,7 +169,7 @@ class _Generated(NamedTuple):
 
 
 def _generate(left: Value, generator: Generator) -> _Generated:
-    """Do in ONNX operators what ``draw_right``, or ``select_views`` and ``shift_left``, do."""
+    """Do in ONNX operators what ``draw_right`` does, by ``select_views`` or by the U-Net."""
     size = left.op("Shape", start=2, end=4)
     multiple = generator.config.side_multiple_px
     # The multiple that a side is close to, or the side itself.

@@ -290,9 +290,11 @@ def scale_by_mount(
     map_plane = _plane(fit)
     road_plane = _plane(ground)
     multiple = float(road_plane[1] / map_plane[1])
-    inverse = multiple / depth_m + _over_image(road_plane - multiple * map_plane, camera, depth_m)
+    inverse = multiple / depth_m + _plane_at_pixels(
+        road_plane - multiple * map_plane, camera, depth_m
+    )
     by_ground_m = 1 / inverse.clamp(min=1 / _FARTHEST_M)
-    off_plane = (_over_image(map_plane, camera, depth_m) * depth_m).clamp(min=1e-3).log().abs()
+    off_plane = (_plane_at_pixels(map_plane, camera, depth_m) * depth_m).clamp(min=1e-3).log().abs()
     stands = (off_plane / _ON_PLANE - 1).clamp(0, 1)
     # A tilt that is off by an angle changes the logarithm of depth by it times depth / height.
     tilt_std = math.radians(ground.tilt_std_deg) / ground.height_m
@@ -305,8 +307,8 @@ def scale_by_mount(
     return replace(rescale(estimate, (by_ground_m / depth_m) ** weight), ground=ground)
 
 
-def _over_image(plane: Float[Tensor, "3"], camera: Camera, example: Map) -> Map:
-    """Give ``plane @ ray`` for the rays (z = 1) of all pixels of a map."""
+def _plane_at_pixels(plane: Float[Tensor, "3"], camera: Camera, example: Map) -> Map:
+    """Give the inverse depth of a plane, ``plane @ ray`` (z = 1), at every pixel of a map."""
     a, b, c = (plane @ torch.linalg.inv(camera.K)).tolist()
     height, width = example.shape
     u = torch.arange(width, dtype=example.dtype, device=example.device)

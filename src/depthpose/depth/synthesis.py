@@ -231,16 +231,19 @@ class SelectionGenerator(nn.Module):
         left, right = self.head(x).chunk(2, 1)
         return left, right
 
-    def find_street(self, deepest: Float[Tensor, "b c _ _"]) -> Float[Tensor, " b"] | None:
-        """Answer how probable a street is, by a logistic regression; None where that is lacking."""
+    def street_probability(self, deepest: Float[Tensor, "b c _ _"]) -> Float[Tensor, " b"] | None:
+        """Give the probability that images show a street, by a logistic regression.
+
+        None where the weights have no such regression. ``deepest``: the encoder's last features.
+        """
         if self.street is None:
             return None
-        # Three moments over the rows: a street has its sky above and its road below.
+        # Moments over the rows (Legendre): a street has its sky above and its road below.
         rows = deepest.shape[2]
         y = (2 * torch.arange(rows, device=deepest.device) + 1) / rows - 1
-        row = deepest.float().mean(3)
+        row_means = deepest.float().mean(3)
         weights = (torch.ones_like(y), y, 1.5 * y**2 - 0.5)
-        moments = torch.cat([(row * weight).mean(2) for weight in weights], 1)
+        moments = torch.cat([(row_means * weight).mean(2) for weight in weights], 1)
         return self.street(moments)[:, 0].sigmoid()
 
 
@@ -332,10 +335,10 @@ class Selected:
     sky: Maps  #: probability of the sky
     confidence: Maps  #: probability of what lies within 15 % of the disparity, sky left out
     #: probability that the image shows a street; None where the weights do not say
-    street: Float[Tensor, " b"] | None = None
+    street_probability: Float[Tensor, " b"] | None = None
 
 
-def average(views: Sequence[Selected], limits_px: Sequence[float]) -> Selected:
+def average_sizes(views: Sequence[Selected], limits_px: Sequence[float]) -> Selected:
     """Average the estimates of one view at several sizes; the confidence is that of the first.
 
     The mean over sizes has the smaller error; the confidence of the first size ranks these errors
@@ -355,7 +358,10 @@ def average(views: Sequence[Selected], limits_px: Sequence[float]) -> Selected:
     log_px = torch.stack([view.disparity_px.log() for view in views])
     sky = torch.stack([view.sky for view in views])
     return Selected(
-        (shares * log_px).sum(0).exp(), (shares * sky).sum(0), first.confidence, first.street
+        (shares * log_px).sum(0).exp(),
+        (shares * sky).sum(0),
+        first.confidence,
+        first.street_probability,
     )
 
 
@@ -373,7 +379,7 @@ def read_logits(logits: Logits, planes: Planes) -> tuple[Tensor, Tensor, Tensor]
     return log_px, logits.softmax(1)[:, 0], (shares * is_near).sum(1)
 
 
-def shift_left(left: Views, right_px: Maps) -> Views:
+def warp_left_to_right(left: Views, right_px: Maps) -> Views:
     """Synthesise the right view by one shift a pixel: ``left`` sampled at ``x + disparity``.
 
     Beyond the border the border repeats. A mixture of shifts has the lower L1, but ghosts, which
@@ -426,7 +432,7 @@ class SynthesisedViews:
     confidence: Maps | None = None
     is_sky: Bool[Tensor, "b h w"] | None = None  #: where the sky is likelier than not
     #: probability that an image shows a street; None where the weights do not say
-    street: Float[Tensor, " b"] | None = None
+    street_probability: Float[Tensor, " b"] | None = None
 
 
 class SelectionSynthesiser:
@@ -466,19 +472,20 @@ class SelectionSynthesiser:
         limits_px = [most_px * size[1] / images.shape[-1] for images in sizes]
         views = [select_views(self.generator, images, size) for images in sizes]
         lefts, rights = zip(*views, strict=True)
-        of_left = average(lefts, limits_px)
-        other = average(rights, limits_px)
-        home = left.device
-        right = shift_left(sizes[0], torch.where(other.sky > 0.5, 0.0, other.disparity_px))
+        of_left = average_sizes(lefts, limits_px)
+        of_right = average_sizes(rights, limits_px)
+        right_px = torch.where(of_right.sky > 0.5, 0.0, of_right.disparity_px)
+        right = warp_left_to_right(sizes[0], right_px)
         is_sky = of_left.sky > 0.5
+        confidence = torch.where(is_sky, of_left.sky, of_left.confidence * (1 - of_left.sky))
+        street = of_left.street_probability
+        home = left.device
         return SynthesisedViews(
             right=right.to(home),
             disparity_px=of_left.disparity_px.to(home),
-            confidence=torch.where(is_sky, of_left.sky, of_left.confidence * (1 - of_left.sky)).to(
-                home
-            ),
+            confidence=confidence.to(home),
             is_sky=is_sky.to(home),
-            street=None if of_left.street is None else of_left.street.to(home),
+            street_probability=None if street is None else street.to(home),
         )
 
 
@@ -537,7 +544,9 @@ def select_views(
     cropped = (logits[..., : rows // 2, : columns // 2] for logits in generator.decode(features))
     planes = generator.planes * (size[1] / columns)
     views = []
-    for logits, street in zip(cropped, (generator.find_street(features[-1]), None), strict=True):
+    for logits, street in zip(
+        cropped, (generator.street_probability(features[-1]), None), strict=True
+    ):
         log_px, sky, confidence = (
             F.interpolate(part[:, None], size, mode="bilinear")[:, 0]
             for part in read_logits(logits, planes)
@@ -554,8 +563,9 @@ def draw_right(generator: Generator, left: Views) -> Views:
     193 rows padded to 256, where 192 were trained, drew views of 15 % too little disparity.
     """
     if isinstance(generator, SelectionGenerator):
-        other = select_views(generator, left)[1]
-        return shift_left(left, torch.where(other.sky > 0.5, 0.0, other.disparity_px))
+        of_right = select_views(generator, left)[1]
+        right_px = torch.where(of_right.sky > 0.5, 0.0, of_right.disparity_px)
+        return warp_left_to_right(left, right_px)
     height, width = left.shape[-2:]
     multiple = generator.config.side_multiple_px
     rows = _near_multiple(height, multiple, ROWS_SHARE)

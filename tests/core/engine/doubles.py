@@ -4,7 +4,15 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from depthpose.core.engine import Done, Files, Function, Sample, Work, read_results, shard_results
+from depthpose.core.engine import (
+    Files,
+    Function,
+    Sample,
+    ShardRecord,
+    Work,
+    read_results,
+    shard_results,
+)
 from depthpose.core.engine.work import Block, Runner
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_text
@@ -54,7 +62,7 @@ class InProcessEngine:
     def __init__(self, dies_at: int | None = None) -> None:
         self.dies_at = dies_at
 
-    def __call__(self, blocks: Sequence[Block], work: Work, out: str) -> Iterator[Done]:
+    def __call__(self, blocks: Sequence[Block], work: Work, out: str) -> Iterator[ShardRecord]:
         runner = Runner(work, out)
         for number, block in enumerate(blocks):
             if number == self.dies_at:

@@ -11,9 +11,9 @@ import pytest
 from tests.core.engine.doubles import InProcessEngine, reverse_work, unpacked, write_texts
 
 from depthpose.core.engine import (
-    Done,
     Inputs,
     ShardedJob,
+    ShardRecord,
     find_items,
     read_results,
     run_job,
@@ -191,7 +191,7 @@ def test_a_shard_whose_record_names_other_results_is_refused(tmp_path: Path) -> 
     (tmp_path / "shards").mkdir()
     write_tar(tmp_path / "shards/s.tar", {"a.length": "1"})
     entries, endings = (("b", ""),), ("length",)
-    done = Done(shard="s.tar", entries=entries, endings=endings, stamp=(), block=0)
+    done = ShardRecord(shard="s.tar", entries=entries, endings=endings, stamp=(), block=0)
     with pytest.raises(InputError, match=r"holds 'a\.length', which its record does not name"):
         list(shard_results(str(tmp_path), done))
 
@@ -201,7 +201,7 @@ def test_what_engines_lose_is_missed(tmp_path: Path) -> None:
     job = job_of(tmp_path, [str(folder)])
 
     class Forgetful(InProcessEngine):
-        def __call__(self, blocks: Sequence[Block], work: Work, out: str) -> Iterator[Done]:
+        def __call__(self, blocks: Sequence[Block], work: Work, out: str) -> Iterator[ShardRecord]:
             return super().__call__(blocks[:1], work, out)
 
     with pytest.raises(InputError, match="1 of 2 shards are missing, first 000001"):

@@ -81,13 +81,13 @@ def _middlebury_facts(path: AnyPath) -> CameraFacts:
     keys = read_key_values(path)
     K = kitti_matrix(path, keys, "cam0", (3, 3))
     right = kitti_matrix(path, keys, "cam1", (3, 3)) if "cam1" in keys else K
-    baseline_mm, difference_px = (_number(path, keys, name) for name in ("baseline", "doffs"))
+    baseline_mm, doffs_px = (_number(path, keys, name) for name in ("baseline", "doffs"))
     refuse_apart(K, right)
-    apart_px = right[0, 2] - K[0, 2]
-    if "cam1" in keys and abs(apart_px - difference_px) > SAME_DIFFERENCE_PX:
+    cx_difference_px = right[0, 2] - K[0, 2]
+    if "cam1" in keys and abs(cx_difference_px - doffs_px) > SAME_DIFFERENCE_PX:
         raise InputError(
-            f"{path}: doffs is {difference_px:g}, but cx of cam1 less that of cam0 is {apart_px:g}"
-            "; write the true one of the two"
+            f"{path}: doffs is {doffs_px:g}, but cx of cam1 less that of cam0 is "
+            f"{cx_difference_px:g}; write the true one of the two"
         )
     if 0 < baseline_mm < 1:
         raise InputError(
@@ -99,7 +99,7 @@ def _middlebury_facts(path: AnyPath) -> CameraFacts:
         K=torch.from_numpy(K),
         size=_size({name: _number(path, keys, name) for name in ("width", "height")}),
         baseline_m=baseline_mm / 1000,
-        cx_right_minus_left_px=difference_px,
+        cx_right_minus_left_px=doffs_px,
         is_metric=True,
     )
 

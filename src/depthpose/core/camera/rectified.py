@@ -89,7 +89,7 @@ class RectificationReport:
 
 
 def check_rectified(
-    left: Float[Tensor, "3 h w"], right: Float[Tensor, "3 h2 w2"], apart_px: float = 0.0
+    left: Float[Tensor, "3 h w"], right: Float[Tensor, "3 h2 w2"], cx_difference_px: float = 0.0
 ) -> RectificationReport:
     """Check that two images are a pair, that its rows agree and that left is left.
 
@@ -99,7 +99,7 @@ def check_rectified(
     Args:
         left: RGB in [0, 1].
         right: of the same size.
-        apart_px: principal point of the right image less that of the left one, along x [px].
+        cx_difference_px: principal point of the right image less that of the left one, in x.
 
     Raises:
         InputError: the sizes differ.
@@ -144,7 +144,7 @@ def check_rectified(
                 )
                 return replace(unlike, is_pair=False, message=finding)
         matched_px, shift_px = _place_finely(left, right, places, matched)
-    report = _report(matched_px, shift_px, len(corners), left.shape[-1], apart_px)
+    report = _report(matched_px, shift_px, len(corners), left.shape[-1], cx_difference_px)
     centre = torch.tensor([left.shape[-1], left.shape[-2]]) / 2
     return replace(report, places_px=matched_px + centre, disparities_px=-shift_px[:, 0].float())
 
@@ -277,12 +277,12 @@ def _find_change(left: Grey, right: Grey, corners: Places) -> str | None:
 
 
 def _report(
-    places_px: Tensor, shift_px: Tensor, corners: int, width: int, apart_px: float
+    places_px: Tensor, shift_px: Tensor, corners: int, width: int, cx_difference_px: float
 ) -> RectificationReport:
     """Summarise the matches; their places are counted from the centre [px]."""
     # How far rows are off, robustly, and how many disparities are positive.
     matches = len(shift_px)
-    disparity_px = apart_px - shift_px[:, 0]
+    disparity_px = cx_difference_px - shift_px[:, 0]
     clear = disparity_px[disparity_px.abs() > 1]
     share = float((clear > 0).float().mean()) if len(clear) else math.nan
     offset = math.nan

@@ -104,7 +104,7 @@ def read_raw_pair(
             another model, or a value cannot be right: the rotation, the distance, the order.
     """
     with naming(path):
-        pair = _read(Path(path), unit_m or 1.0, is_fisheye)
+        pair = _read_pair(Path(path), unit_m or 1.0, is_fisheye)
         R = pair.right_from_left.R
         length = float(pair.right_from_left.t_m.norm())
         if not length:
@@ -113,7 +113,7 @@ def read_raw_pair(
         refuse_baseline(length, remedy, _MAX_BASELINE_M if unit_m else WIDE_BASELINE_M)
         if not torch.allclose(R @ R.mT, torch.eye(3).double(), atol=1e-3) or torch.det(R) < 0:
             raise InputError(f"R is {R.tolist()}, which is no rotation; copy it anew")
-        _doubt_transposed(path, pair.right_from_left)
+        _warn_if_transposed(path, pair.right_from_left)
         x, y, z = pair.right_from_left.inverse().t_m.tolist()
         if abs(x) < max(abs(y), abs(z)):
             raise InputError(
@@ -128,8 +128,8 @@ def read_raw_pair(
         return pair
 
 
-def _doubt_transposed(path: AnyPath, right_from_left: Rigid) -> None:
-    """Say that R looks transposed: it then turns both cameras far more from the line between them.
+def _warn_if_transposed(path: AnyPath, right_from_left: Rigid) -> None:
+    """Warn where R turns both cameras far more from the line between them than its transpose does.
 
     A wrong turn about the vertical moves disparities alone, which no comparison of rows can see.
     """
@@ -152,7 +152,7 @@ def _off_axis_deg(t_m: Tensor) -> float:
     return math.degrees(math.atan2(float(t_m[1:].norm()), abs(float(t_m[0]))))
 
 
-def _read(path: Path, unit_m: float, is_fisheye: bool | None) -> RawPair:
+def _read_pair(path: Path, unit_m: float, is_fisheye: bool | None) -> RawPair:
     """Read the calibration of a pair: two files of ROS or OpenCV in a folder, or one file of both.
 
     ``unit_m``: metres of the unit of its translations.
@@ -160,39 +160,46 @@ def _read(path: Path, unit_m: float, is_fisheye: bool | None) -> RawPair:
     if path.is_dir():
         first, second = read_two_files(path)
         if is_ros(first) and is_ros(second) and "p2" not in first | second:
-            both = ros_pair(first, second)
-            xs = []  # of the two cameras, rectified, from the left one or from a third [m]
-            for names in both:
-                P = matrix(names, ("projectionmatrix", "p"), 12)
-                if P is None or P[0, 0] <= 0:
-                    raise InputError(
-                        "no projection_matrix with a focal length; calibrate as a pair"
-                    )
-                xs.append(-P[0, 3] / P[0, 0])
-            cameras = []
-            turns = []
-            for side, names in zip(("left", "right"), both, strict=True):
-                K = matrix(names, ("cameramatrix", "k"), 9)
-                D = ("distortioncoefficients", "d")
-                kind = _kind(names, is_fisheye)
-                cameras.append(_camera(K, _first(names, D), kind, f"the {side} camera"))
-                turn = matrix(names, ("rectificationmatrix", "r"), 9)
-                if turn is None:
-                    raise InputError(
-                        f"no rectification_matrix of the {side} camera; write the whole pair"
-                    )
-                turns.append(turn)
-            along = np.array([unit_m * (xs[0] - xs[1]), 0, 0])
-            motion = (turns[1].T @ turns[0], turns[1].T @ along)
-            return _pair(cameras[0], cameras[1], motion, size_of(first))
+            return _from_ros(first, second, unit_m, is_fisheye)
         return _from_opencv(first | second, unit_m, is_fisheye)
     text = read_text(path, MAX_LIST_BYTES)
     content = read_json(path) if text.lstrip()[:1] == "{" else None
     names = named(content) if isinstance(content, Mapping) else read_storage(path, text)
     if names is None:
         raise InputError(f"no calibration of two cameras; known are {_KNOWN}")
-    read = _from_kalibr if "cam0" in names else _from_opencv
-    return read(names, unit_m, is_fisheye)
+    if "cam0" in names:
+        return _from_kalibr(names, unit_m, is_fisheye)
+    return _from_opencv(names, unit_m, is_fisheye)
+
+
+def _from_ros(first: Names, second: Names, unit_m: float, is_fisheye: bool | None) -> RawPair:
+    """ROS's two ``camera_info``, whose R and P describe the rectified pair.
+
+    Each R turns a raw camera to its rectified one, and the rectified cameras stand apart along x
+    alone: so ``right_from_left`` has the rotation ``R_right^T R_left`` and the translation
+    ``R_right^T (baseline, 0, 0)``.
+    """
+    both = ros_pair(first, second)
+    xs = []  # of the two rectified cameras, from the left one or from a third [m]
+    for names in both:
+        P = matrix(names, ("projectionmatrix", "p"), 12)
+        if P is None or P[0, 0] <= 0:
+            raise InputError("no projection_matrix with a focal length; calibrate as a pair")
+        xs.append(-P[0, 3] / P[0, 0])
+    cameras = []
+    turns = []
+    for side, names in zip(("left", "right"), both, strict=True):
+        K = matrix(names, ("cameramatrix", "k"), 9)
+        D = _first_numbers(names, ("distortioncoefficients", "d"))
+        kind = _is_fisheye(names, is_fisheye)
+        cameras.append(_make_camera(K, D, kind, f"the {side} camera"))
+        turn = matrix(names, ("rectificationmatrix", "r"), 9)
+        if turn is None:
+            raise InputError(f"no rectification_matrix of the {side} camera; write the whole pair")
+        turns.append(turn)
+    baseline = np.array([unit_m * (xs[0] - xs[1]), 0, 0])
+    motion = (turns[1].T @ turns[0], turns[1].T @ baseline)
+    return _make_pair(cameras[0], cameras[1], motion, size_of(first))
 
 
 def _from_opencv(names: Names, unit_m: float, is_fisheye: bool | None) -> RawPair:
@@ -200,16 +207,18 @@ def _from_opencv(names: Names, unit_m: float, is_fisheye: bool | None) -> RawPai
     if not any(name in names for keys in _K.values() for name in keys):
         reason = "it describes one camera" if is_ros(names) or "cameramatrix" in names else "no K1"
         raise InputError(f"{reason}, not two as they were calibrated; known are {_KNOWN}")
-    kind = _kind(names, is_fisheye)
+    kind = _is_fisheye(names, is_fisheye)
     left, right = (
-        _camera(matrix(names, _K[side], 9), _first(names, _D[side]), kind, f"the {side} camera")
+        _make_camera(
+            matrix(names, _K[side], 9), _first_numbers(names, _D[side]), kind, f"the {side} camera"
+        )
         for side in ("left", "right")
     )
     R = matrix(names, _R, 9)
-    T = _first(names, _T)
+    T = _first_numbers(names, _T)
     if R is None or T is None or len(T) != 3:
         raise InputError("no R of 9 numbers and T of 3, from camera 1 to 2; write both")
-    return _pair(left, right, (R, unit_m * np.array(T)), size_of(names))
+    return _make_pair(left, right, (R, unit_m * np.array(T)), size_of(names))
 
 
 def _from_kalibr(names: Names, unit_m: float, is_fisheye: bool | None) -> RawPair:
@@ -227,20 +236,20 @@ def _from_kalibr(names: Names, unit_m: float, is_fisheye: bool | None) -> RawPai
     size = None if sizes[0] is None else (int(sizes[0][0]), int(sizes[0][-1]))
     cameras = []
     for camera_names, owner in ((first, "cam0"), (second, "cam1")):
-        kind = _kind(camera_names, is_fisheye, f"{owner}'s")
+        kind = _is_fisheye(camera_names, is_fisheye, f"{owner}'s")
         values = numbers(camera_names.get("intrinsics"))
         if values is None or len(values) != 4:
             raise InputError(f"{owner} has no intrinsics [fx, fy, cx, cy]; copy the camchain anew")
         lens = numbers(camera_names.get("distortioncoeffs"))
-        cameras.append(_camera(intrinsics(*values).numpy(), lens, kind, owner))
-    return _pair(cameras[0], cameras[1], (motion[:3, :3], unit_m * motion[:3, 3]), size)
+        cameras.append(_make_camera(intrinsics(*values).numpy(), lens, kind, owner))
+    return _make_pair(cameras[0], cameras[1], (motion[:3, :3], unit_m * motion[:3, 3]), size)
 
 
-def _first(names: Names, keys: tuple[str, ...]) -> list[float] | None:
+def _first_numbers(names: Names, keys: tuple[str, ...]) -> list[float] | None:
     return next((values for name in keys if (values := numbers(names.get(name)))), None)
 
 
-def _kind(names: Names, is_fisheye: bool | None, owner: str = "its") -> bool:
+def _is_fisheye(names: Names, is_fisheye: bool | None, owner: str = "its") -> bool:
     """Say whether a lens is a fisheye: as its file says, else as the user says."""
     is_named_fisheye = is_fisheye_lens(names, owner)
     if is_fisheye and is_named_fisheye is False:
@@ -250,7 +259,7 @@ def _kind(names: Names, is_fisheye: bool | None, owner: str = "its") -> bool:
     return bool(is_fisheye) if is_named_fisheye is None else is_named_fisheye
 
 
-def _camera(
+def _make_camera(
     K: np.ndarray | None, distortion: list[float] | None, is_fisheye: bool, owner: str
 ) -> RawCamera:
     """Make one raw camera, whose coefficients must be as many as its lens model has."""
@@ -265,13 +274,13 @@ def _camera(
             f"{owner} has {len(distortion)} coefficients of distortion, and {model} has "
             f"{' or '.join(map(str, counts))}; look at its model"
         )
-    own_K = torch.from_numpy(np.ascontiguousarray(K, np.float64))
-    check_intrinsics(own_K)
-    refuse_squeezed(own_K)
-    return RawCamera(K=own_K, distortion=tuple(distortion), is_fisheye=is_fisheye)
+    intrinsic = torch.from_numpy(np.ascontiguousarray(K, np.float64))
+    check_intrinsics(intrinsic)
+    refuse_squeezed(intrinsic)
+    return RawCamera(K=intrinsic, distortion=tuple(distortion), is_fisheye=is_fisheye)
 
 
-def _pair(
+def _make_pair(
     left: RawCamera, right: RawCamera, motion: tuple[np.ndarray, np.ndarray], size: Size | None
 ) -> RawPair:
     """Put two raw cameras and their motion (R, t [m], right from left) together as a pair."""

@@ -35,34 +35,41 @@ def read_storage(path: AnyPath, text: str) -> Names | None:
     if len(text) > _MAX_TEXT:
         return None
     if text.lstrip().startswith("<"):
-        if _DECLARATION.search(text):
-            raise InputError(
-                f"{path}: XML with declarations (<!...>), which no camera needs; drop them"
-            )
-        with refused_as(path, "camera file", "correct it there"):
-            root = ElementTree.fromstring(text)  # noqa: S314  entities are refused above
-        if root.tag != "opencv_storage":
-            return None
-        nodes = {node.tag: {leaf.tag: leaf.text for leaf in node} or node.text for node in root}
-        return named(nodes)
+        return _read_opencv_xml(path, text)
     body = _YAML_HEAD.sub("", text)
     with refused_as(path, "camera file", f"correct it there; known are {KNOWN_FILES}"):
         refuse_yaml_bomb(path, body)
         loader = _Loader(body)
-        content = loader.get_data() if loader.check_data() else None
-        others = []
+        documents = []
         while loader.check_data():
-            others.append(loader.get_data())
-    if not isinstance(content, Mapping):
+            documents.append(loader.get_data())
+    if not documents or not isinstance(documents[0], Mapping):
         return None
-    names = named(content)
-    for other in others:  # of a recorded topic they differ in the time alone
-        if isinstance(other, Mapping) and named(other) | {"header": 0} != names | {"header": 0}:
+
+    # A recorded topic of ROS has a document for each message: the same camera at other times.
+    names = named(documents[0])
+    camera = names | {"header": 0}
+    for other in documents[1:]:
+        if isinstance(other, Mapping) and named(other) | {"header": 0} != camera:
             raise InputError(
                 f"{path}: describes several cameras, one after the other; write each into a file "
                 "of its own (those of a pair into a folder)"
             )
     return names
+
+
+def _read_opencv_xml(path: AnyPath, text: str) -> Names | None:
+    """Parse the XML of OpenCV's FileStorage; None where it is another XML."""
+    if _DECLARATION.search(text):
+        raise InputError(
+            f"{path}: XML with declarations (<!...>), which no camera needs; drop them"
+        )
+    with refused_as(path, "camera file", "correct it there"):
+        root = ElementTree.fromstring(text)  # noqa: S314  entities are refused above
+    if root.tag != "opencv_storage":
+        return None
+    nodes = {node.tag: {leaf.tag: leaf.text for leaf in node} or node.text for node in root}
+    return named(nodes)
 
 
 def named(content: Mapping[Any, Any]) -> Names:

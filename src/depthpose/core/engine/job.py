@@ -24,9 +24,9 @@ from depthpose.core.engine.work import (
     PLAN,
     SHARDS,
     Block,
-    Done,
     Item,
     Runner,
+    ShardRecord,
     Work,
     is_unchanged,
     make_plan,
@@ -45,7 +45,7 @@ from depthpose.core.run import (
 
 MANIFEST = "manifest.csv"
 
-Engine = Callable[[Sequence[Block], Work, str], Iterable[Done]]
+Engine = Callable[[Sequence[Block], Work, str], Iterable[ShardRecord]]
 """Processes blocks, on any machine, and yields the outcome of each, in any order."""
 
 
@@ -61,7 +61,7 @@ class ShardedJob:
     block: int = 64  #: inputs of a shard
 
 
-def run_job(job: ShardedJob, engine: Engine) -> list[Done]:
+def run_job(job: ShardedJob, engine: Engine) -> list[ShardRecord]:
     """Do what is not finished of a job, and write ``manifest.csv``, the list of all its inputs.
 
     Returns:
@@ -93,7 +93,7 @@ def run_job(job: ShardedJob, engine: Engine) -> list[Done]:
     return shards
 
 
-def _finished_shards(out: str, blocks: Sequence[Block]) -> dict[str, Done]:
+def _finished_shards(out: str, blocks: Sequence[Block]) -> dict[str, ShardRecord]:
     """Find the blocks whose shards are whole and without failures; give their records by name.
 
     The record of a shard that is not whole is removed.
@@ -101,7 +101,7 @@ def _finished_shards(out: str, blocks: Sequence[Block]) -> dict[str, Done]:
     folder = stores.join(out, SHARDS)
     sizes = stores.list_sizes(folder)
     records = {shard.shard: shard for shard in read_results(out)}
-    done: dict[str, Done] = {}
+    done: dict[str, ShardRecord] = {}
     for block in blocks:
         shard = records.get(f"{block.shard}.tar")
         record = stores.join(folder, f"{block.shard}.json")
@@ -124,7 +124,7 @@ def _finished_shards(out: str, blocks: Sequence[Block]) -> dict[str, Done]:
     return done
 
 
-def _write_manifest(out: str, shards: Sequence[Done]) -> None:
+def _write_manifest(out: str, shards: Sequence[ShardRecord]) -> None:
     """Write ``manifest.csv``: each input with its shard, or the reason why it has no result.
 
     Raises:
@@ -160,18 +160,18 @@ def claim(out: str, settings: Mapping[str, Any]) -> None:
     stores.publish(record.encode(), stores.join(out, RECORD))
 
 
-def read_results(out: str) -> list[Done]:
+def read_results(out: str) -> list[ShardRecord]:
     """Read the records of the shards that earlier runs left; damaged records are skipped."""
-    records: list[Done] = []
+    records: list[ShardRecord] = []
     for _, text in sorted(
         stores.read_all(stores.join(stores.absolute(out), SHARDS), ".json").items()
     ):
         with suppress(ValueError, KeyError, TypeError):
-            records.append(Done.from_json(text))
+            records.append(ShardRecord.from_json(text))
     return records
 
 
-def shard_results(out: str, done: Done) -> Iterator[tuple[str, dict[str, bytes]]]:
+def shard_results(out: str, done: ShardRecord) -> Iterator[tuple[str, dict[str, bytes]]]:
     """Read the results of a shard one by one: the name, and the content of each ending.
 
     Raises:
@@ -211,7 +211,7 @@ class RayEngine:
     worker_cpus: float = 1.0  #: cores that a worker asks for
     worker_gpus: float = 0.0  #: GPUs that it asks for; a part lets workers share one
 
-    def __call__(self, blocks: Sequence[Block], work: Work, out: str) -> Iterator[Done]:
+    def __call__(self, blocks: Sequence[Block], work: Work, out: str) -> Iterator[ShardRecord]:
         """Do blocks, and give what became of each as it is done.
 
         Raises:
@@ -253,7 +253,7 @@ class RayEngine:
             )
             try:
                 for row in rows:
-                    yield Done.from_json(row["done"])
+                    yield ShardRecord.from_json(row["done"])
             except ray.exceptions.RayError as error:
                 inner: BaseException | None = error  # one of ours may be behind Ray's own
                 while inner is not None and not isinstance(inner, InputError):

@@ -309,7 +309,7 @@ class Work:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Done:
+class ShardRecord:
     """What became of a block."""
 
     shard: str  #: name of the shard, with its suffix
@@ -328,7 +328,7 @@ class Done:
         return json.dumps(asdict(self))
 
     @classmethod
-    def from_json(cls, text: str | bytes) -> "Done":
+    def from_json(cls, text: str | bytes) -> "ShardRecord":
         """Read what :meth:`to_json` wrote."""
         row = json.loads(text)
         row["entries"] = tuple((name, reason) for name, reason in row["entries"])
@@ -364,14 +364,14 @@ class Runner:
     out: str
     function: Function | None = None  #: what the work has started
 
-    def run(self, block: Block) -> Done:
+    def run(self, block: Block) -> ShardRecord:
         """Do a block, unless a shard of it without failures is there.
 
         The record ``SHARD.json`` is written after the shard: where it is, the shard is whole.
         """
         record = stores.join(self.out, SHARDS, f"{block.shard}.json")
         if stores.exists(record):
-            done = Done.from_json(stores.read_from(record))
+            done = ShardRecord.from_json(stores.read_from(record))
             if not done.failures:
                 return done
         temporary = tempfile.TemporaryDirectory(prefix="depthpose-")
@@ -381,7 +381,7 @@ class Runner:
             url = stores.join(self.out, SHARDS, file.name)
             stores.publish(file, url)
             stamp = file_stamp(stores.local_path(url) or file)
-        done = Done(
+        done = ShardRecord(
             shard=file.name,
             entries=entries,
             endings=tuple(self.work.endings),

@@ -140,8 +140,8 @@ def _check_images(frame: Frame, *, with_decoding: bool) -> Iterator[Problem]:
     if frame.right is not None and len(images) == 2 and images[0].shape == images[1].shape:
         with suppress(InputError):  # which is told by itself
             rig = frame_camera(frame)
-        apart_px = rig.cx_right_minus_left_px if isinstance(rig, StereoRig) else 0.0
-        report = check_rectified(images[0], images[1], apart_px)
+        cx_difference_px = rig.cx_right_minus_left_px if isinstance(rig, StereoRig) else 0.0
+        report = check_rectified(images[0], images[1], cx_difference_px)
         if report.is_wrong or report.is_rectified is None:
             message = f"beside {frame.left.name}: {report.message}"
             yield Problem(

@@ -108,8 +108,8 @@ def refuse_unrectified(pair: StereoInput, *, with_check: bool = True) -> str:
             )
     if not with_check:
         return ""
-    apart_px = 0.0 if pair.camera is None else pair.camera.cx_right_minus_left_px
-    report = check_rectified(pair.left, pair.right, apart_px)
+    cx_difference_px = 0.0 if pair.camera is None else pair.camera.cx_right_minus_left_px
+    report = check_rectified(pair.left, pair.right, cx_difference_px)
     if report.is_wrong:
         raise InputError(
             f"{pair.name}: {report.message} (--no-check, in Python with_check=False, matches them "
@@ -119,16 +119,16 @@ def refuse_unrectified(pair: StereoInput, *, with_check: bool = True) -> str:
 
 
 def _match_in_range(
-    matcher: NetworkMatcher, pair: StereoInput, apart_px: float
+    matcher: NetworkMatcher, pair: StereoInput, cx_difference_px: float
 ) -> tuple[Match, str]:
     """Measure which disparities a pair has, and search where they lie.
 
-    ``apart_px``: cx of the right camera less that of the left one [px]. Gives the match, and a
-    doubt about what lies beyond the search, or "".
+    ``cx_difference_px``: cx of the right camera less that of the left one [px]. Gives the match,
+    and a doubt about what lies beyond the search, or "".
     """
     assert pair.right is not None
     left = pair.left
-    reach = measure_reach(matcher, left, pair.right, -apart_px)
+    reach = measure_reach(matcher, left, pair.right, -cx_difference_px)
     window = choose_window(matcher, reach, left.shape[1:], pair.camera)
     (match,) = matcher.match_many([(left, pair.right)], pair.camera, window.search)
     if not matcher.config.with_left_right_check:
@@ -136,16 +136,19 @@ def _match_in_range(
     return doubt_outside(match, reach, window)
 
 
-def _match_from_infinity(matcher: Matcher, pair: StereoInput, apart_px: float) -> Match:
-    """Match a pair whose views are moved so that a disparity of 0 is infinitely far away."""
+def _match_moved_views(matcher: Matcher, pair: StereoInput, cx_difference_px: float) -> Match:
+    """Move the views so that a disparity of 0 is infinitely far away, match, and move back.
+
+    ``cx_difference_px``: cx of the right camera less that of the left one [px].
+    """
     assert pair.right is not None
-    first_px = -math.ceil(apart_px)
+    first_px = -math.ceil(cx_difference_px)
     left, right = move_views(pair.left, pair.right, first_px)
     rig = pair.camera
     if isinstance(rig, StereoRig) and first_px != 0:
         K = rig.K.clone()
         K[0, 2] += left.shape[2] - pair.left.shape[2]
-        moved_px = apart_px + first_px
+        moved_px = cx_difference_px + first_px
         rig = replace(rig, width=left.shape[2], K=K, cx_right_minus_left_px=moved_px)
     if isinstance(matcher, CameraMatcher):
         (match,) = matcher.match_many([(left, right)], rig)
@@ -377,22 +380,22 @@ class FakestereoNet:
             )
         warning = refuse_unrectified(pair, with_check=with_check)
         width = pair.left.shape[2]
-        apart_px = 0.0
+        cx_difference_px = 0.0
         if isinstance(pair.camera, StereoRig):
-            apart_px = pair.camera.cx_right_minus_left_px
-        if abs(math.ceil(apart_px)) >= width:
+            cx_difference_px = pair.camera.cx_right_minus_left_px
+        if abs(math.ceil(cx_difference_px)) >= width:
             raise InputError(
-                f"cx_right_minus_left_px is {apart_px:g}, and the images are {width} px wide: "
-                "the two views share nothing that is far away. Take both principal points from "
-                "one calibration of images of this size."
+                f"cx_right_minus_left_px is {cx_difference_px:g}, and the images are {width} px "
+                "wide: the two views share nothing that is far away. Take both principal points "
+                "from one calibration of images of this size."
             )
         with refused_memory(pair.name):
             if isinstance(self.matcher, NetworkMatcher) and self.matcher.finds_range:
-                match, doubt = _match_in_range(self.matcher, pair, apart_px)
+                match, doubt = _match_in_range(self.matcher, pair, cx_difference_px)
                 warning = "; ".join(text for text in (warning, doubt) if text)
             else:
-                match = _match_from_infinity(self.matcher, pair, apart_px)
-            return disparity.from_pair(pair, match, warning)
+                match = _match_moved_views(self.matcher, pair, cx_difference_px)
+            return disparity.estimate_from_pair(pair, match, warning)
 
     @force_float32()
     def estimate_many(
@@ -578,11 +581,12 @@ class FakestereoNet:
             for n, (image, match) in enumerate(zip(images, matches, strict=True)):
                 if views.is_sky is not None:
                     match = replace(match, is_sky=views.is_sky[n])  # noqa: PLW2901
-                estimate = disparity.from_virtual(image, rig, match, views.right[n])
+                estimate = disparity.estimate_from_virtual(image, rig, match, views.right[n])
                 if views.confidence is not None:
-                    mean = views.confidence[n].mean() if views.street is None else views.street[n]
-                    warning = self._ood_warning(image.name, float(mean))
-                    estimate = replace(estimate, image_confidence=float(mean), warning=warning)
+                    street = views.street_probability
+                    score = views.confidence[n].mean() if street is None else street[n]
+                    warning = self._ood_warning(image.name, float(score))
+                    estimate = replace(estimate, image_confidence=float(score), warning=warning)
                 estimates.append(estimate)
         return estimates
 

@@ -83,19 +83,19 @@ class ConvexUpsampling(nn.Module):
             for half in (left_half, right_half)
         )
         shifts = (_neighbours(quarters[:, 0].detach()) / 2).unbind(1)
-        alike = torch.stack([(near * _moved(far, shift)).sum(1) for shift in shifts], 1)
+        alike = torch.stack([(near * _shift_columns(far, shift)).sum(1) for shift in shifts], 1)
         x = F.relu(x + self.agreement(alike.to(x)))
         b, _, h, w = x.shape
         # They sum to one, for the four pixels of each one at half size.
         weights = self.weights(x).float().reshape(b, 9, 4, h, w).softmax(1)
         enlarged = [
-            F.pixel_shuffle((weights * _neighbours(one)[:, :, None]).sum(1), 2)
-            for one in quarters.unbind(1)
+            F.pixel_shuffle((weights * _neighbours(quarter)[:, :, None]).sum(1), 2)
+            for quarter in quarters.unbind(1)
         ]
         return torch.cat(enlarged, 1)
 
 
-def _moved(
+def _shift_columns(
     right: Float[Tensor, "b c h2 w2"], shift: Float[Tensor, "b h2 w2"]
 ) -> Float[Tensor, "b c h2 w2"]:
     """Give for each left pixel the features ``shift`` pixels to the left in the right view."""
@@ -142,7 +142,10 @@ class Refinement(nn.Module):
         # The cosine of each group of features at five disparities about that one.
         near, far = (unit_groups(half.float(), _GROUPS) for half in (left, right))
         cosines = [
-            (near * _moved(far.flatten(1, 2), middle + offset).unflatten(1, near.shape[1:3])).sum(2)
+            (
+                near
+                * _shift_columns(far.flatten(1, 2), middle + offset).unflatten(1, near.shape[1:3])
+            ).sum(2)
             for offset in _OFFSETS
         ]
         x = torch.cat([*cosines, left_half.float(), four - middle[:, None]], 1).to(left)
@@ -227,12 +230,12 @@ class SkyHead(nn.Module):
         Where the match is near and its confidence high, there is no sky.
         """
         quarter, *coarser = levels
-        found: list[Tensor] = []
+        context: list[Tensor] = []  # of the coarser levels; the coarsest one has none
         for layer, level in zip(reversed(self.coarse), reversed(coarser), strict=True):
-            x = F.relu(layer(torch.cat([level, *found], 1)))
-            found = [F.interpolate(x, scale_factor=2.0, mode="nearest")]
+            x = F.relu(layer(torch.cat([level, *context], 1)))
+            context = [F.interpolate(x, scale_factor=2.0, mode="nearest")]
         match = torch.stack([confidence, quarter_px / _USUAL_PX], 1).detach()
-        hidden = F.relu(self.hidden(torch.cat([quarter, *found, match.to(quarter)], 1)))
+        hidden = F.relu(self.hidden(torch.cat([quarter, *context, match.to(quarter)], 1)))
         return self.logit(hidden)[:, 0].to(confidence).sigmoid()
 
 
@@ -359,7 +362,7 @@ class Aggregation(nn.Module):
         # In place where no gradient needs the old values.
         product = torch.Tensor.mul if torch.is_grad_enabled() else torch.Tensor.mul_
 
-        def begin(left: Features, right: Features, guide: Volume) -> Volume:
+        def make_volume(left: Features, right: Features, guide: Volume) -> Volume:
             """Make the cost volume of some rows, and weigh it by the guide."""
             near = unit_groups(left, self.groups)
             far = unit_groups(right, self.groups)
@@ -367,23 +370,29 @@ class Aggregation(nn.Module):
             volume = volume.contiguous(memory_format=torch.channels_last_3d)
             return product(self.first(volume).relu_(), guide)
 
-        def raised(up: nn.Module, volume: Volume, larger: Volume) -> Volume:
-            """Enlarge a volume, and add to the larger one of the way down."""
+        def add_enlarged(up: nn.Module, volume: Volume, larger: Volume) -> Volume:
+            """Enlarge a volume, and add it to the larger one of the way down."""
             return up(volume).add_(larger).relu_()
 
-        def end(volume: Volume) -> Volume:
+        def score_volume(volume: Volume) -> Volume:
+            """Give one score for each disparity of each pixel."""
             return self.score(self.joined[0](volume).relu_())
 
-        scales = [by_rows(begin, (left, right, guides[0]), halo=1, rows=rows)]
+        # Down: each scale has half the size of the one before.
+        scales = [by_rows(make_volume, (left, right, guides[0]), halo=1, rows=rows)]
         for down, same, guide in zip(self.down, self.same, guides[1:], strict=True):
             scales.append(product(same(down(scales[-1]).relu_()).relu_(), guide))
+
+        # Up again; the largest size by rows.
         x = scales.pop()
         for up, joined in zip(self.up[:0:-1], self.joined[:0:-1], strict=True):
-            x = joined(raised(up, x, scales.pop())).relu_()
+            x = joined(add_enlarged(up, x, scales.pop())).relu_()
         largest = scales.pop()
         half = None if rows is None else rows // 2
-        x = by_rows(partial(raised, self.up[0]), (x, largest), halo=1, rows=half, into=largest)
-        return by_rows(end, (x,), halo=2, rows=rows)[:, 0]
+        x = by_rows(
+            partial(add_enlarged, self.up[0]), (x, largest), halo=1, rows=half, into=largest
+        )
+        return by_rows(score_volume, (x,), halo=2, rows=rows)[:, 0]
 
 
 class LightStereo(StereoNetwork):
@@ -458,18 +467,25 @@ class LightStereo(StereoNetwork):
                 f"the light matcher takes sides that are multiples of 32, got {h}x{w}; pad the "
                 "pair, as LightMatcher does"
             )
-        near = self.features(left)
-        far = self.features(right)
-        described = self.describe(near.levels[0]), self.describe(far.levels[0])
-        right_half = far.half
-        del far
+        left_features = self.features(left)
+        right_features = self.features(right)
+        descriptions = (
+            self.describe(left_features.levels[0]),
+            self.describe(right_features.levels[0]),
+        )
+        right_half = right_features.half
+        del right_features  # its levels are large
+
+        # Disparity at 1/4 size: the mean over the few best.
         bins = max_disparity_px // STEP_PX
         first = first_px // STEP_PX
-        scores = self.aggregation(*described, bins, near.levels, self.rows, first)
+        scores = self.aggregation(*descriptions, bins, left_features.levels, self.rows, first)
         # In float32 at least: 8 bits would round the expectation to whole pixels.
         scores = scores.to(torch.promote_types(scores.dtype, torch.float32))
         best = scores.topk(_CANDIDATES, 1)
         quarter_px = first_px + STEP_PX * (best.values.softmax(1) * best.indices).sum(1)
+
+        # Confidence and sky at 1/4 size.
         quarters = [quarter_px]
         if with_confidence or self.sky_head is not None:
             with torch.no_grad():
@@ -478,29 +494,32 @@ class LightStereo(StereoNetwork):
                 near_px = partial(confidence_near, first_px=first_px)
                 quarters.append(by_rows(near_px, parts, halo=0, rows=self.rows))
         if self.sky_head is not None:
-            quarters.append(self.sky_head(near.levels, *quarters))
+            quarters.append(self.sky_head(left_features.levels, *quarters))
         coarse_px = None
         if self.training:  # the mean over all disparities
             steps = torch.arange(bins, dtype=scores.dtype, device=scores.device)[:, None, None]
             coarse_px = first_px + STEP_PX * (scores.softmax(1) * steps).sum(1, keepdim=True)
         del scores
-        parts = (torch.stack(quarters, 1), near.half, near.levels[0], right_half)
-        found_px, *rest = by_rows(self.enlargement, parts, halo=2, rows=self.rows).unbind(1)
-        parts = (found_px, near.half, right_half)
+
+        # All of them at full size, and the disparity refined there.
+        left_half = left_features.half
+        parts = (torch.stack(quarters, 1), left_half, left_features.levels[0], right_half)
+        enlarged_px, *rest = by_rows(self.enlargement, parts, halo=2, rows=self.rows).unbind(1)
+        parts = (enlarged_px, left_half, right_half)
         half_rows = None if self.rows is None else 2 * self.rows
         refine = partial(self.refinement, least_px=first_px + LEAST_PX)
         heads = (by_rows(refine, parts, halo=5, rows=half_rows),)
         if coarse_px is not None:
             wide_px = F.interpolate(coarse_px, scale_factor=4.0, mode="bilinear")[:, 0]
-            heads = (wide_px, found_px, *heads)
+            heads = (wide_px, enlarged_px, *heads)
         confidence = rest[0] if with_confidence else None
         if self.sky_head is None:
             return Reading(heads, confidence, None)
-        sure, sky = rest
+        matched, sky = rest  # the match's confidence, and the probability of the sky
         if not self.training:
-            sky = torch.where(sky > sure, sky, sky.clamp(max=0.5))
+            sky = torch.where(sky > matched, sky, sky.clamp(max=0.5))
         if confidence is not None:
-            confidence = torch.where(sky > 0.5, sky, sure * (1 - sky))
+            confidence = torch.where(sky > 0.5, sky, matched * (1 - sky))
         return Reading(heads, confidence, sky)
 
 

@@ -487,7 +487,7 @@ class MeshBuilder:
         p = np.asarray(start, np.float64)
         q = np.asarray(stop, np.float64)
         length = float(np.linalg.norm(q - p))
-        across, other = _across((q - p) / length)
+        across, other = _perpendicular_axes((q - p) / length)
         angle = np.linspace(0, 2 * np.pi, sides + 1)
         ring = np.cos(angle)[:, None] * across + np.sin(angle)[:, None] * other
         low = p + ring * first
@@ -502,7 +502,7 @@ class MeshBuilder:
         """Add a flat polygon; its texture is one tile from side to side."""
         middle = np.asarray(centre, np.float64)
         direction = np.asarray(axis, np.float64)
-        across, other = _across(direction / np.linalg.norm(direction))
+        across, other = _perpendicular_axes(direction / np.linalg.norm(direction))
         angle = np.linspace(0, 2 * np.pi, sides + 1) + np.pi / sides
         rim_uv = np.stack([np.cos(angle), np.sin(angle)], -1)
         rim = middle + radius_m * (rim_uv[:, :1] * across + rim_uv[:, 1:] * other)
@@ -581,8 +581,8 @@ def _halves(faces: np.ndarray) -> np.ndarray:
     return np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])
 
 
-def _across(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two unit vectors across a direction; the second points up where it can."""
+def _perpendicular_axes(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two unit vectors at right angles to a direction; the second points up where it can."""
     aside = np.array([0.0, 1, 0]) if abs(direction[1]) < 0.9 else np.array([0.0, 0, 1])
     across = np.cross(aside, direction)
     across /= np.linalg.norm(across)

@@ -18,7 +18,7 @@ from depthpose.core.errors import InputError
 from depthpose.depth.config import NearConfig, StreetsConfig
 from depthpose.depth.synthetic.dataset import Projector, StreetFrame, draw_scene
 from depthpose.depth.synthetic.mesh import MeshBuilder, Values
-from depthpose.depth.synthetic.near_shapes import PLAIN, add_thing, draw_surface, random_kind
+from depthpose.depth.synthetic.near_shapes import PLAIN, add_thing, random_kind, random_near_surface
 from depthpose.depth.synthetic.scene import (
     Markings,
     StreetScene,
@@ -198,7 +198,7 @@ class _Place:
         """Add a large rectangle; nothing of it is cut off for being near."""
         self.builder.thing += 1
         size_m = float(np.linalg.norm(np.asarray(along, float)))
-        surface = draw_surface(
+        surface = random_near_surface(
             self.rng, self.near_m * log_uniform(self.rng, 0.3, 3), self.plain_share
         )
         if surface.material in PLAIN:
@@ -274,7 +274,7 @@ class _Place:
             sides = ((right, ahead), (-right, ahead), (ahead, right), (-ahead, right))
             for outwards, along in sides:
                 corner = middle + extent_m * (outwards - along)
-                surface = draw_surface(rng, extent_m)
+                surface = random_near_surface(rng, extent_m)
                 self.builder.rectangle(corner, 2 * extent_m * along, height_m * normal, surface)
         # Things on it: their places by the rays that see the plane.
         common = random_kind(rng) if is_bin else None
@@ -300,7 +300,7 @@ class _Place:
         self.add_wall(back_m * rng.uniform(1.0, 1.6))
         half_x, half_y = (back_m * side * rng.uniform(0.6, 1.5) for side in self.half)
         thick_m = depth_m * rng.uniform(0.02, 0.12)
-        surface = draw_surface(rng, half_x)
+        surface = random_near_surface(rng, half_x)
         turn = rng.normal(0, 0.25)
         rotation = np.array(
             [[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]]

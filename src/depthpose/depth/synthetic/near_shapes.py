@@ -24,7 +24,9 @@ def random_kind(rng: np.random.Generator) -> str:
     return _KINDS[int(rng.integers(len(_KINDS)))]
 
 
-def draw_surface(rng: np.random.Generator, size_m: float, plain_share: float = 0.3) -> Surface:
+def random_near_surface(
+    rng: np.random.Generator, size_m: float, plain_share: float = 0.3
+) -> Surface:
     """Draw a surface of any colour for a thing of ``size_m``; a share of them without texture."""
     surface = random_surface(rng, size_m)
     if rng.random() >= plain_share:
@@ -36,7 +38,7 @@ def draw_surface(rng: np.random.Generator, size_m: float, plain_share: float = 0
 def add_thing(b: MeshBuilder, kind: str, centre: np.ndarray, size_m: float) -> None:
     """Add a thing of a kind about its centre (3,) [m], with a random surface and rotation."""
     b.thing += 1
-    surface = draw_surface(b.rng, size_m)
+    surface = random_near_surface(b.rng, size_m)
     R = random_rotation(b.rng) if b.rng.random() < 0.6 else np.eye(3)
     match kind:
         case "bracket":
@@ -135,7 +137,7 @@ def _add_books(b: MeshBuilder, centre: np.ndarray, size_m: float, R: Rotation) -
         b.thing += 1
         thick = size_m * b.rng.uniform(0.03, 0.15)
         size = (size_m * b.rng.uniform(0.4, 0.7), thick, size_m * b.rng.uniform(0.5, 0.9))
-        b.box(centre + R @ (offset + down * thick / 2), size, draw_surface(b.rng, size_m), R)
+        b.box(centre + R @ (offset + down * thick / 2), size, random_near_surface(b.rng, size_m), R)
         offset = offset + down * thick
 
 

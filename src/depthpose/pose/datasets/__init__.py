@@ -10,8 +10,8 @@ from depthpose.pose.datasets.dataset import write_bop_scene as write_bop_scene
 from depthpose.pose.datasets.detections import Box as Box
 from depthpose.pose.datasets.detections import Detection as Detection
 from depthpose.pose.datasets.detections import box_mask as box_mask
+from depthpose.pose.datasets.detections import group_by_image as group_by_image
 from depthpose.pose.datasets.detections import name_objects as name_objects
-from depthpose.pose.datasets.detections import of_images as of_images
 from depthpose.pose.datasets.detections import parse_box as parse_box
 from depthpose.pose.datasets.detections import parse_labels as parse_labels
 from depthpose.pose.datasets.detections import read_detections as read_detections

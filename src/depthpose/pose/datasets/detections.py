@@ -337,7 +337,7 @@ def name_objects(
     return named
 
 
-def of_images(
+def group_by_image(
     detections: Sequence[Detection], images: Sequence[str], source: str
 ) -> dict[str, list[Detection]]:
     """Share detections among images, by the names of their files without endings.

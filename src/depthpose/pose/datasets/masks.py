@@ -180,7 +180,7 @@ def encode_rle(mask: Bool[Tensor, "h w"]) -> Runs:
 
 
 def read_runs(entry: object, source: str) -> Runs:
-    """Take COCO's run lengths, compressed (text) or not, and their size; nothing is decoded.
+    """Take COCO's run lengths, compressed (text) or not, and their size; no mask is made of them.
 
     They may be the ``segmentation`` of an entry.
 
@@ -207,23 +207,37 @@ def read_runs(entry: object, source: str) -> Runs:
         raise InputError(f"{what}: its size is {size!r}, where [height, width] belongs")
     height, width = size
     text = counts.decode("latin-1") if isinstance(counts, bytes) else counts
-    runs: Any = text
-    value = shift = 0
-    if isinstance(text, str):  # five bits a character, runs as differences from the last but one
-        runs = list[int]()
-        for bits in (ord(character) - 48 for character in text):
-            value |= (bits & 0x1F) << shift
-            shift += 5
-            if shift > _MOST_BITS:
-                raise InputError(f"{what}: its text has a number of more than {_MOST_BITS} bits")
-            if not bits & 0x20:
-                value -= (1 << shift) if bits & 0x10 else 0
-                runs.append(value + (runs[-2] if len(runs) > 2 else 0))
-                value = shift = 0
+    runs: Any = _decompress_runs(text, what) if isinstance(text, str) else text
     is_list = isinstance(runs, list) and all(type(v) is int and v >= 0 for v in runs)
     if not is_list or sum(runs) != height * width or height * width > MAX_PIXELS:
         raise InputError(f"{what} of {height}x{width} pixels: they do not add up to it")
     return tuple(runs), height, width
+
+
+def _decompress_runs(text: str, what: str) -> list[int]:
+    """Read COCO's compressed run lengths; ``what`` names them in errors.
+
+    A character holds five bits of a number, the lowest first, and a bit that says whether more
+    follow. From the fourth run on the numbers are differences from the last run but one.
+    """
+    runs: list[int] = []
+    value = 0
+    shift = 0
+    for bits in (ord(character) - 48 for character in text):
+        value |= (bits & 0x1F) << shift
+        shift += 5
+        if shift > _MOST_BITS:
+            raise InputError(f"{what}: its text has a number of more than {_MOST_BITS} bits")
+        has_more = bits & 0x20
+        if has_more:
+            continue
+        is_negative = bits & 0x10
+        if is_negative:
+            value -= 1 << shift
+        runs.append(value + (runs[-2] if len(runs) > 2 else 0))
+        value = 0
+        shift = 0
+    return runs
 
 
 def mask_box(mask: Bool[Tensor, "h w"]) -> list[int]:

@@ -3,7 +3,7 @@
 from depthpose.pose.evaluate.detection import detection_scores as detection_scores
 from depthpose.pose.evaluate.errors import METRICS as METRICS
 from depthpose.pose.evaluate.errors import Metric as Metric
-from depthpose.pose.evaluate.errors import match as match
+from depthpose.pose.evaluate.errors import match_instances as match_instances
 from depthpose.pose.evaluate.errors import nearest_copy as nearest_copy
 from depthpose.pose.evaluate.evaluate import Conditions as Conditions
 from depthpose.pose.evaluate.evaluate import Evaluation as Evaluation
@@ -14,5 +14,5 @@ from depthpose.pose.evaluate.evaluate import RiskRow as RiskRow
 from depthpose.pose.evaluate.evaluate import error_context as error_context
 from depthpose.pose.evaluate.evaluate import evaluate as evaluate
 from depthpose.pose.evaluate.evaluate import frames_hash as frames_hash
-from depthpose.pose.evaluate.evaluate import of_targets as of_targets
 from depthpose.pose.evaluate.evaluate import read_any as read_any
+from depthpose.pose.evaluate.evaluate import select_targets as select_targets

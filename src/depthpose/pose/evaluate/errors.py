@@ -186,7 +186,7 @@ _POINTS = 500
 _NEAR_DIAMETERS = 1.0
 
 
-def match(
+def match_instances(
     instances: Sequence[Instance],
     predictions: Sequence[Prediction],
     models: Mapping[int, ObjectModel],
@@ -342,7 +342,7 @@ def _count_right(
 ) -> tuple[int, int]:
     """Count how many of some predictions are right by a change, and how many were tried."""
     renumbered = [change.renumber(prediction) for prediction in posed]
-    matched = match(dataset.instances, renumbered, dataset.objects)
+    matched = match_instances(dataset.instances, renumbered, dataset.objects)
     with_estimate = [instance for instance in dataset.instances if instance.name in matched]
     tried = with_estimate[:: max(1, len(with_estimate) // _TRIED)][:_TRIED]
     places = {place_of(instance) for instance in tried}
@@ -354,7 +354,7 @@ def _count_right(
     ]
 
     # A pose may be nearest to another instance of its object once it is changed.
-    matched = match(tried, reposed, dataset.objects)
+    matched = match_instances(tried, reposed, dataset.objects)
     right = 0
     for instance in tried:
         if instance.name not in matched:

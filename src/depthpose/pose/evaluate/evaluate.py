@@ -21,7 +21,7 @@ from depthpose.pose.evaluate.errors import (
     ErrorContext,
     Errors,
     convention_advice,
-    match,
+    match_instances,
 )
 from depthpose.pose.mesh import drawn_triangles, symmetry_transforms
 from depthpose.pose.metrics import SUCCESS_SHARE
@@ -248,7 +248,7 @@ def frames_hash(instances: Sequence[Instance]) -> str:
     return hashlib.sha256("".join(sorted(lines)).encode()).hexdigest()
 
 
-def of_targets(dataset: BopDataset, targets: Sequence[BopTarget]) -> BopDataset:
+def select_targets(dataset: BopDataset, targets: Sequence[BopTarget]) -> BopDataset:
     """Keep the instances that a list of targets asks for, the most visible where it takes fewer.
 
     Raises:
@@ -374,7 +374,7 @@ def evaluate(
             damaged.
     """
     config = EvaluationConfig() if config is None else config
-    matched = match(dataset.instances, predictions, dataset.objects)
+    matched = match_instances(dataset.instances, predictions, dataset.objects)
     if len(dataset) == 0:
         raise InputError(f"{dataset.folder}: split {dataset.split!r} has no instance to measure")
     # A file of another data set would be measured as all missing, and look like a bad method.

@@ -517,9 +517,13 @@ def _is_ear(points: np.ndarray, corners: list[int], is_back: np.ndarray, least: 
     ear = points[corners]
     sides = np.roll(ear, -1, 0) - ear
     turn = sides[0, 0] * sides[1, 1] - sides[0, 1] * sides[1, 0]
-    if abs(turn) <= least or turn < 0:
-        return bool(abs(turn) <= least)
-    gaps = points[is_back] - ear[:, None]  # from each corner of the ear to each of the others
-    is_within = (sides[:, :1] * gaps[..., 1] >= sides[:, 1:] * gaps[..., 0]).all(0)
-    is_within &= gaps.any(-1).all(0)  # what is at the same place does no harm
+    is_flat = abs(turn) <= least
+    if is_flat:  # a straight corner is cut off with no area
+        return True
+    if turn < 0:
+        return False
+    # Another corner lies within if it is on the inner side of all three sides.
+    offsets = points[is_back] - ear[:, None]  # from each corner of the ear to each other corner
+    is_within = (sides[:, :1] * offsets[..., 1] >= sides[:, 1:] * offsets[..., 0]).all(0)
+    is_within &= offsets.any(-1).all(0)  # one at the place of a corner of the ear does no harm
     return not is_within.any()

@@ -17,7 +17,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.datasets import BopFrame, BopObject
 from depthpose.pose.mesh import drawn_triangles, sample_surface
-from depthpose.pose.synthetic.views import measure, random_rotation, uniform, whole
+from depthpose.pose.synthetic.views import random_rotation, simulate_depth, uniform, whole
 from depthpose.pose.types import ObjectModel
 
 _WAVES = 6
@@ -228,7 +228,7 @@ def _make_frame(
     noise = uniform(generator, 0.0, 0.02) * torch.randn(image.shape, generator=generator)
     rgb = (gain * tint * image + noise).clamp(1e-6, 1) ** (1 / 2.2)
     focal_px = (config.focal_px[0], config.focal_px[0])
-    depth_m = measure(raster.depth_m, focal_px, config.sensor, generator)
+    depth_m = simulate_depth(raster.depth_m, focal_px, config.sensor, generator)
     shown: list[BopObject] = []
     for i, (solid, pose) in enumerate(placed):
         if solid.number is None:

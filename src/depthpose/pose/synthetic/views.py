@@ -117,7 +117,7 @@ def occlude(
     return torch.where(is_hidden, occluder_m, depth_m), silhouette & ~is_hidden
 
 
-def measure(
+def simulate_depth(
     depth_m: Depth,
     focal_px: tuple[float, float],
     config: SyntheticSensorConfig,
@@ -440,7 +440,7 @@ class Objects:
         scale = float(clean.K[0, 0]) / self.config.focal_px[0]  # to pixels of the full image
         mask = grow_mask(visible, round(grow_px * scale))
         focal_px = (float(clean.K[0, 0]), self.config.focal_px[0])
-        measured_m = measure(depth_m, focal_px, self.config.sensor, generator)
+        measured_m = simulate_depth(depth_m, focal_px, self.config.sensor, generator)
 
         # And shifted: what comes in at a border is not of the object.
         largest_px = self.config.mask_shift_px

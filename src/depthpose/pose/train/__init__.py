@@ -13,12 +13,12 @@ from depthpose.pose.train.config import PoseTraining as PoseTraining
 from depthpose.pose.train.config import SegmentationTraining as SegmentationTraining
 from depthpose.pose.train.masks import train_segmentation
 from depthpose.pose.train.poses import PoseTask as PoseTask
-from depthpose.pose.train.poses import train_pose as train_pose
+from depthpose.pose.train.poses import train_pose_network as train_pose_network
 
 STAGES = {
-    "pose": (PoseTraining, train_pose),
-    "pointnet": (PointNetTraining, train_pose),
-    "depth-image": (DepthImageTraining, train_pose),
+    "pose": (PoseTraining, train_pose_network),
+    "pointnet": (PointNetTraining, train_pose_network),
+    "depth-image": (DepthImageTraining, train_pose_network),
     "segmentation": (SegmentationTraining, train_segmentation),
 }
 """Config and function of each network, by its word on the command line."""

@@ -293,7 +293,7 @@ def held_out_objects(
     occlusion: float,
 ) -> Objects:
     """Make the views that no training sees, all of one occlusion."""
-    config_here = dataclasses.replace(
+    held_out_config = dataclasses.replace(
         synthetic,
         number=config.number * len(models),
         seed=synthetic.seed + HELD_OUT_SEED,
@@ -302,7 +302,7 @@ def held_out_objects(
         occluded_share=1.0,
         occlusion=(occlusion, occlusion),
     )
-    return Objects(models, config_here, cloud)
+    return Objects(models, held_out_config, cloud)
 
 
 def add_error(estimated: Rigid | None, truth: Rigid, model: ObjectModel) -> float:

@@ -254,7 +254,7 @@ _STATISTICS_CLOUDS = 64  # from which statistics of batch norm, lost by folding,
 
 
 @releases_folder
-def train_pose(config: PoseTraining | DepthImageTraining, run: Run) -> Path:
+def train_pose_network(config: PoseTraining | DepthImageTraining, run: Run) -> Path:
     """Train the network that a config has, ours or a baseline; give its weights file.
 
     Raises:
