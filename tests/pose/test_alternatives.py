@@ -166,14 +166,14 @@ def test_what_was_found_is_kept_for_the_next_process(
     monkeypatch.setenv("DEPTHPOSE_CACHE", str(tmp_path))
     symmetry.cached.cache_clear()
     model = replace(bar(), symmetries=Symmetries(is_found=True))
-    true = symmetry._search(model)
+    true = symmetry._search_near_symmetries(model)
     searches: list[ObjectModel] = []
 
     def counted(model: ObjectModel) -> Any:  # noqa: ANN401
         searches.append(model)
         return true
 
-    monkeypatch.setattr(symmetry, "_search", counted)
+    monkeypatch.setattr(symmetry, "_search_near_symmetries", counted)
     found = near_symmetries(model)
     assert found
     (path,) = tmp_path.glob("near_symmetries/*.json")

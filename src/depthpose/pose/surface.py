@@ -307,9 +307,9 @@ def look_along_rays(
         every: use each n-th point of the surface alone.
 
     Returns:
-        Free-space violation: the share of the points that the posed surface would have occluded.
-        And the unobserved ratio: the share of the cells of the posed surface in which nothing was
-        observed. Both 1 where the surface lies behind the camera.
+        The share of the points that the posed surface would have occluded (free-space violation),
+        and the share of the cells of the posed surface in which nothing was observed. Both 1 where
+        the surface lies behind the camera.
     """
     median_m = float(cloud_m[:, 2].median())
     cloud_m = cloud_m[cloud_m[:, 2] > _FRONT * max(median_m, 0.0)]

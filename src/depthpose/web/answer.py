@@ -39,7 +39,7 @@ class Answer:
     """
 
     is_ok: bool
-    said: str
+    sentence: str
     facts: Sequence[tuple[str, str]]
     scene: Scene
     terms: str = ""

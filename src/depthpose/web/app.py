@@ -410,7 +410,7 @@ class Pages:
             pictures.append({**vars(picture), **size_and_scale})
         return {
             "ok": answer.is_ok,
-            "said": answer.said,
+            "said": answer.sentence,
             "terms": answer.terms,
             "facts": list(answer.facts),
             "tables": dict(answer.tables),

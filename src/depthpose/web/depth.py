@@ -39,7 +39,7 @@ _PHONE = 0.75
 def answer_depth(form: Form, net: FakestereoNet) -> Answer:
     """Estimate depth for a form."""
     began = time.perf_counter()
-    pair, focal = _input(form)
+    pair, focal = _read_input(form)
 
     # Refuse what cannot be drawn or matched, and what would take too long.
     near_m, far_m = (
@@ -73,7 +73,7 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
     facts = [fact for fact in depth_facts(pair, estimate, focal) if fact[0] != "warning"]
     return Answer(
         is_ok=not estimate.warning,
-        said=_sentence(pair, estimate),
+        sentence=_sentence(pair, estimate),
         facts=[*facts, ("computed in", f"{seconds:.2f} s")],
         pictures=pictures,
         scene=depth_scene(pair, estimate, far_m),
@@ -112,7 +112,7 @@ def _refuse_large_work(pair: StereoInput, net: FakestereoNet) -> None:
         )
 
 
-def _input(form: Form) -> tuple[StereoInput, str]:
+def _read_input(form: Form) -> tuple[StereoInput, str]:
     """Read the picture or pair; give the origin of its focal length too, if the user gave none."""
     path = form.file("image")
     width, height = image_size(path)

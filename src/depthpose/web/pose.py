@@ -1,5 +1,6 @@
 """The tab Pose: a depth image or cloud of a known object to its pose, or why there is none."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -15,7 +16,7 @@ from depthpose.pose.datasets import box_mask, parse_box
 from depthpose.pose.datasets.dataset import write_mask
 from depthpose.pose.decide import with_status
 from depthpose.pose.inputs import cloud_input, view_input
-from depthpose.pose.network_pose import GeoPoseNet
+from depthpose.pose.network_pose import CloudDirections, GeoPoseNet
 from depthpose.pose.predictions import CLOUD, PICTURE, Prediction, write_predictions
 from depthpose.pose.registration import Registration
 from depthpose.pose.search import explained_mask
@@ -23,7 +24,7 @@ from depthpose.pose.surface import prepare_surface
 from depthpose.pose.synthetic import make_frames
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 from depthpose.report import pose as report
-from depthpose.report.page import Layer
+from depthpose.report.page import Layer, Scene
 from depthpose.report.pose import object_points
 from depthpose.web.answer import (
     EXAMPLE_SEED,
@@ -49,7 +50,7 @@ class _Target:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Seen:
+class _ShownPose:
     """What was posed, and its answer."""
 
     input: CloudInput | ViewInput
@@ -58,77 +59,94 @@ class _Seen:
 
 def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
     """Estimate poses for a form."""
-    target = _target(form, net)
-    pose_input = _input(form, target.model)
-    name = pose_input.name
-    voted = None
-    boxes = _boxes(form, pose_input)
-    if boxes:
-        estimates = target.net.estimate_many(boxes)
-        shown_poses = [
-            _Seen(input=view, estimate=estimate)
-            for view, estimate in zip(boxes, estimates, strict=True)
-        ]
-        shown_poses.sort(key=lambda shown: -(shown.estimate.certainty or 0.0))
-    elif "depth" in form.files and "mask" not in form.files:
-        assert isinstance(pose_input, ViewInput)
-        shown_poses = []
-        for estimate in target.net.find_in(pose_input, [target.model.name]):
-            shown = pose_input
-            if estimate.camera_from_model is not None:  # with the pixels that it explains
-                surface = prepare_surface(target.model)
-                mask = explained_mask(pose_input, estimate.camera_from_model, surface)
-                shown = replace(pose_input, mask=mask)
-            shown = replace(shown, name=estimate.name)
-            shown_poses.append(_Seen(input=shown, estimate=estimate))
-    elif isinstance(target.net, GeoPoseNet):
-        estimate, voted = target.net.estimate_with_votes(pose_input)
-        shown_poses = [_Seen(input=pose_input, estimate=estimate)]
-    else:
-        (estimate,) = target.net.estimate_many([pose_input])
-        if estimate.status == "unreadable":
-            raise InputError(estimate.reason)
-        shown_poses = [_Seen(input=pose_input, estimate=estimate)]
+    target = _find_target(form, net)
+    pose_input = _read_input(form, target.model)
+    shown_poses, votes = _estimate(form, target, pose_input)
     if (least := form.number("min_certainty")) is not None:
         limit = EstimateConfig(min_certainty=least).min_certainty
         shown_poses = [
-            replace(shown_pose, estimate=with_status(shown_pose.estimate, limit))
-            for shown_pose in shown_poses
+            replace(shown, estimate=with_status(shown.estimate, limit)) for shown in shown_poses
         ]
+
+    # The files for download.
     folder = form.folder / "results"
     folder.mkdir()
+    pictures = _write_results(folder, pose_input.name, shown_poses, target.model)
+
+    # What the page shows: the best of them, and a row and a layer for each.
     best = shown_poses[0]
     agreeing = "votes that agree" if isinstance(target.net, GeoPoseNet) else "points near the model"
-    table = [["", "status", "x [m]", "y [m]", "z [m]", "certainty", "visible", "pick rank"]]
-    table += [[shown.input.name, *_row(shown.estimate)] for shown in shown_poses]
-    pose_input = shown_poses[0].input
-    estimate = shown_poses[0].estimate
-    scene = report.pose_scene(
-        pose_input, object_points(pose_input, target.model.diameter_m), estimate, target.model
-    )
-    layers = list(scene.layers)
-    if estimate.keypoints_m is not None and voted is not None:
-        layers.append(
-            report.vote_layer(voted.cloud.points_m, voted.directions, estimate.keypoints_m)
-        )
-    for shown_pose in shown_poses[1:]:
-        points_m = object_points(shown_pose.input, target.model.diameter_m)
-        cloud = report.posed_cloud(points_m, shown_pose.estimate.camera_from_model, target.model)
-        layers.append(Layer(name=shown_pose.input.name, shape=cloud))
+    tables = report.pose_tables(best.estimate)
+    if len(shown_poses) > 1:
+        head = ["", "status", "x [m]", "y [m]", "z [m]", "certainty", "visible", "pick rank"]
+        rows = [[shown.input.name, *_table_row(shown.estimate)] for shown in shown_poses]
+        tables = {"found in this image": [head, *rows]} | tables
     return Answer(
         is_ok=best.estimate.is_posed,
-        said=report.pose_sentence(best.estimate),
+        sentence=report.pose_sentence(best.estimate),
         facts=report.pose_facts(best.estimate, target.model, target.how, agreeing),
-        tables=({"found in this image": table} if len(shown_poses) > 1 else {})
-        | report.pose_tables(best.estimate),
-        pictures=_write(folder, name, shown_poses, target.model),
-        scene=replace(scene, layers=layers),
+        tables=tables,
+        pictures=pictures,
+        scene=_make_scene(shown_poses, votes, target.model),
         terms=net.terms if target.net is net else "",
         files={path.name: path.read_bytes() for path in sorted(folder.iterdir())},
     )
 
 
-def _boxes(form: Form, pose_input: CloudInput | ViewInput) -> list[ViewInput]:
+def _estimate(
+    form: Form, target: _Target, pose_input: CloudInput | ViewInput
+) -> tuple[list[_ShownPose], CloudDirections | None]:
+    """Estimate what a form asks for, the surest first; give the votes of a single one, if any.
+
+    Boxes are searched, one pose in each; a depth image without a mask is searched as a whole.
+    """
+    boxes = _box_views(form, pose_input)
+    if boxes:
+        estimates = target.net.estimate_many(boxes)
+        shown_poses = [
+            _ShownPose(input=view, estimate=estimate)
+            for view, estimate in zip(boxes, estimates, strict=True)
+        ]
+        return sorted(shown_poses, key=lambda shown: -(shown.estimate.certainty or 0.0)), None
+    if "depth" in form.files and "mask" not in form.files:
+        assert isinstance(pose_input, ViewInput)
+        shown_poses = []
+        for estimate in target.net.find_in(pose_input, [target.model.name]):
+            view = replace(pose_input, name=estimate.name)
+            if estimate.camera_from_model is not None:  # with the pixels that it explains
+                surface = prepare_surface(target.model)
+                mask = explained_mask(pose_input, estimate.camera_from_model, surface)
+                view = replace(view, mask=mask)
+            shown_poses.append(_ShownPose(input=view, estimate=estimate))
+        return shown_poses, None
+    if isinstance(target.net, GeoPoseNet):
+        estimate, votes = target.net.estimate_with_votes(pose_input)
+        return [_ShownPose(input=pose_input, estimate=estimate)], votes
+    (estimate,) = target.net.estimate_many([pose_input])
+    if estimate.status == "unreadable":
+        raise InputError(estimate.reason)
+    return [_ShownPose(input=pose_input, estimate=estimate)], None
+
+
+def _make_scene(
+    shown_poses: Sequence[_ShownPose], votes: CloudDirections | None, model: ObjectModel
+) -> Scene:
+    """Make the 3D view: the best pose with its votes, and a layer for each of the others."""
+    best = shown_poses[0]
+    points_m = object_points(best.input, model.diameter_m)
+    scene = report.pose_scene(best.input, points_m, best.estimate, model)
+    layers = list(scene.layers)
+    keypoints_m = best.estimate.keypoints_m
+    if keypoints_m is not None and votes is not None:
+        layers.append(report.vote_layer(votes.cloud.points_m, votes.directions, keypoints_m))
+    for shown in shown_poses[1:]:
+        points_m = object_points(shown.input, model.diameter_m)
+        cloud = report.posed_cloud(points_m, shown.estimate.camera_from_model, model)
+        layers.append(Layer(name=shown.input.name, shape=cloud))
+    return replace(scene, layers=layers)
+
+
+def _box_views(form: Form, pose_input: CloudInput | ViewInput) -> list[ViewInput]:
     """Give a view for each box in the form: NAME, or of several NAME_1, NAME_2, ..."""
     words = form.fields.get("box", "").split()
     if words and ("mask" in form.files or not isinstance(pose_input, ViewInput)):
@@ -145,7 +163,7 @@ def _boxes(form: Form, pose_input: CloudInput | ViewInput) -> list[ViewInput]:
     return views
 
 
-def _row(estimate: PoseEstimate) -> list[str]:
+def _table_row(estimate: PoseEstimate) -> list[str]:
     """Give the row of an estimate in the table of an image; empty is what it does not have."""
     pose = estimate.camera_from_model
     place = [""] * 3 if pose is None else [f"{v:.4f}" for v in pose.t_m.tolist()]
@@ -155,7 +173,9 @@ def _row(estimate: PoseEstimate) -> list[str]:
     return [estimate.status, *place, *numbers, rank]
 
 
-def _write(folder: Path, name: str, shown_poses: list[_Seen], model: ObjectModel) -> list[Shown]:
+def _write_results(
+    folder: Path, name: str, shown_poses: list[_ShownPose], model: ObjectModel
+) -> list[Shown]:
     """Write ``poses.json``, each cloud with the posed model, and the picture that is shown."""
     write_predictions(
         folder, [Prediction(estimate=shown_pose.estimate) for shown_pose in shown_poses]
@@ -184,7 +204,7 @@ def _write(folder: Path, name: str, shown_poses: list[_Seen], model: ObjectModel
     return [Shown(file=f"{name}.{PICTURE}", caption=caption)]
 
 
-def _target(form: Form, net: GeoPoseNet) -> _Target:
+def _find_target(form: Form, net: GeoPoseNet) -> _Target:
     """Find the object among those of the weights, or in a CAD file."""
     name = form.fields.get("object", "")
     models = net.weights.models
@@ -216,7 +236,7 @@ def _target(form: Form, net: GeoPoseNet) -> _Target:
     return _Target(model=model, net=Registration([model], net.config), how=how)
 
 
-def _input(form: Form, model: ObjectModel) -> CloudInput | ViewInput:
+def _read_input(form: Form, model: ObjectModel) -> CloudInput | ViewInput:
     """Read the cloud, or the depth image with its mask and camera, of a form."""
     if "cloud" in form.files:
         if "depth" in form.files or "mask" in form.files:

@@ -248,7 +248,7 @@ def _foreign_facts(content: object) -> CameraFacts | None:
     # Matrices of OpenCV are objects with ``data``.
     is_storage = any(isinstance(value, dict) and "data" in value for value in content.values())
     if is_storage or is_ros(names) or {"ppx", "cameramatrix"} & names.keys():
-        facts = _with_own_keys(facts_from_names(names), names)
+        facts = _with_json_keys(facts_from_names(names), names)
     if facts is not None or "K" in content:
         return facts
     inner = content.get("intrinsic", content)
@@ -438,14 +438,14 @@ def _read_facts(path: AnyPath) -> CameraFacts:
                 raise InputError(f"{what}. {_WRITE}")
         facts = _bare_facts(text)
         if facts is None and (names := read_storage(path, text)) is not None:
-            facts = _with_own_keys(facts_from_names(names), names)
+            facts = _with_json_keys(facts_from_names(names), names)
     if facts is None:
         shown = " ".join(text[:200].split())[:40]
         raise InputError(f"no camera that is known; it begins with {shown!r}. Known: {KNOWN_FILES}")
     return facts
 
 
-def _with_own_keys(facts: CameraFacts | None, names: Names) -> CameraFacts | None:
+def _with_json_keys(facts: CameraFacts | None, names: Names) -> CameraFacts | None:
     """Add the keys of our JSON that stand in a file of ROS or OpenCV, which has no such values."""
     if facts is None:
         return None

@@ -128,7 +128,7 @@ def check_rectified(
 
         # Where few corners match: is one image changed, or of another scene?
         corners = _find_corners(left_grey)
-        places, matched, alike_count = _match(left_grey, right_grey, corners)
+        places, matched, alike_count = _match_corners(left_grey, right_grey, corners)
         if len(places) < _MIN_MATCHES:
             unlike = RectificationReport(corners=len(corners), matches=len(places), message="")
             change = _find_change(left_grey, right_grey, corners)
@@ -166,22 +166,22 @@ def _find_corners(grey: Grey) -> Places:
     return torch.stack([places % grey.shape[1], places // grey.shape[1]], -1)
 
 
-def _match(source: Grey, target: Grey, corners: Places) -> tuple[Places, Places, int]:
+def _match_corners(source: Grey, target: Grey, corners: Places) -> tuple[Places, Places, int]:
     """Give corners with a mutual match, where they match, and how many have any good match."""
-    matched, is_alike, is_sole = _search(source, target, corners)
+    matched, is_alike, is_sole = _search_patches(source, target, corners)
     alike_count = int(is_alike.sum())
     corners = corners[is_alike & is_sole]
     matched = matched[is_alike & is_sole]
-    back, is_alike, is_sole = _search(target, source, matched)
+    back, is_alike, is_sole = _search_patches(target, source, matched)
     is_mutual = ((back - corners).abs() <= _RETURN_PX).all(-1) & is_alike & is_sole
     return corners[is_mutual], matched[is_mutual], alike_count
 
 
-def _search(source: Grey, target: Grey, corners: Places) -> tuple[Places, Flags, Flags]:
+def _search_patches(source: Grey, target: Grey, corners: Places) -> tuple[Places, Flags, Flags]:
     """Find the best match of each corner's patch, whether it is good, and whether it is unique."""
     if len(corners) == 0:
         return corners, corners[:, 0].bool(), corners[:, 0].bool()
-    patches = _unit(_windows(source, corners - _RADIUS, 2 * _RADIUS + 1))
+    patches = _normalised(_windows(source, corners - _RADIUS, 2 * _RADIUS + 1))
     side = 2 * _RADIUS + 1
     mean, mean_square = functional.avg_pool2d(torch.stack([target, target.square()]), side, 1)
     deviation = (mean_square - mean.square()).clamp_min(0).sqrt()
@@ -206,7 +206,7 @@ def _windows(image: Grey, first: Places, side: int) -> Float[Tensor, "n side sid
     return image[first[:, 1, None, None] + steps[:, None], first[:, 0, None, None] + steps]
 
 
-def _unit(patches: Tensor) -> Tensor:
+def _normalised(patches: Tensor) -> Tensor:
     centred = patches - patches.mean((-2, -1), keepdim=True)
     return centred / centred.norm(dim=(-2, -1), keepdim=True).clamp_min(1e-6)
 
@@ -220,10 +220,10 @@ def _place_finely(
     places, matched = (((p + 0.5) * larger - 0.5).round().long() for p in (places, matched))
     rim = _FINE_RADIUS + _REACH
     padded = functional.pad(left_grey, (rim,) * 4), functional.pad(right_grey, (rim,) * 4)
-    patches = _unit(_windows(padded[0], places + _REACH, 2 * _FINE_RADIUS + 1))
+    patches = _normalised(_windows(padded[0], places + _REACH, 2 * _FINE_RADIUS + 1))
     windows = _windows(padded[1], matched, 2 * rim + 1)
     steps = windows.unfold(1, 2 * _FINE_RADIUS + 1, 1).unfold(2, 2 * _FINE_RADIUS + 1, 1)
-    scores = (_unit(steps) * patches[:, None, None]).sum((-2, -1))
+    scores = (_normalised(steps) * patches[:, None, None]).sum((-2, -1))
     best, index = scores.flatten(1).max(1)
     row = index // scores.shape[2]
     column = index % scores.shape[2]
@@ -255,7 +255,7 @@ def _find_change(left: Grey, right: Grey, corners: Places) -> str | None:
         "mirrored top to bottom": right.flip(0),
     }
     for change, back in flips.items():
-        if len(_match(left, back, some_corners)[0]) >= _MIN_SOME:
+        if len(_match_corners(left, back, some_corners)[0]) >= _MIN_SOME:
             return f"the right image is {change} beside the left one; turn it back"
     height, width = right.shape
     for turn_deg, scale in _CHANGES:
@@ -265,7 +265,7 @@ def _find_change(left: Grey, right: Grey, corners: Places) -> str | None:
         affine = torch.tensor([[[c, s * height / width, 0], [-s * width / height, c, 0]]])
         grid = functional.affine_grid(affine, [1, 1, height, width], align_corners=False)
         back = functional.grid_sample(right[None, None], grid, align_corners=False)[0, 0]
-        places, matched, _ = _match(left, back, some_corners)
+        places, matched, _ = _match_corners(left, back, some_corners)
         if len(places) >= _MIN_SOME:
             rest_deg, rest_scale, _ = _fit_rows(places, (matched - places)[:, 1])
             turn_deg += rest_deg  # noqa: PLW2901

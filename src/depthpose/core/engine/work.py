@@ -240,14 +240,14 @@ class Inputs:
         """
         block = Block("", tuple(self.items[:1]), None if self.items else self.tars[0])
         with tempfile.TemporaryDirectory(prefix="depthpose-") as scratch:
-            sample = next(_samples(block, self.files, Path(scratch)))
+            sample = next(_read_samples(block, self.files, Path(scratch)))
             if sample.reason:
                 raise InputError(sample.reason)
             yield sample.files
 
 
-def _samples(block: Block, wanted: Files, scratch: Path) -> Iterator[Sample]:
-    """Make the files of inputs local; in a tar shard, neighbours with one key are an input."""
+def _read_samples(block: Block, wanted: Files, scratch: Path) -> Iterator[Sample]:
+    """Make the files of a block's inputs local: of listed inputs, or of those in a tar shard."""
     for item in block.items:
         try:
             sample = Sample(item.name, tuple(stores.local_copy(url, scratch) for url in item.files))
@@ -256,42 +256,53 @@ def _samples(block: Block, wanted: Files, scratch: Path) -> Iterator[Sample]:
         yield sample
     if block.tar is None:
         return
-    is_single = len(wanted.roles) == 1
     is_empty = True
     try:
-        named = ((PurePosixPath(name), data) for name, data in read_tar(block.tar))
-        for place, members in groupby(
-            named, lambda member: member[0].parent / member[0].name.partition(".")[0]
-        ):
-            key = str(place)
-            files: dict[str, Path] = {}
+        for sample in _read_tar_samples(block.tar, wanted, scratch):
             is_empty = False
-            for member, data in members:
-                ending = member.name.partition(".")[2]
-                role, _, suffix = ending.rpartition(".")
-                role = role or (wanted.roles[0] if is_single else "")
-                if role in wanted.roles and f".{suffix}".lower() in wanted.suffixes:
-                    files[role] = Path(tempfile.mkdtemp(dir=scratch)) / f"{role}.{suffix}"
-                    files[role].write_bytes(data)
-            missing = [role for role in wanted.roles if role not in files]
-            reason = ""
-            if missing:
-                reason = f"{block.tar}: {key!r} has no {missing[0]}; a sample holds "
-                reason += ", ".join(wanted.roles)
-            try:
-                _refuse_name(key, block.tar)
-            except InputError as error:
-                reason = str(error)
-            for file in files.values() if reason else ():
-                shutil.rmtree(file.parent, ignore_errors=True)
-            paths = () if reason else tuple(files[role] for role in wanted.roles)
-            yield Sample(key, paths, reason)
+            yield sample
     except InputError as error:
         yield Sample(PurePosixPath(block.tar).name, reason=str(error))
     else:
         if is_empty:
             reason = f"{block.tar}: holds no file; pack inputs into it, or leave it out"
             yield Sample(PurePosixPath(block.tar).name, reason=reason)
+
+
+def _read_tar_samples(tar: str, wanted: Files, scratch: Path) -> Iterator[Sample]:
+    """Unpack the inputs of a tar shard; neighbours with one key are an input."""
+    is_single = len(wanted.roles) == 1
+    members = ((PurePosixPath(name), data) for name, data in read_tar(tar))
+    for place, members_of_key in groupby(
+        members, lambda member: member[0].parent / member[0].name.partition(".")[0]
+    ):
+        # Files that have no part in the work, such as a caption, stay in the shard.
+        key = str(place)
+        files: dict[str, Path] = {}
+        for member, data in members_of_key:
+            ending = member.name.partition(".")[2]
+            role, _, suffix = ending.rpartition(".")
+            role = role or (wanted.roles[0] if is_single else "")
+            if role in wanted.roles and f".{suffix}".lower() in wanted.suffixes:
+                files[role] = Path(tempfile.mkdtemp(dir=scratch)) / f"{role}.{suffix}"
+                files[role].write_bytes(data)
+
+        # An input that lacks a file, or has a name of no result, keeps none.
+        missing = [role for role in wanted.roles if role not in files]
+        reason = ""
+        if missing:
+            reason = f"{tar}: {key!r} has no {missing[0]}; a sample holds "
+            reason += ", ".join(wanted.roles)
+        try:
+            _refuse_name(key, tar)
+        except InputError as error:
+            reason = str(error)
+        if not reason:
+            yield Sample(key, tuple(files[role] for role in wanted.roles))
+            continue
+        for file in files.values():
+            shutil.rmtree(file.parent, ignore_errors=True)
+        yield Sample(key, reason=reason)
 
 
 Function = Callable[[Sequence[Sample], Path], Sequence[str]]
@@ -310,7 +321,7 @@ class Work:
 
 @dataclass(frozen=True, kw_only=True)
 class ShardRecord:
-    """What became of a block."""
+    """What became of a block: the shard of its results, and why some inputs have none."""
 
     shard: str  #: name of the shard, with its suffix
     entries: tuple[tuple[str, str], ...]  #: name and "" or the reason of its failure, of each input
@@ -371,9 +382,9 @@ class Runner:
         """
         record = stores.join(self.out, SHARDS, f"{block.shard}.json")
         if stores.exists(record):
-            done = ShardRecord.from_json(stores.read_from(record))
-            if not done.failures:
-                return done
+            earlier = ShardRecord.from_json(stores.read_from(record))
+            if not earlier.failures:
+                return earlier
         temporary = tempfile.TemporaryDirectory(prefix="depthpose-")
         with refused_write(temporary.name), temporary as scratch:
             file = Path(scratch) / f"{block.shard}.tar"
@@ -394,27 +405,32 @@ class Runner:
     def _write(self, block: Block, file: Path, scratch: Path) -> Iterator[tuple[str, str]]:
         """Write the results of a block, and give each name with "" or the reason of a failure."""
         self.function = self.function or self.work.start()
-        samples = _samples(block, self.work.files, scratch)
+        samples = _read_samples(block, self.work.files, scratch)
         results = scratch / "results"
         results.mkdir()
         with tarfile.open(file, "w", format=tarfile.PAX_FORMAT) as tar:
-            while chunk := list(islice(samples, self.work.batch)):
-                reasons = iter(self.function([item for item in chunk if not item.reason], results))
-                for item in chunk:
-                    reason = item.reason or next(reasons)
-                    for path in item.files:
-                        if scratch in path.parents:  # of a copy the name alone says something
-                            reason = reason.replace(str(path), path.name)
-                    for ending in sorted(self.work.endings):
-                        path = results / f"{item.name}.{ending}"
-                        if path.is_file():
-                            if not reason:
-                                data = path.read_bytes()
-                                member = tarfile.TarInfo(f"{item.name}.{ending}")
-                                member.size = len(data)  # neither time nor owner: equal bytes
-                                tar.addfile(member, io.BytesIO(data))
-                            path.unlink()
-                    yield item.name, reason
-                    for path in item.files:
-                        if scratch in path.parents:  # a copy, alone in its folder
-                            shutil.rmtree(path.parent, ignore_errors=True)
+            while batch := list(islice(samples, self.work.batch)):
+                readable = [sample for sample in batch if not sample.reason]
+                reasons = iter(self.function(readable, results))
+                for sample in batch:
+                    copies = [path for path in sample.files if scratch in path.parents]
+                    reason = sample.reason or next(reasons)
+                    for path in copies:  # of a copy the name alone says something
+                        reason = reason.replace(str(path), path.name)
+                    self._pack(tar, results, sample.name, is_kept=not reason)
+                    yield sample.name, reason
+                    for path in copies:  # each is alone in its folder
+                        shutil.rmtree(path.parent, ignore_errors=True)
+
+    def _pack(self, tar: tarfile.TarFile, results: Path, name: str, *, is_kept: bool) -> None:
+        """Move the files of a result into the tar; delete those of a failed one."""
+        for ending in sorted(self.work.endings):
+            path = results / f"{name}.{ending}"
+            if not path.is_file():
+                continue
+            if is_kept:
+                data = path.read_bytes()
+                member = tarfile.TarInfo(f"{name}.{ending}")
+                member.size = len(data)  # neither time nor owner: equal bytes
+                tar.addfile(member, io.BytesIO(data))
+            path.unlink()

@@ -58,10 +58,10 @@ class StereoTask:
         # What is learnt; an encoder at a share of the learning rate.
         groups = [{"params": [p for p in matcher.parameters() if p.requires_grad]}]
         if self._trained_alone is None and matcher.encoder is not None:
-            of_encoder = set(matcher.encoder.parameters())
-            rest = [p for p in matcher.parameters() if p not in of_encoder]
-            learnt = [p for p in matcher.encoder.parameters() if p.requires_grad]
-            groups = [{"params": learnt, "rate": config.encoder_rate}, {"params": rest}]
+            encoder_parameters = set(matcher.encoder.parameters())
+            rest = [p for p in matcher.parameters() if p not in encoder_parameters]
+            trained = [p for p in matcher.encoder.parameters() if p.requires_grad]
+            groups = [{"params": trained, "rate": config.encoder_rate}, {"params": rest}]
         self.optimizers = {"matcher": (make_adam(groups, config.adam), config.adam)}
 
     def _train(self) -> None:
@@ -148,8 +148,8 @@ def validate_pairs(
         errors.append(metrics["epe_px"])
         bad_shares.append(metrics["d1_all"])
     by_name = {"epe_px": errors, "d1": bad_shares}
-    of_sky = {"sky_missed": missed_shares, "sky_false": false_shares}
-    by_name |= {name: shares for name, shares in of_sky.items() if shares}
+    sky_shares = {"sky_missed": missed_shares, "sky_false": false_shares}
+    by_name |= {name: shares for name, shares in sky_shares.items() if shares}
     numbers = {
         f"held_out/{name}": sum(values) / max(len(values), 1) for name, values in by_name.items()
     }
@@ -249,13 +249,13 @@ class FinetuneTask:
     def step(self, batch: TrainingPair) -> Iterator[Update]:
         """One update: draw, match, compare with the truth."""
         drawn = synthesis.draw_right(self.generator, batch.left)
-        (found_px,) = self.matcher(normalise(batch.left), normalise(drawn))
+        (predicted_px,) = self.matcher(normalise(batch.left), normalise(drawn))
         max_disparity_px = self.matcher.config.max_disparity_px
-        found_px = found_px.float()
-        loss = losses.disparity_loss(found_px, batch.left_px, max_disparity_px)
+        predicted_px = predicted_px.float()
+        loss = losses.disparity_loss(predicted_px, batch.left_px, max_disparity_px)
         l1 = (2 * drawn - 2 * batch.right).abs().mean()
         is_valid = (batch.left_px > 0) & (batch.left_px < max_disparity_px)
-        error_px = (found_px.detach() - batch.left_px.nan_to_num(0.0)).abs()
+        error_px = (predicted_px.detach() - batch.left_px.nan_to_num(0.0)).abs()
         epe = error_px.where(is_valid, 0.0).sum() / is_valid.sum().clamp(min=1)
         facts = {"epe": epe, "l1": l1.detach()}
         yield Update("generator", loss + self.config.l1_weight * l1, facts)
@@ -343,11 +343,11 @@ class SelectTask:
             generator.encoder.freeze_early()
         self.modules: dict[str, nn.Module] = {"generator": generator}
         self._train()
-        # What is learnt, the encoder apart, at a share of the learning rate.
-        of_encoder = set(generator.encoder.parameters())
-        rest = [p for p in generator.parameters() if p not in of_encoder]
-        learnt = [p for p in generator.encoder.parameters() if p.requires_grad]
-        groups = [{"params": learnt, "rate": config.encoder_rate}, {"params": rest}]
+        # What is trained, the encoder apart, at a share of the learning rate.
+        encoder_parameters = set(generator.encoder.parameters())
+        rest = [p for p in generator.parameters() if p not in encoder_parameters]
+        trained = [p for p in generator.encoder.parameters() if p.requires_grad]
+        groups = [{"params": trained, "rate": config.encoder_rate}, {"params": rest}]
         self.optimizers = {"generator": (make_adam(groups, config.adam), config.adam)}
 
     def _train(self) -> None:
@@ -363,10 +363,10 @@ class SelectTask:
         """One update: predict disparity, warp the right view, compare."""
         planes = self.generator.planes
         left, right = self.generator(batch.observed)
-        of_left = self._truth_loss(left, batch.left_px)
-        of_right = self._truth_loss(right, batch.right_px)
-        loss = of_left + self.config.right_share * of_right
-        facts = {"left": of_left.detach(), "right": of_right.detach()}
+        left_loss = self._truth_loss(left, batch.left_px)
+        right_loss = self._truth_loss(right, batch.right_px)
+        loss = left_loss + self.config.right_share * right_loss
+        facts = {"left": left_loss.detach(), "right": right_loss.detach()}
         if self.config.view_weight:
             small = [F.avg_pool2d(view, 2) for view in (batch.left, batch.right)]
             drawn = synthesis.mix_shifts(small[0], right.float(), planes / 2)
@@ -413,17 +413,19 @@ class SelectTask:
             assert drawn.disparity_px is not None
             assert drawn.is_sky is not None
             is_sky = drawn.is_sky[0]
-            found_px = drawn.disparity_px[0].where(~is_sky, 0.0).clamp(min=far_px)
+            predicted_px = drawn.disparity_px[0].where(~is_sky, 0.0).clamp(min=far_px)
             if index == 0:
-                views = [pair.left, pair.right, drawn.right[0], draw_disparity(found_px)]
+                views = [pair.left, pair.right, drawn.right[0], draw_disparity(predicted_px)]
                 pictures["left_right_drawn_disparity"] = torch.cat(views, 1)
             is_known = pair.left_px >= far_px
             is_true_sky = pair.left_px == 0
             if bool(is_known.any()):
                 metrics = {"abs_rel": math.nan, "d1": math.nan}  # of a network that diverged
-                if bool(found_px.isfinite().all()):
+                if bool(predicted_px.isfinite().all()):
                     # Of depth without its unit, which these do not depend on.
-                    metrics = measure("depth", 1 / found_px[is_known], 1 / pair.left_px[is_known])
+                    metrics = measure(
+                        "depth", 1 / predicted_px[is_known], 1 / pair.left_px[is_known]
+                    )
                 errors.append(metrics["abs_rel"])
                 within.append(metrics["d1"])
             if bool(is_true_sky.any()):

@@ -58,18 +58,18 @@ def cached(model: ObjectModel, compute: Callable[..., Any], name: str, *settings
 
 
 _EYE = torch.eye(3, dtype=torch.float64)
-_ORDERS = (2, 3, 4, 5, 6)
-_TRIED_ORDERS = range(2, 13)
+_COARSE_ORDERS = (2, 3, 4, 5, 6)
+_ORDERS = range(2, 13)
 _TEETH = range(13, 61)  #: orders of which one step is tried: gears and knurls
-_TURNS = 36
+_CIRCLE_TURNS = 36
 _NEAREST_SAMPLES = 4
-_COARSE = 0.04
+_MAX_ROUGH_DEVIATION = 0.04
 """Deviation, in diameters, from which following the surface may still find a symmetry: an axis
 that is off by 4 degrees moves the surface by about as much."""
 _SAME_RAD = 0.15
 _SUPPRESSION_RAD = 0.25
 SURE = 0.5  #: certainty from which a proposal is taken: that of a copy that is off by the tolerance
-_FOLLOWED = 15  # steps of ICP
+_FOLLOW_STEPS = 15  # steps of ICP
 _MOST_AXES = 40  # a cube has 13 axes, an icosahedron 31
 
 
@@ -175,12 +175,12 @@ def propose_symmetries(model: ObjectModel, tolerance: float = 0.02) -> list[Symm
     for coarse in promising_turns(surface):
         if len(revolution_axes) >= 2 or len(tried_axes) >= _MOST_AXES:
             break
-        if _is_known(_axis_of(coarse), tried_axes, revolution_axes):
+        if _is_covered(_axis_of(coarse), tried_axes, revolution_axes):
             continue
         axis = _axis_of(_follow_surface(surface, coarse))
-        if not _is_known(axis, tried_axes, revolution_axes):
+        if not _is_covered(axis, tried_axes, revolution_axes):
             tried_axes.append(axis)
-            measured = _measure(surface, axis, limit, tolerance)
+            measured = _measure_axis(surface, axis, limit, tolerance)
             revolution_axes += [axis for p in measured if p.kind == "continuous"]
             proposals += measured
     return sorted(proposals, key=lambda p: (p.kind != "continuous", -p.certainty))
@@ -194,7 +194,7 @@ def _axis_of(R: Tensor) -> Tensor:
 def _follow_surface(surface: SurfaceDeviation, R: Tensor) -> Tensor:
     """Refine a rotation that nearly maps a surface onto itself, by ICP about the fixed centre."""
     weight = torch.ones(2 * len(surface.many), dtype=torch.float64)
-    for _ in range(_FOLLOWED):
+    for _ in range(_FOLLOW_STEPS):
         _, index = surface.nearest(surface.many @ R.mT)
         target = surface.points[torch.from_numpy(index)]
         # With each point its mirror image through the centre, the fit cannot shift.
@@ -293,35 +293,39 @@ def _turns(direction: Float[Tensor, "3"], angles: Float[Tensor, " a"]) -> Float[
 def promising_turns(surface: SurfaceDeviation) -> list[Float[Tensor, "3 3"]]:
     """Try turns about principal axes and many directions; those that fit, the best first."""
     candidates = torch.cat([surface.axes, fibonacci_directions(400)])
-    angles = torch.tensor([2 * math.pi / order for order in _ORDERS], dtype=torch.float64)
+    angles = torch.tensor([2 * math.pi / order for order in _COARSE_ORDERS], dtype=torch.float64)
     turns = torch.stack([_turns(direction, angles) for direction in candidates]).flatten(0, 1)
     coarse = surface.rough_distance(turns)
-    return [turns[i] for i in coarse.argsort().tolist() if coarse[i] <= _COARSE]
+    return [turns[i] for i in coarse.argsort().tolist() if coarse[i] <= _MAX_ROUGH_DEVIATION]
 
 
-def _is_known(direction: Tensor, tried_axes: list[Tensor], revolution_axes: list[Tensor]) -> bool:
-    """Whether an axis was tried, or follows: all lines across an axis of revolution are alike."""
-    near = math.cos(_SAME_RAD)
-    across = [a for a in revolution_axes if abs(float(a @ direction)) < math.sin(_SAME_RAD)]
-    is_across = any(abs(float(a @ t)) < math.sin(_SAME_RAD) for a in across for t in tried_axes)
-    return is_across or any(abs(float(direction @ t)) > near for t in tried_axes)
+def _is_covered(direction: Tensor, tried_axes: list[Tensor], revolution_axes: list[Tensor]) -> bool:
+    """Whether an axis was tried, or is like one that was.
+
+    All lines at right angles to an axis of revolution look alike, so one of them is enough.
+    """
+    is_tried = any(abs(float(direction @ t)) > math.cos(_SAME_RAD) for t in tried_axes)
+    most = math.sin(_SAME_RAD)  # cosine of what counts as a right angle
+    perpendicular = [a for a in revolution_axes if abs(float(a @ direction)) < most]
+    is_alike = any(abs(float(a @ t)) < most for a in perpendicular for t in tried_axes)
+    return is_tried or is_alike
 
 
-def _measure(
+def _measure_axis(
     surface: SurfaceDeviation, direction: Tensor, limit: float, tolerance: float
 ) -> list[SymmetryProposal]:
     """Measure the full circle about an axis and, unless that is sure, turns of order 2 to 12."""
-    circle = _turns(direction, torch.arange(1, _TURNS) * (2 * math.pi / _TURNS))
+    circle = _turns(direction, torch.arange(1, _CIRCLE_TURNS) * (2 * math.pi / _CIRCLE_TURNS))
     full: list[tuple[None, float]] = []  # angle and deviation, of every rotation about the axis
     turns: list[tuple[float, float]] = []  # and of single ones
     worst = math.inf
-    if bool((surface.rough_distance(circle) <= _COARSE).all()):
+    if bool((surface.rough_distance(circle) <= _MAX_ROUGH_DEVIATION).all()):
         worst = float(surface.deviation(circle).max())
         full = [(None, worst)] if worst <= limit else []
     # Every turn of order 2 to 12, each once.
-    shares = sorted({k / order for order in _TRIED_ORDERS for k in range(1, order)})
+    shares = sorted({k / order for order in _ORDERS for k in range(1, order)})
     angles = torch.tensor(shares, dtype=torch.float64) * (2 * math.pi)
-    angles = angles[surface.rough_distance(_turns(direction, angles)) <= _COARSE]
+    angles = angles[surface.rough_distance(_turns(direction, angles)) <= _MAX_ROUGH_DEVIATION]
     if worst > tolerance and len(angles):
         deviation = surface.deviation(_turns(direction, angles))
         for i in deviation.argsort().tolist():
@@ -356,7 +360,7 @@ def _measure_teeth(
     for order in _TEETH:
         step = 2 * math.pi / order
         angles = torch.tensor([step, 0.5 * step, 1.5 * step], dtype=torch.float64)
-        if float(surface.rough_distance(_turns(direction, angles[:1]))) > _COARSE:
+        if float(surface.rough_distance(_turns(direction, angles[:1]))) > _MAX_ROUGH_DEVIATION:
             continue
         tooth, *between = surface.deviation(_turns(direction, angles)).tolist()
         if tooth <= tolerance and min(between) > 2 * tooth + ALIKE:
@@ -369,9 +373,9 @@ MIRROR_ALIKE = 0.03
 of an object may differ."""
 _MIRROR_PLANES = 400
 _MIRROR_STARTS = 8
-_APART_RAD = math.radians(25)
-_STEPS = 20
-_NEAREST = 0.9  # points that count in each step of ICP
+_MIN_START_DISTANCE_RAD = math.radians(25)
+_ICP_STEPS = 20
+_ICP_SHARE = 0.9  # points that count in each step of ICP
 _FLIP = torch.diag(torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64))
 
 
@@ -385,10 +389,10 @@ def mirror_deviation(model: ObjectModel) -> float:
     Args:
         model: the object, a mesh or points with normals.
     """
-    return float(cached(model, _mirror_search, "mirror_deviation"))
+    return float(cached(model, _search_mirror, "mirror_deviation"))
 
 
-def _mirror_search(model: ObjectModel) -> float:
+def _search_mirror(model: ObjectModel) -> float:
     """Give the least deviation of a surface from its mirror images, in diameters."""
     surface = SurfaceDeviation(model)
     # Reflections, or reflections with a quarter turn or a half, that fit roughly: by 0, 90, 180
@@ -403,7 +407,9 @@ def _mirror_search(model: ObjectModel) -> float:
     for k in surface.rough_distance(reflections).argsort().tolist():
         if len(starts) == _MIRROR_STARTS:
             break
-        if all(float(geodesic_rad(reflections[k], start)) > _APART_RAD for start in starts):
+        if all(
+            float(geodesic_rad(reflections[k], start)) > _MIN_START_DISTANCE_RAD for start in starts
+        ):
             starts.append(reflections[k])
 
     # From each to where the mirror image fits best.
@@ -430,10 +436,10 @@ def refine_turn(
     linear = R if flip is None else R @ flip
     middle = (surface.points.amin(0) + surface.points.amax(0)) / 2
     turn = Rigid(R, middle - linear @ middle)
-    for _ in range(_STEPS):
+    for _ in range(_ICP_STEPS):
         moved = turn.apply(points)
         distance, index = surface.nearest(moved)
-        near = torch.from_numpy(distance <= np.quantile(distance, _NEAREST)).double()
+        near = torch.from_numpy(distance <= np.quantile(distance, _ICP_SHARE)).double()
         turn = fit_rigid(points, surface.points[torch.from_numpy(index)], near)
     return turn
 
@@ -443,13 +449,13 @@ ALIKE = 0.004
 cylinder of 25 facets deviates. A copy that deviates by more, as a scan's dents or a keyway do, is
 another pose, though a view may not tell which."""
 ALMOST_ALL = 0.998  #: share of the surface that must be so near: a key or a notch is a few percent
-_TOLERANCE = 0.05
+_NEAR_TOLERANCE = 0.05
 """Deviation in diameters at which a sensor's noise begins to mask the difference of two poses: real
 points of LineMOD and YCB lie 1.4 to 2.6 % of the diameter off the posed surface. Twice as much is
 tried."""
 _NEAR_SUPPRESSION_RAD = math.radians(35)  # turns nearer to each other are one to ICP
-_STEP = math.pi / 8  # an axis that nearly is one of revolution counts as eight turns
-_FINE_STEP = math.pi / 36
+_AXIS_STEP_RAD = math.pi / 8  # an axis that nearly is one of revolution counts as eight turns
+_FINE_AXIS_STEP_RAD = math.pi / 36
 _MOST_NEAR = 24
 _NEAR_STARTS = 24  # turns that ICP refines
 
@@ -470,7 +476,7 @@ def near_symmetries(model: ObjectModel) -> tuple[NearSymmetry, ...]:
     Not among them are those of :func:`true_symmetries`, which are no other pose. They are searched
     once for each shape, which takes a second or a few, and kept in ``$DEPTHPOSE_CACHE``.
     """
-    near = cached(model, _search, "near_symmetries")["near"]
+    near = cached(model, _search_near_symmetries, "near_symmetries")["near"]
     turns = [(torch.tensor(matrix, dtype=torch.float64), deviation) for matrix, deviation in near]
     return tuple(
         NearSymmetry(model_from_model=Rigid(M[:3, :3], M[:3, 3]), deviation=deviation)
@@ -491,7 +497,11 @@ def true_symmetries(
     declared = model.symmetries
     if not declared.is_found:
         return declared
-    turns, axes = cached(model, _search, "near_symmetries")["alike"] if alike is None else alike
+    turns, axes = (
+        cached(model, _search_near_symmetries, "near_symmetries")["alike"]
+        if alike is None
+        else alike
+    )
     discrete = declared.discrete
     if discrete is not None:
         discrete = discrete[torch.tensor(turns)] if any(turns) else None
@@ -499,7 +509,7 @@ def true_symmetries(
     return Symmetries(discrete=discrete, continuous=continuous, is_found=True)
 
 
-def _search(model: ObjectModel) -> dict[str, Any]:
+def _search_near_symmetries(model: ObjectModel) -> dict[str, Any]:
     """Search near-symmetries of a model, and which of its declared symmetries the surface has.
 
     Gives JSON values, which are cached: ``near``, transforms with their deviations, the best first;
@@ -516,10 +526,10 @@ def _search(model: ObjectModel) -> dict[str, Any]:
         R = declared.discrete.R.double()
         discrete = (surface.deviation(R, share=ALMOST_ALL) <= ALIKE).tolist()
     alike = (discrete, axes)
-    same = symmetry_transforms(true_symmetries(model, alike), _FINE_STEP).R
+    same = symmetry_transforms(true_symmetries(model, alike), _FINE_AXIS_STEP_RAD).R
     # Symmetries that were found, and turns refined to where they fit best: a scan whose points lie
     # denser on one side has its centre where no symmetry has it.
-    copies = symmetry_transforms(declared, _STEP).R.double()[1:]
+    copies = symmetry_transforms(declared, _AXIS_STEP_RAD).R.double()[1:]
     tried = [
         Rigid(R, torch.zeros(3).double()) for R in (copies if declared.is_found else copies[:0])
     ]
@@ -533,12 +543,14 @@ def _search(model: ObjectModel) -> dict[str, Any]:
             starts.append(R)
     tried += [refine_turn(surface, R) for R in starts]
     measured = _deviations(tried, surface)
-    good = [turn for off, turn in sorted(measured, key=lambda pair: pair[0]) if off <= _TOLERANCE]
+    good = [
+        turn for off, turn in sorted(measured, key=lambda pair: pair[0]) if off <= _NEAR_TOLERANCE
+    ]
     # Two turns one after the other are one: of a can, upside down and then about its axis.
     measured += _deviations([a @ b for a in good[:_NEAR_STARTS] for b in good[:3]], surface)
     near: list[tuple[Rigid, float]] = []
     for off, turn in sorted(measured, key=lambda pair: pair[0]):
-        if len(near) == _MOST_NEAR or off > 2 * _TOLERANCE:
+        if len(near) == _MOST_NEAR or off > 2 * _NEAR_TOLERANCE:
             break
         # New is what is far from the others and from all copies of them that look alike.
         others = torch.cat([R @ same.double() for R in (_EYE, *(motion.R for motion, _ in near))])
