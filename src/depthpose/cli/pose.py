@@ -44,7 +44,7 @@ def predict(
         out: folder for the results.
     """
     from depthpose.cli.pose_frames import search_dataset, search_files
-    from depthpose.cli.pose_methods import source_of
+    from depthpose.cli.pose_methods import make_method_source
     from depthpose.cli.pose_predict import predict_dataset, predict_files, predict_on_ray
 
     # One kind of input; a pair is matched first, to depth images.
@@ -70,7 +70,7 @@ def predict(
         symmetry=pose_inputs.symmetry,
     )
     weights = estimates.weights
-    source = source_of(
+    source = make_method_source(
         weights, register, pose_inputs.unit, dataset, estimates.config, pose_inputs.base_from_camera
     )
     batch = estimates.batch
@@ -129,7 +129,7 @@ def evaluate(
         adds: ADD-S for declared symmetric objects (of LineMOD eggbox and glue), or for all.
     """
     from depthpose.cli.pose_evaluate import measure, open_instances
-    from depthpose.cli.pose_methods import find_masks, pose_methods, predict_instances
+    from depthpose.cli.pose_methods import build_methods, find_masks, predict_instances
     from depthpose.core.config import config_to_dict
     from depthpose.core.run import claim_folder
     from depthpose.pose.config import EvaluationConfig
@@ -143,7 +143,7 @@ def evaluate(
     # More objects, or all of the targets, may be asked for later.
     about = {"bop": str(bop.resolve()), "split": split, "rule": config_to_dict(rule)}
     claim_folder(out, {"command": "pose evaluate", **about}, files)
-    methods = pose_methods(weights, estimates.config, tuple(dataset.objects.values()))
+    methods = build_methods(weights, estimates.config, tuple(dataset.objects.values()))
     shown = find_masks(estimates.masks, dataset, out, estimates.device) if methods else []
     paths = [
         predict_instances(dataset, method, masks, out) for method in methods for masks in shown
@@ -175,7 +175,7 @@ def track(
         weights: of a pose network, by name or file ('depthpose weights list').
     """
     from depthpose.cli.pose_frames import track_dataset, track_files
-    from depthpose.cli.pose_methods import source_of
+    from depthpose.cli.pose_methods import make_method_source
     from depthpose.core.run import find_rank
 
     if sum(place is not None for place in (frames.depth, frames.cloud, frames.bop)) != 1:
@@ -185,7 +185,9 @@ def track(
     if find_rank().world > 1:
         raise InputError("a sequence is followed by one process; start one")
     config = EstimateConfig(device=frames.device, min_certainty=frames.min_certainty)
-    source = source_of(weights, register, frames.unit, frames, config, frames.base_from_camera)
+    source = make_method_source(
+        weights, register, frames.unit, frames, config, frames.base_from_camera
+    )
     method = source.build()
     if method.track is None:
         raise InputError(f"--weights {weights}: these need masked views; give weights that vote")

@@ -239,7 +239,7 @@ class PoseMethod:
     holder: str = "weights"
 
 
-def pose_methods(
+def build_methods(
     names: Sequence[str], config: EstimateConfig, models: Sequence[ObjectModel] = ()
 ) -> list[PoseMethod]:
     """Build the estimators of weights files of any kinds, given by their paths or by names.
@@ -249,12 +249,16 @@ def pose_methods(
     paths = [None if name == REGISTER else find_weights(name) for name in names]
     labels = _file_names(names, paths)
     return [
-        _network(path, label, config) if path else _register(label, models, config)
+        _network_method(path, label, config)
+        if path
+        else _registration_method(label, models, config)
         for path, label in zip(paths, labels, strict=True)
     ]
 
 
-def _register(name: str, models: Sequence[ObjectModel], config: EstimateConfig) -> PoseMethod:
+def _registration_method(
+    name: str, models: Sequence[ObjectModel], config: EstimateConfig
+) -> PoseMethod:
     """Make the method that registers models without training."""
     if not models:
         raise InputError(
@@ -281,7 +285,7 @@ def _register(name: str, models: Sequence[ObjectModel], config: EstimateConfig) 
     )
 
 
-def _network(path: Path, name: str, config: EstimateConfig) -> PoseMethod:
+def _network_method(path: Path, name: str, config: EstimateConfig) -> PoseMethod:
     """Make the method of a weights file: a network that votes, or the regressor.
 
     Its name in tables says how it departs from the defaults.
@@ -309,7 +313,7 @@ def _network(path: Path, name: str, config: EstimateConfig) -> PoseMethod:
     )
 
 
-def _in_base(method: PoseMethod, base: Rigid) -> PoseMethod:
+def _with_base_pose(method: PoseMethod, base: Rigid) -> PoseMethod:
     """Make a method add ``base_from_model`` to its estimates."""
     find = method.find
     track = method.track
@@ -352,18 +356,22 @@ class PoseMethodSource:
     def build(self, device: str | None = None) -> PoseMethod:
         """Build the estimator, on a device or on that of the config."""
         method = self._build(device)
-        return method if self.base_from_camera is None else _in_base(method, self.base_from_camera)
+        return (
+            method
+            if self.base_from_camera is None
+            else _with_base_pose(method, self.base_from_camera)
+        )
 
     def _build(self, device: str | None) -> PoseMethod:
         """Build the estimator without what is added to its estimates."""
         config = self.config if device is None else replace(self.config, device=device)
         if self.weights is None or self.weights == REGISTER:
-            return _register(REGISTER, self.models, config)
+            return _registration_method(REGISTER, self.models, config)
         if isinstance(self.weights, str):
             path = find_weights(self.weights)
-            return _network(path, path.stem, config)
+            return _network_method(path, path.stem, config)
         with self.weights.unpacked() as name:
-            return _network(Path(name), Path(name).stem, config)
+            return _network_method(Path(name), Path(name).stem, config)
 
 
 def unit_of_cad(files: Sequence[str], cad_unit: Unit | None, unit: Unit | None) -> Unit | None:
@@ -375,7 +383,7 @@ def unit_of_cad(files: Sequence[str], cad_unit: Unit | None, unit: Unit | None) 
     return cad_unit
 
 
-def source_of(
+def make_method_source(
     weights: str,
     register: RegisterOptions,
     unit: Unit | None,
@@ -453,7 +461,7 @@ def read_pose(path: Path, option: str = "--first", what: str = "camera_from_mode
     Brackets and commas in it do no harm.
     """
     if path.name == predictions.POSES:
-        return _only_pose(path, option)
+        return _read_only_pose(path, option)
     try:
         text = path.read_text()
     except (OSError, ValueError) as error:
@@ -464,7 +472,7 @@ def read_pose(path: Path, option: str = "--first", what: str = "camera_from_mode
     return _rigid_of(text, f"{option} {path}", what)
 
 
-def _only_pose(path: Path, option: str) -> Rigid:
+def _read_only_pose(path: Path, option: str) -> Rigid:
     """Read the pose of a ``poses.json`` that holds one."""
     rows = enumerate(read_rows(path))
     read = [predictions.parse_prediction(row, f"{path}: entry {i}") for i, row in rows]

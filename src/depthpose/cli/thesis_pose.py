@@ -115,7 +115,7 @@ def reproduce_by_object(
     is_printed = number == "3.2"
     numbers = {model.name: pose_tables.linemod_number(model) if is_printed else model.number
                for model in models}  # fmt: skip
-    methods = pose_methods.pose_methods(weights, options.config, models)
+    methods = pose_methods.build_methods(weights, options.config, models)
     rule = EvaluationConfig(diameters=options.diameters, with_vsd=options.vsd)
     settings = {
         "table": number,

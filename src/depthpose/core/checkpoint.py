@@ -147,7 +147,7 @@ def fetch_weights(name: str) -> Path:
     hub = import_extra("huggingface_hub", "huggingface_hub", "hub", "weights on the hub")
     errors = import_module("huggingface_hub.errors")
     remedies = {
-        errors.HFValidationError: "no name that the hub allows: {said}",
+        errors.HFValidationError: "no name that the hub allows: {reason}",
         errors.GatedRepoError: "its owner asks for consent; give it on the repository's page, then "
         "'hf auth login'.",
         errors.RepositoryNotFoundError: "there is no such repository, or it is private: check the "
@@ -161,7 +161,7 @@ def fetch_weights(name: str) -> Path:
         # Of the connection, of access, of a full disk. Base classes of the library's errors: of
         # requests, of httpx or its successor.
         (OSError, *(k for k in errors.HfHubHTTPError.__mro__[1:] if k.__module__ != "builtins")): (
-            "the hub refused: {said}; try again, or copy the file here and give its path."
+            "the hub refused: {reason}; try again, or copy the file here and give its path."
         ),
     }
     try:

@@ -29,14 +29,14 @@ _DOUBTS = {
     1 / 5.4: "is it of monodepth2, trained with a baseline of 0.1 m (multiply its depth by 5.4)?",
 }
 """What may have been meant by a scale that a poor estimate could have too."""
-_ABOUT = 1.4
+_MISTAKE_FACTOR = 1.4
 """No estimate is wrong by 250 or 1000 in the median, and a slip is met to within this factor."""
-_said: set[str] = set()
-_NEARLY_ALL = 0.9
-_NEAR = 1.1
-_OPPOSITE = -0.8
-_FAR_OFF = 3.0
+_DOUBT_FACTOR = 1.1  # to within which a scale of ``_DOUBTS`` is met
+_POOR_FACTOR = 3.0
 """A median so far off is told of: an estimate of the right scale has one near 1."""
+_NEARLY_ALL = 0.9
+_OPPOSITE_CORRELATION = -0.8  # of the logarithms of prediction and truth
+_given_doubts: set[str] = set()
 LEAST_PX = 0.01
 """Of a corrected disparity in use: depth stays finite. It is what a pair without a rig has in the
 sky."""
@@ -68,20 +68,24 @@ def disparity_advice(predicted_px: Map, true_px: Map) -> str | None:
     median_px = float(predicted_px.median())
     farther = float(true_px.median()) / median_px if median_px > 0 else 0.0
     for factor, question in _MISTAKES.items():
-        if factor / _ABOUT < farther < factor * _ABOUT:
+        if factor / _MISTAKE_FACTOR < farther < factor * _MISTAKE_FACTOR:
             return f"it lies {farther:.4g} times as far as the truth: {question}"
     doubts: list[str] = []
-    if farther > 0 and not 1 / _FAR_OFF < farther < _FAR_OFF:
-        likely = (q for factor, q in _DOUBTS.items() if factor / _NEAR < farther < factor * _NEAR)
+    if farther > 0 and not 1 / _POOR_FACTOR < farther < _POOR_FACTOR:
+        likely = (
+            q
+            for factor, q in _DOUBTS.items()
+            if factor / _DOUBT_FACTOR < farther < factor * _DOUBT_FACTOR
+        )
         question = next(likely, "is it without a scale, or of another focal length or baseline?")
         doubts.append(f"lies {farther:.3g} times as far as the truth in the median: {question}")
     both = torch.stack([predicted_px, true_px]).double().clamp_min(1e-3).log()
-    if len(true_px) > 1 and float(both.corrcoef()[0, 1]) < _OPPOSITE:
+    if len(true_px) > 1 and float(both.corrcoef()[0, 1]) < _OPPOSITE_CORRELATION:
         doubts.append("is the nearer the farther its truth is: is it inverse depth?")
     for doubt in doubts:
         question = doubt.partition(":")[2]
-        if question not in _said:
-            _said.add(question)  # of a whole data set once
+        if question not in _given_doubts:
+            _given_doubts.add(question)  # of a whole data set once
             warnings.warn(f"a prediction {doubt}", Notice, stacklevel=2)
     return None
 

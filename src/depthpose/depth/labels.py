@@ -90,7 +90,7 @@ def label_pairs(
         try:
             pair = dataset.read_input(number)
             refuse_unrectified(pair)
-            known_px = label_pair(net, pair, config)
+            labelled_px = label_pair(net, pair, config)
         except InputError as error:
             fail(error)
             continue
@@ -98,26 +98,26 @@ def label_pairs(
         files = [folder / place / f"{name}.png" for place in ("left", "right", "disp_occ")]
         write_image(files[0], pair.left)
         write_image(files[1], pair.right)
-        write_depth_png(files[2], known_px)
+        write_depth_png(files[2], labelled_px)
         note_result(folder, name, files)
-        yield name, float(known_px.isfinite().float().mean())
+        yield name, float(labelled_px.isfinite().float().mean())
 
 
 def label_pair(net: FakestereoNet, pair: StereoInput, config: LabelConfig) -> Map:
     """Match a pair both ways [px]; NaN where they disagree, in the sky, or where it is not sure."""
     assert pair.right is not None
     mirrored = replace(pair, left=pair.right.flip(-1), right=pair.left.flip(-1))
-    of_pair, of_mirrored = (
+    estimate, mirrored_estimate = (
         net.estimate_pair(views, with_check=False) for views in (pair, mirrored)
     )
-    left_px = of_pair.disparity_px
-    right_px = of_mirrored.disparity_px.flip(-1)
+    left_px = estimate.disparity_px
+    right_px = mirrored_estimate.disparity_px.flip(-1)
     limit_px = (config.largest_share * left_px).clamp(min=config.largest_difference_px)
     is_known = (left_px - warp_right_to_left(right_px[None], left_px)[0]).abs() <= limit_px
-    if of_pair.confidence is not None:
-        is_known &= of_pair.confidence >= config.least_confidence
-    if of_pair.is_sky is not None:
-        is_known &= ~of_pair.is_sky
+    if estimate.confidence is not None:
+        is_known &= estimate.confidence >= config.least_confidence
+    if estimate.is_sky is not None:
+        is_known &= ~estimate.is_sky
     return torch.where(is_known, left_px, torch.nan)
 
 

@@ -128,13 +128,13 @@ MOST_VIEWS = 6
 _REFUSED = 2  # refusals shown at least, where there are so many
 
 
-def spread_evenly(total: int, number: int) -> list[int]:
+def spread_evenly(total: int, count: int) -> list[int]:
     """Choose ``count`` of 0 .. total - 1, the middle of each equal part; all where there are fewer.
 
-    None where ``number`` is 0.
+    None where ``count`` is 0.
     """
-    number = min(number, total)
-    return [(2 * k + 1) * total // (2 * number) for k in range(number)]
+    count = min(count, total)
+    return [(2 * k + 1) * total // (2 * count) for k in range(count)]
 
 
 def choose_answers(is_ok: Sequence[bool]) -> list[int]:

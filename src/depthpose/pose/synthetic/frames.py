@@ -108,12 +108,12 @@ def shade(
     start = 0
     for solid, pose in placed:
         stop = start + len(solid.triangles_m)
-        of_body = ((primitive >= start) & (primitive < stop)).nonzero()[:, 0]
-        corners = solid.normals[primitive[of_body] - start]
-        normal = (corners * share[of_body, :, None]).sum(1) @ pose.R.mT
-        local = pose.inverse().apply(points[of_body])
+        of_solid = ((primitive >= start) & (primitive < stop)).nonzero()[:, 0]
+        corners = solid.normals[primitive[of_solid] - start]
+        normal = (corners * share[of_solid, :, None]).sum(1) @ pose.R.mT
+        local = pose.inverse().apply(points[of_solid])
         normal = F.normalize(normal, dim=-1)
-        sight = F.normalize(-points[of_body], dim=-1)
+        sight = F.normalize(-points[of_solid], dim=-1)
         # Both sides of a thin part are seen.
         normal = normal * torch.where((normal * sight).sum(-1, keepdim=True) < 0, -1.0, 1.0)
         facing = (normal @ towards).clamp(min=0)[:, None]
@@ -125,7 +125,7 @@ def shade(
         look = solid.pattern
         waves = torch.tanh(2 * (local @ look.frequencies.mT + look.phases).sin())
         plain = (look.base * (1 + waves @ look.waves)).clamp(0.01, 1)
-        colour[of_body] = plain * base + look.gloss * shine * lamp
+        colour[of_solid] = plain * base + look.gloss * shine * lamp
         start = stop
     return colour
 
