@@ -266,13 +266,8 @@ def _describe_map(path: Path) -> FileFacts:
 def _describe_points(path: Path, points: Tensor) -> FileFacts:
     """Describe a cloud: the unit that its distance from the origin suggests, and its frame."""
     away = float(points.median(0).values.norm())
-    unit = (
-        "metres"
-        if away < _MAX_LENGTH_M
-        else "centimetres"
-        if away < _MIN_DISTANCE_MM
-        else "millimetres"
-    )
+    unit = "centimetres" if away < _MIN_DISTANCE_MM else "millimetres"
+    unit = "metres" if away < _MAX_LENGTH_M else unit
     description = f"{len(points)} points, {away:.4g} from the origin: {unit}"
     oddities = [oddity] if (oddity := frame_advice(points)) is not None else []
     if away < float((points - points.median(0).values).norm(dim=-1).median()):

@@ -226,14 +226,7 @@ def _read_explained(job: PoseJob[Any], prediction: Prediction, method: PoseMetho
     """Read a whole depth image with the mask of the pixels that a predicted pose explains."""
     view = job.read()
     pose = prediction.estimate.camera_from_model
-    model = next(
-        (
-            known_model
-            for known_model in method.models
-            if known_model.name == prediction.estimate.object
-        ),
-        None,
-    )
+    model = {model.name: model for model in method.models}.get(prediction.estimate.object)
     if model is None or pose is None or not isinstance(view, ViewInput):
         return view
     mask = explained_mask(view, pose, prepare_surface(model))
@@ -256,7 +249,7 @@ def track_files(method: PoseMethod, frames: SequenceOptions, out: Path) -> int:
     if frames.first is not None:
         settings |= {"first": pose_methods.name_with_checksum(frames.first)}
     pose_predict.claim_for_jobs(out, settings, jobs)
-    return _write_sequence(method, _follow(method, jobs, name, start), jobs, out)
+    return _write_sequences(method, _follow(method, jobs, name, start), jobs, out)
 
 
 def track_dataset(method: PoseMethod, frames: SequenceOptions, out: Path) -> int:
@@ -281,12 +274,12 @@ def track_dataset(method: PoseMethod, frames: SequenceOptions, out: Path) -> int
         for (_, number), by_image in sorted(first_instances.items())
     ]
     jobs = [job for sequence in sequences for job in sequence]
-    coming = (
+    followed = (
         prediction
         for sequence in sequences
         for prediction in _follow(method, sequence, str(sequence[0].object))
     )
-    return _write_sequence(method, coming, jobs, out, dataset)
+    return _write_sequences(method, followed, jobs, out, dataset)
 
 
 def _whole_view(instance: Instance, object: str, name: str) -> ViewInput:
@@ -296,28 +289,28 @@ def _whole_view(instance: Instance, object: str, name: str) -> ViewInput:
     return ViewInput(name=name, depth_m=depth_m, mask=everywhere, K=instance.K, object=object)
 
 
-def _write_sequence(
+def _write_sequences(
     method: PoseMethod,
-    coming: Iterable[Prediction],
+    followed: Iterable[Prediction],
     jobs: Sequence[PoseJob[Any]],
     out: Path,
     dataset: BopDataset | None = None,
 ) -> int:
-    """Take predictions as they come, write their files, and print what became of the frames.
+    """Follow sequences, write the files of their predictions, and print what became of the frames.
 
     They are written where the work is interrupted, too; what an earlier run found of frames that
     this one did not reach stays in the file.
     """
-    left = list(earlier_predictions(out).values())
+    earlier = list(earlier_predictions(out).values())
     predictions: list[Prediction] = []
     try:
-        for prediction in coming:
+        for prediction in followed:
             predictions.append(prediction)  # noqa: PERF402  those before an interruption must be there
-        left = []
+        earlier = []
     finally:
         names = {prediction.estimate.name for prediction in predictions}
         if predictions:
-            others = [p for p in left if p.estimate.name not in names]
+            others = [p for p in earlier if p.estimate.name not in names]
             write_predictions(out, [*predictions, *others])
     pairs = zip(predictions, jobs, strict=True)
     explained = [

@@ -356,11 +356,8 @@ class PoseMethodSource:
     def build(self, device: str | None = None) -> PoseMethod:
         """Build the estimator, on a device or on that of the config."""
         method = self._build(device)
-        return (
-            method
-            if self.base_from_camera is None
-            else _with_base_pose(method, self.base_from_camera)
-        )
+        base = self.base_from_camera
+        return method if base is None else _with_base_pose(method, base)
 
     def _build(self, device: str | None) -> PoseMethod:
         """Build the estimator without what is added to its estimates."""

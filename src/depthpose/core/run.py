@@ -259,16 +259,20 @@ def claim_names(
     }
     recorded = read_sources(folder)
     finished = {*results, *(_FRAME.sub("", stem) for stem in results)}
+
+    # The file behind each name, and the size and time by which a change of it is noticed.
     wanted: dict[str, list[str]] = {}
     for name, files in sources.items():
         files_of_name = [files] if isinstance(files, Path) else list(files)
-        stamps: list[str] = []  # size and time, by which a change is noticed
+        stamps: list[str] = []
         for path in files_of_name:
             with suppress(OSError):
                 facts = path.stat()
                 if path.is_file():
                     stamps.append(f"{facts.st_size} bytes of {facts.st_mtime_ns}")
         wanted[name] = [str(files_of_name[0].resolve()), ", ".join(stamps)]
+
+    # Refuse a name that an earlier run gave to another file, and a file that has changed since.
     for name, (path, stamp) in wanted.items():
         earlier, before = recorded.get(name, [path, stamp])
         if earlier != path:
@@ -284,6 +288,8 @@ def claim_names(
                 f"{named}: has changed since its result {name!r} in {folder} was "
                 "made; choose another folder, or delete this one"
             )
+
+    # Of a name that is new, refuse files that no run wrote; what runs wrote is made again.
     new = wanted.keys() - recorded.keys()
     noted = read_results(folder)
     for stem, file in results.items():
@@ -294,6 +300,7 @@ def claim_names(
             note_result(folder, stem, [])
     for name in filter(noted.get, new):  # of which source is not known any more
         note_result(folder, name, [])
+
     if any(recorded.get(name) != entry for name, entry in wanted.items()):
         write_json(record, recorded | wanted)
 

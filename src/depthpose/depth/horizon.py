@@ -107,6 +107,14 @@ def find_segments(grey: Float[np.ndarray, "h w"]) -> Segments:
     # The top of a parabola through three strengths is the edge's place between pixels.
     x = columns + np.where(is_steep[rows, columns], _top(strength, rows, columns, 0, 1), 0)
     y = rows + np.where(is_steep[rows, columns], 0, _top(strength, rows, columns, 1, 0))
+    return _fit_segments(x, y, chain, chains)
+
+
+def _fit_segments(x: np.ndarray, y: np.ndarray, chain: np.ndarray, chains: int) -> Segments:
+    """Fit a line to the points of each chain by their moments; give straight ones, longest first.
+
+    ``chain``: the number of each point's chain; ``chains``: how many there are.
+    """
     size = np.bincount(chain, minlength=chains).astype(float)
     middle_x = np.bincount(chain, x, chains) / size
     middle_y = np.bincount(chain, y, chains) / size

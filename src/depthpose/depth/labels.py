@@ -68,6 +68,7 @@ def label_pairs(
             raise error
         failures.append(error)
 
+    # The rigs first: calib.txt names all of them before any label is there.
     for number in usable:
         name = frames[number].name
         if any("\ud800" <= letter <= "\udfff" for letter in name):  # bytes that are no UTF-8
@@ -83,6 +84,8 @@ def label_pairs(
     if failures and not rigs:
         raise failures[0]
     _write_calibration(folder / "calib.txt", {frames[n].name: rig for n, rig in rigs.items()})
+
+    # Then each pair that an earlier run has not finished.
     for number in rigs:
         name = frames[number].name
         if is_whole(folder, name, [f"disp_occ/{name}.png"]):

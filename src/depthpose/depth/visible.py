@@ -85,12 +85,12 @@ def _black_border(is_black: np.ndarray) -> np.ndarray:
 def _bars(image: Float[Tensor, "3 _ _"]) -> tuple[int, int]:
     """Count the first and the last rows of one colour, where they are bars.
 
-    A bar ends at a row of several colours, which tells it from a ramp of brightness.
+    A bar ends at a row of several colours, which tells it from a ramp of brightness. A bar that is
+    not dark counts only where there is one at the other end too.
     """
     counts: list[int] = []
     dark: list[bool] = []
-    # of each channel and row
-    least = image.amin(2)
+    least = image.amin(2)  # of each channel and row
     most = image.amax(2)
     for low, high in ((least, most), (least.flip(1), most.flip(1))):
         is_same = (high - low[:, :1] <= _SAME) & (high[:, :1] - low <= _SAME)

@@ -216,24 +216,33 @@ def _place_finely(
 ) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2"]]:
     """Give the places of matches from the centre, and their shifts, right less left [px]."""
     left_grey, right_grey = (_grey(image, _FINE_PIXELS) for image in (left, right))
-    larger = left_grey.shape[1] / _grey(left, _COARSE_PIXELS).shape[1]
-    places, matched = (((p + 0.5) * larger - 0.5).round().long() for p in (places, matched))
+    enlargement = left_grey.shape[1] / _grey(left, _COARSE_PIXELS).shape[1]
+    places, matched = (((p + 0.5) * enlargement - 0.5).round().long() for p in (places, matched))
+
+    # Correlate each left patch with all patches up to _REACH pixels from the coarse match.
+    side = 2 * _FINE_RADIUS + 1
     rim = _FINE_RADIUS + _REACH
-    padded = functional.pad(left_grey, (rim,) * 4), functional.pad(right_grey, (rim,) * 4)
-    patches = _normalised(_windows(padded[0], places + _REACH, 2 * _FINE_RADIUS + 1))
-    windows = _windows(padded[1], matched, 2 * rim + 1)
-    steps = windows.unfold(1, 2 * _FINE_RADIUS + 1, 1).unfold(2, 2 * _FINE_RADIUS + 1, 1)
-    scores = (_normalised(steps) * patches[:, None, None]).sum((-2, -1))
+    left_padded = functional.pad(left_grey, (rim,) * 4)
+    right_padded = functional.pad(right_grey, (rim,) * 4)
+    patches = _normalised(_windows(left_padded, places + _REACH, side))
+    windows = _windows(right_padded, matched, 2 * rim + 1)
+    candidates = _normalised(windows.unfold(1, side, 1).unfold(2, side, 1))
+    scores = (candidates * patches[:, None, None]).sum((-2, -1))
+
+    # A good one lies inside of what was searched.
     best, index = scores.flatten(1).max(1)
     row = index // scores.shape[2]
     column = index % scores.shape[2]
     last = 2 * _REACH
     is_good = (best > _MIN_SCORE) & (row > 0) & (row < last) & (column > 0) & (column < last)
+
+    # To a fraction of a pixel: the top of the parabola through three scores, half a pixel off at
+    # most.
     row = row.clamp(1, last - 1)
     column = column.clamp(1, last - 1)
     n = torch.arange(len(places))
     peak = torch.stack([column, row], -1).float()
-    for axis in (0, 1):  # the top of the parabola through three scores, half a pixel off at most
+    for axis in (0, 1):
         before, at, after = (scores[n, row + k * axis, column + k * (1 - axis)] for k in (-1, 0, 1))
         curvature = (2 * at - before - after).clamp_min(1e-6)
         peak[:, axis] += ((after - before) / (2 * curvature)).clamp(-0.5, 0.5)

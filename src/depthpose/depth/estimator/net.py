@@ -446,9 +446,9 @@ class FakestereoNet:
         total = len(several) if isinstance(several, Sized) else None
         with tqdm(total=total, unit=" images", disable=not with_progress) as bar:
             work = partial(self.estimate_together, lens=lens, with_check=with_check)
-            for of_batch in each_in_threads(work, batches, threads):
-                estimates += of_batch
-                bar.update(len(of_batch))
+            for estimates_of_batch in each_in_threads(work, batches, threads):
+                estimates += estimates_of_batch
+                bar.update(len(estimates_of_batch))
         return estimates
 
     @force_float32()

@@ -295,11 +295,12 @@ class LightFeatures(nn.Module):
         quarter = half
         for layer in self.quarter:
             quarter = F.relu(layer(quarter))
+        # The encoder takes RGB in [0, 1], at half size.
         small = F.avg_pool2d(image, 2) * self.deviation.to(image) + self.mean.to(image)
-        skips = self.encoder(small)
-        levels = [F.relu(self.top(skips[3]))]
-        seen = (skips[2], skips[1], torch.cat([skips[0], quarter], 1))
-        for layer, skip in zip(self.decoder, seen, strict=True):
+        of_quarter, of_eighth, of_sixteenth, deepest = self.encoder(small)
+        levels = [F.relu(self.top(deepest))]
+        skips = (of_sixteenth, of_eighth, torch.cat([of_quarter, quarter], 1))
+        for layer, skip in zip(self.decoder, skips, strict=True):
             above = F.interpolate(levels[-1], scale_factor=2.0, mode="nearest")
             levels.append(F.relu(layer(torch.cat([above, skip], 1))))
         return ViewFeatures(half, tuple(levels[::-1]))

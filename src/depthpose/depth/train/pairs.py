@@ -72,7 +72,7 @@ class TrainingPairs:
         for number, folder in enumerate(config.folders):
             dataset = open_dataset(folder, config.split if number == 0 else None)
             excluded -= {frame.name for frame in dataset.frames}
-            usable = _usable(dataset, config, needs_truth=needs_truth, is_mixed=is_mixed)
+            usable = _usable_places(dataset, config, needs_truth=needs_truth, is_mixed=is_mixed)
             sources.append(usable)
         if excluded:
             raise InputError(
@@ -193,12 +193,14 @@ class TrainingPairs:
         return scale_pair(pair, wanted_px / float(focal_px))
 
 
-def _usable(
+def _usable_places(
     dataset: Dataset, config: PairsConfig, *, needs_truth: bool, is_mixed: bool
 ) -> list[_Place]:
     """Frames of a folder that can be learnt from, all with one kind of truth if it is needed."""
     name = dataset.name
     wanted = config.truth
+
+    # The kinds of truth of each frame that has the views.
     kinds_by_index = {
         index: known_truths(frame)
         for index, frame in enumerate(dataset.frames)
@@ -208,6 +210,8 @@ def _usable(
     if alone and not is_mixed and kinds_by_index:
         message = f"{name}: {alone} of {len(dataset)} images have no right view, and are left out"
         warnings.warn(message, Notice, stacklevel=2)
+
+    # One kind is learnt from: the config's, or the only one that there is.
     kind: TruthKind | None = None
     if needs_truth:
         counts: Counter[TruthKind] = Counter(
@@ -223,6 +227,8 @@ def _usable(
                 f"{', '.join(counts)}"
             )
         kind = wanted or next(iter(counts), None)
+
+    # Frames with that truth; where sources are mixed, pairs without truth too.
     places = [
         _Place(dataset, index, kind if kind in kinds else None)
         for index, kinds in kinds_by_index.items()

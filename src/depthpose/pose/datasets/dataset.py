@@ -249,6 +249,8 @@ def _check_models(
         except InputError as error:
             problems.append(unreadable(path, error))
             continue
+
+        # Is it as large as the data set says?
         declared_mm = infos.get(number, {}).get("diameter")
         measured_mm = 1000 * exact_diameter(models[number].vertices_m)
         if not isinstance(declared_mm, int | float):
@@ -257,6 +259,7 @@ def _check_models(
         elif abs(measured_mm - declared_mm) > _DIAMETER_SLACK * declared_mm:
             message = f"is {measured_mm:.1f} mm across, but models_info says {declared_mm:.1f} mm"
             problems.append(Problem(path=path, kind="mismatch", message=message))
+
     # Estimators know objects by name, and refuse two of one.
     names = object_names(folder, numbers)
     for name, count in sorted(Counter(names.values()).items()):
