@@ -23,7 +23,7 @@ from depthpose.pose.synthetic.parts import (
     ring,
     turned,
 )
-from depthpose.pose.synthetic.views import random_rotation, uniform, whole
+from depthpose.pose.synthetic.views import random_index, random_rotation, uniform
 from depthpose.pose.types import ObjectModel
 
 NegativeKind = Literal[
@@ -62,9 +62,9 @@ def negative_of(
         known = [other for other in others if other.name != model.name]
         if not known:
             known = [make_part(name) for name in PARTS if name != model.name]
-        return dataclasses.replace(known[whole(generator, len(known))], name=model.name)
+        return dataclasses.replace(known[random_index(generator, len(known))], name=model.name)
     if kind == "scaled":
-        return scaled(model, scale or SCALES[whole(generator, len(SCALES))])
+        return scaled(model, scale or SCALES[random_index(generator, len(SCALES))])
     return mirrored(model) if kind == "mirrored" else _solid(model, kind, generator)
 
 
@@ -106,7 +106,7 @@ def _solid(model: ObjectModel, kind: NegativeKind, generator: torch.Generator) -
             mesh.vertices *= _bumps(torch.tensor(mesh.vertices), generator).numpy()
         case "hand":
             mesh = _hand(size_m, generator)
-        case _ if whole(generator, 2):
+        case _ if random_index(generator, 2):
             mesh = trimesh.creation.box((size_m, flat * size_m, thin * size_m))
         case _:
             mesh = trimesh.creation.cylinder(0.5 * flat * size_m, size_m, 32)
@@ -148,11 +148,11 @@ def random_part(generator: torch.Generator, name: str = "part") -> ObjectModel:
         name: what samples call it.
     """
     pieces = []
-    for _ in range(3 + whole(generator, 4)):
+    for _ in range(3 + random_index(generator, 4)):
         piece = _random_solid(generator)
         for axis in np.eye(3).tolist():
-            piece = turned(piece, (axis[0], axis[1], axis[2]), 90.0 * whole(generator, 4))
-        if whole(generator, 4) == 0:
+            piece = turned(piece, (axis[0], axis[1], axis[2]), 90.0 * random_index(generator, 4))
+        if random_index(generator, 4) == 0:
             piece = turned(piece, (0.0, 0.0, 1.0), uniform(generator, 0.0, 90.0))
         pieces.append(moved(piece, tuple(uniform(generator, -35.0, 35.0) for _ in range(3))))
     vertices, faces = joined(*pieces)
@@ -182,7 +182,7 @@ def random_simple_part(generator: torch.Generator, name: str = "part") -> Object
         joined(foot, middle),
         joined(foot, left, right),
     ]
-    vertices, faces = solids[whole(generator, len(solids))]
+    vertices, faces = solids[random_index(generator, len(solids))]
     return make_model(torch.from_numpy(vertices) * metres_of("mm"), torch.from_numpy(faces),
                       name=name)  # fmt: skip
 
@@ -194,7 +194,7 @@ def _cup(radius: float, height: float, wall: float) -> Mesh:
 
 
 def _random_solid(generator: torch.Generator) -> Mesh:
-    kind, height = whole(generator, 3), uniform(generator, 10.0, 90.0)
+    kind, height = random_index(generator, 3), uniform(generator, 10.0, 90.0)
     if kind == 0:
         return box((uniform(generator, 4.0, 80.0), uniform(generator, 4.0, 60.0), height))
     low, high = uniform(generator, 3.0, 35.0), uniform(generator, 3.0, 35.0)

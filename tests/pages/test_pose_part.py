@@ -14,7 +14,7 @@ from depthpose.pose.observability import free_motions
 from depthpose.pose.predictions import Prediction, prediction_row
 from depthpose.pose.types import Axis, CloudInput, PoseEstimate, ViewInput
 from depthpose.report.page import Section
-from depthpose.report.pose import FOUND, TRUE, pose_section
+from depthpose.report.pose import ESTIMATED, TRUTH, pose_section
 
 POSE = pose_at(seed=1)
 FOUND_HERE = PoseEstimate(
@@ -63,9 +63,9 @@ def test_the_numbers_are_those_of_the_estimate() -> None:
 
 def test_an_estimate_is_blue_and_the_truth_green() -> None:
     alone, beside = shown(FOUND_HERE), shown(FOUND_HERE, pose_at(x_m=0.02, seed=1))
-    assert has_ink(alone, FOUND) == [True, True]
-    assert has_ink(alone, TRUE) == [False, False]
-    assert has_ink(beside, TRUE) == [True, True]
+    assert has_ink(alone, ESTIMATED) == [True, True]
+    assert has_ink(alone, TRUTH) == [False, False]
+    assert has_ink(beside, TRUTH) == [True, True]
     names = {layer.name: layer.is_shown for layer in beside.scenes[0].layers}
     assert all(names[name] for name in ("true box", "true edges", "its box"))
     names = {layer.name: layer.is_shown for layer in alone.scenes[0].layers}
@@ -78,7 +78,7 @@ def test_a_refusal_says_why_and_shows_the_mask() -> None:
     assert section.text == "Refused (doubtful): the votes <do not> meet."
     assert not section.tables
     assert has_ink(section, (1.0, 0.85, 0.1)) == [True, True]
-    assert has_ink(section, FOUND) == [False, False]
+    assert has_ink(section, ESTIMATED) == [False, False]
     assert [layer.name for layer in section.scenes[0].layers] == ["the object, as seen", "all else"]
 
 

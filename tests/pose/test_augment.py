@@ -13,10 +13,10 @@ from depthpose.pose.config import ObjectsConfig, SyntheticSensorConfig
 from depthpose.pose.synthetic.views import (
     grow_mask,
     occlude,
+    random_index,
     random_levels,
     random_rotation,
     simulate_depth,
-    whole,
 )
 from depthpose.pose.train import PoseTraining
 
@@ -189,7 +189,7 @@ def test_readings_go_missing_at_about_the_share() -> None:
 
 def test_whole_numbers_stay_below_their_count() -> None:
     generator = _generator()
-    assert {whole(generator, 3) for _ in range(50)} == {0, 1, 2}
+    assert {random_index(generator, 3) for _ in range(50)} == {0, 1, 2}
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.mesh import make_model
 from depthpose.pose.types import CloudInput, ObjectModel
 from depthpose.report.page import Lines
-from depthpose.report.pose import TRUE, close_up, keypoint_layers, pose_layers, vote_layer
+from depthpose.report.pose import TRUTH, close_up, keypoint_layers, pose_layers, vote_layer
 
 
 def cube(*, with_repeats: bool = False, faces: int = 12) -> ObjectModel:
@@ -56,7 +56,7 @@ def test_a_posed_model_lies_where_its_pose_says() -> None:
         assert isinstance(one, Lines)
         assert isinstance(other, Lines)
         assert torch.equal(one.ends_m, other.ends_m)
-        assert torch.equal(other.color, torch.tensor(TRUE).expand(len(other.ends_m), 3))
+        assert torch.equal(other.color, torch.tensor(TRUTH).expand(len(other.ends_m), 3))
     assert not truth
 
 

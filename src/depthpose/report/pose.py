@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
@@ -29,13 +29,13 @@ from depthpose.report.page import (
 )
 
 Color = tuple[float, float, float]
-FOUND: Color = (0.15, 0.35, 1.0)
+ESTIMATED: Color = (0.15, 0.35, 1.0)
 """Colour of an estimate: blue."""
-TRUE: Color = (0.1, 0.8, 0.2)
+TRUTH: Color = (0.1, 0.8, 0.2)
 """Colour of the truth: green."""
 VOTED: Color = (1.0, 0.55, 0.1)
 """Colour of voted keypoints: orange."""
-OTHER: Color = (0.6, 0.3, 0.85)
+ALTERNATIVE: Color = (0.6, 0.3, 0.85)
 """Colour of an alternative: violet."""
 _SURFACE = 5000
 _BEND = math.radians(30)
@@ -72,11 +72,11 @@ def draw_pose(
         ends_px = project(pose.double().apply(box_edges(model).double()), K)
         posed_m = pose.double().apply(drawn_triangles(model).double())
         raster = rasterize(posed_m, K, image.shape[2], image.shape[1], with_barycentric=False)
-        image = draw_outline(image, raster.depth_m.isfinite(), FOUND)
-        image = draw_lines(image, ends_px, FOUND)
+        image = draw_outline(image, raster.depth_m.isfinite(), ESTIMATED)
+        image = draw_lines(image, ends_px, ESTIMATED)
     if truth is not None:
         ends_px = project(truth.double().apply(box_edges(model).double()), K)
-        image = draw_lines(image, ends_px, TRUE, dash_px=_DASH_PX)
+        image = draw_lines(image, ends_px, TRUTH, dash_px=_DASH_PX)
     return image
 
 
@@ -114,30 +114,41 @@ def pose_layers(
     """
     pose = pose.double()
     box_m = pose.apply(box_edges(model).double()).float()
-    edges_m = None
-    if len(model.faces):
-        # By place, not by number: STL repeats the points of every face.
-        places_m, place = torch.unique(model.vertices_m, dim=0, return_inverse=True)
-        ends = place[model.faces]
-        side = torch.cat([ends[:, [0, 1]], ends[:, [1, 2]], ends[:, [2, 0]]]).sort(-1).values
-        edges, which, count = torch.unique(side, dim=0, return_inverse=True, return_counts=True)
-        a, b, c = model.vertices_m[model.faces].double().unbind(1)
-        normal = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
-        total = normal.new_zeros(len(edges), 3).index_add_(0, which, normal.repeat(3, 1))
-        # Two unit normals at an angle have a mean as long as the cosine of half of it.
-        is_bent = total.norm(dim=-1) / count < math.cos(_BEND / 2)
-        edges_m = pose.apply(places_m[edges[is_bent | (count == 1)]].double()).float()
+    edges_m = _bent_edges(model)
+    if edges_m is not None:
+        edges_m = pose.apply(edges_m).float()
     if is_true:
-        layers = [Layer(name="true box", shape=colored_lines(box_m, TRUE))]
+        layers = [Layer(name="true box", shape=colored_lines(box_m, TRUTH))]
         if edges_m is not None:
-            layers.append(Layer(name="true edges", shape=colored_lines(edges_m, TRUE)))
+            layers.append(Layer(name="true edges", shape=colored_lines(edges_m, TRUTH)))
         return layers
     layers = [Layer(name="posed model", shape=posed_cloud(torch.empty(0, 3), pose, model))]
     if edges_m is not None:
-        layers.append(Layer(name="its edges", shape=colored_lines(edges_m, FOUND)))
+        layers.append(Layer(name="its edges", shape=colored_lines(edges_m, ESTIMATED)))
     axes = frame_axes(pose.t_m, pose.R, model.diameter_m / 2)
-    box = Layer(name="its box", shape=colored_lines(box_m, FOUND), is_shown=with_box)
+    box = Layer(name="its box", shape=colored_lines(box_m, ESTIMATED), is_shown=with_box)
     return [*layers, box, Layer(name="its axes (x red, y green, z blue)", shape=axes)]
+
+
+def _bent_edges(model: ObjectModel) -> Float64[Tensor, "n 2 3"] | None:
+    """Give both ends of the edges where a mesh ends, or bends by more than ``_BEND`` [m].
+
+    None of a model without faces.
+    """
+    if not len(model.faces):
+        return None
+    # By place, not by number: STL repeats the points of every face.
+    places_m, place = torch.unique(model.vertices_m, dim=0, return_inverse=True)
+    ends = place[model.faces]
+    sides = torch.cat([ends[:, [0, 1]], ends[:, [1, 2]], ends[:, [2, 0]]]).sort(-1).values
+    edges, edge_of, count = torch.unique(sides, dim=0, return_inverse=True, return_counts=True)
+
+    # Two unit normals at an angle have a mean as long as the cosine of half of it.
+    a, b, c = model.vertices_m[model.faces].double().unbind(1)
+    normal = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
+    total = normal.new_zeros(len(edges), 3).index_add_(0, edge_of, normal.repeat(3, 1))
+    is_bent = total.norm(dim=-1) / count < math.cos(_BEND / 2)
+    return places_m[edges[is_bent | (count == 1)]].double()
 
 
 def keypoint_layers(
@@ -146,8 +157,8 @@ def keypoint_layers(
     """Show the keypoints as voted, and as the model has them if it was posed (camera frame)."""
     marks = [("keypoints, voted", voted_m, VOTED)]
     if pose is not None:
-        own_m = pose.apply(model.keypoints_m.to(pose.R))
-        marks.append(("keypoints, of the posed model", own_m, FOUND))
+        posed_m = pose.apply(model.keypoints_m.to(pose.R))
+        marks.append(("keypoints, of the posed model", posed_m, ESTIMATED))
     layers = []
     for name, at_m, color in marks:
         arms_m = _CROSS * model.diameter_m * torch.eye(3).to(at_m)
@@ -179,7 +190,7 @@ def posed_cloud(cloud_m: Float[Tensor, "n 3"], pose: Rigid | None, model: Object
     if pose is None:
         return Cloud(points=cloud_m.float(), color=torch.full((len(cloud_m), 3), 0.6))
     surface_m = pose.apply(sample_surface(model, _SURFACE)[0].to(pose.R))
-    colors = [torch.full((len(cloud_m), 3), 0.6), torch.tensor(FOUND).expand(len(surface_m), 3)]
+    colors = [torch.full((len(cloud_m), 3), 0.6), torch.tensor(ESTIMATED).expand(len(surface_m), 3)]
     return Cloud(points=torch.cat([cloud_m.float(), surface_m.float()]), color=torch.cat(colors))
 
 
@@ -380,7 +391,7 @@ def pose_scene(
     for other in estimate.alternatives:  # by axes and box, not shown at first
         placed = other.camera_from_model.double()
         box_m = placed.apply(box_edges(model).double()).float()
-        box = colored_lines(box_m, OTHER)
+        box = colored_lines(box_m, ALTERNATIVE)
         layers.append(Layer(name=f"box if {other}", shape=box, is_shown=False))
         axes = frame_axes(placed.t_m, placed.R, model.diameter_m / 2)
         layers.append(Layer(name=f"axes if {other}", shape=axes, is_shown=False))

@@ -17,7 +17,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.datasets import BopFrame, BopObject
 from depthpose.pose.mesh import drawn_triangles, sample_surface
-from depthpose.pose.synthetic.views import random_rotation, simulate_depth, uniform, whole
+from depthpose.pose.synthetic.views import random_index, random_rotation, simulate_depth, uniform
 from depthpose.pose.types import ObjectModel
 
 _WAVES = 6
@@ -72,7 +72,7 @@ def random_clutter(generator: torch.Generator) -> Solid:
     size_m = uniform(generator, 0.04, 0.15)
     flat = uniform(generator, 0.3, 1.0)
     thin = uniform(generator, 0.3, 1.0)
-    match whole(generator, 3):
+    match random_index(generator, 3):
         case 0:
             mesh = trimesh.creation.box((size_m, flat * size_m, thin * size_m))
         case 1:
@@ -253,9 +253,11 @@ def _arranged(
     """Lay things on the table, none in another, in the table's frame (z up)."""
     low, high = (min(n, len(solids)) for n in config.frame_objects)
     order = torch.randperm(len(solids), generator=generator)
-    chosen = [solids[i] for i in order[: low + whole(generator, high - low + 1)].tolist()]
+    chosen = [solids[i] for i in order[: low + random_index(generator, high - low + 1)].tolist()]
     low, high = config.frame_clutter
-    chosen += [random_clutter(generator) for _ in range(low + whole(generator, high - low + 1))]
+    chosen += [
+        random_clutter(generator) for _ in range(low + random_index(generator, high - low + 1))
+    ]
     placed: list[tuple[Solid, Rigid]] = []
     circles: list[tuple[float, float, float]] = []
     for solid in chosen:
@@ -286,7 +288,7 @@ def _piled(
     generator: torch.Generator,
 ) -> list[tuple[Solid, Rigid]]:
     """Drop copies of one thing straight down until they touch, in the table's frame (z up)."""
-    which = whole(generator, len(solids))
+    which = random_index(generator, len(solids))
     points = sample_surface(models[which], 20000)[0]
     middle = (points.amin(0) + points.amax(0)) / 2
     points = points - middle

@@ -51,8 +51,8 @@ def uniform(generator: torch.Generator, low: float, high: float) -> float:
     return low + (high - low) * float(torch.rand((), generator=generator))
 
 
-def whole(generator: torch.Generator, count: int) -> int:
-    """Draw one of 0 .. count - 1."""
+def random_index(generator: torch.Generator, count: int) -> int:
+    """Draw a whole number, 0 to count - 1, all equally likely."""
     return int(torch.randint(count, (), generator=generator))
 
 
@@ -82,7 +82,7 @@ def random_levels(height: int, width: int, generator: torch.Generator) -> Depth:
     u = (torch.arange(width)[None] - column) / size
     along = math.cos(angle) * u + math.sin(angle) * v
     across = (math.cos(angle) * v - math.sin(angle) * u) * stretch
-    match whole(generator, 4):
+    match random_index(generator, 4):
         case 0:
             return along
         case 1:
@@ -90,7 +90,7 @@ def random_levels(height: int, width: int, generator: torch.Generator) -> Depth:
         case 2:
             return torch.maximum(along.abs(), across.abs())
         case _:  # a convex polygon
-            sides = 3 + whole(generator, 4)
+            sides = 3 + random_index(generator, 4)
             turns = torch.rand(sides, generator=generator).cumsum(0)
             angles = 2 * math.pi * turns / (turns[-1] + uniform(generator, 0.2, 0.8))
             far = 0.5 + torch.rand(sides, generator=generator)
@@ -132,7 +132,7 @@ def simulate_depth(
         config: kinds of sensor, and how bad they are.
         generator: of the chance.
     """
-    kind: SensorKind = config.kinds[whole(generator, len(config.kinds))]
+    kind: SensorKind = config.kinds[random_index(generator, len(config.kinds))]
     noise = uniform(generator, *config.noise)
     missing = uniform(generator, *config.missing)
     if kind == "none":
@@ -418,7 +418,7 @@ class Objects:
             pose = Rigid(R, turn[:, 2] * distance_m - R @ shape.middle_m)
             clean = draw_view(shape, pose, K)
         else:  # the camera of a stored view is turned
-            stored = self._stored((number, whole(generator, views)))
+            stored = self._stored((number, random_index(generator, views)))
             K = self.intrinsics(float(stored.K[0, 0]) / self.config.focal_px[0])
             turn = self._gaze(number, stored.distance_m, K, generator)
             depth_m = stored.depth_m.float() + stored.distance_m
@@ -436,7 +436,7 @@ class Objects:
 
         # A mask that is too large or too small, and what a sensor measures.
         largest_px = self.config.mask_error_px
-        grow_px = whole(generator, 2 * largest_px + 1) - largest_px
+        grow_px = random_index(generator, 2 * largest_px + 1) - largest_px
         scale = float(clean.K[0, 0]) / self.config.focal_px[0]  # to pixels of the full image
         mask = grow_mask(visible, round(grow_px * scale))
         focal_px = (float(clean.K[0, 0]), self.config.focal_px[0])
@@ -445,7 +445,8 @@ class Objects:
         # And shifted: what comes in at a border is not of the object.
         largest_px = self.config.mask_shift_px
         rows, columns = (
-            round((whole(generator, 2 * largest_px + 1) - largest_px) * scale) for _ in range(2)
+            round((random_index(generator, 2 * largest_px + 1) - largest_px) * scale)
+            for _ in range(2)
         )
         mask = mask.roll((rows, columns), (0, 1))
         for axis, steps in enumerate((rows, columns)):

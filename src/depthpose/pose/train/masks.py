@@ -39,7 +39,7 @@ from depthpose.pose.segmentation import (
     normalise_colors,
     write_segmentation,
 )
-from depthpose.pose.synthetic.views import uniform, whole
+from depthpose.pose.synthetic.views import random_index, uniform
 from depthpose.pose.train.config import ImageAugmentConfig, ImagesConfig, SegmentationTraining
 from depthpose.pose.train.poses import claim_run, with_origin
 
@@ -159,14 +159,14 @@ def cut_window(
     slack = [side - part for side, part in zip(labels.shape, size, strict=True)]
     shown = labels.unique()[1:] if uniform(generator, 0.0, 1.0) < 0.5 else labels[:0, 0]
     if len(shown):
-        chosen = labels == shown[whole(generator, len(shown))]
+        chosen = labels == shown[random_index(generator, len(shown))]
         middle = chosen.nonzero().float().mean(0).tolist()
         top, left = (
             min(max(round(at - part / 2), 0), most)
             for at, part, most in zip(middle, size, slack, strict=True)
         )
     else:
-        top, left = (whole(generator, most + 1) for most in slack)
+        top, left = (random_index(generator, most + 1) for most in slack)
     window = (slice(top, top + size[0]), slice(left, left + size[1]))
     return LabelledImage(image[:, *window], labels[window])
 
