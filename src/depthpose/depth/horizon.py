@@ -154,6 +154,7 @@ def find_angles(image: View, camera: Camera, expected: Angles) -> Angles:
     Returns:
         Mean and deviation of the angles by both. Where there is no edge, those expected.
     """
+    # Edges of a smaller copy, in pixels of the image.
     halvings = max(math.ceil(math.log2(image.shape[1] * image.shape[2] / _MOST_PIXELS) / 2), 0)
     scale = 2**halvings
     grey = grey_of(image.detach().cpu().float())
@@ -164,6 +165,8 @@ def find_angles(image: View, camera: Camera, expected: Angles) -> Angles:
     segments[:, :2] = (segments[:, :2] + 0.5) * scale - 0.5
     segments[:, 4] *= scale
 
+    # The posterior on a grid of angles: how well edges point to their vanishing points, times the
+    # normal distributions of what is expected.
     pans, tilts, rolls = (
         part.ravel()
         for part in np.meshgrid(
@@ -173,15 +176,16 @@ def find_angles(image: View, camera: Camera, expected: Angles) -> Angles:
             indexing="ij",
         )
     )
-    fit = _log_likelihood(segments, camera, pans, tilts, rolls, _OFF_PX * scale)
-    apart = (
+    log_likelihood = _log_likelihood(segments, camera, pans, tilts, rolls, _OFF_PX * scale)
+    squared_deviation = (
         (pans / _PAN_STD_DEG) ** 2
         + ((tilts - expected.tilt_deg) / expected.tilt_std_deg) ** 2
         + ((rolls - expected.roll_deg) / expected.roll_std_deg) ** 2
     )
-    log = _PER_SEGMENT * fit - apart / 2
-    weight = np.exp(log - log.max())
+    log_posterior = _PER_SEGMENT * log_likelihood - squared_deviation / 2
+    weight = np.exp(log_posterior - log_posterior.max())
     weight /= weight.sum()
+
     tilt_deg = float(weight @ tilts)
     roll_deg = float(weight @ rolls)
     return Angles(

@@ -278,7 +278,7 @@ def facts_from_projections(
     with np.errstate(all="ignore"):  # what overflows is refused as a baseline
         baseline_m = left[0, 3] / left[0, 0] - right[0, 3] / right[0, 0]
         down_m = left[1, 3] / left[1, 1] - right[1, 3] / right[1, 1]
-        difference_px = right[0, 2] - left[0, 2]
+        cx_difference_px = right[0, 2] - left[0, 2]
     if abs(down_m) > abs(baseline_m):
         raise InputError("its cameras stand one above the other; turn the images by 90 degrees")
     return CameraFacts(
@@ -286,7 +286,7 @@ def facts_from_projections(
         K=K,
         size=size,
         baseline_m=float(baseline_m),
-        cx_right_minus_left_px=float(difference_px),
+        cx_right_minus_left_px=float(cx_difference_px),
     )
 
 

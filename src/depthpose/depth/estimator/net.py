@@ -533,8 +533,10 @@ class FakestereoNet:
         height, width = image.left.shape[1:]
         check_image_matches_camera(image.camera, width, height, image.name)
         rig_px = self.synthesiser.config.virtual_focal_px
-        own_px = float(image.camera.K.diagonal()[:2].min())
-        usable_scales = [s for s in self.synthesiser.scales if s == 1 or s * rig_px <= own_px]
+        image_focal_px = float(image.camera.K.diagonal()[:2].min())
+        usable_scales = [
+            s for s in self.synthesiser.scales if s == 1 or s * rig_px <= image_focal_px
+        ]
         return [disparity.focal_size(image.camera, scale * rig_px) for scale in usable_scales]
 
     def _estimate_alone(

@@ -56,8 +56,8 @@ def by_rows(
             whole = torch.empty(
                 size, dtype=piece_result.dtype, device=piece_result.device, memory_format=order
             )
-        own_rows = piece_result[..., times * (first - before) : times * (stop - before), :]
-        whole[..., times * first : times * stop, :] = own_rows
+        rows_of_piece = piece_result[..., times * (first - before) : times * (stop - before), :]
+        whole[..., times * first : times * stop, :] = rows_of_piece
     assert whole is not None, "there are rows"
     return whole
 
@@ -222,4 +222,4 @@ def has_onednn_operators() -> bool:
         (convolved, F.conv3d(*tensors, 1, 1)),
         (transposed, F.conv_transpose3d(*tensors, 2, 1, 1)),
     )
-    return all(one.shape == other.shape and torch.allclose(one, other) for one, other in both)
+    return all(a.shape == b.shape and torch.allclose(a, b) for a, b in both)

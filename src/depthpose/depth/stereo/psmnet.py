@@ -348,7 +348,7 @@ class PSMNetMatcher(NetworkMatcher):
     ) -> list[Match]:
         """Match normalised pairs whose sides suit the network."""
         assert first_px == 0, "its volume begins at 0; the views are moved instead"
-        near, far = (one.to(self.dtype, memory_format=torch.channels_last) for one in (left, right))
+        near, far = (v.to(self.dtype, memory_format=torch.channels_last) for v in (left, right))
         costs = self._network.costs(near, far, network_config.max_disparity_px)[-1][:, 0]
         height, width = left.shape[-2:]
         matches = [

@@ -357,9 +357,9 @@ def write_bop_scene(
     for frame in frames:
         name = f"{frame.number:06d}"
         poses = list[dict[str, Any]]()
-        more = list[dict[str, Any]]()
+        visibilities = list[dict[str, Any]]()
         truths[str(frame.number)] = poses
-        infos[str(frame.number)] = more
+        infos[str(frame.number)] = visibilities
         write_depth_png(scene / "depth" / f"{name}.png", frame.depth_m, _DEPTH_UNIT_M)
         if frame.rgb is not None:
             write_image(scene / "rgb" / f"{name}.png", frame.rgb)
@@ -376,7 +376,7 @@ def write_bop_scene(
                     "obj_id": shown.number,
                 }
             )
-            more.append(
+            visibilities.append(
                 {
                     "bbox_obj": mask_box(shown.silhouette),
                     "bbox_visib": mask_box(shown.visible),

@@ -119,15 +119,17 @@ def _error_tables(
 def _is_far(name: str, pose: Rigid, instance: Instance, context: ErrorContext) -> bool:
     """Say whether an error is beyond all its limits, without measuring it."""
     points_m = context.model.vertices_m.double()
-    moved_m = [one.double().apply(points_m) for one in (pose, instance.camera_from_model)]
+    posed_m = [p.double().apply(points_m) for p in (pose, instance.camera_from_model)]
     if name == "mssd_m":
-        away_m = float((moved_m[0].mean(0) - moved_m[1].mean(0)).norm())
+        away_m = float((posed_m[0].mean(0) - posed_m[1].mean(0)).norm())
         return away_m > _AWAY_DIAMETERS * context.model.diameter_m
-    pixels = [project(one, instance.K) for one in moved_m]
-    if not all(bool(one.isfinite().all()) for one in pixels):  # a point lies behind the camera
+    pixels = [project(points, instance.K) for points in posed_m]
+    if not all(
+        bool(places.isfinite().all()) for places in pixels
+    ):  # a point lies behind the camera
         return False
     # No two points are nearer than the boxes about them.
-    first, second = ((one.amin(0), one.amax(0)) for one in pixels)
+    first, second = ((places.amin(0), places.amax(0)) for places in pixels)
     gap = torch.maximum(first[0] - second[1], second[0] - first[1]).clamp(min=0).norm()
     return float(gap) * BOP_WIDTH_PX / image_size(instance.depth)[0] > BOP_PIXELS[-1]
 
@@ -135,7 +137,11 @@ def _is_far(name: str, pose: Rigid, instance: Instance, context: ErrorContext) -
 def _precision(
     images: Sequence[_Image], tables: Sequence[Float[Tensor, "_ _"]], limit: float
 ) -> float | None:
-    """Give the average precision of one object at one threshold; None where nothing counts."""
+    """Give the average precision of one object at one threshold; None where nothing counts.
+
+    In each image, the surest first, an estimate takes the nearest instance that is left. One that
+    takes a mostly hidden instance is neither right nor wrong, as BOP has it.
+    """
     counted: list[tuple[float, bool]] = []  # score, and whether it is right
     targets = 0
     for image, table in zip(images, tables, strict=True):

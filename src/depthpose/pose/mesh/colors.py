@@ -189,9 +189,9 @@ def _colored_samples(path: AnyPath, suffix: str) -> tuple[_Samples | None, list[
     first = 0
     for mesh, _ in parts:
         mine = (face >= first) & (face < first + len(mesh.faces))
-        own = face[mine] - first
+        faces_of_mesh = face[mine] - first
         first += len(mesh.faces)
-        colors = _colors_of(mesh, own.numpy(), share[mine].numpy(), lost=bool(files.lost))
+        colors = _colors_of(mesh, faces_of_mesh.numpy(), share[mine].numpy(), lost=bool(files.lost))
         if colors is not None:
             rgb[mine] = torch.from_numpy(colors)
     has_color = rgb.isfinite().all(-1)
@@ -212,7 +212,7 @@ def _colors_of(mesh: Any, face: np.ndarray, share: np.ndarray, *, lost: bool) ->
     if visual.kind == "face":
         return np.asarray(visual.face_colors)[face, :3] / 255
     if visual.kind == "vertex":
-        return _between(visual.vertex_colors, corners, share) / 255
+        return _interpolate_corners(visual.vertex_colors, corners, share) / 255
     if visual.kind != "texture":
         return None
     material = visual.material
@@ -228,17 +228,17 @@ def _colors_of(mesh: Any, face: np.ndarray, share: np.ndarray, *, lost: bool) ->
             "it smaller"
         )
     if image is not None and visual.uv is not None:
-        places = _between(visual.uv, corners, share)
+        places = _interpolate_corners(visual.uv, corners, share)
         colors = uv_to_interpolated_color(places, image)[:, :3] / 255 * tint
     elif in_vertices is not None:
-        colors = _between(in_vertices, corners, share)[:, :3] / 255 * tint
+        colors = _interpolate_corners(in_vertices, corners, share)[:, :3] / 255 * tint
     elif not lost:
         plain = tint if factor is not None else np.asarray(material.main_color)[:3] / 255
         colors = np.broadcast_to(plain, (len(face), 3))
     return colors
 
 
-def _between(values: Any, corners: np.ndarray, share: np.ndarray) -> np.ndarray:  # noqa: ANN401
+def _interpolate_corners(values: Any, corners: np.ndarray, share: np.ndarray) -> np.ndarray:  # noqa: ANN401
     """Interpolate values of vertices at places between the corners of faces."""
     every = np.asarray(values, np.float64)[corners]
     return (every[..., : min(every.shape[-1], 3)] * share[..., None]).sum(1)

@@ -99,7 +99,7 @@ def declare_symmetry(model: ObjectModel, symmetry: AnySymmetry) -> ObjectModel:
     elif isinstance(symmetry, Symmetries):
         declared = replace(symmetry, is_found=False)
     elif isinstance(symmetry, str | Path):
-        declared = symmetries_from_bop(_entry_of(Path(symmetry), model), source=str(symmetry))
+        declared = symmetries_from_bop(_read_entry(Path(symmetry), model), source=str(symmetry))
     elif isinstance(symmetry, Mapping):
         declared = symmetries_from_bop(symmetry, source=f"symmetry of {model.name}")
     else:
@@ -168,7 +168,7 @@ def _refuse_other(name: str, names: Sequence[str], message: str) -> None:
         raise InputError(f"{message}: no object is called so; {nearest_name(name, names)}")
 
 
-def _entry_of(path: Path, model: ObjectModel) -> Mapping[str, Any]:
+def _read_entry(path: Path, model: ObjectModel) -> Mapping[str, Any]:
     """Give BOP's entry of an object: the file itself, its only entry, or that of its number."""
     content = read_json(path)
     if isinstance(content, Mapping) and any(str(k).startswith("symmetries_") for k in content):

@@ -386,13 +386,13 @@ def exact_diameter(points_m: Float[Tensor, "n 3"]) -> float:
     # All on one plane, or fewer than four: there is no hull, and every pair is looked at.
     with suppress(QhullError, ValueError):
         points = points[ConvexHull(points).vertices]
-    everything = torch.from_numpy(points)
-    if len(everything) > _HULL:
+    corners = torch.from_numpy(points)
+    if len(corners) > _HULL:
         farthest = []
-        for some in fibonacci_directions(_HULL_DIRECTIONS).T.split(256, dim=1):
-            along = everything @ some
+        for directions in fibonacci_directions(_HULL_DIRECTIONS).T.split(256, dim=1):
+            along = corners @ directions
             farthest += [along.argmax(0), along.argmin(0)]
-        everything = everything[torch.cat(farthest).unique()]
+        corners = corners[torch.cat(farthest).unique()]
     exactly = "donot_use_mm_for_euclid_dist"
-    rows = (torch.cdist(row, everything, compute_mode=exactly) for row in everything.split(1024))
-    return max(float(row.max()) for row in rows)
+    distances = (torch.cdist(part, corners, compute_mode=exactly) for part in corners.split(1024))
+    return max(float(part.max()) for part in distances)

@@ -296,8 +296,8 @@ def _with_sizes(
         "keypoints": len(models[0].keypoints_m),
         "inputs": SHAPE_FEATURES if config.cloud.with_shape else 1,
     }
-    own_sizes = {name: size for name, size in sizes.items() if hasattr(config.network, name)}
-    network = dataclasses.replace(config.network, **own_sizes)
+    network_sizes = {name: size for name, size in sizes.items() if hasattr(config.network, name)}
+    network = dataclasses.replace(config.network, **network_sizes)
     return dataclasses.replace(config, network=network)
 
 
