@@ -2,8 +2,17 @@
 
 import numpy as np
 import pytest
+import torch
 
-from depthpose.pose.sensor import SHARED_PER_WHITE, DepthNoise, measure_noise
+from depthpose.pose.sensor import (
+    FLAT_M,
+    NOISE_PER_M2,
+    SHARED_PER_WHITE,
+    DepthNoise,
+    measure_noise,
+    measure_noise_per_m2,
+    plane_tolerance_m,
+)
 
 
 def tilted_plane(noise_m: float) -> np.ndarray:
@@ -53,3 +62,19 @@ def test_a_slanted_surface_deviates_more_along_the_ray() -> None:
     assert front == pytest.approx(0.001)
     assert slanted == pytest.approx(0.002)
     assert grazing < 0.004, "what is seen along the surface is hardly measured"
+
+
+def test_noise_of_a_whole_image_is_that_for_the_square_of_its_depth() -> None:
+    depth_m = tilted_plane(0.0)
+    noise = np.random.default_rng(1).normal(size=depth_m.shape)
+    noisy_m = torch.from_numpy(depth_m + 0.002 * depth_m**2 * noise)
+    noisy_m[::7, ::5] = 0.0
+    assert measure_noise_per_m2(noisy_m) == pytest.approx(0.002, rel=0.05)
+    assert measure_noise_per_m2(torch.zeros(120, 160).double()) == NOISE_PER_M2
+
+
+def test_a_reading_may_lie_off_its_plane_by_the_noise_but_not_by_any() -> None:
+    depth_m = torch.tensor([0.5, 1.0, 2.0], dtype=torch.float64)
+    assert plane_tolerance_m(depth_m, 0.0).tolist() == [FLAT_M] * 3
+    assert float(plane_tolerance_m(depth_m, 0.0001)[1]) == pytest.approx(FLAT_M + 0.001)
+    assert float(plane_tolerance_m(depth_m, 1.0)[2]) == pytest.approx(0.004 + 4 * 0.003)

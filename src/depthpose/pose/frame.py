@@ -15,7 +15,7 @@ from torch.nn.functional import max_pool2d, normalize, pad
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.camera import back_project, project
-from depthpose.pose.sensor import LAG_PX, SHARED_PER_WHITE
+from depthpose.pose.sensor import NOISE_PER_M2, measure_noise_per_m2, plane_tolerance_m
 from depthpose.pose.types import KnownBackground
 
 _MOST_PIXELS = 110_000
@@ -32,16 +32,6 @@ _ALONG = math.cos(math.radians(20))
 _JUMP_M = 0.004
 _JUMP_PER_M = 0.012
 """Neighbours are of one surface up to this difference in depth, and this share of it."""
-_TOLERANCE_M = 0.0005
-_DEVIATIONS = 4.0
-"""Points lie on a plane up to half a millimetre, and four standard deviations of the error that
-neighbouring readings share, which grows with the square of the depth."""
-_WIDEST_M = 0.004
-_WIDEST_PER_M2 = 0.003
-"""But no farther than 4 mm, and 3 mm for the square of their depth in metres: a Kinect's noise."""
-NOISE_PER_M2 = 0.0015
-"""Standard deviation of a Kinect's readings, for the square of the depth in metres (Nguyen et al.
-2012): where nothing better is known."""
 _PLANES = 6
 _HYPOTHESES = 400
 _SAMPLE = 4000
@@ -120,7 +110,7 @@ def prepare_frame(
         known: background that is known, of the whole image.
     """
     depth_m = torch.where(depth_m.isfinite() & (depth_m > 0), depth_m, 0.0).double()
-    noise_per_m2 = _measure_noise_per_m2(depth_m)
+    noise_per_m2 = measure_noise_per_m2(depth_m)
     step = math.ceil(math.sqrt(depth_m.numel() / _MOST_PIXELS))
     is_read = depth_m > 0
     if diameter_m is not None and bool(is_read.any()):
@@ -146,22 +136,6 @@ def prepare_frame(
         background_limit_m=limit_m, nearest_m=nearest_m, noise_per_m2=noise_per_m2,
         backgrounds=backgrounds,
     )  # fmt: skip
-
-
-def _measure_noise_per_m2(depth_m: Float64[Tensor, "h w"]) -> float:
-    """Measure the noise of an image by second differences, over the square of the depth.
-
-    Args:
-        depth_m: 0 where there is no reading.
-    """
-    scaled = torch.where(depth_m > 0, depth_m, torch.nan)
-    bends: list[Tensor] = []
-    for along in (scaled, scaled.T):
-        middle = along[:, LAG_PX:-LAG_PX]
-        bend = (along[:, : -2 * LAG_PX] + along[:, 2 * LAG_PX :] - 2 * middle) / middle.square()
-        bends.append(bend[bend.isfinite()])
-    bend = torch.cat(bends).abs()
-    return float(bend.median()) / 0.6745 / math.sqrt(6) if len(bend) else NOISE_PER_M2
 
 
 def _normals(
@@ -270,7 +244,7 @@ def _bent(
     off_m = points_m @ plane[0] - plane[1]
     x, y = (points_m[..., :2] / points_m[..., 2:].clamp(min=1e-6)).unbind(-1)
     terms = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], -1)
-    tolerance_m = _tolerance_m(points_m[..., 2], noise_per_m2)
+    tolerance_m = plane_tolerance_m(points_m[..., 2], noise_per_m2)
     is_bent = near & is_along
     for _ in range(_BENDINGS):
         A, b = (take_evenly(grid[is_bent], _SAMPLE) for grid in (terms, off_m))
@@ -294,7 +268,7 @@ def largest_plane(
     length = normal.norm(dim=-1, keepdim=True)
     normal = normal / length.clamp(min=1e-12)
     offset = (normal * a).sum(-1)
-    tolerance_m = _tolerance_m(some[:, 2], noise_per_m2)
+    tolerance_m = plane_tolerance_m(some[:, 2], noise_per_m2)
     on = (some @ normal.T - offset).abs() < tolerance_m[:, None]
     on &= length[:, 0] > 1e-8
     best = int(on.sum(0).argmax())
@@ -346,7 +320,7 @@ def share_behind(
     margin_px = margin_m * float(frame.K[0, 0] / points_m[:, 2].median().clamp(min=1e-6))
     reach = min(math.ceil(margin_px), min(frame.depth_m.shape) // 2)
     limit_m = _largest_about(background.depth_m, reach)
-    limit_m += margin_m + _tolerance_m(limit_m, frame.noise_per_m2)
+    limit_m += margin_m + plane_tolerance_m(limit_m, frame.noise_per_m2)
     readings = readings_toward(frame, points_m)
     limit_m = limit_m.flatten()[readings.pixel]
     # What stands before the background hides it; where the camera saw farther it has ended.
@@ -367,7 +341,7 @@ def is_on_background(
         background_m: depth of the background in the same image; NaN where it is not known.
     """
     read_m = torch.where(depth_m > 0, depth_m, 0.0).double()
-    tolerance_m = math.sqrt(2) * _tolerance_m(read_m, _measure_noise_per_m2(read_m))
+    tolerance_m = math.sqrt(2) * plane_tolerance_m(read_m, measure_noise_per_m2(read_m))
     known_m = background_m.double().nan_to_num(torch.inf)
     farthest_m = _largest_about(known_m, 1)
     nearest_m = -_largest_about(-known_m, 1)
@@ -382,19 +356,12 @@ def _largest_about(values: Float64[Tensor, "h w"], reach: int) -> Float64[Tensor
     return torch.where(largest.isfinite(), largest, torch.inf)
 
 
-def _tolerance_m(depth_m: Float64[Tensor, "*n"], noise_per_m2: float) -> Float64[Tensor, "*n"]:
-    """How far from a plane a reading of it may lie, at each depth."""
-    square = depth_m.square()
-    tolerance_m = _TOLERANCE_M + _DEVIATIONS * SHARED_PER_WHITE * noise_per_m2 * square
-    return torch.minimum(tolerance_m, _WIDEST_M + _WIDEST_PER_M2 * square)
-
-
 def is_on_plane(
     points_m: Float64[Tensor, "*batch 3"], plane: Plane, noise_per_m2: float = NOISE_PER_M2
 ) -> Bool[Tensor, "*batch"]:
     """Whether points of the camera frame lie on a plane, as far as a depth sensor measures it."""
     normal, offset = plane
-    tolerance_m = _tolerance_m(points_m[..., 2], noise_per_m2)
+    tolerance_m = plane_tolerance_m(points_m[..., 2], noise_per_m2)
     return (points_m @ normal - offset).abs() < tolerance_m
 
 

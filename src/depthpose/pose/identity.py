@@ -20,7 +20,7 @@ from depthpose.pose.evidence import BORDER_PX
 from depthpose.pose.icp import refine_pose, refine_roughly
 from depthpose.pose.mesh import MIRROR_ALIKE
 from depthpose.pose.mesh.models import fibonacci_directions
-from depthpose.pose.sensor import INDEPENDENT_SIDES
+from depthpose.pose.sensor import INDEPENDENT_SIDES, LARGEST_OFFSET_M
 from depthpose.pose.surface import NEAR, Surface, finite_array
 from depthpose.pose.types import Evidence, Identity
 
@@ -38,7 +38,6 @@ _CLEAR = 0.05
 """Where the mirror image, roughly fitted, is so much farther from the points than the model, exact
 steps do not bring it nearer: in 123 views the gain was then -0.035 at most."""
 _FLIP = torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
-_OFFSET_M = 0.006  # sensors are off along the ray by 3 to 6 mm: so much nearer, things look larger
 _SURE = 2.0  # standard deviations
 _SIZE_GAIN = 0.05
 """Where another size gains less (0.25 % of the diameter), what is seen of the surface fits at many,
@@ -223,8 +222,11 @@ def mirror_gain(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) ->
 
 
 def sensor_size_error(distance_m: float, focal_px: float, diameter_m: float) -> float:
-    """Give the share by which an offset and displaced edges of a sensor may change a size."""
-    return _OFFSET_M / distance_m + 2 * BORDER_PX * distance_m / focal_px / diameter_m
+    """Give the share by which an offset and displaced edges of a sensor may change a size.
+
+    What looks nearer by the offset looks larger by the same share.
+    """
+    return LARGEST_OFFSET_M / distance_m + 2 * BORDER_PX * distance_m / focal_px / diameter_m
 
 
 def identify(
@@ -288,7 +290,7 @@ def identify(
         reason = f"the mirror image of {name} fits what was seen as well"
     elif scale.gain > _SIZE_GAIN:
         reason = f"{size}, which a sensor's errors may explain"
-    elif size_error > max(_NEAR_SIZE, _SURE * scale.sigma) + _OFFSET_M / distance_m:
+    elif size_error > max(_NEAR_SIZE, _SURE * scale.sigma) + LARGEST_OFFSET_M / distance_m:
         reason = f"{size}, and not that of the model"
     elif evidence.contradicted > 0:
         reason = (

@@ -20,7 +20,7 @@ _HYPOTHESES = 120
 _PLANES = 3
 _REFITS = 3
 _TOLERANCE_M = 0.0015
-_TOLERANCE_PER_M = 0.004
+_TOLERANCE_PER_M2 = 0.004
 """Readings lie on a plane up to so much, and so much for the square of their depth in metres."""
 _LEAST_SHARE = 0.05
 """Of the readings: fewer make no plane."""
@@ -117,7 +117,7 @@ def _planes(
     """
     depth_m = reading_m / stretch
     points_m = rays * depth_m[:, None]
-    tolerance = _TOLERANCE_M / depth_m + _TOLERANCE_PER_M * depth_m
+    tolerance = _TOLERANCE_M / depth_m + _TOLERANCE_PER_M2 * depth_m
     generator = torch.Generator().manual_seed(0)
     is_free = torch.ones(len(rays), dtype=torch.bool)  # of no plane yet
     least = max(3, _LEAST_SHARE * len(rays))

@@ -1,4 +1,4 @@
-"""What a depth camera and a real object are off by: the deviations in which evidence is counted.
+"""What depth cameras and real objects are off by: every physical constant of a sensor is here.
 
 A depth camera errs in three ways. Each reading has noise of its own. Neighbouring readings also
 share an error, because stereo and structured light match windows of several pixels: a patch of
@@ -6,13 +6,30 @@ readings that is off together is one observation, not hundreds. And all readings
 shifted alike along the ray, which refinement takes up in the pose. Beside the camera, a real object
 deviates from its file: by a few tenths of a millimetre if it is machined, by a millimetre or more
 if the file is a scan or the object a carton.
+
+Noise grows with the square of the depth. Where it is given for that square, as ``noise_per_m2``,
+its unit is metres per square metre of depth.
 """
 
 import math
 from dataclasses import dataclass
 
 import numpy as np
+import torch
+from jaxtyping import Float64
+from torch import Tensor
 
+NOISE_PER_M2 = 0.0015
+"""Standard deviation [m] of a Kinect's readings, for the square of the depth in metres (Nguyen et
+al., 3DIMPVT 2012): where nothing better is known."""
+NOISIEST_PER_M2 = 4 * NOISE_PER_M2
+"""Largest noise that is believed, for the square of the depth in metres."""
+OFFSET_DEVIATION_M = 0.004
+LARGEST_OFFSET_M = 0.006
+"""Depth cameras are off along the ray by 3 to 6 mm as a whole (``bench/sensors.py``): the standard
+deviation of that offset, and what it is at most."""
+FLAT_M = 0.0005
+"""Real tables and walls are flat to half a millimetre."""
 LAG_PX = 3
 """Noise is measured between readings so far apart: direct neighbours of a real sensor err alike."""
 SHARED_PER_WHITE = 2.5
@@ -27,12 +44,14 @@ CORRELATION_PX = 10
 a Kinect's, is as many independent readings as squares of 4 pi 3^2 pixels; a RealSense smooths by
 5 px."""
 CORRELATION_RAD = CORRELATION_PX / 570  #: the same as an angle, for a Kinect of 640 columns
-NOISIEST_PER_M = 0.006
-"""Largest noise that is believed, for the square of the depth in metres: four times a Kinect's
-(Nguyen et al. 2012)."""
 INDEPENDENT_SIDES = 6.0
 """A real object deviates from its model by whole sides, of which a body has about six: they are so
 few independent deviations, however many readings there are."""
+_TOLERATED = 4.0
+"""A reading lies on a plane up to so many deviations of the error that its neighbours share."""
+_WIDEST_M = 0.004
+_WIDEST_PER_M2 = 0.003
+"""But no farther than 4 mm, and 3 mm for the square of its depth in metres: twice a Kinect's."""
 _MEDIAN_TO_DEVIATION = 1.4826  # of a normal distribution
 _STEEPEST = 0.3
 """Least cosine by which a deviation along the surface normal is divided: what is seen at a smaller
@@ -87,5 +106,35 @@ def measure_noise(depth_m: np.ndarray, is_object: np.ndarray, object_m: float) -
         # A second difference of independent readings has six times their variance.
         white_m = _MEDIAN_TO_DEVIATION * float(np.median(bend_m)) / math.sqrt(6)
         # On a small object its own curvature is in the differences: no sensor is so noisy.
-        white_m = min(white_m, NOISIEST_PER_M * float(np.nanmedian(masked_m)) ** 2)
+        white_m = min(white_m, NOISIEST_PER_M2 * float(np.nanmedian(masked_m)) ** 2)
     return DepthNoise(white_m=white_m, shared_m=SHARED_PER_WHITE * white_m, object_m=object_m)
+
+
+def measure_noise_per_m2(depth_m: Float64[Tensor, "h w"]) -> float:
+    """Measure the noise of a whole image, for the square of the depth in metres.
+
+    The median of second differences, as :func:`measure_noise` takes it on one object.
+
+    Args:
+        depth_m: 0 where there is no reading.
+    """
+    scaled = torch.where(depth_m > 0, depth_m, torch.nan)
+    bends: list[Tensor] = []
+    for along in (scaled, scaled.T):
+        middle = along[:, LAG_PX:-LAG_PX]
+        bend = (along[:, : -2 * LAG_PX] + along[:, 2 * LAG_PX :] - 2 * middle) / middle.square()
+        bends.append(bend[bend.isfinite()])
+    bend = torch.cat(bends).abs()
+    return float(bend.median()) / 0.6745 / math.sqrt(6) if len(bend) else NOISE_PER_M2
+
+
+def plane_tolerance_m(depth_m: Float64[Tensor, "*n"], noise_per_m2: float) -> Float64[Tensor, "*n"]:
+    """How far off a plane a reading of it may lie.
+
+    Args:
+        depth_m: of the readings.
+        noise_per_m2: of the image, as :func:`measure_noise_per_m2` gives it.
+    """
+    square = depth_m.square()
+    tolerance_m = FLAT_M + _TOLERATED * SHARED_PER_WHITE * noise_per_m2 * square
+    return torch.minimum(tolerance_m, _WIDEST_M + _WIDEST_PER_M2 * square)

@@ -11,11 +11,9 @@ from torch.nn.functional import normalize
 from depthpose.core.rigid import Rigid, perturb
 from depthpose.pose.frame import Frame, readings_toward
 from depthpose.pose.propose.point_pairs import STEP, PairTable, vote_poses
+from depthpose.pose.sensor import NOISE_PER_M2
 from depthpose.pose.surface import BESIDE, NEAR, Surface
 
-_NOISE_PER_M2 = 0.0015
-"""Standard deviation of a depth sensor's readings, for the square of the depth in metres (Nguyen et
-al. 2012): beyond where it is as large as what counts as near, no shape is seen."""
 _REFERENCES, _FEWEST, _ALL_REFERENCES = 2000, 200, 6000
 """Points of the scene that vote with each of the others: at most, at least, and for all objects."""
 _EVERY = 8
@@ -98,7 +96,8 @@ def _scene_points(
 ) -> tuple[Float64[Tensor, "n 3"], Float64[Tensor, "n 3"]]:
     """Average points and normals in cells, without planes and what is too far to have a shape."""
     used = frame.is_smooth & is_left & (frame.background_limit_m < surface.diameter_m)
-    used &= _NOISE_PER_M2 * frame.depth_m.square() < NEAR * surface.diameter_m
+    # Beyond where the noise is as large as what counts as near, no shape is seen.
+    used &= NOISE_PER_M2 * frame.depth_m.square() < NEAR * surface.diameter_m
     points_m, normals = frame.points_m[used], frame.normals[used]
     if len(points_m) == 0:
         return points_m, normals
@@ -185,7 +184,7 @@ def compare_with_image(
     # A plane that is wider than the object is no side of it.
     at = readings_toward(frame, posed_m)
     no_side = (frame.background_limit_m >= surface.diameter_m).flatten()
-    limit_m = stage.fits * surface.diameter_m + 2 * _NOISE_PER_M2 * posed_m[..., 2].square()
+    limit_m = stage.fits * surface.diameter_m + 2 * NOISE_PER_M2 * posed_m[..., 2].square()
     gap_m, is_side = at.depth_m - posed_m[..., 2], ~no_side[at.pixel]
     cosine = (normals * frame.normals.flatten(0, 1)[at.pixel]).sum(-1).abs()
     fits = at.is_read & (gap_m.abs() < limit_m)
