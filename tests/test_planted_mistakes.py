@@ -27,11 +27,11 @@ from depthpose.core.units import Unit
 from depthpose.depth.disparity import disparity_advice, disparity_from_depth
 from depthpose.depth.estimator import refuse_unrectified
 from depthpose.depth.types import StereoInput
-from depthpose.pose.cloud import Refusal, prepare_cloud
+from depthpose.pose.cloud import prepare_cloud
 from depthpose.pose.config import CloudConfig, EstimateConfig
 from depthpose.pose.inputs import AnyInput, cloud_input, view_input
 from depthpose.pose.mesh import read_model
-from depthpose.pose.types import CloudInput, ViewInput
+from depthpose.pose.types import CloudInput, Refusal, ViewInput
 
 CAMERA: dict[str, Any] = {
     "width": 640,

@@ -157,7 +157,7 @@ class Oracle(GeoPoseNet):
         ready = [one for one in group if isinstance(one, CloudToPose)]
         self.calls += [len(ready)] if ready else []
         for one in ready:
-            one.directions = self._true(one.cloud.points_m, one.prepared.number)
+            one.directions = self._true(one.voxels.points_m, one.prepared.number)
             one.seconds["network"] = 0.01
         return group
 

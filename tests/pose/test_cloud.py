@@ -11,10 +11,10 @@ from depthpose.core.files import read_depth_png, read_image
 from depthpose.pose.cloud import (
     cloud_from_depth,
     is_reading,
-    refusal_of,
     sample_points,
     turn_axis_to,
     voxelise,
+    why_too_few,
 )
 from depthpose.pose.config import SHAPE_FEATURES, CloudConfig
 from depthpose.pose.types import CloudInput
@@ -59,13 +59,13 @@ def test_a_mask_of_another_size_is_refused() -> None:
 
 
 def test_too_small_a_cloud_is_refused_with_a_reason() -> None:
-    assert refusal_of(torch.rand(16, 3)) is None
-    assert refusal_of(torch.rand(15, 3)) == (
+    assert why_too_few(torch.rand(16, 3)) is None
+    assert why_too_few(torch.rand(15, 3)) == (
         "the cloud has 15 points, fewer than the 16 that a pose takes: is the mask empty, or the "
         "depth missing there?"
     )
     empty = cloud_from_depth(torch.ones(4, 4), torch.zeros(4, 4, dtype=torch.bool), K, 0.1)
-    assert "0 points" in (refusal_of(empty) or "")
+    assert "0 points" in (why_too_few(empty) or "")
 
 
 def plain(voxel_m: float) -> CloudConfig:

@@ -78,7 +78,7 @@ def test_true_votes_end_at_their_keypoints() -> None:
     assert torch.equal(found.camera_from_model.t_m, alone.camera_from_model.t_m)
     assert voted is not None
     keypoints_m = pose.apply(model.keypoints_m)
-    layer = vote_layer(voted.cloud.points_m, voted.directions[..., :3], keypoints_m)
+    layer = vote_layer(voted.points_m, voted.directions[..., :3], keypoints_m)
     assert isinstance(layer.shape, Lines)
     assert not layer.is_shown
     tips_m = layer.shape.ends_m[:, 1].unflatten(0, (-1, 8))

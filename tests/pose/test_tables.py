@@ -190,7 +190,7 @@ def test_votes_are_those_of_the_estimator() -> None:
     assert case is not None
     expected = torch.nn.functional.normalize(voted.directions, dim=-1)
     # A kept point of each voxel; the estimator drops flying pixels by the same rule.
-    gaps = (case.points_m[None] - voted.cloud.points_m[:, None]).norm(dim=-1)
+    gaps = (case.points_m[None] - voted.points_m[:, None]).norm(dim=-1)
     place = gaps.argmin(1)
     assert float(gaps.amin(1).max()) == 0.0
     assert torch.allclose(case.directions[place], expected, atol=1e-4)

@@ -1,4 +1,4 @@
-"""Depth and mask to the partial cloud of one object, or the reason why it cannot be posed."""
+"""Depth and mask to the partial cloud of one object, its checks, and the grid of a network."""
 
 import math
 from dataclasses import dataclass
@@ -16,26 +16,27 @@ from depthpose.pose.types import (
     CloudInput,
     CloudSample,
     ObjectModel,
-    Status,
+    Refusal,
     ViewInput,
     ViewSample,
 )
 
 _LARGEST_CELL = 2**20
 _NEIGHBOURS = 20
-_MOST = 0.5
-_STEEP = 1.73  # tangent of 60 degrees
-_BEFORE = 0.05  # nearly all points of a seen cloud are so many diameters before the camera
-_THIN = 0.002  # below this root mean square, in diameters, a cloud has no extent
+_MAJORITY = 0.5
+_WIDEST_TANGENT = 1.73  # what a camera sees lies less than 60 degrees off its axis
+_BEFORE_CAMERA_DIAMETERS = 0.05  # nearly all points of a seen cloud lie so far before the camera
+_FLAT_DIAMETERS = 0.002  # below this root mean square a cloud has no extent
 _FARTHEST_M = 1e6  # a coordinate beyond this marks a missing reading
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class VoxelGrid:
-    """Which cells of a grid a cloud fills, and the point that was kept in each."""
+    """Which cells of a grid a cloud fills, and the point that was kept in each: it votes."""
 
     #: of the filled cells, ``floor((x - mean) / voxel)`` of the turned cloud; no two are equal.
     coordinates: Int64[Tensor, "m 3"]
+    points_m: Float[Tensor, "m 3"]  #: of the cloud, that was kept in each cell
     kept: Int64[Tensor, " m"]  #: index of the point of each cell, ascending: the first of its cell
     row_of_point: Int64[Tensor, " n"]  #: which of the cells each point of the cloud lies in
     grid_from_camera: Float[Tensor, "3 3"]  #: how the cloud was turned before
@@ -47,30 +48,27 @@ class VoxelGrid:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ObjectCloud:
-    """A cloud that can be posed."""
+    """A cloud of one object that can be posed."""
 
     name: str  #: that of the input
     cloud_m: Float[Tensor, "n 3"]  #: all usable points, without flying pixels
-    points_m: Float[Tensor, "m 3"]  #: those that the network sees and that vote, one a voxel
-    voxels: VoxelGrid  #: of the network's grid
     view: ViewInput | None  #: the depth image that shows the cloud; None of a cloud alone
-
-
-@dataclass(frozen=True, kw_only=True)
-class Refusal:
-    """Why there is no pose."""
-
-    status: Status
-    reason: str
 
 
 def prepare_cloud(
     pose_input: CloudInput | ViewInput,
     model: ObjectModel,
-    cloud: CloudConfig,
+    cloud_config: CloudConfig,
     config: EstimateConfig,
 ) -> ObjectCloud | Refusal:
-    """Lift, thin, drop flying pixels, check, sample and put on the grid of the network."""
+    """Lift an input to the usable points of its object, or say why it cannot be posed.
+
+    Args:
+        pose_input: a cloud, or a depth image with a mask.
+        model: of the object.
+        cloud_config: limits: the fewest points, and how far flying pixels are.
+        config: how many points of a larger cloud are taken.
+    """
     if isinstance(pose_input, ViewInput):
         view = pose_input
         mask = view.mask if view.background is None else view.mask & ~view.background.is_seen
@@ -84,20 +82,11 @@ def prepare_cloud(
 
     # What is far from the median is background at the mask's border.
     off_m = (readings_m - readings_m.median(0).values).norm(dim=-1)
-    object_m = readings_m[~(off_m > cloud.max_offset_diameters * model.diameter_m)]
-    if (refusal := _refusal_of(pose_input, readings_m, object_m, model, cloud)) is not None:
+    object_m = readings_m[~(off_m > cloud_config.max_offset_diameters * model.diameter_m)]
+    refusal = _refuse_input(pose_input, readings_m, object_m, model, cloud_config)
+    if refusal is not None:
         return refusal
-
-    generator = torch.Generator().manual_seed(config.voting.seed)
-    sampled_m = sample_points(object_m, cloud.max_points, generator)
-    voxels = voxelise(sampled_m, cloud)
-    return ObjectCloud(
-        name=pose_input.name,
-        cloud_m=object_m,
-        points_m=sampled_m[voxels.kept],
-        voxels=voxels,
-        view=view,
-    )
+    return ObjectCloud(name=pose_input.name, cloud_m=object_m, view=view)
 
 
 def _why_empty(pose_input: CloudInput | ViewInput) -> str:
@@ -125,64 +114,82 @@ def nothing_seen(view: ViewInput) -> str:
     return f"none of the {masked} masked pixels has a depth reading"
 
 
-def _refusal_of(
+def _refuse_input(
     pose_input: CloudInput | ViewInput,
-    points_m: Float[Tensor, "n 3"],
+    readings_m: Float[Tensor, "n 3"],
     object_m: Float[Tensor, "m 3"],
     model: ObjectModel,
-    cloud: CloudConfig,
+    cloud_config: CloudConfig,
 ) -> Refusal | None:
-    """Refuse a cloud by its place, its size and its shape; ``object_m``: without flying pixels."""
-    if (few := refusal_of(points_m, cloud)) is not None:
-        return Refusal(status="too few points", reason=few)
-    # Of the object's size is what is left without flying pixels, if those are few.
-    sized_m = object_m if len(object_m) > _MOST * len(points_m) else points_m
-    advice = unit_advice(model.diameter_m, sized_m)
-
-    # A camera sees only what lies before it: a cloud about the origin is in other axes.
-    is_about_origin = float(points_m.median(0).values.norm()) < model.diameter_m / 2
-    least_m = float(take_evenly(points_m[:, 2], 10_000).quantile(0.05))
-    is_centred = is_about_origin and least_m < _BEFORE * model.diameter_m
-    unusable = frame_advice(points_m)
-    if isinstance(pose_input, CloudInput) and is_centred and advice is None:
-        unusable = (
-            "the cloud lies about the origin, where the camera is: it was centred, or is in "
-            "the frame of the model; give it in the camera's frame, as it was seen"
-        )
-    # Some background in the mask is not of another size.
-    elif (
-        not unusable and advice and not (sized_m is object_m and "larger than the model" in advice)
-    ):
-        hint = ""
-        if isinstance(pose_input, ViewInput):  # what else changes the size of a cloud
-            mask = pose_input.mask.float()
-            edge = torch.cat([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
-            hint = (
-                "; a mask of more than it, or a K of another image size, changes the size of its "
-                "cloud too, and so does another depth unit: 0.001 m of most sensors, 0.0002 m of "
-                "TUM RGB-D, 1/256 m of KITTI"
-            )
-            if (share := float(mask.mean())) > _MOST and float(edge.mean()) > _MOST:
-                hint = f"; the mask covers {share:.0%} of the image and its border: is it inverted?"
-        unusable = f"{advice} (the object is {model.diameter_m:.3g} m long{hint})"
+    """Refuse a cloud by its size, its place and its shape; ``object_m``: without flying pixels."""
+    too_few = why_too_few(readings_m, cloud_config)
+    if too_few is not None:
+        return Refusal(status="too few points", reason=too_few)
+    unusable = _why_unusable(pose_input, readings_m, object_m, model)
     if unusable is not None:
         return Refusal(status="unusable input", reason=unusable)
-    if (few := refusal_of(object_m, cloud)) is not None:
-        return Refusal(status="too few points", reason=few)
+    too_few = why_too_few(object_m, cloud_config)
+    if too_few is not None:
+        return Refusal(status="too few points", reason=too_few)
 
     # A plane or a line can slide within itself.
     centred = object_m.double() - object_m.double().mean(0)
     extent_m = torch.linalg.eigvalsh(centred.T @ centred / len(centred)).clamp(min=0).sqrt()
-    flat = int((extent_m < _THIN * model.diameter_m).sum())
-    if flat == 0:
+    flat_axes = int((extent_m < _FLAT_DIAMETERS * model.diameter_m).sum())
+    if flat_axes == 0:
         return None
-    shape = {1: "in a plane", 2: "on a line", 3: "in one place"}[flat]
-    beside = isinstance(pose_input, ViewInput) and flat == 1
-    return Refusal(
-        status="not observable",
-        reason=f"the points lie {shape}, so that motions along it change nothing that is seen; "
-        "look from a side that shows more of the object"
-        f"{', or give the mask of this image: this one may lie on the background' * beside}",
+    shape = {1: "in a plane", 2: "on a line", 3: "in one place"}[flat_axes]
+    reason = (
+        f"the points lie {shape}, so that motions along it change nothing that is seen; look from "
+        "a side that shows more of the object"
+    )
+    if isinstance(pose_input, ViewInput) and flat_axes == 1:
+        reason += ", or give the mask of this image: this one may lie on the background"
+    return Refusal(status="not observable", reason=reason)
+
+
+def _why_unusable(
+    pose_input: CloudInput | ViewInput,
+    readings_m: Float[Tensor, "n 3"],
+    object_m: Float[Tensor, "m 3"],
+    model: ObjectModel,
+) -> str | None:
+    """Say that a cloud is in another frame or of another unit than the model; None where not."""
+    # Its size is that of what is left without flying pixels, if those are few.
+    are_few_flying = len(object_m) > _MAJORITY * len(readings_m)
+    size_advice = unit_advice(model.diameter_m, object_m if are_few_flying else readings_m)
+
+    # A camera sees only what lies before it: a cloud about the origin is in other axes.
+    is_about_origin = float(readings_m.median(0).values.norm()) < model.diameter_m / 2
+    nearest_m = float(take_evenly(readings_m[:, 2], 10_000).quantile(0.05))
+    is_centred = is_about_origin and nearest_m < _BEFORE_CAMERA_DIAMETERS * model.diameter_m
+    if isinstance(pose_input, CloudInput) and is_centred and size_advice is None:
+        return (
+            "the cloud lies about the origin, where the camera is: it was centred, or is in "
+            "the frame of the model; give it in the camera's frame, as it was seen"
+        )
+    axes_advice = frame_advice(readings_m)
+    if axes_advice is not None:
+        return axes_advice
+    if size_advice is None:
+        return None
+    # Some background in the mask is not of another size.
+    if are_few_flying and "larger than the model" in size_advice:
+        return None
+    hint = _size_hint(pose_input.mask) if isinstance(pose_input, ViewInput) else ""
+    return f"{size_advice} (the object is {model.diameter_m:.3g} m long{hint})"
+
+
+def _size_hint(mask: Bool[Tensor, "h w"]) -> str:
+    """Say what else than the unit changes the size of a cloud that a mask was lifted to."""
+    share = float(mask.float().mean())
+    border = torch.cat([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
+    if share > _MAJORITY and float(border.float().mean()) > _MAJORITY:
+        return f"; the mask covers {share:.0%} of the image and its border: is it inverted?"
+    return (
+        "; a mask of more than it, or a K of another image size, changes the size of its "
+        "cloud too, and so does another depth unit: 0.001 m of most sensors, 0.0002 m of "
+        "TUM RGB-D, 1/256 m of KITTI"
     )
 
 
@@ -259,7 +266,7 @@ def is_reading(points_m: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
     return (points_m.abs() < _FARTHEST_M).all(-1) & (points_m != 0).any(-1)
 
 
-def refusal_of(points_m: Float[Tensor, "n 3"], config: CloudConfig | None = None) -> str | None:
+def why_too_few(points_m: Float[Tensor, "n 3"], config: CloudConfig | None = None) -> str | None:
     """Say why a cloud is too small to be posed; None where it is not."""
     config = CloudConfig() if config is None else config
     if len(points_m) >= config.min_points:
@@ -330,14 +337,14 @@ def frame_advice(points_m: Float[Tensor, "n 3"]) -> str | None:
     behind = float((points_m[:, 2] <= 0).float().mean())
     across_m = points_m[:, :2].median(0).values.abs()
     forward_m = points_m[:, 2].median().abs()
-    if float(across_m.max()) > _STEEP * float(forward_m):
+    if float(across_m.max()) > _WIDEST_TANGENT * float(forward_m):
         axis = "xy"[int(across_m.argmax())]
         return (
             f"the points lie along {axis}, more than 60 degrees off z: does {axis} point forward, "
             "as x does in LiDAR and robot frames? Turn the cloud to x right, y down, z forward: of "
             "(x forward, y left, z up) that is (-y, -z, x)"
         )
-    if behind <= _MOST:
+    if behind <= _MAJORITY:
         return None
     return (
         f"{behind:.0%} of the points lie behind the camera (z <= 0): is its z backward or in "
@@ -369,7 +376,7 @@ def voxelise(points_m: Float[Tensor, "n 3"], config: CloudConfig) -> VoxelGrid:
             wide.
     """
     if len(points_m) == 0:
-        raise InputError("voxelise: the cloud has no point; see refusal_of first.")
+        raise InputError("voxelise: the cloud has no point; see why_too_few first.")
     if not bool(points_m.isfinite().all()):
         # One NaN would move the mean, and with it every point, into one cell.
         count = int((~points_m.isfinite().all(-1)).sum())
@@ -405,11 +412,18 @@ def voxelise(points_m: Float[Tensor, "n 3"], config: CloudConfig) -> VoxelGrid:
         features = torch.cat([features, shape.float()], 1)
     return VoxelGrid(
         coordinates=cells[kept],
+        points_m=points_m[kept],
         kept=kept,
         row_of_point=row_of_point,
         grid_from_camera=turn,
         features=features,
     )
+
+
+def sample_and_voxelise(cloud_m: Float[Tensor, "n 3"], config: CloudConfig, seed: int) -> VoxelGrid:
+    """Put at most ``max_points`` of a cloud, chosen at random, on the grid of a network."""
+    generator = torch.Generator().manual_seed(seed)
+    return voxelise(sample_points(cloud_m, config.max_points, generator), config)
 
 
 def turn_axis_to(direction: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:

@@ -16,7 +16,6 @@ from depthpose.core.files import Picture
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
 from depthpose.pose.background import AnyBackground, with_background
-from depthpose.pose.cloud import Refusal
 from depthpose.pose.color_inputs import with_color
 from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.copies import PreparedObject, copies_of
@@ -41,7 +40,7 @@ from depthpose.pose.search import (
 )
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.track import TrackedObject, track
-from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
+from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, Refusal, ViewInput
 
 Made = TypeVar("Made")
 _NAME = "input"  # what an input is called that came without a name

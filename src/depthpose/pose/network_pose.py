@@ -29,10 +29,11 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.baselines import DepthCrop, DepthImageNet, cut_depth, poses_of
 from depthpose.pose.cloud import (
     ObjectCloud,
-    Refusal,
+    VoxelGrid,
     cloud_from_depth,
     prepare_cloud,
-    refusal_of,
+    sample_and_voxelise,
+    why_too_few,
 )
 from depthpose.pose.config import EstimateConfig
 from depthpose.pose.copies import PreparedObject, copies_of
@@ -47,6 +48,7 @@ from depthpose.pose.types import (
     AnyInput,
     CloudInput,
     PoseEstimate,
+    Refusal,
     Status,
     ViewInput,
     VotingPoints,
@@ -59,21 +61,23 @@ _COMPARED = 100  # points at which the best of symmetric copies is chosen
 _NEEDS_MASK = "a regressed depth image takes a depth image with a mask; give both, or other weights"
 
 
-class CloudDirections(NamedTuple):
-    """A cloud and the network's directions at its points."""
+class VotingDirections(NamedTuple):
+    """The points that vote, in the camera frame, and the network's directions at them."""
 
-    cloud: ObjectCloud
+    points_m: Float[Tensor, "n 3"]
     directions: Float[Tensor, "n k 3"]
 
 
 @dataclass(kw_only=True, eq=False)
 class CloudToPose:
-    """An input on its way: its object, its cloud, the seconds, and what the network says of it."""
+    """An input on its way through the network."""
 
     pose_input: AnyInput
-    prepared: PreparedObject
-    cloud: ObjectCloud
-    seconds: dict[str, float]
+    prepared: PreparedObject  #: its object
+    cloud: ObjectCloud  #: all points of the object
+    voxels: VoxelGrid  #: those that the network sees and that vote, one a voxel
+    seconds: dict[str, float]  #: spent so far
+    #: of the network at each voting point, in the camera frame; empty before it was asked
     directions: Float[Tensor, "n k 3"] = field(default_factory=lambda: torch.empty(0, 0, 3))
 
 
@@ -84,7 +88,7 @@ def _batches(
     group: list[CloudToPose | PoseEstimate] = []
     total = 0
     for job in clouds:
-        count = len(job.cloud.points_m) if isinstance(job, CloudToPose) else 0
+        count = len(job.voxels.points_m) if isinstance(job, CloudToPose) else 0
         if group and total + count > most:
             yield group
             group = []
@@ -193,14 +197,14 @@ class GeoPoseNet(PoseEstimator):
     @force_float32()
     def estimate_with_votes(
         self, pose_input: AnyInput
-    ) -> tuple[PoseEstimate, CloudDirections | None]:
+    ) -> tuple[PoseEstimate, VotingDirections | None]:
         """Estimate one pose, and give what the network said of each keypoint at each point.
 
         What the network doubts is not registered here.
 
         Returns:
-            The estimate, and the cloud with the outputs in the camera frame; None for them where
-            the network was not run, as there is too little to pose.
+            The estimate, and the points that vote with their directions in the camera frame; None
+            for them where the network was not run, as there is too little to pose.
 
         Raises:
             InputError: an unknown object, or a mask that does not fit its depth image.
@@ -211,7 +215,7 @@ class GeoPoseNet(PoseEstimator):
                 return job, None
             self._ask_network([job])
             voted = self._vote(pose_input, job=job, is_likely=True)
-            return voted, CloudDirections(job.cloud, job.directions)
+            return voted, VotingDirections(job.voxels.points_m, job.directions)
 
     def _prepare(self, pose_input: AnyInput) -> CloudToPose | PoseEstimate:
         """Lift an input to the cloud that the network takes; estimate one of a region here."""
@@ -221,10 +225,17 @@ class GeoPoseNet(PoseEstimator):
         copies_of(prepared)  # in the seconds of no input
         start = time.perf_counter()
         cloud = prepare_cloud(pose_input, prepared.model, self.weights.cloud, self.config)
-        seconds = {"cloud": time.perf_counter() - start}
         if isinstance(cloud, Refusal):
-            return refused(pose_input, cloud, seconds)
-        return CloudToPose(pose_input=pose_input, prepared=prepared, cloud=cloud, seconds=seconds)
+            return refused(pose_input, cloud, {"cloud": time.perf_counter() - start})
+        seed = self.config.voting.seed
+        voxels = sample_and_voxelise(cloud.cloud_m, self.weights.cloud, seed)
+        return CloudToPose(
+            pose_input=pose_input,
+            prepared=prepared,
+            cloud=cloud,
+            voxels=voxels,
+            seconds={"cloud": time.perf_counter() - start},
+        )
 
     def _ask_network(
         self, group: list[CloudToPose | PoseEstimate]
@@ -234,12 +245,12 @@ class GeoPoseNet(PoseEstimator):
         if not ready:
             return group
         start = time.perf_counter()
-        counts = [len(job.cloud.points_m) for job in ready]
+        grids = [job.voxels for job in ready]
+        counts = [len(grid.points_m) for grid in grids]
         cloud_of_point = torch.repeat_interleave(torch.arange(len(ready)), torch.tensor(counts))
         numbers = torch.tensor([job.prepared.number for job in ready])
-        grids = [job.cloud.voxels for job in ready]
         coordinates = torch.cat([grid.coordinates for grid in grids])
-        points_m = [job.cloud.points_m @ job.cloud.voxels.grid_from_camera.mT for job in ready]
+        points_m = [grid.points_m @ grid.grid_from_camera.mT for grid in grids]
         device = self.config.device
         network_input = VotingPoints(
             points_m=torch.cat(points_m).to(device),
@@ -249,7 +260,7 @@ class GeoPoseNet(PoseEstimator):
         )
         outputs = self._network.directions(network_input).float().cpu().split(counts)
         for job, of_cloud in zip(ready, outputs, strict=True):
-            job.directions = of_cloud @ job.cloud.voxels.grid_from_camera
+            job.directions = of_cloud @ job.voxels.grid_from_camera
         spent_s = time.perf_counter() - start
         for job, count in zip(ready, counts, strict=True):  # each has a share of the time
             job.seconds["network"] = spent_s * count / sum(counts)
@@ -280,7 +291,7 @@ class GeoPoseNet(PoseEstimator):
 
         # Propose: where the directions meet are the keypoints, to which the model's are fitted.
         began = time.perf_counter()
-        points_m = cloud.points_m.double()
+        points_m = job.voxels.points_m.double()
         directions = job.directions.double()
         if config.voting.method == "ransac":
             vote = vote_ransac(points_m, directions, config=config.voting)
@@ -334,7 +345,7 @@ class GeoPoseNet(PoseEstimator):
         """
         keypoints_m = job.prepared.model.keypoints_m.double()
         copies_m = (pose @ copies_of(job.prepared).trained).apply(keypoints_m)
-        points_m = job.cloud.points_m.double()
+        points_m = job.voxels.points_m.double()
         directions = normalize(job.directions.double(), dim=-1)
         step = max(1, len(points_m) // _COMPARED)
         toward = normalize(copies_m[:, None] - points_m[::step, None], dim=-1)
@@ -411,7 +422,7 @@ class DepthImageRegressor(PoseEstimator):
         points_m = cloud_from_depth(
             pose_input.depth_m, pose_input.mask, pose_input.K, model.diameter_m, self._cloud
         ).float()
-        if (few := refusal_of(points_m, self._cloud)) is not None:
+        if (few := why_too_few(points_m, self._cloud)) is not None:
             return replace(estimate, status="too few points", reason=few, camera_from_model=None)
         pose = estimate.camera_from_model
         assert pose is not None

@@ -15,7 +15,7 @@ from depthpose.core.devices import each_in_threads, force_float32
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
-from depthpose.pose.cloud import ObjectCloud, Refusal, local_planes, prepare_cloud, thin
+from depthpose.pose.cloud import ObjectCloud, local_planes, prepare_cloud, thin
 from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig
 from depthpose.pose.copies import PreparedObject
 from depthpose.pose.decide import (
@@ -40,9 +40,9 @@ from depthpose.pose.mesh import (
     with_found_symmetries,
 )
 from depthpose.pose.propose.point_pairs import propose_poses
-from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
+from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, Refusal, ViewInput
 
-_VOXEL_DIAMETERS = 0.05  # distance of the points that vote
+_VOTING_DIAMETERS = 0.05  # distance of the points that vote
 _LEAST_POINTS = 500  # of a model without faces
 _PROPOSALS = 40
 _HOPELESS = 0.02
@@ -173,7 +173,7 @@ class Registration(PoseEstimator):
         prepared = self._prepared_object(pose_input.object)
         is_masked = proposals is None
         began = time.perf_counter()
-        cloud = self._cloud(pose_input, prepared)
+        cloud = prepare_cloud(pose_input, prepared.model, CloudConfig(), self.config)
         seconds = {"cloud": time.perf_counter() - began}
         if isinstance(cloud, Refusal):
             return refused(pose_input, cloud, seconds)
@@ -228,17 +228,11 @@ class Registration(PoseEstimator):
             prior_odds,
         )
 
-    def _cloud(self, pose_input: AnyInput, prepared: PreparedObject) -> ObjectCloud | Refusal:
-        """Lift the input to a cloud, with voxels as far apart as the points that vote."""
-        voxel_m = min(0.9, _VOXEL_DIAMETERS * prepared.model.diameter_m)
-        config = CloudConfig(voxel_m=voxel_m, max_points=None)
-        return prepare_cloud(pose_input, prepared.model, config, self.config)
-
     def _propose(self, cloud: ObjectCloud, prepared: PreparedObject) -> Rigid:
         """Propose poses by the point pairs of a cloud."""
         assert prepared.pairs is not None, "_prepared_object computes them"
         dense_m = take_evenly(cloud.cloud_m.double(), _SMOOTHED_POINTS)
-        step_m = _VOXEL_DIAMETERS * prepared.surface.diameter_m
+        step_m = _VOTING_DIAMETERS * prepared.surface.diameter_m
         voting_m = dense_m[thin(dense_m, torch.zeros_like(dense_m), step_m)]
         normals, _ = local_planes(dense_m, voting_m)
         generator = torch.Generator().manual_seed(self.config.voting.seed)

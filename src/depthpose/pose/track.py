@@ -14,7 +14,7 @@ from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid
-from depthpose.pose.cloud import Refusal, cloud_from_depth
+from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.decide import (
     PRIOR_MASKED,
@@ -34,6 +34,7 @@ from depthpose.pose.types import (
     CloudInput,
     ObjectModel,
     PoseEstimate,
+    Refusal,
     ViewInput,
 )
 

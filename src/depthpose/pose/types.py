@@ -30,6 +30,15 @@ than the sensor explains."""
 
 POSED: tuple[Status, ...] = ("ok", "ambiguous")  #: with a pose
 
+
+@dataclass(frozen=True, kw_only=True)
+class Refusal:
+    """Why there is no pose."""
+
+    status: Status  #: the kind of refusal
+    reason: str  #: one sentence for people
+
+
 Tracking = Literal["tracked", "found", "lost"]
 """How an estimate of a sequence came about: followed from the frame before, looked for anew, or
 neither."""

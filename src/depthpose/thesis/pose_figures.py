@@ -15,12 +15,12 @@ from torch.nn import functional as F
 from depthpose.core.arrays import take_evenly
 from depthpose.core.errors import InputError
 from depthpose.core.files.images import picture_tensor
-from depthpose.pose.cloud import Refusal, prepare_cloud
+from depthpose.pose.cloud import prepare_cloud, sample_and_voxelise
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.network import ResUNet
 from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.pose.sparse import Voxels
-from depthpose.pose.types import AnyInput, ObjectModel
+from depthpose.pose.types import AnyInput, ObjectModel, Refusal
 
 _GAP_PX = 8
 
@@ -94,13 +94,13 @@ def seen_points(
     if not isinstance(network, ResUNet):
         raise InputError("figure 3-2 shows features of the sparse network; give weights of it")
     model = next(m for m in net.weights.models if m.name == pose_input.object)
-    prepared = prepare_cloud(pose_input, model, net.weights.cloud, net.config)
-    if isinstance(prepared, Refusal):
+    cloud = prepare_cloud(pose_input, model, net.weights.cloud, net.config)
+    if isinstance(cloud, Refusal):
         return None
-    grid = prepared.voxels
+    grid = sample_and_voxelise(cloud.cloud_m, net.weights.cloud, net.config.voting.seed)
     rows = F.pad(grid.coordinates, (1, 0))
     voxels = Voxels.from_points(rows, grid.features)
-    return prepared.points_m, network.features(voxels).at_points().float()
+    return grid.points_m, network.features(voxels).at_points().float()
 
 
 def draw_features(

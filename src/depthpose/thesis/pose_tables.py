@@ -16,7 +16,7 @@ from torch import Tensor
 
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
-from depthpose.pose.cloud import cloud_from_depth, refusal_of, sample_points, voxelise
+from depthpose.pose.cloud import cloud_from_depth, sample_points, voxelise, why_too_few
 from depthpose.pose.config import VotingConfig
 from depthpose.pose.evaluate import ObjectRow
 from depthpose.pose.metrics import SUCCESS_SHARE, add_m, adds_m
@@ -268,13 +268,13 @@ def voting_cases(
         ).float()
         generator = torch.Generator().manual_seed(0)
         points_m = sample_points(cloud, points, generator)
-        if refusal_of(points_m, net.weights.cloud) is not None:
+        if why_too_few(points_m, net.weights.cloud) is not None:
             yield None
             continue
         grid = voxelise(points_m, net.weights.cloud)
         places = torch.nn.functional.pad(grid.coordinates, (1, 0))
         seen_points = VotingPoints(
-            points_m=points_m[grid.kept],
+            points_m=grid.points_m,
             coordinates=places,
             features=grid.features,
             class_of_point=torch.full((len(places),), number),

@@ -138,7 +138,7 @@ def _make_scene(
     layers = list(scene.layers)
     keypoints_m = best.estimate.keypoints_m
     if keypoints_m is not None and votes is not None:
-        layers.append(report.vote_layer(votes.cloud.points_m, votes.directions, keypoints_m))
+        layers.append(report.vote_layer(votes.points_m, votes.directions, keypoints_m))
     for shown in shown_poses[1:]:
         points_m = object_points(shown.input, model.diameter_m)
         cloud = report.posed_cloud(points_m, shown.estimate.camera_from_model, model)

@@ -31,8 +31,8 @@ from depthpose.pose.cloud import (
     cloud_from_depth,
     grow_mask,
     other_size,
-    refusal_of,
     unit_advice,
+    why_too_few,
 )
 from depthpose.pose.datasets.layouts import (
     Instance,
@@ -290,10 +290,10 @@ def _check_instance(instance: Instance, model: ObjectModel | None) -> Iterator[P
     mask = read_instance_mask(instance)
     depth_m = read_depth_png(instance.depth, instance.depth_unit_m)
     cloud = cloud_from_depth(depth_m, mask, instance.K)
-    refusal = refusal_of(cloud)
-    if refusal is not None:
+    too_few = why_too_few(cloud)
+    if too_few is not None:
         # Instances that are fully occluded are annotated too: no fault, but no test either.
-        yield Problem(path=instance.mask, kind="note", message=refusal)
+        yield Problem(path=instance.mask, kind="note", message=too_few)
         return
     centre_m = instance.camera_from_model.apply(model.vertices_m.double()).mean(0)
     away_m = float((cloud.double().median(0).values - centre_m).norm())

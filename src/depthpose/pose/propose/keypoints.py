@@ -10,9 +10,8 @@ from torch import Tensor
 
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, cross_matrix, fit_rigid, rotation_by
-from depthpose.pose.cloud import Refusal
 from depthpose.pose.config import EstimateConfig, VotingConfig
-from depthpose.pose.types import ObjectModel, PoseFit, Vote
+from depthpose.pose.types import ObjectModel, PoseFit, Refusal, Vote
 
 _SMALLEST = 1e-12
 _NEAREST = 0.1

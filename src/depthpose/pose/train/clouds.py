@@ -14,7 +14,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.loop import ValidationResult, make_adam, sample_generator, shuffled_index
 from depthpose.core.rigid import Rigid
 from depthpose.pose.baselines import DepthImageNet
-from depthpose.pose.cloud import lift_sample, refusal_of, sample_points, voxelise
+from depthpose.pose.cloud import lift_sample, sample_points, voxelise, why_too_few
 from depthpose.pose.config import CloudConfig, ObjectsConfig
 from depthpose.pose.datasets import open_bop
 from depthpose.pose.datasets.layouts import read_bop_models, read_models_info
@@ -147,7 +147,7 @@ class TrainingClouds(TrainingViews[PoseTraining]):
                         input=dataclasses.replace(sample.input, points_m=points_m),
                         truth=dataclasses.replace(sample.truth, camera_from_model=turned),
                     )
-            if refusal_of(sample.input.points_m, cloud) is None:
+            if why_too_few(sample.input.points_m, cloud) is None:
                 return voxelised_cloud(sample, number, cloud, generator)
         raise InputError(
             f"sample {index}: {TRIES} samples in a row have fewer than "
@@ -183,7 +183,7 @@ def voxelised_cloud(
     turn = voxels.grid_from_camera.float()
     pose = sample.truth.camera_from_model
     return Cloud(
-        points_m=points[voxels.kept].float() @ turn.mT,
+        points_m=voxels.points_m.float() @ turn.mT,
         coordinates=voxels.coordinates,
         features=voxels.features,
         class_number=class_number,

@@ -38,7 +38,7 @@ from depthpose.pose.baselines import (
     cut_depth,
     poses_of,
 )
-from depthpose.pose.cloud import lift_sample, refusal_of
+from depthpose.pose.cloud import lift_sample, why_too_few
 from depthpose.pose.config import SHAPE_FEATURES, RefusalConfig
 from depthpose.pose.copies import near_symmetry_lines
 from depthpose.pose.losses import direction_loss, model_point_loss
@@ -108,7 +108,7 @@ class PoseTask(ViewsTask):
         model = self.models[number]
         config = self.config.cloud
         sample = lift_sample(view, model.diameter_m, config)
-        if refusal_of(sample.input.points_m, config) is not None:
+        if why_too_few(sample.input.points_m, config) is not None:
             return math.inf
         cloud = voxelised_cloud(sample, number, config, chance)
         device = next(self.network.parameters()).device
