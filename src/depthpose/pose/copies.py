@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float64
@@ -17,7 +18,7 @@ from depthpose.pose.mesh import (
     symmetry_transforms,
     true_symmetries,
 )
-from depthpose.pose.propose.point_pairs import PairTable, find_turns
+from depthpose.pose.propose.point_pairs import PairTable, find_turns, prepare_pairs
 from depthpose.pose.surface import Surface
 from depthpose.pose.types import ObjectModel
 
@@ -76,13 +77,21 @@ class SymmetricCopies:
 
 @dataclass(kw_only=True, eq=False)
 class PreparedObject:
-    """A known object, and what is computed of its model once for all inputs."""
+    """A known object, and what is computed of its model once, when it is first asked for."""
 
     number: int  #: among the models of an estimator
     model: ObjectModel
     surface: Surface
-    copies: SymmetricCopies | None = None
-    pairs: PairTable | None = None
+
+    @cached_property
+    def copies(self) -> SymmetricCopies:
+        """Poses at which it looks alike."""
+        return find_copies(self.model)
+
+    @cached_property
+    def pairs(self) -> PairTable:
+        """Pairs of points that vote for its pose."""
+        return prepare_pairs(self.surface)
 
 
 def find_copies(model: ObjectModel) -> SymmetricCopies:
@@ -146,9 +155,7 @@ def _empty() -> Rigid:
 
 
 def copies_of(prepared: PreparedObject) -> SymmetricCopies:
-    """Give an object's symmetric copies, searched when they are first asked for."""
-    if prepared.copies is None:
-        prepared.copies = find_copies(prepared.model)
+    """Give an object's symmetric copies."""
     return prepared.copies
 
 

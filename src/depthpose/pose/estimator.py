@@ -1,5 +1,6 @@
 """What every estimator of poses offers: one object, several, whole depth images, sequences."""
 
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from dataclasses import replace
 from functools import partial
@@ -16,11 +17,22 @@ from depthpose.core.files import Picture
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
 from depthpose.pose.background import AnyBackground, with_background
+from depthpose.pose.cloud import ObjectCloud
 from depthpose.pose.color_inputs import with_color
-from depthpose.pose.config import EstimateConfig, RefusalConfig
-from depthpose.pose.copies import PreparedObject, copies_of
+from depthpose.pose.config import EstimateConfig, IcpConfig, RefusalConfig
+from depthpose.pose.copies import PreparedObject
 from depthpose.pose.datasets.detections import Box, box_mask
-from depthpose.pose.decide import PRIOR_REGION, refused, with_status
+from depthpose.pose.decide import (
+    PRIOR_REGION,
+    contradiction,
+    decide,
+    probability_right,
+    refused,
+    with_status,
+)
+from depthpose.pose.evidence import compare, observe
+from depthpose.pose.hypotheses import compete
+from depthpose.pose.icp import BestStart
 from depthpose.pose.inputs import (
     AnyArray,
     AnyCloud,
@@ -32,7 +44,6 @@ from depthpose.pose.inputs import (
     split_instances,
     view_input,
 )
-from depthpose.pose.propose.point_pairs import prepare_pairs
 from depthpose.pose.search import (
     SearchTargets,
     choose_object,
@@ -40,10 +51,12 @@ from depthpose.pose.search import (
 )
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.track import TrackedObject, track
-from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, Refusal, ViewInput
+from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, Refusal, ViewInput, Vote
 
 Made = TypeVar("Made")
 _NAME = "input"  # what an input is called that came without a name
+_HOPELESS = 0.02
+"""A proposal of a search that is less likely is not compared with its copies and look-alikes."""
 
 
 class PoseEstimator:
@@ -93,10 +106,15 @@ class PoseEstimator:
         return list(tqdm(each, total=total, unit=" poses", disable=not with_progress))
 
     def _each(
-        self, inputs: Iterable[AnyInput], threads: int, *, is_likely: bool = True
+        self, inputs: Iterable[AnyInput], threads: int, *, is_expected: bool = True
     ) -> Iterator[PoseEstimate]:
-        """Give each input's estimate in order; ``is_likely``: most of them show their object."""
-        del is_likely
+        """Give each input's estimate, in order.
+
+        ``is_expected``: whether the inputs are meant to show their objects; else each is one try of
+        several. A network's prior odds depend on it; by models alone each try is judged as if it
+        were expected, and the best of them is chosen by its evidence.
+        """
+        del is_expected
         return each_in_threads(partial(unreadable_on_error, self._estimate), inputs, threads)
 
     def _estimate(self, pose_input: AnyInput) -> PoseEstimate:
@@ -106,15 +124,88 @@ class PoseEstimator:
     @torch.no_grad()
     @force_float32()
     def _estimate_or_raise(
-        self, inputs: Sequence[AnyInput], *, is_likely: bool
+        self, inputs: Sequence[AnyInput], *, is_expected: bool
     ) -> list[PoseEstimate]:
         """Estimate inputs; raise the :class:`InputError` of one that could not be taken."""
         answers: list[PoseEstimate] = []
-        for estimate in self._each(inputs, 1, is_likely=is_likely):
+        for estimate in self._each(inputs, 1, is_expected=is_expected):
             if estimate.status == "unreadable":
                 raise InputError(estimate.reason)
             answers.append(estimate)
         return answers
+
+    def _judge(
+        self,
+        cloud: ObjectCloud,
+        prepared: PreparedObject,
+        refinement: BestStart,
+        icp: IcpConfig | None,
+        seconds: dict[str, float],
+        *,
+        prior_odds: float,
+        is_masked: bool,
+        vote: Vote | None = None,
+        votes_rad: Callable[[Rigid], float] | None = None,
+    ) -> PoseEstimate:
+        """Compare a refined pose with the depth image and with its competitors, and decide.
+
+        Args:
+            cloud: points of the object.
+            prepared: the object.
+            refinement: the best pose, and others at which refinement ended.
+            icp: by which competing poses are refined; None: they stay where they are.
+            seconds: spent in the stages before.
+            prior_odds: of the best pose being right.
+            is_masked: whether all points of the cloud are the object's, as a mask gives them.
+            vote: of a network.
+            votes_rad: what a network's directions are off at a pose, as :func:`compete` takes it.
+        """
+        began = time.perf_counter()
+        observation = observe(
+            cloud.cloud_m,
+            cloud.view,
+            prepared.surface.diameter_m,
+            self.config.object_deviation_m,
+            is_masked=is_masked,
+        )
+        # A search proposes much: what the depth image plainly contradicts goes no further.
+        if not is_masked:
+            pose = refinement.refined.camera_from_model
+            evidence = compare(observation, pose, prepared.surface)
+            probability = probability_right(evidence, prior_odds)
+            if probability < _HOPELESS:
+                return PoseEstimate(
+                    name=cloud.name,
+                    object=prepared.model.name,
+                    status="doubtful",
+                    reason=contradiction(evidence, probability),
+                    seconds={**seconds, "evidence": time.perf_counter() - began},
+                )
+
+        # The best pose against its near-symmetric copies, look-alikes and other local minima.
+        has_color = cloud.view is not None and cloud.view.color is not None
+        competition = compete(
+            cloud.cloud_m.double(),
+            refinement.refined,
+            refinement.others,
+            prepared,
+            observation,
+            icp,
+            cloud.view if has_color else None,
+            votes_rad,
+        )
+        seconds = {**seconds, "evidence": time.perf_counter() - began}
+        return decide(
+            cloud,
+            prepared,
+            competition,
+            observation,
+            self.refusal,
+            self.config,
+            seconds,
+            prior_odds,
+            vote,
+        )
 
     def _estimate_in_region(self, view: ViewInput) -> PoseEstimate:
         """Estimate the one object that is somewhere in the mask of a view, as in a box."""
@@ -207,9 +298,9 @@ class PoseEstimator:
             models = self.models if object is None else [self._object(object).model]
             pose_input = with_color(pose_input, models, color, color_camera, color_from_depth)
         if object is not None or len(self.models) == 1:
-            return self._estimate_or_raise([pose_input], is_likely=True)[0]
+            return self._estimate_or_raise([pose_input], is_expected=True)[0]
         tried = [replace(pose_input, object=name) for name in self.objects]
-        estimates = self._estimate_or_raise(tried, is_likely=False)
+        estimates = self._estimate_or_raise(tried, is_expected=False)
         return with_status(choose_object(estimates), self.config.min_certainty)
 
     @force_float32()
@@ -376,7 +467,7 @@ class PoseEstimator:
 
         def look(pose_input: AnyInput) -> PoseEstimate:
             if isinstance(pose_input, CloudInput):
-                return self._estimate_or_raise([pose_input], is_likely=False)[0]
+                return self._estimate_or_raise([pose_input], is_expected=False)[0]
             return self.find_in(pose_input, [object], is_single=True)[0]
 
         prepared = self._object(object)
@@ -412,11 +503,9 @@ class PoseEstimator:
         return self._objects[name]
 
     def _prepared_object(self, name: str) -> PreparedObject:
-        """Give an object by its name, with its point pairs, near-symmetries and turns."""
+        """Give an object by its name, all that is kept of it computed: in the seconds of no input."""
         prepared = self._object(name)
-        copies_of(prepared)
-        if prepared.pairs is None:
-            prepared.pairs = prepare_pairs(prepared.surface)
+        _ = prepared.copies, prepared.pairs
         return prepared
 
 

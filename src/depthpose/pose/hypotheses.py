@@ -11,7 +11,7 @@ from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid, geodesic_rad
 from depthpose.pose.color import color_agreement, color_copies, settle_spin
 from depthpose.pose.config import IcpConfig
-from depthpose.pose.copies import PreparedObject, copies_of
+from depthpose.pose.copies import PreparedObject
 from depthpose.pose.decide import Competition, Hypothesis, share_among_copies, share_among_poses
 from depthpose.pose.evidence import Observation, compare
 from depthpose.pose.icp import RefinedPose, refine_pose, refine_roughly
@@ -50,7 +50,7 @@ def compete(
         view: whose colour image tells copies apart; None: depth alone.
         votes_rad: mean angle between a network's directions and those to the keypoints of a pose.
     """
-    copies = copies_of(prepared)
+    copies = prepared.copies
     surface = prepared.surface
 
     def hypothesis(source: RefinedPose) -> Hypothesis:
@@ -112,7 +112,7 @@ def _distinct_copies(
     view: ViewInput | None,
 ) -> list[RefinedPose]:
     """Refine the near-symmetric copies of a pose; give those that are no exact copies of others."""
-    copies = copies_of(prepared)
+    copies = prepared.copies
     pose = winning_pose.camera_from_model
     starts = pose @ copies.near_copies
     if view is not None:  # print shows finer steps about an axis than shape does

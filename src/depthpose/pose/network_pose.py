@@ -36,12 +36,10 @@ from depthpose.pose.cloud import (
     why_too_few,
 )
 from depthpose.pose.config import EstimateConfig
-from depthpose.pose.copies import PreparedObject, copies_of
-from depthpose.pose.decide import PRIOR_MASKED, PRIOR_PROPOSED, decide, refused
+from depthpose.pose.copies import PreparedObject
+from depthpose.pose.decide import PRIOR_MASKED, PRIOR_PROPOSED, refused
 from depthpose.pose.estimator import PoseEstimator, unreadable_on_error
-from depthpose.pose.evidence import observe
-from depthpose.pose.hypotheses import compete
-from depthpose.pose.icp import RefinedPose, refine_best
+from depthpose.pose.icp import BestStart, RefinedPose, refine_best
 from depthpose.pose.propose import fits_of, meet_lines, vote_ransac
 from depthpose.pose.registration import Registration
 from depthpose.pose.types import (
@@ -164,16 +162,16 @@ class GeoPoseNet(PoseEstimator):
         return f"GeoPoseNet({kind} of {objects}{named}, {self.config.device})"
 
     def _each(
-        self, inputs: Iterable[AnyInput], threads: int, *, is_likely: bool = True
+        self, inputs: Iterable[AnyInput], threads: int, *, is_expected: bool = True
     ) -> Iterator[PoseEstimate]:
         """Ask the network for several clouds together, and register what it doubts.
 
         The answer for an input does not depend on those beside it, but for the rounding of the
-        network's sums. Only what is likely is registered, where the config wants it.
+        network's sums. Where the config wants it, what is expected and doubted is registered.
         """
         prepared = each_in_threads(partial(unreadable_on_error, self._prepare), inputs, threads)
         groups = map(self._ask_network, _batches(prepared, self.config.batch_voxels))
-        pose = partial(self._pose, is_likely=is_likely)
+        pose = partial(self._pose, is_expected=is_expected)
         return chain.from_iterable(map(partial(each_in_threads, pose, threads=threads), groups))
 
     def _by_models(self) -> Registration:
@@ -214,7 +212,7 @@ class GeoPoseNet(PoseEstimator):
             if isinstance(job, PoseEstimate):
                 return job, None
             self._ask_network([job])
-            voted = self._vote(pose_input, job=job, is_likely=True)
+            voted = self._estimate_by_votes(pose_input, job=job, is_expected=True)
             return voted, VotingDirections(job.voxels.points_m, job.directions)
 
     def _prepare(self, pose_input: AnyInput) -> CloudToPose | PoseEstimate:
@@ -222,7 +220,7 @@ class GeoPoseNet(PoseEstimator):
         if isinstance(pose_input, ViewInput) and pose_input.is_region:
             return self._estimate_in_region(pose_input)
         prepared = self._object(pose_input.object)
-        copies_of(prepared)  # in the seconds of no input
+        _ = prepared.copies  # searched now, in the seconds of no input
         start = time.perf_counter()
         cloud = prepare_cloud(pose_input, prepared.model, self.weights.cloud, self.config)
         if isinstance(cloud, Refusal):
@@ -266,14 +264,14 @@ class GeoPoseNet(PoseEstimator):
             job.seconds["network"] = spent_s * count / sum(counts)
         return group
 
-    def _pose(self, job: CloudToPose | PoseEstimate, *, is_likely: bool) -> PoseEstimate:
+    def _pose(self, job: CloudToPose | PoseEstimate, *, is_expected: bool) -> PoseEstimate:
         """Pose a cloud by its votes, or by registration where these are doubted."""
         if isinstance(job, PoseEstimate):
             return job
         voted = unreadable_on_error(
-            partial(self._vote, job=job, is_likely=is_likely), job.pose_input
+            partial(self._estimate_by_votes, job=job, is_expected=is_expected), job.pose_input
         )
-        if not (self.config.register_refused and is_likely) or voted.status not in _DOUBTED:
+        if not (self.config.register_refused and is_expected) or voted.status not in _DOUBTED:
             return voted
         start = time.perf_counter()
         (registered,) = self._by_models().estimate_many([job.pose_input])
@@ -281,12 +279,13 @@ class GeoPoseNet(PoseEstimator):
         best = registered if registered.is_posed else voted
         return replace(best, seconds={**voted.seconds, "registration": spent_s})
 
-    def _vote(self, pose_input: AnyInput, *, job: CloudToPose, is_likely: bool) -> PoseEstimate:
+    def _estimate_by_votes(
+        self, pose_input: AnyInput, *, job: CloudToPose, is_expected: bool
+    ) -> PoseEstimate:
         """Vote for the keypoints, fit the pose to them, refine it, and decide by the evidence."""
         config = self.config
         prepared = job.prepared
         cloud = job.cloud
-        cloud_m = cloud.cloud_m.double()
         seconds = dict(job.seconds)
 
         # Propose: where the directions meet are the keypoints, to which the model's are fitted.
@@ -302,40 +301,35 @@ class GeoPoseNet(PoseEstimator):
         if isinstance(fits, Refusal):
             return refused(pose_input, fits, seconds)
 
-        # Refine.
+        # Refine; where ICP brings no point near the model, the fit of the keypoints stays.
         began = time.perf_counter()
         poses = fits.camera_from_model.double()
-        leading = RefinedPose(
+        fitted = RefinedPose(
             camera_from_model=poses[0],
             covariance=fits.covariance[0],
             residual_m=fits.residual_m[0],
             inlier_share=torch.ones(()),
         )
-        others = poses[:0]
+        refinement = BestStart(refined=fitted, start=0, others=poses[:0])
         icp = None
         if config.with_icp:
-            refinement = refine_best(cloud_m, poses, prepared.surface, config.icp)
-            if float(refinement.refined.inlier_share) > 0:
-                leading = refinement.refined
-                others = refinement.others
+            by_icp = refine_best(cloud.cloud_m.double(), poses, prepared.surface, config.icp)
+            if float(by_icp.refined.inlier_share) > 0:
+                refinement = by_icp
                 icp = config.icp
             seconds["icp"] = time.perf_counter() - began
 
-        # Compare with the depth image, and decide.
-        began = time.perf_counter()
-        surface = prepared.surface
-        observation = observe(
-            cloud_m, cloud.view, surface.diameter_m, config.object_deviation_m, is_masked=True
+        return self._judge(
+            cloud,
+            prepared,
+            refinement,
+            icp,
+            seconds,
+            prior_odds=PRIOR_MASKED if is_expected else PRIOR_PROPOSED,
+            is_masked=True,
+            vote=vote,
+            votes_rad=partial(self._disagreement, job),
         )
-        prior_odds = PRIOR_MASKED if is_likely else PRIOR_PROPOSED
-        votes_rad = partial(self._disagreement, job)
-        view = cloud.view if cloud.view is not None and cloud.view.color is not None else None
-        competition = compete(cloud_m, leading, others, prepared, observation, icp, view, votes_rad)
-        seconds["evidence"] = time.perf_counter() - began
-        return decide(
-            cloud, prepared, competition, observation, self.refusal, config, seconds, prior_odds,
-            vote,
-        )  # fmt: skip
 
     def _disagreement(self, job: CloudToPose, pose: Rigid) -> float:
         """Mean angle between the network's directions and those to the keypoints of a pose [rad].
@@ -344,7 +338,7 @@ class GeoPoseNet(PoseEstimator):
         the directions point best.
         """
         keypoints_m = job.prepared.model.keypoints_m.double()
-        copies_m = (pose @ copies_of(job.prepared).trained).apply(keypoints_m)
+        copies_m = (pose @ job.prepared.copies.trained).apply(keypoints_m)
         points_m = job.voxels.points_m.double()
         directions = normalize(job.directions.double(), dim=-1)
         step = max(1, len(points_m) // _COMPARED)
@@ -380,12 +374,12 @@ class DepthImageRegressor(PoseEstimator):
         self._cloud = weights.cloud
 
     def _estimate_or_raise(
-        self, inputs: Sequence[AnyInput], *, is_likely: bool
+        self, inputs: Sequence[AnyInput], *, is_expected: bool
     ) -> list[PoseEstimate]:
         if len(inputs) > 1:
             names = ", ".join(item.object for item in inputs)
             raise InputError(f"object: say which of {names}; a regressor refuses none")
-        return super()._estimate_or_raise(inputs, is_likely=is_likely)
+        return super()._estimate_or_raise(inputs, is_expected=is_expected)
 
     def find_in(
         self, view: ViewInput, objects: Sequence[str], *, is_single: bool = False

@@ -18,16 +18,8 @@ from depthpose.core.units import Unit
 from depthpose.pose.cloud import ObjectCloud, local_planes, prepare_cloud, thin
 from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig
 from depthpose.pose.copies import PreparedObject
-from depthpose.pose.decide import (
-    PRIOR_MASKED,
-    contradiction,
-    decide,
-    probability_right,
-    refused,
-)
+from depthpose.pose.decide import PRIOR_MASKED, refused
 from depthpose.pose.estimator import PoseEstimator
-from depthpose.pose.evidence import compare, observe
-from depthpose.pose.hypotheses import compete
 from depthpose.pose.icp import refine_best
 from depthpose.pose.inputs import AnyInput
 from depthpose.pose.mesh import (
@@ -45,8 +37,6 @@ from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, Refusal,
 _VOTING_DIAMETERS = 0.05  # distance of the points that vote
 _LEAST_POINTS = 500  # of a model without faces
 _PROPOSALS = 40
-_HOPELESS = 0.02
-"""A proposal of a search that is less likely is not compared with its copies and look-alikes."""
 _SMOOTHED_POINTS = 1500  # of so many, 20 neighbours give a normal that noise hardly turns
 
 
@@ -168,21 +158,30 @@ class Registration(PoseEstimator):
     def _estimate_cloud(
         self, pose_input: AnyInput, proposals: Rigid | None, prior_odds: float
     ) -> PoseEstimate:
-        """Estimate a pose from a mask's points, or from those at a pose that a search proposed."""
-        # Prepared once for all inputs, and in the seconds of none.
+        """Estimate a pose from a mask's points, or from those at poses that a search proposed.
+
+        Args:
+            pose_input: the points.
+            proposals: of a search; None: point pairs of the points propose.
+            prior_odds: of the best pose being right.
+        """
         prepared = self._prepared_object(pose_input.object)
         is_masked = proposals is None
+
+        # The usable points of the object.
         began = time.perf_counter()
         cloud = prepare_cloud(pose_input, prepared.model, CloudConfig(), self.config)
         seconds = {"cloud": time.perf_counter() - began}
         if isinstance(cloud, Refusal):
             return refused(pose_input, cloud, seconds)
 
+        # Propose.
         began = time.perf_counter()
         if proposals is None:
             proposals = self._propose(cloud, prepared)
         seconds["proposal"] = time.perf_counter() - began
 
+        # Refine, from each pose alone: the proposals are many.
         began = time.perf_counter()
         icp = replace(self.config.icp, starts=1)
         refinement = refine_best(cloud.cloud_m.double(), proposals, prepared.surface, icp)
@@ -191,46 +190,18 @@ class Registration(PoseEstimator):
             reason = "no pose brings the model near the points: another object, or too little of it"
             return refused(pose_input, Refusal(status="no pose found", reason=reason), seconds)
 
-        # A search proposes much: what the depth image plainly contradicts goes no further.
-        began = time.perf_counter()
-        observation = observe(
-            cloud.cloud_m,
-            cloud.view,
-            prepared.surface.diameter_m,
-            self.config.object_deviation_m,
-            is_masked=is_masked,
-        )
-        first = compare(observation, refinement.refined.camera_from_model, prepared.surface)
-        if not is_masked and probability_right(first, prior_odds) < _HOPELESS:
-            seconds["evidence"] = time.perf_counter() - began
-            reason = contradiction(first, probability_right(first, prior_odds))
-            return refused(pose_input, Refusal(status="doubtful", reason=reason), seconds)
-        # The best pose against its near-symmetric copies, look-alikes and other local minima.
-        has_color = cloud.view is not None and cloud.view.color is not None
-        competition = compete(
-            cloud.cloud_m.double(),
-            refinement.refined,
-            refinement.others,
-            prepared,
-            observation,
-            icp,
-            cloud.view if has_color else None,
-        )
-        seconds["evidence"] = time.perf_counter() - began
-        return decide(
+        return self._judge(
             cloud,
             prepared,
-            competition,
-            observation,
-            self.refusal,
-            self.config,
+            refinement,
+            icp,
             seconds,
-            prior_odds,
+            prior_odds=prior_odds,
+            is_masked=is_masked,
         )
 
     def _propose(self, cloud: ObjectCloud, prepared: PreparedObject) -> Rigid:
         """Propose poses by the point pairs of a cloud."""
-        assert prepared.pairs is not None, "_prepared_object computes them"
         dense_m = take_evenly(cloud.cloud_m.double(), _SMOOTHED_POINTS)
         step_m = _VOTING_DIAMETERS * prepared.surface.diameter_m
         voting_m = dense_m[thin(dense_m, torch.zeros_like(dense_m), step_m)]
