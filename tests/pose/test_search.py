@@ -101,8 +101,8 @@ def test_the_image_agrees_with_the_true_pose_and_with_none_beside_it() -> None:
     aside = [Rigid(truth.R, truth.t_m + torch.tensor(shift).double())
              for shift in ([0.05, 0, 0], [0, 0, 0.06], [0, 0, -0.06])]  # fmt: skip
     seen = compare_with_image(frame, Rigid.stack([truth, *aside]), surface)
-    assert float(seen.agreement[0]) > 0.7
-    assert float(seen.agreement[1:].max()) < 0.3
+    assert float(seen.score[0]) > 0.7
+    assert float(seen.score[1:].max()) < 0.3
     assert float(seen.continued[0]) < 0.02
 
 
@@ -138,10 +138,10 @@ def test_point_pairs_propose_every_instance() -> None:
     surface = prepare_surface(model)
     frame = prepare_frame(table(), K)
     everywhere = torch.ones(frame.depth_m.shape, dtype=torch.bool)
-    poses, agreement = propose_in_frame(frame, everywhere, prepare_pairs(surface))
-    expected = compare_with_image(frame, poses, surface).agreement
-    assert torch.allclose(agreement, expected)
-    assert bool((agreement.diff() <= 1e-9).all()), "what the image agrees with best comes first"
+    poses, score = propose_in_frame(frame, everywhere, prepare_pairs(surface))
+    expected = compare_with_image(frame, poses, surface).score
+    assert torch.allclose(score, expected)
+    assert bool((score.diff() <= 1e-9).all()), "what the image agrees with best comes first"
     for truth in TRUTHS:
         assert nearest_m(poses, truth, model) < 0.06 * model.diameter_m
 

@@ -503,7 +503,7 @@ class PoseEstimator:
         return self._objects[name]
 
     def _prepared_object(self, name: str) -> PreparedObject:
-        """Give an object by its name, all that is kept of it computed: in the seconds of no input."""
+        """Give an object by its name, with all that is computed once: in no input's seconds."""
         prepared = self._object(name)
         _ = prepared.copies, prepared.pairs
         return prepared

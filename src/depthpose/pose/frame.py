@@ -58,8 +58,9 @@ class Frame:
         points_m: in the camera frame.
         normals: toward the camera.
         is_smooth: where a normal is known.
-        background_limit_m: diameter [m] up to which no object has the background at a pixel as a
-            side; 0 where the reading is of no background, infinite on a known one.
+        background_limit_m: at a pixel of a wide plane the diameter [m] of the largest object that
+            has no side so wide; infinite on a known background, 0 elsewhere. What it means for an
+            object is :meth:`may_show`.
         nearest_m: least depth of the pixels up to two away; infinite where none has a reading.
         noise_per_m2: standard deviation of a reading, for the square of the depth in metres.
         backgrounds: the known one, and the wide planes.
@@ -75,6 +76,10 @@ class Frame:
     nearest_m: Float64[Tensor, "h w"]
     noise_per_m2: float
     backgrounds: Sequence["Background"]
+
+    def may_show(self, diameter_m: float) -> Bool[Tensor, "h w"]:
+        """Mark the pixels that are of no background before which an object so large lies."""
+        return self.background_limit_m < diameter_m
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -94,7 +99,7 @@ class Background:
 def prepare_frame(
     depth_m: Float[Tensor, "h w"],
     K: Float[Tensor, "3 3"],
-    diameter_m: float | None = None,
+    smallest_m: float | None = None,
     known: KnownBackground | None = None,
 ) -> Frame:
     """Lay a plane through the neighbours of each pixel, and find the background.
@@ -105,31 +110,34 @@ def prepare_frame(
     Args:
         depth_m: along the optical axis; NaN or 0 where there is no reading.
         K: intrinsic matrix.
-        diameter_m: of the smallest object that is looked for: the image is not thinned so much that
-            it would be few pixels wide.
+        smallest_m: diameter of the smallest object that is looked for: the image is not thinned so
+            much that it would be few pixels wide.
         known: background that is known, of the whole image.
     """
     depth_m = torch.where(depth_m.isfinite() & (depth_m > 0), depth_m, 0.0).double()
     noise_per_m2 = measure_noise_per_m2(depth_m)
     step = math.ceil(math.sqrt(depth_m.numel() / _MOST_PIXELS))
     is_read = depth_m > 0
-    if diameter_m is not None and bool(is_read.any()):
-        object_px = diameter_m * float(K[0, 0]) / float(depth_m[is_read].median())
+    if smallest_m is not None and bool(is_read.any()):
+        object_px = smallest_m * float(K[0, 0]) / float(depth_m[is_read].median())
         step = min(step, max(1, math.floor(object_px / _OBJECT_PX)))
     depth_m = depth_m[::step, ::step]
     K = K.double() / torch.tensor([[step], [step], [1]])
     points_m = back_project(depth_m, K)
     normals, is_smooth = _normals(depth_m, points_m, K)
-    limit_m = torch.zeros_like(depth_m)
-    is_left = depth_m > 0
+
+    # The background: a known one, and elsewhere wide planes.
+    is_searched = depth_m > 0
     backgrounds: list[Background] = []
     if known is not None:  # before it there are objects alone: a plane is that of several
-        limit_m[known.is_seen[::step, ::step]] = torch.inf
         known_m = known.depth_m[::step, ::step].double().nan_to_num(torch.inf)
-        is_left &= ~known_m.isfinite()
+        is_searched &= ~known_m.isfinite()
         backgrounds.append(Background(depth_m=known_m, diameter_m=math.inf))
     rays = back_project(torch.ones_like(depth_m), K)
-    backgrounds += _wide_planes(depth_m, points_m, normals, rays, noise_per_m2, is_left, limit_m)
+    planes, limit_m = _wide_planes(depth_m, points_m, normals, rays, noise_per_m2, is_searched)
+    backgrounds += planes
+    if known is not None:
+        limit_m[known.is_seen[::step, ::step] & (limit_m == 0)] = torch.inf
     nearest_m = -max_pool2d(-torch.where(depth_m > 0, depth_m, torch.inf)[None], 5, 1, 2)[0]
     return Frame(
         step=step, depth_m=depth_m, K=K, points_m=points_m, normals=normals, is_smooth=is_smooth,
@@ -185,10 +193,9 @@ def _wide_planes(
     normals: Float64[Tensor, "h w 3"],
     rays: Float64[Tensor, "h w 3"],
     noise_per_m2: float,
-    is_left: Bool[Tensor, "h w"],
-    limit_m: Float64[Tensor, "h w"],
-) -> list[Background]:
-    """Find wide planes by RANSAC in the readings that are left; mark their pixels in limit_m.
+    is_searched: Bool[Tensor, "h w"],
+) -> tuple[list[Background], Float64[Tensor, "h w"]]:
+    """Find wide planes one after the other by RANSAC; give them and ``Frame.background_limit_m``.
 
     Args:
         depth_m: 0 where there is no reading.
@@ -196,9 +203,10 @@ def _wide_planes(
         normals: toward the camera.
         rays: points of the pixels at a depth of 1 m.
         noise_per_m2: as in :class:`Frame`.
-        is_left: readings that may be of a plane.
-        limit_m: ``Frame.background_limit_m``, which is filled in.
+        is_searched: readings that may be of a plane.
     """
+    is_left = is_searched.clone()  # of no plane yet
+    limit_m = torch.zeros_like(depth_m)
     planes: list[Background] = []
     least = max(_LEAST_POINTS, _LEAST_SHARE * int((depth_m > 0).sum()))
     generator = torch.Generator().manual_seed(0)
@@ -230,7 +238,7 @@ def _wide_planes(
             on_rays_m = plane[1] / (rays @ plane[0])
             on_rays_m = torch.where(on_rays_m > 0, on_rays_m, torch.inf)
             planes.append(Background(depth_m=on_rays_m, diameter_m=diameter_m))
-    return planes
+    return planes, limit_m
 
 
 def _bent(
@@ -366,11 +374,11 @@ def is_on_plane(
 
 
 def label_regions(
-    depth_m: Float[Tensor, "h w"], is_left: Bool[Tensor, "h w"]
+    depth_m: Float[Tensor, "h w"], is_counted: Bool[Tensor, "h w"]
 ) -> Int64[Tensor, "h w"]:
     """Number the connected regions: neighbours, at corners too, without a jump in depth.
 
-    Those that ``is_left`` marks count; what is beside them has the number of a region of its own.
+    Those that ``is_counted`` marks; each other pixel has the number of a region of its own.
     """
     height, width = depth_m.shape
     index = torch.arange(height * width).reshape(height, width)
@@ -381,7 +389,7 @@ def label_regions(
         second = slice(down, None), slice(max(0, right), width - max(0, -right))
         z_a, z_b = depth_m[first], depth_m[second]
         joined = (z_a - z_b).abs() < _JUMP_M + _JUMP_PER_M * torch.minimum(z_a, z_b)
-        joined &= is_left[first] & is_left[second]
+        joined &= is_counted[first] & is_counted[second]
         rows.append(index[first][joined])
         columns.append(index[second][joined])
     a, b = torch.cat(rows).numpy(), torch.cat(columns).numpy()
