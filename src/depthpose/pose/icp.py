@@ -77,6 +77,23 @@ class _NormalEquations(NamedTuple):
     rms_m: Float64[Tensor, "*batch"]  # of the weighted residuals; infinite where no point counts
 
 
+def tukey_weight(square_m2: Float64[Tensor, "*n"], limit_m: float) -> Float64[Tensor, "*n"]:
+    """Give Tukey's weight of squared distances: 1 at 0, and 0 from the limit on.
+
+    It is the loss of every ICP here. Another one goes here, in :func:`_influence_slope` and in
+    ``tukey_weight`` of ``compiled/points.py``.
+    """
+    return (1 - square_m2 / limit_m**2).clamp(min=0).square()
+
+
+def _influence_slope(
+    weight: Float64[Tensor, "*batch n"], residual_m: Float64[Tensor, "*batch n"], limit_m: float
+) -> Float64[Tensor, "*batch n"]:
+    """Give the derivative of weight times residual by the residual, for :func:`tukey_weight`."""
+    root = weight.sqrt()
+    return root * (root - 4 * (residual_m / limit_m).square())
+
+
 def refine_pose(
     points_m: Float[Tensor, "n 3"],
     initial: Rigid,
@@ -405,7 +422,7 @@ def _normal_equations(
     if how == ON_RAY:  # along the ray it is the residual that counts
         along = (gap * cloud).sum(-1).square() / cloud.square().sum(-1)
         square = square - along + residual_m.square()
-    weight = torch.where(index >= 0, (1 - square / limit_m**2).clamp(min=0).square(), 0.0)
+    weight = torch.where(index >= 0, tukey_weight(square, limit_m), 0.0)
     arm = target - cloud.mean(0)
     # Moving the model by (w, v) moves its point by w x arm + v, and lowers the residual.
     J = torch.cat([torch.linalg.cross(arm, normal), normal], -1)
@@ -438,9 +455,8 @@ def _covariance(
     because the correlation length is not known. With few blocks a direction can look certain by
     chance, so no direction is inflated by less than the mean over all, or by less than 1.
     """
-    # The information A of the residuals, by the slope of the influence function w r (Tukey's).
-    root = equations.weight.sqrt()
-    slope = root * (root - 4 * (equations.residual_m / limit_m).square())
+    # The information A of the residuals.
+    slope = _influence_slope(equations.weight, equations.residual_m, limit_m)
     independent, whitening, spread_m = _independent_factor(equations, slope)
     inflation, directions = _jackknife_inflation(
         cloud, equations, slope, independent, whitening, spread_m, diameter_m

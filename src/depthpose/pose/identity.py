@@ -17,7 +17,7 @@ from depthpose.core.rigid import Rigid, rotation_by
 from depthpose.pose.compiled import use_numba
 from depthpose.pose.config import IcpConfig
 from depthpose.pose.evidence import BORDER_PX
-from depthpose.pose.icp import refine_pose, refine_roughly
+from depthpose.pose.icp import refine_pose, refine_roughly, tukey_weight
 from depthpose.pose.mesh import MIRROR_ALIKE
 from depthpose.pose.mesh.models import fibonacci_directions
 from depthpose.pose.sensor import INDEPENDENT_SIDES, LARGEST_OFFSET_M
@@ -116,7 +116,7 @@ def _growth_equations(
     return _Equations(
         J=torch.cat([torch.linalg.cross(arm_m, normal), normal, growth_m], -1),
         residual_m=(normal * offset_m).sum(-1),
-        weight=(1 - offset_m.square().sum(-1) / limit_m**2).clamp(min=0).square(),
+        weight=tukey_weight(offset_m.square().sum(-1), limit_m),
     )
 
 
@@ -182,7 +182,7 @@ def distance_to(
     With ``times`` the surface is so many times as large, grown about its middle.
     """
     if times is not None:
-        local_m = (local_m - surface.ball_m[:3]) / times[:, None, None] + surface.ball_m[:3]
+        local_m = (local_m - surface.middle_m) / times[:, None, None] + surface.middle_m
     index = surface.nearest(local_m) if is_exact else surface.boxes.look_up(local_m)
     gap_m = (local_m - surface.points_m[index]).norm(dim=-1)
     if times is not None:

@@ -21,6 +21,13 @@ def damp(H, least):
 
 
 @compiled
+def tukey_weight(square, limit):
+    """Give Tukey's weight of a squared distance: 1 at 0, and 0 from the limit on."""
+    share = max(0.0, 1 - square / (limit * limit))
+    return share * share
+
+
+@compiled
 def rotation(x, y, z, R):
     """Write the rotation by a rotation vector [rad]: Rodrigues' formula."""
     square = x * x + y * y + z * z

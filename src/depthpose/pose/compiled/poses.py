@@ -5,7 +5,15 @@ from typing import NamedTuple
 import numpy as np
 
 from depthpose.pose.compiled import GRAZING, LOOKED_UP, ON_RAY, SEARCHED, SLACK, compiled
-from depthpose.pose.compiled.points import Array, Tree, damp, faces, neighbours, rotation
+from depthpose.pose.compiled.points import (
+    Array,
+    Tree,
+    damp,
+    faces,
+    neighbours,
+    rotation,
+    tukey_weight,
+)
 
 
 class Target(NamedTuple):
@@ -95,8 +103,8 @@ def _add_equations(local, places, R, arm, limit, points, normals, eye, how, H, b
             x, y, z = local[i, 0] - eye[0], local[i, 1] - eye[1], local[i, 2] - eye[2]
             along = gx * x + gy * y + gz * z
             square += residual * residual - along * along / (x * x + y * y + z * z)
-        share = 1 - square / (limit * limit)
-        if share <= 0:
+        weight = tukey_weight(square, limit)
+        if weight <= 0:
             continue
         nx = R[0, 0] * mx + R[0, 1] * my + R[0, 2] * mz
         ny = R[1, 0] * mx + R[1, 1] * my + R[1, 2] * mz
@@ -107,7 +115,7 @@ def _add_equations(local, places, R, arm, limit, points, normals, eye, how, H, b
         J[0], J[1], J[2] = ay * nz - az * ny, az * nx - ax * nz, ax * ny - ay * nx
         J[3], J[4], J[5] = nx, ny, nz
         for k in range(6):
-            scaled = share * share * J[k]
+            scaled = weight * J[k]
             b[k] += scaled * residual
             for m in range(6):
                 H[k, m] += scaled * J[m]
@@ -171,13 +179,13 @@ def grow(local, times, middle, limits, target, is_exact, converged):
                 gx = points[i, 0] - middle[0] - ax
                 gy = points[i, 1] - middle[1] - ay
                 gz = points[i, 2] - middle[2] - az
-                share = 1 - (gx * gx + gy * gy + gz * gz) / (limit * limit)
-                if share <= 0:
+                weight[i] = tukey_weight(gx * gx + gy * gy + gz * gz, limit)
+                if weight[i] <= 0:
                     continue
                 nx, ny, nz = normals[place, 0], normals[place, 1], normals[place, 2]
                 row[0], row[1], row[2] = ay * nz - az * ny, az * nx - ax * nz, ax * ny - ay * nx
                 row[3], row[4], row[5], row[6] = nx, ny, nz, nx * ax + ny * ay + nz * az
-                residual[i], weight[i] = nx * gx + ny * gy + nz * gz, share * share
+                residual[i] = nx * gx + ny * gy + nz * gz
             weighted = J * weight.reshape(-1, 1)
             H = weighted.T @ J
             damp(H, 1e-9)

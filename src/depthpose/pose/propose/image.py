@@ -10,6 +10,7 @@ from torch.nn.functional import normalize
 
 from depthpose.core.rigid import Rigid, perturb
 from depthpose.pose.frame import Frame, readings_toward
+from depthpose.pose.icp import tukey_weight
 from depthpose.pose.propose.point_pairs import STEP, PairTable, vote_poses
 from depthpose.pose.sensor import NOISE_PER_M2
 from depthpose.pose.surface import BESIDE, NEAR, Surface
@@ -104,14 +105,21 @@ def propose_in_frame(
     poses, _ = vote_poses(points_m[order], normals[order], references, table, _PEAKS)
 
     # Fewer and fewer poses are refined and compared, more and more closely.
-    for stage in _STAGES:
-        poses = refine_projectively(frame, poses, surface, stage)
-        score = compare_with_image(frame, poses, surface, stage).score
-        best = _distinct(poses, score, surface, stage.most)
-        poses = poses[best]
-        score = score[best]
+    for stage in _STAGES[:-1]:
+        poses, _ = _refine_and_thin(frame, poses, surface, stage)
+    poses, score = _refine_and_thin(frame, poses, surface, _STAGES[-1])
     is_good = score >= _LEAST_SCORE
     return poses[is_good], score[is_good]
+
+
+def _refine_and_thin(
+    frame: Frame, poses: Rigid, surface: Surface, stage: _Stage
+) -> tuple[Rigid, Float64[Tensor, " b"]]:
+    """Refine poses, and give the best distinct ones of a stage with their scores."""
+    poses = refine_projectively(frame, poses, surface, stage)
+    score = compare_with_image(frame, poses, surface, stage).score
+    best = _distinct(poses, score, surface, stage.most)
+    return poses[best], score[best]
 
 
 def _number_of_references(points: int, models: int) -> int:
@@ -186,8 +194,7 @@ def refine_projectively(frame: Frame, poses: Rigid, surface: Surface, stage: _St
 
         # One step of Gauss-Newton about the middle of the object, weighted by Tukey's function.
         limit_m = share * surface.diameter_m
-        weight = (1 - gap_m.square().sum(-1) / limit_m**2).clamp(min=0).square()
-        weight = torch.where(is_used, weight, 0.0)
+        weight = torch.where(is_used, tukey_weight(gap_m.square().sum(-1), limit_m), 0.0)
         middle_m = poses.apply(surface.middle_m[None])
         arm_m = visible.points_m - middle_m
         J = torch.cat([torch.linalg.cross(arm_m, normal), normal], -1)
@@ -205,7 +212,7 @@ def refine_projectively(frame: Frame, poses: Rigid, surface: Surface, stage: _St
 class ImageScore(NamedTuple):
     """How well an image agrees with each of several proposed poses, as shares of the surface.
 
-    It ranks proposals; whether a pose is right is decided by :class:`depthpose.pose.types.Evidence`.
+    It ranks proposals; whether a pose is right :class:`depthpose.pose.types.Evidence` says.
 
     Attributes:
         score: what was seen where it should be, less what contradicts it; at most 1.
