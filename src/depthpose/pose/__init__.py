@@ -1,1 +1,1 @@
-"""One partial point cloud of a known object to its 6-DoF pose (Geo-PoseNet)."""
+"""Depth images and clouds of known objects to their 6-DoF poses, by registration or a network."""

@@ -80,7 +80,7 @@ class _NormalEquations(NamedTuple):
 def tukey_weight(square_m2: Float64[Tensor, "*n"], limit_m: float) -> Float64[Tensor, "*n"]:
     """Give Tukey's weight of squared distances: 1 at 0, and 0 from the limit on.
 
-    It is the loss of every ICP here. Another one goes here, in :func:`_influence_slope` and in
+    It is the loss of every ICP. Another one is written here, in ``_influence_slope``, and as
     ``tukey_weight`` of ``compiled/points.py``.
     """
     return (1 - square_m2 / limit_m**2).clamp(min=0).square()
