@@ -61,7 +61,7 @@ class RefinedPose:
 class BestStart(NamedTuple):
     """The best of several refined poses."""
 
-    refined: RefinedPose  #: it
+    refined: RefinedPose  #: the best
     start: int  #: number of the initial pose that it began from
     others: Rigid  #: the best poses beside it, three at most, roughly refined
 
@@ -184,22 +184,36 @@ def refine_best(
     score = _score(points_m, rough, surface, end_m)
     best = int(score.argmax())
 
-    # Exactly from the initial pose, where the best began there: by the table a pose drifts along
-    # what little constrains. Not where that pose was farther off than exact steps reach.
-    short = replace(config, iterations=(config.iterations + 1) // 2)
-    refined = None
-    if best < len(initial.R):
-        refined = refine_pose(points_m, initial[best], surface, short)
-        exact = refined.camera_from_model.double()
-        exact_and_rough = Rigid.stack([exact, rough[best]])
-        if float(_score(points_m, exact_and_rough, surface, end_m).diff()) > 0:
-            refined = None
-    if refined is None:
-        short = replace(short, start_distance_diameters=config.end_distance_diameters)
-        refined = refine_pose(points_m, rough[best], surface, short)
-
+    is_initial = best < len(initial.R)
+    start = initial[best] if is_initial else None
+    refined = _refine_exactly(points_m, start, rough[best], surface, config)
     pose = refined.camera_from_model.double()
     return BestStart(refined, best % len(initial.R), _distinct_poses(rough, score, pose, surface))
+
+
+def _refine_exactly(
+    points_m: Float[Tensor, "n 3"],
+    start: Rigid | None,
+    rough: Rigid,
+    surface: Surface,
+    config: IcpConfig,
+) -> RefinedPose:
+    """Refine the best start exactly, in half of the steps.
+
+    From the start itself, where it was no rotated one: rough steps let a pose drift along what
+    little constrains. From the rough end, where that explains the cloud better: then the start was
+    farther off than exact steps reach.
+    """
+    half = replace(config, iterations=(config.iterations + 1) // 2)
+    if start is not None:
+        from_start = refine_pose(points_m, start, surface, half)
+        ends = Rigid.stack([from_start.camera_from_model.double(), rough])
+        end_m = config.end_distance_diameters * surface.diameter_m
+        is_rough_better = float(_score(points_m, ends, surface, end_m).diff()) > 0
+        if not is_rough_better:
+            return from_start
+    near = replace(half, start_distance_diameters=config.end_distance_diameters)
+    return refine_pose(points_m, rough, surface, near)
 
 
 def _rotated_starts(poses: Rigid, surface: Surface, number: int) -> Rigid:
@@ -261,7 +275,10 @@ def _iterate(
     *,
     is_exact: bool,
 ) -> tuple[Rigid, Int64[Tensor, "*batch n"]]:
-    """Step until ``most`` of the points lie on the surface; give each one's sample, or -1."""
+    """Step until ``most`` of the points lie on the surface; give each one's sample, or -1.
+
+    Where numba is there the same steps are those of ``refine`` in ``compiled/poses.py``.
+    """
     if len(points_m) == 0 or not bool(points_m.isfinite().all()):
         raise InputError(
             f"ICP of {len(points_m)} points, {int((~points_m.isfinite().all(-1)).sum())} of them "

@@ -32,33 +32,45 @@ from depthpose.pose.types import ObjectModel
 
 STEP = 0.07
 """Of the diameter: distance of the points of the model, and a bin of the distances of a pair."""
-_MODEL, _COARSER = 800, 1.1
-"""At most so many points of the model; where there are more, their distance grows by this."""
-_SCENE, _REFERENCES = 400, 50
-"""At most so many points of the cloud, and those of them that vote with each of the others."""
+_MODEL_POINTS = 800
+"""Of the model at most; where there are more, their distance grows by the factor below."""
+_COARSER = 1.1
+_SCENE_POINTS = 400
+"""Of a cloud at most."""
+_REFERENCES = 50
+"""Points of a cloud that vote with each of the others."""
 _PEAKS = 6
-"""Poses that each reference point proposes."""
+"""Poses that each of them proposes."""
 _VIEWS = 30
 """Directions from which the model is looked at, to find which side of its surface is seen."""
 _FACING = 0.2
 """Cosine from which a surface is seen."""
 _CELLS = 40
 """Cells along the diameter in which points hide those behind them."""
-_CHECKED = 100
-"""Points of the cloud that compare the proposed poses."""
-_FAR = 0.1
+_SCORED_POINTS = 100
+"""Of the cloud, that compare the proposed poses."""
+_NEAR_ROUGHLY = 0.1
 """Of the diameter: points within this distance of a proposed pose, which is rough, are near it."""
-_EVERY = 16
+_RAYS_EVERY = 16
 """One point of the surface of so many shows what a pose would occlude."""
-_UNSEEN = 0.3
-"""Weight of the share of the surface that should be seen and is not."""
-_OWN_REFERENCES, _OWN_PEAKS, _OWN_POINTS = 40, 48, 250
-"""Points of a model that look for it in itself, poses that each proposes, and points compared."""
-_ROUGHLY, _NEARLY, _MOSTLY = 0.25, 0.85, 0.8
-"""A turn lays the first share of a surface on itself at least, and the second of what the best turn
-does; one that lays the third share there may be near another."""
-_MIN_COSINE, _TURNED_RAD, _MOST_TURNS = 0.7, math.radians(12), 36
-"""Cosine of the normals there, the least angle between two turns, and their number at most."""
+_UNSEEN_WEIGHT = 0.3
+"""Of the share of the surface that should be seen and is not."""
+
+# A model that is looked for in itself.
+_SELF_REFERENCES = 40
+_SELF_PEAKS = 48
+_SELF_COMPARED = 250
+"""Points that vote, poses that each proposes, and points that are compared."""
+_LEAST_SHARE = 0.25
+_LEAST_OF_BEST = 0.85
+"""A turn lays this share of the surface on itself at least, and this one of what the best does."""
+_MOSTLY = 0.8
+"""One that lays this share there may be near another."""
+_MIN_COSINE = 0.7
+"""Of the normals there."""
+_APART_RAD = math.radians(12)
+"""Least angle between two turns."""
+_MOST_TURNS = 36
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -96,8 +108,8 @@ def find_turns(model: ObjectModel) -> dict[str, Any]:
     surface = prepare_surface(replace(model, symmetries=true_symmetries(model)))
     table = prepare_pairs(surface)
     # Of all sides, not those of the first faces.
-    references = take_evenly(torch.arange(len(table.points_m)), _OWN_REFERENCES)
-    candidates, _ = vote_poses(table.points_m, table.frames[..., 0], references, table, _OWN_PEAKS)
+    references = take_evenly(torch.arange(len(table.points_m)), _SELF_REFERENCES)
+    candidates, _ = vote_poses(table.points_m, table.frames[..., 0], references, table, _SELF_PEAKS)
     candidates = candidates[_distinct_turns(candidates, surface)[0]]
     # With the camera in the middle of the model, from where it sees all.
     points_m, starts = surface.points_m - surface.middle_m, candidates.t_m - surface.middle_m
@@ -117,7 +129,7 @@ def _distinct_turns(turns: Rigid, surface: Surface) -> tuple[list[int], int]:
     The best come first. None is within 12 degrees of one before it or of a symmetry, nor of the two
     together, or, where it lays less there, within 60: what is turned a little lies near itself.
     """
-    every = max(1, len(surface.points_m) // _OWN_POINTS)
+    every = max(1, len(surface.points_m) // _SELF_COMPARED)
     local_m = turns.inverse().apply(surface.points_m[::every])
     index = surface.boxes.look_up(local_m)
     is_alike = (local_m - surface.points_m[index]).norm(dim=-1) < NEAR * surface.diameter_m
@@ -125,10 +137,10 @@ def _distinct_turns(turns: Rigid, surface: Surface) -> tuple[list[int], int]:
     share = (is_alike & (cosine.abs() > _MIN_COSINE)).double().mean(-1)
     chosen, taken = list[int](), surface.symmetries.R
     for k in share.argsort(descending=True).tolist():
-        least = _NEARLY * float(share[chosen[0]]) if chosen else _ROUGHLY
-        if share[k] < max(least, _ROUGHLY) or len(chosen) == _MOST_TURNS:
+        least = _LEAST_OF_BEST * float(share[chosen[0]]) if chosen else _LEAST_SHARE
+        if share[k] < max(least, _LEAST_SHARE) or len(chosen) == _MOST_TURNS:
             break
-        apart_rad = _TURNED_RAD if share[k] >= _MOSTLY else 5 * _TURNED_RAD
+        apart_rad = _APART_RAD if share[k] >= _MOSTLY else 5 * _APART_RAD
         if float(geodesic_rad(turns.R[k].expand_as(taken), taken).min()) > apart_rad:
             chosen.append(k)
             taken = torch.cat([taken, turns.R[k] @ surface.symmetries.R])
@@ -143,7 +155,7 @@ def prepare_pairs(surface: Surface) -> PairTable:
     """
     points_m, normals = _seen_from_outside(surface)
     step_m = STEP * surface.diameter_m
-    while len(kept := thin(points_m, normals, step_m)) > _MODEL:
+    while len(kept := thin(points_m, normals, step_m)) > _MODEL_POINTS:
         step_m *= _COARSER
     points_m, frames = points_m[kept], _frames(normals[kept])
     count = len(points_m)
@@ -183,7 +195,7 @@ def propose_poses(
         generator: chooses the reference points.
     """
     chosen = torch.randperm(len(points_m), generator=generator)
-    points_m, normals = points_m[chosen[:_SCENE]], normals[chosen[:_SCENE]]
+    points_m, normals = points_m[chosen[:_SCENE_POINTS]], normals[chosen[:_SCENE_POINTS]]
     references = torch.arange(min(_REFERENCES, len(points_m)))
     poses, _ = vote_poses(points_m, normals, references, table, _PEAKS)
     scores = _scores(points_m, normals, poses, table.surface)
@@ -353,12 +365,12 @@ def _scores(
     surface: Surface,
 ) -> Float64[Tensor, " b"]:
     """Share of points near each posed surface, whose normals fit, less what contradicts it."""
-    some_m, some = points_m[:_CHECKED], normals[:_CHECKED]
     inverse = poses.inverse()
-    local_m = some_m @ inverse.R.mT + inverse.t_m[:, None]
+    local_m = points_m[:_SCORED_POINTS] @ inverse.R.mT + inverse.t_m[:, None]
+    local_normals = normals[:_SCORED_POINTS] @ inverse.R.mT
     index = surface.boxes.look_up(local_m)
-    limit_m = _FAR * surface.diameter_m
-    near = (local_m - surface.points_m[index]).norm(dim=-1) < limit_m
-    cosine = ((some @ inverse.R.mT) * surface.normals[index]).sum(-1).abs()
-    front, unseen = look_along_rays(points_m, poses, surface, every=_EVERY)
-    return (near * cosine).mean(-1) - front - _UNSEEN * unseen
+    limit_m = _NEAR_ROUGHLY * surface.diameter_m
+    is_near = (local_m - surface.points_m[index]).norm(dim=-1) < limit_m
+    cosine = (local_normals * surface.normals[index]).sum(-1).abs()
+    free_space_violation, unseen = look_along_rays(points_m, poses, surface, every=_RAYS_EVERY)
+    return (is_near * cosine).mean(-1) - free_space_violation - _UNSEEN_WEIGHT * unseen
