@@ -187,7 +187,7 @@ def test_what_else_it_may_be_moves_along() -> None:
     model = net.weights.models[0]
     known = TrackedObject(
         model=model, surface=prepare_surface(model), refusal=net.weights.refusal,
-        config=net.config, look=lambda _: start,
+        config=net.config, search=lambda _: start,
     )  # fmt: skip
     views = [back_project(frame(p).double(), K).reshape(-1, 3) for p in poses]
     from depthpose.pose.types import CloudInput

@@ -465,7 +465,7 @@ class PoseEstimator:
         In place of a frame that cannot be read there is an estimate that says so.
         """
 
-        def look(pose_input: AnyInput) -> PoseEstimate:
+        def search(pose_input: AnyInput) -> PoseEstimate:
             if isinstance(pose_input, CloudInput):
                 return self._estimate_or_raise([pose_input], is_expected=False)[0]
             return self.find_in(pose_input, [object], is_single=True)[0]
@@ -476,7 +476,7 @@ class PoseEstimator:
             surface=prepared.surface,
             refusal=self.refusal,
             config=self.config,
-            look=look,
+            search=search,
         )
         return each_in_float32(track(frames, target, first))
 

@@ -70,6 +70,8 @@ def without_motions(
     covariance: Float[Tensor, "6 6"], free: Float[Tensor, "m 6"]
 ) -> Float[Tensor, "6 6"]:
     """Give the covariance where the pose does not move along ``free``: finite, and 0 along them."""
+    if len(free) == 0:
+        return covariance
     _, sizes, rows = torch.linalg.svd(free.double())
     basis = rows[int((sizes > 1e-9 * sizes[0]).sum()) :].T
     # Rotations and metres differ in size; the information of the rest is what counts.

@@ -43,13 +43,13 @@ MARGIN = 0.15
 object's; between two frames it moves by less."""
 _MOST_POINTS = 10_000  # of what a camera saw about the object, evenly taken
 _LEAST_POINTS = 60
-_NEW_PER_FRAME = 0.2
+_NEW_EVIDENCE = 0.2
 """Of the evidence of a frame so much is new: the sensor and the object err alike in the next."""
 _MOST_LOG_ODDS = 9.0  # of a track: a few contradicting frames must be able to end it
 _LEAST_CERTAINTY = 1e-4
 _SUPPORTS = 2  # planes beside the object that are looked for: a table and a wall
-_BESIDE = 1000  # points beside the object that show them
-_ON = 3.0  # standard deviations of a plane's points: nearer ones are of it
+_SUPPORT_POINTS = 1000  # beside the object, that show them
+_SUPPORT_DEVIATIONS = 3.0  # of the points of such a plane: nearer ones are of it
 
 
 def scene_about(pose_input: AnyInput, poses: Rigid, surface: Surface) -> Float64[Tensor, "n 3"]:
@@ -88,7 +88,7 @@ class TrackedObject:
     surface: Surface  #: of the model
     refusal: RefusalConfig  #: when a pose is refused
     config: EstimateConfig  #: settings of the estimates
-    look: Callable[[AnyInput], PoseEstimate]  #: estimates the object in a frame not yet known
+    search: Callable[[AnyInput], PoseEstimate]  #: poses the object where no last pose is known
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -125,7 +125,7 @@ def track(
         if isinstance(pose_input, PoseEstimate):
             yield pose_input
             continue
-        estimate, following = _next(pose_input, current, target)
+        estimate, following = _follow_or_search(pose_input, current, target)
         # In a cloud of a whole scene an object that is lost can be looked for only where it was.
         is_scene = isinstance(pose_input, CloudInput) and pose_input.view is None
         if following is None and is_scene and current is not None:
@@ -134,10 +134,10 @@ def track(
         yield estimate
 
 
-def _next(
+def _follow_or_search(
     pose_input: AnyInput, current: _Track | None, target: TrackedObject
 ) -> tuple[PoseEstimate, _Track | None]:
-    """Follow the object into a frame, or look for it there."""
+    """Follow the object into a frame, or search it there; give what is known of it then."""
     spent_s = 0.0
     if current is not None:
         began = time.perf_counter()
@@ -146,32 +146,37 @@ def _next(
         if not isinstance(followed, Refusal):
             estimate, following = followed
             return replace(estimate, name=pose_input.name, seconds={"icp": spent_s}), following
-    looked = target.look(pose_input)
-    seconds = {**looked.seconds, "icp": looked.seconds.get("icp", 0.0) + spent_s}
-    pose = looked.camera_from_model
+
+    # Not known from the frame before, or not seen there.
+    searched = target.search(pose_input)
+    seconds = {**searched.seconds, "icp": searched.seconds.get("icp", 0.0) + spent_s}
+    pose = searched.camera_from_model
     tracking = "lost" if pose is None else "found"
-    estimate = replace(looked, name=pose_input.name, seconds=seconds, tracking=tracking)
+    estimate = replace(searched, name=pose_input.name, seconds=seconds, tracking=tracking)
     if pose is None:
         return estimate, None
     # A track that begins at something else stays there: what was searched for must be `ok`.
-    is_searched = isinstance(pose_input, ViewInput) and looked.certainty is not None
-    if is_searched and not looked.is_ok:
+    is_searched = isinstance(pose_input, ViewInput) and searched.certainty is not None
+    if is_searched and not searched.is_ok:
         return estimate, None
-    certainty = min(max(looked.certainty or 0.0, _LEAST_CERTAINTY), 1 - _LEAST_CERTAINTY)
+    certainty = min(max(searched.certainty or 0.0, _LEAST_CERTAINTY), 1 - _LEAST_CERTAINTY)
     log_odds = math.log(certainty / (1 - certainty))
-    return estimate, _Track(pose=pose.double(), moved=None, log_odds=log_odds, origin=looked)
+    return estimate, _Track(pose=pose.double(), moved=None, log_odds=log_odds, origin=searched)
 
 
 def _follow(
     pose_input: AnyInput, current: _Track, target: TrackedObject
 ) -> tuple[PoseEstimate, _Track] | Refusal:
     """Refine the last pose and the predicted one; weigh the better by the evidence of the frame."""
+    # Where it may be: at its last pose, or going on as it moved last.
     surface = target.surface
     starts = [current.pose]
-    if current.moved is not None:  # the pose that goes on as it moved last
+    if current.moved is not None:
         R = current.moved.R @ current.pose.R
         starts.insert(0, Rigid(R, current.pose.t_m + current.moved.t_m))
     poses = Rigid.stack(starts)
+
+    # The points there, but for those of what it lies on.
     scene_m = scene_about(pose_input, poses, surface)
     near = _is_near(scene_m, poses, surface, MARGIN)
     is_support = _is_support(scene_m, near, current.pose.apply(surface.points_m))
@@ -181,6 +186,8 @@ def _follow(
             status="too few points",
             reason=f"{len(cloud_m)} points lie where the object was, below {_LEAST_POINTS}",
         )
+
+    # Refined, and the points that lie on it then.
     icp = replace(target.config.icp, starts=1)
     refined = refine_best(cloud_m, poses, surface, icp).refined
     pose = refined.camera_from_model.double()
@@ -204,12 +211,13 @@ def _follow(
     probability = probability_right(evidence, PRIOR_MASKED)
     if probability < target.refusal.min_probability:
         return Refusal(status="doubtful", reason=contradiction(evidence, probability))
-    log_odds = current.log_odds + _NEW_PER_FRAME * log_odds_right(evidence)
+    log_odds = current.log_odds + _NEW_EVIDENCE * log_odds_right(evidence)
     log_odds = min(max(log_odds, -_MOST_LOG_ODDS), _MOST_LOG_ODDS)
     certainty = 1 / (1 + math.exp(-log_odds))
     if certainty < target.refusal.min_probability:
         return Refusal(status="doubtful", reason=contradiction(evidence, certainty))
 
+    # Does what is seen of it determine its pose?
     free = free_motions(target.model.symmetries.continuous, pose)
     observable, _ = observability(object_points_m, pose, surface, free)
     if observable < target.refusal.min_observability:
@@ -218,14 +226,14 @@ def _follow(
             reason="the visible part of the object does not determine its pose (observability "
             f"{observable:.1%})",
         )
+
+    # The answer, and what the next frame begins with.
     estimate = PoseEstimate(
         name="",
         object=target.model.name,
         status="ok",
         camera_from_model=refined.camera_from_model.float(),
-        covariance=(
-            without_motions(refined.covariance, free) if len(free) else refined.covariance
-        ).float(),
+        covariance=without_motions(refined.covariance, free).float(),
         free_motions=free.float(),
         residual_m=float(refined.residual_m),
         evidence=evidence,
@@ -269,7 +277,7 @@ def _is_support(
     is_flat = torch.zeros(len(posed_m), dtype=torch.bool)
     generator = torch.Generator().manual_seed(0)
     for _ in range(_SUPPORTS):
-        beside_m = take_evenly(scene_m[~near & ~is_support], _BESIDE)
+        beside_m = take_evenly(scene_m[~near & ~is_support], _SUPPORT_POINTS)
         plane = largest_plane(beside_m, generator)
         if plane is None:
             break
@@ -277,7 +285,7 @@ def _is_support(
         gap_m = (beside_m @ normal - offset)[is_on_plane(beside_m, plane)]
         if len(gap_m) < _LEAST_POINTS:
             break
-        limit_m = _ON * gap_m.square().mean().sqrt()
+        limit_m = _SUPPORT_DEVIATIONS * gap_m.square().mean().sqrt()
         is_support |= (scene_m @ normal - offset).abs() < limit_m
         is_flat |= (posed_m @ normal - offset).abs() < limit_m
     # What is as flat as the noise cannot be parted from what it lies on; else it was taken away.
