@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -101,9 +101,12 @@ class Surface:
         _, _, axes = torch.linalg.svd(toward[:, None])
         # The last two rows of each frame are two axes across the direction.
         views = [_view_of(self, way, across[1:]) for way, across in zip(toward, axes, strict=True)]
-        points_m, normals, is_inner, beside_m = map(torch.stack, zip(*views, strict=True))
         return Views(
-            toward=toward, points_m=points_m, normals=normals, is_inner=is_inner, beside_m=beside_m
+            toward=toward,
+            points_m=torch.stack([view.points_m for view in views]),
+            normals=torch.stack([view.normals for view in views]),
+            is_inner=torch.stack([view.is_inner for view in views]),
+            beside_m=torch.stack([view.beside_m for view in views]),
         )
 
     @cached_property
@@ -144,46 +147,82 @@ def finite_array(array: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(array)
 
 
-def _view_of(surface: Surface, toward: Tensor, across: Tensor) -> tuple[Tensor, ...]:
-    """Gather a surface in cells of a picture; give the nearest points, and places beside them."""
+class _View(NamedTuple):
+    """What a camera far off sees from one side: a row of each part of :class:`Views`."""
+
+    points_m: Float64[Tensor, "n 3"]
+    normals: Float64[Tensor, "n 3"]
+    is_inner: Bool[Tensor, " n"]
+    beside_m: Float64[Tensor, "m 3"]
+
+
+def _view_of(surface: Surface, toward: Tensor, across: Tensor) -> _View:
+    """Look at a surface from one side: the points that are seen, and places beside them.
+
+    Args:
+        surface: of the model.
+        toward: unit vector to the camera.
+        across: two unit vectors across it, (2, 3).
+    """
+    # A picture along parallel rays: in each cell the point that is nearest to the camera.
     cell_m = _CELL * surface.diameter_m
     side = 2 * round(0.5 / _CELL) + 10
     about_m = surface.points_m - surface.middle_m
     column, row = (about_m @ across.T / cell_m).floor().long().add(side // 2).unbind(-1)
     place = row * side + column
-    near_m = about_m @ toward
-    most_m = near_m.new_full((side**2,), -torch.inf).scatter_reduce_(0, place, near_m, "amax")
-    first = torch.full((side**2,), len(place))
-    first[place[near_m == most_m[place]]] = torch.arange(len(place))[near_m == most_m[place]]
-    # Between sparse points the far side shows: it is none that a camera would see.
-    picture_m = most_m.reshape(1, side, side)
-    is_seen = most_m > max_pool2d(picture_m, 3, 1, 1).flatten() - BESIDE * surface.diameter_m
-    is_seen &= most_m.isfinite()
+    height_m = about_m @ toward
+    nearest_m = height_m.new_full((side**2,), -torch.inf)
+    nearest_m = nearest_m.scatter_reduce_(0, place, height_m, "amax")
+    is_nearest = height_m == nearest_m[place]
+    sample = torch.full((side**2,), len(place))
+    sample[place[is_nearest]] = torch.arange(len(place))[is_nearest]
+    picture_m = nearest_m.reshape(1, side, side)
+
+    # Where samples are sparse the far side shows through the gaps: no camera sees it.
+    front_m = max_pool2d(picture_m, 3, 1, 1).flatten()
+    is_seen = nearest_m > front_m - BESIDE * surface.diameter_m
+    is_seen &= nearest_m.isfinite()
     filled = is_seen.double().reshape(1, side, side)
-    wide, narrow = (max_pool2d(filled, size, 1, size // 2) for size in (5, 3))
-    # Neither at the silhouette, single empty cells aside, nor beside something farther off.
-    whole = -max_pool2d(-max_pool2d(picture_m.isfinite().double(), 3, 1, 1), 5, 1, 2)
-    farther_m = max_pool2d(torch.where(picture_m.isfinite(), -picture_m, -torch.inf), 3, 1, 1)
-    is_inner = (whole > 0) & (-farther_m > picture_m - BESIDE * surface.diameter_m)
+
+    # Inner cells: two from the silhouette, whose single empty cells are closed first, and beside
+    # nothing that lies farther off.
+    closed = max_pool2d(picture_m.isfinite().double(), 3, 1, 1)
+    whole = -max_pool2d(-closed, 5, 1, 2)
+    depth_m = torch.where(picture_m.isfinite(), -picture_m, -torch.inf)
+    farthest_m = max_pool2d(depth_m, 3, 1, 1)
+    is_inner = (whole > 0) & (-farthest_m > picture_m - BESIDE * surface.diameter_m)
+
+    # The ring of cells two from the silhouette, as far off as the border is nearby in the mean.
+    wide = max_pool2d(filled, 5, 1, 2)
+    narrow = max_pool2d(filled, 3, 1, 1)
+    is_ring = (wide > 0) & (narrow == 0)
     shown_m = torch.where(filled > 0, picture_m, 0.0)
     border_m = avg_pool2d(shown_m, 5, 1, 2) / avg_pool2d(filled, 5, 1, 2)
-    # So many at most, in an order of chance: the first ones are a sample of all.
-    cell_and_ring = is_seen.nonzero()[:, 0], ((wide > 0) & (narrow == 0)).flatten().nonzero()[:, 0]
-    cells, ring = (
-        index[torch.randperm(len(index), generator=torch.Generator().manual_seed(0))[:most]]
-        for index, most in zip(cell_and_ring, (_POINTS, _RING), strict=True)
-    )
-    shown = first[cells]
+
+    # At most so many of both, shuffled: every n-th of them is a sample of all.
+    cells = _shuffled(is_seen, _POINTS)
+    ring = _shuffled(is_ring.flatten(), _RING)
     at = torch.stack([ring % side, ring.div(side, rounding_mode="floor")], -1).double()
     at += 0.5 - side // 2
     beside_m = at * cell_m @ across + border_m.flatten()[ring, None] * toward + surface.middle_m
-    parts = (surface.points_m[shown], surface.normals[shown], beside_m)
-    points_m, normals, beside_m = (
-        pad(part, (0, 0, 0, most - len(part)), value=torch.nan)
-        for part, most in zip(parts, (_POINTS, _POINTS, _RING), strict=True)
+    seen = sample[cells]
+    return _View(
+        points_m=_padded(surface.points_m[seen], _POINTS),
+        normals=_padded(surface.normals[seen], _POINTS),
+        is_inner=pad(is_inner.flatten()[cells], (0, _POINTS - len(cells))),
+        beside_m=_padded(beside_m, _RING),
     )
-    inner = pad(is_inner.flatten()[cells], (0, _POINTS - len(cells)))
-    return points_m, normals, inner, beside_m
+
+
+def _shuffled(is_chosen: Bool[Tensor, " n"], most: int) -> Int64[Tensor, " m"]:
+    """Give the numbers of the cells that are chosen, ``most`` of them, in an order of chance."""
+    index = is_chosen.nonzero()[:, 0]
+    return index[torch.randperm(len(index), generator=torch.Generator().manual_seed(0))[:most]]
+
+
+def _padded(rows: Float64[Tensor, "n 3"], count: int) -> Float64[Tensor, "{count} 3"]:
+    """Fill up with rows of NaN."""
+    return pad(rows, (0, 0, 0, count - len(rows)), value=torch.nan)
 
 
 def prepare_surface(model: ObjectModel, count: int = 10_000) -> Surface:
