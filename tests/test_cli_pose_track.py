@@ -90,14 +90,14 @@ def test_an_interrupted_sequence_keeps_its_poses_in_the_order_of_the_numbers(
 
 def interrupt_after(count: int, patch: pytest.MonkeyPatch) -> None:
     """Interrupt the work in the frame after so many."""
-    real, done = tracking_module._next, iter(range(count))
+    real, done = tracking_module._follow_or_search, iter(range(count))
 
     def until(*given: Any) -> Any:  # noqa: ANN401
         if next(done, None) is None:
             raise KeyboardInterrupt
         return real(*given)
 
-    patch.setattr(tracking_module, "_next", until)
+    patch.setattr(tracking_module, "_follow_or_search", until)
 
 
 def test_clouds_are_taken_in_the_order_of_their_numbers(tmp_path: Path) -> None:

@@ -114,6 +114,7 @@ def prepare_frame(
             much that it would be few pixels wide.
         known: background that is known, of the whole image.
     """
+    # Thinned, but not so much that the smallest object would be few pixels wide.
     depth_m = torch.where(depth_m.isfinite() & (depth_m > 0), depth_m, 0.0).double()
     noise_per_m2 = measure_noise_per_m2(depth_m)
     step = math.ceil(math.sqrt(depth_m.numel() / _MOST_PIXELS))
@@ -123,6 +124,7 @@ def prepare_frame(
         step = min(step, max(1, math.floor(object_px / _OBJECT_PX)))
     depth_m = depth_m[::step, ::step]
     K = K.double() / torch.tensor([[step], [step], [1]])
+
     points_m = back_project(depth_m, K)
     normals, is_smooth = _normals(depth_m, points_m, K)
 
@@ -154,7 +156,11 @@ def _normals(
     depth_m = depth_m.float()  # differences of neighbours are exact enough, and twice as fast
     inverse = torch.where(depth_m > 0, 1 / depth_m, 0.0)
     limit = (_JUMP_M + _JUMP_PER_M * depth_m) * inverse.square()
-    padded, side = pad(inverse, (_WINDOW,) * 4), 2 * _WINDOW + 1
+    padded = pad(inverse, (_WINDOW,) * 4)
+    side = 2 * _WINDOW + 1
+
+    # Sums over the neighbours of the same surface: their number, the places x and y, what q their
+    # 1 / depth is beyond that of the middle, and products of these.
     n, x, y, q, xx, xy, yy, xq, yq = depth_m.new_zeros(9, height, width)
     for down in range(-_WINDOW, _WINDOW + 1):
         for right in range(-_WINDOW, _WINDOW + 1):
@@ -172,13 +178,18 @@ def _normals(
             yy += down * down * is_same
             xq += right * gap
             yq += down * gap
+
+    # Means, and second moments about them.
     count = n.clamp(min=1)
     x, y, q = x / count, y / count, q / count
     xx, xy, yy = xx / count - x * x, xy / count - x * y, yy / count - y * y
     xq, yq = xq / count - x * q, yq / count - y * q
+
+    # The slopes a and b of q by x and y, of least squares.
     spread = xx * yy - xy * xy
     a = (xq * yy - yq * xy) / spread.clamp(min=1e-9)
     b = (yq * xx - xq * xy) / spread.clamp(min=1e-9)
+
     # n . X = -1 for the ray (x', y', 1): 1 / depth = -(n_x x' + n_y y' + n_z).
     along = torch.stack([a * K[0, 0], b * K[1, 1]], -1)
     ray = torch.where((depth_m > 0)[..., None], points_m[..., :2] * inverse[..., None], 0.0)
@@ -211,12 +222,15 @@ def _wide_planes(
     least = max(_LEAST_POINTS, _LEAST_SHARE * int((depth_m > 0).sum()))
     generator = torch.Generator().manual_seed(0)
     for _ in range(_PLANES):
+        # The plane of the most readings.
         plane = largest_plane(points_m[is_left], generator, noise_per_m2)
         if plane is None:
             break
         near = is_on_plane(points_m, plane, noise_per_m2) & is_left
         if int(near.sum()) < least:
             break
+
+        # Its largest connected piece, bent as the sensor bends it, with the regions that it joins.
         is_along = is_left & ((normals @ plane[0]).abs() > _ALONG)
         bent = near | _bent(points_m, plane, near, is_along, noise_per_m2)
         label = label_regions(depth_m, bent)
@@ -227,6 +241,7 @@ def _wide_planes(
             whole = torch.bincount(label[bent], minlength=len(sizes))
             joined = (sizes > 0.5 * whole)[label] & bent
             is_left &= ~joined
+
             # An object of up to this diameter has no side as wide or as long.
             some = take_evenly(points_m[piece], _SAMPLE)
             offset = some - some.mean(0)
@@ -235,6 +250,8 @@ def _wide_planes(
             width_m, length_m = (along.quantile(0.95, 0) - along.quantile(0.05, 0)).tolist()
             diameter_m = max(width_m / _WIDER, length_m / _LONGER)
             limit_m[joined] = diameter_m
+
+            # Behind the objects it goes on.
             on_rays_m = plane[1] / (rays @ plane[0])
             on_rays_m = torch.where(on_rays_m > 0, on_rays_m, torch.inf)
             planes.append(Background(depth_m=on_rays_m, diameter_m=diameter_m))
