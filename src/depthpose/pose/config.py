@@ -5,7 +5,6 @@ from typing import Annotated, ClassVar, Literal, get_args
 
 from depthpose.core.config import ASCENDING, Seed, Settings
 from depthpose.core.errors import InputError
-from depthpose.pose.sensor import OFFSET_DEVIATION_M
 
 VotingMethod = Literal["least squares", "ransac"]
 InlierTest = Literal["angle", "distance"]
@@ -111,7 +110,7 @@ class IcpConfig(Settings):
     surface_points: Annotated[int, "[100, inf)"] = 10000
     """Points sampled on the model's surface."""
 
-    sensor_offset_m: Annotated[float, "[0, 1]"] = OFFSET_DEVIATION_M
+    sensor_offset_m: Annotated[float, "[0, 1]"] = 0.004
     """Standard deviation of an offset of all readings along the ray, which no residual shows: it is
     added to the covariance of a pose. Depth cameras are off by 3 to 6 mm as a whole
     (``bench/sensors.py``); 0 where yours is calibrated at the distance of the object."""

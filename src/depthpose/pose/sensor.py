@@ -24,10 +24,9 @@ NOISE_PER_M2 = 0.0015
 al., 3DIMPVT 2012): where nothing better is known."""
 NOISIEST_PER_M2 = 4 * NOISE_PER_M2
 """Largest noise that is believed, for the square of the depth in metres."""
-OFFSET_DEVIATION_M = 0.004
 LARGEST_OFFSET_M = 0.006
-"""Depth cameras are off along the ray by 3 to 6 mm as a whole (``bench/sensors.py``): the standard
-deviation of that offset, and what it is at most."""
+"""Depth cameras are off along the ray by 3 to 6 mm as a whole (``bench/sensors.py``): so much at
+most. The standard deviation of that offset is a setting, ``IcpConfig.sensor_offset_m``."""
 FLAT_M = 0.0005
 """Real tables and walls are flat to half a millimetre."""
 LAG_PX = 3
