@@ -1,4 +1,4 @@
-"""What depth cameras and real objects are off by: every physical constant of a sensor is here.
+"""What depth cameras and real objects are off by: noise, offsets, and how far off a plane.
 
 A depth camera errs in three ways. Each reading has noise of its own. Neighbouring readings also
 share an error, because stereo and structured light match windows of several pixels: a patch of
