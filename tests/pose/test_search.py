@@ -22,7 +22,7 @@ from depthpose.pose.frame import prepare_frame
 from depthpose.pose.inputs import view_input
 from depthpose.pose.mesh import make_model
 from depthpose.pose.metrics import add_m
-from depthpose.pose.propose.image import compare_with_image, propose_in_frame
+from depthpose.pose.propose.image import propose_in_frame, score_by_image
 from depthpose.pose.propose.point_pairs import prepare_pairs
 from depthpose.pose.registration import Registration
 from depthpose.pose.search import SearchTargets, find_objects
@@ -94,16 +94,34 @@ def test_a_plane_through_several_objects_is_no_plane() -> None:
     assert not bool(is_plane[mask].any())
 
 
+def test_a_plane_that_things_are_seen_behind_joins_the_tops_of_several_parts() -> None:
+    """Touching bars before a wall: the wall is background, the tops of the bars are none.
+
+    A board of the same size is, for nothing is seen behind it.
+    """
+    for is_board in (True, False):
+        depth_m = torch.full((240, 320), 1.2)
+        top = (1 / (1.1 - 0.0005 * torch.arange(120).float()))[:, None].expand(120, 240)
+        is_top = torch.ones(120, 240).bool()
+        if not is_board:
+            is_top = (torch.arange(240) % 30 < 20).expand(120, 240).clone()
+            is_top[:10] = is_top[110:] = True  # where they touch
+        depth_m[60:180, 40:280] = torch.where(is_top, top, 1.2)
+        is_background = prepare_frame(depth_m, K.float()).background_limit_m >= 0.15
+        within = is_background[60:180, 40:280]
+        assert float(within[is_top].float().mean()) == pytest.approx(float(is_board), abs=0.02)
+        assert bool(is_background[:60].all())
+
+
 def test_the_image_agrees_with_the_true_pose_and_with_none_beside_it() -> None:
     model, truth = bracket(), TRUTHS[0].double()
     surface = prepare_surface(model)
     frame = prepare_frame(table(), K)
     aside = [Rigid(truth.R, truth.t_m + torch.tensor(shift).double())
              for shift in ([0.05, 0, 0], [0, 0, 0.06], [0, 0, -0.06])]  # fmt: skip
-    seen = compare_with_image(frame, Rigid.stack([truth, *aside]), surface)
-    assert float(seen.score[0]) > 0.7
-    assert float(seen.score[1:].max()) < 0.3
-    assert float(seen.continued[0]) < 0.02
+    score = score_by_image(frame, Rigid.stack([truth, *aside]), surface)
+    assert float(score[0]) > 0.7
+    assert float(score[1:].max()) < 0.3
 
 
 def test_edges_that_a_sensor_cuts_contradict_no_pose_and_a_missing_half_does() -> None:
@@ -114,17 +132,16 @@ def test_edges_that_a_sensor_cuts_contradict_no_pose_and_a_missing_half_does() -
     cut, half = mask & ~grow_mask(mask, -4), mask.clone()
     half[:, : int(mask.nonzero()[:, 1].median())] = False
     pose = Rigid(truth.R.double(), truth.t_m.double())
-    share, agreement = {}, {}
+    roughly, agreement = {}, {}
     for name, lost in (("cut", cut), ("half", half)):
         depth_m = torch.where(mask & ~lost, seen.float(), 1.25)
         frame = prepare_frame(depth_m, K.float())
-        share[name] = float(compare_with_image(frame, pose[None], surface).contradicted)
+        roughly[name] = float(score_by_image(frame, pose[None], surface))
         view = view_input(depth_m, mask & ~lost, CAMERA, model.name, "view", None)
         own_m = cloud_from_depth(depth_m, mask & ~lost, K.float())
         observation = observe(own_m, view, surface.diameter_m, 0.001, is_masked=False)
         agreement[name] = compare(observation, pose, surface).agreement
-    assert share["cut"] < 0.02
-    assert share["half"] > 0.1
+    assert roughly["half"] < 0.6 < roughly["cut"]
     assert agreement["half"] < 0.6 < agreement["cut"]
 
 
@@ -139,7 +156,7 @@ def test_point_pairs_propose_every_instance() -> None:
     frame = prepare_frame(table(), K)
     everywhere = torch.ones(frame.depth_m.shape, dtype=torch.bool)
     poses, score = propose_in_frame(frame, everywhere, prepare_pairs(surface))
-    expected = compare_with_image(frame, poses, surface).score
+    expected = score_by_image(frame, poses, surface)
     assert torch.allclose(score, expected)
     assert bool((score.diff() <= 1e-9).all()), "what the image agrees with best comes first"
     for truth in TRUTHS:
@@ -207,11 +224,6 @@ def test_the_handle_of_a_mug_decides_its_turn(handle: str) -> None:
     poses = [one.camera_from_model for one in Registration([mug]).find(depth_m, CAMERA)]
     errors = [float(add_m(pose, truth, mug.vertices_m)) for pose in poses if pose is not None]
     assert errors == ([pytest.approx(0, abs=0.05 * mug.diameter_m)] if handle == "seen" else [])
-    about = Rigid(rotation_by(torch.tensor([0.0, 0, 1.8])), torch.zeros(3))  # 103 degrees
-    prepared = Registration([mug])._prepared_object("mug")
-    best = search._best_copy(prepare_frame(depth_m, K), (truth @ about).double(), prepared)
-    off = math.degrees(float(geodesic_rad(best.R, truth.R.double())))
-    assert off < (20 if handle == "seen" else 70), "hidden: anywhere behind the mug"
 
 
 def test_turns_that_fit_as_well_are_named() -> None:
@@ -430,7 +442,7 @@ def test_the_best_evidence_leads_a_place_not_the_first_proposal(net: Registratio
     assert float((likely[0].pose.t_m - truth.t_m).norm()) < 0.001, "refined"
     assert float(geodesic_rad(likely[0].pose.R.float(), truth.R.float())) < 0.1
     assert len(likely) + len(hopeless) == len(places)
-    leader = search._group(likely, frame, targets)[0][0]
+    leader = search._group(likely)[0][0]
     assert float((leader.pose.t_m - truth.t_m).norm()) < 0.001
 
 

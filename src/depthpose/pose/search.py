@@ -24,7 +24,7 @@ from depthpose.core.devices import each_in_threads
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import cloud_from_depth, grow_mask
 from depthpose.pose.config import EstimateConfig
-from depthpose.pose.copies import PreparedObject, copies_of
+from depthpose.pose.copies import PreparedObject
 from depthpose.pose.decide import (
     LEAST_NAMED,
     PRIOR_MANY,
@@ -44,7 +44,7 @@ from depthpose.pose.frame import (
 from depthpose.pose.icp import refine_roughly
 from depthpose.pose.inputs import nothing_seen
 from depthpose.pose.picking import with_pick_ranks
-from depthpose.pose.propose.image import compare_with_image, propose_in_frame
+from depthpose.pose.propose.image import propose_in_frame
 from depthpose.pose.surface import NEAR, Surface
 from depthpose.pose.types import (
     CloudInput,
@@ -56,9 +56,6 @@ from depthpose.pose.types import (
 
 _MOST_PLACES, _LEAST_PROPOSALS = 40, 4
 """Proposals that are looked at in an image, and of each object at least."""
-_ALIGNED, _CLEARLY = 0.7, 0.01
-"""Cosine of the normals from which a reading and the surface are alike, and by how much more a
-copy must score to take the place of the pose that was proposed."""
 _HOPELESS = 0.02
 """A refined proposal that is less likely is given up."""
 _ROUNDS = 4
@@ -177,7 +174,7 @@ def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
     for _ in range(1 if targets.is_single else _ROUNDS):
         proposed = _propose(frame, is_unclaimed, names, taken, targets)
         likely, hopeless = _refine(proposed, frame, view, targets)
-        judged, refused = _judge(_group(likely, frame, targets), frame, view, targets)
+        judged, refused = _judge(_group(likely), frame, view, targets)
         misses += hopeless + refused
         if targets.is_single:
             judged, outside = _within(judged, is_unclaimed, targets)
@@ -290,47 +287,17 @@ def _readings_of(place: _Place, frame: Frame, view: ViewInput) -> Float[Tensor, 
     return cloud_from_depth(view.depth_m, mask[:height, :width], view.K)
 
 
-def _group(places: Sequence[_Place], frame: Frame, targets: SearchTargets) -> list[list[_Place]]:
+def _group(places: Sequence[_Place]) -> list[list[_Place]]:
     """Gather proposals of an object that explain the same readings; the likeliest leads each."""
     groups: list[list[_Place]] = []
     for place in places:
         same = [group for group in groups if group[0].object == place.object]
         group = next((group for group in same if place.shared_with(group[0]) > _RIVAL), None)
         if group is None:
-            prepared = targets.object_of(place.object)
-            pose = _best_copy(frame, place.pose, prepared)
-            explained = explained_mask(frame, pose, prepared.surface)
-            groups.append([replace(place, pose=pose, explained=explained)])
+            groups.append([place])
         elif len(group) < _MOST_TOGETHER:
             group.append(place)
     return groups
-
-
-def _best_copy(frame: Frame, pose: Rigid, prepared: PreparedObject) -> Rigid:
-    """Give the pose or the one of its copies at which the object explains most readings about it.
-
-    A handle that a wrong copy of a mug leaves out does not contradict it, for a neighbour may be
-    there. So each is scored by the readings that it explains, over the most that one does, less the
-    share of its surface that the image contradicts.
-    """
-    surface = prepared.surface
-    copies = copies_of(prepared)
-    motions = Rigid.cat([copies.near_copies, copies.lookalikes])
-    if len(motions.R) == 0:
-        return pose
-    every = Rigid.cat([pose[None], pose[None] @ motions])
-    about = (frame.depth_m > 0) & (frame.background_limit_m < surface.diameter_m)
-    middle_m = pose.apply(surface.middle_m[None])[0]
-    about &= (frame.points_m - middle_m).norm(dim=-1) < surface.diameter_m
-    local_m = every.inverse().apply(frame.points_m[about])
-    index = surface.boxes.look_up(local_m)
-    is_near = (local_m - surface.points_m[index]).norm(dim=-1) < NEAR * surface.diameter_m
-    cosine = ((surface.normals[index] @ every.R.mT) * frame.normals[about]).sum(-1).abs()
-    number = (is_near & ((cosine > _ALIGNED) | ~frame.is_smooth[about])).sum(-1)
-    contradicted = compare_with_image(frame, every, surface).contradicted
-    score = number / number.max().clamp(min=1) - contradicted
-    best = int(score.argmax())
-    return every[best] if float(score[best] - score[0]) > _CLEARLY else pose
 
 
 def _judge(

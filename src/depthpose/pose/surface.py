@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from scipy.spatial import KDTree
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, max_pool2d, pad
+from torch.nn.functional import max_pool2d, pad
 
 from depthpose.core.rigid import Rigid
 from depthpose.pose.compiled import use_numba
@@ -28,10 +28,8 @@ _BOXES = 48  # boxes along the longest side of a model, to look up what is near 
 _MARGIN = 0.15  # of the diameter: so far the boxes reach beyond the model
 _VIEWS = 256  # directions from which a model is looked at
 _POINTS = 160  # cells of a picture, at most
-_RING = 64  # cells beside its silhouette, at most
-BESIDE = 0.08
-"""Of the diameter: where what is beside a silhouette is no farther than so much from its border in
-depth, the same surface goes on."""
+_STEP = 0.08
+"""Of the diameter: neighbouring cells that differ in depth by more are the two sides of an edge."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -62,8 +60,6 @@ class Views:
     normals: Float64[Tensor, "v n 3"]  #: theirs
     #: whether the surface goes on around a point: no rim or edge, which sensors cut.
     is_inner: Bool[Tensor, "v n"]
-    #: places beside the silhouette, as far off as its border; NaN where there are fewer.
-    beside_m: Float64[Tensor, "v m 3"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -106,7 +102,6 @@ class Surface:
             points_m=torch.stack([view.points_m for view in views]),
             normals=torch.stack([view.normals for view in views]),
             is_inner=torch.stack([view.is_inner for view in views]),
-            beside_m=torch.stack([view.beside_m for view in views]),
         )
 
     @cached_property
@@ -153,11 +148,10 @@ class _View(NamedTuple):
     points_m: Float64[Tensor, "n 3"]
     normals: Float64[Tensor, "n 3"]
     is_inner: Bool[Tensor, " n"]
-    beside_m: Float64[Tensor, "m 3"]
 
 
 def _view_of(surface: Surface, toward: Tensor, across: Tensor) -> _View:
-    """Look at a surface from one side: the points that are seen, and places beside them.
+    """Look at a surface from one side: the points that are seen.
 
     Args:
         surface: of the model.
@@ -180,9 +174,8 @@ def _view_of(surface: Surface, toward: Tensor, across: Tensor) -> _View:
 
     # Where samples are sparse the far side shows through the gaps: no camera sees it.
     front_m = max_pool2d(picture_m, 3, 1, 1).flatten()
-    is_seen = nearest_m > front_m - BESIDE * surface.diameter_m
+    is_seen = nearest_m > front_m - _STEP * surface.diameter_m
     is_seen &= nearest_m.isfinite()
-    filled = is_seen.double().reshape(1, side, side)
 
     # Inner cells: two from the silhouette, whose single empty cells are closed first, and beside
     # nothing that lies farther off.
@@ -190,27 +183,15 @@ def _view_of(surface: Surface, toward: Tensor, across: Tensor) -> _View:
     whole = -max_pool2d(-closed, 5, 1, 2)
     depth_m = torch.where(picture_m.isfinite(), -picture_m, -torch.inf)
     farthest_m = max_pool2d(depth_m, 3, 1, 1)
-    is_inner = (whole > 0) & (-farthest_m > picture_m - BESIDE * surface.diameter_m)
+    is_inner = (whole > 0) & (-farthest_m > picture_m - _STEP * surface.diameter_m)
 
-    # The ring of cells two from the silhouette, as far off as the border is nearby in the mean.
-    wide = max_pool2d(filled, 5, 1, 2)
-    narrow = max_pool2d(filled, 3, 1, 1)
-    is_ring = (wide > 0) & (narrow == 0)
-    shown_m = torch.where(filled > 0, picture_m, 0.0)
-    border_m = avg_pool2d(shown_m, 5, 1, 2) / avg_pool2d(filled, 5, 1, 2)
-
-    # At most so many of both, shuffled: every n-th of them is a sample of all.
+    # At most so many, shuffled: every n-th of them is a sample of all.
     cells = _shuffled(is_seen, _POINTS)
-    ring = _shuffled(is_ring.flatten(), _RING)
-    at = torch.stack([ring % side, ring.div(side, rounding_mode="floor")], -1).double()
-    at += 0.5 - side // 2
-    beside_m = at * cell_m @ across + border_m.flatten()[ring, None] * toward + surface.middle_m
     seen = sample[cells]
     return _View(
         points_m=_padded(surface.points_m[seen], _POINTS),
         normals=_padded(surface.normals[seen], _POINTS),
         is_inner=pad(is_inner.flatten()[cells], (0, _POINTS - len(cells))),
-        beside_m=_padded(beside_m, _RING),
     )
 
 

@@ -13,7 +13,7 @@ from depthpose.pose.frame import Frame, readings_toward
 from depthpose.pose.icp import tukey_weight
 from depthpose.pose.propose.point_pairs import STEP, PairTable, vote_poses
 from depthpose.pose.sensor import NOISE_PER_M2
-from depthpose.pose.surface import BESIDE, NEAR, Surface
+from depthpose.pose.surface import NEAR, Surface
 
 # Votes.
 _REFERENCE_EVERY = 8
@@ -47,12 +47,6 @@ _DAMPING = 0.02
 # The score of a pose.
 _DEVIATIONS = 2.0
 """A reading lies on the surface up to so many deviations of the noise, beside the stage's limit."""
-_OTHERWISE_WEIGHT = 0.5
-"""Against a pose: a reading at the surface's depth that is turned otherwise."""
-_OCCLUDED_SHARE = 0.4
-"""And of that a reading before it, which may occlude it."""
-_CONTINUED_WEIGHT = 0.6
-"""And the share of what is beside its silhouette in which the same surface goes on."""
 _LEAST_READ = 0.5
 """Where less of the surface is read, it counts as so much."""
 
@@ -94,7 +88,7 @@ def propose_in_frame(
         models: so many are searched in the image.
 
     Returns:
-        Poses, roughly refined, the best first, and the score of each (:class:`ImageScore`).
+        Poses, roughly refined, the best first, and the score of each (:func:`score_by_image`).
     """
     # Votes.
     surface = table.surface
@@ -117,7 +111,7 @@ def _refine_and_thin(
 ) -> tuple[Rigid, Float64[Tensor, " b"]]:
     """Refine poses, and give the best distinct ones of a stage with their scores."""
     poses = refine_projectively(frame, poses, surface, stage)
-    score = compare_with_image(frame, poses, surface, stage).score
+    score = score_by_image(frame, poses, surface, stage)
     best = _distinct(poses, score, surface, stage.most)
     return poses[best], score[best]
 
@@ -209,29 +203,17 @@ def refine_projectively(frame: Frame, poses: Rigid, surface: Surface, stage: _St
     return poses
 
 
-class ImageScore(NamedTuple):
-    """How well an image agrees with each of several proposed poses, as shares of the surface.
+def score_by_image(
+    frame: Frame, poses: Rigid, surface: Surface, stage: _Stage = _STAGES[-1]
+) -> Float64[Tensor, " b"]:
+    """Score posed surfaces by what the camera saw in the direction of their points.
 
     It ranks proposals; whether a pose is right :class:`depthpose.pose.types.Evidence` says.
 
-    Attributes:
-        score: what was seen where it should be, less what contradicts it; at most 1.
-        continued: share of what is beside the silhouette in which the same surface goes on.
-        contradicted: share of the surface through which the camera saw, or a table before it.
-    """
-
-    score: Float64[Tensor, " b"]
-    continued: Float64[Tensor, " b"]
-    contradicted: Float64[Tensor, " b"]
-
-
-def compare_with_image(
-    frame: Frame, poses: Rigid, surface: Surface, stage: _Stage = _STAGES[-1]
-) -> ImageScore:
-    """Compare posed surfaces with what the camera saw in their direction, and beside it.
-
-    What was seen at a point's depth and turned alike agrees. What was seen behind it, a table
-    before it, and a surface that goes on beyond its silhouette contradict it.
+    Returns:
+        The share of the surface that was read at its depth and turned alike, less the share that
+        was read there and is turned otherwise, that the camera saw through, or that a background
+        hides; at most 1.
     """
     # What was read in the direction of each visible point, and how far behind it.
     visible = _visible_points(poses, surface, stage.every)
@@ -239,41 +221,25 @@ def compare_with_image(
     readings = readings_toward(frame, visible.points_m)
     gap_m = readings.depth_m - depth_m
     limit_m = stage.near * surface.diameter_m + _DEVIATIONS * NOISE_PER_M2 * depth_m.square()
-    # A plane that is wider than the object is no side of it.
-    may_show = frame.may_show(surface.diameter_m).flatten()
-    is_side = may_show[readings.pixel]
-    cosine = (visible.normals * frame.normals.flatten(0, 1)[readings.pixel]).sum(-1).abs()
-    is_alike = (cosine > _MIN_COSINE) | ~frame.is_smooth.flatten()[readings.pixel]
+    is_background = ~frame.may_show(surface.diameter_m).flatten()[readings.pixel]
 
-    # On the surface and turned alike, on it and turned otherwise, before it, or behind it.
+    # At the depth of the surface, and turned alike or otherwise.
     is_at_depth = readings.is_read & (gap_m.abs() < limit_m)
-    agrees = is_at_depth & is_side & is_alike
-    is_otherwise = is_at_depth & ~agrees
-    is_before = readings.is_read & (gap_m < -limit_m)
-    # A sensor cuts rims and edges: the camera saw through where it saw nothing near beside either,
-    # and where the surface goes on around; what it cut off counts as not read.
-    is_through = frame.nearest_m.flatten()[readings.pixel] > depth_m + limit_m
-    is_through &= readings.is_read
-    is_cut = is_through & ~visible.is_inner
-    contradicts = (is_through & visible.is_inner) | (is_before & ~is_side)
-    is_occluded = is_before & is_side
+    cosine = (visible.normals * frame.normals.flatten(0, 1)[readings.pixel]).sum(-1).abs()
+    is_turned = (cosine <= _MIN_COSINE) & frame.is_smooth.flatten()[readings.pixel]
+    supports = is_at_depth & ~is_turned & ~is_background
 
-    # Of the places beside the silhouette those at which the same surface goes on.
-    beside = readings_toward(frame, visible.beside_m)
-    gap_m = beside.depth_m - visible.beside_m[..., 2]
-    is_level = beside.is_read & (gap_m.abs() < BESIDE * surface.diameter_m)
-    places = visible.beside_m[..., 2].isfinite().sum(1).clamp(min=1).double()
-    continued = (is_level & may_show[beside.pixel]).sum(1) / places
+    # Behind a background, or seen through. A sensor cuts rims and edges: where it saw nothing near
+    # about a point of an edge, the point counts as not read.
+    is_hidden = readings.is_read & (gap_m < -limit_m) & is_background
+    is_through = readings.is_read
+    is_through &= frame.nearest_m.flatten()[readings.pixel] > depth_m + limit_m
+    is_cut = is_through & ~visible.is_inner
+    contradicts = (is_at_depth & is_turned) | is_hidden | (is_through & visible.is_inner)
 
     count = depth_m.isfinite().sum(1).clamp(min=1)
     read = (readings.is_read & ~is_cut).sum(1).maximum(_LEAST_READ * count).double()
-    against = is_otherwise.double() + _OCCLUDED_SHARE * is_occluded.double()
-    good = agrees.sum(1) - contradicts.sum(1) - _OTHERWISE_WEIGHT * against.sum(1)
-    return ImageScore(
-        score=good / read - _CONTINUED_WEIGHT * continued,
-        continued=continued,
-        contradicted=contradicts.sum(1) / read,
-    )
+    return (supports.sum(1) - contradicts.sum(1)) / read
 
 
 class _Visible(NamedTuple):
@@ -282,7 +248,6 @@ class _Visible(NamedTuple):
     points_m: Points
     normals: Points
     is_inner: Bool[Tensor, "b n"]
-    beside_m: Float64[Tensor, "b m 3"]
 
 
 def _visible_points(poses: Rigid, surface: Surface, every: int) -> _Visible:
@@ -294,5 +259,4 @@ def _visible_points(poses: Rigid, surface: Surface, every: int) -> _Visible:
         points_m=poses.apply(views.points_m[side, ::every]),
         normals=views.normals[side, ::every] @ poses.R.mT,
         is_inner=views.is_inner[side, ::every],
-        beside_m=poses.apply(views.beside_m[side, ::every]),
     )
