@@ -9,15 +9,16 @@ from tests.pose.synthetic_objects import CAMERA, K, box_faces, bracket, pose_at,
 
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
-from depthpose.pose import search
 from depthpose.pose.background import PosedBin, with_background
 from depthpose.pose.cloud import cloud_from_depth, grow_mask
 from depthpose.pose.evidence import compare, observe
+from depthpose.pose.footprint import is_cut_out, why_background_excludes
 from depthpose.pose.frame import prepare_frame
 from depthpose.pose.inputs import view_input
 from depthpose.pose.mesh import make_model
 from depthpose.pose.metrics import add_m
 from depthpose.pose.registration import Registration
+from depthpose.pose.sensor import NOISE_PER_M2
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.types import ObjectModel, PoseEstimate
 
@@ -115,14 +116,14 @@ def test_a_pose_in_a_wave_of_the_floor_is_no_place() -> None:
     sunk = Rigid(TRUTH.R, TRUTH.t_m + torch.tensor([0.12, 0.0, 0.2])).double()
     depth_m = posed_bin().draw(K, 240, 320) + noise(2)
     plain = view_input(depth_m, None, CAMERA, "bracket", "x")
-    assert search._exclusion_by_background(
+    assert why_background_excludes(
         prepare_frame(plain.depth_m, plain.K), plain, sunk, surface
     ) == ""  # fmt: skip
     view = with_background(plain, posed_bin())
     frame = prepare_frame(view.depth_m, view.K, None, view.background)
-    assert "would lie in" in search._exclusion_by_background(frame, view, sunk, surface)
+    assert "would lie in" in why_background_excludes(frame, view, sunk, surface)
     before = Rigid(TRUTH.R, TRUTH.t_m).double()
-    assert search._exclusion_by_background(frame, view, before, surface) == ""
+    assert why_background_excludes(frame, view, before, surface) == ""
 
 
 def test_a_plane_through_the_tops_of_parts_is_no_background_before_a_known_bin() -> None:
@@ -171,8 +172,8 @@ def test_a_plate_that_lies_flush_in_its_tray_is_not_cut_out_of_it() -> None:
     plain = view_input(depth_m, mask, CAMERA, "plate", "x")
     known = with_background(plain, empty_m + noise(1))
     surface = prepare_surface(plate)
-    assert search.is_cut_out(plain, pose, surface)
-    assert not search.is_cut_out(known, pose, surface)
+    assert is_cut_out(plain, pose, surface, NOISE_PER_M2)
+    assert not is_cut_out(known, pose, surface, NOISE_PER_M2)
     cloud_m = cloud_from_depth(depth_m, mask, K)
     beside = [
         compare(

@@ -11,18 +11,19 @@ from tests.pose.synthetic_objects import pose_at
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EstimateConfig
-from depthpose.pose.decide import (
-    PRIOR_MASKED,
-    PRIOR_PROPOSED,
+from depthpose.pose.decide import contradiction, with_status
+from depthpose.pose.hypotheses import (
     Competition,
     Hypothesis,
-    Rate,
-    contradiction,
-    log_odds_right,
-    probability_right,
     share_among_copies,
     share_among_poses,
-    with_status,
+)
+from depthpose.pose.probability import (
+    PRIOR_MASKED,
+    PRIOR_PROPOSED,
+    Rate,
+    log_odds_right,
+    probability_right,
 )
 from depthpose.pose.types import Alternative, Evidence, PoseEstimate
 

@@ -20,9 +20,12 @@ from depthpose.core.camera import back_project
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import RefusalConfig
+from depthpose.pose.decide import choose_object
+from depthpose.pose.footprint import explained_mask, is_cut_out
 from depthpose.pose.mesh import make_model
 from depthpose.pose.metrics import add_m
-from depthpose.pose.search import choose_object, explained_mask, is_cut_out, nothing_found
+from depthpose.pose.search import nothing_found
+from depthpose.pose.sensor import NOISE_PER_M2
 from depthpose.pose.surface import NEAR, prepare_surface
 from depthpose.pose.types import (
     Alternative,
@@ -98,7 +101,7 @@ def test_a_piece_of_a_larger_plane_is_no_flat_part(
     depth_m = torch.where(mask, seen.float(), depth_m)
     depth_m += 0.001 * torch.randn(240, 320, generator=torch.Generator().manual_seed(0))
     view = ViewInput(name="a", depth_m=depth_m, mask=mask, K=K, object=model.name)
-    assert is_cut_out(view, pose, prepare_surface(model)) == is_cut
+    assert is_cut_out(view, pose, prepare_surface(model), NOISE_PER_M2) == is_cut
 
 
 def test_readings_on_a_posed_surface_are_all_that_are_near_it() -> None:

@@ -16,12 +16,13 @@ from depthpose.pose import search
 from depthpose.pose.cloud import cloud_from_depth, grow_mask
 from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.copies import find_copies
-from depthpose.pose.decide import PRIOR_PROPOSED
 from depthpose.pose.evidence import compare, observe
+from depthpose.pose.footprint import explained_mask, why_background_excludes
 from depthpose.pose.frame import prepare_frame
 from depthpose.pose.inputs import view_input
 from depthpose.pose.mesh import make_model
 from depthpose.pose.metrics import add_m
+from depthpose.pose.probability import PRIOR_PROPOSED
 from depthpose.pose.propose.image import propose_in_frame, score_by_image
 from depthpose.pose.propose.point_pairs import prepare_pairs
 from depthpose.pose.registration import Registration
@@ -413,11 +414,11 @@ def test_what_would_lie_in_the_wall_is_not_possible(net: Registration) -> None:
     depth_m = torch.where(mask, torch.minimum(seen.float(), wall), wall)
     frame = prepare_frame(depth_m, K.float())
     view = view_input(depth_m, None, CAMERA, "bracket", "x", None)
-    assert "would lie in" in search._exclusion_by_background(frame, view, pose.double(), surface)
+    assert "would lie in" in why_background_excludes(frame, view, pose.double(), surface)
     before = Rigid(pose.R, pose.t_m - torch.tensor([0.0, 0.0, 0.15]))
-    assert search._exclusion_by_background(frame, view, before.double(), surface) == ""
+    assert why_background_excludes(frame, view, before.double(), surface) == ""
     gap = replace(frame, depth_m=torch.where(grow_mask(mask, 12), 3.0, frame.depth_m))
-    assert search._exclusion_by_background(gap, view, pose.double(), surface) == ""
+    assert why_background_excludes(gap, view, pose.double(), surface) == ""
 
 
 def test_the_best_evidence_leads_a_place_not_the_first_proposal(net: Registration) -> None:
@@ -433,7 +434,7 @@ def test_the_best_evidence_leads_a_place_not_the_first_proposal(net: Registratio
     places = [
         search._Place(
             object="bracket", pose=pose,
-            explained=search.explained_mask(frame, pose, prepared.surface),
+            explained=explained_mask(frame, pose, prepared.surface),
         )
         for pose in (wrong, coarse)
     ]  # fmt: skip

@@ -21,6 +21,7 @@ from depthpose.core.run import find_rank
 from depthpose.core.runner import Job, Results, run_jobs
 from depthpose.pose.datasets import BopDataset, Instance, open_bop, read_targets
 from depthpose.pose.evaluate import select_targets
+from depthpose.pose.footprint import explained_mask
 from depthpose.pose.inputs import AnyInput
 from depthpose.pose.predictions import (
     Place,
@@ -31,7 +32,6 @@ from depthpose.pose.predictions import (
     unreadable_estimate,
     write_predictions,
 )
-from depthpose.pose.search import explained_mask
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.types import PoseEstimate, ViewInput
 

@@ -154,11 +154,6 @@ def _empty() -> Rigid:
     return Rigid(torch.zeros(0, 3, 3).double(), torch.zeros(0, 3).double())
 
 
-def copies_of(prepared: PreparedObject) -> SymmetricCopies:
-    """Give an object's symmetric copies."""
-    return prepared.copies
-
-
 def near_symmetry_lines(model: ObjectModel) -> list[str]:
     """Say after which rotations a model looks nearly as before, and by how much it deviates."""
     copies = find_copies(model)

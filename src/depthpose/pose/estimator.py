@@ -23,10 +23,9 @@ from depthpose.pose.config import EstimateConfig, IcpConfig, RefusalConfig
 from depthpose.pose.copies import PreparedObject
 from depthpose.pose.datasets.detections import Box, box_mask
 from depthpose.pose.decide import (
-    PRIOR_REGION,
+    choose_object,
     contradiction,
     decide,
-    probability_right,
     refused,
     with_status,
 )
@@ -44,11 +43,8 @@ from depthpose.pose.inputs import (
     split_instances,
     view_input,
 )
-from depthpose.pose.search import (
-    SearchTargets,
-    choose_object,
-    find_objects,
-)
+from depthpose.pose.probability import PRIOR_REGION, probability_right
+from depthpose.pose.search import SearchTargets, find_objects
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.track import TrackedObject, track
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, Refusal, ViewInput, Vote
@@ -200,11 +196,11 @@ class PoseEstimator:
             prepared,
             competition,
             observation,
-            self.refusal,
-            self.config,
-            seconds,
-            prior_odds,
-            vote,
+            refusal=self.refusal,
+            config=self.config,
+            seconds=seconds,
+            prior_odds=prior_odds,
+            vote=vote,
         )
 
     def _estimate_in_region(self, view: ViewInput) -> PoseEstimate:

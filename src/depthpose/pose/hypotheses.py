@@ -1,10 +1,11 @@
 """Competing poses of one object: refined, distinct, each with its evidence."""
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from jaxtyping import Float64
+import torch
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
@@ -12,11 +13,11 @@ from depthpose.core.rigid import Rigid, geodesic_rad
 from depthpose.pose.color import color_agreement, color_copies, settle_spin
 from depthpose.pose.config import IcpConfig
 from depthpose.pose.copies import PreparedObject
-from depthpose.pose.decide import Competition, Hypothesis, share_among_copies, share_among_poses
 from depthpose.pose.evidence import Observation, compare
 from depthpose.pose.icp import RefinedPose, refine_pose, refine_roughly
+from depthpose.pose.probability import LEAST_AREA, VOTES_RAD, log_fit_right, log_odds_right
 from depthpose.pose.surface import NEAR, Surface
-from depthpose.pose.types import ViewInput
+from depthpose.pose.types import Evidence, ViewInput
 
 _POINTS = 250  # of the cloud that refine a competing pose
 _STEPS = 6  # of ICP for poses that were refined roughly
@@ -26,6 +27,50 @@ _UNEXPLAINED_MORE = 0.25
 _MOST_LEADING = 8  #: poses that are compared, and of one of them so many copies
 _MOST_COPIES = 36
 _SAME_PRINT_RAD = 0.1  # poses nearer than this show the same surface colours, the "print"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Hypothesis:
+    """A refined pose and the evidence for it.
+
+    Attributes:
+        pose: ``camera_from_model``.
+        covariance: 6x6, as :class:`~depthpose.pose.types.PoseFit` says.
+        residual_m: root mean square distance of the points to the surface.
+        evidence: of the pose.
+        votes_rad: mean angle between a network's directions and those to the keypoints of the
+            pose; None without a network.
+        log_color: log likelihood of the colour image; 0 without one.
+    """
+
+    pose: Rigid
+    covariance: Float[Tensor, "6 6"]
+    residual_m: float
+    evidence: Evidence
+    votes_rad: float | None = None
+    log_color: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Competition:
+    """Poses that compete for one object, and how they share the probability of one.
+
+    Attributes:
+        best: the likeliest pose.
+        best_share: its share.
+        copies: near-symmetric copies of it, with their shares.
+        others: other poses, with theirs.
+    """
+
+    best: Hypothesis
+    best_share: float
+    copies: list[tuple[Hypothesis, float]]
+    others: list[tuple[Hypothesis, float]]
+
+    @property
+    def group_share(self) -> float:
+        """Share of the best pose and its near-symmetric copies together."""
+        return self.best_share + sum(share for _, share in self.copies)
 
 
 def compete(
@@ -102,6 +147,45 @@ def compete(
         copies=[(h, float(copy_shares[k])) for k, h in enumerate(group) if k != best],
         others=others_shares,
     )
+
+
+def share_among_poses(
+    hypotheses: Sequence[Hypothesis], *, is_masked: bool
+) -> Float64[Tensor, " n"]:
+    """Share the probability of one among different poses of an object.
+
+    If one of them is right the others are wrong, and wrong poses leave much contradicted: so each
+    is weighed by how much better its evidence fits a right pose than a wrong one. They are poses of
+    the same readings: where no mask says which, what another pose explains, and a pose does not,
+    contradicts it.
+    """
+    most = 0.0
+    if not is_masked:
+        most = max(hypothesis.evidence.supported for hypothesis in hypotheses)
+    weights: list[float] = []
+    for hypothesis in hypotheses:
+        evidence = hypothesis.evidence
+        unexplained = max(evidence.beside, most - evidence.supported)
+        log_odds = log_odds_right(replace(evidence, beside=unexplained))
+        weights.append(log_odds + _log_beside_depth(hypothesis))
+    return torch.tensor(weights, dtype=torch.float64).softmax(0)
+
+
+def share_among_copies(hypotheses: Sequence[Hypothesis]) -> Float64[Tensor, " n"]:
+    """Share the probability of one among near-symmetric copies of a pose.
+
+    Wrong copies are contradicted little, for they look nearly alike: so each is weighed by how well
+    its evidence fits a right pose. A network's votes say nothing here: it saw no more.
+    """
+    area = max(LEAST_AREA, *(hypothesis.evidence.visible for hypothesis in hypotheses))
+    weights = [log_fit_right(h.evidence, area) + h.log_color for h in hypotheses]
+    return torch.tensor(weights, dtype=torch.float64).softmax(0)
+
+
+def _log_beside_depth(hypothesis: Hypothesis) -> float:
+    """Log likelihood of what is known beside depth: a colour image, a network's votes."""
+    log_votes = 0.0 if hypothesis.votes_rad is None else -hypothesis.votes_rad / VOTES_RAD
+    return log_votes + hypothesis.log_color
 
 
 def _distinct_copies(

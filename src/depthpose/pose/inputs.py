@@ -23,7 +23,6 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import read_cloud, read_stored_depth
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit, metres_of
-from depthpose.pose.cloud import nothing_seen as nothing_seen
 from depthpose.pose.datasets import decode_rle, number_objects, one_mask, read_labels
 from depthpose.pose.datasets.masks import read_runs
 from depthpose.pose.mesh.shapes import is_shape, shape_geometry

@@ -37,9 +37,10 @@ from depthpose.pose.cloud import (
 )
 from depthpose.pose.config import EstimateConfig
 from depthpose.pose.copies import PreparedObject
-from depthpose.pose.decide import PRIOR_MASKED, PRIOR_PROPOSED, refused
+from depthpose.pose.decide import refused
 from depthpose.pose.estimator import PoseEstimator, unreadable_on_error
 from depthpose.pose.icp import BestStart, RefinedPose, refine_best
+from depthpose.pose.probability import PRIOR_MASKED, PRIOR_PROPOSED
 from depthpose.pose.propose import fits_of, meet_lines, vote_ransac
 from depthpose.pose.registration import Registration
 from depthpose.pose.types import (

@@ -18,7 +18,7 @@ from depthpose.core.units import Unit
 from depthpose.pose.cloud import ObjectCloud, local_planes, prepare_cloud, thin
 from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig
 from depthpose.pose.copies import PreparedObject
-from depthpose.pose.decide import PRIOR_MASKED, refused
+from depthpose.pose.decide import refused
 from depthpose.pose.estimator import PoseEstimator
 from depthpose.pose.icp import refine_best
 from depthpose.pose.inputs import AnyInput
@@ -31,6 +31,7 @@ from depthpose.pose.mesh import (
     symmetry_of_each,
     with_found_symmetries,
 )
+from depthpose.pose.probability import PRIOR_MASKED
 from depthpose.pose.propose.point_pairs import propose_poses
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, Refusal, ViewInput
 

@@ -12,50 +12,42 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import softplus
 
-from depthpose.core.camera import back_project, project
 from depthpose.core.devices import each_in_threads
 from depthpose.core.rigid import Rigid
-from depthpose.pose.cloud import cloud_from_depth, grow_mask
+from depthpose.pose.cloud import cloud_from_depth, nothing_seen
 from depthpose.pose.config import EstimateConfig
 from depthpose.pose.copies import PreparedObject
 from depthpose.pose.decide import (
-    LEAST_NAMED,
+    LEAST_SHARE,
+    contradiction,
+    likeliest_object,
+    scaled,
+)
+from depthpose.pose.evidence import compare, observe
+from depthpose.pose.footprint import explained_mask, why_background_excludes, window_of_region
+from depthpose.pose.frame import Frame, prepare_frame
+from depthpose.pose.icp import refine_roughly
+from depthpose.pose.picking import with_pick_ranks
+from depthpose.pose.probability import (
     PRIOR_MANY,
     PRIOR_PROPOSED,
-    contradiction,
     log_odds_right,
+    probability_of_instances,
     probability_right,
 )
-from depthpose.pose.evidence import BORDER_PX, compare, observe
-from depthpose.pose.frame import (
-    Frame,
-    is_on_plane,
-    largest_plane,
-    prepare_frame,
-    share_behind,
-)
-from depthpose.pose.icp import refine_roughly
-from depthpose.pose.inputs import nothing_seen
-from depthpose.pose.picking import with_pick_ranks
 from depthpose.pose.propose.image import propose_in_frame
-from depthpose.pose.surface import NEAR, Surface
-from depthpose.pose.types import (
-    CloudInput,
-    Evidence,
-    KnownBackground,
-    PoseEstimate,
-    ViewInput,
-)
+from depthpose.pose.types import CloudInput, Evidence, PoseEstimate, ViewInput
 
-_MOST_PLACES, _LEAST_PROPOSALS = 40, 4
-"""Proposals that are looked at in an image, and of each object at least."""
+_MOST_PLACES = 40
+"""Proposals that are looked at in an image."""
+_LEAST_PROPOSALS = 4
+"""Proposals of each object that are looked at in any case."""
 _HOPELESS = 0.02
 """A refined proposal that is less likely is given up."""
 _ROUNDS = 4
@@ -68,18 +60,6 @@ _SHARED = 0.3
 """Estimates that explain so large a share of the same readings are of one thing; one stays."""
 _RIVAL = 0.5
 """Poses of two objects that explain so much of the same readings compete."""
-_FLAT = 0.9
-"""What lies on one plane by so large a share is flat: anything of its outline looks the same."""
-_CONTINUED = 0.4
-"""Where the plane goes on beside so much of it, the outline is a cut through something larger."""
-_RIM = 0.05
-"""Width of what is looked at beside it, in diameters."""
-_REGION_MARGIN = 0.5
-"""Of the larger side of a region: so far about it planes and neighbours are looked at."""
-_SUNK = 0.05
-"""Of a surface no larger share lies in a bin, table or wall: its pose is off by less."""
-_LEAST_SHARE = 0.8
-"""Where no object among several has so large a share of the probability, none is reported."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -161,72 +141,93 @@ def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
         view: depth and camera; its mask limits where is looked.
         targets: what for.
     """
+    # The part of the image that is searched, its normals and its background.
     began = time.perf_counter()
-    whole = view
-    view = _window_of_region(view)
+    window = window_of_region(view)
     smallest_m = min(targets.object_of(name).surface.diameter_m for name in targets.names)
-    frame = prepare_frame(view.depth_m, view.K, smallest_m, view.background)
-    is_unclaimed = view.mask[:: frame.step, :: frame.step].clone()
+    frame = prepare_frame(window.depth_m, window.K, smallest_m, window.background)
+    is_unclaimed = window.mask[:: frame.step, :: frame.step].clone()
+
+    # Round after round: propose, refine, judge, suppress. What is posed claims its readings.
     names = list(targets.names)
-    accepted: list[_Judged] = []
-    taken: list[_Judged] = []
+    posed: list[_Judged] = []
+    claimed: list[_Judged] = []  # posed, or of one of several objects
     misses: list[_Miss] = []
     for _ in range(1 if targets.is_single else _ROUNDS):
-        proposed = _propose(frame, is_unclaimed, names, taken, targets)
-        likely, hopeless = _refine(proposed, frame, view, targets)
-        judged, refused = _judge(_group(likely), frame, view, targets)
+        proposals = _propose(frame, is_unclaimed, names, claimed, targets)
+        likely, hopeless = _refine(proposals, frame, window, targets)
+        judged, refused = _judge(_group(likely), frame, window, targets)
         misses += hopeless + refused
         if targets.is_single:
             judged, outside = _within(judged, is_unclaimed, targets)
             misses += outside
-        more, taken, uncertain = _suppress(judged, taken, targets)
+        kept, claimed, uncertain = _suppress(judged, claimed, targets)
         misses += uncertain
-        accepted += more
-        for place in more:
+        posed += kept
+        for place in kept:
             is_unclaimed &= ~place.explained
-        # What is there twice may be there more often; what was found once is not asked for again.
-        count = Counter(place.object for place in accepted)
-        names = sorted({place.object for place in more if count[place.object] > 1})
+        # What is there twice may be there more often; what is there once is not looked for again.
+        count = Counter(place.object for place in posed)
+        names = sorted({place.object for place in kept if count[place.object] > 1})
         if not names:
             break
-    accepted, missed = _weigh_instances(accepted, targets)
-    misses += missed
-    accepted.sort(key=lambda place: -place.log_odds)
+
+    # The places of one object are weighed by each other.
+    posed, unlikely = _weigh_instances(posed, targets)
+    misses += unlikely
+    posed.sort(key=lambda place: -place.log_odds)
+
+    # An estimate for each place, and for each object without one a refusal.
     spent_s = time.perf_counter() - began
     estimates = [
         replace(place.estimate, seconds={**place.estimate.seconds, "search": spent_s})
-        for place in accepted
+        for place in posed
     ]
     if not targets.is_single:
         surfaces = {name: targets.object_of(name).surface for name in targets.names}
-        estimates = with_pick_ranks(estimates, view, surfaces)
-    posed = {estimate.object for estimate in estimates}
+        estimates = with_pick_ranks(estimates, window, surfaces)
+    missing = set(targets.names) - {place.object for place in posed}
     estimates += [
-        nothing_found(whole, name, [miss for miss in misses if miss.object == name], spent_s)
+        nothing_found(view, name, [miss for miss in misses if miss.object == name], spent_s)
         for name in targets.names
-        if name not in posed
+        if name in missing
     ]
     if len(estimates) == 1:
         return [replace(estimates[0], name=view.name)]
     return [replace(estimate, name=f"{view.name}_{k}") for k, estimate in enumerate(estimates)]
 
 
+class _Proposal(NamedTuple):
+    """A pose that votes propose.
+
+    Attributes:
+        score: by which the image agrees with it.
+        rank: among those of its object.
+        object: its name.
+        pose: of the object.
+    """
+
+    score: float
+    rank: int
+    object: str
+    pose: Rigid
+
+
 def _propose(
     frame: Frame,
     is_unclaimed: Bool[Tensor, "h w"],
     names: Sequence[str],
-    taken: Sequence[_Place],
+    claimed: Sequence[_Place],
     targets: SearchTargets,
 ) -> list[_Place]:
-    """Propose poses of every object: the best of all, and some of each, but where one is taken."""
+    """Propose poses of every object: the best of all, and some of each; none at a claimed place."""
 
-    def propose(name: str) -> list[tuple[float, int, str, Rigid]]:
+    def propose(name: str) -> list[_Proposal]:
         pairs = targets.object_of(name).pairs
-        assert pairs is not None
-        poses, agreement = propose_in_frame(frame, is_unclaimed, pairs, len(names))
+        poses, score = propose_in_frame(frame, is_unclaimed, pairs, len(names))
         return [
-            (float(agreement[rank]), rank, name, poses[rank])
-            for rank in range(min(len(agreement), _MOST_PLACES))
+            _Proposal(score=float(score[rank]), rank=rank, object=name, pose=poses[rank])
+            for rank in range(min(len(score), _MOST_PLACES))
         ]
 
     proposals = [
@@ -234,15 +235,16 @@ def _propose(
         for group in each_in_threads(propose, names, torch.get_num_threads())
         for proposal in group
     ]
-    proposals.sort(key=lambda proposal: -proposal[0])
+    proposals.sort(key=lambda proposal: -proposal.score)
     places: list[_Place] = []
-    for number, (_, rank, name, pose) in enumerate(proposals):
-        if number >= _MOST_PLACES and rank >= _LEAST_PROPOSALS:
+    for number, proposal in enumerate(proposals):
+        if number >= _MOST_PLACES and proposal.rank >= _LEAST_PROPOSALS:
             continue
-        explained = explained_mask(frame, pose, targets.object_of(name).surface)
-        place = _Place(object=name, pose=pose, explained=explained)
-        is_taken = any(place.shared_with(other) > _SHARED for other in taken)
-        if place.area_px * frame.step**2 >= _LEAST_PIXELS and not is_taken:
+        surface = targets.object_of(proposal.object).surface
+        explained = explained_mask(frame, proposal.pose, surface)
+        place = _Place(object=proposal.object, pose=proposal.pose, explained=explained)
+        is_claimed = any(place.shared_with(other) > _SHARED for other in claimed)
+        if place.area_px * frame.step**2 >= _LEAST_PIXELS and not is_claimed:
             places.append(place)
     return places
 
@@ -318,7 +320,7 @@ def _judge(
         evidence = estimate.evidence
         reason = estimate.reason
         if estimate.camera_from_model is not None:
-            reason = _exclusion_by_background(
+            reason = why_background_excludes(
                 frame, view, estimate.camera_from_model.double(), surface
             )
         if estimate.camera_from_model is None or evidence is None or reason:
@@ -365,7 +367,7 @@ def _weigh_instances(
         for k, place in enumerate(places):
             probability = float(probabilities[k])
             if probability >= targets.min_probability:
-                estimate = _scaled(place.estimate, float(shares[k]))
+                estimate = scaled(place.estimate, float(shares[k]))
                 remaining.append(replace(place, estimate=estimate))
             else:
                 reason = (
@@ -373,27 +375,6 @@ def _weigh_instances(
                 )
                 misses.append(_miss_at(place, place.estimate.evidence, reason, targets))
     return remaining, misses
-
-
-def probability_of_instances(
-    log_odds: Float64[Tensor, " n"], prior_many: float
-) -> Float64[Tensor, " n"]:
-    """Give the probability of each place of one object, of which there is one or any number.
-
-    A table holds one of each object, a bin holds many: so a second place needs more evidence than
-    the first, and where several have it further ones need no more.
-
-    Args:
-        log_odds: of each place being right, by itself.
-        prior_many: odds of any number of instances, and not one at most; 0 in a detector's box.
-    """
-    by_itself = log_odds.sigmoid()
-    none_or_one = torch.cat([log_odds.new_zeros(1), log_odds])
-    log_many = (
-        log_odds.new_tensor(prior_many).log() + softplus(log_odds).sum()
-    )  # of all choices of places
-    many = (log_many - none_or_one.logsumexp(0)).sigmoid()
-    return many * by_itself + (1 - many) * none_or_one.softmax(0)[1:]
 
 
 def _within(
@@ -436,124 +417,14 @@ def _suppress(
         for other in ranked[number + 1 :]:
             if place.shared_with(other) > _RIVAL:
                 rivals.setdefault(other.object, other)
-        estimate, share = choose_object_of_place(list(rivals.values()))
-        if share >= _LEAST_SHARE:
+        estimate, share = likeliest_object([rival.estimate for rival in rivals.values()])
+        if share >= LEAST_SHARE:
             kept.append(replace(place, estimate=estimate))
         else:
             others = ", ".join(name for name in rivals if name != place.object)
             reason = f"what lies there may be {others} as well"
             misses.append(_miss_at(place, place.estimate.evidence, reason, targets))
     return kept, taken, misses
-
-
-def explained_mask(image: Frame | ViewInput, pose: Rigid, surface: Surface) -> Bool[Tensor, "h w"]:
-    """Mark the pixels whose points lie on a posed surface; in a frame, none of its background."""
-    pose = pose.double()
-    window = _pixels_about(image, pose, surface)
-    depth_m = image.depth_m[window].double()
-    if isinstance(image, Frame):
-        points_m = image.points_m[window]
-        is_explained = (depth_m > 0) & (image.background_limit_m[window] < surface.diameter_m)
-    else:
-        points_m = back_project(depth_m, _window_intrinsics(image.K, window).double())
-        is_explained = points_m.isfinite().all(-1) & image.mask[window]
-    local_m = pose.inverse().apply(points_m[is_explained])
-    distance_m = (local_m - surface.points_m[surface.boxes.look_up(local_m)]).norm(dim=-1)
-    # The nearest sample is nearer than the one of the box by its diagonal at most.
-    limit_m = NEAR * surface.diameter_m
-    is_open = (distance_m >= limit_m) & (distance_m < limit_m + math.sqrt(3) * surface.boxes.side_m)
-    nearest_m = surface.points_m[surface.nearest(local_m[is_open])]
-    distance_m[is_open] = (local_m[is_open] - nearest_m).norm(dim=-1)
-    is_explained[is_explained.clone()] = distance_m < limit_m
-    explained = torch.zeros(image.depth_m.shape, dtype=torch.bool)
-    explained[window] = is_explained
-    return explained
-
-
-def _pixels_about(image: Frame | ViewInput, pose: Rigid, surface: Surface) -> tuple[slice, slice]:
-    """Rows and columns in which a posed surface lies, with a margin."""
-    height, width = image.depth_m.shape
-    posed_m = pose.double().apply(surface.points_m)
-    pixel = project(posed_m[posed_m[:, 2] > 0], image.K.double())
-    if len(pixel) == 0:
-        return slice(0, 0), slice(0, 0)
-    low = pixel.amin(0)
-    high = pixel.amax(0)
-    margin = 0.1 * (high - low) + 2 * BORDER_PX
-    left, top = (low - margin).floor().tolist()
-    right, bottom = (high + margin).ceil().tolist()
-    rows = slice(min(max(int(top), 0), height), min(max(int(bottom) + 1, 0), height))
-    columns = slice(min(max(int(left), 0), width), min(max(int(right) + 1, 0), width))
-    return rows, columns
-
-
-def _window_intrinsics(
-    K: Float[Tensor, "3 3"], window: tuple[slice, slice]
-) -> Float[Tensor, "3 3"]:
-    """Intrinsic matrix of a part of an image."""
-    K = K.clone()
-    K[0, 2] -= window[1].start
-    K[1, 2] -= window[0].start
-    return K
-
-
-def _window_of_region(view: ViewInput) -> ViewInput:
-    """Cut a view about its mask, with a margin in which planes and neighbours show."""
-    rows, columns = view.mask.any(1).nonzero()[:, 0], view.mask.any(0).nonzero()[:, 0]
-    if len(rows) == 0:
-        return view
-    margin = int(_REGION_MARGIN * max(int(rows[-1] - rows[0]), int(columns[-1] - columns[0])))
-    part = (
-        slice(max(int(rows[0]) - margin, 0), int(rows[-1]) + margin + 1),
-        slice(max(int(columns[0]) - margin, 0), int(columns[-1]) + margin + 1),
-    )
-    return _cut(view, part)
-
-
-def _cut(view: ViewInput, part: tuple[slice, slice]) -> ViewInput:
-    """Cut a part out of a view."""
-    K = _window_intrinsics(view.K, part)
-    known = view.background
-    if known is not None:
-        known = KnownBackground(depth_m=known.depth_m[part], is_seen=known.is_seen[part])
-    return replace(view, depth_m=view.depth_m[part], mask=view.mask[part], K=K, background=known)
-
-
-def _exclusion_by_background(frame: Frame, view: ViewInput, pose: Rigid, surface: Surface) -> str:
-    """Say why the background of an image excludes a pose; nothing where it does not."""
-    if is_cut_out(view, pose, surface):
-        return "it would be cut out of a plane that goes on beside it"
-    points_m = pose.apply(surface.points_m)
-    wider = [other for other in frame.backgrounds if other.diameter_m >= surface.diameter_m]
-    for background in wider:
-        share = share_behind(frame, background, points_m, NEAR * surface.diameter_m)
-        if share > _SUNK:
-            return f"{share:.0%} of it would lie in the bin, table or wall before which it is seen"
-    return ""
-
-
-def is_cut_out(view: ViewInput, pose: Rigid, surface: Surface) -> bool:
-    """Whether what lies on a posed surface is flat, and goes on in its plane beyond the outline.
-
-    Args:
-        view: in which the pose was found.
-        pose: of the object.
-        surface: of its model.
-    """
-    window = _cut(view, _pixels_about(view, pose, surface))
-    explained = explained_mask(window, pose, surface)
-    points_m = back_project(window.depth_m.double(), window.K.double())
-    plane = largest_plane(points_m[explained], torch.Generator().manual_seed(0))
-    if plane is None:
-        return False
-    if float(is_on_plane(points_m[explained], plane).double().mean()) < _FLAT:
-        return False
-    pixel_m = float(points_m[explained][:, 2].median() / window.K[0, 0])
-    reach = BORDER_PX + math.ceil(_RIM * surface.diameter_m / pixel_m)
-    rim = grow_mask(explained, reach) & ~grow_mask(explained, BORDER_PX)
-    if window.background is not None:
-        rim &= ~window.background.is_seen
-    return float(is_on_plane(points_m[rim], plane).double().mean()) > _CONTINUED
 
 
 def nothing_found(
@@ -579,84 +450,3 @@ def nothing_found(
             f"{z:.3f}) m: {nearest.reason}"
         )
     return PoseEstimate(status="doubtful", reason=reason, **facts)
-
-
-def choose_object(estimates: Sequence[PoseEstimate]) -> PoseEstimate:
-    """Choose which object one input shows, from the estimates for every object that it may be.
-
-    An object that was refused is not the one; one of the others is.
-
-    Args:
-        estimates: for the same input, one an object.
-
-    Returns:
-        The best, its certainty given the others; refused where none is posed, or where another
-        object is too likely.
-    """
-    posed = [estimate for estimate in estimates if estimate.is_posed]
-    seconds: Counter[str] = Counter()
-    for estimate in estimates:
-        seconds.update(estimate.seconds)
-    if not posed:
-        nearest = max(estimates, key=lambda e: 0.0 if e.evidence is None else e.evidence.agreement)
-        names = ", ".join(estimate.object for estimate in estimates)
-        reason = f"none of {names} surely; {nearest.object} comes nearest: {nearest.reason}"
-        return replace(nearest, reason=reason, seconds=dict(seconds))
-    shares = _object_shares(posed)
-    best, share = _likeliest(posed, shares)
-    if share < _LEAST_SHARE:
-        candidates = ", ".join(
-            f"{estimate.object} ({float(its_share):.0%})"
-            for estimate, its_share in zip(posed, shares, strict=True)
-        )
-        return PoseEstimate(
-            name=best.name,
-            object=best.object,
-            status="doubtful",
-            reason=f"it may be {candidates}; say which by object",
-            seconds=dict(seconds),
-        )
-    return replace(best, seconds=dict(seconds))
-
-
-def choose_object_of_place(places: Sequence[_Judged]) -> tuple[PoseEstimate, float]:
-    """Give the estimate of the likeliest object of one place, and its share among the objects."""
-    estimates = [place.estimate for place in places]
-    return _likeliest(estimates, _object_shares(estimates))
-
-
-def _object_shares(estimates: Sequence[PoseEstimate]) -> Tensor:
-    """Give the probability of each object, if the readings are of one of them.
-
-    Each is weighed by the evidence of its best pose.
-    """
-    evidences = [estimate.evidence for estimate in estimates if estimate.evidence is not None]
-    log_odds = [log_odds_right(evidence) for evidence in evidences]
-    return torch.tensor(log_odds, dtype=torch.float64).softmax(0)
-
-
-def _likeliest(estimates: Sequence[PoseEstimate], shares: Tensor) -> tuple[PoseEstimate, float]:
-    """Give the likeliest estimate, its probabilities multiplied by its share among the objects."""
-    best = int(shares.argmax())
-    share, estimate = float(shares[best]), estimates[best]
-    chosen = _scaled(estimate, share)
-    if len(estimates) > 1 and estimate.identity is not None and share < 1 - LEAST_NAMED:
-        second = estimates[int(shares.topk(2).indices[1])].object
-        reason = f"it may be {second} ({1 - share:.0%} for all other objects)"
-        identity = replace(estimate.identity, status="not excluded", other=second, reason=reason)
-        chosen = replace(chosen, identity=identity)
-    return chosen, share
-
-
-def _scaled(estimate: PoseEstimate, share: float) -> PoseEstimate:
-    """Multiply the probabilities of an estimate by a share."""
-    certainty, copy_certainty = estimate.certainty, estimate.copy_certainty
-    return replace(
-        estimate,
-        certainty=None if certainty is None else share * certainty,
-        copy_certainty=None if copy_certainty is None else share * copy_certainty,
-        alternatives=tuple(
-            replace(alternative, probability=share * alternative.probability)
-            for alternative in estimate.alternatives
-        ),
-    )

@@ -16,17 +16,12 @@ from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import EstimateConfig, RefusalConfig
-from depthpose.pose.decide import (
-    PRIOR_MASKED,
-    contradiction,
-    log_odds_right,
-    probability_right,
-    with_status,
-)
+from depthpose.pose.decide import contradiction, with_status
 from depthpose.pose.evidence import compare, observe
 from depthpose.pose.frame import is_on_plane, largest_plane
 from depthpose.pose.icp import refine_best
 from depthpose.pose.observability import free_motions, observability, without_motions
+from depthpose.pose.probability import PRIOR_MASKED, log_odds_right, probability_right
 from depthpose.pose.surface import NEAR, Surface
 from depthpose.pose.types import (
     Alternative,

@@ -15,11 +15,11 @@ from depthpose.pose.config import EstimateConfig, ObjectsConfig
 from depthpose.pose.datasets import box_mask, parse_box
 from depthpose.pose.datasets.dataset import write_mask
 from depthpose.pose.decide import with_status
+from depthpose.pose.footprint import explained_mask
 from depthpose.pose.inputs import cloud_input, view_input
 from depthpose.pose.network_pose import CloudDirections, GeoPoseNet
 from depthpose.pose.predictions import CLOUD, PICTURE, Prediction, write_predictions
 from depthpose.pose.registration import Registration
-from depthpose.pose.search import explained_mask
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.synthetic import make_frames
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput

@@ -1,0 +1,145 @@
+"""How likely a pose is right, given the evidence for and against it.
+
+At a right pose a tenth of the visible area is contradicted on average, by edges, reflections and
+dents that the model does not have; at a wrong pose half of it. Both shares vary from view to view,
+so that a count of contradicting patches has a negative binomial distribution: ten patches more say
+much of a small object and little of a large one.
+
+The coefficients of this file are all that a probability depends on beside the noise of the sensor
+(:mod:`depthpose.pose.sensor`).
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+from torch.nn.functional import softplus
+
+from depthpose.pose.sensor import INDEPENDENT_SIDES
+from depthpose.pose.types import Evidence
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rate:
+    """Distribution of a share of the visible area from view to view: gamma, of a mean and a shape.
+
+    A count of patches in an area whose share varies so has a negative binomial distribution.
+    """
+
+    mean: float
+    shape: float
+
+    def log_likelihood(self, count: float, area: float) -> float:
+        """Log probability of a count of patches in an area, both in independent patches."""
+        scale = self.shape / self.mean
+        a = self.shape
+        log_binomial = math.lgamma(count + a) - math.lgamma(a) - math.lgamma(count + 1)
+        log_none = a * (math.log(scale) - math.log(scale + area))
+        return log_binomial + log_none + count * (math.log(area) - math.log(scale + area))
+
+
+RIGHT_CONTRADICTED = Rate(mean=0.1, shape=2.0)
+WRONG_CONTRADICTED = Rate(mean=0.5, shape=3.0)
+"""Share of what was observed of the visible area that contradicts a right and a wrong pose."""
+COPY_CONTRADICTED = Rate(mean=0.1, shape=1.0)
+"""Of copies, of which the one with the least contradicted is always the likeliest."""
+RIGHT_UNOBSERVED = Rate(mean=0.2, shape=1.0)
+WRONG_UNOBSERVED = Rate(mean=0.5, shape=3.0)
+"""Share of the visible area that has no reading, or is hidden."""
+PRIOR_MASKED = 5.0
+"""Odds of the best pose being right before its evidence is seen, where a mask shows the object."""
+PRIOR_REGION = 2.0
+"""The same where a detector's box or a mask that does not fit says that one is there."""
+PRIOR_PROPOSED = 0.02
+"""The same where a search proposed the pose: votes of a whole image refine to some fifty poses for
+each object that is there."""
+PRIOR_MANY = 0.1
+"""Odds of a search showing any number of instances of an object, and not one at most."""
+WRONG_RMS = 1.2
+"""Root mean square residual of what supports a wrong pose, in standard deviations: of residuals
+that are as often large as small it is 1.7, and refinement makes it smaller."""
+VOTES_RAD = 0.15
+"""Mean angle between a network's directions and those to the keypoints at a right pose."""
+LEAST_AGREEMENT = 2 / 3
+"""Share of what was compared that must support a pose."""
+LEAST_AREA = 1.0
+"""Independent patches: of less nothing is said."""
+
+
+def probability_right(evidence: Evidence, prior_odds: float) -> float:
+    """Probability that a pose is right, up to near-symmetry, and not the best of wrong ones.
+
+    It is 0 where less than two thirds of what was observed supports the pose.
+    """
+    if evidence.agreement < LEAST_AGREEMENT:
+        return 0.0
+    log_odds = math.log(prior_odds) + log_odds_right(evidence)
+    return 1 / (1 + math.exp(-min(log_odds, 50.0)))
+
+
+def log_odds_right(evidence: Evidence) -> float:
+    """Log likelihood ratio of a right and a wrong pose: contradicted, unobserved, residuals.
+
+    It grows with the area that was compared: a pose that shows little has little to support it.
+    """
+    area = max(LEAST_AREA, evidence.visible)
+    # Only what was observed can contradict a pose, and what contradicts it was observed.
+    observed_area = max(LEAST_AREA, area - evidence.unobserved)
+    rest = max(LEAST_AREA, area - evidence.seen_through - evidence.bulging)
+    contradicted = RIGHT_CONTRADICTED.log_likelihood(evidence.contradicted, observed_area)
+    contradicted -= WRONG_CONTRADICTED.log_likelihood(evidence.contradicted, observed_area)
+    unobserved = RIGHT_UNOBSERVED.log_likelihood(evidence.unobserved, rest)
+    unobserved -= WRONG_UNOBSERVED.log_likelihood(evidence.unobserved, rest)
+    # Residuals are of the supported part alone.
+    fit = evidence.observed * (_log_fit(evidence.rms) - _log_fit(WRONG_RMS))
+    return contradicted + unobserved + fit
+
+
+def log_fit_right(evidence: Evidence, area: float) -> float:
+    """Log likelihood of the evidence at a right pose, of one of several copies.
+
+    Args:
+        evidence: of the copy.
+        area: that is visible of any of them.
+    """
+    contradicted = COPY_CONTRADICTED.log_likelihood(evidence.contradicted, area)
+    unobserved = RIGHT_UNOBSERVED.log_likelihood(evidence.unobserved, area)
+    return contradicted + unobserved + _log_fit(evidence.rms)
+
+
+def _log_fit(rms: float) -> float:
+    """Log likelihood of residuals: normal, of a variance of at least the sensor's and object's."""
+    return -INDEPENDENT_SIDES / 2 * math.log(1 + rms**2)
+
+
+def probability_of_instances(
+    log_odds: Float64[Tensor, " n"], prior_many: float
+) -> Float64[Tensor, " n"]:
+    """Give the probability of each place of one object, of which there is one or any number.
+
+    A table holds one of each object, a bin holds many: so a second place needs more evidence than
+    the first, and where several have it further ones need no more.
+
+    Args:
+        log_odds: of each place being right, by itself.
+        prior_many: odds of any number of instances, and not one at most; 0 in a detector's box.
+    """
+    by_itself = log_odds.sigmoid()
+    none_or_one = torch.cat([log_odds.new_zeros(1), log_odds])
+    log_many = (
+        log_odds.new_tensor(prior_many).log() + softplus(log_odds).sum()
+    )  # of all choices of places
+    many = (log_many - none_or_one.logsumexp(0)).sigmoid()
+    return many * by_itself + (1 - many) * none_or_one.softmax(0)[1:]
+
+
+def share_among_objects(evidences: Sequence[Evidence]) -> Float64[Tensor, " n"]:
+    """Give the probability of each object, if the readings are of one of them.
+
+    Each is weighed by the evidence of its best pose.
+    """
+    log_odds = [log_odds_right(evidence) for evidence in evidences]
+    return torch.tensor(log_odds, dtype=torch.float64).softmax(0)
