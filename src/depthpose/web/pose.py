@@ -17,7 +17,7 @@ from depthpose.pose.datasets.dataset import write_mask
 from depthpose.pose.decide import with_status
 from depthpose.pose.footprint import explained_mask
 from depthpose.pose.inputs import cloud_input, view_input
-from depthpose.pose.network_pose import CloudDirections, GeoPoseNet
+from depthpose.pose.network_pose import VotingDirections, GeoPoseNet
 from depthpose.pose.predictions import CLOUD, PICTURE, Prediction, write_predictions
 from depthpose.pose.registration import Registration
 from depthpose.pose.surface import prepare_surface
@@ -95,7 +95,7 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
 
 def _estimate(
     form: Form, target: _Target, pose_input: CloudInput | ViewInput
-) -> tuple[list[_ShownPose], CloudDirections | None]:
+) -> tuple[list[_ShownPose], VotingDirections | None]:
     """Estimate what a form asks for, the surest first; give the votes of a single one, if any.
 
     Boxes are searched, one pose in each; a depth image without a mask is searched as a whole.
@@ -129,7 +129,7 @@ def _estimate(
 
 
 def _make_scene(
-    shown_poses: Sequence[_ShownPose], votes: CloudDirections | None, model: ObjectModel
+    shown_poses: Sequence[_ShownPose], votes: VotingDirections | None, model: ObjectModel
 ) -> Scene:
     """Make the 3D view: the best pose with its votes, and a layer for each of the others."""
     best = shown_poses[0]
