@@ -17,7 +17,7 @@ from depthpose.pose.datasets.dataset import write_mask
 from depthpose.pose.decide import with_status
 from depthpose.pose.footprint import explained_mask
 from depthpose.pose.inputs import cloud_input, view_input
-from depthpose.pose.network_pose import VotingDirections, GeoPoseNet
+from depthpose.pose.network_pose import GeoPoseNet, VotingDirections
 from depthpose.pose.predictions import CLOUD, PICTURE, Prediction, write_predictions
 from depthpose.pose.registration import Registration
 from depthpose.pose.surface import prepare_surface
