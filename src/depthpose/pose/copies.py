@@ -7,6 +7,7 @@ from functools import cached_property
 import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid, geodesic_rad
@@ -20,13 +21,14 @@ from depthpose.pose.mesh import (
 )
 from depthpose.pose.propose.point_pairs import PairTable, find_turns, prepare_pairs
 from depthpose.pose.surface import Surface
-from depthpose.pose.types import ObjectModel
+from depthpose.pose.types import Axis, ObjectModel
 
 SAME_DIAMETERS = 0.1  #: mean distance of the model's points up to which two poses are one
 SAME_RAD = math.radians(8)  #: and angle; both must hold
 _STEP_RAD = math.pi / 32  # half of the step between rotations about an axis: within SAME_RAD
 _FOUND_STEP_RAD = math.pi / 18  # and about one that was found within a tolerance
 _COPY_DIAMETERS = 0.05  # deviation of a near-symmetric copy: of more it is another pose
+_CLOSE_RAD = math.radians(45)  # a copy after a smaller rotation is one of a row about its axis
 _COMPARED = 100  # points of the model by which poses are compared
 _ALONG = math.cos(math.radians(15))
 _LONGER = 1.15
@@ -69,6 +71,22 @@ class SymmetricCopies:
         is_near = apart_m.norm(dim=-1).mean(-1) < SAME_DIAMETERS * self.diameter_m
         angle = geodesic_rad(pose.R.expand_as(moved.R), moved.R)
         return (is_near & ((angle < SAME_RAD) | self._is_ball)).any(-1)
+
+    @cached_property
+    def near_axis(self) -> Axis | None:
+        """Axis about which near-symmetric copies follow each other closely, if there is one.
+
+        A rotation about it changes little that a camera sees: the copies say how far.
+        """
+        angle = geodesic_rad(self.near_copies.R, torch.eye(3).to(self.near_copies.R))
+        if len(angle) == 0 or float(angle.min()) > _CLOSE_RAD:
+            return None
+        motion = self.near_copies[int(angle.argmin())]
+        twist = motion.R - motion.R.T
+        direction = normalize(torch.stack([twist[2, 1], twist[0, 2], twist[1, 0]]), dim=0)
+        # The points of the axis stay where they are: p = R p + t.
+        fixed = torch.linalg.lstsq(torch.eye(3).to(motion.R) - motion.R, motion.t_m[:, None])
+        return Axis(direction=direction.float(), point_m=fixed.solution[:, 0].float())
 
     @property
     def _is_ball(self) -> bool:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+import torch
 from jaxtyping import Float64
 from torch import Tensor
 
@@ -127,7 +128,13 @@ def _why_not_observable(
     free: Float64[Tensor, "k 6"],
     least: float,
 ) -> Refusal | None:
-    """Refuse a view that leaves a motion of the object undetermined, beside its free ones."""
+    """Refuse a view that leaves a motion of the object undetermined, beside its free ones.
+
+    How far it is rotated about an axis of near-symmetry its copies say, which are named.
+    """
+    near_axis = prepared.copies.near_axis
+    if near_axis is not None:
+        free = torch.cat([free, free_motions((near_axis,), pose)])
     observable, weakest = observability(cloud.cloud_m, pose, prepared.surface, free)
     if observable >= least:
         return None

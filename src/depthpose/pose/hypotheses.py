@@ -139,7 +139,7 @@ def compete(
         group = [replace(leading[winner], log_color=log_color)]
     for copy in _distinct_copies(cloud_m, winning_pose, prepared, icp, view):
         group.append(hypothesis(copy))
-    copy_shares = float(shares[winner]) * share_among_copies(group)
+    copy_shares = float(shares[winner]) * share_among_copies(group, is_masked=observation.is_masked)
     best = int(copy_shares.argmax())
     return Competition(
         best=group[best],
@@ -155,31 +155,46 @@ def share_among_poses(
     """Share the probability of one among different poses of an object.
 
     If one of them is right the others are wrong, and wrong poses leave much contradicted: so each
-    is weighed by how much better its evidence fits a right pose than a wrong one. They are poses of
-    the same readings: where no mask says which, what another pose explains, and a pose does not,
-    contradicts it.
+    is weighed by how much better its evidence fits a right pose than a wrong one.
     """
-    most = 0.0
-    if not is_masked:
-        most = max(hypothesis.evidence.supported for hypothesis in hypotheses)
-    weights: list[float] = []
-    for hypothesis in hypotheses:
-        evidence = hypothesis.evidence
-        unexplained = max(evidence.beside, most - evidence.supported)
-        log_odds = log_odds_right(replace(evidence, beside=unexplained))
-        weights.append(log_odds + _log_beside_depth(hypothesis))
+    weights = [
+        log_odds_right(evidence) + _log_beside_depth(hypothesis)
+        for hypothesis, evidence in zip(
+            hypotheses, _compared_evidence(hypotheses, is_masked=is_masked), strict=True
+        )
+    ]
     return torch.tensor(weights, dtype=torch.float64).softmax(0)
 
 
-def share_among_copies(hypotheses: Sequence[Hypothesis]) -> Float64[Tensor, " n"]:
+def share_among_copies(
+    hypotheses: Sequence[Hypothesis], *, is_masked: bool
+) -> Float64[Tensor, " n"]:
     """Share the probability of one among near-symmetric copies of a pose.
 
     Wrong copies are contradicted little, for they look nearly alike: so each is weighed by how well
     its evidence fits a right pose. A network's votes say nothing here: it saw no more.
     """
     area = max(LEAST_AREA, *(hypothesis.evidence.visible for hypothesis in hypotheses))
-    weights = [log_fit_right(h.evidence, area) + h.log_color for h in hypotheses]
+    weights = [
+        log_fit_right(evidence, area) + hypothesis.log_color
+        for hypothesis, evidence in zip(
+            hypotheses, _compared_evidence(hypotheses, is_masked=is_masked), strict=True
+        )
+    ]
     return torch.tensor(weights, dtype=torch.float64).softmax(0)
+
+
+def _compared_evidence(hypotheses: Sequence[Hypothesis], *, is_masked: bool) -> list[Evidence]:
+    """Give the evidence of poses of the same readings, by each other.
+
+    Where no mask says which readings are the object's, those that another pose explains, and a pose
+    does not, contradict it: a mug's handle that one copy leaves out.
+    """
+    evidences = [hypothesis.evidence for hypothesis in hypotheses]
+    if is_masked:
+        return evidences
+    most = max(evidence.supported for evidence in evidences)
+    return [replace(e, beside=max(e.beside, most - e.supported)) for e in evidences]
 
 
 def _log_beside_depth(hypothesis: Hypothesis) -> float:
