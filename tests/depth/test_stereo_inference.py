@@ -168,6 +168,7 @@ def test_a_larger_size_is_searched_through_half_as_many_disparities_more_at_most
     assert matcher.work_disparities(Camera(width=200, height=100, K=K)) == disparities
 
 
+@pytest.mark.skipif(not computes_bf16("cpu"), reason="this processor has no arithmetic for bf16")
 def test_bf16_stays_near() -> None:
     network = random_network(SMALL)
     left, right = torch.rand(2, 3, 64, 96)

@@ -109,21 +109,35 @@ def test_without_a_mask_the_pose_that_explains_more_of_the_same_readings_is_like
 def test_copies_share_by_a_patch_that_tells_them_apart() -> None:
     """A keyway where the model has none contradicts a copy by a few patches, of very many."""
     keyway = replace(GOOD, supported=35.0, bulging=1.5, seen_through=1.5)
-    shares = share_among_copies([hypothesis(GOOD), *[hypothesis(keyway)] * 3])
+    shares = share_among_copies([hypothesis(GOOD), *[hypothesis(keyway)] * 3], is_masked=True)
     assert float(shares.sum()) == pytest.approx(1)
     assert float(shares[0]) > float(shares[1])
     # A handle that should be seen and is not: another copy has it on the far side.
     unseen = replace(GOOD, supported=30.0, unobserved=10.0)
-    assert float(share_among_copies([hypothesis(GOOD), hypothesis(unseen)])[0]) > 0.6
-    alike = share_among_copies([hypothesis(GOOD)] * 4)
+    assert (
+        float(share_among_copies([hypothesis(GOOD), hypothesis(unseen)], is_masked=True)[0]) > 0.6
+    )
+    alike = share_among_copies([hypothesis(GOOD)] * 4, is_masked=True)
     assert alike.tolist() == pytest.approx([0.25] * 4)
+
+
+def test_without_a_mask_a_copy_that_leaves_a_handle_unexplained_is_unlikely() -> None:
+    """Nothing contradicts it: its own handle would be hidden behind the mug."""
+    left_out = replace(GOOD, visible=34.0, supported=34.0, unobserved=0.0)
+    both = [hypothesis(GOOD), hypothesis(left_out)]
+    in_a_mask = share_among_copies(both, is_masked=True)
+    without = share_among_copies(both, is_masked=False)
+    assert float(without[0]) > 0.6 > float(in_a_mask[0])
 
 
 def test_votes_and_colour_tell_apart_what_depth_does_not() -> None:
     voted = [hypothesis(GOOD, votes_rad=0.1), hypothesis(GOOD, votes_rad=1.0)]
     shares = share_among_poses(voted, is_masked=True)
     assert float(shares[0]) > 0.95
-    for share in (partial(share_among_poses, is_masked=True), share_among_copies):
+    for share in (
+        partial(share_among_poses, is_masked=True),
+        partial(share_among_copies, is_masked=True),
+    ):
         shares = share([hypothesis(GOOD, color=0.0), hypothesis(GOOD, color=math.log(9.0))])
         assert shares.tolist() == pytest.approx([0.1, 0.9])
 

@@ -121,8 +121,8 @@ def test_the_image_agrees_with_the_true_pose_and_with_none_beside_it() -> None:
     aside = [Rigid(truth.R, truth.t_m + torch.tensor(shift).double())
              for shift in ([0.05, 0, 0], [0, 0, 0.06], [0, 0, -0.06])]  # fmt: skip
     score = score_by_image(frame, Rigid.stack([truth, *aside]), surface)
-    assert float(score[0]) > 0.7
-    assert float(score[1:].max()) < 0.3
+    assert float(score[0]) > 0.6, "all but creases, at which normals are between those of two sides"
+    assert float(score[1:].max()) < 0.1
 
 
 def test_edges_that_a_sensor_cuts_contradict_no_pose_and_a_missing_half_does() -> None:
@@ -142,7 +142,8 @@ def test_edges_that_a_sensor_cuts_contradict_no_pose_and_a_missing_half_does() -
         own_m = cloud_from_depth(depth_m, mask & ~lost, K.float())
         observation = observe(own_m, view, surface.diameter_m, 0.001, is_masked=False)
         agreement[name] = compare(observation, pose, surface).agreement
-    assert roughly["half"] < 0.6 < roughly["cut"]
+    assert roughly["half"] < 0.2
+    assert roughly["cut"] > 0.5
     assert agreement["half"] < 0.6 < agreement["cut"]
 
 
@@ -215,16 +216,23 @@ def test_a_needle_of_few_points_can_be_looked_for_in_itself(
 
 @pytest.mark.parametrize("handle", ["seen", "hidden"])
 def test_the_handle_of_a_mug_decides_its_turn(handle: str) -> None:
-    """A mug on its side: its handle is toward the camera, or the mug hides it and fixes no turn."""
-    mug = make_part("mug")
+    """A mug on its side: its handle is toward the camera, or hidden, and any turn fits."""
     toward = -1.0 if handle == "seen" else 1.0  # the camera looks along z, the handle is at x
     R = torch.tensor([[0.0, -toward, 0], [0, 0, -1], [toward, 0, 0]])
     truth = Rigid(R, torch.tensor([0.0, 0.05, 0.6]))
     seen, mask = view_of(mug, truth)
     depth_m = torch.where(mask, seen.float(), 1.2)
-    poses = [one.camera_from_model for one in Registration([mug]).find(depth_m, CAMERA)]
-    errors = [float(add_m(pose, truth, mug.vertices_m)) for pose in poses if pose is not None]
-    assert errors == ([pytest.approx(0, abs=0.05 * mug.diameter_m)] if handle == "seen" else [])
+    (found,) = Registration([mug]).find(depth_m, CAMERA)
+    assert found.camera_from_model is not None, found.reason
+    error_m = float(add_m(found.camera_from_model, truth, mug.vertices_m))
+    if handle == "seen":
+        assert error_m < 0.05 * mug.diameter_m
+        return
+    named = [found.camera_from_model, *(other.camera_from_model for other in found.alternatives)]
+    assert min(float(add_m(pose, truth, mug.vertices_m)) for pose in named) < 0.2 * mug.diameter_m
+    assert found.certainty is not None
+    assert found.copy_certainty is not None
+    assert found.copy_certainty < 0.5 * found.certainty
 
 
 def test_turns_that_fit_as_well_are_named() -> None:

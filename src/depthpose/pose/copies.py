@@ -78,14 +78,17 @@ class SymmetricCopies:
 
         A rotation about it changes little that a camera sees: the copies say how far.
         """
-        angle = geodesic_rad(self.near_copies.R, torch.eye(3).to(self.near_copies.R))
-        if len(angle) == 0 or float(angle.min()) > _CLOSE_RAD:
+        if len(self.near_copies.R) == 0:
+            return None
+        identity = torch.eye(3).to(self.near_copies.R)
+        angle = geodesic_rad(self.near_copies.R, identity.expand_as(self.near_copies.R))
+        if float(angle.min()) > _CLOSE_RAD:
             return None
         motion = self.near_copies[int(angle.argmin())]
         twist = motion.R - motion.R.T
         direction = normalize(torch.stack([twist[2, 1], twist[0, 2], twist[1, 0]]), dim=0)
         # The points of the axis stay where they are: p = R p + t.
-        fixed = torch.linalg.lstsq(torch.eye(3).to(motion.R) - motion.R, motion.t_m[:, None])
+        fixed = torch.linalg.lstsq(identity - motion.R, motion.t_m[:, None])
         return Axis(direction=direction.float(), point_m=fixed.solution[:, 0].float())
 
     @property

@@ -189,7 +189,7 @@ def contradiction(evidence: Evidence, probability: float) -> str:
             f"{evidence.unobserved / visible:.0%} of the posed surface was not observed",
         ),
     ]
-    area, worst = max(reasons)
+    area, worst = max(reasons, key=lambda reason: reason[0])
     if area < LEAST_AREA / 4:
         worst = "too little of the object was observed"
         if evidence.rms > WRONG_RMS:

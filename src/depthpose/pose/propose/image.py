@@ -232,8 +232,8 @@ def score_by_image(
     # Behind a background, or seen through. A sensor cuts rims and edges: where it saw nothing near
     # about a point of an edge, the point counts as not read.
     is_hidden = readings.is_read & (gap_m < -limit_m) & is_background
-    is_through = readings.is_read
-    is_through &= frame.nearest_m.flatten()[readings.pixel] > depth_m + limit_m
+    nearest_m = frame.nearest_m.flatten()[readings.pixel]
+    is_through = readings.is_read & (nearest_m > depth_m + limit_m)
     is_cut = is_through & ~visible.is_inner
     contradicts = (is_at_depth & is_turned) | is_hidden | (is_through & visible.is_inner)
 
