@@ -217,6 +217,7 @@ def test_a_needle_of_few_points_can_be_looked_for_in_itself(
 @pytest.mark.parametrize("handle", ["seen", "hidden"])
 def test_the_handle_of_a_mug_decides_its_turn(handle: str) -> None:
     """A mug on its side: its handle is toward the camera, or hidden, and any turn fits."""
+    mug = make_part("mug")
     toward = -1.0 if handle == "seen" else 1.0  # the camera looks along z, the handle is at x
     R = torch.tensor([[0.0, -toward, 0], [0, 0, -1], [toward, 0, 0]])
     truth = Rigid(R, torch.tensor([0.0, 0.05, 0.6]))
