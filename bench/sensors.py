@@ -26,9 +26,9 @@ from torch import Tensor
 from depthpose.core.files import read_depth_png, read_image
 from depthpose.pose.cloud import grow_mask
 from depthpose.pose.config import SensorKind, SyntheticSensorConfig
-from depthpose.pose.evidence import _ACROSS, _LEVEL_M, _OFF_LINE, _STRAIGHT, _mean_depth
+from depthpose.pose.evidence import _ACROSS, _OFF_LINE, _STRAIGHT, _mean_depth
 from depthpose.pose.frame import prepare_frame
-from depthpose.pose.sensor import AVERAGED_PER_WHITE
+from depthpose.pose.sensor import AVERAGED_PER_WHITE, FLAT_M
 from depthpose.pose.synthetic.views import simulate_depth
 from depthpose.report.page import markdown_table
 
@@ -163,7 +163,7 @@ def bend_of_planes(frame: Frame) -> tuple[float, float]:
     depth_m = 1 / inverse[middles[0], middles[1]]
     bend_m = np.abs(_OFF_LINE @ across).max(0) * depth_m**2
     white_m = prepared.noise_per_m2 * float(np.nanmedian(depth_m)) ** 2
-    straight_m = _STRAIGHT * math.hypot(AVERAGED_PER_WHITE * white_m, _LEVEL_M)
+    straight_m = _STRAIGHT * math.hypot(AVERAGED_PER_WHITE * white_m, FLAT_M)
     return float(np.nanquantile(bend_m, 0.8)), straight_m
 
 

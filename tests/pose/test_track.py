@@ -10,6 +10,7 @@ from tests.pose.synthetic_objects import CAMERA, K, Oracle, bracket, pose_at, ti
 from depthpose.core.camera import back_project
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, rotation_by
+from depthpose.pose.copies import PreparedObject
 from depthpose.pose.metrics import add_m
 from depthpose.pose.predictions import Prediction, parse_prediction, prediction_row
 from depthpose.pose.surface import prepare_surface
@@ -186,7 +187,8 @@ def test_what_else_it_may_be_moves_along() -> None:
     net = oracle(poses)
     model = net.weights.models[0]
     known = TrackedObject(
-        model=model, surface=prepare_surface(model), refusal=net.weights.refusal,
+        prepared=PreparedObject(number=0, model=model, surface=prepare_surface(model)),
+        refusal=net.weights.refusal,
         config=net.config, search=lambda _: start,
     )  # fmt: skip
     views = [back_project(frame(p).double(), K).reshape(-1, 3) for p in poses]

@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.rigid import Rigid
@@ -71,7 +71,9 @@ def decide(
 
     # Does the view determine a pose, is it right, and is it of this object?
     identity = None
-    withheld = _why_not_observable(cloud, prepared, best.pose, free, refusal.min_observability)
+    withheld = why_not_observable(
+        cloud.cloud_m, prepared, best.pose, free, refusal.min_observability
+    )
     if withheld is None and probability < refusal.min_probability:
         withheld = Refusal(status="doubtful", reason=contradiction(best.evidence, probability))
     if withheld is None and config.with_icp and refusal.max_size_error < 1:
@@ -121,21 +123,28 @@ def decide(
     return estimate
 
 
-def _why_not_observable(
-    cloud: ObjectCloud,
+def why_not_observable(
+    cloud_m: Float[Tensor, "n 3"],
     prepared: PreparedObject,
     pose: Rigid,
-    free: Float64[Tensor, "k 6"],
+    free: Float[Tensor, "k 6"],
     least: float,
 ) -> Refusal | None:
     """Refuse a view that leaves a motion of the object undetermined, beside its free ones.
 
     How far it is rotated about an axis of near-symmetry its copies say, which are named.
+
+    Args:
+        cloud_m: points of the object, in the camera frame.
+        prepared: the object.
+        pose: of it.
+        free: motions of declared symmetries (:func:`~depthpose.pose.observability.free_motions`).
+        least: share of its length by which every other motion must move the visible surface.
     """
     near_axis = prepared.copies.near_axis
     if near_axis is not None:
         free = torch.cat([free, free_motions((near_axis,), pose)])
-    observable, weakest = observability(cloud.cloud_m, pose, prepared.surface, free)
+    observable, weakest = observability(cloud_m, pose, prepared.surface, free)
     if observable >= least:
         return None
     motion = "rotation" if float(weakest[:3].norm()) > math.sqrt(0.5) else "shift"

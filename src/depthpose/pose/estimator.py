@@ -43,7 +43,7 @@ from depthpose.pose.inputs import (
     split_instances,
     view_input,
 )
-from depthpose.pose.probability import PRIOR_REGION, probability_right
+from depthpose.pose.probability import LEAST_POSSIBLE, PRIOR_REGION, probability_right
 from depthpose.pose.search import SearchTargets, find_objects
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.track import TrackedObject, track
@@ -51,8 +51,6 @@ from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, Refusal,
 
 Made = TypeVar("Made")
 _NAME = "input"  # what an input is called that came without a name
-_HOPELESS = 0.02
-"""A proposal of a search that is less likely is not compared with its copies and look-alikes."""
 
 
 class PoseEstimator:
@@ -169,7 +167,7 @@ class PoseEstimator:
             pose = refinement.refined.camera_from_model
             evidence = compare(observation, pose, prepared.surface)
             probability = probability_right(evidence, prior_odds)
-            if probability < _HOPELESS:
+            if probability < LEAST_POSSIBLE:
                 return PoseEstimate(
                     name=cloud.name,
                     object=prepared.model.name,
@@ -468,8 +466,7 @@ class PoseEstimator:
 
         prepared = self._object(object)
         target = TrackedObject(
-            model=prepared.model,
-            surface=prepared.surface,
+            prepared=prepared,
             refusal=self.refusal,
             config=self.config,
             search=search,

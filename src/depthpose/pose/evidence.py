@@ -27,6 +27,9 @@ from depthpose.pose.sensor import (
     AVERAGED_PER_WHITE,
     CORRELATION_PX,
     CORRELATION_RAD,
+    EDGE_PX,
+    FINEST_RAD,
+    FLAT_M,
     DepthNoise,
     measure_noise,
 )
@@ -35,23 +38,17 @@ from depthpose.pose.types import Evidence, ViewInput
 
 THRESHOLD = 3.0  #: deviations beyond which a residual contradicts a pose
 AVERAGED_PX = 5  #: residuals are averaged over a square of this side
-BORDER_PX = 3
-"""Readings so near an edge may be of either side: stereo matches windows, and masks end so far from
-the silhouette."""
 _LEAST_FILLED = 0.3  # share of the averaged square that must have residuals
 _LEAST_PATCH = 0.25  # independent patches: smaller ones are accidents of edges and drop-outs
-_WITHIN = -0.5
-_ACROSS = (-1.0, _WITHIN, 0.5, 1.0)
+_ACROSS = (-1.0, -0.5, 0.5, 1.0)
+_NEAREST_WITHIN = 1
 """Where readings are compared across a silhouette: as shares of the way from it to a pixel. The
 nearest one within supports the pose; of thin things the next lies beyond."""
-_LEVEL_M = 0.0005  #: a surface is plane to so much
 _STRAIGHT = 2.0  #: deviations of the noise of means, by which these are off their line at most
 _LEAST_INNER = 0.25  # share of the silhouette that its borders may leave
 _DISK = 1.3  # radius of the disk drawn for a sample, in median distances of samples
 _OBJECT_PX = 8000  # pixels of an object that are compared; of larger ones every n-th
 _NEIGHBOURS = 4
-_FINEST_RAD = 2e-4
-"""No sensor has finer pixels: nearer neighbours are of several frames in one cloud."""
 _POINT_PX = 1.5  # side of a pixel of a drawn cloud, in distances of its points
 _JUMP_DIAMETERS = 0.02
 _JUMP_M = 0.01
@@ -134,7 +131,7 @@ def observe(
     is_background = torch.zeros_like(is_object)
     if view is not None and view.background is not None:
         is_background = view.background.is_seen[top : top + height, left : left + width]
-    inner = grow_mask(is_object, -BORDER_PX)
+    inner = grow_mask(is_object, -EDGE_PX)
     inner = inner if bool(inner.any()) else is_object  # thin things are all border
     noise = measure_noise(depth_m.numpy(), inner.numpy(), object_m)
 
@@ -165,7 +162,7 @@ def _camera_of_cloud(cloud_m: Float64[Tensor, "n 3"]) -> Float64[Tensor, "3 3"]:
     rays = (cloud_m[:, :2] / cloud_m[:, 2:]).unique(dim=0)  # some clouds hold points twice
     neighbours = min(_NEIGHBOURS + 1, len(rays))
     apart, _ = KDTree(rays.numpy()).query(take_evenly(rays, 200).numpy(), neighbours, workers=1)
-    spacing = max(float(np.median(apart[:, -1])), _FINEST_RAD)
+    spacing = max(float(np.median(apart[:, -1])), FINEST_RAD)
     focal_px = 1 / (_POINT_PX * spacing)
     return torch.diag(torch.tensor([focal_px, focal_px, 1.0], dtype=torch.float64))
 
@@ -250,7 +247,7 @@ def compare(observation: Observation, pose: Rigid, surface: Surface) -> Evidence
         surface: of the model.
     """
     noise, step = observation.noise, observation.step
-    patch_px = observation.patch_px**2
+    patch_area_px2 = observation.patch_px**2
     drawn_m, cosine, window = draw_surface(surface, pose, observation.K, *observation.depth_m.shape)
     depth_m = observation.depth_m[window]
     is_object = observation.is_object[window]
@@ -272,20 +269,21 @@ def compare(observation: Observation, pose: Rigid, surface: Surface) -> Evidence
 
     # Patches that contradict the pose, and what supports it.
     is_supported = is_compared & (np.abs(deviations) <= THRESHOLD)
-    seen_through = _patch_area(deviations > THRESHOLD, patch_px)
-    bulging = _patch_area((deviations < -THRESHOLD) & is_object, patch_px)
+    seen_through = _patch_area(deviations > THRESHOLD, patch_area_px2)
+    bulging = _patch_area((deviations < -THRESHOLD) & is_object, patch_area_px2)
     if observation.is_masked:
         is_beside = observation.is_object & np.isfinite(observation.depth_m)
-        border = max(1, round((BORDER_PX + 1) / step))
+        border = max(1, round((EDGE_PX + 1) / step))
         is_shown = np.zeros_like(is_beside)
         is_shown[window] = is_drawn
         is_beside &= np.logical_not(ndimage.binary_dilation(is_shown, iterations=border))
-        beside_px = patch_px
+        beside_px2 = patch_area_px2
     else:  # no mask says which readings are the object's: those that go on where the model ends
         is_beside = _is_continued(observation, is_drawn, is_supported, window)
-        beside_px = patch_px / 2  # a patch beside the silhouette is as long as others, half as wide
-    visible = float(inner.sum()) / patch_px
-    supported = float(is_supported.sum()) / patch_px
+        # A patch beside the silhouette is as long as others, and half as wide.
+        beside_px2 = patch_area_px2 / 2
+    visible = float(inner.sum()) / patch_area_px2
+    supported = float(is_supported.sum()) / patch_area_px2
     square = deviations[is_supported] ** 2
     return Evidence(
         visible=visible,
@@ -294,7 +292,7 @@ def compare(observation: Observation, pose: Rigid, surface: Surface) -> Evidence
         unobserved=max(0.0, visible - supported - seen_through - bulging),
         seen_through=seen_through,
         bulging=bulging,
-        beside=_patch_area(is_beside, beside_px),
+        beside=_patch_area(is_beside, beside_px2),
         rms=float(np.sqrt(square.mean())) if len(square) else THRESHOLD,
         noise_m=noise.white_m,
     )
@@ -320,7 +318,7 @@ def _is_continued(
         window: rows and columns of the drawing in the observation.
     """
     # The silhouette, in a window with a margin.
-    border = math.ceil(BORDER_PX / observation.step + observation.patch_px / 2)
+    border = math.ceil(EDGE_PX / observation.step + observation.patch_px / 2)
     reach = border + max(1, round(observation.patch_px / 2))
     height, width = observation.depth_m.shape
     rows = slice(max(0, window[0].start - reach), min(height, window[0].stop + reach))
@@ -350,15 +348,15 @@ def _is_continued(
     side = _averaged_side(observation.step)
     inverse = 1 / _mean_depth(depth_m, side)
     across = []
-    for times in _ACROSS:
+    for k, times in enumerate(_ACROSS):
         pixel = edge + np.rint(times * outward).astype(int)
         row, column = np.clip(pixel, 0, np.array(shape)[:, None] - 1)
         across.append(inverse[row, column])
-        if times == _WITHIN:
+        if k == _NEAREST_WITHIN:
             across[-1] = np.where(supports[row, column], across[-1], np.nan)
     values = np.stack(across)
     bend = np.abs(_OFF_LINE @ values).max(0)
-    noise_m = math.hypot(AVERAGED_PER_WHITE * observation.noise.white_m, _LEVEL_M)
+    noise_m = math.hypot(AVERAGED_PER_WHITE * observation.noise.white_m, FLAT_M)
     is_straight = bend <= _STRAIGHT * noise_m * values[0] ** 2
     is_continued = np.zeros((height, width), bool)
     is_continued[rows, columns][tuple(beside)] = is_straight
@@ -388,18 +386,18 @@ def _without_edges(
     is_edge = farthest_m - nearest_m > jump_m
     surface = is_drawn & ~is_edge
     # Of what is thinner than two borders the middle remains.
-    for border in range(math.ceil(BORDER_PX / step), 0, -1):
+    for border in range(math.ceil(EDGE_PX / step), 0, -1):
         inner = ndimage.binary_erosion(surface, iterations=border)
         if inner.sum() >= _LEAST_INNER * is_drawn.sum():
             return inner
     return surface
 
 
-def _patch_area(mask: Bool[np.ndarray, "h w"], patch_px: float) -> float:
+def _patch_area(mask: Bool[np.ndarray, "h w"], patch_area_px2: float) -> float:
     """Area of the connected patches in a mask that are no accident, in independent patches."""
     labels = np.zeros(mask.shape, np.int32)
     ndimage.label(mask, output=labels)
     areas_px = np.bincount(labels.ravel())[1:]
-    areas_px = areas_px[areas_px >= _LEAST_PATCH * patch_px]
+    areas_px = areas_px[areas_px >= _LEAST_PATCH * patch_area_px2]
     # What remains is wider than a sensor moves an edge: it is one observation at least.
-    return float(np.maximum(areas_px / patch_px, 1.0).sum())
+    return float(np.maximum(areas_px / patch_area_px2, 1.0).sum())

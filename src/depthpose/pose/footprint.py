@@ -10,8 +10,8 @@ from torch import Tensor
 from depthpose.core.camera import back_project, project
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import grow_mask
-from depthpose.pose.evidence import BORDER_PX
 from depthpose.pose.frame import Frame, is_on_plane, largest_plane, share_behind
+from depthpose.pose.sensor import EDGE_PX
 from depthpose.pose.surface import NEAR, Surface
 from depthpose.pose.types import KnownBackground, ViewInput
 
@@ -34,7 +34,7 @@ def explained_mask(image: Frame | ViewInput, pose: Rigid, surface: Surface) -> B
     depth_m = image.depth_m[window].double()
     if isinstance(image, Frame):
         points_m = image.points_m[window]
-        is_explained = (depth_m > 0) & (image.background_limit_m[window] < surface.diameter_m)
+        is_explained = (depth_m > 0) & image.may_show(surface.diameter_m)[window]
     else:
         points_m = back_project(depth_m, _window_intrinsics(image.K, window).double())
         is_explained = points_m.isfinite().all(-1) & image.mask[window]
@@ -60,7 +60,7 @@ def _pixels_about(image: Frame | ViewInput, pose: Rigid, surface: Surface) -> tu
         return slice(0, 0), slice(0, 0)
     low = pixel.amin(0)
     high = pixel.amax(0)
-    margin = 0.1 * (high - low) + 2 * BORDER_PX
+    margin = 0.1 * (high - low) + 2 * EDGE_PX
     left, top = (low - margin).floor().tolist()
     right, bottom = (high + margin).ceil().tolist()
     rows = slice(min(max(int(top), 0), height), min(max(int(bottom) + 1, 0), height))
@@ -131,8 +131,8 @@ def is_cut_out(view: ViewInput, pose: Rigid, surface: Surface, noise_per_m2: flo
     if float(is_on_plane(points_m[explained], plane, noise_per_m2).double().mean()) < _FLAT:
         return False
     pixel_m = float(points_m[explained][:, 2].median() / window.K[0, 0])
-    reach = BORDER_PX + math.ceil(_RIM * surface.diameter_m / pixel_m)
-    rim = grow_mask(explained, reach) & ~grow_mask(explained, BORDER_PX)
+    reach = EDGE_PX + math.ceil(_RIM * surface.diameter_m / pixel_m)
+    rim = grow_mask(explained, reach) & ~grow_mask(explained, EDGE_PX)
     if window.background is not None:
         rim &= ~window.background.is_seen
     return float(is_on_plane(points_m[rim], plane, noise_per_m2).double().mean()) > _CONTINUED

@@ -16,11 +16,10 @@ from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid, rotation_by
 from depthpose.pose.compiled import use_numba
 from depthpose.pose.config import IcpConfig
-from depthpose.pose.evidence import BORDER_PX
 from depthpose.pose.icp import refine_pose, refine_roughly, tukey_weight
 from depthpose.pose.mesh import MIRROR_ALIKE
 from depthpose.pose.mesh.models import fibonacci_directions
-from depthpose.pose.sensor import INDEPENDENT_SIDES, LARGEST_OFFSET_M
+from depthpose.pose.sensor import EDGE_PX, INDEPENDENT_SIDES, LARGEST_OFFSET_M
 from depthpose.pose.surface import NEAR, Surface, finite_array
 from depthpose.pose.types import Evidence, Identity
 
@@ -226,7 +225,7 @@ def sensor_size_error(distance_m: float, focal_px: float, diameter_m: float) -> 
 
     What looks nearer by the offset looks larger by the same share.
     """
-    return LARGEST_OFFSET_M / distance_m + 2 * BORDER_PX * distance_m / focal_px / diameter_m
+    return LARGEST_OFFSET_M / distance_m + 2 * EDGE_PX * distance_m / focal_px / diameter_m
 
 
 def identify(

@@ -65,6 +65,8 @@ VOTES_RAD = 0.15
 """Mean angle between a network's directions and those to the keypoints at a right pose."""
 LEAST_AGREEMENT = 2 / 3
 """Share of what was compared that must support a pose."""
+LEAST_POSSIBLE = 0.02
+"""A proposal of a search that is less likely goes no further."""
 LEAST_AREA = 1.0
 """Independent patches: of less nothing is said."""
 

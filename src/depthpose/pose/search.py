@@ -35,6 +35,7 @@ from depthpose.pose.frame import Frame, prepare_frame
 from depthpose.pose.icp import refine_roughly
 from depthpose.pose.picking import with_pick_ranks
 from depthpose.pose.probability import (
+    LEAST_POSSIBLE,
     PRIOR_MANY,
     PRIOR_PROPOSED,
     log_odds_right,
@@ -48,8 +49,6 @@ _MOST_PLACES = 40
 """Proposals that are looked at in an image."""
 _LEAST_PROPOSALS = 4
 """Proposals of each object that are looked at in any case."""
-_HOPELESS = 0.02
-"""A refined proposal that is less likely is given up."""
 _ROUNDS = 4
 """So often an image is searched for an object that is there more than once, at most."""
 _MOST_TOGETHER = 8
@@ -272,7 +271,7 @@ def _refine(
     refined = each_in_threads(refine, places, torch.get_num_threads())
     for place, (pose, evidence) in zip(places, refined, strict=True):
         probability = probability_right(evidence, targets.prior_odds)
-        if probability < _HOPELESS:
+        if probability < LEAST_POSSIBLE:
             reason = contradiction(evidence, probability)
             hopeless.append(_miss_at(place, evidence, reason, targets))
             continue

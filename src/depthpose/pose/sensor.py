@@ -29,6 +29,11 @@ LARGEST_OFFSET_M = 0.006
 most. The standard deviation of that offset is a setting, ``IcpConfig.sensor_offset_m``."""
 FLAT_M = 0.0005
 """Real tables and walls are flat to half a millimetre."""
+EDGE_PX = 3
+"""Readings so near an edge may be of either side: stereo matches windows, and masks end so far from
+the silhouette."""
+FINEST_RAD = 2e-4
+"""No sensor has finer pixels: nearer neighbours are of several frames in one cloud."""
 LAG_PX = 3
 """Noise is measured between readings so far apart: direct neighbours of a real sensor err alike."""
 SHARED_PER_WHITE = 2.5

@@ -16,18 +16,18 @@ from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import EstimateConfig, RefusalConfig
-from depthpose.pose.decide import contradiction, with_status
+from depthpose.pose.copies import PreparedObject
+from depthpose.pose.decide import contradiction, why_not_observable, with_status
 from depthpose.pose.evidence import compare, observe
 from depthpose.pose.frame import is_on_plane, largest_plane
 from depthpose.pose.icp import refine_best
-from depthpose.pose.observability import free_motions, observability, without_motions
+from depthpose.pose.observability import free_motions, without_motions
 from depthpose.pose.probability import PRIOR_MASKED, log_odds_right, probability_right
 from depthpose.pose.surface import NEAR, Surface
 from depthpose.pose.types import (
     Alternative,
     AnyInput,
     CloudInput,
-    ObjectModel,
     PoseEstimate,
     Refusal,
     ViewInput,
@@ -79,8 +79,7 @@ def scene_about(pose_input: AnyInput, poses: Rigid, surface: Surface) -> Float64
 class TrackedObject:
     """What is followed, and how it is looked for."""
 
-    model: ObjectModel  #: the object
-    surface: Surface  #: of the model
+    prepared: PreparedObject  #: the object
     refusal: RefusalConfig  #: when a pose is refused
     config: EstimateConfig  #: settings of the estimates
     search: Callable[[AnyInput], PoseEstimate]  #: poses the object where no last pose is known
@@ -164,7 +163,7 @@ def _follow(
 ) -> tuple[PoseEstimate, _Track] | Refusal:
     """Refine the last pose and the predicted one; weigh the better by the evidence of the frame."""
     # Where it may be: at its last pose, or going on as it moved last.
-    surface = target.surface
+    surface = target.prepared.surface
     starts = [current.pose]
     if current.moved is not None:
         R = current.moved.R @ current.pose.R
@@ -213,19 +212,17 @@ def _follow(
         return Refusal(status="doubtful", reason=contradiction(evidence, certainty))
 
     # Does what is seen of it determine its pose?
-    free = free_motions(target.model.symmetries.continuous, pose)
-    observable, _ = observability(object_points_m, pose, surface, free)
-    if observable < target.refusal.min_observability:
-        return Refusal(
-            status="not observable",
-            reason="the visible part of the object does not determine its pose (observability "
-            f"{observable:.1%})",
-        )
+    free = free_motions(target.prepared.model.symmetries.continuous, pose)
+    withheld = why_not_observable(
+        object_points_m, target.prepared, pose, free, target.refusal.min_observability
+    )
+    if withheld is not None:
+        return withheld
 
     # The answer, and what the next frame begins with.
     estimate = PoseEstimate(
         name="",
-        object=target.model.name,
+        object=target.prepared.model.name,
         status="ok",
         camera_from_model=refined.camera_from_model.float(),
         covariance=without_motions(refined.covariance, free).float(),
