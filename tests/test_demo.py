@@ -110,6 +110,7 @@ def test_the_demo_poses_parts_and_answers_none_wrongly(after_demo: Path) -> None
     answered = [row for row in rows if row["status"] == "ok"]
     assert len(answered) >= 3
     assert all(row["of_diameter"] < 0.1 for row in answered)
+    assert {row["object"] for row in rows if row["copies"]} == {"mug"}, "its handle is hidden"
     assert all(row["reason"] for row in rows if row not in answered)
     (scene, *_) = re.findall(_SCENE, (demo / "report.html").read_text(), re.DOTALL)
     names = [layer["name"] for layer in json.loads(scene)["layers"]]

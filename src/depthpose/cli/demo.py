@@ -4,7 +4,15 @@ from pathlib import Path
 
 from depthpose.cli.arguments import NewPath, WeightsName
 
-_OF_POSES = ("object", "status", "error_mm", "of_diameter", "rotation_deg", "translation_mm")
+_OF_POSES = (
+    "object",
+    "status",
+    "copies",
+    "error_mm",
+    "of_diameter",
+    "rotation_deg",
+    "translation_mm",
+)
 _OF_DEPTHS = ("scene", "method", "input", "abs_rel", "rmse", "d1", "epe_px")
 """Columns that are printed; the page and the files hold all."""
 

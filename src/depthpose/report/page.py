@@ -349,6 +349,7 @@ _ABOUT = {
     "auc": "area under the recall of ADD(-S) up to 10 cm",
     "ause": "how badly the confidence ranks the errors: 0 as the errors themselves",
     "certainty": "probability that this pose, and none that looks alike, is the right one",
+    "copies": "near-symmetric copies that fit too and are named; the error is the nearest one's",
     "coverage": "share that has an answer",
     "d1": "share of pixels whose depth is within a factor of 1.25; d2, d3: of its powers",
     "d1_all": "share of pixels off by more than 3 px and by more than 5 % of the truth",
