@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from depthpose.core.rigid import Rigid
@@ -261,11 +261,11 @@ def choose_object(estimates: Sequence[PoseEstimate]) -> PoseEstimate:
         names = ", ".join(estimate.object for estimate in estimates)
         reason = f"none of {names} surely; {nearest.object} comes nearest: {nearest.reason}"
         return replace(nearest, reason=reason, seconds=dict(seconds))
-    best, share = likeliest_object(posed)
-    if share < LEAST_SHARE:
+    best, shares = likeliest_object(posed)
+    if float(shares.max()) < LEAST_SHARE:
         candidates = ", ".join(
             f"{estimate.object} ({float(its_share):.0%})"
-            for estimate, its_share in zip(posed, _object_shares(posed), strict=True)
+            for estimate, its_share in zip(posed, shares, strict=True)
         )
         return PoseEstimate(
             name=best.name,
@@ -277,24 +277,28 @@ def choose_object(estimates: Sequence[PoseEstimate]) -> PoseEstimate:
     return replace(best, seconds=dict(seconds))
 
 
-def likeliest_object(estimates: Sequence[PoseEstimate]) -> tuple[PoseEstimate, float]:
-    """Give the likeliest of the estimates for one place, and its share among their objects.
+def likeliest_object(
+    estimates: Sequence[PoseEstimate],
+) -> tuple[PoseEstimate, Float64[Tensor, " n"]]:
+    """Give the likeliest of the estimates for one place, and the share of each object.
 
-    Its probabilities are multiplied by that share.
+    The probabilities of the likeliest are multiplied by its share.
     """
-    shares = _object_shares(estimates)
+    evidences = [estimate.evidence for estimate in estimates if estimate.evidence is not None]
+    shares = share_among_objects(evidences)
     best = int(shares.argmax())
-    share, estimate = float(shares[best]), estimates[best]
-    chosen = scaled(estimate, share)
+    share = float(shares[best])
+    estimate = estimates[best]
+    chosen = with_share(estimate, share)
     if len(estimates) > 1 and estimate.identity is not None and share < 1 - LEAST_NAMED:
         second = estimates[int(shares.topk(2).indices[1])].object
         reason = f"it may be {second} ({1 - share:.0%} for all other objects)"
         identity = replace(estimate.identity, status="not excluded", other=second, reason=reason)
         chosen = replace(chosen, identity=identity)
-    return chosen, share
+    return chosen, shares
 
 
-def scaled(estimate: PoseEstimate, share: float) -> PoseEstimate:
+def with_share(estimate: PoseEstimate, share: float) -> PoseEstimate:
     """Multiply the probabilities of an estimate by a share."""
     certainty, copy_certainty = estimate.certainty, estimate.copy_certainty
     return replace(
@@ -305,11 +309,4 @@ def scaled(estimate: PoseEstimate, share: float) -> PoseEstimate:
             replace(alternative, probability=share * alternative.probability)
             for alternative in estimate.alternatives
         ),
-    )
-
-
-def _object_shares(estimates: Sequence[PoseEstimate]) -> Tensor:
-    """Give the probability of each estimate's object, if they are of one thing."""
-    return share_among_objects(
-        [estimate.evidence for estimate in estimates if estimate.evidence is not None]
     )

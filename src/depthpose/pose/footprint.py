@@ -94,10 +94,14 @@ def window_of_region(view: ViewInput) -> ViewInput:
 def _cut(view: ViewInput, part: tuple[slice, slice]) -> ViewInput:
     """Cut a part out of a view."""
     K = _window_intrinsics(view.K, part)
-    known = view.background
-    if known is not None:
-        known = KnownBackground(depth_m=known.depth_m[part], is_seen=known.is_seen[part])
-    return replace(view, depth_m=view.depth_m[part], mask=view.mask[part], K=K, background=known)
+    background = view.background
+    if background is not None:
+        background = KnownBackground(
+            depth_m=background.depth_m[part], is_seen=background.is_seen[part]
+        )
+    return replace(
+        view, depth_m=view.depth_m[part], mask=view.mask[part], K=K, background=background
+    )
 
 
 def why_background_excludes(frame: Frame, view: ViewInput, pose: Rigid, surface: Surface) -> str:

@@ -157,12 +157,9 @@ def share_among_poses(
     If one of them is right the others are wrong, and wrong poses leave much contradicted: so each
     is weighed by how much better its evidence fits a right pose than a wrong one.
     """
-    weights = [
-        log_odds_right(evidence) + _log_beside_depth(hypothesis)
-        for hypothesis, evidence in zip(
-            hypotheses, _compared_evidence(hypotheses, is_masked=is_masked), strict=True
-        )
-    ]
+    if not is_masked:
+        hypotheses = _against_each_other(hypotheses)
+    weights = [log_odds_right(h.evidence) + _log_beside_depth(h) for h in hypotheses]
     return torch.tensor(weights, dtype=torch.float64).softmax(0)
 
 
@@ -175,26 +172,25 @@ def share_among_copies(
     its evidence fits a right pose. A network's votes say nothing here: it saw no more.
     """
     area = max(LEAST_AREA, *(hypothesis.evidence.visible for hypothesis in hypotheses))
-    weights = [
-        log_fit_right(evidence, area) + hypothesis.log_color
-        for hypothesis, evidence in zip(
-            hypotheses, _compared_evidence(hypotheses, is_masked=is_masked), strict=True
-        )
-    ]
+    if not is_masked:
+        hypotheses = _against_each_other(hypotheses)
+    weights = [log_fit_right(h.evidence, area) + h.log_color for h in hypotheses]
     return torch.tensor(weights, dtype=torch.float64).softmax(0)
 
 
-def _compared_evidence(hypotheses: Sequence[Hypothesis], *, is_masked: bool) -> list[Evidence]:
-    """Give the evidence of poses of the same readings, by each other.
+def _against_each_other(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Count what another pose of the same readings explains, and a pose does not, against it.
 
-    Where no mask says which readings are the object's, those that another pose explains, and a pose
-    does not, contradict it: a mug's handle that one copy leaves out.
+    Where no mask says which readings are the object's, nothing else does: a mug's handle that one
+    copy leaves out may be of a neighbour.
     """
-    evidences = [hypothesis.evidence for hypothesis in hypotheses]
-    if is_masked:
-        return evidences
-    most = max(evidence.supported for evidence in evidences)
-    return [replace(e, beside=max(e.beside, most - e.supported)) for e in evidences]
+    most = max(hypothesis.evidence.supported for hypothesis in hypotheses)
+    compared: list[Hypothesis] = []
+    for hypothesis in hypotheses:
+        evidence = hypothesis.evidence
+        unexplained = max(evidence.beside, most - evidence.supported)
+        compared.append(replace(hypothesis, evidence=replace(evidence, beside=unexplained)))
+    return compared
 
 
 def _log_beside_depth(hypothesis: Hypothesis) -> float:

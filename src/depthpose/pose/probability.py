@@ -131,9 +131,8 @@ def probability_of_instances(
     """
     by_itself = log_odds.sigmoid()
     none_or_one = torch.cat([log_odds.new_zeros(1), log_odds])
-    log_many = (
-        log_odds.new_tensor(prior_many).log() + softplus(log_odds).sum()
-    )  # of all choices of places
+    # Of any number of instances every choice of places is possible.
+    log_many = log_odds.new_tensor(prior_many).log() + softplus(log_odds).sum()
     many = (log_many - none_or_one.logsumexp(0)).sigmoid()
     return many * by_itself + (1 - many) * none_or_one.softmax(0)[1:]
 

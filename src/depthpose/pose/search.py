@@ -27,7 +27,7 @@ from depthpose.pose.decide import (
     LEAST_SHARE,
     contradiction,
     likeliest_object,
-    scaled,
+    with_share,
 )
 from depthpose.pose.evidence import compare, observe
 from depthpose.pose.footprint import explained_mask, why_background_excludes, window_of_region
@@ -58,7 +58,7 @@ _LEAST_PIXELS = 100
 _SHARED = 0.3
 """Estimates that explain so large a share of the same readings are of one thing; one stays."""
 _RIVAL = 0.5
-"""Poses of two objects that explain so much of the same readings compete."""
+"""Poses that explain so much of the same readings are at one place; two objects compete there."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -366,7 +366,7 @@ def _weigh_instances(
         for k, place in enumerate(places):
             probability = float(probabilities[k])
             if probability >= targets.min_probability:
-                estimate = scaled(place.estimate, float(shares[k]))
+                estimate = with_share(place.estimate, float(shares[k]))
                 remaining.append(replace(place, estimate=estimate))
             else:
                 reason = (
@@ -416,8 +416,8 @@ def _suppress(
         for other in ranked[number + 1 :]:
             if place.shared_with(other) > _RIVAL:
                 rivals.setdefault(other.object, other)
-        estimate, share = likeliest_object([rival.estimate for rival in rivals.values()])
-        if share >= LEAST_SHARE:
+        estimate, shares = likeliest_object([rival.estimate for rival in rivals.values()])
+        if float(shares.max()) >= LEAST_SHARE:
             kept.append(replace(place, estimate=estimate))
         else:
             others = ", ".join(name for name in rivals if name != place.object)
