@@ -24,6 +24,7 @@ import torch
 from score import Job, Row, Section
 from score_depth import IMAGES, INDOOR, STREET_PAIRS
 from score_instances import BOXES, MASKS, NETWORKS, SCANS
+from score_parts import PART_SHAPES
 from score_reports import REPORTS
 from score_scenes import BINS, FRAMES
 from score_tracking import TRACKING
@@ -39,6 +40,7 @@ SECTIONS: dict[str, Section] = {
     "bins": BINS,
     "frames": FRAMES,
     "reports": REPORTS,
+    "parts": PART_SHAPES,
     "tracking": TRACKING,
     "indoor": INDOOR,
     "streets": STREET_PAIRS,

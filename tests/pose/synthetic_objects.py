@@ -28,6 +28,18 @@ def box_faces() -> tuple[Tensor, Tensor]:
     return corners, torch.tensor(faces)
 
 
+Block = tuple[tuple[float, float, float], tuple[float, float, float]]
+"""Size and middle of a box [m]."""
+
+
+def boxes(name: str, *blocks: Block) -> ObjectModel:
+    """A model of boxes."""
+    corners, faces = box_faces()
+    vertices = torch.cat([corners * torch.tensor(size) + torch.tensor(at) for size, at in blocks])
+    every = torch.cat([faces + 8 * k for k in range(len(blocks))])
+    return make_model(vertices, every, name=name, number=1)
+
+
 def bracket(name: str = "bracket", keypoints: int = 8) -> ObjectModel:
     """Three boxes of different lengths that meet in a corner, 20 cm long, of no two equal sides."""
     corners, faces = box_faces()

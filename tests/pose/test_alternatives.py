@@ -13,15 +13,23 @@ from tests.pose.synthetic_objects import (
     Oracle,
     bar,
     bottle,
+    boxes,
     bracket,
     cloud_of,
+    generator,
     noisy,
     pose_at,
     tiny_weights,
     view_of,
 )
 
-from depthpose.core.rigid import Rigid, geodesic_rad
+from depthpose.core.rigid import Rigid, geodesic_rad, rotation_by
+from depthpose.pose.cloud import cloud_from_depth
+from depthpose.pose.config import IcpConfig
+from depthpose.pose.copies import PreparedObject
+from depthpose.pose.evidence import observe
+from depthpose.pose.hypotheses import compete
+from depthpose.pose.icp import refine_pose
 from depthpose.pose.mesh import (
     NearSymmetry,
     SymmetryProposal,
@@ -34,6 +42,7 @@ from depthpose.pose.mesh import (
 )
 from depthpose.pose.metrics import add_m
 from depthpose.pose.registration import Registration
+from depthpose.pose.surface import prepare_surface
 from depthpose.pose.synthetic.parts import make_part
 from depthpose.pose.types import ObjectModel, Symmetries, ViewInput
 
@@ -114,6 +123,32 @@ def test_the_right_end_is_the_estimate_or_named() -> None:
     poses = [found.camera_from_model, *(other.camera_from_model for other in found.alternatives)]
     errors_m = [float(add_m(pose, truth, model.vertices_m)) for pose in poses if pose is not None]
     assert min(errors_m) < 0.005
+
+
+@pytest.mark.parametrize("seed", [3, 7])
+def test_copies_of_a_plate_stay_where_its_symmetry_has_them(seed: int) -> None:
+    """Its back says little of where it lies in its plane, and rough steps shift it there."""
+    boss = ((0.028, 0.028, 0.008), (0.035, 0.018, 0.005))
+    plate = boxes("plate", ((0.15, 0.1, 0.003), (0, 0, 0)), boss)
+    noise = generator(seed)
+    tilt = rotation_by(0.4 * torch.randn(3, generator=noise).double())
+    from_behind = half_turn([1.0, 0.0, 0.0]).R
+    truth = Rigid(tilt @ from_behind, torch.tensor([0.0, 0.0, 0.4]).double())
+    depth_m, mask = view_of(plate, truth.float())
+    depth_m = depth_m + 0.0012 * torch.randn(depth_m.shape, generator=noise)
+    view = ViewInput(name="a", depth_m=depth_m.float(), mask=mask, K=K, object=plate.name)
+    cloud_m = cloud_from_depth(view.depth_m, mask, K).double()
+    prepared = PreparedObject(number=0, model=plate, surface=prepare_surface(plate))
+
+    leading = truth @ half_turn([1.0, 0.0, 0.0])
+    config = IcpConfig(start_distance_diameters=0.05)
+    refined = refine_pose(cloud_m, leading, prepared.surface, config)
+    observation = observe(cloud_m, view, plate.diameter_m, 0.001, is_masked=True)
+    none = Rigid(torch.zeros(0, 3, 3).double(), torch.zeros(0, 3).double())
+    competition = compete(cloud_m, refined, none, prepared, observation, IcpConfig())
+    poses = [competition.best.pose, *(copy.pose for copy, _ in competition.copies)]
+    errors = [float(add_m(pose.float(), truth.float(), plate.vertices_m)) for pose in poses]
+    assert min(errors) < 0.004
 
 
 def test_only_what_has_a_copy_is_less_certain_of_it() -> None:

@@ -7,32 +7,29 @@ import numpy as np
 import pytest
 import torch
 from scipy import ndimage
-from tests.pose.synthetic_objects import K, bottle, box_faces, bracket, generator, pose_at, view_of
+from tests.pose.synthetic_objects import (
+    Block,
+    K,
+    bottle,
+    boxes,
+    bracket,
+    generator,
+    pose_at,
+    view_of,
+)
 from torch import Tensor
 
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import cloud_from_depth, grow_mask
 from depthpose.pose.evidence import Observation, _mean_depth, compare, draw_surface, observe
-from depthpose.pose.mesh import make_model, turn_about
+from depthpose.pose.mesh import turn_about
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.synthetic.parts import make_part
 from depthpose.pose.types import Evidence, ObjectModel, ViewInput
 
 WALL_M = 1.3
 OBJECT_M = 0.001
-
-Block = tuple[tuple[float, float, float], tuple[float, float, float]]
-"""Size and middle of a box [m]."""
-
-
-def boxes(name: str, *parts: Block) -> ObjectModel:
-    """A model of boxes."""
-    corners, faces = box_faces()
-    vertices = torch.cat([corners * torch.tensor(size) + torch.tensor(at) for size, at in parts])
-    every = torch.cat([faces + 8 * k for k in range(len(parts))])
-    return make_model(vertices, every, name=name, number=1)
-
 
 BAR = boxes("bar", ((0.2, 0.07, 0.03), (0.0, 0.0, 0.0)))
 
@@ -207,9 +204,9 @@ def test_more_than_three_deviations_contradict_behind_and_before(
     assert unmasked.unobserved == pytest.approx(bulging * visible, abs=0.02 * visible)
 
 
-@pytest.mark.parametrize(("side_px", "through"), [(5, 1.0), (0, 0.0)])
+@pytest.mark.parametrize(("side_px", "through"), [(9, 1.0), (4, 0.0)])
 def test_a_small_hole_is_one_observation(side_px: int, through: float) -> None:
-    """Averaged over 5 px it is 9 px wide, less than the 10 px that are independent."""
+    """One is less than the 10 px that are independent, the other as wide as an edge may move."""
     pose = Rigid(torch.eye(3), torch.tensor([0.0, 0.0, 0.6]))
     view = view_before_wall(BAR, pose)
     view.depth_m[118 : 118 + side_px, 150 : 150 + side_px] = WALL_M
@@ -226,6 +223,20 @@ def test_a_mask_may_end_a_few_pixels_beside_the_silhouette(grow_px: int, is_besi
     view = view_before_wall(BAR, pose)
     view = replace(view, mask=grow_mask(view.mask, grow_px), depth_m=view.depth_m.clamp(max=0.6))
     assert (evidence_of(view, BAR, pose).beside > 1) == is_beside
+
+
+def test_a_moved_edge_of_a_thin_part_does_not_contradict() -> None:
+    """A strip of 5 px is all edge: a sensor that moves its edge by two shows the wall on it."""
+    strip = boxes("strip", ((0.2, 0.006, 0.006), (0, 0, 0)))
+    pose = Rigid(torch.eye(3), torch.tensor([0.0, 0.0, 0.6]))
+    view = view_before_wall(strip, pose, 0.001)
+    moved = replace(view, depth_m=view.depth_m.roll(2, 0))
+    evidence = evidence_of(moved, strip, pose)
+    assert evidence.visible > 1
+    assert evidence.contradicted == 0
+    # Where it is not it is seen through.
+    beside = Rigid(pose.R, pose.t_m + torch.tensor([0.0, 0.012, 0.0]))
+    assert evidence_of(view, strip, beside).seen_through > 1
 
 
 def test_own_readings_beside_the_silhouette_contradict() -> None:

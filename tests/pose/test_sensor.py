@@ -41,12 +41,20 @@ def test_only_readings_of_the_object_are_measured() -> None:
     assert noise.white_m == pytest.approx(0.001, rel=0.1)
 
 
-def test_an_object_of_a_few_pixels_has_no_measured_noise() -> None:
+def test_an_object_too_thin_to_be_measured_has_the_noise_of_what_is_about_it() -> None:
     is_object = np.zeros((120, 160), dtype=bool)
-    is_object[50:54, 50:54] = True
-    noise = measure_noise(tilted_plane(0.01), is_object, object_m=0.001)
-    assert noise.white_m == 0.0
-    assert noise.deviation_m(np.ones(1), 9) == pytest.approx(0.001)
+    is_object[50:54, :] = True
+    is_object[:, 80:84] = True
+    is_object[54:, 80:84] = False
+    noise = measure_noise(tilted_plane(0.003), is_object, object_m=0.001)
+    assert noise.white_m == pytest.approx(0.003, rel=0.05)
+
+
+def test_where_nothing_can_be_measured_the_noise_is_that_of_a_kinect() -> None:
+    depth_m = np.full((120, 160), np.nan)
+    depth_m[50:54, 50:54] = 0.8
+    noise = measure_noise(depth_m, np.isfinite(depth_m), object_m=0.001)
+    assert noise.white_m == pytest.approx(NOISE_PER_M2 * 0.8**2)
 
 
 def test_averaging_lowers_independent_noise_alone() -> None:

@@ -37,6 +37,7 @@ from depthpose.pose.surface import Surface
 from depthpose.pose.types import Evidence, ViewInput
 
 THRESHOLD = 3.0  #: deviations beyond which a residual contradicts a pose
+_CUT_OFF = 2 * THRESHOLD  # deviations of one reading, of which a mean takes no more
 AVERAGED_PX = 5  #: residuals are averaged over a square of this side
 _LEAST_FILLED = 0.3  # share of the averaged square that must have residuals
 _LEAST_PATCH = 0.25  # independent patches: smaller ones are accidents of edges and drop-outs
@@ -259,6 +260,9 @@ def compare(observation: Observation, pose: Rigid, surface: Surface) -> Evidence
     side = _averaged_side(step)
     is_compared = is_read & inner
     residual_m = np.where(is_compared, depth_m - drawn_m, 0).astype(np.float32)
+    # Cut off, so that a reading of the background at an edge does not decide for its neighbours.
+    limit_m = _CUT_OFF * noise.deviation_m(cosine, 1).astype(np.float32)
+    residual_m = np.clip(residual_m, -limit_m, limit_m)
     filled = ndimage.uniform_filter(is_compared.astype(np.float32), side)
     mean_m = ndimage.uniform_filter(residual_m, side)
     # A pixel without a reading of its own has that of its neighbours: clouds are sparse.

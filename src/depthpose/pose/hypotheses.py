@@ -277,12 +277,20 @@ def _refine_competitors(
         return [_Candidate(candidate, candidate) for candidate in unrefined]
     if len(starts.R) == 0:
         return []
-    # Roughly, to drop those that leave too much of the cloud unexplained.
+    # Roughly, to drop those that leave too much of the cloud unexplained. Rough steps let a pose
+    # drift along what little constrains it: it stays at its start where that explains as much.
     rough = refine_roughly(cloud_m, starts, surface, icp)
-    leading_and_rough = Rigid.cat([leading.camera_from_model.double()[None], rough])
-    unexplained = _unexplained(cloud_m, leading_and_rough, surface)
-    order = unexplained[1:].argsort(stable=True)[:most]
-    order = order[unexplained[1:][order] <= unexplained[0] + _UNEXPLAINED_MORE]
+    before = _unexplained(cloud_m, starts, surface)
+    after = _unexplained(cloud_m, rough, surface)
+    is_nearer = after < before
+    nearer = Rigid(
+        R=torch.where(is_nearer[:, None, None], rough.R, starts.R),
+        t_m=torch.where(is_nearer[:, None], rough.t_m, starts.t_m),
+    )
+    unexplained = torch.minimum(before, after)
+    leading_unexplained = _unexplained(cloud_m, leading.camera_from_model.double()[None], surface)
+    order = unexplained.argsort(stable=True)[:most]
+    order = order[unexplained[order] <= leading_unexplained + _UNEXPLAINED_MORE]
     if len(order) == 0:
         return []
     # Then exactly, a few steps for each.
@@ -292,7 +300,7 @@ def _refine_competitors(
         cloud_points=min(_POINTS, icp.cloud_points),
         start_distance_diameters=icp.end_distance_diameters,
     )
-    batch = refine_pose(cloud_m, rough[order], surface, short)
+    batch = refine_pose(cloud_m, nearer[order], surface, short)
     candidates: list[_Candidate] = []
     for k, number in enumerate(order.tolist()):
         refined = RefinedPose(

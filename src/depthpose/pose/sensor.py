@@ -57,6 +57,7 @@ _WIDEST_M = 0.004
 _WIDEST_PER_M2 = 0.003
 """But no farther than 4 mm, and 3 mm for the square of its depth in metres: twice a Kinect's."""
 _MEDIAN_TO_DEVIATION = 1.4826  # of a normal distribution
+_FEWEST_DIFFERENCES = 30  # of readings, whose median says how large the noise is
 _STEEPEST = 0.3
 """Least cosine by which a deviation along the surface normal is divided: what is seen at a smaller
 angle is hardly measured at all."""
@@ -91,7 +92,8 @@ def measure_noise(depth_m: np.ndarray, is_object: np.ndarray, object_m: float) -
     """Measure the noise of a depth image on an object, and derive what neighbours share.
 
     The noise is the median second difference of readings three pixels apart, to which a slope adds
-    nothing and a curved surface little.
+    nothing and a curved surface little. Of an object too thin for it, that of all readings is
+    taken.
 
     Args:
         depth_m: (h, w), NaN where there is no reading.
@@ -99,19 +101,28 @@ def measure_noise(depth_m: np.ndarray, is_object: np.ndarray, object_m: float) -
         object_m: standard deviation of the real surface from its model.
     """
     masked_m = np.where(is_object, depth_m, np.nan)
-    differences = []
-    for along_m in (masked_m, masked_m.T):
+    distance_m = float(np.nanmedian(masked_m)) if np.isfinite(masked_m).any() else 0.0
+    bend_m = _second_differences(masked_m)
+    if len(bend_m) < _FEWEST_DIFFERENCES:
+        bend_m = _second_differences(depth_m)
+    if len(bend_m) < _FEWEST_DIFFERENCES:
+        white_m = NOISE_PER_M2 * distance_m**2
+    else:
+        # A second difference of independent readings has six times their variance.
+        white_m = _MEDIAN_TO_DEVIATION * float(np.median(np.abs(bend_m))) / math.sqrt(6)
+        # On a small object its own curvature is in the differences: no sensor is so noisy.
+        white_m = min(white_m, NOISIEST_PER_M2 * distance_m**2)
+    return DepthNoise(white_m=white_m, shared_m=SHARED_PER_WHITE * white_m, object_m=object_m)
+
+
+def _second_differences(depth_m: np.ndarray) -> np.ndarray:
+    """Second differences of readings ``LAG_PX`` apart, along rows and columns."""
+    differences: list[np.ndarray] = []
+    for along_m in (depth_m, depth_m.T):
         ends_m = along_m[:, : -2 * LAG_PX] + along_m[:, 2 * LAG_PX :]
         bend_m = ends_m - 2 * along_m[:, LAG_PX:-LAG_PX]
         differences.append(bend_m[np.isfinite(bend_m)])
-    bend_m = np.abs(np.concatenate(differences))
-    white_m = 0.0
-    if len(bend_m) > 0:
-        # A second difference of independent readings has six times their variance.
-        white_m = _MEDIAN_TO_DEVIATION * float(np.median(bend_m)) / math.sqrt(6)
-        # On a small object its own curvature is in the differences: no sensor is so noisy.
-        white_m = min(white_m, NOISIEST_PER_M2 * float(np.nanmedian(masked_m)) ** 2)
-    return DepthNoise(white_m=white_m, shared_m=SHARED_PER_WHITE * white_m, object_m=object_m)
+    return np.concatenate(differences)
 
 
 def measure_noise_per_m2(depth_m: Float64[Tensor, "h w"]) -> float:

@@ -1,0 +1,292 @@
+"""Twenty parts that a pose is easily mistaken on: long, thin, toothed and nearly symmetric ones.
+
+Each part has one small feature that tells its pose from a look-alike, such as the block at one end
+of a profile. Its twin has that feature elsewhere. Sizes are in millimetres.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import trimesh
+from torch import Tensor
+
+from depthpose.core.loop import sample_generator
+from depthpose.core.render import rasterize
+from depthpose.core.rigid import Rigid
+from depthpose.pose.config import SensorKind, SyntheticSensorConfig
+from depthpose.pose.mesh import drawn_triangles
+from depthpose.pose.synthetic.parts import Mesh, box, circle, joined, moved, revolved, ring, turned
+from depthpose.pose.synthetic.views import random_rotation, simulate_depth, uniform
+from depthpose.pose.types import ObjectModel
+
+FOCAL_PX = 570.0
+WIDTH, HEIGHT = 640, 480
+K = torch.tensor([[FOCAL_PX, 0, 319.5], [0, FOCAL_PX, 239.5], [0, 0, 1]], dtype=torch.float64)
+SENSORS: tuple[SensorKind, ...] = ("structured light", "active stereo", "time of flight", "laser")
+"""They take turns from view to view."""
+NEAREST_M = 0.35  # of these sensors
+IMAGED_PX = (120.0, 300.0)  # length of a part in an image
+FEWEST_PX = 300  # of a mask
+APART_PX, APART_M = 150, 0.008
+"""A twin is seen to be one where so many pixels differ by so much."""
+SEED = 0x20A7
+X, Y = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
+
+
+class Part(NamedTuple):
+    """A part, of which the twin differs in one feature.
+
+    ``mesh``: from the shift of that feature [mm] to the mesh. ``symmetry``: of the true surface, as
+    :func:`~depthpose.pose.mesh.declare_symmetry` takes it. ``right_deg``: a rotation that is off by
+    less is right; less than half a tooth. ``is_held``: left out of every choice.
+    """
+
+    mesh: Callable[[float], Mesh]
+    twin_mm: float
+    symmetry: str | None = None
+    right_deg: float = 15.0
+    is_held: bool = False
+
+    def as_trimesh(self, *, is_twin: bool = False) -> trimesh.Trimesh:
+        """Make the mesh of the part or of its twin."""
+        vertices, faces = self.mesh(self.twin_mm if is_twin else 0.0)
+        return trimesh.Trimesh(vertices, faces, process=False)
+
+
+def teeth(number: int, radius: float, depth: float, *, is_leaning: bool = False) -> np.ndarray:
+    """Outline of a toothed wheel about the origin, of as many corners as a circle."""
+    unit = circle(1.0)
+    of_tooth = number * np.arange(len(unit)) % len(unit) / len(unit)  # from 0 to 1
+    height = 1 - 2 * of_tooth if is_leaning else np.tanh(3 * np.cos(2 * math.pi * of_tooth))
+    return (radius + depth / 2 * height)[:, None] * unit
+
+
+def notched(radius: float, depth: float, width: float, at: float = 0.0) -> np.ndarray:
+    """Outline of a circle from which a notch is cut (or, of negative depth, on which one stands).
+
+    ``width`` and ``at``: as angles [rad].
+    """
+    angle = np.arange(len(circle(1.0))) * (2 * math.pi / len(circle(1.0)))
+    apart = np.abs((angle - at + math.pi) % (2 * math.pi) - math.pi)
+    return (radius - depth * (apart < width / 2))[:, None] * circle(1.0)
+
+
+def bar(length: float, radius: float) -> Mesh:
+    """A round bar along x."""
+    upright = revolved([(0, -length / 2), (radius, -length / 2), (radius, length / 2),
+                        (0, length / 2)])  # fmt: skip
+    return turned(upright, Y, 90.0)
+
+
+def profile(shift: float) -> Mesh:
+    """An L profile of 600 mm with a block at one end."""
+    flange = moved(box((600, 40, 3)), (0, 0, -11))
+    web = moved(box((600, 3, 25)), (0, -18.5, 0))
+    return joined(flange, web, moved(box((20, 30, 12)), (285 - shift, 2, -4)))
+
+
+def channel(shift: float) -> Mesh:
+    """A U channel of 500 mm with a wall near one end."""
+    base = moved(box((500, 30, 2)), (0, 0, -14))
+    sides = [moved(box((500, 2, 30)), (0, y, 0)) for y in (-14.0, 14.0)]
+    return joined(base, *sides, moved(box((3, 28, 26)), (240 - shift, 0, 0)))
+
+
+def keyed_shaft(shift: float) -> Mesh:
+    """A shaft of 300 mm with a key near one end."""
+    return joined(bar(300, 12), moved(box((40, 6, 10)), (115 - shift, 0, 11)))
+
+
+def flat_shaft(shift: float) -> Mesh:
+    """A shaft of 250 mm with a flat of 60 mm at one end."""
+    outline = circle(14.0).copy()
+    outline[:, 0] = np.minimum(outline[:, 0], 8.0)
+    flat = turned(ring(outline, circle(0.01), 60.0 + shift), Y, 90.0)
+    round_part = bar(190.0 - shift, 14.0)
+    return joined(moved(round_part, (-30.0 - shift / 2, 0, 0)), moved(flat, (95 - shift / 2, 0, 0)))
+
+
+def flanged_tube(shift: float) -> Mesh:
+    """A tube of 350 mm with a flange near one end."""
+    tube = turned(ring(circle(20), circle(16), 350), Y, 90.0)
+    flange = turned(ring(circle(32), circle(18), 8), Y, 90.0)
+    return joined(tube, moved(flange, (160 - shift, 0, 0)))
+
+
+def rail(shift: float) -> Mesh:
+    """A rail of 400 mm with two carriages, not at equal distances from the ends."""
+    carriages = [moved(box((50, 36, 16)), (x, 0, 12)) for x in (-130.0, 90.0 + shift)]
+    return joined(box((400, 24, 14)), *carriages)
+
+
+def plate(shift: float) -> Mesh:
+    """A plate of 3 mm with a boss off its middle."""
+    return joined(box((150, 100, 3)), moved(ring(circle(14), circle(7), 8), (35 - shift, 18, 4)))
+
+
+def washer(shift: float) -> Mesh:
+    """A washer of 3 mm with a notch."""
+    return ring(notched(40, 9 - shift, 0.5), circle(20), 3)
+
+
+def sheet_bracket(shift: float) -> Mesh:
+    """A bracket of sheet metal of 2 mm, with a tab on one side."""
+    base = box((80, 60, 2))
+    wall = moved(box((2, 60, 50)), (-39, 0, 25))
+    return joined(base, wall, moved(box((20, 2, 14)), (15 - shift, 29, 7)))
+
+
+def clip(shift: float) -> Mesh:
+    """A clip of sheet metal with legs of unlike length."""
+    back = moved(box((2, 24, 40)), (-30, 0, 0))
+    long_leg = moved(box((70, 24, 2)), (5, 0, 19))
+    short_leg = moved(box((50 + shift, 24, 2)), (-5 + shift / 2, 0, -19))
+    return joined(back, long_leg, short_leg)
+
+
+def comb(shift: float) -> Mesh:
+    """A comb of five prongs, of which the outer one is shorter."""
+    prongs = [moved(box((8, 60, 4)), (x, 38, 0)) for x in (-40.0, -20.0, 0.0, 20.0)]
+    return joined(
+        box((100, 18, 4)), *prongs, moved(box((8, 40 + shift, 4)), (40, 28 + shift / 2, 0))
+    )
+
+
+def gear(shift: float) -> Mesh:
+    """A gear of 24 teeth with a hub and a keyway."""
+    wheel = ring(teeth(24, 50, 7), notched(12, -5, 0.6), 14)
+    return joined(wheel, moved(ring(circle(20), notched(12, -5, 0.6), 10 + shift), (0, 0, 12)))
+
+
+def sprocket(shift: float) -> Mesh:
+    """A sprocket of 12 teeth with a pin off its middle."""
+    pin = revolved([(0, 0), (5, 0), (5, 12), (0, 12)])
+    return joined(ring(teeth(12, 45, 10), circle(8), 6), moved(pin, (24 - shift, 0, 3)))
+
+
+def rack(shift: float) -> Mesh:
+    """A rack of 200 mm with a block on one end."""
+    ridges = [moved(box((5, 20, 6)), (x, 0, 11)) for x in np.arange(-95.0, 96.0, 10.0)]
+    return joined(box((200, 20, 16)), *ridges, moved(box((16, 20, 12)), (92 - shift, 0, -14)))
+
+
+def ratchet(shift: float) -> Mesh:
+    """A ratchet of 16 leaning teeth with a hub on one side."""
+    wheel = ring(teeth(16, 40, 9, is_leaning=True), circle(10), 8)
+    return joined(wheel, moved(ring(circle(18), circle(10), 12 + shift), (0, 0, 10)))
+
+
+def nut(shift: float) -> Mesh:
+    """A nut of 60 mm with a collar on one side."""
+    angle = np.arange(len(circle(1.0))) * (2 * math.pi / len(circle(1.0)))
+    to_side = (angle + math.pi / 6) % (math.pi / 3) - math.pi / 6
+    hexagon = (30 / np.cos(to_side))[:, None] * circle(1.0)
+    collar = moved(ring(circle(38 - shift), circle(16), 4), (0, 0, -12))
+    return joined(ring(hexagon, circle(16), 24), collar)
+
+
+def dice(shift: float) -> Mesh:
+    """A cube of 50 mm with a boss off the middle of one face."""
+    boss = revolved([(0, 0), (9, 0), (9, 8), (0, 8)])
+    return joined(box((50, 50, 50)), moved(boss, (10 - shift, 6, 25)))
+
+
+def cup(shift: float) -> Mesh:
+    """A cup with a small handle."""
+    wall = revolved([(0, 0), (30, 0), (36, 70), (32, 70), (27, 5), (0, 5)])
+    return joined(wall, moved(box((18, 8, 26)), (40, 0, 40 - shift)))
+
+
+def knob(shift: float) -> Mesh:
+    """A knob with a pointer."""
+    body = revolved([(0, 0), (28, 0), (24, 24), (0, 24)])
+    return joined(body, moved(box((22, 6, 6)), (12 - shift, 0, 26)))
+
+
+def lid(shift: float) -> Mesh:
+    """A box of 90x50x30 mm with a lip along one long edge."""
+    return joined(box((90, 50, 30)), moved(box((60, 8, 4)), (shift, 28, 11)))
+
+
+PARTS: dict[str, Part] = {
+    "profile": Part(profile, 40),
+    "channel": Part(channel, 40, is_held=True),
+    "keyed shaft": Part(keyed_shaft, 30),
+    "flat shaft": Part(flat_shaft, 30, is_held=True),
+    "flanged tube": Part(flanged_tube, 30, "x,free"),
+    "rail": Part(rail, 20, is_held=True),
+    "plate": Part(plate, 12),
+    "washer": Part(washer, -7, "x,2", is_held=True),
+    "sheet bracket": Part(sheet_bracket, 14),
+    "clip": Part(clip, 10, is_held=True),
+    "comb": Part(comb, 12),
+    "gear": Part(gear, 10, right_deg=7.5),
+    "sprocket": Part(sprocket, 10, right_deg=14.0, is_held=True),
+    "rack": Part(rack, 20),
+    "ratchet": Part(ratchet, 10, "z,16", right_deg=10.0, is_held=True),
+    "nut": Part(nut, 12, "z,6"),
+    "dice": Part(dice, 12, is_held=True),
+    "cup": Part(cup, 14),
+    "knob": Part(knob, 14, is_held=True),
+    "lid": Part(lid, 14, is_held=True),
+}
+
+
+class PartView(NamedTuple):
+    """A view of a part: depth [m], its exact mask, the true pose."""
+
+    depth_m: Tensor
+    mask: Tensor
+    truth: Rigid
+
+
+def views(
+    model: ObjectModel, number: int, seed: int, unlike: ObjectModel | None = None
+) -> Iterator[PartView]:
+    """Render views of a part before a wall, from any side, measured by one sensor after another.
+
+    ``unlike``: only views in which this model in its place would look different.
+    """
+    triangles_m = drawn_triangles(model).double()
+    middle_m = triangles_m.reshape(-1, 3).mean(0)
+    made = 0
+    for attempt in range(20 * number):
+        generator = sample_generator(attempt, SEED + seed)
+        length_px = uniform(generator, *IMAGED_PX)
+        distance_m = max(NEAREST_M, FOCAL_PX * model.diameter_m / length_px)
+        R = random_rotation(generator).double()
+        shift = (torch.rand(2, generator=generator).double() - 0.5) * 0.2 * distance_m
+        centre_m = torch.cat([shift, torch.tensor([distance_m], dtype=torch.float64)])
+        truth = Rigid(R, centre_m - R @ middle_m)
+        clean_m = _draw(model, truth)
+        mask = clean_m.isfinite()
+        if int(mask.sum()) < FEWEST_PX or not _is_inside(mask):
+            continue
+        if unlike is not None:
+            apart_m = (
+                clean_m.nan_to_num(posinf=9.0) - _draw(unlike, truth).nan_to_num(posinf=9.0)
+            ).abs()
+            if int((apart_m > APART_M).sum()) < APART_PX:
+                continue
+        wall_m = distance_m + 0.6 * model.diameter_m + 0.2
+        scene_m = torch.where(mask, clean_m, wall_m)
+        sensor = SyntheticSensorConfig(kinds=(SENSORS[made % len(SENSORS)],))
+        depth_m = simulate_depth(scene_m.float(), (FOCAL_PX, FOCAL_PX), sensor, generator)
+        yield PartView(depth_m, mask, truth)
+        made += 1
+        if made == number:
+            return
+
+
+def _draw(model: ObjectModel, pose: Rigid) -> Tensor:
+    """Draw the depth of a posed model."""
+    corners_m = pose.apply(drawn_triangles(model).double().reshape(-1, 3)).reshape(-1, 3, 3)
+    return rasterize(corners_m, K, WIDTH, HEIGHT).depth_m
+
+
+def _is_inside(mask: Tensor) -> bool:
+    """Whether no pixel of a mask lies at the edge of the image."""
+    return not bool(mask[0].any() | mask[-1].any() | mask[:, 0].any() | mask[:, -1].any())
