@@ -30,7 +30,7 @@ SENSORS: tuple[SensorKind, ...] = ("structured light", "active stereo", "time of
 NEAREST_M = 0.35  # of these sensors
 IMAGED_PX = (120.0, 300.0)  # length of a part in an image
 FEWEST_PX = 300  # of a mask
-APART_PX, APART_M = 150, 0.008
+APART_PX, APART_M = 200, 0.012
 """A twin is seen to be one where so many pixels differ by so much."""
 SEED = 0x20A7
 X, Y = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
@@ -226,7 +226,7 @@ PARTS: dict[str, Part] = {
     "gear": Part(gear, 10, right_deg=7.5),
     "sprocket": Part(sprocket, 10, right_deg=14.0, is_held=True),
     "rack": Part(rack, 20),
-    "ratchet": Part(ratchet, 10, "z,16", right_deg=10.0, is_held=True),
+    "ratchet": Part(ratchet, 20, "z,16", right_deg=10.0, is_held=True),
     "nut": Part(nut, 12, "z,6"),
     "dice": Part(dice, 12, is_held=True),
     "cup": Part(cup, 14),

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 import trimesh as _trimesh
-from tests.pose.synthetic_objects import bar, bottle, box_faces, bracket, gear, pose_at
+from tests.pose.synthetic_objects import bar, bottle, box_faces, boxes, bracket, gear, pose_at
 
 from depthpose.core.rigid import Rigid, geodesic_rad
 from depthpose.pose.copies import SymmetricCopies, difference_of, find_copies, near_symmetry_lines
@@ -85,6 +85,22 @@ def test_what_is_declared_is_no_copy() -> None:
     upright = find_copies(bottle())
     assert len(upright.near_copies.R) == 1, "after any rotation about its axis it is one pose"
     assert float(upright.near_copies.R[0, 2, 2]) < -0.99, "it may stand on its head"
+
+
+def test_a_mug_has_an_axis_of_near_symmetry() -> None:
+    axis = find_copies(make_part("mug", 1)).near_axis
+    assert axis is not None
+    assert abs(float(axis.direction[2])) == pytest.approx(1.0, abs=0.01)
+    off_m = torch.linalg.cross(axis.point_m, axis.direction)
+    assert float(off_m.norm()) < 0.003
+
+
+def test_a_plate_that_lies_mostly_on_itself_after_a_small_turn_has_no_such_axis() -> None:
+    """Four fifths of it, after 13 degrees: but a quarter turn is another pose."""
+    plate = boxes(
+        "plate", ((0.15, 0.1, 0.003), (0, 0, 0)), ((0.028, 0.028, 0.008), (0.035, 0.018, 0.005))
+    )
+    assert find_copies(plate).near_axis is None
 
 
 def test_what_looks_alike_from_no_two_sides_has_no_copy() -> None:

@@ -7,11 +7,11 @@ from functools import cached_property
 import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid, geodesic_rad
 from depthpose.pose.mesh import (
+    axis_of_turn,
     cached,
     mirror_deviation,
     near_symmetries,
@@ -74,7 +74,7 @@ class SymmetricCopies:
 
     @cached_property
     def near_axis(self) -> Axis | None:
-        """Axis about which near-symmetric copies follow each other closely, if there is one.
+        """Axis about which near-symmetric copies follow each other all round, if there is one.
 
         A rotation about it changes little that a camera sees: the copies say how far.
         """
@@ -84,12 +84,11 @@ class SymmetricCopies:
         angle = geodesic_rad(self.near_copies.R, identity.expand_as(self.near_copies.R))
         if float(angle.min()) > _CLOSE_RAD:
             return None
-        motion = self.near_copies[int(angle.argmin())]
-        twist = motion.R - motion.R.T
-        direction = normalize(torch.stack([twist[2, 1], twist[0, 2], twist[1, 0]]), dim=0)
-        # The points of the axis stay where they are: p = R p + t.
-        fixed = torch.linalg.lstsq(identity - motion.R, motion.t_m[:, None])
-        return Axis(direction=direction.float(), point_m=fixed.solution[:, 0].float())
+        direction, point_m = axis_of_turn(self.near_copies[int(angle.argmin())])
+        is_about = self.near_copies.R @ direction @ direction > _ALONG
+        if int(is_about.sum()) < 2 * math.pi / _CLOSE_RAD - 1:
+            return None
+        return Axis(direction=direction.float(), point_m=point_m.float())
 
     @property
     def _is_ball(self) -> bool:

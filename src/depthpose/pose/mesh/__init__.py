@@ -11,6 +11,7 @@ from depthpose.pose.mesh.files import MESH_READERS as MESH_READERS
 from depthpose.pose.mesh.files import AnyModel as AnyModel
 from depthpose.pose.mesh.files import read_geometry as read_geometry
 from depthpose.pose.mesh.files import unit_of as unit_of
+from depthpose.pose.mesh.models import axis_of_turn as axis_of_turn
 from depthpose.pose.mesh.models import drawn_triangles as drawn_triangles
 from depthpose.pose.mesh.models import exact_diameter as exact_diameter
 from depthpose.pose.mesh.models import farthest_points as farthest_points

@@ -36,6 +36,19 @@ def turn_about(
     return Rigid(R, point_m - (R @ point_m[..., None]).squeeze(-1))
 
 
+def axis_of_turn(turn: Rigid) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+    """Give the direction of the line that a turn by less than a half is about, and a point on it.
+
+    Args:
+        turn: a rotation about a line, as :func:`turn_about` makes it.
+    """
+    twist = turn.R - turn.R.T
+    direction = torch.stack([twist[2, 1], twist[0, 2], twist[1, 0]])
+    # The points of the line stay where they are, p = R p + t: that nearest to the origin.
+    change = torch.eye(3).to(turn.R) - turn.R
+    return direction / direction.norm(), torch.linalg.pinv(change, rtol=1e-3) @ turn.t_m
+
+
 def symmetry_transforms(symmetries: Symmetries, max_step: float = BOP_STEP) -> Rigid:
     """List the transforms ``model_from_model`` that leave the object as it is.
 
