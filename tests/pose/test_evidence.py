@@ -20,7 +20,7 @@ from tests.pose.synthetic_objects import (
 from torch import Tensor
 
 from depthpose.core.render import rasterize
-from depthpose.core.rigid import Rigid
+from depthpose.core.rigid import Rigid, rotation_by
 from depthpose.pose.cloud import cloud_from_depth, grow_mask
 from depthpose.pose.evidence import Observation, _mean_depth, compare, draw_surface, observe
 from depthpose.pose.mesh import turn_about
@@ -261,6 +261,26 @@ def test_without_a_mask_a_surface_that_goes_on_contradicts(
     evidence = evidence_of(view_before_wall(more, pose, 0.001), bar, pose, is_masked=False)
     assert (evidence.beside > 1) == is_continued
     assert evidence.seen_through == evidence.bulging == 0
+
+
+@pytest.mark.parametrize(
+    ("beside_it", "axis", "is_continued"),
+    [(((0.1, 0.1, 0.1), (0, 0, 0.002)), (0.0, 1.0, 0.0), True),
+     (((0.3, 0.004, 0.3), (0, 0.052, 0)), (1.0, 0.0, 0.0), False)],
+    ids=["one side of a box", "standing on a table"],
+)  # fmt: skip
+def test_without_a_mask_a_surface_that_bends_away_at_the_silhouette_goes_on(
+    beside_it: Block, axis: tuple[float, float, float], is_continued: bool
+) -> None:
+    """Round its corner a box goes on; where a plate touches a table the edge is concave."""
+    plate_block = ((0.1, 0.1, 0.004), (0, 0, -0.048))
+    plate = boxes("plate", plate_block)
+    more = boxes("more", plate_block, beside_it)
+    R = rotation_by(0.7 * torch.tensor(axis))
+    pose = Rigid(R, torch.tensor([0.0, 0.0, 0.7]))
+    evidence = evidence_of(view_before_wall(more, pose, 0.001), plate, pose, is_masked=False)
+    assert evidence.supported > 0.9 * evidence.visible
+    assert (evidence.beside > 1) == is_continued
 
 
 @pytest.mark.parametrize("reading_m", [math.nan, 0.45], ids=["no reading", "something before it"])

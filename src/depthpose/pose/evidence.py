@@ -45,7 +45,7 @@ _ACROSS = (-1.0, -0.5, 0.5, 1.0)
 _NEAREST_WITHIN = 1
 """Where readings are compared across a silhouette: as shares of the way from it to a pixel. The
 nearest one within supports the pose; of thin things the next lies beyond."""
-_STRAIGHT = 2.0  #: deviations of the noise of means, by which these are off their line at most
+_TOLERATED = 2.0  # deviations of the noise, up to which two sides meet, and without a bend
 _LEAST_INNER = 0.25  # share of the silhouette that its borders may leave
 _DISK = 1.3  # radius of the disk drawn for a sample, in median distances of samples
 _OBJECT_PX = 8000  # pixels of an object that are compared; of larger ones every n-th
@@ -55,8 +55,6 @@ _JUMP_DIAMETERS = 0.02
 _JUMP_M = 0.01
 """Drawn neighbours that differ in depth by more than both are the two sides of an edge."""
 _FAR_M = np.float32(1e6)
-_LINE = np.stack([np.ones(4), np.array(_ACROSS)], 1)
-_OFF_LINE = np.eye(4) - _LINE @ np.linalg.pinv(_LINE)  # residuals of the line through four values
 _MARGIN = 0.6  # half of the window about an object, in diameters
 
 
@@ -283,7 +281,8 @@ def compare(observation: Observation, pose: Rigid, surface: Surface) -> Evidence
         is_beside &= np.logical_not(ndimage.binary_dilation(is_shown, iterations=border))
         beside_px2 = patch_area_px2
     else:  # no mask says which readings are the object's: those that go on where the model ends
-        is_beside = _is_continued(observation, is_drawn, is_supported, window)
+        is_hidden = deviations < -THRESHOLD
+        is_beside = _is_continued(observation, is_drawn & ~is_hidden, is_supported, window)
         # A patch beside the silhouette is as long as others, and half as wide.
         beside_px2 = patch_area_px2 / 2
     visible = float(inner.sum()) / patch_area_px2
@@ -308,16 +307,18 @@ def _is_continued(
     is_supported: np.ndarray,
     window: tuple[slice, slice],
 ) -> Bool[np.ndarray, "h w"]:
-    """Mark pixels beside the silhouette in which the surface within it goes on.
+    """Mark pixels beside the silhouette, or before it, in which the surface within it goes on.
 
-    At its silhouette an object ends: by a step in depth, or by an edge where it touches something.
-    A box that is posed on the side of a larger one ends where the readings go on straight. Four
-    means of readings on a line across the silhouette, one or two of them within it, are straight in
-    1 / depth where they are of one plane. Readings on a known background are of no object.
+    At its silhouette an object ends: by a step in depth, or by a concave edge where it touches
+    something. A box that is posed on the side of a larger one ends where the readings go on
+    straight, and a bracket that is posed on two sides of a box where they bend away, as round a
+    corner of one body. Four means of readings on a line across the silhouette, two on each side,
+    say so: in 1 / depth those of one plane are straight, and so each side is extended to the
+    silhouette. Readings on a known background are of no object.
 
     Args:
         observation: its readings, (h, w).
-        is_drawn: pixels of the silhouette, in the window of the drawing.
+        is_drawn: pixels of the silhouette that nothing hides, in the window of the drawing.
         is_supported: of these the ones on which readings lie.
         window: rows and columns of the drawing in the observation.
     """
@@ -346,7 +347,7 @@ def _is_continued(
     edge = nearest[:, beside[0], beside[1]]
     outward = beside - edge
 
-    # Means of readings on the line across it at each, and what these are off a straight line.
+    # Means of readings on the line across it at each, and how the two sides meet.
     is_background = observation.is_background[rows, columns]
     depth_m = np.where(is_background, np.nan, observation.depth_m[rows, columns])
     side = _averaged_side(observation.step)
@@ -358,12 +359,18 @@ def _is_continued(
         across.append(inverse[row, column])
         if k == _NEAREST_WITHIN:
             across[-1] = np.where(supports[row, column], across[-1], np.nan)
-    values = np.stack(across)
-    bend = np.abs(_OFF_LINE @ values).max(0)
+    far_within, within, outside, far_outside = across
+    gap = (2 * within - far_within) - (2 * outside - far_outside)
+    bend = (far_outside - outside) - (within - far_within)  # above 0: it comes nearer
     noise_m = math.hypot(AVERAGED_PER_WHITE * observation.noise.white_m, FLAT_M)
-    is_straight = bend <= _STRAIGHT * noise_m * values[0] ** 2
+    noise = noise_m * far_within**2
+    # A sensor moves edges: two sides that bend at one may meet some pixels beside the silhouette.
+    bend_per_px = bend / (0.5 * distance[tuple(beside)])
+    moved_gap = EDGE_PX / observation.step * np.abs(bend_per_px)
+    is_joined = np.abs(gap) <= _TOLERATED * math.sqrt(10) * noise + moved_gap
+    is_concave = bend > _TOLERATED * 2 * noise
     is_continued = np.zeros((height, width), bool)
-    is_continued[rows, columns][tuple(beside)] = is_straight
+    is_continued[rows, columns][tuple(beside)] = is_joined & ~is_concave
     return ndimage.binary_closing(is_continued)
 
 
