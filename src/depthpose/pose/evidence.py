@@ -6,7 +6,8 @@ the object (:mod:`depthpose.pose.sensor`). A connected patch of residuals beyond
 contradicts the pose, however small its share of the whole: behind the drawn surface the camera saw
 through it (a free-space violation), before it the object bulges where the model does not, and the
 object's own readings beside the drawn silhouette are not explained at all. Where no mask says which
-readings are the object's, a surface that goes on straight across the silhouette does not end there.
+readings are the object's, a surface that goes on across the silhouette, straight or bent away as
+round a corner of one body, does not end there.
 """
 
 import math
@@ -313,8 +314,8 @@ def _is_continued(
     something. A box that is posed on the side of a larger one ends where the readings go on
     straight, and a bracket that is posed on two sides of a box where they bend away, as round a
     corner of one body. Four means of readings on a line across the silhouette, two on each side,
-    say so: in 1 / depth those of one plane are straight, and so each side is extended to the
-    silhouette. Readings on a known background are of no object.
+    say so; in 1 / depth those of one plane lie on a line. Readings on a known background are of no
+    object.
 
     Args:
         observation: its readings, (h, w).
@@ -347,7 +348,7 @@ def _is_continued(
     edge = nearest[:, beside[0], beside[1]]
     outward = beside - edge
 
-    # Means of readings on the line across it at each, and how the two sides meet.
+    # Means of readings on the line across it at each.
     is_background = observation.is_background[rows, columns]
     depth_m = np.where(is_background, np.nan, observation.depth_m[rows, columns])
     side = _averaged_side(observation.step)
@@ -359,19 +360,41 @@ def _is_continued(
         across.append(inverse[row, column])
         if k == _NEAREST_WITHIN:
             across[-1] = np.where(supports[row, column], across[-1], np.nan)
-    far_within, within, outside, far_outside = across
+
+    # Do the two sides meet there, and is the edge not concave?
+    apart_px = 0.5 * distance[tuple(beside)]
+    moved_px = EDGE_PX / observation.step
+    noise_m = math.hypot(AVERAGED_PER_WHITE * observation.noise.white_m, FLAT_M)
+    is_continued = np.zeros((height, width), bool)
+    is_continued[rows, columns][tuple(beside)] = _goes_on(
+        np.stack(across), apart_px, moved_px, noise_m
+    )
+    return ndimage.binary_closing(is_continued)
+
+
+def _goes_on(
+    inverse: Float[np.ndarray, "4 n"],
+    apart_px: Float[np.ndarray, " n"],
+    moved_px: float,
+    noise_m: float,
+) -> Bool[np.ndarray, " n"]:
+    """Whether a surface goes on across a silhouette: straight, or bent away.
+
+    Args:
+        inverse: 1 / depth at the places of ``_ACROSS``, from within to outside.
+        apart_px: distance of the first two, and of the last two.
+        moved_px: by so much a sensor moves edges.
+        noise_m: standard deviation of the depths.
+    """
+    far_within, within, outside, far_outside = inverse
+    noise = noise_m * far_within**2
+    # Each side is extended to the silhouette: where they bend, they may meet some pixels beside it.
     gap = (2 * within - far_within) - (2 * outside - far_outside)
     bend = (far_outside - outside) - (within - far_within)  # above 0: it comes nearer
-    noise_m = math.hypot(AVERAGED_PER_WHITE * observation.noise.white_m, FLAT_M)
-    noise = noise_m * far_within**2
-    # A sensor moves edges: two sides that bend at one may meet some pixels beside the silhouette.
-    bend_per_px = bend / (0.5 * distance[tuple(beside)])
-    moved_gap = EDGE_PX / observation.step * np.abs(bend_per_px)
+    moved_gap = moved_px * np.abs(bend) / apart_px
     is_joined = np.abs(gap) <= _TOLERATED * math.sqrt(10) * noise + moved_gap
     is_concave = bend > _TOLERATED * 2 * noise
-    is_continued = np.zeros((height, width), bool)
-    is_continued[rows, columns][tuple(beside)] = is_joined & ~is_concave
-    return ndimage.binary_closing(is_continued)
+    return is_joined & ~is_concave
 
 
 def _averaged_side(step: int) -> int:
