@@ -26,7 +26,7 @@ from torch import Tensor
 from depthpose.core.files import read_depth_png, read_image
 from depthpose.pose.cloud import grow_mask
 from depthpose.pose.config import SensorKind, SyntheticSensorConfig
-from depthpose.pose.evidence import _ACROSS, _OFF_LINE, _STRAIGHT, _mean_depth
+from depthpose.pose.evidence import _ACROSS, _TOLERATED, _mean_depth
 from depthpose.pose.frame import prepare_frame
 from depthpose.pose.sensor import AVERAGED_PER_WHITE, FLAT_M
 from depthpose.pose.synthetic.views import simulate_depth
@@ -36,6 +36,9 @@ _BASELINE_M = 0.075
 _LAGS = (1, 2, 4, 8)
 _FARTHEST_M = 1.6
 _SIZE = (480, 640)
+_LINE = np.stack([np.ones(4), np.array(_ACROSS)], 1)
+OFF_LINE = np.eye(4) - _LINE @ np.linalg.pinv(_LINE)
+"""Residuals of the line through four values."""
 
 
 @dataclass(frozen=True)
@@ -161,9 +164,9 @@ def bend_of_planes(frame: Frame) -> tuple[float, float]:
     places = [middles + np.rint(times * toward).astype(int) for times in _ACROSS]
     across = np.stack([inverse[row, column] for row, column in places])
     depth_m = 1 / inverse[middles[0], middles[1]]
-    bend_m = np.abs(_OFF_LINE @ across).max(0) * depth_m**2
+    bend_m = np.abs(OFF_LINE @ across).max(0) * depth_m**2
     white_m = prepared.noise_per_m2 * float(np.nanmedian(depth_m)) ** 2
-    straight_m = _STRAIGHT * math.hypot(AVERAGED_PER_WHITE * white_m, FLAT_M)
+    straight_m = _TOLERATED * math.hypot(AVERAGED_PER_WHITE * white_m, FLAT_M)
     return float(np.nanquantile(bend_m, 0.8)), straight_m
 
 
