@@ -545,10 +545,10 @@ def test_a_cad_file_that_no_weights_know_is_registered(
 def test_another_part_than_the_cad_file_is_refused(
     samples: Path, truth: Rigid, page: TestClient
 ) -> None:
-    (samples / "wide.obj").write_text(
-        "v 0 0 0\nv 0.3 0 0\nv 0 0.1 0\nv 0 0 0.1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    (samples / "rod.obj").write_text(
+        "v 0 0 0\nv 0.5 0 0\nv 0 0.02 0\nv 0 0 0.02\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
     )
-    files = VIEW | {"cad": "wide.obj"}
+    files = VIEW | {"cad": "rod.obj"}
     found = ask(page, "pose", samples, files, object="cad", cad_unit="m").json()
     assert not found["ok"]
     assert found["said"].startswith("Refused")
