@@ -7,9 +7,10 @@ and its mean over 41x41 pixels, as disparity in pixels of a stereo camera of 7.5
 it is some pixels apart. Edges are measured within 3 px of the border of what stands before the
 plane, where depth jumps by 3 cm or more: the share of readings that lie between both surfaces, and
 of pixels without a reading. The bend is what four means of 5x5 readings, 8 to 13 px to each side of
-a pixel of a wide plane, are off a straight line (80 % are off by less), beside what evidence takes
-for straight. Real frames are LineMOD's (Kinect) and PoseCNN's of YCB objects (RealSense); synthetic
-ones show a disc of 12 cm before a slanted plane at the same distance.
+a pixel of a wide plane, are off a straight line (80 % are off by less), beside two deviations of
+the noise that evidence assumes of such means. Real frames are LineMOD's (Kinect) and PoseCNN's of
+YCB objects (RealSense); synthetic ones show a disc of 12 cm before a slanted plane at the same
+distance.
 """
 
 import json
@@ -26,7 +27,7 @@ from torch import Tensor
 from depthpose.core.files import read_depth_png, read_image
 from depthpose.pose.cloud import grow_mask
 from depthpose.pose.config import SensorKind, SyntheticSensorConfig
-from depthpose.pose.evidence import _ACROSS, _TOLERATED, _mean_depth
+from depthpose.pose.evidence import _ACROSS, _MEETING, _mean_depth
 from depthpose.pose.frame import prepare_frame
 from depthpose.pose.sensor import AVERAGED_PER_WHITE, FLAT_M
 from depthpose.pose.synthetic.views import simulate_depth
@@ -37,7 +38,7 @@ _LAGS = (1, 2, 4, 8)
 _FARTHEST_M = 1.6
 _SIZE = (480, 640)
 _LINE = np.stack([np.ones(4), np.array(_ACROSS)], 1)
-OFF_LINE = np.eye(4) - _LINE @ np.linalg.pinv(_LINE)
+_OFF_LINE = np.eye(4) - _LINE @ np.linalg.pinv(_LINE)
 """Residuals of the line through four values."""
 
 
@@ -146,7 +147,7 @@ def edges(frame: Frame) -> tuple[float, float]:
 
 
 def bend_of_planes(frame: Frame) -> tuple[float, float]:
-    """Give the bend [m] that 80 % of the means on wide planes stay below, and what is straight."""
+    """Give the bend [m] that 80 % of the means on wide planes stay below, and two deviations."""
     focal_px = frame.focal_px
     height, width = frame.depth_m.shape
     K = torch.tensor([[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1]])
@@ -164,10 +165,10 @@ def bend_of_planes(frame: Frame) -> tuple[float, float]:
     places = [middles + np.rint(times * toward).astype(int) for times in _ACROSS]
     across = np.stack([inverse[row, column] for row, column in places])
     depth_m = 1 / inverse[middles[0], middles[1]]
-    bend_m = np.abs(OFF_LINE @ across).max(0) * depth_m**2
+    bend_m = np.abs(_OFF_LINE @ across).max(0) * depth_m**2
     white_m = prepared.noise_per_m2 * float(np.nanmedian(depth_m)) ** 2
-    straight_m = _TOLERATED * math.hypot(AVERAGED_PER_WHITE * white_m, FLAT_M)
-    return float(np.nanquantile(bend_m, 0.8)), straight_m
+    limit_m = _MEETING * math.hypot(AVERAGED_PER_WHITE * white_m, FLAT_M)
+    return float(np.nanquantile(bend_m, 0.8)), limit_m
 
 
 def _mean(values: Tensor, size: int) -> Tensor:
@@ -182,7 +183,7 @@ def row_of(frame: Frame) -> dict[str, str]:
     """Measure a frame for the table."""
     deviation_px, alike = noise_of_plane(frame)
     between, lost = edges(frame)
-    bend_m, straight_m = bend_of_planes(frame)
+    bend_m, limit_m = bend_of_planes(frame)
     return {
         "frame": frame.name,
         "noise [px]": f"{deviation_px:.3f}",
@@ -190,7 +191,7 @@ def row_of(frame: Frame) -> dict[str, str]:
         "between": f"{between:.1%}",
         "lost": f"{lost:.0%}",
         "bend [mm]": f"{1000 * bend_m:.2f}",
-        "straight [mm]": f"{1000 * straight_m:.2f}",
+        "two deviations [mm]": f"{1000 * limit_m:.2f}",
     }
 
 

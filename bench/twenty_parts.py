@@ -33,7 +33,7 @@ FEWEST_PX = 300  # of a mask
 APART_PX, APART_M = 200, 0.012
 """A twin is seen to be one where so many pixels differ by so much."""
 SEED = 0x20A7
-X, Y = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
+Y = (0.0, 1.0, 0.0)
 
 
 class Part(NamedTuple):
@@ -64,14 +64,11 @@ def teeth(number: int, radius: float, depth: float, *, is_leaning: bool = False)
     return (radius + depth / 2 * height)[:, None] * unit
 
 
-def notched(radius: float, depth: float, width: float, at: float = 0.0) -> np.ndarray:
-    """Outline of a circle from which a notch is cut (or, of negative depth, on which one stands).
-
-    ``width`` and ``at``: as angles [rad].
-    """
-    angle = np.arange(len(circle(1.0))) * (2 * math.pi / len(circle(1.0)))
-    apart = np.abs((angle - at + math.pi) % (2 * math.pi) - math.pi)
-    return (radius - depth * (apart < width / 2))[:, None] * circle(1.0)
+def notched(radius: float, depth: float, width_rad: float) -> np.ndarray:
+    """Outline of a circle with a notch along x; of negative depth it points outward."""
+    unit = circle(1.0)
+    is_notch = unit[:, 0] > math.cos(width_rad / 2)
+    return (radius - depth * is_notch)[:, None] * unit
 
 
 def bar(length: float, radius: float) -> Mesh:
@@ -181,9 +178,10 @@ def ratchet(shift: float) -> Mesh:
 
 def nut(shift: float) -> Mesh:
     """A nut of 60 mm with a collar on one side."""
-    angle = np.arange(len(circle(1.0))) * (2 * math.pi / len(circle(1.0)))
+    unit = circle(1.0)
+    angle = np.arange(len(unit)) * (2 * math.pi / len(unit))
     to_side = (angle + math.pi / 6) % (math.pi / 3) - math.pi / 6
-    hexagon = (30 / np.cos(to_side))[:, None] * circle(1.0)
+    hexagon = (30 / np.cos(to_side))[:, None] * unit
     collar = moved(ring(circle(38 - shift), circle(16), 4), (0, 0, -12))
     return joined(ring(hexagon, circle(16), 24), collar)
 
@@ -248,7 +246,11 @@ def views(
 ) -> Iterator[PartView]:
     """Render views of a part before a wall, from any side, measured by one sensor after another.
 
-    ``unlike``: only views in which this model in its place would look different.
+    Args:
+        model: of the part.
+        number: of views; fewer come out where few of many random ones are taken.
+        seed: of the random poses.
+        unlike: only views in which this model in its place would look different.
     """
     triangles_m = drawn_triangles(model).double()
     middle_m = triangles_m.reshape(-1, 3).mean(0)
@@ -265,14 +267,12 @@ def views(
         mask = clean_m.isfinite()
         if int(mask.sum()) < FEWEST_PX or not _is_inside(mask):
             continue
-        if unlike is not None:
-            apart_m = (
-                clean_m.nan_to_num(posinf=9.0) - _draw(unlike, truth).nan_to_num(posinf=9.0)
-            ).abs()
-            if int((apart_m > APART_M).sum()) < APART_PX:
-                continue
         wall_m = distance_m + 0.6 * model.diameter_m + 0.2
         scene_m = torch.where(mask, clean_m, wall_m)
+        if unlike is not None:
+            other_m = _draw(unlike, truth).clamp(max=wall_m)
+            if int(((scene_m - other_m).abs() > APART_M).sum()) < APART_PX:
+                continue
         sensor = SyntheticSensorConfig(kinds=(SENSORS[made % len(SENSORS)],))
         depth_m = simulate_depth(scene_m.float(), (FOCAL_PX, FOCAL_PX), sensor, generator)
         yield PartView(depth_m, mask, truth)
@@ -282,7 +282,7 @@ def views(
 
 
 def _draw(model: ObjectModel, pose: Rigid) -> Tensor:
-    """Draw the depth of a posed model."""
+    """Draw the depth of a posed model; infinite beside it."""
     corners_m = pose.apply(drawn_triangles(model).double().reshape(-1, 3)).reshape(-1, 3, 3)
     return rasterize(corners_m, K, WIDTH, HEIGHT).depth_m
 

@@ -85,6 +85,7 @@ class SymmetricCopies:
         if float(angle.min()) > _CLOSE_RAD:
             return None
         direction, point_m = axis_of_turn(self.near_copies[int(angle.argmin())])
+        # All round, with no wider gaps, there are at least so many.
         is_about = self.near_copies.R @ direction @ direction > _ALONG
         if int(is_about.sum()) < 2 * math.pi / _CLOSE_RAD - 1:
             return None

@@ -46,7 +46,9 @@ _ACROSS = (-1.0, -0.5, 0.5, 1.0)
 _NEAREST_WITHIN = 1
 """Where readings are compared across a silhouette: as shares of the way from it to a pixel. The
 nearest one within supports the pose; of thin things the next lies beyond."""
-_TOLERATED = 2.0  # deviations of the noise, up to which two sides meet, and without a bend
+_MEETING = 2.0
+"""Deviations of the noise: sides of a silhouette that are farther apart do not meet there, and an
+edge that bends more toward the camera is concave."""
 _LEAST_INNER = 0.25  # share of the silhouette that its borders may leave
 _DISK = 1.3  # radius of the disk drawn for a sample, in median distances of samples
 _OBJECT_PX = 8000  # pixels of an object that are compared; of larger ones every n-th
@@ -282,8 +284,7 @@ def compare(observation: Observation, pose: Rigid, surface: Surface) -> Evidence
         is_beside &= np.logical_not(ndimage.binary_dilation(is_shown, iterations=border))
         beside_px2 = patch_area_px2
     else:  # no mask says which readings are the object's: those that go on where the model ends
-        is_hidden = deviations < -THRESHOLD
-        is_beside = _is_continued(observation, is_drawn & ~is_hidden, is_supported, window)
+        is_beside = _is_continued(observation, is_drawn, is_supported, window)
         # A patch beside the silhouette is as long as others, and half as wide.
         beside_px2 = patch_area_px2 / 2
     visible = float(inner.sum()) / patch_area_px2
@@ -308,7 +309,7 @@ def _is_continued(
     is_supported: np.ndarray,
     window: tuple[slice, slice],
 ) -> Bool[np.ndarray, "h w"]:
-    """Mark pixels beside the silhouette, or before it, in which the surface within it goes on.
+    """Mark pixels beside the silhouette in which the surface within it goes on.
 
     At its silhouette an object ends: by a step in depth, or by a concave edge where it touches
     something. A box that is posed on the side of a larger one ends where the readings go on
@@ -319,7 +320,7 @@ def _is_continued(
 
     Args:
         observation: its readings, (h, w).
-        is_drawn: pixels of the silhouette that nothing hides, in the window of the drawing.
+        is_drawn: pixels of the silhouette, in the window of the drawing.
         is_supported: of these the ones on which readings lie.
         window: rows and columns of the drawing in the observation.
     """
@@ -381,19 +382,26 @@ def _goes_on(
     """Whether a surface goes on across a silhouette: straight, or bent away.
 
     Args:
-        inverse: 1 / depth at the places of ``_ACROSS``, from within to outside.
-        apart_px: distance of the first two, and of the last two.
+        inverse: 1 / depth [1/m] at the places of ``_ACROSS``, from within to outside; NaN where
+            there is none.
+        apart_px: distance of the two within, and of the two outside.
         moved_px: by so much a sensor moves edges.
         noise_m: standard deviation of the depths.
     """
     far_within, within, outside, far_outside = inverse
     noise = noise_m * far_within**2
-    # Each side is extended to the silhouette: where they bend, they may meet some pixels beside it.
-    gap = (2 * within - far_within) - (2 * outside - far_outside)
-    bend = (far_outside - outside) - (within - far_within)  # above 0: it comes nearer
+
+    # Extended to the silhouette, do the two sides meet? The gap has the variance of ten means.
+    within_edge = 2 * within - far_within
+    outside_edge = 2 * outside - far_outside
+    gap = np.abs(within_edge - outside_edge)
+    bend = (far_outside - outside) - (within - far_within)
+    # Where they bend, a moved edge leaves a gap at the silhouette.
     moved_gap = moved_px * np.abs(bend) / apart_px
-    is_joined = np.abs(gap) <= _TOLERATED * math.sqrt(10) * noise + moved_gap
-    is_concave = bend > _TOLERATED * 2 * noise
+    is_joined = gap <= _MEETING * math.sqrt(10) * noise + moved_gap
+
+    # Concave, the surface comes nearer outside. The bend has the variance of four means.
+    is_concave = bend > _MEETING * 2 * noise
     return is_joined & ~is_concave
 
 

@@ -277,17 +277,19 @@ def _refine_competitors(
         return [_Candidate(candidate, candidate) for candidate in unrefined]
     if len(starts.R) == 0:
         return []
-    # Roughly, to drop those that leave too much of the cloud unexplained. Rough steps let a pose
-    # drift along what little constrains it: it stays at its start where that explains as much.
+    # Roughly. Such steps let a pose drift along what little constrains it, so it stays at its start
+    # where that explains as much.
     rough = refine_roughly(cloud_m, starts, surface, icp)
-    before = _unexplained(cloud_m, starts, surface)
-    after = _unexplained(cloud_m, rough, surface)
-    is_nearer = after < before
-    nearer = Rigid(
-        R=torch.where(is_nearer[:, None, None], rough.R, starts.R),
-        t_m=torch.where(is_nearer[:, None], rough.t_m, starts.t_m),
+    unexplained_before = _unexplained(cloud_m, starts, surface)
+    unexplained_after = _unexplained(cloud_m, rough, surface)
+    is_better = unexplained_after < unexplained_before
+    improved = Rigid(
+        R=torch.where(is_better[:, None, None], rough.R, starts.R),
+        t_m=torch.where(is_better[:, None], rough.t_m, starts.t_m),
     )
-    unexplained = torch.minimum(before, after)
+
+    # Those that leave too much of the cloud unexplained are dropped.
+    unexplained = torch.minimum(unexplained_before, unexplained_after)
     leading_unexplained = _unexplained(cloud_m, leading.camera_from_model.double()[None], surface)
     order = unexplained.argsort(stable=True)[:most]
     order = order[unexplained[order] <= leading_unexplained + _UNEXPLAINED_MORE]
@@ -300,7 +302,7 @@ def _refine_competitors(
         cloud_points=min(_POINTS, icp.cloud_points),
         start_distance_diameters=icp.end_distance_diameters,
     )
-    batch = refine_pose(cloud_m, nearer[order], surface, short)
+    batch = refine_pose(cloud_m, improved[order], surface, short)
     candidates: list[_Candidate] = []
     for k, number in enumerate(order.tolist()):
         refined = RefinedPose(

@@ -92,8 +92,8 @@ def measure_noise(depth_m: np.ndarray, is_object: np.ndarray, object_m: float) -
     """Measure the noise of a depth image on an object, and derive what neighbours share.
 
     The noise is the median second difference of readings three pixels apart, to which a slope adds
-    nothing and a curved surface little. Of an object too thin for it, that of all readings is
-    taken.
+    nothing and a curved surface little. Of an object too thin for it that of all readings is
+    taken; where these are too few, that of a Kinect.
 
     Args:
         depth_m: (h, w), NaN where there is no reading.

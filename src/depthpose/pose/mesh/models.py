@@ -37,16 +37,21 @@ def turn_about(
 
 
 def axis_of_turn(turn: Rigid) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """Give the direction of the line that a turn by less than a half is about, and a point on it.
+    """Give the line about which a motion turns, the inverse of :func:`turn_about`.
 
     Args:
-        turn: a rotation about a line, as :func:`turn_about` makes it.
+        turn: about a line, by less than half a turn and by more than none.
+
+    Returns:
+        The unit vector of the line (3,), by the right-hand rule, and its point nearest to the
+        origin (3,) [m].
     """
     twist = turn.R - turn.R.T
     direction = torch.stack([twist[2, 1], twist[0, 2], twist[1, 0]])
-    # The points of the line stay where they are, p = R p + t: that nearest to the origin.
+    # The points of the line stay where they are: p = R p + t.
     change = torch.eye(3).to(turn.R) - turn.R
-    return direction / direction.norm(), torch.linalg.pinv(change, rtol=1e-3) @ turn.t_m
+    point_m = torch.linalg.pinv(change, rtol=1e-3) @ turn.t_m
+    return direction / direction.norm(), point_m
 
 
 def symmetry_transforms(symmetries: Symmetries, max_step: float = BOP_STEP) -> Rigid:
