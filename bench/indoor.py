@@ -33,7 +33,7 @@ from depthpose.depth.disparity import depth_from_disparity
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.stereo import SGBMMatcher
 from depthpose.depth.stereo.matcher import NetworkMatcher
-from depthpose.depth.stereo.reach import choose_window, measure_reach
+from depthpose.depth.stereo.search_range import choose_search_range, measure_disparity_range
 from depthpose.depth.synthetic import draw_near
 from depthpose.depth.types import DepthEstimate, StereoInput, StereoSample, StereoTruth
 from depthpose.report.page import markdown_table
@@ -207,8 +207,9 @@ def last_searched_px(net: FakestereoNet, pair: StereoInput) -> float:
     """Give the largest disparity that is searched in a pair [px]."""
     assert isinstance(net.matcher, NetworkMatcher)
     assert pair.right is not None
-    reach = measure_reach(net.matcher, pair.left, pair.right, 0.0)
-    return choose_window(net.matcher, reach, pair.left.shape[1:], pair.camera).last_px
+    measured = measure_disparity_range(net.matcher, pair.left, pair.right, 0.0)
+    search = choose_search_range(net.matcher, measured, pair.left.shape[1:], pair.camera)
+    return search.last_in_images_px
 
 
 def match_wide(samples: Iterable[StereoSample], net: FakestereoNet) -> list[Result]:

@@ -166,8 +166,8 @@ def bend_of_planes(frame: Frame) -> tuple[float, float]:
     across = np.stack([inverse[row, column] for row, column in places])
     depth_m = 1 / inverse[middles[0], middles[1]]
     bend_m = np.abs(_OFF_LINE @ across).max(0) * depth_m**2
-    white_m = prepared.noise_per_m2 * float(np.nanmedian(depth_m)) ** 2
-    limit_m = _MEETING * math.hypot(AVERAGED_PER_WHITE * white_m, FLAT_M)
+    white_std_m = prepared.noise_per_m2 * float(np.nanmedian(depth_m)) ** 2
+    limit_m = _MEETING * math.hypot(AVERAGED_PER_WHITE * white_std_m, FLAT_M)
     return float(np.nanquantile(bend_m, 0.8)), limit_m
 
 

@@ -12,7 +12,7 @@ from tests.pose.synthetic_objects import K, Oracle, bottle, bracket, tiny_weight
 from tests.pose.test_track import moving
 
 from depthpose.cli import main, pose_methods
-from depthpose.cli.pose_predict import cloud_jobs
+from depthpose.cli.pose_jobs import cloud_jobs
 from depthpose.core.camera import Camera, back_project, write_camera
 from depthpose.core.files import read_cloud, write_depth_png
 from depthpose.pose import track as tracking_module

@@ -21,7 +21,7 @@ from depthpose.pose.hypotheses import (
 from depthpose.pose.probability import (
     PRIOR_MASKED,
     PRIOR_PROPOSED,
-    Rate,
+    GammaShare,
     log_odds_right,
     probability_right,
 )
@@ -43,13 +43,15 @@ def hypothesis(evidence: Evidence, votes_rad: float | None = None, color: float 
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("rate", [Rate(mean=0.1, shape=1.0), Rate(mean=0.5, shape=3.0)])
+@pytest.mark.parametrize(
+    "share", [GammaShare(mean=0.1, shape=1.0), GammaShare(mean=0.5, shape=3.0)]
+)
 @pytest.mark.parametrize("area", [1.0, 30.0])
-def test_a_rate_is_a_distribution_of_counts(rate: Rate, area: float) -> None:
-    probabilities = [math.exp(rate.log_likelihood(count, area)) for count in range(2000)]
+def test_counts_have_a_distribution(share: GammaShare, area: float) -> None:
+    probabilities = [math.exp(share.log_likelihood(count, area)) for count in range(2000)]
     assert sum(probabilities) == pytest.approx(1)
     mean = sum(count * p for count, p in enumerate(probabilities))
-    assert mean == pytest.approx(rate.mean * area, rel=1e-6)
+    assert mean == pytest.approx(share.mean * area, rel=1e-6)
 
 
 def test_each_kind_of_contradiction_lowers_the_probability() -> None:

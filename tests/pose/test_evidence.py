@@ -127,7 +127,7 @@ def test_the_right_pose_is_not_contradicted(model: ObjectModel, noise_m: float, 
     evidence = evidence_of(view_before_wall(model, truth, noise_m), model, truth)
     assert evidence.agreement > 0.99
     assert evidence.rms < 1
-    assert evidence.observed > 0.9
+    assert evidence.supported_share > 0.9
     if noise_m > 0:
         assert evidence.contradicted == 0
         assert evidence.noise_m == pytest.approx(noise_m, rel=0.3)

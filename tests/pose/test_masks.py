@@ -8,7 +8,7 @@ import pytest
 import torch
 from PIL import Image
 
-from depthpose.cli.pose_predict import mask_jobs
+from depthpose.cli.pose_jobs import mask_jobs
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_depth_png
 from depthpose.pose.datasets import (

@@ -1,5 +1,7 @@
 """The noise of a depth image, as evidence is counted in it."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -25,10 +27,10 @@ def tilted_plane(noise_m: float) -> np.ndarray:
 @pytest.mark.parametrize("noise_m", [0.0, 0.0005, 0.003])
 def test_noise_of_a_leaning_plane_is_that_of_its_readings(noise_m: float) -> None:
     everywhere = np.ones((120, 160), dtype=bool)
-    noise = measure_noise(tilted_plane(noise_m), everywhere, object_m=0.001)
-    assert noise.white_m == pytest.approx(noise_m, rel=0.05, abs=1e-9)
-    assert noise.shared_m == SHARED_PER_WHITE * noise.white_m
-    assert noise.object_m == 0.001
+    noise = measure_noise(tilted_plane(noise_m), everywhere, object_std_m=0.001, focal_px=570.0)
+    assert noise.white_std_m == pytest.approx(noise_m, rel=0.05, abs=1e-9)
+    assert noise.shared_std_m == SHARED_PER_WHITE * noise.white_std_m
+    assert noise.object_std_m == 0.001
 
 
 def test_only_readings_of_the_object_are_measured() -> None:
@@ -37,37 +39,44 @@ def test_only_readings_of_the_object_are_measured() -> None:
     is_object[30:90, 40:120] = True
     depth_m = np.where(is_object, tilted_plane(0.001), tilted_plane(0.05))
     depth_m[40:50, 60:70] = np.nan
-    noise = measure_noise(depth_m, is_object, object_m=0.0)
-    assert noise.white_m == pytest.approx(0.001, rel=0.1)
+    noise = measure_noise(depth_m, is_object, object_std_m=0.0, focal_px=570.0)
+    assert noise.white_std_m == pytest.approx(0.001, rel=0.1)
 
 
 def test_an_object_too_thin_to_be_measured_has_the_noise_of_what_is_about_it() -> None:
     is_object = np.zeros((120, 160), dtype=bool)
     is_object[50:54, 50:54] = True
-    noise = measure_noise(tilted_plane(0.003), is_object, object_m=0.001)
-    assert noise.white_m == pytest.approx(0.003, rel=0.05)
+    noise = measure_noise(tilted_plane(0.003), is_object, object_std_m=0.001, focal_px=570.0)
+    assert noise.white_std_m == pytest.approx(0.003, rel=0.05)
 
 
 def test_where_nothing_can_be_measured_the_noise_is_that_of_a_kinect() -> None:
     depth_m = np.full((120, 160), np.nan)
     depth_m[50:54, 50:54] = 0.8
-    noise = measure_noise(depth_m, np.isfinite(depth_m), object_m=0.001)
-    assert noise.white_m == pytest.approx(NOISE_PER_M2 * 0.8**2)
+    noise = measure_noise(depth_m, np.isfinite(depth_m), object_std_m=0.001, focal_px=570.0)
+    assert noise.white_std_m == pytest.approx(NOISE_PER_M2 * 0.8**2)
 
 
 def test_averaging_lowers_independent_noise_alone() -> None:
-    noise = DepthNoise(white_m=0.003, shared_m=0.0, object_m=0.0)
+    noise = DepthNoise(white_std_m=0.003, shared_std_m=0.0, lateral_std_m=0.0, object_std_m=0.0)
     assert noise.deviation_m(np.ones(1), 9) == pytest.approx(0.001)
-    shared = DepthNoise(white_m=0.0, shared_m=0.003, object_m=0.004)
+    shared = DepthNoise(white_std_m=0.0, shared_std_m=0.003, lateral_std_m=0.0, object_std_m=0.004)
     assert shared.deviation_m(np.ones(1), 900) == pytest.approx(0.005)
 
 
 def test_a_slanted_surface_deviates_more_along_the_ray() -> None:
-    noise = DepthNoise(white_m=0.0, shared_m=0.0, object_m=0.001)
+    noise = DepthNoise(white_std_m=0.0, shared_std_m=0.0, lateral_std_m=0.0, object_std_m=0.001)
     front, slanted, grazing = noise.deviation_m(np.array([1.0, 0.5, 0.01]), 9)
     assert front == pytest.approx(0.001)
     assert slanted == pytest.approx(0.002)
     assert grazing < 0.004, "what is seen along the surface is hardly measured"
+
+
+def test_a_slant_turns_a_shift_across_the_axis_into_depth() -> None:
+    noise = DepthNoise(white_std_m=0.003, shared_std_m=0.0, lateral_std_m=0.001, object_std_m=0.0)
+    front, diagonal = noise.deviation_m(np.array([1.0, math.sqrt(0.5)]), 9)
+    assert front == pytest.approx(0.001), "noise is along the axis, whatever the slant"
+    assert diagonal == pytest.approx(math.hypot(0.001, 0.001))
 
 
 def test_noise_of_a_whole_image_is_that_for_the_square_of_its_depth() -> None:

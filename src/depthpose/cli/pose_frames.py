@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from depthpose.cli import pose_methods, pose_predict
+from depthpose.cli import pose_jobs, pose_methods, pose_output
 from depthpose.cli.pose_methods import PoseMethod
 from depthpose.cli.pose_options import DataSetOptions, PoseInputs, SequenceOptions
 from depthpose.core.errors import InputError
@@ -129,12 +129,9 @@ def search_files(method: PoseMethod, inputs: PoseInputs, out: Path) -> int:
     NAME_0, NAME_1, ..., or NAME where one was looked for and not found. A rerun goes on where it
     was, and reads again what could not be read.
     """
-    lens = inputs.camera or inputs.focal_px
-    assert inputs.depth is not None
-    assert lens is not None
     objects = tuple(model.name for model in method.models)
     if inputs.object is not None:
-        objects = (pose_predict.object_named(inputs.object, method),)
+        objects = (pose_jobs.object_named(inputs.object, method),)
     if method.find is None:
         raise InputError(
             "--depth without --mask: these weights need masked views; give --mask, --box or "
@@ -142,8 +139,8 @@ def search_files(method: PoseMethod, inputs: PoseInputs, out: Path) -> int:
         )
     if find_rank().world > 1:
         raise InputError("--depth without --mask is done by one process; give --mask, or start one")
-    unit = inputs.unit
-    jobs = pose_predict.frame_jobs(Path(inputs.depth), lens, objects[0], unit, out)
+    plan = pose_jobs.plan_searches(method, inputs, objects, out)
+    jobs = plan.jobs
     names = {job.name for job in jobs}
     for name in sorted(names):
         if (plain := re.sub(r"_\d+$", "", name)) != name and plain in names:
@@ -151,22 +148,18 @@ def search_files(method: PoseMethod, inputs: PoseInputs, out: Path) -> int:
                 f"two depth images are called {plain!r} and {name!r}, and so would be what is "
                 "found in the first; rename one"
             )
-    facts = pose_predict.camera_facts(lens) | ({} if unit is None else {"unit": unit})
-    settings = {**method.settings, "find": sorted(objects), **facts}
-    models = [model for model in method.models if model.name in objects]
-    jobs = pose_predict.background_jobs(jobs, inputs, settings)
-    jobs = pose_predict.colored_jobs(jobs, inputs, models, out, settings)
-    pose_predict.claim_for_jobs(out, settings, jobs, pose_predict.is_result_of)
+    settings = {**method.settings, **plan.settings}
+    pose_output.claim_for_jobs(out, settings, jobs, pose_output.is_result_of)
     earlier = [p for p in earlier_predictions(out).values() if p.estimate.status != "unreadable"]
 
     def is_of_image(prediction: Prediction, image: str) -> bool:
-        return pose_predict.is_result_of(prediction.estimate.name, image)
+        return pose_output.is_result_of(prediction.estimate.name, image)
 
     results = SearchResults(out, [job.name for job in jobs], earlier, is_of_image)
     predictions, searched = _search(method, objects, jobs, results)
-    pose_predict.claim_for_jobs(out, settings, searched, pose_predict.is_result_of)
-    pose_predict.write_files(predictions, searched, out, method, input_count=len(jobs))
-    return pose_predict.print_result(predictions, out, len(jobs))
+    pose_output.claim_for_jobs(out, settings, searched, pose_output.is_result_of)
+    pose_output.write_files(predictions, searched, out, method, input_count=len(jobs))
+    return pose_output.print_result(predictions, out, len(jobs))
 
 
 def search_dataset(
@@ -188,7 +181,7 @@ def search_dataset(
     numbers = {name: n for n, name in pose_methods.match_names(dataset, method.models).items()}
     settings = {**method.settings, **pose_methods.dataset_settings(dataset), "masks": "search"}
     settings["find"] = sorted(numbers)
-    pose_predict.claim_for_dataset(out, settings, dataset)
+    pose_output.claim_for_dataset(out, settings, dataset)
     images = {(i.scene_id, i.image_id): i for i in dataset.instances}
     some_object = next(iter(numbers))
     jobs = [
@@ -206,8 +199,8 @@ def search_dataset(
     earlier = list(earlier_predictions(out).values())
     results = SearchResults(out, [job.name for job in jobs], earlier, is_of_image, numbers)
     predictions, searched = _search(method, list(numbers), jobs, results)
-    pose_predict.write_files(predictions, searched, out, method, dataset, input_count=len(images))
-    return pose_predict.print_result(predictions, out, len(images))
+    pose_output.write_files(predictions, searched, out, method, dataset, input_count=len(images))
+    return pose_output.print_result(predictions, out, len(images))
 
 
 def _frame_job(instance: Instance, object: str) -> PoseJob[Any]:
@@ -237,18 +230,18 @@ def track_files(method: PoseMethod, frames: SequenceOptions, out: Path) -> int:
     """Follow one object through depth images with a camera, or clouds; give the exit code."""
     unit = frames.unit
     start = None if frames.first is None else pose_methods.read_pose(frames.first)
-    name = pose_predict.object_named(frames.object, method)
-    settings = {**method.settings, "track": name} | ({} if unit is None else {"unit": unit})
+    name = pose_jobs.object_named(frames.object, method)
+    settings = {**method.settings, "track": name, **pose_jobs.unit_facts(unit)}
     if frames.cloud is not None:
-        jobs = pose_predict.cloud_jobs(frames.cloud, unit or "m", name, out)
+        jobs = pose_jobs.cloud_jobs(frames.cloud, unit or "m", name, out)
     else:
         assert frames.depth is not None
         assert frames.camera is not None
-        jobs = pose_predict.frame_jobs(frames.depth, frames.camera, name, unit, out)
-        settings |= pose_predict.camera_facts(frames.camera)
+        jobs = pose_jobs.frame_jobs(frames.depth, frames.camera, name, unit, out)
+        settings |= pose_jobs.camera_facts(frames.camera)
     if frames.first is not None:
         settings |= {"first": pose_methods.name_with_checksum(frames.first)}
-    pose_predict.claim_for_jobs(out, settings, jobs)
+    pose_output.claim_for_jobs(out, settings, jobs)
     return _write_sequences(method, _follow(method, jobs, name, start), jobs, out)
 
 
@@ -263,7 +256,7 @@ def track_dataset(method: PoseMethod, frames: SequenceOptions, out: Path) -> int
         **pose_methods.dataset_settings(dataset),
         "track": sorted(names.values()),
     }
-    pose_predict.claim_for_dataset(out, settings, dataset)
+    pose_output.claim_for_dataset(out, settings, dataset)
     # The first instance of an object in each image of a scene is followed.
     first_instances: dict[tuple[int, int], dict[int, Instance]] = {}
     for instance in sorted(dataset.instances, key=lambda i: (i.image_id, i.index)):
@@ -321,8 +314,8 @@ def _write_sequences(
         )
         for prediction, job in pairs
     ]
-    pose_predict.write_files(predictions, explained, out, method, dataset)
-    code = pose_predict.print_result(predictions, out)
+    pose_output.write_files(predictions, explained, out, method, dataset)
+    code = pose_output.print_result(predictions, out)
     kinds = Counter(p.estimate.tracking for p in predictions if p.estimate.tracking is not None)
     print(", ".join(f"{kinds[kind]} {kind}" for kind in ("tracked", "found", "lost")))
     return code

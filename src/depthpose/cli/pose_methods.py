@@ -224,6 +224,7 @@ class PoseMethod:
 
     ``find`` gives the poses of named objects in a view without a mask, ``track`` follows one
     through frames; None: it cannot. ``holder``: what knows the objects, in messages.
+    ``expects_all``: whether each object is expected in each image, as CAD files are that are given.
     """
 
     name: str
@@ -237,6 +238,7 @@ class PoseMethod:
         | None
     ) = None
     holder: str = "weights"
+    expects_all: bool = False
 
 
 def build_methods(
@@ -282,6 +284,7 @@ def _registration_method(
         find=net.find_in,
         track=net.track_in,
         holder="models",
+        expects_all=True,
     )
 
 

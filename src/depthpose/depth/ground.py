@@ -20,19 +20,23 @@ from depthpose.depth.types import DepthEstimate, Ground, Map, StereoInput
 
 _INLIER = 0.06
 """Inverse depths within this share of the plane's belong to it."""
-_POINTS = 2000
-_DRAWS = 200
-_STRIPS = 8
+_POINTS = 2000  # that a plane is fitted to
+_DRAWS = 200  # of three points for a plane
+_REFITS = 3
+_FEWEST_POINTS = 60  # with depth in the lower part of an image
+_FEWEST_ON_PLANE = 30  # of them
+_STRIPS = 8  # of columns, of which the jackknife leaves one out at a time
 _LEAST_SHARE = 0.25
 """Of the points in the lower part of the image, on the plane; with less there is no ground."""
 _MOST_ROLL_DEG = 10.0
-_MOST_TILT, _MOST_ROLL = (math.tan(math.radians(angle)) for angle in (25, _MOST_ROLL_DEG))
+_MAX_TAN_TILT = math.tan(math.radians(25))
+_MAX_TAN_ROLL = math.tan(math.radians(_MOST_ROLL_DEG))
 _LEAST_HEIGHT_M = 0.2
 _MOST_HEIGHT_M = 20.0
 _MOST_ROAD_TILT_DEG = 15.0
+"""Steeper planes were no road in any of 59 views by cameras tilted up to 7 degrees."""
 _MOST_TILT_APART_DEG = 8.0
-"""Steeper planes were no road in any of 59 views by cameras tilted up to 7 degrees, and roads were
-at most 5.5 degrees off the true tilt."""
+"""Of a given tilt and that of the road in the map, which was at most 5.5 degrees off in these."""
 _MAP_TILT_STD_DEG = 0.8
 _MAP_ROLL_STD_DEG = 1.2
 _ROAD_STD_DEG = 0.3
@@ -53,9 +57,10 @@ _HEIGHT_NOISE = 0.06
 _FOOT_STD = 0.12
 """Of the logarithm of depth by where things touch the ground."""
 _ON_PLANE = 0.1
-_FARTHEST_M = 400.0
 """What is off the map's plane by less, in the logarithm of depth, is ground; by twice as much, it
 stands on it."""
+_FARTHEST_M = 400.0
+"""Largest depth of the ground: beyond its horizon it has none."""
 _RIG = SelectionConfig()
 _DECIMALS = 6
 """Of the numbers of a mount: as files hold them, so that a rerun goes on from the same."""
@@ -69,7 +74,7 @@ def fit_ground(depth_m: Map, camera: Camera) -> Ground | None:
     None where a quarter of the lower part does not lie on one that could be ground.
     """
     rays, inverse, strips = _lower_points(depth_m, camera)
-    if len(inverse) < 60:
+    if len(inverse) < _FEWEST_POINTS:
         return None
 
     # RANSAC: planes through three points, below the camera, and tilted and rolled as cameras of
@@ -78,9 +83,9 @@ def fit_ground(depth_m: Map, camera: Camera) -> Ground | None:
     drawn = torch.randint(len(inverse), (_DRAWS, 3), generator=chance)
     planes = torch.linalg.solve_ex(rays[drawn], inverse[drawn])[0]
     size = planes.norm(dim=1).clamp(min=1e-9)
-    tilt = planes[:, 2].abs() / planes[:, 1]
-    roll = planes[:, 0].abs() / planes[:, 1]
-    is_upright = (planes[:, 1] > 0) & (tilt < _MOST_TILT) & (roll < _MOST_ROLL)
+    tan_tilt = planes[:, 2].abs() / planes[:, 1]
+    tan_roll = planes[:, 0].abs() / planes[:, 1]
+    is_upright = (planes[:, 1] > 0) & (tan_tilt < _MAX_TAN_TILT) & (tan_roll < _MAX_TAN_ROLL)
     is_near = (size > 1 / _MOST_HEIGHT_M) & (size < 1 / _LEAST_HEIGHT_M)
     is_usable = planes.isfinite().all(1) & is_upright & is_near
     errors = (planes[is_usable] @ rays.T / inverse - 1).abs()
@@ -90,11 +95,11 @@ def fit_ground(depth_m: Map, camera: Camera) -> Ground | None:
 
     # Least squares over the points on the best of them.
     plane, angles = _fit_plane(rays[is_on], inverse[is_on])
-    for _ in range(3):
-        plane, angles = _fit_plane(rays[is_on], inverse[is_on])
+    for _ in range(_REFITS):
         is_on = (rays @ plane / inverse - 1).abs() < _INLIER
-        if int(is_on.sum()) < 30:
+        if int(is_on.sum()) < _FEWEST_ON_PLANE:
             return None
+        plane, angles = _fit_plane(rays[is_on], inverse[is_on])
     share = float(is_on.double().mean())
     height_m, tilt_deg, roll_deg = angles
     is_upright = abs(tilt_deg) <= _MOST_ROAD_TILT_DEG and abs(roll_deg) < _MOST_ROLL_DEG
@@ -103,7 +108,7 @@ def fit_ground(depth_m: Map, camera: Camera) -> Ground | None:
 
     # The jackknife's deviation: how far the fit moves when a strip of columns is left out.
     selections = [is_on & (strips != strip) for strip in range(_STRIPS)]
-    selections = [selection for selection in selections if int(selection.sum()) >= 30]
+    selections = [selection for selection in selections if int(selection.sum()) >= _FEWEST_ON_PLANE]
     fits = torch.tensor([_fit_plane(rays[k], inverse[k])[1] for k in selections])
     count = len(fits)
     deviation = ((count - 1) / count * ((fits - fits.mean(0)) ** 2).sum(0)).sqrt()
@@ -123,15 +128,18 @@ def _lower_points(
     """Give rays (z = 1), inverse depths and column strips of points in the lower middle."""
     height, width = depth_m.shape
     top = height * 3 // 5
+    left = width // 7
+    right = width * 6 // 7
     step = max(math.isqrt((height - top) * width // _POINTS), 1)
     rows = torch.arange(top, height, step)
-    columns = torch.arange(width // 7, width * 6 // 7, step)
+    columns = torch.arange(left, right, step)
     v, u = (part.flatten() for part in torch.meshgrid(rows, columns, indexing="ij"))
     inverse = 1 / depth_m.detach().cpu().double()[v, u]
     has_depth = inverse.isfinite() & (inverse > 0)
     pixels = torch.stack([u, v, torch.ones_like(u)], 1).double()
     rays = pixels @ torch.linalg.inv(camera.K).T
-    return rays[has_depth], inverse[has_depth], (u * _STRIPS // width)[has_depth]
+    strips = (u - left) * _STRIPS // (right - left)
+    return rays[has_depth], inverse[has_depth], strips[has_depth]
 
 
 def _fit_plane(
@@ -175,9 +183,9 @@ def find_mount(
 ) -> Ground:
     """Find the camera's height, tilt and roll above a road, with their deviations.
 
-    What the camera says of its mount is taken. Else the tilt is joined of that of the road in the
-    map, that of the frame before and that of the edges in the image (:func:`find_angles`), and the
-    height is that in the map, corrected by how far its tilt is off.
+    What the camera says of its mount is taken. Else three estimates of the tilt are joined by their
+    deviations: that of the road in the map, that of the frame before, and that of the edges in the
+    image (:func:`find_angles`). The height is that in the map, corrected for its wrong tilt.
 
     Args:
         fit: the road in the map of the image (:func:`fit_ground`).
@@ -192,10 +200,11 @@ def find_mount(
         roll_deg=fit.roll_deg, roll_std_deg=_MAP_ROLL_STD_DEG,
     )  # fmt: skip
     if before is not None:
-        step = math.hypot(before.tilt_std_deg, _TILT_STEP_DEG)
-        tilt = _join((expected.tilt_deg, expected.tilt_std_deg), (before.tilt_deg, step))
-        step = math.hypot(_MAP_ROLL_STD_DEG / 2, _TILT_STEP_DEG)
-        roll = _join((expected.roll_deg, expected.roll_std_deg), (before.roll_deg, step))
+        tilt_std_deg = math.hypot(before.tilt_std_deg, _TILT_STEP_DEG)
+        tilt = _join((expected.tilt_deg, expected.tilt_std_deg), (before.tilt_deg, tilt_std_deg))
+        # A mount does not hold the deviation of its roll: edges halve that of the map's.
+        roll_std_deg = math.hypot(_MAP_ROLL_STD_DEG / 2, _TILT_STEP_DEG)
+        roll = _join((expected.roll_deg, expected.roll_std_deg), (before.roll_deg, roll_std_deg))
         expected = Angles(
             tilt_deg=tilt[0], tilt_std_deg=tilt[1], roll_deg=roll[0], roll_std_deg=roll[1]
         )
@@ -244,10 +253,10 @@ def scale_by_mount(
 ) -> DepthEstimate:
     """Find the camera's mount, and correct each pixel's depth by where the ground then is.
 
-    In the map every thing stands on the map's road. On the true road its foot has another depth,
-    and so has it: inverse depth changes by a multiple and a plane. This and the map's own depth are
-    joined by inverse variances of their logarithms. That of the ground grows with the distance, for
-    its tilt is not known exactly, and is larger for what stands on it than for the ground itself.
+    An object stands on the road, so what corrects the road at its foot corrects the object too:
+    inverse depth changes by a factor and a plane. This and the map's own depth are joined by
+    inverse variances of their logarithms. That of the ground grows with the distance, for its tilt
+    is not known exactly, and is larger for what stands on it than for the ground itself.
 
     Args:
         estimate: depth as the network judges it.
@@ -296,7 +305,8 @@ def scale_by_mount(
     by_ground_m = 1 / inverse.clamp(min=1 / _FARTHEST_M)
     off_plane = (_plane_at_pixels(map_plane, camera, depth_m) * depth_m).clamp(min=1e-3).log().abs()
     stands = (off_plane / _ON_PLANE - 1).clamp(0, 1)
-    # A tilt that is off by an angle changes the logarithm of depth by it times depth / height.
+    # A tilt that is off by an angle changes the logarithm of depth by it times depth / height. What
+    # a height is off that is estimated by the map, the map's depth is off too: it does not count.
     tilt_std = math.radians(ground.tilt_std_deg) / ground.height_m
     ground_variance = (
         (torch.maximum(by_ground_m, depth_m) * tilt_std).square()
@@ -323,12 +333,13 @@ def _plane(ground: Ground) -> Float[Tensor, "3"]:
     return plane / plane.norm() / ground.height_m
 
 
-def rescale(
-    estimate: DepthEstimate, factor: float | Map, *, fit: Ground | None = None
-) -> DepthEstimate:
-    """Multiply the depth of an estimate by ``factor``, and divide its disparity; not the sky's."""
+def rescale(estimate: DepthEstimate, factor: float | Map) -> DepthEstimate:
+    """Multiply the depth of an estimate by ``factor``, and divide its disparity by it.
+
+    The sky keeps its disparity. The height of the ground is multiplied by a single factor alone.
+    """
     assert estimate.depth_m is not None
-    ground = estimate.ground if fit is None else fit
+    ground = estimate.ground
     if ground is not None and not isinstance(factor, Tensor):
         ground = replace(
             ground, height_m=ground.height_m * factor, height_std_m=ground.height_std_m * factor

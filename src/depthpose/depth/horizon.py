@@ -24,7 +24,7 @@ _MOST_PIXELS = 500_000
 """Larger images are halved until they have fewer: edges in a street are long."""
 _LEAST_CONTRAST = 0.012
 """Of an edge: change of grey a pixel, of a white that is 1."""
-_MOST_TURN = math.cos(math.radians(20))
+_MIN_COS_TURN = math.cos(math.radians(20))
 """Cosine of the angle by which gradients of two neighbours on one segment differ at most."""
 _LEAST_LENGTH_PX = 20.0
 _MOST_WIDTH = 0.03
@@ -97,9 +97,9 @@ def find_segments(grey: Float[np.ndarray, "h w"]) -> Segments:
         other = number[rows + 1 + step_y, columns + 1 + step_x]
         first = np.nonzero(other >= 0)[0]
         second = other[first]
-        turn = slope_x[first] * slope_x[second] + slope_y[first] * slope_y[second]
-        firsts.append(first[turn > _MOST_TURN])
-        seconds.append(second[turn > _MOST_TURN])
+        cos_turn = slope_x[first] * slope_x[second] + slope_y[first] * slope_y[second]
+        firsts.append(first[cos_turn > _MIN_COS_TURN])
+        seconds.append(second[cos_turn > _MIN_COS_TURN])
     joined = (np.concatenate(firsts), np.concatenate(seconds))
     links = coo_array((np.ones(len(joined[0]), np.int8), joined), shape=(count, count))
     chains, chain = connected_components(links, directed=False)

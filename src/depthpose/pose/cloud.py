@@ -82,11 +82,11 @@ def prepare_cloud(
 
     # What is far from the median is background at the mask's border.
     off_m = (readings_m - readings_m.median(0).values).norm(dim=-1)
-    object_m = readings_m[~(off_m > cloud_config.max_offset_diameters * model.diameter_m)]
-    refusal = _refuse_input(pose_input, readings_m, object_m, model, cloud_config)
+    cloud_m = readings_m[~(off_m > cloud_config.max_offset_diameters * model.diameter_m)]
+    refusal = _refuse_input(pose_input, readings_m, cloud_m, model, cloud_config)
     if refusal is not None:
         return refusal
-    return ObjectCloud(name=pose_input.name, cloud_m=object_m, view=view)
+    return ObjectCloud(name=pose_input.name, cloud_m=cloud_m, view=view)
 
 
 def _why_empty(pose_input: CloudInput | ViewInput) -> str:
@@ -117,23 +117,23 @@ def nothing_seen(view: ViewInput) -> str:
 def _refuse_input(
     pose_input: CloudInput | ViewInput,
     readings_m: Float[Tensor, "n 3"],
-    object_m: Float[Tensor, "m 3"],
+    cloud_m: Float[Tensor, "m 3"],
     model: ObjectModel,
     cloud_config: CloudConfig,
 ) -> Refusal | None:
-    """Refuse a cloud by its size, its place and its shape; ``object_m``: without flying pixels."""
+    """Refuse a cloud by its size, place and shape; ``cloud_m``: readings but for flying pixels."""
     too_few = why_too_few(readings_m, cloud_config)
     if too_few is not None:
         return Refusal(status="too few points", reason=too_few)
-    unusable = _why_unusable(pose_input, readings_m, object_m, model)
+    unusable = _why_unusable(pose_input, readings_m, cloud_m, model)
     if unusable is not None:
         return Refusal(status="unusable input", reason=unusable)
-    too_few = why_too_few(object_m, cloud_config)
+    too_few = why_too_few(cloud_m, cloud_config)
     if too_few is not None:
         return Refusal(status="too few points", reason=too_few)
 
     # A plane or a line can slide within itself.
-    centred = object_m.double() - object_m.double().mean(0)
+    centred = cloud_m.double() - cloud_m.double().mean(0)
     extent_m = torch.linalg.eigvalsh(centred.T @ centred / len(centred)).clamp(min=0).sqrt()
     flat_axes = int((extent_m < _FLAT_DIAMETERS * model.diameter_m).sum())
     if flat_axes == 0:
@@ -151,13 +151,13 @@ def _refuse_input(
 def _why_unusable(
     pose_input: CloudInput | ViewInput,
     readings_m: Float[Tensor, "n 3"],
-    object_m: Float[Tensor, "m 3"],
+    cloud_m: Float[Tensor, "m 3"],
     model: ObjectModel,
 ) -> str | None:
     """Say that a cloud is in another frame or of another unit than the model; None where not."""
     # Its size is that of what is left without flying pixels, if those are few.
-    are_few_flying = len(object_m) > _MAJORITY * len(readings_m)
-    size_advice = unit_advice(model.diameter_m, object_m if are_few_flying else readings_m)
+    are_few_flying = len(cloud_m) > _MAJORITY * len(readings_m)
+    size_advice = unit_advice(model.diameter_m, cloud_m if are_few_flying else readings_m)
 
     # A camera sees only what lies before it: a cloud about the origin is in other axes.
     is_about_origin = float(readings_m.median(0).values.norm()) < model.diameter_m / 2

@@ -2,8 +2,7 @@
 
 import math
 import time
-from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -144,7 +143,12 @@ def why_not_observable(
     near_axis = prepared.copies.near_axis
     if near_axis is not None:
         free = torch.cat([free, free_motions((near_axis,), pose)])
-    observable, weakest = observability(cloud_m, pose, prepared.surface, free)
+    observed = observability(cloud_m, pose, prepared.surface, free)
+    if observed is None:
+        return Refusal(
+            status="doubtful", reason="too few points lie on the posed surface to determine a pose"
+        )
+    observable, weakest = observed
     if observable >= least:
         return None
     motion = "rotation" if float(weakest[:3].norm()) > math.sqrt(0.5) else "shift"
@@ -253,14 +257,12 @@ def choose_object(estimates: Sequence[PoseEstimate]) -> PoseEstimate:
         object is too likely.
     """
     posed = [estimate for estimate in estimates if estimate.is_posed]
-    seconds: Counter[str] = Counter()
-    for estimate in estimates:
-        seconds.update(estimate.seconds)
+    seconds = seconds_of_all(estimates)
     if not posed:
         nearest = max(estimates, key=lambda e: 0.0 if e.evidence is None else e.evidence.agreement)
         names = ", ".join(estimate.object for estimate in estimates)
         reason = f"none of {names} surely; {nearest.object} comes nearest: {nearest.reason}"
-        return replace(nearest, reason=reason, seconds=dict(seconds))
+        return replace(nearest, reason=reason, seconds=seconds)
     best, shares = likeliest_object(posed)
     if float(shares.max()) < LEAST_SHARE:
         candidates = ", ".join(
@@ -272,9 +274,18 @@ def choose_object(estimates: Sequence[PoseEstimate]) -> PoseEstimate:
             object=best.object,
             status="doubtful",
             reason=f"it may be {candidates}; say which by object",
-            seconds=dict(seconds),
+            seconds=seconds,
         )
-    return replace(best, seconds=dict(seconds))
+    return replace(best, seconds=seconds)
+
+
+def seconds_of_all(estimates: Iterable[PoseEstimate]) -> dict[str, float]:
+    """Add up what each stage took for several estimates."""
+    seconds: dict[str, float] = {}
+    for estimate in estimates:
+        for stage, stage_s in estimate.seconds.items():
+            seconds[stage] = seconds.get(stage, 0.0) + stage_s
+    return seconds
 
 
 def likeliest_object(
@@ -282,9 +293,12 @@ def likeliest_object(
 ) -> tuple[PoseEstimate, Float64[Tensor, " n"]]:
     """Give the likeliest of the estimates for one place, and the share of each object.
 
-    The probabilities of the likeliest are multiplied by its share.
+    All of them have evidence. The probabilities of the likeliest are multiplied by its share.
     """
-    evidences = [estimate.evidence for estimate in estimates if estimate.evidence is not None]
+    evidences: list[Evidence] = []
+    for estimate in estimates:
+        assert estimate.evidence is not None
+        evidences.append(estimate.evidence)
     shares = share_among_objects(evidences)
     best = int(shares.argmax())
     share = float(shares[best])

@@ -41,11 +41,13 @@ THRESHOLD = 3.0  #: deviations beyond which a residual contradicts a pose
 _CUT_OFF = 2 * THRESHOLD  # deviations of one reading, of which a mean takes no more
 AVERAGED_PX = 5  #: residuals are averaged over a square of this side
 _LEAST_FILLED = 0.3  # share of the averaged square that must have residuals
+_ALIKE_READINGS = 3  # neighbours err alike: of so many averaged readings one is independent
 _LEAST_PATCH = 0.25  # independent patches: smaller ones are accidents of edges and drop-outs
 _ACROSS = (-1.0, -0.5, 0.5, 1.0)
+"""Where readings are compared across a silhouette, on the line from it to a pixel beside it: 0 is
+the silhouette, 1 the pixel, and what is negative lies within."""
 _NEAREST_WITHIN = 1
-"""Where readings are compared across a silhouette: as shares of the way from it to a pixel. The
-nearest one within supports the pose; of thin things the next lies beyond."""
+"""Of these, the one whose reading must support the pose; the first lies beyond a thin object."""
 _MEETING = 2.0
 """Deviations of the noise: sides of a silhouette that are farther apart do not meet there, and an
 edge that bends more toward the camera is concave."""
@@ -58,7 +60,7 @@ _JUMP_DIAMETERS = 0.02
 _JUMP_M = 0.01
 """Drawn neighbours that differ in depth by more than both are the two sides of an edge."""
 _FAR_M = np.float32(1e6)
-_MARGIN = 0.6  # half of the window about an object, in diameters
+_MARGIN = 0.6  # of the window about the points of an object, in diameters
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -90,7 +92,7 @@ def observe(
     cloud_m: Float[Tensor, "n 3"],
     view: ViewInput | None,
     diameter_m: float,
-    object_m: float,
+    object_std_m: float,
     *,
     is_masked: bool,
 ) -> Observation:
@@ -101,7 +103,7 @@ def observe(
         view: their depth image; None: the points are drawn as a camera would have seen them, to
             which they are a pixel apart.
         diameter_m: of the model.
-        object_m: standard deviation of the real surface from its model.
+        object_std_m: standard deviation of the real surface from its model.
         is_masked: whether the points are all of the object, as an exact mask gives them, so that
             those which a pose does not explain contradict it.
     """
@@ -135,7 +137,7 @@ def observe(
         is_background = view.background.is_seen[top : top + height, left : left + width]
     inner = grow_mask(is_object, -EDGE_PX)
     inner = inner if bool(inner.any()) else is_object  # thin things are all border
-    noise = measure_noise(depth_m.numpy(), inner.numpy(), object_m)
+    noise = measure_noise(depth_m.numpy(), inner.numpy(), object_std_m, float(K[0, 0]))
 
     step = max(1, math.floor(math.sqrt(float(is_object.sum()) / _OBJECT_PX)))
     # The pixels of a drawn cloud are not those of its sensor: of that the angle is assumed.
@@ -259,18 +261,19 @@ def compare(observation: Observation, pose: Rigid, surface: Surface) -> Evidence
 
     # Residuals in standard deviations of their mean over some neighbours.
     side = _averaged_side(step)
-    is_compared = is_read & inner
-    residual_m = np.where(is_compared, depth_m - drawn_m, 0).astype(np.float32)
+    has_reading = is_read & inner
+    residual_m = np.where(has_reading, depth_m - drawn_m, 0).astype(np.float32)
     # Cut off, so that a reading of the background at an edge does not decide for its neighbours.
     limit_m = _CUT_OFF * noise.deviation_m(cosine, 1).astype(np.float32)
     residual_m = np.clip(residual_m, -limit_m, limit_m)
-    filled = ndimage.uniform_filter(is_compared.astype(np.float32), side)
+    filled = ndimage.uniform_filter(has_reading.astype(np.float32), side)
     mean_m = ndimage.uniform_filter(residual_m, side)
     # A pixel without a reading of its own has that of its neighbours: clouds are sparse.
     is_compared = inner & (filled > _LEAST_FILLED)
     mean_m = mean_m[is_compared] / filled[is_compared]
     deviations = np.zeros_like(residual_m)
-    deviations[is_compared] = mean_m / noise.deviation_m(cosine[is_compared], side**2 // 3)
+    independent = side**2 // _ALIKE_READINGS
+    deviations[is_compared] = mean_m / noise.deviation_m(cosine[is_compared], independent)
 
     # Patches that contradict the pose, and what supports it.
     is_supported = is_compared & (np.abs(deviations) <= THRESHOLD)
@@ -299,7 +302,7 @@ def compare(observation: Observation, pose: Rigid, surface: Surface) -> Evidence
         bulging=bulging,
         beside=_patch_area(is_beside, beside_px2),
         rms=float(np.sqrt(square.mean())) if len(square) else THRESHOLD,
-        noise_m=noise.white_m,
+        noise_m=noise.white_std_m,
     )
 
 
@@ -365,7 +368,7 @@ def _is_continued(
     # Do the two sides meet there, and is the edge not concave?
     apart_px = 0.5 * distance[tuple(beside)]
     moved_px = EDGE_PX / observation.step
-    noise_m = math.hypot(AVERAGED_PER_WHITE * observation.noise.white_m, FLAT_M)
+    noise_m = math.hypot(AVERAGED_PER_WHITE * observation.noise.white_std_m, FLAT_M)
     is_continued = np.zeros((height, width), bool)
     is_continued[rows, columns][tuple(beside)] = _goes_on(
         np.stack(across), apart_px, moved_px, noise_m

@@ -9,7 +9,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
-from depthpose.core.rigid import Rigid, geodesic_rad
+from depthpose.core.rigid import Rigid
 from depthpose.pose.color import color_agreement, color_copies, settle_spin
 from depthpose.pose.config import IcpConfig
 from depthpose.pose.copies import PreparedObject
@@ -24,9 +24,8 @@ _STEPS = 6  # of ICP for poses that were refined roughly
 _SHARE_POINTS = 1000  # of the cloud that say what a pose leaves unexplained
 _UNEXPLAINED_MORE = 0.25
 """A competing pose that leaves by so much more of the readings unexplained is not compared."""
-_MOST_LEADING = 8  #: poses that are compared, and of one of them so many copies
-_MOST_COPIES = 36
-_SAME_PRINT_RAD = 0.1  # poses nearer than this show the same surface colours, the "print"
+_MOST_LEADING = 8  # different poses that are compared
+_MOST_COPIES = 36  # and near-symmetric copies of the best of them
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -120,8 +119,8 @@ def compete(
         pose = candidate.refined.camera_from_model
         if not bool(copies.is_same(pose, before, alike).any()):
             leading.append(hypothesis(candidate.refined))
-    if view is not None:  # one of its copies may have the print that is observed
-        leading = _by_best_print(leading, prepared, view, alike)
+    if view is not None:  # one of its copies may have the surface colours that are observed
+        leading = _with_color_of_best_copy(leading, prepared, view, alike)
     shares = share_among_poses(leading, is_masked=observation.is_masked)
     winner = int(shares.argmax())
     others_shares = [(h, float(shares[k])) for k, h in enumerate(leading) if k != winner]
@@ -210,7 +209,7 @@ def _distinct_copies(
     copies = prepared.copies
     pose = winning_pose.camera_from_model
     starts = pose @ copies.near_copies
-    if view is not None:  # print shows finer steps about an axis than shape does
+    if view is not None:  # colours show finer rotations about an axis than shape does
         starts = Rigid.cat([color_copies(pose, prepared.model, view), starts])
     distinct: list[RefinedPose] = []
     distinct_poses = [pose]
@@ -232,22 +231,24 @@ def _distinct_copies(
     return distinct
 
 
-def _by_best_print(
+def _with_color_of_best_copy(
     leading: list[Hypothesis], prepared: PreparedObject, view: ViewInput, alike: Rigid
 ) -> list[Hypothesis]:
     """Give each pose the colour evidence of the best of its copies, for it stands for all of them.
 
     Poses whose best copies are one pose are copies of each other: the first stands for them.
     """
+    copies = prepared.copies
     distinct: list[Hypothesis] = []
-    prints: list[Rigid] = []
+    best_copies: list[Rigid] = []
     for hypothesis in leading:
-        copies = color_copies(hypothesis.pose, prepared.model, view, turns=alike)
-        likelihood = color_agreement(copies, prepared.model, view).log_likelihood
-        best = copies[int(likelihood.argmax())]
-        if all(float(geodesic_rad(best.R, pose.R)) > _SAME_PRINT_RAD for pose in prints):
-            distinct.append(replace(hypothesis, log_color=float(likelihood.max())))
-            prints.append(best)
+        colored = color_copies(hypothesis.pose, prepared.model, view, turns=alike)
+        likelihood = color_agreement(colored, prepared.model, view).log_likelihood
+        best = colored[int(likelihood.argmax())]
+        if best_copies and copies.is_same(best, Rigid.stack(best_copies), copies.symmetries).any():
+            continue
+        distinct.append(replace(hypothesis, log_color=float(likelihood.max())))
+        best_copies.append(best)
     return distinct
 
 

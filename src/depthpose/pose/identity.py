@@ -60,7 +60,7 @@ class Scale:
 
 
 def scale_of(
-    cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface, object_m: float
+    cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface, object_std_m: float
 ) -> Scale:
     """Measure the scale of the model that fits a cloud best, the pose moving with it.
 
@@ -71,7 +71,7 @@ def scale_of(
         cloud_m: points of the object, in the camera frame.
         pose: ``camera_from_model``.
         surface: of the model.
-        object_m: standard deviation of the real surface from the model.
+        object_std_m: standard deviation of the real surface from the model.
     """
     local_m = pose.inverse().apply(take_evenly(cloud_m.double(), POINTS))
     starts = torch.tensor(_STARTS, dtype=torch.float64)
@@ -84,7 +84,7 @@ def scale_of(
     reached = distance_to(grown_m, surface, times, is_exact=True)
     gain = distance_to(local_m, surface, is_exact=True) - reached[0]
     equations = _growth_equations(grown_m, times, surface, NEAR * surface.diameter_m, is_exact=True)
-    return Scale(float(times), _scale_deviation(equations, object_m), float(gain))
+    return Scale(float(times), _scale_deviation(equations, object_std_m), float(gain))
 
 
 class _Equations(NamedTuple):
@@ -125,14 +125,14 @@ def _damped(H: Float64[Tensor, "b 7 7"]) -> Float64[Tensor, "b 7 7"]:
     return H + 1e-9 * largest * torch.eye(7, dtype=torch.float64)
 
 
-def _scale_deviation(equations: _Equations, object_m: float) -> float:
+def _scale_deviation(equations: _Equations, object_std_m: float) -> float:
     """Standard deviation of a scale: noise that neighbours share, and sides that deviate."""
     J = equations.J[0]
     weight = equations.weight[0]
     inverse = torch.linalg.inv(_damped(((J.mT * weight) @ J)[None]))[0]
     noise_m2 = (weight * equations.residual_m[0].square()).sum() / (weight.sum() - 7).clamp(min=1)
     variance = _INDEPENDENT * noise_m2 * inverse[6, 6]
-    variance += object_m**2 * weight.sum() * inverse[6, 6] / INDEPENDENT_SIDES
+    variance += object_std_m**2 * weight.sum() * inverse[6, 6] / INDEPENDENT_SIDES
     return float(variance.clamp(min=0).sqrt())
 
 
@@ -237,7 +237,7 @@ def identify(
     evidence: Evidence,
     focal_px: float,
     max_size_error: float,
-    object_m: float,
+    object_std_m: float,
 ) -> Identity:
     """Fit another size and the mirror image, and say whether one of them is what was seen.
 
@@ -250,9 +250,9 @@ def identify(
         evidence: of the pose.
         focal_px: of the depth image.
         max_size_error: by so much a real object may differ in size from its model.
-        object_m: standard deviation of its surface from the model's.
+        object_std_m: standard deviation of its surface from the model's.
     """
-    scale = scale_of(cloud_m, pose, surface, object_m)
+    scale = scale_of(cloud_m, pose, surface, object_std_m)
     mirror = None
     if mirror_deviation > MIRROR_ALIKE:
         mirror = mirror_gain(cloud_m, pose, surface)
@@ -268,7 +268,7 @@ def identify(
     status = "not excluded"
     reason = ""
     # Sides that deviate from the model may fit its mirror image a little better.
-    deviation = object_m / math.sqrt(INDEPENDENT_SIDES) / (NEAR * surface.diameter_m)
+    deviation = object_std_m / math.sqrt(INDEPENDENT_SIDES) / (NEAR * surface.diameter_m)
     least_gain = max(_MIRROR_GAIN, deviation, scale.gain if is_other_size else 0.0)
     if mirror is not None and mirror > least_gain:
         status = "contradicted"

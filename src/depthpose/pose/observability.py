@@ -34,7 +34,7 @@ def free_motions(axes: tuple[Axis, ...], camera_from_model: Rigid) -> Float[Tens
 
 def observability(
     cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface, free: Float[Tensor, "m 6"]
-) -> tuple[float, Float64[Tensor, "6"]]:
+) -> tuple[float, Float64[Tensor, "6"]] | None:
     """Measure how well the seen surface determines the pose: 0 where a motion is unobservable.
 
     A motion ``y = (d/2 w, v)`` about the middle of the cloud moves a surface point at ``a`` with
@@ -42,15 +42,15 @@ def observability(
     of that over the points near the surface, for the unit motion that moves it least (Gelfand et
     al., Geometrically Stable Sampling for the ICP Algorithm, 2003). Motions of declared symmetries
     (``free``) are left out. The weakest motion is given too: (rotation, translation at the middle
-    of the cloud), of unit length after scaling.
+    of the cloud), of unit length after scaling. None where fewer than six points lie near the
+    surface.
     """
     points = take_evenly(cloud_m.double(), _SAMPLED)
     local_m = pose.inverse().apply(points)
     index = surface.nearest(local_m)
     near = (local_m - surface.points_m[index]).norm(dim=-1) < NEAR * surface.diameter_m
-    weakest = torch.zeros(6, dtype=torch.float64)
     if int(near.sum()) < 6:
-        return 0.0, weakest
+        return None
     normal = (surface.normals[index] @ pose.R.mT)[near]
     middle = points.mean(0)
     radius_m = surface.diameter_m / 2

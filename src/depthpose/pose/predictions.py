@@ -42,6 +42,7 @@ PICTURE = "pose.png"  #: after ``NAME.``: the picture that shows a pose
 CLOUD = "pose.ply"  #: and the cloud
 STAGES = (
     "search", "segmentation", "cloud", "network", "proposal", "icp", "evidence", "decision",
+    "tracking",
 )  # fmt: skip
 """What an estimate's ``seconds`` are of, in order; a stage that was not run is missing."""
 

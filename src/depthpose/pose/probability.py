@@ -5,8 +5,8 @@ dents that the model does not have; at a wrong pose half of it. Both shares vary
 so that a count of contradicting patches has a negative binomial distribution: ten patches more say
 much of a small object and little of a large one.
 
-The coefficients of this file are all that a probability depends on beside the noise of the sensor
-(:mod:`depthpose.pose.sensor`).
+How patches are counted :mod:`depthpose.pose.evidence` says; what a count then means is said by the
+coefficients of this file alone.
 """
 
 import math
@@ -23,7 +23,7 @@ from depthpose.pose.types import Evidence
 
 
 @dataclass(frozen=True, kw_only=True)
-class Rate:
+class GammaShare:
     """Distribution of a share of the visible area from view to view: gamma, of a mean and a shape.
 
     A count of patches in an area whose share varies so has a negative binomial distribution.
@@ -34,20 +34,20 @@ class Rate:
 
     def log_likelihood(self, count: float, area: float) -> float:
         """Log probability of a count of patches in an area, both in independent patches."""
-        scale = self.shape / self.mean
-        a = self.shape
-        log_binomial = math.lgamma(count + a) - math.lgamma(a) - math.lgamma(count + 1)
-        log_none = a * (math.log(scale) - math.log(scale + area))
-        return log_binomial + log_none + count * (math.log(area) - math.log(scale + area))
+        rate = self.shape / self.mean
+        shape = self.shape
+        log_binomial = math.lgamma(count + shape) - math.lgamma(shape) - math.lgamma(count + 1)
+        log_none = shape * (math.log(rate) - math.log(rate + area))
+        return log_binomial + log_none + count * (math.log(area) - math.log(rate + area))
 
 
-RIGHT_CONTRADICTED = Rate(mean=0.1, shape=2.0)
-WRONG_CONTRADICTED = Rate(mean=0.5, shape=3.0)
+RIGHT_CONTRADICTED = GammaShare(mean=0.1, shape=2.0)
+WRONG_CONTRADICTED = GammaShare(mean=0.5, shape=3.0)
 """Share of what was observed of the visible area that contradicts a right and a wrong pose."""
-COPY_CONTRADICTED = Rate(mean=0.1, shape=1.0)
+COPY_CONTRADICTED = GammaShare(mean=0.1, shape=1.0)
 """Of copies, of which the one with the least contradicted is always the likeliest."""
-RIGHT_UNOBSERVED = Rate(mean=0.2, shape=1.0)
-WRONG_UNOBSERVED = Rate(mean=0.5, shape=3.0)
+RIGHT_UNOBSERVED = GammaShare(mean=0.2, shape=1.0)
+WRONG_UNOBSERVED = GammaShare(mean=0.5, shape=3.0)
 """Share of the visible area that has no reading, or is hidden."""
 PRIOR_MASKED = 5.0
 """Odds of the best pose being right before its evidence is seen, where a mask shows the object."""
@@ -96,7 +96,7 @@ def log_odds_right(evidence: Evidence) -> float:
     unobserved = RIGHT_UNOBSERVED.log_likelihood(evidence.unobserved, rest)
     unobserved -= WRONG_UNOBSERVED.log_likelihood(evidence.unobserved, rest)
     # Residuals are of the supported part alone.
-    fit = evidence.observed * (_log_fit(evidence.rms) - _log_fit(WRONG_RMS))
+    fit = evidence.supported_share * (_log_fit(evidence.rms) - _log_fit(WRONG_RMS))
     return contradicted + unobserved + fit
 
 
@@ -113,7 +113,10 @@ def log_fit_right(evidence: Evidence, area: float) -> float:
 
 
 def _log_fit(rms: float) -> float:
-    """Log likelihood of residuals: normal, of a variance of at least the sensor's and object's."""
+    """Log likelihood of residuals, up to a constant: normal, of the variance 1 + rms^2.
+
+    The variance is fitted to them, and at least 1, that of the sensor and the object.
+    """
     return -INDEPENDENT_SIDES / 2 * math.log(1 + rms**2)
 
 

@@ -18,7 +18,7 @@ from depthpose.core.units import Unit
 from depthpose.pose.cloud import ObjectCloud, local_planes, prepare_cloud, thin
 from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig
 from depthpose.pose.copies import PreparedObject
-from depthpose.pose.decide import refused
+from depthpose.pose.decide import refused, seconds_of_all
 from depthpose.pose.estimator import PoseEstimator
 from depthpose.pose.icp import refine_best
 from depthpose.pose.inputs import AnyInput
@@ -152,9 +152,8 @@ class Registration(PoseEstimator):
         if estimate.status != "doubtful" or not isinstance(pose_input, ViewInput):
             return estimate
         in_region = self._estimate_in_region(replace(pose_input, is_region=True))
-        if not in_region.is_posed:
-            return estimate
-        return replace(in_region, seconds={**estimate.seconds, **in_region.seconds})
+        seconds = seconds_of_all([estimate, in_region])
+        return replace(in_region if in_region.is_posed else estimate, seconds=seconds)
 
     def _estimate_cloud(
         self, pose_input: AnyInput, proposals: Rigid | None, prior_odds: float

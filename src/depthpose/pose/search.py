@@ -46,15 +46,15 @@ from depthpose.pose.propose.image import propose_in_frame
 from depthpose.pose.types import CloudInput, Evidence, PoseEstimate, ViewInput
 
 _MOST_PLACES = 40
-"""Proposals that are looked at in an image."""
+"""Largest number of proposals that are looked at in an image."""
 _LEAST_PROPOSALS = 4
-"""Proposals of each object that are looked at in any case."""
+"""Number of proposals of each object that are looked at in any case."""
 _ROUNDS = 4
-"""So often an image is searched for an object that is there more than once, at most."""
+"""An image is searched at most so many times for an object that is there more than once."""
 _MOST_TOGETHER = 8
-"""Proposals of one object at one place at most."""
+"""Largest number of proposals of one object at one place."""
 _LEAST_PIXELS = 100
-"""Of the whole image: fewer show no shape."""
+"""Of the image at full resolution, that a pose must explain: fewer show no shape."""
 _SHARED = 0.3
 """Estimates that explain so large a share of the same readings are of one thing; one stays."""
 _RIVAL = 0.5
@@ -257,13 +257,13 @@ def _refine(
         The proposals that may be right, the likeliest first; and the hopeless ones.
     """
     icp = targets.config.icp
-    object_m = targets.config.object_deviation_m
+    object_std_m = targets.config.object_deviation_m
 
     def refine(place: _Place) -> tuple[Rigid, Evidence]:
         surface = targets.object_of(place.object).surface
         cloud_m = _readings_of(place, frame, view)
         pose = refine_roughly(cloud_m, place.pose[None], surface, icp)[0]
-        observation = observe(cloud_m, view, surface.diameter_m, object_m, is_masked=False)
+        observation = observe(cloud_m, view, surface.diameter_m, object_std_m, is_masked=False)
         return pose, compare(observation, pose, surface)
 
     likely: list[tuple[float, _Place]] = []
@@ -386,7 +386,7 @@ def _within(
         if float(is_region[place.explained].double().mean()) > 0.5:
             inside.append(place)
         else:
-            reason = "most of it lies beside the box"
+            reason = "most of it lies outside the given region"
             misses.append(_miss_at(place, place.estimate.evidence, reason, targets))
     return inside, misses
 

@@ -1,11 +1,12 @@
 """What depth cameras and real objects are off by: noise, offsets, and how far off a plane.
 
-A depth camera errs in three ways. Each reading has noise of its own. Neighbouring readings also
+A depth camera errs in four ways. Each reading has noise of its own. Neighbouring readings also
 share an error, because stereo and structured light match windows of several pixels: a patch of
-readings that is off together is one observation, not hundreds. And all readings of an object are
-shifted alike along the ray, which refinement takes up in the pose. Beside the camera, a real object
-deviates from its file: by a few tenths of a millimetre if it is machined, by a millimetre or more
-if the file is a scan or the object a carton.
+readings that is off together is one observation, not hundreds. For the same reason a reading may be
+that of a neighbour some pixels away, which on a slanted surface has another depth. And all readings
+of an object are shifted alike along the ray, which refinement takes up in the pose. Beside the
+camera, a real object deviates from its file: by a few tenths of a millimetre if it is machined, by
+a millimetre or more if the file is a scan or the object a carton.
 
 Noise grows with the square of the depth. Where it is given for that square, as ``noise_per_m2``,
 its unit is metres per square metre of depth.
@@ -32,6 +33,9 @@ FLAT_M = 0.0005
 EDGE_PX = 3
 """Readings so near an edge may be of either side: stereo matches windows, and masks end so far from
 the silhouette."""
+LATERAL_PX = 1.0
+"""Standard deviation of where a reading is [px]: on elbows in real bins residuals grow with their
+slant as by 0.5 to 1.2 px, on steep sides of YCB objects as by 0.8 to 1.6 (``bench/slants.py``)."""
 FINEST_RAD = 2e-4
 """No sensor has finer pixels: nearer neighbours are of several frames in one cloud."""
 LAG_PX = 3
@@ -59,36 +63,44 @@ _WIDEST_PER_M2 = 0.003
 _MEDIAN_TO_DEVIATION = 1.4826  # of a normal distribution
 _FEWEST_DIFFERENCES = 30  # of readings, whose median says how large the noise is
 _STEEPEST = 0.3
-"""Least cosine by which a deviation along the surface normal is divided: what is seen at a smaller
-angle is hardly measured at all."""
+"""Least cosine between ray and normal that counts: what is seen at a smaller one is hardly measured
+at all."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DepthNoise:
-    """Deviations of readings from the surface of a model, in metres along the ray.
+    """Deviations of readings from the surface of a model, in metres.
 
     Attributes:
-        white_m: standard deviation of a reading, independent of its neighbours.
-        shared_m: standard deviation of the error that neighbouring readings share.
-        object_m: standard deviation of the real surface from the model, along its normal.
+        white_std_m: standard deviation of a reading along the optical axis, independent of others.
+        shared_std_m: standard deviation of the error that neighbouring readings share, along it.
+        lateral_std_m: standard deviation of where a reading is, across it.
+        object_std_m: standard deviation of the real surface from the model, along its normal.
     """
 
-    white_m: float
-    shared_m: float
-    object_m: float
+    white_std_m: float
+    shared_std_m: float
+    lateral_std_m: float
+    object_std_m: float
 
     def deviation_m(self, cosine: np.ndarray, readings: int) -> np.ndarray:
-        """Standard deviation of the mean of neighbouring readings.
+        """Standard deviation of the mean of neighbouring readings, along the optical axis.
 
         Args:
             cosine: between the ray and the surface normal, any shape.
-            readings: how many are averaged.
+            readings: how many independent ones are averaged.
         """
-        variance = self.white_m**2 / readings + self.shared_m**2 + self.object_m**2
-        return math.sqrt(variance) / np.clip(cosine, _STEEPEST, 1.0)
+        cosine = np.clip(cosine, _STEEPEST, 1.0)
+        noise_m2 = self.white_std_m**2 / readings + self.shared_std_m**2
+        # On a slanted surface, what is off across the axis or along the normal is off in depth.
+        place_m = self.lateral_std_m * np.sqrt(1 / cosine**2 - 1)
+        object_m = self.object_std_m / cosine
+        return np.sqrt(noise_m2 + place_m**2 + object_m**2)
 
 
-def measure_noise(depth_m: np.ndarray, is_object: np.ndarray, object_m: float) -> DepthNoise:
+def measure_noise(
+    depth_m: np.ndarray, is_object: np.ndarray, object_std_m: float, focal_px: float
+) -> DepthNoise:
     """Measure the noise of a depth image on an object, and derive what neighbours share.
 
     The noise is the median second difference of readings three pixels apart, to which a slope adds
@@ -98,7 +110,8 @@ def measure_noise(depth_m: np.ndarray, is_object: np.ndarray, object_m: float) -
     Args:
         depth_m: (h, w), NaN where there is no reading.
         is_object: (h, w) pixels of one object, without its border.
-        object_m: standard deviation of the real surface from its model.
+        object_std_m: standard deviation of the real surface from its model.
+        focal_px: of the depth image.
     """
     masked_m = np.where(is_object, depth_m, np.nan)
     distance_m = float(np.nanmedian(masked_m)) if np.isfinite(masked_m).any() else 0.0
@@ -106,13 +119,18 @@ def measure_noise(depth_m: np.ndarray, is_object: np.ndarray, object_m: float) -
     if len(bend_m) < _FEWEST_DIFFERENCES:
         bend_m = _second_differences(depth_m)
     if len(bend_m) < _FEWEST_DIFFERENCES:
-        white_m = NOISE_PER_M2 * distance_m**2
+        white_std_m = NOISE_PER_M2 * distance_m**2
     else:
         # A second difference of independent readings has six times their variance.
-        white_m = _MEDIAN_TO_DEVIATION * float(np.median(np.abs(bend_m))) / math.sqrt(6)
+        white_std_m = _MEDIAN_TO_DEVIATION * float(np.median(np.abs(bend_m))) / math.sqrt(6)
         # On a small object its own curvature is in the differences: no sensor is so noisy.
-        white_m = min(white_m, NOISIEST_PER_M2 * distance_m**2)
-    return DepthNoise(white_m=white_m, shared_m=SHARED_PER_WHITE * white_m, object_m=object_m)
+        white_std_m = min(white_std_m, NOISIEST_PER_M2 * distance_m**2)
+    return DepthNoise(
+        white_std_m=white_std_m,
+        shared_std_m=SHARED_PER_WHITE * white_std_m,
+        lateral_std_m=LATERAL_PX * distance_m / focal_px,
+        object_std_m=object_std_m,
+    )
 
 
 def _second_differences(depth_m: np.ndarray) -> np.ndarray:
@@ -140,7 +158,9 @@ def measure_noise_per_m2(depth_m: Float64[Tensor, "h w"]) -> float:
         bend = (along[:, : -2 * LAG_PX] + along[:, 2 * LAG_PX :] - 2 * middle) / middle.square()
         bends.append(bend[bend.isfinite()])
     bend = torch.cat(bends).abs()
-    return float(bend.median()) / 0.6745 / math.sqrt(6) if len(bend) else NOISE_PER_M2
+    if len(bend) == 0:
+        return NOISE_PER_M2
+    return _MEDIAN_TO_DEVIATION * float(bend.median()) / math.sqrt(6)
 
 
 def plane_tolerance_m(depth_m: Float64[Tensor, "*n"], noise_per_m2: float) -> Float64[Tensor, "*n"]:

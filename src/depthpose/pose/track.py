@@ -39,12 +39,14 @@ object's; between two frames it moves by less."""
 _MOST_POINTS = 10_000  # of what a camera saw about the object, evenly taken
 _LEAST_POINTS = 60
 _NEW_EVIDENCE = 0.2
-"""Of the evidence of a frame so much is new: the sensor and the object err alike in the next."""
+"""Share of a frame's evidence that is new: sensor and object err alike in the next frame."""
 _MOST_LOG_ODDS = 9.0  # of a track: a few contradicting frames must be able to end it
 _LEAST_CERTAINTY = 1e-4
 _SUPPORTS = 2  # planes beside the object that are looked for: a table and a wall
 _SUPPORT_POINTS = 1000  # beside the object, that show them
 _SUPPORT_DEVIATIONS = 3.0  # of the points of such a plane: nearer ones are of it
+_LITTLE = 0.2  # share of the points near an object that its support may leave
+_FLAT = 0.9  # share of a flat object's surface that lies in the plane of its support
 
 
 def scene_about(pose_input: AnyInput, poses: Rigid, surface: Surface) -> Float64[Tensor, "n 3"]:
@@ -139,11 +141,11 @@ def _follow_or_search(
         spent_s = time.perf_counter() - began
         if not isinstance(followed, Refusal):
             estimate, following = followed
-            return replace(estimate, name=pose_input.name, seconds={"icp": spent_s}), following
+            return replace(estimate, name=pose_input.name, seconds={"tracking": spent_s}), following
 
     # Not known from the frame before, or not seen there.
     searched = target.search(pose_input)
-    seconds = {**searched.seconds, "icp": searched.seconds.get("icp", 0.0) + spent_s}
+    seconds = {"tracking": spent_s, **searched.seconds}
     pose = searched.camera_from_model
     tracking = "lost" if pose is None else "found"
     estimate = replace(searched, name=pose_input.name, seconds=seconds, tracking=tracking)
@@ -170,7 +172,7 @@ def _follow(
         starts.insert(0, Rigid(R, current.pose.t_m + current.moved.t_m))
     poses = Rigid.stack(starts)
 
-    # The points there, but for those of what it lies on.
+    # The points near these poses, without the plane that the object lies on.
     scene_m = scene_about(pose_input, poses, surface)
     near = _is_near(scene_m, poses, surface, MARGIN)
     is_support = _is_support(scene_m, near, current.pose.apply(surface.points_m))
@@ -280,9 +282,12 @@ def _is_support(
         limit_m = _SUPPORT_DEVIATIONS * gap_m.square().mean().sqrt()
         is_support |= (scene_m @ normal - offset).abs() < limit_m
         is_flat |= (posed_m @ normal - offset).abs() < limit_m
-    # What is as flat as the noise cannot be parted from what it lies on; else it was taken away.
-    few = int((near & ~is_support).sum()) < max(_LEAST_POINTS, 0.2 * int(near.sum()))
-    return torch.zeros_like(near) if few and float(is_flat.double().mean()) > 0.9 else is_support
+    # An object as flat as the noise cannot be told from its support: all points are kept. Of any
+    # other one, few points beside the support mean that it was taken away.
+    left = int((near & ~is_support).sum())
+    is_little_left = left < max(_LEAST_POINTS, _LITTLE * int(near.sum()))
+    is_object_flat = float(is_flat.double().mean()) > _FLAT
+    return torch.zeros_like(near) if is_little_left and is_object_flat else is_support
 
 
 def _is_near(

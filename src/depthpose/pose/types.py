@@ -272,14 +272,15 @@ class Evidence:
         return self.supported / compared if compared > 0 else 0.0
 
     @property
-    def observed(self) -> float:
-        """Share of the visible area on which readings lie, 0..1."""
+    def supported_share(self) -> float:
+        """Share of the visible area whose readings support the pose, 0..1."""
         return self.supported / self.visible if self.visible > 0 else 0.0
 
 
 IdentityStatus = Literal["confirmed", "not excluded", "contradicted"]
-"""Confirmed: neither another size nor the mirror image fits. Not excluded: one of them fits as
-well, or it was not tested. Contradicted: one fits better by more than the sensor explains."""
+"""Confirmed: neither another size nor the mirror image fits, and no reading contradicts the model.
+Not excluded: one of them fits as well, something contradicts it, or it was not tested.
+Contradicted: one of them fits better by more than the sensor explains."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -351,7 +352,7 @@ class PoseEstimate:
     @property
     def visible_share(self) -> float | None:
         """Share of the surface that faces the camera on which readings lie, 0..1; None: unknown."""
-        return None if self.evidence is None else self.evidence.observed
+        return None if self.evidence is None else self.evidence.supported_share
 
     def in_base(self, base_from_camera: Rigid) -> "PoseEstimate":
         """Add ``base_from_model`` by a hand-eye calibration in metres; a refusal has none."""

@@ -312,7 +312,7 @@ def pose_facts(
     if (evidence := estimate.evidence) is not None:
         facts += [
             ("agreement", f"{evidence.agreement:.1%} of what was compared supports the pose"),
-            ("visible", f"{evidence.observed:.0%} of the surface that faces the camera"),
+            ("visible", f"{evidence.supported_share:.0%} of the surface that faces the camera"),
             ("noise of the sensor there", f"{1000 * evidence.noise_m:.1f} mm"),
         ]
     if estimate.pick_rank is not None:

@@ -40,10 +40,10 @@ from depthpose.depth.stereo import (
     Matcher,
     NetworkMatcher,
     SGBMMatcher,
-    choose_window,
+    choose_search_range,
     doubt_hidden,
     doubt_outside,
-    measure_reach,
+    measure_disparity_range,
     move_views,
     moved_back,
 )
@@ -128,12 +128,12 @@ def _match_in_range(
     """
     assert pair.right is not None
     left = pair.left
-    reach = measure_reach(matcher, left, pair.right, -cx_difference_px)
-    window = choose_window(matcher, reach, left.shape[1:], pair.camera)
-    (match,) = matcher.match_many([(left, pair.right)], pair.camera, window.search)
+    measured = measure_disparity_range(matcher, left, pair.right, -cx_difference_px)
+    search = choose_search_range(matcher, measured, left.shape[1:], pair.camera)
+    (match,) = matcher.match_many([(left, pair.right)], pair.camera, search)
     if not matcher.config.with_left_right_check:
-        match = doubt_hidden(match, reach)
-    return doubt_outside(match, reach, window)
+        match = doubt_hidden(match, measured)
+    return doubt_outside(match, measured, search)
 
 
 def _match_moved_views(matcher: Matcher, pair: StereoInput, cx_difference_px: float) -> Match:

@@ -6,7 +6,7 @@ from depthpose.depth.stereo.matcher import CallableMatcher as CallableMatcher
 from depthpose.depth.stereo.matcher import CameraMatcher as CameraMatcher
 from depthpose.depth.stereo.matcher import Matcher as Matcher
 from depthpose.depth.stereo.matcher import NetworkMatcher as NetworkMatcher
-from depthpose.depth.stereo.matcher import Search as Search
+from depthpose.depth.stereo.matcher import SearchRange as SearchRange
 from depthpose.depth.stereo.matcher import SGBMMatcher as SGBMMatcher
 from depthpose.depth.stereo.matcher import StereoNetwork as StereoNetwork
 from depthpose.depth.stereo.matcher import check_pair as check_pair
@@ -16,11 +16,10 @@ from depthpose.depth.stereo.psmnet import PSMNet as PSMNet
 from depthpose.depth.stereo.psmnet import PSMNetMatcher as PSMNetMatcher
 from depthpose.depth.stereo.psmnet import import_psmnet as import_psmnet
 from depthpose.depth.stereo.psmnet import psmnet_from_published as psmnet_from_published
-from depthpose.depth.stereo.reach import Reach as Reach
-from depthpose.depth.stereo.reach import Window as Window
-from depthpose.depth.stereo.reach import choose_window as choose_window
-from depthpose.depth.stereo.reach import doubt_hidden as doubt_hidden
-from depthpose.depth.stereo.reach import doubt_outside as doubt_outside
-from depthpose.depth.stereo.reach import measure_reach as measure_reach
-from depthpose.depth.stereo.reach import move_views as move_views
-from depthpose.depth.stereo.reach import moved_back as moved_back
+from depthpose.depth.stereo.search_range import DisparityRange as DisparityRange
+from depthpose.depth.stereo.search_range import choose_search_range as choose_search_range
+from depthpose.depth.stereo.search_range import doubt_hidden as doubt_hidden
+from depthpose.depth.stereo.search_range import doubt_outside as doubt_outside
+from depthpose.depth.stereo.search_range import measure_disparity_range as measure_disparity_range
+from depthpose.depth.stereo.search_range import move_views as move_views
+from depthpose.depth.stereo.search_range import moved_back as moved_back

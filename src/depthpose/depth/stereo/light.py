@@ -560,8 +560,8 @@ class LightMatcher(NetworkMatcher):
 
     fine_pixels = 650_000
     """Pixels of a fine match at most: an image of KITTI, enlarged 1.18 times."""
-    most_enlarged = 1.5
-    most_disparities = 1.75
+    largest_upscale = 1.5
+    largest_span_factor = 1.75
     finds_range = True
     activation_bytes = staticmethod(light_bytes)
 

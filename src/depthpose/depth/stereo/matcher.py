@@ -49,12 +49,17 @@ class Matcher(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Search:
-    """The size at which a pair is matched, and how many disparities are looked through there."""
+class SearchRange:
+    """The size at which a pair is matched, and the disparities that are searched there."""
 
     scale: float  #: rows and columns are so many times those of the images
-    first_px: int  #: the least disparity that is searched at that size, a multiple of 4
-    max_disparity_px: int  #: so many disparities are searched from there on
+    first_px: int  #: the least disparity, in pixels at that scale, a multiple of 4
+    span_px: int  #: how many disparities are searched from there on
+
+    @property
+    def last_in_images_px(self) -> float:
+        """The largest disparity, in pixels of the images."""
+        return (self.first_px + self.span_px) / self.scale
 
 
 @runtime_checkable
@@ -277,9 +282,9 @@ class NetworkMatcher(ABC):
 
     fine_pixels: ClassVar[int]
     """Pixels of a fine match at most."""
-    most_enlarged: ClassVar[float] = 1.0
+    largest_upscale: ClassVar[float] = 1.0
     """Times the size of the images at which a fine match may be."""
-    most_disparities: ClassVar[float] = 1.5
+    largest_span_factor: ClassVar[float] = 1.5
     """Times the disparities of training that a fine match looks through at most."""
     finds_range: bool = False
     """Whether the disparities of a pair are measured first, and searched where they lie."""
@@ -338,7 +343,7 @@ class NetworkMatcher(ABC):
         self,
         pairs: Sequence[tuple[Tensor, Tensor]],
         camera: Camera | None = None,
-        search: Search | None = None,
+        search: SearchRange | None = None,
     ) -> list[Match]:
         """Match pairs; those of one size together, unless memory is bounded.
 
@@ -373,13 +378,13 @@ class NetworkMatcher(ABC):
         self,
         pairs: Sequence[tuple[Tensor, Tensor]],
         camera: Camera | None,
-        search: Search | None,
+        search: SearchRange | None,
     ) -> tuple[Sequence[tuple[Tensor, ...]], Any]:
         """Resize pairs to the size at which they are matched, with the settings for that size."""
         trained = self.network_config
         if search is not None:
             sizes = [_scaled_size(left, search.scale, camera) for left, _ in pairs]
-            largest_px = search.max_disparity_px
+            largest_px = search.span_px
         elif camera is not None and trained.work_focal_px is not None:
             sizes = [self.work_size(camera)] * len(pairs)
             largest_px = self.work_disparities(camera)
@@ -457,7 +462,7 @@ class NetworkMatcher(ABC):
         if trained.work_focal_px is None:
             return trained.max_disparity_px
         # A larger size needs more disparities; the same filters look through them.
-        larger = min(self.work_focal_px(camera) / trained.work_focal_px, self.most_disparities)
+        larger = min(self.work_focal_px(camera) / trained.work_focal_px, self.largest_span_factor)
         return self.whole_steps(trained.max_disparity_px * larger)
 
     def whole_steps(self, disparity_px: float) -> int:
@@ -473,7 +478,7 @@ class NetworkMatcher(ABC):
         if self.config.speed == "quick":
             return trained_px
         share = math.sqrt(self.fine_pixels / (camera.height * camera.width))
-        return max(trained_px, float(camera.K[0, 0]) * min(share, self.most_enlarged))
+        return max(trained_px, float(camera.K[0, 0]) * min(share, self.largest_upscale))
 
 
 def _scaled_size(left: View, scale: float, camera: Camera | None) -> tuple[int, int]:
@@ -507,8 +512,8 @@ def lower_where_disagreeing(
 ) -> Match:
     """Lower the confidence where the right view's own disparity is another.
 
-    Halved at least where the matching point lies outside the right view: nothing there can
-    agree, and nothing contradicts. That of the sky is kept.
+    Halved where the matching point lies outside the right view, for nothing there can agree. The
+    sky keeps its confidence.
 
     Args:
         match: that of the left view.

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from depthpose.core.arrays import take_evenly
-from depthpose.core.rigid import Rigid, geodesic_rad
+from depthpose.core.rigid import Rigid, geodesic_rad, rotation_by
 from depthpose.pose.cloud import thin
 from depthpose.pose.compiled import ANGLES, DISTANCES, MOST_ALIKE, TURNS, use_numba
 from depthpose.pose.config import IcpConfig
@@ -112,8 +112,9 @@ def find_turns(model: ObjectModel) -> dict[str, Any]:
     candidates, _ = vote_poses(table.points_m, table.frames[..., 0], references, table, _SELF_PEAKS)
     candidates = candidates[_distinct_turns(candidates, surface)[0]]
     # With the camera in the middle of the model, from where it sees all.
-    points_m, starts = surface.points_m - surface.middle_m, candidates.t_m - surface.middle_m
-    candidates = refine_roughly(points_m, Rigid(candidates.R, starts), surface, IcpConfig())
+    points_m = surface.points_m - surface.middle_m
+    starts = Rigid(candidates.R, candidates.t_m - surface.middle_m)
+    candidates = refine_roughly(points_m, starts, surface, IcpConfig())
     candidates = Rigid(candidates.R, candidates.t_m + surface.middle_m)
     candidates = candidates[_distinct_turns(candidates, surface)[0]]
     # One after the other they are turns too, which fill the gaps between those that were found.
@@ -135,7 +136,8 @@ def _distinct_turns(turns: Rigid, surface: Surface) -> tuple[list[int], int]:
     is_alike = (local_m - surface.points_m[index]).norm(dim=-1) < NEAR * surface.diameter_m
     cosine = ((surface.normals[index] @ turns.R.mT) * surface.normals[::every]).sum(-1)
     share = (is_alike & (cosine.abs() > _MIN_COSINE)).double().mean(-1)
-    chosen, taken = list[int](), surface.symmetries.R
+    chosen: list[int] = []
+    taken = surface.symmetries.R
     for k in share.argsort(descending=True).tolist():
         least = _LEAST_OF_BEST * float(share[chosen[0]]) if chosen else _LEAST_SHARE
         if share[k] < max(least, _LEAST_SHARE) or len(chosen) == _MOST_TURNS:
@@ -157,7 +159,8 @@ def prepare_pairs(surface: Surface) -> PairTable:
     step_m = STEP * surface.diameter_m
     while len(kept := thin(points_m, normals, step_m)) > _MODEL_POINTS:
         step_m *= _COARSER
-    points_m, frames = points_m[kept], _frames(normals[kept])
+    points_m = points_m[kept]
+    frames = _frames(normals[kept])
     count = len(points_m)
     first, second = (~torch.eye(count, dtype=torch.bool)).nonzero(as_tuple=True)
     feature, turn_rad = _features(points_m, frames, first, second, surface.diameter_m)
@@ -195,7 +198,9 @@ def propose_poses(
         generator: chooses the reference points.
     """
     chosen = torch.randperm(len(points_m), generator=generator)
-    points_m, normals = points_m[chosen[:_SCENE_POINTS]], normals[chosen[:_SCENE_POINTS]]
+    chosen = chosen[:_SCENE_POINTS]
+    points_m = points_m[chosen]
+    normals = normals[chosen]
     references = torch.arange(min(_REFERENCES, len(points_m)))
     poses, _ = vote_poses(points_m, normals, references, table, _PEAKS)
     scores = _scores(points_m, normals, poses, table.surface)
@@ -209,18 +214,21 @@ def _seen_from_outside(
     """Give the points that a camera far off sees, with normals toward it; thin sheets have both."""
     half = fibonacci_directions(_VIEWS // 2).double()
     directions = torch.cat([half, -half])
-    every = []
+    seen_from: list[Tensor] = []
     for toward in directions:
         across = torch.linalg.svd(toward[None]).Vh[1:]
         cells = ((surface.points_m @ across.T) / surface.diameter_m * _CELLS).floor().long()
         column, row = (cells - cells.amin(0)).unbind(-1)
         width = int(row.max()) + 1
-        place, depth_m = column * width + row, surface.points_m @ toward
+        cell = column * width + row
+        toward_m = surface.points_m @ toward
         nearest_m = torch.full(((int(column.max()) + 1) * width,), -torch.inf, dtype=torch.float64)
-        nearest_m.scatter_reduce_(0, place, depth_m, "amax")
-        every.append(depth_m > nearest_m[place] - surface.diameter_m / _CELLS)
-    seen, cosine = torch.stack(every), directions @ surface.normals.T
-    front, back = ((seen & (sign * cosine > _FACING)).any(0) for sign in (1, -1))
+        nearest_m.scatter_reduce_(0, cell, toward_m, "amax")
+        seen_from.append(toward_m > nearest_m[cell] - surface.diameter_m / _CELLS)
+    is_seen = torch.stack(seen_from)
+    cosine = directions @ surface.normals.T
+    front = (is_seen & (cosine > _FACING)).any(0)
+    back = (is_seen & (-cosine > _FACING)).any(0)
     points_m = torch.cat([surface.points_m[front], surface.points_m[back]])
     return points_m, torch.cat([surface.normals[front], -surface.normals[back]])
 
@@ -283,29 +291,32 @@ def vote_poses(
     Returns:
         Poses and their votes, reference after reference.
     """
-    frames, models = _frames(normals), len(table.points_m)
-    peaks = min(peaks, models)
+    frames = _frames(normals)
+    peaks = min(peaks, len(table.points_m))
     if use_numba(points_m):
         from depthpose.pose.compiled.pairs import vote
 
         shape = (len(references), peaks)
-        number, bin_ = torch.zeros(shape, dtype=torch.int64), torch.zeros(shape, dtype=torch.int64)
+        number = torch.zeros(shape, dtype=torch.int64)
+        turn_bin = torch.zeros(shape, dtype=torch.int64)
         votes = torch.zeros(shape, dtype=torch.float64)
         vote(
             finite_array(points_m.numpy()), finite_array(frames.numpy()), references.numpy(),
-            table.bounds.numpy(), table.first.numpy(), table.turn_rad.numpy(), models,
-            STEP * table.surface.diameter_m, number.numpy(), bin_.numpy(), votes.numpy(),
+            table.bounds.numpy(), table.first.numpy(), table.turn_rad.numpy(), len(table.points_m),
+            STEP * table.surface.diameter_m, number.numpy(), turn_bin.numpy(), votes.numpy(),
         )  # fmt: skip
-        number, bin_, votes = number.flatten(), bin_.flatten(), votes.flatten()
+        number = number.flatten()
+        turn_bin = turn_bin.flatten()
+        votes = votes.flatten()
     else:
-        chunks = [_peaks(points_m, frames, some, table, peaks)
-                  for some in references.split(20)]  # fmt: skip
-        number, bin_, votes = (torch.cat(parts) for parts in zip(*chunks, strict=True))
+        chunks = [_peaks(points_m, frames, chunk, table, peaks)
+                  for chunk in references.split(20)]  # fmt: skip
+        number, turn_bin, votes = (torch.cat(parts) for parts in zip(*chunks, strict=True))
+
     # Model points and their normals on reference points, turned about the normals.
-    angle = ((bin_ + 0.5) * (2 * math.pi / TURNS)).double()
+    angle = ((turn_bin + 0.5) * (2 * math.pi / TURNS)).double()
+    turn = rotation_by(angle[:, None] * angle.new_tensor([1.0, 0.0, 0.0]))
     reference = references.repeat_interleave(peaks)
-    ones, zero, c, s = torch.ones_like(angle), torch.zeros_like(angle), angle.cos(), angle.sin()
-    turn = torch.stack([ones, zero, zero, zero, c, -s, zero, s, c], -1).reshape(-1, 3, 3)
     R = frames[reference] @ turn @ table.frames[number].mT
     t_m = points_m[reference] - (R @ table.points_m[number][..., None]).squeeze(-1)
     return Rigid(R, t_m), votes
@@ -319,43 +330,66 @@ def _peaks(
     peaks: int,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Vote without numba: numbers of model points, bins of turns and votes."""
-    count, models, diameter_m = len(references), len(table.points_m), table.surface.diameter_m
-    far_m = (points_m[references, None] - points_m).norm(dim=-1)
+    diameter_m = table.surface.diameter_m
+    model_points = len(table.points_m)
+
+    # Pairs of each reference and the points that are neither too near nor too far.
     step_m = STEP * diameter_m
-    used = (far_m > step_m) & (far_m < DISTANCES * step_m)
-    row, second = used.nonzero(as_tuple=True)
+    distance_m = (points_m[references, None] - points_m).norm(dim=-1)
+    is_paired = (distance_m > step_m) & (distance_m < DISTANCES * step_m)
+    row, second = is_paired.nonzero(as_tuple=True)
     feature, turn_rad = _features(points_m, frames, references[row], second, diameter_m)
-    # The bin of each feature, and of each of its four values the next bin beside it.
+
+    # Each looks up its own feature and, in each of its four values, the nearer bin beside it.
     own_bin = feature.floor().long()
     aside = torch.where(feature - own_bin < 0.5, -1, 1)
-    moved = own_bin[:, None] + aside[:, None] * torch.eye(4, dtype=torch.int64)
-    keys = torch.cat([_key(own_bin)[:, None], _key(moved)], 1)
-    size = (table.bounds[keys + 1] - table.bounds[keys]).long()
-    same = (keys[:, 1:] == keys[:, :1]).nonzero(as_tuple=True)
-    size[:, 1:][same] = 0
-    turn_bin = ((turn_rad + math.pi) / (2 * math.pi) * TURNS).long().clamp(max=TURNS - 1)
-    vote_key = (row[:, None] * len(table.bounds) + keys) * TURNS + turn_bin[:, None]
-    vote_key = torch.where(size > 0, vote_key, -1).flatten()
-    _, place = vote_key.unique(return_inverse=True)
-    first = torch.full((int(place.max()) + 1 if len(place) else 0,), len(vote_key))
-    first = first.scatter_reduce_(0, place, torch.arange(len(vote_key)), "amin")
-    first = first[vote_key[first] >= 0].sort().values
-    size = size.flatten()[first]
-    pairs_read = size.clamp(max=MOST_ALIKE)
-    key_of_pair = torch.repeat_interleave(torch.arange(len(pairs_read)), pairs_read)
-    offset = torch.arange(len(key_of_pair)) - (pairs_read.cumsum(0) - pairs_read)[key_of_pair]
-    pair = table.bounds[keys.flatten()[first][key_of_pair]] + offset
-    scene = first[key_of_pair] // keys.shape[1]
-    turn = (turn_rad[scene] - table.turn_rad[pair]) / (2 * math.pi) % 1
-    bin_ = (turn * TURNS).long().clamp(max=TURNS - 1)
-    cell = (row[scene] * models + table.first[pair]) * TURNS + bin_
-    weight = 1 / size[key_of_pair].double().sqrt()
-    votes = torch.bincount(cell, weight, minlength=count * models * TURNS)
-    votes = votes.reshape(count, models, TURNS)
+    beside = own_bin[:, None] + aside[:, None] * torch.eye(4, dtype=torch.int64)
+    keys = torch.cat([_key(own_bin)[:, None], _key(beside)], 1)
+    model_pairs = (table.bounds[keys + 1] - table.bounds[keys]).long()
+    is_own_again = keys[:, 1:] == keys[:, :1]  # beyond the last bin
+    model_pairs[:, 1:][is_own_again] = 0
+
+    # A turn votes once for a feature: of look-ups that have both alike the first counts.
+    turn_bin = _turn_bin((turn_rad + math.pi) / (2 * math.pi))
+    vote = (row[:, None] * len(table.bounds) + keys) * TURNS + turn_bin[:, None]
+    vote = torch.where(model_pairs > 0, vote, -1).flatten()
+    lookup = _first_of_each(vote)
+    lookup = lookup[vote[lookup] >= 0].sort().values
+
+    # The model's pairs of each look-up; of a frequent feature the first ones.
+    alike = model_pairs.flatten()[lookup]
+    read = alike.clamp(max=MOST_ALIKE)
+    of_read = torch.repeat_interleave(torch.arange(len(read)), read)
+    offset = torch.arange(len(of_read)) - (read.cumsum(0) - read)[of_read]
+    model_pair = table.bounds[keys.flatten()[lookup][of_read]] + offset
+    scene_pair = lookup[of_read] // keys.shape[1]
+
+    # A vote for a model point and a turn; rare features weigh more, and neighbouring turns share.
+    turn = (turn_rad[scene_pair] - table.turn_rad[model_pair]) / (2 * math.pi) % 1
+    model_point = row[scene_pair] * model_points + table.first[model_pair]
+    weight = 1 / alike[of_read].double().sqrt()
+    bins = len(references) * model_points * TURNS
+    votes = torch.bincount(model_point * TURNS + _turn_bin(turn), weight, minlength=bins)
+    votes = votes.reshape(len(references), model_points, TURNS)
     votes = 2 * votes + votes.roll(1, -1) + votes.roll(-1, -1)
-    most, bins = votes.max(-1)
+
+    # The best turn of each model point, and of these the best model points.
+    most, best_turn = votes.max(-1)
     best = most.topk(peaks)
-    return best.indices.flatten(), bins.gather(1, best.indices).flatten(), best.values.flatten()
+    number = best.indices
+    return number.flatten(), best_turn.gather(1, number).flatten(), best.values.flatten()
+
+
+def _turn_bin(share: Float64[Tensor, " n"]) -> Int64[Tensor, " n"]:
+    """Number the bin of a turn, as a share of a whole one."""
+    return (share * TURNS).long().clamp(max=TURNS - 1)
+
+
+def _first_of_each(numbers: Int64[Tensor, " n"]) -> Int64[Tensor, " m"]:
+    """Give the place at which each different number is met first, in the order of the numbers."""
+    different, which = numbers.unique(return_inverse=True)
+    first = torch.full((len(different),), len(numbers))
+    return first.scatter_reduce_(0, which, torch.arange(len(numbers)), "amin")
 
 
 def _scores(

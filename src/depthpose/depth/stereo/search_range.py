@@ -18,15 +18,15 @@ from torch.nn import functional as F
 
 from depthpose.core.camera import Camera
 from depthpose.depth.disparity import changed_match, warp_right_to_left
-from depthpose.depth.stereo.matcher import NetworkMatcher, Search, lower_where_disagreeing
+from depthpose.depth.stereo.matcher import NetworkMatcher, SearchRange, lower_where_disagreeing
 from depthpose.depth.types import Map, Match
 from depthpose.depth.visible import without_picture
 
 _TAIL = 0.001
 """Share of the copy's pixels that may lie beyond either end: single pixels at edges are wrong."""
 _SURE = 0.5
-"""Confidence from which a near place counts: it is more probable than not. What is far is always
-less sure, by the few disparities that are like it, so every far place counts."""
+"""Confidence from which a near place counts: it is more probable than not. Every far place counts,
+for its confidence is low by construction: few disparities are within 15 % of a small one."""
 STEP_PX = 4
 """Between disparities that have a score, of every network here: volumes are of a quarter's size."""
 _NAMED = 0.001
@@ -34,7 +34,7 @@ _NAMED = 0.001
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Reach:
+class DisparityRange:
     """Where the disparities of a pair lie, in pixels of its images."""
 
     low_px: float  #: the least, or infinity's where that may be there
@@ -42,21 +42,6 @@ class Reach:
     step_px: float  #: how exactly they are known, which both ends include
     coarse: Match  #: the match of the copy, at the size of the images
     right_px: Map  #: disparity of the right view in the copy, at the size of the images
-
-
-@dataclass(frozen=True, kw_only=True)
-class Window:
-    """Disparities that are searched, in pixels of the images."""
-
-    search: Search  #: how they are searched
-    first_px: float  #: the least
-    last_px: float  #: the largest
-
-
-def _window(search: Search) -> Window:
-    first_px = search.first_px / search.scale
-    last_px = first_px + search.max_disparity_px / search.scale
-    return Window(search=search, first_px=first_px, last_px=last_px)
 
 
 def move_views(left: Tensor, right: Tensor, first_px: int) -> tuple[Tensor, Tensor]:
@@ -91,10 +76,10 @@ def moved_back(match: Match, first_px: int) -> Match:
     return replace(moved, confidence=moved.confidence.where(columns >= first_px, 0.0))
 
 
-def measure_reach(
+def measure_disparity_range(
     matcher: NetworkMatcher, left: Tensor, right: Tensor, infinity_px: float
-) -> Reach:
-    """Measure the disparities of a pair in a narrow copy of it.
+) -> DisparityRange:
+    """Measure where the disparities of a pair lie, in a narrow copy of it.
 
     Args:
         matcher: a network that matches pairs of any size.
@@ -105,11 +90,11 @@ def measure_reach(
     """
     trained = matcher.network_config
     width = left.shape[2]
-    reach_px = matcher.whole_steps(trained.max_disparity_px * matcher.most_disparities)
-    scale = min(1.0, reach_px / (width + abs(infinity_px)))
+    span_px = matcher.whole_steps(trained.max_disparity_px * matcher.largest_span_factor)
+    scale = min(1.0, span_px / (width + abs(infinity_px)))
     step_px = STEP_PX / scale
     first_px = STEP_PX * math.floor(infinity_px * scale / STEP_PX)
-    search = Search(scale=scale, first_px=first_px, max_disparity_px=reach_px)
+    search = SearchRange(scale=scale, first_px=first_px, span_px=span_px)
     views = (left, right)
     mirrored = (right.flip(-1), left.flip(-1))
     coarse, other = matcher.match_many([views, mirrored], search=search)
@@ -143,43 +128,43 @@ def measure_reach(
     near_px = sampled_px[counts_as_near].sort().values
     if min(len(far_px), len(near_px)) <= tail:  # too few are left: all samples count
         far_px = near_px = sampled_px.flatten().sort().values
-    low_px = float(far_px[tail]) - step_px
-    high_px = float(near_px[-1 - tail]) + step_px
-    return Reach(
-        low_px=max(low_px, infinity_px),
-        high_px=max(high_px, low_px + step_px),
+    low_px = max(float(far_px[tail]) - step_px, infinity_px)
+    high_px = max(float(near_px[-1 - tail]) + step_px, low_px + step_px)
+    return DisparityRange(
+        low_px=low_px,
+        high_px=high_px,
         step_px=step_px,
         coarse=coarse,
         right_px=right_px[0],
     )
 
 
-def choose_window(
-    matcher: NetworkMatcher, reach: Reach, size: Sequence[int], camera: Camera | None
-) -> Window:
+def choose_search_range(
+    matcher: NetworkMatcher, measured: DisparityRange, size: Sequence[int], camera: Camera | None
+) -> SearchRange:
     """Choose the disparities that are searched, so that those that were measured are among them.
 
     They are at least as many as the network was trained with.
 
     Args:
         matcher: a network.
-        reach: what was measured.
+        measured: where the disparities lie.
         size: rows and columns of the images.
         camera: of the left image, where it is known.
     """
     scale, usual_span_px = _usual_size(matcher, size, camera)
-    high_px = reach.high_px
+    high_px = measured.high_px
     if matcher.config.max_disparity_px is not None:
         high_px = matcher.config.max_disparity_px
     # The volume has scale^2 H W pixels and scale span disparities: a wider span is searched at a
     # smaller scale, in the same memory.
-    span_px = max(high_px - reach.low_px, reach.step_px)
+    span_px = max(high_px - measured.low_px, measured.step_px)
     if span_px * scale > usual_span_px:
         scale = (usual_span_px * scale**2 / span_px) ** (1 / 3)
-    first_px = STEP_PX * math.floor(reach.low_px * scale / STEP_PX)
+    first_px = STEP_PX * math.floor(measured.low_px * scale / STEP_PX)
     trained_px = matcher.network_config.max_disparity_px
-    searched = max(trained_px, matcher.whole_steps(high_px * scale - first_px))
-    return _window(Search(scale=scale, first_px=first_px, max_disparity_px=searched))
+    searched_px = max(trained_px, matcher.whole_steps(high_px * scale - first_px))
+    return SearchRange(scale=scale, first_px=first_px, span_px=searched_px)
 
 
 def _usual_size(
@@ -196,11 +181,11 @@ def _usual_size(
     if matcher.config.speed == "quick" or trained.work_focal_px is None:
         return 1.0, trained.max_disparity_px
     scale = math.sqrt(matcher.fine_pixels / (size[0] * size[1]))
-    span_px = matcher.whole_steps(trained.max_disparity_px * matcher.most_disparities)
-    return min(scale, matcher.most_enlarged), span_px
+    span_px = matcher.whole_steps(trained.max_disparity_px * matcher.largest_span_factor)
+    return min(scale, matcher.largest_upscale), span_px
 
 
-def doubt_hidden(match: Match, reach: Reach) -> Match:
+def doubt_hidden(match: Match, measured: DisparityRange) -> Match:
     """Lower the confidence where the narrow copy's right view disagrees: mostly hidden places.
 
     A difference of up to a pixel of the copy is within its error. A check at full size would find
@@ -208,11 +193,11 @@ def doubt_hidden(match: Match, reach: Reach) -> Match:
     """
     if match.confidence is None:
         return match
-    pixel_px = reach.step_px / STEP_PX
-    return lower_where_disagreeing(match, reach.right_px, pixel_px, 2 * pixel_px)
+    pixel_px = measured.step_px / STEP_PX
+    return lower_where_disagreeing(match, measured.right_px, pixel_px, 2 * pixel_px)
 
 
-def doubt_outside(match: Match, reach: Reach, window: Window) -> tuple[Match, str]:
+def doubt_outside(match: Match, measured: DisparityRange, search: SearchRange) -> tuple[Match, str]:
     """Set the confidence to 0 where the true disparity may lie beyond what was searched.
 
     That is where the narrow copy has a larger disparity than was searched, and where the match is
@@ -224,22 +209,25 @@ def doubt_outside(match: Match, reach: Reach, window: Window) -> tuple[Match, st
     """
     if match.confidence is None:
         return match, ""
-    coarse_px = reach.coarse.disparity_px
-    coarse_confidence = reach.coarse.confidence
-    # Within two pixels of the copy, its error, neighbours may be beyond too.
-    is_beyond = coarse_px > window.last_px - reach.step_px
-    if bool(is_beyond.any()):
-        radius = round(2 * reach.step_px / STEP_PX)
-        wide = is_beyond.float()[None]
+    coarse_px = measured.coarse.disparity_px
+    coarse_confidence = measured.coarse.confidence
+    last_px = search.last_in_images_px
+    # Within two pixels of the copy, its error, neighbours may lie beyond too.
+    may_be_beyond = coarse_px > last_px - measured.step_px
+    if bool(may_be_beyond.any()):
+        radius = round(2 * measured.step_px / STEP_PX)
+        wide = may_be_beyond.float()[None]
         for kernel, padding in (
             ((1, 2 * radius + 1), (0, radius)),
             ((2 * radius + 1, 1), (radius, 0)),
         ):
             wide = F.max_pool2d(wide, kernel, 1, padding)
-        is_beyond = wide[0] > 0
-    is_last = match.disparity_px > window.last_px - STEP_PX / window.search.scale
-    doubted = replace(match, confidence=match.confidence.masked_fill(is_beyond | is_last, 0.0))
-    is_beyond = coarse_px > window.last_px + reach.step_px
+        may_be_beyond = wide[0] > 0
+    is_last = match.disparity_px > last_px - STEP_PX / search.scale
+    doubted = replace(match, confidence=match.confidence.masked_fill(may_be_beyond | is_last, 0.0))
+
+    # What is surely beyond is named.
+    is_beyond = coarse_px > last_px + measured.step_px
     is_beyond &= coarse_px <= torch.arange(coarse_px.shape[1], device=coarse_px.device)
     if coarse_confidence is not None:
         is_beyond &= coarse_confidence >= _SURE
@@ -247,7 +235,7 @@ def doubt_outside(match: Match, reach: Reach, window: Window) -> tuple[Match, st
     if share < _NAMED:
         return doubted, ""
     return doubted, (
-        f"{share:.1%} of the image have disparities beyond {window.last_px:.0f} px, the largest "
+        f"{share:.1%} of the image have disparities beyond {last_px:.0f} px, the largest "
         f"that was searched (up to {float(coarse_px[is_beyond].max()):.0f} px); their confidence "
         "is 0. Give a larger --max-disparity (in Python MatcherConfig(max_disparity_px=...)), or "
         "none, and it is measured"

@@ -13,14 +13,13 @@ from depthpose.core.checkpoint import SHIPPED
 from depthpose.depth.config import MatcherConfig
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.stereo import (
+    DisparityRange,
     LightMatcher,
-    Reach,
-    Search,
-    Window,
-    choose_window,
+    SearchRange,
+    choose_search_range,
     doubt_hidden,
     doubt_outside,
-    measure_reach,
+    measure_disparity_range,
     move_views,
     moved_back,
 )
@@ -61,9 +60,9 @@ def planes(near_px: int, far_px: int, width: int = 320, height: int = 96) -> tup
     return left, right, truth_px
 
 
-def reach_of(low_px: float, high_px: float, size: tuple[int, int] = (96, 320)) -> Reach:
+def range_of(low_px: float, high_px: float, size: tuple[int, int] = (96, 320)) -> DisparityRange:
     flat = Match(disparity_px=torch.full(size, high_px), confidence=torch.ones(size))
-    return Reach(
+    return DisparityRange(
         low_px=low_px, high_px=high_px, step_px=4.0, coarse=flat, right_px=flat.disparity_px
     )
 
@@ -79,26 +78,26 @@ def rig(width: int = 320, height: int = 96, apart_px: float = 0.0) -> StereoRig:
 @pytest.mark.parametrize(("near_px", "far_px"), [(30, 6), (140, 20), (150, 110)])
 def test_both_ends_of_a_pair_are_measured(near_px: int, far_px: int) -> None:
     left, right, _ = planes(near_px, far_px)
-    reach = measure_reach(matcher(), left, right, 0.0)
-    assert reach.low_px <= far_px
+    measured = measure_disparity_range(matcher(), left, right, 0.0)
+    assert measured.low_px <= far_px
     if far_px < 50:  # else the right view shows nothing of a third of the left one
-        assert far_px <= reach.low_px + 3 * reach.step_px
-    assert reach.high_px - 3 * reach.step_px <= near_px <= reach.high_px
+        assert far_px <= measured.low_px + 3 * measured.step_px
+    assert measured.high_px - 3 * measured.step_px <= near_px <= measured.high_px
 
 
 @needs_weights
 def test_black_borders_say_nothing_about_a_pair() -> None:
     """They match each other over the whole width."""
     left, right, _ = planes(30, 6)
-    usual = measure_reach(matcher(), left, right, 0.0)
+    usual = measure_disparity_range(matcher(), left, right, 0.0)
     for view, columns in ((left, 16), (right, 24)):
         view[..., :columns] = 0.0
         view[..., -columns:] = 0.0
         view[..., -8:, :] = 0.0
-    reach = measure_reach(matcher(), left, right, 0.0)
-    assert reach.high_px <= usual.high_px + reach.step_px
-    assert reach.coarse.confidence is not None
-    assert not bool(reach.coarse.confidence[:, :16].any())
+    measured = measure_disparity_range(matcher(), left, right, 0.0)
+    assert measured.high_px <= usual.high_px + measured.step_px
+    assert measured.coarse.confidence is not None
+    assert not bool(measured.coarse.confidence[:, :16].any())
 
 
 @needs_weights
@@ -123,29 +122,28 @@ def test_a_pair_is_matched_wherever_its_disparities_lie(near_px: int, far_px: in
 def test_streets_are_searched_from_infinity_on(high_px: float) -> None:
     """At the camera's usual size, through the disparities of training and those that are there."""
     camera = rig(1242, 375)
-    window = choose_window(matcher(), reach_of(0.0, high_px), (375, 1242), camera)
+    search = choose_search_range(matcher(), range_of(0.0, high_px), (375, 1242), camera)
     trained_px = matcher().network_config.max_disparity_px
-    assert window.search.first_px == 0
-    assert trained_px <= window.search.max_disparity_px <= matcher().work_disparities(camera)
-    assert window.last_px >= high_px
-    assert window.search.scale * 558 == pytest.approx(matcher().work_focal_px(camera))
+    assert search.first_px == 0
+    assert trained_px <= search.span_px <= matcher().work_disparities(camera)
+    assert search.last_in_images_px >= high_px
+    assert search.scale * 558 == pytest.approx(matcher().work_focal_px(camera))
 
 
 @needs_weights
 def test_a_search_takes_no_more_memory_than_usual() -> None:
     camera = rig(1280, 720)
-    usual = choose_window(matcher(), reach_of(0.0, 100.0), (720, 1280), camera).search
+    usual = choose_search_range(matcher(), range_of(0.0, 100.0), (720, 1280), camera)
     for high_px in (200.0, 300.0, 450.0, 640.0):
-        window = choose_window(matcher(), reach_of(0.0, high_px), (720, 1280), camera)
-        search = window.search
-        assert window.first_px <= 0
-        assert window.last_px >= high_px
-        voxels = search.scale**2 * search.max_disparity_px
-        step = 1 + 36 / search.max_disparity_px  # disparities are searched in whole steps
-        usual_voxels = usual.scale**2 * usual.max_disparity_px
+        search = choose_search_range(matcher(), range_of(0.0, high_px), (720, 1280), camera)
+        assert search.first_px <= 0
+        assert search.last_in_images_px >= high_px
+        voxels = search.scale**2 * search.span_px
+        step = 1 + 36 / search.span_px  # disparities are searched in whole steps
+        usual_voxels = usual.scale**2 * usual.span_px
         assert voxels <= step * usual_voxels * 1.001
         assert voxels >= 0.9 * usual_voxels, "a size smaller than need be loses detail"
-    near = choose_window(matcher(), reach_of(420.0, 540.0), (720, 1280), camera).search
+    near = choose_search_range(matcher(), range_of(420.0, 540.0), (720, 1280), camera)
     assert near.scale == usual.scale, "a table at arm's length needs no smaller size"
     assert near.first_px > 0
 
@@ -170,15 +168,14 @@ def test_doubt_leaves_what_was_searched() -> None:
     match = Match(disparity_px=torch.full((2, 4), 50.0), confidence=confidence)
     coarse_px = torch.tensor([[0.0, 1, 2, 3], [0, 1, 2, 3]]) + 48
     far = dataclasses.replace(match, disparity_px=coarse_px, confidence=confidence)
-    reach = Reach(low_px=0.0, high_px=60.0, step_px=4.0, coarse=far, right_px=coarse_px)
-    search = Search(scale=1.0, first_px=0, max_disparity_px=128)
-    window = Window(search=search, first_px=0.0, last_px=128.0)
-    kept, said = doubt_outside(match, reach, window)
+    measured = DisparityRange(low_px=0.0, high_px=60.0, step_px=4.0, coarse=far, right_px=coarse_px)
+    search = SearchRange(scale=1.0, first_px=0, span_px=128)
+    kept, said = doubt_outside(match, measured, search)
     assert said == ""
     assert kept.confidence is not None
     assert torch.equal(kept.confidence, confidence)
     at_end = dataclasses.replace(match, disparity_px=torch.full((2, 4), 126.0))
-    doubted, _ = doubt_outside(at_end, reach, window)
+    doubted, _ = doubt_outside(at_end, measured, search)
     assert doubted.confidence is not None
     assert not bool(doubted.confidence.any()), "the last step may stand for all that is beyond"
 
@@ -191,8 +188,10 @@ def test_hidden_places_are_doubted_by_the_copy_of_the_right_view() -> None:
     confidence = torch.ones(4, 40)
     confidence[:, 39] = 0.9
     match = Match(disparity_px=left_px, confidence=confidence)
-    reach = Reach(low_px=0.0, high_px=20.0, step_px=4.0, coarse=match, right_px=right_px)
-    doubted = doubt_hidden(match, reach).confidence
+    measured = DisparityRange(
+        low_px=0.0, high_px=20.0, step_px=4.0, coarse=match, right_px=right_px
+    )
+    doubted = doubt_hidden(match, measured).confidence
     assert doubted is not None
     hidden = torch.zeros(40, dtype=torch.bool)
     hidden[12:22] = True
@@ -200,7 +199,7 @@ def test_hidden_places_are_doubted_by_the_copy_of_the_right_view() -> None:
     assert float(doubted[:, hidden].max()) < 0.51
     torch.testing.assert_close(doubted[:, ~hidden], confidence[:, ~hidden])
     unsure = dataclasses.replace(match, confidence=None)
-    assert doubt_hidden(unsure, reach).confidence is None
+    assert doubt_hidden(unsure, measured).confidence is None
 
 
 @pytest.mark.parametrize("first", [0, 3, -2])
