@@ -77,7 +77,7 @@ def test_a_copy_of_another_size_is_contradicted_with_its_size() -> None:
 def test_an_identity_is_confirmed_where_the_size_that_fits_is_near(
     times: float, status: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    scale = Scale(times, sigma=0.02, gain=0.03)
+    scale = Scale(times, sigma=0.01, gain=0.03)
     monkeypatch.setattr("depthpose.pose.identity.scale_of", lambda *_: scale)
     identity = estimated(1.0).identity
     assert identity is not None

@@ -28,9 +28,10 @@ _STEPS = 12
 _WIDE_STEP = 2.0  # times the usual limit of a distance in the first step
 _INDEPENDENT = 10.0  # so many neighbouring readings err alike: the variance is so many times larger
 _STARTS = (1.0, 0.87, 1.15)
-"""Scales at which the search begins: from one alone it stays there where the copy is smaller."""
+"""Scales at which ICP starts: from 1 alone it stays there for smaller copies."""
 _ROUGH_POINTS = 150
-_TRUST = 0.03  # a scale beside 1 must lower the mean squared distance, in squared limits, so much
+_TRUST = 0.03
+"""A start beside 1 must lower the mean squared distance so much, in squared limits of nearness."""
 _CONVERGED = 3e-4
 _PLANES = 24  # planes across which the posed model is mirrored for a start
 _CLEAR = 0.05
@@ -143,7 +144,7 @@ def _grow(
     *,
     is_exact: bool,
 ) -> tuple[Float64[Tensor, " b"], Float64[Tensor, "b n 3"]]:
-    """Step by step to the scale and place that fit; give also the moved points."""
+    """Iterate point-to-plane ICP with a scale; give the scales and the moved points."""
     middle_m = surface.middle_m
     widths = (1 + (_WIDE_STEP - 1) * max(0.0, 1 - 2 * step / _STEPS) for step in range(_STEPS))
     limits_m = [NEAR * surface.diameter_m * width for width in widths]
@@ -193,7 +194,7 @@ def mirror_gain(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) ->
     """Measure by how much nearer the points lie to the mirror image of the model, in its best pose.
 
     The cloud is mirrored in place of the model, so that ICP finds a pose. Negative where the
-    mirror image fits worse, of what is clear already by a rough fit.
+    mirror image fits worse: by a rough fit, where that is clearly worse already.
     """
     # Mirrored once, the cloud is brought back by rotations: a reflection at each of many planes.
     local_m = pose.inverse().apply(take_evenly(cloud_m.double(), POINTS))
@@ -257,6 +258,7 @@ def identify(
     if mirror_deviation > MIRROR_ALIKE:
         mirror = mirror_gain(cloud_m, pose, surface)
     distance_m = float(cloud_m[:, 2].double().median())
+    offset_error = LARGEST_OFFSET_M / distance_m  # what looks nearer by the offset looks larger
     sensor_error = sensor_size_error(distance_m, focal_px, surface.diameter_m)
     size_error = abs(scale.times - 1)
     largest_error = max_size_error + sensor_error + _SURE * scale.sigma
@@ -283,13 +285,13 @@ def identify(
             f"{size}, and the sensor explains {max_size_error + sensor_error:.0%}: a copy "
             "of another size, another object, or a wrong unit, camera or focal length"
         )
-    elif size_error + _SURE * scale.sigma > _OTHER_SIZES + sensor_error:
+    elif size_error + _SURE * scale.sigma + offset_error > _OTHER_SIZES:
         reason = f"what was seen does not fix the size: {size}"
     elif mirror is not None and mirror > -_MIRROR_GAIN:
         reason = f"the mirror image of {name} fits what was seen as well"
     elif scale.gain > _SIZE_GAIN:
         reason = f"{size}, which a sensor's errors may explain"
-    elif size_error > max(_NEAR_SIZE, _SURE * scale.sigma) + LARGEST_OFFSET_M / distance_m:
+    elif size_error > max(_NEAR_SIZE, _SURE * scale.sigma) + offset_error:
         reason = f"{size}, and not that of the model"
     elif evidence.contradicted > 0:
         reason = (
