@@ -73,7 +73,7 @@ def test_a_copy_of_another_size_is_contradicted_with_its_size() -> None:
     assert unmeasured.identity is None
 
 
-@pytest.mark.parametrize(("times", "status"), [(1.04, "confirmed"), (1.07, "not excluded")])
+@pytest.mark.parametrize(("times", "status"), [(1.03, "confirmed"), (1.07, "not excluded")])
 def test_an_identity_is_confirmed_where_the_size_that_fits_is_near(
     times: float, status: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
