@@ -24,7 +24,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from depthpose.core.camera import StereoRig
 from depthpose.core.checkpoint import find_weights
 from depthpose.depth.config import GeneratorConfig, MatcherConfig, Speed
-from depthpose.depth.disparity import focal_size, resize_image
+from depthpose.depth.disparity import resize_image, size_at_focal_length
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.stereo import NetworkMatcher, PSMNet, PSMNetMatcher
 from depthpose.depth.synthesis import UNetGenerator, make_synthesiser
@@ -106,7 +106,7 @@ def run_once(weights: str, precision: str, device: str) -> dict[str, object]:
     assert net.synthesiser is not None
     assert image.camera is not None
     draw = net.synthesiser.draw
-    size = focal_size(image.camera, net.synthesiser.config.virtual_focal_px)
+    size = size_at_focal_length(image.camera, net.synthesiser.config.virtual_focal_px)
     left = resize_image(image.left, *size)
     right = draw(left[None]).right[0]
     whole_s = seconds(lambda: net.estimate_pair(image), device)

@@ -10,7 +10,7 @@ import torch
 from depthpose.core.config import config_to_dict, read_config
 from depthpose.depth.augment import TrainingPair
 from depthpose.depth.datasets import open_dataset, read_split
-from depthpose.depth.disparity import focal_size
+from depthpose.depth.disparity import size_at_focal_length
 from depthpose.depth.stereo import PSMNet
 from depthpose.depth.synthesis import ROWS_SHARE, UNetGenerator
 from depthpose.depth.synthetic import kitti_rig
@@ -115,7 +115,7 @@ def test_a_crop_is_the_whole_height_of_every_rig(name: str) -> None:
     crop_rows = config.pairs.augment.crop_px[0]
     assert crop_rows % config.generator.side_multiple_px == 0
     for number in range(5):
-        rows, _ = focal_size(kitti_rig(number), config.generator.virtual_focal_px)
+        rows, _ = size_at_focal_length(kitti_rig(number), config.generator.virtual_focal_px)
         assert crop_rows <= rows <= (1 + ROWS_SHARE) * crop_rows
 
 

@@ -8,9 +8,9 @@ from depthpose.depth.disparity import (
     depth_deviation,
     depth_from_disparity,
     disparity_from_depth,
-    focal_size,
     resized_match,
     right_disparity_from_left,
+    size_at_focal_length,
     warp_right_to_left,
 )
 from depthpose.depth.types import Match
@@ -42,7 +42,7 @@ def test_the_deviation_of_depth_is_what_that_of_its_disparity_does_to_it() -> No
 def test_pixels_that_are_not_square_become_so() -> None:
     """A wheel is round at the size where both focal lengths are alike."""
     squeezed = Camera(width=640, height=480, K=intrinsics(400, 800, 319.5, 239.5))
-    assert focal_size(squeezed, 800.0) == (480, 1280)
+    assert size_at_focal_length(squeezed, 800.0) == (480, 1280)
 
 
 @pytest.mark.parametrize("offset_px", [0.0, 7.5])

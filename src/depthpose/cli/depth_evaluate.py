@@ -227,25 +227,26 @@ def _frame_sections(
     protocol: str,
     most: int,
 ) -> list[Section]:
-    """Show at most so many frames of a method, chosen by the metric that ranks them."""
+    """Show up to ``most`` frames of a method, chosen by AbsRel or EPE, at the first cap alone."""
     cap_m = per_frame[0].cap_m
-    of_cap = [row for row in per_frame if row.cap_m == cap_m and row.pixels]
+    rows_at_cap = [row for row in per_frame if row.cap_m == cap_m and row.pixels]
     metric = METRICS[RANKING["disparity" if cap_m is None else "depth"]]
     sign = 1 if metric.better == "lower" else -1
-    cap = "" if cap_m is None else f", truth up to {cap_m:g} m"
-    frames = f"{len(of_cap)} frame{'' if len(of_cap) == 1 else 's'}"
+    cap_text = "" if cap_m is None else f", truth up to {cap_m:g} m"
+    frame_count = f"{len(rows_at_cap)} frame{'' if len(rows_at_cap) == 1 else 's'}"
     index_of = {frame.name: index for index, frame in enumerate(dataset.frames)}
     sections: list[Section] = []
-    errors = [sign * row.metrics[metric.name] for row in of_cap]
+    errors = [sign * row.metrics[metric.name] for row in rows_at_cap]
     for role, k in page.choose_ranked(errors, most):
-        row = of_cap[k]
+        row = rows_at_cap[k]
         index = index_of[row.frame or ""]
         estimate, error = frame_result(dataset, index, folder, protocol, row.cap_m)
         section = depth_section(
             f"{folder.name}: {row.frame}, {role}",
             dataset.read_input(index),
             estimate,
-            f"The {role} of {frames} by {metric.name}: {row.metrics[metric.name]:.4f}{cap}.",
+            f"The {role} of {frame_count} by {metric.name}: "
+            f"{row.metrics[metric.name]:.4f}{cap_text}.",
             error=error,
         )
         columns = {name: v for name, v in row.columns().items() if name not in _IN_THE_TABLE}

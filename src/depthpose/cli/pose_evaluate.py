@@ -124,7 +124,10 @@ def describe(predictions: Sequence[Path]) -> list[Origin]:
 def measure(
     dataset: BopDataset, predictions: Sequence[Path], config: EvaluationConfig, out: Path
 ) -> int:
-    """Measure, write rows.json, rows.csv, table.md, report.html and instances.csv, and print."""
+    """Measure folders or files of predictions against the truth; write tables and page, and print.
+
+    The files: rows.json, rows.csv, table.md, report.html and instances.csv.
+    """
     evaluations = measure_each(dataset, predictions, config)
     measured = join(evaluations)
     rows = [row.columns() for row in measured.rows]

@@ -306,15 +306,23 @@ def claim_names(
 
 
 def read_sources(folder: Path) -> dict[str, list[str]]:
-    """Give path and stamp of the file that each result is of, by name; none of a damaged record."""
+    """Give the path and stamp (size and time) of each result's source, by the result's name.
+
+    Empty where the record is missing or damaged.
+    """
+    if not (folder / _SOURCES).exists():
+        return {}
     content = None
     with suppress(InputError):
-        content = read_json(folder / _SOURCES) if (folder / _SOURCES).exists() else {}
-    return {
-        name: entry
-        for name, entry in (content.items() if isinstance(content, dict) else ())
-        if isinstance(entry, list) and list(map(type, entry)) == [str, str]
-    }
+        content = read_json(folder / _SOURCES)
+    if not isinstance(content, dict):
+        return {}
+    return {name: entry for name, entry in content.items() if _is_source(entry)}
+
+
+def _is_source(entry: object) -> bool:
+    """Whether an entry of the record is a path and a stamp."""
+    return isinstance(entry, list) and len(entry) == 2 and all(isinstance(v, str) for v in entry)
 
 
 def refuse_to_replace(path: Path) -> None:

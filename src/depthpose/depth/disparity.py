@@ -171,7 +171,7 @@ def right_disparity_from_left(left_px: Map) -> Map:
     return torch.where(carried.isinf(), torch.nan, carried).reshape(height, width)
 
 
-def focal_size(camera: Camera, focal_px: float) -> tuple[int, int]:
+def size_at_focal_length(camera: Camera, focal_px: float) -> tuple[int, int]:
     """Rows and columns at which the camera's image has ``focal_px``, with square pixels.
 
     Raises:

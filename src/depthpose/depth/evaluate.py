@@ -453,11 +453,11 @@ def _prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) ->
         depth_m=depth_m if depth_m is not None and depth_m.shape == truth.shape else None,
         confidence=confidence,
         rig=rig,
-        view=_drawn_view_errors(frame, predictions),
+        view=_synthesised_view_errors(frame, predictions),
     )
 
 
-def _drawn_view_errors(frame: Frame, predictions: Path) -> dict[str, float]:
+def _synthesised_view_errors(frame: Frame, predictions: Path) -> dict[str, float]:
     """Compare the drawn right view of a frame with the real one, where there are both."""
     drawn = files.read_part(predictions, frame.name, "right.png")
     if drawn is None or frame.right is None:

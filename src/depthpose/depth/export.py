@@ -360,9 +360,26 @@ _FLIPPING_LIMITS = {
 """Where two scores tie, the last bit decides between candidates."""
 _FLIPPING: tuple[type[StereoNetwork], ...] = (LightStereo,)
 """Matchers that choose between candidates."""
-_SIZES = ((256, 512, 1.0, 1), (375, 1242, 2.0, 1), (190, 300, 0.8, 2), (233, 401, 1.3, 1))
-"""Rows, columns, focal length over the one that the weights want, images: a multiple of what the
-networks take; one that is stretched to it; one that is enlarged; one that is padded."""
+
+
+@dataclass(frozen=True)
+class _Size:
+    """Of the images of a case: how many, and their focal length as a share of the network's."""
+
+    rows: int
+    columns: int
+    focal_share: float
+    count: int = 1
+
+
+_SIZES = (
+    _Size(256, 512, 1.0),
+    _Size(375, 1242, 2.0),
+    _Size(190, 300, 0.8, count=2),
+    _Size(233, 401, 1.3),
+)
+"""A multiple of what the networks take; one that is stretched to it; one that is enlarged; one that
+is padded."""
 _SHIFT_PX = 6
 _SKY = (0.72, 0.82, 0.95)
 """RGB of the sky at its brightest."""
@@ -488,21 +505,19 @@ def _case(
 
 
 def _scenes(
-    size: tuple[int, int, float, int], focal_px: float, *, with_sky: bool
+    size: _Size, network_focal_px: float, *, with_sky: bool
 ) -> tuple[Tensor, Tensor, Camera]:
-    """Make images of smooth noise, the same moved to the left, which match everywhere; and a lens.
-
-    Its focal length is the share of ``size`` of that which the weights want.
-    """
-    rows, columns, share, count = size
-    f = share * focal_px
+    """Make pairs of smooth noise, the right view moved by one disparity, and their camera."""
+    rows = size.rows
+    columns = size.columns
+    f = size.focal_share * network_focal_px
     K = torch.tensor([[f, 0, columns / 2], [0, f, rows / 2], [0, 0, 1]], dtype=torch.float64)
     camera = Camera(width=columns, height=rows, K=K)
-    shift = round(_SHIFT_PX * share)
+    shift = round(_SHIFT_PX * size.focal_share)
     chance = torch.Generator().manual_seed(0)
-    noise = torch.rand(count, 3, rows // 6, columns // 6, generator=chance)
+    noise = torch.rand(size.count, 3, rows // 6, columns // 6, generator=chance)
     scene = F.interpolate(noise, (rows, columns + shift), mode="bicubic").clamp(0, 1)
-    if with_sky:  # bright and smooth, over the upper two fifths
+    if with_sky:  # bright and nearly without texture, over the upper two fifths
         top = rows * 2 // 5
         sky = torch.tensor(_SKY)[:, None, None] * torch.linspace(0.9, 1.0, top)[:, None]
         scene[:, :, :top] = torch.lerp(scene[:, :, :top], sky, 0.97)

@@ -47,7 +47,7 @@ class UNetGenerator(nn.Module):
     def __init__(self, config: GeneratorConfig | None = None) -> None:
         super().__init__()
         self.config = config or GeneratorConfig()
-        # Channels after each level of the encoder.
+        # Channels after each level of the encoder: doubled down to eight times the first.
         widths = [self.config.width * min(2**level, 8) for level in range(self.config.levels)]
         deepest = len(widths) - 1
         # No norm in the outermost level (raw colours) nor the innermost (one pixel may be left).
@@ -60,11 +60,12 @@ class UNetGenerator(nn.Module):
             self.down.append(nn.Sequential(OrderedDict(conv=conv, norm=norm)))
         # Each level of the decoder answers at the size of the encoder's input of that level.
         for level, outputs in enumerate((3, *widths[:-1])):
-            inputs = widths[level] * (1 if level == deepest else 2)
+            inputs = widths[level] if level == deepest else 2 * widths[level]  # beside a skip
             conv = nn.ConvTranspose2d(inputs, outputs, 4, 2, 1, bias=level == 0)
-            # The three inner blocks between full widths, without the innermost itself.
-            has_dropout = 5 <= level + 1 < self.config.levels and self.config.with_dropout
             norm = nn.BatchNorm2d(outputs) if level > 0 else nn.Identity()
+            # pix2pix has dropout in the three blocks of full width that are not the innermost.
+            is_inner = 4 <= level < deepest
+            has_dropout = is_inner and self.config.with_dropout
             dropout = nn.Dropout(0.5) if has_dropout else nn.Identity()
             self.up.append(nn.Sequential(OrderedDict(conv=conv, norm=norm, dropout=dropout)))
         self.apply(_initialise)

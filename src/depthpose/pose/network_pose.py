@@ -217,11 +217,14 @@ class GeoPoseNet(PoseEstimator):
             return voted, VotingDirections(job.voxels.points_m, job.directions)
 
     def _prepare(self, pose_input: AnyInput) -> CloudToPose | PoseEstimate:
-        """Lift an input to the cloud that the network takes; estimate one of a region here."""
+        """Give the cloud and voxels that the network takes.
+
+        In their place the estimate itself, where the input is a region or is refused.
+        """
         if isinstance(pose_input, ViewInput) and pose_input.is_region:
             return self._estimate_in_region(pose_input)
         prepared = self._object(pose_input.object)
-        _ = prepared.copies  # searched now, in the seconds of no input
+        _ = prepared.copies  # cached now, so that the seconds of no stage hold it
         start = time.perf_counter()
         cloud = prepare_cloud(pose_input, prepared.model, self.weights.cloud, self.config)
         if isinstance(cloud, Refusal):

@@ -214,10 +214,14 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
     if tracking is not None and tracking not in get_args(Tracking):
         raise InputError(f"{source}: tracking is {tracking!r}; write one of {get_args(Tracking)}")
     pose = _pose(row, source)
-    if (pose is not None) != (status in POSED) or (status != "ok" and not reason):
+    if (pose is not None) != (status in POSED):
         raise InputError(
             f"{source}: an estimate that is ok or ambiguous has a camera_from_model, a refused one "
-            f"none; all but ok have a reason; its status is {status!r}"
+            f"none; its status is {status!r}"
+        )
+    if status != "ok" and not reason:
+        raise InputError(
+            f"{source}: every estimate but one that is ok has a reason; its status is {status!r}"
         )
 
     # The numbers that belong to it.

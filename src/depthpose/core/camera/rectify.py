@@ -245,8 +245,13 @@ def _from_kalibr(names: Names, unit_m: float, is_fisheye: bool | None) -> RawPai
     return _make_pair(cameras[0], cameras[1], (motion[:3, :3], unit_m * motion[:3, 3]), size)
 
 
-def _first_numbers(names: Names, keys: tuple[str, ...]) -> list[float] | None:
-    return next((values for name in keys if (values := numbers(names.get(name)))), None)
+def _first_numbers(fields: Names, keys: tuple[str, ...]) -> list[float] | None:
+    """Give the numbers of the first of some fields that a file has; None where it has none."""
+    for key in keys:
+        values = numbers(fields.get(key))
+        if values:
+            return values
+    return None
 
 
 def _is_fisheye(names: Names, is_fisheye: bool | None, owner: str = "its") -> bool:

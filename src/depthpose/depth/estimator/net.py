@@ -537,7 +537,9 @@ class FakestereoNet:
         usable_scales = [
             s for s in self.synthesiser.scales if s == 1 or s * rig_px <= image_focal_px
         ]
-        return [disparity.focal_size(image.camera, scale * rig_px) for scale in usable_scales]
+        return [
+            disparity.size_at_focal_length(image.camera, scale * rig_px) for scale in usable_scales
+        ]
 
     def _estimate_alone(
         self,

@@ -225,9 +225,12 @@ class SkyHead(nn.Module):
     def forward(
         self, levels: tuple[Features, ...], quarter_px: Quarter, confidence: Quarter
     ) -> Quarter:
-        """Tell the sky by features of the left view, and by its match, which learns nothing.
+        """Give the probability of the sky by features of the left view and by its match.
 
-        Where the match is near and its confidence high, there is no sky.
+        Args:
+            levels: features from 1/4 size down.
+            quarter_px: disparity at 1/4 size. Detached: no gradient reaches the matcher by it.
+            confidence: of it, likewise: what is surely matched as near is no sky.
         """
         quarter, *coarser = levels
         context: list[Tensor] = []  # of the coarser levels; the coarsest one has none

@@ -454,7 +454,7 @@ class NetworkMatcher(ABC):
         """Rows and columns at which images of a camera are matched [px]."""
         if self.network_config.work_focal_px is None:
             return camera.height, camera.width
-        return disparity.focal_size(camera, self.work_focal_px(camera))
+        return disparity.size_at_focal_length(camera, self.work_focal_px(camera))
 
     def work_disparities(self, camera: Camera) -> int:
         """Disparities that are searched at :meth:`work_size` [px]."""
@@ -484,7 +484,7 @@ class NetworkMatcher(ABC):
 def _scaled_size(left: View, scale: float, camera: Camera | None) -> tuple[int, int]:
     """Give the rows and columns of a view that is scaled; with a camera, pixels become square."""
     if camera is not None:
-        return disparity.focal_size(camera, scale * float(camera.K[0, 0]))
+        return disparity.size_at_focal_length(camera, scale * float(camera.K[0, 0]))
     return max(1, round(left.shape[1] * scale)), max(1, round(left.shape[2] * scale))
 
 

@@ -260,25 +260,34 @@ def draw_sensors(
 
 def expose(light: Float[Tensor, "h w 3"], sensor: Sensor) -> View:
     """Take a picture: RGB in [0, 1], in steps of 1/255."""
+    # Exposure, and a vignette: the corners of an image of 3:1 are at a radius^2 of about 1.1.
     signal = light.permute(2, 0, 1) * torch.tensor(sensor.exposure)[:, None, None]
     height, width = signal.shape[1:]
     y = torch.linspace(-1, 1, height)[:, None] * height / width
     x = torch.linspace(-1, 1, width)[None]
     signal = signal * (1 - sensor.vignette * (x**2 + y**2) / 1.1)
+
+    # Veiling glare: what is bright in blocks of 32 px spreads over their neighbours. A pixel is
+    # full at 8 times white.
     blocks = (max(height // 32, 1), max(width // 32, 1))
     small = F.avg_pool2d(F.adaptive_avg_pool2d(signal.clamp(max=6)[None], blocks), 3, 1, 1)
     wide = F.interpolate(small, (height, width), mode="bilinear")[0]
     signal = torch.lerp(signal.clamp(max=8), wide, sensor.glare)
+
+    # Blur of the lens: three taps along both axes.
     for axis, size in ((1, height), (2, width)):
         before = signal.narrow(axis, 0, 1), signal.narrow(axis, 0, size - 1)
         after = signal.narrow(axis, 1, size - 1), signal.narrow(axis, size - 1, 1)
         beside = torch.cat(before, axis) + torch.cat(after, axis)
         signal = signal * (1 - sensor.blur) + beside * (sensor.blur / 2)
+
+    # Shot noise and read noise.
     generator = torch.Generator().manual_seed(sensor.noise_seed)
     shot, dark = sensor.noise
     deviation = (signal * shot**2 + dark**2).sqrt()
     signal = signal + torch.randn(signal.shape, generator=generator) * deviation
-    # A shoulder before white, as cameras have; the brightest is lost all the same.
+
+    # The tone curve: a shoulder before white, as cameras have; the brightest is lost all the same.
     signal = (signal - sensor.black) / (1 - sensor.black)
     signal = (signal * 1.12 / (1 + 0.12 * signal.clamp(min=0))).clamp(0, 1)
     picture = (signal ** (1 / sensor.gamma) * 255 + 0.5).floor() / 255

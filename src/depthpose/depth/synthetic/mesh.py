@@ -470,7 +470,15 @@ class MeshBuilder:
         rotation: Rotation | None = None,
         taper: float = 1.0,
     ) -> None:
-        """Add a box; ``taper`` scales its top. Boxes are made all at once, in :meth:`finish`."""
+        """Add a box. Boxes are made all at once, in :meth:`finish`.
+
+        Args:
+            centre: of the box [m].
+            size: along x, y and z, before it is rotated [m].
+            surface: what it looks like.
+            rotation: of the box.
+            taper: scales its upper face, toward -y.
+        """
         R = np.eye(3) if rotation is None else rotation
         self._boxes.append((centre, size, R, taper, surface, self.thing))
 

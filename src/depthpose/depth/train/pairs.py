@@ -14,6 +14,7 @@ from depthpose.depth.config import PairsConfig, TruthKind
 from depthpose.depth.datasets import Dataset, known_truths, lidar_truth, open_dataset
 from depthpose.depth.disparity import disparity_from_depth, right_disparity_from_left
 from depthpose.depth.synthetic import Streets, kitti_rig
+from depthpose.depth.types import Map
 
 BASELINE_TOLERANCE = 0.02
 """Relative difference of baselines that one virtual rig may stand for: KITTI's differ by 1.4 %."""
@@ -144,44 +145,31 @@ class TrainingPairs:
     def _read(self, index: int) -> TrainingPair:
         """Read a pair, and its truth if it is needed; 0 in the sky, where that is known."""
         source, number, kind = self._places[index]
-        left_px = right_px = None
-        name = source.frames[number].name if isinstance(source, Dataset) else f"street {number}"
         if isinstance(source, Dataset):
+            name = source.frames[number].name
             views = source.read_input(number)
             rig = views.camera if isinstance(views.camera, StereoRig) else None
-            if kind == "disparity":
-                truth = source.read_truth(number)
-                assert truth.disparity_px is not None, "frames without truth were left out"
-                left_px = truth.disparity_px
-                if truth.is_sky is not None:
-                    left_px = torch.where(truth.is_sky, 0.0, left_px)
-            elif kind is not None and rig is None:
-                raise InputError(
-                    f"{name}: has depth as its truth but no calibration of the pair, so it cannot "
-                    "become disparity; add the calibration, or exclude the frame"
-                )
-            elif kind is not None and rig is not None:
-                depth_m = source.read_truth(number).depth_m
-                if kind == "scan":
-                    depth_m = lidar_truth(source.frames[number], "camera_z")
-                assert depth_m is not None, "frames without truth were left out"
-                left_px = disparity_from_depth(depth_m, rig)
+            left_px = _truth_of_frame(source, number, kind, rig)
+            right_px = None
         else:
+            name = f"street {number}"
             sample = source[number]
             views = sample.input
-            rig = sample.input.camera
-            if kind is not None:
-                exact = (sample.truth.disparity_px, sample.truth.right_disparity_px)
-                left_px, right_px = (px if px is None else px.nan_to_num(0.0) for px in exact)
+            rig = views.camera
+            left_px = _known_px(sample.truth.disparity_px, kind)
+            right_px = _known_px(sample.truth.right_disparity_px, kind)
+
         if left_px is None:
             left_px = torch.full_like(views.left[0], torch.nan)
-        focal_px = torch.tensor(torch.nan if rig is None else float(rig.K[0, 0]))
-        if views.right is None:
+        right = views.right
+        if right is None:  # of an image alone: a sample says that it has no right view
+            right = views.left
             right_px = left_px
         elif right_px is None:
             right_px = right_disparity_from_left(left_px)
-        right = views.left if views.right is None else views.right
+        focal_px = torch.tensor(torch.nan if rig is None else float(rig.K[0, 0]))
         pair = TrainingPair(views.left, right, left_px, right_px, focal_px)
+
         wanted_px = self.config.focal_px
         if wanted_px is None:
             return pair
@@ -191,6 +179,35 @@ class TrainingPairs:
                 f"focal length of {wanted_px} px; add one, exclude it, or leave focal_px out"
             )
         return scale_pair(pair, wanted_px / float(focal_px))
+
+
+def _truth_of_frame(
+    dataset: Dataset, number: int, kind: TruthKind | None, rig: StereoRig | None
+) -> Map | None:
+    """Read the disparity of a frame's left view [px] from its kind of truth; None without one."""
+    if kind is None:
+        return None
+    if kind == "disparity":
+        truth = dataset.read_truth(number)
+        assert truth.disparity_px is not None, "frames without truth were left out"
+        if truth.is_sky is None:
+            return truth.disparity_px
+        return torch.where(truth.is_sky, 0.0, truth.disparity_px)
+    if rig is None:
+        raise InputError(
+            f"{dataset.frames[number].name}: has depth as its truth but no calibration of the "
+            "pair, so it cannot become disparity; add the calibration, or exclude the frame"
+        )
+    depth_m = dataset.read_truth(number).depth_m
+    if kind == "scan":
+        depth_m = lidar_truth(dataset.frames[number], "camera_z")
+    assert depth_m is not None, "frames without truth were left out"
+    return disparity_from_depth(depth_m, rig)
+
+
+def _known_px(exact_px: Map | None, kind: TruthKind | None) -> Map | None:
+    """Give the exact disparity of a made view, 0 in the sky; None where no truth is wanted."""
+    return None if exact_px is None or kind is None else exact_px.nan_to_num(0.0)
 
 
 def _usable_places(

@@ -238,10 +238,10 @@ def _colors_of(mesh: Any, face: np.ndarray, share: np.ndarray, *, lost: bool) ->
     return colors
 
 
-def _interpolate_corners(values: Any, corners: np.ndarray, share: np.ndarray) -> np.ndarray:  # noqa: ANN401
-    """Interpolate values of vertices at places between the corners of faces."""
-    every = np.asarray(values, np.float64)[corners]
-    return (every[..., : min(every.shape[-1], 3)] * share[..., None]).sum(1)
+def _interpolate_corners(values: Any, corners: np.ndarray, barycentric: np.ndarray) -> np.ndarray:  # noqa: ANN401
+    """Interpolate values of vertices (uv or RGB, without alpha) between the corners of faces."""
+    at_corners = np.asarray(values, np.float64)[corners][..., :3]
+    return (at_corners * barycentric[..., None]).sum(1)
 
 
 def _files_beside(path: AnyPath) -> Any:  # noqa: ANN401  trimesh's classes carry no types

@@ -111,7 +111,7 @@ class SurfaceDeviation:
         self.axes = torch.linalg.eigh(self.points.T @ self.points).eigenvectors.T
 
     def nearest(self, moved: Float[Tensor, "*batch m 3"]) -> tuple[np.ndarray, np.ndarray]:
-        """Give distance and index of the nearest sample."""
+        """Give the distance [diameters] and index of the sample nearest to each point."""
         distance, index = self._tree.query(moved.numpy(), workers=torch.get_num_threads())
         return np.asarray(distance), np.asarray(index)
 

@@ -143,7 +143,14 @@ def cut_window(
     """Scale an image and cut a window out of it; what lies beside a small image is background.
 
     Half of the windows show the middle of an object: most of an image is background.
+
+    Args:
+        labelled: the image and the class of each pixel, 0 the background.
+        scale: of both.
+        size: rows and columns of the window [px].
+        generator: chooses the window.
     """
+    # Scale.
     rows, columns = (max(1, round(side * scale)) for side in labelled.image.shape[-2:])
     image = F.interpolate(
         labelled.image[None], (rows, columns), mode="bilinear", antialias=scale < 1
@@ -152,21 +159,26 @@ def cut_window(
         labelled.labels[None, None].float(), (rows, columns), mode="nearest-exact"
     )
     labels = labels[0, 0].long()
+
+    # Pad what is smaller than the window.
     bottom = max(0, size[0] - rows)
     right = max(0, size[1] - columns)
     image = F.pad(image[None], (0, right, 0, bottom), mode="replicate")[0]
     labels = F.pad(labels, (0, right, 0, bottom))
-    slack = [side - part for side, part in zip(labels.shape, size, strict=True)]
-    shown = labels.unique()[1:] if uniform(generator, 0.0, 1.0) < 0.5 else labels[:0, 0]
-    if len(shown):
-        chosen = labels == shown[random_index(generator, len(shown))]
-        middle = chosen.nonzero().float().mean(0).tolist()
-        top, left = (
-            min(max(round(at - part / 2), 0), most)
-            for at, part, most in zip(middle, size, slack, strict=True)
-        )
+
+    # The window: about the middle of an object, or anywhere.
+    last_top = labels.shape[0] - size[0]
+    last_left = labels.shape[1] - size[1]
+    is_about_object = uniform(generator, 0.0, 1.0) < 0.5
+    classes = labels[labels > 0].unique()
+    if is_about_object and len(classes):
+        chosen = labels == classes[random_index(generator, len(classes))]
+        row, column = chosen.nonzero().float().mean(0).tolist()
+        top = min(max(round(row - size[0] / 2), 0), last_top)
+        left = min(max(round(column - size[1] / 2), 0), last_left)
     else:
-        top, left = (random_index(generator, most + 1) for most in slack)
+        top = random_index(generator, last_top + 1)
+        left = random_index(generator, last_left + 1)
     window = (slice(top, top + size[0]), slice(left, left + size[1]))
     return LabelledImage(image[:, *window], labels[window])
 
