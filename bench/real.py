@@ -1,4 +1,4 @@
-"""The scoreboard: every figure of real data, beside those of an earlier run.
+"""The scoreboard: real data, and rendered parts and sequences, beside those of an earlier run.
 
     python bench/real.py $DEPTHPOSE_DATA --json out/real.json
     python bench/real.py $DEPTHPOSE_DATA --before out/real.json
@@ -6,7 +6,8 @@
 
 A figure of the earlier run stands in brackets where it was another. ``use`` says of each set
 whether it takes part when a method or a limit is chosen (choice), or is only looked at afterwards
-(held). CPU seconds leave out the preparation of models. Each process computes with one thread.
+(held). What is right each section's module (``score_*.py``) says. CPU seconds leave out the
+preparation of models. Each process computes with one thread.
 """
 
 import argparse
@@ -55,38 +56,40 @@ def main() -> None:
     )
     parser.add_argument("samples", type=Path, help="folder with pose/ and depth/")
     parser.add_argument("--only", nargs="+", choices=SECTIONS, default=list(SECTIONS))
-    parser.add_argument("--seeds", type=int, default=1, help="of each instance one by one")
+    parser.add_argument(
+        "--seeds", type=int, default=1, help="of each real instance; views of parts are multiplied"
+    )
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument(
-        "--json", type=Path, help="file for all rows and tables; other sections stay"
+        "--json", type=Path, help="file for all rows and tables; sections not run are kept in it"
     )
     parser.add_argument("--before", type=Path, help="such a file of an earlier run")
-    words = parser.parse_args()
+    options = parser.parse_args()
 
-    before = {} if words.before is None else json.loads(words.before.read_text())
-    done = (
-        {} if words.json is None or not words.json.exists() else json.loads(words.json.read_text())
-    )
-    for name in words.only:
+    before = {} if options.before is None else json.loads(options.before.read_text())
+    done = {}
+    if options.json is not None and options.json.exists():
+        done = json.loads(options.json.read_text())
+    for name in options.only:
         section = SECTIONS[name]
         began = time.perf_counter()
-        rows, cpu_s = run_jobs(section.jobs(words.samples, words.seeds), words.processes)
+        rows, cpu_s = run_jobs(section.jobs(options.samples, options.seeds), options.processes)
         table = section.table(rows)
 
         earlier = before.get(name, {})
-        facts = {"seeds": words.seeds, "environment": environment()}
+        facts = {"seeds": options.seeds, "environment": environment()}
         done[name] = {**facts, "cpu_s": cpu_s, "table": table, "rows": rows}
         print(f"\n## {section.title} ({name})\n")
-        print(markdown_table(beside(table, earlier.get("table", []))))
+        print(markdown_table(with_earlier(table, earlier.get("table", []))))
         print(f"{cpu_s:.0f} CPU s with all preparation, {time.perf_counter() - began:.0f} s")
         if earlier:
-            print(f"in brackets: {described(earlier)}")
+            print(f"in brackets: {describe_run(earlier)}")
         sys.stdout.flush()
-        if words.json is not None:
-            words.json.write_text(json.dumps(done, indent=1))
+        if options.json is not None:
+            options.json.write_text(json.dumps(done, indent=1))
 
 
-def described(section: Row) -> str:
+def describe_run(section: Row) -> str:
     """Say of what an earlier section was measured."""
     facts = section["environment"]
     return f"commit {facts.get('commit', 'unknown')} of {facts['date']}, {section['seeds']} seeds"
@@ -108,26 +111,28 @@ def timed(job: Job) -> tuple[list[Row], float]:
     return rows, time.process_time() - began
 
 
-def beside(table: Sequence[Row], before: Sequence[Row]) -> list[Row]:
+def with_earlier(table: Sequence[Row], before: Sequence[Row]) -> list[Row]:
     """Write what differs in an earlier table in brackets; a line is known by its first column."""
     earlier = {next(iter(line.values())): line for line in before}
     lines = list[Row]()
     for line in table:
         name, *columns = line
         old = earlier.get(line[name], {})
-        cells = {column: shown(line[column], old.get(column, line[column])) for column in columns}
+        cells = {
+            column: format_cell(line[column], old.get(column, line[column])) for column in columns
+        }
         lines.append({name: line[name], **cells})
     return lines
 
 
-def shown(value: object, old: object) -> str:
+def format_cell(value: object, old: object) -> str:
     """Write a cell, and what it was if that was something else."""
-    return (
-        short(value) if short(value) == short(old) else f"{short(value)} ({short(old) or 'none'})"
-    )
+    now = format_value(value)
+    before = format_value(old)
+    return now if now == before else f"{now} ({before or 'none'})"
 
 
-def short(value: object) -> str:
+def format_value(value: object) -> str:
     """Write three digits of a fraction, and nothing for None."""
     match value:
         case None:

@@ -1,8 +1,8 @@
 """Twenty parts of awkward shape (``bench/twenty_parts.py``), and each one's file on its twin.
 
-Right is, beside an ADD below a tenth of the diameter, a rotation within 15 degrees, or half a
-tooth. Twins are shown from sides where they look different by more than the sensor's noise. Ten of
-the parts take part in a choice, ten are held back.
+Right is an ADD below a tenth of the diameter and a rotation within 15 degrees, of toothed parts
+within half a tooth; it may be `ok` or `ambiguous`. Twins are shown from sides where the two differ
+by 12 mm and more. Ten of the parts take part in choices, ten are held back.
 """
 
 import time
@@ -104,6 +104,7 @@ def line(name: str, rows: Sequence[Row]) -> Row:
         "copy sure": len(sure_copies),
         "copy sure, wrong": sum(not row["right"] for row in sure_copies),
         "refused": sum(row["certainty"] is None for row in shown),
+        "confirmed": sum(row["identity"] == "confirmed" for row in shown),
         "twins": len(twins), "twin confirmed": sum(row["identity"] == "confirmed" for row in twins),
     }  # fmt: skip
 

@@ -31,7 +31,8 @@ NEAREST_M = 0.35  # of these sensors
 IMAGED_PX = (120.0, 300.0)  # length of a part in an image
 FEWEST_PX = 300  # of a mask
 APART_PX, APART_M = 200, 0.012
-"""A twin is seen to be one where so many pixels differ by so much."""
+"""A twin is seen to be one where so many pixels differ by so much: more than three deviations of
+these sensors' noise, that of neighbours included, at the usual distance."""
 SEED = 0x20A7
 Y = (0.0, 1.0, 0.0)
 
@@ -41,7 +42,7 @@ class Part(NamedTuple):
 
     ``mesh``: from the shift of that feature [mm] to the mesh. ``symmetry``: of the true surface, as
     :func:`~depthpose.pose.mesh.declare_symmetry` takes it. ``right_deg``: a rotation that is off by
-    less is right; less than half a tooth. ``is_held``: left out of every choice.
+    less is right; at most half a tooth. ``is_held``: left out of every choice.
     """
 
     mesh: Callable[[float], Mesh]
@@ -248,7 +249,7 @@ def views(
 
     Args:
         model: of the part.
-        number: of views; fewer come out where few of many random ones are taken.
+        number: of views; twenty times as many random ones are tried at most.
         seed: of the random poses.
         unlike: only views in which this model in its place would look different.
     """

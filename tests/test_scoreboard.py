@@ -110,7 +110,7 @@ def test_a_confirmed_identity_misleads_where_the_part_is_another(bench: SimpleNa
 
 def test_an_earlier_figure_stands_beside_one_that_differs(bench: SimpleNamespace) -> None:
     table = [{"set": "lm", "right": 2, "ok": 1}, {"set": "new", "right": 1, "ok": 1}]
-    lines = bench.real.beside(table, [{"set": "lm", "right": 1, "ok": 1}])
+    lines = bench.real.with_earlier(table, [{"set": "lm", "right": 1, "ok": 1}])
     assert lines == [
         {"set": "lm", "right": "2 (1)", "ok": "1"}, {"set": "new", "right": "1", "ok": "1"}
     ]  # fmt: skip

@@ -137,8 +137,8 @@ def find_copies(model: ObjectModel) -> SymmetricCopies:
     # Half turns about the principal axes: the usual mistake about a long or flat part.
     half = 2 * axes[:, :, None] * axes[:, None] - torch.eye(3).double()
     halves = Rigid(half, middle_m - half @ middle_m)
-    lookalikes = Rigid.cat([*unlike, turns[proposed["mostly"] :], halves])
-    copies = Rigid.cat([copies, turns[: proposed["mostly"]]])
+    lookalikes = Rigid.cat([*unlike, turns[proposed["near"] :], halves])
+    copies = Rigid.cat([copies, turns[: proposed["near"]]])
     centre_m = exact.ball_centre_m
     if centre_m is not None:  # every rotation of a ball is the same pose: its centre says where
         compared_m = centre_m.to(points_m)[None]

@@ -19,7 +19,7 @@ from depthpose.pose.sensor import NOISE_PER_M2, measure_noise_per_m2, plane_tole
 from depthpose.pose.types import KnownBackground
 
 _MOST_PIXELS = 110_000
-"""Of a larger image every n-th row and column is used."""
+"""Of a larger image every n-th row and column is used, so that about so many pixels remain."""
 _OBJECT_PX = 60
 """Pixels that an object is wide at least, if the image has them."""
 _WINDOW = 3
@@ -61,9 +61,9 @@ class Frame:
         points_m: in the camera frame.
         normals: toward the camera.
         is_smooth: where a normal is known.
-        background_limit_m: at a pixel of a wide plane the diameter [m] of the largest object that
-            has no side so wide; infinite on a known background, 0 elsewhere. What it means for an
-            object is :meth:`may_show`.
+        background_limit_m: up to this diameter [m] an object is too small to have the wide plane at
+            a pixel as a side, so that for it the pixel is background; infinite on a known
+            background, 0 elsewhere. What it means for an object is :meth:`may_show`.
         nearest_m: least depth of the pixels up to two away; infinite where none has a reading.
         noise_per_m2: standard deviation of a reading, for the square of the depth in metres.
         backgrounds: the known one, and the wide planes.
@@ -134,7 +134,7 @@ def prepare_frame(
     # The background: a known one, and elsewhere wide planes.
     is_searched = depth_m > 0
     backgrounds: list[Background] = []
-    if known is not None:  # before it there are objects alone: a plane is that of several
+    if known is not None:  # a plane before a known background is made of objects
         known_m = known.depth_m[::step, ::step].double().nan_to_num(torch.inf)
         is_searched &= ~known_m.isfinite()
         backgrounds.append(Background(depth_m=known_m, diameter_m=math.inf))

@@ -268,23 +268,34 @@ def refine_roughly(
 
 def _iterate(
     points_m: Float[Tensor, "m 3"],
-    most: int,
+    max_points: int,
     pose: Rigid,
     surface: Surface,
     limits_m: list[float],
     *,
     is_exact: bool,
 ) -> tuple[Rigid, Int64[Tensor, "*batch n"]]:
-    """Step until ``most`` of the points lie on the surface; give each one's sample, or -1.
+    """Take Gauss-Newton steps of ICP until the poses move no more.
 
     Where numba is there the same steps are those of ``refine`` in ``compiled/poses.py``.
+
+    Args:
+        points_m: of the object, in the camera frame.
+        max_points: so many of them are used, evenly taken.
+        pose: one or a batch, ``camera_from_model``.
+        surface: of the model.
+        limits_m: distance at which a point no longer counts, for each step.
+        is_exact: by the nearest sample, later the one on the ray; else by a table of what is near.
+
+    Returns:
+        The poses, and for each used point the number of its sample of the surface, or -1.
     """
     if len(points_m) == 0 or not bool(points_m.isfinite().all()):
         raise InputError(
             f"ICP of {len(points_m)} points, {int((~points_m.isfinite().all(-1)).sum())} of them "
             "not finite: leave those out, and refuse a cloud of none."
         )
-    cloud = take_evenly(points_m.double(), most)
+    cloud = take_evenly(points_m.double(), max_points)
     if use_numba(cloud, pose.R, pose.t_m):
         from depthpose.pose.compiled.poses import refine
 
@@ -297,11 +308,13 @@ def _iterate(
         refine(*arrays, surface.diameter_m, _CONVERGED, target, is_exact, places)
         index = torch.from_numpy(np.append(target.tree.order, -1)[places])
         return Rigid(R, t_m), index.view(*t_m.shape[:-1], len(points))
+
     scale = torch.tensor([1.0] * 3 + [surface.diameter_m] * 3, dtype=torch.float64)
     moves = torch.ones_like(pose.t_m[..., :1])
     index = torch.full((*pose.t_m.shape[:-1], len(cloud)), -1)
     steps = len(limits_m) - 1
     for k, limit_m in enumerate(limits_m):
+        # Correspondences.
         how = LOOKED_UP
         if is_exact:
             how = SEARCHED if 2 * k < steps else ON_RAY
@@ -309,12 +322,16 @@ def _iterate(
         index = torch.where(moves > 0, matches, index)
         if k == steps:
             break
+
+        # The motion that brings them together. About the middle itself: a turn by w about the
+        # camera, which is D away, with the shift that makes it one about the object to first order
+        # would leave the object w^2 D / 2 off.
         equations = _normal_equations(cloud, pose, surface, limit_m, index, how)
         motion = torch.linalg.solve(equations.information, equations.gradient) * moves
-        # About the middle itself: a turn by w about the camera, which is D away, with the shift
-        # that makes it one about the object to first order would leave the object w^2 D / 2 off.
         turned = perturb(Rigid(pose.R, pose.t_m - cloud.mean(0)), motion)
         pose = Rigid(turned.R, turned.t_m + cloud.mean(0))
+
+        # A pose that hardly moved at the last limit stays.
         if limit_m <= limits_m[-1] and how != SEARCHED:
             moves = ((motion / scale).abs() >= _CONVERGED).any(-1, keepdim=True).double()
             if not bool(moves.any()):

@@ -234,7 +234,7 @@ class Alternative:
 
     camera_from_model: Rigid  #: the pose
     probability: float  #: that it is the right one, 0..1
-    difference: str  #: from the estimate's own pose: "turned by 180 degrees about the long axis"
+    difference: str  #: from the estimate's own pose: "rotated by 180 degrees about the long axis"
     is_copy: bool = False  #: a near-symmetric copy of the estimate's pose, which looks nearly alike
 
     def __str__(self) -> str:

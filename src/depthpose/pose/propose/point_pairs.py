@@ -64,8 +64,8 @@ _SELF_COMPARED = 250
 _LEAST_SHARE = 0.25
 _LEAST_OF_BEST = 0.85
 """A turn lays this share of the surface on itself at least, and this one of what the best does."""
-_MOSTLY = 0.8
-"""One that lays this share there may be near another."""
+_NEAR_SYMMETRY = 0.8
+"""One that lays this share there is a near-symmetry, and may be near another."""
 _MIN_COSINE = 0.7
 """Of the normals there."""
 _APART_RAD = math.radians(12)
@@ -102,8 +102,8 @@ def find_turns(model: ObjectModel) -> dict[str, Any]:
     which lay half of it on itself. They are found by looking for the model in itself.
 
     Returns:
-        What JSON holds: ``turns``, 4x4 matrices in metres, the best first, and ``mostly``, how many
-        of them lay 80 % of the surface on itself.
+        What JSON holds: ``turns``, 4x4 matrices in metres, the best first, and ``near``, how many
+        of them, the first ones, are near-symmetries: they lay 80 % of the surface on itself.
     """
     surface = prepare_surface(replace(model, symmetries=true_symmetries(model)))
     table = prepare_pairs(surface)
@@ -120,8 +120,8 @@ def find_turns(model: ObjectModel) -> dict[str, Any]:
     # One after the other they are turns too, which fill the gaps between those that were found.
     twice = candidates[:, None] @ candidates
     candidates = Rigid.cat([candidates, Rigid(twice.R.flatten(0, 1), twice.t_m.flatten(0, 1))])
-    chosen, mostly = _distinct_turns(candidates, surface)
-    return {"turns": candidates[chosen].matrix().tolist(), "mostly": mostly}
+    chosen, near = _distinct_turns(candidates, surface)
+    return {"turns": candidates[chosen].matrix().tolist(), "near": near}
 
 
 def _distinct_turns(turns: Rigid, surface: Surface) -> tuple[list[int], int]:
@@ -142,11 +142,11 @@ def _distinct_turns(turns: Rigid, surface: Surface) -> tuple[list[int], int]:
         least = _LEAST_OF_BEST * float(share[chosen[0]]) if chosen else _LEAST_SHARE
         if share[k] < max(least, _LEAST_SHARE) or len(chosen) == _MOST_TURNS:
             break
-        apart_rad = _APART_RAD if share[k] >= _MOSTLY else 5 * _APART_RAD
+        apart_rad = _APART_RAD if share[k] >= _NEAR_SYMMETRY else 5 * _APART_RAD
         if float(geodesic_rad(turns.R[k].expand_as(taken), taken).min()) > apart_rad:
             chosen.append(k)
             taken = torch.cat([taken, turns.R[k] @ surface.symmetries.R])
-    return chosen, int((share[chosen] >= _MOSTLY).sum())
+    return chosen, int((share[chosen] >= _NEAR_SYMMETRY).sum())
 
 
 def prepare_pairs(surface: Surface) -> PairTable:
