@@ -23,7 +23,7 @@ SHAPE_FEATURES = 9  #: numbers that the network gets of each voxel with its shap
 
 @dataclass(frozen=True, kw_only=True)
 class CloudConfig(Settings):
-    """How a mask and a depth map become the cloud that the network sees."""
+    """How a mask and a depth map become the points of an object, and the voxels of a network."""
 
     voxel_m: Annotated[float, "(0, 1)"] = 0.008
     """Side of a voxel; one point is kept in each. The published method takes 0.001."""
