@@ -82,31 +82,37 @@ def main() -> None:
         options.processes, initializer=torch.set_num_threads, initargs=(1,)
     ) as pool:
         collected = [view for part in pool.imap(call, jobs) for view in part]
-    held = [view for view in collected if view.group in PARTS and PARTS[view.group].is_held]
-    choice = [view for view in collected if view not in held]
+    held_out = [view for view in collected if is_held_out(view)]
+    choice = [view for view in collected if not is_held_out(view)]
 
     # The coefficients, and their range when a group is left out.
-    every = fit(choice)
+    fitted = fit(choice)
     groups = list(dict.fromkeys(view.group for view in choice))
-    without = {group: fit([v for v in choice if v.group != group]) for group in groups}
+    fitted_without = {group: fit([v for v in choice if v.group != group]) for group in groups}
     rows: list[dict[str, Any]] = []
-    for name in vars(every):
-        values = [words(getattr(fitted, name)) for fitted in without.values()]
+    for name in vars(fitted):
+        values = sorted((getattr(other, name) for other in fitted_without.values()), key=mean_of)
         rows.append({
-            "coefficient": name, "file": words(getattr(Coefficients(), name)),
-            "fit": words(getattr(every, name)),
-            "without a group": f"{min(values)} to {max(values)}",
+            "coefficient": name, "file": format_coefficient(getattr(Coefficients(), name)),
+            "fit": format_coefficient(getattr(fitted, name)),
+            "without a group":
+                f"{format_coefficient(values[0])} to {format_coefficient(values[-1])}",
         })  # fmt: skip
     print(markdown_table(rows))
 
     # What they predict of views that took no part in the fit.
-    left_out = [(view, without[view.group]) for view in choice]
+    left_out = [(view, fitted_without[view.group]) for view in choice]
     print(markdown_table([
         row("choice, file", [(view, Coefficients()) for view in choice]),
         row("choice, each group by the others", left_out),
-        row("held back, file", [(view, Coefficients()) for view in held]),
-        row("held back, fit", [(view, every) for view in held]),
+        row("held back, file", [(view, Coefficients()) for view in held_out]),
+        row("held back, fit", [(view, fitted) for view in held_out]),
     ]))  # fmt: skip
+
+
+def is_held_out(view: View) -> bool:
+    """Whether a view is of a part that takes part in no choice."""
+    return view.group in PARTS and PARTS[view.group].is_held
 
 
 def call(job: Callable[[], list[View]]) -> list[View]:
@@ -161,7 +167,7 @@ def fit(collected: Sequence[View]) -> Coefficients:
     ]
     right = [evidence for evidence, is_right in labelled if is_right]
     wrong = [evidence for evidence, is_right in labelled if not is_right]
-    found = sum(any(view.is_right) for view in collected)
+    has_right = sum(any(view.is_right) for view in collected)
     # The root mean square whose log likelihood is the mean of those of wrong poses.
     mean_log = sum(math.log(1 + e.rms**2) for e in wrong) / len(wrong)
     return Coefficients(
@@ -170,7 +176,7 @@ def fit(collected: Sequence[View]) -> Coefficients:
         right_unobserved=fit_share([unobserved(e) for e in right]),
         wrong_unobserved=fit_share([unobserved(e) for e in wrong]),
         wrong_rms=math.sqrt(math.exp(mean_log) - 1),
-        prior_masked=found / max(1, len(collected) - found),
+        prior_masked=has_right / max(1, len(collected) - has_right),
     )
 
 
@@ -230,7 +236,12 @@ def row(title: str, judged: Sequence[tuple[View, Coefficients]]) -> dict[str, An
     }  # fmt: skip
 
 
-def words(value: GammaShare | float) -> str:
+def mean_of(value: GammaShare | float) -> float:
+    """Give the mean of a share, or the number itself, to sort by."""
+    return value.mean if isinstance(value, GammaShare) else value
+
+
+def format_coefficient(value: GammaShare | float) -> str:
     """Format a coefficient."""
     if isinstance(value, GammaShare):
         return f"{value.mean:.3f}, {value.shape:.2f}"

@@ -11,7 +11,7 @@ from tests.pose.synthetic_objects import pose_at
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EstimateConfig
-from depthpose.pose.decide import contradiction, with_status
+from depthpose.pose.decide import contradiction, seconds_of_all, with_status
 from depthpose.pose.hypotheses import (
     Competition,
     Hypothesis,
@@ -52,6 +52,14 @@ def test_counts_have_a_distribution(share: GammaShare, area: float) -> None:
     assert sum(probabilities) == pytest.approx(1)
     mean = sum(count * p for count, p in enumerate(probabilities))
     assert mean == pytest.approx(share.mean * area, rel=1e-6)
+
+
+def test_the_seconds_of_several_tries_add_up() -> None:
+    tries = [
+        PoseEstimate(name="a", object="part", status="doubtful", reason="no", seconds=seconds)
+        for seconds in ({"cloud": 1.0, "icp": 2.0}, {"icp": 0.5, "search": 4.0})
+    ]
+    assert seconds_of_all(tries) == {"cloud": 1.0, "icp": 2.5, "search": 4.0}
 
 
 def test_each_kind_of_contradiction_lowers_the_probability() -> None:

@@ -17,12 +17,7 @@ from depthpose.cli.pose_options import PoseInputs
 from depthpose.core.camera import AnyLens
 from depthpose.core.checkpoint import file_sha256
 from depthpose.core.errors import InputError, nearest_name
-from depthpose.core.files import (
-    CLOUD_READERS,
-    MAP_SUFFIXES,
-    list_images,
-    read_stored_depth,
-)
+from depthpose.core.files import CLOUD_READERS, MAP_SUFFIXES, list_images, read_stored_depth
 from depthpose.core.files.disk import natural_order
 from depthpose.core.files.images import refuse_among_inputs
 from depthpose.core.rigid import Rigid
@@ -40,9 +35,7 @@ from depthpose.pose.datasets import (
     read_labels,
 )
 from depthpose.pose.inputs import AnyMask, cloud_input, view_input
-from depthpose.pose.predictions import (
-    PoseJob,
-)
+from depthpose.pose.predictions import PoseJob
 from depthpose.pose.types import ObjectModel, ViewInput
 
 

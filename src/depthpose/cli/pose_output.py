@@ -13,16 +13,10 @@ from scipy.spatial.transform import Rotation
 from depthpose.cli.pose_methods import PoseMethod
 from depthpose.core import run
 from depthpose.core.errors import InputError
-from depthpose.core.files import (
-    read_image,
-    write_cloud,
-    write_image,
-)
+from depthpose.core.files import read_image, write_cloud, write_image
 from depthpose.core.rigid import Rigid
 from depthpose.core.run import is_whole, note_result
-from depthpose.pose.datasets import (
-    BopDataset,
-)
+from depthpose.pose.datasets import BopDataset
 from depthpose.pose.predictions import (
     CLOUD,
     PICTURE,

@@ -25,30 +25,14 @@ from depthpose.core import run
 from depthpose.core.camera import Camera, camera_of
 from depthpose.core.checkpoint import find_weights
 from depthpose.core.config import config_to_dict
-from depthpose.core.engine import (
-    Files,
-    Function,
-    Inputs,
-    Sample,
-    Work,
-)
+from depthpose.core.engine import Files, Function, Inputs, Sample, Work
 from depthpose.core.errors import InputError
-from depthpose.core.files import (
-    CLOUD_READERS,
-    image_size,
-    write_json,
-)
+from depthpose.core.files import CLOUD_READERS, image_size, write_json
 from depthpose.core.files.images import LISTED_SUFFIXES
 from depthpose.core.runner import Job, Results, run_jobs
 from depthpose.core.units import Unit
 from depthpose.pose.config import EstimateConfig
-from depthpose.pose.datasets import (
-    Box,
-    Detection,
-    open_bop,
-    parse_box,
-    read_targets,
-)
+from depthpose.pose.datasets import Box, Detection, open_bop, parse_box, read_targets
 from depthpose.pose.evaluate import select_targets
 from depthpose.pose.inputs import cloud_input, view_input
 from depthpose.pose.predictions import (

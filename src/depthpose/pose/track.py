@@ -134,18 +134,18 @@ def _follow_or_search(
     pose_input: AnyInput, current: _Track | None, target: TrackedObject
 ) -> tuple[PoseEstimate, _Track | None]:
     """Follow the object into a frame, or search it there; give what is known of it then."""
-    spent_s = 0.0
+    seconds: dict[str, float] = {}
     if current is not None:
         began = time.perf_counter()
         followed = _follow(pose_input, current, target)
-        spent_s = time.perf_counter() - began
+        seconds["tracking"] = time.perf_counter() - began
         if not isinstance(followed, Refusal):
             estimate, following = followed
-            return replace(estimate, name=pose_input.name, seconds={"tracking": spent_s}), following
+            return replace(estimate, name=pose_input.name, seconds=seconds), following
 
     # Not known from the frame before, or not seen there.
     searched = target.search(pose_input)
-    seconds = {"tracking": spent_s, **searched.seconds}
+    seconds |= searched.seconds
     pose = searched.camera_from_model
     tracking = "lost" if pose is None else "found"
     estimate = replace(searched, name=pose_input.name, seconds=seconds, tracking=tracking)

@@ -351,7 +351,7 @@ class PoseEstimate:
 
     @property
     def visible_share(self) -> float | None:
-        """Share of the surface that faces the camera on which readings lie, 0..1; None: unknown."""
+        """Share of the surface facing the camera whose readings support the pose, 0..1, or None."""
         return None if self.evidence is None else self.evidence.supported_share
 
     def in_base(self, base_from_camera: Rigid) -> "PoseEstimate":

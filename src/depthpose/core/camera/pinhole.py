@@ -439,7 +439,7 @@ def refuse_outside(K: Float[Tensor, "3 3"], width: int, height: int) -> None:
 def suspicious_centre(camera: Camera) -> str | None:
     """Warn where K looks like that of another image size than the camera's; else None.
 
-    So it does, too, where the principal point is more than a quarter of the size off the centre.
+    The principal point is doubted as well where it is more than a quarter off the centre.
     """
     try:
         refuse_other_resolution(camera.K, camera.width, camera.height)
@@ -454,7 +454,7 @@ def suspicious_centre(camera: Camera) -> str | None:
     return (
         f"the principal point ({cx:g}, {cy:g}) lies at {across:.0%} of the width and {down:.0%} of "
         f"the height of {camera.width}x{camera.height}, more than a quarter off the centre: is K "
-        "of another size? Scale fx, fy, cx and cy as the image was; a crop's is right so"
+        "of another size? Scale fx, fy, cx and cy as the image was. Of a crop it may be right"
     )
 
 

@@ -156,8 +156,8 @@ class TrainingPairs:
             sample = source[number]
             views = sample.input
             rig = views.camera
-            left_px = _known_px(sample.truth.disparity_px, kind)
-            right_px = _known_px(sample.truth.right_disparity_px, kind)
+            left_px = _with_sky_at_zero(sample.truth.disparity_px, kind)
+            right_px = _with_sky_at_zero(sample.truth.right_disparity_px, kind)
 
         if left_px is None:
             left_px = torch.full_like(views.left[0], torch.nan)
@@ -205,7 +205,7 @@ def _truth_of_frame(
     return disparity_from_depth(depth_m, rig)
 
 
-def _known_px(exact_px: Map | None, kind: TruthKind | None) -> Map | None:
+def _with_sky_at_zero(exact_px: Map | None, kind: TruthKind | None) -> Map | None:
     """Give the exact disparity of a made view, 0 in the sky; None where no truth is wanted."""
     return None if exact_px is None or kind is None else exact_px.nan_to_num(0.0)
 
