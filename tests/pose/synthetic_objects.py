@@ -170,7 +170,7 @@ class Oracle(GeoPoseNet):
         self.calls += [len(ready)] if ready else []
         for one in ready:
             one.directions = self._true(one.voxels.points_m, one.prepared.number)
-            one.seconds["network"] = 0.01
+            one.watch.seconds["network"] = 0.01
         return group
 
     def _true(self, points_m: Tensor, number: int) -> Tensor:

@@ -15,7 +15,7 @@ from depthpose.core.rigid import Rigid, geodesic_rad, rotation_by
 from depthpose.pose import search
 from depthpose.pose.cloud import cloud_from_depth, grow_mask
 from depthpose.pose.config import EstimateConfig, RefusalConfig
-from depthpose.pose.copies import find_copies
+from depthpose.pose.copies import PreparedObject, find_copies
 from depthpose.pose.evidence import compare, observe
 from depthpose.pose.footprint import explained_mask, why_background_excludes
 from depthpose.pose.frame import prepare_frame
@@ -25,6 +25,7 @@ from depthpose.pose.metrics import add_m
 from depthpose.pose.probability import PRIOR_PROPOSED
 from depthpose.pose.propose.image import propose_in_frame, score_by_image
 from depthpose.pose.propose.point_pairs import prepare_pairs
+from depthpose.pose.register import register
 from depthpose.pose.registration import Registration
 from depthpose.pose.search import SearchTargets, find_objects
 from depthpose.pose.surface import prepare_surface
@@ -246,8 +247,15 @@ def test_turns_that_fit_as_well_are_named() -> None:
     view = view_input(seen, mask & (local_m[..., 0] < 0.043), CAMERA, "mug", "view", None)
     cloud = CloudInput(name="view", points_m=cloud_from_depth(seen, view.mask, K), object="mug",
                        view=view)  # fmt: skip
-    net = Registration([mug], refusal=RefusalConfig(min_observability=0.0, min_probability=0.0))
-    (found,) = net._estimate_near([cloud], [truth[None]], PRIOR_PROPOSED)
+    net = Registration([mug])
+    found = register(
+        cloud,
+        net._prepared_object("mug"),
+        net.config,
+        RefusalConfig(min_observability=0.0, min_probability=0.0),
+        proposals=truth[None],
+        prior_odds=PRIOR_PROPOSED,
+    )
     assert found.camera_from_model is not None
     named = [found.camera_from_model, *(one.camera_from_model for one in found.alternatives)]
     assert len(named) > 5
@@ -283,29 +291,34 @@ def test_a_model_larger_than_the_view_has_an_answer_soon() -> None:
 
 
 @pytest.mark.slow
-def test_a_hundred_models_take_bounded_time(net: Registration) -> None:
+def test_a_hundred_models_take_bounded_time(
+    net: Registration, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A hundred of one shape: what is there may be any of them, so none is answered."""
     view = view_input(table(), None, CAMERA, "bracket", "input", None)
-    judged = list[int]()
+    registered = list[str]()
 
-    def estimate_near(
-        inputs: Sequence[CloudInput], poses: Sequence[Rigid], prior_odds: float
-    ) -> list[PoseEstimate]:
-        judged.append(len(inputs))
-        given = [replace(one, object="bracket") for one in inputs]
-        found = net._estimate_near(given, poses, prior_odds)
-        return [replace(e, object=one.object) for e, one in zip(found, inputs, strict=True)]
+    def count(
+        cloud: CloudInput, prepared: PreparedObject, config: EstimateConfig,
+        refusal: RefusalConfig, *, proposals: Rigid, prior_odds: float,
+    ) -> PoseEstimate:  # fmt: skip
+        registered.append(cloud.name)
+        return register(
+            cloud, prepared, config, refusal, proposals=proposals, prior_odds=prior_odds
+        )
 
-    known = SearchTargets(
-        names=[f"part {k}" for k in range(100)],
-        object_of=lambda _: net._prepared_object("bracket"),
-        estimate_near=estimate_near,
-        config=EstimateConfig(),
-        min_probability=0.5,
-    )
+    monkeypatch.setattr(search, "register", count)
+    prepared = net._prepared_object("bracket")
+    objects: dict[str, PreparedObject] = {}
+    for k in range(100):
+        model = replace(prepared.model, name=f"part {k}")
+        copy = PreparedObject(number=k, model=model, surface=prepared.surface)
+        copy.copies, copy.pairs = prepared.copies, prepared.pairs  # computed once
+        objects[model.name] = copy
+    targets = replace(TARGETS, objects=objects)
     began = time.process_time()
-    assert not any(estimate.is_posed for estimate in find_objects(view, known))
-    assert judged[0] <= 400, "which bounds the memory too"
+    assert not any(estimate.is_posed for estimate in find_objects(view, targets))
+    assert len(registered) <= 400, "which bounds the memory too"
     assert time.process_time() - began < 120
 
 
@@ -332,10 +345,14 @@ def judged(
     )
 
 
+PREPARED = MagicMock()
+PREPARED.surface.middle_m = torch.zeros(3)
+PREPARED.surface.diameter_m = 0.1
 TARGETS = SearchTargets(
-    names=["a"], estimate_near=MagicMock(), config=EstimateConfig(), min_probability=0.5,
-    object_of=MagicMock(**{"return_value.surface.middle_m": torch.zeros(3)}),
-)  # fmt: skip
+    objects={"a": PREPARED, "b": PREPARED, "c": PREPARED},
+    config=EstimateConfig(),
+    refusal=RefusalConfig(),
+)
 
 
 def test_what_may_be_either_of_two_objects_stays_unanswered_in_later_rounds() -> None:
@@ -447,7 +464,7 @@ def test_the_best_evidence_leads_a_place_not_the_first_proposal(net: Registratio
         )
         for pose in (wrong, coarse)
     ]  # fmt: skip
-    targets = replace(TARGETS, object_of=net._prepared_object, names=["bracket"])
+    targets = replace(TARGETS, objects={"bracket": prepared})
     likely, hopeless = search._refine(places, frame, view, targets)
     assert float((likely[0].pose.t_m - truth.t_m).norm()) < 0.001, "refined"
     assert float(geodesic_rad(likely[0].pose.R.float(), truth.R.float())) < 0.1
@@ -479,14 +496,7 @@ def test_what_is_there_twice_is_searched_for_again(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(search, "_propose", propose)
     monkeypatch.setattr(search, "with_pick_ranks", lambda estimates, *_: estimates)
     monkeypatch.setattr(search, "_judge", lambda *_: (rounds[len(searched) - 1], []))
-    targets = SearchTargets(
-        names=["a", "b"],
-        object_of=MagicMock(**{
-            "return_value.surface.diameter_m": 0.1,
-            "return_value.surface.middle_m": torch.zeros(3),
-        }),
-        estimate_near=MagicMock(), config=EstimateConfig(), min_probability=0.5,
-    )  # fmt: skip
+    targets = replace(TARGETS, objects={"a": PREPARED, "b": PREPARED})
     found = find_objects(view, targets)
     assert searched == [(["a", "b"], 40), (["a"], 16), (["a"], 8)]
     assert [estimate.object for estimate in found] == ["a", "a", "a", "b"], "the surest first"

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
+from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, geodesic_rad
 from depthpose.pose.mesh import (
     axis_of_turn,
@@ -31,6 +32,7 @@ _COPY_DIAMETERS = 0.05  # deviation of a near-symmetric copy: of more it is anot
 _CLOSE_RAD = math.radians(45)  # a copy after a smaller rotation is one of a row about its axis
 _COMPARED = 100  # points of the model by which poses are compared
 _ALONG = math.cos(math.radians(15))
+_LEAST_POINTS = 500  # of a model without faces
 _LONGER = 1.15
 """An axis is the longest or shortest where it differs by so much from the next."""
 
@@ -111,8 +113,23 @@ class PreparedObject:
 
     @cached_property
     def pairs(self) -> PairTable:
-        """Pairs of points that vote for its pose."""
+        """Pairs of points that vote for its pose.
+
+        Raises:
+            InputError: the model has no surface.
+        """
+        require_surface(self.model)
         return prepare_pairs(self.surface)
+
+
+def require_surface(model: ObjectModel) -> None:
+    """Raise an :class:`InputError` if a model is a few points without faces."""
+    points = len(model.vertices_m)
+    if len(model.faces) == 0 and points < _LEAST_POINTS:
+        raise InputError(
+            f"{model.name}: {points} points without faces are no surface; export the part as a "
+            f"mesh with triangles, such as STL, or give {_LEAST_POINTS} points"
+        )
 
 
 def find_copies(model: ObjectModel) -> SymmetricCopies:

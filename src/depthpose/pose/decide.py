@@ -1,7 +1,6 @@
 """Competing poses and their probabilities to an estimate: a pose, or the reason for none."""
 
 import math
-import time
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -24,7 +23,7 @@ from depthpose.pose.probability import (
     probability_right,
     share_among_objects,
 )
-from depthpose.pose.types import Alternative, AnyInput, Evidence, PoseEstimate, Refusal, Vote
+from depthpose.pose.types import Alternative, AnyInput, Evidence, PoseEstimate, Refusal
 
 OTHER_FRAME = (
     ". Or is the cloud not in the camera's frame (x right, y down, z forward)? A robot's base and "
@@ -45,9 +44,8 @@ def decide(
     *,
     refusal: RefusalConfig,
     config: EstimateConfig,
-    seconds: dict[str, float],
     prior_odds: float,
-    vote: Vote | None = None,
+    is_refined: bool,
 ) -> PoseEstimate:
     """Give the likeliest of competing poses as the estimate, or say why it is withheld.
 
@@ -58,11 +56,9 @@ def decide(
         observation: that they were compared with.
         refusal: limits.
         config: settings of the estimate.
-        seconds: spent in the stages before.
         prior_odds: of the best pose being right, before its evidence is seen.
-        vote: of a network.
+        is_refined: whether ICP refined the poses; else size and mirror image are not tested.
     """
-    began = time.perf_counter()
     model = prepared.model
     best = competition.best
     probability = probability_right(best.evidence, prior_odds)
@@ -75,7 +71,7 @@ def decide(
     )
     if withheld is None and probability < refusal.min_probability:
         withheld = Refusal(status="doubtful", reason=contradiction(best.evidence, probability))
-    if withheld is None and config.with_icp and refusal.max_size_error < 1:
+    if withheld is None and is_refined and refusal.max_size_error < 1:
         identity = identify(
             cloud.cloud_m,
             best.pose,
@@ -93,12 +89,9 @@ def decide(
     facts: dict[str, Any] = {
         "name": cloud.name,
         "object": model.name,
-        "keypoints_m": None if vote is None else vote.keypoints_m.float(),
-        "inlier_share": None if vote is None else float(vote.inlier_share.mean()),
         "residual_m": best.residual_m,
         "evidence": best.evidence,
         "identity": identity,
-        "seconds": {**seconds, "decision": time.perf_counter() - began},
     }
     # A cloud, other than a depth image, may be in another frame than the camera's.
     hint = OTHER_FRAME if cloud.view is None else ""
@@ -233,11 +226,11 @@ def with_status(estimate: PoseEstimate, min_certainty: float) -> PoseEstimate:
     return replace(estimate, status="ambiguous", reason=reason)
 
 
-def refused(given: AnyInput, refusal: Refusal, seconds: dict[str, float]) -> PoseEstimate:
+def refused(pose_input: AnyInput, refusal: Refusal, seconds: dict[str, float]) -> PoseEstimate:
     """Give the estimate of an input without a pose."""
     return PoseEstimate(
-        name=given.name,
-        object=given.object,
+        name=pose_input.name,
+        object=pose_input.object,
         status=refusal.status,
         reason=refusal.reason,
         seconds=seconds,

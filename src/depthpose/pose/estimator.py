@@ -1,6 +1,5 @@
 """What every estimator of poses offers: one object, several, whole depth images, sequences."""
 
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from dataclasses import replace
 from functools import partial
@@ -17,21 +16,11 @@ from depthpose.core.files import Picture
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
 from depthpose.pose.background import AnyBackground, with_background
-from depthpose.pose.cloud import ObjectCloud
 from depthpose.pose.color_inputs import with_color
-from depthpose.pose.config import EstimateConfig, IcpConfig, RefusalConfig
+from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.copies import PreparedObject
 from depthpose.pose.datasets.detections import Box, box_mask
-from depthpose.pose.decide import (
-    choose_object,
-    contradiction,
-    decide,
-    refused,
-    with_status,
-)
-from depthpose.pose.evidence import compare, observe
-from depthpose.pose.hypotheses import compete
-from depthpose.pose.icp import BestStart
+from depthpose.pose.decide import choose_object, refused, seconds_of_all, with_status
 from depthpose.pose.inputs import (
     AnyArray,
     AnyCloud,
@@ -43,11 +32,12 @@ from depthpose.pose.inputs import (
     split_instances,
     view_input,
 )
-from depthpose.pose.probability import LEAST_POSSIBLE, PRIOR_REGION, probability_right
+from depthpose.pose.probability import PRIOR_REGION
+from depthpose.pose.register import register
 from depthpose.pose.search import SearchTargets, find_objects
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.track import TrackedObject, track
-from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, Refusal, ViewInput, Vote
+from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, Refusal, ViewInput
 
 Made = TypeVar("Made")
 _NAME = "input"  # what an input is called that came without a name
@@ -59,7 +49,7 @@ class PoseEstimator:
     Args:
         models: the objects.
         config: ICP, limits, device.
-        refusal: when an answer is withheld.
+        refusal: when what is registered, searched or tracked is withheld.
     """
 
     _holder = "the weights"
@@ -128,98 +118,29 @@ class PoseEstimator:
             answers.append(estimate)
         return answers
 
-    def _judge(
-        self,
-        cloud: ObjectCloud,
-        prepared: PreparedObject,
-        refinement: BestStart,
-        icp: IcpConfig | None,
-        seconds: dict[str, float],
-        *,
-        prior_odds: float,
-        is_masked: bool,
-        vote: Vote | None = None,
-        votes_rad: Callable[[Rigid], float] | None = None,
-    ) -> PoseEstimate:
-        """Compare a refined pose with the depth image and with its competitors, and decide.
+    def _register(self, pose_input: AnyInput) -> PoseEstimate:
+        """Register one object to the points of its mask; search the region if the mask is loose."""
+        if isinstance(pose_input, ViewInput) and pose_input.is_region:
+            return self._search_region(pose_input)
+        prepared = self._prepared_object(pose_input.object)
+        estimate = register(pose_input, prepared, self.config, self.refusal)
+        if estimate.status != "doubtful" or not isinstance(pose_input, ViewInput):
+            return estimate
+        in_region = self._search_region(replace(pose_input, is_region=True))
+        seconds = seconds_of_all([estimate, in_region])
+        return replace(in_region if in_region.is_posed else estimate, seconds=seconds)
 
-        Args:
-            cloud: points of the object.
-            prepared: the object.
-            refinement: the best pose, and others at which refinement ended.
-            icp: by which competing poses are refined; None: they stay where they are.
-            seconds: spent in the stages before.
-            prior_odds: of the best pose being right.
-            is_masked: whether all points of the cloud are the object's, as a mask gives them.
-            vote: of a network.
-            votes_rad: what a network's directions are off at a pose, as :func:`compete` takes it.
-        """
-        began = time.perf_counter()
-        observation = observe(
-            cloud.cloud_m,
-            cloud.view,
-            prepared.surface.diameter_m,
-            self.config.object_deviation_m,
-            is_masked=is_masked,
-        )
-        # A search proposes much: what the depth image plainly contradicts goes no further.
-        if not is_masked:
-            pose = refinement.refined.camera_from_model
-            evidence = compare(observation, pose, prepared.surface)
-            probability = probability_right(evidence, prior_odds)
-            if probability < LEAST_POSSIBLE:
-                return PoseEstimate(
-                    name=cloud.name,
-                    object=prepared.model.name,
-                    status="doubtful",
-                    reason=contradiction(evidence, probability),
-                    seconds={**seconds, "evidence": time.perf_counter() - began},
-                )
-
-        # The best pose against its near-symmetric copies, look-alikes and other local minima.
-        has_color = cloud.view is not None and cloud.view.color is not None
-        competition = compete(
-            cloud.cloud_m.double(),
-            refinement.refined,
-            refinement.others,
-            prepared,
-            observation,
-            icp,
-            cloud.view if has_color else None,
-            votes_rad,
-        )
-        seconds = {**seconds, "evidence": time.perf_counter() - began}
-        return decide(
-            cloud,
-            prepared,
-            competition,
-            observation,
-            refusal=self.refusal,
-            config=self.config,
-            seconds=seconds,
-            prior_odds=prior_odds,
-            vote=vote,
-        )
-
-    def _estimate_in_region(self, view: ViewInput) -> PoseEstimate:
-        """Estimate the one object that is somewhere in the mask of a view, as in a box."""
+    def _search_region(self, view: ViewInput) -> PoseEstimate:
+        """Search the one object that is somewhere in the mask of a view, as in a box."""
         targets = SearchTargets(
-            names=[view.object],
-            object_of=self._prepared_object,
-            estimate_near=self._estimate_near,
+            objects={view.object: self._prepared_object(view.object)},
             config=self.config,
-            min_probability=self.refusal.min_probability,
+            refusal=self.refusal,
             prior_odds=PRIOR_REGION,
             is_single=True,
         )
         best = find_objects(view, targets)[0]
         return with_status(replace(best, name=view.name), self.config.min_certainty)
-
-    def _estimate_near(
-        self, inputs: Sequence[CloudInput], proposals: Sequence[Rigid], prior_odds: float
-    ) -> list[PoseEstimate]:
-        """Estimate clouds by the poses that were proposed for each."""
-        raise NotImplementedError
 
     @force_float32()
     def estimate(  # noqa: PLR0913  every form of input
@@ -384,11 +305,9 @@ class PoseEstimator:
             is_single: search once, without further rounds for more of the same object.
         """
         targets = SearchTargets(
-            names=objects,
-            object_of=self._prepared_object,
-            estimate_near=self._estimate_near,
+            objects={name: self._prepared_object(name) for name in objects},
             config=self.config,
-            min_probability=self.refusal.min_probability,
+            refusal=self.refusal,
             is_single=is_single,
         )
         estimates = find_objects(view, targets)

@@ -4,7 +4,6 @@ Several clouds go through the network at once; the directions of each vote for k
 the pose is fitted, refined by ICP, and checked. A baseline regresses the pose from the depth image.
 """
 
-import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -26,6 +25,7 @@ from depthpose.core.devices import (
 )
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
+from depthpose.core.stopwatch import Stopwatch
 from depthpose.pose.baselines import DepthCrop, DepthImageNet, cut_depth, poses_of
 from depthpose.pose.cloud import (
     ObjectCloud,
@@ -35,21 +35,21 @@ from depthpose.pose.cloud import (
     sample_and_voxelise,
     why_too_few,
 )
-from depthpose.pose.config import EstimateConfig
-from depthpose.pose.copies import PreparedObject
+from depthpose.pose.config import EstimateConfig, RefusalConfig
+from depthpose.pose.copies import PreparedObject, require_surface
 from depthpose.pose.decide import refused
 from depthpose.pose.estimator import PoseEstimator, unreadable_on_error
 from depthpose.pose.icp import BestStart, RefinedPose, refine_best
 from depthpose.pose.probability import PRIOR_MASKED, PRIOR_PROPOSED
 from depthpose.pose.propose import fits_of, meet_lines, vote_ransac
-from depthpose.pose.registration import Registration
+from depthpose.pose.register import judge
 from depthpose.pose.types import (
     AnyInput,
-    CloudInput,
     PoseEstimate,
     Refusal,
     Status,
     ViewInput,
+    Vote,
     VotingPoints,
 )
 from depthpose.pose.weights import PoseWeights, read_pose_weights
@@ -75,7 +75,7 @@ class CloudToPose:
     prepared: PreparedObject  #: its object
     cloud: ObjectCloud  #: all points of the object
     voxels: VoxelGrid  #: those that the network sees and that vote, one a voxel
-    seconds: dict[str, float]  #: spent so far
+    watch: Stopwatch  #: of the stages so far
     #: of the network at each voting point, in the camera frame; empty before it was asked
     directions: Float[Tensor, "n k 3"] = field(default_factory=lambda: torch.empty(0, 0, 3))
 
@@ -120,7 +120,8 @@ class GeoPoseNet(PoseEstimator):
     """What the weights were called; nothing where they came from memory."""
 
     def __init__(self, weights: PoseWeights, config: EstimateConfig | None = None) -> None:
-        super().__init__(weights.models, config, weights.refusal)
+        # The weights' limits are for the network's votes; what is searched has the usual ones.
+        super().__init__(weights.models, config, RefusalConfig())
         self.weights = weights
         self.terms = weights.facts.get("terms", "")
         """Terms of the weights, where they bind whoever uses them; else nothing."""
@@ -130,9 +131,9 @@ class GeoPoseNet(PoseEstimator):
                 "read_pose_weights(FILE) to DepthImageRegressor"
             )
         self._network = weights.network.to(usable_device(self.config.device)).eval()
-        self._registration: Registration | None = None
         if self.config.register_refused:
-            self._by_models()  # models without a surface are refused at once
+            for model in self.models:
+                require_surface(model)
 
     @classmethod
     @force_float32()
@@ -175,23 +176,6 @@ class GeoPoseNet(PoseEstimator):
         pose = partial(self._pose, is_expected=is_expected)
         return chain.from_iterable(map(partial(each_in_threads, pose, threads=threads), groups))
 
-    def _by_models(self) -> Registration:
-        """Give the registration of the same objects, which shares what was prepared of them.
-
-        What a search proposes, and what the network refuses, is estimated by it, with the usual
-        limits of refusal: those of a network may doubt what registration is sure of.
-        """
-        if self._registration is None:
-            config = replace(self.config, register_refused=False, with_icp=True)
-            self._registration = Registration(self.models, config)
-            self._registration._objects = self._objects
-        return self._registration
-
-    def _estimate_near(
-        self, inputs: Sequence[CloudInput], proposals: Sequence[Rigid], prior_odds: float
-    ) -> list[PoseEstimate]:
-        return self._by_models()._estimate_near(inputs, proposals, prior_odds)
-
     @torch.no_grad()
     @force_float32()
     def estimate_with_votes(
@@ -222,21 +206,19 @@ class GeoPoseNet(PoseEstimator):
         In their place the estimate itself, where the input is a region or is refused.
         """
         if isinstance(pose_input, ViewInput) and pose_input.is_region:
-            return self._estimate_in_region(pose_input)
+            return self._search_region(pose_input)
         prepared = self._object(pose_input.object)
         _ = prepared.copies  # cached now, so that the seconds of no stage hold it
-        start = time.perf_counter()
-        cloud = prepare_cloud(pose_input, prepared.model, self.weights.cloud, self.config)
+        watch = Stopwatch()
+        with watch.stage("cloud"):
+            cloud = prepare_cloud(pose_input, prepared.model, self.weights.cloud, self.config)
         if isinstance(cloud, Refusal):
-            return refused(pose_input, cloud, {"cloud": time.perf_counter() - start})
-        seed = self.config.voting.seed
-        voxels = sample_and_voxelise(cloud.cloud_m, self.weights.cloud, seed)
+            return refused(pose_input, cloud, watch.seconds)
+        with watch.stage("cloud"):
+            seed = self.config.voting.seed
+            voxels = sample_and_voxelise(cloud.cloud_m, self.weights.cloud, seed)
         return CloudToPose(
-            pose_input=pose_input,
-            prepared=prepared,
-            cloud=cloud,
-            voxels=voxels,
-            seconds={"cloud": time.perf_counter() - start},
+            pose_input=pose_input, prepared=prepared, cloud=cloud, voxels=voxels, watch=watch
         )
 
     def _ask_network(
@@ -246,26 +228,26 @@ class GeoPoseNet(PoseEstimator):
         ready = [job for job in group if isinstance(job, CloudToPose)]
         if not ready:
             return group
-        start = time.perf_counter()
-        grids = [job.voxels for job in ready]
-        counts = [len(grid.points_m) for grid in grids]
-        cloud_of_point = torch.repeat_interleave(torch.arange(len(ready)), torch.tensor(counts))
-        numbers = torch.tensor([job.prepared.number for job in ready])
-        coordinates = torch.cat([grid.coordinates for grid in grids])
-        points_m = [grid.points_m @ grid.grid_from_camera.mT for grid in grids]
-        device = self.config.device
-        network_input = VotingPoints(
-            points_m=torch.cat(points_m).to(device),
-            coordinates=torch.cat([cloud_of_point[:, None], coordinates], 1).to(device),
-            features=torch.cat([grid.features for grid in grids]).to(device),
-            class_of_point=numbers[cloud_of_point].to(device),
-        )
-        outputs = self._network.directions(network_input).float().cpu().split(counts)
-        for job, of_cloud in zip(ready, outputs, strict=True):
+        watch = Stopwatch()
+        with watch.stage("network"):
+            grids = [job.voxels for job in ready]
+            counts = [len(grid.points_m) for grid in grids]
+            cloud_of_point = torch.repeat_interleave(torch.arange(len(ready)), torch.tensor(counts))
+            numbers = torch.tensor([job.prepared.number for job in ready])
+            coordinates = torch.cat([grid.coordinates for grid in grids])
+            points_m = [grid.points_m @ grid.grid_from_camera.mT for grid in grids]
+            device = self.config.device
+            network_input = VotingPoints(
+                points_m=torch.cat(points_m).to(device),
+                coordinates=torch.cat([cloud_of_point[:, None], coordinates], 1).to(device),
+                features=torch.cat([grid.features for grid in grids]).to(device),
+                class_of_point=numbers[cloud_of_point].to(device),
+            )
+            outputs = self._network.directions(network_input).float().cpu().split(counts)
+        for job, of_cloud, count in zip(ready, outputs, counts, strict=True):
             job.directions = of_cloud @ job.voxels.grid_from_camera
-        spent_s = time.perf_counter() - start
-        for job, count in zip(ready, counts, strict=True):  # each has a share of the time
-            job.seconds["network"] = spent_s * count / sum(counts)
+            # Each has a share of the time.
+            job.watch.seconds["network"] = watch.seconds["network"] * count / sum(counts)
         return group
 
     def _pose(self, job: CloudToPose | PoseEstimate, *, is_expected: bool) -> PoseEstimate:
@@ -277,11 +259,11 @@ class GeoPoseNet(PoseEstimator):
         )
         if not (self.config.register_refused and is_expected) or voted.status not in _DOUBTED:
             return voted
-        start = time.perf_counter()
-        (registered,) = self._by_models().estimate_many([job.pose_input])
-        spent_s = time.perf_counter() - start
+        watch = Stopwatch()
+        with watch.stage("registration"):
+            registered = unreadable_on_error(self._register, job.pose_input)
         best = registered if registered.is_posed else voted
-        return replace(best, seconds={**voted.seconds, "registration": spent_s})
+        return replace(best, seconds={**voted.seconds, **watch.seconds})
 
     def _estimate_by_votes(
         self, pose_input: AnyInput, *, job: CloudToPose, is_expected: bool
@@ -289,24 +271,16 @@ class GeoPoseNet(PoseEstimator):
         """Vote for the keypoints, fit the pose to them, refine it, and decide by the evidence."""
         config = self.config
         prepared = job.prepared
-        cloud = job.cloud
-        seconds = dict(job.seconds)
+        watch = job.watch
 
         # Propose: where the directions meet are the keypoints, to which the model's are fitted.
-        began = time.perf_counter()
-        points_m = job.voxels.points_m.double()
-        directions = job.directions.double()
-        if config.voting.method == "ransac":
-            vote = vote_ransac(points_m, directions, config=config.voting)
-        else:
-            vote = meet_lines(points_m, directions, refinements=config.voting.refinements)
-        fits = fits_of(vote, prepared.model, config)
-        seconds["proposal"] = time.perf_counter() - began
+        with watch.stage("proposal"):
+            vote = self._vote(job)
+            fits = fits_of(vote, prepared.model, config)
         if isinstance(fits, Refusal):
-            return refused(pose_input, fits, seconds)
+            return refused(pose_input, fits, watch.seconds)
 
         # Refine; where ICP brings no point near the model, the fit of the keypoints stays.
-        began = time.perf_counter()
         poses = fits.camera_from_model.double()
         fitted = RefinedPose(
             camera_from_model=poses[0],
@@ -317,23 +291,40 @@ class GeoPoseNet(PoseEstimator):
         refinement = BestStart(refined=fitted, start=0, others=poses[:0])
         icp = None
         if config.with_icp:
-            by_icp = refine_best(cloud.cloud_m.double(), poses, prepared.surface, config.icp)
+            with watch.stage("icp"):
+                cloud_m = job.cloud.cloud_m.double()
+                by_icp = refine_best(cloud_m, poses, prepared.surface, config.icp)
             if float(by_icp.refined.inlier_share) > 0:
                 refinement = by_icp
                 icp = config.icp
-            seconds["icp"] = time.perf_counter() - began
 
-        return self._judge(
-            cloud,
+        # Compare, compete, decide.
+        estimate = judge(
+            job.cloud,
             prepared,
             refinement,
-            icp,
-            seconds,
+            config,
+            self.weights.refusal,
+            watch,
+            icp=icp,
             prior_odds=PRIOR_MASKED if is_expected else PRIOR_PROPOSED,
             is_masked=True,
-            vote=vote,
             votes_rad=partial(self._disagreement, job),
         )
+        return replace(
+            estimate,
+            keypoints_m=vote.keypoints_m.float(),
+            inlier_share=float(vote.inlier_share.mean()),
+        )
+
+    def _vote(self, job: CloudToPose) -> Vote:
+        """Intersect the directions at the voting points: the keypoints, in the camera frame."""
+        points_m = job.voxels.points_m.double()
+        directions = job.directions.double()
+        voting = self.config.voting
+        if voting.method == "ransac":
+            return vote_ransac(points_m, directions, config=voting)
+        return meet_lines(points_m, directions, refinements=voting.refinements)
 
     def _disagreement(self, job: CloudToPose, pose: Rigid) -> float:
         """Mean angle between the network's directions and those to the keypoints of a pose [rad].
@@ -399,38 +390,39 @@ class DepthImageRegressor(PoseEstimator):
             raise InputError(_NEEDS_MASK)
         config = self._network.config
         model = prepared.model
-        began = time.perf_counter()
-        crop = cut_depth(pose_input, config, model.diameter_m)
+        watch = Stopwatch()
+        with watch.stage("network"):
+            crop = cut_depth(pose_input, config, model.diameter_m)
         if crop is None:
             reason = f"fewer than {config.min_points} masked pixels have a depth"
             return refused(pose_input, Refusal(status="too few points", reason=reason), {})
-        batch = DepthCrop(*(part[None].to(self.config.device) for part in crop))
-        numbers = torch.tensor([prepared.number], device=self.config.device)
-        poses = poses_of(self._network(batch.image, numbers), batch)
-        regressed = time.perf_counter()
+        with watch.stage("network"):
+            batch = DepthCrop(*(part[None].to(self.config.device) for part in crop))
+            numbers = torch.tensor([prepared.number], device=self.config.device)
+            poses = poses_of(self._network(batch.image, numbers), batch)
+            pose = Rigid(poses.R[0].cpu().float(), poses.t_m[0].cpu().float())
         estimate = PoseEstimate(
             name=pose_input.name,
             object=pose_input.object,
             status="ok",
-            camera_from_model=Rigid(poses.R[0].cpu().float(), poses.t_m[0].cpu().float()),
-            seconds={"network": regressed - began},
+            camera_from_model=pose,
+            seconds=watch.seconds,
         )
         if not self.config.with_icp:
             return estimate
-        points_m = cloud_from_depth(
-            pose_input.depth_m, pose_input.mask, pose_input.K, model.diameter_m, self._cloud
-        ).float()
+
+        with watch.stage("icp"):
+            points_m = cloud_from_depth(
+                pose_input.depth_m, pose_input.mask, pose_input.K, model.diameter_m, self._cloud
+            ).float()
         if (few := why_too_few(points_m, self._cloud)) is not None:
             return replace(estimate, status="too few points", reason=few, camera_from_model=None)
-        pose = estimate.camera_from_model
-        assert pose is not None
-        refined = refine_best(points_m, pose, prepared.surface, self.config.icp).refined
-        seconds = {**estimate.seconds, "icp": time.perf_counter() - regressed}
+        with watch.stage("icp"):
+            refined = refine_best(points_m, pose, prepared.surface, self.config.icp).refined
         if float(refined.inlier_share) == 0:  # nothing near the surface: ICP had no say
-            return replace(estimate, seconds=seconds)
+            return estimate
         return replace(
             estimate,
-            seconds=seconds,
             camera_from_model=refined.camera_from_model,
             covariance=refined.covariance,
             residual_m=float(refined.residual_m),

@@ -9,7 +9,7 @@ explains. Places that explain the same readings compete.
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -21,7 +21,7 @@ from torch import Tensor
 from depthpose.core.devices import each_in_threads
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import cloud_from_depth, nothing_seen
-from depthpose.pose.config import EstimateConfig
+from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.copies import PreparedObject
 from depthpose.pose.decide import (
     LEAST_SHARE,
@@ -43,6 +43,7 @@ from depthpose.pose.probability import (
     probability_right,
 )
 from depthpose.pose.propose.image import propose_in_frame
+from depthpose.pose.register import register
 from depthpose.pose.types import CloudInput, Evidence, PoseEstimate, ViewInput
 
 _MOST_PLACES = 40
@@ -66,20 +67,16 @@ class SearchTargets:
     """What is looked for.
 
     Attributes:
-        names: of the objects.
-        object_of: gives an object by its name, with its point pairs and copies.
-        estimate_near: estimates objects from clouds and the poses that were proposed for them.
+        objects: by their names.
         config: of ICP, and of what a real object is off from its model.
-        min_probability: with which a pose must be right to be given.
+        refusal: when a pose is withheld.
         prior_odds: of the best pose at a place being right.
-        is_single: search once, for one object.
+        is_single: search once, for one instance of each object.
     """
 
-    names: Sequence[str]
-    object_of: Callable[[str], PreparedObject]
-    estimate_near: Callable[[Sequence[CloudInput], Sequence[Rigid], float], list[PoseEstimate]]
+    objects: Mapping[str, PreparedObject]
     config: EstimateConfig
-    min_probability: float
+    refusal: RefusalConfig
     prior_odds: float = PRIOR_PROPOSED
     is_single: bool = False
 
@@ -143,12 +140,12 @@ def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
     # The part of the image that is searched, its normals and its background.
     began = time.perf_counter()
     window = window_of_region(view)
-    smallest_m = min(targets.object_of(name).surface.diameter_m for name in targets.names)
+    smallest_m = min(target.surface.diameter_m for target in targets.objects.values())
     frame = prepare_frame(window.depth_m, window.K, smallest_m, window.background)
     is_unclaimed = window.mask[:: frame.step, :: frame.step].clone()
 
     # Round after round: propose, refine, judge, suppress. What is posed claims its readings.
-    names = list(targets.names)
+    names = list(targets.objects)
     posed: list[_Judged] = []
     claimed: list[_Judged] = []  # posed, or of one of several objects
     misses: list[_Miss] = []
@@ -183,12 +180,12 @@ def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
         for place in posed
     ]
     if not targets.is_single:
-        surfaces = {name: targets.object_of(name).surface for name in targets.names}
+        surfaces = {name: target.surface for name, target in targets.objects.items()}
         estimates = with_pick_ranks(estimates, window, surfaces)
-    missing = set(targets.names) - {place.object for place in posed}
+    missing = set(targets.objects) - {place.object for place in posed}
     estimates += [
         nothing_found(view, name, [miss for miss in misses if miss.object == name], spent_s)
-        for name in targets.names
+        for name in targets.objects
         if name in missing
     ]
     if len(estimates) == 1:
@@ -222,7 +219,7 @@ def _propose(
     """Propose poses of every object: the best of all, and some of each; none at a claimed place."""
 
     def propose(name: str) -> list[_Proposal]:
-        pairs = targets.object_of(name).pairs
+        pairs = targets.objects[name].pairs
         poses, score = propose_in_frame(frame, is_unclaimed, pairs, len(names))
         return [
             _Proposal(score=float(score[rank]), rank=rank, object=name, pose=poses[rank])
@@ -239,7 +236,7 @@ def _propose(
     for number, proposal in enumerate(proposals):
         if number >= _MOST_PLACES and proposal.rank >= _LEAST_PROPOSALS:
             continue
-        surface = targets.object_of(proposal.object).surface
+        surface = targets.objects[proposal.object].surface
         explained = explained_mask(frame, proposal.pose, surface)
         place = _Place(object=proposal.object, pose=proposal.pose, explained=explained)
         is_claimed = any(place.shared_with(other) > _SHARED for other in claimed)
@@ -260,7 +257,7 @@ def _refine(
     object_std_m = targets.config.object_deviation_m
 
     def refine(place: _Place) -> tuple[Rigid, Evidence]:
-        surface = targets.object_of(place.object).surface
+        surface = targets.objects[place.object].surface
         cloud_m = _readings_of(place, frame, view)
         pose = refine_roughly(cloud_m, place.pose[None], surface, icp)[0]
         observation = observe(cloud_m, view, surface.diameter_m, object_std_m, is_masked=False)
@@ -275,7 +272,7 @@ def _refine(
             reason = contradiction(evidence, probability)
             hopeless.append(_miss_at(place, evidence, reason, targets))
             continue
-        explained = explained_mask(frame, pose, targets.object_of(place.object).surface)
+        explained = explained_mask(frame, pose, targets.objects[place.object].surface)
         likely.append((probability, replace(place, pose=pose, explained=explained)))
     likely.sort(key=lambda pair: -pair[0])
     return [place for _, place in likely], hopeless
@@ -305,17 +302,30 @@ def _judge(
     groups: Sequence[Sequence[_Place]], frame: Frame, view: ViewInput, targets: SearchTargets
 ) -> tuple[list[_Judged], list[_Miss]]:
     """Estimate the object of each place from what its best pose explains; separate refusals."""
-    inputs: list[CloudInput] = []
-    for number, group in enumerate(groups):
-        cloud_m = _readings_of(group[0], frame, view)
-        name = f"{view.name}_{number}"
-        inputs.append(CloudInput(name=name, points_m=cloud_m, object=group[0].object, view=view))
-    proposals = [Rigid.stack([place.pose for place in group]) for group in groups]
+
+    def estimate_place(numbered: tuple[int, Sequence[_Place]]) -> PoseEstimate:
+        number, group = numbered
+        leader = group[0]
+        cloud = CloudInput(
+            name=f"{view.name}_{number}",
+            points_m=_readings_of(leader, frame, view),
+            object=leader.object,
+            view=view,
+        )
+        return register(
+            cloud,
+            targets.objects[leader.object],
+            targets.config,
+            targets.refusal,
+            proposals=Rigid.stack([place.pose for place in group]),
+            prior_odds=targets.prior_odds,
+        )
+
     judged: list[_Judged] = []
     misses: list[_Miss] = []
-    estimates = targets.estimate_near(inputs, proposals, targets.prior_odds) if inputs else []
+    estimates = each_in_threads(estimate_place, enumerate(groups), torch.get_num_threads())
     for estimate, group in zip(estimates, groups, strict=True):
-        surface = targets.object_of(estimate.object).surface
+        surface = targets.objects[estimate.object].surface
         evidence = estimate.evidence
         reason = estimate.reason
         if estimate.camera_from_model is not None:
@@ -342,7 +352,7 @@ def _miss_at(
     place: _Place, evidence: Evidence | None, reason: str, targets: SearchTargets
 ) -> _Miss:
     """Describe a place at which an object was refused."""
-    surface = targets.object_of(place.object).surface
+    surface = targets.objects[place.object].surface
     return _Miss(
         object=place.object,
         middle_m=place.pose.apply(surface.middle_m[None])[0],
@@ -365,7 +375,7 @@ def _weigh_instances(
         shares = probabilities / log_odds.sigmoid()  # of the probability that each has by itself
         for k, place in enumerate(places):
             probability = float(probabilities[k])
-            if probability >= targets.min_probability:
+            if probability >= targets.refusal.min_probability:
                 estimate = with_share(place.estimate, float(shares[k]))
                 remaining.append(replace(place, estimate=estimate))
             else:

@@ -4,7 +4,6 @@ A frame costs ICP alone as long as what was seen agrees with the pose that comes
 """
 
 import math
-import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
@@ -14,6 +13,7 @@ from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid
+from depthpose.core.stopwatch import Stopwatch
 from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.copies import PreparedObject
@@ -134,18 +134,17 @@ def _follow_or_search(
     pose_input: AnyInput, current: _Track | None, target: TrackedObject
 ) -> tuple[PoseEstimate, _Track | None]:
     """Follow the object into a frame, or search it there; give what is known of it then."""
-    seconds: dict[str, float] = {}
+    watch = Stopwatch()
     if current is not None:
-        began = time.perf_counter()
-        followed = _follow(pose_input, current, target)
-        seconds["tracking"] = time.perf_counter() - began
+        with watch.stage("tracking"):
+            followed = _follow(pose_input, current, target)
         if not isinstance(followed, Refusal):
             estimate, following = followed
-            return replace(estimate, name=pose_input.name, seconds=seconds), following
+            return replace(estimate, name=pose_input.name, seconds=watch.seconds), following
 
     # Not known from the frame before, or not seen there.
     searched = target.search(pose_input)
-    seconds |= searched.seconds
+    seconds = {**watch.seconds, **searched.seconds}
     pose = searched.camera_from_model
     tracking = "lost" if pose is None else "found"
     estimate = replace(searched, name=pose_input.name, seconds=seconds, tracking=tracking)

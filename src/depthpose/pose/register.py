@@ -1,0 +1,173 @@
+"""One object from its points: propose, refine, compare, compete, decide.
+
+:func:`register` does all of it by the model alone. A network proposes poses in its own way
+(:mod:`depthpose.pose.network_pose`); what follows, :func:`judge`, is the same for both.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+
+from depthpose.core.arrays import take_evenly
+from depthpose.core.rigid import Rigid
+from depthpose.core.stopwatch import Stopwatch
+from depthpose.pose.cloud import ObjectCloud, local_planes, prepare_cloud, thin
+from depthpose.pose.config import CloudConfig, EstimateConfig, IcpConfig, RefusalConfig
+from depthpose.pose.copies import PreparedObject
+from depthpose.pose.decide import contradiction, decide, refused
+from depthpose.pose.evidence import compare, observe
+from depthpose.pose.hypotheses import compete
+from depthpose.pose.icp import BestStart, refine_best
+from depthpose.pose.probability import LEAST_POSSIBLE, PRIOR_MASKED, probability_right
+from depthpose.pose.propose.point_pairs import propose_poses
+from depthpose.pose.types import AnyInput, PoseEstimate, Refusal
+
+_VOTING_DIAMETERS = 0.05  # distance of the points that vote
+_PROPOSALS = 40
+_SMOOTHED_POINTS = 1500  # of so many, 20 neighbours give a normal that noise hardly turns
+
+
+def register(
+    pose_input: AnyInput,
+    prepared: PreparedObject,
+    config: EstimateConfig,
+    refusal: RefusalConfig,
+    *,
+    proposals: Rigid | None = None,
+    prior_odds: float = PRIOR_MASKED,
+) -> PoseEstimate:
+    """Register a model to the points of an object: of a mask, or where a search proposed it.
+
+    Args:
+        pose_input: the points.
+        prepared: the object.
+        config: of ICP, and of what a real object is off from its model.
+        refusal: when the estimate is withheld.
+        proposals: poses of a search, whose points need not be the object's alone; None: point pairs
+            of a mask's points propose.
+        prior_odds: of the best pose being right, before its evidence is seen.
+    """
+    is_masked = proposals is None
+    watch = Stopwatch()
+
+    # The usable points of the object.
+    with watch.stage("cloud"):
+        cloud = prepare_cloud(pose_input, prepared.model, CloudConfig(), config)
+    if isinstance(cloud, Refusal):
+        return refused(pose_input, cloud, watch.seconds)
+
+    # Propose.
+    with watch.stage("proposal"):
+        if proposals is None:
+            proposals = propose_by_pairs(cloud, prepared, config.voting.seed)
+
+    # Refine, from each pose alone: the proposals are many.
+    icp = replace(config.icp, starts=1)
+    with watch.stage("icp"):
+        refinement = refine_best(cloud.cloud_m.double(), proposals, prepared.surface, icp)
+    if float(refinement.refined.inlier_share) == 0:
+        reason = "no pose brings the model near the points: another object, or too little of it"
+        return refused(pose_input, Refusal(status="no pose found", reason=reason), watch.seconds)
+
+    # Compare, compete, decide.
+    return judge(
+        cloud,
+        prepared,
+        refinement,
+        config,
+        refusal,
+        watch,
+        icp=icp,
+        prior_odds=prior_odds,
+        is_masked=is_masked,
+    )
+
+
+def propose_by_pairs(cloud: ObjectCloud, prepared: PreparedObject, seed: int) -> Rigid:
+    """Propose poses by the point pairs of a cloud."""
+    dense_m = take_evenly(cloud.cloud_m.double(), _SMOOTHED_POINTS)
+    step_m = _VOTING_DIAMETERS * prepared.surface.diameter_m
+    voting_m = dense_m[thin(dense_m, torch.zeros_like(dense_m), step_m)]
+    normals, _ = local_planes(dense_m, voting_m)
+    generator = torch.Generator().manual_seed(seed)
+    return propose_poses(voting_m, normals, prepared.pairs, _PROPOSALS, generator)
+
+
+def judge(
+    cloud: ObjectCloud,
+    prepared: PreparedObject,
+    refinement: BestStart,
+    config: EstimateConfig,
+    refusal: RefusalConfig,
+    watch: Stopwatch,
+    *,
+    icp: IcpConfig | None,
+    prior_odds: float,
+    is_masked: bool,
+    votes_rad: Callable[[Rigid], float] | None = None,
+) -> PoseEstimate:
+    """Compare a refined pose with the depth image and with its competitors, and decide.
+
+    Args:
+        cloud: points of the object.
+        prepared: the object.
+        refinement: the best pose, and others at which refinement ended.
+        config: settings of the estimate.
+        refusal: when it is withheld.
+        watch: of the stages before, to which this one's are added.
+        icp: by which competing poses are refined; None: they stay where they are.
+        prior_odds: of the best pose being right, before its evidence is seen.
+        is_masked: whether all points of the cloud are the object's, as a mask gives them.
+        votes_rad: angle between a network's directions and a pose, as :func:`compete` takes it.
+    """
+    with watch.stage("evidence"):
+        observation = observe(
+            cloud.cloud_m,
+            cloud.view,
+            prepared.surface.diameter_m,
+            config.object_deviation_m,
+            is_masked=is_masked,
+        )
+
+    # A search proposes much: what the depth image plainly contradicts goes no further.
+    if not is_masked:
+        with watch.stage("evidence"):
+            pose = refinement.refined.camera_from_model
+            evidence = compare(observation, pose, prepared.surface)
+        probability = probability_right(evidence, prior_odds)
+        if probability < LEAST_POSSIBLE:
+            return PoseEstimate(
+                name=cloud.name,
+                object=prepared.model.name,
+                status="doubtful",
+                reason=contradiction(evidence, probability),
+                seconds=watch.seconds,
+            )
+
+    # The best pose against its near-symmetric copies, look-alikes and other local minima.
+    has_color = cloud.view is not None and cloud.view.color is not None
+    with watch.stage("evidence"):
+        competition = compete(
+            cloud.cloud_m.double(),
+            refinement.refined,
+            refinement.others,
+            prepared,
+            observation,
+            icp,
+            cloud.view if has_color else None,
+            votes_rad,
+        )
+
+    with watch.stage("decision"):
+        estimate = decide(
+            cloud,
+            prepared,
+            competition,
+            observation,
+            refusal=refusal,
+            config=config,
+            prior_odds=prior_odds,
+            is_refined=icp is not None,
+        )
+    return replace(estimate, seconds=watch.seconds)
