@@ -180,7 +180,7 @@ def refine(cloud, Rs, ts, limits, diameter, converged, target, is_exact, all_pla
 
 @compiled
 def grow(local, times, middle, limits, target, is_exact, converged):
-    """Iterate ICP with a scale, in place, as ``_grow`` of ``identity.py``.
+    """Iterate ICP with a scale, in place, as ``_fit_scale`` of ``identity.py``.
 
     Args:
         local: points (starts, n, 3) in the model frame; moved.
