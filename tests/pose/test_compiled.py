@@ -87,13 +87,13 @@ def test_nearest_surface_points(surface: Surface, monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.parametrize("count", [1, 7, 8, 9, 100])
 def test_trees_of_few_points(count: int) -> None:
-    from depthpose.pose.compiled.points import Tree, nearest_many, planted
+    from depthpose.pose.compiled.points import Tree, build_tree, nearest_many
 
     generator = torch.Generator().manual_seed(count)
     points = torch.randn(count, 3, generator=generator, dtype=torch.float64)
     points[count // 2] = points[0]  # two alike
     asked = torch.randn(50, 3, generator=generator, dtype=torch.float64)
-    _, found = nearest_many(asked.numpy(), Tree(*planted(points.numpy())))
+    _, found = nearest_many(asked.numpy(), Tree(*build_tree(points.numpy())))
     true = torch.cdist(asked, points, compute_mode="donot_use_mm_for_euclid_dist").amin(1)
     assert is_near(torch.from_numpy(found), true, 1e-12)
 

@@ -218,7 +218,7 @@ def test_the_diameter_of_a_large_smooth_hull_is_found_in_directions(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """900 corners, all on the hull: more than are compared each with each."""
-    monkeypatch.setattr("depthpose.pose.mesh.models._HULL", 800)
+    monkeypatch.setattr("depthpose.pose.mesh.models._MOST_HULL_CORNERS", 800)
     monkeypatch.setattr("depthpose.pose.mesh.models._HULL_DIRECTIONS", 1024)
     turns = torch.linspace(0, 2 * math.pi, 31)[:-1]
     rings = torch.linspace(0.01, math.pi - 0.01, 30)
@@ -229,9 +229,9 @@ def test_the_diameter_of_a_large_smooth_hull_is_found_in_directions(
     # A ball is alike on both sides; where it is cut it has no corner opposite to another.
     cut = points[points @ torch.tensor([0.6, 0.0, 0.8]) > -0.08]
     assert len(cut) > 500
-    monkeypatch.setattr("depthpose.pose.mesh.models._HULL", 400)
+    monkeypatch.setattr("depthpose.pose.mesh.models._MOST_HULL_CORNERS", 400)
     assert exact_diameter(cut) == pytest.approx(float(torch.cdist(cut, cut).max()), rel=1e-3)
-    monkeypatch.setattr("depthpose.pose.mesh.models._HULL", 800)
+    monkeypatch.setattr("depthpose.pose.mesh.models._MOST_HULL_CORNERS", 800)
     with patch.object(torch, "cdist", wraps=torch.cdist) as compared:
         assert exact_diameter(points) == pytest.approx(0.5 * math.cos(0.01), rel=2e-3)
     assert sum(len(call.args[0]) for call in compared.call_args_list) < 900

@@ -17,7 +17,7 @@ from depthpose.pose.cloud import cloud_from_depth, grow_mask
 from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.copies import PreparedObject, find_copies
 from depthpose.pose.evidence import compare, observe
-from depthpose.pose.footprint import explained_mask, why_background_excludes
+from depthpose.pose.footprint import explained_frame_mask, why_background_excludes
 from depthpose.pose.frame import prepare_frame
 from depthpose.pose.inputs import view_input
 from depthpose.pose.mesh import make_model
@@ -460,7 +460,7 @@ def test_the_best_evidence_leads_a_place_not_the_first_proposal(net: Registratio
     places = [
         search._Place(
             object="bracket", pose=pose,
-            explained=explained_mask(frame, pose, prepared.surface),
+            explained=explained_frame_mask(frame, pose, prepared.surface),
         )
         for pose in (wrong, coarse)
     ]  # fmt: skip

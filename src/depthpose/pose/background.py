@@ -1,4 +1,4 @@
-"""What a camera sees without the objects: an empty frame, or a bin drawn at its pose."""
+"""Known backgrounds of objects: an empty frame, or a bin drawn at its pose."""
 
 from dataclasses import dataclass, replace
 
@@ -15,10 +15,10 @@ from depthpose.pose.inputs import AnyArray, depth_input, rigid_input
 from depthpose.pose.mesh import AnyModel, drawn_triangles, read_model
 from depthpose.pose.types import KnownBackground, ObjectModel, ViewInput
 
-_LEAST_SEEN = 0.01
-"""Of the readings in the pixels of a background: where fewer lie on it, it is another's."""
+_LEAST_ON_BACKGROUND = 0.01
+"""Share of the readings in the pixels of a background: where fewer lie on it, it is a wrong one."""
 _MOST_BEHIND = 0.5
-"""Where more of them lie behind it, it is not there: no camera sees through a bin."""
+"""Share of them: where more lie behind it, it is not there, since no camera sees through a bin."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -53,7 +53,7 @@ class PosedBin:
     def draw(
         self, K: Float[Tensor, "3 3"], height: int, width: int
     ) -> Float[Tensor, "{height} {width}"]:
-        """Draw the depth [m] at which a camera sees the bin, NaN where it does not.
+        """Draw the depth [m] of the bin in a camera's image, NaN where it is not visible.
 
         Args:
             K: intrinsic matrix of the camera.
@@ -89,48 +89,50 @@ def with_background(
 
     Args:
         view: depth and camera.
-        background: what the camera sees without the objects.
-        camera: which says the unit of an empty frame, as that of the depth image.
+        background: an empty frame, or a bin at its pose.
+        camera: of the empty frame, for its unit of depth.
         unit: of an empty frame, where its camera says none.
 
     Raises:
         InputError: a file that cannot be read, an empty frame of another size, or a background on
-            which nothing of the view lies, or behind which most of it does.
+            which no reading of the view lies, or behind which most do.
     """
     if background is None:
         return view
     height, width = view.depth_m.shape
     if isinstance(background, PosedBin):
-        what = "the bin"
+        label = "the bin"
         background_m = background.draw(view.K, height, width)
         remedy = "give its pose in this camera, camera_from_model in metres"
     else:
-        what = "the empty frame"
-        background_m, _ = depth_input(background, camera, what, unit)
+        label = "the empty frame"
+        background_m, _ = depth_input(background, camera, label, unit)
         remedy = "take it again by this camera, where it stands now"
     if background_m.shape != view.depth_m.shape:
         raise InputError(
-            f"{view.name}: {what} has {background_m.shape[1]}x{background_m.shape[0]} pixels, the "
+            f"{view.name}: {label} has {background_m.shape[1]}x{background_m.shape[0]} pixels, the "
             f"depth image {width}x{height}; take both by one camera and in one size"
         )
     is_compared = (view.depth_m > 0) & background_m.isfinite()
     if not bool(is_compared.any()):
         raise InputError(
-            f"{view.name}: no pixel has a reading both in the depth image and in {what}; {remedy}"
+            f"{view.name}: no pixel has a reading both in the depth image and in {label}; {remedy}"
         )
+
+    # Does the background fit the view?
     is_seen = is_on_background(view.depth_m, background_m)
     is_behind = is_compared & ~is_seen & (view.depth_m > background_m)
-    behind = float(is_behind[is_compared].double().mean())
-    if behind > _MOST_BEHIND:
+    behind_share = float(is_behind[is_compared].double().mean())
+    if behind_share > _MOST_BEHIND:
         off_mm = 1000 * float((view.depth_m - background_m)[is_behind].median())
         raise InputError(
-            f"{view.name}: {behind:.0%} of the readings lie behind {what}, {off_mm:.3g} mm in the "
-            f"median, and no camera sees through it; {remedy}"
+            f"{view.name}: {behind_share:.0%} of the readings lie behind {label}, {off_mm:.3g} "
+            f"mm in the median, and no camera sees through it; {remedy}"
         )
-    seen = float(is_seen[is_compared].double().mean())
-    if seen < _LEAST_SEEN:
+    on_share = float(is_seen[is_compared].double().mean())
+    if on_share < _LEAST_ON_BACKGROUND:
         raise InputError(
-            f"{view.name}: {seen:.1%} of the readings lie on {what}, as if it were not there; "
+            f"{view.name}: {on_share:.1%} of the readings lie on {label}, as if it were not there; "
             f"{remedy}, or omit it"
         )
     return replace(view, background=KnownBackground(depth_m=background_m, is_seen=is_seen))

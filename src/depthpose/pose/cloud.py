@@ -21,25 +21,25 @@ from depthpose.pose.types import (
     ViewSample,
 )
 
-_LARGEST_CELL = 2**20
-_NEIGHBOURS = 20
+_LARGEST_CELL = 2**20  # cells of a grid along an axis, at most
+_NEIGHBOURS = 20  # to which the plane at a point is fitted
 _MAJORITY = 0.5
-_WIDEST_TANGENT = 1.73  # what a camera sees lies less than 60 degrees off its axis
-_BEFORE_CAMERA_DIAMETERS = 0.05  # nearly all points of a seen cloud lie so far before the camera
+_WIDEST_TANGENT = 1.73  # points that a camera sees lie less than 60 degrees off its axis
+_BEFORE_CAMERA_DIAMETERS = 0.05  # nearly all points that a camera saw lie farther before it
 _FLAT_DIAMETERS = 0.002  # below this root mean square a cloud has no extent
 _FARTHEST_M = 1e6  # a coordinate beyond this marks a missing reading
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class VoxelGrid:
-    """Which cells of a grid a cloud fills, and the point that was kept in each: it votes."""
+    """The cells of a grid that a cloud fills, and the point of each cell that votes."""
 
-    #: of the filled cells, ``floor((x - mean) / voxel)`` of the turned cloud; no two are equal.
+    #: of the filled cells, ``floor((x - mean) / voxel)`` of the rotated cloud; no two are equal.
     coordinates: Int64[Tensor, "m 3"]
-    points_m: Float[Tensor, "m 3"]  #: of the cloud, that was kept in each cell
-    kept: Int64[Tensor, " m"]  #: index of the point of each cell, ascending: the first of its cell
-    row_of_point: Int64[Tensor, " n"]  #: which of the cells each point of the cloud lies in
-    grid_from_camera: Float[Tensor, "3 3"]  #: how the cloud was turned before
+    points_m: Float[Tensor, "m 3"]  #: the first point of each cell, in the camera frame
+    kept: Int64[Tensor, " m"]  #: index of that point in the cloud, ascending
+    row_of_point: Int64[Tensor, " n"]  #: index of the cell of each point of the cloud
+    grid_from_camera: Float[Tensor, "3 3"]  #: rotation of the cloud to the axes of the grid
     #: of each cell, in the axes of the grid: the number 1 or, with shape, also the place of its
     #: mean in the cell (-1 to 1), log2 of its number of points, the normal toward the camera, and
     #: the curvature (0 in a plane, 1 in a ball).
@@ -80,10 +80,10 @@ def prepare_cloud(
     if len(readings_m) == 0:
         return Refusal(status="too few points", reason=_why_empty(pose_input))
 
-    # What is far from the median is background at the mask's border.
-    off_m = (readings_m - readings_m.median(0).values).norm(dim=-1)
-    cloud_m = readings_m[~(off_m > cloud_config.max_offset_diameters * model.diameter_m)]
-    refusal = _refuse_input(pose_input, readings_m, cloud_m, model, cloud_config)
+    # Points far from the median are background at the mask's border.
+    offset_m = (readings_m - readings_m.median(0).values).norm(dim=-1)
+    cloud_m = readings_m[~(offset_m > cloud_config.max_offset_diameters * model.diameter_m)]
+    refusal = _why_refused(pose_input, readings_m, cloud_m, model, cloud_config)
     if refusal is not None:
         return refusal
     return ObjectCloud(name=pose_input.name, cloud_m=cloud_m, view=view)
@@ -114,14 +114,17 @@ def nothing_seen(view: ViewInput) -> str:
     return f"none of the {masked} masked pixels has a depth reading"
 
 
-def _refuse_input(
+def _why_refused(
     pose_input: CloudInput | ViewInput,
     readings_m: Float[Tensor, "n 3"],
     cloud_m: Float[Tensor, "m 3"],
     model: ObjectModel,
     cloud_config: CloudConfig,
 ) -> Refusal | None:
-    """Refuse a cloud by its size, place and shape; ``cloud_m``: readings but for flying pixels."""
+    """Say why a cloud cannot be posed, by its size, place and shape; None where it can.
+
+    ``readings_m`` are all readings in the mask, ``cloud_m`` those without flying pixels.
+    """
     too_few = why_too_few(readings_m, cloud_config)
     if too_few is not None:
         return Refusal(status="too few points", reason=too_few)
@@ -132,7 +135,7 @@ def _refuse_input(
     if too_few is not None:
         return Refusal(status="too few points", reason=too_few)
 
-    # A plane or a line can slide within itself.
+    # A plane or a line can slide within itself: in how many directions has the cloud no extent?
     centred = cloud_m.double() - cloud_m.double().mean(0)
     extent_m = torch.linalg.eigvalsh(centred.T @ centred / len(centred)).clamp(min=0).sqrt()
     flat_axes = int((extent_m < _FLAT_DIAMETERS * model.diameter_m).sum())
@@ -154,12 +157,15 @@ def _why_unusable(
     cloud_m: Float[Tensor, "m 3"],
     model: ObjectModel,
 ) -> str | None:
-    """Say that a cloud is in another frame or of another unit than the model; None where not."""
-    # Its size is that of what is left without flying pixels, if those are few.
+    """Say that a cloud is in another frame or unit than the camera and the model; None where not.
+
+    ``readings_m`` are all readings in the mask, ``cloud_m`` those without flying pixels.
+    """
+    # The size is measured without flying pixels, if those are few.
     are_few_flying = len(cloud_m) > _MAJORITY * len(readings_m)
     size_advice = unit_advice(model.diameter_m, cloud_m if are_few_flying else readings_m)
 
-    # A camera sees only what lies before it: a cloud about the origin is in other axes.
+    # A camera sees only points before it: a cloud about the origin is in another frame.
     is_about_origin = float(readings_m.median(0).values.norm()) < model.diameter_m / 2
     nearest_m = float(take_evenly(readings_m[:, 2], 10_000).quantile(0.05))
     is_centred = is_about_origin and nearest_m < _BEFORE_CAMERA_DIAMETERS * model.diameter_m
@@ -173,7 +179,7 @@ def _why_unusable(
         return axes_advice
     if size_advice is None:
         return None
-    # Some background in the mask is not of another size.
+    # Some background in the mask makes a cloud larger, and does not mean another unit.
     if are_few_flying and "larger than the model" in size_advice:
         return None
     hint = _size_hint(pose_input.mask) if isinstance(pose_input, ViewInput) else ""
@@ -181,7 +187,7 @@ def _why_unusable(
 
 
 def _size_hint(mask: Bool[Tensor, "h w"]) -> str:
-    """Say what else than the unit changes the size of a cloud that a mask was lifted to."""
+    """Say which mistakes with a mask or camera, other than a unit, change the size of its cloud."""
     share = float(mask.float().mean())
     border = torch.cat([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
     if share > _MAJORITY and float(border.float().mean()) > _MAJORITY:
@@ -215,7 +221,7 @@ def cloud_from_depth(
     if depth_m.shape != mask.shape:
         raise other_size(mask, depth_m)
     is_read = mask & torch.isfinite(depth_m) & (depth_m > 0)
-    # As ``back_project`` does, for a fraction of the image.
+    # As ``back_project`` does, for these pixels alone.
     v, u = is_read.nonzero(as_tuple=True)
     (fx, skew, cx), (_, fy, cy), _ = K.tolist()
     y = (v.to(depth_m) - cy) / fy
@@ -224,8 +230,8 @@ def cloud_from_depth(
     if diameter_m is None or len(points_m) == 0:
         return points_m
     config = CloudConfig() if config is None else config
-    off_m = (points_m - points_m.median(0).values).norm(dim=-1)
-    return points_m[~(off_m > diameter_m * config.max_offset_diameters)]
+    offset_m = (points_m - points_m.median(0).values).norm(dim=-1)
+    return points_m[~(offset_m > diameter_m * config.max_offset_diameters)]
 
 
 def lift_sample(view: ViewSample, diameter_m: float, config: CloudConfig) -> CloudSample:
@@ -247,7 +253,7 @@ def other_size(mask: Bool[Tensor, "mask_h mask_w"], depth_m: Float[Tensor, "h w"
 
 
 def grow_mask(mask: Bool[Tensor, "h w"], grow_px: int) -> Bool[Tensor, "h w"]:
-    """Grow a mask by so many pixels, or shrink it by as many where the number is negative."""
+    """Grow a mask by ``grow_px`` pixels in a square; shrink it where the number is negative."""
     if grow_px == 0:
         return mask
     source = (mask if grow_px > 0 else ~mask).float()[None, None]
@@ -279,11 +285,13 @@ def why_too_few(points_m: Float[Tensor, "n 3"], config: CloudConfig | None = Non
 
 _PER_METRE = {"mm": 1000.0, "cm": 100.0, "inches": 39.37}
 _MM = {"cm": 10.0, "inches": 25.4}
-_LARGEST_SHARE = 1.5  # a cloud is part of its object; noise and grown masks make it somewhat larger
-_SMALLEST_SHARE = 0.1  # what shows less than a tenth of the diameter cannot be posed anyway
-_LIKELY_SHARE = 0.3  # a cloud too large is of another unit if that makes it as long as this
-_USUAL_SHARE = 0.7  # of the diameter, the length of a usual view of an object
-_AS_LIKELY = 0.3  # difference of log lengths, up to which a unit fits nearly as well as the best
+
+# Size of a cloud over the diameter of its model.
+_LARGEST_RATIO = 1.5  # a cloud is part of its object; noise and grown masks make it somewhat larger
+_SMALLEST_RATIO = 0.1  # a cloud of less cannot be posed anyway
+_LIKELY_RATIO = 0.3  # least in the right unit, for a cloud that is too large to be likely of that
+_USUAL_RATIO = 0.7  # of a usual view of an object
+_AS_LIKELY = 0.3  # difference of log ratios, up to which a unit fits nearly as well as the best
 
 
 def unit_advice(model_diameter_m: float, points_m: Float[Tensor, "n 3"]) -> str | None:
@@ -299,40 +307,61 @@ def unit_advice(model_diameter_m: float, points_m: Float[Tensor, "n 3"]) -> str 
     if len(points_m) < 2:
         return None
     distance_m = (points_m - points_m.median(0).values).norm(dim=-1)
-    size_m = 2 * float(distance_m.kthvalue(1 + int(0.95 * (len(distance_m) - 1))).values)
+    rank = 1 + int(0.95 * (len(distance_m) - 1))
+    size_m = 2 * float(distance_m.kthvalue(rank).values)
     if size_m <= 0:
         return None
-    share = size_m / model_diameter_m
-    if _SMALLEST_SHARE <= share <= _LARGEST_SHARE:
+    ratio = size_m / model_diameter_m
+    if _SMALLEST_RATIO <= ratio <= _LARGEST_RATIO:
         return None
-    more = max(share, 1 / share)
-    larger = "cloud" if share > 1 else "model"
-    smaller = "model" if share > 1 else "cloud"
+
+    # Is one of the two in a smaller unit than metres?
+    is_cloud_larger = ratio > 1
+    larger = "cloud" if is_cloud_larger else "model"
+    smaller = "model" if is_cloud_larger else "cloud"
     # Five times too large is a mask of more than the object sooner than a sliver in inches.
-    least = _LIKELY_SHARE if share > 1 else _SMALLEST_SHARE
-    fits = {unit: share * factor if share < 1 else share / factor
-            for unit, factor in _PER_METRE.items()}  # fmt: skip
-    likely = {abs(math.log(fit / _USUAL_SHARE)): unit for unit, fit in fits.items()
-              if least <= fit <= _LARGEST_SHARE}  # fmt: skip
-    if likely:
-        best = min(likely)
-        units = " or ".join(unit for off, unit in likely.items() if off < best + _AS_LIKELY)
-        return f"your {larger} is {more:.0f} times larger than the {smaller}: is it in {units}?"
+    least = _LIKELY_RATIO if is_cloud_larger else _SMALLEST_RATIO
+    units = _likely_units(ratio, least)
+    if units:
+        times = max(ratio, 1 / ratio)
+        return f"your {larger} is {times:.0f} times larger than the {smaller}: is it in {units}?"
+
+    # Or the smaller one in a larger unit, where the other is in mm?
     units = " or ".join(
-        unit for unit, mm in _MM.items()
-        if _LIKELY_SHARE <= (share * mm if share < 1 else share / mm) <= _LARGEST_SHARE
-    )  # fmt: skip
-    relation = "larger" if share > 1 else "smaller"
+        unit
+        for unit, mm in _MM.items()
+        if _LIKELY_RATIO <= (ratio / mm if is_cloud_larger else ratio * mm) <= _LARGEST_RATIO
+    )
+    relation = "larger" if is_cloud_larger else "smaller"
     return (
-        f"the cloud is {more:.1f} times {relation} than the model: is this the right object, and "
-        f"does the mask fit it?{f' Or is the {smaller} in {units}?' if units else ''}"
+        f"the cloud is {max(ratio, 1 / ratio):.1f} times {relation} than the model: is this the "
+        "right object, and does the mask fit it?"
+        f"{f' Or is the {smaller} in {units}?' if units else ''}"
+    )
+
+
+def _likely_units(ratio: float, least: float) -> str:
+    """Name the units of the larger of cloud and model that would explain the ratio of their sizes.
+
+    ``ratio`` is that of cloud to model; it must lie above ``least`` in the right unit.
+    """
+    distance_of_unit: dict[str, float] = {}
+    for unit, factor in _PER_METRE.items():
+        corrected = ratio / factor if ratio > 1 else ratio * factor
+        if least <= corrected <= _LARGEST_RATIO:
+            distance_of_unit[unit] = abs(math.log(corrected / _USUAL_RATIO))
+    if not distance_of_unit:
+        return ""
+    best = min(distance_of_unit.values())
+    return " or ".join(
+        unit for unit, distance in distance_of_unit.items() if distance < best + _AS_LIKELY
     )
 
 
 def frame_advice(points_m: Float[Tensor, "n 3"]) -> str | None:
     """Say that a cloud lies in another frame than x right, y down, z forward; None where not.
 
-    What a camera sees lies before it, less than 60 degrees off its axis.
+    The points that a camera sees lie before it, less than 60 degrees off its axis.
     """
     behind = float((points_m[:, 2] <= 0).float().mean())
     across_m = points_m[:, :2].median(0).values.abs()
@@ -356,7 +385,7 @@ def frame_advice(points_m: Float[Tensor, "n 3"]) -> str | None:
 def sample_points(
     points_m: Float[Tensor, "n 3"], count: int | None, generator: torch.Generator
 ) -> Float[Tensor, "m 3"]:
-    """Take ``count`` points at random, in their order; all where there are no more."""
+    """Choose ``count`` points at random and keep their order; all where there are fewer."""
     if count is None or len(points_m) <= count:
         return points_m
     index = torch.randperm(len(points_m), generator=generator)[:count].sort().values
@@ -366,10 +395,9 @@ def sample_points(
 def voxelise(points_m: Float[Tensor, "n 3"], config: CloudConfig) -> VoxelGrid:
     """Put a cloud on a grid about its mean, without scaling it; keep the first point of each cell.
 
-    The grid's axes are the camera's, or with ``with_sight_axis`` turned so that the third points at
-    the cloud's mean, the shortest way.
-
-    Votes are cast from the kept points' own coordinates, not from the centres of cells.
+    The grid's axes are the camera's, or with ``with_sight_axis`` rotated by the least angle so that
+    the third points at the cloud's mean. Votes are cast from the kept points, not from the centres
+    of cells.
 
     Raises:
         InputError: there is no point, one is not finite, or the cloud is over a million voxels
@@ -381,11 +409,12 @@ def voxelise(points_m: Float[Tensor, "n 3"], config: CloudConfig) -> VoxelGrid:
         # One NaN would move the mean, and with it every point, into one cell.
         count = int((~points_m.isfinite().all(-1)).sum())
         raise InputError(f"voxelise: {count} points are not finite; leave such points out.")
+    # The cell of each point.
     mean_m = points_m.mean(0)
-    turn = torch.eye(3).to(points_m)
+    grid_from_camera = torch.eye(3).to(points_m)
     if config.with_sight_axis and float(mean_m.norm()) > 0:
-        turn = turn_axis_to(mean_m).mT.to(points_m)
-    places = (points_m - mean_m) @ turn.mT / config.voxel_m
+        grid_from_camera = turn_axis_to(mean_m).mT.to(points_m)
+    places = (points_m - mean_m) @ grid_from_camera.mT / config.voxel_m
     cells = torch.floor(places).long()
     extent = int((cells.amax(0) - cells.amin(0)).max()) + 1
     if extent > _LARGEST_CELL:
@@ -393,6 +422,8 @@ def voxelise(points_m: Float[Tensor, "n 3"], config: CloudConfig) -> VoxelGrid:
             f"voxelise: the cloud is {extent} voxels of {config.voxel_m} m wide; are its points in "
             "mm, or is one of them far away? Give metres."
         )
+
+    # The first point of each filled cell, and the cells in the order of these points.
     local = cells - cells.amin(0)
     key = (local[:, 0] * extent + local[:, 1]) * extent + local[:, 2]
     _, cell = torch.unique(key, return_inverse=True)
@@ -400,14 +431,16 @@ def voxelise(points_m: Float[Tensor, "n 3"], config: CloudConfig) -> VoxelGrid:
     first = torch.full((int(cell.max()) + 1,), len(cells), device=cells.device)
     kept, rank = first.scatter_reduce_(0, cell, order, "amin").sort()
     row_of_point = rank.argsort()[cell]
+
     features = torch.ones(len(kept), 1, dtype=torch.float32, device=kept.device)
     if config.with_shape:
-        # The mean of the points of each cell about its middle, in half cells, and their number.
+        # The mean of the points of each cell about its middle, in half cells; their number; plane.
         inside = places - cells
         counts = torch.bincount(row_of_point).to(inside)[:, None]
         sums = inside.new_zeros(len(counts), 3).index_add(0, row_of_point, inside)
-        normals, bend = local_planes(points_m.double().cpu(), points_m[kept].double().cpu())
-        plane = torch.cat([normals @ turn.double().cpu().mT, bend], 1).to(sums)
+        normals, curvature = local_planes(points_m.double().cpu(), points_m[kept].double().cpu())
+        normals = normals @ grid_from_camera.double().cpu().mT
+        plane = torch.cat([normals, curvature], 1).to(sums)
         shape = torch.cat([2 * sums / counts - 1, counts.log2(), plane], 1)
         features = torch.cat([features, shape.float()], 1)
     return VoxelGrid(
@@ -415,7 +448,7 @@ def voxelise(points_m: Float[Tensor, "n 3"], config: CloudConfig) -> VoxelGrid:
         points_m=points_m[kept],
         kept=kept,
         row_of_point=row_of_point,
-        grid_from_camera=turn,
+        grid_from_camera=grid_from_camera,
         features=features,
     )
 
@@ -427,10 +460,10 @@ def sample_and_voxelise(cloud_m: Float[Tensor, "n 3"], config: CloudConfig, seed
 
 
 def turn_axis_to(direction: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """Rotation that carries the z axis to a direction the shortest way, in float64.
+    """Give the rotation by the least angle that carries the z axis to a direction, in float64.
 
-    Rodrigues' formula with ``1 / (1 + z)``. Opposite to the axis no way is the shortest: half a
-    turn about x is taken there.
+    Rodrigues' formula with ``1 / (1 + z)``. For the direction opposite to the axis, where many are
+    as small, it is the half turn about x.
     """
     x, y, z = (direction / direction.norm()).tolist()
     if z < -1 + 1e-9:
@@ -443,7 +476,7 @@ def turn_axis_to(direction: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
 def thin(
     points_m: Float64[Tensor, "n 3"], normals: Float64[Tensor, "n 3"], step_m: float
 ) -> Int64[Tensor, " m"]:
-    """Choose one point of each cell of a grid and of each octant of normals in it."""
+    """Give the index of one point of each cell of a grid and each octant of normals in it."""
     cells = ((points_m - points_m.amin(0)) / step_m).long()
     cells = torch.cat([cells, (normals > 0).long()], 1)
     _, place = torch.unique(cells, dim=0, return_inverse=True)

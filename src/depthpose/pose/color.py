@@ -1,9 +1,9 @@
 """Colour as evidence: which of the poses that depth cannot tell apart shows the right print?
 
-At each pose the coloured surface that the camera sees is compared with the image: brightness, and
-red and blue each against green, all as logarithms. Exposure, white balance and a screen's gamma are
-then constants and factors, which a correlation does not see. What light adds to brightness by the
-direction of a surface (Lambert) is taken off both by regression on the normal.
+At each pose the colours of the visible surface are compared with the image: brightness, red over
+green and blue over green, all as logarithms. Exposure, white balance and a screen's gamma are then
+constants and factors, to which a correlation is blind. Shading, the part of the brightness that is
+linear in the normal (Lambert), is removed from both by regression.
 
 A correlation ``r`` of ``n`` independent places says how much of the image a pose explains: its log
 likelihood above that of a pose whose print has nothing to do with the image is
@@ -30,15 +30,17 @@ from depthpose.pose.mesh import near_symmetries, turn_about
 from depthpose.pose.types import Axis, ColorImage, ObjectModel, SurfaceColors, ViewInput
 
 _SAMPLES = 4000  # coloured points of a model that are compared, about a third of them visible
-_SWEPT = 1500  # in a sweep about an axis
-_FACING = 0.3  # least cosine between ray and normal: more slanted print is blurred along the slant
-_NEAR = 0.05  # of the diameter: a reading farther before the surface is of something else
-_LEAST_VISIBLE = 40  # points; fewer say nothing
-_BLUR = 1.0  # standard deviation of the image's blur, in distances of the model's coloured points
-_BLACK = 0.05  # of the range: what noise and stray light make of black
+_SWEEP_SAMPLES = 1500  # in a sweep about an axis
+_LEAST_COSINE = 0.3  # between ray and normal: more slanted print is blurred along the slant
+_NEAR = 0.05  # of the diameter: a reading farther from the surface is of another object
+_LEAST_VISIBLE = 40  # points; fewer are not compared
+_BLUR = 1.0  # standard deviation of the image's blur, in spacings of the model's coloured points
+_BLACK = 0.05  # of the range: the value that noise and stray light give to black
 _SATURATED = 0.98  # a channel of more is clipped, so the colour is false
 _DARK = 0.06  # where no channel has more, the colour is noise
-_PLAIN = 0.03  # standard deviation of a logarithm: of less contrast is no print
+_PLAIN = 0.03  # standard deviation of a logarithm below which there is no print
+_MOST_CORRELATION = 0.99  # that an image and a model can have: both are digitised
+_FITTED = 2  # a factor and a constant are fitted to the image
 _POINTS_AT_ONCE = 1_000_000
 
 
@@ -63,13 +65,9 @@ class ColorAgreement:
         Differences are log odds between poses, and between objects at one place. It is 0 where
         colour says nothing: a grey model, too few places, or a print that runs the other way.
         """
-        explained = self.correlation.clamp(0, _MOST).square()
+        explained = self.correlation.clamp(0, _MOST_CORRELATION).square()
         freedom = (self.places - _FITTED).clamp(min=0)
         return (-freedom / 2 * torch.log1p(-explained)).sum(-1)
-
-
-_MOST = 0.99  # correlation that an image and a model can have: both are digitised
-_FITTED = 2  # a factor and a constant are fitted to the image
 
 
 def color_agreement(
@@ -82,21 +80,21 @@ def color_agreement(
         model: the object; without ``colors`` colour says nothing.
         view: depth and colour; without ``color`` colour says nothing. Its mask limits where the
             object is.
-        samples: how many coloured points of the model are looked at.
+        samples: how many coloured points of the model are compared at most.
     """
     if model.colors is None or view.color is None:
         nothing = torch.zeros(len(poses.R), 3, dtype=torch.float64)
         return ColorAgreement(correlation=nothing, places=nothing, visible=nothing[:, 0].long())
-    surface = _thinned(model.colors, samples)
-    image = _blurred(view.color, poses, surface)
+    surface = _thin(model.colors, samples)
+    image = _blur_image(view.color, poses, surface)
     parts: list[ColorAgreement] = []
     at_once = max(1, _POINTS_AT_ONCE // len(surface.points_m))
     for first in range(0, len(poses.R), at_once):
-        of_chunk = poses[first : first + at_once].double()
-        seen = _look(of_chunk, surface, view, image, _NEAR * model.diameter_m)
-        correlation = _correlation(seen)
-        places = torch.where(correlation != 0, _independent_places(seen, surface), 0.0)
-        visible = seen.weight[..., 0].sum(-1).long()
+        chunk = poses[first : first + at_once].double()
+        compared = _compare_features(chunk, surface, view, image, _NEAR * model.diameter_m)
+        correlation = _correlation(compared)
+        places = torch.where(correlation != 0, _independent_places(compared, surface), 0.0)
+        visible = compared.weight[..., 0].sum(-1).long()
         parts.append(ColorAgreement(correlation=correlation, places=places, visible=visible))
     return ColorAgreement(
         correlation=torch.cat([part.correlation for part in parts]),
@@ -105,8 +103,8 @@ def color_agreement(
     )
 
 
-def _thinned(colors: SurfaceColors, samples: int) -> SurfaceColors:
-    """Give at most so many of the coloured points, evenly taken."""
+def _thin(colors: SurfaceColors, samples: int) -> SurfaceColors:
+    """Take at most ``samples`` of the coloured points, evenly."""
     return SurfaceColors(
         points_m=take_evenly(colors.points_m, samples),
         normals=take_evenly(colors.normals, samples),
@@ -119,25 +117,25 @@ class _BlurredImage(NamedTuple):
     """The part of a colour image about an object, as blurred as the model's colours are."""
 
     rgb: Float[Tensor, "3 h w"]
-    left: int
-    top: int
+    left: int  # first column of the part
+    top: int  # and its first row
 
 
-def _in_color_camera(
+def _project_to_color(
     points_m: Float64[Tensor, "*b n 3"], color: ColorImage
 ) -> tuple[Float64[Tensor, "*b n 2"], Float64[Tensor, "*b n"]]:
-    """Give pixels of a colour image, and depths, of points in the depth camera's frame."""
-    beside = color.color_from_depth
-    moved_m = points_m if beside is None else beside.double().apply(points_m)
-    depth_m = moved_m[..., 2]
-    pixels = (moved_m @ color.K.double().mT)[..., :2] / depth_m.clamp(min=1e-6)[..., None]
+    """Project points of the depth camera's frame to a colour image: pixels, and depths there."""
+    transform = color.color_from_depth
+    color_m = points_m if transform is None else transform.double().apply(points_m)
+    depth_m = color_m[..., 2]
+    pixels = (color_m @ color.K.double().mT)[..., :2] / depth_m.clamp(min=1e-6)[..., None]
     return pixels, depth_m
 
 
-def _blurred(color: ColorImage, poses: Rigid, surface: SurfaceColors) -> _BlurredImage:
-    """Blur an image over the distance of the model's colours, where the poses lie."""
+def _blur_image(color: ColorImage, poses: Rigid, surface: SurfaceColors) -> _BlurredImage:
+    """Blur an image, where the posed models lie, by the spacing of the model's colours."""
     some_m = take_evenly(surface.points_m, 300).double()
-    pixels, depth_m = _in_color_camera(poses.double().apply(some_m), color)
+    pixels, depth_m = _project_to_color(poses.double().apply(some_m), color)
     is_front = depth_m > 0
     height, width = color.rgb.shape[1:]
     if not bool(is_front.any()):
@@ -145,12 +143,16 @@ def _blurred(color: ColorImage, poses: Rigid, surface: SurfaceColors) -> _Blurre
     sigma = _BLUR * surface.spacing_m * float(color.K[0, 0] / depth_m[is_front].median())
     sigma = min(max(sigma, 1.0), max(height, width) / 8)
     reach = math.ceil(3 * sigma)
+
+    # The part about the poses.
     low = pixels[is_front].amin(0) - 2 * reach
     high = pixels[is_front].amax(0) + 2 * reach
     left = int(low[0].clamp(0, width - 1))
     right = int(high[0].clamp(0, width - 1)) + 1
     top = int(low[1].clamp(0, height - 1))
     bottom = int(high[1].clamp(0, height - 1)) + 1
+
+    # A Gaussian, one axis after the other.
     steps = torch.arange(-reach, reach + 1, dtype=torch.float32)
     kernel = torch.exp(-(steps**2) / (2 * sigma**2))
     kernel /= kernel.sum()
@@ -160,8 +162,8 @@ def _blurred(color: ColorImage, poses: Rigid, surface: SurfaceColors) -> _Blurre
     return _BlurredImage(part[:, 0], left, top)
 
 
-class _Seen(NamedTuple):
-    """Features of a model and of an image at the same places, each less its mean and shading."""
+class _Compared(NamedTuple):
+    """Colour features of a model and of an image at the same points, less mean and shading."""
 
     weight: Float64[Tensor, "b n 3"]  # 1 where a feature is compared, else 0
     of_model: Float64[Tensor, "b n 3"]
@@ -169,148 +171,162 @@ class _Seen(NamedTuple):
 
 
 def _features(rgb: Float64[Tensor, "*b 3"]) -> Float64[Tensor, "*b 3"]:
-    """Give logarithms of brightness, of red over green, and of blue over green."""
+    """Give the logarithms of brightness, of red over green, and of blue over green."""
     red, green, blue = (rgb + _BLACK).log().unbind(-1)
     return torch.stack([(rgb.mean(-1) + _BLACK).log(), red - green, blue - green], -1)
 
 
-def _look(
+def _compare_features(
     poses: Rigid, surface: SurfaceColors, view: ViewInput, image: _BlurredImage, near_m: float
-) -> _Seen:
-    """Find what the cameras see of the posed surface, and what colours are there."""
+) -> _Compared:
+    """Give the colour features of posed surfaces and of the image, where both cameras see them.
+
+    Args:
+        poses: a batch, ``camera_from_model`` of the depth camera.
+        surface: coloured points of the model.
+        view: depth, mask and colour image.
+        image: the colour image, blurred.
+        near_m: largest distance of a point to the depth reading in its direction.
+    """
     assert view.color is not None
     points_m = poses.apply(surface.points_m.double())
     normals = surface.normals.double() @ poses.R.mT
     distance_m = points_m.norm(dim=-1)
-    facing = -(normals * points_m).sum(-1) / distance_m.clamp(min=1e-9)
+    cosine = -(normals * points_m).sum(-1) / distance_m.clamp(min=1e-9)
 
-    # The depth camera sees the surface, and nothing before it.
+    # Visible to the depth camera: facing it, with a reading there.
     pixels = (points_m @ view.K.double().mT)[..., :2] / points_m[..., 2:].clamp(min=1e-6)
     height, width = view.depth_m.shape
     column, row = pixels.round().long().unbind(-1)
-    is_seen = (facing > _FACING) & (points_m[..., 2] > 0)
-    is_seen &= (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    is_visible = (cosine > _LEAST_COSINE) & (points_m[..., 2] > 0)
+    is_visible &= (column >= 0) & (column < width) & (row >= 0) & (row < height)
     place = row.clamp(0, height - 1) * width + column.clamp(0, width - 1)
     read_m = view.depth_m.flatten()[place].double()
-    is_seen &= ((read_m - points_m[..., 2]).abs() < near_m) & view.mask.flatten()[place]
+    is_visible &= ((read_m - points_m[..., 2]).abs() < near_m) & view.mask.flatten()[place]
 
-    # The colour camera's image there.
-    at, depth_m = _in_color_camera(points_m, view.color)
+    # The colour camera's image there, between pixels.
+    color_pixels, depth_m = _project_to_color(points_m, view.color)
     rows, columns = view.color.rgb.shape[1:]
-    u, v = at.unbind(-1)
-    is_seen &= (depth_m > 0) & (u >= 0) & (u <= columns - 1) & (v >= 0) & (v <= rows - 1)
+    u, v = color_pixels.unbind(-1)
+    is_visible &= (depth_m > 0) & (u >= 0) & (u <= columns - 1) & (v >= 0) & (v <= rows - 1)
     side = torch.tensor(image.rgb.shape[:0:-1]).double().sub(1).clamp(min=1)
     corner = torch.tensor([image.left, image.top]).double()
-    grid = (2 * (at - corner) / side - 1).float()
+    grid = (2 * (color_pixels - corner) / side - 1).float()  # -1 to 1 within the part
     rgb = F.grid_sample(image.rgb[None], grid[None], align_corners=True)[0].double()
     rgb = rgb.permute(1, 2, 0)
 
     # Colour is false where a channel is clipped, and noise where all are dark.
     has_color = (rgb.amax(-1) < _SATURATED) & (rgb.amax(-1) > _DARK)
-    weight = torch.stack([is_seen, is_seen & has_color, is_seen & has_color], -1).double()
+    with_color = is_visible & has_color
+    weight = torch.stack([is_visible, with_color, with_color], -1).double()
     of_model = _features(surface.rgb.double()).expand(len(points_m), -1, -1)
-    return _Seen(
+    return _Compared(
         weight=weight,
-        of_model=_without_light(of_model, normals, weight),
-        of_image=_without_light(_features(rgb), normals, weight),
+        of_model=_without_shading(of_model, normals, weight),
+        of_image=_without_shading(_features(rgb), normals, weight),
     )
 
 
 _RIDGE = 1e-4  # of the normals' second moments: a plane has no second direction
 
 
-def _without_light(
+def _without_shading(
     features: Float64[Tensor, "b n 3"],
     normals: Float64[Tensor, "b n 3"],
     weight: Float64[Tensor, "b n 3"],
 ) -> Float64[Tensor, "b n 3"]:
-    """Take means off features, and off brightness what is linear in the normal (Lambert)."""
+    """Subtract from features their means, and from brightness its shading (Lambert)."""
     total = weight.sum(1, keepdim=True).clamp(min=1)
     features = (features - (weight * features).sum(1, keepdim=True) / total) * weight
-    lit = features[..., :1]
+
+    # Regression of brightness on the normals.
+    brightness = features[..., :1]
     used = weight[..., :1]
-    sides = (normals - (used * normals).sum(1, keepdim=True) / total[..., :1]) * used
-    moments = sides.mT @ sides + _RIDGE * total[..., :1] * torch.eye(3, dtype=torch.float64)
-    shade = sides @ torch.linalg.solve(moments, sides.mT @ lit)
-    return torch.cat([lit - shade, features[..., 1:]], -1)
+    centred = (normals - (used * normals).sum(1, keepdim=True) / total[..., :1]) * used
+    moments = centred.mT @ centred + _RIDGE * total[..., :1] * torch.eye(3, dtype=torch.float64)
+    shading = centred @ torch.linalg.solve(moments, centred.mT @ brightness)
+    return torch.cat([brightness - shading, features[..., 1:]], -1)
 
 
-def _correlation(seen: _Seen) -> Float64[Tensor, "b 3"]:
-    """Correlate what is seen; 0 where too little is, or either has no print."""
-    total = seen.weight.sum(1)
-    of_model = seen.of_model.square().sum(1)
-    of_image = seen.of_image.square().sum(1)
-    both = (seen.of_model * seen.of_image).sum(1)
+def _correlation(compared: _Compared) -> Float64[Tensor, "b 3"]:
+    """Correlate model and image; 0 where few points are visible, or either has no print."""
+    total = compared.weight.sum(1)
+    of_model = compared.of_model.square().sum(1)
+    of_image = compared.of_image.square().sum(1)
+    both = (compared.of_model * compared.of_image).sum(1)
     least = _PLAIN**2 * total
     is_printed = (of_model > least) & (of_image > least) & (total >= _LEAST_VISIBLE)
     return torch.where(is_printed, both / (of_model * of_image).clamp(min=1e-12).sqrt(), 0.0)
 
 
-_PAIRED = 250  # visible points whose pairs give the correlation of neighbours
-_BINS = 16  # of distances, the finer the nearer
+_PAIRED = 250  # visible points whose pairs give the autocorrelations
+_BINS = 16  # of distances, the nearer the finer
 _POSES_AT_ONCE = 16
 
 
-def _independent_places(seen: _Seen, surface: SurfaceColors) -> Float64[Tensor, "b 3"]:
-    """Effective number of places of a correlation of two fields with neighbours alike.
+def _independent_places(compared: _Compared, surface: SurfaceColors) -> Float64[Tensor, "b 3"]:
+    """Give the effective number of independent places of each correlation.
 
     The variance of the correlation of two unrelated fields is the mean product of their
-    autocorrelations over all pairs of places (Dutilleul 1993). Products below 0, as those of
-    chance, are left out, so that the number is rather too small.
+    autocorrelations over all pairs of places (Dutilleul 1993), and the number its inverse. Products
+    below 0, which come from chance, are left out, so that the number is rather too small.
     """
     generator = torch.Generator().manual_seed(0)
-    key = torch.rand(seen.weight.shape[1], generator=generator, dtype=torch.float64)
-    count = min(_PAIRED, seen.weight.shape[1])
+    key = torch.rand(compared.weight.shape[1], generator=generator, dtype=torch.float64)
+    count = min(_PAIRED, compared.weight.shape[1])
     reach_m = float((surface.points_m.amax(0) - surface.points_m.amin(0)).norm())
     places: list[Tensor] = []
-    for first in range(0, len(seen.weight), _POSES_AT_ONCE):
-        here = slice(first, first + _POSES_AT_ONCE)
-        chosen = (seen.weight[here, :, 0] * (1 + key)).topk(count, dim=1).indices
+    for first in range(0, len(compared.weight), _POSES_AT_ONCE):
+        # Visible points of each pose, chosen at random, and the bin of the distance of each pair.
+        chunk = slice(first, first + _POSES_AT_ONCE)
+        chosen = (compared.weight[chunk, :, 0] * (1 + key)).topk(count, dim=1).indices
         points_m = surface.points_m.double()[chosen]
-        apart = torch.cdist(points_m, points_m) / reach_m
-        number = (apart.sqrt() * _BINS).long().clamp(max=_BINS - 1)
-        number += _BINS * torch.arange(len(chosen))[:, None, None]
-        each = chosen[..., None].expand(-1, -1, 3)
-        weight, *fields = (values[here].gather(1, each) for values in seen)
-        pairs = torch.einsum("bif,bjf->fbij", weight, weight)
-        alike: list[Tensor] = []
+        distance = torch.cdist(points_m, points_m) / reach_m
+        bins = (distance.sqrt() * _BINS).long().clamp(max=_BINS - 1)
+        bins += _BINS * torch.arange(len(chosen))[:, None, None]
+
+        # Autocorrelations of the model and of the image, by distance.
+        index = chosen[..., None].expand(-1, -1, 3)
+        weight, *fields = (values[chunk].gather(1, index) for values in compared)
+        pairs = _sum_by_bin(torch.einsum("bif,bjf->fbij", weight, weight), bins)
+        autocorrelations: list[Tensor] = []
         for values in fields:
-            products = torch.einsum("bif,bjf->fbij", values, values)
-            binned = _binned(products, number) / _binned(pairs, number).clamp(min=1)
+            products = _sum_by_bin(torch.einsum("bif,bjf->fbij", values, values), bins)
             variance = values.square().sum(1).mT / weight.sum(1).mT.clamp(min=1)
-            alike.append(binned / variance.clamp(min=1e-12)[..., None])
-        product = (alike[0] * alike[1]).clamp(min=0)
-        off_diagonal = _binned(pairs, number) * product
-        # A place with itself is alike, whatever its bin says.
-        itself = weight.square().sum(1).mT
-        off_diagonal[..., 0] -= itself * product[..., 0]
-        total = itself.square()
-        variance = (off_diagonal.sum(-1) + itself) / total.clamp(min=1)
+            mean = products / pairs.clamp(min=1)
+            autocorrelations.append(mean / variance.clamp(min=1e-12)[..., None])
+
+        # The mean of their product over all pairs; that of a place with itself is 1.
+        product = (autocorrelations[0] * autocorrelations[1]).clamp(min=0)
+        sums = pairs * product
+        visible = weight.square().sum(1).mT
+        sums[..., 0] -= visible * product[..., 0]
+        variance = (sums.sum(-1) + visible) / visible.square().clamp(min=1)
         places.append((1 / variance.clamp(min=1 / count)).mT)
     return torch.cat(places)
 
 
-def _binned(
-    values: Float64[Tensor, "f b m m"], number: Int64[Tensor, "b m m"]
+def _sum_by_bin(
+    values: Float64[Tensor, "f b m m"], bins: Int64[Tensor, "b m m"]
 ) -> Float64[Tensor, "f b bins"]:
-    """Sum values of pairs by the bin of their distance."""
+    """Sum values of pairs of points by the bin of their distance."""
     flat = values.flatten(1)
-    sums = flat.new_zeros(len(flat), len(number) * _BINS)
-    return sums.index_add_(1, number.flatten(), flat).unflatten(1, (len(number), _BINS))
+    sums = flat.new_zeros(len(flat), len(bins) * _BINS)
+    return sums.index_add_(1, bins.flatten(), flat).unflatten(1, (len(bins), _BINS))
 
 
 _STEP_DEG = 5.0
-_FINE = 5  # finer steps in each of a sweep
-_MOST_SPINS = 3  # of one axis that are kept
+_FINE_STEPS = 5  # in each step of a sweep
+_MOST_PEAKS = 3  # of a sweep about one axis that are returned
 
 
 def copies_about_axis(
     pose: Rigid, axis: Axis, model: ObjectModel, view: ViewInput, *, step_deg: float = _STEP_DEG
 ) -> Rigid:
-    """Turn a pose about an axis of the model to where its print agrees with the image.
+    """Rotate a pose about an axis of the model to where its print agrees with the image.
 
-    A sweep of the full turn finds where the agreement is largest; there, finer steps and the
-    parabola through the best three follow.
+    A sweep of the full circle finds the largest agreements; each is refined by finer steps and by
+    the parabola through the best three of them.
 
     Args:
         pose: ``camera_from_model``, one.
@@ -325,55 +341,66 @@ def copies_about_axis(
     """
     if model.colors is None or view.color is None:
         return pose.double()[None]
+    # The largest agreements of a sweep.
     steps = max(3, math.ceil(360 / step_deg))
     step_rad = 2 * math.pi / steps
     sweep_rad = torch.arange(steps, dtype=torch.float64) * step_rad
-    rough = _explained(_turned(pose, axis, sweep_rad), model, view, _SWEPT)
+    rough = _sweep_scores(_rotated(pose, axis, sweep_rad), model, view, _SWEEP_SAMPLES)
     is_peak = (rough >= rough.roll(1)) & (rough > rough.roll(-1)) & (rough > 0)
     peaks = is_peak.nonzero()[:, 0]
-    peaks = peaks[rough[peaks].argsort(descending=True)][:_MOST_SPINS]
+    peaks = peaks[rough[peaks].argsort(descending=True)][:_MOST_PEAKS]
     if len(peaks) == 0:
         return pose.double()[None]
-    offsets = torch.arange(-_FINE, _FINE + 1, dtype=torch.float64) * (step_rad / _FINE)
-    angles_rad = sweep_rad[peaks, None] + offsets
-    fine = _explained(_turned(pose, axis, angles_rad.flatten()), model, view, _SAMPLES)
+
+    # Finer steps about each, and a parabola through the best three.
+    fine_rad = step_rad / _FINE_STEPS
+    offsets_rad = torch.arange(-_FINE_STEPS, _FINE_STEPS + 1, dtype=torch.float64) * fine_rad
+    angles_rad = sweep_rad[peaks, None] + offsets_rad
+    fine = _sweep_scores(_rotated(pose, axis, angles_rad.flatten()), model, view, _SAMPLES)
     fine = fine.reshape(angles_rad.shape)
-    best = fine.argmax(1).clamp(1, 2 * _FINE - 1)
-    beside = fine.gather(1, best[:, None] + torch.tensor([-1, 0, 1]))
-    found_rad = angles_rad.gather(1, best[:, None])[:, 0] + _peak(beside) * step_rad / _FINE
-    order = beside[:, 1].argsort(descending=True)
-    return _turned(pose, axis, found_rad[order])
+    best = fine.argmax(1).clamp(1, 2 * _FINE_STEPS - 1)
+    three = fine.gather(1, best[:, None] + torch.tensor([-1, 0, 1]))
+    best_rad = angles_rad.gather(1, best[:, None])[:, 0]
+    best_rad = best_rad + _parabola_peak(three) * step_rad / _FINE_STEPS
+    order = three[:, 1].argsort(descending=True)
+    return _rotated(pose, axis, best_rad[order])
 
 
-def _turned(pose: Rigid, axis: Axis, angles_rad: Float64[Tensor, " a"]) -> Rigid:
+def _rotated(pose: Rigid, axis: Axis, angles_rad: Float64[Tensor, " a"]) -> Rigid:
+    """Rotate the model at a pose about one of its axes by each angle."""
     return pose.double()[None] @ turn_about(
         axis.direction.double(), axis.point_m.double(), angles_rad
     )
 
 
-def _explained(
+def _sweep_scores(
     poses: Rigid, model: ObjectModel, view: ViewInput, samples: int
 ) -> Float64[Tensor, " b"]:
-    """Give what colours explain, a place alike for all poses: for sweeps of many of them."""
+    """Score poses by how much of the colours they explain, fast enough for sweeps of many poses.
+
+    As :attr:`ColorAgreement.log_likelihood`, but with every visible point counted as independent.
+    """
     assert model.colors is not None
     assert view.color is not None
-    surface = _thinned(model.colors, samples)
-    image = _blurred(view.color, poses, surface)
-    shares: list[Tensor] = []
+    surface = _thin(model.colors, samples)
+    image = _blur_image(view.color, poses, surface)
+    scores: list[Tensor] = []
     at_once = max(1, _POINTS_AT_ONCE // len(surface.points_m))
     for first in range(0, len(poses.R), at_once):
-        of_chunk = poses[first : first + at_once]
-        seen = _look(of_chunk, surface, view, image, _NEAR * model.diameter_m)
-        explained = _correlation(seen).clamp(0, _MOST).square()
-        shares.append((-seen.weight.sum(1) * torch.log1p(-explained)).sum(-1))
-    return torch.cat(shares)
+        chunk = poses[first : first + at_once]
+        compared = _compare_features(chunk, surface, view, image, _NEAR * model.diameter_m)
+        explained = _correlation(compared).clamp(0, _MOST_CORRELATION).square()
+        scores.append((-compared.weight.sum(1) * torch.log1p(-explained)).sum(-1))
+    return torch.cat(scores)
 
 
-_SAME_RAD = math.radians(3)
+_SAME_RAD = math.radians(3)  # angle up to which two proposed copies are the same
 _MOST_COPIES = 8
-_ONE_TURN_RAD = math.radians(10)
+_SAME_TURN_RAD = math.radians(10)  # angle up to which two rotations that are tried are the same
 _MANY_TURNS = 6  # about one line: the shape nearly is a body of revolution
-_ALONG = math.cos(math.radians(8))  # cosine from which two directions are one
+_PARALLEL_COSINE = math.cos(math.radians(8))  # from which two directions are the same
+_SETTLE_STEP_RAD = math.radians(2)  # of the small sweep about a pose
+_SETTLE_STEPS = 10  # to each side
 
 
 def color_copies(
@@ -384,56 +411,60 @@ def color_copies(
     turns: Rigid | None = None,
     most: int = _MOST_COPIES,
 ) -> Rigid:
-    """Propose what a pose may be exchanged for by colour: copies that look alike to depth.
+    """Propose poses that depth cannot tell from a given one, but colour may: its copies.
 
-    They are symmetric copies that were found in the shape, near-symmetric ones, half turns about
-    the principal axes, and of each the turns about axes of revolution, or nearly so, by which its
-    print agrees. Declared symmetries are none: their copies are one answer. A copy is to be refined
-    by depth, and settled (:func:`settle_spin`), before its evidence is compared.
+    They are symmetric copies that were found in the shape, near-symmetric ones, and half turns
+    about the principal axes. Each is rotated about axes of revolution, or nearly so, to where its
+    print agrees. Declared symmetries make no copies: they count as one answer. Refine a copy by
+    depth, and settle it (:func:`settle_spin`), before its evidence is compared.
 
     Args:
         pose: ``camera_from_model``, one.
         model: the object.
         view: depth and colour.
-        turns: motions of the model to try in place of those that its shape shows.
-        most: so many are given beside ``pose``.
+        turns: motions of the model to try in place of those found in its shape.
+        most: largest number of poses beside ``pose``.
 
     Returns:
-        A batch of poses, ``pose`` itself the first, then the others, what agrees best before.
+        A batch of poses, ``pose`` itself the first, then the others, those that agree best before.
     """
     pose = pose.double()
     if model.colors is None or view.color is None:
         return pose[None]
-    shown, axes = _look_alikes(model)
-    tried = shown if turns is None else [turns.double()[k] for k in range(len(turns.R))]
+    found, axes = _ambiguous_motions(model)
+    motions = found if turns is None else [turns.double()[k] for k in range(len(turns.R))]
 
-    # Of copies that a turn about an axis carries into each other one is swept.
-    eye = Rigid(torch.eye(3).double(), torch.zeros(3).double())
-    distinct = [eye]
-    for turn in tried:
-        is_swept = any(_is_spun(turn, other, axis) for axis in axes for other in distinct)
-        apart_rad = [float(geodesic_rad(turn.R, other.R)) for other in distinct]
-        if not is_swept and min(apart_rad) > _ONE_TURN_RAD:
-            distinct.append(turn)
+    # Of motions that differ by a rotation about an axis one is tried: it is swept about the axis.
+    distinct = [Rigid(torch.eye(3).double(), torch.zeros(3).double())]
+    for motion in motions:
+        is_swept = any(
+            _differ_by_rotation_about(axis, motion, other) for axis in axes for other in distinct
+        )
+        apart_rad = [float(geodesic_rad(motion.R, other.R)) for other in distinct]
+        if not is_swept and min(apart_rad) > _SAME_TURN_RAD:
+            distinct.append(motion)
     proposed: list[Rigid] = []
-    for base in (pose @ turn for turn in distinct):
-        spun = [copies_about_axis(base, axis, model, view) for axis in axes]
-        proposed += spun or [base[None]]
-    every = Rigid.cat(proposed)
-    order = _explained(every, model, view, _SAMPLES).argsort(descending=True, stable=True)
+    for motion in distinct:
+        copy = pose @ motion
+        swept = [copies_about_axis(copy, axis, model, view) for axis in axes]
+        proposed += swept or [copy[None]]
+
+    # The best that are distinct.
+    copies = Rigid.cat(proposed)
+    order = _sweep_scores(copies, model, view, _SAMPLES).argsort(descending=True, stable=True)
     best = [pose[None]]
     for k in order.tolist():
-        before = Rigid.cat(best)
-        apart_rad = geodesic_rad(every.R[k].expand_as(before.R), before.R)
+        better = Rigid.cat(best)
+        apart_rad = geodesic_rad(copies.R[k].expand_as(better.R), better.R)
         if float(apart_rad.min()) > _SAME_RAD and len(best) <= most:
-            best.append(every[k][None])
+            best.append(copies[k][None])
     return Rigid.cat(best)
 
 
 def settle_spin(pose: Rigid, model: ObjectModel, view: ViewInput) -> Rigid:
-    """Turn a pose a little about axes that depth does not fix, to where its print agrees best.
+    """Rotate a pose a little about axes that depth does not fix, to where its print agrees best.
 
-    Refinement by depth drifts about an axis of revolution; print says where it stands.
+    Refinement by depth lets a pose drift about an axis of revolution.
 
     Args:
         pose: ``camera_from_model``, one; within 20 degrees of where it belongs.
@@ -441,38 +472,46 @@ def settle_spin(pose: Rigid, model: ObjectModel, view: ViewInput) -> Rigid:
         view: depth and colour.
 
     Returns:
-        The pose, turned; as it was where colour says nothing or the shape has no such axis.
+        The rotated pose; the same one where colour says nothing or the shape has no such axis.
     """
     pose = pose.double()
     if model.colors is None or view.color is None:
         return pose
-    offsets_rad = torch.arange(-10, 11).double() * math.radians(2)
-    for axis in _look_alikes(model)[1]:
-        explained = _explained(_turned(pose, axis, offsets_rad), model, view, _SWEPT)
-        best = int(explained.argmax().clamp(1, len(offsets_rad) - 2))
-        if float(explained[best]) > 0:
-            peak = _peak(explained[best - 1 : best + 2])
-            pose = _turned(pose, axis, offsets_rad[best, None] + peak * math.radians(2))[0]
+    steps = torch.arange(-_SETTLE_STEPS, _SETTLE_STEPS + 1).double()
+    offsets_rad = steps * _SETTLE_STEP_RAD
+    _, axes = _ambiguous_motions(model)
+    for axis in axes:
+        scores = _sweep_scores(_rotated(pose, axis, offsets_rad), model, view, _SWEEP_SAMPLES)
+        best = int(scores.argmax().clamp(1, len(offsets_rad) - 2))
+        if float(scores[best]) > 0:
+            peak = _parabola_peak(scores[best - 1 : best + 2])
+            pose = _rotated(pose, axis, offsets_rad[best, None] + peak * _SETTLE_STEP_RAD)[0]
     return pose
 
 
-def _peak(values: Float64[Tensor, "*b 3"]) -> Float64[Tensor, "*b"]:
-    """Place of the largest value of a parabola through three, from the middle one, -1..1."""
-    before, at, after = values.unbind(-1)
-    bend = (before - 2 * at + after).clamp(max=-1e-9)
+def _parabola_peak(values: Float64[Tensor, "*b 3"]) -> Float64[Tensor, "*b"]:
+    """Give where the parabola through three values is largest, -1 to 1 from the middle one."""
+    before, middle, after = values.unbind(-1)
+    bend = (before - 2 * middle + after).clamp(max=-1e-9)
     return ((before - after) / (2 * bend)).clamp(-1, 1)
 
 
 @lru_cache(maxsize=64)
-def _look_alikes(model: ObjectModel) -> tuple[list[Rigid], list[Axis]]:
-    """Give the turns after which a shape looks alike or nearly, and axes of any turn."""
+def _ambiguous_motions(model: ObjectModel) -> tuple[list[Rigid], list[Axis]]:
+    """Give the motions of a model after which depth looks alike or nearly, and its free axes.
+
+    Declared symmetries are not among them.
+    """
     assert model.colors is not None
-    symmetries = model.symmetries if model.symmetries.is_found else None
     turns = [near.model_from_model.double() for near in near_symmetries(model)]
-    if symmetries is not None and symmetries.discrete is not None:
-        turns += [symmetries.discrete.double()[k] for k in range(len(symmetries.discrete.R))]
-    axes = [] if symmetries is None else list(symmetries.continuous)
-    axes += _axes_of_many(turns, axes)
+    axes: list[Axis] = []
+    if model.symmetries.is_found:
+        discrete = model.symmetries.discrete
+        if discrete is not None:
+            turns += [discrete.double()[k] for k in range(len(discrete.R))]
+        axes += model.symmetries.continuous
+    axes += _axes_of_many_turns(turns, axes)
+
     # A box whose halves differ a little looks alike after half turns about its middle.
     points_m = model.colors.points_m.double()
     principal = torch.linalg.eigh((points_m - points_m.mean(0)).T.cov()).eigenvectors.T
@@ -483,25 +522,31 @@ def _look_alikes(model: ObjectModel) -> tuple[list[Rigid], list[Axis]]:
     return turns, axes
 
 
-def _axes_of_many(turns: Sequence[Rigid], known: Sequence[Axis]) -> list[Axis]:
-    """Find lines about which a shape looks alike after many turns, beside those that are known."""
+def _axes_of_many_turns(turns: Sequence[Rigid], known: Sequence[Axis]) -> list[Axis]:
+    """Find lines about which many of the turns are, beside the known axes."""
     eye = torch.eye(3).double()
-    # The direction that a rotation leaves alone, and a point that it does.
+    # The direction of each axis is the one that the rotation leaves as it is.
     directions = [torch.linalg.svd(turn.R - eye).Vh[-1] for turn in turns]
     axes: list[Axis] = []
     for direction in directions:
         others = [*known, *axes]
-        is_known = any(abs(float(direction @ axis.direction.double())) > _ALONG for axis in others)
-        alike = [k for k, d in enumerate(directions) if abs(float(d @ direction)) > _ALONG]
+        is_known = any(_are_parallel(direction, axis.direction.double()) for axis in others)
+        alike = [k for k, other in enumerate(directions) if _are_parallel(other, direction)]
         if is_known or len(alike) < _MANY_TURNS:
             continue
+        # A point that each turn leaves where it is.
         points = [torch.linalg.pinv(eye - turns[k].R, rtol=1e-3) @ turns[k].t_m for k in alike]
         point_m = torch.stack(points).median(0).values
         axes.append(Axis(direction=direction, point_m=point_m))
     return axes
 
 
-def _is_spun(turn: Rigid, other: Rigid, axis: Axis) -> bool:
-    """Whether two turns differ by a turn about an axis of the model: both move it alike."""
+def _are_parallel(first: Float64[Tensor, "3"], second: Float64[Tensor, "3"]) -> bool:
+    """Whether two unit vectors are of the same line, within 8 degrees."""
+    return abs(float(first @ second)) > _PARALLEL_COSINE
+
+
+def _differ_by_rotation_about(axis: Axis, first: Rigid, second: Rigid) -> bool:
+    """Whether two motions differ by a rotation about an axis: both carry it to one direction."""
     direction = axis.direction.double()
-    return float((turn.R @ direction) @ (other.R @ direction)) > _ALONG
+    return float((first.R @ direction) @ (second.R @ direction)) > _PARALLEL_COSINE

@@ -12,7 +12,7 @@ round a corner of one body, does not end there.
 
 import math
 from dataclasses import dataclass
-from typing import cast
+from typing import NamedTuple, cast
 
 import numpy as np
 import torch
@@ -22,6 +22,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
+from depthpose.core.camera.pinhole import crop_intrinsics
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import grow_mask
 from depthpose.pose.sensor import (
@@ -38,10 +39,10 @@ from depthpose.pose.surface import Surface
 from depthpose.pose.types import Evidence, ViewInput
 
 THRESHOLD = 3.0  #: deviations beyond which a residual contradicts a pose
-_CUT_OFF = 2 * THRESHOLD  # deviations of one reading, of which a mean takes no more
+_CUT_OFF = 2 * THRESHOLD  # deviations at which the residual of one reading is clipped
 AVERAGED_PX = 5  #: residuals are averaged over a square of this side
 _LEAST_FILLED = 0.3  # share of the averaged square that must have residuals
-_ALIKE_READINGS = 3  # neighbours err alike: of so many averaged readings one is independent
+_CORRELATED_READINGS = 3  # neighbours err alike: of so many averaged readings one is independent
 _LEAST_PATCH = 0.25  # independent patches: smaller ones are accidents of edges and drop-outs
 _ACROSS = (-1.0, -0.5, 0.5, 1.0)
 """Where readings are compared across a silhouette, on the line from it to a pixel beside it: 0 is
@@ -51,21 +52,24 @@ _NEAREST_WITHIN = 1
 _MEETING = 2.0
 """Deviations of the noise: sides of a silhouette that are farther apart do not meet there, and an
 edge that bends more toward the camera is concave."""
-_LEAST_INNER = 0.25  # share of the silhouette that its borders may leave
+_LEAST_INNER = 0.25  # share of the silhouette that must remain without its borders
 _DISK = 1.3  # radius of the disk drawn for a sample, in median distances of samples
-_OBJECT_PX = 8000  # pixels of an object that are compared; of larger ones every n-th
-_NEIGHBOURS = 4
-_POINT_PX = 1.5  # side of a pixel of a drawn cloud, in distances of its points
+_OBJECT_PX = 8000  # pixels of an object that are compared; the window of a larger one is thinned
+_NEIGHBOURS = 4  # the one whose distance is the spacing of a cloud's points
+_POINT_PX = 1.5  # side of a pixel of a drawn cloud, in spacings of its points
 _JUMP_DIAMETERS = 0.02
 _JUMP_M = 0.01
 """Drawn neighbours that differ in depth by more than both are the two sides of an edge."""
 _FAR_M = np.float32(1e6)
-_MARGIN = 0.6  # of the window about the points of an object, in diameters
+_MARGIN_DIAMETERS = 0.6  # of the window about the points of an object
+
+_Window = tuple[slice, slice]
+"""Rows and columns of an image."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Observation:
-    """What a camera saw about an object, in a window of its image, thinned if it is large.
+    """What a camera observed about an object, in a window of its image, thinned if it is large.
 
     Attributes:
         depth_m: (h, w), NaN where there is no reading.
@@ -74,7 +78,7 @@ class Observation:
         is_background: (h, w) pixels whose readings lie on a known background.
         K: intrinsic matrix of the window.
         noise: of readings on the object.
-        step: every so many rows and columns of the image are used.
+        step: every ``step``-th row and column of the image is used.
         patch_px: side of a square of readings that is one observation, in pixels of the window.
     """
 
@@ -96,23 +100,26 @@ def observe(
     *,
     is_masked: bool,
 ) -> Observation:
-    """Cut the window about an object out of its depth image.
+    """Crop a depth image to the window about an object, and measure its noise there.
 
     Args:
         cloud_m: points that lie on the object, in the camera frame.
-        view: their depth image; None: the points are drawn as a camera would have seen them, to
-            which they are a pixel apart.
+        view: their depth image; None: the points are drawn as one, by a camera in whose image they
+            are about a pixel apart.
         diameter_m: of the model.
         object_std_m: standard deviation of the real surface from its model.
-        is_masked: whether the points are all of the object, as an exact mask gives them, so that
-            those which a pose does not explain contradict it.
+        is_masked: whether the points are exactly those of the object, so that points which a pose
+            does not explain contradict it.
     """
     cloud_m = cloud_m.double()
     K = _camera_of_cloud(cloud_m) if view is None else view.K.double()
     pixel = (cloud_m @ K.T)[:, :2].div(cloud_m[:, 2:]).round().long()
-    reach_px = int(_MARGIN * diameter_m / float(cloud_m[:, 2].median()) * float(K[0, 0])) + 4
-    low = pixel.amin(0) - reach_px
-    high = pixel.amax(0) + reach_px + 1
+
+    # The window of the points, with a margin, within the image.
+    distance_m = float(cloud_m[:, 2].median())
+    margin_px = int(_MARGIN_DIAMETERS * diameter_m / distance_m * float(K[0, 0])) + 4
+    low = pixel.amin(0) - margin_px
+    high = pixel.amax(0) + margin_px + 1
     if view is not None:
         low = low.clamp(min=0)
         high = torch.minimum(high, torch.tensor(view.depth_m.shape).flip(0))
@@ -120,14 +127,17 @@ def observe(
     left, top = low.tolist()
 
     # The object's pixels. Of a large cloud some points were left out: small gaps are closed.
-    inside = ((pixel >= low) & (pixel < high)).all(-1)
-    place = ((pixel - low)[:, 1] * width + (pixel - low)[:, 0])[inside]
+    is_inside = ((pixel >= low) & (pixel < high)).all(-1)
+    column, row = (pixel - low)[is_inside].unbind(-1)
+    place = row * width + column
     is_object = torch.zeros(height * width, dtype=torch.bool)
     is_object[place] = True
     is_object = grow_mask(grow_mask(is_object.view(height, width), 1), -1)
+
+    # The readings: of the image, or the nearest point in each pixel.
     if view is None:
         depth_m = torch.full((height * width,), torch.inf, dtype=torch.float64)
-        depth_m.scatter_reduce_(0, place, cloud_m[inside, 2], "amin")
+        depth_m.scatter_reduce_(0, place, cloud_m[is_inside, 2], "amin")
         depth_m = depth_m.view(height, width)
     else:
         depth_m = view.depth_m[top : top + height, left : left + width].double()
@@ -136,15 +146,15 @@ def observe(
     if view is not None and view.background is not None:
         is_background = view.background.is_seen[top : top + height, left : left + width]
     inner = grow_mask(is_object, -EDGE_PX)
-    inner = inner if bool(inner.any()) else is_object  # thin things are all border
+    inner = inner if bool(inner.any()) else is_object  # thin objects are all border
     noise = measure_noise(depth_m.numpy(), inner.numpy(), object_std_m, float(K[0, 0]))
 
+    # Thinned, if the object is large.
     step = max(1, math.floor(math.sqrt(float(is_object.sum()) / _OBJECT_PX)))
-    # The pixels of a drawn cloud are not those of its sensor: of that the angle is assumed.
-    correlation_px = CORRELATION_PX if view is not None else CORRELATION_RAD * float(K[0, 0])
-    window_K = K.clone()
-    window_K[:2, 2] -= torch.tensor([left, top], dtype=torch.float64)
+    window_K = crop_intrinsics(K, left, top)
     window_K[:2] /= step
+    # The pixels of a drawn cloud are not those of its sensor, whose correlation is then an angle.
+    correlation_px = CORRELATION_PX if view is not None else CORRELATION_RAD * float(K[0, 0])
     return Observation(
         depth_m=np.ascontiguousarray(depth_m.float().numpy()[::step, ::step]),
         is_masked=is_masked,
@@ -158,22 +168,30 @@ def observe(
 
 
 def _camera_of_cloud(cloud_m: Float64[Tensor, "n 3"]) -> Float64[Tensor, "3 3"]:
-    """Intrinsic matrix of a camera to which neighbouring points of a cloud are a pixel apart.
+    """Make the intrinsic matrix of a camera to which neighbouring points are about a pixel apart.
 
-    The fourth neighbour of a pixel is as far as the first; of a cloud in which one surface is seen
-    through another, the first is much nearer than the points of one surface are.
+    Their spacing is the distance to the fourth neighbour, which in a grid is that of the first.
+    Where a cloud holds one surface behind another, the first neighbour may be of the other one.
     """
     rays = (cloud_m[:, :2] / cloud_m[:, 2:]).unique(dim=0)  # some clouds hold points twice
-    neighbours = min(_NEIGHBOURS + 1, len(rays))
-    apart, _ = KDTree(rays.numpy()).query(take_evenly(rays, 200).numpy(), neighbours, workers=1)
-    spacing = max(float(np.median(apart[:, -1])), FINEST_RAD)
+    count = min(_NEIGHBOURS + 1, len(rays))  # the nearest is the ray itself
+    distance, _ = KDTree(rays.numpy()).query(take_evenly(rays, 200).numpy(), count, workers=1)
+    spacing = max(float(np.median(distance[:, -1])), FINEST_RAD)
     focal_px = 1 / (_POINT_PX * spacing)
     return torch.diag(torch.tensor([focal_px, focal_px, 1.0], dtype=torch.float64))
 
 
+class Drawing(NamedTuple):
+    """A drawn surface, in the part of an image that it covers."""
+
+    depth_m: np.ndarray  #: (h, w), along the optical axis; NaN where nothing is drawn
+    cosine: np.ndarray  #: (h, w), between ray and normal
+    window: _Window  #: rows and columns of the part
+
+
 def draw_surface(
     surface: Surface, pose: Rigid, K: Float64[Tensor, "3 3"], height: int, width: int
-) -> tuple[np.ndarray, np.ndarray, tuple[slice, slice]]:
+) -> Drawing:
     """Draw a surface as a camera sees it: each sample as a disk in its tangent plane.
 
     Args:
@@ -182,32 +200,30 @@ def draw_surface(
         K: intrinsic matrix of the image.
         height: rows of the image.
         width: its columns.
-
-    Returns:
-        Depth along the optical axis, NaN where nothing is drawn, and the cosine between ray and
-        normal, of the rows and columns that the drawing covers; and these rows and columns.
     """
-    R, t_m = pose.R.double(), pose.t_m.double()
-    points_m = surface.points_m @ R.mT + t_m
+    # The samples that the camera may see.
+    R = pose.R.double()
+    points_m = surface.points_m @ R.mT + pose.t_m.double()
     is_facing = ((surface.outward @ R.mT) * points_m).sum(-1) <= 0
     is_drawn = (points_m[:, 2] > 0) & is_facing & ~surface.is_hidden
     pixel = ((points_m @ K.mT)[:, :2] / points_m[:, 2:]).round()
     is_drawn &= ((pixel >= 0) & (pixel < torch.tensor([width, height]))).all(-1)
-    nothing = slice(0, 0), slice(0, 0)
     if not bool(is_drawn.any()):
-        return np.empty((0, 0)), np.empty((0, 0)), nothing
+        return Drawing(np.empty((0, 0)), np.empty((0, 0)), (slice(0, 0), slice(0, 0)))
     # Single precision: the depth of a pixel is exact to a ten-millionth.
     points_m = points_m[is_drawn].float()
     normals = (surface.normals @ R.mT)[is_drawn].float()
     pixel = pixel[is_drawn].long()
 
-    # The pixels that a disk may cover, and where their rays meet its plane.
+    # The window that the disks cover.
     radius_m = _DISK * surface.spacing_m
     radius_px = radius_m * float(K[0, 0]) / float(points_m[:, 2].median())
     reach = math.ceil(radius_px)
     low = (pixel.amin(0) - reach).clamp(min=0)
     high = torch.minimum(pixel.amax(0) + reach + 1, torch.tensor([width, height]))
     drawn_width, drawn_height = (high - low).tolist()
+
+    # The pixels that each disk may cover, and where their rays meet its plane.
     steps = torch.arange(-reach, reach + 1)
     offsets = torch.cartesian_prod(steps, steps)
     offsets = offsets[offsets.square().sum(-1) <= (radius_px + 0.71) ** 2]
@@ -218,13 +234,13 @@ def draw_surface(
     x = (column.float() + (float(low[0]) - cx) - skew * y) / fx
     along = normals[:, :1] * x + normals[:, 1:2] * y + normals[:, 2:]
     depth_m = (normals * points_m).sum(-1, keepdim=True) / along
-    apart_m2 = (x * depth_m - points_m[:, :1]).square()
-    apart_m2 += (y * depth_m - points_m[:, 1:2]).square()
-    apart_m2 += (depth_m - points_m[:, 2:]).square()
-    is_hit = apart_m2 < radius_m**2
+    distance_m2 = (x * depth_m - points_m[:, :1]).square()
+    distance_m2 += (y * depth_m - points_m[:, 1:2]).square()
+    distance_m2 += (depth_m - points_m[:, 2:]).square()
+    is_hit = distance_m2 < radius_m**2
     is_hit &= (column >= 0) & (column < drawn_width) & (row >= 0) & (row < drawn_height)
 
-    # The nearest disk of each pixel is seen.
+    # The nearest disk of each pixel is visible.
     place = (row * drawn_width + column)[is_hit]
     depth_m = depth_m[is_hit]
     cosine = along[is_hit].abs() / (x[is_hit].square() + y[is_hit].square() + 1).sqrt()
@@ -235,10 +251,10 @@ def draw_surface(
     drawn_cosine[place[is_nearest]] = cosine[is_nearest]
     drawn_m = torch.where(nearest_m.isfinite(), nearest_m, torch.nan)
     (left, top), (right, bottom) = low.tolist(), high.tolist()
-    return (
-        drawn_m.view(drawn_height, drawn_width).numpy(),
-        drawn_cosine.view(drawn_height, drawn_width).numpy(),
-        (slice(top, bottom), slice(left, right)),
+    return Drawing(
+        depth_m=drawn_m.view(drawn_height, drawn_width).numpy(),
+        cosine=drawn_cosine.view(drawn_height, drawn_width).numpy(),
+        window=(slice(top, bottom), slice(left, right)),
     )
 
 
@@ -250,49 +266,29 @@ def compare(observation: Observation, pose: Rigid, surface: Surface) -> Evidence
         pose: ``camera_from_model``.
         surface: of the model.
     """
-    noise, step = observation.noise, observation.step
-    patch_area_px2 = observation.patch_px**2
-    drawn_m, cosine, window = draw_surface(surface, pose, observation.K, *observation.depth_m.shape)
-    depth_m = observation.depth_m[window]
-    is_object = observation.is_object[window]
-    is_read = np.isfinite(depth_m)
-    is_drawn = np.isfinite(drawn_m)
-    inner = _without_edges(drawn_m, is_drawn, surface.diameter_m, step)
-
-    # Residuals in standard deviations of their mean over some neighbours.
-    side = _averaged_side(step)
-    has_reading = is_read & inner
-    residual_m = np.where(has_reading, depth_m - drawn_m, 0).astype(np.float32)
-    # Cut off, so that a reading of the background at an edge does not decide for its neighbours.
-    limit_m = _CUT_OFF * noise.deviation_m(cosine, 1).astype(np.float32)
-    residual_m = np.clip(residual_m, -limit_m, limit_m)
-    filled = ndimage.uniform_filter(has_reading.astype(np.float32), side)
-    mean_m = ndimage.uniform_filter(residual_m, side)
-    # A pixel without a reading of its own has that of its neighbours: clouds are sparse.
-    is_compared = inner & (filled > _LEAST_FILLED)
-    mean_m = mean_m[is_compared] / filled[is_compared]
-    deviations = np.zeros_like(residual_m)
-    independent = side**2 // _ALIKE_READINGS
-    deviations[is_compared] = mean_m / noise.deviation_m(cosine[is_compared], independent)
-
-    # Patches that contradict the pose, and what supports it.
+    drawing = draw_surface(surface, pose, observation.K, *observation.depth_m.shape)
+    is_drawn = np.isfinite(drawing.depth_m)
+    inner = _without_edges(drawing.depth_m, is_drawn, surface.diameter_m, observation.step)
+    deviations, is_compared = _residual_deviations(observation, drawing, inner)
     is_supported = is_compared & (np.abs(deviations) <= THRESHOLD)
+
+    # Patches that contradict the pose. Beside the silhouette a mask says which readings are the
+    # object's; without one, those count that go on where the model ends.
+    patch_area_px2 = observation.patch_px**2
+    is_bulging = (deviations < -THRESHOLD) & observation.is_object[drawing.window]
     seen_through = _patch_area(deviations > THRESHOLD, patch_area_px2)
-    bulging = _patch_area((deviations < -THRESHOLD) & is_object, patch_area_px2)
+    bulging = _patch_area(is_bulging, patch_area_px2)
     if observation.is_masked:
-        is_beside = observation.is_object & np.isfinite(observation.depth_m)
-        border = max(1, round((EDGE_PX + 1) / step))
-        is_shown = np.zeros_like(is_beside)
-        is_shown[window] = is_drawn
-        is_beside &= np.logical_not(ndimage.binary_dilation(is_shown, iterations=border))
-        beside_px2 = patch_area_px2
-    else:  # no mask says which readings are the object's: those that go on where the model ends
-        is_beside = _is_continued(observation, is_drawn, is_supported, window)
+        is_beside = _is_beside_silhouette(observation, is_drawn, drawing.window)
+        beside = _patch_area(is_beside, patch_area_px2)
+    else:
+        is_beside = _is_continued(observation, is_drawn, is_supported, drawing.window)
         # A patch beside the silhouette is as long as others, and half as wide.
-        beside_px2 = patch_area_px2 / 2
+        beside = _patch_area(is_beside, patch_area_px2 / 2)
+
     visible = float(inner.sum()) / patch_area_px2
     supported = float(is_supported.sum()) / patch_area_px2
-    square = deviations[is_supported] ** 2
+    squares = deviations[is_supported] ** 2
     return Evidence(
         visible=visible,
         supported=supported,
@@ -300,31 +296,76 @@ def compare(observation: Observation, pose: Rigid, surface: Surface) -> Evidence
         unobserved=max(0.0, visible - supported - seen_through - bulging),
         seen_through=seen_through,
         bulging=bulging,
-        beside=_patch_area(is_beside, beside_px2),
-        rms=float(np.sqrt(square.mean())) if len(square) else THRESHOLD,
-        noise_m=noise.white_std_m,
+        beside=beside,
+        rms=float(np.sqrt(squares.mean())) if len(squares) else THRESHOLD,
+        noise_m=observation.noise.white_std_m,
     )
+
+
+def _residual_deviations(
+    observation: Observation, drawing: Drawing, inner: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Average residuals over neighbours, in standard deviations of their mean.
+
+    A pixel without a reading of its own has the mean of its neighbours: clouds are sparse.
+
+    Args:
+        observation: the readings.
+        drawing: of the posed surface.
+        inner: its pixels without those near edges, which alone are compared.
+
+    Returns:
+        Reading less drawn depth in deviations, 0 where nothing is compared; and the pixels that
+        are compared.
+    """
+    noise = observation.noise
+    depth_m = observation.depth_m[drawing.window]
+    has_residual = np.isfinite(depth_m) & inner
+    residual_m = np.where(has_residual, depth_m - drawing.depth_m, 0).astype(np.float32)
+    # Clipped, so that a reading of the background at an edge does not decide for its neighbours.
+    limit_m = _CUT_OFF * noise.deviation_m(drawing.cosine, 1).astype(np.float32)
+    residual_m = np.clip(residual_m, -limit_m, limit_m)
+
+    side = _averaged_side(observation.step)
+    filled_share = ndimage.uniform_filter(has_residual.astype(np.float32), side)
+    mean_m = ndimage.uniform_filter(residual_m, side)
+    is_compared = inner & (filled_share > _LEAST_FILLED)
+    mean_m = mean_m[is_compared] / filled_share[is_compared]
+    independent = side**2 // _CORRELATED_READINGS
+    deviations = np.zeros_like(residual_m)
+    deviations[is_compared] = mean_m / noise.deviation_m(drawing.cosine[is_compared], independent)
+    return deviations, is_compared
+
+
+def _is_beside_silhouette(
+    observation: Observation, is_drawn: np.ndarray, window: _Window
+) -> Bool[np.ndarray, "h w"]:
+    """Mark the object's readings that lie beside the silhouette, farther than an edge may move."""
+    border = max(1, round((EDGE_PX + 1) / observation.step))
+    is_silhouette = np.zeros(observation.depth_m.shape, bool)
+    is_silhouette[window] = is_drawn
+    is_near = ndimage.binary_dilation(is_silhouette, iterations=border)
+    return observation.is_object & np.isfinite(observation.depth_m) & np.logical_not(is_near)
 
 
 def _is_continued(
     observation: Observation,
     is_drawn: np.ndarray,
     is_supported: np.ndarray,
-    window: tuple[slice, slice],
+    window: _Window,
 ) -> Bool[np.ndarray, "h w"]:
     """Mark pixels beside the silhouette in which the surface within it goes on.
 
     At its silhouette an object ends: by a step in depth, or by a concave edge where it touches
-    something. A box that is posed on the side of a larger one ends where the readings go on
-    straight, and a bracket that is posed on two sides of a box where they bend away, as round a
-    corner of one body. Four means of readings on a line across the silhouette, two on each side,
-    say so; in 1 / depth those of one plane lie on a line. Readings on a known background are of no
-    object.
+    something. It does not end where the readings go on straight, as those of a larger box on whose
+    side a box is posed, or where they bend away, as round a corner of one body. This is decided by
+    four means of readings on a line across the silhouette, two on each side; in 1 / depth those of
+    one plane lie on a straight line. Readings on a known background are of no object.
 
     Args:
         observation: its readings, (h, w).
         is_drawn: pixels of the silhouette, in the window of the drawing.
-        is_supported: of these the ones on which readings lie.
+        is_supported: of these the ones whose readings support the pose.
         window: rows and columns of the drawing in the observation.
     """
     # The silhouette, in a window with a margin.
@@ -340,10 +381,10 @@ def _is_continued(
     shape = rows.stop - rows.start, columns.stop - columns.start
     is_silhouette = np.zeros(shape, bool)
     is_silhouette[inset] = is_drawn
-    supports = np.zeros(shape, bool)
-    supports[inset] = is_supported
+    is_support = np.zeros(shape, bool)
+    is_support[inset] = is_supported
 
-    # The pixels beside the silhouette, and the nearest of the silhouette.
+    # The pixels beside the silhouette, and the pixel of the silhouette nearest to each.
     distance, nearest = cast(
         "tuple[np.ndarray, np.ndarray]",
         ndimage.distance_transform_edt(~is_silhouette, return_indices=True),
@@ -352,7 +393,7 @@ def _is_continued(
     edge = nearest[:, beside[0], beside[1]]
     outward = beside - edge
 
-    # Means of readings on the line across it at each.
+    # Means of readings on the line across the silhouette through each pixel.
     is_background = observation.is_background[rows, columns]
     depth_m = np.where(is_background, np.nan, observation.depth_m[rows, columns])
     side = _averaged_side(observation.step)
@@ -363,23 +404,24 @@ def _is_continued(
         row, column = np.clip(pixel, 0, np.array(shape)[:, None] - 1)
         across.append(inverse[row, column])
         if k == _NEAREST_WITHIN:
-            across[-1] = np.where(supports[row, column], across[-1], np.nan)
+            across[-1] = np.where(is_support[row, column], across[-1], np.nan)
 
-    # Do the two sides meet there, and is the edge not concave?
-    apart_px = 0.5 * distance[tuple(beside)]
-    moved_px = EDGE_PX / observation.step
     noise_m = math.hypot(AVERAGED_PER_WHITE * observation.noise.white_std_m, FLAT_M)
     is_continued = np.zeros((height, width), bool)
-    is_continued[rows, columns][tuple(beside)] = _goes_on(
-        np.stack(across), apart_px, moved_px, noise_m
+    is_continued[rows, columns][tuple(beside)] = _is_joined_across(
+        np.stack(across),
+        spacing_px=0.5 * distance[tuple(beside)],
+        edge_px=EDGE_PX / observation.step,
+        noise_m=noise_m,
     )
     return ndimage.binary_closing(is_continued)
 
 
-def _goes_on(
+def _is_joined_across(
     inverse: Float[np.ndarray, "4 n"],
-    apart_px: Float[np.ndarray, " n"],
-    moved_px: float,
+    *,
+    spacing_px: Float[np.ndarray, " n"],
+    edge_px: float,
     noise_m: float,
 ) -> Bool[np.ndarray, " n"]:
     """Whether a surface goes on across a silhouette: straight, or bent away.
@@ -387,8 +429,8 @@ def _goes_on(
     Args:
         inverse: 1 / depth [1/m] at the places of ``_ACROSS``, from within to outside; NaN where
             there is none.
-        apart_px: distance of the two within, and of the two outside.
-        moved_px: by so much a sensor moves edges.
+        spacing_px: distance of the two places within, and of the two outside.
+        edge_px: distance by which a sensor moves edges.
         noise_m: standard deviation of the depths.
     """
     far_within, within, outside, far_outside = inverse
@@ -400,8 +442,8 @@ def _goes_on(
     gap = np.abs(within_edge - outside_edge)
     bend = (far_outside - outside) - (within - far_within)
     # Where they bend, a moved edge leaves a gap at the silhouette.
-    moved_gap = moved_px * np.abs(bend) / apart_px
-    is_joined = gap <= _MEETING * math.sqrt(10) * noise + moved_gap
+    edge_gap = edge_px * np.abs(bend) / spacing_px
+    is_joined = gap <= _MEETING * math.sqrt(10) * noise + edge_gap
 
     # Concave, the surface comes nearer outside. The bend has the variance of four means.
     is_concave = bend > _MEETING * 2 * noise
@@ -414,7 +456,7 @@ def _averaged_side(step: int) -> int:
 
 
 def _mean_depth(depth_m: np.ndarray, side: int) -> np.ndarray:
-    """Mean of the readings in a square about each pixel that has one; NaN where it has none."""
+    """Average readings over a square about each pixel that has one; NaN for other pixels."""
     is_read = np.isfinite(depth_m)
     filled = ndimage.uniform_filter(is_read.astype(np.float32), side)
     mean_m = ndimage.uniform_filter(np.where(is_read, depth_m, 0).astype(np.float32), side)
@@ -424,13 +466,15 @@ def _mean_depth(depth_m: np.ndarray, side: int) -> np.ndarray:
 def _without_edges(
     drawn_m: np.ndarray, is_drawn: np.ndarray, diameter_m: float, step: int
 ) -> np.ndarray:
-    """Leave out what is near an edge of the drawing, which a sensor moves by some pixels."""
+    """Mark the drawn pixels that are not near an edge, which a sensor moves by some pixels.
+
+    The border left out is narrowed where less than a quarter of the drawing would remain.
+    """
     jump_m = max(_JUMP_M, _JUMP_DIAMETERS * diameter_m)
     nearest_m = ndimage.minimum_filter(np.where(is_drawn, drawn_m, _FAR_M), 3)
     farthest_m = ndimage.maximum_filter(np.where(is_drawn, drawn_m, -_FAR_M), 3)
     is_edge = farthest_m - nearest_m > jump_m
     surface = is_drawn & ~is_edge
-    # Of what is thinner than two borders the middle remains.
     for border in range(math.ceil(EDGE_PX / step), 0, -1):
         inner = ndimage.binary_erosion(surface, iterations=border)
         if inner.sum() >= _LEAST_INNER * is_drawn.sum():
@@ -439,10 +483,13 @@ def _without_edges(
 
 
 def _patch_area(mask: Bool[np.ndarray, "h w"], patch_area_px2: float) -> float:
-    """Area of the connected patches in a mask that are no accident, in independent patches."""
+    """Add up the areas of connected patches in a mask, in independent patches.
+
+    Patches too small to be more than accidents are left out.
+    """
     labels = np.zeros(mask.shape, np.int32)
     ndimage.label(mask, output=labels)
     areas_px = np.bincount(labels.ravel())[1:]
     areas_px = areas_px[areas_px >= _LEAST_PATCH * patch_area_px2]
-    # What remains is wider than a sensor moves an edge: it is one observation at least.
+    # A patch that remains is wider than a sensor moves an edge: it is one observation at least.
     return float(np.maximum(areas_px / patch_area_px2, 1.0).sum())

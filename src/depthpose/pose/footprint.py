@@ -1,13 +1,14 @@
-"""Where a posed surface lies in an image: what it explains there, and what is about it."""
+"""The footprint of a posed surface in an image: the readings that it explains, and its rim."""
 
 import math
 from dataclasses import replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from depthpose.core.camera import back_project, project
+from depthpose.core.camera.pinhole import crop_intrinsics
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import grow_mask
 from depthpose.pose.frame import Frame, is_on_plane, largest_plane, share_behind
@@ -15,104 +16,134 @@ from depthpose.pose.sensor import EDGE_PX
 from depthpose.pose.surface import NEAR, Surface
 from depthpose.pose.types import KnownBackground, ViewInput
 
-_FLAT = 0.9
-"""What lies on one plane by so large a share is flat: anything of its outline looks the same."""
-_CONTINUED = 0.4
-"""Where the plane goes on beside so much of it, the outline is a cut through something larger."""
-_RIM = 0.05
-"""Width of what is looked at beside it, in diameters."""
+_FLAT_SHARE = 0.9
+"""A footprint is flat where at least so much of it lies on one plane: anything with its outline
+looks the same."""
+_CONTINUED_SHARE = 0.4
+"""Where so much of the rim lies on that plane, the outline is cut out of something larger."""
+_RIM_DIAMETERS = 0.05
+"""Width of the rim beside a footprint that is examined."""
 _REGION_MARGIN = 0.5
-"""Of the larger side of a region: so far about it planes and neighbours are looked at."""
-_SUNK = 0.05
-"""Of a surface no larger share lies in a bin, table or wall: its pose is off by less."""
+"""Margin about a region in which planes and neighbours are examined, of its larger side."""
+_MOST_SUNK = 0.05
+"""Largest share of a right surface in a bin, table or wall: its pose is off by less."""
 
 
-def explained_mask(image: Frame | ViewInput, pose: Rigid, surface: Surface) -> Bool[Tensor, "h w"]:
-    """Mark the pixels whose points lie on a posed surface; in a frame, none of its background."""
-    pose = pose.double()
-    window = _pixels_about(image, pose, surface)
-    depth_m = image.depth_m[window].double()
-    if isinstance(image, Frame):
-        points_m = image.points_m[window]
-        is_explained = (depth_m > 0) & image.may_show(surface.diameter_m)[window]
-    else:
-        points_m = back_project(depth_m, _window_intrinsics(image.K, window).double())
-        is_explained = points_m.isfinite().all(-1) & image.mask[window]
-    local_m = pose.inverse().apply(points_m[is_explained])
-    distance_m = (local_m - surface.points_m[surface.boxes.look_up(local_m)]).norm(dim=-1)
-    # The nearest sample is nearer than the one of the box by its diagonal at most.
-    limit_m = NEAR * surface.diameter_m
-    is_open = (distance_m >= limit_m) & (distance_m < limit_m + math.sqrt(3) * surface.boxes.side_m)
-    nearest_m = surface.points_m[surface.nearest(local_m[is_open])]
-    distance_m[is_open] = (local_m[is_open] - nearest_m).norm(dim=-1)
-    is_explained[is_explained.clone()] = distance_m < limit_m
-    explained = torch.zeros(image.depth_m.shape, dtype=torch.bool)
-    explained[window] = is_explained
+def explained_mask(view: ViewInput, pose: Rigid, surface: Surface) -> Bool[Tensor, "h w"]:
+    """Mark the pixels in a view's mask whose readings lie on a posed surface."""
+    window = _window_of_pose(view.depth_m.shape, view.K, pose, surface)
+    part = _crop_view(view, window)
+    points_m = back_project(part.depth_m.double(), part.K.double())
+    is_candidate = points_m.isfinite().all(-1) & part.mask
+    explained = torch.zeros(view.depth_m.shape, dtype=torch.bool)
+    explained[window] = _lies_on_surface(points_m, is_candidate, pose, surface)
     return explained
 
 
-def _pixels_about(image: Frame | ViewInput, pose: Rigid, surface: Surface) -> tuple[slice, slice]:
-    """Rows and columns in which a posed surface lies, with a margin."""
-    height, width = image.depth_m.shape
+def explained_frame_mask(frame: Frame, pose: Rigid, surface: Surface) -> Bool[Tensor, "h w"]:
+    """Mark the pixels of a frame, outside its background, whose readings lie on a posed surface."""
+    window = _window_of_pose(frame.depth_m.shape, frame.K, pose, surface)
+    is_candidate = (frame.depth_m[window] > 0) & frame.may_show(surface.diameter_m)[window]
+    explained = torch.zeros(frame.depth_m.shape, dtype=torch.bool)
+    explained[window] = _lies_on_surface(frame.points_m[window], is_candidate, pose, surface)
+    return explained
+
+
+def _lies_on_surface(
+    points_m: Float64[Tensor, "h w 3"],
+    is_candidate: Bool[Tensor, "h w"],
+    pose: Rigid,
+    surface: Surface,
+) -> Bool[Tensor, "h w"]:
+    """Mark the candidates among points of the camera frame that lie on a posed surface."""
+    local_m = pose.double().inverse().apply(points_m[is_candidate])
+    distance_m = (local_m - surface.points_m[surface.boxes.look_up(local_m)]).norm(dim=-1)
+
+    # The sample of a point's box is farther than its nearest one by the box's diagonal at most:
+    # only between these limits the nearest is searched.
+    limit_m = NEAR * surface.diameter_m
+    diagonal_m = math.sqrt(3) * surface.boxes.side_m
+    is_undecided = (distance_m >= limit_m) & (distance_m < limit_m + diagonal_m)
+    nearest_m = surface.points_m[surface.nearest(local_m[is_undecided])]
+    distance_m[is_undecided] = (local_m[is_undecided] - nearest_m).norm(dim=-1)
+
+    is_explained = is_candidate.clone()
+    is_explained[is_candidate] = distance_m < limit_m
+    return is_explained
+
+
+def _window_of_pose(
+    shape: tuple[int, ...], K: Float[Tensor, "3 3"], pose: Rigid, surface: Surface
+) -> tuple[slice, slice]:
+    """Give the rows and columns in which a posed surface lies, with a margin; clipped to the image.
+
+    ``shape`` is (height, width) of the image. Nothing of a surface behind the camera lies in it.
+    """
+    height, width = shape
     posed_m = pose.double().apply(surface.points_m)
-    pixel = project(posed_m[posed_m[:, 2] > 0], image.K.double())
+    pixel = project(posed_m[posed_m[:, 2] > 0], K.double())
     if len(pixel) == 0:
         return slice(0, 0), slice(0, 0)
     low = pixel.amin(0)
     high = pixel.amax(0)
     margin = 0.1 * (high - low) + 2 * EDGE_PX
-    left, top = (low - margin).floor().tolist()
-    right, bottom = (high + margin).ceil().tolist()
-    rows = slice(min(max(int(top), 0), height), min(max(int(bottom) + 1, 0), height))
-    columns = slice(min(max(int(left), 0), width), min(max(int(right) + 1, 0), width))
+    left, top = (int(value) for value in (low - margin).floor().tolist())
+    right, bottom = (int(value) for value in (high + margin).ceil().tolist())
+    rows = slice(min(max(top, 0), height), min(max(bottom + 1, 0), height))
+    columns = slice(min(max(left, 0), width), min(max(right + 1, 0), width))
     return rows, columns
 
 
-def _window_intrinsics(
-    K: Float[Tensor, "3 3"], window: tuple[slice, slice]
-) -> Float[Tensor, "3 3"]:
-    """Intrinsic matrix of a part of an image."""
-    K = K.clone()
-    K[0, 2] -= window[1].start
-    K[1, 2] -= window[0].start
-    return K
-
-
 def window_of_region(view: ViewInput) -> ViewInput:
-    """Cut a view about its mask, with a margin in which planes and neighbours show."""
-    rows, columns = view.mask.any(1).nonzero()[:, 0], view.mask.any(0).nonzero()[:, 0]
+    """Crop a view to its mask, with a margin in which planes and neighbours are visible."""
+    rows = view.mask.any(1).nonzero()[:, 0]
+    columns = view.mask.any(0).nonzero()[:, 0]
     if len(rows) == 0:
         return view
-    margin = int(_REGION_MARGIN * max(int(rows[-1] - rows[0]), int(columns[-1] - columns[0])))
-    part = (
-        slice(max(int(rows[0]) - margin, 0), int(rows[-1]) + margin + 1),
-        slice(max(int(columns[0]) - margin, 0), int(columns[-1]) + margin + 1),
+    top, bottom = int(rows[0]), int(rows[-1])
+    left, right = int(columns[0]), int(columns[-1])
+    margin = int(_REGION_MARGIN * max(bottom - top, right - left))
+    window = (
+        slice(max(top - margin, 0), bottom + margin + 1),
+        slice(max(left - margin, 0), right + margin + 1),
     )
-    return _cut(view, part)
+    return _crop_view(view, window)
 
 
-def _cut(view: ViewInput, part: tuple[slice, slice]) -> ViewInput:
-    """Cut a part out of a view."""
-    K = _window_intrinsics(view.K, part)
+def _crop_view(view: ViewInput, window: tuple[slice, slice]) -> ViewInput:
+    """Crop a view to rows and columns of its image."""
     background = view.background
     if background is not None:
         background = KnownBackground(
-            depth_m=background.depth_m[part], is_seen=background.is_seen[part]
+            depth_m=background.depth_m[window], is_seen=background.is_seen[window]
         )
+    rows, columns = window
     return replace(
-        view, depth_m=view.depth_m[part], mask=view.mask[part], K=K, background=background
+        view,
+        depth_m=view.depth_m[window],
+        mask=view.mask[window],
+        K=crop_intrinsics(view.K, left=columns.start, top=rows.start),
+        background=background,
     )
 
 
 def why_background_excludes(frame: Frame, view: ViewInput, pose: Rigid, surface: Surface) -> str:
-    """Say why the background of an image excludes a pose; nothing where it does not."""
+    """Say why the background of an image excludes a pose; an empty text where it does not.
+
+    Args:
+        frame: of the whole image, whose backgrounds count.
+        view: in which the pose was found.
+        pose: ``camera_from_model``.
+        surface: of the model.
+    """
     if is_cut_out(view, pose, surface, frame.noise_per_m2):
         return "it would be cut out of a plane that goes on beside it"
     points_m = pose.apply(surface.points_m)
-    wider = [other for other in frame.backgrounds if other.diameter_m >= surface.diameter_m]
-    for background in wider:
+    for background in frame.backgrounds:
+        if background.diameter_m < surface.diameter_m:  # the plane may be a side of the object
+            continue
         share = share_behind(frame, background, points_m, NEAR * surface.diameter_m)
-        if share > _SUNK:
+        if share > _MOST_SUNK:
             return f"{share:.0%} of it would lie in the bin, table or wall before which it is seen"
     return ""
 
@@ -126,17 +157,23 @@ def is_cut_out(view: ViewInput, pose: Rigid, surface: Surface, noise_per_m2: flo
         surface: of its model.
         noise_per_m2: of the view, as of :class:`~depthpose.pose.frame.Frame`.
     """
-    window = _cut(view, _pixels_about(view, pose, surface))
-    explained = explained_mask(window, pose, surface)
-    points_m = back_project(window.depth_m.double(), window.K.double())
-    plane = largest_plane(points_m[explained], torch.Generator().manual_seed(0), noise_per_m2)
+    # Is the footprint flat?
+    part = _crop_view(view, _window_of_pose(view.depth_m.shape, view.K, pose, surface))
+    explained = explained_mask(part, pose, surface)
+    points_m = back_project(part.depth_m.double(), part.K.double())
+    footprint_m = points_m[explained]
+    plane = largest_plane(footprint_m, torch.Generator().manual_seed(0), noise_per_m2)
     if plane is None:
         return False
-    if float(is_on_plane(points_m[explained], plane, noise_per_m2).double().mean()) < _FLAT:
+    flat_share = float(is_on_plane(footprint_m, plane, noise_per_m2).double().mean())
+    if flat_share < _FLAT_SHARE:
         return False
-    pixel_m = float(points_m[explained][:, 2].median() / window.K[0, 0])
-    reach = EDGE_PX + math.ceil(_RIM * surface.diameter_m / pixel_m)
-    rim = grow_mask(explained, reach) & ~grow_mask(explained, EDGE_PX)
-    if window.background is not None:
-        rim &= ~window.background.is_seen
-    return float(is_on_plane(points_m[rim], plane, noise_per_m2).double().mean()) > _CONTINUED
+
+    # Does its plane go on in the rim? Readings at the edge itself may be of either side.
+    pixel_m = float(footprint_m[:, 2].median() / part.K[0, 0])
+    reach_px = EDGE_PX + math.ceil(_RIM_DIAMETERS * surface.diameter_m / pixel_m)
+    is_rim = grow_mask(explained, reach_px) & ~grow_mask(explained, EDGE_PX)
+    if part.background is not None:
+        is_rim &= ~part.background.is_seen
+    rim_share = float(is_on_plane(points_m[is_rim], plane, noise_per_m2).double().mean())
+    return rim_share > _CONTINUED_SHARE

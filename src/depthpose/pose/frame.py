@@ -21,29 +21,37 @@ from depthpose.pose.types import KnownBackground
 _MOST_PIXELS = 110_000
 """Of a larger image every n-th row and column is used, so that about so many pixels remain."""
 _OBJECT_PX = 60
-"""Pixels that an object is wide at least, if the image has them."""
+"""Least width of the smallest object in the thinned image, if the full image has so many pixels."""
 _WINDOW = 3
-"""Pixels to each side of one through which its plane is laid."""
-_FILLED = 0.4
-"""Least share of the window that is of the same surface."""
-_BENDINGS = 3
-"""A sensor bends walls: what lies on a plane is found again so often, each time bent as it was."""
-_ALONG = math.cos(math.radians(20))
+"""Reach, in pixels to each side, of the window in which the normal of a pixel is fitted."""
+_LEAST_FILLED = 0.4
+"""Least share of that window that is of the same surface as the pixel."""
+_LEAST_SPREAD_PX4 = 0.3
+"""Least determinant of the second moments of the pixels that a normal is fitted to."""
 _JUMP_M = 0.004
 _JUMP_PER_M = 0.012
 """Neighbours are of one surface up to this difference in depth, and this share of it."""
-_PLANES = 6
-_HYPOTHESES = 400
-_SAMPLE = 4000
+
+# Wide planes.
+_MOST_PLANES = 6
+_HYPOTHESES = 400  # of RANSAC
+_REFITS = 3  # of a plane to the readings on it
+_SAMPLE = 4000  # readings by which a plane is found
 _LEAST_SHARE = 0.04
 """Of the readings: a plane of fewer is no table or wall."""
 _LEAST_POINTS = 60
-_SEEN_BEHIND = 0.08
-"""Of the readings within its outline no more lie behind a table or wall. Real ones have up to 4 %,
-planes through the tops of several parts from 12 % on."""
-_WIDER, _LONGER = 1.3, 3.0
-"""A plane that is wider than an object by so much is none of its sides; nor is one that is so much
-longer, but for sides of several that lie in one plane and touch."""
+_BEND_REFITS = 3
+"""Fits of how the sensor bends a plane, each to the readings on the fit before."""
+_PARALLEL_COSINE = math.cos(math.radians(20))
+"""Least cosine between a plane's normal and that of a reading that it may hold."""
+_MOST_BEHIND = 0.08
+"""Largest share of the readings within the outline of a table or wall that lie behind it. Real ones
+have up to 4 %, planes through the tops of several parts from 12 % on."""
+_WIDTH_RATIO = 1.3
+_LENGTH_RATIO = 3.0
+"""A plane that is wider than an object's diameter by the first ratio is none of its sides, nor is
+one longer by the second. The second is larger for sides of several objects that lie in one plane
+and touch."""
 
 
 Plane = tuple[Float64[Tensor, "3"], Float64[Tensor, ""]]
@@ -55,15 +63,15 @@ class Frame:
     """A depth image, thinned to some hundred thousand pixels.
 
     Attributes:
-        step: every so many rows and columns of the image are used.
+        step: every ``step``-th row and column of the image is used.
         depth_m: 0 where there is no reading.
         K: of the thinned image.
         points_m: in the camera frame.
         normals: toward the camera.
         is_smooth: where a normal is known.
-        background_limit_m: up to this diameter [m] an object is too small to have the wide plane at
-            a pixel as a side, so that for it the pixel is background; infinite on a known
-            background, 0 elsewhere. What it means for an object is :meth:`may_show`.
+        background_limit_m: largest diameter [m] of an object for which the pixel is background: the
+            wide plane there is too large to be a side of it. Infinite on a known background, 0
+            where there is none.
         nearest_m: least depth of the pixels up to two away; infinite where none has a reading.
         noise_per_m2: standard deviation of a reading, for the square of the depth in metres.
         backgrounds: the known one, and the wide planes.
@@ -81,7 +89,7 @@ class Frame:
     backgrounds: Sequence["Background"]
 
     def may_show(self, diameter_m: float) -> Bool[Tensor, "h w"]:
-        """Mark the pixels that are of no background before which an object so large lies."""
+        """Mark the pixels that are no background for an object of this diameter."""
         return self.background_limit_m < diameter_m
 
 
@@ -90,9 +98,9 @@ class Background:
     """A surface before which objects lie: a known bin or table, or a wide plane.
 
     Attributes:
-        depth_m: at which the ray of a pixel meets it, behind objects too; infinite where it does
-            not, or nothing is known.
-        diameter_m: up to which no object has it as a side, as ``Frame.background_limit_m``.
+        depth_m: at which the ray of a pixel meets it, also behind objects; infinite where the ray
+            does not meet it, or that is not known.
+        diameter_m: largest diameter of an object that cannot have it as a side.
     """
 
     depth_m: Float64[Tensor, "h w"]
@@ -105,10 +113,10 @@ def prepare_frame(
     smallest_m: float | None = None,
     known: KnownBackground | None = None,
 ) -> Frame:
-    """Lay a plane through the neighbours of each pixel, and find the background.
+    """Thin a depth image, fit a normal at each pixel, and find the background.
 
-    Beside the known one it is the widest planes, which are found one after the other by RANSAC
-    (Fischler and Bolles 1981) and refitted.
+    The background is the known one and, elsewhere, the widest planes, which are found one after the
+    other by RANSAC (Fischler and Bolles 1981).
 
     Args:
         depth_m: along the optical axis; NaN or 0 where there is no reading.
@@ -117,24 +125,18 @@ def prepare_frame(
             much that it would be few pixels wide.
         known: background that is known, of the whole image.
     """
-    # Thinned, but not so much that the smallest object would be few pixels wide.
     depth_m = torch.where(depth_m.isfinite() & (depth_m > 0), depth_m, 0.0).double()
     noise_per_m2 = measure_noise_per_m2(depth_m)
-    step = math.ceil(math.sqrt(depth_m.numel() / _MOST_PIXELS))
-    is_read = depth_m > 0
-    if smallest_m is not None and bool(is_read.any()):
-        object_px = smallest_m * float(K[0, 0]) / float(depth_m[is_read].median())
-        step = min(step, max(1, math.floor(object_px / _OBJECT_PX)))
+    step = _thinning_step(depth_m, float(K[0, 0]), smallest_m)
     depth_m = depth_m[::step, ::step]
     K = K.double() / torch.tensor([[step], [step], [1]])
-
     points_m = back_project(depth_m, K)
-    normals, is_smooth = _normals(depth_m, points_m, K)
+    normals, is_smooth = _fit_normals(depth_m, points_m, K)
 
-    # The background: a known one, and elsewhere wide planes.
+    # A known background is not searched for planes: one before it is made of objects.
     is_searched = depth_m > 0
     backgrounds: list[Background] = []
-    if known is not None:  # a plane before a known background is made of objects
+    if known is not None:
         known_m = known.depth_m[::step, ::step].double().nan_to_num(torch.inf)
         is_searched &= ~known_m.isfinite()
         backgrounds.append(Background(depth_m=known_m, diameter_m=math.inf))
@@ -143,7 +145,9 @@ def prepare_frame(
     backgrounds += planes
     if known is not None:
         limit_m[known.is_seen[::step, ::step] & (limit_m == 0)] = torch.inf
-    nearest_m = -max_pool2d(-torch.where(depth_m > 0, depth_m, torch.inf)[None], 5, 1, 2)[0]
+
+    read_m = torch.where(depth_m > 0, depth_m, torch.inf)
+    nearest_m = -max_pool2d(-read_m[None], 5, 1, 2)[0]
     return Frame(
         step=step, depth_m=depth_m, K=K, points_m=points_m, normals=normals, is_smooth=is_smooth,
         background_limit_m=limit_m, nearest_m=nearest_m, noise_per_m2=noise_per_m2,
@@ -151,10 +155,26 @@ def prepare_frame(
     )  # fmt: skip
 
 
-def _normals(
+def _thinning_step(
+    depth_m: Float64[Tensor, "h w"], focal_px: float, smallest_m: float | None
+) -> int:
+    """Say of how many rows and columns one is used: few pixels remain, but enough of an object."""
+    step = math.ceil(math.sqrt(depth_m.numel() / _MOST_PIXELS))
+    is_read = depth_m > 0
+    if smallest_m is None or not bool(is_read.any()):
+        return step
+    object_px = smallest_m * focal_px / float(depth_m[is_read].median())
+    return min(step, max(1, math.floor(object_px / _OBJECT_PX)))
+
+
+def _fit_normals(
     depth_m: Float64[Tensor, "h w"], points_m: Float64[Tensor, "h w 3"], K: Float64[Tensor, "3 3"]
 ) -> tuple[Float64[Tensor, "h w 3"], Bool[Tensor, "h w"]]:
-    """Fit 1 / depth, which is linear in the picture of a plane, in a window of the same surface."""
+    """Fit a plane to each pixel and its neighbours; give its normal, and where the fit is good.
+
+    In the image of a plane 1 / depth is linear in x and y: its slopes are fitted by least squares
+    in a window, to the pixels that are of the same surface as the middle one.
+    """
     height, width = depth_m.shape
     depth_m = depth_m.float()  # differences of neighbours are exact enough, and twice as fast
     inverse = torch.where(depth_m > 0, 1 / depth_m, 0.0)
@@ -162,15 +182,15 @@ def _normals(
     padded = pad(inverse, (_WINDOW,) * 4)
     side = 2 * _WINDOW + 1
 
-    # Sums over the neighbours of the same surface: their number, the places x and y, what q their
-    # 1 / depth is beyond that of the middle, and products of these.
+    # Sums over the neighbours of the same surface: their number n, their offsets x and y [px], the
+    # difference q of their 1 / depth to that of the middle, and products of these.
     n, x, y, q, xx, xy, yy, xq, yq = depth_m.new_zeros(9, height, width)
     for down in range(-_WINDOW, _WINDOW + 1):
         for right in range(-_WINDOW, _WINDOW + 1):
             top, left = _WINDOW + down, _WINDOW + right
-            other = padded[top : top + height, left : left + width]
-            gap = other - inverse
-            is_same = ((other > 0) & (gap.abs() < limit)).to(depth_m)
+            neighbour = padded[top : top + height, left : left + width]
+            gap = neighbour - inverse
+            is_same = ((neighbour > 0) & (gap.abs() < limit)).to(depth_m)
             gap = gap * is_same
             n += is_same
             x += right * is_same
@@ -193,12 +213,14 @@ def _normals(
     a = (xq * yy - yq * xy) / spread.clamp(min=1e-9)
     b = (yq * xx - xq * xy) / spread.clamp(min=1e-9)
 
-    # n . X = -1 for the ray (x', y', 1): 1 / depth = -(n_x x' + n_y y' + n_z).
+    # The plane n . X = -1 has 1 / depth = -(n_x x' + n_y y' + n_z) on the ray (x', y', 1).
     along = torch.stack([a * K[0, 0], b * K[1, 1]], -1)
     ray = torch.where((depth_m > 0)[..., None], points_m[..., :2] * inverse[..., None], 0.0)
     last = inverse + q - a * x - b * y - (along * ray).sum(-1)
     normals = -normalize(torch.cat([along, last[..., None]], -1), dim=-1)
-    return normals.double(), (n >= _FILLED * side * side) & (spread > 0.3) & (depth_m > 0)
+    is_filled = n >= _LEAST_FILLED * side * side
+    is_smooth = is_filled & (spread > _LEAST_SPREAD_PX4) & (depth_m > 0)
+    return normals.double(), is_smooth
 
 
 def _wide_planes(
@@ -209,7 +231,7 @@ def _wide_planes(
     noise_per_m2: float,
     is_searched: Bool[Tensor, "h w"],
 ) -> tuple[list[Background], Float64[Tensor, "h w"]]:
-    """Find wide planes one after the other by RANSAC; give them and ``Frame.background_limit_m``.
+    """Find tables and walls one after the other; give them and ``Frame.background_limit_m``.
 
     Args:
         depth_m: 0 where there is no reading.
@@ -219,123 +241,173 @@ def _wide_planes(
         noise_per_m2: as in :class:`Frame`.
         is_searched: readings that may be of a plane.
     """
-    is_left = is_searched.clone()  # of no plane yet
+    is_free = is_searched.clone()  # of no plane yet
     limit_m = torch.zeros_like(depth_m)
     planes: list[Background] = []
-    least = max(_LEAST_POINTS, _LEAST_SHARE * int((depth_m > 0).sum()))
+    least_px = max(_LEAST_POINTS, _LEAST_SHARE * int((depth_m > 0).sum()))
     generator = torch.Generator().manual_seed(0)
-    for _ in range(_PLANES):
+    for _ in range(_MOST_PLANES):
         # The plane of the most readings.
-        plane = largest_plane(points_m[is_left], generator, noise_per_m2)
+        plane = largest_plane(points_m[is_free], generator, noise_per_m2)
         if plane is None:
             break
-        is_near = is_on_plane(points_m, plane, noise_per_m2) & is_left
-        if int(is_near.sum()) < least:
+        is_near = is_on_plane(points_m, plane, noise_per_m2) & is_free
+        if int(is_near.sum()) < least_px:
             break
 
-        # The largest connected piece of it, and all that joins such pieces as the sensor bends it.
-        is_along = is_left & ((normals @ plane[0]).abs() > _ALONG)
-        is_bent = is_near | _bent(points_m, plane, is_near, is_along, noise_per_m2)
-        label = label_regions(depth_m, is_bent)
-        near_px = torch.bincount(label[is_near], minlength=int(label.max()) + 1)
-        bent_px = torch.bincount(label[is_bent], minlength=len(near_px))
-        piece = is_near & (label == near_px.argmax())
-        is_left &= ~is_near
-        if int(piece.sum()) < least:
+        # Its largest connected piece, and the pieces of the surface as the sensor bends it.
+        is_parallel = is_free & ((normals @ plane[0]).abs() > _PARALLEL_COSINE)
+        is_bent = is_near | _is_on_bent_plane(points_m, plane, is_near, is_parallel, noise_per_m2)
+        piece, surface = _pieces_of_plane(depth_m, is_near, is_bent)
+        is_free &= ~is_near
+        if int(piece.sum()) < least_px:
             continue
-        joined = (near_px > 0.5 * bent_px)[label] & is_bent
-        is_left &= ~joined
+        is_free &= ~surface
 
-        # Nothing is seen behind a table or wall; a plane through the tops of parts has gaps.
-        on_rays_m = plane[1] / (rays @ plane[0])
-        on_rays_m = torch.where(on_rays_m > 0, on_rays_m, torch.inf)
-        is_behind = depth_m > on_rays_m + 2 * plane_tolerance_m(on_rays_m, noise_per_m2)
-        is_read_within = _outline(joined) & (depth_m > 0)
-        if float(is_behind[is_read_within].double().mean()) > _SEEN_BEHIND:
+        # No readings lie behind a table or wall; a plane through the tops of parts has gaps.
+        plane_depth_m = plane[1] / (rays @ plane[0])
+        plane_depth_m = torch.where(plane_depth_m > 0, plane_depth_m, torch.inf)
+        behind_share = _share_of_readings_behind(depth_m, plane_depth_m, surface, noise_per_m2)
+        if behind_share > _MOST_BEHIND:
             continue
 
-        # An object of up to this diameter has no side as wide or as long.
-        some = take_evenly(points_m[piece], _SAMPLE)
-        offset = some - some.mean(0)
-        _, axes = torch.linalg.eigh(offset.T @ offset)
-        along = offset @ axes[:, 1:]
-        width_m, length_m = (along.quantile(0.95, 0) - along.quantile(0.05, 0)).tolist()
-        diameter_m = max(width_m / _WIDER, length_m / _LONGER)
-        limit_m[joined] = diameter_m
-        planes.append(Background(depth_m=on_rays_m, diameter_m=diameter_m))
+        diameter_m = _largest_diameter_without_side(points_m[piece])
+        limit_m[surface] = diameter_m
+        planes.append(Background(depth_m=plane_depth_m, diameter_m=diameter_m))
     return planes, limit_m
 
 
-def _outline(mask: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
-    """Fill a mask: what lies between two of its pixels both in its row and in its column."""
+def _pieces_of_plane(
+    depth_m: Float64[Tensor, "h w"], is_near: Bool[Tensor, "h w"], is_bent: Bool[Tensor, "h w"]
+) -> tuple[Bool[Tensor, "h w"], Bool[Tensor, "h w"]]:
+    """Give the largest connected piece of a plane, and all of the bent plane that belongs to it.
+
+    Args:
+        depth_m: 0 where there is no reading.
+        is_near: readings on the flat plane.
+        is_bent: readings on the plane as the sensor bends it, those on the flat one among them.
+
+    Returns:
+        The flat readings of the largest piece; and the bent pieces that are flat by half or more.
+    """
+    label = label_regions(depth_m, is_bent)
+    near_px = torch.bincount(label[is_near], minlength=int(label.max()) + 1)
+    bent_px = torch.bincount(label[is_bent], minlength=len(near_px))
+    piece = is_near & (label == near_px.argmax())
+    surface = (near_px > 0.5 * bent_px)[label] & is_bent
+    return piece, surface
+
+
+def _share_of_readings_behind(
+    depth_m: Float64[Tensor, "h w"],
+    plane_depth_m: Float64[Tensor, "h w"],
+    surface: Bool[Tensor, "h w"],
+    noise_per_m2: float,
+) -> float:
+    """Give the share of readings within the outline of a surface that lie behind its plane."""
+    margin_m = 2 * plane_tolerance_m(plane_depth_m, noise_per_m2)
+    is_behind = depth_m > plane_depth_m + margin_m
+    is_read_within = _fill_outline(surface) & (depth_m > 0)
+    return float(is_behind[is_read_within].double().mean())
+
+
+def _largest_diameter_without_side(points_m: Float64[Tensor, "n 3"]) -> float:
+    """Give the largest diameter of an object that has no side as wide or as long as a plane."""
+    some_m = take_evenly(points_m, _SAMPLE)
+    offset_m = some_m - some_m.mean(0)
+    _, axes = torch.linalg.eigh(offset_m.T @ offset_m)
+    along_m = offset_m @ axes[:, 1:]
+    width_m, length_m = (along_m.quantile(0.95, 0) - along_m.quantile(0.05, 0)).tolist()
+    return max(width_m / _WIDTH_RATIO, length_m / _LENGTH_RATIO)
+
+
+def _fill_outline(mask: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
+    """Fill a mask: add the pixels between two of its pixels both in their row and their column."""
     is_within = torch.ones_like(mask)
-    for along in (0, 1):
-        is_after = mask.int().cummax(along).values > 0
-        is_before = mask.flip(along).int().cummax(along).values.flip(along) > 0
+    for axis in (0, 1):
+        is_after = mask.int().cummax(axis).values > 0
+        is_before = mask.flip(axis).int().cummax(axis).values.flip(axis) > 0
         is_within &= is_after & is_before
     return is_within
 
 
-def _bent(
+def _is_on_bent_plane(
     points_m: Float64[Tensor, "h w 3"],
     plane: Plane,
-    near: Bool[Tensor, "h w"],
-    is_along: Bool[Tensor, "h w"],
+    is_near: Bool[Tensor, "h w"],
+    is_parallel: Bool[Tensor, "h w"],
     noise_per_m2: float,
 ) -> Bool[Tensor, "h w"]:
-    """Mark what is turned as a plane and lies on it as the sensor bends it, by a quadratic."""
+    """Mark the readings on a plane as the sensor bends it.
+
+    The bend is a quadratic in x and y of the image, fitted to the readings on it, from those near
+    the flat plane on.
+
+    Args:
+        points_m: in the camera frame.
+        plane: the flat one.
+        is_near: readings on it.
+        is_parallel: readings whose normals are along that of the plane; no others are marked.
+        noise_per_m2: as in :class:`Frame`.
+    """
     off_m = points_m @ plane[0] - plane[1]
     x, y = (points_m[..., :2] / points_m[..., 2:].clamp(min=1e-6)).unbind(-1)
     terms = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], -1)
     tolerance_m = plane_tolerance_m(points_m[..., 2], noise_per_m2)
-    is_bent = near & is_along
-    for _ in range(_BENDINGS):
-        A, b = (take_evenly(grid[is_bent], _SAMPLE) for grid in (terms, off_m))
+    is_on_bend = is_near & is_parallel
+    for _ in range(_BEND_REFITS):
+        A = take_evenly(terms[is_on_bend], _SAMPLE)
+        b = take_evenly(off_m[is_on_bend], _SAMPLE)
         if len(b) < _LEAST_POINTS:
             break
-        bend_m = terms @ torch.linalg.lstsq(A, b[:, None]).solution
-        is_bent = is_along & ((off_m - bend_m[..., 0]).abs() < tolerance_m)
-    return is_bent
+        coefficients = torch.linalg.lstsq(A, b[:, None]).solution
+        bend_m = (terms @ coefficients)[..., 0]
+        is_on_bend = is_parallel & ((off_m - bend_m).abs() < tolerance_m)
+    return is_on_bend
 
 
 def largest_plane(
     points_m: Float64[Tensor, "n 3"], generator: torch.Generator, noise_per_m2: float = NOISE_PER_M2
 ) -> Plane | None:
     """Give the plane that most points lie on, by RANSAC; None for fewer than 60 points."""
-    some = take_evenly(points_m, _SAMPLE)
-    if len(some) < _LEAST_POINTS:
+    some_m = take_evenly(points_m, _SAMPLE)
+    if len(some_m) < _LEAST_POINTS:
         return None
-    triple = torch.randint(len(some), (_HYPOTHESES, 3), generator=generator)
-    a, b, c = some[triple].unbind(1)
+
+    # Planes through three points each; the one with the most points on it.
+    triple = torch.randint(len(some_m), (_HYPOTHESES, 3), generator=generator)
+    a, b, c = some_m[triple].unbind(1)
     normal = torch.linalg.cross(b - a, c - a)
     length = normal.norm(dim=-1, keepdim=True)
     normal = normal / length.clamp(min=1e-12)
-    offset = (normal * a).sum(-1)
-    tolerance_m = plane_tolerance_m(some[:, 2], noise_per_m2)
-    on = (some @ normal.T - offset).abs() < tolerance_m[:, None]
-    on &= length[:, 0] > 1e-8
-    best = int(on.sum(0).argmax())
-    plane = (normal[best], offset[best])
-    for _ in range(3):
-        near = some[is_on_plane(some, plane, noise_per_m2)]
-        if len(near) < 3:
+    offset_m = (normal * a).sum(-1)
+    tolerance_m = plane_tolerance_m(some_m[:, 2], noise_per_m2)
+    is_on = (some_m @ normal.T - offset_m).abs() < tolerance_m[:, None]
+    is_on &= length[:, 0] > 1e-8  # three points on a line make no plane
+    best = int(is_on.sum(0).argmax())
+    plane = (normal[best], offset_m[best])
+
+    # Refitted to the points on it.
+    for _ in range(_REFITS):
+        near_m = some_m[is_on_plane(some_m, plane, noise_per_m2)]
+        if len(near_m) < 3:
             return None
-        middle = near.mean(0)
-        _, axes = torch.linalg.eigh((near - middle).T @ (near - middle))
-        plane = (axes[:, 0], axes[:, 0] @ middle)
+        middle_m = near_m.mean(0)
+        _, axes = torch.linalg.eigh((near_m - middle_m).T @ (near_m - middle_m))
+        plane = (axes[:, 0], axes[:, 0] @ middle_m)
     return plane
 
 
 class Readings(NamedTuple):
-    """The pixels in whose direction points lie, their depth, and whether they have one."""
+    """The readings of a frame in the directions of points."""
 
-    pixel: Int64[Tensor, "*n"]
+    pixel: Int64[Tensor, "*n"]  #: index of the pixel, row after row; 0 outside the image
     depth_m: Float64[Tensor, "*n"]
-    is_read: Bool[Tensor, "*n"]
+    is_read: Bool[Tensor, "*n"]  #: whether the pixel lies in the image and has a reading
 
 
 def readings_toward(frame: Frame, points_m: Float64[Tensor, "*n 3"]) -> Readings:
-    """Look up what was read in the direction of points of the camera frame."""
+    """Look up the readings in the directions of points of the camera frame."""
     height, width = frame.depth_m.shape
     column, row = project(points_m, frame.K).round().unbind(-1)
     is_inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
@@ -348,13 +420,14 @@ def readings_toward(frame: Frame, points_m: Float64[Tensor, "*n 3"]) -> Readings
 def share_behind(
     frame: Frame, background: Background, points_m: Float64[Tensor, "n 3"], margin_m: float
 ) -> float:
-    """Give the share of points that lie behind a background, where it is not known to end.
+    """Give the share of points that lie behind a background, where it is not observed to end.
 
     Args:
         frame: the image.
         background: one of the image.
         points_m: of a posed surface, in the camera frame.
-        margin_m: a point counts from so far behind, beyond what the sensor's noise explains.
+        margin_m: distance behind the background, beyond the sensor's noise, from which a point
+            counts.
 
     Returns:
         Between 0 and 1.
@@ -366,18 +439,19 @@ def share_behind(
     limit_m += margin_m + plane_tolerance_m(limit_m, frame.noise_per_m2)
     readings = readings_toward(frame, points_m)
     limit_m = limit_m.flatten()[readings.pixel]
-    # What stands before the background hides it; where the camera saw farther it has ended.
-    is_solid = readings.is_read & (readings.depth_m < limit_m)
-    return float((is_solid & (points_m[:, 2] > limit_m)).double().mean())
+    # Where the camera saw farther than the background it has ended; what lies before it hides it.
+    is_present = readings.is_read & (readings.depth_m < limit_m)
+    is_behind = points_m[:, 2] > limit_m
+    return float((is_present & is_behind).double().mean())
 
 
 def is_on_background(
     depth_m: Float[Tensor, "h w"], background_m: Float[Tensor, "h w"]
 ) -> Bool[Tensor, "h w"]:
-    """Mark the readings that lie on a known background, as far as a depth sensor measures it.
+    """Mark the readings that lie on a known background, within the noise of a depth sensor.
 
-    Both images have errors, and a pixel may see what its neighbour should: a reading is of the
-    background between the nearest and the farthest that it has there, beyond the noise.
+    Edges may be displaced by a pixel in either image: a reading is of the background where it lies
+    between the background's least and largest depth at the pixel and its neighbours.
 
     Args:
         depth_m: the image; 0 or NaN where there is no reading.
@@ -393,7 +467,7 @@ def is_on_background(
 
 
 def _largest_about(values: Float64[Tensor, "h w"], reach: int) -> Float64[Tensor, "h w"]:
-    """Give the largest of the finite values up to so many pixels away; infinite without one."""
+    """Give the largest finite value up to ``reach`` pixels away; infinite where there is none."""
     finite = torch.where(values.isfinite(), values, -torch.inf)
     largest = max_pool2d(finite[None], 2 * reach + 1, 1, reach)[0]
     return torch.where(largest.isfinite(), largest, torch.inf)
@@ -402,7 +476,7 @@ def _largest_about(values: Float64[Tensor, "h w"], reach: int) -> Float64[Tensor
 def is_on_plane(
     points_m: Float64[Tensor, "*batch 3"], plane: Plane, noise_per_m2: float = NOISE_PER_M2
 ) -> Bool[Tensor, "*batch"]:
-    """Whether points of the camera frame lie on a plane, as far as a depth sensor measures it."""
+    """Whether points of the camera frame lie on a plane, within the noise of a depth sensor."""
     normal, offset = plane
     tolerance_m = plane_tolerance_m(points_m[..., 2], noise_per_m2)
     return (points_m @ normal - offset).abs() < tolerance_m
@@ -411,27 +485,28 @@ def is_on_plane(
 def label_regions(
     depth_m: Float[Tensor, "h w"], is_counted: Bool[Tensor, "h w"]
 ) -> Int64[Tensor, "h w"]:
-    """Number the connected regions: neighbours, at corners too, without a jump in depth.
+    """Label the connected regions of the marked pixels.
 
-    Those that ``is_counted`` marks; each other pixel has the number of a region of its own.
+    Neighbours, diagonal ones too, are connected where their depth does not jump. Each pixel that is
+    not marked is a region of its own.
     """
     height, width = depth_m.shape
     index = torch.arange(height * width).reshape(height, width)
-    rows, columns = [], []
+    starts, ends = [], []  # of the edges between connected pixels
     for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
         # Each pixel, and its neighbour so many rows down and columns to the right.
         first = slice(height - down), slice(max(0, -right), width - max(0, right))
         second = slice(down, None), slice(max(0, right), width - max(0, -right))
-        z_a, z_b = depth_m[first], depth_m[second]
-        joined = (z_a - z_b).abs() < _JUMP_M + _JUMP_PER_M * torch.minimum(z_a, z_b)
-        joined &= is_counted[first] & is_counted[second]
-        rows.append(index[first][joined])
-        columns.append(index[second][joined])
-    a, b = torch.cat(rows).numpy(), torch.cat(columns).numpy()
+        first_m = depth_m[first]
+        second_m = depth_m[second]
+        jump_m = _JUMP_M + _JUMP_PER_M * torch.minimum(first_m, second_m)
+        is_joined = (first_m - second_m).abs() < jump_m
+        is_joined &= is_counted[first] & is_counted[second]
+        starts.append(index[first][is_joined])
+        ends.append(index[second][is_joined])
+    a = torch.cat(starts).numpy()
+    b = torch.cat(ends).numpy()
     size = height * width
     graph = coo_matrix((np.ones(len(a), np.int8), (a, b)), shape=(size, size))
-    return (
-        torch.from_numpy(connected_components(graph, directed=False)[1])
-        .long()
-        .reshape(height, width)
-    )
+    _, label = connected_components(graph, directed=False)
+    return torch.from_numpy(label).long().reshape(height, width)

@@ -12,36 +12,30 @@ from torch import Tensor
 from depthpose.core.arrays import take_evenly
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, cross_matrix, perturb, rotation_by
-from depthpose.pose.compiled import (
-    GRAZING,
-    LOOKED_UP,
-    ON_RAY,
-    SEARCHED,
-    SLACK,
-    use_numba,
-)
+from depthpose.pose.compiled import GRAZING, SLACK, use_numba
 from depthpose.pose.config import IcpConfig
 from depthpose.pose.surface import Surface, finite_array, look_along_rays
 
-_CONVERGED = 3e-4  # stop when a step turns [rad] and shifts [diameters] by less than this
-_TURN_RAD = math.radians(15)  # by how much further starts are turned
+_CONVERGED = 3e-4  # stop when a step rotates [rad] and shifts [diameters] by less than this
+_START_ROTATION_RAD = math.radians(15)  # of further starts from the initial pose
 _ROUGH_LIMITS = (3.0, 2.4, 2.0, 1.6, 1.4, 1.2, 1.0, 1.0, 1.0, 1.0)
 """Limits of the rough steps, over the last limit of the exact ones: starts begin farther off."""
 _ROUGH_POINTS = 100  # points of the cloud that refine and compare starts
-_OCCLUDING_POINTS = 1000  # points of the cloud that show what a pose would occlude
-_UNOBSERVED_WEIGHT = 0.3  # of a score: below 1, for something may occlude what is not observed
-_OTHER = 0.1  # mean distance between the points of two poses, in diameters, from which they are two
-_MOST_OTHERS = 3  # local minima beside the best that are kept
-_TRUST = 0.02
-"""How much better another pose must score than the first, in shares of the points near the surface:
-a plane fits many places, and noise would choose among them. A start's rough end must score better
-by as much than its exact end to be preferred."""
+_OCCLUSION_POINTS = 1000  # points of the cloud by which free-space violations are counted
+_UNOBSERVED_WEIGHT = 0.3  # in a score: below 1, for something may occlude what is not observed
+_DISTINCT_DIAMETERS = 0.1  # mean distance between the surfaces of two poses that are distinct
+_MOST_OTHERS = 3  # local minima beside the best that are returned
+_FIRST_POSE_BONUS = 0.02
+"""Added to the score of the first pose, a share of points near the surface: another one must be
+better by more, since a plane fits many places and noise would choose among them."""
 
-_BLOCKS = (0.15, 0.2, 0.3, 0.4)  # sides of the blocks of the jackknife, in diameters
+_BLOCK_DIAMETERS = (0.15, 0.2, 0.3, 0.4)  # sides of the blocks of the jackknife
 _LEAST_REMAINING = 0.03
 """Share of the information that counts as remaining where a block is left out: else a block that
 alone constrains a direction would make it infinitely uncertain."""
-_LEAST_SLOPE = 0.25  # least information of the weighted residuals, over that of constant weights
+_LEAST_SLOPE = 0.25
+"""Least information of the residuals with Tukey's weights as they change with the residual, over
+that with the weights held constant."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -49,12 +43,12 @@ class RefinedPose:
     """A refined pose, with leading batch axes of the poses that it began from."""
 
     camera_from_model: Rigid  #: the pose
-    #: of (rotation, translation) as :class:`~depthpose.pose.types.PoseFit` says, from the
-    #: residuals, of which neighbours may be alike, and an offset of all readings along the ray
-    #: (``IcpConfig.sensor_offset_m``); what the surface does not fix (a turn of a ball) is far too
-    #: uncertain to be missed. Local: of this minimum alone, whether it is the right one or not.
+    #: of (rotation, translation) as in :class:`~depthpose.pose.types.PoseFit`. It allows for
+    #: correlated residuals and for an offset of all readings along the ray
+    #: (``IcpConfig.sensor_offset_m``). A motion that the surface leaves free, such as a rotation of
+    #: a ball, has a very large variance. It describes this local minimum, right or wrong.
     covariance: Float[Tensor, "*batch 6 6"]
-    residual_m: Float[Tensor, "*batch"]  #: root mean square distance to the surface, of what counts
+    residual_m: Float[Tensor, "*batch"]  #: weighted root mean square distance to the surface
     inlier_share: Float[Tensor, "*batch"]  #: share of the points within the last limit
 
 
@@ -62,12 +56,12 @@ class BestStart(NamedTuple):
     """The best of several refined poses."""
 
     refined: RefinedPose  #: the best
-    start: int  #: number of the initial pose that it began from
+    start: int  #: index of the initial pose that it began from
     others: Rigid  #: the best poses beside it, three at most, roughly refined
 
 
 class _NormalEquations(NamedTuple):
-    """Gauss-Newton step of poses: ``information @ motion = gradient``, and what it is made of."""
+    """Gauss-Newton step of poses, ``information @ motion = gradient``, and its residuals."""
 
     information: Float64[Tensor, "*batch 6 6"]
     gradient: Float64[Tensor, "*batch 6"]
@@ -80,8 +74,8 @@ class _NormalEquations(NamedTuple):
 def tukey_weight(square_m2: Float64[Tensor, "*n"], limit_m: float) -> Float64[Tensor, "*n"]:
     """Give Tukey's weight of squared distances: 1 at 0, and 0 from the limit on.
 
-    It is the loss of every ICP. Another one is written here, in ``_influence_slope``, and as
-    ``tukey_weight`` of ``compiled/points.py``.
+    Every ICP weights its residuals so. To use another loss, change this function,
+    ``_influence_slope`` and ``tukey_weight`` in ``compiled/points.py``.
     """
     return (1 - square_m2 / limit_m**2).clamp(min=0).square()
 
@@ -123,32 +117,36 @@ def refine_pose(
         InputError: there is no point, or one is not finite.
     """
     config = IcpConfig() if config is None else config
-    # The limit shrinks in even ratios over half of the steps; then it is kept, and checked by.
+    # The limit shrinks in even ratios over half of the steps, then stays. A last limit is for the
+    # residuals of the final pose.
     start = config.start_distance_diameters
     end = config.end_distance_diameters
     half = max(1, config.iterations // 2)
-    shares = [start * (end / start) ** min(1.0, i / half) for i in range(config.iterations)]
-    limits_m = [share * surface.diameter_m for share in (*shares, end)]
+    limits = [start * (end / start) ** min(1.0, i / half) for i in range(config.iterations)]
+    limits_m = [limit * surface.diameter_m for limit in (*limits, end)]
     pose, index = _iterate(
         points_m, config.cloud_points, initial.double(), surface, limits_m, is_exact=True
     )
 
-    # Uncertainty about the middle of the cloud: of the residuals, and of an offset along the ray.
-    cloud = take_evenly(points_m.double(), config.cloud_points)
-    equations = _normal_equations(cloud, pose, surface, limits_m[-1], index, ON_RAY)
-    covariance = _covariance(cloud, equations, limits_m[-1], surface.diameter_m)
-    middle_m = cloud.mean(0)
+    # Covariance about the middle of the cloud, of the residuals and of an offset along the ray.
+    cloud_m = take_evenly(points_m.double(), config.cloud_points)
+    equations = _normal_equations(cloud_m, pose, surface, limits_m[-1], index, is_along_rays=True)
+    covariance = _covariance(cloud_m, equations, limits_m[-1], surface.diameter_m)
+    middle_m = cloud_m.mean(0)
     ray = torch.nn.functional.normalize(middle_m, dim=0)
     offset_m = config.sensor_offset_m * torch.cat([torch.zeros(3), ray])
     covariance = covariance + torch.outer(offset_m, offset_m)
 
-    # About the camera: w x (p - c) + v = w x p + (v + c x w).
+    # The same about the camera: w x (p - c) + v = w x p + (v + c x w).
     eye = torch.eye(3, dtype=torch.float64)
     zero = torch.zeros(3, 3, dtype=torch.float64)
-    shift = torch.cat([torch.cat([eye, zero], 1), torch.cat([cross_matrix(middle_m), eye], 1)])
+    camera_from_middle = torch.cat(
+        [torch.cat([eye, zero], 1), torch.cat([cross_matrix(middle_m), eye], 1)]
+    )
+    covariance = camera_from_middle @ covariance @ camera_from_middle.mT
     return RefinedPose(
         camera_from_model=Rigid(pose.R.to(points_m), pose.t_m.to(points_m)),
-        covariance=(shift @ covariance @ shift.mT).to(points_m),
+        covariance=covariance.to(points_m),
         residual_m=equations.rms_m.to(points_m),
         inlier_share=(equations.weight > 0).to(points_m).mean(-1),
     )
@@ -160,10 +158,9 @@ def refine_best(
     surface: Surface,
     config: IcpConfig | None = None,
 ) -> BestStart:
-    """Refine poses, and rotations of each; give the one that explains the cloud best.
+    """Refine poses, and rotated copies of each, and give the one that explains the cloud best.
 
-    All are refined roughly, with some of the points and a table of nearest samples
-    (:class:`~depthpose.pose.surface.Boxes`). Each is scored by the share of points near the
+    All are refined roughly (:func:`refine_roughly`). Each is scored by the share of points near the
     surface, less free-space violations and part of the unobserved surface. The best is refined
     exactly, in half of the steps.
 
@@ -181,14 +178,15 @@ def refine_best(
     starts = _rotated_starts(initial.double(), surface, config.starts)
     rough = refine_roughly(points_m, starts, surface, config)
     end_m = config.end_distance_diameters * surface.diameter_m
-    score = _score(points_m, rough, surface, end_m)
+    score = _score_poses(points_m, rough, surface, end_m)
     best = int(score.argmax())
 
+    # The starts are the initial poses, then their rotated copies in the same order.
     is_initial = best < len(initial.R)
     start = initial[best] if is_initial else None
     refined = _refine_exactly(points_m, start, rough[best], surface, config)
-    pose = refined.camera_from_model.double()
-    return BestStart(refined, best % len(initial.R), _distinct_poses(rough, score, pose, surface))
+    others = _distinct_poses(rough, score, refined.camera_from_model.double(), surface)
+    return BestStart(refined, start=best % len(initial.R), others=others)
 
 
 def _refine_exactly(
@@ -198,19 +196,26 @@ def _refine_exactly(
     surface: Surface,
     config: IcpConfig,
 ) -> RefinedPose:
-    """Refine the best start exactly, in half of the steps.
+    """Refine the best start exactly, in half of the steps, from before or after its rough steps.
 
-    From the start itself, where it was no rotated one: rough steps let a pose drift along what
-    little constrains. From the rough end, where that explains the cloud better: then the start was
-    farther off than exact steps reach.
+    Exact steps begin from the pose before, since rough steps let a pose drift where it is weakly
+    constrained. They begin from the pose after where that explains the cloud better: the start was
+    then farther off than exact steps reach.
+
+    Args:
+        points_m: of the object, in the camera frame.
+        start: the initial pose; None where it is a rotated copy, of which the rough end is used.
+        rough: the pose after rough steps from the start.
+        surface: of the model.
+        config: of all steps.
     """
     half = replace(config, iterations=(config.iterations + 1) // 2)
     if start is not None:
         from_start = refine_pose(points_m, start, surface, half)
         ends = Rigid.stack([from_start.camera_from_model.double(), rough])
         end_m = config.end_distance_diameters * surface.diameter_m
-        is_rough_better = float(_score(points_m, ends, surface, end_m).diff()) > 0
-        if not is_rough_better:
+        score_exact, score_rough = _score_poses(points_m, ends, surface, end_m).tolist()
+        if score_rough <= score_exact:
             return from_start
     near = replace(half, start_distance_diameters=config.end_distance_diameters)
     return refine_pose(points_m, rough, surface, near)
@@ -219,11 +224,12 @@ def _refine_exactly(
 def _rotated_starts(poses: Rigid, surface: Surface, number: int) -> Rigid:
     """Give poses, then all of them rotated about the object's middle by each of the camera's axes.
 
-    ``number``: of starts from each pose, 1 to 7: it alone, then rotated one way and the other.
+    ``number`` is the starts from each pose, 1 to 7: itself, then rotated by 15 degrees about x, y
+    and z, then the other way.
     """
     axes = torch.eye(3, dtype=torch.float64)
     axes = torch.cat([torch.zeros(1, 3).double(), axes, -axes])[:number]
-    rotations = rotation_by(_TURN_RAD * axes)[:, None]
+    rotations = rotation_by(_START_ROTATION_RAD * axes)[:, None]
     middle_m = poses.R @ surface.points_m.mean(0) + poses.t_m
     t_m = (rotations @ (poses.t_m - middle_m)[..., None]).squeeze(-1) + middle_m
     return Rigid((rotations @ poses.R).flatten(0, 1), t_m.flatten(0, 1))
@@ -232,20 +238,20 @@ def _rotated_starts(poses: Rigid, surface: Surface, number: int) -> Rigid:
 def _distinct_poses(
     poses: Rigid, score: Float64[Tensor, " b"], best: Rigid, surface: Surface
 ) -> Rigid:
-    """Give up to three poses, the best first, that differ from each other and from ``best``.
+    """Give up to three poses, the best first, that are distinct from each other and from ``best``.
 
-    They differ where their surfaces lie apart: poses that differ by a symmetry are one.
+    Distinct are poses whose surfaces lie apart; poses that differ by a symmetry are the same.
     """
     chosen: list[int] = []
     points_m = surface.points_m[:: max(1, len(surface.points_m) // 50)]
-    copies_m = surface.symmetries.apply(points_m)
+    symmetric_m = surface.symmetries.apply(points_m)
     for k in score.argsort(descending=True).tolist():
         if len(chosen) == _MOST_OTHERS or score[k] == -torch.inf:
             break
         better = Rigid.stack([best, *(poses[j] for j in chosen)])
         moved_m = (better.inverse() @ poses[k]).apply(points_m)
-        gap_m = (moved_m[:, None] - copies_m).norm(dim=-1).mean(-1)
-        if float(gap_m.min()) > _OTHER * surface.diameter_m:
+        distance_m = (moved_m[:, None] - symmetric_m).norm(dim=-1).mean(-1)
+        if float(distance_m.min()) > _DISTINCT_DIAMETERS * surface.diameter_m:
             chosen.append(k)
     return poses[chosen]
 
@@ -253,17 +259,18 @@ def _distinct_poses(
 def refine_roughly(
     points_m: Float[Tensor, "n 3"], starts: Rigid, surface: Surface, config: IcpConfig
 ) -> Rigid:
-    """Refine a batch of poses with a hundred of the points and a table of what lies near.
+    """Refine a batch of poses fast: with a hundred points and a table of nearest samples.
 
     Args:
         points_m: of the object, in the camera frame.
         starts: poses in float64, ``camera_from_model``.
-        surface: of the model.
-        config: its last limit.
+        surface: of the model; its table is :class:`~depthpose.pose.surface.Boxes`.
+        config: ``end_distance_diameters`` is used.
     """
     end_m = config.end_distance_diameters * surface.diameter_m
-    limits_m = [share * end_m for share in _ROUGH_LIMITS]
-    return _iterate(points_m, _ROUGH_POINTS, starts, surface, limits_m, is_exact=False)[0]
+    limits_m = [ratio * end_m for ratio in _ROUGH_LIMITS]
+    poses, _ = _iterate(points_m, _ROUGH_POINTS, starts, surface, limits_m, is_exact=False)
+    return poses
 
 
 def _iterate(
@@ -277,189 +284,261 @@ def _iterate(
 ) -> tuple[Rigid, Int64[Tensor, "*batch n"]]:
     """Take Gauss-Newton steps of ICP until the poses move no more.
 
-    Where numba is there the same steps are those of ``refine`` in ``compiled/poses.py``.
+    Exact steps match each point with its nearest sample of the surface in the first half of the
+    steps, and with the sample on its ray in the second; other steps look samples up in a table.
+    ``refine`` in ``compiled/poses.py`` takes the same steps where numba is installed.
 
     Args:
         points_m: of the object, in the camera frame.
         max_points: so many of them are used, evenly taken.
         pose: one or a batch, ``camera_from_model``.
         surface: of the model.
-        limits_m: distance at which a point no longer counts, for each step.
-        is_exact: by the nearest sample, later the one on the ray; else by a table of what is near.
+        limits_m: distance at which a point no longer counts, for each step; the last one is for
+            the samples that are returned.
+        is_exact: whether samples are searched, not looked up.
 
     Returns:
-        The poses, and for each used point the number of its sample of the surface, or -1.
+        The poses, and for each used point the index of its sample of the surface, or -1.
     """
     if len(points_m) == 0 or not bool(points_m.isfinite().all()):
         raise InputError(
             f"ICP of {len(points_m)} points, {int((~points_m.isfinite().all(-1)).sum())} of them "
             "not finite: leave those out, and refuse a cloud of none."
         )
-    cloud = take_evenly(points_m.double(), max_points)
-    if use_numba(cloud, pose.R, pose.t_m):
-        from depthpose.pose.compiled.poses import refine
+    cloud_m = take_evenly(points_m.double(), max_points)
+    if use_numba(cloud_m, pose.R, pose.t_m):
+        return _iterate_compiled(cloud_m, pose, surface, limits_m, is_exact=is_exact)
 
-        parts = [part.detach().numpy() for part in (pose.R, pose.t_m)]
-        R, t_m = (torch.from_numpy(finite_array(part).copy()) for part in parts)
-        target = surface.target
-        points = finite_array(cloud.detach().numpy())
-        arrays = (points, R.view(-1, 3, 3).numpy(), t_m.view(-1, 3).numpy(), np.array(limits_m))
-        places = np.full((len(arrays[2]), len(points)), -1)
-        refine(*arrays, surface.diameter_m, _CONVERGED, target, is_exact, places)
-        index = torch.from_numpy(np.append(target.tree.order, -1)[places])
-        return Rigid(R, t_m), index.view(*t_m.shape[:-1], len(points))
-
+    middle_m = cloud_m.mean(0)
     scale = torch.tensor([1.0] * 3 + [surface.diameter_m] * 3, dtype=torch.float64)
-    moves = torch.ones_like(pose.t_m[..., :1])
-    index = torch.full((*pose.t_m.shape[:-1], len(cloud)), -1)
-    steps = len(limits_m) - 1
-    for k, limit_m in enumerate(limits_m):
-        # Correspondences.
-        how = LOOKED_UP
-        if is_exact:
-            how = SEARCHED if 2 * k < steps else ON_RAY
-        matches = match(cloud, pose, surface, limit_m, how, index)
-        index = torch.where(moves > 0, matches, index)
-        if k == steps:
+    is_moving = torch.ones_like(pose.t_m[..., :1])  # 1 or 0 for each pose
+    index = torch.full((*pose.t_m.shape[:-1], len(cloud_m)), -1)
+    last = len(limits_m) - 1
+    for step, limit_m in enumerate(limits_m):
+        # Correspondences; those of a pose that has converged stay.
+        is_along_rays = is_exact and 2 * step >= last
+        if is_along_rays:
+            matches = _match_along_rays(cloud_m, pose, surface, limit_m, index)
+        elif is_exact:
+            matches = _match_nearest(cloud_m, pose, surface, limit_m)
+        else:
+            matches = _match_by_table(cloud_m, pose, surface)
+        index = torch.where(is_moving > 0, matches, index)
+        if step == last:
             break
 
-        # The motion that brings them together. About the middle itself: a turn by w about the
-        # camera, which is D away, with the shift that makes it one about the object to first order
-        # would leave the object w^2 D / 2 off.
-        equations = _normal_equations(cloud, pose, surface, limit_m, index, how)
-        motion = torch.linalg.solve(equations.information, equations.gradient) * moves
-        turned = perturb(Rigid(pose.R, pose.t_m - cloud.mean(0)), motion)
-        pose = Rigid(turned.R, turned.t_m + cloud.mean(0))
+        # One Gauss-Newton step. It is taken about the middle of the cloud: a rotation by w about
+        # the camera, D away, with the shift that cancels it to first order would leave the object
+        # w^2 D / 2 off.
+        equations = _normal_equations(
+            cloud_m, pose, surface, limit_m, index, is_along_rays=is_along_rays
+        )
+        motion = torch.linalg.solve(equations.information, equations.gradient) * is_moving
+        moved = perturb(Rigid(pose.R, pose.t_m - middle_m), motion)
+        pose = Rigid(moved.R, moved.t_m + middle_m)
 
-        # A pose that hardly moved at the last limit stays.
-        if limit_m <= limits_m[-1] and how != SEARCHED:
-            moves = ((motion / scale).abs() >= _CONVERGED).any(-1, keepdim=True).double()
-            if not bool(moves.any()):
+        # A pose that hardly moved, with the last limit and the last kind of match, has converged.
+        has_last_kind = is_along_rays or not is_exact
+        if limit_m <= limits_m[-1] and has_last_kind:
+            is_moving = ((motion / scale).abs() >= _CONVERGED).any(-1, keepdim=True).double()
+            if not bool(is_moving.any()):
                 break
     return pose, index
 
 
-def _score(
+def _iterate_compiled(
+    cloud_m: Float64[Tensor, "n 3"],
+    pose: Rigid,
+    surface: Surface,
+    limits_m: list[float],
+    *,
+    is_exact: bool,
+) -> tuple[Rigid, Int64[Tensor, "*batch n"]]:
+    """Take the steps of :func:`_iterate` by numba, on copies of the poses."""
+    from depthpose.pose.compiled.poses import refine
+
+    R = torch.from_numpy(finite_array(pose.R.detach().numpy()).copy())
+    t_m = torch.from_numpy(finite_array(pose.t_m.detach().numpy()).copy())
+    points = finite_array(cloud_m.detach().numpy())
+    rotations = R.view(-1, 3, 3).numpy()
+    translations = t_m.view(-1, 3).numpy()
+    target = surface.target
+    places = np.full((len(translations), len(points)), -1)
+    refine(
+        points,
+        rotations,
+        translations,
+        np.array(limits_m),
+        surface.diameter_m,
+        _CONVERGED,
+        target,
+        is_exact,
+        places,
+    )
+
+    # From places in the tree to samples; place -1, of no sample, takes the -1 appended.
+    index = torch.from_numpy(np.append(target.tree.order, -1)[places])
+    return Rigid(R, t_m), index.view(*t_m.shape[:-1], len(points))
+
+
+def _score_poses(
     points_m: Float[Tensor, "n 3"], poses: Rigid, surface: Surface, limit_m: float
 ) -> Float64[Tensor, " b"]:
-    """Score each pose: share of points near the surface, less distance and contradictions.
+    """Score poses by how they explain a cloud; the first one, which is trusted more, gets a bonus.
 
-    The first pose is trusted more.
+    A score is the share of points near the surface, less their distance, free-space violations and
+    part of the unobserved surface.
     """
-    cloud = take_evenly(points_m.double(), _OCCLUDING_POINTS)
-    free_space_violation, unobserved = look_along_rays(cloud, poses, surface, every=4)
-    few = take_evenly(cloud, _ROUGH_POINTS)
-    index = match(few, poses, surface, limit_m, LOOKED_UP)
-    equations = _normal_equations(few, poses, surface, limit_m, index, LOOKED_UP)
+    cloud_m = take_evenly(points_m.double(), _OCCLUSION_POINTS)
+    free_space_violation, unobserved = look_along_rays(cloud_m, poses, surface, every=4)
+    few_m = take_evenly(cloud_m, _ROUGH_POINTS)
+    index = _match_by_table(few_m, poses, surface)
+    equations = _normal_equations(few_m, poses, surface, limit_m, index, is_along_rays=False)
     inlier_share = (equations.weight > 0).double().mean(-1)
-    # Of equals, the nearer one.
+    # Of poses with equal shares the nearer one is better.
     closeness = inlier_share - equations.rms_m / surface.diameter_m
     score = closeness - free_space_violation - _UNOBSERVED_WEIGHT * unobserved
-    score[0] += _TRUST
+    score[0] += _FIRST_POSE_BONUS
     return score
 
 
-def match(
+def _in_model_frame(
+    cloud_m: Float64[Tensor, "n 3"], pose: Rigid
+) -> tuple[Float64[Tensor, "b n 3"], Float64[Tensor, "b 1 3"]]:
+    """Give the cloud and the camera in the model frame of each pose; one pose is a batch of one."""
+    poses = Rigid(pose.R.reshape(-1, 3, 3), pose.t_m.reshape(-1, 3))
+    inverse = poses.inverse()
+    return inverse.apply(cloud_m), inverse.t_m[:, None]
+
+
+def _match_by_table(
+    cloud_m: Float64[Tensor, "n 3"], pose: Rigid, surface: Surface
+) -> Int64[Tensor, "*batch n"]:
+    """Look up a visible sample of the surface near each point; -1 where the table has none.
+
+    Where the sample in the table faces away, that on the other side of the wall is taken.
+    """
+    local_m, camera_m = _in_model_frame(cloud_m, pose)
+    index = surface.boxes.look_up(local_m)
+    is_facing = _is_visible(camera_m, index, surface)
+    index = torch.where(is_facing, index, surface.across[index])
+    is_matched = (index >= 0) & _is_visible(camera_m, index, surface)
+    return torch.where(is_matched, index, -1).reshape(*pose.t_m.shape[:-1], -1)
+
+
+def _match_nearest(
+    cloud_m: Float64[Tensor, "n 3"], pose: Rigid, surface: Surface, limit_m: float
+) -> Int64[Tensor, "*batch n"]:
+    """Find the nearest visible sample of the surface within the limit of each point, or -1."""
+    local_m, camera_m = _in_model_frame(cloud_m, pose)
+    return _nearest_visible(local_m, camera_m, surface, limit_m).reshape(*pose.t_m.shape[:-1], -1)
+
+
+def _match_along_rays(
     cloud_m: Float64[Tensor, "n 3"],
     pose: Rigid,
     surface: Surface,
     limit_m: float,
-    how: int,
-    before: Int64[Tensor, "*batch n"] | None = None,
+    previous: Int64[Tensor, "*batch n"],
 ) -> Int64[Tensor, "*batch n"]:
-    """Give for each point the number of a visible sample of the surface, or -1.
+    """Find the visible sample nearest to where the ray of each point meets the surface, or -1.
 
-    A sample is visible where its outer side faces the camera, or nearly; one without a known side
-    always, and all where the camera is within a ball about the surface.
-
-    Args:
-        cloud_m: in the camera frame.
-        pose: ``camera_from_model``, one or a batch.
-        surface: of the model.
-        limit_m: beyond it nothing is searched.
-        how: ``LOOKED_UP``, by the table of boxes; ``SEARCHED``, the nearest; or ``ON_RAY``, the
-            nearest to where the point's ray meets the plane of its sample ``before``.
-        before: what was found a step earlier.
+    The surface there is the plane of the point's ``previous`` sample. Where the ray grazes it, that
+    sample itself is the query, and where there was none the point.
     """
-    poses = Rigid(pose.R.reshape(-1, 3, 3), pose.t_m.reshape(-1, 3))
-    local_m = poses.inverse().apply(cloud_m)
-    eyes_m = poses.inverse().t_m[:, None]
-    if how == LOOKED_UP:
-        index = surface.boxes.look_up(local_m)
-        is_facing = _is_visible(eyes_m, index, surface)
-        index = torch.where(is_facing, index, surface.across[index])
-        is_good = (index >= 0) & _is_visible(eyes_m, index, surface)
-        return torch.where(is_good, index, -1).reshape(*pose.t_m.shape[:-1], -1)
-    if how == ON_RAY and before is not None:
-        sample = before.reshape(local_m.shape[:2])
-        ray_m = local_m - eyes_m
-        normal = surface.normals[sample]
-        point_m = surface.points_m[sample]
-        slope = (normal * ray_m).sum(-1, keepdim=True)
-        share = (normal * (point_m - local_m)).sum(-1, keepdim=True) / slope
-        is_met = slope.square() > GRAZING**2 * ray_m.square().sum(-1, keepdim=True)
-        meet_m = torch.where(is_met, local_m + share * ray_m, point_m)
-        local_m = torch.where(sample[..., None] >= 0, meet_m, local_m)
+    local_m, camera_m = _in_model_frame(cloud_m, pose)
+    sample = previous.reshape(local_m.shape[:2])
+    ray_m = local_m - camera_m
+    normal = surface.normals[sample]
+    sample_m = surface.points_m[sample]
+    slope = (normal * ray_m).sum(-1, keepdim=True)
+    share = (normal * (sample_m - local_m)).sum(-1, keepdim=True) / slope
+    is_meeting = slope.square() > GRAZING**2 * ray_m.square().sum(-1, keepdim=True)
+    meeting_m = torch.where(is_meeting, local_m + share * ray_m, sample_m)
+    query_m = torch.where(sample[..., None] >= 0, meeting_m, local_m)
+    return _nearest_visible(query_m, camera_m, surface, limit_m).reshape(*pose.t_m.shape[:-1], -1)
+
+
+def _nearest_visible(
+    query_m: Float64[Tensor, "b n 3"],
+    camera_m: Float64[Tensor, "b 1 3"],
+    surface: Surface,
+    limit_m: float,
+) -> Int64[Tensor, "b n"]:
+    """Find the visible sample nearest to each point of the model frame, or -1 beyond the limit."""
+    total = len(surface.points_m)
+    index = torch.full(query_m.shape[:2], -1)
+    pose, point = (index < 0).nonzero(as_tuple=True)  # of the queries without an answer yet
 
     # Ask for ever more of the nearest samples until one is visible.
     count = 1
-    total = len(surface.points_m)
-    index = torch.full(local_m.shape[:2], -1)
-    of_pose, point = (index < 0).nonzero(as_tuple=True)
-    while len(of_pose):
-        queries_m = local_m[of_pose, point].numpy()
+    while len(pose) > 0:
         _, nearest = surface.tree.query(
-            queries_m, k=range(1, count + 1), distance_upper_bound=limit_m
+            query_m[pose, point].numpy(), k=range(1, count + 1), distance_upper_bound=limit_m
         )
         nearest = torch.from_numpy(nearest)
         is_within = nearest < total  # beyond the limit the tree gives the number of its points
         nearest = nearest.clamp(max=total - 1)
-        is_good = is_within & _is_visible(eyes_m[of_pose, 0, None], nearest, surface)
-        first = is_good.int().argmax(1)
-        is_done = is_good.any(1)
-        index[of_pose[is_done], point[is_done]] = nearest[is_done, first[is_done]]
-        is_open = ~is_done & is_within.all(1) & (count < total)
-        of_pose = of_pose[is_open]
+        is_match = is_within & _is_visible(camera_m[pose, 0, None], nearest, surface)
+        first = is_match.int().argmax(1)
+        has_match = is_match.any(1)
+        index[pose[has_match], point[has_match]] = nearest[has_match, first[has_match]]
+        is_open = ~has_match & is_within.all(1) & (count < total)
+        pose = pose[is_open]
         point = point[is_open]
         count = min(8 * count, total)
-    return index.reshape(*pose.t_m.shape[:-1], -1)
+    return index
 
 
 def _is_visible(
-    eyes_m: Float64[Tensor, "b k 3"], index: Int64[Tensor, "b n"], surface: Surface
+    camera_m: Float64[Tensor, "b k 3"], index: Int64[Tensor, "b n"], surface: Surface
 ) -> Bool[Tensor, "b n"]:
-    distance_m = (eyes_m - surface.ball_m[:3]).norm(dim=-1)
-    toward_m = ((eyes_m - surface.points_m[index]) * surface.outward[index]).sum(-1)
-    return (toward_m >= -SLACK * distance_m) | (distance_m <= surface.ball_m[3])
+    """Whether samples show a camera, in the model frame, their outer side, or nearly so.
+
+    A sample whose outer side is not known counts as visible, and all do where the camera is within
+    the ball about the surface.
+    """
+    distance_m = (camera_m - surface.ball_m[:3]).norm(dim=-1)
+    facing_m = ((camera_m - surface.points_m[index]) * surface.outward[index]).sum(-1)
+    return (facing_m >= -SLACK * distance_m) | (distance_m <= surface.ball_m[3])
 
 
 def _normal_equations(
-    cloud: Float[Tensor, "n 3"],
+    cloud_m: Float[Tensor, "n 3"],
     pose: Rigid,
     surface: Surface,
     limit_m: float,
     index: Int64[Tensor, "*batch n"],
-    how: int,
+    *,
+    is_along_rays: bool,
 ) -> _NormalEquations:
     """Linearise the residuals about the middle of the cloud, where the parameters hardly correlate.
 
-    ``index``: of each point's sample, -1 where it has none; ``how`` it was found, as
-    :func:`match` takes it.
+    Args:
+        cloud_m: in the camera frame.
+        pose: one or a batch, ``camera_from_model``.
+        surface: of the model.
+        limit_m: distance from which a point has no weight.
+        index: of each point's sample, -1 where it has none.
+        is_along_rays: whether the samples lie on the rays of their points; then the residual
+            replaces the part of the distance that lies along the ray.
     """
-    # In the camera frame, where the covariance is wanted.
+    # In the camera frame, as the covariance is.
     normal = surface.normals[index] @ pose.R.mT
-    target = surface.points_m[index] @ pose.R.mT + pose.t_m[..., None, :]
-    gap = cloud - target
-    residual_m = (normal * gap).sum(-1)
-    # Tukey's weight of the whole gap: a point beyond an edge is near the plane, not the surface.
-    square = gap.square().sum(-1)
-    if how == ON_RAY:  # along the ray it is the residual that counts
-        along = (gap * cloud).sum(-1).square() / cloud.square().sum(-1)
-        square = square - along + residual_m.square()
-    weight = torch.where(index >= 0, tukey_weight(square, limit_m), 0.0)
-    arm = target - cloud.mean(0)
+    sample_m = surface.points_m[index] @ pose.R.mT + pose.t_m[..., None, :]
+    gap_m = cloud_m - sample_m
+    residual_m = (normal * gap_m).sum(-1)
+
+    # Weighted by the whole distance: a point beyond an edge is near the plane, not the surface.
+    square_m2 = gap_m.square().sum(-1)
+    if is_along_rays:
+        along_ray_m2 = (gap_m * cloud_m).sum(-1).square() / cloud_m.square().sum(-1)
+        square_m2 = square_m2 - along_ray_m2 + residual_m.square()
+    weight = torch.where(index >= 0, tukey_weight(square_m2, limit_m), 0.0)
+
     # Moving the model by (w, v) moves its point by w x arm + v, and lowers the residual.
-    J = torch.cat([torch.linalg.cross(arm, normal), normal], -1)
+    arm_m = sample_m - cloud_m.mean(0)
+    J = torch.cat([torch.linalg.cross(arm_m, normal), normal], -1)
     weighted = J.mT * weight[..., None, :]
     H = weighted @ J
     # Damped, so that a direction that no point constrains stays where it was.
@@ -478,7 +557,10 @@ def _normal_equations(
 
 
 def _covariance(
-    cloud: Float64[Tensor, "n 3"], equations: _NormalEquations, limit_m: float, diameter_m: float
+    cloud_m: Float64[Tensor, "n 3"],
+    equations: _NormalEquations,
+    limit_m: float,
+    diameter_m: float,
 ) -> Float64[Tensor, "*batch 6 6"]:
     """Give the covariance of a motion (rotation, translation) about the middle of the cloud.
 
@@ -489,15 +571,15 @@ def _covariance(
     because the correlation length is not known. With few blocks a direction can look certain by
     chance, so no direction is inflated by less than the mean over all, or by less than 1.
     """
-    # The information A of the residuals.
     slope = _influence_slope(equations.weight, equations.residual_m, limit_m)
     independent, whitening, spread_m = _independent_factor(equations, slope)
     inflation, directions = _jackknife_inflation(
-        cloud, equations, slope, independent, whitening, spread_m, diameter_m
+        cloud_m, equations, slope, independent, whitening, spread_m, diameter_m
     )
     least = inflation.mean(-1, keepdim=True).clamp(min=1)
+    inflation = torch.maximum(inflation, least)
     factor = independent @ directions
-    return (factor * torch.maximum(inflation, least)[..., None, :]) @ factor.mT
+    return (factor * inflation[..., None, :]) @ factor.mT
 
 
 def _independent_factor(
@@ -507,15 +589,19 @@ def _independent_factor(
 ]:
     """Factor the covariance under independent residuals: ``F F^T = s^2 A^-1``.
 
-    Gives the factor ``F``, its inverse and ``s``. ``A`` may be singular to rounding: its
-    eigenvalues over those of the information are bounded below.
+    Gives the factor ``F``, its inverse and ``s``. ``A = sum slope J J^T`` may be singular to
+    rounding: its eigenvalues over those of the information are bounded below.
     """
+    # A in coordinates in which the information matrix is the identity.
     J = equations.jacobian
+    A = J.mT * slope[..., None, :] @ J
     cholesky = torch.linalg.cholesky(equations.information)
-    relative = torch.linalg.solve_triangular(cholesky, J.mT * slope[..., None, :] @ J, upper=False)
+    relative = torch.linalg.solve_triangular(cholesky, A, upper=False)
     relative = torch.linalg.solve_triangular(cholesky, relative.mT, upper=False)
     values, vectors = torch.linalg.eigh(relative)
     size = values.clamp(min=_LEAST_SLOPE).sqrt()[..., None, :]
+
+    # The deviation s of the residuals, with 6 degrees of freedom less.
     weight = equations.weight
     square_sum = (weight * equations.residual_m.square()).sum(-1)
     variance = square_sum / (weight.sum(-1) - 6).clamp(min=1)
@@ -526,7 +612,7 @@ def _independent_factor(
 
 
 def _jackknife_inflation(
-    cloud: Float64[Tensor, "n 3"],
+    cloud_m: Float64[Tensor, "n 3"],
     equations: _NormalEquations,
     slope: Float64[Tensor, "*batch n"],
     independent: Float64[Tensor, "*batch 6 6"],
@@ -534,23 +620,24 @@ def _jackknife_inflation(
     spread_m: Float64[Tensor, "*batch 1 1"],
     diameter_m: float,
 ) -> tuple[Float64[Tensor, "*batch 6"], Float64[Tensor, "*batch 6 6"]]:
-    """Give the variances of a block jackknife over the independent ones, and their directions.
+    """Give the ratios of a block jackknife's variances to independent ones, and their directions.
 
-    Of several block sizes those with the largest sum; the independent ones (1 each) where no size
-    has a larger one. Directions are columns, in the coordinates of ``whitening``, the inverse of
-    the factor ``independent``.
+    Of several block sizes the one with the largest sum is taken; the ratios are 1 where no size has
+    a larger sum. Directions are columns, in the coordinates of ``whitening``, the inverse of the
+    factor ``independent``.
     """
     inverse_information = independent @ independent.mT / spread_m.square()
     J = equations.jacobian
     gradients = (equations.weight * equations.residual_m)[..., None] * J
     informations = (slope[..., None] * J)[..., None] * J[..., None, :]
-    view_m = cloud[:, :2] / cloud[:, 2:] * cloud[:, 2].mean()
+    image_m = cloud_m[:, :2] / cloud_m[:, 2:] * cloud_m[:, 2].mean()
     eye = torch.eye(6, dtype=torch.float64)
     inflation = torch.ones_like(independent[..., 0])
     directions = eye.expand_as(independent)
-    for side in _BLOCKS:
-        cells = (view_m / (side * diameter_m)).floor() @ torch.tensor([1.0, 1e6]).double()
-        _, block = cells.unique(return_inverse=True)
+    for side in _BLOCK_DIAMETERS:
+        # Sums over the points of each block; a block's key is its column plus a million rows.
+        keys = (image_m / (side * diameter_m)).floor() @ torch.tensor([1.0, 1e6]).double()
+        _, block = keys.unique(return_inverse=True)
         count = int(block.max()) + 1
         gradient = gradients.new_zeros(*gradients.shape[:-2], count, 6)
         gradient = gradient.index_add_(-2, block, gradients)

@@ -24,39 +24,40 @@ from depthpose.pose.surface import NEAR, Surface, finite_array
 from depthpose.pose.types import Evidence, Identity
 
 POINTS = 400  #: of the cloud, evenly taken
-_STEPS = 12
-_WIDE_STEP = 2.0  # times the usual limit of a distance in the first step
-_INDEPENDENT = 10.0  # so many neighbouring readings err alike: the variance is so many times larger
+_ROUGH_POINTS = 150  # of these, to compare starts
+_ROUGH_MIRROR_POINTS = 100  # of these, to compare starts of the mirror image
+_STEPS = 12  # of ICP with a scale
+_WIDE_STEP = 2.0  # limit of the first step, in the usual limit of a distance
+_CONVERGED = 3e-4  # largest step [rad, m or share] at which ICP with a scale stops
+_CORRELATED_READINGS = 10.0  # neighbours that err alike: the variance is so many times larger
 _STARTS = (1.0, 0.87, 1.15)
 """Scales at which ICP starts: from 1 alone it stays there for smaller copies."""
-_ROUGH_POINTS = 150
-_TRUST = 0.03
-"""A start beside 1 must lower the mean squared distance so much, in squared limits of nearness."""
-_CONVERGED = 3e-4
-_PLANES = 24  # planes across which the posed model is mirrored for a start
-_CLEAR = 0.05
+_FIRST_START_BONUS = 0.03
+"""Subtracted from the mean squared distance, in squared limits of nearness, of the start at 1."""
+_MIRROR_PLANES = 24  # across which the posed model is mirrored for a start
+_CLEARLY_WORSE = 0.05
 """Where the mirror image, roughly fitted, is so much farther from the points than the model, exact
 steps do not bring it nearer: in 123 views the gain was then -0.035 at most."""
 _FLIP = torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
-_SURE = 2.0  # standard deviations
+_DEVIATIONS = 2.0  # standard deviations by which a size may err
 _SIZE_GAIN = 0.05
-"""Where another size gains less (0.25 % of the diameter), what is seen of the surface fits at many,
+"""Where another size gains less (0.25 % of the diameter), the visible surface fits at many sizes,
 or a sensor errs so: the right pose of a real bowl gains 0.032 at 1.07."""
 _MIRROR_GAIN = 0.02
 """Gain from which a cloud is that of a mirrored copy, 0.1 % of the diameter: of right answers for
 synthetic views it was at most 0.004, where the mirror image is not nearly the model."""
-_OTHER_SIZES = 0.1  # sizes so far from 1 must be excluded for an identity to be confirmed
-_NEAR_SIZE = 0.03  # and the size that fits is as near to 1, beside its deviation and an offset
+_OTHER_SIZES = 0.1  # difference of sizes that must be excluded for an identity to be confirmed
+_NEAR_SIZE = 0.03  # difference of the size that fits, beside its errors, that is still the model's
 
 
 @dataclass(frozen=True)
 class Scale:
-    """How many times as large as the model the seen object is, and how sure that is."""
+    """How many times as large as the model the observed object is, and how certain that is."""
 
     times: float  #: 1 for the model itself
     sigma: float  #: standard deviation of it
-    #: by how much it lowers the root mean square distance of the points to the surface, in units of
-    #: the distance up to which a point is near.
+    #: how much it lowers the root mean square distance of the points to the surface, in limits of
+    #: nearness (``NEAR`` of the diameter).
     gain: float
 
 
@@ -74,24 +75,27 @@ def scale_of(
         surface: of the model.
         object_std_m: standard deviation of the real surface from the model.
     """
+    # The best of several starting scales, roughly.
     local_m = pose.inverse().apply(take_evenly(cloud_m.double(), POINTS))
     starts = torch.tensor(_STARTS, dtype=torch.float64)
     few_m = take_evenly(local_m, _ROUGH_POINTS).expand(len(starts), -1, -1)
-    times, grown_m = _grow(few_m, starts, surface, is_exact=False)
-    costs = distance_to(grown_m, surface, times, is_exact=False).square()
-    costs[0] -= _TRUST
+    times, moved_m = _fit_scale(few_m, starts, surface, is_exact=False)
+    costs = distance_to(moved_m, surface, times, is_exact=False).square()
+    costs[0] -= _FIRST_START_BONUS
     start = starts[costs.argmin()][None]
-    times, grown_m = _grow(local_m[None], start, surface, is_exact=True)
-    reached = distance_to(grown_m, surface, times, is_exact=True)
-    gain = distance_to(local_m, surface, is_exact=True) - reached[0]
-    equations = _growth_equations(grown_m, times, surface, NEAR * surface.diameter_m, is_exact=True)
+
+    # From it exactly.
+    times, moved_m = _fit_scale(local_m[None], start, surface, is_exact=True)
+    distance = distance_to(moved_m, surface, times, is_exact=True)[0]
+    gain = distance_to(local_m, surface, is_exact=True) - distance
+    equations = _growth_equations(moved_m, times, surface, NEAR * surface.diameter_m, is_exact=True)
     return Scale(float(times), _scale_deviation(equations, object_std_m), float(gain))
 
 
 class _Equations(NamedTuple):
-    """Point-to-plane equations of turn, shift and growth, one a point."""
+    """Point-to-plane equations of rotation, translation and growth, one a point."""
 
-    J: Float64[Tensor, "b n 7"]
+    J: Float64[Tensor, "b n 7"]  # derivatives of the residuals
     residual_m: Float64[Tensor, "b n"]
     weight: Float64[Tensor, "b n"]
 
@@ -104,7 +108,7 @@ def _growth_equations(
     *,
     is_exact: bool,
 ) -> _Equations:
-    """Linearise the distances of points to a surface that is so many times as large."""
+    """Linearise the distances of points to a surface that is ``times`` as large."""
     middle_m = surface.middle_m
     scale = times[:, None, None]
     unscaled_m = (local_m - middle_m) / scale + middle_m
@@ -121,32 +125,44 @@ def _growth_equations(
 
 
 def _damped(H: Float64[Tensor, "b 7 7"]) -> Float64[Tensor, "b 7 7"]:
-    """Damp what the points leave undetermined."""
+    """Add a little to the diagonal: what the points leave undetermined stays as it is."""
     largest = H.diagonal(dim1=1, dim2=2).amax(-1)[:, None, None].clamp(min=1e-9)
     return H + 1e-9 * largest * torch.eye(7, dtype=torch.float64)
 
 
 def _scale_deviation(equations: _Equations, object_std_m: float) -> float:
-    """Standard deviation of a scale: noise that neighbours share, and sides that deviate."""
+    """Give the standard deviation of a scale.
+
+    It has two causes: noise of the readings, which neighbours share, and sides of the real object
+    that deviate from the model by ``object_std_m``.
+    """
     J = equations.J[0]
     weight = equations.weight[0]
     inverse = torch.linalg.inv(_damped(((J.mT * weight) @ J)[None]))[0]
     noise_m2 = (weight * equations.residual_m[0].square()).sum() / (weight.sum() - 7).clamp(min=1)
-    variance = _INDEPENDENT * noise_m2 * inverse[6, 6]
+    variance = _CORRELATED_READINGS * noise_m2 * inverse[6, 6]
     variance += object_std_m**2 * weight.sum() * inverse[6, 6] / INDEPENDENT_SIDES
     return float(variance.clamp(min=0).sqrt())
 
 
-def _grow(
+def _fit_scale(
     local_m: Float64[Tensor, "b n 3"],
     times: Float64[Tensor, " b"],
     surface: Surface,
     *,
     is_exact: bool,
 ) -> tuple[Float64[Tensor, " b"], Float64[Tensor, "b n 3"]]:
-    """Iterate point-to-plane ICP with a scale; give the scales and the moved points."""
+    """Iterate point-to-plane ICP with a scale; give the scales and the moved points.
+
+    Args:
+        local_m: points in the model frame, for each start.
+        times: scales to begin with.
+        surface: of the model.
+        is_exact: whether the nearest samples are searched, not looked up in a table.
+    """
+    # The limit of a distance shrinks over half of the steps, then stays.
     middle_m = surface.middle_m
-    widths = (1 + (_WIDE_STEP - 1) * max(0.0, 1 - 2 * step / _STEPS) for step in range(_STEPS))
+    widths = [1 + (_WIDE_STEP - 1) * max(0.0, 1 - 2 * step / _STEPS) for step in range(_STEPS)]
     limits_m = [NEAR * surface.diameter_m * width for width in widths]
     if use_numba(local_m, times):
         from depthpose.pose.compiled.poses import grow
@@ -156,6 +172,7 @@ def _grow(
         arrays = (local_m.numpy(), times.numpy(), middle_m.numpy(), np.array(limits_m))
         grow(*arrays, surface.target, is_exact, _CONVERGED)
         return times, local_m
+
     for limit_m in limits_m:
         J, residual_m, weight = _growth_equations(
             local_m, times, surface, limit_m, is_exact=is_exact
@@ -163,8 +180,9 @@ def _grow(
         weighted = J.mT * weight[:, None]
         motion = torch.linalg.solve(_damped(weighted @ J), weighted @ residual_m[..., None])[..., 0]
         times = (times * (1 + motion[:, 6].clamp(-0.1, 0.1))).clamp(0.5, 2.0)
-        turn = rotation_by(motion[:, :3])
-        local_m = (local_m - middle_m - motion[:, None, 3:6]) @ turn + middle_m
+        # The points move by the inverse of the surface's motion.
+        R = rotation_by(motion[:, :3])
+        local_m = (local_m - middle_m - motion[:, None, 3:6]) @ R + middle_m
         if float(motion[:, [0, 1, 2, 6]].abs().max()) < _CONVERGED:
             break
     return times, local_m
@@ -177,9 +195,9 @@ def distance_to(
     *,
     is_exact: bool,
 ) -> Float64[Tensor, "*batch"]:
-    """Root mean square distance of points to a surface, in limits of nearness, cut off at 1.
+    """Give the root mean square distance of points to a surface, in limits of nearness.
 
-    With ``times`` the surface is so many times as large, grown about its middle.
+    Distances are cut off at 1, the limit. With ``times`` the surface is scaled about its middle.
     """
     if times is not None:
         local_m = (local_m - surface.middle_m) / times[:, None, None] + surface.middle_m
@@ -191,42 +209,62 @@ def distance_to(
 
 
 def mirror_gain(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) -> float:
-    """Measure by how much nearer the points lie to the mirror image of the model, in its best pose.
+    """Measure how much nearer a cloud lies to the mirror image of the model, in its best pose.
 
-    The cloud is mirrored in place of the model, so that ICP finds a pose. Negative where the
-    mirror image fits worse: by a rough fit, where that is clearly worse already.
+    The cloud is mirrored in place of the model, so that ICP finds a pose.
+
+    Returns:
+        The gain in root mean square distance, in limits of nearness; negative where the mirror
+        image fits worse. It is measured roughly where the mirror image is clearly worse.
     """
-    # Mirrored once, the cloud is brought back by rotations: a reflection at each of many planes.
+    # The mirrored cloud, and starts that together with it are reflections at many planes.
     local_m = pose.inverse().apply(take_evenly(cloud_m.double(), POINTS))
     middle_m = surface.middle_m
     mirrored_m = (local_m - middle_m) * _FLIP + middle_m
     config = IcpConfig()
-    normals = fibonacci_directions(_PLANES)  # of planes that mirror the cloud back
-    R = _FLIP[:, None] * (torch.eye(3).double() - 2 * normals[:, :, None] * normals[:, None])
-    tried = refine_roughly(mirrored_m, Rigid(R, middle_m - R @ middle_m), surface, config)
+    normals = fibonacci_directions(_MIRROR_PLANES)
+    reflections = torch.eye(3).double() - 2 * normals[:, :, None] * normals[:, None]
+    R = _FLIP[:, None] * reflections
+    rough = refine_roughly(mirrored_m, Rigid(R, middle_m - R @ middle_m), surface, config)
 
-    # Roughly: is the mirror image clearly worse?
-    few_m = take_evenly(mirrored_m, 100).expand(len(tried.R), -1, -1)
-    rough = distance_to(tried.inverse().apply(few_m), surface, is_exact=False)
-    unmirrored = distance_to(take_evenly(local_m, 100), surface, is_exact=False)
-    if float(rough.min() - unmirrored) > _CLEAR:
-        return float(unmirrored - rough.min())
+    # Is the mirror image clearly worse?
+    few_m = take_evenly(mirrored_m, _ROUGH_MIRROR_POINTS).expand(len(rough.R), -1, -1)
+    distance = distance_to(rough.inverse().apply(few_m), surface, is_exact=False)
+    few_m = take_evenly(local_m, _ROUGH_MIRROR_POINTS)
+    unmirrored = distance_to(few_m, surface, is_exact=False)
+    if float(distance.min() - unmirrored) > _CLEARLY_WORSE:
+        return float(unmirrored - distance.min())
 
-    # Exactly, from the best of them: three found no other gain in 24 views.
-    nearest = rough.argmin()[None]
+    # Exactly, from the best start alone: the best three had no other gain in 24 views.
+    best = distance.argmin()[None]
     config = replace(config, start_distance_diameters=config.end_distance_diameters)
-    refined = refine_pose(mirrored_m, tried[nearest], surface, config)
+    refined = refine_pose(mirrored_m, rough[best], surface, config)
     exact_m = refined.camera_from_model.inverse().apply(mirrored_m[None])
+    distance = distance_to(exact_m, surface, is_exact=True)
     unmirrored = distance_to(local_m, surface, is_exact=True)
-    return float(unmirrored - distance_to(exact_m, surface, is_exact=True).min())
+    return float(unmirrored - distance.min())
 
 
 def sensor_size_error(distance_m: float, focal_px: float, diameter_m: float) -> float:
-    """Give the share by which an offset and displaced edges of a sensor may change a size.
+    """Give the share by which an offset and displaced edges of a sensor may change a size."""
+    edges_m = 2 * EDGE_PX * distance_m / focal_px
+    return _offset_size_error(distance_m) + edges_m / diameter_m
 
-    What looks nearer by the offset looks larger by the same share.
-    """
-    return LARGEST_OFFSET_M / distance_m + 2 * EDGE_PX * distance_m / focal_px / diameter_m
+
+def _offset_size_error(distance_m: float) -> float:
+    """Give the share by which a sensor's offset may change a size: the same as of the distance."""
+    return LARGEST_OFFSET_M / distance_m
+
+
+class _Fits(NamedTuple):
+    """What other fits of a model to a cloud found, and how far their results may be off."""
+
+    name: str  # of the model
+    scale: Scale
+    mirror_gain: float | None  # None where the mirror image is the model itself
+    size_tolerance: float  # share by which a right object may seem to differ in size
+    mirror_tolerance: float  # gain of the mirror image that deviating sides explain
+    offset_error: float  # share by which a sensor's offset may change the size
 
 
 def identify(
@@ -240,7 +278,7 @@ def identify(
     max_size_error: float,
     object_std_m: float,
 ) -> Identity:
-    """Fit another size and the mirror image, and say whether one of them is what was seen.
+    """Check whether a posed object has the size and the handedness of its model.
 
     Args:
         cloud_m: points of the object, in the camera frame.
@@ -254,56 +292,83 @@ def identify(
         object_std_m: standard deviation of its surface from the model's.
     """
     scale = scale_of(cloud_m, pose, surface, object_std_m)
-    mirror = None
-    if mirror_deviation > MIRROR_ALIKE:
-        mirror = mirror_gain(cloud_m, pose, surface)
+    has_mirror_image = mirror_deviation > MIRROR_ALIKE
+    gain = mirror_gain(cloud_m, pose, surface) if has_mirror_image else None
+
+    # Errors that explain a difference: of the sensor, and of sides that deviate from the model.
     distance_m = float(cloud_m[:, 2].double().median())
-    offset_error = LARGEST_OFFSET_M / distance_m  # what looks nearer by the offset looks larger
     sensor_error = sensor_size_error(distance_m, focal_px, surface.diameter_m)
-    size_error = abs(scale.times - 1)
-    largest_error = max_size_error + sensor_error + _SURE * scale.sigma
-    is_other_size = size_error > largest_error and scale.gain > _SIZE_GAIN
-    size = (
-        f"{scale.times:.2f} times the model's size fits best (standard deviation {scale.sigma:.2f})"
+    sides_m = object_std_m / math.sqrt(INDEPENDENT_SIDES)
+    fits = _Fits(
+        name=name,
+        scale=scale,
+        mirror_gain=gain,
+        size_tolerance=max_size_error + sensor_error,
+        mirror_tolerance=sides_m / (NEAR * surface.diameter_m),
+        offset_error=_offset_size_error(distance_m),
     )
 
-    status = "not excluded"
-    reason = ""
-    # Sides that deviate from the model may fit its mirror image a little better.
-    deviation = object_std_m / math.sqrt(INDEPENDENT_SIDES) / (NEAR * surface.diameter_m)
-    least_gain = max(_MIRROR_GAIN, deviation, scale.gain if is_other_size else 0.0)
-    if mirror is not None and mirror > least_gain:
+    reason = _why_contradicted(fits)
+    if reason:
         status = "contradicted"
-        reason = (
-            f"the mirror image of {name} fits better (by {NEAR * mirror:.2%} of the "
-            "diameter): a mirrored copy, another object, or a camera whose x or y axis points "
-            "the other way"
-        )
-    elif is_other_size:
-        status = "contradicted"
-        reason = (
-            f"{size}, and the sensor explains {max_size_error + sensor_error:.0%}: a copy "
-            "of another size, another object, or a wrong unit, camera or focal length"
-        )
-    elif size_error + _SURE * scale.sigma + offset_error > _OTHER_SIZES:
-        reason = f"what was seen does not fix the size: {size}"
-    elif mirror is not None and mirror > -_MIRROR_GAIN:
-        reason = f"the mirror image of {name} fits what was seen as well"
-    elif scale.gain > _SIZE_GAIN:
-        reason = f"{size}, which a sensor's errors may explain"
-    elif size_error > max(_NEAR_SIZE, _SURE * scale.sigma) + offset_error:
-        reason = f"{size}, and not that of the model"
-    elif evidence.contradicted > 0:
-        reason = (
-            f"{evidence.contradicted / (evidence.supported + evidence.contradicted):.1%} of what "
-            "was compared contradicts the model: a similar part, or one that differs from its file"
-        )
     else:
-        status = "confirmed"
+        reason = _why_not_confirmed(fits, evidence)
+        status = "not excluded" if reason else "confirmed"
     return Identity(
         status=status,
         size=scale.times,
         size_deviation=scale.sigma,
-        mirror_gain=None if mirror is None else NEAR * mirror,
+        mirror_gain=None if gain is None else NEAR * gain,
         reason=reason,
+    )
+
+
+def _why_contradicted(fits: _Fits) -> str:
+    """Say which other fit is clearly better than that of the model; an empty text where none is."""
+    scale = fits.scale
+    largest_error = fits.size_tolerance + _DEVIATIONS * scale.sigma
+    is_other_size = abs(scale.times - 1) > largest_error and scale.gain > _SIZE_GAIN
+
+    # Where both another size and the mirror image fit better, the one that gains more is named.
+    size_gain = scale.gain if is_other_size else 0.0
+    least_gain = max(_MIRROR_GAIN, fits.mirror_tolerance, size_gain)
+    if fits.mirror_gain is not None and fits.mirror_gain > least_gain:
+        return (
+            f"the mirror image of {fits.name} fits better (by {NEAR * fits.mirror_gain:.2%} of the "
+            "diameter): a mirrored copy, another object, or a camera whose x or y axis points "
+            "the other way"
+        )
+    if is_other_size:
+        return (
+            f"{_describe_size(scale)}, and the sensor explains {fits.size_tolerance:.0%}: a copy "
+            "of another size, another object, or a wrong unit, camera or focal length"
+        )
+    return ""
+
+
+def _why_not_confirmed(fits: _Fits, evidence: Evidence) -> str:
+    """Say what keeps a model that nothing contradicts from being confirmed; empty where nothing."""
+    scale = fits.scale
+    size_error = abs(scale.times - 1)
+    deviation = _DEVIATIONS * scale.sigma
+    if size_error + deviation + fits.offset_error > _OTHER_SIZES:
+        return f"what was seen does not fix the size: {_describe_size(scale)}"
+    if fits.mirror_gain is not None and fits.mirror_gain > -_MIRROR_GAIN:
+        return f"the mirror image of {fits.name} fits what was seen as well"
+    if scale.gain > _SIZE_GAIN:
+        return f"{_describe_size(scale)}, which a sensor's errors may explain"
+    if size_error > max(_NEAR_SIZE, deviation) + fits.offset_error:
+        return f"{_describe_size(scale)}, and not that of the model"
+    if evidence.contradicted > 0:
+        share = evidence.contradicted / (evidence.supported + evidence.contradicted)
+        return (
+            f"{share:.1%} of what was compared contradicts the model: a similar part, or one that "
+            "differs from its file"
+        )
+    return ""
+
+
+def _describe_size(scale: Scale) -> str:
+    return (
+        f"{scale.times:.2f} times the model's size fits best (standard deviation {scale.sigma:.2f})"
     )

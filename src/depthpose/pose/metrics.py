@@ -7,7 +7,7 @@ Computed in float64.
 from collections.abc import Callable, Sequence
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
@@ -21,7 +21,7 @@ BOP_PIXELS = tuple(5.0 * i for i in range(1, 11))  #: BOP's, of MSPD [px], at 64
 
 SUCCESS_SHARE = 0.1  #: of the diameter: a pose is right whose ADD or ADD-S is below
 
-_CHUNK = 2**22
+_CHUNK = 2**22  # coordinates of posed points in memory at a time
 
 RenderDepth = Callable[[Rigid], Float[Tensor, "h w"]]
 """Renders the depth [m] of an object at a pose; NaN, 0 or infinity where it is not."""
@@ -29,7 +29,8 @@ RenderDepth = Callable[[Rigid], Float[Tensor, "h w"]]
 
 def add_m(estimated: Rigid, true: Rigid, points_m: Float[Tensor, "n 3"]) -> Float[Tensor, "*batch"]:
     """ADD [m]: mean distance of each model point at one pose to itself at the other."""
-    return (_moved(estimated, points_m) - _moved(true, points_m)).norm(dim=-1).mean(-1)
+    gap_m = _posed(estimated, points_m) - _posed(true, points_m)
+    return gap_m.norm(dim=-1).mean(-1)
 
 
 def adds_m(
@@ -37,41 +38,55 @@ def adds_m(
 ) -> Float[Tensor, "*batch"]:
     """ADD-S [m]: mean distance of each true point to the nearest estimated one.
 
-    So BOP and Hinterstoisser; DenseFusion and the method's published code go the other way, from
-    each estimated point to the nearest true one.
+    This is the definition of BOP and Hinterstoisser. DenseFusion and the method's published code
+    measure from each estimated point to the nearest true one.
     """
-    first = _moved(true, points_m)
-    second = _moved(estimated, points_m)
-    rows = zip(first.reshape(-1, *first.shape[-2:]), second.reshape(-1, *second.shape[-2:]),
-               strict=True)  # fmt: skip
-    means = [float(KDTree(b.numpy()).query(a.numpy())[0].mean()) for a, b in rows]
-    return torch.tensor(means, dtype=torch.float64).reshape(first.shape[:-2])
+    true_m = _posed(true, points_m)
+    estimated_m = _posed(estimated, points_m)
+    means_m: list[float] = []
+    rows = -1, *true_m.shape[-2:]
+    for of_truth, of_estimate in zip(true_m.reshape(rows), estimated_m.reshape(rows), strict=True):
+        distance_m, _ = KDTree(of_estimate.numpy()).query(of_truth.numpy())
+        means_m.append(float(distance_m.mean()))
+    return torch.tensor(means_m, dtype=torch.float64).reshape(true_m.shape[:-2])
 
 
 def add_of_nearest_m(
     estimated: Rigid, true: Rigid, points_m: Float[Tensor, "n 3"], symmetries: Rigid
 ) -> Float[Tensor, ""]:
-    """ADD [m] for the most lenient symmetric truth.
+    """ADD [m] to the nearest symmetric copy of the true pose.
 
-    ADD-S is lower: it forgives any pose that lays the surface near itself, such as a U turned by
-    90 degrees, and not only those that leave the object as it is. Poses are ``camera_from_model``,
-    symmetries a batch with the identity, of ``mesh.symmetry_transforms``.
+    ADD-S is lower: it forgives any pose with the surface near the true one, such as a U rotated by
+    90 degrees, and not only symmetries.
+
+    Args:
+        estimated: ``camera_from_model``, one.
+        true: the same, annotated.
+        points_m: of the model.
+        symmetries: ``model_from_model``, a batch with the identity, of
+            ``mesh.symmetry_transforms``.
     """
-    moved_m = _moved(estimated, points_m)
-    copies = _symmetric_copies(true, symmetries, len(points_m))
-    return torch.cat([(_moved(c, points_m) - moved_m).norm(dim=-1).mean(-1) for c in copies]).min()
+    estimated_m = _posed(estimated, points_m)
+    errors_m = [
+        (_posed(copies, points_m) - estimated_m).norm(dim=-1).mean(-1)
+        for copies in _symmetric_copies(true, symmetries, len(points_m))
+    ]
+    return torch.cat(errors_m).min()
 
 
 def mssd_m(
     estimated: Rigid, true: Rigid, points_m: Float[Tensor, "n 3"], symmetries: Rigid
 ) -> Float[Tensor, ""]:
-    """MSSD [m]: largest distance of a surface point, for the most lenient symmetric truth.
+    """MSSD [m]: largest distance of a surface point, to the nearest symmetric copy of the truth.
 
     The arguments are those of :func:`add_of_nearest_m`.
     """
-    moved_m = _moved(estimated, points_m)
-    copies = _symmetric_copies(true, symmetries, len(points_m))
-    return torch.cat([(_moved(c, points_m) - moved_m).norm(dim=-1).amax(-1) for c in copies]).min()
+    estimated_m = _posed(estimated, points_m)
+    errors_m = [
+        (_posed(copies, points_m) - estimated_m).norm(dim=-1).amax(-1)
+        for copies in _symmetric_copies(true, symmetries, len(points_m))
+    ]
+    return torch.cat(errors_m).min()
 
 
 def mspd_px(
@@ -81,17 +96,17 @@ def mspd_px(
     symmetries: Rigid,
     K: Float[Tensor, "3 3"],
 ) -> Float[Tensor, ""]:
-    """MSPD [px]: largest distance of a projected point, for the most lenient symmetric truth.
+    """MSPD [px]: largest distance of a projected point, to the nearest symmetric copy of the truth.
 
     Infinite where a point lies behind the camera. BOP scales it by 640 / image width before its
     thresholds; see :func:`average_recall`.
     """
-    pixels = project(_moved(estimated, points_m), K)
-    largest = [
-        (project(_moved(copy, points_m), K) - pixels).norm(dim=-1).nan_to_num(torch.inf).amax(-1)
-        for copy in _symmetric_copies(true, symmetries, len(points_m))
-    ]
-    return torch.cat(largest).min()
+    pixels = project(_posed(estimated, points_m), K)
+    errors_px: list[Tensor] = []
+    for copies in _symmetric_copies(true, symmetries, len(points_m)):
+        distance_px = (project(_posed(copies, points_m), K) - pixels).norm(dim=-1)
+        errors_px.append(distance_px.nan_to_num(torch.inf).amax(-1))
+    return torch.cat(errors_px).min()
 
 
 def vsd(
@@ -107,8 +122,8 @@ def vsd(
 
     Distances are those from the camera's centre, not along its axis. A pixel of a render is
     visible where the measured surface is not more than ``delta_m`` in front of it, or where
-    nothing was measured ("bop19"); the estimate is visible also where the truth is. A pixel
-    visible in one render alone is off. 1 where neither is visible anywhere.
+    there is no reading ("bop19"); the estimate is visible also where the truth is. A pixel
+    visible in one render alone counts as off. 1 where neither is visible anywhere.
 
     Args:
         estimated: ``camera_from_model``.
@@ -126,24 +141,31 @@ def vsd(
     y = (pixels[..., 1] - K[1, 2]) / K[1, 1]
     x = (pixels[..., 0] - K[0, 2] - K[0, 1] * y) / K[0, 0]
     rays = (x * x + y * y + 1).sqrt()
-    measured, predicted, known = (
+    measured_m, estimated_m, true_m = (
         image_m.double().nan_to_num(nan=0.0, posinf=0.0) * rays
         for image_m in (depth_m, render(estimated), render(true))
     )
-    is_known, is_found = (
-        (model > 0) & ((model - measured <= delta_m) | (measured == 0))
-        for model in (known, predicted)
-    )
-    is_found |= is_known & (predicted > 0)
-    both = is_known & is_found
-    either = is_known | is_found
-    count = int(either.sum())
+    is_true_visible = _is_visible(true_m, measured_m, delta_m)
+    is_estimated_visible = _is_visible(estimated_m, measured_m, delta_m)
+    is_estimated_visible |= is_true_visible & (estimated_m > 0)
+
+    in_both = is_true_visible & is_estimated_visible
+    in_either = is_true_visible | is_estimated_visible
+    count = int(in_either.sum())
     if count == 0:
         return torch.ones(len(taus_m), dtype=torch.float64)
-    gap_m = (known[both] - predicted[both]).abs()
-    alone = count - int(both.sum())
-    bad = torch.stack([(gap_m >= tau).sum() for tau in taus_m])
-    return (bad.double() + alone) / count
+    gap_m = (true_m[in_both] - estimated_m[in_both]).abs()
+    in_one_alone = count - int(in_both.sum())
+    off = torch.stack([(gap_m >= tau).sum() for tau in taus_m])
+    return (off.double() + in_one_alone) / count
+
+
+def _is_visible(
+    rendered_m: Float[Tensor, "h w"], measured_m: Float[Tensor, "h w"], delta_m: float
+) -> Bool[Tensor, "h w"]:
+    """Mark the pixels of a render that no measured surface occludes; distances, 0 for none."""
+    is_unoccluded = (rendered_m - measured_m <= delta_m) | (measured_m == 0)
+    return (rendered_m > 0) & is_unoccluded
 
 
 def auc(error_m: Float[Tensor, " n"], limit_m: float = 0.1) -> float:
@@ -159,7 +181,7 @@ def auc(error_m: Float[Tensor, " n"], limit_m: float = 0.1) -> float:
 def average_recall(errors: Float[Tensor, "n t"], thresholds: Sequence[float]) -> float:
     """BOP's average recall: share of errors below each threshold, mean over thresholds and taus.
 
-    A missing estimate is infinite or NaN: it stays in the denominator.
+    A missing estimate is infinite or NaN, and counts as wrong.
 
     Args:
         errors: one row a target; the taus of VSD, or one column. MSPD is scaled by 640 / width and
@@ -170,14 +192,14 @@ def average_recall(errors: Float[Tensor, "n t"], thresholds: Sequence[float]) ->
 
 
 def average_precision(is_right: Sequence[bool], targets: int) -> float:
-    """Average precision of answers, the surest first, among so many things to be found; 0..1.
+    """Average precision of detections; 0..1.
 
     The mean, over 101 recalls from 0 to 1, of the best precision at that recall or a higher one:
     COCO's interpolation, as BOP takes it for 6D detection since 2024.
 
     Args:
-        is_right: of each answer, in the order of falling scores.
-        targets: how many there are to be found, at least 1.
+        is_right: of each detection, in the order of falling scores.
+        targets: number of objects to be detected, at least 1.
     """
     right = torch.tensor(list(is_right), dtype=torch.float64).cumsum(0)
     if len(right) == 0:
@@ -185,18 +207,19 @@ def average_precision(is_right: Sequence[bool], targets: int) -> float:
     recall = right / targets
     precision = right / torch.arange(1, len(right) + 1, dtype=torch.float64)
     best = precision.flip(0).cummax(0).values.flip(0)  # at this recall or a higher one
-    wanted = torch.linspace(0, 1, 101, dtype=torch.float64)
-    place = torch.searchsorted(recall, wanted)
-    return float(torch.cat([best, best.new_zeros(1)])[place].mean())
+    recalls = torch.linspace(0, 1, 101, dtype=torch.float64)
+    place = torch.searchsorted(recall, recalls)
+    best = torch.cat([best, best.new_zeros(1)])  # a recall that is not reached has a precision of 0
+    return float(best[place].mean())
 
 
-def _moved(pose: Rigid, points_m: Float[Tensor, "n 3"]) -> Float[Tensor, "*batch n 3"]:
+def _posed(pose: Rigid, points_m: Float[Tensor, "n 3"]) -> Float[Tensor, "*batch n 3"]:
     points = points_m.double()
     return points @ pose.R.double().mT + pose.t_m.double()[..., None, :]
 
 
 def _symmetric_copies(true: Rigid, symmetries: Rigid, points: int) -> list[Rigid]:
-    """Poses that look like the true one, in groups that fit into memory."""
+    """Give the poses that look like the true one, in batches that fit into memory."""
     pose = true.double()
     R = symmetries.R.double()
     t_m = symmetries.t_m.double()

@@ -9,24 +9,25 @@ from depthpose.core.rigid import Rigid, cross_matrix
 from depthpose.pose.surface import NEAR, Surface
 from depthpose.pose.types import Axis, Symmetries
 
-_SAMPLED = 1000  # points of the cloud that say how well it determines a pose
+_SAMPLED = 1000  # points of the cloud by which observability is measured
 
 
 def free_motions(axes: tuple[Axis, ...], camera_from_model: Rigid) -> Float[Tensor, "m 6"]:
-    """Give the motions of the camera frame that turn the object about its axes of revolution.
+    """Give the motions in the camera frame that rotate an object about its axes of revolution.
 
-    Unit vectors of (rotation, translation): along them no observation says anything, the variance
-    is infinite, and the pose is valid all the same. Two axes make a ball, which is free to turn
-    about the third too.
+    They are unit vectors of (rotation, translation). No observation constrains a pose along them;
+    it is valid all the same. An object with two axes is a ball, free to rotate about a third too.
     """
-    rows = []
     centre_m = Symmetries(continuous=axes).ball_centre_m
-    if centre_m is not None:  # turns about two axes of a ball make those about every axis
+    if centre_m is not None:
         axes = tuple(Axis(direction=row, point_m=centre_m) for row in torch.eye(3).to(centre_m))
-    for axis in axes if centre_m is not None else axes[:1]:
+    else:  # several that do not make a ball are parallel: one axis
+        axes = axes[:1]
+    rows = []
+    for axis in axes:
         direction = camera_from_model.R @ axis.direction.to(camera_from_model.R)
         point_m = camera_from_model.apply(axis.point_m.to(camera_from_model.R)[None])[0]
-        # Turning by w about a line through c moves c nowhere: w x c + v = 0.
+        # A rotation by w about a line through c leaves c where it is: w x c + v = 0.
         motion = torch.cat([direction, torch.linalg.cross(point_m, direction)])
         rows.append(motion / motion.norm())
     return torch.stack(rows) if rows else camera_from_model.R.new_zeros(0, 6)
@@ -35,32 +36,44 @@ def free_motions(axes: tuple[Axis, ...], camera_from_model: Rigid) -> Float[Tens
 def observability(
     cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface, free: Float[Tensor, "m 6"]
 ) -> tuple[float, Float64[Tensor, "6"]] | None:
-    """Measure how well the seen surface determines the pose: 0 where a motion is unobservable.
+    """Measure how well the observed surface determines the pose: 0 where a motion is unobservable.
 
-    A motion ``y = (d/2 w, v)`` about the middle of the cloud moves a surface point at ``a`` with
-    normal ``n`` across itself by ``n . v + (a x n) . w``. The observability is the root mean square
-    of that over the points near the surface, for the unit motion that moves it least (Gelfand et
-    al., Geometrically Stable Sampling for the ICP Algorithm, 2003). Motions of declared symmetries
-    (``free``) are left out. The weakest motion is given too: (rotation, translation at the middle
-    of the cloud), of unit length after scaling. None where fewer than six points lie near the
-    surface.
+    A motion ``y = (d/2 w, v)`` about the middle of the cloud, with the diameter ``d``, moves a
+    surface point at ``a`` with normal ``n`` across the surface by ``n . v + (a x n) . w``. The
+    observability is the root mean square of that over the points near the surface, for the unit
+    motion ``y`` for which it is least (Gelfand et al., Geometrically Stable Sampling for the ICP
+    Algorithm, 2003).
+
+    Args:
+        cloud_m: points of the object, in the camera frame.
+        pose: ``camera_from_model``.
+        surface: of the model.
+        free: motions of symmetries (:func:`free_motions`), which are left out.
+
+    Returns:
+        The observability and that weakest motion ``y``; None where fewer than six points lie near
+        the surface.
     """
-    points = take_evenly(cloud_m.double(), _SAMPLED)
-    local_m = pose.inverse().apply(points)
+    points_m = take_evenly(cloud_m.double(), _SAMPLED)
+    local_m = pose.inverse().apply(points_m)
     index = surface.nearest(local_m)
-    near = (local_m - surface.points_m[index]).norm(dim=-1) < NEAR * surface.diameter_m
-    if int(near.sum()) < 6:
+    is_near = (local_m - surface.points_m[index]).norm(dim=-1) < NEAR * surface.diameter_m
+    if int(is_near.sum()) < 6:
         return None
-    normal = (surface.normals[index] @ pose.R.mT)[near]
-    middle = points.mean(0)
+
+    # Displacement of each point across the surface by each unknown.
+    normal = (surface.normals[index] @ pose.R.mT)[is_near]
+    middle_m = points_m.mean(0)
     radius_m = surface.diameter_m / 2
-    arm = points[near] - middle
-    J = torch.cat([torch.linalg.cross(arm, normal) / radius_m, normal], -1)
-    # Declared symmetries as motions about the middle, turns in metres at the radius.
-    turn = free[:, :3].double()
-    shift = free[:, 3:].double()
-    motions = torch.cat([turn * radius_m, shift + turn @ cross_matrix(middle)], -1)
-    _, _, rows = torch.linalg.svd(motions)  # the last ones are orthogonal to all of them
+    arm_m = points_m[is_near] - middle_m
+    J = torch.cat([torch.linalg.cross(arm_m, normal) / radius_m, normal], -1)
+
+    # A basis of the motions that no symmetry leaves free: they are orthogonal to those of free,
+    # here about the middle, with rotations in metres at the radius.
+    rotation = free[:, :3].double()
+    translation = free[:, 3:].double()
+    motions = torch.cat([rotation * radius_m, translation + rotation @ cross_matrix(middle_m)], -1)
+    _, _, rows = torch.linalg.svd(motions)
     basis = rows[int(torch.linalg.matrix_rank(motions, rtol=1e-9)) :].T
     values, vectors = torch.linalg.eigh(basis.T @ (J.T @ J / len(J)) @ basis)
     return float(values[0].clamp(min=0).sqrt()), basis @ vectors[:, 0]
@@ -69,12 +82,12 @@ def observability(
 def without_motions(
     covariance: Float[Tensor, "6 6"], free: Float[Tensor, "m 6"]
 ) -> Float[Tensor, "6 6"]:
-    """Give the covariance where the pose does not move along ``free``: finite, and 0 along them."""
+    """Condition a covariance on no motion along ``free``: it becomes finite, and 0 along them."""
     if len(free) == 0:
         return covariance
     _, sizes, rows = torch.linalg.svd(free.double())
     basis = rows[int((sizes > 1e-9 * sizes[0]).sum()) :].T
-    # Rotations and metres differ in size; the information of the rest is what counts.
+    # The information is restricted to the other motions, not the covariance, as conditioning asks.
     information = torch.linalg.inv(covariance.double())
     inner = torch.linalg.inv(basis.T @ information @ basis)
     return (basis @ inner @ basis.T).to(covariance)

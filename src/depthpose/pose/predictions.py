@@ -1,4 +1,4 @@
-"""Predictions as files: records of what is done, and BOP results."""
+"""Predictions as files: ``poses.json``, which records a run as it goes, and BOP's csv."""
 
 import csv
 import math
@@ -46,12 +46,12 @@ STAGES = (
 )  # fmt: skip
 """What an estimate's ``seconds`` are of, in order; a stage that was not run is missing."""
 
-_ROTATION_SLACK = 1e-4
-_PLACE = ("scene_id", "im_id", "obj_id")
+_ROTATION_SLACK = 1e-4  # of a rotation matrix times its transpose
+_PLACE = ("scene_id", "im_id", "obj_id")  # keys of a :class:`Place`
 
 
 class Place(NamedTuple):
-    """Where in a BOP data set an estimate belongs."""
+    """The scene, image and object of a BOP data set that an estimate is of."""
 
     scene_id: int
     image_id: int
@@ -60,20 +60,20 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Prediction:
-    """An estimate as a file keeps it."""
+    """An estimate, or a refusal, and its place in a data set."""
 
-    #: or refusal; from the annotated mask of an instance it bears the instance's name.
+    #: one from the annotated mask of an instance has the instance's name.
     estimate: PoseEstimate
     place: Place | None = None  #: scene, image and object; None for a cloud of no data set
 
 
 class Predictions(list[Prediction]):
-    """Estimates in their order, which pandas may tabulate."""
+    """A list of predictions that can be given as a table of pandas."""
 
     def to_frame(self) -> Any:  # noqa: ANN401  pandas is no dependency
-        """Give a ``pandas.DataFrame``: a row an estimate, the columns those of ``poses.json``.
+        """Give a ``pandas.DataFrame``: a row for each estimate, with the columns of ``poses.json``.
 
-        What has names itself is a column each, such as ``evidence.supported`` and ``seconds.icp``.
+        Values of nested names are columns too, such as ``evidence.supported`` and ``seconds.icp``.
 
         Raises:
             ImportError: pandas is not installed.
@@ -82,7 +82,7 @@ class Predictions(list[Prediction]):
 
 
 def place_of(instance: Instance) -> Place:
-    """Say where an annotated object belongs."""
+    """Give the place of an annotated instance."""
     return Place(instance.scene_id, instance.image_id, instance.object_id)
 
 
@@ -114,31 +114,29 @@ def read_predictions(folder: Path) -> Predictions:
 
 
 def earlier_predictions(folder: Path) -> dict[str, Prediction]:
-    """Read what earlier runs left in a folder, and in those of the parts of several processes.
+    """Read the predictions of earlier runs by name, of a folder and its parts of several processes.
 
-    By the names of estimates. A damaged file is as none, and a notice.
+    A damaged file counts as missing, and gives a notice.
     """
     predictions: dict[str, Prediction] = {}
     for home in (folder, *sorted(folder.glob("part-*"))):
         try:
-            every = read_predictions(home) if (home / POSES).is_file() else []
+            found = read_predictions(home) if (home / POSES).is_file() else []
         except InputError as error:
             warnings.warn(f"{error} - it is damaged, and made again", Notice, stacklevel=2)
             continue
-        for prediction in every:
-            # What was read at last counts, whatever another part said of an earlier try.
-            if (
-                prediction.estimate.status != "unreadable"
-                or prediction.estimate.name not in predictions
-            ):
-                predictions[prediction.estimate.name] = prediction
+        for prediction in found:
+            # An input that one part could read counts as read, though another part could not.
+            name = prediction.estimate.name
+            if prediction.estimate.status != "unreadable" or name not in predictions:
+                predictions[name] = prediction
     return predictions
 
 
 def score_of(estimate: PoseEstimate) -> float:
-    """Say how sure an estimate is, 0..1: the chance of being right, where it is known.
+    """Give the score of an estimate, 0..1: its certainty where known, else its share of inliers.
 
-    Else the share of the votes that agree, or 1 where nothing is said.
+    1 where neither is known.
     """
     if estimate.certainty is not None:
         return estimate.certainty
@@ -159,19 +157,20 @@ def prediction_row(prediction: Prediction) -> dict[str, Any]:
     for name in ("covariance", "free_motions", "keypoints_m"):
         values: Tensor | None = getattr(estimate, name)
         row[name] = None if values is None else values.double().tolist()
-    # JSON has no infinity: a free axis has no deviation, nothing near the surface no distance.
+    # JSON has no infinity: the deviation along a free axis becomes null, and so does the distance
+    # where no point lies near the surface.
     for name in ("origin_std_mm", "rotation_std_deg"):
         values = None if pose is None else getattr(estimate, name)
-        certainties = [] if values is None else values.tolist()
-        row[name] = [v if math.isfinite(v) else None for v in certainties] or None
+        deviations = [] if values is None else values.tolist()
+        row[name] = [v if math.isfinite(v) else None for v in deviations] or None
     for name in ("inlier_share", "residual_m", "certainty", "copy_certainty"):
         value: float | None = getattr(estimate, name)
         row[name] = value if value is not None and math.isfinite(value) else None
     row["visible_share"] = estimate.visible_share
     row["pick_rank"] = estimate.pick_rank
     for name in ("evidence", "identity"):
-        answer = getattr(estimate, name)
-        row[name] = None if answer is None else asdict(answer)
+        record = getattr(estimate, name)
+        row[name] = None if record is None else asdict(record)
     row["alternatives"] = [
         {
             "camera_from_model": other.camera_from_model.matrix().tolist(),
@@ -198,7 +197,7 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
             "with the depthpose that wrote it, or a newer one"
         )
 
-    # What it is of, and what became of it.
+    # Names and status.
     name = row.get("name")
     object_name = row.get("object")
     if not isinstance(name, str) or not isinstance(object_name, str):
@@ -213,7 +212,7 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
     tracking = row.get("tracking")
     if tracking is not None and tracking not in get_args(Tracking):
         raise InputError(f"{source}: tracking is {tracking!r}; write one of {get_args(Tracking)}")
-    pose = _pose(row, source)
+    pose = _parse_pose(row, source)
     if (pose is not None) != (status in POSED):
         raise InputError(
             f"{source}: an estimate that is ok or ambiguous has a camera_from_model, a refused one "
@@ -224,11 +223,11 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
             f"{source}: every estimate but one that is ok has a reason; its status is {status!r}"
         )
 
-    # The numbers that belong to it.
+    # The numbers.
     values: dict[str, Any] = {
-        "keypoints_m": _table(row, "keypoints_m", 3, source),
-        "covariance": _table(row, "covariance", 6, source, rows=6),
-        "free_motions": _table(row, "free_motions", 6, source),
+        "keypoints_m": _parse_table(row, "keypoints_m", 3, source),
+        "covariance": _parse_table(row, "covariance", 6, source, rows=6),
+        "free_motions": _parse_table(row, "free_motions", 6, source),
     }
     for key in ("inlier_share", "residual_m", "certainty", "copy_certainty"):
         values[key] = None if row.get(key) is None else number(row, key, None, source)
@@ -248,8 +247,8 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
         status=cast("Status", status),
         reason=str(reason),
         camera_from_model=pose,
-        base_from_model=_pose(row, source, "base_from_model"),
-        alternatives=_alternatives(row, source),
+        base_from_model=_parse_pose(row, source, "base_from_model"),
+        alternatives=_parse_alternatives(row, source),
         tracking=cast("Tracking | None", tracking),
         pick_rank=None if row.get("pick_rank") is None else integer(row, "pick_rank", source),
         **values,
@@ -259,15 +258,15 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
     return Prediction(estimate=estimate, place=place)
 
 
-def _alternatives(row: dict[str, Any], source: str) -> tuple[Alternative, ...]:
-    """Read the other poses of an entry."""
+def _parse_alternatives(row: dict[str, Any], source: str) -> tuple[Alternative, ...]:
+    """Read the alternative poses of an entry."""
     entries = row.get("alternatives", [])
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise InputError(f"{source}: alternatives are no list of poses; write [...] of them")
     alternatives: list[Alternative] = []
     for k, entry in enumerate(entries):
         where = f"{source}: alternative {k}"
-        pose = _pose(entry, where)
+        pose = _parse_pose(entry, where)
         if pose is None:
             raise InputError(f"{where}: has no camera_from_model; leave it out, or write it")
         alternatives.append(
@@ -281,9 +280,9 @@ def _alternatives(row: dict[str, Any], source: str) -> tuple[Alternative, ...]:
     return tuple(alternatives)
 
 
-def _pose(row: dict[str, Any], source: str, key: str = "camera_from_model") -> Rigid | None:
+def _parse_pose(row: dict[str, Any], source: str, key: str = "camera_from_model") -> Rigid | None:
     """Read a pose of ``poses.json``; None where the entry has none."""
-    matrix = _table(row, key, 4, source, rows=4)
+    matrix = _parse_table(row, key, 4, source, rows=4)
     if matrix is None:
         return None
     R = matrix[:3, :3]
@@ -297,7 +296,7 @@ def _pose(row: dict[str, Any], source: str, key: str = "camera_from_model") -> R
     return Rigid(R.clone(), matrix[:3, 3].clone())
 
 
-def _table(
+def _parse_table(
     row: dict[str, Any], key: str, width: int, source: str, rows: int | None = None
 ) -> Tensor | None:
     """Read a table of ``width`` columns, and of ``rows`` rows where that is given."""
@@ -312,7 +311,7 @@ def _table(
         ) from error
 
 
-_SAVE_EVERY = 200
+_SAVE_EVERY = 200  # results
 
 Input = TypeVar("Input")
 
@@ -321,11 +320,11 @@ Input = TypeVar("Input")
 class PoseJob(Job[Input]):
     """One input of an estimator of poses."""
 
-    #: what is posed, where an input that cannot be read gives an estimate that says so; else it is
-    #: an error
+    #: name of the object; with it an input that cannot be read gives an estimate that says so,
+    #: without it an error
     object: str | None = None
-    place: Place | None = None  #: as :class:`Prediction` has it
-    seconds: Mapping[str, float] = field(default_factory=dict)  #: what was spent before, on a mask
+    place: Place | None = None  #: as in :class:`Prediction`
+    seconds: Mapping[str, float] = field(default_factory=dict)  #: spent before, on a mask
 
 
 def unreadable_estimate(name: str, object: str, error: InputError) -> PoseEstimate:
@@ -337,8 +336,8 @@ def unreadable_estimate(name: str, object: str, error: InputError) -> PoseEstima
 class PoseResults(Results[Input, PoseEstimate]):
     """One estimate for each input, in the ``poses.json`` of a folder.
 
-    What was unreadable is tried again: it may have been repaired. The file is written every 200
-    results, and when the run ends or is interrupted.
+    Inputs that were unreadable are tried again, for they may have been repaired. The file is
+    written every 200 results, and when the run ends or is interrupted.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -388,14 +387,14 @@ def predict(
     settings: dict[str, Any],
     batch: int = 1,
 ) -> Generator[Prediction, None, None]:
-    """Estimate what is not finished, and yield all predictions in the order of the jobs.
+    """Estimate the inputs that are not finished, and yield all predictions in the order of jobs.
 
     Args:
         estimate_many: gives an estimate for each input, of the same name.
-        jobs: all that there are to do, the finished ones too.
-        folder: where ``poses.json`` goes; refused if other settings made what it holds.
-        settings: what decides the results.
-        batch: how many inputs are handed over at once. Each then takes an equal share of the time.
+        jobs: all jobs, finished ones too.
+        folder: of ``poses.json``; refused if that was made with other settings.
+        settings: that determine the results.
+        batch: how many inputs are given at once. Each then takes an equal share of the time.
 
     Raises:
         InputError: an input whose job names no object cannot be read.
@@ -410,9 +409,12 @@ def predict(
 def instance_jobs(
     dataset: BopDataset, names: Mapping[int, str], predicted_mask: str | None = None
 ) -> list[PoseJob[ViewInput]]:
-    """Take every annotated instance by its own mask, or a predicted one: see ``Layout``.
+    """Make a job for each annotated instance, by its own mask or a predicted one.
 
-    ``names`` are those of the estimator, by the objects' numbers.
+    Args:
+        dataset: with the instances.
+        names: of the objects in the estimator, by number.
+        predicted_mask: the file of a predicted mask, as ``Layout.predicted_mask``; None: its own.
     """
     jobs: list[PoseJob[ViewInput]] = []
     for instance in dataset.instances:
@@ -429,7 +431,7 @@ def instance_jobs(
 def _read_view(
     dataset: BopDataset, instance: Instance, name: str, object: str, mask: Path | Detection | None
 ) -> ViewInput:
-    """Read the view of an instance by the mask of a file or a detection; None: its own."""
+    """Read the view of an instance with a mask from a file or a detection; None for its own."""
     pixels = None
     if isinstance(mask, Detection):
         width, height = image_size(instance.depth)
@@ -444,17 +446,20 @@ def _read_view(
 def detection_jobs(
     dataset: BopDataset, names: Mapping[int, str], detections: Sequence[Detection]
 ) -> list[PoseJob[ViewInput]]:
-    """Take the surest detections of each object, as many as an image shows of it.
+    """Make jobs of the detections with the highest scores, as many as an image shows of an object.
 
-    What is not detected has no job, and is missing in what is measured. The time of an image's
-    detection is shared by all its jobs.
+    An instance that is not detected has no job, and counts as missing. The time of an image's
+    detection is divided among its jobs.
 
-    ``names`` are those of the estimator, by the objects' numbers. Detections of images that the
-    data set has not are left out.
+    Args:
+        dataset: with the instances.
+        names: of the objects in the estimator, by number.
+        detections: those of images that are not in the data set are left out.
 
     Raises:
         InputError: no detection is of the data set.
     """
+    # The best detections of each object in each image.
     shown: dict[Place, list[Instance]] = defaultdict(list)
     for instance in dataset.instances:
         shown[place_of(instance)].append(instance)
@@ -470,24 +475,22 @@ def detection_jobs(
             of_place[place].append(detection)
     kept = [
         (place, k, detection)
-        for place, every in of_place.items()
-        for k, detection in enumerate(every)
+        for place, best in of_place.items()
+        for k, detection in enumerate(best)
     ]
     if not kept:
         raise InputError(
             f"{dataset.folder}: none of the {len(detections)} detections is of an image and object "
             f"of split {dataset.split!r}; give those of this very split"
         )
-    sharing = Counter(place[:2] for place, _, _ in kept)
 
+    jobs_of_image = Counter(place[:2] for place, _, _ in kept)
     jobs: list[PoseJob[ViewInput]] = []
     for place, k, detection in sorted(kept, key=lambda item: item[:2]):
         name = f"{place.scene_id:06d}_{place.image_id:06d}_object{place.object_id}_{k}"
-        seconds = (
-            {}
-            if detection.seconds is None
-            else {"segmentation": detection.seconds / sharing[place[:2]]}
-        )
+        seconds: dict[str, float] = {}
+        if detection.seconds is not None:
+            seconds = {"segmentation": detection.seconds / jobs_of_image[place[:2]]}
         instance = shown[place][0]
         object = names[place.object_id]
         read = partial(_read_view, dataset, instance, name, object, detection)
@@ -501,16 +504,15 @@ _SAME_TIME_S = 0.001  # BOP's toolkit refuses rows of an image whose times diffe
 
 def results_name(dataset: BopDataset, method: str = "depthpose") -> str:
     """Name the BOP csv of a data set: ``METHOD_DATASET-SPLIT.csv``."""
-    split = dataset.folder_of_split.replace(
-        "_", "-"
-    )  # as test_primesense; BOP's toolkit parts names at _
+    # BOP's toolkit splits names at _, which a split such as test_primesense may hold.
+    split = dataset.folder_of_split.replace("_", "-")
     return f"{method}_{dataset.folder.resolve().name}-{split}.csv"
 
 
 def read_bop_results(path: str | Path) -> list[Prediction]:
-    """Read anybody's BOP csv (mm, seconds) as predictions.
+    """Read a BOP csv (mm, seconds) of any method as predictions.
 
-    A row has a share of its image's time; its score is kept as the share of votes that agree.
+    The time of an image is divided among its rows; a score becomes the share of inliers.
 
     Raises:
         InputError: it is missing or damaged, or rows of an image have different times.
@@ -526,40 +528,18 @@ def read_bop_results(path: str | Path) -> list[Prediction]:
     for line, row in enumerate(rows[1:], 2):
         if not row:
             continue
-        source = f"{path}: line {line}"
-        if len(row) != len(_HEADER):
-            raise InputError(f"{source}: {len(row)} values, where {len(_HEADER)} belong")
-        try:
-            place = Place(*(int(value) for value in row[:3]))
-            score = float(row[3])
-            time_s = float(row[6])
-            R, t_mm = ([float(value) for value in text.split()] for text in row[4:6])
-        except ValueError as error:
-            raise InputError(
-                f"{source}: {error}; write numbers, R and t parted by blanks"
-            ) from error
-        if not all(0 <= value <= MOST for value in place):
-            raise InputError(f"{source}: scene, image and object are numbers from 0 to {MOST}")
-        if len(R) != 9 or len(t_mm) != 3 or not all(map(math.isfinite, [score, time_s, *R, *t_mm])):
-            raise InputError(f"{source}: {len(R)} numbers of R and {len(t_mm)} of t, where 9 and 3 "
-                             "finite ones belong")  # fmt: skip
+        place, estimate, time_s = _parse_bop_row(row, len(estimates) + 1, f"{path}: line {line}")
+        estimates.append((place, estimate))
+
+        # All rows of an image have its time; a negative one is not known.
         first_time_s = image_s.setdefault(place[:2], time_s)
-        if (first_time_s < 0) != (time_s < 0) or (
-            time_s >= 0 and abs(first_time_s - time_s) > _SAME_TIME_S
-        ):
+        is_one_known = (first_time_s < 0) != (time_s < 0)
+        if is_one_known or (time_s >= 0 and abs(first_time_s - time_s) > _SAME_TIME_S):
             raise InputError(
                 f"{path}: scene {place.scene_id} image {place.image_id} took {first_time_s} s in "
                 f"one row and {time_s} s in another; time is that of the whole image, "
                 "the same in all"
             )
-        estimate = PoseEstimate(
-            name=f"row {len(estimates) + 1}",
-            object=f"obj_{place.object_id:06d}",
-            status="ok",
-            camera_from_model=make_pose(R, t_mm, source),
-            inlier_share=score,
-        )
-        estimates.append((place, estimate))
     rows_of = Counter(place[:2] for place, _ in estimates)
     shares = {image: {"image": s / rows_of[image]} for image, s in image_s.items() if s >= 0}
     return [
@@ -568,17 +548,45 @@ def read_bop_results(path: str | Path) -> list[Prediction]:
     ]
 
 
+def _parse_bop_row(
+    row: Sequence[str], number: int, source: str
+) -> tuple[Place, PoseEstimate, float]:
+    """Read a row of BOP's csv: its place, an estimate named by ``number``, and the image's time."""
+    if len(row) != len(_HEADER):
+        raise InputError(f"{source}: {len(row)} values, where {len(_HEADER)} belong")
+    try:
+        place = Place(*(int(value) for value in row[:3]))
+        score = float(row[3])
+        time_s = float(row[6])
+        R = [float(value) for value in row[4].split()]
+        t_mm = [float(value) for value in row[5].split()]
+    except ValueError as error:
+        raise InputError(f"{source}: {error}; write numbers, R and t parted by blanks") from error
+    if not all(0 <= value <= MOST for value in place):
+        raise InputError(f"{source}: scene, image and object are numbers from 0 to {MOST}")
+    if len(R) != 9 or len(t_mm) != 3 or not all(map(math.isfinite, [score, time_s, *R, *t_mm])):
+        raise InputError(f"{source}: {len(R)} numbers of R and {len(t_mm)} of t, where 9 and 3 "
+                         "finite ones belong")  # fmt: skip
+    estimate = PoseEstimate(
+        name=f"row {number}",
+        object=f"obj_{place.object_id:06d}",
+        status="ok",
+        camera_from_model=make_pose(R, t_mm, source),
+        inlier_share=score,
+    )
+    return place, estimate, time_s
+
+
 def write_bop_results(
     path: str | Path, predictions: Iterable[Prediction], *, with_alternatives: bool = False
 ) -> None:
-    """Write BOP's csv; refused ones have no row. An image's time is the sum over its estimates.
+    """Write BOP's csv, without refusals. An image's time is the sum over its estimates.
 
     Args:
         path: the csv. Numbers keep all their digits.
         predictions: of a data set.
-        with_alternatives: give each alternative a row too, its probability the score. BOP's
-            measures take the surest rows of an image, so they are no row of the csv that is
-            measured.
+        with_alternatives: give each alternative a row too, with its probability as the score.
+            Leave them out of a csv that is measured: BOP takes the best rows of an image.
 
     Raises:
         InputError: a pose belongs to no scene, or the disk refuses.
@@ -601,11 +609,11 @@ def write_bop_results(
                 f"{estimate.name}: belongs to no scene of a BOP data set, and its csv is of such; "
                 "leave it out"
             )
-        answers = [(estimate.camera_from_model, score_of(estimate))]
+        scored_poses = [(estimate.camera_from_model, score_of(estimate))]
         if with_alternatives:
             others = estimate.alternatives
-            answers += [(other.camera_from_model, other.probability) for other in others]
-        for pose, score in answers:
+            scored_poses += [(other.camera_from_model, other.probability) for other in others]
+        for pose, score in scored_poses:
             R = " ".join(repr(value) for value in pose.R.double().flatten().tolist())
             t_mm = " ".join(repr(value) for value in (1000 * pose.t_m.double()).tolist())
             writer.writerow([*place, score, R, t_mm, image_s[place[:2]] or -1])

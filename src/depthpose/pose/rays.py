@@ -15,17 +15,18 @@ from torch import Tensor
 from depthpose.core.arrays import take_evenly
 from depthpose.core.errors import Notice
 
-_SAMPLE = 1000
-_HYPOTHESES = 120
-_PLANES = 3
-_REFITS = 3
+_SAMPLE = 1000  # readings of an image that are examined
+_HYPOTHESES = 120  # of RANSAC, for each plane
+_PLANES = 3  # at most
+_REFITS = 3  # of a plane to the readings on it
 _TOLERANCE_M = 0.0015
 _TOLERANCE_PER_M2 = 0.004
-"""Readings lie on a plane up to so much, and so much for the square of their depth in metres."""
+"""Distance up to which a reading lies on a plane: the first, and the second times the square of its
+depth in metres."""
 _LEAST_SHARE = 0.05
 """Of the readings: fewer make no plane."""
-_CLEARLY = 1.1
-"""By so much more readings must lie on the planes of one assumption than on those of the other."""
+_LEAST_RATIO = 1.1
+"""Of the readings on the planes of the better assumption to those of the other."""
 _LEAST_BEND = 0.007
 """Least bend that distance along the ray gives the planes, as a share of their depth, for an
 answer: sensors bend planes themselves, by up to 0.1 % of the depth in the real frames."""
@@ -34,7 +35,7 @@ _RAY_BEND = (0.75, 1.3)
 their depth was turned into distance."""
 
 _told: set[tuple[float, ...]] = set()
-"""Intrinsics of cameras that were told of: of a folder of images once."""
+"""Intrinsics of cameras for which the notice was given: it is given once."""
 
 
 def warn_of_rays(depth_m: Float[Tensor, "h w"], K: Float[Tensor, "3 3"]) -> None:
@@ -56,10 +57,10 @@ def warn_of_rays(depth_m: Float[Tensor, "h w"], K: Float[Tensor, "3 3"]) -> None
 
 
 def ray_bend(depth_m: Float[Tensor, "h w"], K: Float[Tensor, "3 3"]) -> float | None:
-    """Measure how planes are bent: 0 of depth along the axis, 1 of distance along the ray.
+    """Measure how planes are bent: 0 where values are depth along the axis, 1 along the ray.
 
-    Planes are sought by RANSAC under both assumptions; those of the one by which more readings lie
-    on planes are fitted anew, with the bend as a further unknown.
+    Planes are searched by RANSAC under both assumptions. Those of the assumption under which more
+    readings lie on planes are refitted, with the bend as a further unknown.
 
     Args:
         depth_m: NaN or 0 where there is no reading.
@@ -79,25 +80,28 @@ def ray_bend(depth_m: Float[Tensor, "h w"], K: Float[Tensor, "3 3"]) -> float | 
         return None
     stretch = rays.norm(dim=1)
 
-    of_axis = _planes(rays, reading_m, torch.ones_like(stretch))
-    of_ray = _planes(rays, reading_m, stretch)
-    on_axis = sum(int(plane.sum()) for plane in of_axis)
-    on_ray = sum(int(plane.sum()) for plane in of_ray)
-    if max(on_axis, on_ray) < _CLEARLY * min(on_axis, on_ray):
+    # Under which assumption do clearly more readings lie on planes?
+    axis_planes = _find_planes(rays, reading_m, torch.ones_like(stretch))
+    ray_planes = _find_planes(rays, reading_m, stretch)
+    axis_count = sum(int(is_on.sum()) for is_on in axis_planes)
+    ray_count = sum(int(is_on.sum()) for is_on in ray_planes)
+    count = max(axis_count, ray_count)
+    if count < _LEAST_RATIO * min(axis_count, ray_count):
         return None
-    planes = of_axis if on_axis > on_ray else of_ray
-    count = max(on_axis, on_ray)
+    planes = axis_planes if axis_count > ray_count else ray_planes
+
+    # The bend that all planes share, by least squares.
     total = 0.0
     weighted = 0.0
-    for plane in planes:
+    for is_on in planes:
         # (1 + bend (s - 1)) / d = a x + b y + c, times d: linear in the plane and the bend.
-        points_m = rays[plane] * reading_m[plane, None]
+        points_m = rays[is_on] * reading_m[is_on, None]
         ones = torch.ones(len(points_m), dtype=torch.float64)
-        bent = 1 - stretch[plane]
-        plane_alone = torch.linalg.lstsq(points_m, torch.stack([ones, bent], 1)).solution
-        # What the plane alone leaves of both.
-        off_plane = ones - points_m @ plane_alone[:, 0]
-        bent = bent - points_m @ plane_alone[:, 1]
+        bent = 1 - stretch[is_on]
+        # The residuals of both columns after a fit of the plane alone.
+        plane = torch.linalg.lstsq(points_m, torch.stack([ones, bent], 1)).solution
+        off_plane = ones - points_m @ plane[:, 0]
+        bent = bent - points_m @ plane[:, 1]
         total += float(bent.square().sum())
         weighted += float((off_plane * bent).sum())
     if count == 0 or total < count * _LEAST_BEND**2:
@@ -105,15 +109,15 @@ def ray_bend(depth_m: Float[Tensor, "h w"], K: Float[Tensor, "3 3"]) -> float | 
     return weighted / total
 
 
-def _planes(
+def _find_planes(
     rays: Float64[Tensor, "n 3"], reading_m: Float64[Tensor, " n"], stretch: Float64[Tensor, " n"]
 ) -> list[Bool[Tensor, " n"]]:
     """Find planes one after the other by RANSAC; give which readings lie on each.
 
     Args:
         rays: of the readings, with z = 1.
-        reading_m: what the sensor gave.
-        stretch: what a reading is over the depth along the axis: 1, or the length of the ray.
+        reading_m: values of the depth image.
+        stretch: reading over depth along the axis: 1, or the length of the ray.
     """
     depth_m = reading_m / stretch
     points_m = rays * depth_m[:, None]

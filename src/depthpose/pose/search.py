@@ -30,7 +30,7 @@ from depthpose.pose.decide import (
     with_share,
 )
 from depthpose.pose.evidence import compare, observe
-from depthpose.pose.footprint import explained_mask, why_background_excludes, window_of_region
+from depthpose.pose.footprint import explained_frame_mask, why_background_excludes, window_of_region
 from depthpose.pose.frame import Frame, prepare_frame
 from depthpose.pose.icp import refine_roughly
 from depthpose.pose.picking import with_pick_ranks
@@ -237,7 +237,7 @@ def _propose(
         if number >= _MOST_PLACES and proposal.rank >= _LEAST_PROPOSALS:
             continue
         surface = targets.objects[proposal.object].surface
-        explained = explained_mask(frame, proposal.pose, surface)
+        explained = explained_frame_mask(frame, proposal.pose, surface)
         place = _Place(object=proposal.object, pose=proposal.pose, explained=explained)
         is_claimed = any(place.shared_with(other) > _SHARED for other in claimed)
         if place.area_px * frame.step**2 >= _LEAST_PIXELS and not is_claimed:
@@ -272,7 +272,7 @@ def _refine(
             reason = contradiction(evidence, probability)
             hopeless.append(_miss_at(place, evidence, reason, targets))
             continue
-        explained = explained_mask(frame, pose, targets.objects[place.object].surface)
+        explained = explained_frame_mask(frame, pose, targets.objects[place.object].surface)
         likely.append((probability, replace(place, pose=pose, explained=explained)))
     likely.sort(key=lambda pair: -pair[0])
     return [place for _, place in likely], hopeless
@@ -340,7 +340,7 @@ def _judge(
             _Judged(
                 object=estimate.object,
                 pose=pose,
-                explained=explained_mask(frame, pose, surface),
+                explained=explained_frame_mask(frame, pose, surface),
                 estimate=estimate,
                 log_odds=math.log(targets.prior_odds) + log_odds_right(evidence),
             )

@@ -5,13 +5,13 @@ a coarser level holds ``floor(c / 2) * 2`` of the finer one's coordinates, the o
 run with x fastest, odd kernels are centred and even ones start at 0.
 
 A key packs (cloud, x, y, z) so that sorting and searching are one-dimensional: 12 bits of the
-cloud's number and 17 bits of each coordinate, z lowest. Adding packed offsets to a key moves the
-voxel; coordinates keep off the ends of their field by more than any kernel reaches, so that a move
-never carries into the next field. All levels and kernel maps of one set of voxels are made once
+cloud's number and 17 bits of each coordinate, z lowest. Adding a packed offset to a key gives the
+key of the neighbour; coordinates keep a margin in their field, so that no addition carries into the
+next field. All levels and kernel maps of one set of voxels are made once
 (:class:`CoordinateCache`).
 
-Every way of computing a convolution is gather, multiply, add up; the ways differ in how much is
-gathered at once. Without gradients small ones go through a compiled loop, where numba is installed.
+A convolution gathers, multiplies and adds up; its three methods differ in how much is gathered at
+once. Small ones without gradients are computed by a compiled loop, where numba is installed.
 """
 
 from collections.abc import Iterator
@@ -64,7 +64,7 @@ def pack(coordinates: Int[Tensor, "n 4"]) -> Keys:
 
 
 def unpack(keys: Keys) -> Int64[Tensor, "n 4"]:
-    """Give back what :func:`pack` packed."""
+    """Give the rows of (cloud, x, y, z) that keys pack."""
     low = (1 << FIELD_BITS) - 1
     x, y, z = ((keys >> shift * FIELD_BITS & low) - HALF for shift in (2, 1, 0))
     return torch.stack([keys >> 3 * FIELD_BITS, x, y, z], 1)
@@ -73,18 +73,18 @@ def unpack(keys: Keys) -> Int64[Tensor, "n 4"]:
 Moves = tuple[tuple[int, int, int], ...]
 
 MARGIN = 4
-"""Cells about the box: as far as a kernel may look beyond it. With fewer a look past one row's end
-would find the next row."""
+"""Cells about the box: as far as a kernel may reach beyond it. With fewer, a neighbour past the end
+of a row would be looked up in the next row."""
 
 MAX_CELLS = 1 << 24
-CELLS_PER_VOXEL = 512  #: a box with more cells is mostly air: binary search is then the cheaper
+CELLS_PER_VOXEL = 512  #: a box with more cells is mostly empty: binary search is then cheaper
 
 
 class VoxelIndex:
-    """Finds rows of one level's voxels, the same in each of two ways.
+    """Finds rows of one level's voxels by their keys.
 
-    A table of the cells of the clouds' common box where that is small enough, some five times
-    faster than binary search; or that.
+    By a table of all cells of the clouds' common box where that is small enough, which is some five
+    times as fast as binary search; else by binary search.
     """
 
     def __init__(self, keys: Keys, step: int) -> None:
@@ -113,24 +113,25 @@ class VoxelIndex:
         rows = torch.arange(len(coordinates), dtype=torch.int32, device=device)
         self._table[((coordinates - low) * self._strides).sum(1)] = rows
 
-    def find(self, standing: Keys, moves: Moves) -> Int32[Tensor, "moves standing"]:
-        """Give the row of each voxel ``standing + move * step``.
+    def find(self, keys: Keys, moves: Moves) -> Int32[Tensor, "moves keys"]:
+        """Give the row of each voxel at ``key + move * step``.
 
-        Where there is none, one past the last row: a row of zeros put there answers for it.
+        Where there is no such voxel it is one past the last row, for which callers add a row of
+        zeros.
         """
         if not len(self._keys):
-            return standing.new_zeros(len(moves), len(standing), dtype=torch.int32)
-        offsets = torch.tensor(moves, device=standing.device)
+            return keys.new_zeros(len(moves), len(keys), dtype=torch.int32)
+        offsets = torch.tensor(moves, device=keys.device)
         if self._table is None:
             packed = (offsets * self._step * offsets.new_tensor(AXES)).sum(-1)
-            wanted = standing + packed[:, None]
-            rows = torch.searchsorted(self._keys, wanted).clamp_(max=len(self._keys) - 1)
-            return torch.where(self._keys[rows] == wanted, rows, len(self._keys)).int()
-        coordinates = unpack(standing)
+            neighbours = keys + packed[:, None]
+            rows = torch.searchsorted(self._keys, neighbours).clamp_(max=len(self._keys) - 1)
+            return torch.where(self._keys[rows] == neighbours, rows, len(self._keys)).int()
+        coordinates = unpack(keys)
         coordinates[:, 1:] >>= self._step.bit_length() - 1
         cells = ((coordinates - self._low) * self._strides).sum(1)
-        wanted = (offsets * self._strides[1:]).sum(-1)[:, None] + cells
-        return self._table.index_select(0, wanted.flatten()).view(wanted.shape)
+        neighbours = (offsets * self._strides[1:]).sum(-1)[:, None] + cells
+        return self._table.index_select(0, neighbours.flatten()).view(neighbours.shape)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -166,7 +167,7 @@ class NeighbourTable:
 
     @cached_property
     def pairs(self) -> PairList:
-        """The neighbours listed, but for the centre: there input and output rows are the same."""
+        """The neighbours as a list, without the centre, which pairs each row with itself."""
         is_pair = self.table < self.fine_rows
         if self.centre is not None:
             is_pair[self.centre] = False
@@ -186,7 +187,7 @@ class NeighbourTable:
         )  # fmt: skip
 
     def slots(self, *, is_transposed: bool) -> Slots:
-        """The pairs as a grid; ``is_transposed``: from the coarse rows to the fine ones."""
+        """Give the pairs as a grid; ``is_transposed`` is from the coarse rows to the fine ones."""
         if is_transposed not in self._slots:
             pairs = self.pairs
             read = pairs.fine
@@ -205,13 +206,13 @@ class NeighbourTable:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class KernelMap:
-    """Neighbours with a direction: what a convolution reads and where it writes."""
+    """Neighbours with a direction: the rows that a convolution reads and those that it writes."""
 
     neighbours: NeighbourTable  #: of the two levels, or of the one
     is_transposed: bool = False  #: False: fine to coarse (or the level to itself); True: back
 
     def by_offset(self) -> Iterator[tuple[int, Tensor, Tensor]]:
-        """Give each filled offset with the rows that its pairs read, and those they add to."""
+        """Give each offset that has pairs, the rows that these read, and those that they add to."""
         pairs = self.neighbours.pairs
         # Lists of views, each from one call: slicing one by one costs as much as small products.
         fine = pairs.fine.split(pairs.counts)
@@ -254,7 +255,7 @@ class CoordinateCache:
     def kernel_map(
         self, level: int, kernel: int, stride: int = 1, *, is_transposed: bool = False
     ) -> KernelMap:
-        """Find what a convolution reads and writes.
+        """Find the rows that a convolution reads and writes.
 
         Args:
             level: the level that it reads.
@@ -285,21 +286,21 @@ class CoordinateCache:
 
 
 GRID_PRODUCTS = 1 << 20
-"""Where the fullest offset takes up to this many multiplications, all offsets are one batched
-product, padded: up to twice as fast. Beyond, padding costs what fewer calls save: offset by offset
+"""Where the offset with the most pairs takes up to this many multiplications, all offsets are one
+batched product, padded: up to twice as fast. Beyond, padding costs more than fewer calls save
 (measured by bench/sparse_speed.py)."""
 
 GRID_ELEMENTS = 1 << 29
 """Largest padded table on a GPU, where the calls cost more than the padding: a training step of 128
 clouds takes 101 ms with it, one of only 64 clouds offset by offset 169 ms (H200)."""
 
-NARROW = 4  #: inputs of up to so many channels are laid out as a table: products are too thin
+NARROW = 4  #: channels up to which inputs are gathered as a table: products are too thin else
 
 TABLE_ELEMENTS = 1 << 25  #: largest such table
 
 
 COMPILED_ELEMENTS = 1 << 17
-"""Up to so many offsets times outputs the compiled loop, which has no gradient, is the faster."""
+"""Offsets times outputs up to which the compiled loop, which has no gradient, is faster."""
 
 
 def conv(
@@ -329,8 +330,8 @@ def conv(
         assert features.shape == (read, weight.shape[1]), "a row for each voxel"
         assert len(weight) == len(near.table), "a weight for each offset"
         out = features.new_zeros(written, weight.shape[2])
-        given = (part.detach().contiguous().numpy() for part in (features, weight, near.table))
-        convolve(*given, kernel_map.is_transposed, out.numpy())
+        arrays = (part.detach().contiguous().numpy() for part in (features, weight, near.table))
+        convolve(*arrays, kernel_map.is_transposed, out.numpy())
         return out
     return _Convolution.apply(features, weight, kernel_map)
 
@@ -360,11 +361,11 @@ class _Convolution(torch.autograd.Function):
         for_x = _convolve(gradient, weight.mT, back) if wants_x else None
         if not wants_weight:
             return for_x, None, None
-        way = _way(x, weight, m)
-        if way == "table":
-            return for_x, (_table(x, m) @ gradient).view(weight.shape), None
-        if way == "grid":
-            for_weight = torch.bmm(_read(x, m).mT, _read(gradient, back))
+        method = _choose_method(x, weight, m)
+        if method == "table":
+            return for_x, (_gather_table(x, m) @ gradient).view(weight.shape), None
+        if method == "grid":
+            for_weight = torch.bmm(_gather_slots(x, m).mT, _gather_slots(gradient, back))
         else:
             for_weight = torch.zeros_like(weight)
             for offset, read, write in m.by_offset():
@@ -376,13 +377,13 @@ class _Convolution(torch.autograd.Function):
 
 
 def _convolve(x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
-    """Convolve features by the way that is fastest for the size; see :func:`_way`."""
-    way = _way(x, weight, m)
+    """Convolve features by the fastest method for their size; see :func:`_choose_method`."""
+    method = _choose_method(x, weight, m)
     near = m.neighbours
-    if way == "table":
-        return _table(x, m).T @ weight.flatten(0, 1)
-    if way == "grid":  # all offsets in one operation each, padded to the fullest
-        products = torch.bmm(_read(x, m), weight).flatten(0, 1)
+    if method == "table":
+        return _gather_table(x, m).T @ weight.flatten(0, 1)
+    if method == "grid":  # all offsets at once, padded to the one with the most pairs
+        products = torch.bmm(_gather_slots(x, m), weight).flatten(0, 1)
         # The slots of an output are gathered, not scattered: the same bits on every run, on CUDA
         # too, and several times faster on the CPU than ``index_add_``.
         slots = near.slots(is_transposed=m.is_transposed)
@@ -396,7 +397,7 @@ def _convolve(x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
     return out if near.centre is None else out.addmm_(x, weight[near.centre])
 
 
-def _read(x: Tensor, m: KernelMap) -> Tensor:
+def _gather_slots(x: Tensor, m: KernelMap) -> Tensor:
     """Gather the slots of (volume, most); empty ones read a row of zeros."""
     near = m.neighbours
     padded = F.pad(x, (0, 0, 0, 1))
@@ -404,16 +405,18 @@ def _read(x: Tensor, m: KernelMap) -> Tensor:
     return read.view(len(near.table), near.pairs.most, x.shape[1])
 
 
-def _table(x: Tensor, m: KernelMap) -> Tensor:
-    """Lay out what each output voxel reads: (volume * channels, outputs), 0 where it is empty."""
+def _gather_table(x: Tensor, m: KernelMap) -> Tensor:
+    """Gather the inputs of each output voxel (volume * channels, outputs); 0 for no neighbour."""
     padded = F.pad(x, (0, 0, 0, 1))
     rows = m.neighbours.table
     read = padded.index_select(0, rows.flatten()).view(*rows.shape, x.shape[1])
     return read.transpose(1, 2).reshape(len(rows) * x.shape[1], rows.shape[1])
 
 
-def _way(x: Tensor, weight: Tensor, m: KernelMap) -> Literal["table", "grid", "offset by offset"]:
-    """Choose what is gathered at once: all that is read, the padded pairs, or one offset's."""
+def _choose_method(
+    x: Tensor, weight: Tensor, m: KernelMap
+) -> Literal["table", "grid", "offset by offset"]:
+    """Choose how much is gathered at once: all inputs, the padded pairs, or those of one offset."""
     table = m.neighbours.table
     channels = x.shape[1]
     is_small = channels <= NARROW and table.numel() * channels <= TABLE_ELEMENTS

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,23 +19,23 @@ from depthpose.pose.mesh.models import fibonacci_directions
 from depthpose.pose.types import ObjectModel
 
 NEAR = 0.05  #: of the diameter: a point of the cloud within this distance lies on the posed surface
-_TURN_STEP = 0.1  # half of the step between the turns about a continuous axis [rad]
-_CELL = 1 / 24  # side of a ray's cell at the object, in diameters: several samples in each
+_AXIS_STEP = 0.1  # half of the step between the rotations about a continuous axis [rad]
+_CELL = 1 / 24  # side of a cell of an image or of rays, in diameters: it holds several samples
 _REACH = 72
-"""Cells to each side of the middle of the cloud that are distinguished, three diameters; what lies
-farther off counts as if it lay there."""
-_FRONT = 0.1  # points nearer to the camera than this share of the median are no part of what it saw
-_BOXES = 48  # boxes along the longest side of a model, to look up what is near without a search
-_MARGIN = 0.15  # of the diameter: so far the boxes reach beyond the model
-_VIEWS = 256  # directions from which a model is looked at
-_POINTS = 160  # cells of a picture, at most
-_STEP = 0.08
+"""Cells to each side of the middle of the cloud that are distinguished, three diameters; points
+farther off count as if they lay at this border."""
+_NEAREST_SHARE = 0.1  # of the median depth: nearer points are no part of what a camera observed
+_BOXES = 48  # boxes along the longest side of a model, to look up near samples without a search
+_BOX_MARGIN = 0.15  # by which the boxes reach beyond the model, in diameters
+_VIEWS = 256  # directions from which a model is viewed
+_POINTS = 160  # points of a view, at most
+_EDGE_STEP = 0.08
 """Of the diameter: neighbouring cells that differ in depth by more are the two sides of an edge."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Boxes:
-    """For each box of a grid about a model, the surface point that is nearest to its middle."""
+    """A table of near surface points: for each box of a grid, the one nearest to its middle."""
 
     low_m: Float64[Tensor, "3"]  #: corner of the grid, in the model frame
     side_m: float  #: of a box
@@ -42,9 +43,9 @@ class Boxes:
     nearest: Int64[Tensor, " boxes"]  #: number of the surface point, axes one after the other
 
     def look_up(self, points_m: Float64[Tensor, "*batch n 3"]) -> Int64[Tensor, "*batch n"]:
-        """Give the surface point nearest to the middle of each point's box.
+        """Give the index of the surface point nearest to the middle of each point's box.
 
-        A point beyond the grid has the answer of the border.
+        For a point outside the grid the box at the border is used.
         """
         box = ((points_m - self.low_m) / self.side_m).long()
         x, y, z = torch.minimum(box.clamp_(min=0), self.counts - 1).unbind(-1)
@@ -53,11 +54,11 @@ class Boxes:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Views:
-    """What a camera far off sees of a model, from many sides, in the model's frame."""
+    """The visible points of a model from many directions of a far camera, in the model's frame."""
 
     toward: Float64[Tensor, "v 3"]  #: unit vectors to the camera
-    points_m: Float64[Tensor, "v n 3"]  #: what is seen, evenly spread; NaN where there are fewer
-    normals: Float64[Tensor, "v n 3"]  #: theirs
+    points_m: Float64[Tensor, "v n 3"]  #: visible ones, evenly spread; NaN where there are fewer
+    normals: Float64[Tensor, "v n 3"]  #: of these points
     #: whether the surface goes on around a point: no rim or edge, which sensors cut.
     is_inner: Bool[Tensor, "v n"]
 
@@ -67,20 +68,20 @@ class Surface:
     """Samples of a model's surface, computed once and used for every cloud."""
 
     points_m: Float64[Tensor, "m 3"]  #: of the surface, in the model frame
-    normals: Float64[Tensor, "m 3"]  #: theirs; their side does not matter
+    normals: Float64[Tensor, "m 3"]  #: of these points, to either side
     outward: Float64[Tensor, "m 3"]  #: normals on the outer side, 0 where none is known
-    is_hidden: Bool[Tensor, " m"]  #: samples that no camera sees from afar, as faces inside a part
-    across: Int64[Tensor, " m"]  #: number of the sample on the other side of a wall, or -1
+    is_hidden: Bool[Tensor, " m"]  #: samples not visible from afar, as faces inside a part
+    across: Int64[Tensor, " m"]  #: index of the sample on the other side of a wall, or -1
     diameter_m: float  #: of the object
     spacing_m: float  #: distance from a point to the third nearest, in the median
     middle_m: Float64[Tensor, "3"]  #: of the box about the surface, along the axes of the model
     ball_m: Float64[Tensor, "4"]  #: middle and radius of a ball about the surface
     symmetries: Rigid  #: declared and found, ``model_from_model``, the identity first
-    tree: KDTree  #: finds the nearest of the points
-    boxes: Boxes  #: find it nearly, some thirty times as fast
+    tree: KDTree  #: of the points
+    boxes: Boxes  #: a table of near points, some thirty times as fast as the tree
 
     def nearest(self, points_m: Float64[Tensor, "*batch n 3"]) -> Int64[Tensor, "*batch n"]:
-        """Give the number of the surface point nearest to each point of the model frame."""
+        """Give the index of the surface point nearest to each point of the model frame."""
         if use_numba(points_m):
             from depthpose.pose.compiled.points import nearest_many
 
@@ -91,12 +92,15 @@ class Surface:
 
     @cached_property
     def views(self) -> Views:
-        """What a camera sees of the surface: looked at once for many images."""
+        """The visible points from many directions, computed once for many images."""
         half = fibonacci_directions(_VIEWS // 2).double()
         toward = torch.cat([half, -half])
-        _, _, axes = torch.linalg.svd(toward[:, None])
         # The last two rows of each frame are two axes across the direction.
-        views = [_view_of(self, way, across[1:]) for way, across in zip(toward, axes, strict=True)]
+        _, _, frames = torch.linalg.svd(toward[:, None])
+        views = [
+            _visible_from(self, direction, frame[1:])
+            for direction, frame in zip(toward, frames, strict=True)
+        ]
         return Views(
             toward=toward,
             points_m=torch.stack([view.points_m for view in views]),
@@ -106,33 +110,35 @@ class Surface:
 
     @cached_property
     def target(self) -> Any:  # noqa: ANN401  a tuple of numba's
-        """Points, normals and table as compiled functions take them, in memory of their own.
+        """Points, normals and table as compiled functions take them (``compiled.poses.Target``).
 
-        Where a surface is sent to another process, torch moves its tensors to shared memory and
-        frees where they were: an array that stood on a tensor's memory would point at nothing.
+        They are copies: where a surface is sent to another process, torch moves its tensors to
+        shared memory and frees the old one, and an array on that memory would point at nothing.
         """
-        from depthpose.pose.compiled.points import Tree, planted
+        from depthpose.pose.compiled.points import Tree, build_tree
         from depthpose.pose.compiled.poses import Target
 
-        tree = Tree(*planted(finite_array(self.points_m.numpy())))
-        boxes = self.boxes
+        tree = Tree(*build_tree(finite_array(self.points_m.numpy())))
+        # The place of each sample in the tree; the last one, -1, is that of no sample.
         place = np.full(len(self.points_m) + 1, -1)
         place[tree.order] = np.arange(len(self.points_m))
+        boxes = self.boxes
         return Target(
-            tree,
-            np.ascontiguousarray(self.normals.numpy()[tree.order]),
-            boxes.low_m.numpy().copy(),
-            boxes.side_m,
-            boxes.counts.numpy().copy(),
-            place[boxes.nearest.numpy()].astype(np.int32),  # half of the memory: read at random
-            np.ascontiguousarray(self.outward.numpy()[tree.order]),
-            place[self.across.numpy()[tree.order]].astype(np.int32),
-            self.ball_m.numpy().copy(),
+            tree=tree,
+            normals=np.ascontiguousarray(self.normals.numpy()[tree.order]),
+            low=boxes.low_m.numpy().copy(),
+            side=boxes.side_m,
+            counts=boxes.counts.numpy().copy(),
+            # In 32 bits: half of the memory, which is read at random.
+            table=place[boxes.nearest.numpy()].astype(np.int32),
+            outward=np.ascontiguousarray(self.outward.numpy()[tree.order]),
+            across=place[self.across.numpy()[tree.order]].astype(np.int32),
+            ball=self.ball_m.numpy().copy(),
         )
 
 
 def finite_array(array: np.ndarray) -> np.ndarray:
-    """Give what a compiled loop reads: contiguous, and finite, as cells and trees need it.
+    """Make an array contiguous, as compiled loops read it, and refuse values that are not finite.
 
     Raises:
         ValueError: a value is not finite.
@@ -143,89 +149,80 @@ def finite_array(array: np.ndarray) -> np.ndarray:
 
 
 class _View(NamedTuple):
-    """What a camera far off sees from one side: a row of each part of :class:`Views`."""
+    """The visible points from one direction: a row of each part of :class:`Views`."""
 
     points_m: Float64[Tensor, "n 3"]
     normals: Float64[Tensor, "n 3"]
     is_inner: Bool[Tensor, " n"]
 
 
-def _view_of(surface: Surface, toward: Tensor, across: Tensor) -> _View:
-    """Look at a surface from one side: the points that are seen.
+def _visible_from(surface: Surface, toward: Tensor, across: Tensor) -> _View:
+    """Choose the points of a surface that a far camera sees, 160 at most.
 
     Args:
         surface: of the model.
         toward: unit vector to the camera.
         across: two unit vectors across it, (2, 3).
     """
-    # A picture along parallel rays: in each cell the point that is nearest to the camera.
+    # An image along parallel rays: in each cell the sample that is nearest to the camera.
     cell_m = _CELL * surface.diameter_m
     side = 2 * round(0.5 / _CELL) + 10
-    about_m = surface.points_m - surface.middle_m
-    column, row = (about_m @ across.T / cell_m).floor().long().add(side // 2).unbind(-1)
+    centred_m = surface.points_m - surface.middle_m
+    column, row = (centred_m @ across.T / cell_m).floor().long().add(side // 2).unbind(-1)
     place = row * side + column
-    height_m = about_m @ toward
+    height_m = centred_m @ toward
     nearest_m = height_m.new_full((side**2,), -torch.inf)
     nearest_m = nearest_m.scatter_reduce_(0, place, height_m, "amax")
     is_nearest = height_m == nearest_m[place]
     sample = torch.full((side**2,), len(place))
     sample[place[is_nearest]] = torch.arange(len(place))[is_nearest]
-    picture_m = nearest_m.reshape(1, side, side)
+    image_m = nearest_m.reshape(1, side, side)
 
     # Where samples are sparse the far side shows through the gaps: no camera sees it.
-    front_m = max_pool2d(picture_m, 3, 1, 1).flatten()
-    is_seen = nearest_m > front_m - _STEP * surface.diameter_m
-    is_seen &= nearest_m.isfinite()
+    front_m = max_pool2d(image_m, 3, 1, 1).flatten()
+    is_visible = nearest_m > front_m - _EDGE_STEP * surface.diameter_m
+    is_visible &= nearest_m.isfinite()
 
-    # Inner cells: two from the silhouette, whose single empty cells are closed first, and beside
-    # nothing that lies farther off.
-    closed = max_pool2d(picture_m.isfinite().double(), 3, 1, 1)
-    whole = -max_pool2d(-closed, 5, 1, 2)
-    depth_m = torch.where(picture_m.isfinite(), -picture_m, -torch.inf)
+    # Inner cells: two from the silhouette, whose single empty cells are closed first, and with no
+    # neighbour across an edge.
+    closed = max_pool2d(image_m.isfinite().double(), 3, 1, 1)
+    eroded = -max_pool2d(-closed, 5, 1, 2)
+    depth_m = torch.where(image_m.isfinite(), -image_m, -torch.inf)
     farthest_m = max_pool2d(depth_m, 3, 1, 1)
-    is_inner = (whole > 0) & (-farthest_m > picture_m - _STEP * surface.diameter_m)
+    is_inner = (eroded > 0) & (-farthest_m > image_m - _EDGE_STEP * surface.diameter_m)
 
-    # At most so many, shuffled: every n-th of them is a sample of all.
-    cells = _shuffled(is_seen, _POINTS)
-    seen = sample[cells]
+    # Shuffled, so that every n-th of the points is a sample of all.
+    cells = is_visible.nonzero()[:, 0]
+    shuffle = torch.randperm(len(cells), generator=torch.Generator().manual_seed(0))
+    cells = cells[shuffle[:_POINTS]]
+    visible = sample[cells]
     return _View(
-        points_m=_padded(surface.points_m[seen], _POINTS),
-        normals=_padded(surface.normals[seen], _POINTS),
+        points_m=_pad_rows(surface.points_m[visible], _POINTS),
+        normals=_pad_rows(surface.normals[visible], _POINTS),
         is_inner=pad(is_inner.flatten()[cells], (0, _POINTS - len(cells))),
     )
 
 
-def _shuffled(is_chosen: Bool[Tensor, " n"], most: int) -> Int64[Tensor, " m"]:
-    """Give the numbers of the cells that are chosen, ``most`` of them, in an order of chance."""
-    index = is_chosen.nonzero()[:, 0]
-    return index[torch.randperm(len(index), generator=torch.Generator().manual_seed(0))[:most]]
-
-
-def _padded(rows: Float64[Tensor, "n 3"], count: int) -> Float64[Tensor, "{count} 3"]:
-    """Fill up with rows of NaN."""
+def _pad_rows(rows: Float64[Tensor, "n 3"], count: int) -> Float64[Tensor, "{count} 3"]:
+    """Add rows of NaN up to ``count``."""
     return pad(rows, (0, 0, 0, count - len(rows)), value=torch.nan)
 
 
 def prepare_surface(model: ObjectModel, count: int = 10_000) -> Surface:
-    """Sample a model once for many clouds."""
+    """Sample the surface of a model once for many clouds, by ``count`` points."""
     points_m, normals = (part.double() for part in sample_surface(model, count))
     tree = KDTree(points_m.numpy(), copy_data=True)  # for other processes, as in Surface.target
-    # A cell in which a ray finds about four samples.
-    near_m = tree.query(points_m.numpy()[:: max(1, len(points_m) // 500)], k=min(5, len(points_m)))[
-        0
-    ]
-    cell_m = _SAMPLES_CELL * float(np.median(near_m[:, -1])) * np.sqrt(np.pi) / 2
+
+    # The outer side of each sample, by cells that hold about four samples.
+    some_m = points_m.numpy()[:: max(1, len(points_m) // 500)]
+    near_m, _ = tree.query(some_m, k=min(5, len(points_m)))
+    cell_m = _CELL_SPACINGS * float(np.median(near_m[:, -1])) * np.sqrt(np.pi) / 2
     limit_m = 3 * NEAR * model.diameter_m
     sides = outer_sides(points_m.numpy(), normals.numpy(), cell_m, limit_m)
     outward, across, is_hidden = (torch.from_numpy(part) for part in sides)
-    low_m = points_m.amin(0) - _MARGIN * model.diameter_m
-    size_m = points_m.amax(0) + _MARGIN * model.diameter_m - low_m
-    side_m = float(size_m.max()) / _BOXES
-    counts = (size_m / side_m).ceil().clamp(min=1).long()
-    middles = [(torch.arange(int(count)) + 0.5) * side_m for count in counts]
-    grid_m = torch.cartesian_prod(*middles).double() + low_m
-    nearest = torch.from_numpy(tree.query(grid_m.numpy(), workers=1)[1])
+
     some_m = points_m.numpy()[:: max(1, len(points_m) // 1000)]
+    near_m, _ = tree.query(some_m, k=4, workers=1)
     middle_m = (points_m.amin(0) + points_m.amax(0)) / 2
     radius_m = (points_m - middle_m).norm(dim=-1).amax()
     return Surface(
@@ -235,42 +232,68 @@ def prepare_surface(model: ObjectModel, count: int = 10_000) -> Surface:
         is_hidden=is_hidden,
         across=across,
         diameter_m=model.diameter_m,
-        spacing_m=float(np.median(tree.query(some_m, k=4, workers=1)[0][:, -1])),
+        spacing_m=float(np.median(near_m[:, -1])),
         middle_m=middle_m,
         ball_m=torch.cat([middle_m, radius_m[None]]),
-        symmetries=symmetry_transforms(model.symmetries, _TURN_STEP).double(),
+        symmetries=symmetry_transforms(model.symmetries, _AXIS_STEP).double(),
         tree=tree,
-        boxes=Boxes(low_m=low_m, side_m=side_m, counts=counts, nearest=nearest),
+        boxes=_make_boxes(points_m, tree, _BOX_MARGIN * model.diameter_m),
     )
 
 
+def _make_boxes(points_m: Float64[Tensor, "m 3"], tree: KDTree, margin_m: float) -> Boxes:
+    """Tabulate the surface point nearest to each box of a grid that reaches beyond the points."""
+    low_m = points_m.amin(0) - margin_m
+    size_m = points_m.amax(0) + margin_m - low_m
+    side_m = float(size_m.max()) / _BOXES
+    counts = (size_m / side_m).ceil().clamp(min=1).long()
+    middles_m = [(torch.arange(int(count)) + 0.5) * side_m for count in counts]
+    grid_m = torch.cartesian_prod(*middles_m).double() + low_m
+    nearest = torch.from_numpy(tree.query(grid_m.numpy(), workers=1)[1])
+    return Boxes(low_m=low_m, side_m=side_m, counts=counts, nearest=nearest)
+
+
 _SIDE_DIRECTIONS = 32
-_SAMPLES_CELL = 2.0  # side of a cell in mean distances of samples: four in each on average
-_SHEET = 0.5  # up to so many mean distances from another's plane a sample is of the same sheet
-_SLANT = 0.3  # least cosine at which a sample is looked at
-_SEEN_FROM = 0.1  # least share of directions from which an outer side is seen
-_CLEARER = 0.4  # the inner side is seen in at most so many times the directions of the outer
+_CELL_SPACINGS = 2.0  # side of a cell in mean distances of samples: four in each on average
+_SAME_SHEET = 0.5  # mean distances from a sample's plane up to which others are of its sheet
+_LEAST_COSINE = 0.3  # of the angle to its normal, at which a side of a sample is examined
+_LEAST_VISIBLE = 0.1  # least share of directions from which an outer side is visible
+_MOST_INNER = 0.4  # largest share for the inner side, over that of the outer side
 
 
 def outer_sides(
     points: np.ndarray, normals: np.ndarray, cell: float, limit: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Turn normals to the side from which the surface is visible from afar.
+    """Flip normals to the side from which the surface is visible from afar.
 
-    What is thinner than half the distance of the samples, open sheets and what is never visible
-    have no outer side: their normals become 0.
+    Walls thinner than half the distance of the samples, open sheets and hidden surfaces have no
+    outer side: their normals become 0.
 
     Args:
         points: samples of the surface (n, 3).
-        normals: of either side (n, 3).
+        normals: to either side (n, 3).
         cell: side of the cells in which samples hide each other.
         limit: farthest distance to a sample of an opposite side.
 
     Returns:
-        The normals (n, 3); for each sample the number of the nearest one of an opposite side, or
+        The normals (n, 3); for each sample the index of the nearest one of an opposite side, or
         -1; and which samples are never visible.
     """
-    # From many directions: how often each side faces the camera, and is in front then.
+    share = _visible_shares(points, normals, cell)
+    # The outer side is visible from clearly more directions than the inner one.
+    outer = share.argmax(0)
+    is_clear = share.max(0) > _LEAST_VISIBLE
+    is_clear &= share.min(0) < _MOST_INNER * share.max(0)
+    outward = normals * ((1 - 2 * outer) * is_clear)[:, None]
+    across = _nearest_opposite(points, outward, limit)
+    return outward, across, share.max(0) <= _LEAST_VISIBLE
+
+
+def _visible_shares(points: np.ndarray, normals: np.ndarray, cell: float) -> np.ndarray:
+    """Give for both sides of each sample (2, n) from how many directions they are visible.
+
+    As a share of the directions that a side faces. The first side is that of the normal.
+    """
     visible_count = np.zeros((2, len(points)))
     facing_count = np.full((2, len(points)), 1e-9)
     for axis in fibonacci_directions(_SIDE_DIRECTIONS).numpy():
@@ -278,53 +301,54 @@ def outer_sides(
         flat = np.floor(points @ across.T / cell).astype(np.int64)
         flat -= flat.min(0)
         place = flat[:, 0] * (flat[:, 1].max() + 1) + flat[:, 1]
-        slant = normals @ axis
+        cosine = normals @ axis
         order = np.argsort(points @ axis)
         first = np.empty(place.max() + 1, np.int64)
         for sign in (1, -1):  # toward a camera in this direction, and in the other
             first[place[order[::sign]]] = order[::sign]
             front = first[place]
-            off = ((points - points[front]) * normals[front]).sum(1)
-            is_in_front = np.abs(off) < _SHEET / _SAMPLES_CELL * cell
+            off_plane = ((points - points[front]) * normals[front]).sum(1)
+            is_in_front = np.abs(off_plane) < _SAME_SHEET / _CELL_SPACINGS * cell
             for side in (0, 1):
-                is_facing = sign * (1 - 2 * side) * slant > _SLANT
+                is_facing = sign * (1 - 2 * side) * cosine > _LEAST_COSINE
                 visible_count[side] += is_facing & is_in_front
                 facing_count[side] += is_facing
+    return visible_count / facing_count
 
-    # The outer side is visible from clearly more directions than the inner one.
-    share = visible_count / facing_count
-    outer = share.argmax(0)
-    is_clear = (share.max(0) > _SEEN_FROM) & (share.min(0) < _CLEARER * share.max(0))
-    outward = normals * ((1 - 2 * outer) * is_clear)[:, None]
 
-    # The nearest sample that looks the other way, as through a thin wall.
+def _nearest_opposite(points: np.ndarray, outward: np.ndarray, limit: float) -> np.ndarray:
+    """Find for each sample the nearest one that faces the other way, as through a wall, or -1.
+
+    Samples are searched by six groups of normals, each about a direction of an axis: every normal
+    has a component of 1 / sqrt(3) or more.
+    """
     across = np.full(len(points), -1)
     nearest = np.full(len(points), np.inf)
-    for column, sign in ((c, s) for c in range(3) for s in (1, -1)):
-        (is_of_side,) = np.nonzero(sign * outward[:, column] > 0.577)
-        if len(is_of_side) == 0:
+    for axis, sign in product(range(3), (1, -1)):
+        (group,) = np.nonzero(sign * outward[:, axis] > 0.577)
+        if len(group) == 0:
             continue
-        distance, neighbour = KDTree(points[is_of_side]).query(points, distance_upper_bound=limit)
-        number = is_of_side[np.minimum(neighbour, len(is_of_side) - 1)]
-        is_opposite = (outward[number] * outward).sum(1) < 0
+        distance, neighbour = KDTree(points[group]).query(points, distance_upper_bound=limit)
+        candidate = group[np.minimum(neighbour, len(group) - 1)]
+        is_opposite = (outward[candidate] * outward).sum(1) < 0
         is_better = is_opposite & (distance < nearest)
-        across = np.where(is_better, number, across)
+        across = np.where(is_better, candidate, across)
         nearest = np.where(is_better, distance, nearest)
-    return outward, across, share.max(0) <= _SEEN_FROM
+    return across
 
 
 def look_along_rays(
     cloud_m: Float64[Tensor, "n 3"], poses: Rigid, surface: Surface, every: int = 1
 ) -> tuple[Float64[Tensor, " b"], Float64[Tensor, " b"]]:
-    """Compare what a camera at the origin observed with what it would observe of a posed surface.
+    """Compare an observed cloud with what a camera at the origin would see of a posed surface.
 
-    Rays are gathered in cells, each as wide, where the object is, as 1/24 of its diameter.
+    Rays are binned in cells, each as wide, where the object is, as 1/24 of its diameter.
 
     Args:
-        cloud_m: what was observed, in the camera frame.
+        cloud_m: in the camera frame.
         poses: a batch, ``camera_from_model``.
         surface: of the model.
-        every: use each n-th point of the surface alone.
+        every: of how many points of the surface one is used.
 
     Returns:
         The share of the points that the posed surface would have occluded (free-space violation),
@@ -332,10 +356,10 @@ def look_along_rays(
         the surface lies behind the camera.
     """
     median_m = float(cloud_m[:, 2].median())
-    cloud_m = cloud_m[cloud_m[:, 2] > _FRONT * max(median_m, 0.0)]
+    cloud_m = cloud_m[cloud_m[:, 2] > _NEAREST_SHARE * max(median_m, 0.0)]
     if len(cloud_m) == 0:
-        none = torch.ones(len(poses.R), dtype=torch.float64)
-        return none, none
+        ones = torch.ones(len(poses.R), dtype=torch.float64)
+        return ones, ones
     scale = median_m / (_CELL * surface.diameter_m)
     observed_rays = cloud_m[:, :2] / cloud_m[:, 2:] * scale
     middle = observed_rays.median(0).values.floor()
@@ -348,7 +372,7 @@ def look_along_rays(
         violation, unobserved = compare_rays(*arrays, scale, *middle.tolist(), _REACH, limit_m)
         return torch.from_numpy(violation), torch.from_numpy(unobserved)
 
-    # The cells of the rays, in a square about the middle one; what lies beyond is at its border.
+    # The cells of the rays, in a square about the middle one; rays beyond are at its border.
     posed_m = poses.apply(surface.points_m[::every])
     depth_m = posed_m[..., 2]
     posed_rays = posed_m[..., :2] / depth_m.clamp(min=1e-6)[..., None] * scale

@@ -172,6 +172,13 @@ def back_project(
     return torch.stack([x, y, torch.ones_like(x)], -1) * depth_m[..., None]
 
 
+def crop_intrinsics(K: Float[Tensor, "3 3"], left: int, top: int) -> Float[Tensor, "3 3"]:
+    """Make the intrinsic matrix of a window that begins at column ``left`` and row ``top`` [px]."""
+    K = K.clone()
+    K[:2, 2] -= K.new_tensor([left, top])
+    return K
+
+
 def crop_camera(camera: AnyCamera, left: int, top: int, width: int, height: int) -> AnyCamera:
     """Make the camera of a window of the image.
 
@@ -186,9 +193,7 @@ def crop_camera(camera: AnyCamera, left: int, top: int, width: int, height: int)
             f"the window {width}x{height} at ({left}, {top}) does not lie inside the image of "
             f"{camera.width}x{camera.height}; make it smaller"
         )
-    K = camera.K.clone()
-    K[:2, 2] -= K.new_tensor([left, top])
-    return replace(camera, width=width, height=height, K=K)
+    return replace(camera, width=width, height=height, K=crop_intrinsics(camera.K, left, top))
 
 
 def resize_camera(camera: AnyCamera, width: int, height: int) -> AnyCamera:

@@ -21,14 +21,13 @@ from torch import Tensor
 
 from depthpose.core.errors import Notice
 
-LOOKED_UP, SEARCHED, ON_RAY = 0, 1, 2  #: how the sample of a surface that a point shows is found
-SLACK = 0.1  #: sine of the angle by which a surface may face away from the camera and still be seen
-GRAZING = 0.1  #: sine of the angle between a ray and a plane below which they meet nowhere near
-DISTANCES, ANGLES, TURNS = 15, 15, 30
-"""Bins of a point pair: of its length, as long as the longest pair together; of an angle from 0 to
-180 degrees; of the turn about the normal of its first point."""
+SLACK = 0.1  #: sine of the angle by which a surface may face away and still count as visible
+GRAZING = 0.1  #: sine of the angle between a ray and a plane below which they do not meet nearby
+DISTANCES = 15  #: bins of the length of a point pair; the longest pair is in the last one
+ANGLES = 15  #: bins of an angle of a point pair, from 0 to 180 degrees
+TURNS = 30  #: bins of the rotation about the normal of the first point of a pair, 360 degrees
 MOST_ALIKE = 150
-"""Pairs of the model with the same feature, of which so many vote: those of a plane are all alike
+"""Of the model's pairs with the same feature at most so many vote: all pairs of a plane are alike
 and say little."""
 _SWITCH = "DEPTHPOSE_COMPILED"  # environment variable; 0 keeps to torch
 
@@ -68,11 +67,13 @@ def compiled(function: Callable[..., Any]) -> Any:  # noqa: ANN401  numba's disp
 
     # Tests check annotations by wrapping every function: numba wants what is inside.
     inner = inspect.unwrap(function)
-    # One folder for all sources as they are: numba itself looks at the file of a function alone,
-    # and functions call those of other files.
+
+    # A cache folder named by the contents of all source files: numba itself checks the file of a
+    # function alone, and functions call those of other files.
     config: Any = import_module("numba").config
     before = config.CACHE_DIR
-    folder, digest = Path(__file__).parent, sha256()
+    folder = Path(__file__).parent
+    digest = sha256()
     for path in sorted(folder.glob("*.py")):
         digest.update(path.read_bytes())
     config.CACHE_DIR = str(folder / "__pycache__" / f"numba-{digest.hexdigest()[:16]}")

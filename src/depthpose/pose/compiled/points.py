@@ -1,7 +1,4 @@
-"""Points in space: rotations, nearest neighbours, what a camera sees.
-
-And sparse convolution of small clouds: no call for each offset, nothing gathered.
-"""
+"""Compiled rotations, nearest neighbours, comparison of rays, and sparse convolution."""
 
 from typing import NamedTuple
 
@@ -12,7 +9,7 @@ from depthpose.pose.compiled import compiled
 
 @compiled
 def damp(H, least):
-    """Keep unknowns that nothing determines where they are."""
+    """Add a little to the diagonal of normal equations: undetermined unknowns stay as they are."""
     size = least
     for k in range(len(H)):
         size = max(size, H[k, k])
@@ -47,21 +44,21 @@ def rotation(x, y, z, R):
 
 
 Array = np.ndarray
-_LEAF = 8  # points of a range that is not parted any more
+_LEAF = 8  # most points of a range that is not split any more
 
 
 class Tree(NamedTuple):
     """Points in the order of a balanced k-d tree, whose ranges are halved down to few points."""
 
     points: Array  #: (m, 3), float64
-    order: Array  #: number that each had before, (m,)
-    axes: Array  #: across which axis each inner node is parted, (nodes,)
-    values: Array  #: where, (nodes,)
+    order: Array  #: index that each point had before, (m,)
+    axes: Array  #: axis across which each inner node is split, (nodes,)
+    values: Array  #: coordinate at which it is split, (nodes,)
 
 
 @compiled
-def planted(points):
-    """Sort points (m, 3) into the fields of a :class:`Tree`; one at least, float64."""
+def build_tree(points):
+    """Sort points (m, 3), float64 and one at least, into the fields of a :class:`Tree`."""
     count = len(points)
     order = np.arange(count)
     depth = 0
@@ -94,7 +91,10 @@ def planted(points):
 
 @compiled
 def _select(points, order, low, high, wanted, axis):
-    """Bring the one of rank ``wanted`` to its place, smaller ones before it."""
+    """Partially sort ``order[low:high + 1]`` by a coordinate: rank ``wanted`` gets to its place.
+
+    Quickselect: smaller ones come before it, larger ones after it.
+    """
     while low < high:
         pivot = points[order[(low + high) // 2], axis]
         i, j = low, high
@@ -119,7 +119,12 @@ def _select(points, order, low, high, wanted, axis):
 def neighbours(
     x, y, z, points, axes, values, places, squares, stack, bounds, outward=None, eye=None, slack=0.0
 ):
-    """Find the places of a tree nearest to a point, as many as ``places`` holds, nearest first."""
+    """Find the points of a tree nearest to (x, y, z), as many as ``places`` holds.
+
+    ``places`` and ``squares`` hold the best so far, nearest first, and are improved: a square is
+    the limit where there is none. ``stack`` and ``bounds`` (64 rows) are memory for the search.
+    With ``eye``, a camera, only points that face it count (:func:`faces`, with ``slack``).
+    """
     inner, last, top = len(axes), len(places) - 1, 0
     stack[0, 0], stack[0, 1], stack[0, 2] = 0, 0, len(points)
     bounds[0, :] = 0.0
@@ -159,14 +164,17 @@ def neighbours(
 
 @compiled
 def faces(place, points, outward, eye, least):
-    """Whether a surface point shows its outer side to a camera, or nearly."""
+    """Whether a surface point shows a camera (``eye``) its outer side.
+
+    ``least`` is the least component toward the camera, below 0 to count those nearly facing it.
+    """
     x, y, z = eye[0] - points[place, 0], eye[1] - points[place, 1], eye[2] - points[place, 2]
     return outward[place, 0] * x + outward[place, 1] * y + outward[place, 2] * z >= least
 
 
 @compiled
 def nearest_many(queries, tree):
-    """Give the number of the point nearest to each of (n, 3), float64, and its distance."""
+    """Give the index of the point nearest to each query (n, 3), float64, and its distance."""
     index, distance = np.empty(len(queries), np.int64), np.empty(len(queries))
     stack, bounds = np.empty((64, 3), np.int64), np.empty((64, 4))
     points, order, axes, values = tree
@@ -182,7 +190,7 @@ def nearest_many(queries, tree):
 
 @compiled
 def _cell(x, y, z, scale, column, row, half):
-    """Number the cell of a ray, those far off at the border."""
+    """Give the index of the cell of a ray; rays far off are in a cell at the border."""
     u = min(max(np.floor(x / z * scale - column), -half), half) + half
     v = min(max(np.floor(y / z * scale - row), -half), half) + half
     return int(u) * (2 * half + 1) + int(v)
@@ -190,14 +198,18 @@ def _cell(x, y, z, scale, column, row, half):
 
 @compiled
 def compare_rays(cloud, Rs, ts, points, scale, column, row, half, limit):
-    """Compare a cloud with each pose of a surface, as :func:`look_along_rays` says."""
-    front, unseen = np.empty(len(ts)), np.empty(len(ts))
+    """Compute ``look_along_rays`` of ``surface.py`` for each pose.
+
+    ``scale`` is cells per unit of x / z, (``column``, ``row``) the middle cell, ``half`` the cells
+    to each side of it, and ``limit`` how far before a point the surface must lie to occlude it.
+    """
+    violation, unobserved = np.empty(len(ts)), np.empty(len(ts))
     cells = (2 * half + 1) ** 2
-    is_seen = np.zeros(cells, np.bool_)
-    theirs = np.empty(len(cloud), np.int64)
+    is_observed = np.zeros(cells, np.bool_)
+    cloud_cells = np.empty(len(cloud), np.int64)
     for i in range(len(cloud)):
-        theirs[i] = _cell(cloud[i, 0], cloud[i, 1], cloud[i, 2], scale, column, row, half)
-        is_seen[theirs[i]] = True
+        cloud_cells[i] = _cell(cloud[i, 0], cloud[i, 1], cloud[i, 2], scale, column, row, half)
+        is_observed[cloud_cells[i]] = True
     nearest = np.empty(cells)
     for b in range(len(ts)):
         R, t = Rs[b], ts[b]
@@ -209,24 +221,24 @@ def compare_rays(cloud, Rs, ts, points, scale, column, row, half, limit):
                 continue
             x = R[0, 0] * sx + R[0, 1] * sy + R[0, 2] * sz + t[0]
             y = R[1, 0] * sx + R[1, 1] * sy + R[1, 2] * sz + t[1]
-            mine = _cell(x, y, max(z, 1e-6), scale, column, row, half)
-            nearest[mine] = min(nearest[mine], z)
+            cell = _cell(x, y, max(z, 1e-6), scale, column, row, half)
+            nearest[cell] = min(nearest[cell], z)
         total, missed = 0, 0
         for k in range(cells):
             if nearest[k] < np.inf:
                 total += 1
-                missed += not is_seen[k]
+                missed += not is_observed[k]
         occluded = 0
         for i in range(len(cloud)):
-            occluded += nearest[theirs[i]] < cloud[i, 2] - limit
-        front[b] = occluded / len(cloud) if total else 1.0
-        unseen[b] = missed / total if total else 1.0
-    return front, unseen
+            occluded += nearest[cloud_cells[i]] < cloud[i, 2] - limit
+        violation[b] = occluded / len(cloud) if total else 1.0
+        unobserved[b] = missed / total if total else 1.0
+    return violation, unobserved
 
 
 @compiled
 def _add_row(out, row, weight):
-    """``out += row @ weight``: four inputs at once, outputs along the vector unit."""
+    """Add ``row @ weight`` to ``out``: four inputs at once, so that each output is loaded once."""
     inputs, outputs = weight.shape
     whole = inputs - inputs % 4
     for c in range(0, whole, 4):
@@ -242,7 +254,16 @@ def _add_row(out, row, weight):
 
 @compiled
 def convolve(x, weight, table, is_transposed, out):
-    """Add up: ``out[o] = sum over neighbours (i, k) of o of x[i] @ weight[k]``."""
+    """Convolve sparse rows: ``out[o] += sum over neighbours (i, k) of o of x[i] @ weight[k]``.
+
+    Args:
+        x: features of the inputs (rows, channels).
+        weight: of each offset k (offsets, inputs, outputs).
+        table: row of the fine grid that is the neighbour of each coarse row at each offset, or the
+            number of fine rows where there is none (offsets, coarse rows).
+        is_transposed: whether the inputs are the coarse rows.
+        out: features of the outputs, added to.
+    """
     fine = len(out) if is_transposed else len(x)
     for k in range(len(table)):
         kernel = weight[k]

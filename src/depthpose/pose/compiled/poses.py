@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from depthpose.pose.compiled import GRAZING, LOOKED_UP, ON_RAY, SEARCHED, SLACK, compiled
+from depthpose.pose.compiled import GRAZING, SLACK, compiled
 from depthpose.pose.compiled.points import (
     Array,
     Tree,
@@ -17,7 +17,7 @@ from depthpose.pose.compiled.points import (
 
 
 class Target(NamedTuple):
-    """A surface, and the table by which what is near is looked up without searching."""
+    """A surface for compiled functions, with a table of near points to look up without a search."""
 
     tree: Tree  #: of the surface points
     normals: Array  #: of these, in the tree's order, (m, 3)
@@ -32,7 +32,10 @@ class Target(NamedTuple):
 
 @compiled
 def _meet_planes(local, eye, target, places):
-    """Give where each ray meets the plane of its sample; a point without one stays."""
+    """Give where the ray of each point meets the plane of its sample.
+
+    The sample itself where the ray grazes the plane; the point where it has no sample.
+    """
     meet = local.copy()
     for i in range(len(local)):
         place = places[i]
@@ -55,7 +58,12 @@ def _meet_planes(local, eye, target, places):
 
 @compiled
 def find_places(local, limit, target, is_exact, places, eye=None, least=0.0):
-    """Find the place of the surface point near each point."""
+    """Write the place in the tree of the surface point near each point into ``places``.
+
+    Exactly, the nearest within ``limit``, or -1; else the one of the table. With ``eye``, a camera,
+    only points that show it their outer side count (:func:`faces`). Exact searches begin from
+    what ``places`` holds, -1 for no guess.
+    """
     points, axes, values = target.tree.points, target.tree.axes, target.tree.values
     low, side, counts, outward = target.low, target.side, target.counts, target.outward
     stack, bounds = np.empty((64, 3), np.int64), np.empty((64, 4))
@@ -86,8 +94,12 @@ def find_places(local, limit, target, is_exact, places, eye=None, least=0.0):
 
 
 @compiled
-def _add_equations(local, places, R, arm, limit, points, normals, eye, how, H, b):
-    """Add up the normal equations of one pose about a point, from which ``arm`` is its origin."""
+def _write_equations(local, places, R, arm, limit, points, normals, eye, is_along_rays, H, b):
+    """Write the normal equations of one pose, ``H @ motion = b``, about the middle of the cloud.
+
+    ``arm`` is the translation of the pose less that middle; otherwise as ``_normal_equations`` of
+    ``icp.py``, with the cloud and the camera (``eye``) in the model frame.
+    """
     H[:] = 0.0
     b[:] = 0.0
     J = np.empty(6)
@@ -98,8 +110,9 @@ def _add_equations(local, places, R, arm, limit, points, normals, eye, how, H, b
         px, py, pz = points[place, 0], points[place, 1], points[place, 2]
         mx, my, mz = normals[place, 0], normals[place, 1], normals[place, 2]
         gx, gy, gz = local[i, 0] - px, local[i, 1] - py, local[i, 2] - pz
-        residual, square = mx * gx + my * gy + mz * gz, gx * gx + gy * gy + gz * gz
-        if how == ON_RAY:
+        residual = mx * gx + my * gy + mz * gz
+        square = gx * gx + gy * gy + gz * gz
+        if is_along_rays:
             x, y, z = local[i, 0] - eye[0], local[i, 1] - eye[1], local[i, 2] - eye[2]
             along = gx * x + gy * y + gz * z
             square += residual * residual - along * along / (x * x + y * y + z * z)
@@ -122,41 +135,62 @@ def _add_equations(local, places, R, arm, limit, points, normals, eye, how, H, b
 
 
 @compiled
-def refine(cloud, Rs, ts, limits, scale, converged, target, is_exact, every):
-    """Move poses in place, step by step, each until it moves no more; ``every`` is of places."""
+def refine(cloud, Rs, ts, limits, diameter, converged, target, is_exact, all_places):
+    """Take the steps of ``_iterate`` of ``icp.py``: move poses in place, each until it converges.
+
+    ``all_places`` (poses, points) receives each point's place in the tree, or -1.
+    """
     middle = cloud.sum(0) / len(cloud)
     points, normals = target.tree.points, target.normals
-    local, eye, turn = np.empty_like(cloud), np.empty(3), np.empty((3, 3))
+    local, eye, rotated = np.empty_like(cloud), np.empty(3), np.empty((3, 3))
     H, b = np.empty((6, 6)), np.empty(6)
+    last = len(limits) - 1
     for p in range(len(ts)):
-        R, t, places = Rs[p], ts[p], every[p]
-        for k in range(len(limits)):
-            limit, how = limits[k], SEARCHED if is_exact else LOOKED_UP
-            if is_exact and 2 * k >= len(limits) - 1:
-                how = ON_RAY
-            # The places of surface points that the camera may see; within the ball it sees no side.
+        R, t, places = Rs[p], ts[p], all_places[p]
+        for step in range(len(limits)):
+            limit = limits[step]
+            is_along_rays = is_exact and 2 * step >= last
+
+            # Visible samples of the surface; all are where the camera is within the ball.
             eye[:] = -(t @ R)
             local[:] = (cloud - t) @ R
-            sought = _meet_planes(local, eye, target, places) if how == ON_RAY else local
+            queries = _meet_planes(local, eye, target, places) if is_along_rays else local
             distance = np.linalg.norm(eye - target.ball[:3])
             least = -SLACK * distance if distance > target.ball[3] else -np.inf
-            find_places(sought, limit, target, how != LOOKED_UP, places, eye, least)
-            if k == len(limits) - 1:
+            find_places(queries, limit, target, is_exact, places, eye, least)
+            if step == last:
                 break
-            _add_equations(local, places, R, t - middle, limit, points, normals, eye, how, H, b)
+
+            # One Gauss-Newton step about the middle of the cloud.
+            arm = t - middle
+            _write_equations(
+                local, places, R, arm, limit, points, normals, eye, is_along_rays, H, b
+            )
             damp(H, 1e-6)
             motion = np.linalg.solve(H, b)
-            rotation(motion[0], motion[1], motion[2], turn)
-            t[:] = turn @ (t - middle) + middle + motion[3:]
-            R[:] = turn @ R
-            most = max(np.abs(motion[:3]).max(), np.abs(motion[3:]).max() / scale)
-            if most < converged and how != SEARCHED and limit <= limits[-1]:
+            rotation(motion[0], motion[1], motion[2], rotated)
+            t[:] = rotated @ (t - middle) + middle + motion[3:]
+            R[:] = rotated @ R
+
+            has_last_kind = is_along_rays or not is_exact
+            most = max(np.abs(motion[:3]).max(), np.abs(motion[3:]).max() / diameter)
+            if most < converged and has_last_kind and limit <= limits[-1]:
                 break
 
 
 @compiled
 def grow(local, times, middle, limits, target, is_exact, converged):
-    """Move points and grow a surface about its middle, step by step, in place."""
+    """Iterate ICP with a scale, in place, as ``_fit_scale`` of ``identity.py``.
+
+    Args:
+        local: points (starts, n, 3) in the model frame; moved.
+        times: scale of the surface for each start; changed.
+        middle: about which the surface grows.
+        limits: distance from which a point has no weight, for each step.
+        target: the surface.
+        is_exact: whether nearest points are searched, not looked up.
+        converged: largest step, in radians and scale, at which it stops.
+    """
     count = local.shape[1]
     places = np.full((len(times), count), -1)
     surface, normals = target.tree.points, target.normals
@@ -166,9 +200,9 @@ def grow(local, times, middle, limits, target, is_exact, converged):
         most = 0.0
         for p in range(len(times)):
             s, points = times[p], local[p]
-            own = (points - middle) / s + middle  # beside the surface of its own size
-            find_places(own, limit / s, target, is_exact, places[p])
-            for i in range(count):  # derivatives by turn, shift and growth
+            unscaled = (points - middle) / s + middle  # beside the surface at scale 1
+            find_places(unscaled, limit / s, target, is_exact, places[p])
+            for i in range(count):  # derivatives by rotation, translation and growth
                 row, place = J[i], places[p, i]
                 weight[i] = 0.0
                 if place < 0:
@@ -189,10 +223,10 @@ def grow(local, times, middle, limits, target, is_exact, converged):
             weighted = J * weight.reshape(-1, 1)
             H = weighted.T @ J
             damp(H, 1e-9)
-            motion = np.linalg.solve(H, weighted.T @ residual)  # turn, shift and growth
+            motion = np.linalg.solve(H, weighted.T @ residual)  # rotation, translation, growth
             times[p] = min(max(s * (1 + min(max(motion[6], -0.1), 0.1)), 0.5), 2.0)
             rotation(motion[0], motion[1], motion[2], turn)
-            # By the inverse of the surface's motion.
+            # The points move by the inverse of the surface's motion.
             points[:] = (points - middle - motion[3:6]) @ turn + middle
             most = max(most, abs(motion[0]), abs(motion[1]), abs(motion[2]), abs(motion[6]))
         if most < converged:

@@ -1,4 +1,4 @@
-"""6D detection as BOP has measured it since 2024: average precision, so wrong answers count too."""
+"""6D detection as BOP has measured it since 2024: average precision, so that wrong poses count."""
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -17,12 +17,13 @@ from depthpose.pose.metrics import BOP_PIXELS, BOP_SHARES, average_precision
 from depthpose.pose.predictions import Place, Prediction, place_of, score_of
 
 LEAST_VISIBLE = 0.1
-"""Share of an instance that is seen; one of less is neither missed nor wrongly found."""
-MOST_ESTIMATES = 100  #: of one image: the surest of all its objects
+"""Visible share of an instance; one of less is neither missed nor wrongly detected."""
+MOST_ESTIMATES = 100  #: of one image: those of the highest scores of all its objects
 _LIMITS = {"mssd_m": BOP_SHARES, "mspd_px": BOP_PIXELS}  # of the diameter, and pixels
 _COLUMNS = {"mssd_m": "ap_mssd", "mspd_px": "ap_mspd"}
-_AWAY_DIAMETERS = 1.0
-"""Centres of two poses that are so far apart: MSSD is beyond its largest limit, half a diameter."""
+_FAR_DIAMETERS = 1.0
+"""Distance of the centres of two poses from which MSSD is beyond its largest limit, half a
+diameter."""
 
 Pairs = Mapping[tuple[str, str], Mapping[str, Errors]]
 """Errors by the names of an estimate and an instance."""
@@ -44,50 +45,55 @@ def detection_scores(
 ) -> dict[int, dict[str, float | None]]:
     """Give ``ap_mssd``, ``ap_mspd`` and their mean ``ap`` of each object, by its number.
 
-    For each error and threshold the estimates of an image, the surest first, take the instance of
-    the least error below the threshold that none has taken yet. An estimate that takes none is
-    wrong; one that takes an instance of which less than a tenth is seen does not count, nor does
-    such an instance. The average precision is that of all images of the data set; means are over
-    thresholds, then over errors (Nguyen et al. 2025, BOP Challenge 2024). None where no instance
-    counts.
+    For each error and threshold the estimates of an image, those of the highest scores first, are
+    matched with the instance of the least error below the threshold that is not matched yet. An
+    estimate that is not matched is wrong. Instances of which less than a tenth is visible, and
+    estimates matched with them, do not count. The average precision is that of all images of the
+    data set; means are over thresholds, then over errors (Nguyen et al. 2025, BOP Challenge 2024).
+    None where no instance counts.
 
     Args:
         dataset: instances with truth; estimates of other images are left out.
         predictions: with their places, or the names of instances.
-        contexts: what the errors of each object depend on.
-        measured: errors that are known already.
+        contexts: by the number of the object.
+        measured: errors that were measured before.
     """
     images = _by_image(dataset, predictions)
     scores: dict[int, dict[str, float | None]] = {}
     for number, context in contexts.items():
-        shown = [image for place, image in images.items() if place.object_id == number]
-        tables = [_error_tables(image, context, measured) for image in shown]
-        row: dict[str, float | None] = {}
+        images_of_object = [image for place, image in images.items() if place.object_id == number]
+        tables = [_error_tables(image, context, measured) for image in images_of_object]
+        precisions: dict[str, float | None] = {}
         for name, limits in _LIMITS.items():
             scale = context.diameter_m if name == "mssd_m" else 1.0
-            of_limits = [
-                _precision(shown, [table[name] for table in tables], scale * limit)
-                for limit in limits
-            ]
-            counted = [value for value in of_limits if value is not None]
-            row[_COLUMNS[name]] = sum(counted) / len(counted) if counted else None
-        both = [value for value in row.values() if value is not None]
-        scores[number] = {"ap": sum(both) / len(both) if both else None, **row}
+            tables_of_error = [table[name] for table in tables]
+            precisions[_COLUMNS[name]] = _mean(
+                [_precision(images_of_object, tables_of_error, scale * limit) for limit in limits]
+            )
+        scores[number] = {"ap": _mean(list(precisions.values())), **precisions}
     return scores
 
 
+def _mean(values: Sequence[float | None]) -> float | None:
+    """Average the values that are not None; None where there are none."""
+    numbers = [value for value in values if value is not None]
+    return sum(numbers) / len(numbers) if numbers else None
+
+
 def _by_image(dataset: BopDataset, predictions: Sequence[Prediction]) -> dict[Place, _Image]:
-    """Share instances and estimates among images and objects, the surest estimates first."""
+    """Group instances and estimates by image and object, estimates of the highest scores first."""
     images: dict[Place, _Image] = defaultdict(_Image)
     places = {instance.name: place_of(instance) for instance in dataset.instances}
     for instance in dataset.instances:
         images[place_of(instance)].instances.append(instance)
-    there = {place[:2] for place in images}
+
+    # The estimates of images of the data set; of one image at most 100.
+    image_keys = {place[:2] for place in images}
     numbers = {place.object_id for place in images}
     of_image: dict[tuple[int, int], list[tuple[Place, Prediction]]] = defaultdict(list)
     for prediction in predictions:
         place = prediction.place or places.get(prediction.estimate.name)
-        if place is not None and place[:2] in there and prediction.estimate.is_posed:
+        if place is not None and place[:2] in image_keys and prediction.estimate.is_posed:
             of_image[place[:2]].append((place, prediction))
     for pairs in of_image.values():
         pairs.sort(key=lambda pair: -score_of(pair[1].estimate))
@@ -100,7 +106,7 @@ def _by_image(dataset: BopDataset, predictions: Sequence[Prediction]) -> dict[Pl
 def _error_tables(
     image: _Image, context: ErrorContext, measured: Pairs
 ) -> dict[str, Float[Tensor, "estimates instances"]]:
-    """Measure every estimate against every instance; infinite where it is surely beyond limits."""
+    """Measure each estimate against each instance; infinite where it is certainly beyond limits."""
     size = (len(image.predictions), len(image.instances))
     tables = {name: torch.full(size, torch.inf, dtype=torch.float64) for name in _LIMITS}
     for row, prediction in enumerate(image.predictions):
@@ -117,52 +123,52 @@ def _error_tables(
 
 
 def _is_far(name: str, pose: Rigid, instance: Instance, context: ErrorContext) -> bool:
-    """Say whether an error is beyond all its limits, without measuring it."""
+    """Whether an error is certainly beyond all its limits, by a bound that is fast to compute."""
     points_m = context.model.vertices_m.double()
-    posed_m = [p.double().apply(points_m) for p in (pose, instance.camera_from_model)]
+    estimated_m = pose.double().apply(points_m)
+    true_m = instance.camera_from_model.double().apply(points_m)
     if name == "mssd_m":
-        away_m = float((posed_m[0].mean(0) - posed_m[1].mean(0)).norm())
-        return away_m > _AWAY_DIAMETERS * context.model.diameter_m
-    pixels = [project(points, instance.K) for points in posed_m]
-    if not all(
-        bool(places.isfinite().all()) for places in pixels
-    ):  # a point lies behind the camera
-        return False
-    # No two points are nearer than the boxes about them.
-    first, second = ((places.amin(0), places.amax(0)) for places in pixels)
-    gap = torch.maximum(first[0] - second[1], second[0] - first[1]).clamp(min=0).norm()
-    return float(gap) * BOP_WIDTH_PX / image_size(instance.depth)[0] > BOP_PIXELS[-1]
+        distance_m = float((estimated_m.mean(0) - true_m.mean(0)).norm())
+        return distance_m > _FAR_DIAMETERS * context.model.diameter_m
+
+    # MSPD: no two points are nearer than the boxes about the points.
+    estimated_px = project(estimated_m, instance.K)
+    true_px = project(true_m, instance.K)
+    if not bool(estimated_px.isfinite().all() & true_px.isfinite().all()):
+        return False  # a point lies behind the camera
+    right_gap = estimated_px.amin(0) - true_px.amax(0)
+    left_gap = true_px.amin(0) - estimated_px.amax(0)
+    gap_px = float(torch.maximum(right_gap, left_gap).clamp(min=0).norm())
+    return gap_px * BOP_WIDTH_PX / image_size(instance.depth)[0] > BOP_PIXELS[-1]
 
 
 def _precision(
     images: Sequence[_Image], tables: Sequence[Float[Tensor, "_ _"]], limit: float
 ) -> float | None:
-    """Give the average precision of one object at one threshold; None where nothing counts.
+    """Give the average precision of one object at one threshold; None where no instance counts.
 
-    In each image, the surest first, an estimate takes the nearest instance that is left. One that
-    takes a mostly hidden instance is neither right nor wrong, as BOP has it.
+    In each image, the highest score first, an estimate is matched with the nearest instance that is
+    left. One that is matched with a mostly hidden instance is neither right nor wrong, as in BOP.
     """
     counted: list[tuple[float, bool]] = []  # score, and whether it is right
     targets = 0
     for image, table in zip(images, tables, strict=True):
-        hidden = {
-            column
-            for column, instance in enumerate(image.instances)
-            if (1.0 if instance.visible_fraction is None else instance.visible_fraction)
-            < LEAST_VISIBLE
-        }
+        hidden = {k for k, instance in enumerate(image.instances) if _is_hidden(instance)}
         targets += len(image.instances) - len(hidden)
-        taken: set[int] = set()
+        free = set(range(len(image.instances)))
         for row, prediction in enumerate(image.predictions):
-            free = [k for k in range(len(image.instances)) if k not in taken]
-            best = min(free, key=lambda k: float(table[row, k]), default=None)
+            best = min(sorted(free), key=lambda k: float(table[row, k]), default=None)
             is_right = best is not None and float(table[row, best]) < limit
             if is_right:
-                assert best is not None
-                taken.add(best)
+                free.discard(best)
             if not (is_right and best in hidden):
                 counted.append((score_of(prediction.estimate), is_right))
     if targets == 0:
         return None
     counted.sort(key=lambda pair: -pair[0])
     return average_precision([is_right for _, is_right in counted], targets)
+
+
+def _is_hidden(instance: Instance) -> bool:
+    """Whether less than a tenth of an instance is visible; not where that is not known."""
+    return instance.visible_fraction is not None and instance.visible_fraction < LEAST_VISIBLE

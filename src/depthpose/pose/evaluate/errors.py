@@ -1,4 +1,4 @@
-"""Errors of estimates against truth, by the conventions of those who published."""
+"""Errors of estimates against truth, by published conventions."""
 
 import math
 from collections import defaultdict
@@ -13,6 +13,7 @@ from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from depthpose.core.camera import project
+from depthpose.core.camera.pinhole import crop_intrinsics
 from depthpose.core.files import image_size, read_depth_png
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid, geodesic_rad
@@ -33,20 +34,20 @@ from depthpose.pose.metrics import (
 from depthpose.pose.predictions import Place, Prediction, place_of, score_of
 from depthpose.pose.types import ObjectModel, PoseEstimate, Symmetries
 
-BOP_WIDTH_PX = 640
-_MARGIN_PX = 2
+BOP_WIDTH_PX = 640  #: width of the image in which MSPD is measured
+_MARGIN_PX = 2  # of the window in which VSD is measured
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ErrorContext:
-    """What the errors of an object depend on."""
+    """The object and settings that errors depend on."""
 
     model: ObjectModel  #: the object
-    diameter_m: float  #: of the table that was asked for
+    diameter_m: float  #: by the table that ``EvaluationConfig.diameters`` names
     is_adds: bool  #: whether ADD-S decides a success
     vsd_delta_m: float | None  #: see ``EvaluationConfig``; None: VSD is not measured
     symmetries: Rigid  #: motions of the model that leave it as it is, the identity first
-    triangles_m: Float[Tensor, "f 3 3"]  #: what VSD draws; a model of points is drawn as discs
+    triangles_m: Float[Tensor, "f 3 3"]  #: drawn for VSD; a model of points is drawn as discs
 
 
 Errors = Float[Tensor, " n"]  #: one number, or several whose mean a row shows (VSD: one a tau)
@@ -54,25 +55,29 @@ Errors = Float[Tensor, " n"]  #: one number, or several whose mean a row shows (
 
 @dataclass(frozen=True, kw_only=True)
 class Metric:
-    """An error of a pose, and what the rows of objects say of it."""
+    """An error of a pose, and how it is summed up in the rows of objects."""
 
     #: ``(estimated, instance, context)``, the first ``camera_from_model``, to the error.
     measure: Callable[[Rigid, Instance, ErrorContext], Errors | Tensor | float]
-    missing: tuple[float, ...] = (math.inf,)  #: the error of an instance without an answer
+    missing: tuple[float, ...] = (math.inf,)  #: the error of an instance without an estimate
     is_wanted: Callable[[ErrorContext], bool] = lambda _: True  #: whether it is measured at all
     #: columns of the rows of objects: name to a function of the errors (n, t) of all instances and
     #: their diameters [m] (n).
     summaries: Mapping[str, Callable[[Tensor, Tensor], float]] = field(default_factory=dict)
-    has_median: bool = False  #: whether rows of objects hold the median of answers, ``NAME_median``
+    has_median: bool = False  #: whether rows hold the median over estimates, ``NAME_median``
 
 
 def nearest_copy(
     estimated: Rigid, true: Rigid, symmetries: Rigid, declared: Symmetries | None = None
 ) -> Rigid:
-    """Give the true pose that is turned least against an estimate, of those that look alike.
+    """Give the symmetric copy of the true pose whose rotation is nearest to an estimate's.
 
-    ``symmetries`` are motions of the model that leave it as it is, the identity first. With the
-    ``declared`` ones that they are of, turns about their axes are exact, not one of the steps.
+    Args:
+        estimated: ``camera_from_model``.
+        true: the same, annotated.
+        symmetries: motions of the model that leave it as it is, the identity first.
+        declared: the symmetries that these are steps of; then rotations about their axes are exact,
+            not rounded to a step.
     """
     R = symmetries.R.double()
     t_m = symmetries.t_m.double()
@@ -81,45 +86,47 @@ def nearest_copy(
     copy = copies[nearest]
     if declared is None or not declared.continuous:
         return copy
-    # Turned about the axes of revolution until it is nearest.
-    wanted = estimated.R.double()
+
+    # A ball is rotated about its centre to the estimated rotation itself.
+    estimated_R = estimated.R.double()
     centre_m = declared.ball_centre_m
-    relative = copy.R.mT @ wanted
+    relative = copy.R.mT @ estimated_R
     if centre_m is not None:
-        centre_m = centre_m.to(wanted)
+        centre_m = centre_m.to(estimated_R)
         return copy @ Rigid(relative, centre_m - relative @ centre_m)
-    turns = []
+
+    # Else the copy is rotated about each axis to the angle of the largest trace of
+    # relative^T rotation(angle), which is that of the least difference.
+    rotated = []
     for axis in declared.continuous:
-        a = axis.direction.to(wanted) / axis.direction.norm()
-        # The trace of relative^T turn(angle) is largest there.
+        a = axis.direction.to(estimated_R) / axis.direction.norm()
         skew = relative - relative.mT
         across = torch.stack([skew[2, 1], skew[0, 2], skew[1, 0]])
         angle = torch.atan2(a @ across, relative.trace() - a @ relative @ a)
-        turns.append(copy @ turn_about(a, axis.point_m.to(wanted), angle))
-    return min(turns, key=lambda turn: float(geodesic_rad(wanted, turn.R)))
+        rotated.append(copy @ turn_about(a, axis.point_m.to(estimated_R), angle))
+    return min(rotated, key=lambda pose: float(geodesic_rad(estimated_R, pose.R)))
 
 
 def _vsd(estimated: Rigid, instance: Instance, context: ErrorContext) -> Float[Tensor, "10"]:
-    """Give the visible surface discrepancy at each of BOP's ten tolerances, 0..1."""
+    """Measure the visible surface discrepancy at each of BOP's ten tolerances, 0..1."""
     assert context.vsd_delta_m is not None
     depth_m = _read_depth(instance.depth, instance.depth_unit_m)
     poses = (estimated, instance.camera_from_model)
-    K = instance.K.double().clone()
-    # What neither pose covers does not count: only the window about both is drawn.
+
+    # Pixels that neither pose covers do not count: only the window about both is drawn.
     size = torch.tensor(depth_m.shape).flip(0)
     points_m = torch.cat(
         [pose.double().apply(context.triangles_m).reshape(-1, 3) for pose in poses]
     )
-    pixels = project(points_m, K)
+    pixels = project(points_m, instance.K.double())
     low = torch.zeros_like(size)
     high = size
-    if bool(pixels.isfinite().all()):  # else something lies behind the camera
+    if bool(pixels.isfinite().all()):  # else a point lies behind the camera
         low = (pixels.amin(0) - _MARGIN_PX).clamp(min=0).minimum(size - 1).long()
         high = (pixels.amax(0) + _MARGIN_PX + 1).clamp(min=1).minimum(size).long()
     left, top = low.tolist()
     right, bottom = torch.maximum(high, low + 1).tolist()
-    K[0, 2] -= left
-    K[1, 2] -= top
+    K = crop_intrinsics(instance.K.double(), left, top)
     window = depth_m[top:bottom, left:right]
     height, width = window.shape
 
@@ -133,44 +140,67 @@ def _vsd(estimated: Rigid, instance: Instance, context: ErrorContext) -> Float[T
 
 _read_depth = lru_cache(maxsize=4)(read_depth_png)  # instances of one image follow each other
 
-METRICS = {  # i: the instance, c: its context
-    "error_m": Metric(  # ADD, or ADD-S where that decides a success
-        measure=lambda pose, i, c: (adds_m if c.is_adds else add_m)(
-            pose, i.camera_from_model, c.model.vertices_m
-        ),
-        summaries={"auc": lambda errors, _: auc(errors[:, 0])},
-    ),
-    "adds_m": Metric(
-        measure=lambda pose, i, c: adds_m(pose, i.camera_from_model, c.model.vertices_m),
-        summaries={"auc_adds": lambda errors, _: auc(errors[:, 0])},
-    ),
+
+def _add(estimated: Rigid, instance: Instance, context: ErrorContext) -> Tensor:
+    """Measure ADD [m], or ADD-S where that decides a success."""
+    measure = adds_m if context.is_adds else add_m
+    return measure(estimated, instance.camera_from_model, context.model.vertices_m)
+
+
+def _adds(estimated: Rigid, instance: Instance, context: ErrorContext) -> Tensor:
+    """Measure ADD-S [m]."""
+    return adds_m(estimated, instance.camera_from_model, context.model.vertices_m)
+
+
+def _mssd(estimated: Rigid, instance: Instance, context: ErrorContext) -> Tensor:
+    """Measure MSSD [m]."""
+    points_m = context.model.vertices_m
+    return mssd_m(estimated, instance.camera_from_model, points_m, context.symmetries)
+
+
+def _mspd(estimated: Rigid, instance: Instance, context: ErrorContext) -> Tensor:
+    """Measure MSPD [px], scaled to an image 640 wide."""
+    points_m = context.model.vertices_m
+    true = instance.camera_from_model
+    error_px = mspd_px(estimated, true, points_m, context.symmetries, instance.K)
+    return (BOP_WIDTH_PX / image_size(instance.depth)[0]) * error_px
+
+
+def _true_copy(estimated: Rigid, instance: Instance, context: ErrorContext) -> Rigid:
+    """Give the symmetric copy of the annotated pose that is nearest to an estimate."""
+    true = instance.camera_from_model
+    return nearest_copy(estimated, true, context.symmetries, context.model.symmetries)
+
+
+def _rotation_deg(estimated: Rigid, instance: Instance, context: ErrorContext) -> Tensor:
+    """Measure the angle to the nearest symmetric copy of the true pose [deg]."""
+    true = _true_copy(estimated, instance, context)
+    return geodesic_rad(estimated.R.double(), true.R.double()).rad2deg()
+
+
+def _translation_m(estimated: Rigid, instance: Instance, context: ErrorContext) -> Tensor:
+    """Measure the distance to the nearest symmetric copy of the true pose [m]."""
+    true = _true_copy(estimated, instance, context)
+    return (true.t_m.double() - estimated.t_m.double()).norm(dim=-1)
+
+
+METRICS = {
+    "error_m": Metric(measure=_add, summaries={"auc": lambda errors, _: auc(errors[:, 0])}),
+    "adds_m": Metric(measure=_adds, summaries={"auc_adds": lambda errors, _: auc(errors[:, 0])}),
     "mssd_m": Metric(
-        measure=lambda pose, i, c: mssd_m(
-            pose, i.camera_from_model, c.model.vertices_m, c.symmetries
-        ),
-        summaries={"ar_mssd": lambda errors, d: average_recall(errors / d[:, None], BOP_SHARES)},
+        measure=_mssd,
+        summaries={
+            "ar_mssd": lambda errors, diameters_m: average_recall(
+                errors / diameters_m[:, None], BOP_SHARES
+            )
+        },
     ),
-    "mspd_px": Metric(  # scaled to an image 640 wide
-        measure=lambda pose, i, c: (
-            (BOP_WIDTH_PX / image_size(i.depth)[0])
-            * mspd_px(pose, i.camera_from_model, c.model.vertices_m, c.symmetries, i.K)
-        ),
+    "mspd_px": Metric(
+        measure=_mspd,
         summaries={"ar_mspd": lambda errors, _: average_recall(errors, BOP_PIXELS)},
     ),
-    "rotation_deg": Metric(
-        measure=lambda pose, i, c: geodesic_rad(
-            pose.R.double(),
-            nearest_copy(pose, i.camera_from_model, c.symmetries, c.model.symmetries).R.double(),
-        ).rad2deg(),
-        has_median=True,
-    ),
-    "translation_m": Metric(
-        measure=lambda pose, i, c: (
-            nearest_copy(pose, i.camera_from_model, c.symmetries, c.model.symmetries).t_m.double()
-            - pose.t_m.double()
-        ).norm(dim=-1),
-        has_median=True,
-    ),
+    "rotation_deg": Metric(measure=_rotation_deg, has_median=True),
+    "translation_m": Metric(measure=_translation_m, has_median=True),
     "vsd": Metric(
         measure=_vsd,
         missing=(1.0,) * len(BOP_SHARES),
@@ -182,8 +212,8 @@ METRICS = {  # i: the instance, c: its context
 the nearest of the true poses that look alike."""
 
 
-_POINTS = 500
-_NEAR_DIAMETERS = 1.0
+_POINTS = 500  # of a model, by which poses are assigned
+_MOST_DIAMETERS = 1.0  # error at which the cost of an assignment is cut off
 
 
 def match_instances(
@@ -191,13 +221,13 @@ def match_instances(
     predictions: Sequence[Prediction],
     models: Mapping[int, ObjectModel],
 ) -> dict[str, PoseEstimate]:
-    """Give each instance the estimate that answers for it, by the instance's name.
+    """Match each instance with one estimate at most; give estimates by the instances' names.
 
-    An estimate with an instance's name was computed from its mask, and is its own, unless
-    it says that it belongs elsewhere: in another data set names may be the same. Of the
-    others an image with n instances of an object takes the n of the highest scores, as BOP does,
-    and sets them against the instances so that the sum of ADD-S, at most a diameter each, is least.
-    BOP does so anew for each error and threshold. Refusals go to instances that are left over.
+    An estimate with an instance's name was computed from its mask and belongs to it, unless its
+    place is another: in another data set names may be the same. Of the others an image with n
+    instances of an object takes the n of the highest scores, as BOP does, and matches them so that
+    the sum of ADD-S, at most a diameter each, is least. BOP does so anew for each error and
+    threshold. Refusals are matched with instances that are left over.
     """
     places = {instance.name: place_of(instance) for instance in instances}
     matched: dict[str, PoseEstimate] = {}
@@ -209,7 +239,7 @@ def match_instances(
         else:
             unnamed.append(prediction)
 
-    # The others by image and object.
+    # The others, by image and object.
     unmatched: dict[Place, list[Instance]] = defaultdict(list)
     for instance in instances:
         if instance.name not in matched:
@@ -241,13 +271,13 @@ def _assign(
             pose = estimates[column].camera_from_model
             assert pose is not None
             error_m = float(adds_m(pose, instances[row].camera_from_model, points_m))
-            costs_m[row, column] = min(error_m, _NEAR_DIAMETERS * model.diameter_m)
+            costs_m[row, column] = min(error_m, _MOST_DIAMETERS * model.diameter_m)
     assigned = zip(*linear_sum_assignment(costs_m), strict=True)
     return {instances[row].name: estimates[column] for row, column in assigned}
 
 
 _TRIED = 40  # instances that each change is tried on
-_MORE = 0.2  # a change is named where so large a share more is right by it
+_GAIN = 0.2  # share of them that more must be right by a change for it to be named
 _SCALES = {
     1.0: "",
     1000.0: "t were 1000 times larger (is it in metres? BOP's csv has millimetres)",
@@ -268,16 +298,16 @@ _COUNTED_FROM = {"smaller (are yours counted from 1?)": -1, "larger (from 0?)": 
 
 @dataclass(frozen=True, kw_only=True)
 class _Change:
-    """A change of all predictions: of the numbers that they are of, and of their poses."""
+    """A change of all predictions: of their image and object numbers, and of their poses."""
 
-    words: str = ""
+    words: str = ""  # that describe it
     image_step: int = 0  # that is added to the numbers of images
     object_step: int = 0  # and of objects
     convention: str = ""  # a key of ``_CONVENTIONS``
     scale: float = 1.0  # of translations
 
     def renumber(self, prediction: Prediction) -> Prediction:
-        """Change the numbers of image and object that a prediction is of."""
+        """Give a prediction with its numbers of image and object changed."""
         place = prediction.place
         if place is None:
             return prediction
@@ -286,7 +316,7 @@ class _Change:
         return replace(prediction, place=Place(place.scene_id, image_id, object_id))
 
     def repose(self, prediction: Prediction) -> Prediction:
-        """Change the convention and the unit of a predicted pose."""
+        """Give a prediction with the convention and the unit of its pose changed."""
         pose = prediction.estimate.camera_from_model
         assert pose is not None
         pose = _CONVENTIONS[self.convention](pose.double())
@@ -316,17 +346,17 @@ def convention_advice(
     predictions: Sequence[Prediction],
     contexts: Mapping[int, ErrorContext],
 ) -> str | None:
-    """Say by which change of all predictions many more were right; None where by none."""
+    """Say by which change of all predictions many more would be right; None where by none."""
     posed = [p for p in predictions if p.estimate.is_posed]
     right, tried = _count_right(dataset, posed, contexts, _Change())
-    if right > (1 - _MORE) * tried > 0:
+    if right > (1 - _GAIN) * tried > 0:
         return None
 
     changes = _changes()
     counts = [_count_right(dataset, posed, contexts, change) for change in changes]
     best = max(range(len(changes)), key=lambda k: counts[k][0])
     best_right, best_tried = counts[best]
-    if best_right < right + max(1, min(3, best_tried), _MORE * best_tried):
+    if best_right < right + max(1, min(3, best_tried), _GAIN * best_tried):
         return None
     return (
         f"{right} of {tried} answers that were tried are right, but {best_right} of {best_tried} "
@@ -340,7 +370,7 @@ def _count_right(
     contexts: Mapping[int, ErrorContext],
     change: _Change,
 ) -> tuple[int, int]:
-    """Count how many of some predictions are right by a change, and how many were tried."""
+    """Count the predictions that are right by a change, of some instances, and these instances."""
     renumbered = [change.renumber(prediction) for prediction in posed]
     matched = match_instances(dataset.instances, renumbered, dataset.objects)
     with_estimate = [instance for instance in dataset.instances if instance.name in matched]

@@ -1,4 +1,4 @@
-"""Bodies of a mesh, and those that lie far from the part: what a CAD file holds beside it."""
+"""The part in a CAD file, and small bodies far from it that the file holds too."""
 
 import warnings
 
@@ -9,10 +9,10 @@ from scipy.sparse.csgraph import connected_components
 from depthpose.core.errors import InputError, Notice
 from depthpose.core.files import AnyPath
 
-_FAR = 0.25  # diagonals of the box about a part: a small body farther away is not of the part
-_APART = 1.0  # the same of a body of any size
-_SMALL = 0.05  # of the part's area: so small a body changes the part's size and no pose
-_MOST_NAMED = 3
+_SMALL_BODY_GAP = 0.25  # diagonals of the box about a part: a small body farther away is not of it
+_BODY_GAP = 1.0  # the same for a body of any size
+_SMALL = 0.05  # of the part's area: a smaller body far away is left out
+_MOST_NAMED = 3  # bodies in a message
 
 
 def faces_of_part(
@@ -20,27 +20,28 @@ def faces_of_part(
 ) -> np.ndarray:
     """Mark the faces of a file's part: all but those of small bodies that lie far from the rest.
 
-    The largest body is of the part, and so is what is near to it, and near to that. A small body
-    beyond, a sketch point or a screw beside the origin, would set the diameter of the part and draw
-    its keypoints: it is left out, and a notice names it.
+    The largest body is of the part, and so are bodies near it, and bodies near those. A small body
+    farther away, a sketch point or a screw beside the origin, would set the diameter of the part
+    and attract keypoints: it is left out, and a notice names it.
 
     Args:
-        path: of the file, for what is said.
-        vertices: (n, 3); points at one place have one number.
-        faces: (m, 3) numbers of their corners.
+        path: of the file, for messages.
+        vertices: (n, 3), no two at one place.
+        faces: (m, 3), indices of their corners.
         area: of each face.
 
     Raises:
         InputError: a body far from the part is too large to be left out.
     """
+    # Bodies are the connected components of the mesh.
     sides = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
     joined = coo_array((np.ones(len(sides), bool), sides.T), shape=(len(vertices),) * 2)
     _, label = connected_components(joined, directed=False)
     _, body = np.unique(label[faces[:, 0]], return_inverse=True)
     count = int(body.max()) + 1
-    whole = np.ones(len(faces), bool)
+    all_faces = np.ones(len(faces), bool)
     if count == 1:
-        return whole
+        return all_faces
 
     # The box about each body, and its area.
     low = np.full((count, 3), np.inf)
@@ -50,7 +51,7 @@ def faces_of_part(
     np.maximum.at(high, body, corners.max(1))
     size = np.bincount(body, area, count)
 
-    # From the largest body on, what is near joins the part until nothing more does.
+    # From the largest body on, near bodies join the part until none is left.
     is_part = np.zeros(count, bool)
     is_part[size.argmax()] = True
     while True:
@@ -59,12 +60,12 @@ def faces_of_part(
         diagonal = float(np.linalg.norm(part_high - part_low))
         gap = np.linalg.norm(np.maximum(0, np.maximum(low - part_high, part_low - high)), axis=1)
         is_small = size < _SMALL * size[is_part].sum()
-        is_near = gap <= diagonal * np.where(is_small, _FAR, _APART)
+        is_near = gap <= diagonal * np.where(is_small, _SMALL_BODY_GAP, _BODY_GAP)
         if not (is_near & ~is_part).any():
             break
         is_part |= is_near
     if is_part.all():
-        return whole
+        return all_faces
 
     left_out = np.flatnonzero(~is_part)
     extent = np.linalg.norm(high - low, axis=1)

@@ -21,10 +21,10 @@ from depthpose.pose.mesh.sampling import surface_places
 from depthpose.pose.types import ObjectModel, SurfaceColors
 
 _SAMPLES = 10_000  # about 1 % of the diameter apart, as far as a pose is usually off
-_DENSE = 4  # so many colours are averaged in each sample
+_DENSE = 4  # colours that are averaged in each sample
 _LEAST_CONTRAST = 0.01  # standard deviation of colours below which a model is of one colour
-_SAME_BOX = 1e-3  # of the extent: by less two readers of one file may differ
-_LEAST_INSIDE = 0.5  # share of the coloured surface in the shape's box, else they are not one
+_SAME_BOX = 1e-3  # of the extent: two readers of one file may differ by less
+_LEAST_INSIDE = 0.5  # share of the coloured surface that must lie in the shape's box
 _MOST_TEXELS = 2**26  # 8192 x 8192
 _WITH_COLORS = (".ply", ".obj", ".glb")
 
@@ -47,7 +47,7 @@ def read_colors(path: AnyPath, scale: float, model: ObjectModel) -> SurfaceColor
     """
     suffix = Path(path).suffix.lower()
     if len(model.faces) == 0:
-        return _of_points(path, model) if suffix in CLOUD_READERS else None
+        return _read_point_colors(path, model) if suffix in CLOUD_READERS else None
     if suffix not in _WITH_COLORS or not _may_have_colors(path, suffix):
         return None
     try:
@@ -88,7 +88,7 @@ def average_colors(
     """Keep every fourth of the samples of a surface, each with the mean colour about it.
 
     Returns:
-        None where all have one colour.
+        The coloured points; None where all have one colour.
     """
     if float(rgb.double().std(0).max()) < _LEAST_CONTRAST:
         return None
@@ -97,7 +97,9 @@ def average_colors(
     tree = KDTree(kept_m.numpy())
     distance_m, _ = tree.query(kept_m.numpy()[:: max(1, len(kept_m) // 1000)], k=2)
     spacing_m = float(np.median(distance_m[:, 1]))
-    # Of a thin sheet the nearest sample may be of the other side, whose colour is another.
+
+    # The mean of the samples nearest to each one kept. On a thin sheet a sample of the other side,
+    # which may have another colour, is left out.
     _, nearest = tree.query(points_m.double().numpy())
     owner = torch.from_numpy(np.asarray(nearest))
     is_same_side = (normals.double() * kept_normals[owner]).sum(-1) > 0
@@ -116,7 +118,7 @@ def average_colors(
 
 
 def _may_have_colors(path: AnyPath, suffix: str) -> bool:
-    """Whether a file names colours at all: most CAD files do not, and need no second reading."""
+    """Whether a file may hold colours: most CAD files do not, and need no second reading."""
     data = read_bytes(path)
     if suffix == ".ply":
         header = data[: data.find(b"end_header")].lower()
@@ -127,8 +129,8 @@ def _may_have_colors(path: AnyPath, suffix: str) -> bool:
     return True
 
 
-def _of_points(path: AnyPath, model: ObjectModel) -> SurfaceColors | None:
-    """Take the colours of bare points."""
+def _read_point_colors(path: AnyPath, model: ObjectModel) -> SurfaceColors | None:
+    """Read the colours of a file of bare points; None where it has none, or a single one."""
     rgb = read_cloud(path).color
     if rgb is None or len(rgb) != len(model.vertices_m):
         return None
@@ -145,13 +147,18 @@ def _of_points(path: AnyPath, model: ObjectModel) -> SurfaceColors | None:
 
 
 class _Samples(NamedTuple):
+    """Coloured points of a surface."""
+
     points: Float[Tensor, "n 3"]  # in the file's own unit
     normals: Float[Tensor, "n 3"]
     rgb: Float[Tensor, "n 3"]
 
 
 def _colored_samples(path: AnyPath, suffix: str) -> tuple[_Samples | None, list[str]]:
-    """Sample the coloured surface of a file, None without one; name files that are missing."""
+    """Sample the coloured surface of a file; give the samples, and names of files not beside it.
+
+    The samples are None where no part of the surface has a colour.
+    """
     import trimesh
 
     files = _files_beside(path)
@@ -163,79 +170,103 @@ def _colored_samples(path: AnyPath, suffix: str) -> tuple[_Samples | None, list[
             process=False,
             allow_remote=False,
         )
-    parts = [
-        (mesh, np.asarray(mesh.vertices, np.float64) @ placed[:3, :3].T + placed[:3, 3])
-        for placed, mesh in (
-            (scene.graph[node][0], scene.geometry[scene.graph[node][1]])
-            for node in scene.graph.nodes_geometry
-        )
-        if len(getattr(mesh, "faces", ()))
-    ]
+    # The meshes of the scene, and their vertices where the scene places them.
+    parts: list[tuple[Any, np.ndarray]] = []
+    for node in scene.graph.nodes_geometry:
+        transform, geometry = scene.graph[node]
+        mesh = scene.geometry[geometry]
+        if len(getattr(mesh, "faces", ())):
+            vertices = np.asarray(mesh.vertices, np.float64)
+            parts.append((mesh, vertices @ transform[:3, :3].T + transform[:3, 3]))
     if not parts:
         return None, files.lost
 
-    # Samples by area over all parts at once; then each part colours its own.
-    corners = torch.from_numpy(np.concatenate([placed[mesh.faces] for mesh, placed in parts]))
+    # Samples by area over all parts at once.
+    corners = torch.from_numpy(np.concatenate([vertices[mesh.faces] for mesh, vertices in parts]))
     face, share = surface_places(corners, _DENSE * _SAMPLES)
     points = (corners[face] * share[..., None]).sum(-2)
     sides = corners[:, 1:] - corners[:, :1]
-    across = torch.linalg.cross(sides[:, 0], sides[:, 1])
-    # A file whose faces all look inward is turned inside out.
+    doubled = torch.linalg.cross(sides[:, 0], sides[:, 1])
+    # Faces of a negative volume look inward: their normals are flipped.
     middle = corners.flatten(0, 1).mean(0)
-    volume = float(((corners.mean(1) - middle) * across).sum())
-    across = across if volume >= 0 else -across
-    normals = torch.nn.functional.normalize(across[face], dim=-1)
+    volume = float(((corners.mean(1) - middle) * doubled).sum())
+    doubled = doubled if volume >= 0 else -doubled
+    normals = torch.nn.functional.normalize(doubled[face], dim=-1)
+
+    # The colours of the samples of each part.
     rgb = torch.full((len(face), 3), torch.nan, dtype=torch.float64)
     first = 0
     for mesh, _ in parts:
-        mine = (face >= first) & (face < first + len(mesh.faces))
-        faces_of_mesh = face[mine] - first
+        is_of_mesh = (face >= first) & (face < first + len(mesh.faces))
+        face_of_mesh = (face[is_of_mesh] - first).numpy()
         first += len(mesh.faces)
-        colors = _colors_of(mesh, faces_of_mesh.numpy(), share[mine].numpy(), lost=bool(files.lost))
+        barycentric = share[is_of_mesh].numpy()
+        colors = _colors_of(mesh, face_of_mesh, barycentric, is_file_missing=bool(files.lost))
         if colors is not None:
-            rgb[mine] = torch.from_numpy(colors)
+            rgb[is_of_mesh] = torch.from_numpy(colors)
     has_color = rgb.isfinite().all(-1)
     if not bool(has_color.any()):
         return None, files.lost
     return _Samples(points[has_color], normals[has_color], rgb[has_color]), files.lost
 
 
-def _colors_of(mesh: Any, face: np.ndarray, share: np.ndarray, *, lost: bool) -> np.ndarray | None:  # noqa: ANN401  trimesh's classes carry no types
-    """Give the colour of places of a mesh, 0..1; None where it has none.
+def _colors_of(
+    mesh: Any,  # noqa: ANN401  trimesh's classes carry no types
+    face: np.ndarray,
+    barycentric: np.ndarray,
+    *,
+    is_file_missing: bool,
+) -> np.ndarray | None:
+    """Give the colours of points of a mesh (n, 3), 0..1; None where it has none.
 
-    ``lost``: a file with colours is missing, so what trimesh puts in place of a material is none.
+    Args:
+        mesh: of trimesh.
+        face: of each point (n,).
+        barycentric: coordinates of each point in it (n, 3).
+        is_file_missing: whether a file with colours was missing; then the material that trimesh
+            puts in its place does not count.
     """
-    from trimesh.visual.color import uv_to_interpolated_color
-
     visual = mesh.visual
     corners = np.asarray(mesh.faces)[face]
     if visual.kind == "face":
         return np.asarray(visual.face_colors)[face, :3] / 255
     if visual.kind == "vertex":
-        return _interpolate_corners(visual.vertex_colors, corners, share) / 255
+        return _interpolate_corners(visual.vertex_colors, corners, barycentric) / 255
     if visual.kind != "texture":
         return None
+    return _material_colors(visual, corners, barycentric, is_file_missing=is_file_missing)
+
+
+def _material_colors(
+    visual: Any,  # noqa: ANN401  trimesh's classes carry no types
+    corners: np.ndarray,
+    barycentric: np.ndarray,
+    *,
+    is_file_missing: bool,
+) -> np.ndarray | None:
+    """Give the colours of points by a texture, else by vertices, else by the material's colour."""
+    from trimesh.visual.color import uv_to_interpolated_color
+
     material = visual.material
-    in_vertices = visual.vertex_attributes.get("color")
+    vertex_colors = visual.vertex_attributes.get("color")
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
-    # A factor of glTF is linear, and so multiplies what a screen shows by its root.
+    # A factor of glTF is linear: it multiplies values of sRGB by its root.
     factor = getattr(material, "baseColorFactor", None)
     tint = np.ones(3) if factor is None else (np.asarray(factor)[:3] / 255) ** (1 / 2.2)
-    colors = None
     if image is not None and image.width * image.height > _MOST_TEXELS:
         raise InputError(
             f"its texture is {image.width}x{image.height}, more than {_MOST_TEXELS} pixels; save "
             "it smaller"
         )
     if image is not None and visual.uv is not None:
-        places = _interpolate_corners(visual.uv, corners, share)
-        colors = uv_to_interpolated_color(places, image)[:, :3] / 255 * tint
-    elif in_vertices is not None:
-        colors = _interpolate_corners(in_vertices, corners, share)[:, :3] / 255 * tint
-    elif not lost:
-        plain = tint if factor is not None else np.asarray(material.main_color)[:3] / 255
-        colors = np.broadcast_to(plain, (len(face), 3))
-    return colors
+        uv = _interpolate_corners(visual.uv, corners, barycentric)
+        return uv_to_interpolated_color(uv, image)[:, :3] / 255 * tint
+    if vertex_colors is not None:
+        return _interpolate_corners(vertex_colors, corners, barycentric)[:, :3] / 255 * tint
+    if is_file_missing:
+        return None
+    plain = tint if factor is not None else np.asarray(material.main_color)[:3] / 255
+    return np.broadcast_to(plain, (len(corners), 3))
 
 
 def _interpolate_corners(values: Any, corners: np.ndarray, barycentric: np.ndarray) -> np.ndarray:  # noqa: ANN401
@@ -245,7 +276,7 @@ def _interpolate_corners(values: Any, corners: np.ndarray, barycentric: np.ndarr
 
 
 def _files_beside(path: AnyPath) -> Any:  # noqa: ANN401  trimesh's classes carry no types
-    """Give trimesh the files in the folder of a model, and note those that are missing."""
+    """Make the resolver by which trimesh reads files beside a model; it notes missing ones."""
     from trimesh.resolvers import FilePathResolver
 
     class FilesBeside(FilePathResolver):
@@ -268,7 +299,7 @@ def _files_beside(path: AnyPath) -> Any:  # noqa: ANN401  trimesh's classes carr
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep trimesh from logging a traceback of a missing texture, which is said in a sentence."""
+    """Keep trimesh from logging a traceback of a missing texture, of which a notice tells."""
     log = logging.getLogger("trimesh")
     level = log.level
     log.setLevel(logging.CRITICAL + 1)

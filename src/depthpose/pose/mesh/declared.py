@@ -1,4 +1,4 @@
-"""Symmetries that a user declares: turns about an axis, found in place on the surface."""
+"""Symmetries that a user declares: rotations about axes, which are placed by the surface."""
 
 import math
 import warnings
@@ -31,23 +31,23 @@ _FORM = (
 )
 _MOST_TURNS = 360  # of one axis: more is a body of revolution
 _MOST_COPIES = 720  # of all axes together
-_SAME_RAD = 0.005
+_SAME_RAD = 0.005  # angle up to which two rotations are the same
 _CONTRADICTED = 0.02
-"""Deviation in diameters beyond which a declared symmetry is doubted: at it, one found is as likely
-as not."""
-_CHECKED = 12  # turns of a symmetry that are measured
+"""Deviation in diameters beyond which a notice doubts a declared symmetry: at it, the certainty of
+one found in the shape is one half."""
+_CHECKED = 12  # rotations of a symmetry that are measured
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DeclaredTurns:
-    """Equal turns about one axis."""
+    """Equal rotations about one axis."""
 
     direction: Float64[Tensor, "3"]  #: unit vector, in the model file's axes
-    turns: int | None  #: so many in a full circle; None: any
+    turns: int | None  #: rotations in a full circle; None for a free axis
 
     @property
     def angles_rad(self) -> Float64[Tensor, " a"]:
-        """All turns but that by 0; of a free axis some, by which it is measured."""
+        """Angles of all rotations but that by 0; of a free axis some, by which it is measured."""
         count = self.turns or _CHECKED
         return torch.arange(1, count, dtype=torch.float64) * (2 * math.pi / count)
 
@@ -83,8 +83,8 @@ def read_symmetry(text: str) -> tuple[DeclaredTurns, ...]:
 def declare_symmetry(model: ObjectModel, symmetry: AnySymmetry) -> ObjectModel:
     """Declare the symmetry of a model: its copies are one answer.
 
-    An axis in words goes where the surface turned about it fits best, not through the file's
-    origin. A notice says where the surface lies 2 % of the diameter and more off its turned self.
+    An axis in words is placed where the surface rotated about it fits best, not through the file's
+    origin. A notice is given where the rotated surface lies more than 2 % of the diameter off.
 
     Args:
         model: the object.
@@ -186,7 +186,7 @@ def _read_entry(path: Path, model: ObjectModel) -> Mapping[str, Any]:
 def _from_words(
     terms: Sequence[DeclaredTurns], surface: SurfaceDeviation, model: ObjectModel
 ) -> Symmetries:
-    """Place the axes on the surface, and complete their turns to a group."""
+    """Place the axes by the surface, and complete their rotations to a group."""
     axes = [
         Axis(direction=term.direction, point_m=_point_on_axis(term, surface, model))
         for term in terms
@@ -198,12 +198,14 @@ def _from_words(
         for term, axis in pairs
         if term.turns is not None
     ]
+
+    # Products are added until there is no new one: the list grows while it is read.
     copies = [Rigid(torch.eye(3).double(), torch.zeros(3).double())]
-    for first in copies:  # grows under way: products until there is no new one
+    for first in copies:
         for turn in generators:
             product = turn @ first
-            every = torch.stack([copy.R for copy in copies])
-            apart_rad = geodesic_rad(product.R.expand_as(every), every)
+            copies_R = torch.stack([copy.R for copy in copies])
+            apart_rad = geodesic_rad(product.R.expand_as(copies_R), copies_R)
             if float(apart_rad.min()) > _SAME_RAD:
                 copies.append(product)
         if len(copies) > _MOST_COPIES:
@@ -214,20 +216,21 @@ def _from_words(
     return Symmetries(discrete=Rigid.stack(copies[1:]) if copies[1:] else None, continuous=free)
 
 
-_FOLLOWED = 20
-_NEAREST = 0.9  # of the points: what has no counterpart, as a keyway, does not move the axis
+_FOLLOW_STEPS = 20  # by which an axis is placed
+_NEAREST = 0.9  # share of the points that place an axis: a keyway, without a counterpart, does not
 
 
 def _point_on_axis(
     term: DeclaredTurns, surface: SurfaceDeviation, model: ObjectModel
 ) -> Float64[Tensor, "3"]:
-    """Find where an axis of a given direction meets the surface's plane of symmetry best.
+    """Find a point on an axis of given direction, such that the surface rotated about it fits best.
 
-    From the centroid, the middle of the box and the file's origin the axis follows the surface that
-    is turned about it, by about a half turn: its fit moves a point by twice the axis' own error.
+    Starts are the centroid, the middle of the box and the file's origin. In each step the surface
+    is rotated by about a half turn, and the axis moves to where the rotated points would lie on
+    the surface.
     """
     axis = term.direction
-    across = torch.linalg.svd(axis[None]).Vh[1:]
+    across = torch.linalg.svd(axis[None]).Vh[1:]  # two axes across it
     half = (term.turns or 2) // 2
     angle_rad = torch.tensor(2 * math.pi * half / (term.turns or 2), dtype=torch.float64)
     low = surface.points.amin(0)
@@ -236,13 +239,13 @@ def _point_on_axis(
     candidates: list[tuple[float, Tensor]] = []
     for start in (torch.zeros(3).double(), (low + high) / 2, origin):
         point = start
-        for _ in range(_FOLLOWED):
+        for _ in range(_FOLLOW_STEPS):
             turn = turn_about(axis, point, angle_rad)
             moved = turn.apply(surface.many)
             distance, index = surface.nearest(moved)
-            near = distance <= np.quantile(distance, _NEAREST)
-            gap = (surface.points[torch.from_numpy(index)] - moved)[torch.from_numpy(near)].mean(0)
-            # A turn about p moves by (1 - R) p: across the axis that can be solved.
+            is_near = torch.from_numpy(distance <= np.quantile(distance, _NEAREST))
+            gap = (surface.points[torch.from_numpy(index)] - moved)[is_near].mean(0)
+            # Moving the axis by p shifts the rotated points by (1 - R) p, solved across the axis.
             lever = across @ (torch.eye(3).double() - turn.R) @ across.T
             point = point + across.T @ torch.linalg.solve(lever, across @ gap)
         turns = turn_about(axis, point, term.angles_rad[:: max(1, len(term.angles_rad) // 6)])
@@ -252,7 +255,7 @@ def _point_on_axis(
 
 
 def _deviation(declared: Symmetries, surface: SurfaceDeviation, model: ObjectModel) -> float:
-    """Give how far the surface lies off itself after any of the turns, in diameters."""
+    """Measure how far the surface lies off itself after any of the rotations, in diameters."""
     turns = symmetry_transforms(declared, 2 * math.pi / _CHECKED / 2).double()[1:]
     some = turns[:: max(1, len(turns.R) // (2 * _CHECKED))]
     # From the model's frame and metres to the surface's centre and unit.

@@ -31,12 +31,14 @@ _NO_FACES = Ragged(np.empty(0, np.int64), np.empty(0, np.int64))
 _MOST_NODES = 10_000  # of a GLB's scene
 _MOST_SCENE_BYTES = 2**22  # of the JSON that describes it
 _MOST_NESTED = 6e7  # sum of the cubes of the depths of a GLB's nodes: some ten seconds of trimesh
+_TRIANGLE_FAN = 6  # mode of a primitive of glTF
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+"""Numbers of an element of an accessor of glTF."""
 _KNOWN = ("KHR_materials", "KHR_texture", "KHR_lights", "KHR_xmp", "EXT_texture", "KHR_mesh_quant")
-"""How extensions of glTF begin that change no surface, or that trimesh reads."""
+"""Beginnings of the names of glTF extensions that change no surface, or that trimesh reads."""
 _NO_AREA = 1e-12  # of the square of the extent: a face of no more is a line or a point
-_LEAST_AREA = 1e-6  # of the squared extent: all faces of less are no surface; a wire has 0.003
-_FARTHEST = 1e9  # a coordinate beyond is no model's, in whatever unit, and overflows in float32
+_LEAST_AREA = 1e-6  # of the squared extent: faces of less in all are no surface; a wire has 0.003
+_FARTHEST = 1e9  # no model has a larger coordinate, in whatever unit; it overflows in float32
 
 
 AnyModel = AnyPath | object  #: a model file, or a mesh of trimesh or Open3D
@@ -44,10 +46,10 @@ FIXED_UNITS: dict[str, Unit] = {".glb": "m"}  #: of formats that fix theirs
 
 
 def unit_of(path: AnyModel, unit: Unit | None) -> Unit:
-    """Give the unit of a model: what is said, else what its format fixes, or the mesh itself says.
+    """Give the unit of a model: the one given, else that of its format or of the mesh itself.
 
     Raises:
-        InputError: neither.
+        InputError: there is none.
     """
     if isinstance(path, str | Path):
         declared = unit or FIXED_UNITS.get(Path(path).suffix.lower())
@@ -86,18 +88,34 @@ def read_geometry(path: AnyModel) -> tuple[np.ndarray, np.ndarray]:
             f"{path}: holds {len(vertices)} points, or one that is not finite or beyond "
             f"{_FARTHEST:g}; a model needs 4 and more. Export it again."
         )
+    triangles = _to_triangles(str(path), vertices, faces)
+    if len(triangles) == 0:
+        return vertices, triangles
+    return _clean_surface(str(path), vertices, triangles)
+
+
+def _to_triangles(path: AnyPath, vertices: np.ndarray, faces: np.ndarray | Ragged) -> np.ndarray:
+    """Give faces as triangles (m, 3): as they are, or polygons cut."""
     if isinstance(faces, np.ndarray):
         faces = Ragged(np.full(len(faces), faces.shape[1]), faces.reshape(-1))
     sizes = faces.sizes
     corners = faces.values.astype(np.int64)
     if (sizes == 3).all() and ((corners >= 0) & (corners < len(vertices))).all():
-        faces = corners.reshape(-1, 3)
-    else:
-        faces = cut_polygons(str(path), vertices, sizes, corners)
-    if len(faces) == 0:
-        return vertices, faces
-    # Dropped are faces without area, and all but the first of those on the same three points: a
-    # face and its reverse would cancel in the normals. Holes are no flaw.
+        return corners.reshape(-1, 3)
+    return cut_polygons(path, vertices, sizes, corners)
+
+
+def _clean_surface(
+    path: AnyPath, vertices: np.ndarray, faces: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Drop faces without area, repeated faces, and small bodies far from the part.
+
+    Of faces on the same three points the first stays: a face and its reverse would cancel in the
+    normals. Holes are no flaw.
+
+    Raises:
+        InputError: the faces have no area, or bodies lie far from each other.
+    """
     sides = vertices[faces[:, 1:]] - vertices[faces[:, :1]]
     area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=-1) / 2
     square = float(np.ptp(vertices, axis=0).max()) ** 2
@@ -106,15 +124,14 @@ def read_geometry(path: AnyModel) -> tuple[np.ndarray, np.ndarray]:
             f"{path}: its {len(faces)} faces have no area, so there is no surface to see; all are "
             "lines or points. Export it again as triangles, or as points without faces."
         )
-    # By place, not by number: STL repeats the points of every face.
+
+    # Points are compared by place, not by index: STL repeats the points of every face.
     places, place = np.unique(vertices, axis=0, return_inverse=True)
     merged = place.reshape(-1)[faces]
     _, first = np.unique(np.sort(merged, axis=-1), axis=0, return_index=True)
-    kept = np.isin(np.arange(len(faces)), first) & (area > _NO_AREA * square)
-    faces = faces[kept]
-    merged = merged[kept]
-    area = area[kept]
-    is_part = faces_of_part(str(path), places, merged, area)
+    is_kept = np.isin(np.arange(len(faces)), first) & (area > _NO_AREA * square)
+    faces = faces[is_kept]
+    is_part = faces_of_part(path, places, merged[is_kept], area[is_kept])
     if is_part.all():
         return vertices, faces
     used, faces = np.unique(faces[is_part], return_inverse=True)
@@ -122,12 +139,14 @@ def read_geometry(path: AnyModel) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _read_ply(path: AnyPath) -> tuple[np.ndarray, Ragged]:
-    """Read vertices and faces; the list of a face has one of several names."""
+    """Read vertices and faces of a PLY file."""
     columns, lists = read_ply_elements(path)
     if not columns.keys() >= set("xyz"):
         raise InputError(f"{path}: no x, y and z among {list(columns)}. Export it again.")
     with np.errstate(invalid="ignore"):  # a signalling NaN is a NaN, and refused as such
         vertices = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], -1)
+
+    # The list of a face has one of several names: vertex_indices, vertex_index, ...
     faces = [name for name in lists if name.split()[0] in ("face", "tristrips")]
     indices = [name for name in faces if name.startswith("face ") and "ind" in name]
     named = [name for name in indices if "vert" in name] or indices
@@ -141,15 +160,18 @@ def _read_ply(path: AnyPath) -> tuple[np.ndarray, Ragged]:
 
 
 def _rows_of(path: AnyPath, data: bytes) -> Iterator[tuple[int, list[bytes]]]:
-    """Give the words of each line and its number: the first in lower case, without comments."""
+    """Give the number and the words of each line of text, without comments.
+
+    The first word is in lower case. A backslash at the end of a line joins it with the next.
+    """
     if len(data) > _MOST_TEXT:
         raise InputError(
             f"{path}: {len(data)} bytes of text, more than the {_MOST_TEXT} that are read; save it "
             "as binary PLY or STL"
         )
-    before = bytearray()  # which grows in place, as bytes do not
+    before = bytearray()  # it grows in place, as bytes do not
     text = data.removeprefix(BOM_UTF8).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
-    # A backslash joins lines; behind one that ends the file comes an empty line.
+    # An empty line is added, for a backslash may end the file.
     for number, line in enumerate(BytesIO(text + b"\n\n"), 1):
         if line.endswith(b"\\\n"):
             before += line[:-2]
@@ -160,12 +182,12 @@ def _rows_of(path: AnyPath, data: bytes) -> Iterator[tuple[int, list[bytes]]]:
             yield number, [words[0].lower(), *words[1:]]
 
 
-def _place(path: AnyPath, line: int, words: list[bytes]) -> list[float]:
-    """Take x, y and z of a line; what follows them is a weight or a colour."""
+def _read_point(path: AnyPath, line: int, words: list[bytes]) -> list[float]:
+    """Read x, y and z of a line; a weight or a colour may follow them."""
     with suppress(ValueError):
-        place = [float(word) for word in words[1:4]]
-        if len(place) == 3:
-            return place
+        point = [float(word) for word in words[1:4]]
+        if len(point) == 3:
+            return point
     raise InputError(
         f"{path}: line {line}, {b' '.join(words)[:60].decode('latin-1')!r}, does not give x, y and "
         "z with decimal points; export it again"
@@ -173,73 +195,89 @@ def _place(path: AnyPath, line: int, words: list[bytes]) -> list[float]:
 
 
 def _read_stl(path: AnyPath) -> tuple[np.ndarray, Ragged]:
-    """Read triangles; text if it says so and its length is not that of its triangles."""
+    """Read triangles; as text if the file says so and its length is not that of its triangles."""
     data = read_bytes(path)
     (count,) = struct.unpack("<I", data[80:84]) if len(data) >= 84 else (0,)
-    there, more = divmod(len(data) - 84, 50)
+    records, spare_bytes = divmod(len(data) - 84, 50)
     head = data[: 2**16].removeprefix(BOM_UTF8).lstrip().lower()
     is_text = head.startswith(b"solid") and b"facet" in head and b"\0" not in head
-    if is_text and (there, more) != (count, 0):
-        # Facets of one or more solids; a loop of four corners and more is a polygon.
-        places = array("d")
-        ends = array("q", [0])
-        last = b""
-        for number, words in _rows_of(path, data):
-            last = words[0]
-            if last == b"vertex":
-                places.extend(_place(path, number, words))
-            elif last == b"endloop":
-                ends.append(len(places) // 3)
-        if last != b"endsolid" or ends[-1] != len(places) // 3:
-            raise InputError(
-                f"{path}: STL in text that ends by {last.decode('latin-1')[:20]!r}, not by "
-                "'endsolid'; it is truncated. Export it again."
-            )
-        return np.array(places).reshape(-1, 3), Ragged(np.diff(ends), np.arange(ends[-1]))
-    # Writers that stream leave the count at 0; a byte or two behind the last one do no harm.
-    if there < 1 or (there != count and (count or more)):
+    if is_text and (records, spare_bytes) != (count, 0):
+        return _read_stl_text(path, data)
+    # Writers that stream leave the count at 0; a byte or two after the last record do no harm.
+    if records < 1 or (records != count and (count or spare_bytes)):
         raise InputError(
             f"{path}: declares {count} triangles, and {max(0, len(data) - 84)} bytes follow, those "
-            f"of {max(0, there)}; it is truncated or no STL. Export it again."
+            f"of {max(0, records)}; it is truncated or no STL. Export it again."
         )
     record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", 9), ("attribute", "<u2")])
-    corners = np.frombuffer(data, record, there, 84)["corners"].reshape(-1, 3)
-    return corners.astype(np.float64), Ragged(np.full(there, 3), np.arange(3 * there))
+    corners = np.frombuffer(data, record, records, 84)["corners"].reshape(-1, 3)
+    return corners.astype(np.float64), Ragged(np.full(records, 3), np.arange(3 * records))
+
+
+def _read_stl_text(path: AnyPath, data: bytes) -> tuple[np.ndarray, Ragged]:
+    """Read the facets of one or more solids; a loop of four corners and more is a polygon."""
+    points = array("d")
+    ends = array("q", [0])  # of loops, in points
+    keyword = b""
+    for line, words in _rows_of(path, data):
+        keyword = words[0]
+        if keyword == b"vertex":
+            points.extend(_read_point(path, line, words))
+        elif keyword == b"endloop":
+            ends.append(len(points) // 3)
+    if keyword != b"endsolid" or ends[-1] != len(points) // 3:
+        raise InputError(
+            f"{path}: STL in text that ends by {keyword.decode('latin-1')[:20]!r}, not by "
+            "'endsolid'; it is truncated. Export it again."
+        )
+    return np.array(points).reshape(-1, 3), Ragged(np.diff(ends), np.arange(ends[-1]))
 
 
 def _read_obj(path: AnyPath) -> tuple[np.ndarray, Ragged]:
-    """Read vertices and polygons; negative numbers count back from the line they stand in."""
-    places = array("d")
+    """Read vertices and polygons of an OBJ file."""
+    points = array("d")
     sizes = array("q")
     corners = array("q")
-    is_other = False
+    has_curves = False
     highest = 0
     highest_line = 0
-    for number, words in _rows_of(path, read_bytes(path)):
+    for line, words in _rows_of(path, read_bytes(path)):
         if words[0] == b"v":
-            places.extend(_place(path, number, words))
+            points.extend(_read_point(path, line, words))
         elif words[0] in (b"f", b"fo"):  # fo of old writers is the same
-            there = len(places) // 3
-            named = [0]
-            with suppress(ValueError):
-                named = [int(word.partition(b"/")[0]) for word in words[1:]] or [0]
-            if 0 in named or min(named) < -there or max(named) > _MOST_TEXT:
-                raise InputError(
-                    f"{path}: line {number}, {b' '.join(words)[:60].decode('latin-1')!r}: a face "
-                    f"names points from 1 on, or back from -1 to -{there}; export it again"
-                )
-            if max(named) > highest:
-                highest = max(named)
-                highest_line = number
-            sizes.append(len(named))
-            corners.extend(k - 1 if k > 0 else there + k for k in named)
-        is_other |= words[0] in (b"surf", b"curv", b"curv2", b"l")
-    vertices = np.array(places).reshape(-1, 3)
-    if highest > len(vertices) or (is_other and not sizes):
-        problem = f"line {highest_line} names point {highest} of {len(vertices)}; it is damaged"
-        problem = problem if sizes else "holds free-form surfaces or lines alone, and no triangles"
-        raise InputError(f"{path}: {problem}. Export it again.")
+            count = len(points) // 3
+            indices = _read_face(path, line, words, count)
+            if max(indices) > highest:
+                highest = max(indices)
+                highest_line = line
+            sizes.append(len(indices))
+            # Indices begin with 1; negative ones count back from the points before the line.
+            corners.extend(k - 1 if k > 0 else count + k for k in indices)
+        has_curves |= words[0] in (b"surf", b"curv", b"curv2", b"l")
+    vertices = np.array(points).reshape(-1, 3)
+    if has_curves and not sizes:
+        raise InputError(
+            f"{path}: holds free-form surfaces or lines alone, and no triangles. Export it again."
+        )
+    if highest > len(vertices):
+        raise InputError(
+            f"{path}: line {highest_line} names point {highest} of {len(vertices)}; it is damaged. "
+            "Export it again."
+        )
     return vertices, Ragged(np.array(sizes, np.int64), np.array(corners, np.int64))
+
+
+def _read_face(path: AnyPath, line: int, words: list[bytes], count: int) -> list[int]:
+    """Read the indices of a face's points, of which ``count`` stand before its line."""
+    indices: list[int] = []
+    with suppress(ValueError):
+        indices = [int(word.partition(b"/")[0]) for word in words[1:]]
+    if not indices or 0 in indices or min(indices) < -count or max(indices) > _MOST_TEXT:
+        raise InputError(
+            f"{path}: line {line}, {b' '.join(words)[:60].decode('latin-1')!r}: a face names "
+            f"points from 1 on, or back from -1 to -{count}; export it again"
+        )
+    return indices
 
 
 def _read_glb(path: AnyPath) -> tuple[np.ndarray, np.ndarray]:
@@ -259,7 +297,11 @@ def _read_glb(path: AnyPath) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _refuse_scene(path: AnyPath, data: bytes) -> None:
-    """Refuse a GLB by the JSON at its head: accessors without bytes hold as many zeros as said."""
+    """Refuse a GLB by the JSON at its head, before its numbers are read.
+
+    It may declare more numbers than are read, since an accessor without bytes stands for as many
+    zeros as it declares; numbers in another file; or features of glTF that are not read.
+    """
     if not data.startswith(b"glTF"):
         raise InputError(f"{path}: begins by {data[:12]!r}, not by 'glTF'; export it as binary GLB")
     with refused_as(path, "GLB", "export it again"):
@@ -267,28 +309,10 @@ def _refuse_scene(path: AnyPath, data: bytes) -> None:
         if size > _MOST_SCENE_BYTES:
             raise InputError(f"{path}: {size} bytes of JSON in a GLB; export the part alone")
         scene: Any = json.loads(data[20 : 20 + size])
-        accessors = scene.get("accessors", [])
-        values = [abs(int(entry["count"])) * _WIDTHS[entry["type"]] for entry in accessors]
-        placed = sum(
-            values[part["attributes"]["POSITION"]]
-            for node in scene.get("nodes", [])
-            if "mesh" in node
-            for part in scene["meshes"][node["mesh"]]["primitives"]
-            if "POSITION" in part.get("attributes", {})
-        )
-        nodes = len(scene.get("nodes", []))
-        work = _refuse_nodes(path, scene.get("nodes", []))
-        needed = [n for n in scene.get("extensionsRequired", []) if not n.startswith(_KNOWN)]
-        parts = [part for mesh in scene.get("meshes", []) for part in mesh["primitives"]]
-        needed += ["TRIANGLE_FAN" for part in parts if part.get("mode") == 6]
-        places = [p["attributes"]["POSITION"] for p in parts if "POSITION" in p["attributes"]]
-        needed += ["normalized positions" for k in places if accessors[k].get("normalized")]
-        read = [*places, *(part["indices"] for part in parts if "indices" in part)]
-        needed += ["sparse accessors" for k in read if accessors[k].get("sparse")]
-        meshes = [node for node in scene.get("nodes", []) if "mesh" in node]
-        needed += ["a skin" for node in meshes if "skin" in node]
-        weights = [entry.get("weights", []) for entry in (*scene.get("meshes", []), *meshes)]
-        needed += ["morph targets" for entry_weights in weights if any(entry_weights)]
+        nodes = scene.get("nodes", [])
+        values = _count_values(scene)
+        work = _refuse_nodes(path, nodes)
+        unread = _unread_features(scene)
         links = [str(buffer.get("uri") or "data:") for buffer in scene.get("buffers", [])]
         outside = [link for link in links if not link.startswith("data:")]
     if outside:
@@ -296,28 +320,62 @@ def _refuse_scene(path: AnyPath, data: bytes) -> None:
             f"{path}: its numbers are in another file, {outside[0][:60]!r}, and a GLB is read "
             "alone; export it as one file, with its buffers inside"
         )
-    if needed:
+    if unread:
         raise InputError(
-            f"{path}: needs {needed[0][:60]!r}, which is not read; export it as plain triangles, "
+            f"{path}: needs {unread[0][:60]!r}, which is not read; export it as plain triangles, "
             "uncompressed"
         )
     if work > _MOST_NESTED:
         raise InputError(
-            f"{path}: its {nodes} nodes hang too deep in each other to be read in seconds; export "
-            "the part alone, its transforms applied"
+            f"{path}: its {len(nodes)} nodes hang too deep in each other to be read in seconds; "
+            "export the part alone, its transforms applied"
         )
-    if max(sum(values), placed) > _MOST_VALUES or nodes > _MOST_NODES:
+    if values > _MOST_VALUES or len(nodes) > _MOST_NODES:
         raise InputError(
-            f"{path}: declares {max(sum(values), placed)} numbers in {nodes} nodes, more than "
-            f"{_MOST_VALUES} and {_MOST_NODES}; export the part alone"
+            f"{path}: declares {values} numbers in {len(nodes)} nodes, more than {_MOST_VALUES} "
+            f"and {_MOST_NODES}; export the part alone"
         )
+
+
+def _count_values(scene: Any) -> int:  # noqa: ANN401  JSON
+    """Count the numbers of a glTF scene: of its accessors, or of the points that nodes place."""
+    accessors = scene.get("accessors", [])
+    values = [abs(int(entry["count"])) * _WIDTHS[entry["type"]] for entry in accessors]
+    placed = 0
+    for node in scene.get("nodes", []):
+        if "mesh" not in node:
+            continue
+        for primitive in scene["meshes"][node["mesh"]]["primitives"]:
+            if "POSITION" in primitive.get("attributes", {}):
+                placed += values[primitive["attributes"]["POSITION"]]
+    return max(sum(values), placed)
+
+
+def _unread_features(scene: Any) -> list[str]:  # noqa: ANN401  JSON
+    """Name the features of a glTF scene that change its surface, and are not read."""
+    unread = [n for n in scene.get("extensionsRequired", []) if not n.startswith(_KNOWN)]
+    accessors = scene.get("accessors", [])
+    meshes = scene.get("meshes", [])
+    primitives = [primitive for mesh in meshes for primitive in mesh["primitives"]]
+    unread += ["TRIANGLE_FAN" for p in primitives if p.get("mode") == _TRIANGLE_FAN]
+
+    # Accessors of points and of faces, by index.
+    positions = [p["attributes"]["POSITION"] for p in primitives if "POSITION" in p["attributes"]]
+    indices = [p["indices"] for p in primitives if "indices" in p]
+    unread += ["normalized positions" for k in positions if accessors[k].get("normalized")]
+    unread += ["sparse accessors" for k in (*positions, *indices) if accessors[k].get("sparse")]
+
+    mesh_nodes = [node for node in scene.get("nodes", []) if "mesh" in node]
+    unread += ["a skin" for node in mesh_nodes if "skin" in node]
+    unread += ["morph targets" for entry in (*meshes, *mesh_nodes) if any(entry.get("weights", []))]
+    return unread
 
 
 def _refuse_nodes(path: AnyPath, nodes: list[dict[str, Any]]) -> float:
-    """Refuse nodes that are no trees, or whose numbers no transform has; give what they cost.
+    """Refuse nodes that make no trees or have impossible transforms; give the cost of placing all.
 
-    Readers differ in what they make of them: a mesh would be lost, or placed anywhere. The cost is
-    that of trimesh's products of matrices, the sum of the cubes of the nodes' depths.
+    Readers place such nodes differently, or lose their meshes. The cost is that of trimesh's
+    products of matrices: the sum of the cubes of the nodes' depths.
     """
     parents: dict[int, int] = {}
     for number, node in enumerate(nodes):
@@ -335,12 +393,14 @@ def _refuse_nodes(path: AnyPath, nodes: list[dict[str, Any]]) -> float:
                     f"{path}: the {name} of node {number} holds {wild[0]:g}, which moves nothing "
                     "to where a sensor sees it; export it again"
                 )
+
+    # The depth of each node, from the roots on; a circle of nodes has no root.
     depths: dict[int, int] = {}
-    left = [(number, 1) for number in range(len(nodes)) if number not in parents]
-    while left:
-        number, depth = left.pop()
+    open_nodes = [(number, 1) for number in range(len(nodes)) if number not in parents]
+    while open_nodes:
+        number, depth = open_nodes.pop()
         depths[number] = depth
-        left += [(child, depth + 1) for child in nodes[number].get("children", [])]
+        open_nodes += [(child, depth + 1) for child in nodes[number].get("children", [])]
     if len(depths) < len(nodes):
         lost = next(number for number in range(len(nodes)) if number not in depths)
         raise InputError(
@@ -355,17 +415,17 @@ MESH_READERS: dict[str, Callable[[AnyPath], tuple[np.ndarray, np.ndarray | Ragge
     ".obj": _read_obj,
     ".glb": _read_glb,
 }
-"""Suffix to reader of points (n, 3; float64) in the file's unit, and faces (f, corners; int64)."""
+"""Readers by suffix: of points (n, 3; float64) in the file's unit, and faces (f, n; int64)."""
 
 
 _MOST_CORNERS = 5_000  # of one polygon
 _MOST_CLIPPED = 2e8
-"""Of polygons that are not convex, the sum of corners times 1,000 and the corners that turn back:
-each is clipped in about so many steps, together some ten seconds."""
+"""Steps that clip all polygons that are not convex, some ten seconds: each takes about its corners
+times 1,000 plus its reflex corners."""
 _MOST_TOGETHER = 2**20  # corners of polygons that are cut at a time
 _MOST_ROUNDS = 3  # about a polygon in search of ears; one that needs more crosses itself
-_FLAT = 1e-9  # of the square of a polygon's area: a corner that turns back by less is straight
-_OVERLAP = 1e-3  # of all area: polygons that cross themselves may lay so much of it twice
+_FLAT = 1e-9  # of the square of a polygon's area: a corner that is reflex by less is straight
+_OVERLAP = 1e-3  # of all area: share that polygons which cross themselves may cover twice
 
 
 def cut_polygons(
@@ -373,7 +433,16 @@ def cut_polygons(
 ) -> np.ndarray:
     """Cut simple polygons without holes into triangles of the same corners, in their order.
 
-    A polygon that is not planar is cut as it looks along the normal of its area (Newell's).
+    A polygon that is not planar is cut as it looks along its normal (Newell's).
+
+    Args:
+        path: of the file, for errors.
+        vertices: points (n, 3).
+        sizes: number of corners of each polygon.
+        corners: indices of their points, one polygon after the other.
+
+    Raises:
+        InputError: an index is out of range, a polygon has too many corners or crosses itself.
     """
     starts = np.cumsum(sizes) - sizes
     wrong = (corners < 0) | (corners >= len(vertices))
@@ -390,35 +459,36 @@ def cut_polygons(
             f"{path}: face {wrong.argmax()} has {sizes[wrong.argmax()]} corners, and 3 to "
             f"{_MOST_CORNERS} are read; the file is truncated, or export it as triangles"
         )
+
+    # Polygons of equally many corners together.
     pieces = [np.empty((0, 3), np.int64)]
-    owners = [np.empty(0, np.int64)]
-    overlap = np.zeros(len(sizes))
+    owners = [np.empty(0, np.int64)]  # polygon of each triangle
+    overlap = np.zeros(len(sizes))  # area of each polygon that its triangles cover twice
     area = 0.0
     steps = 0.0
-    order = np.argsort(sizes, kind="stable")
-    for which in _alike(sizes, order):
-        size = int(sizes[which[0]])
-        polygons = corners[starts[which, None] + np.arange(size)]
-        normals, is_back = _back_turns(vertices[polygons])
-        backs = is_back.sum(1)
-        steps += float((size * (1000.0 + backs[backs > 0])).sum())
+    for group in _groups_by_size(sizes):
+        size = int(sizes[group[0]])
+        polygons = corners[starts[group, None] + np.arange(size)]
+        normals, is_reflex = _find_reflex(vertices[polygons])
+        reflex = is_reflex.sum(1)
+        steps += float((size * (1000.0 + reflex[reflex > 0])).sum())
         if steps > _MOST_CLIPPED:
             raise InputError(
                 f"{path}: its polygons that are not convex have too many corners to be cut in some "
                 f"seconds (one of {size} among them); export it as triangles"
             )
-        local = _cut(vertices[polygons], normals, is_back)
+        local = _cut(vertices[polygons], normals, is_reflex)
         triangles = np.take_along_axis(polygons[:, None], local, 2)
         pieces.append(triangles.reshape(-1, 3))
-        owners.append(which.repeat(size - 2))
+        owners.append(group.repeat(size - 2))
         if size > 3:
             sides = vertices[triangles[..., 1:]] - vertices[triangles[..., :1]]
             doubled = np.cross(sides[..., 0, :], sides[..., 1, :])
             length = np.linalg.norm(normals, axis=-1)
             along = np.abs(np.einsum("mtc,mc->mt", doubled, normals)).sum(-1)
             each = np.linalg.norm(doubled, axis=-1).sum(-1)
-            seen = np.divide(along, length, where=length > _FLAT * each, out=each.copy())
-            overlap[which] = seen - length
+            projected = np.divide(along, length, where=length > _FLAT * each, out=each.copy())
+            overlap[group] = projected - length
             area += float(each.sum())
     if overlap.sum() > _OVERLAP * area:
         raise InputError(
@@ -428,17 +498,20 @@ def cut_polygons(
     return np.concatenate(pieces)[np.argsort(np.concatenate(owners), kind="stable")]
 
 
-def _alike(sizes: np.ndarray, order: np.ndarray) -> Iterator[np.ndarray]:
-    """Give the numbers of polygons of equally many corners, so many that they fit in memory."""
-    for alike in np.split(order, np.flatnonzero(np.diff(sizes[order])) + 1):
-        size = int(sizes[alike[0]]) if len(alike) else 0
-        step = max(1, _MOST_TOGETHER // max(size, 1))
-        for start in range(0, len(alike) if size > 2 else 0, step):
-            yield alike[start : start + step]
+def _groups_by_size(sizes: np.ndarray) -> Iterator[np.ndarray]:
+    """Give the indices of polygons of equally many corners, in groups that fit in memory."""
+    order = np.argsort(sizes, kind="stable")
+    for same_size in np.split(order, np.flatnonzero(np.diff(sizes[order])) + 1):
+        size = int(sizes[same_size[0]]) if len(same_size) else 0
+        if size < 3:
+            continue
+        step = max(1, _MOST_TOGETHER // size)
+        for start in range(0, len(same_size), step):
+            yield same_size[start : start + step]
 
 
-def _back_turns(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Give the normals (m, 3) of polygons (m, n, 3), and which corners turn back (m, n)."""
+def _find_reflex(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Give the normals (m, 3) of polygons (m, n, 3), and which corners are reflex (m, n)."""
     points = points - points[:, :1]
     after = np.roll(points, -1, 1)
     before = np.roll(points, 1, 1)
@@ -447,27 +520,37 @@ def _back_turns(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return normals, turns < -_FLAT * (normals**2).sum(-1, keepdims=True)
 
 
-def _cut(points: np.ndarray, normals: np.ndarray, is_back: np.ndarray) -> np.ndarray:
-    """Cut polygons (m, n, 3) of equally many corners; give their corners (m, n - 2, 3)."""
+def _cut(points: np.ndarray, normals: np.ndarray, is_reflex: np.ndarray) -> np.ndarray:
+    """Cut polygons (m, n, 3) into triangles; give the corners of each, as indices (m, n - 2, 3).
+
+    Convex polygons are cut as fans, others by ear clipping.
+    """
     count = points.shape[1]
     points = points - points[:, :1]
     steps = np.arange(count - 2)
     fan = np.stack([0 * steps, steps + 1, steps + 2], -1)
     local = np.repeat(fan[None], len(points), 0)
-    for k in np.flatnonzero(is_back.any(1)):
+    for k in np.flatnonzero(is_reflex.any(1)):
         # Projected along its normal, which then points at the viewer.
         across = np.cross(normals[k], np.eye(3)[np.abs(normals[k]).argmin()])
         basis = np.stack([across, np.cross(normals[k], across)], -1)
         flat = points[k] @ (basis / np.linalg.norm(basis, axis=0).clip(1e-300))
-        local[k] = _clip_ears(flat, is_back[k])
+        local[k] = _clip_ears(flat, is_reflex[k])
     return local
 
 
-def _clip_ears(points: np.ndarray, is_back: np.ndarray) -> list[list[int]]:
-    """Cut off a corner whose triangle holds no other, again and again; points (n, 2), in order.
+def _clip_ears(points: np.ndarray, is_reflex: np.ndarray) -> list[list[int]]:
+    """Cut off ears, corners whose triangles hold no other corner; points (n, 2), in order.
 
-    If a triangle holds any, then one of the corners that turn back. A cut changes what its two
-    neighbours are, so that these alone are looked at again: three corners for each that is cut.
+    A triangle that holds any corner holds a reflex one, so that only these are tested. A cut
+    changes its two neighbours alone, which are then examined again.
+
+    Args:
+        points: corners of the polygon (n, 2), in order.
+        is_reflex: which of them are reflex (n,); changed.
+
+    Returns:
+        Corners of the triangles, as indices.
     """
     count = len(points)
     ears = list[list[int]]()
@@ -483,8 +566,8 @@ def _clip_ears(points: np.ndarray, is_back: np.ndarray) -> list[list[int]]:
     must_cut = False
     while len(ears) < count - 3:
         if not waiting:
-            # No ear is left: the polygon crosses itself, or touches itself. All are looked at once
-            # more, and if there is none then, any corner is cut.
+            # No ear is left: the polygon crosses itself, or touches itself. All corners are
+            # examined once more, and if none is an ear then, any one is cut.
             waiting.extend(k for k in range(count) if is_left[k])
             for k in waiting:
                 is_waiting[k] = True
@@ -496,11 +579,11 @@ def _clip_ears(points: np.ndarray, is_back: np.ndarray) -> list[list[int]]:
         if not is_left[k]:
             continue
         ear = [before[k], k, after[k]]
-        if not (must_cut or rounds > _MOST_ROUNDS or _is_ear(points, ear, is_back, least)):
+        if not (must_cut or rounds > _MOST_ROUNDS or _is_ear(points, ear, is_reflex, least)):
             continue
         ears.append(ear)
         is_left[k] = False
-        is_back[k] = False
+        is_reflex[k] = False
         is_cut = True
         must_cut = False
         after[ear[0]], before[ear[2]] = ear[2], ear[0]
@@ -512,8 +595,11 @@ def _clip_ears(points: np.ndarray, is_back: np.ndarray) -> list[list[int]]:
     return [*ears, [k for k in range(count) if is_left[k]]]
 
 
-def _is_ear(points: np.ndarray, corners: list[int], is_back: np.ndarray, least: float) -> bool:
-    """Whether the triangle of three corners in a row lies within, and holds no other corner."""
+def _is_ear(points: np.ndarray, corners: list[int], is_reflex: np.ndarray, least: float) -> bool:
+    """Whether the triangle of three successive corners lies in the polygon, and holds no other one.
+
+    ``least`` is twice the area below which the middle corner is straight, and an ear.
+    """
     ear = points[corners]
     sides = np.roll(ear, -1, 0) - ear
     turn = sides[0, 0] * sides[1, 1] - sides[0, 1] * sides[1, 0]
@@ -523,7 +609,7 @@ def _is_ear(points: np.ndarray, corners: list[int], is_back: np.ndarray, least: 
     if turn < 0:
         return False
     # Another corner lies within if it is on the inner side of all three sides.
-    offsets = points[is_back] - ear[:, None]  # from each corner of the ear to each other corner
+    offsets = points[is_reflex] - ear[:, None]  # from each corner of the ear to each other corner
     is_within = (sides[:, :1] * offsets[..., 1] >= sides[:, 1:] * offsets[..., 0]).all(0)
     is_within &= offsets.any(-1).all(0)  # one at the place of a corner of the ear does no harm
     return not is_within.any()

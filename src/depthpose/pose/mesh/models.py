@@ -31,16 +31,16 @@ BOP_STEP = 0.01
 def turn_about(
     direction: Float[Tensor, "3"], point_m: Float[Tensor, "3"], angle_rad: Float[Tensor, "*batch"]
 ) -> Rigid:
-    """Turn about the line through ``point_m``, by the right-hand rule."""
+    """Make the rotation about a line through ``point_m``, by the right-hand rule."""
     R = rotation_by(angle_rad[..., None].to(direction) * direction / direction.norm())
     return Rigid(R, point_m - (R @ point_m[..., None]).squeeze(-1))
 
 
 def axis_of_turn(turn: Rigid) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """Give the line about which a motion turns, the inverse of :func:`turn_about`.
+    """Give the line about which a motion rotates, the inverse of :func:`turn_about`.
 
     Args:
-        turn: about a line, by less than half a turn and by more than none.
+        turn: rotation about a line by more than 0 and less than 180 degrees.
 
     Returns:
         The unit vector of the line (3,), by the right-hand rule, and its point nearest to the
@@ -57,28 +57,28 @@ def axis_of_turn(turn: Rigid) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
 def symmetry_transforms(symmetries: Symmetries, max_step: float = BOP_STEP) -> Rigid:
     """List the transforms ``model_from_model`` that leave the object as it is.
 
-    The identity, the discrete ones, and each of them followed by turns about each continuous axis
-    (BOP: ``ceil(pi / max_step)`` equal steps of the full turn). BOP's toolkit leaves out the turn
-    by 0 where there is an axis; here it is in, so that an exact estimate has no error.
+    They are the identity, the discrete ones, and each of them followed by rotations about each
+    continuous axis (BOP: ``ceil(pi / max_step)`` equal steps of the full circle). BOP's toolkit
+    leaves out the rotation by 0 where there is an axis; here an exact estimate has no error.
 
     Returns:
         A batch, the identity first.
     """
-    eye = Rigid(torch.eye(3)[None], torch.zeros(1, 3))
+    base = Rigid(torch.eye(3)[None], torch.zeros(1, 3))
     discrete = symmetries.discrete
     if discrete is not None:
-        eye = Rigid(torch.cat([eye.R.to(discrete.R), discrete.R]),
-                    torch.cat([eye.t_m.to(discrete.t_m), discrete.t_m]))  # fmt: skip
+        base = Rigid(torch.cat([base.R.to(discrete.R), discrete.R]),
+                     torch.cat([base.t_m.to(discrete.t_m), discrete.t_m]))  # fmt: skip
     if not symmetries.continuous:
-        return eye
+        return base
     steps = math.ceil(math.pi / max_step)
     angles = torch.arange(steps, dtype=torch.float64) * (2 * math.pi / steps)
-    every = [eye]
+    transforms = [base]
     for axis in symmetries.continuous:
-        turns = turn_about(axis.direction.to(eye.R), axis.point_m.to(eye.R), angles[1:])
-        turned = turns[:, None] @ eye[None]
-        every.append(Rigid(turned.R.flatten(0, 1), turned.t_m.flatten(0, 1)))
-    return Rigid.cat(every)
+        rotations = turn_about(axis.direction.to(base.R), axis.point_m.to(base.R), angles[1:])
+        products = rotations[:, None] @ base[None]
+        transforms.append(Rigid(products.R.flatten(0, 1), products.t_m.flatten(0, 1)))
+    return Rigid.cat(transforms)
 
 
 def symmetries_from_bop(info: Mapping[str, Any], *, source: str) -> Symmetries:
@@ -90,42 +90,12 @@ def symmetries_from_bop(info: Mapping[str, Any], *, source: str) -> Symmetries:
     Raises:
         InputError: an entry is no rigid transform or no axis.
     """
-    turns, lines = (info.get(f"symmetries_{kind}", []) for kind in ("discrete", "continuous"))
-    if not isinstance(turns, list) or not isinstance(lines, list):
+    rows = info.get("symmetries_discrete", [])
+    entries = info.get("symmetries_continuous", [])
+    if not isinstance(rows, list) or not isinstance(entries, list):
         raise InputError(f"{source}: its symmetries are no lists; write [...] of them")
-    motions: list[Rigid] = []
-    for row in turns:
-        try:
-            matrix = torch.tensor(row, dtype=torch.float64).reshape(4, 4)
-        except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-            raise InputError(
-                f"{source}: the symmetry {repr(row)[:80]} is not 16 numbers; write a 4x4 matrix "
-                "row by row"
-            ) from error
-        R = matrix[:3, :3]
-        is_rigid = torch.allclose(R @ R.T, torch.eye(3).double(), atol=1e-3) and torch.det(R) > 0
-        if not is_rigid or matrix[3].tolist() != [0, 0, 0, 1]:
-            raise InputError(
-                f"{source}: the symmetry {repr(row)[:200]} is no rigid motion; its upper left 3x3 "
-                "is a rotation, its last row 0 0 0 1"
-            )
-        motions.append(Rigid(R, 0.001 * matrix[:3, 3]))
-    axes: list[Axis] = []
-    for entry in lines:
-        try:
-            assert isinstance(entry, Mapping)
-            direction = torch.tensor(entry["axis"], dtype=torch.float64).reshape(3)
-            offset_mm = torch.tensor(entry.get("offset", [0, 0, 0]), dtype=torch.float64).reshape(3)
-            length = float(direction.norm())
-            assert 0 < length < math.inf
-        except (
-            AssertionError, KeyError, TypeError, ValueError, RuntimeError, OverflowError
-        ) as error:  # fmt: skip
-            raise InputError(
-                f'{source}: the continuous symmetry {repr(entry)[:80]} is not {{"axis": [x, y, z], '
-                '"offset": [x, y, z]} with an axis of some length'
-            ) from error
-        axes.append(Axis(direction=direction / length, point_m=0.001 * offset_mm))
+    motions = [_motion_from_bop(row, source) for row in rows]
+    axes = [_axis_from_bop(entry, source) for entry in entries]
     return Symmetries(
         discrete=Rigid.stack(motions) if motions else None,
         continuous=tuple(axes),
@@ -133,8 +103,45 @@ def symmetries_from_bop(info: Mapping[str, Any], *, source: str) -> Symmetries:
     )
 
 
+def _motion_from_bop(row: object, source: str) -> Rigid:
+    """Read an entry of ``symmetries_discrete``: a 4x4 matrix row by row, its translation in mm."""
+    try:
+        matrix = torch.tensor(row, dtype=torch.float64).reshape(4, 4)
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise InputError(
+            f"{source}: the symmetry {repr(row)[:80]} is not 16 numbers; write a 4x4 matrix row by "
+            "row"
+        ) from error
+    R = matrix[:3, :3]
+    is_rotation = torch.allclose(R @ R.T, torch.eye(3).double(), atol=1e-3) and torch.det(R) > 0
+    if not is_rotation or matrix[3].tolist() != [0, 0, 0, 1]:
+        raise InputError(
+            f"{source}: the symmetry {repr(row)[:200]} is no rigid motion; its upper left 3x3 is a "
+            "rotation, its last row 0 0 0 1"
+        )
+    return Rigid(R, 0.001 * matrix[:3, 3])
+
+
+def _axis_from_bop(entry: object, source: str) -> Axis:
+    """Read an entry of ``symmetries_continuous``: an axis, and a point on it in mm."""
+    try:
+        assert isinstance(entry, Mapping)
+        direction = torch.tensor(entry["axis"], dtype=torch.float64).reshape(3)
+        offset_mm = torch.tensor(entry.get("offset", [0, 0, 0]), dtype=torch.float64).reshape(3)
+        length = float(direction.norm())
+        assert 0 < length < math.inf
+    except (
+        AssertionError, KeyError, TypeError, ValueError, RuntimeError, OverflowError
+    ) as error:  # fmt: skip
+        raise InputError(
+            f'{source}: the continuous symmetry {repr(entry)[:80]} is not {{"axis": [x, y, z], '
+            '"offset": [x, y, z]} with an axis of some length'
+        ) from error
+    return Axis(direction=direction / length, point_m=0.001 * offset_mm)
+
+
 def symmetries_to_bop(symmetries: Symmetries) -> dict[str, Any]:
-    """Write symmetries as ``models_info.json`` has them; kinds without an entry are left out."""
+    """Give symmetries as an entry of ``models_info.json`` holds them; empty lists are left out."""
     info: dict[str, Any] = {}
     if symmetries.discrete is not None:
         R = symmetries.discrete.R
@@ -151,15 +158,16 @@ def symmetries_to_bop(symmetries: Symmetries) -> dict[str, Any]:
     return info
 
 
-_NORMAL_NEIGHBOURS = 16
-_DENSE = 20_000
+_NORMAL_NEIGHBOURS = 16  # to which the plane at a bare point is fitted
+_DENSE = 20_000  # points of a surface between its vertices
 
 
 def farthest_points(points_m: Float[Tensor, "n 3"], count: int) -> Int64[Tensor, " count"]:
-    """Choose points each of which is farthest from all before it; the first, from the centre.
+    """Choose points each of which is farthest from all before it; give their indices.
 
-    The centre of the bounding box, as PVNet does: it does not depend on how densely a part is
-    meshed. Of equals the earliest in the file is taken, so that a mesh always has the same points.
+    The first is farthest from the centre of the bounding box, which does not depend on how densely
+    a part is meshed (as PVNet). Of equals the earliest in the file is taken, so that a mesh always
+    has the same points.
 
     Raises:
         InputError: there are fewer different points than wanted.
@@ -177,7 +185,7 @@ def farthest_points(points_m: Float[Tensor, "n 3"], count: int) -> Int64[Tensor,
             )
         chosen.append(farthest)
         distance = ((points - points[farthest]) ** 2).sum(-1)
-        # All are measured to the chosen ones alone: the centre decides the first alone.
+        # Distances are to the chosen points: the centre counts for the first one alone.
         nearest = distance if len(chosen) == 1 else np.minimum(nearest, distance)
     return torch.tensor(chosen)
 
@@ -185,16 +193,16 @@ def farthest_points(points_m: Float[Tensor, "n 3"], count: int) -> Int64[Tensor,
 def sample_surface(
     model: ObjectModel, count: int
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
-    """Spread points evenly over the surface, always the same ones, with their outward normals.
+    """Spread points evenly over the surface, always the same ones; give them and outward normals.
 
-    A model of points gives its own in even steps of their order, at most all.
+    Of a model of points some of its own are taken, evenly by their order.
 
     Args:
         model: the object.
-        count: how many; a model of points may have fewer.
+        count: how many points; a model of points may have fewer.
     """
     if len(model.faces) == 0:
-        # Farthest points would be evener, and quadratic; point models are even as they come.
+        # Farthest points would be more even, but take quadratic time.
         return take_evenly(model.vertices_m, count), take_evenly(model.normals, count)
     corners = model.vertices_m[model.faces].double()
     face, share = surface_places(corners, count)
@@ -204,8 +212,8 @@ def sample_surface(
     return points.to(model.vertices_m), normals.to(model.vertices_m)
 
 
-_CORNERS = 6  # of a disc: three quarters of its area, in four triangles
-_DISC = 1.6
+_DISC_CORNERS = 6  # three quarters of a disc's area, in four triangles
+_DISC_RADIUS = 1.6
 """Radius of a disc, in spacings of its points: neighbours then overlap, and nothing shows through
 where the points are twice as far apart as usual."""
 
@@ -222,31 +230,32 @@ def drawn_triangles(model: ObjectModel) -> Float[Tensor, "n 3 3"]:
     points = model.vertices_m.double()
     distance, _ = KDTree(points.numpy()).query(points.numpy(), k=min(4, len(points)))
     spacing = torch.from_numpy(distance[:, -1])
-    radius = _DISC * spacing.clamp(max=2 * float(spacing.median())) / 2**0.5
+    radius = _DISC_RADIUS * spacing.clamp(max=2 * float(spacing.median())) / 2**0.5
     normal = model.normals.double()
-    # Any axis that is not along the normal.
+
+    # Corners about each point, from two tangents.
     helper = torch.eye(3, dtype=torch.float64)[normal.abs().argmin(1)]
     first = torch.nn.functional.normalize(torch.linalg.cross(normal, helper), dim=-1)
     second = torch.linalg.cross(normal, first)
-    angle = 2 * math.pi * torch.arange(_CORNERS, dtype=torch.float64) / _CORNERS
+    angle = 2 * math.pi * torch.arange(_DISC_CORNERS, dtype=torch.float64) / _DISC_CORNERS
     spokes = first[:, None] * angle.cos()[:, None] + second[:, None] * angle.sin()[:, None]
     corners = points[:, None] + radius[:, None, None] * spokes
-    fan = torch.tensor([[0, i, i + 1] for i in range(1, _CORNERS - 1)])
+    fan = torch.tensor([[0, i, i + 1] for i in range(1, _DISC_CORNERS - 1)])
     return corners[:, fan].flatten(0, 1).to(model.vertices_m)
 
 
 def gap_to_surface_m(points_m: Float[Tensor, "n 3"], model: ObjectModel) -> float:
-    """Say how far off a model's surface the farthest of some points lies [m].
+    """Give the largest distance of some points from a model's surface [m].
 
-    The surface is its vertices and 20,000 points between them, a hundredth of the diameter apart:
-    the vertices of a coarse mesh alone are far from most of it.
+    The surface is represented by its vertices and 20,000 points between them, a hundredth of the
+    diameter apart.
     """
     surface_m = torch.cat([model.vertices_m, sample_surface(model, _DENSE)[0]])
     return float(torch.cdist(points_m, surface_m).amin(1).max())
 
 
 def fibonacci_directions(count: int) -> Float[Tensor, "count 3"]:
-    """Spread unit vectors evenly over half of the sphere (an axis needs no sign)."""
+    """Spread unit vectors evenly over the half of the sphere with z > 0, by a Fibonacci lattice."""
     i = torch.arange(count, dtype=torch.float64) + 0.5
     z = 1 - i / count
     angle = math.pi * (1 + 5**0.5) * i
@@ -255,8 +264,9 @@ def fibonacci_directions(count: int) -> Float[Tensor, "count 3"]:
 
 
 _COARSE_MESH = 1000  # a mesh of fewer points (a box: eight) also takes keypoints inside its faces
-_LARGEST_M = 20.0  # a model of metres that is larger is likely one of millimetres
-_SMALLEST_M = 0.002  # and one of millimetres that is smaller is likely one of metres
+_KEYPOINT_CANDIDATES = 4096  # inside the faces of such a mesh
+_LARGEST_M = 20.0  # a model in metres that is larger is likely in millimetres
+_SMALLEST_M = 0.002  # a model in millimetres that is smaller is likely in metres
 
 
 def read_model(
@@ -339,25 +349,7 @@ def make_model(
         kept, faces = torch.unique(faces, return_inverse=True)
         vertices_m = vertices_m[kept]
     vertices_m = vertices_m.float()
-    if len(faces):  # the mean of the normals of the faces at a vertex, each by its area
-        corners = vertices_m.double()[faces]
-        sides = corners[:, 1:] - corners[:, :1]
-        doubled = torch.linalg.cross(sides[:, 0], sides[:, 1])
-        total = torch.zeros(len(vertices_m), 3, dtype=torch.float64)
-        for corner in range(3):
-            total.index_add_(0, faces[:, corner], doubled)
-        normals = (total / total.norm(dim=-1, keepdim=True).clamp(min=1e-300)).to(vertices_m)
-    else:
-        # By the plane through the nearest 16, pointing away from the mean of the points: right for
-        # convex parts alone. What needs no side, as point-to-plane distance, may use them anywhere.
-        points = vertices_m.double().cpu().numpy()
-        _, index = KDTree(points).query(points, k=min(_NORMAL_NEIGHBOURS, len(points)))
-        near = points[index.reshape(len(points), -1)]
-        near = near - near.mean(1, keepdims=True)
-        _, axes = np.linalg.eigh(near.transpose(0, 2, 1) @ near)
-        outward = axes[:, :, 0]
-        outward[((points - points.mean(0)) * outward).sum(-1) < 0] *= -1
-        normals = torch.from_numpy(outward).to(vertices_m)
+    normals = _vertex_normals(vertices_m, faces) if len(faces) else _point_normals(vertices_m)
     model = ObjectModel(
         name=name,
         number=number,
@@ -370,8 +362,35 @@ def make_model(
     )
     candidates = vertices_m
     if len(faces) and len(candidates) < _COARSE_MESH:
-        candidates = torch.cat([candidates, sample_surface(model, 4096)[0]])
+        inside_m, _ = sample_surface(model, _KEYPOINT_CANDIDATES)
+        candidates = torch.cat([candidates, inside_m])
     return replace(model, keypoints_m=candidates[farthest_points(candidates, config.keypoints)])
+
+
+def _vertex_normals(vertices_m: Float[Tensor, "v 3"], faces: Tensor) -> Float[Tensor, "v 3"]:
+    """Average at each vertex the normals of its faces, weighted by their areas."""
+    corners = vertices_m.double()[faces]
+    sides = corners[:, 1:] - corners[:, :1]
+    doubled = torch.linalg.cross(sides[:, 0], sides[:, 1])  # normals, twice as long as the area
+    total = torch.zeros(len(vertices_m), 3, dtype=torch.float64)
+    for corner in range(3):
+        total.index_add_(0, faces[:, corner], doubled)
+    return (total / total.norm(dim=-1, keepdim=True).clamp(min=1e-300)).to(vertices_m)
+
+
+def _point_normals(points_m: Float[Tensor, "v 3"]) -> Float[Tensor, "v 3"]:
+    """Fit a plane to the nearest 16 points of each; its normal points away from their mean.
+
+    That is the outer side of convex parts alone. Point-to-plane distances need no side.
+    """
+    points = points_m.double().cpu().numpy()
+    _, index = KDTree(points).query(points, k=min(_NORMAL_NEIGHBOURS, len(points)))
+    near = points[index.reshape(len(points), -1)]
+    near = near - near.mean(1, keepdims=True)
+    _, axes = np.linalg.eigh(near.transpose(0, 2, 1) @ near)
+    outward = axes[:, :, 0]
+    outward[((points - points.mean(0)) * outward).sum(-1) < 0] *= -1
+    return torch.from_numpy(outward).to(points_m)
 
 
 def refuse_one_name(models: Sequence[ObjectModel]) -> None:
@@ -390,22 +409,22 @@ def refuse_one_name(models: Sequence[ObjectModel]) -> None:
         )
 
 
-_HULL = 8000  # corners of a hull of which all pairs are compared; more take seconds
+_MOST_HULL_CORNERS = 8000  # of which all pairs are compared; more take seconds
 _HULL_DIRECTIONS = 4096  # no direction is farther than 0.03 rad from one of these: cosine 0.9995
 
 
 def exact_diameter(points_m: Float[Tensor, "n 3"]) -> float:
-    """Largest distance of two points [m]: both are corners of the convex hull.
+    """Give the largest distance of two points [m], which are corners of the convex hull.
 
-    Of a hull of more than 8,000 corners, those farthest in many directions are compared:
-    less than 0.05 % too short.
+    Of a hull of more than 8,000 corners those farthest in many directions are compared: the result
+    is less than 0.05 % too short.
     """
     points = np.unique(points_m.double().cpu().numpy(), axis=0)
-    # All on one plane, or fewer than four: there is no hull, and every pair is looked at.
+    # Points of one plane, or fewer than four, have no hull: all of them are compared.
     with suppress(QhullError, ValueError):
         points = points[ConvexHull(points).vertices]
     corners = torch.from_numpy(points)
-    if len(corners) > _HULL:
+    if len(corners) > _MOST_HULL_CORNERS:
         farthest = []
         for directions in fibonacci_directions(_HULL_DIRECTIONS).T.split(256, dim=1):
             along = corners @ directions

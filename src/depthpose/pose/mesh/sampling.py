@@ -1,19 +1,19 @@
-"""Places spread evenly over triangles."""
+"""Points spread evenly over triangles."""
 
 import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-_PLASTIC = 1.32471795724474602596
+_PLASTIC = 1.32471795724474602596  # plastic number, the root of x^3 = x + 1
 
 
 def surface_places(
     corners: Float64[Tensor, "f 3 3"], count: int
 ) -> tuple[Int64[Tensor, " count"], Float64[Tensor, "count 3"]]:
-    """Spread places evenly over triangles: the triangle of each, and the shares of its corners.
+    """Spread points evenly over triangles; give the triangle and barycentric coordinates of each.
 
-    Faces are entered in proportion to their area at equal steps, and each point placed by a
-    sequence of low discrepancy (Roberts 2018), which is more even than chance.
+    Points are at equal steps of the cumulated area, and placed in their triangle by a sequence of
+    low discrepancy (Roberts 2018), which is more even than random numbers.
     """
     doubled = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     bounds = doubled.norm(dim=-1).cumsum(0)

@@ -1,4 +1,4 @@
-"""Meshes and clouds of trimesh and Open3D that are in memory: their points, triangles and unit."""
+"""Meshes and clouds of trimesh and Open3D in memory: their points, triangles and unit."""
 
 from pathlib import Path
 from typing import Any
@@ -13,11 +13,11 @@ _UNITS: dict[str, Unit] = {
     "cm": "cm", "centimeter": "cm", "centimeters": "cm",
     "mm": "mm", "millimeter": "mm", "millimeters": "mm",
 }  # fmt: skip
-"""What trimesh calls them."""
+"""Names of units in trimesh."""
 
 
 def is_shape(value: object) -> bool:
-    """Whether it is an object of trimesh or Open3D; neither is imported for that."""
+    """Whether a value is an object of trimesh or Open3D; neither is imported for that."""
     return type(value).__module__.partition(".")[0] in ("trimesh", "open3d")
 
 
@@ -28,7 +28,7 @@ def shape_geometry(shape: Any) -> tuple[np.ndarray, np.ndarray]:  # noqa: ANN401
     ``PointCloud``, of its tensors too.
 
     Raises:
-        InputError: it is something else, or has no points.
+        InputError: the shape is something else, or has no points.
     """
     if not is_shape(shape):
         raise InputError(
@@ -51,12 +51,12 @@ def shape_geometry(shape: Any) -> tuple[np.ndarray, np.ndarray]:  # noqa: ANN401
 
 
 def shape_unit(shape: Any) -> Unit | None:  # noqa: ANN401
-    """Give the unit that a shape says, None where it says none."""
+    """Give the unit that a shape declares; None where it declares none."""
     return _UNITS.get(str(getattr(shape, "units", None)).lower())
 
 
 def shape_name(shape: Any, number: int) -> str:  # noqa: ANN401
-    """Give what a shape is called: its own name, that of its file, or ``object_NUMBER``."""
+    """Give the name of a shape: its own, that of its file, or ``object_NUMBER``."""
     metadata = getattr(shape, "metadata", None) or {}
     file = getattr(getattr(shape, "source", None), "file_name", None)
     name = metadata.get("name") or file or metadata.get("file_name")

@@ -30,16 +30,17 @@ from depthpose.pose.types import Axis, ObjectModel, Symmetries
 
 @lru_cache(maxsize=64)
 def cached(model: ObjectModel, compute: Callable[..., Any], name: str, *settings: float) -> Any:  # noqa: ANN401
-    """Give JSON values of a model that take long to compute.
+    """Give ``compute(model, *settings)``, JSON values that take long, from the cache if possible.
 
-    They are kept in ``$DEPTHPOSE_CACHE``, where that can be written to, by the bytes of the shape
-    and its symmetries, and by the code that computes.
+    The cache is ``$DEPTHPOSE_CACHE``, where that can be written to. Its key is made of the bytes of
+    the shape and its symmetries, and of the code that computes.
     """
     symmetries = model.symmetries
     tensors = [model.vertices_m, model.faces]
     if symmetries.discrete is not None:
         tensors.append(symmetries.discrete.R)
     tensors += [axis.direction for axis in symmetries.continuous]
+
     digest = sha256(f"{symmetries.is_found}".encode())
     code = {*Path(__file__).parent.glob("*.py"), Path(compute.__code__.co_filename)}
     for path in sorted(code):
@@ -58,43 +59,45 @@ def cached(model: ObjectModel, compute: Callable[..., Any], name: str, *settings
 
 
 _EYE = torch.eye(3, dtype=torch.float64)
-_COARSE_ORDERS = (2, 3, 4, 5, 6)
-_ORDERS = range(2, 13)
+_COARSE_ORDERS = (2, 3, 4, 5, 6)  # of rotations that are tried in all directions
+_ORDERS = range(2, 13)  # of rotations that are measured about an axis
 _TEETH = range(13, 61)  #: orders of which one step is tried: gears and knurls
-_CIRCLE_TURNS = 36
-_NEAREST_SAMPLES = 4
+_CIRCLE_TURNS = 36  # by which a full circle is measured
+_NEAREST_SAMPLES = 4  # of the surface, that are compared with a point in an exact measure
 _MAX_ROUGH_DEVIATION = 0.04
-"""Deviation, in diameters, from which following the surface may still find a symmetry: an axis
-that is off by 4 degrees moves the surface by about as much."""
-_SAME_RAD = 0.15
-_SUPPRESSION_RAD = 0.25
-SURE = 0.5  #: certainty from which a proposal is taken: that of a copy that is off by the tolerance
+"""Deviation, in diameters, from which ICP may still reach a symmetry: an axis that is off by 4
+degrees moves the surface by about as much."""
+_SAME_RAD = 0.15  # angle up to which two axes or rotations are the same
+_SUPPRESSION_RAD = 0.25  # angle up to which a rotation about one axis is that of a better one
+SURE = 0.5  #: certainty from which a proposal is accepted: that of a deviation of the tolerance
+_MOST_GROUP = 60  # discrete symmetries of an icosahedron: no group of a body is larger
 _FOLLOW_STEPS = 15  # steps of ICP
 _MOST_AXES = 40  # a cube has 13 axes, an icosahedron 31
+_DIRECTIONS = 400  # of axes that are tried, beside the principal ones
 
 
 class SymmetryProposal(NamedTuple):
-    """One way in which an object may look alike, in numbers that JSON holds."""
+    """A rotation after which an object may look alike, in numbers that JSON holds."""
 
     kind: str  #: ``discrete`` or ``continuous``
-    direction: Sequence[float]  #: unit vector of the axis to turn about
-    point_m: Sequence[float]  #: a point that the axis goes through
-    angle_rad: float | None  #: by how much; nothing for a continuous symmetry
-    #: distance of the turned surface from the surface, in diameters: the largest but for 2 % of the
-    #: points, and for ``continuous`` over all turns.
+    direction: Sequence[float]  #: unit vector of the axis
+    point_m: Sequence[float]  #: a point on the axis
+    angle_rad: float | None  #: of the rotation; None for a continuous symmetry
+    #: largest distance of the rotated surface from the surface, in diameters, without the farthest
+    #: 2 % of the points; for ``continuous`` over all rotations.
     deviation: float
     certainty: float  #: 1 for an exact copy, 1/2 at the tolerance, toward 0 beyond
 
 
 class SurfaceDeviation:
-    """Measures how far a turned surface lies from itself, in diameters.
+    """Measures how far a moved surface lies from itself, in diameters.
 
     Attributes:
-        centre_m: of the surface, about which it is turned.
+        centre_m: of the surface, about which it is rotated.
         points: samples of the surface about the centre, in diameters.
-        few: a hundred of them, for a rough measure of thousands of turns.
-        many: a thousand.
-        dense: five thousand.
+        few: a hundred of them, for a rough measure of thousands of rotations.
+        many: a thousand of them.
+        dense: five thousand of them.
         axes: principal axes, one a row.
     """
 
@@ -116,9 +119,9 @@ class SurfaceDeviation:
         return np.asarray(distance), np.asarray(index)
 
     def rough_distance(self, R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
-        """Mean distance of few turned points to a rough surface: for thousands of turns."""
-        turned = (self.few @ R.mT).numpy()
-        distance, _ = self._rough_tree.query(turned, workers=torch.get_num_threads())
+        """Measure the mean distance of few rotated points to few samples, for many rotations."""
+        rotated = (self.few @ R.mT).numpy()
+        distance, _ = self._rough_tree.query(rotated, workers=torch.get_num_threads())
         return torch.from_numpy(np.asarray(distance)).mean(-1)
 
     def deviation(
@@ -127,37 +130,46 @@ class SurfaceDeviation:
         shift: Float[Tensor, "*batch 3"] | None = None,
         share: float = 0.98,
     ) -> Float[Tensor, "*batch"]:
-        """Distance to the surface after a rotation and a shift that a share of it stays within.
+        """Measure how far the surface lies off itself after a rotation and a shift.
 
-        The larger of both ways is given, from the rotated surface to the other and back.
+        It is the distance within which a share of the points lies, and the larger one of two ways:
+        from the moved surface to the other and back.
+
+        Args:
+            R: rotation about the centre.
+            shift: in diameters; None: none.
+            share: of the points; from ``ALMOST_ALL`` on more points and samples are compared.
         """
-        points, near = (self.many, 1) if share < ALMOST_ALL else (self.dense, _NEAREST_SAMPLES)
-        turn = Rigid(R, torch.zeros_like(R[..., 0]) if shift is None else shift)
+        is_exact = share >= ALMOST_ALL
+        points = self.dense if is_exact else self.many
+        count = _NEAREST_SAMPLES if is_exact else 1
         spacing = 2.0 / math.sqrt(len(self.points))
-        farthest: list[Float[Tensor, "*batch"]] = []
-        for motion in (turn, turn.inverse()):
+        forward = Rigid(R, torch.zeros_like(R[..., 0]) if shift is None else shift)
+        deviations: list[Float[Tensor, "*batch"]] = []
+        for motion in (forward, forward.inverse()):
             moved = motion.apply(points)
-            nearest = self._tree.query(moved.numpy(), k=near, workers=torch.get_num_threads())
-            distance, index = (np.reshape(part, (*moved.shape[:-1], near)) for part in nearest)
+            nearest = self._tree.query(moved.numpy(), k=count, workers=torch.get_num_threads())
+            distance, index = (np.reshape(part, (*moved.shape[:-1], count)) for part in nearest)
+
+            # Between samples the distance is that to the tangent plane, beside an edge that to the
+            # sample. The least of several samples counts, since the nearest one may lie on the
+            # other side of an edge.
             gap = moved.numpy()[..., None, :] - self.points.numpy()[index]
             height = np.abs((gap * self._normals[index]).sum(-1))
-            # Between samples the plane says the distance; beside an edge, the sample does. Of the
-            # few points that decide, the nearest sample may lie on the other side of an edge: the
-            # next ones count too.
             beside = np.maximum(distance - spacing, 0)
             off = torch.from_numpy(np.maximum(height, beside).min(-1))
-            farthest.append(off.quantile(share, dim=-1))
-        return torch.maximum(*farthest)
+            deviations.append(off.quantile(share, dim=-1))
+        return torch.maximum(*deviations)
 
 
 def propose_symmetries(model: ObjectModel, tolerance: float = 0.02) -> list[SymmetryProposal]:
-    """Search for turns that leave the shape as it is, and say how sure each is.
+    """Search for rotations that leave the shape as it is, and say how certain each is.
 
-    Every symmetry fixes the centre of the surface. Turns by a half to a sixth about the principal
-    axes and about 400 directions are tried coarsely; the promising ones follow the surface to an
-    exact axis; there, turns of order 2 to 12 and a full circle are measured. Texture does not
-    count: neither does it to a method that sees depth alone. Bumps smaller than the tolerance are
-    overlooked, so that a cup's handle is seen and its seam is not. Takes some seconds. A sphere is
+    Every symmetry leaves the centre of the surface where it is. Rotations by 1/2 to 1/6 of the
+    circle about the principal axes and about 400 directions are measured coarsely; the promising
+    ones are refined by ICP to an exact axis; about it, rotations of order 2 to 12 and a full circle
+    are measured. Texture does not count. Bumps smaller than the tolerance are overlooked, so that
+    the handle of a cup breaks a symmetry and its seam does not. Takes some seconds. A sphere is
     reported as two axes of revolution.
 
     Args:
@@ -205,9 +217,10 @@ def _follow_surface(surface: SurfaceDeviation, R: Tensor) -> Tensor:
 
 
 def symmetries_from_proposals(proposals: list[SymmetryProposal]) -> Symmetries:
-    """Take the sure proposals: axes of revolution, and rotations that do not follow from an axis.
+    """Make symmetries of the certain proposals.
 
-    Without an axis the rotations are completed to a group: the product of two symmetries is one.
+    They are axes of revolution, and rotations that do not follow from an axis. Without an axis the
+    rotations are completed to a group, for the product of two symmetries is one.
     """
     sure = [p for p in proposals if p.certainty >= SURE]
     lines = [
@@ -238,17 +251,22 @@ def symmetries_from_proposals(proposals: list[SymmetryProposal]) -> Symmetries:
     if not turns:
         return Symmetries(continuous=axes)
 
+    group = turns if axes else _complete_group(turns)
+    return Symmetries(discrete=Rigid.stack(group), continuous=axes)
+
+
+def _complete_group(turns: list[Rigid]) -> list[Rigid]:
+    """Add products of rotations until there is no new one; the rotations alone where that fails."""
     group = list(turns)
-    for first in group if not axes else ():  # grows under way: products until there is no new one
+    for first in group:  # the list grows while it is read
         for second in turns:
             product = first @ second
             rotations = [_EYE, *(turn.R for turn in group)]
             if all(float(geodesic_rad(product.R, R)) > _SAME_RAD for R in rotations):
                 group.append(product)
-        if len(group) > 60:  # what passes 60 was no group (an icosahedron's)
-            group = turns
-            break
-    return Symmetries(discrete=Rigid.stack(group), continuous=axes)
+        if len(group) > _MOST_GROUP:
+            return turns
+    return group
 
 
 def with_found_symmetries(
@@ -258,10 +276,16 @@ def with_found_symmetries(
     is_taken: bool,
     tolerance: float = 0.02,
 ) -> ObjectModel:
-    """Look for the symmetries of a model that declares none, and count them if that is wanted.
+    """Search the symmetries of a model that declares none; give the model with them, if wanted.
 
-    They are searched once for each shape, and kept in ``$DEPTHPOSE_CACHE``. ``on_message`` is told
-    what was found, taken or not; without it, symmetries that are not taken are not searched.
+    They are searched once for each shape, and kept in ``$DEPTHPOSE_CACHE``.
+
+    Args:
+        model: the object.
+        on_message: called with a sentence on symmetries that were found; without it nothing is
+            searched where ``is_taken`` is false.
+        is_taken: whether the model gets the symmetries.
+        tolerance: as of :func:`propose_symmetries`.
     """
     declared = model.symmetries
     if not (is_taken or on_message) or declared.discrete is not None or declared.continuous:
@@ -286,55 +310,59 @@ def with_found_symmetries(
     return replace(model, symmetries=symmetries) if is_taken else model
 
 
-def _turns(direction: Float[Tensor, "3"], angles: Float[Tensor, " a"]) -> Float[Tensor, "a 3 3"]:
+def _rotations(
+    direction: Float[Tensor, "3"], angles: Float[Tensor, " a"]
+) -> Float[Tensor, "a 3 3"]:
+    """Give the rotation matrices about a direction by each angle."""
     return turn_about(direction, torch.zeros_like(direction), angles).R
 
 
 def promising_turns(surface: SurfaceDeviation) -> list[Float[Tensor, "3 3"]]:
-    """Try turns about principal axes and many directions; those that fit, the best first."""
-    candidates = torch.cat([surface.axes, fibonacci_directions(400)])
+    """Give the rotations about principal axes and many directions that fit roughly, best first."""
+    directions = torch.cat([surface.axes, fibonacci_directions(_DIRECTIONS)])
     angles = torch.tensor([2 * math.pi / order for order in _COARSE_ORDERS], dtype=torch.float64)
-    turns = torch.stack([_turns(direction, angles) for direction in candidates]).flatten(0, 1)
-    coarse = surface.rough_distance(turns)
-    return [turns[i] for i in coarse.argsort().tolist() if coarse[i] <= _MAX_ROUGH_DEVIATION]
+    rotations = torch.stack([_rotations(direction, angles) for direction in directions])
+    rotations = rotations.flatten(0, 1)
+    distance = surface.rough_distance(rotations)
+    order = distance.argsort().tolist()
+    return [rotations[i] for i in order if distance[i] <= _MAX_ROUGH_DEVIATION]
 
 
 def _is_covered(direction: Tensor, tried_axes: list[Tensor], revolution_axes: list[Tensor]) -> bool:
-    """Whether an axis was tried, or is like one that was.
+    """Whether an axis was tried, or is equivalent to one that was.
 
-    All lines at right angles to an axis of revolution look alike, so one of them is enough.
+    All lines at right angles to an axis of revolution are equivalent.
     """
-    is_tried = any(abs(float(direction @ t)) > math.cos(_SAME_RAD) for t in tried_axes)
-    most = math.sin(_SAME_RAD)  # cosine of what counts as a right angle
-    perpendicular = [a for a in revolution_axes if abs(float(a @ direction)) < most]
-    is_alike = any(abs(float(a @ t)) < most for a in perpendicular for t in tried_axes)
-    return is_tried or is_alike
+    is_tried = any(abs(float(direction @ tried)) > math.cos(_SAME_RAD) for tried in tried_axes)
+    right_angle_cosine = math.sin(_SAME_RAD)  # up to which two lines are at right angles
+    perpendicular = [
+        axis for axis in revolution_axes if abs(float(axis @ direction)) < right_angle_cosine
+    ]
+    is_equivalent = any(
+        abs(float(axis @ tried)) < right_angle_cosine
+        for axis in perpendicular
+        for tried in tried_axes
+    )
+    return is_tried or is_equivalent
 
 
 def _measure_axis(
     surface: SurfaceDeviation, direction: Tensor, limit: float, tolerance: float
 ) -> list[SymmetryProposal]:
-    """Measure the full circle about an axis and, unless that is sure, turns of order 2 to 12."""
-    circle = _turns(direction, torch.arange(1, _CIRCLE_TURNS) * (2 * math.pi / _CIRCLE_TURNS))
-    full: list[tuple[None, float]] = []  # angle and deviation, of every rotation about the axis
-    turns: list[tuple[float, float]] = []  # and of single ones
+    """Measure the rotations about an axis; give those within ``limit``, in diameters.
+
+    They are the full circle and, unless that is within the tolerance, rotations of order 2 to 12;
+    and a rotation by one of many teeth.
+    """
+    # Angle and deviation of each symmetry; an angle of None is that of the full circle.
+    step = 2 * math.pi / _CIRCLE_TURNS
+    circle = _rotations(direction, torch.arange(1, _CIRCLE_TURNS) * step)
+    full: list[tuple[None, float]] = []
     worst = math.inf
     if bool((surface.rough_distance(circle) <= _MAX_ROUGH_DEVIATION).all()):
         worst = float(surface.deviation(circle).max())
         full = [(None, worst)] if worst <= limit else []
-    # Every turn of order 2 to 12, each once.
-    shares = sorted({k / order for order in _ORDERS for k in range(1, order)})
-    angles = torch.tensor(shares, dtype=torch.float64) * (2 * math.pi)
-    angles = angles[surface.rough_distance(_turns(direction, angles)) <= _MAX_ROUGH_DEVIATION]
-    if worst > tolerance and len(angles):
-        deviation = surface.deviation(_turns(direction, angles))
-        for i in deviation.argsort().tolist():
-            angle = float(angles[i])
-            value = float(deviation[i])
-            # A turn near a better one is the same symmetry (non-maximum suppression).
-            is_shadow = any(abs(angle - other) < _SUPPRESSION_RAD for other, _ in turns)
-            if value <= limit and not is_shadow:
-                turns.append((angle, value))
+    turns = _measure_orders(surface, direction, limit) if worst > tolerance else []
     teeth = [] if full else _measure_teeth(surface, direction, tolerance)
     return [
         SymmetryProposal(
@@ -349,20 +377,42 @@ def _measure_axis(
     ]
 
 
+def _measure_orders(
+    surface: SurfaceDeviation, direction: Tensor, limit: float
+) -> list[tuple[float, float]]:
+    """Measure rotations of order 2 to 12; give angle and deviation of the best within ``limit``."""
+    shares = sorted({k / order for order in _ORDERS for k in range(1, order)})
+    angles = torch.tensor(shares, dtype=torch.float64) * (2 * math.pi)
+    rough = surface.rough_distance(_rotations(direction, angles))
+    angles = angles[rough <= _MAX_ROUGH_DEVIATION]
+    if len(angles) == 0:
+        return []
+    deviation = surface.deviation(_rotations(direction, angles))
+    chosen: list[tuple[float, float]] = []
+    for i in deviation.argsort().tolist():
+        angle = float(angles[i])
+        # A rotation near a better one is the same symmetry (non-maximum suppression).
+        is_suppressed = any(abs(angle - better) < _SUPPRESSION_RAD for better, _ in chosen)
+        if float(deviation[i]) <= limit and not is_suppressed:
+            chosen.append((angle, float(deviation[i])))
+    return chosen
+
+
 def _measure_teeth(
     surface: SurfaceDeviation, direction: Tensor, tolerance: float
 ) -> list[tuple[float, float]]:
-    """Measure rotations by one of many teeth, and by half of one, which is to look otherwise.
+    """Measure rotations by one of many teeth, which fit, and between teeth, which do not.
 
-    Gives the angle and the deviation of the order that fits best, if there is one.
+    Gives angle and deviation of the number of teeth that fits best; an empty list where none does.
     """
     measured: list[tuple[float, float]] = []
     for order in _TEETH:
         step = 2 * math.pi / order
         angles = torch.tensor([step, 0.5 * step, 1.5 * step], dtype=torch.float64)
-        if float(surface.rough_distance(_turns(direction, angles[:1]))) > _MAX_ROUGH_DEVIATION:
+        rough = float(surface.rough_distance(_rotations(direction, angles[:1])))
+        if rough > _MAX_ROUGH_DEVIATION:
             continue
-        tooth, *between = surface.deviation(_turns(direction, angles)).tolist()
+        tooth, *between = surface.deviation(_rotations(direction, angles)).tolist()
         if tooth <= tolerance and min(between) > 2 * tooth + ALIKE:
             measured.append((step, tooth))
     return sorted(measured, key=lambda pair: pair[1])[:1]
@@ -382,9 +432,9 @@ _FLIP = torch.diag(torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64))
 def mirror_deviation(model: ObjectModel) -> float:
     """Measure how far the mirror image of a model deviates from it, in diameters.
 
-    The mirror image is laid on the model by ICP from the best of 400 mirror planes and rotary
-    reflections; the deviation is the largest distance but for 2 % of the points. It takes about a
-    second, once for each shape: it is kept in ``$DEPTHPOSE_CACHE``.
+    The mirror image is aligned with the model by ICP, from the best of 400 mirror planes and
+    rotary reflections. The deviation is the largest distance, without the farthest 2 % of the
+    points. It takes about a second, once for each shape: it is kept in ``$DEPTHPOSE_CACHE``.
 
     Args:
         model: the object, a mesh or points with normals.
@@ -395,8 +445,8 @@ def mirror_deviation(model: ObjectModel) -> float:
 def _search_mirror(model: ObjectModel) -> float:
     """Give the least deviation of a surface from its mirror images, in diameters."""
     surface = SurfaceDeviation(model)
-    # Reflections, or reflections with a quarter turn or a half, that fit roughly: by 0, 90, 180
-    # and 270 degrees about the normal n: cos (1 - nn') + sin [n] - nn'.
+    # Reflections across planes with normal n, followed by rotations about n by 0, 90, 180 and 270
+    # degrees: cos (1 - nn') + sin [n] - nn'. The best that are distinct are the starts.
     normals = torch.cat([surface.axes, fibonacci_directions(_MIRROR_PLANES)])
     along = normals[:, :, None] * normals[:, None]
     across = _EYE - along
@@ -412,10 +462,9 @@ def _search_mirror(model: ObjectModel) -> float:
         ):
             starts.append(reflections[k])
 
-    # From each to where the mirror image fits best.
-    turns = [refine_turn(surface, R @ _FLIP, _FLIP) for R in starts]
-    R = torch.stack([t.R for t in turns]) @ _FLIP
-    shift = torch.stack([t.t_m for t in turns])
+    refined = [refine_turn(surface, R @ _FLIP, _FLIP) for R in starts]
+    R = torch.stack([motion.R for motion in refined]) @ _FLIP
+    shift = torch.stack([motion.t_m for motion in refined])
     return float(surface.deviation(R, shift).min())
 
 
@@ -427,7 +476,7 @@ def refine_turn(
     Args:
         surface: in units of the object's diameter.
         R: the rotation to begin with, about the middle of the surface's box.
-        flip: the reflection that makes the mirror image; None: the surface itself.
+        flip: the reflection that makes the mirror image; None for the surface itself.
 
     Returns:
         The motion of the surface, or of its mirror image.
@@ -435,136 +484,157 @@ def refine_turn(
     points = surface.many if flip is None else surface.many @ flip
     linear = R if flip is None else R @ flip
     middle = (surface.points.amin(0) + surface.points.amax(0)) / 2
-    turn = Rigid(R, middle - linear @ middle)
+    motion = Rigid(R, middle - linear @ middle)
     for _ in range(_ICP_STEPS):
-        moved = turn.apply(points)
-        distance, index = surface.nearest(moved)
-        near = torch.from_numpy(distance <= np.quantile(distance, _ICP_SHARE)).double()
-        turn = fit_rigid(points, surface.points[torch.from_numpy(index)], near)
-    return turn
+        distance, index = surface.nearest(motion.apply(points))
+        is_near = torch.from_numpy(distance <= np.quantile(distance, _ICP_SHARE)).double()
+        motion = fit_rigid(points, surface.points[torch.from_numpy(index)], is_near)
+    return motion
 
 
 ALIKE = 0.004
 """Deviation in diameters up to which a symmetry that was found in a shape is exact: as much as a
 cylinder of 25 facets deviates. A copy that deviates by more, as a scan's dents or a keyway do, is
 another pose, though a view may not tell which."""
-ALMOST_ALL = 0.998  #: share of the surface that must be so near: a key or a notch is a few percent
+ALMOST_ALL = (
+    0.998  #: share of the surface within ``ALIKE``; a key or a notch is a few percent of it
+)
 _NEAR_TOLERANCE = 0.05
 """Deviation in diameters at which a sensor's noise begins to mask the difference of two poses: real
 points of LineMOD and YCB lie 1.4 to 2.6 % of the diameter off the posed surface. Twice as much is
 tried."""
-_NEAR_SUPPRESSION_RAD = math.radians(35)  # turns nearer to each other are one to ICP
-_AXIS_STEP_RAD = math.pi / 8  # an axis that nearly is one of revolution counts as eight turns
+_NEAR_SUPPRESSION_RAD = math.radians(35)  # rotations nearer to each other are the same to ICP
+_AXIS_STEP_RAD = math.pi / 8  # an axis that nearly is one of revolution counts as eight rotations
 _FINE_AXIS_STEP_RAD = math.pi / 36
-_MOST_NEAR = 24
-_NEAR_STARTS = 24  # turns that ICP refines
+_MOST_NEAR = 24  # near-symmetries that are given
+_NEAR_STARTS = 24  # rotations that ICP refines
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class NearSymmetry:
-    """A turn after which the object looks nearly as before."""
+    """A motion after which the object looks nearly as before."""
 
-    model_from_model: Rigid  #: the turn
-    #: distance of the turned surface from the surface, in diameters: the largest but for 2 % of the
-    #: points.
+    model_from_model: Rigid  #: the motion
+    #: largest distance of the moved surface from the surface, in diameters, without the farthest
+    #: 2 % of the points.
     deviation: float
 
 
 def near_symmetries(model: ObjectModel) -> tuple[NearSymmetry, ...]:
-    """Find the turns that leave a model nearly as it is, the nearest first.
+    """Find the motions that leave a model nearly as it is, those of the least deviation first.
 
-    Not among them are those of :func:`true_symmetries`, which are no other pose. They are searched
-    once for each shape, which takes a second or a few, and kept in ``$DEPTHPOSE_CACHE``.
+    Those of :func:`true_symmetries`, which make no other pose, are not among them. They are
+    searched once for each shape, in a few seconds, and kept in ``$DEPTHPOSE_CACHE``.
     """
-    near = cached(model, _search_near_symmetries, "near_symmetries")["near"]
-    turns = [(torch.tensor(matrix, dtype=torch.float64), deviation) for matrix, deviation in near]
-    return tuple(
-        NearSymmetry(model_from_model=Rigid(M[:3, :3], M[:3, 3]), deviation=deviation)
-        for M, deviation in turns
-    )
+    near: list[NearSymmetry] = []
+    for rows, deviation in cached(model, _search_near_symmetries, "near_symmetries")["near"]:
+        matrix = torch.tensor(rows, dtype=torch.float64)
+        motion = Rigid(matrix[:3, :3], matrix[:3, 3])
+        near.append(NearSymmetry(model_from_model=motion, deviation=deviation))
+    return tuple(near)
 
 
 def true_symmetries(
     model: ObjectModel, alike: tuple[list[bool], list[bool]] | None = None
 ) -> Symmetries:
-    """Give the symmetries whose copies are one pose.
+    """Give the symmetries whose copies count as one pose.
 
-    Declared ones are all. Of those that were found in the geometry, copies that lie 1 % of the
-    diameter and more off the surface are left out: near-symmetries.
+    These are all that were declared. Of those that were found in the geometry, near-symmetries,
+    whose copies deviate by more than ``ALIKE``, are left out.
 
-    ``alike``: which discrete symmetries and which axes look so; None: as a search finds them.
+    ``alike`` says which discrete symmetries and which axes deviate by less; None: it is searched.
     """
-    declared = model.symmetries
-    if not declared.is_found:
-        return declared
-    turns, axes = (
-        cached(model, _search_near_symmetries, "near_symmetries")["alike"]
-        if alike is None
-        else alike
-    )
-    discrete = declared.discrete
+    symmetries = model.symmetries
+    if not symmetries.is_found:
+        return symmetries
+    if alike is None:
+        cached_values = cached(model, _search_near_symmetries, "near_symmetries")
+        are_turns_alike, are_axes_alike = cached_values["alike"]
+    else:
+        are_turns_alike, are_axes_alike = alike
+    discrete = symmetries.discrete
     if discrete is not None:
-        discrete = discrete[torch.tensor(turns)] if any(turns) else None
-    continuous = tuple(a for a, is_alike in zip(declared.continuous, axes, strict=True) if is_alike)
+        discrete = discrete[torch.tensor(are_turns_alike)] if any(are_turns_alike) else None
+    pairs = zip(symmetries.continuous, are_axes_alike, strict=True)
+    continuous = tuple(axis for axis, is_alike in pairs if is_alike)
     return Symmetries(discrete=discrete, continuous=continuous, is_found=True)
 
 
 def _search_near_symmetries(model: ObjectModel) -> dict[str, Any]:
-    """Search near-symmetries of a model, and which of its declared symmetries the surface has.
+    """Search near-symmetries of a model, and which of its symmetries the surface has exactly.
 
     Gives JSON values, which are cached: ``near``, transforms with their deviations, the best first;
     and ``alike``, flags of the discrete and the continuous symmetries.
     """
     surface = SurfaceDeviation(model)
-    # Which discrete symmetries, and which axes, have copies that lie on the surface.
-    declared = model.symmetries
-    circle = torch.arange(1, 8, dtype=torch.float64) * (math.pi / 4)
-    turns = [_turns(axis.direction.double(), circle) for axis in declared.continuous]
-    axes = [float(surface.deviation(R, share=ALMOST_ALL).max()) <= ALIKE for R in turns]
+    alike = _which_are_alike(model.symmetries, surface)
+    measured = _deviations(_near_candidates(model.symmetries, surface), surface)
+
+    # Products of the best candidates are candidates too: a can upside down, then about its axis.
+    by_deviation = sorted(measured, key=lambda pair: pair[0])
+    good = [motion for deviation, motion in by_deviation if deviation <= _NEAR_TOLERANCE]
+    products = [first @ second for first in good[:_NEAR_STARTS] for second in good[:3]]
+    measured += _deviations(products, surface)
+
+    # The best, each far from better ones and from all copies of these that look alike.
+    same = symmetry_transforms(true_symmetries(model, alike), _FINE_AXIS_STEP_RAD).R.double()
+    near: list[tuple[Rigid, float]] = []
+    for deviation, motion in sorted(measured, key=lambda pair: pair[0]):
+        if len(near) == _MOST_NEAR or deviation > 2 * _NEAR_TOLERANCE:
+            break
+        better = torch.cat([R @ same for R in (_EYE, *(chosen.R for chosen, _ in near))])
+        apart_rad = float(geodesic_rad(motion.R.expand_as(better), better).min())
+        if apart_rad > _NEAR_SUPPRESSION_RAD:
+            # From the surface's centre and unit to the model's.
+            shift_m = surface.centre_m - motion.R @ surface.centre_m + motion.t_m * model.diameter_m
+            near.append((Rigid(motion.R, shift_m), deviation))
+    rows = [(motion.matrix().tolist(), deviation) for motion, deviation in near]
+    return {"near": rows, "alike": alike}
+
+
+def _which_are_alike(
+    symmetries: Symmetries, surface: SurfaceDeviation
+) -> tuple[list[bool], list[bool]]:
+    """Say which discrete symmetries, and which axes, have copies that lie on the surface."""
     discrete = list[bool]()
-    if declared.discrete is not None:
-        R = declared.discrete.R.double()
+    if symmetries.discrete is not None:
+        R = symmetries.discrete.R.double()
         discrete = (surface.deviation(R, share=ALMOST_ALL) <= ALIKE).tolist()
-    alike = (discrete, axes)
-    same = symmetry_transforms(true_symmetries(model, alike), _FINE_AXIS_STEP_RAD).R
-    # Symmetries that were found, and turns refined to where they fit best: a scan whose points lie
-    # denser on one side has its centre where no symmetry has it.
-    copies = symmetry_transforms(declared, _AXIS_STEP_RAD).R.double()[1:]
-    tried = [
-        Rigid(R, torch.zeros(3).double()) for R in (copies if declared.is_found else copies[:0])
-    ]
-    # From quarter turns about the principal axes, and the best of thousands of other turns.
+    circle = torch.arange(1, 8, dtype=torch.float64) * (math.pi / 4)
+    continuous = list[bool]()
+    for axis in symmetries.continuous:
+        R = _rotations(axis.direction.double(), circle)
+        continuous.append(float(surface.deviation(R, share=ALMOST_ALL).max()) <= ALIKE)
+    return discrete, continuous
+
+
+def _near_candidates(symmetries: Symmetries, surface: SurfaceDeviation) -> list[Rigid]:
+    """Give motions that may be near-symmetries: symmetries that were found, and refined rotations.
+
+    Refinement may shift the surface too: a scan whose points are denser on one side has its centre
+    where no symmetry has it.
+    """
+    candidates: list[Rigid] = []
+    if symmetries.is_found:
+        copies = symmetry_transforms(symmetries, _AXIS_STEP_RAD).R.double()[1:]
+        candidates = [Rigid(R, torch.zeros(3).double()) for R in copies]
+
+    # Refined from quarter turns about the principal axes, and the best of many other rotations.
     quarters = torch.arange(1, 4).double() * (math.pi / 2)
-    starts = [R for axis in surface.axes for R in _turns(axis, quarters)]
+    starts = [R for axis in surface.axes for R in _rotations(axis, quarters)]
     for R in promising_turns(surface):
         if len(starts) >= _NEAR_STARTS:
             break
-        if all(float(geodesic_rad(R, o)) > _NEAR_SUPPRESSION_RAD for o in (_EYE, *starts)):
+        distances = [float(geodesic_rad(R, start)) for start in (_EYE, *starts)]
+        if min(distances) > _NEAR_SUPPRESSION_RAD:
             starts.append(R)
-    tried += [refine_turn(surface, R) for R in starts]
-    measured = _deviations(tried, surface)
-    good = [
-        turn for off, turn in sorted(measured, key=lambda pair: pair[0]) if off <= _NEAR_TOLERANCE
-    ]
-    # Two turns one after the other are one: of a can, upside down and then about its axis.
-    measured += _deviations([a @ b for a in good[:_NEAR_STARTS] for b in good[:3]], surface)
-    near: list[tuple[Rigid, float]] = []
-    for off, turn in sorted(measured, key=lambda pair: pair[0]):
-        if len(near) == _MOST_NEAR or off > 2 * _NEAR_TOLERANCE:
-            break
-        # New is what is far from the others and from all copies of them that look alike.
-        others = torch.cat([R @ same.double() for R in (_EYE, *(motion.R for motion, _ in near))])
-        apart_rad = float(geodesic_rad(turn.R.expand_as(others), others).min())
-        if apart_rad > _NEAR_SUPPRESSION_RAD:  # from the surface's centre and unit to the model's
-            shift_m = surface.centre_m - turn.R @ surface.centre_m + turn.t_m * model.diameter_m
-            near.append((Rigid(turn.R, shift_m), off))
-    return {"near": [(turn.matrix().tolist(), off) for turn, off in near], "alike": alike}
+    return candidates + [refine_turn(surface, R) for R in starts]
 
 
-def _deviations(turns: list[Rigid], surface: SurfaceDeviation) -> list[tuple[float, Rigid]]:
-    """Measure how far each transform moves the surface off itself, in diameters."""
-    if not turns:
+def _deviations(motions: list[Rigid], surface: SurfaceDeviation) -> list[tuple[float, Rigid]]:
+    """Pair each motion with how far it moves the surface off itself, in diameters."""
+    if not motions:
         return []
-    R = torch.stack([t.R for t in turns])
-    shift = torch.stack([t.t_m for t in turns])
-    return list(zip(surface.deviation(R, shift).tolist(), turns, strict=True))
+    R = torch.stack([motion.R for motion in motions])
+    shift = torch.stack([motion.t_m for motion in motions])
+    return list(zip(surface.deviation(R, shift).tolist(), motions, strict=True))

@@ -1,4 +1,4 @@
-"""Poses at which a model may be in a whole depth image: votes, clusters, ICP, and the image."""
+"""Proposals of a model's poses in a whole depth image: voting, refinement, and a score."""
 
 import math
 from typing import NamedTuple
@@ -17,38 +17,39 @@ from depthpose.pose.surface import NEAR, Surface
 
 # Votes.
 _REFERENCE_EVERY = 8
-"""One point of the scene of so many votes with each of the others: of a small object in a large
-scene enough must."""
+"""Of so many points of the scene one is a reference, which votes with each of the others: on a
+small object in a large scene enough must lie."""
 _WANTED_REFERENCES = 600
-"""At least so many of them, if there are."""
+"""References at least, if there are as many points."""
 _MOST_REFERENCES = 2000
 _MOST_REFERENCES_OF_ALL = 6000
-"""At most for one object, and for all objects of a search together."""
+"""References at most for one object, and for all objects of a search together."""
 _FEWEST_REFERENCES = 200
-"""But for each object so many, however many are searched."""
+"""References for each object at least, however many are searched."""
 _LEAST_POINTS = 30
+"""Of a scene: with fewer nothing is proposed."""
 _MOST_POINTS = 20_000
 _PEAKS = 3
 """Poses that each reference point proposes."""
 _LEAST_SCORE = 0.25
-"""Poses with which the image agrees less are none."""
+"""Poses with a lower score are not proposed."""
 _SAME_DIAMETERS = 0.1
 _SAME_RAD = math.radians(25)
-"""Poses are one up to this distance of their middles, in diameters, and this angle."""
+"""Distance of the middles, in diameters, and angle up to which two poses are the same."""
 
 # Normals and ICP.
 _MIN_COSINE = 0.7
 """Cosine of the angle between the normals of the image and of the posed surface, at least."""
 _MIN_COSINE_ICP = 0.5
-"""The same for a reading that draws the surface: poses are rough then."""
+"""The same in ICP, whose poses are rough."""
 _DAMPING = 0.02
-"""Of ICP: a motion that moves the readings across the surface by less is hardly taken."""
+"""Of ICP: a motion that moves the readings across the surface by less is nearly suppressed."""
 
 # The score of a pose.
 _DEVIATIONS = 2.0
-"""A reading lies on the surface up to so many deviations of the noise, beside the stage's limit."""
+"""Of the noise, by which a reading may lie farther off the surface than the stage's limit."""
 _LEAST_READ = 0.5
-"""Where less of the surface is read, it counts as so much."""
+"""Least share of the visible surface by which a score is divided, though less of it is read."""
 
 Points = Float64[Tensor, "b n 3"]
 
@@ -57,10 +58,10 @@ class _Stage(NamedTuple):
     """How closely poses are compared with an image.
 
     Attributes:
-        every: one point of so many of what is seen is compared.
-        near: of the diameter, beside the sensor's noise: a reading so near to the surface is of it.
-        icp_limits: of the diameter: up to so far a reading counts in each step of ICP.
-        most: poses that go on.
+        every: of so many visible points of the model one is compared.
+        near: distance up to which a reading lies on the surface, beside noise, in diameters.
+        icp_limits: distance up to which a reading counts in each step of ICP, in diameters.
+        most: poses that enter the next stage.
     """
 
     every: int
@@ -79,13 +80,13 @@ _STAGES = (
 def propose_in_frame(
     frame: Frame, is_unclaimed: Bool[Tensor, "h w"], table: PairTable, models: int = 1
 ) -> tuple[Rigid, Float64[Tensor, " b"]]:
-    """Let point pairs of the whole image vote; refine and keep what the image agrees with best.
+    """Propose poses of a model in an image: point pairs vote, the best are refined and scored.
 
     Args:
         frame: the image.
         is_unclaimed: pixels that may vote: in the mask, and explained by no object found before.
         table: point pairs of the model.
-        models: so many are searched in the image.
+        models: number of models that are searched in the image.
 
     Returns:
         Poses, roughly refined, the best first, and the score of each (:func:`score_by_image`).
@@ -96,28 +97,21 @@ def propose_in_frame(
     generator = torch.Generator().manual_seed(0)
     order = torch.randperm(len(points_m), generator=generator)[:_MOST_POINTS]
     references = torch.arange(_number_of_references(len(order), models))
-    poses, _ = vote_poses(points_m[order], normals[order], references, table, _PEAKS)
+    poses, score = vote_poses(points_m[order], normals[order], references, table, _PEAKS)
 
     # Fewer and fewer poses are refined and compared, more and more closely.
-    for stage in _STAGES[:-1]:
-        poses, _ = _refine_and_thin(frame, poses, surface, stage)
-    poses, score = _refine_and_thin(frame, poses, surface, _STAGES[-1])
+    for stage in _STAGES:
+        poses = refine_projectively(frame, poses, surface, stage)
+        score = score_by_image(frame, poses, surface, stage)
+        best = _best_distinct(poses, score, surface, stage.most)
+        poses = poses[best]
+        score = score[best]
     is_good = score >= _LEAST_SCORE
     return poses[is_good], score[is_good]
 
 
-def _refine_and_thin(
-    frame: Frame, poses: Rigid, surface: Surface, stage: _Stage
-) -> tuple[Rigid, Float64[Tensor, " b"]]:
-    """Refine poses, and give the best distinct ones of a stage with their scores."""
-    poses = refine_projectively(frame, poses, surface, stage)
-    score = score_by_image(frame, poses, surface, stage)
-    best = _distinct(poses, score, surface, stage.most)
-    return poses[best], score[best]
-
-
 def _number_of_references(points: int, models: int) -> int:
-    """So many points of the scene vote with each of the others."""
+    """Say how many points of a scene vote with each of the others, in a search of some models."""
     if points < _LEAST_POINTS:
         return 0
     wanted = max(_WANTED_REFERENCES, points // _REFERENCE_EVERY)
@@ -128,14 +122,19 @@ def _number_of_references(points: int, models: int) -> int:
 def _scene_points(
     frame: Frame, is_unclaimed: Bool[Tensor, "h w"], surface: Surface
 ) -> tuple[Float64[Tensor, "n 3"], Float64[Tensor, "n 3"]]:
-    """Average points and normals in cells, without planes and what is too far to have a shape."""
+    """Average the points and normals of a frame that may be of an object, in cells.
+
+    Left out are its background, and readings too far away to show a shape.
+    """
     is_used = frame.is_smooth & is_unclaimed & frame.may_show(surface.diameter_m)
-    # Beyond where the noise is as large as what counts as near, no shape is seen.
+    # Where the noise is as large as the limit of nearness, no shape is visible.
     is_used &= NOISE_PER_M2 * frame.depth_m.square() < NEAR * surface.diameter_m
     points_m = frame.points_m[is_used]
     normals = frame.normals[is_used]
     if len(points_m) == 0:
         return points_m, normals
+
+    # Means of each cell; where normals differ much it holds several surfaces.
     cell = (points_m / (STEP * surface.diameter_m)).floor().long()
     cell -= cell.amin(0)
     size = cell.amax(0) + 1
@@ -143,14 +142,14 @@ def _scene_points(
     _, place, count = key.unique(return_inverse=True, return_counts=True)
     sums = points_m.new_zeros(len(count), 6)
     means = sums.index_add_(0, place, torch.cat([points_m, normals], 1)) / count[:, None]
-    is_of_one_side = means[:, 3:].norm(dim=-1) > _MIN_COSINE
-    return means[is_of_one_side, :3], normalize(means[is_of_one_side, 3:], dim=-1)
+    is_one_surface = means[:, 3:].norm(dim=-1) > _MIN_COSINE
+    return means[is_one_surface, :3], normalize(means[is_one_surface, 3:], dim=-1)
 
 
-def _distinct(
+def _best_distinct(
     poses: Rigid, score: Float64[Tensor, " b"], surface: Surface, most: int
 ) -> Int64[Tensor, " c"]:
-    """Choose the best poses, none nearly as one before it."""
+    """Give the indices of the best poses, ``most`` of them, without any near a better one."""
     order = score.argsort(descending=True, stable=True)[: 5 * most]
     middles_m = poses[order].apply(surface.middle_m[None])[:, 0]
     rotations = poses.R[order].flatten(1)
@@ -167,10 +166,16 @@ def _distinct(
 
 
 def refine_projectively(frame: Frame, poses: Rigid, surface: Surface, stage: _Stage) -> Rigid:
-    """Bring what a camera sees of each posed surface onto what it saw, pixel by pixel.
+    """Refine poses by projective point-to-plane ICP (Blais and Levine 1995).
 
-    Point to plane, each point with the reading in its own direction (Blais and Levine 1995): the
-    inner side of a thin wall draws no reading of the outer one.
+    Each visible point of the posed surface is matched with the reading in its own direction, so
+    that the inner side of a thin wall is not matched with readings of the outer one.
+
+    Args:
+        frame: the image.
+        poses: a batch, ``camera_from_model``.
+        surface: of the model.
+        stage: how many points are used, and the limit of each step.
     """
     is_usable = (frame.is_smooth & frame.may_show(surface.diameter_m)).flatten()
     radius_m = surface.diameter_m / 2
@@ -194,28 +199,26 @@ def refine_projectively(frame: Frame, poses: Rigid, surface: Surface, stage: _St
         J = torch.cat([torch.linalg.cross(arm_m, normal), normal], -1)
         J = torch.where(is_used[..., None], J, 0.0)
         weighted = J.mT * weight[:, None]
-        # Few readings hold little: what they do not hold stays where it was voted for.
+        # Damped, so that a motion that few readings constrain stays where it was voted for.
         H = weighted @ J + weight.sum(-1)[:, None, None].clamp(min=1.0) * damping
         distance_m = torch.where(is_used, (gap_m * normal).sum(-1), 0.0)
         motion = torch.linalg.solve(H, weighted @ distance_m[..., None])[..., 0]
-        turned = perturb(Rigid(poses.R, poses.t_m - middle_m[:, 0]), motion)
-        poses = Rigid(turned.R, turned.t_m + middle_m[:, 0])
+        moved = perturb(Rigid(poses.R, poses.t_m - middle_m[:, 0]), motion)
+        poses = Rigid(moved.R, moved.t_m + middle_m[:, 0])
     return poses
 
 
 def score_by_image(
     frame: Frame, poses: Rigid, surface: Surface, stage: _Stage = _STAGES[-1]
 ) -> Float64[Tensor, " b"]:
-    """Score posed surfaces by what the camera saw in the direction of their points.
-
-    It ranks proposals; whether a pose is right :class:`depthpose.pose.types.Evidence` says.
+    """Score posed surfaces by the readings in the directions of their points, to rank proposals.
 
     Returns:
-        The share of the surface that was read at its depth and turned alike, less the share that
-        was read there and is turned otherwise, that the camera saw through, or that a background
+        The share of the surface with a reading at its depth and with its normal, less the share
+        with a reading there of another normal, that the camera saw through, or that a background
         hides; at most 1.
     """
-    # What was read in the direction of each visible point, and how far behind it.
+    # The reading in the direction of each visible point, and how far behind it.
     visible = _visible_points(poses, surface, stage.every)
     depth_m = visible.points_m[..., 2]
     readings = readings_toward(frame, visible.points_m)
@@ -223,19 +226,19 @@ def score_by_image(
     limit_m = stage.near * surface.diameter_m + _DEVIATIONS * NOISE_PER_M2 * depth_m.square()
     is_background = ~frame.may_show(surface.diameter_m).flatten()[readings.pixel]
 
-    # At the depth of the surface, and turned alike or otherwise.
+    # At the depth of the surface, with its normal or another one.
     is_at_depth = readings.is_read & (gap_m.abs() < limit_m)
     cosine = (visible.normals * frame.normals.flatten(0, 1)[readings.pixel]).sum(-1).abs()
-    is_turned = (cosine <= _MIN_COSINE) & frame.is_smooth.flatten()[readings.pixel]
-    supports = is_at_depth & ~is_turned & ~is_background
+    has_other_normal = (cosine <= _MIN_COSINE) & frame.is_smooth.flatten()[readings.pixel]
+    supports = is_at_depth & ~has_other_normal & ~is_background
 
-    # Behind a background, or seen through. A sensor cuts rims and edges: where it saw nothing near
-    # about a point of an edge, the point counts as not read.
+    # Behind a background, or seen through. A sensor cuts rims and edges: a point of an edge without
+    # a reading near it counts as not read.
     is_hidden = readings.is_read & (gap_m < -limit_m) & is_background
     nearest_m = frame.nearest_m.flatten()[readings.pixel]
     is_through = readings.is_read & (nearest_m > depth_m + limit_m)
     is_cut = is_through & ~visible.is_inner
-    contradicts = (is_at_depth & is_turned) | is_hidden | (is_through & visible.is_inner)
+    contradicts = (is_at_depth & has_other_normal) | is_hidden | (is_through & visible.is_inner)
 
     count = depth_m.isfinite().sum(1).clamp(min=1)
     read = (readings.is_read & ~is_cut).sum(1).maximum(_LEAST_READ * count).double()
@@ -243,7 +246,7 @@ def score_by_image(
 
 
 class _Visible(NamedTuple):
-    """What a camera sees of posed surfaces: ``surface.Views`` of the nearest side, in its frame."""
+    """The visible points of posed surfaces, in the camera frame; parts of ``surface.Views``."""
 
     points_m: Points
     normals: Points
@@ -251,12 +254,15 @@ class _Visible(NamedTuple):
 
 
 def _visible_points(poses: Rigid, surface: Surface, every: int) -> _Visible:
-    """Pose what a camera sees from the nearest of the sides that the model was looked at from."""
+    """Give the points of each posed surface that are visible from the view nearest to the camera's.
+
+    ``every``: of so many of them one is given.
+    """
     views = surface.views
     camera_m = -(poses.t_m[:, None] @ poses.R)[:, 0]  # in the model frame
-    side = ((camera_m - surface.middle_m) @ views.toward.T).argmax(-1)
+    nearest = ((camera_m - surface.middle_m) @ views.toward.T).argmax(-1)
     return _Visible(
-        points_m=poses.apply(views.points_m[side, ::every]),
-        normals=views.normals[side, ::every] @ poses.R.mT,
-        is_inner=views.is_inner[side, ::every],
+        points_m=poses.apply(views.points_m[nearest, ::every]),
+        normals=views.normals[nearest, ::every] @ poses.R.mT,
+        is_inner=views.is_inner[nearest, ::every],
     )

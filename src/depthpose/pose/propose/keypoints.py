@@ -1,11 +1,11 @@
-"""Directions to keypoints to a pose: least squares, RANSAC, rigidity, Kabsch, covariances."""
+"""From directions to keypoints to a pose: voting, a check of rigidity, and Kabsch."""
 
 import math
 from dataclasses import replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
 from depthpose.core.errors import InputError
@@ -15,16 +15,18 @@ from depthpose.pose.types import ObjectModel, PoseFit, Refusal, Vote
 
 _SMALLEST = 1e-12
 _NEAREST = 0.1
-"""Points nearer to a keypoint than this share of the mean distance weigh no more: a point on the
-keypoint would outweigh all others, and its direction means nothing."""
+"""Share of the mean distance to a keypoint: nearer points weigh no more than at this distance. A
+point on the keypoint would outweigh all others, and its direction means nothing."""
+_EIGENVALUE_ROUNDING = 1e-7
+"""Of a matrix of trace 2, sums in float32: a smaller eigenvalue is that of parallel lines."""
 
 
 class Lines(NamedTuple):
-    """Lines through points about their mean, of unit directions; a weight of 0 leaves one out."""
+    """Lines through points; coordinates are about the mean of the points, and come before them."""
 
     points: Float[Tensor, "*batch 1 3 n"]
-    directions: Float[Tensor, "*batch k 3 n"]
-    weights: Float[Tensor, "*batch k n"]
+    directions: Float[Tensor, "*batch k 3 n"]  # unit vectors
+    weights: Float[Tensor, "*batch k n"]  # 0 leaves a line out
 
 
 def meet_lines(
@@ -35,10 +37,10 @@ def meet_lines(
 ) -> Vote:
     """Find for each keypoint the point where the lines ``x_i + s n_i`` meet best.
 
-    First the point nearest to all of them, ``(sum w (I - n n^T)) p = sum w (I - n n^T) x``. It is
-    biased toward the points: the noise of ``n`` enters both sides. Each refinement is then a step
-    of Fisher scoring to the largest ``sum w n . q`` with ``q = (p - x) / |p - x|``, the most
-    likely point when directions err by angles (von Mises-Fisher). Its expected gradient is zero at
+    The start is the point nearest to all of them, ``(sum w (I - n n^T)) p = sum w (I - n n^T) x``.
+    It is biased toward the points, since the noise of ``n`` enters both sides. Each refinement is a
+    step of Fisher scoring to the largest ``sum w n . q`` with ``q = (p - x) / |p - x|``, the most
+    likely point where directions err by angles (von Mises-Fisher). Its expected gradient is zero at
     the truth for any error that is symmetric about the true direction, however large.
 
     The covariance is ``A^-1 (sum g g^T) A^-1`` with the gradient ``g`` of each line (White 1980):
@@ -55,16 +57,20 @@ def meet_lines(
     Raises:
         InputError: fewer than two lines of a keypoint have weight.
     """
-    lines, centre_m = prepare_lines(points_m, directions, weight)
-    return meet_prepared(lines, centre_m, refinements)
+    lines, centre_m = _make_lines(points_m, directions, weight)
+    return _meet(lines, centre_m, refinements)
 
 
-def prepare_lines(
+def _make_lines(
     points_m: Float[Tensor, "*batch n 3"],
     directions: Float[Tensor, "*batch n k 3"],
     weight: Float[Tensor, "*batch n k"] | None,
 ) -> tuple[Lines, Float[Tensor, "*batch 1 3"]]:
-    """Turn coordinates before points, about the points' mean, with unit directions."""
+    """Make lines of points and directions; give them, and the points' mean.
+
+    Raises:
+        InputError: fewer than two lines of a keypoint have weight.
+    """
     centre_m = points_m.mean(-2, keepdim=True)
     local = (points_m - centre_m).mT[..., None, :, :].contiguous()
     n = directions.movedim(-3, -1).contiguous()
@@ -81,25 +87,28 @@ def prepare_lines(
     return Lines(local, n, w), centre_m
 
 
-def meet_prepared(lines: Lines, centre_m: Float[Tensor, "*batch 1 3"], refinements: int) -> Vote:
-    """Do as :func:`meet_lines` does, for what :func:`prepare_lines` gave."""
+def _meet(lines: Lines, centre_m: Float[Tensor, "*batch 1 3"], refinements: int) -> Vote:
+    """Find where lines meet best, as :func:`meet_lines`; ``centre_m`` is added to the points."""
     local, n, w = lines
-    all_count = torch.ones_like(w[..., 0])
-    along, total = (n * local).sum(-2, keepdim=True), w.sum(-1).double()[..., None, None]
-    wn, eye = n * w[..., None, :], torch.eye(3, dtype=torch.float64, device=n.device)
-    # Over the sum of weights, the damping is a pure number.
+    eye = torch.eye(3, dtype=torch.float64, device=n.device)
+
+    # The point nearest to all lines. Divided by the sum of weights, A has a trace of 2.
+    along = (n * local).sum(-2, keepdim=True)
+    total = w.sum(-1).double()[..., None, None]
+    wn = n * w[..., None, :]
     A = (total * eye - (wn @ n.mT).double()) / total
     b = (local @ w[..., None] - wn @ along.mT).double() / total
     p = torch.linalg.solve(_damped(A), b).squeeze(-1)
     values = torch.linalg.eigvalsh(A)
-    # Of a trace of 2, what lies below is the rounding of float32 sums.
-    is_real = values[..., 0] > 1e-7
-    condition = torch.where(is_real, values[..., 2] / values[..., 0].clamp(min=1e-7), torch.inf)
+    least = values[..., 0].clamp(min=_EIGENVALUE_ROUNDING)
+    is_crossing = values[..., 0] > _EIGENVALUE_ROUNDING
+    condition = torch.where(is_crossing, values[..., 2] / least, torch.inf)
     offset = p.to(n)[..., None] - local
     gradient = offset - n * (n * offset).sum(-2, keepdim=True)
     gradient = gradient * (w / w.sum(-1, keepdim=True))[..., None, :]
+
     for _ in range(refinements):
-        # The information matrix, and the gradient of each line, over the sum of weights.
+        # The gradient of each line, and the information matrix, over the sum of weights.
         offset = p.to(n)[..., None] - local
         distance = offset.square().sum(-2).sqrt_()
         scale = distance.mean(-1, keepdim=True).clamp(min=_SMALLEST)
@@ -108,34 +117,38 @@ def meet_prepared(lines: Lines, centre_m: Float[Tensor, "*batch 1 3"], refinemen
         cosine = (n * q).sum(-2)
         pull = w / distance / w.sum(-1, keepdim=True)
         gradient = (n - q * cosine[..., None, :]) * pull[..., None, :]
-        # Outliers may not turn the matrix negative: each line counts as half at least.
+        # A cosine of one half at least: outliers would make the matrix indefinite.
         amount = pull / distance * cosine.clamp(min=0.5)
         outer = ((q * amount[..., None, :]) @ q.mT).double()
         A = amount.sum(-1).double()[..., None, None] * eye - outer
         step = torch.linalg.solve(_damped(A), gradient.sum(-1).double()[..., None]).squeeze(-1)
-        # Within the distance of the keypoint to the points.
+        # No step is longer than the root mean square distance of the keypoint to the points.
         spread = local.square().sum(-2).mean(-1).double()
         limit = (p.square().sum(-1) + spread).sqrt()
-        p = p + step * (limit / step.norm(dim=-1).clamp(min=_SMALLEST)).clamp(max=1.0)[..., None]
-    inverse, votes = torch.linalg.inv(_damped(A)), (w > 0).sum(-1)
-    # n lines of rank 2 fix 3 unknowns: few lines look surer than they are.
-    spare = (2 * votes.double() / (2 * votes - 3).clamp(min=1))[..., None, None]
-    covariance = spare * (inverse @ (gradient @ gradient.mT).double() @ inverse)
+        shortening = (limit / step.norm(dim=-1).clamp(min=_SMALLEST)).clamp(max=1.0)
+        p = p + step * shortening[..., None]
+
+    # Each line gives 2 equations for 3 unknowns: the correction for the degrees of freedom.
+    inverse = torch.linalg.inv(_damped(A))
+    votes = (w > 0).sum(-1)
+    correction = (2 * votes.double() / (2 * votes - 3).clamp(min=1))[..., None, None]
+    covariance = correction * (inverse @ (gradient @ gradient.mT).double() @ inverse)
     return Vote(
         keypoints_m=p.to(centre_m) + centre_m,
         covariance_m2=covariance.to(centre_m),
         condition=condition.to(centre_m),
-        inlier_share=all_count,
+        inlier_share=torch.ones_like(w[..., 0]),
     )
 
 
 def _damped(A: Float64[Tensor, "*b k 3 3"]) -> Float64[Tensor, "*b k 3 3"]:
-    """Keep parallel lines solvable: their point stays near the mean of the points."""
+    """Add a little to the diagonal: parallel lines then meet near the mean of the points."""
     size = A.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None].clamp(min=1e-300)
     return A + 1e-12 * size * torch.eye(3, dtype=A.dtype, device=A.device)
 
 
-_PARALLEL = 1e-6
+_PARALLEL = 1e-6  # square of the sine of the angle of two lines, below which they do not cross
+_LEAST_INLIERS = 3  # lines that fix a point and its covariance
 _BLOCK = 2**17
 """Votes scored at a time on a CPU. All blocks of a call share two pieces of memory that stay in its
 cache: fresh megabytes for each call cost three times the arithmetic in page faults alone. A GPU is
@@ -148,12 +161,12 @@ def vote_ransac(
     weight: Float[Tensor, "*batch n k"] | None = None,
     config: VotingConfig | None = None,
 ) -> Vote:
-    """Find each keypoint where most directions agree, and refit it on those.
+    """Find each keypoint where most directions agree, by RANSAC, and refit it to its inliers.
 
-    One program over hypotheses, keypoints and objects: nothing is tried one by one. The score of a
-    hypothesis is the weight of its inliers; pairs come from ``config.seed`` alone, drawn evenly
-    from the votes of positive weight. The refit chooses its inliers twice: by the best hypothesis,
-    then by what those agree on.
+    A hypothesis is where the lines of two votes nearly cross; its score is the weight of its
+    inliers. Pairs are drawn evenly from the votes of positive weight, by ``config.seed`` alone. All
+    hypotheses, keypoints and objects are computed at once. The inliers are chosen twice: those of
+    the best hypothesis, then those of the point that is fitted to them.
 
     Args:
         points_m: where the votes start.
@@ -165,20 +178,53 @@ def vote_ransac(
         InputError: fewer than two directions of a keypoint carry weight.
     """
     config = VotingConfig() if config is None else config
-    lines, centre_m = prepare_lines(points_m, directions, weight)
-    # Pairs of two different votes of positive weight for each keypoint, on any device alike.
+    lines, centre_m = _make_lines(points_m, directions, weight)
+    first, second = _draw_pairs(lines.weights, config)
+    hypotheses, is_crossing = _cross_pairs(lines, first, second)
+
+    # The best hypothesis. Parallel pairs score 0, as the least of all, so that one always wins.
+    inlier_test = InlierTest(lines, config)
+    scores = torch.where(is_crossing, inlier_test.score(hypotheses), 0)
+    best = scores.argmax(-1)[..., None, None]
+    keypoint = hypotheses.gather(-2, best.expand(*best.shape[:-1], 3))
+
+    # Refitted to its inliers, then to those of the refitted point.
     w = lines.weights
-    counts = (w > 0).sum(-1, keepdim=True)
+    for steps in (min(config.refinements, 1), config.refinements):
+        inlier_weight = inlier_test.agree(keypoint).squeeze(-2) * w
+        is_enough = (inlier_weight > 0).sum(-1, keepdim=True) >= _LEAST_INLIERS
+        # Where there are too few inliers all votes are used, and the share is 0.
+        share = torch.where(is_enough, inlier_weight, 0).sum(-1) / w.sum(-1)
+        used = lines._replace(weights=torch.where(is_enough, inlier_weight, w))
+        vote = _meet(used, torch.zeros_like(centre_m), steps)
+        keypoint = vote.keypoints_m[..., None, :]
+    return replace(vote, keypoints_m=vote.keypoints_m + centre_m, inlier_share=share)
+
+
+def _draw_pairs(
+    weights: Float[Tensor, "*batch k n"], config: VotingConfig
+) -> tuple[Int64[Tensor, "*batch k h"], Int64[Tensor, "*batch k h"]]:
+    """Draw pairs of two different votes of positive weight for each keypoint, on any device alike.
+
+    Gives the indices of the first and the second vote of each hypothesis.
+    """
+    counts = (weights > 0).sum(-1, keepdim=True)
     generator = torch.Generator().manual_seed(config.seed)
     shape = (2, *counts.shape[:-1], config.hypotheses)
-    draws = torch.rand(shape, generator=generator, dtype=torch.float64).to(w.device)
+    draws = torch.rand(shape, generator=generator, dtype=torch.float64).to(weights.device)
     first = (draws[0] * counts).long()
-    # A step of 1 .. count - 1 further round never comes back to the first.
+    # 1 to count - 1 further round, which never is the first itself.
     second = (first + 1 + (draws[1] * (counts - 1)).long()) % counts
-    if int(counts.min()) < w.shape[-1]:
-        voters = (w > 0).to(torch.uint8).argsort(dim=-1, descending=True, stable=True)
-        first, second = voters.gather(-1, first), voters.gather(-1, second)
-    # The middle of the common perpendicular of each pair, where they cross.
+    if int(counts.min()) == weights.shape[-1]:
+        return first, second
+    voters = (weights > 0).to(torch.uint8).argsort(dim=-1, descending=True, stable=True)
+    return voters.gather(-1, first), voters.gather(-1, second)
+
+
+def _cross_pairs(
+    lines: Lines, first: Int64[Tensor, "*batch k h"], second: Int64[Tensor, "*batch k h"]
+) -> tuple[Float[Tensor, "*batch k h 3"], Bool[Tensor, "*batch k h"]]:
+    """Give the middle of the common perpendicular of pairs of lines, and which are not parallel."""
     wide = (*first.shape[:-1], 3, first.shape[-1])
     x1, x2, n1, n2 = (
         values.expand_as(lines.directions).gather(-1, index[..., None, :].expand(wide))
@@ -187,36 +233,22 @@ def vote_ransac(
     )
     gap = x1 - x2
     cosine = (n1 * n2).sum(-2, keepdim=True)
-    d, e = (n1 * gap).sum(-2, keepdim=True), (n2 * gap).sum(-2, keepdim=True)
+    d = (n1 * gap).sum(-2, keepdim=True)
+    e = (n2 * gap).sum(-2, keepdim=True)
     sine_squared = 1 - cosine * cosine
     is_crossing = sine_squared > _PARALLEL
     scale = torch.where(is_crossing, sine_squared, 1)
-    is_crossing = is_crossing.squeeze(-2)
     on_first = x1 + n1 * ((cosine * e - d) / scale)
     on_second = x2 + n2 * ((e - cosine * d) / scale)
-    tried = ((on_first + on_second) / 2).mT
-    inlier_test = InlierTest(lines, config)
-    # Parallel pairs propose nothing, yet score 0 so that one always wins.
-    best = torch.where(is_crossing, inlier_test.score(tried), 0).argmax(-1)[..., None, None]
-    keypoint = tried.gather(-2, best.expand(*best.shape[:-1], 3))
-    # Once toward what the best hypothesis gathered, then with those that agree on that.
-    for steps in (min(config.refinements, 1), config.refinements):
-        agreeing = inlier_test.agree(keypoint).squeeze(-2) * w
-        is_enough = (agreeing > 0).sum(-1, keepdim=True) >= 3
-        # Where fewer agree than fix a point with its covariance all votes are used, the share is 0.
-        share = torch.where(is_enough, agreeing, 0).sum(-1) / w.sum(-1)
-        used = lines._replace(weights=torch.where(is_enough, agreeing, w))
-        vote = meet_prepared(used, torch.zeros_like(centre_m), steps)
-        keypoint = vote.keypoints_m[..., None, :]
-    return replace(vote, keypoints_m=vote.keypoints_m + centre_m, inlier_share=share)
+    return ((on_first + on_second) / 2).mT, is_crossing.squeeze(-2)
 
 
 class InlierTest:
-    """Says which lines agree with which hypotheses.
+    """Tests which lines agree with which hypotheses, by angle or by distance.
 
     Both tests compare polynomials in the hypothesis h, and so are two products of matrices:
-    ``along = n . (h - x)`` and ``range^2 = |h|^2 - 2 h . x + |x|^2``. By angle a line agrees when
-    ``along > cos range``, so that a vote that points away does not; by distance when ``range^2 -
+    ``along = n . (h - x)`` and ``range^2 = |h|^2 - 2 h . x + |x|^2``. By angle a line agrees where
+    ``along > cos range``, so that a vote that points away does not; by distance where ``range^2 -
     along^2 < limit^2``, whatever the sense of the vote (published practice).
     """
 
@@ -226,79 +258,88 @@ class InlierTest:
         along = torch.cat([n, -(n * local).sum(-2, keepdim=True)], -2)
         square = local.square().sum(-2, keepdim=True)
         far = torch.cat([-2 * local, torch.ones_like(square), square], -2)
-        # The scale of the test goes into the small factor, not into the large product.
+        # The test's cosine is multiplied into the small factor, not into the large product.
         far = far * (config.min_cosine**2 if self._limit is None else 1.0)
-        # Keypoints and objects are alike here: one axis.
+        # Keypoints and objects become one axis.
         self._along = along.detach().flatten(0, -3)
         self._far = far.detach().expand(*n.shape[:-2], *far.shape[-2:]).flatten(0, -3)
         self._w = w.detach().flatten(0, -2)[:, None]
         self._is_weighted = not bool((w == 1).all())
 
     @torch.no_grad()
-    def score(self, tried: Float[Tensor, "*batch k h 3"]) -> Float[Tensor, "*batch k h"]:
-        """Add up the weight of the lines that agree with each hypothesis."""
-        flat, n = tried.flatten(0, -3), self._w.shape[-1]
-        lines, rows = flat.shape[:2]
-        if tried.device.type == "cpu":
-            rows = max(1, min(rows, _BLOCK // (lines * n)))
-        memory = tried.new_empty(2, lines * rows * n)
-        scores = tried.new_empty(flat.shape[:-1])
-        for part in range(0, flat.shape[1], rows):
-            agreed = self.agree(flat[:, part : part + rows], memory)
+    def score(self, hypotheses: Float[Tensor, "*batch k h 3"]) -> Float[Tensor, "*batch k h"]:
+        """Add up the weights of the lines that agree with each hypothesis."""
+        flat = hypotheses.flatten(0, -3)
+        votes = self._w.shape[-1]
+        keypoints, rows = flat.shape[:2]
+        if hypotheses.device.type == "cpu":
+            rows = max(1, min(rows, _BLOCK // (keypoints * votes)))
+        memory = hypotheses.new_empty(2, keypoints * rows * votes)
+        scores = hypotheses.new_empty(flat.shape[:-1])
+        for start in range(0, flat.shape[1], rows):
+            agreed = self.agree(flat[:, start : start + rows], memory)
             agreed = agreed.mul_(self._w) if self._is_weighted else agreed
-            scores[:, part : part + rows] = agreed.sum(-1)
-        return scores.view(tried.shape[:-1])
+            scores[:, start : start + rows] = agreed.sum(-1)
+        return scores.view(hypotheses.shape[:-1])
 
     @torch.no_grad()
     def agree(
-        self, tried: Float[Tensor, "*batch k h 3"], memory: Tensor | None = None
+        self, hypotheses: Float[Tensor, "*batch k h 3"], memory: Tensor | None = None
     ) -> Float[Tensor, "*batch k h n"]:
-        """Give 1 where a line agrees with a hypothesis, else 0; the answer lies in ``memory``."""
-        flat = tried.detach().flatten(0, -3)
-        square, ones = flat.square().sum(-1, keepdim=True), torch.ones_like(flat[..., :1])
+        """Give 1 where a line agrees with a hypothesis, else 0; a view of ``memory``, if given."""
+        flat = hypotheses.detach().flatten(0, -3)
+        square = flat.square().sum(-1, keepdim=True)
+        ones = torch.ones_like(flat[..., :1])
         shape = (*flat.shape[:2], self._w.shape[-1])
         size = math.prod(shape)
-        memory = tried.new_empty(2, size) if memory is None else memory
+        memory = hypotheses.new_empty(2, size) if memory is None else memory
         along, far = (part[:size].view(shape) for part in memory)
         torch.bmm(torch.cat([flat, ones], -1), self._along, out=along)
         torch.bmm(torch.cat([flat, square, ones], -1), self._far, out=far)
         if self._limit is not None:
             agreed = far.addcmul_(along, along, value=-1).lt_(self._limit)
-        else:  # what points away reaches nothing, and no square is below its own share
+        else:  # a vote that points away gets an along of 0, and does not agree
             agreed = far.addcmul_(along.clamp_(min=0), along, value=-1).lt_(0)
-        return agreed.view(*tried.shape[:-1], shape[-1])
+        return agreed.view(*hypotheses.shape[:-1], shape[-1])
 
 
-_LEAST = 4  # keypoints that must agree: three fix a pose with nothing left to contradict it
+_LEAST_KEYPOINTS = 4  # that must agree: three fix a pose with nothing left to contradict it
 _STEPS = 4  # Gauss-Newton from Kabsch: the fourth step is below float64's noise
 
 
 def fits_of(vote: Vote, model: ObjectModel, config: EstimateConfig) -> PoseFit | Refusal:
-    """Fit the keypoints that agree; where ICP refines the fits, also all of them.
+    """Fit a pose to the keypoints that are consistent; where ICP follows, also to all of them.
 
     Returns:
-        One fit or two as a batch; or why there is none.
+        A batch of one or two fits; or why there is none.
     """
-    is_intersection = (vote.condition <= config.voting.max_condition) & (vote.inlier_share > 0)
-    total = len(is_intersection)
-    met = int(is_intersection.sum())
-    if met < _LEAST:
+    # Keypoints at which the votes meet.
+    is_met = (vote.condition <= config.voting.max_condition) & (vote.inlier_share > 0)
+    total = len(is_met)
+    if int(is_met.sum()) < _LEAST_KEYPOINTS:
         return Refusal(
             status="votes do not meet",
-            reason=f"the directions meet at {met} of {total} keypoints, but {_LEAST} are "
-            "needed: too few points, or not the object that the mask promises",
+            reason=f"the directions meet at {int(is_met.sum())} of {total} keypoints, but "
+            f"{_LEAST_KEYPOINTS} are needed: too few points, or not the object that the mask "
+            "promises",
         )
-    strict, rough = config.voting.rigidity_diameters, config.rough_rigidity_diameters
-    limit_m = model.diameter_m * (rough if config.with_icp else strict)
-    used = consistent_keypoints(vote.keypoints_m, model.keypoints_m, limit_m, is_intersection)
-    choices = [used] if int(used.sum()) >= _LEAST else []
-    if config.with_icp and not torch.equal(used, is_intersection):
-        choices.append(is_intersection)
+
+    # Of these the ones with the model's distances.
+    limit_diameters = (
+        config.rough_rigidity_diameters if config.with_icp else config.voting.rigidity_diameters
+    )
+    limit_m = model.diameter_m * limit_diameters
+    is_consistent = consistent_keypoints(vote.keypoints_m, model.keypoints_m, limit_m, is_met)
+    consistent = int(is_consistent.sum())
+    choices = [is_consistent] if consistent >= _LEAST_KEYPOINTS else []
+    if config.with_icp and not torch.equal(is_consistent, is_met):
+        choices.append(is_met)
     if not choices:
         return Refusal(
             status="keypoints do not fit",
-            reason=f"{int(used.sum())} of {total} keypoints have the model's distances within "
-            f"{limit_m:.2g} m, but {_LEAST} are needed: another object, or too much of it occluded",
+            reason=f"{consistent} of {total} keypoints have the model's distances within "
+            f"{limit_m:.2g} m, but {_LEAST_KEYPOINTS} are needed: another object, or too much of "
+            "it occluded",
         )
     count = len(choices)
     return fit_pose(
@@ -315,54 +356,67 @@ def fit_pose(
     model_keypoints_m: Float[Tensor, "k 3"],
     is_used: Bool[Tensor, "*batch k"] | None = None,
 ) -> PoseFit:
-    """Carry the model's keypoints onto the found ones.
+    """Fit the pose that moves the model's keypoints onto observed ones.
 
-    Begins with the weighted Kabsch fit, weights one over each covariance's trace, then minimises
-    ``sum e^T C^-1 e`` with ``e = R m + t - p`` over left perturbations. A vote is far surer across
-    its lines than along them, which one weight a keypoint cannot say. The covariance of the pose is
-    the inverse of ``sum J^T C^-1 J`` with ``J = [-[R m + t]_x, I]``.
+    Begins with the weighted Kabsch fit, weights the trace of each inverse covariance, then
+    minimises ``sum e^T C^-1 e`` with ``e = R m + t - p`` over left perturbations: a keypoint is far
+    more certain across its votes' lines than along them, which one weight cannot express. The
+    covariance of the pose is the inverse of ``sum J^T C^-1 J`` with ``J = [-[R m + t]_x, I]``.
 
     Args:
-        keypoints_m: found, in the camera frame.
-        covariance_m2: of each; a lower bound keeps exact keypoints finite.
-        model_keypoints_m: known, in the model frame.
-        is_used: which count; None: all. Three at least, not on a line.
+        keypoints_m: observed, in the camera frame.
+        covariance_m2: of each; a lower bound keeps the information of exact keypoints finite.
+        model_keypoints_m: in the model frame.
+        is_used: which keypoints count; None: all. Three at least, not on a line.
 
     Raises:
         InputError: fewer than three keypoints are used.
     """
-    found, model = keypoints_m.double(), model_keypoints_m.double()
-    model = model.expand_as(found)
-    used = torch.ones_like(found[..., 0], dtype=torch.bool) if is_used is None else is_used
-    # No keypoint is known better than a millionth of the object, whatever its votes say.
-    spread = (model - model.mean(-2, keepdim=True)).square().sum(-1).mean(-1)
-    floor = (1e-12 * spread)[..., None, None, None] * torch.eye(3).to(model)
-    information = torch.linalg.inv(covariance_m2.double() + floor) * used[..., None, None]
+    observed_m = keypoints_m.double()
+    model_m = model_keypoints_m.double().expand_as(observed_m)
+    used = torch.ones_like(observed_m[..., 0], dtype=torch.bool) if is_used is None else is_used
+
+    # Information of each keypoint; none is known better than a millionth of the object.
+    spread_m2 = (model_m - model_m.mean(-2, keepdim=True)).square().sum(-1).mean(-1)
+    floor_m2 = (1e-12 * spread_m2)[..., None, None, None] * torch.eye(3).to(model_m)
+    information = torch.linalg.inv(covariance_m2.double() + floor_m2) * used[..., None, None]
+
+    # Kabsch. One keypoint that looks exact must not decide alone; a rotation takes three.
     trace = information.diagonal(dim1=-2, dim2=-1).sum(-1)
-    # One keypoint that looks exact must not decide alone; a rotation takes three.
     most = 100 * trace.median(-1, keepdim=True).values.clamp(min=1e-300)
-    pose = fit_rigid(model, found, trace.clamp(max=most))
-    moved_m, eye = pose.apply(model), torch.eye(3).to(model).expand(*model.shape, 3)
-    steps = 0
-    while True:
-        # The information matrix of (rotation, translation), and the right side.
-        J = torch.cat([-cross_matrix(moved_m), eye], -1)
-        weighted = J.mT @ information
-        H = (weighted @ J).sum(-3)
-        if steps == _STEPS:
-            break
-        pull = (weighted @ (found - moved_m)[..., None]).sum(-3).squeeze(-1)
-        motion = torch.linalg.solve(H, pull)
+    pose = fit_rigid(model_m, observed_m, trace.clamp(max=most))
+
+    for _ in range(_STEPS):  # of Gauss-Newton
+        moved_m = pose.apply(model_m)
+        weighted, H = _pose_information(moved_m, information)
+        gradient = (weighted @ (observed_m - moved_m)[..., None]).sum(-3).squeeze(-1)
+        motion = torch.linalg.solve(H, gradient)
         pose = Rigid(rotation_by(motion[..., :3]), motion[..., 3:]) @ pose
-        moved_m = pose.apply(model)
-        steps += 1
-    error_m = moved_m - found
-    square = (error_m.square().sum(-1) * used).sum(-1) / used.sum(-1)
+
+    moved_m = pose.apply(model_m)
+    _, H = _pose_information(moved_m, information)
+    error_m = moved_m - observed_m
+    mean_square_m2 = (error_m.square().sum(-1) * used).sum(-1) / used.sum(-1)
     return PoseFit(
         camera_from_model=Rigid(pose.R.to(keypoints_m), pose.t_m.to(keypoints_m)),
         covariance=torch.linalg.inv(H).to(keypoints_m),
-        residual_m=square.sqrt().to(keypoints_m),
+        residual_m=mean_square_m2.sqrt().to(keypoints_m),
     )
+
+
+def _pose_information(
+    moved_m: Float64[Tensor, "*batch k 3"], information: Float64[Tensor, "*batch k 3 3"]
+) -> tuple[Float64[Tensor, "*batch k 6 3"], Float64[Tensor, "*batch 6 6"]]:
+    """Give ``J^T C^-1`` of each keypoint and ``sum J^T C^-1 J``, by left perturbations of a pose.
+
+    Args:
+        moved_m: keypoints of the model at the pose.
+        information: ``C^-1`` of each observed keypoint.
+    """
+    eye = torch.eye(3).to(moved_m).expand(*moved_m.shape, 3)
+    J = torch.cat([-cross_matrix(moved_m), eye], -1)
+    weighted = J.mT @ information
+    return weighted, (weighted @ J).sum(-3)
 
 
 def consistent_keypoints(
@@ -371,35 +425,37 @@ def consistent_keypoints(
     tolerance_m: float,
     is_found: Bool[Tensor, "*batch k"] | None = None,
 ) -> Bool[Tensor, "*batch k"]:
-    """Outvote keypoints until no pair of those that stay breaks its distance.
+    """Remove keypoints until all pairs that remain have the distance of the model.
 
-    In each round the keypoint in most broken pairs goes; of equals the one with the larger sum of
-    errors. Two keypoints that are wrong together by a common motion cannot be distinguished from
-    right ones by this test, except where they are in the minority.
+    In each round the keypoint in most inconsistent pairs is removed; of equals the one with the
+    larger sum of errors. Keypoints that are wrong by a common motion pass this test, unless they
+    are in the minority.
 
     Args:
-        keypoints_m: found.
-        model_keypoints_m: known, in any frame: distances alone count.
-        tolerance_m: by how much a distance may differ.
-        is_found: those to begin with; None: all.
+        keypoints_m: observed.
+        model_keypoints_m: in any frame, for distances alone count.
+        tolerance_m: largest difference of a distance.
+        is_found: keypoints to begin with; None: all.
 
     Returns:
-        Those that stay; three or more of them fix a pose.
+        Those that remain; three or more of them fix a pose.
     """
-    found, known = (
-        (points_m[..., :, None, :] - points_m[..., None, :, :]).norm(dim=-1)
-        for points_m in (keypoints_m, model_keypoints_m.to(keypoints_m))
-    )
-    errors_m = (found - known).abs()
+    distance_m = _pairwise_distance(keypoints_m)
+    model_distance_m = _pairwise_distance(model_keypoints_m.to(keypoints_m))
+    errors_m = (distance_m - model_distance_m).abs()
     count = keypoints_m.shape[-2]
-    stays = torch.ones(keypoints_m.shape[:-1], dtype=torch.bool, device=keypoints_m.device)
-    stays = stays if is_found is None else is_found.clone()
-    # Errors beyond the limit decide ties: capped, so that they never weigh as much as a pair.
+    remains = torch.ones(keypoints_m.shape[:-1], dtype=torch.bool, device=keypoints_m.device)
+    remains = remains if is_found is None else is_found.clone()
+    # Errors decide ties: they are capped, so that together they weigh less than one pair.
     severity = (errors_m / tolerance_m).clamp(max=100.0) / (200.0 * count)
     for _ in range(count):
-        pairs = stays[..., :, None] & stays[..., None, :]
-        broken = pairs & (errors_m > tolerance_m)
-        blame = (broken * (1 + severity)).sum(-1)
-        worst = torch.nn.functional.one_hot(blame.argmax(-1), count).bool()
-        stays = stays & ~(worst & broken.any((-1, -2))[..., None])
-    return stays
+        is_pair = remains[..., :, None] & remains[..., None, :]
+        is_inconsistent = is_pair & (errors_m > tolerance_m)
+        blame = (is_inconsistent * (1 + severity)).sum(-1)
+        is_worst = torch.nn.functional.one_hot(blame.argmax(-1), count).bool()
+        remains = remains & ~(is_worst & is_inconsistent.any((-1, -2))[..., None])
+    return remains
+
+
+def _pairwise_distance(points_m: Float[Tensor, "*batch k 3"]) -> Float[Tensor, "*batch k k"]:
+    return (points_m[..., :, None, :] - points_m[..., None, :, :]).norm(dim=-1)

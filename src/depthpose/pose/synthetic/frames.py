@@ -20,35 +20,38 @@ from depthpose.pose.mesh import drawn_triangles, sample_surface
 from depthpose.pose.synthetic.views import random_index, random_rotation, simulate_depth, uniform
 from depthpose.pose.types import ObjectModel
 
-_WAVES = 6
+_WAVES = 6  # of a pattern
 _COLOUR_SEED = 0xC0102
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Pattern:
-    """Colour of a point: linear RGB, waves of brightness and hue [rad/m], and a share of gloss."""
+    """The colour of a surface by place: a base colour that waves in space change."""
 
-    base: Float[Tensor, "3"]
-    waves: Float[Tensor, "w 3"]
-    frequencies: Float[Tensor, "w 3"]
-    phases: Float[Tensor, " w"]
-    gloss: float
+    base: Float[Tensor, "3"]  # linear RGB
+    waves: Float[Tensor, "w 3"]  # amplitude of each wave in RGB, a share of the base
+    frequencies: Float[Tensor, "w 3"]  # [rad/m] along x, y and z
+    phases: Float[Tensor, " w"]  # [rad]
+    gloss: float  # share of the lamp's light that is mirrored
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Solid:
-    """One thing of a scene, in its own frame; ``number``: its ``obj_id``, None of clutter."""
+    """A body of a scene, in its own frame."""
 
     triangles_m: Float[Tensor, "n 3 3"]
-    normals: Float[Tensor, "n 3 3"]
+    normals: Float[Tensor, "n 3 3"]  # at each corner
     pattern: Pattern
-    number: int | None
+    number: int | None  # ``obj_id``; None for clutter
 
 
 def random_pattern(
     generator: torch.Generator, size_m: float, colourful: tuple[float, float] = (0.0, 0.8)
 ) -> Pattern:
-    """Draw a colour, plain or patterned, with features of about a third of a size."""
+    """Draw a pattern whose features are about a third of a size.
+
+    ``colourful`` is the range of the share of a hue, against grey.
+    """
     strength = uniform(generator, 0.0, 0.25)
     directions = torch.randn(_WAVES, 3, generator=generator)
     grey = uniform(generator, 0.1, 0.8)
@@ -66,7 +69,7 @@ def random_pattern(
 
 
 def random_clutter(generator: torch.Generator) -> Solid:
-    """Draw a box, a ball or a can of no known object."""
+    """Draw clutter: a box, a ball or a can."""
     import trimesh
 
     size_m = uniform(generator, 0.04, 0.15)
@@ -94,10 +97,17 @@ def shade(
     lamp: Float[Tensor, "3"],
     ambient: Float[Tensor, "3"],
 ) -> Float[Tensor, "n 3"]:
-    """Colour of each pixel that sees something, in the order of the image's rows.
+    """Shade the pixels of a raster that show a surface, in the order of the image's rows.
 
-    By Lambert's law and a mirrored lamp (Blinn 1977); no shadow is cast. The lamp is far away,
-    ``towards`` a unit vector of the camera's frame; ambient light comes from everywhere.
+    By Lambert's law and a mirrored lamp (Blinn 1977); no shadow is cast.
+
+    Args:
+        placed: bodies and their poses ``camera_from_body``, in the order of the raster's triangles.
+        raster: of all of them.
+        K: intrinsic matrix.
+        towards: unit vector to the lamp, which is far away, in the camera frame.
+        lamp: colour of its light, linear RGB.
+        ambient: colour of the light from everywhere.
     """
     assert raster.barycentric is not None
     is_seen = raster.primitive >= 0
@@ -109,28 +119,32 @@ def shade(
     for solid, pose in placed:
         stop = start + len(solid.triangles_m)
         of_solid = ((primitive >= start) & (primitive < stop)).nonzero()[:, 0]
+
+        # Normals, toward the camera: both sides of a thin part are visible.
         corners = solid.normals[primitive[of_solid] - start]
         normal = (corners * share[of_solid, :, None]).sum(1) @ pose.R.mT
-        local = pose.inverse().apply(points[of_solid])
         normal = F.normalize(normal, dim=-1)
         sight = F.normalize(-points[of_solid], dim=-1)
-        # Both sides of a thin part are seen.
         normal = normal * torch.where((normal * sight).sum(-1, keepdim=True) < 0, -1.0, 1.0)
+
+        # Light: from the lamp, directly and mirrored, and ambient, half as much from below.
         facing = (normal @ towards).clamp(min=0)[:, None]
         half = F.normalize(sight + towards, dim=-1)
         shine = (normal * half).sum(-1, keepdim=True).clamp(min=0) ** (1 / math.radians(2))
-        # From below comes half of what comes from above.
         open_sky = 0.75 + 0.25 * (normal @ towards)[:, None]
-        base = ambient * open_sky + lamp * facing
-        look = solid.pattern
-        waves = torch.tanh(2 * (local @ look.frequencies.mT + look.phases).sin())
-        plain = (look.base * (1 + waves @ look.waves)).clamp(0.01, 1)
-        colour[of_solid] = plain * base + look.gloss * shine * lamp
+        diffuse = ambient * open_sky + lamp * facing
+
+        # The colour of the surface.
+        pattern = solid.pattern
+        local_m = pose.inverse().apply(points[of_solid])
+        waves = torch.tanh(2 * (local_m @ pattern.frequencies.mT + pattern.phases).sin())
+        albedo = (pattern.base * (1 + waves @ pattern.waves)).clamp(0.01, 1)
+        colour[of_solid] = albedo * diffuse + pattern.gloss * shine * lamp
         start = stop
     return colour
 
 
-_TRIES = 30
+_TRIES = 30  # places that are tried for a body on the table
 _FRAMES_SEED = 0xF4A3E5
 
 
@@ -139,9 +153,14 @@ def make_frames(
 ) -> Iterator[BopFrame]:
     """Make frames of several objects on a table, as BOP lays them out.
 
-    Frame i is a function of the seed and i alone. A frame shows each object once at most, or a pile
-    of one of them (``frame_pile``); poses are exact, sensor errors lie over the depth alone. The
-    numbers of the models become ``obj_id``; so many frames are made, from number ``first`` on.
+    Frame i depends on the seed and i alone. A frame shows each object once at most, or a pile of
+    one of them (``frame_pile``). Poses are exact; the depth has a sensor's errors.
+
+    Args:
+        models: of the objects; their numbers become ``obj_id``.
+        config: of the frames.
+        number: how many frames are made.
+        first: number of the first one.
 
     Raises:
         InputError: no model, two of one number, or a camera that would be inside an object.
@@ -178,55 +197,35 @@ def _make_frame(
     models: Sequence[ObjectModel], solids: Sequence[Solid], config: ObjectsConfig, index: int
 ) -> BopFrame:
     """Render a frame: objects on a table before a blurred background, in colour and depth."""
+    # The scene in the table's frame (z up), and the camera.
     generator = sample_generator(index, config.seed + _FRAMES_SEED)
     if config.frame_pile:
-        world = _piled(models, solids, config, generator)
+        scene = _pile(models, solids, config, generator)
     else:
-        world = _arranged(solids, config, generator)
-    h = 0.5 * uniform(generator, 0.8, 3.0)
-    table = Solid(  # its top, at height 0
-        triangles_m=torch.tensor([[[-h, -h, 0.0], [h, -h, 0.0], [h, h, 0.0]],
-                                  [[-h, -h, 0.0], [h, h, 0.0], [-h, h, 0.0]]]),
-        normals=torch.tensor([0.0, 0.0, 1.0]).expand(2, 3, 3),
-        pattern=random_pattern(generator, uniform(generator, 0.05, 0.5)),
-        number=None,
-    )  # fmt: skip
-    world.append((table, Rigid(torch.eye(3), torch.zeros(3))))
-    view = _viewpoint(config, generator)
-    placed = [(solid, view @ pose) for solid, pose in world]
-    assert config.centre_px is not None, "the config gives what was left out"
+        scene = _arrange(solids, config, generator)
+    scene.append((_random_table(generator), Rigid(torch.eye(3), torch.zeros(3))))
+    camera_from_table = _random_viewpoint(config, generator)
+    placed = [(solid, camera_from_table @ pose) for solid, pose in scene]
+    assert config.centre_px is not None, "the config computes a centre left out"
     fx, fy = config.focal_px
     cx, cy = config.centre_px
     K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+
+    # What each pixel shows: the index of a body, or -1.
     width, height = config.image_px
     corners = [pose.apply(solid.triangles_m) for solid, pose in placed]
     raster = rasterize(torch.cat(corners), K, width, height)
     owner = torch.cat([torch.full((len(c),), i) for i, c in enumerate(corners)])
     visible = torch.where(raster.primitive >= 0, owner[raster.primitive.clamp(min=0)], -1)
-    # Behind the table blots of several sizes over a colour, out of focus.
-    image = torch.rand(3, 1, 1, generator=generator) * torch.ones(1, height, width)
-    for cells in (3, 8, 24):
-        blots = torch.randn(1, 3, cells, cells, generator=generator)
-        smooth = F.interpolate(blots, (height, width), mode="bilinear", align_corners=False)
-        image = image + uniform(generator, 0.0, 0.25) * smooth[0]
-    image = image.clamp(0, 1)
-    # A lamp above the table, warm or cold, strong or weak.
-    up = view.R[:, 2]
-    towards = F.normalize(1.2 * up + 0.8 * torch.randn(3, generator=generator), dim=0)
-    strength = uniform(generator, 0.3, 0.9)
-    warmth = uniform(generator, -0.15, 0.15)
-    colour = torch.tensor([1 + warmth, 1.0, 1 - warmth])
-    ambient = uniform(generator, 0.2, 0.6) * (2 - colour)
-    lit = shade(placed, raster, K, towards, strength * colour, ambient)
-    image[:, raster.primitive >= 0] = lit.mT
-    # Blurred a little, tinted, exposed, with noise, and brought from linear light to sRGB's curve.
-    blur = uniform(generator, 0.0, 0.3)
-    near = F.avg_pool2d(image[None], 3, 1, 1, count_include_pad=False)[0]
-    image = torch.lerp(image, near, blur)
-    tint = 1 + 0.15 * (2 * torch.rand(3, 1, 1, generator=generator) - 1)
-    gain = math.exp(uniform(generator, -0.8, 0.2))
-    noise = uniform(generator, 0.0, 0.02) * torch.randn(image.shape, generator=generator)
-    rgb = (gain * tint * image + noise).clamp(1e-6, 1) ** (1 / 2.2)
+
+    # The picture: a background, lit bodies before it, and a camera's errors.
+    image = _blurred_background(height, width, generator)
+    up = camera_from_table.R[:, 2]
+    towards, lamp, ambient = _random_light(up, generator)
+    image[:, raster.primitive >= 0] = shade(placed, raster, K, towards, lamp, ambient).mT
+    rgb = _photograph(image, generator)
+
+    # Depth, and the bodies that are annotated.
     focal_px = (config.focal_px[0], config.focal_px[0])
     depth_m = simulate_depth(raster.depth_m, focal_px, config.sensor, generator)
     shown: list[BopObject] = []
@@ -247,17 +246,69 @@ def _make_frame(
     return BopFrame(number=index, K=K, depth_m=depth_m, objects=shown, rgb=rgb)
 
 
-def _arranged(
+def _random_table(generator: torch.Generator) -> Solid:
+    """Draw the top of a table, at height 0."""
+    h = 0.5 * uniform(generator, 0.8, 3.0)
+    return Solid(
+        triangles_m=torch.tensor([[[-h, -h, 0.0], [h, -h, 0.0], [h, h, 0.0]],
+                                  [[-h, -h, 0.0], [h, h, 0.0], [-h, h, 0.0]]]),
+        normals=torch.tensor([0.0, 0.0, 1.0]).expand(2, 3, 3),
+        pattern=random_pattern(generator, uniform(generator, 0.05, 0.5)),
+        number=None,
+    )  # fmt: skip
+
+
+def _blurred_background(
+    height: int, width: int, generator: torch.Generator
+) -> Float[Tensor, "3 {height} {width}"]:
+    """Draw a background out of focus: blots of several sizes over a colour."""
+    image = torch.rand(3, 1, 1, generator=generator) * torch.ones(1, height, width)
+    for cells in (3, 8, 24):
+        blots = torch.randn(1, 3, cells, cells, generator=generator)
+        smooth = F.interpolate(blots, (height, width), mode="bilinear", align_corners=False)
+        image = image + uniform(generator, 0.0, 0.25) * smooth[0]
+    return image.clamp(0, 1)
+
+
+def _random_light(
+    up: Float[Tensor, "3"], generator: torch.Generator
+) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"], Float[Tensor, "3"]]:
+    """Draw a lamp above a table: the direction to it, its colour, and that of ambient light."""
+    towards = F.normalize(1.2 * up + 0.8 * torch.randn(3, generator=generator), dim=0)
+    strength = uniform(generator, 0.3, 0.9)
+    warmth = uniform(generator, -0.15, 0.15)
+    colour = torch.tensor([1 + warmth, 1.0, 1 - warmth])
+    ambient = uniform(generator, 0.2, 0.6) * (2 - colour)
+    return towards, strength * colour, ambient
+
+
+def _photograph(
+    image: Float[Tensor, "3 h w"], generator: torch.Generator
+) -> Float[Tensor, "3 h w"]:
+    """Blur, tint and expose linear light, add noise, and encode it as sRGB."""
+    blur = uniform(generator, 0.0, 0.3)
+    near = F.avg_pool2d(image[None], 3, 1, 1, count_include_pad=False)[0]
+    image = torch.lerp(image, near, blur)
+    tint = 1 + 0.15 * (2 * torch.rand(3, 1, 1, generator=generator) - 1)
+    gain = math.exp(uniform(generator, -0.8, 0.2))
+    noise = uniform(generator, 0.0, 0.02) * torch.randn(image.shape, generator=generator)
+    return (gain * tint * image + noise).clamp(1e-6, 1) ** (1 / 2.2)
+
+
+def _arrange(
     solids: Sequence[Solid], config: ObjectsConfig, generator: torch.Generator
 ) -> list[tuple[Solid, Rigid]]:
-    """Lay things on the table, none in another, in the table's frame (z up)."""
+    """Lay bodies on the table, none in another; give their poses in its frame (z up)."""
+    # Some of the objects, and clutter.
     low, high = (min(n, len(solids)) for n in config.frame_objects)
     order = torch.randperm(len(solids), generator=generator)
-    chosen = [solids[i] for i in order[: low + random_index(generator, high - low + 1)].tolist()]
+    objects = low + random_index(generator, high - low + 1)
+    chosen = [solids[i] for i in order[:objects].tolist()]
     low, high = config.frame_clutter
-    chosen += [
-        random_clutter(generator) for _ in range(low + random_index(generator, high - low + 1))
-    ]
+    clutter = low + random_index(generator, high - low + 1)
+    chosen += [random_clutter(generator) for _ in range(clutter)]
+
+    # Each is tried at places farther and farther off, until its circle is free.
     placed: list[tuple[Solid, Rigid]] = []
     circles: list[tuple[float, float, float]] = []
     for solid in chosen:
@@ -265,7 +316,7 @@ def _arranged(
         corners = solid.triangles_m.reshape(-1, 3) @ R.mT
         middle = (corners.amin(0) + corners.amax(0)) / 2
         radius_m = float((corners - middle)[:, :2].norm(dim=1).max())
-        for attempt in range(_TRIES):  # a free place, farther off each time
+        for attempt in range(_TRIES):
             reach_m = 0.08 + 0.015 * attempt + 0.03 * len(circles)
             x, y = (uniform(generator, -reach_m, reach_m) for _ in range(2))
             if all(math.hypot(x - a, y - b) > radius_m + r for a, b, r in circles):
@@ -277,19 +328,22 @@ def _arranged(
     return placed
 
 
-_CELL_M = 0.004
-_DROPS = 10
+_CELL_M = 0.004  # side of a cell of the height map of a pile
+_DROPS = 10  # places that are tried for each body of a pile
 
 
-def _piled(
+def _pile(
     models: Sequence[ObjectModel],
     solids: Sequence[Solid],
     config: ObjectsConfig,
     generator: torch.Generator,
 ) -> list[tuple[Solid, Rigid]]:
-    """Drop copies of one thing straight down until they touch, in the table's frame (z up)."""
-    which = random_index(generator, len(solids))
-    points = sample_surface(models[which], 20000)[0]
+    """Drop copies of one object straight down until they touch; poses in the table's frame (z up).
+
+    Of several drops of each copy the one is taken by which its middle comes to lie lowest.
+    """
+    chosen = random_index(generator, len(solids))
+    points = sample_surface(models[chosen], 20000)[0]
     middle = (points.amin(0) + points.amax(0)) / 2
     points = points - middle
     radius_m = float(points.norm(dim=1).max())
@@ -297,37 +351,40 @@ def _piled(
     cells = math.ceil((reach_m + radius_m) / _CELL_M)
     height_m = torch.zeros((2 * cells + 1) ** 2)
     placed: list[tuple[Solid, Rigid]] = []
-    for _ in range(config.frame_pile):  # each where its middle comes to lie lowest
+    for _ in range(config.frame_pile):
         drops: list[tuple[float, Rigid, Tensor, Tensor]] = []
         for _ in range(_DROPS):
             R = random_rotation(generator).float()
             x, y = (uniform(generator, -reach_m, reach_m) for _ in range(2))
-            turned = points @ R.mT + torch.tensor([x, y, 0.0])
-            column, row = ((turned[:, :2] / _CELL_M).round().long() + cells).unbind(1)
+            moved = points @ R.mT + torch.tensor([x, y, 0.0])
+            column, row = ((moved[:, :2] / _CELL_M).round().long() + cells).unbind(1)
             cell = row * (2 * cells + 1) + column
             bottom = torch.full_like(height_m, math.inf)
-            bottom = bottom.scatter_reduce(0, cell, turned[:, 2], "amin")
+            bottom = bottom.scatter_reduce(0, cell, moved[:, 2], "amin")
             z = float((height_m - bottom)[bottom.isfinite()].max())
             t = torch.tensor([x, y, z]) - R @ middle
-            drops.append((z, Rigid(R, t), cell, turned[:, 2] + z))
+            drops.append((z, Rigid(R, t), cell, moved[:, 2] + z))
         _, pose, cell, top = min(drops, key=lambda drop: drop[0])
         height_m = height_m.scatter_reduce(0, cell, top, "amax")
-        placed.append((solids[which], pose))
+        placed.append((solids[chosen], pose))
     return placed
 
 
-def _viewpoint(config: ObjectsConfig, generator: torch.Generator) -> Rigid:
-    """Look down at about the middle of the table, from 25 to 85 degrees above it."""
-    up = math.radians(uniform(generator, 25.0, 85.0))
-    around = uniform(generator, 0.0, 2 * math.pi)
+def _random_viewpoint(config: ObjectsConfig, generator: torch.Generator) -> Rigid:
+    """Draw a camera that looks down at about the middle of the table; ``camera_from_table``.
+
+    It is 25 to 85 degrees above the table.
+    """
+    elevation = math.radians(uniform(generator, 25.0, 85.0))
+    azimuth = uniform(generator, 0.0, 2 * math.pi)
     distance_m = uniform(generator, *config.distance_m)
-    flat = math.cos(up)
-    eye = [flat * math.cos(around), flat * math.sin(around), math.sin(up)]
+    flat = math.cos(elevation)
+    eye = [flat * math.cos(azimuth), flat * math.sin(azimuth), math.sin(elevation)]
     forward = -torch.tensor(eye)
-    right = torch.nn.functional.normalize(
-        torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0])), dim=0
-    )
+    right = F.normalize(torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0])), dim=0)
     R = torch.stack([right, torch.linalg.cross(forward, right), forward])
+
+    # Rolled a little, and about a point near the middle.
     roll = uniform(generator, -0.3, 0.3)
     c = math.cos(roll)
     s = math.sin(roll)

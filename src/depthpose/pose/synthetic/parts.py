@@ -1,4 +1,4 @@
-"""CAD parts of our own, made by formula: for the demo, the default weights, and tests.
+"""Synthetic CAD parts, made by formula: for the demo, the default weights, and tests.
 
 Each is a few closed surfaces that run into one another, as assemblies are exported; the sizes are
 in millimetres, as CAD files are.
@@ -17,16 +17,16 @@ from depthpose.pose.types import Axis, ObjectModel, Symmetries
 
 Mesh = tuple[np.ndarray, np.ndarray]  #: corners (n, 3) [mm]; outward faces (m, 3)
 
-_ROUND = 96  # corners of a circle
-_TEETH = 6
+_CIRCLE_CORNERS = 96
+_TEETH = 6  # of the flange
 
 
 PARTS = ("bracket", "flange", "mug", "connector", "spool")
-"""Parts by name."""
+"""Names of the parts."""
 
 
 def make_part(name: str, number: int = 0, config: MeshConfig | None = None) -> ObjectModel:
-    """Make a part of our own by its name, with the symmetries that it has by construction.
+    """Make a part by its name, with the symmetries that it has by construction.
 
     Raises:
         InputError: there is no such part.
@@ -67,7 +67,7 @@ def part_mesh(name: str) -> Mesh:
                 moved(ring(circle(9.0), circle(4.0), 22.0), (38.0, -18.0, 12.0)),
             )
         case "flange":  # a disc with teeth and a hub on one side: alike after sixths of a turn
-            angle = np.arange(_ROUND) * (2 * math.pi / _ROUND)
+            angle = np.arange(_CIRCLE_CORNERS) * (2 * math.pi / _CIRCLE_CORNERS)
             radius = 50 + 9 * np.tanh(4 * np.cos(_TEETH * angle))
             outer = np.stack([radius * np.cos(angle), radius * np.sin(angle)], 1)
             disc = ring(outer, circle(14.0), 14.0)
@@ -102,17 +102,24 @@ def part_mesh(name: str) -> Mesh:
 
 
 def circle(radius: float) -> np.ndarray:
-    """Corners of a circle about the origin (n, 2)."""
-    angle = np.arange(_ROUND) * (2 * math.pi / _ROUND)
+    """Give the corners of a circle about the origin (n, 2)."""
+    angle = np.arange(_CIRCLE_CORNERS) * (2 * math.pi / _CIRCLE_CORNERS)
     return radius * np.stack([np.cos(angle), np.sin(angle)], 1)
 
 
 def _plate(size: tuple[float, float, float], hole_at: tuple[float, float], hole: float) -> Mesh:
-    """A plate with a round hole of a diameter; the outline is seen from the hole."""
+    """Make a plate about the origin with a round hole.
+
+    Args:
+        size: in x, y and z.
+        hole_at: x and y of the middle of the hole.
+        hole: its diameter.
+    """
+    # The outline about the middle of the hole: where rays from it at equal angles meet the border.
     unit = circle(1.0)
-    at = np.array(hole_at)
-    low = -np.array(size[:2]) / 2 - at
-    high = np.array(size[:2]) / 2 - at
+    middle = np.array(hole_at)
+    low = -np.array(size[:2]) / 2 - middle
+    high = np.array(size[:2]) / 2 - middle
     with np.errstate(divide="ignore", invalid="ignore"):
         extent = np.where(unit > 0, high / unit, np.where(unit < 0, low / unit, np.inf)).min(1)
     corners = np.array([[x, y] for x in (low[0], high[0]) for y in (low[1], high[1])])
@@ -124,7 +131,7 @@ def _plate(size: tuple[float, float, float], hole_at: tuple[float, float], hole:
 
 
 def ring(outer: np.ndarray, inner: np.ndarray, height: float) -> Mesh:
-    """What lies between two outlines of as many corners, from -height/2 to height/2."""
+    """Extrude the area between two outlines of equally many corners, from -height/2 to height/2."""
     low, high = (np.full((len(outer), 1), z) for z in (-height / 2, height / 2))
     loops = [
         np.hstack([outer, low]),
@@ -144,13 +151,16 @@ def box(size: tuple[float, float, float]) -> Mesh:
 
 
 def revolved(profile: list[tuple[float, float]]) -> Mesh:
-    """Turn (radius, height) about z, from the lower end of the axis along the outside and back."""
-    loops = [np.hstack([circle(r), np.full((_ROUND, 1), z)]) for r, z in profile]
+    """Revolve a profile of (radius, height) about z.
+
+    It begins at the lower end of the axis, goes up along the outside, and comes back to the axis.
+    """
+    loops = [np.hstack([circle(r), np.full((_CIRCLE_CORNERS, 1), z)]) for r, z in profile]
     return _skin(loops)
 
 
 def _hose(path: np.ndarray, radius: float) -> Mesh:
-    """A round hose along a path in a plane y = constant, closed at its ends."""
+    """Make a round hose along a path in a plane y = constant, closed at its ends."""
     along = np.gradient(path, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     side = np.array([0.0, 1.0, 0.0])
@@ -159,12 +169,15 @@ def _hose(path: np.ndarray, radius: float) -> Mesh:
     for point, direction in zip(path, along, strict=True):
         across = np.cross(side, direction)
         loops.append(point + outline[:, :1] * across + outline[:, 1:] * side)
-    ends = [np.repeat(path[i][None], _ROUND, 0) for i in (0, -1)]
+    ends = [np.repeat(path[i][None], _CIRCLE_CORNERS, 0) for i in (0, -1)]
     return _skin([ends[0], *loops, ends[1]])
 
 
 def _skin(loops: list[np.ndarray]) -> Mesh:
-    """Join loops of as many corners, counter-clockwise seen against their order."""
+    """Make the surface between successive loops of equally many corners.
+
+    Corners run counter-clockwise, as seen against the order of the loops.
+    """
     count = len(loops[0])
     vertices = np.concatenate(loops)
     i, j = np.meshgrid(np.arange(len(loops) - 1), np.arange(count), indexing="ij")
@@ -179,12 +192,12 @@ def _skin(loops: list[np.ndarray]) -> Mesh:
 
 
 def moved(mesh: Mesh, shift: tuple[float, ...]) -> Mesh:
-    """Shift a mesh."""
+    """Give a mesh shifted by a vector."""
     return mesh[0] + np.array(shift), mesh[1]
 
 
 def turned(mesh: Mesh, axis: tuple[float, float, float], degrees: float) -> Mesh:
-    """Turn a mesh about an axis through the origin."""
+    """Give a mesh rotated about an axis through the origin."""
     turn = turn_about(
         torch.tensor(axis, dtype=torch.float64),
         torch.zeros(3).double(),
@@ -194,7 +207,7 @@ def turned(mesh: Mesh, axis: tuple[float, float, float], degrees: float) -> Mesh
 
 
 def joined(*meshes: Mesh) -> Mesh:
-    """Put meshes into one."""
+    """Give several meshes as one."""
     starts = np.cumsum([0, *(len(vertices) for vertices, _ in meshes)])
     faces = [faces + start for (_, faces), start in zip(meshes, starts, strict=False)]
     return np.concatenate([vertices for vertices, _ in meshes]), np.concatenate(faces)

@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
+from depthpose.core.camera.pinhole import crop_intrinsics
 from depthpose.core.errors import InputError
 from depthpose.core.loop import sample_generator
 from depthpose.core.render import rasterize
@@ -34,11 +35,11 @@ Depth = Float[Tensor, "h w"]
 Mask = Bool[Tensor, "h w"]
 
 _KINECT_BASELINE_M = 0.075
-_STEPS_A_PIXEL = 8
+_KINECT_STEPS_PER_PX = 8  # of its disparity
 _STEREO_BASELINE_M = 0.05
-_STEREO_STEPS_A_PIXEL = 32
-_STEREO_CORRELATION_PX = (3.0, 6.0)
-_STEREO_WINDOW = 2  # pixels by which active stereo displaces an edge at most
+_STEREO_STEPS_PER_PX = 32
+_STEREO_CORRELATION_PX = (3.0, 6.0)  # range of the width of its noise
+_STEREO_WINDOW_PX = 2  # by which active stereo displaces an edge at most
 _STEEPEST = math.tan(math.radians(80))
 """No sensor reads a surface that is turned farther away than 80 degrees."""
 _JUMP = 0.02
@@ -69,9 +70,10 @@ def random_rotation(generator: torch.Generator) -> Float[Tensor, "3 3"]:
 
 
 def random_levels(height: int, width: int, generator: torch.Generator) -> Depth:
-    """Draw a function whose lower parts are half-planes, ellipses, boxes or convex polygons.
+    """Draw an image whose sublevel sets are half-planes, ellipses, boxes or convex polygons.
 
-    Cut at a quantile, it occludes exactly the wanted share of anything.
+    Where it lies below a quantile of its values on an object, exactly that share of the object is
+    occluded.
     """
     size = max(height, width)
     angle = uniform(generator, 0.0, 2 * math.pi)
@@ -91,27 +93,31 @@ def random_levels(height: int, width: int, generator: torch.Generator) -> Depth:
             return torch.maximum(along.abs(), across.abs())
         case _:  # a convex polygon
             sides = 3 + random_index(generator, 4)
-            turns = torch.rand(sides, generator=generator).cumsum(0)
-            angles = 2 * math.pi * turns / (turns[-1] + uniform(generator, 0.2, 0.8))
-            far = 0.5 + torch.rand(sides, generator=generator)
+            gaps = torch.rand(sides, generator=generator).cumsum(0)
+            angles = 2 * math.pi * gaps / (gaps[-1] + uniform(generator, 0.2, 0.8))
+            extents = 0.5 + torch.rand(sides, generator=generator)
             level = torch.full_like(along, -torch.inf)
-            for turn, extent in zip(angles.tolist(), far.tolist(), strict=True):
-                side = (math.cos(turn) * along + math.sin(turn) * across) / extent
-                level = torch.maximum(level, side)
+            for side_angle, extent in zip(angles.tolist(), extents.tolist(), strict=True):
+                side = math.cos(side_angle) * along + math.sin(side_angle) * across
+                level = torch.maximum(level, side / extent)
             return level
 
 
 def occlude(
     depth_m: Depth, silhouette: Mask, share: float, generator: torch.Generator
 ) -> tuple[Depth, Mask]:
-    """Occlude exactly a share of a silhouette by something before it; give what is left of both."""
+    """Occlude exactly a share of a silhouette by something before it.
+
+    Returns:
+        The depth with the occluder, and the part of the silhouette that stays visible.
+    """
     count = round(share * int(silhouette.sum()))
     levels = random_levels(depth_m.shape[0], depth_m.shape[1], generator)
     gap_m = uniform(generator, 0.005, 0.15)
     if count == 0:
         return depth_m, silhouette
     is_hidden = levels <= levels[silhouette].kthvalue(count).values
-    # Nearer than all that it occludes.
+    # The occluder is nearer than all that it occludes.
     nearest_m = depth_m.masked_fill(~(silhouette & is_hidden), torch.inf).min()
     occluder_m = (nearest_m - gap_m).clamp(min=0.1 * nearest_m)
     return torch.where(is_hidden, occluder_m, depth_m), silhouette & ~is_hidden
@@ -123,87 +129,121 @@ def simulate_depth(
     config: SyntheticSensorConfig,
     generator: torch.Generator,
 ) -> Depth:
-    """Measure a clean depth window as a sensor would.
+    """Simulate the measurement of a clean depth window by a sensor.
 
     Args:
-        depth_m: of every pixel of the window; NaN where there is nothing.
+        depth_m: of every pixel of the window; NaN where there is no surface.
         focal_px: of this window, and of the sensor's full image (which says how fine its disparity
             is).
-        config: kinds of sensor, and how bad they are.
-        generator: of the chance.
+        config: kinds of sensor, and their errors.
+        generator: of random numbers.
     """
     kind: SensorKind = config.kinds[random_index(generator, len(config.kinds))]
     noise = uniform(generator, *config.noise)
     missing = uniform(generator, *config.missing)
     if kind == "none":
         return depth_m
-    steepest = _STEEPEST if kind != "laser" else 2 * _STEEPEST
-    # Lost is what is seen at a grazing angle: one pixel on, the depth changes by far too much.
-    limit_m = depth_m * (steepest / focal_px[0])
-    is_lost = torch.zeros_like(depth_m, dtype=torch.bool)
-    across = depth_m.diff(dim=1).abs_()
-    down = depth_m.diff(dim=0).abs_()
-    # A jump to another surface is steep on one side alone: the flatter side decides.
-    is_lost[:, 1:-1] = torch.fmin(across[:, 1:], across[:, :-1]) > limit_m[:, 1:-1]
-    is_lost[1:-1] |= torch.fmin(down[1:], down[:-1]) > limit_m[1:-1]
-    # Half of the missing readings singly, half in patches.
-    height, width = depth_m.shape
-    is_lost |= torch.rand(height, width, generator=generator) < 0.5 * missing
-    coarse = torch.rand(1, 1, 2 + height // 12, 2 + width // 12, generator=generator)
-    patches = F.interpolate(coarse, (height, width), mode="bilinear", align_corners=False)[0, 0]
-    # Their level is met on every fourth row and column: the share is a matter of chance anyway.
-    some = patches[::4, ::4].flatten()
-    if count := round(0.5 * missing * len(some)):
-        is_lost |= patches <= some.kthvalue(count).values
+    is_lost = _is_too_steep(depth_m, focal_px[0], is_laser=kind == "laser")
+    is_lost |= _random_gaps(depth_m.shape, missing, generator)
+
+    # Noise that neighbours share, by a width in pixels of the full image.
     correlation_px = config.noise_correlation_px
     if kind == "active stereo":
         correlation_px = correlation_px or _STEREO_CORRELATION_PX
-    of_full = focal_px[0] / focal_px[1]
-    width_px = of_full * uniform(generator, *correlation_px) if correlation_px else 0.0
-    white = noise * smooth_noise((depth_m.shape[0], depth_m.shape[1]), width_px, generator)
+    scale = focal_px[0] / focal_px[1]
+    width_px = scale * uniform(generator, *correlation_px) if correlation_px else 0.0
+    unit_noise = noise * smooth_noise((depth_m.shape[0], depth_m.shape[1]), width_px, generator)
+
     if kind == "structured light":
         is_lost |= _is_shadowed(depth_m, focal_px[0])
-        # Each pixel reads one that is a pixel or none away: edges are blurred. At the ends of a row
-        # it reads beyond; windows have a margin there.
-        steps = torch.tensor([-1, 0, 0, 1])
-        index = torch.arange(height * width)
-        moves = (steps[:, None] * width + steps).flatten()
-        index += moves[torch.randint(16, (height * width,), generator=generator)]
-        index = index.clamp_(0, height * width - 1)
-        read_m = depth_m.reshape(-1)[index].view(height, width)
+        read_m = _swap_neighbours(depth_m, generator)
         # Nguyen, Izadi and Lovell 2012: sigma_z = 0.0012 + 0.0019 (z - 0.4)^2 [m].
-        read_m = read_m + white * (0.0012 + 0.0019 * (read_m - 0.4).square())
-        scale = _STEPS_A_PIXEL * focal_px[1] * _KINECT_BASELINE_M
-        read_m = scale / (scale / read_m).round()
+        read_m = read_m + unit_noise * (0.0012 + 0.0019 * (read_m - 0.4).square())
+        scale_px_m = _KINECT_STEPS_PER_PX * focal_px[1] * _KINECT_BASELINE_M
+        read_m = _round_disparity(read_m, scale_px_m)
     elif kind == "active stereo":
         is_lost |= _is_shadowed(depth_m.flip(1), focal_px[0], _STEREO_BASELINE_M).flip(1)
-        first, other = (_displaced(depth_m, of_full, generator) for _ in range(2))
-        read_m = torch.lerp(first, other, torch.rand(depth_m.shape, generator=generator))
-        read_m = read_m + white * 0.003 * read_m.square()
-        scale = _STEREO_STEPS_A_PIXEL * focal_px[1] * _STEREO_BASELINE_M
-        read_m = scale / (scale / read_m).round()
+        first, second = (_displace(depth_m, scale, generator) for _ in range(2))
+        read_m = torch.lerp(first, second, torch.rand(depth_m.shape, generator=generator))
+        read_m = read_m + unit_noise * 0.003 * read_m.square()
+        scale_px_m = _STEREO_STEPS_PER_PX * focal_px[1] * _STEREO_BASELINE_M
+        read_m = _round_disparity(read_m, scale_px_m)
     elif kind == "time of flight":
-        # A pixel is mixed with its right or lower neighbour where depth jumps.
-        share = torch.rand(depth_m.shape, generator=generator)
-        right = depth_m.roll(-1, 1)
-        lower = depth_m.roll(-1, 0)
-        right[:, -1] = depth_m[:, -1]
-        lower[-1] = depth_m[-1]
-        read_m = depth_m
-        for other in (right, lower):
-            is_jump = (other - read_m).abs() > _JUMP * read_m
-            read_m = torch.where(is_jump, torch.lerp(read_m, other, share), read_m)
-        read_m = read_m + white * (0.001 + 0.002 * read_m.square())
+        read_m = _mix_at_jumps(depth_m, generator)
+        read_m = read_m + unit_noise * (0.001 + 0.002 * read_m.square())
     else:
-        read_m = depth_m + 0.0005 * white
+        read_m = depth_m + 0.0005 * unit_noise
     read_m = read_m + uniform(generator, *config.offset_m)
     return torch.where(is_lost, torch.nan, read_m)
 
 
-def smooth_noise(size: tuple[int, int], width_px: float, generator: torch.Generator) -> Depth:
-    """Draw normal noise of deviation 1 that neighbours share: white noise under a Gaussian.
+def _is_too_steep(depth_m: Depth, focal_px: float, *, is_laser: bool) -> Mask:
+    """Mark pixels of a surface seen at a grazing angle, which a sensor does not read."""
+    steepest = 2 * _STEEPEST if is_laser else _STEEPEST
+    limit_m = depth_m * (steepest / focal_px)  # largest change of depth to the next pixel
+    across_m = depth_m.diff(dim=1).abs_()
+    down_m = depth_m.diff(dim=0).abs_()
+    # A jump to another surface is steep on one side alone: the flatter side decides.
+    is_steep = torch.zeros_like(depth_m, dtype=torch.bool)
+    is_steep[:, 1:-1] = torch.fmin(across_m[:, 1:], across_m[:, :-1]) > limit_m[:, 1:-1]
+    is_steep[1:-1] |= torch.fmin(down_m[1:], down_m[:-1]) > limit_m[1:-1]
+    return is_steep
 
-    ``size`` is rows and columns; a Gaussian of deviation ``width_px`` 0 leaves the noise white.
+
+def _random_gaps(size: torch.Size, share: float, generator: torch.Generator) -> Mask:
+    """Mark a share of the pixels as missing, half of them singly, half in patches."""
+    height, width = size
+    is_missing = torch.rand(height, width, generator=generator) < 0.5 * share
+    coarse = torch.rand(1, 1, 2 + height // 12, 2 + width // 12, generator=generator)
+    patches = F.interpolate(coarse, (height, width), mode="bilinear", align_corners=False)[0, 0]
+    # The level of the patches is a quantile of every fourth row and column, which is near enough.
+    some = patches[::4, ::4].flatten()
+    if count := round(0.5 * share * len(some)):
+        is_missing |= patches <= some.kthvalue(count).values
+    return is_missing
+
+
+def _swap_neighbours(depth_m: Depth, generator: torch.Generator) -> Depth:
+    """Let each pixel read one that is a pixel or none away: edges are blurred.
+
+    At the ends of a row it reads the next row; windows have a margin there.
+    """
+    height, width = depth_m.shape
+    steps = torch.tensor([-1, 0, 0, 1])
+    moves = (steps[:, None] * width + steps).flatten()
+    index = torch.arange(height * width)
+    index += moves[torch.randint(16, (height * width,), generator=generator)]
+    index = index.clamp_(0, height * width - 1)
+    return depth_m.reshape(-1)[index].view(height, width)
+
+
+def _round_disparity(depth_m: Depth, scale_px_m: float) -> Depth:
+    """Round depth to whole steps of disparity, which is ``scale_px_m`` over the depth.
+
+    The scale is the steps in a pixel times focal length [px] and baseline [m].
+    """
+    return scale_px_m / (scale_px_m / depth_m).round()
+
+
+def _mix_at_jumps(depth_m: Depth, generator: torch.Generator) -> Depth:
+    """Mix each pixel with its right or lower neighbour where depth jumps."""
+    share = torch.rand(depth_m.shape, generator=generator)
+    right_m = depth_m.roll(-1, 1)
+    lower_m = depth_m.roll(-1, 0)
+    right_m[:, -1] = depth_m[:, -1]
+    lower_m[-1] = depth_m[-1]
+    mixed_m = depth_m
+    for neighbour_m in (right_m, lower_m):
+        is_jump = (neighbour_m - mixed_m).abs() > _JUMP * mixed_m
+        mixed_m = torch.where(is_jump, torch.lerp(mixed_m, neighbour_m, share), mixed_m)
+    return mixed_m
+
+
+def smooth_noise(size: tuple[int, int], width_px: float, generator: torch.Generator) -> Depth:
+    """Draw normal noise of deviation 1, correlated between neighbours.
+
+    It is white noise convolved with a Gaussian of deviation ``width_px``, 0 for white noise;
+    ``size`` is rows and columns.
     """
     radius = math.ceil(3 * width_px)
     white = torch.randn(size[0] + 2 * radius, size[1] + 2 * radius, generator=generator)
@@ -216,47 +256,50 @@ def smooth_noise(size: tuple[int, int], width_px: float, generator: torch.Genera
 
 
 def _is_shadowed(depth_m: Depth, focal_px: float, baseline_m: float = _KINECT_BASELINE_M) -> Mask:
-    """Mark what the projector, beside the camera, cannot light: something nearer is in its way."""
+    """Mark pixels in shadow: a nearer surface hides them from the projector beside the camera."""
     column = torch.arange(depth_m.shape[1])
-    lit = column + (focal_px * baseline_m / depth_m).nan_to_num(-torch.inf)
-    # The projector's columns ascend along a row, but for what lies behind an edge.
-    return lit < lit.cummax(1).values - 1.5
+    projector_column = column + (focal_px * baseline_m / depth_m).nan_to_num(-torch.inf)
+    # The projector's columns ascend along a row, except behind an edge.
+    return projector_column < projector_column.cummax(1).values - 1.5
 
 
-def _displaced(depth_m: Depth, scale: float, generator: torch.Generator) -> Depth:
-    """Read each pixel ``scale`` times some pixels away, alike its neighbours: edges wander."""
+def _displace(depth_m: Depth, scale: float, generator: torch.Generator) -> Depth:
+    """Let each pixel read one some pixels away, as its neighbours do: edges wander.
+
+    ``scale`` is that of the window to the full image, in whose pixels the displacement is drawn.
+    """
     height, width = depth_m.shape
     shifts = [1.2 * smooth_noise((height, width), 3.0 * scale, generator) for _ in range(2)]
-    farthest = _STEREO_WINDOW * scale
+    farthest = _STEREO_WINDOW_PX * scale
     dy, dx = ((scale * shift).clamp(-farthest, farthest).round().long() for shift in shifts)
     rows = (torch.arange(height)[:, None] + dy).clamp(0, height - 1)
     columns = (torch.arange(width) + dx).clamp(0, width - 1)
     return depth_m[rows, columns]
 
 
-MARGIN_PX = 8  #: around the object: what lies behind it must be seen where a mask is too large
+MARGIN_PX = 8  #: around the object, in which the background is visible where a mask is too large
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Shape:
-    """What is drawn of an object; the corners of its hull are about the middle of its box.
+    """The geometry of an object for drawing.
 
-    ``Rigid(R, t - R @ middle_m)`` turns it and puts its middle at t of the camera.
+    The pose ``Rigid(R, t - R @ middle_m)`` rotates it by R and puts its middle at t.
     """
 
-    triangles_m: Float[Tensor, "n 3 3"]
-    hull_m: Float[Tensor, "m 3"]
-    middle_m: Float[Tensor, "3"]
+    triangles_m: Float[Tensor, "n 3 3"]  #: in the model frame
+    hull_m: Float[Tensor, "m 3"]  #: corners of the convex hull, about the middle
+    middle_m: Float[Tensor, "3"]  #: of the box about the object
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CleanView:
     """An object alone, without any error, in a window of the image."""
 
-    depth_m: Float[Tensor, "h w"]  #: less ``distance_m``; NaN beside the object
+    depth_m: Float[Tensor, "h w"]  #: minus ``distance_m``; NaN beside the object
     K: Float[Tensor, "3 3"]  #: intrinsic matrix of the window
     camera_from_model: Rigid  #: the pose
-    distance_m: float = 0.0  #: taken off depths of stored views: float16 is then exact to 0.1 mm
+    distance_m: float = 0.0  #: subtracted in stored views: float16 is then exact to 0.1 mm
 
 
 def make_shape(model: ObjectModel) -> Shape:
@@ -271,7 +314,7 @@ def make_shape(model: ObjectModel) -> Shape:
 
 
 def gaze(direction: Float[Tensor, "3"], roll_rad: float) -> Float[Tensor, "3 3"]:
-    """Rotation that carries the optical axis to a direction, the shortest way, after a roll."""
+    """Give the rotation that rolls a camera and then points its optical axis at a direction."""
     cosine = math.cos(roll_rad)
     sine = math.sin(roll_rad)
     roll = [[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]]
@@ -288,72 +331,96 @@ def pixel_to_ray(K: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
 def window_of(
     shape: Shape, pose: Rigid, K: Float[Tensor, "3 3"]
 ) -> tuple[Float[Tensor, "3 3"], int, int]:
-    """Cut the window in which an object lies, with a margin."""
+    """Give the window in which an object lies, with a margin: its intrinsics, width and height."""
     corners = shape.hull_m @ pose.R.mT + (pose.t_m + pose.R @ shape.middle_m)
     pixels = (corners @ K.mT)[:, :2] / corners[:, 2:]
     left, top = (pixels.amin(0).floor() - MARGIN_PX).tolist()
     right, bottom = (pixels.amax(0).ceil() + MARGIN_PX).tolist()
-    moved = K.clone()
-    moved[0, 2] -= left
-    moved[1, 2] -= top
-    return moved, int(right - left) + 1, int(bottom - top) + 1
+    window_K = crop_intrinsics(K, int(left), int(top))
+    return window_K, int(right - left) + 1, int(bottom - top) + 1
 
 
 def draw_view(shape: Shape, pose: Rigid, K: Float[Tensor, "3 3"]) -> CleanView:
-    """Draw an object, in the window around it."""
-    moved, width, height = window_of(shape, pose, K)
+    """Draw an object in the window around it."""
+    window_K, width, height = window_of(shape, pose, K)
     # float64 poses: the corners are rounded once.
     triangles = (shape.triangles_m.double() @ pose.R.mT + pose.t_m).float()
-    raster = rasterize(triangles, moved, width, height, with_barycentric=False)
-    return CleanView(depth_m=raster.depth_m, K=moved, camera_from_model=pose)
+    raster = rasterize(triangles, window_K, width, height, with_barycentric=False)
+    return CleanView(depth_m=raster.depth_m, K=window_K, camera_from_model=pose)
 
 
 def turn_view(
     view: CleanView, turn: Float[Tensor, "3 3"], shape: Shape, K: Float[Tensor, "3 3"]
 ) -> CleanView:
-    """See a view with the camera turned: ``x_new = turn @ x_old``."""
+    """Resample a view as a rotated camera sees it: ``x_new = turn @ x_old``.
+
+    Args:
+        view: the view.
+        turn: rotation of the camera frame.
+        shape: of the object, for the window.
+        K: intrinsic matrix of the image of the new view.
+    """
     old = view.camera_from_model
     pose = Rigid(turn @ old.R, turn @ old.t_m)
-    moved, width, height = window_of(shape, pose, K)
-    # Homogeneous old pixels of the new grid, and how much longer the old ray is.
-    ray_from_pixel = turn.mT @ pixel_to_ray(moved)
+    window_K, width, height = window_of(shape, pose, K)
+
+    # The old pixel of each new one, and w, the old depth over the new one.
+    ray_from_pixel = turn.mT @ pixel_to_ray(window_K)
     (a, b, c), (d, e, f), (g, h, i) = (view.K @ ray_from_pixel).tolist()
     u = torch.arange(width)[None]
     v = torch.arange(height)[:, None]
     w = g * u + h * v + i
     source_u = (a * u + b * v + c) / w
     source_v = (d * u + e * v + f) / w
-    values = 1 / view.depth_m
-    # Between pixels; at edges and beside the object the nearest pixel; NaN outside.
-    rows, columns = values.shape
+
+    # 1 / depth, interpolated between pixels; at edges and beside the object that of the nearest
+    # pixel; NaN outside.
+    inverse = 1 / view.depth_m
+    rows, columns = inverse.shape
     left = source_u.floor().clamp_(0, columns - 2)
     top = source_v.floor().clamp_(0, rows - 2)
     x = source_u - left
     y = source_v - top
     index = (top * columns + left).long()
-    flat = values.reshape(-1)
+    flat = inverse.reshape(-1)
     nw, ne, sw, se = (flat[index + beyond] for beyond in (0, 1, columns, columns + 1))
     smooth = torch.lerp(torch.lerp(nw, ne, x), torch.lerp(sw, se, x), y)
     nearest = torch.where(y < 0.5, torch.where(x < 0.5, nw, ne), torch.where(x < 0.5, sw, se))
-    # A comparison with NaN is false: where a corner sees nothing, the nearest decides.
+    # A comparison with NaN is false: where one of the four pixels is empty the nearest is taken.
     highest = torch.maximum(torch.maximum(nw, ne), torch.maximum(sw, se))
     lowest = torch.minimum(torch.minimum(nw, ne), torch.minimum(sw, se))
-    turned = torch.where(highest - lowest < _JUMP * smooth, smooth, nearest)
+    resampled = torch.where(highest - lowest < _JUMP * smooth, smooth, nearest)
     is_inside = (x - 0.5).abs().maximum((y - 0.5).abs()) <= 1
-    inverse_m = torch.where(is_inside, turned, torch.nan)
-    return CleanView(depth_m=1 / (inverse_m * w), K=moved, camera_from_model=pose)
+    resampled = torch.where(is_inside, resampled, torch.nan)
+    return CleanView(depth_m=1 / (resampled * w), K=window_K, camera_from_model=pose)
 
 
-_BANK_SEED = 0x0B7EC7
-_TILT_RAD = math.radians(75)  # a table is seen from no flatter an angle
+def _random_offset(generator: torch.Generator, most: int) -> int:
+    """Draw a whole number, -most to most, all equally likely."""
+    return random_index(generator, 2 * most + 1) - most
+
+
+def _shift_mask(mask: Mask, down: int, right: int) -> Mask:
+    """Shift a mask by some pixels; those that come in at a border are not of the object."""
+    mask = mask.roll((down, right), (0, 1))
+    for axis, steps in enumerate((down, right)):
+        if steps:
+            size = mask.shape[axis]
+            start = 0 if steps > 0 else max(0, size + steps)
+            mask.narrow(axis, start, min(abs(steps), size)).fill_(False)
+    return mask
+
+
+_BANK_SEED = 0x0B7EC7  # added to the seed, for stored views
+_MOST_TILT_RAD = math.radians(75)  # of the plane behind an object against the line of sight
 
 
 class Objects:
-    """Synthetic partial views, each a function of the seed and its index alone: no order, no state.
+    """Synthetic partial views by index; each depends on the seed and its index alone.
 
     Args:
-        models: what is shown; sample i shows ``models[i % len(models)]``.
-        config: how the samples look.
+        models: of the objects; sample i shows ``models[i % len(models)]``.
+        config: of the views.
         cloud: how they are lifted to clouds.
 
     Raises:
@@ -397,63 +464,37 @@ class Objects:
         return lift_sample(self.view(index), diameter_m, self.cloud)
 
     def draw_stored(self, workers: int) -> None:
-        """Draw all stored views now, in so many threads: processes forked later share them."""
-        wanted = [(n, k) for k in range(self.config.views or 0) for n in range(len(self.models))]
+        """Draw all stored views now, in ``workers`` threads: processes forked later share them."""
+        keys = [(n, k) for k in range(self.config.views or 0) for n in range(len(self.models))]
         with ThreadPoolExecutor(workers) as pool:
-            for _ in pool.map(self._stored, wanted):
+            for _ in pool.map(self._stored, keys):
                 pass
 
     def view(self, index: int) -> ViewSample:
         """Make the window of depth and the mask that a sample is lifted from."""
         number = index % len(self.models)
         generator = sample_generator(index, self.config.seed)
-        shape = self._shapes[number]
-        views = self.config.views
-        if views is None:  # drawn anew
-            R = random_rotation(generator)
-            distance_m = uniform(generator, *self.config.distance_m)
-            K = self.intrinsics(uniform(generator, *self.config.resolution))
-            turn = self._gaze(number, distance_m, K, generator)
-            R = turn @ R
-            pose = Rigid(R, turn[:, 2] * distance_m - R @ shape.middle_m)
-            clean = draw_view(shape, pose, K)
-        else:  # the camera of a stored view is turned
-            stored = self._stored((number, random_index(generator, views)))
-            K = self.intrinsics(float(stored.K[0, 0]) / self.config.focal_px[0])
-            turn = self._gaze(number, stored.distance_m, K, generator)
-            depth_m = stored.depth_m.float() + stored.distance_m
-            clean = turn_view(replace(stored, depth_m=depth_m, distance_m=0.0), turn, shape, K)
-
-        # What lies behind the object, and what hides a part of it.
+        clean = self._clean_view(number, generator)
         silhouette = clean.depth_m.isfinite()
         depth_m = clean.depth_m
         visible = silhouette
+
+        # A background behind the object, and something that occludes a part of it.
         if self.config.with_background:
-            depth_m = self._before_background(clean, shape, generator)
+            depth_m = self._before_background(clean, self._shapes[number], generator)
         if uniform(generator, 0.0, 1.0) < self.config.occluded_share:
             share = uniform(generator, *self.config.occlusion)
             depth_m, visible = occlude(depth_m, silhouette, share, generator)
 
-        # A mask that is too large or too small, and what a sensor measures.
-        largest_px = self.config.mask_error_px
-        grow_px = random_index(generator, 2 * largest_px + 1) - largest_px
+        # The errors of a mask, and those of a sensor.
         scale = float(clean.K[0, 0]) / self.config.focal_px[0]  # to pixels of the full image
+        grow_px = _random_offset(generator, self.config.mask_error_px)
         mask = grow_mask(visible, round(grow_px * scale))
         focal_px = (float(clean.K[0, 0]), self.config.focal_px[0])
         measured_m = simulate_depth(depth_m, focal_px, self.config.sensor, generator)
-
-        # And shifted: what comes in at a border is not of the object.
-        largest_px = self.config.mask_shift_px
-        rows, columns = (
-            round((random_index(generator, 2 * largest_px + 1) - largest_px) * scale)
-            for _ in range(2)
-        )
-        mask = mask.roll((rows, columns), (0, 1))
-        for axis, steps in enumerate((rows, columns)):
-            if steps:
-                size = mask.shape[axis]
-                start = 0 if steps > 0 else max(0, size + steps)
-                mask.narrow(axis, start, min(abs(steps), size)).fill_(False)
+        down = round(_random_offset(generator, self.config.mask_shift_px) * scale)
+        right = round(_random_offset(generator, self.config.mask_shift_px) * scale)
+        mask = _shift_mask(mask, down, right)
 
         model = self.models[number]
         view = ViewInput(
@@ -469,8 +510,26 @@ class Objects:
         )
         return ViewSample(input=view, truth=truth)
 
+    def _clean_view(self, number: int, generator: torch.Generator) -> CleanView:
+        """Make a view of an object without errors: drawn anew, or a stored one, rotated."""
+        shape = self._shapes[number]
+        views = self.config.views
+        if views is None:
+            R = random_rotation(generator)
+            distance_m = uniform(generator, *self.config.distance_m)
+            K = self.intrinsics(uniform(generator, *self.config.resolution))
+            turn = self._gaze(number, distance_m, K, generator)
+            R = turn @ R
+            pose = Rigid(R, turn[:, 2] * distance_m - R @ shape.middle_m)
+            return draw_view(shape, pose, K)
+        stored = self._stored((number, random_index(generator, views)))
+        K = self.intrinsics(float(stored.K[0, 0]) / self.config.focal_px[0])
+        turn = self._gaze(number, stored.distance_m, K, generator)
+        depth_m = stored.depth_m.float() + stored.distance_m
+        return turn_view(replace(stored, depth_m=depth_m, distance_m=0.0), turn, shape, K)
+
     def _stored(self, key: tuple[int, int]) -> CleanView:
-        """Give a view by the number of its object and its own, drawn when it is first needed."""
+        """Give a stored view by the numbers of its object and of the view; drawn when needed."""
         if key not in self._views:
             number, place = key
             index = place * len(self.models) + number
@@ -486,8 +545,8 @@ class Objects:
         return self._views[key]
 
     def intrinsics(self, scale: float = 1.0) -> Float[Tensor, "3 3"]:
-        """Intrinsic matrix of the sensor's image at so many times its size."""
-        assert self.config.centre_px is not None, "the config gives what was left out"
+        """Give the intrinsic matrix of the sensor's image, enlarged by ``scale``."""
+        assert self.config.centre_px is not None, "the config computes a centre left out"
         fx, fy = self.config.focal_px
         cx, cy = self.config.centre_px
         rows = [
@@ -499,7 +558,7 @@ class Objects:
     def _gaze(
         self, number: int, distance_m: float, K: Tensor, generator: torch.Generator
     ) -> Float[Tensor, "3 3"]:
-        """Look so that the object lies somewhere in the image, whole, and rolled at random."""
+        """Draw a rotation of the camera by which an object lies wholly in the image, anywhere."""
         diameter = self.models[number].diameter_m
         scale = float(K[0, 0]) / self.config.focal_px[0]
         radius_px = float(K[0, 0]) * 0.5 * diameter / max(distance_m - 0.5 * diameter, 1e-3)
@@ -515,12 +574,12 @@ class Objects:
     def _before_background(
         self, clean: CleanView, shape: Shape, generator: torch.Generator
     ) -> Float[Tensor, "h w"]:
-        """Put a table or wall behind the object, and something else beside it."""
+        """Put a table or wall behind an object, and clutter beside it; give the depth."""
+        # A plane that touches the object or lies behind it, tilted against the line of sight.
         pose = clean.camera_from_model
         hull_m = shape.hull_m @ pose.R.mT + (pose.t_m + pose.R @ shape.middle_m)
-        tilt = uniform(generator, 0.0, _TILT_RAD)
+        tilt = uniform(generator, 0.0, _MOST_TILT_RAD)
         side = uniform(generator, 0.0, 2 * math.pi)
-        # It stands upright in the picture of its own pixel, so tilt is from the line of sight.
         normal = gaze(hull_m.mean(0), side) @ torch.tensor(
             [math.sin(tilt), 0.0, -math.cos(tilt)], dtype=torch.float64
         )
@@ -530,13 +589,14 @@ class Objects:
         height, width = clean.depth_m.shape
         slope = a * torch.arange(width)[None] + b * torch.arange(height)[:, None] + c
         behind_m = torch.where(slope * offset > 0, offset / slope, torch.nan)
-        near = float(hull_m[:, 2].min())
-        far = float(hull_m[:, 2].max())
+
+        # Clutter: a shape parallel to the image, at about the depth of the object.
+        nearest_m = float(hull_m[:, 2].min())
+        farthest_m = float(hull_m[:, 2].max())
         levels = random_levels(height, width, generator)
-        level = float(levels.amin()) + uniform(generator, 0.0, 0.6) * float(
-            levels.amax() - levels.amin()
-        )
-        clutter_m = uniform(generator, near, far + 0.2)
+        lowest = float(levels.amin())
+        level = lowest + uniform(generator, 0.0, 0.6) * float(levels.amax() - levels.amin())
+        clutter_m = uniform(generator, nearest_m, farthest_m + 0.2)
         is_clutter = (levels < level) & ~(behind_m < clutter_m)
         behind_m = torch.where(is_clutter, clutter_m, behind_m)
         return torch.where(clean.depth_m.isfinite(), clean.depth_m, behind_m)

@@ -1,4 +1,4 @@
-"""The objects of a training, their clouds, synthetic or real, and those held out."""
+"""The objects of a training, its samples of synthetic views or real frames, and held-out views."""
 
 import dataclasses
 import math
@@ -38,11 +38,11 @@ from depthpose.pose.types import (
 )
 from depthpose.pose.weights import PoseWeights
 
-TRIES = 20  #: samples in a row that may show too little
+TRIES = 20  #: samples in a row that may show too few points
 
 
 class Cloud(NamedTuple):
-    """One training sample: the points that were kept, and the truth, in the axes of the grid."""
+    """One training sample: the point of each voxel, and the true pose, in the axes of the grid."""
 
     points_m: Float[Tensor, "n 3"]
     coordinates: Int[Tensor, "n 3"]
@@ -64,7 +64,7 @@ class CloudBatch(NamedTuple):
 
     @property
     def network_input(self) -> VotingPoints:
-        """What the network is shown: everything but the truth."""
+        """The input of the network: everything but the truth."""
         return VotingPoints(
             points_m=self.points_m,
             coordinates=self.coordinates,
@@ -77,9 +77,9 @@ Config = TypeVar("Config", bound=ViewsTraining)
 
 
 class TrainingViews(Generic[Config]):
-    """What is learnt from by sample index: synthetic views, real frames, or both.
+    """The views of a training by sample index: synthetic ones, real frames, or both.
 
-    ``seed`` is that of the order of frames and of the choice of points.
+    ``seed`` determines the order of frames and the choice of points.
     """
 
     def __init__(self, models: Sequence[ObjectModel], config: Config, seed: int) -> None:
@@ -108,7 +108,10 @@ class TrainingViews(Generic[Config]):
         return max(1, round(len(self._real) / self._frames.share))
 
     def _view(self, place: int, generator: torch.Generator) -> tuple[ViewSample, bool]:
-        """Give a frame, as often as their share says, or a synthetic view; and whether a frame."""
+        """Give a frame, with the probability of their share, or a synthetic view; and which it is.
+
+        The second value is whether it is a frame.
+        """
         share = 0.0 if self._frames is None else self._frames.share
         if self._real is not None and float(torch.rand((), generator=generator)) < share:
             return self._real[shuffled_index(place, len(self._real), self.seed)], True
@@ -122,31 +125,22 @@ class TrainingClouds(TrainingViews[PoseTraining]):
         """Make the sample of an index; one with too few points is replaced by another.
 
         Raises:
-            InputError: so many in a row have too few points that the config must be wrong.
+            InputError: 20 in a row have too few points, so that the config must be wrong.
         """
         generator = sample_generator(index, self.seed)
         cloud = self.config.cloud
         for attempt in range(TRIES):
-            # Far beyond any training, and the same object.
+            # A further attempt takes an index beyond any training, of the same object.
             place = index + attempt * len(self.models) * 2**32
-            # Sample i shows object i modulo their number.
+            # Sample i shows object i modulo their number: multiples show the first object.
             place *= len(self.models) if place < self.config.first_alone else 1
             view, is_frame = self._view(place, generator)
             number = self._class_of[view.input.object]
             sample = lift_sample(view, self.models[number].diameter_m, cloud)
             if self._frames is not None and is_frame:
                 angle_rad = 2 * math.pi * float(torch.rand((), generator=generator))
-                if self._frames.with_roll:  # the camera turns: cloud and pose turn with it
-                    c = math.cos(angle_rad)
-                    s = math.sin(angle_rad)
-                    turn = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-                    pose = sample.truth.camera_from_model
-                    turned = Rigid(turn @ pose.R.float(), turn @ pose.t_m.float())
-                    points_m = sample.input.points_m.float() @ turn.mT
-                    sample = CloudSample(
-                        input=dataclasses.replace(sample.input, points_m=points_m),
-                        truth=dataclasses.replace(sample.truth, camera_from_model=turned),
-                    )
+                if self._frames.with_roll:
+                    sample = _roll_camera(sample, angle_rad)
             if why_too_few(sample.input.points_m, cloud) is None:
                 return voxelised_cloud(sample, number, cloud, generator)
         raise InputError(
@@ -157,7 +151,7 @@ class TrainingClouds(TrainingViews[PoseTraining]):
 
     @staticmethod
     def collate(clouds: Sequence[Cloud]) -> CloudBatch:
-        """Put clouds one after the other."""
+        """Make a batch of clouds, one after the other."""
         numbers = [torch.full((len(c.points_m), 1), k) for k, c in enumerate(clouds)]
         return CloudBatch(
             points_m=torch.cat([c.points_m for c in clouds]),
@@ -171,24 +165,38 @@ class TrainingClouds(TrainingViews[PoseTraining]):
         )
 
 
+def _roll_camera(sample: CloudSample, angle_rad: float) -> CloudSample:
+    """Give a sample as a camera rolled about its optical axis sees it: cloud and pose rotate."""
+    c = math.cos(angle_rad)
+    s = math.sin(angle_rad)
+    roll = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    pose = sample.truth.camera_from_model
+    rolled = Rigid(roll @ pose.R.float(), roll @ pose.t_m.float())
+    points_m = sample.input.points_m.float() @ roll.mT
+    return CloudSample(
+        input=dataclasses.replace(sample.input, points_m=points_m),
+        truth=dataclasses.replace(sample.truth, camera_from_model=rolled),
+    )
+
+
 def voxelised_cloud(
     sample: CloudSample, class_number: int, config: CloudConfig, generator: torch.Generator
 ) -> Cloud:
-    """Take points of a sample and put them on the grid, as an estimate would.
+    """Choose points of a sample and voxelise them, as an estimate does.
 
-    Cloud and truth are turned with the grid.
+    Cloud and true pose are rotated to the axes of the grid.
     """
     points = sample_points(sample.input.points_m, config.max_points, generator)
     voxels = voxelise(points, config)
-    turn = voxels.grid_from_camera.float()
+    grid_from_camera = voxels.grid_from_camera.float()
     pose = sample.truth.camera_from_model
     return Cloud(
-        points_m=voxels.points_m.float() @ turn.mT,
+        points_m=voxels.points_m.float() @ grid_from_camera.mT,
         coordinates=voxels.coordinates,
         features=voxels.features,
         class_number=class_number,
-        R=turn @ pose.R.float(),
-        t_m=turn @ pose.t_m.float(),
+        R=grid_from_camera @ pose.R.float(),
+        t_m=grid_from_camera @ pose.t_m.float(),
     )
 
 
@@ -197,11 +205,11 @@ def read_models(
 ) -> tuple[ObjectModel, ...]:
     """Read the models that a training names.
 
-    ``on_message`` is told of symmetries that were found and are not declared, taken or not.
+    ``on_message`` is called with a sentence on symmetries that were found in a model.
 
     Raises:
-        InputError: none is named, or of two kinds, CAD files without their unit, two have one name,
-            or a file is damaged.
+        InputError: no model is named, or models of two kinds, CAD files without their unit, two of
+            one name, or a damaged file.
     """
     sources = [name for name in ("cad", "bop", "parts") if getattr(config, name)]
     if len(sources) > 1:
@@ -239,14 +247,14 @@ def read_models(
 
 
 HELD_OUT_SEED = 0x4E1D  #: added to the seed of the views that are trained on
-_SURFACE = 1000
+_SURFACE_POINTS = 1000  # by which ADD is measured
 
 
 class ViewsTask:
-    """What the trainings of networks that pose have in common: one network, and held-out views.
+    """Base of the tasks that train one network which poses, and validate it on held-out views.
 
-    Each of the views is a rendering of its own at the full resolution; so many of each object are
-    at each occlusion. ``method`` says in the names of numbers how the network poses.
+    The views are rendered at the full resolution, equally many of each object at each occlusion.
+    ``method`` says in the names of numbers how the network poses.
     """
 
     method: ClassVar[str]
@@ -266,14 +274,14 @@ class ViewsTask:
 
     @torch.no_grad()
     def validate(self) -> ValidationResult:
-        """Share of ADD below a tenth of the diameter, and its median, by occlusion."""
+        """Measure ADD by occlusion: the share below a tenth of the diameter, and the median."""
         numbers: dict[str, float] = {}
         self.modules["network"].eval()
-        given = self.training
-        for occlusion in given.held_out.occlusions:
+        config = self.training
+        for occlusion in config.held_out.occlusions:
             if occlusion not in self._held_out:
                 drawn = held_out_objects(
-                    self.models, given.objects, given.cloud, given.held_out, occlusion
+                    self.models, config.objects, config.cloud, config.held_out, occlusion
                 )
                 self._held_out[occlusion] = [drawn.view(index) for index in range(len(drawn))]
             views = self._held_out[occlusion]
@@ -292,7 +300,7 @@ def held_out_objects(
     config: HeldOutConfig,
     occlusion: float,
 ) -> Objects:
-    """Make the views that no training sees, all of one occlusion."""
+    """Make views that no training uses, all of one occlusion."""
     held_out_config = dataclasses.replace(
         synthetic,
         number=config.number * len(models),
@@ -306,10 +314,10 @@ def held_out_objects(
 
 
 def add_error(estimated: Rigid | None, truth: Rigid, model: ObjectModel) -> float:
-    """ADD to the nearest symmetric pose, in diameters; infinite where there is no answer."""
+    """ADD to the nearest symmetric pose, in diameters; infinite where there is no estimate."""
     if estimated is None:
         return math.inf
-    points_m = sample_surface(model, _SURFACE)[0]
+    points_m, _ = sample_surface(model, _SURFACE_POINTS)
     copies = symmetry_transforms(model.symmetries)
     return float(add_of_nearest_m(estimated, truth, points_m, copies)) / model.diameter_m
 
@@ -317,14 +325,14 @@ def add_error(estimated: Rigid | None, truth: Rigid, model: ObjectModel) -> floa
 _CLOUDS_AT_ONCE = 32
 
 Table = Mapping[str, Mapping[str, float | None]]
-"""By occlusion in percent: shares of right, ambiguous, wrong and refused, and the median error of
-all poses in diameters, None where there is none."""
+"""By occlusion in percent: the shares ``right``, ``ambiguous``, ``wrong`` and ``refused``, and the
+``median`` error of all poses in diameters, None where there is none."""
 
 
 def score_held_out(weights: PoseWeights, synthetic: ObjectsConfig, config: HeldOutConfig) -> Table:
-    """Count right, wrong and refused answers of the whole estimator, by occlusion.
+    """Measure the shares of right, ambiguous, wrong and refused estimates, by occlusion.
 
-    Ambiguous are those whose certainty is too low for an answer, whether right or not.
+    Ambiguous are poses of too low a certainty, whether right or not.
     """
     table: dict[str, dict[str, float | None]] = {}
     for occlusion in config.occlusions:
@@ -344,7 +352,7 @@ def score_held_out(weights: PoseWeights, synthetic: ObjectsConfig, config: HeldO
 
 
 def table_text(table: Table) -> str:
-    """Show what was counted, for people."""
+    """Format a table as Markdown."""
     lines = [
         "Synthetic views that no training saw, posed with ICP and refusal; right is an "
         "ADD, to the nearest symmetric pose, below a tenth of the diameter.",
@@ -353,9 +361,11 @@ def table_text(table: Table) -> str:
         "| --- | --- | --- | --- | --- | --- |",
     ]
     for occlusion, row in table.items():
-        given = [row[k] for k in ("right", "ambiguous", "wrong", "refused", "median")]
-        values = " | ".join("-" if value is None else f"{100 * value:.1f}" for value in given)
-        lines.append(f"| {occlusion} | {values} |")
+        cells: list[str] = []
+        for column in ("right", "ambiguous", "wrong", "refused", "median"):
+            value = row[column]
+            cells.append("-" if value is None else f"{100 * value:.1f}")
+        lines.append(f"| {occlusion} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 

@@ -1,4 +1,4 @@
-"""Training of segmentation: annotated images, random changes of them, and the task."""
+"""Training of segmentation: annotated images, their augmentation, and the task."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -83,38 +83,45 @@ class AnnotatedImages:
         return len(self._images)
 
     def __getitem__(self, index: int) -> LabelledImage:
-        """Read one whole image."""
-        held = self._cache.get(index)
-        if held is None:
-            path = self._images[index][0].rgb
-            assert path is not None
-            image = read_image(path)
-            labels = torch.zeros(image.shape[1:], dtype=torch.uint8)
-            for instance in self._images[index]:
-                number = self._class_of.get(instance.object_id)
-                if number is None:
-                    continue
-                mask = read_instance_mask(instance)
-                if mask.shape != labels.shape:
-                    raise InputError(
-                        f"{instance.name}: the mask is {mask.shape[1]}x{mask.shape[0]}, but the "
-                        f"picture {labels.shape[1]}x{labels.shape[0]}; one of them is another's"
-                    )
-                labels[mask] = number
-            held = (image * 255).round().to(torch.uint8), labels
+        """Read one whole image, or take it from the cache."""
+        stored = self._cache.get(index)
+        if stored is None:
+            stored = self._read(self._images[index])
             if self._with_cache:
-                self._cache[index] = held
-        return LabelledImage(held[0].float() / 255, held[1].long())
+                self._cache[index] = stored
+        image, labels = stored
+        return LabelledImage(image.float() / 255, labels.long())
+
+    def _read(
+        self, instances: list[Instance]
+    ) -> tuple[UInt8[Tensor, "3 h w"], UInt8[Tensor, "h w"]]:
+        """Read the image that shows some instances, and label the pixels of their masks."""
+        path = instances[0].rgb
+        assert path is not None
+        image = read_image(path)
+        labels = torch.zeros(image.shape[1:], dtype=torch.uint8)
+        for instance in instances:
+            number = self._class_of.get(instance.object_id)
+            if number is None:
+                continue
+            mask = read_instance_mask(instance)
+            if mask.shape != labels.shape:
+                raise InputError(
+                    f"{instance.name}: the mask is {mask.shape[1]}x{mask.shape[0]}, but the "
+                    f"picture {labels.shape[1]}x{labels.shape[0]}; one of them is another's"
+                )
+            labels[mask] = number
+        return (image * 255).round().to(torch.uint8), labels
 
 
 @dataclass(frozen=True, eq=False)
 class TrainingImages:
-    """An image by sample index, randomly changed and cut."""
+    """Augmented windows of annotated images, by sample index."""
 
-    images: AnnotatedImages  #: what is changed
-    config: ImageAugmentConfig  #: how
-    long_side_px: int  #: of the images that the network sees
-    seed: int  #: of the order and of the changes
+    images: AnnotatedImages  #: the images
+    config: ImageAugmentConfig  #: of the augmentation
+    long_side_px: int  #: of the images that the network is given
+    seed: int  #: of the order and of the augmentation
 
     def __len__(self) -> int:
         return len(self.images)
@@ -122,27 +129,28 @@ class TrainingImages:
     def __getitem__(self, index: int) -> LabelledImage:
         """Make the sample of an index."""
         generator = sample_generator(index, self.seed)
-        given = self.images[shuffled_index(index, len(self), self.seed)]
-        scale = self.long_side_px / max(given.image.shape[-2:])
+        labelled = self.images[shuffled_index(index, len(self), self.seed)]
+        scale = self.long_side_px / max(labelled.image.shape[-2:])
         scale *= uniform(generator, *self.config.scale)
-        changed = cut_window(given, scale, self.config.crop_px, generator)
+        window = cut_window(labelled, scale, self.config.crop_px, generator)
+
         # Brightness, contrast and saturation change by the jitter at most, each color by a third.
         changes = 1 + self.config.jitter * (2 * torch.rand(6, generator=generator) - 1)
         brightness, contrast, saturation = changes[:3].tolist()
         balance = 1 + (changes[3:, None, None] - 1) / 3
-        bright = changed.image * brightness * balance
+        bright = window.image * brightness * balance
         bright = (bright - bright.mean()) * contrast + bright.mean()
         grey = grey_of(bright)
         image = (grey + (bright - grey) * saturation).clamp(0, 1)
-        return LabelledImage(image, changed.labels)
+        return LabelledImage(image, window.labels)
 
 
 def cut_window(
     labelled: LabelledImage, scale: float, size: tuple[int, int], generator: torch.Generator
 ) -> LabelledImage:
-    """Scale an image and cut a window out of it; what lies beside a small image is background.
+    """Scale an image and crop it to a window; pixels beside a small image are background.
 
-    Half of the windows show the middle of an object: most of an image is background.
+    Half of the windows show the middle of an object, since most of an image is background.
 
     Args:
         labelled: the image and the class of each pixel, 0 the background.
@@ -184,9 +192,9 @@ def cut_window(
 
 
 class SegmentationTask:
-    """Cross entropy of each pixel, those of objects weighing more than the background.
+    """Trains FCN by the cross entropy of each pixel, objects weighing more than the background.
 
-    At one weight the background dominates, for objects cover a few percent.
+    With equal weights the background would dominate, for objects cover a few percent.
     """
 
     def __init__(
@@ -202,7 +210,7 @@ class SegmentationTask:
             self._held_out = AnnotatedImages(config.held_out, objects)
 
     def step(self, batch: LabelledImage) -> Iterator[Update]:
-        """One update: label and compare."""
+        """One update: the loss of a batch, and its intersection over union."""
         logits = self.network(normalise_colors(batch.image)).float()
         weight = logits.new_full((logits.shape[1],), self.config.object_weight)
         weight[0] = 1.0
@@ -212,7 +220,7 @@ class SegmentationTask:
         yield Update("network", loss, {"iou": iou})
 
     def validate(self) -> ValidationResult:
-        """Intersection over union on held-out images; the first with its labels as a picture."""
+        """Measure intersection over union on held-out images; give the first one as a picture."""
         if self._held_out is None:
             return ValidationResult()
         self.network.eval()
@@ -224,15 +232,9 @@ class SegmentationTask:
             predicted = class_probabilities(self.network, image).argmax(0)
             table += count_overlap(predicted, labels, classes)
             if index == 0:
-                # The background darkened, and each object tinted with a colour of its own.
-                both = torch.cat([predicted, labels], -1)
-                angle = 2 * torch.pi * torch.arange(classes) / max(classes - 1, 1)
-                phase = torch.tensor([0.0, 2.0, 4.0]) * torch.pi / 3
-                tint = (0.5 + 0.5 * (angle[:, None] + phase).cos())[both].movedim(-1, 0)
-                twice = torch.cat([image, image], -1)
-                pictures["found_truth"] = torch.where(
-                    both > 0, 0.5 * twice + 0.5 * tint, 0.3 * twice
-                )
+                found = _tint_objects(image, predicted, classes)
+                truth = _tint_objects(image, labels, classes)
+                pictures["found_truth"] = torch.cat([found, truth], -1)
         self.network.train()
         iou = intersection_over_union(table)
         numbers = {
@@ -244,16 +246,26 @@ class SegmentationTask:
         return ValidationResult(numbers=numbers, pictures=pictures)
 
 
+def _tint_objects(
+    image: Float[Tensor, "3 h w"], labels: Int[Tensor, "h w"], classes: int
+) -> Float[Tensor, "3 h w"]:
+    """Darken the background of an image, and tint the pixels of each object by a colour."""
+    angle = 2 * torch.pi * torch.arange(classes) / max(classes - 1, 1)
+    phase = torch.tensor([0.0, 2.0, 4.0]) * torch.pi / 3
+    tint = (0.5 + 0.5 * (angle[:, None] + phase).cos())[labels].movedim(-1, 0)
+    return torch.where(labels > 0, 0.5 * image + 0.5 * tint, 0.3 * image)
+
+
 @releases_folder
 def train_segmentation(config: SegmentationTraining, run: Run) -> Path:
-    """Train FCN; give its weights file."""
+    """Train FCN; give the path of its weights."""
     torch.manual_seed(config.loop.seed)
     images = AnnotatedImages(config.images)
     network = FCN(len(images.objects), config.network)
     if config.start is not None:
         path = find_weights(config.start)
-        held = Checkpoint(kind=KIND, config={}, state=read_checkpoint(path, ENCODER_KIND).state)
-        load_weights(network.encoder, held, str(path))
+        encoder = Checkpoint(kind=KIND, config={}, state=read_checkpoint(path, ENCODER_KIND).state)
+        load_weights(network.encoder, encoder, str(path))
     claim_run(config, run)
     task = SegmentationTask(network, config, images.objects)
     samples = TrainingImages(images, config.augment, config.network.long_side_px, config.loop.seed)

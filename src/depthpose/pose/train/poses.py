@@ -74,9 +74,9 @@ _SYMMETRY_STEP = 0.05  # half the step about an axis of revolution [rad]; votes 
 
 
 class PoseTask(ViewsTask):
-    """Directions from each point to the keypoints of its object (thesis, 3.3).
+    """Trains directions from each point to the keypoints of its object (thesis, 3.3).
 
-    A symmetric object's copy of the truth is chosen once for each cloud.
+    Of a symmetric object the copy of the truth is chosen once for each cloud.
     """
 
     method = "ransac"
@@ -88,9 +88,9 @@ class PoseTask(ViewsTask):
         self.network = network
         self.config = config
         # Keypoints of each object under each of its symmetries (classes, copies, k, 3).
-        turns = symmetric_copies(models, _SYMMETRY_STEP)
+        copies = symmetric_copies(models, _SYMMETRY_STEP)
         keypoints_m = torch.stack([model.keypoints_m.double() for model in models])
-        self._copies_m = (keypoints_m[:, None] @ turns.R.mT + turns.t_m[:, :, None]).float()
+        self._copies_m = (keypoints_m[:, None] @ copies.R.mT + copies.t_m[:, :, None]).float()
 
     def step(self, batch: CloudBatch) -> Iterator[Update]:
         """One update: all clouds at once."""
@@ -102,15 +102,15 @@ class PoseTask(ViewsTask):
         yield Update("network", loss, {"directions": loss.detach()})
 
     def held_out_error(self, view: ViewSample, index: int) -> float:
-        """Let the cloud of a view vote; one that shows too few points is a failure."""
+        """Pose the cloud of a view by voting and measure ADD; infinite for too few points."""
         number = index % len(self.models)
-        chance = sample_generator(index, HELD_OUT_SEED)
+        generator = sample_generator(index, HELD_OUT_SEED)
         model = self.models[number]
         config = self.config.cloud
         sample = lift_sample(view, model.diameter_m, config)
         if why_too_few(sample.input.points_m, config) is not None:
             return math.inf
-        cloud = voxelised_cloud(sample, number, config, chance)
+        cloud = voxelised_cloud(sample, number, config, generator)
         device = next(self.network.parameters()).device
         batch = TrainingClouds.collate([cloud])
         points = CloudBatch(*(part.to(device) for part in batch)).network_input
@@ -120,7 +120,10 @@ class PoseTask(ViewsTask):
 
 
 def symmetric_copies(models: Sequence[ObjectModel], step_rad: float) -> Rigid:
-    """``model_from_model`` of each object (classes, copies); the identity fills the shorter."""
+    """Give the symmetries of each object, ``model_from_model`` (classes, copies).
+
+    Objects with fewer are filled up with the identity.
+    """
     of_models = [symmetry_transforms(model.symmetries, step_rad).double() for model in models]
     most = max(len(copies.R) for copies in of_models)
     R = torch.eye(3).double().repeat(len(models), most, 1, 1)
@@ -135,7 +138,7 @@ _ROTATIONS_ON_CARD = 3  # rotations by which an object looks nearly alike, on a 
 
 
 def claim_run(config: Any, run: Run, files: Sequence[str] = ()) -> None:  # noqa: ANN401
-    """Make the folder this config's own, with the checksums of ``files`` and of its start."""
+    """Claim the folder of a run for a config, with the checksums of ``files`` and of its start."""
     checksums: dict[str, Any] = {"sha256": [file_sha256(Path(path)) for path in files]}
     if config.start is not None:
         checksums["start_sha256"] = file_sha256(find_weights(config.start))
@@ -147,7 +150,7 @@ def claim_run(config: Any, run: Run, files: Sequence[str] = ()) -> None:  # noqa
 def packed(
     network: AnyNetwork, models: tuple[ObjectModel, ...], config: ViewsTraining
 ) -> PoseWeights:
-    """Put a trained network and its objects together, with what the card says of them."""
+    """Make weights of a trained network and its objects, with the facts for their card."""
     frames = "" if config.frames is None else f"{Path(config.frames.folder).name} and "
     names = ", ".join(model.name for model in models)
     facts = {"trained_on": f"{frames}synthetic views of {names}", "licence": config.models.licence}
@@ -163,7 +166,7 @@ def packed(
 
 
 def with_origin(facts: Mapping[str, str], config: Any) -> dict[str, str]:  # noqa: ANN401
-    """Add to a card the stage, and the weights that it began with: their terms bind it too."""
+    """Give facts with the stage and the start weights added, whose terms bind the new ones too."""
     origin = {**facts, "stage": type(config).__name__}
     if config.start is None:
         return origin
@@ -171,8 +174,8 @@ def with_origin(facts: Mapping[str, str], config: Any) -> dict[str, str]:  # noq
 
 
 _IMAGE_SYMMETRY_STEP = 0.2
-"""Turns about a continuous axis are tried every 23 degrees: half of that is far below the error
-that this network is left with."""
+"""Half the step between rotations about a continuous axis [rad]: 11 degrees, far below the error
+that remains after training."""
 
 
 class CropSample(NamedTuple):
@@ -190,7 +193,7 @@ class TrainingCrops(TrainingViews[DepthImageTraining]):
     def __getitem__(self, index: int) -> CropSample:
         """Make the sample of an index; one with too few pixels is replaced by another."""
         for attempt in range(TRIES):
-            # Far beyond any training, and the same object.
+            # A further attempt takes an index beyond any training, of the same object.
             place = index + attempt * len(self.models) * 2**32
             view, _ = self._view(place, sample_generator(place, self.seed))
             number = self._class_of[view.input.object]
@@ -205,7 +208,7 @@ class TrainingCrops(TrainingViews[DepthImageTraining]):
 
 
 class DepthImageTask(ViewsTask):
-    """ADD of the regressed pose against the nearest symmetric copy of the truth."""
+    """Trains a regressed pose, by its ADD to the nearest symmetric copy of the truth."""
 
     method = "regressed"
 
@@ -215,7 +218,7 @@ class DepthImageTask(ViewsTask):
         super().__init__(network, models, config)
         self.network = network
         self.config = config
-        # Points of each surface; those of a sparse model of points come again.
+        # Equally many points of each surface; those of a model of fewer points are repeated.
         count = config.surface_points
         surfaces_m = [sample_surface(model, count)[0] for model in models]
         self._points_m = torch.stack([
@@ -225,18 +228,19 @@ class DepthImageTask(ViewsTask):
         self._diameter_m = torch.tensor([model.diameter_m for model in models])
 
     def step(self, batch: CropSample) -> Iterator[Update]:
-        """One update: regress, move the model's points, compare; in diameters."""
-        which = batch.class_of
+        """One update: regress poses and compare the points of the models; in diameters."""
+        class_of = batch.class_of
         device = batch.R.device
-        outputs = self.network(batch.crop.image, which).float()
-        copies = Rigid(self._copies.R.to(device)[which], self._copies.t_m.to(device)[which])
-        points_m = self._points_m.to(device)[which]
+        outputs = self.network(batch.crop.image, class_of).float()
+        copies = Rigid(self._copies.R.to(device)[class_of], self._copies.t_m.to(device)[class_of])
+        points_m = self._points_m.to(device)[class_of]
         truth = Rigid(batch.R, batch.t_m)
         error_m = model_point_loss(poses_of(outputs, batch.crop), truth, points_m, copies)
-        yield Update("network", (error_m / self._diameter_m.to(device)[which]).mean(), {})
+        diameter_m = self._diameter_m.to(device)[class_of]
+        yield Update("network", (error_m / diameter_m).mean(), {})
 
     def held_out_error(self, view: ViewSample, index: int) -> float:
-        """Regress the pose of a view; one that shows too few pixels is a failure."""
+        """Regress the pose of a view and measure ADD; infinite for too few pixels."""
         number = index % len(self.models)
         model = self.models[number]
         device = next(self.network.parameters()).device
@@ -266,7 +270,7 @@ def train_pose_network(config: PoseTraining | DepthImageTraining, run: Run) -> P
     kind, task, samples = _build_training(config, models)
     if config.start is not None:
         _start_from(task.network, config.start, samples)
-    # Only now is the folder this config's: until here a setting may be refused.
+    # The folder is claimed only now: until here a setting may be refused.
     claim_run(config, run, config.models.cad)
 
     seconds = run.train(task, samples, config.loop)
