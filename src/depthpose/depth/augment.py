@@ -268,7 +268,7 @@ def set_apart(
 
 
 def shift_rows(image: View, left_px: float, right_px: float) -> View:
-    """Move an image up: by ``left_px`` at its left border, linearly to ``right_px`` at the right one.
+    """Move an image up by ``left_px`` at its left border, and linearly to ``right_px`` at the right.
 
     Columns stay, and so does disparity.
     """
