@@ -268,9 +268,9 @@ def set_apart(
 
 
 def shift_rows(image: View, left_px: float, right_px: float) -> View:
-    """Move an image up by ``left_px`` at its left border, and linearly to ``right_px`` at the right.
+    """Move an image up: by ``left_px`` at its left border, ``right_px`` at its right one.
 
-    Columns stay, and so does disparity.
+    The shift is linear between the borders. Columns stay, and so does disparity.
     """
     height, width = image.shape[1:]
     rows = torch.arange(height)[:, None] + torch.linspace(left_px, right_px, width)
