@@ -150,7 +150,7 @@ DYNAMIC_SHAPE_NETWORKS: dict[type[StereoNetwork], Callable[[Any], nn.Module]] = 
 
 
 class DynamicSelection(_Dynamic):
-    """The generator that selects with the post-processing of its logits, at half the image's size."""
+    """The generator that selects with the post-processing of its logits, at half the image size."""
 
     def forward(self, image: Views) -> tuple[Tensor, ...]:
         """Give log of disparity, sky and confidence of the left view; the first two of the right.
