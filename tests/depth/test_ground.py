@@ -137,6 +137,22 @@ def test_deviations_are_those_of_the_jackknife() -> None:
     assert [found.height_std_m, found.tilt_std_deg] == pytest.approx(spread, rel=1e-3)
 
 
+def test_a_road_of_few_points_in_every_strip_is_no_ground() -> None:
+    """Of 32 points on a plane no strip can be left out, so nothing says how sure the plane is."""
+    small = Camera(
+        width=28,
+        height=20,
+        K=torch.tensor([[20.0, 0, 14], [0, 20, 10], [0, 0, 1]], dtype=torch.float64),
+    )
+    depth_m = torch.full((20, 28), torch.nan)
+    depth_m[12, 4:24] = 1.5 * 20 / 2
+    depth_m[13, 4:24] = 1.5 * 20 / 3
+    depth_m[12:14, [6, 11, 16, 21]] = torch.nan
+    noise = torch.rand(2, 20, generator=torch.Generator().manual_seed(1))
+    depth_m[16:18, 4:24] = 6 * torch.exp(3 * noise)
+    assert fit_ground(depth_m, small) is None
+
+
 @pytest.mark.parametrize(
     "depth_m",
     [

@@ -56,7 +56,7 @@ def batch(source: SelectionSamples, count: int = 2) -> SelectionSample:
 
 def test_only_the_input_is_degraded(pairs: PairsConfig) -> None:
     sample = samples(pairs)[0]
-    assert not torch.equal(sample.observed, sample.left)
+    assert not torch.equal(sample.degraded, sample.left)
     error = (warp_right_to_left(sample.right, sample.left_px) - sample.left).abs()
     assert float(error.nanmedian()) < 0.06
     assert bool(sample.has_right)

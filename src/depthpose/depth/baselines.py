@@ -23,9 +23,12 @@ from depthpose.depth.types import DepthEstimate, Map, StereoInput, View
 _CANONICAL_FOCAL_PX = 721.5377
 """Rows are counted in a camera of this focal length (KITTI's), centred at its principal point."""
 _ROWS = 1443
+"""Of that camera."""
 _NEAR_M = 1.0
 _FAR_M = 80.0
-_STEPS = 4096
+_DEPTH_STEPS = 4096
+"""Range of the true depths that are learnt from, and steps of their histogram, equal in the
+logarithm of depth."""
 
 Progress = Callable[[Sequence[int]], Iterable[int]]
 
@@ -45,15 +48,16 @@ class RowDepthBaseline:
     def fit(cls, dataset: Dataset, progress: Progress = iter) -> "RowDepthBaseline":
         """Find for each row the constant c that minimises the mean of ``|c - t| / t``.
 
-        That is the median of the true depths t weighted by 1 / t (nearest first, where half of the
-        weight is reached). Each frame counts the same. Depths are counted in steps of 0.1 %, so
-        that any number of frames fits in memory. Rows without truth get what lies between their
-        neighbours, in inverse depth, and beyond the last row with truth its value.
+        That is the median of the true depths t weighted by 1 / t. Each frame counts the same. The
+        depths are counted in a histogram with steps of 0.1 %, so that any number of frames fits in
+        memory. Rows without truth are interpolated in inverse depth, and beyond the outermost rows
+        with truth their values go on.
 
         Raises:
             InputError: no frame has both truth and a rig.
         """
-        weight = np.zeros((_ROWS, _STEPS))
+        # A histogram of the depths of each row, weighted by 1 / t.
+        weight = np.zeros((_ROWS, _DEPTH_STEPS))
         for index in progress(range(len(dataset))):
             known_m = read_known_depth(dataset, index)
             rig = dataset.read_rig(index)
@@ -62,19 +66,20 @@ class RowDepthBaseline:
             true_m = known_m.double().numpy()
             v, u = np.nonzero((true_m > _NEAR_M) & (true_m < _FAR_M))
             true_m = true_m[v, u]
-            slope = (v - float(rig.K[1, 2])) / float(rig.K[1, 1])
-            row = np.rint(slope * _CANONICAL_FOCAL_PX + _ROWS // 2).astype(np.int64)
-            row = row.clip(0, _ROWS - 1)
-            step = np.log(true_m / _NEAR_M) / np.log(_FAR_M / _NEAR_M) * _STEPS
-            flat = row * _STEPS + step.astype(np.int64)
-            share = 1 / true_m / max(len(true_m), 1)
-            weight += np.bincount(flat, share, _ROWS * _STEPS).reshape(_ROWS, _STEPS)
+            row = np.rint(_canonical_rows(v, rig)).astype(np.int64).clip(0, _ROWS - 1)
+            step = np.log(true_m / _NEAR_M) / np.log(_FAR_M / _NEAR_M) * _DEPTH_STEPS
+            cell = row * _DEPTH_STEPS + step.astype(np.int64)
+            cell_weight = 1 / true_m / max(len(true_m), 1)
+            counted = np.bincount(cell, cell_weight, _ROWS * _DEPTH_STEPS)
+            weight += counted.reshape(_ROWS, _DEPTH_STEPS)
         has_truth = weight.sum(1) > 0
         if not has_truth.any():
             raise _nothing_to_learn(dataset)
-        reached = weight.cumsum(1) >= weight.sum(1, keepdims=True) / 2
-        # The depth in the middle of a step.
-        median_m = _NEAR_M * (_FAR_M / _NEAR_M) ** ((reached.argmax(1) + 0.5) / _STEPS)
+
+        # The weighted median: the middle of the step where half of the weight is reached.
+        is_half_reached = weight.cumsum(1) >= weight.sum(1, keepdims=True) / 2
+        step_share = (is_half_reached.argmax(1) + 0.5) / _DEPTH_STEPS
+        median_m = _NEAR_M * (_FAR_M / _NEAR_M) ** step_share
         rows = np.arange(_ROWS)
         return cls(1 / np.interp(rows, rows[has_truth], 1 / median_m[has_truth]))
 
@@ -86,35 +91,40 @@ class RowDepthBaseline:
         """
         rig = _rig_of(pair)
         height, width = pair.left.shape[1:]
-        slope = (np.arange(height) - float(rig.K[1, 2])) / float(rig.K[1, 1])
-        row = slope * _CANONICAL_FOCAL_PX + _ROWS // 2
-        inverse = np.interp(row, np.arange(_ROWS), 1 / self.depth_m)
-        depth_m = torch.from_numpy(1 / inverse).float()[:, None].expand(height, width)
-        depth_m = depth_m.contiguous()
+        rows = _canonical_rows(np.arange(height), rig)
+        inverse = np.interp(rows, np.arange(_ROWS), 1 / self.depth_m)
+        row_depth_m = torch.from_numpy(1 / inverse).float()
+        depth_m = row_depth_m[:, None].expand(height, width).contiguous()
         return DepthEstimate(depth_m=depth_m, disparity_px=disparity_from_depth(depth_m, rig))
+
+
+def _canonical_rows(rows: np.ndarray, rig: StereoRig) -> np.ndarray:
+    """Convert rows of a camera's image to fractional rows of the canonical camera."""
+    slope = (rows - float(rig.K[1, 2])) / float(rig.K[1, 1])
+    return slope * _CANONICAL_FOCAL_PX + _ROWS // 2
 
 
 @dataclass(frozen=True, eq=False)
 class NearestImageBaseline:
-    """The depth of the training image that looks most alike.
+    """The depth of the most similar training image.
 
-    Images are compared as colour thumbnails of 24 x 8 cells, by correlation. The truth of the
-    nearest one is sparse and is filled in a pyramid: inverse depth is averaged over ever larger
+    Images are compared as colour thumbnails of 24 x 8 cells, by correlation. The truth of the most
+    similar one is sparse and is filled in a pyramid: inverse depth is averaged over ever larger
     cells, and a pixel without truth takes the smallest cell that has any. It is then brought to
     the size of the input, and to its focal length: what looks alike through a lens twice as long
     is twice as far.
     """
 
     dataset: Dataset  #: of training
-    indices: list[int]  #: of its frames that have a truth and a rig
-    thumbnails: Float[Tensor, "n d"]  #: of their left images
+    indices: list[int]  #: of its frames that have truth and a rig
+    thumbnails: Float[Tensor, "n d"]  #: of the left images of these frames
 
     @classmethod
     def fit(cls, dataset: Dataset, progress: Progress = iter) -> "NearestImageBaseline":
         """Make the thumbnail of every training image that has truth and a rig.
 
         Raises:
-            InputError: none has.
+            InputError: no image has both.
         """
         indices = [
             i
@@ -128,7 +138,7 @@ class NearestImageBaseline:
         return cls(dataset, indices, torch.stack(thumbnails))
 
     def estimate_pair(self, pair: StereoInput) -> DepthEstimate:
-        """Give the left image the depth of its nearest training image.
+        """Give the left image the depth of the most similar training image.
 
         Raises:
             InputError: the input has no rig.
@@ -137,13 +147,16 @@ class NearestImageBaseline:
         height, width = pair.left.shape[1:]
         nearest = self.indices[int((self.thumbnails @ _thumbnail(pair.left)).argmax())]
         known_m = read_known_depth(self.dataset, nearest)
-        other = self.dataset.read_rig(nearest)
+        nearest_rig = self.dataset.read_rig(nearest)
         assert known_m is not None  # `fit` chose frames that have both
-        assert other is not None
+        assert nearest_rig is not None
         inverse = fill_by_pyramid(1 / known_m)
         inverse = F.interpolate(inverse[None, None], (height, width), mode="bilinear")[0, 0]
-        focal, other_focal = (float(c.K[0, 0]) / c.width for c in (rig, other))
-        depth_m = focal / other_focal / inverse
+
+        # Focal lengths in widths of the images, which now have one size.
+        focal = float(rig.K[0, 0]) / rig.width
+        nearest_focal = float(nearest_rig.K[0, 0]) / nearest_rig.width
+        depth_m = focal / nearest_focal / inverse
         return DepthEstimate(depth_m=depth_m, disparity_px=disparity_from_depth(depth_m, rig))
 
 
@@ -155,15 +168,17 @@ def fill_by_pyramid(values: Map) -> Map:
     is_known = torch.isfinite(values)
     if bool(is_known.all()) or values.shape == (1, 1):
         return values
-    padded = F.pad(torch.stack([values.nan_to_num(0.0), is_known.to(values.dtype)]),
-                   (0, values.shape[1] % 2, 0, values.shape[0] % 2))  # fmt: skip
+    height, width = values.shape
+    parts = torch.stack([values.nan_to_num(0.0), is_known.to(values.dtype)])
+    padded = F.pad(parts, (0, width % 2, 0, height % 2))
     total, count = F.avg_pool2d(padded, 2)
     coarse = fill_by_pyramid(torch.where(count > 0, total / count, torch.nan))
     fine = coarse.repeat_interleave(2, 0).repeat_interleave(2, 1)
-    return torch.where(is_known, values, fine[: values.shape[0], : values.shape[1]])
+    return torch.where(is_known, values, fine[:height, :width])
 
 
 def _thumbnail(image: View) -> Float[Tensor, " d"]:
+    """Shrink an image to 24 x 8 cells, with mean 0 and norm 1: dot products are correlations."""
     cells = F.interpolate(image[None], (8, 24), mode="area").flatten()
     centred = cells - cells.mean()
     return centred / centred.norm().clamp(min=1e-9)

@@ -10,12 +10,13 @@ TruthKind = Literal["scan", "annotated", "disparity"]
 """scan: one LiDAR scan, drawn into the left image; annotated: a depth map of the left image
 (KITTI's annotated maps, filled-in LiDAR of object frames); disparity: the left image's own."""
 
-_MOST_FOCAL_PX = 20_000
-"""Of pairs: several times that of the largest images; beyond it they would fill the memory."""
-_FOCAL_PX = f"[1, {_MOST_FOCAL_PX}]"
+_MAX_FOCAL_PX = 20_000
+"""Largest focal length that pairs are brought to: several times that of the largest images. Beyond
+it images would fill the memory."""
+_FOCAL_PX = f"[1, {_MAX_FOCAL_PX}]"
 _BASELINE_M = "[0.0001, 1000]"
 _DISPARITY_PX = "[0.01, 16384]"
-"""What the rigs of weights may be like: depth from them is a finite number above 0."""
+"""Ranges of the rigs of weights, within which depth is finite and above 0."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,7 +24,8 @@ class DegradeConfig(Settings):
     """Augmentation of the input image alone, for transfer from synthetic to real images."""
 
     colour: Annotated[float, "[0, 1)"] = 0.35
-    """Exposure, contrast, saturation, gamma are scaled by 1 +- this, channels by a third of it."""
+    """Exposure, contrast, saturation and gamma are each scaled by up to 1 +- this, each channel by
+    up to 1 +- a third of it."""
 
     hue_share: Annotated[float, "[0, 1]"] = 0.1
     """Share of images whose channels are exchanged."""
@@ -32,7 +34,7 @@ class DegradeConfig(Settings):
     """Share of images with haze."""
 
     glare_share: Annotated[float, "[0, 1]"] = 0.2
-    """Share of images with a light in them."""
+    """Share of images with glare, which fades from one place on."""
 
     blur_share: Annotated[float, "[0, 1]"] = 0.4
     """Share of images that are blurred."""
@@ -58,8 +60,8 @@ class AugmentConfig(Settings):
     """Rows and columns of the crop."""
 
     scale: Annotated[tuple[float, float], "(0, 10]", ASCENDING] = (1.0, 1.0)
-    """Range of the size at which a pair is seen. A pair smaller than the crop is padded with black
-    on the right and below, never enlarged: another size would be another focal length."""
+    """Range of the factor by which a pair is resized. A pair smaller than the crop is padded with
+    black on the right and below, never enlarged: another size would be another focal length."""
 
     jitter: Annotated[float, "[0, 1)"] = 0.2
     """Brightness, contrast and saturation are each scaled by 1 +- this."""
@@ -164,7 +166,7 @@ class PairsConfig(Settings):
     limit: Annotated[int | None, "[1, inf)"] = None
     """Take so many pairs of each folder, and so many streets, spread evenly; None: all."""
 
-    focal_px: Annotated[float | None, f"(0, {_MOST_FOCAL_PX}]"] = None
+    focal_px: Annotated[float | None, f"(0, {_MAX_FOCAL_PX}]"] = None
     """Bring every pair to this focal length [px]; None: that of the generator, or sizes as they
     are. Before ``augment.scale``: give the largest focal length that it is to make, and scales up
     to 1, and no image is enlarged."""

@@ -1,7 +1,7 @@
-"""Named protocols to rows: predictions are files, metrics read files.
+"""Evaluation of predictions in files by a named protocol: rows of metrics.
 
 A protocol fixes the truth, the pixels that count and how the prediction is prepared. Numbers of
-two protocols do not compare; every row carries its protocol's name.
+two protocols are not comparable, so every row carries its protocol's name.
 """
 
 import warnings
@@ -34,11 +34,12 @@ from depthpose.depth.metrics import (
 )
 from depthpose.depth.types import DepthError, DepthEstimate, Map, StereoInput
 
-_SAME_ASPECT = 1.01
-"""Of a map made of an image that was scaled: sides are rounded to whole pixels, often to 32."""
-_CLEARLY = 0.7
-"""Of the error of the map when it is stretched: with less it is a part of the image."""
-_stretched: set[str] = set()
+_ASPECT_TOLERANCE = 1.01
+"""Ratio of two aspects that are still the same: the sides of a scaled image are rounded to whole
+pixels, often to multiples of 32."""
+_CROP_ERROR_SHARE = 0.7
+"""Of the error of a stretched map: a map with less error as a crop is a crop of the image."""
+_noticed_sizes: set[str] = set()
 NO_PREDICTION = "no right view to match, and no prediction"
 
 
@@ -46,7 +47,7 @@ NO_PREDICTION = "no right view to match, and no prediction"
 class Protocol:
     """How a prediction is compared with the truth.
 
-    In all protocols of depth truth counts between 0.001 m and the cap, and predictions are clamped
+    In all protocols of depth, truth counts between 0.001 m and the cap, and predictions are clamped
     to that range.
     """
 
@@ -78,7 +79,7 @@ def find_protocol(name: str) -> Protocol:
     """Give a protocol by name.
 
     Raises:
-        InputError: there is none; the error names the nearest.
+        InputError: there is none; the error suggests the most similar name.
     """
     if name not in PROTOCOLS:
         raise InputError(f"protocol {name!r}: {nearest_name(name, PROTOCOLS)}")
@@ -86,7 +87,7 @@ def find_protocol(name: str) -> Protocol:
 
 
 def has_truth(frame: Frame, rule: Protocol) -> bool:
-    """Whether a frame has the truth that a protocol needs, by its files alone."""
+    """Whether a frame has files of the truth that a protocol needs; none is read."""
     match rule.truth:
         case "disparity":
             return frame.disparity is not None
@@ -98,43 +99,40 @@ def has_truth(frame: Frame, rule: Protocol) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationRow:
-    """Numbers of one frame, their mean over frames (each counts the same), or one decile of it.
+    """Metrics of one frame, their mean over frames (each counts the same), or those of a decile.
 
-    Its columns are its fields, in order.
+    The columns of a table are the fields in this order.
     """
 
-    method: str | None = None  #: whose predictions were measured; None, as the next four: not known
-    input: str | None = None  #: which images it was given
-    speed: str | None = None  #: at which networks ran
-    weights: str | None = None  #: name of the file
+    method: str | None = None  #: that predicted; None, as in the next four fields: not known
+    input: str | None = None  #: which images the method had
+    speed: str | None = None  #: at which its networks ran
+    weights: str | None = None  #: name of their file
     weights_sha256: str | None = None  #: the first 12 digits
     protocol: str  #: by which the frames were measured
     dataset: str  #: its name
-    frame: str | None = None  #: of one frame, its name
+    frame: str | None = None  #: name of the frame, in a row of one frame
     cap_m: float | None  #: truth beyond it does not count; None for disparity
-    frames: int | None = None  #: how many a mean is over
-    pixels: int | None = None  #: that were compared, in all frames
+    frames: int | None = None  #: number of frames, in a row of means
+    pixels: int | None = None  #: number of pixels that were compared, in all frames
     coverage: float | None = None  #: share of the pixels with truth that have a prediction
-    #: n, where the numbers are of the n-th tenth of the pixels, from the least sure (1) to the
-    #: surest (10)
+    #: in a row of the n-th tenth of the pixels: n, from 1 (the least confidence) to 10
     confidence_decile: int | None = None
-    #: what all frames with a predicted pixel have, in the order of ``depth.metrics.METRICS``, then
-    #: those of the drawn view and of the confidence
+    #: metrics that all frames with a compared pixel have, in the order of
+    #: ``depth.metrics.METRICS``, then those of the synthesised view and of the confidence
     metrics: Mapping[str, float]
 
     def columns(self) -> dict[str, str | int | float]:
-        """Give the columns by name, one for each metric, as files and printed tables hold them.
-
-        A field that is None is no column.
-        """
+        """Give the columns of files and tables: the fields that are not None, and each metric."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         metrics = values.pop("metrics")
-        return {**{name: value for name, value in values.items() if value is not None}, **metrics}
+        columns = {name: value for name, value in values.items() if value is not None}
+        return columns | metrics
 
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """What evaluating one set of predictions gave."""
+    """Result of the evaluation of one folder of predictions."""
 
     rows: list[EvaluationRow]  #: means over frames, one row for each cap
     per_frame: list[EvaluationRow]  #: one row for each frame and cap
@@ -154,27 +152,28 @@ class Evaluation:
 
 @dataclass(frozen=True, kw_only=True)
 class Measured:
-    """One frame's numbers by one cap (None for disparity), and its error by decile."""
+    """Metrics of one frame at one cap."""
 
-    frame: str
-    cap_m: float | None
-    pixels: int
-    coverage: float
-    metrics: Mapping[str, float]
+    frame: str  #: its name
+    cap_m: float | None  #: None for disparity
+    pixels: int  #: that were compared
+    coverage: float  #: share of the pixels with truth that have a prediction
+    metrics: Mapping[str, float]  #: by name; empty where no pixel was compared
+    #: mean error of each tenth of the pixels, by rising confidence; None without a confidence
     deciles: list[float] | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Prepared:
-    """A frame's truth and prediction, brought to the size of the image."""
+    """A frame's truth and prediction, at the size of the image."""
 
     frame: Frame
-    truth: Map
+    truth: Map  # depth [m] or disparity [px], as the protocol says
     disparity_px: Map
-    depth_m: Map | None  # of what was predicted as depth alone, which is compared
+    depth_m: Map | None  # where depth was predicted and no disparity
     confidence: Map | None
     rig: StereoRig | None
-    view: dict[str, float]  # errors of the drawn right view
+    view_metrics: dict[str, float]  # of the synthesised right view
 
 
 def evaluate(
@@ -191,7 +190,7 @@ def evaluate(
         predictions: folder of ``NAME.disparity_px.npy`` (see ``predictions``).
         protocol: a key of ``PROTOCOLS``.
         caps_m: truth beyond a cap does not count and predictions are clamped to it; one row each.
-        progress: wraps the sequence of frames, to show how far it is.
+        progress: wraps the sequence of frame indices to show the progress, as ``tqdm`` does.
 
     Raises:
         InputError: an unknown protocol, a missing prediction, or no frame with truth.
@@ -206,7 +205,7 @@ def evaluate(
 def measure_frame(
     dataset: Dataset, index: int, predictions: Path, protocol: str, caps_m: Sequence[float]
 ) -> list[Measured] | str:
-    """Measure one frame, once for each cap, or give the reason why it does not count.
+    """Measure one frame at each cap, or give the reason why it does not count.
 
     Raises:
         InputError: an unknown protocol, or a missing or damaged prediction.
@@ -216,14 +215,14 @@ def measure_frame(
     if isinstance(prepared, str):
         return prepared
     caps: Sequence[float | None] = [None] if rule.truth == "disparity" else caps_m
-    measured = [_measure_by_cap(prepared, rule, cap_m) for cap_m in caps]
-    with_truth = [result for result in measured if result is not None]
-    return with_truth or "no truth within the caps and the crop"
+    results = [_measure_at_cap(prepared, rule, cap_m) for cap_m in caps]
+    measured = [result for result in results if result is not None]
+    return measured or "no truth within the caps and the crop"
 
 
-def _measure_by_cap(prepared: _Prepared, rule: Protocol, cap_m: float | None) -> Measured | None:
-    """Measure a frame by one cap, None for disparity; None where no truth is within it."""
-    predicted, truth = _compared(prepared, rule, cap_m)
+def _measure_at_cap(prepared: _Prepared, rule: Protocol, cap_m: float | None) -> Measured | None:
+    """Measure a frame at one cap (None for disparity); None where it has no truth within it."""
+    predicted, truth = _apply_protocol(prepared, rule, cap_m)
     has_truth = torch.isfinite(truth)
     is_compared = has_truth & torch.isfinite(predicted)
     if not bool(has_truth.any()):
@@ -235,11 +234,11 @@ def _measure_by_cap(prepared: _Prepared, rule: Protocol, cap_m: float | None) ->
         error = (predicted - truth).abs()
         if cap_m is None:
             metrics |= measure("disparity", predicted[is_compared], truth[is_compared])
-            metrics |= _visible_in_both(prepared)
+            metrics |= _measure_non_occluded(prepared)
         else:
             metrics |= measure("depth", predicted[is_compared], truth[is_compared])
             error = error / truth
-        metrics |= prepared.view
+        metrics |= prepared.view_metrics
         # A confidence is judged by how well it ranks the pixels by their errors.
         if prepared.confidence is not None:
             errors = error[is_compared]
@@ -256,8 +255,8 @@ def _measure_by_cap(prepared: _Prepared, rule: Protocol, cap_m: float | None) ->
     )
 
 
-def _visible_in_both(prepared: _Prepared) -> dict[str, float]:
-    """Measure the disparity of pixels that both views see, where the frame has their truth."""
+def _measure_non_occluded(prepared: _Prepared) -> dict[str, float]:
+    """Measure the disparity of the pixels that both views show; {} where they have no truth."""
     if prepared.frame.disparity_noc is None:
         return {}
     truth_px = read_disparity(prepared.frame.disparity_noc)
@@ -270,78 +269,89 @@ def _visible_in_both(prepared: _Prepared) -> dict[str, float]:
 def summarise(
     dataset: Dataset, protocol: str, results: Mapping[str, list[Measured] | str]
 ) -> Evaluation:
-    """Make the rows of a table of its frames, the same ones wherever they were measured.
+    """Make the rows of all frames and their means, wherever the frames were measured.
 
-    ``results`` has for each frame's name what :func:`measure_frame` gave.
+    ``results``: what :func:`measure_frame` gave, by the name of the frame.
 
     Raises:
         InputError: no frame has truth.
     """
-    outcomes = {frame.name: results[frame.name] for frame in dataset.frames}
-    skipped = {name: reason for name, reason in outcomes.items() if isinstance(reason, str)}
-    measured = [
-        frame_row
-        for outcome in outcomes.values()
-        if not isinstance(outcome, str)
-        for frame_row in outcome
-    ]
+    # One result for each frame and cap.
+    measured: list[Measured] = []
+    skipped: dict[str, str] = {}
+    for frame in dataset.frames:
+        outcome = results[frame.name]
+        if isinstance(outcome, str):
+            skipped[frame.name] = outcome
+        else:
+            measured += outcome
     if not measured:
         raise _nothing_measured(dataset, protocol, skipped)
 
-    row = partial(EvaluationRow, protocol=protocol, dataset=dataset.name)
-    columns = ("frame", "cap_m", "pixels", "coverage", "metrics")
+    make_row = partial(EvaluationRow, protocol=protocol, dataset=dataset.name)
     per_frame = [
-        row(**{name: getattr(frame_row, name) for name in columns}) for frame_row in measured
+        make_row(
+            frame=result.frame,
+            cap_m=result.cap_m,
+            pixels=result.pixels,
+            coverage=result.coverage,
+            metrics=result.metrics,
+        )
+        for result in measured
     ]
-    evaluation = Evaluation(rows=[], per_frame=per_frame, deciles=[], skipped=skipped)
-    for cap_m in dict.fromkeys(frame_row.cap_m for frame_row in measured):
-        of_cap = [frame_row for frame_row in measured if frame_row.cap_m == cap_m]
-
-        # Means over frames: coverage over all, metrics over those with a compared pixel.
-        compared = [frame_row for frame_row in of_cap if frame_row.pixels]
-        if not compared:
+    rows: list[EvaluationRow] = []
+    deciles: list[EvaluationRow] = []
+    for cap_m in dict.fromkeys(result.cap_m for result in measured):
+        at_cap = [result for result in measured if result.cap_m == cap_m]
+        if not any(result.pixels for result in at_cap):
             raise InputError(f"{dataset.name}: no prediction has a pixel where there is truth")
-        names = [
-            name
-            for name in compared[0].metrics
-            if all(name in frame_row.metrics for frame_row in compared)
-        ]
-        metrics = {
-            name: sum(frame_row.metrics[name] for frame_row in compared) / len(compared)
-            for name in names
-        }
-        coverage = sum(frame_row.coverage for frame_row in of_cap) / len(of_cap)
-        pixels = sum(frame_row.pixels for frame_row in of_cap)
-        evaluation.rows.append(
-            row(cap_m=cap_m, frames=len(of_cap), pixels=pixels, coverage=coverage, metrics=metrics)
+        rows.append(
+            make_row(
+                cap_m=cap_m,
+                frames=len(at_cap),
+                pixels=sum(result.pixels for result in at_cap),
+                coverage=sum(result.coverage for result in at_cap) / len(at_cap),
+                metrics=_mean_metrics(at_cap),
+            )
         )
 
-        # Errors by tenths of the pixels, from the least sure to the surest.
-        deciles = [frame_row.deciles for frame_row in of_cap if frame_row.deciles is not None]
-        errors = torch.tensor(deciles, dtype=torch.float64).nanmean(0).tolist() if deciles else []
-        ranked_by = RANKING["disparity" if cap_m is None else "depth"]
-        for decile, error in enumerate(errors, 1):
-            metrics = {ranked_by: error}
-            evaluation.deciles.append(
-                row(cap_m=cap_m, frames=len(deciles), confidence_decile=decile, metrics=metrics)
-            )
-    return evaluation
+        # Mean errors of tenths of the pixels, from the least confidence to the largest.
+        by_decile = [result.deciles for result in at_cap if result.deciles is not None]
+        if by_decile:
+            errors = torch.tensor(by_decile, dtype=torch.float64).nanmean(0).tolist()
+            metric = RANKING["disparity" if cap_m is None else "depth"]
+            deciles += [
+                make_row(
+                    cap_m=cap_m,
+                    frames=len(by_decile),
+                    confidence_decile=decile,
+                    metrics={metric: error},
+                )
+                for decile, error in enumerate(errors, 1)
+            ]
+    return Evaluation(rows=rows, per_frame=per_frame, deciles=deciles, skipped=skipped)
+
+
+def _mean_metrics(results: Sequence[Measured]) -> dict[str, float]:
+    """Average over frames with a compared pixel the metrics that all of them have."""
+    compared = [result.metrics for result in results if result.pixels]
+    common = [name for name in compared[0] if all(name in metrics for metrics in compared)]
+    return {name: sum(metrics[name] for metrics in compared) / len(compared) for name in common}
 
 
 def _nothing_measured(dataset: Dataset, protocol: str, skipped: Mapping[str, str]) -> InputError:
     """Make the error of a dataset of which no frame could be measured, with the remedy."""
-    without = next((name for name, reason in skipped.items() if reason == NO_PREDICTION), None)
-    if without is not None:
+    unpredicted = [name for name, reason in skipped.items() if reason == NO_PREDICTION]
+    if unpredicted:
         return InputError(
-            f"{dataset.name}: no frame has both truth and a prediction; {without!r} has the truth "
-            f"and {NO_PREDICTION}. Predictions are called {files.EXPECTED}"
+            f"{dataset.name}: no frame has both truth and a prediction; {unpredicted[0]!r} has the "
+            f"truth and {NO_PREDICTION}. Predictions are called {files.EXPECTED}"
         )
     rule = find_protocol(protocol)
-    others = {name: other for name, other in PROTOCOLS.items() if other.truth != rule.truth}
     fitting = [
         name
-        for name, other in others.items()
-        if any(has_truth(frame, other) for frame in dataset.frames)
+        for name, other in PROTOCOLS.items()
+        if other.truth != rule.truth and any(has_truth(frame, other) for frame in dataset.frames)
     ]
     remedy = f"--protocol {' or '.join(fitting)} fits." if fitting else "Choose another folder."
     return InputError(
@@ -353,10 +363,10 @@ def _nothing_measured(dataset: Dataset, protocol: str, skipped: Mapping[str, str
 def frame_result(
     dataset: Dataset, index: int, predictions: Path, protocol: str, cap_m: float | None
 ) -> tuple[DepthEstimate, DepthError]:
-    """Give the estimate of one frame and its error by pixel, as :func:`evaluate` measured them.
+    """Read the estimate of one frame, and its error at each pixel, as :func:`evaluate` has them.
 
-    Both have the size of the truth. ``cap_m`` is that of the row, None for a protocol of disparity;
-    the error is then one of disparity [px], else one of depth as a share of the true depth.
+    Both have the size of the truth. With ``cap_m`` None, for a protocol of disparity, the error is
+    that of disparity [px]; else it is that of depth as a share of the true depth.
 
     Raises:
         InputError: the frame does not count, or a file is damaged.
@@ -368,15 +378,15 @@ def frame_result(
         raise InputError(f"{name}: {prepared}; choose a frame that counts")
     rig = prepared.rig
 
-    # What is shown: the whole prediction, without the sky.
+    # The whole prediction, without the sky.
     depth_m = None if rig is None else disparity.depth_from_disparity(prepared.disparity_px, rig)
     sky = files.read_part(predictions, name, "sky.png")
     is_sky = None if sky is None else sky[0] > 0
     if is_sky is not None and depth_m is not None and is_sky.shape == depth_m.shape:
         depth_m = torch.where(is_sky, torch.nan, depth_m)
 
-    # What is measured: the pixels that count, clamped to the cap.
-    predicted, truth = _compared(prepared, rule, cap_m)
+    # The error at the pixels that count.
+    predicted, truth = _apply_protocol(prepared, rule, cap_m)
     error = (predicted - truth).abs()
     if cap_m is not None:
         error = error / truth
@@ -395,7 +405,7 @@ def frame_result(
 
 
 def clamped_depth(disparity_px: Map, rig: StereoRig, cap_m: float) -> Map:
-    """Turn disparity into depth as the published script does: infinity to 0, then the clamp.
+    """Convert disparity to depth between 0.001 m and a cap, as the published Eigen script does.
 
     NaN (no prediction) stays NaN; zero and negative disparity become the smallest depth, as there.
     """
@@ -405,39 +415,47 @@ def clamped_depth(disparity_px: Map, rig: StereoRig, cap_m: float) -> Map:
 
 
 def _prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) -> _Prepared | str:
-    """Read truth and prediction of a frame, or give the reason why it is not measured."""
+    """Read truth and prediction of a frame, or give the reason why it is not measured.
+
+    Raises:
+        InputError: the prediction is missing or damaged, or of another unit, sign or size.
+    """
     frame = dataset.frames[index]
-    is_stereo = rule.truth == "disparity"
+    is_disparity = rule.truth == "disparity"
     if not has_truth(frame, rule):
         return f"no truth of the kind {rule.truth}"
     if frame.right is None and not files.has_prediction(predictions, frame.name):
         return NO_PREDICTION
+
+    # The truth.
     if rule.truth in ("velodyne_x", "camera_z"):
         truth = lidar_truth(frame, rule.truth)
     else:
-        shipped = dataset.read_truth(index)
-        truth = shipped.disparity_px if is_stereo else shipped.depth_m
+        stored_truth = dataset.read_truth(index)
+        truth = stored_truth.disparity_px if is_disparity else stored_truth.depth_m
     assert truth is not None, "has_truth said so"
     height, width = truth.shape
 
-    # Depth that was predicted as such is compared as it is; else it follows from the disparity.
+    # The prediction. Depth is compared as it was predicted, or made from the predicted disparity.
     rig = dataset.read_rig(index)
     depth_m = None
     has_disparity = files.has_prediction(predictions, frame.name, of_disparity=True)
-    if not is_stereo and (rig is None or not has_disparity):
+    if not is_disparity and (rig is None or not has_disparity):
         depth_m = files.read_depth(predictions, frame.name)
-    if not is_stereo and rig is None:
+    if not is_disparity and rig is None:
         if depth_m is None:
             raise InputError(
                 f"{frame.name}: no calibration of a pair, so its disparity cannot become metres; "
                 f"predict depth ({frame.name}.depth_m.npy), or give the frame its baseline"
             )
+        # Any rig will do: it is undone where depth is compared.
         K = torch.tensor([[width, 0, 0], [0, width, 0], [0, 0, 1]], dtype=torch.float64)
-        rig = StereoRig(width=width, height=height, K=K, baseline_m=1.0)  # depth takes any
-    stored_px = files.read_disparity(predictions, frame.name, rig, with_disparity_png=is_stereo)
-    true_px = truth if is_stereo or rig is None else disparity.disparity_from_depth(truth, rig)
-    predicted_px = _at_size_of(true_px, stored_px, predictions / frame.name)
-    # With principal points apart, the disparity of far points is negative.
+        rig = StereoRig(width=width, height=height, K=K, baseline_m=1.0)
+    stored_px = files.read_disparity(predictions, frame.name, rig, with_disparity_png=is_disparity)
+    true_px = truth if is_disparity or rig is None else disparity.disparity_from_depth(truth, rig)
+    predicted_px = _resize_to_truth(true_px, stored_px, predictions / frame.name)
+
+    # Units and signs; where principal points differ, the disparity of far points is negative.
     cx_difference_px = 0.0 if rig is None else rig.cx_right_minus_left_px
     advice = disparity.disparity_advice(predicted_px + cx_difference_px, true_px + cx_difference_px)
     if advice is not None:
@@ -453,57 +471,49 @@ def _prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) ->
         depth_m=depth_m if depth_m is not None and depth_m.shape == truth.shape else None,
         confidence=confidence,
         rig=rig,
-        view=_synthesised_view_errors(frame, predictions),
+        view_metrics=_measure_view(frame, predictions),
     )
 
 
-def _synthesised_view_errors(frame: Frame, predictions: Path) -> dict[str, float]:
-    """Compare the drawn right view of a frame with the real one, where there are both."""
-    drawn = files.read_part(predictions, frame.name, "right.png")
-    if drawn is None or frame.right is None:
+def _measure_view(frame: Frame, predictions: Path) -> dict[str, float]:
+    """Compare the synthesised right view of a frame with the real one; {} where one is missing."""
+    synthesised = files.read_part(predictions, frame.name, "right.png")
+    if synthesised is None or frame.right is None:
         return {}
     real = read_image(frame.right)
-    if real.shape != drawn.shape:
+    if real.shape != synthesised.shape:
         raise InputError(
             f"{predictions}: the drawn view of {frame.name} is "
-            f"{drawn.shape[2]}x{drawn.shape[1]}, but its right image is "
+            f"{synthesised.shape[2]}x{synthesised.shape[1]}, but its right image is "
             f"{real.shape[2]}x{real.shape[1]}; predict it again"
         )
-    return view_errors(drawn, real)
+    return view_errors(synthesised, real)
 
 
-def _at_size_of(true_px: Map, stored_px: Float[Tensor, "_ _"], path: Path) -> Map:
-    """Bring a prediction to the size of the truth.
+def _resize_to_truth(true_px: Map, stored_px: Float[Tensor, "_ _"], path: Path) -> Map:
+    """Resize a predicted disparity to the size of the truth.
 
-    Networks that take squeezed images give maps of another aspect, which are stretched back, with a
-    notice; a map that is turned, or a part of the image's, is refused.
+    A map of another aspect, as networks give it that take squeezed images, is stretched, with a
+    notice. ``path`` names the prediction in errors.
+
+    Raises:
+        InputError: the map is transposed, or a crop of the image's.
     """
     height, width = true_px.shape
     rows, columns = stored_px.shape
     stretched_px = disparity.resized_map(stored_px, height, width) * (width / columns)
-    aspect = columns * height / (rows * width)
-    turned = rows * height / (columns * width)
-    if 1 / _SAME_ASPECT < aspect < _SAME_ASPECT:
+    aspect_ratio = columns * height / (rows * width)
+    if 1 / _ASPECT_TOLERANCE < aspect_ratio < _ASPECT_TOLERANCE:
         return stretched_px
+
     sizes = f"{columns}x{rows}, and its truth {width}x{height}"
-    if 1 / _SAME_ASPECT < turned < _SAME_ASPECT:
+    transposed_ratio = rows * height / (columns * width)
+    if 1 / _ASPECT_TOLERANCE < transposed_ratio < _ASPECT_TOLERANCE:
         raise InputError(f"{path}: is {sizes}: it is transposed; save rows first, (H, W)")
     if rows <= height and columns <= width:
-        left = (width - columns) // 2
-        errors_px = {}
-        for top in ((height - rows) // 2, height - rows):  # from the middle, or as KITTI's 1216x352
-            window = true_px[top : top + rows, left : left + columns]
-            errors_px[top] = float((stored_px - window).abs().nanmedian())
-        top = min(errors_px, key=lambda row: errors_px[row])
-        stretched = float((stretched_px - true_px).abs().nanmedian())
-        if errors_px[top] < _CLEARLY * stretched:
-            raise InputError(
-                f"{path}: is {sizes}: it is a part of the image, cut out at column {left}, row "
-                f"{top} (there the median error is {errors_px[top]:.2f} px, stretched to all of it "
-                f"{stretched:.2f} px); put it into a map of {width}x{height}, NaN around it"
-            )
-    if sizes not in _stretched:
-        _stretched.add(sizes)  # of a whole data set once
+        _refuse_crop(true_px, stored_px, stretched_px, f"{path}: is {sizes}")
+    if sizes not in _noticed_sizes:
+        _noticed_sizes.add(sizes)  # once for all frames of a data set
         message = (
             f"{path}: is {sizes}, of another aspect, so it is stretched: right where the image was "
             "squeezed for it; what was cut out of the image is put into a map of its size, NaN "
@@ -513,23 +523,58 @@ def _at_size_of(true_px: Map, stored_px: Float[Tensor, "_ _"], path: Path) -> Ma
     return stretched_px
 
 
-def _compared(prepared: _Prepared, rule: Protocol, cap_m: float | None) -> tuple[Map, Map]:
-    """Prepare prediction and truth as the protocol says; NaN where there is none or none counts."""
+def _refuse_crop(
+    true_px: Map, stored_px: Float[Tensor, "_ _"], stretched_px: Map, context: str
+) -> None:
+    """Refuse a predicted disparity that fits a crop of the truth better than all of it.
+
+    Crops are cut out of the middle of the columns, and of the middle or the bottom of the rows, as
+    KITTI's of 1216x352. ``stretched_px`` is the prediction at the size of the truth, ``context``
+    begins the error.
+    """
+    height, width = true_px.shape
+    rows, columns = stored_px.shape
+    left = (width - columns) // 2
+    errors_px: dict[int, float] = {}
+    for top in ((height - rows) // 2, height - rows):
+        window_px = true_px[top : top + rows, left : left + columns]
+        errors_px[top] = float((stored_px - window_px).abs().nanmedian())
+    top = min(errors_px, key=lambda row: errors_px[row])
+    stretched_error_px = float((stretched_px - true_px).abs().nanmedian())
+    if errors_px[top] < _CROP_ERROR_SHARE * stretched_error_px:
+        raise InputError(
+            f"{context}: it is a part of the image, cut out at column {left}, row "
+            f"{top} (there the median error is {errors_px[top]:.2f} px, stretched to all of it "
+            f"{stretched_error_px:.2f} px); put it into a map of {width}x{height}, NaN around it"
+        )
+
+
+def _apply_protocol(prepared: _Prepared, rule: Protocol, cap_m: float | None) -> tuple[Map, Map]:
+    """Clamp the prediction and mask the truth as the protocol says.
+
+    Both are disparity [px] where ``cap_m`` is None, else depth [m]; NaN where there is no
+    prediction, and where there is no truth or it does not count.
+    """
     truth = prepared.truth
-    predicted_m = prepared.depth_m
     if cap_m is None:
         return prepared.disparity_px, truth
-    counts = (truth > SMALLEST_DEPTH_M) & (truth < cap_m)
+    is_counted = (truth > SMALLEST_DEPTH_M) & (truth < cap_m)
     if rule.with_crop:
-        counts &= garg_crop(*truth.shape)
+        is_counted &= garg_crop(*truth.shape)
+    predicted_m = prepared.depth_m
     if predicted_m is None:
         assert prepared.rig is not None
         predicted_m = clamped_depth(prepared.disparity_px, prepared.rig, cap_m)
-    return predicted_m.clamp(SMALLEST_DEPTH_M, cap_m), torch.where(counts, truth, torch.nan)
+    clamped_m = predicted_m.clamp(SMALLEST_DEPTH_M, cap_m)
+    return clamped_m, torch.where(is_counted, truth, torch.nan)
 
 
 def measure_image_confidence(net: FakestereoNet, images: Iterable[StereoInput]) -> list[float]:
-    """Give the confidence in each image as a whole, 0..1 (``DepthEstimate.image_confidence``)."""
+    """Estimate images, and give the ``DepthEstimate.image_confidence`` of each, 0..1.
+
+    Raises:
+        InputError: the weights have no such confidence, or an image cannot be estimated.
+    """
     confidences: list[float] = []
     for image in images:
         image_confidence = net.estimate_pair(replace(image, right=None)).image_confidence

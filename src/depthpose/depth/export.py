@@ -1,6 +1,6 @@
 """Depth as one ONNX graph, the estimator's own steps included, and its comparison with PyTorch."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -31,42 +31,55 @@ from depthpose.depth.synthesis import (
 from depthpose.depth.types import DepthEstimate, StereoInput, Views
 from depthpose.depth.weights import DepthWeights, make_matcher
 
+# float32 constants of graphs.
 _0 = np.float32(0)
 _1 = np.float32(1)
 _2 = np.float32(2)
 _HALF = np.float32(0.5)
+_NAN = np.float32(np.nan)
 
 
 def _side(size: Value, axis: int) -> Value:
-    """Give the number of rows (axis 0) or columns (1), as a list of one."""
+    """Give the number of rows (axis 0) or columns (1) of a size, as a list of one number."""
     return size.slice([axis], [axis + 1], [0])
 
 
-def _resized_image(image: Value, size: Value) -> Value:
-    """Resize images, averaging where they shrink."""
-    resized = image.op("Resize", None, None, size, mode="linear", axes=[2, 3],
-                       antialias=1, exclude_outside=1)  # fmt: skip
+def _resize_image(image: Value, size: Value) -> Value:
+    """Resize images to rows and columns, with antialiasing where they shrink; clip to [0, 1]."""
+    resized = image.op(
+        "Resize", None, None, size, mode="linear", axes=[2, 3], antialias=1, exclude_outside=1
+    )
     return resized.op("Clip", _0, _1)
 
 
-def _resized_map(values: Value, size: Value) -> Value:
-    """Resize maps (batch, height, width) without averaging."""
-    lifted = values.op("Unsqueeze", [1])
-    return lifted.op("Resize", None, None, size, mode="linear", axes=[2, 3]).op("Squeeze", [1])
+def _resize_map(values: Value, size: Value) -> Value:
+    """Resize maps (batch, height, width) to rows and columns, without antialiasing."""
+    with_channel = values.op("Unsqueeze", [1])
+    resized = with_channel.op("Resize", None, None, size, mode="linear", axes=[2, 3])
+    return resized.op("Squeeze", [1])
 
 
-def _ratio(wide: Value, narrow: Value) -> Value:
-    """Give the ratio of the widths of two images, by which disparities scale."""
-    wide_px = _side(wide, 1).cast(np.float64)
-    narrow_px = _side(narrow, 1).cast(np.float64)
-    return (wide_px / narrow_px).cast(np.float32)
+def _width_ratio(size: Value, other: Value) -> Value:
+    """Give the width of a size as a multiple of another's, by which disparities scale."""
+    width = _side(size, 1).cast(np.float64)
+    other_width = _side(other, 1).cast(np.float64)
+    return (width / other_width).cast(np.float32)
+
+
+def _size_at_focal_length(size: Value, target_px: float, focal_px: Value | np.ndarray) -> Value:
+    """Give rows and columns at which images have a focal length, as ``size_at_focal_length`` does.
+
+    ``size``: rows and columns of the images; ``focal_px``: their focal lengths along both.
+    """
+    scaled = size.cast(np.float64) * target_px / focal_px
+    return scaled.op("Round").op("Max", 1.0).cast(np.int64)
 
 
 Maps = Float[Tensor, "b rows columns"]
 
 
 class DynamicPSMNet(nn.Module):
-    """PSMNet with its soft arg-min, in eval mode.
+    """PSMNet with its soft arg-min in eval mode, in operators that allow images of any size.
 
     Disparities are few and fixed, so their interpolation is a matrix; rows and columns are resized.
     """
@@ -87,152 +100,202 @@ class DynamicPSMNet(nn.Module):
         self, left: Views, right: Views
     ) -> tuple[Float[Tensor, "b h w"], Float[Tensor, "b h w"]]:
         """Give disparity [px] and confidence of normalised images."""
-        near = self.network.features(left)
-        far = self.network.features(right)
-        cost0 = self.network.aggregate(gathered_volume(near, far, self.bins))
-        cost = self.network.refine(cost0)[-1][:, 0]
-        align = self.network.config.align_corners
-        wide = F.interpolate(cost, left.shape[-2:], mode="bilinear", align_corners=align)
-        probability = F.conv2d(wide, self.matrix).softmax(1)
-        steps_px = torch.arange(self.network.config.max_disparity_px).to(cost)[:, None, None]
-        disparity_px = (probability * steps_px).sum(1)
-        is_near = (steps_px - disparity_px[:, None]).abs() <= WINDOW_PX
+        config = self.network.config
+        left_features = self.network.features(left)
+        right_features = self.network.features(right)
+        volume = gathered_volume(left_features, right_features, self.bins)
+        cost = self.network.refine(self.network.aggregate(volume))[-1][:, 0]
+
+        # Costs at the size of the images and for each disparity.
+        resized = F.interpolate(
+            cost, left.shape[-2:], mode="bilinear", align_corners=config.align_corners
+        )
+        probability = F.conv2d(resized, self.matrix).softmax(1)
+
+        disparities_px = torch.arange(config.max_disparity_px).to(cost)[:, None, None]
+        disparity_px = (probability * disparities_px).sum(1)
+        is_near = (disparities_px - disparity_px[:, None]).abs() <= WINDOW_PX
         return disparity_px, (probability * is_near).sum(1).clamp(0, 1)
 
 
 class _Dynamic(nn.Module):
+    """A module that computes what an export needs of a network."""
+
     def __init__(self, network: Any) -> None:  # noqa: ANN401
         super().__init__()
         self.network = network
 
 
 class DynamicLightStereo(_Dynamic):
-    """The light network with what its matcher makes of its scores."""
+    """The light network with its matcher's post-processing."""
 
     def forward(self, left: Views, right: Views) -> tuple[Maps, ...]:
-        """Give disparity [px], confidence and, with that class, the sky of normalised images."""
+        """Give disparity [px] and confidence of normalised images, then 1 in the sky.
+
+        The sky is left out where the network does not recognise it.
+        """
         max_disparity_px = self.network.config.max_disparity_px
-        read = self.network.read(left, right, max_disparity_px, with_confidence=True)
-        assert read.confidence is not None
-        sky = () if read.sky is None else ((read.sky > 0.5).float(),)
-        return read.heads[-1], read.confidence, *sky
+        output = self.network.read(left, right, max_disparity_px, with_confidence=True)
+        assert output.confidence is not None
+        if output.sky is None:
+            return output.heads[-1], output.confidence
+        return output.heads[-1], output.confidence, (output.sky > 0.5).float()
 
 
 DYNAMIC_SHAPE_NETWORKS: dict[type[StereoNetwork], Callable[[Any], nn.Module]] = {
     PSMNet: DynamicPSMNet,
     LightStereo: DynamicLightStereo,
 }
-"""Each kind of matcher network in its form with dynamic shapes: a new kind is one entry."""
+"""Modules that matcher networks are exported as, for any image size: a new kind is one entry."""
 
 
 class DynamicSelection(_Dynamic):
-    """The generator that selects, and what its logits say, at half of the image's sides."""
+    """The generator that selects with the post-processing of its logits, at half the image size."""
 
     def forward(self, image: Views) -> tuple[Tensor, ...]:
         """Give log of disparity, sky and confidence of the left view; the first two of the right.
 
-        Disparity is counted in pixels of the image's width. Where the weights know streets, how
-        probable one is follows, (b,).
+        Disparity is counted in pixels of the image's width. The probability of a street follows,
+        (b,), where the weights have a layer for it.
         """
+        planes = self.network.planes
         features = self.network.encoder(image)
-        left, right = (
-            read_logits(logits, self.network.planes) for logits in self.network.decode(features)
-        )
-        street = self.network.street_probability(features[-1])
-        return *left, *right[:2], *(() if street is None else (street,))
+        left_logits, right_logits = self.network.decode(features)
+        left_log_px, left_sky, left_confidence = read_logits(left_logits, planes)
+        right_log_px, right_sky, _ = read_logits(right_logits, planes)
+        outputs = (left_log_px, left_sky, left_confidence, right_log_px, right_sky)
+        street_probability = self.network.street_probability(features[-1])
+        return outputs if street_probability is None else (*outputs, street_probability)
 
 
 def gathered_volume(
     left: Float[Tensor, "b c h w"], right: Float[Tensor, "b c h w"], bins: int
 ) -> Float[Tensor, "b c2 {bins} h w"]:
-    """Make ``concatenation_volume`` by one gather in place of a copy a disparity."""
-    column = torch.arange(left.shape[-1]) - torch.arange(bins)[:, None]
-    is_inside = (column >= 0).to(left.dtype)
-    sides = [left[..., None, :] * is_inside, right[..., column.clamp(min=0)] * is_inside]
-    return torch.cat(sides, 1).transpose(2, 3)
+    """Make ``concatenation_volume`` by one gather in place of a copy for each disparity."""
+    right_column = torch.arange(left.shape[-1]) - torch.arange(bins)[:, None]
+    is_inside = (right_column >= 0).to(left.dtype)
+    left_part = left[..., None, :] * is_inside
+    right_part = right[..., right_column.clamp(min=0)] * is_inside
+    return torch.cat([left_part, right_part], 1).transpose(2, 3)
 
 
 class _Maps(NamedTuple):
-    """Disparity [px], confidence, and 1 in the sky where it is known."""
+    """Maps of left views in a graph."""
 
     disparity_px: Value
     confidence: Value
-    sky: Value | None = None
+    sky: Value | None = None  # 1 in the sky; None where the weights do not recognise it
 
 
 class _Generated(NamedTuple):
-    """What a generator makes of left views."""
+    """Outputs of a generator for left views in a graph."""
 
     right: Value
-    left_maps: _Maps | None = None  # of a generator that estimates disparity
-    street: Value | None = None  # probability that the image shows a street
+    left_maps: _Maps | None = None  # None of a generator that estimates no disparity
+    street_probability: Value | None = None  # None where the weights do not give it
 
 
 def _generate(left: Value, generator: Generator) -> _Generated:
-    """Do in ONNX operators what ``draw_right`` does, by ``select_views`` or by the U-Net."""
+    """Add a generator to a graph: ``draw_right``, and the left maps of ``select_views``."""
     size = left.op("Shape", start=2, end=4)
     multiple = generator.config.side_multiple_px
+
     # The multiple that a side is close to, or the side itself.
     sides = size.cast(np.float64)
     nearest = (sides / float(multiple)).op("Round").op("Max", 1.0) * float(multiple)
     limits = sides * np.array([ROWS_SHARE, COLUMNS_SHARE])
     is_near = (nearest - sides).op("Abs").op("LessOrEqual", limits)
-    near = is_near.op("Where", nearest, sides).cast(np.int64)
-    example = torch.rand(2, 3, 2 * multiple, 3 * multiple)
-    if not isinstance(generator, SelectionGenerator):
-        image = _resized_image(left, near) * _2 - _1
-        network = network_model(generator, [example], multiple)
-        (selection,) = left.graph.call(network, _mirrored(image, near, multiple))
-        cropped = (selection + _1).slice([0, 0], near, [2, 3]) / _2
-        return _Generated(_resized_image(cropped, size))
-    even = (near / 2 * 2).op("Max", 2)  # since logits stand for two rows and two columns
-    image = _mirrored(_resized_image(left, even), even, multiple)
-    network = network_model(DynamicSelection(generator).eval(), [example], multiple)
+    network_size = is_near.op("Where", nearest, sides).cast(np.int64)
+
+    if isinstance(generator, SelectionGenerator):
+        return _generate_by_selection(left, size, network_size, generator)
+    example = _example_image(multiple)
+    image = _resize_image(left, network_size) * _2 - _1
+    network = network_model(generator, [example], multiple)
+    (output,) = left.graph.call(network, _pad_by_reflection(image, network_size, multiple))
+    right = (output + _1).slice([0, 0], network_size, [2, 3]) / _2
+    return _Generated(_resize_image(right, size))
+
+
+def _generate_by_selection(
+    left: Value, size: Value, network_size: Value, generator: SelectionGenerator
+) -> _Generated:
+    """Add a generator that selects to a graph.
+
+    ``size``: rows and columns of ``left``; ``network_size``: those to which the network's input is
+    resized before it is padded.
+    """
+    multiple = generator.config.side_multiple_px
+    even_size = (network_size / 2 * 2).op("Max", 2)  # logits stand for two rows and two columns
+    image = _pad_by_reflection(_resize_image(left, even_size), even_size, multiple)
+    network = network_model(
+        DynamicSelection(generator).eval(), [_example_image(multiple)], multiple
+    )
     outputs = left.graph.call(network, image)
-    maps = [m.slice([0, 0], even / 2, [1, 2]) for m in outputs[:5]]
-    log_px, sky, match_confidence, right_log_px, right_sky = (_resized_map(m, size) for m in maps)
-    scale = _ratio(size, even)
+    log_px, sky, disparity_confidence, right_log_px, right_sky = (
+        _resize_map(output.slice([0, 0], even_size / 2, [1, 2]), size) for output in outputs[:5]
+    )
+    street_probability = outputs[5] if generator.config.with_street else None
+
+    # The left view.
+    scale = _width_ratio(size, even_size)
     is_sky = sky.op("Greater", _HALF)
-    confidence = is_sky.op("Where", sky, match_confidence * (sky * np.float32(-1) + _1))
-    of_left = _Maps(log_px.op("Exp") * scale, confidence, is_sky.cast(np.float32))
-    right_px = right_sky.op("Greater", _HALF).op("Where", _0, right_log_px.op("Exp") * scale)
-    street = outputs[5] if generator.config.with_street else None
-    # Look the left image up at ``x + shift``; beyond the border the border repeats.
+    not_sky = sky * np.float32(-1) + _1
+    confidence = is_sky.op("Where", sky, disparity_confidence * not_sky)
+    left_maps = _Maps(log_px.op("Exp") * scale, confidence, is_sky.cast(np.float32))
+
+    # The right view; the sky is not shifted.
+    is_right_sky = right_sky.op("Greater", _HALF)
+    right_px = is_right_sky.op("Where", _0, right_log_px.op("Exp") * scale)
+    return _Generated(_warp_left_to_right(left, right_px, size), left_maps, street_probability)
+
+
+def _warp_left_to_right(left: Value, right_px: Value, size: Value) -> Value:
+    """Sample left views at ``x + disparity``; beyond the border the border repeats."""
     graph = left.graph
-    row, column = (  # 0, 1, ... of each side
+    row, column = (
         graph.op("Range", 0, _side(size, axis).op("Squeeze", [0]), 1).cast(np.float32)
         for axis in (0, 1)
     )
+    # GridSample's coordinates: -1 and 1 are the outer borders of the image.
     y, x = (
         (values * _2 + _1) / _side(size, axis).cast(np.float32) - _1
         for axis, values in enumerate((row.op("Unsqueeze", [1]), right_px + column))
     )
-    parts = (v.op("Expand", right_px.op("Shape")).op("Unsqueeze", [-1]) for v in (x, y))
-    grid = graph.op("Concat", *parts, axis=-1)
-    right = left.op("GridSample", grid, mode="bilinear", padding_mode="border", align_corners=0)
-    return _Generated(right, of_left, street)
+    shape = right_px.op("Shape")
+    coordinates = (values.op("Expand", shape).op("Unsqueeze", [-1]) for values in (x, y))
+    grid = graph.op("Concat", *coordinates, axis=-1)
+    return left.op("GridSample", grid, mode="bilinear", padding_mode="border", align_corners=0)
 
 
-def _mirrored(image: Value, size: Value, multiple: int) -> Value:
-    """Pad images at the right and below by mirroring, until both sides are multiples."""
+def _example_image(multiple: int) -> Tensor:
+    """Make an image of sides that are multiples, by which a generator's network is traced."""
+    return torch.rand(2, 3, 2 * multiple, 3 * multiple)
+
+
+def _pad_by_reflection(image: Value, size: Value, multiple: int) -> Value:
+    """Pad images of a size at the right and below, until both sides are multiples."""
     lacking = (size + (multiple - 1)) / multiple * multiple - size
     none = [0, 0]
     pads = image.graph.op("Concat", none, none, none, lacking, axis=0)
     return image.op("Pad", pads, mode="reflect")
 
 
-_IMAGES = ("batch", 3, "height", "width")
-_MAPS = ("batch", "height", "width")
+_IMAGES_SHAPE = ("batch", 3, "height", "width")
+_MAPS_SHAPE = ("batch", "height", "width")
 
 
 def image_graph(weights: DepthWeights) -> Graph:
-    """Write one image to depth: what ``FakestereoNet.estimate`` does without a right view.
+    """Make the graph of depth from one image: ``FakestereoNet.estimate`` without a right view.
 
-    Inputs ``image`` (batch, 3, height, width; RGB in [0, 1]) and ``K`` (3, 3; float64, of all
-    images). Outputs ``depth_m``, ``disparity_px`` (of the imitated rig, in the image's pixels),
-    ``confidence`` (each batch, height, width) and ``right``, the drawn view; of networks that know
-    the sky ``is_sky`` too (batch, height, width; bool), of weights that know streets
-    ``image_confidence`` (batch), how probable one is.
+    Inputs are ``image`` (batch, 3, height, width; RGB in [0, 1]) and ``K`` (3, 3; float64, of all
+    images). Outputs are ``depth_m``, ``disparity_px`` (of the imitated rig, in the image's pixels),
+    ``confidence`` (each batch, height, width) and ``right``, the synthesised view; with networks
+    that recognise the sky also ``is_sky`` (batch, height, width; bool), and with weights that
+    recognise streets ``image_confidence`` (batch), the probability of a street.
+
+    Raises:
+        InputError: the weights have no generator, or no matcher where they need one.
     """
     generator = weights.generator
     if generator is None or (weights.matcher is None and generator.config.answer != "own"):
@@ -243,70 +306,79 @@ def image_graph(weights: DepthWeights) -> Graph:
         )
     rig = generator.config
     graph = Graph()
-    image = graph.input("image", np.float32, _IMAGES)
+    image = graph.input("image", np.float32, _IMAGES_SHAPE)
     K = graph.input("K", np.float64, (3, 3)).op("Reshape", [-1])
-    full = image.op("Shape", start=2, end=4)
-    scaled = full.cast(np.float64) * float(rig.virtual_focal_px) / K.op("Gather", [4, 0])
-    small = scaled.op("Round").op("Max", 1.0).cast(np.int64)
-    left = _resized_image(image, small)
-    right, of_left, street = _generate(left, generator)
-    maps = of_left
+
+    # The virtual rig: the right view, and maps of the left one.
+    size = image.op("Shape", start=2, end=4)
+    focal_px = K.op("Gather", [4, 0])  # fy, fx
+    virtual_size = _size_at_focal_length(size, float(rig.virtual_focal_px), focal_px)
+    left = _resize_image(image, virtual_size)
+    right, generator_maps, street_probability = _generate(left, generator)
+    maps = generator_maps
     if rig.answer == "matched":
         assert weights.matcher is not None, "checked before"
-        maps = _matched(left, right, np.array([rig.virtual_focal_px] * 2), weights.matcher)
-        if of_left is not None:
-            maps = maps._replace(sky=of_left.sky)
+        maps = _match(left, right, np.array([rig.virtual_focal_px] * 2), weights.matcher)
+        if generator_maps is not None:
+            maps = maps._replace(sky=generator_maps.sky)
     assert maps is not None
-    disparity_px = _resized_map(maps.disparity_px, full) * _ratio(full, small)
-    # Depth is that over disparity.
+
+    # Depth at the size of the image.
+    disparity_px = _resize_map(maps.disparity_px, size) * _width_ratio(size, virtual_size)
     focal_m_px = K.op("Gather", 0).cast(np.float32) * np.float32(rig.virtual_baseline_m)
-    is_known = disparity_px.op("Greater", _0)
-    depth_m = is_known.op("Where", focal_m_px / disparity_px, np.float32(np.nan))
+    is_positive = disparity_px.op("Greater", _0)
+    depth_m = is_positive.op("Where", focal_m_px / disparity_px, _NAN)
     if maps.sky is not None:
-        is_sky = _resized_map(maps.sky, full).op("Greater", _HALF)
-        depth_m = is_sky.op("Where", np.float32(np.nan), depth_m)
+        is_sky = _resize_map(maps.sky, size).op("Greater", _HALF)
+        depth_m = is_sky.op("Where", _NAN, depth_m)
         disparity_px = is_sky.op("Where", focal_m_px / np.float32(SKY_M), disparity_px)
-        graph.output("is_sky", is_sky, np.bool_, _MAPS)
-    graph.output("depth_m", depth_m, np.float32, _MAPS)
-    graph.output("disparity_px", disparity_px, np.float32, _MAPS)
-    graph.output("confidence", _resized_map(maps.confidence, full), np.float32, _MAPS)
-    graph.output("right", _resized_image(right, full), np.float32, _IMAGES)
-    if street is not None:
-        graph.output("image_confidence", street, np.float32, ("batch",))
+        graph.output("is_sky", is_sky, np.bool_, _MAPS_SHAPE)
+    graph.output("depth_m", depth_m, np.float32, _MAPS_SHAPE)
+    graph.output("disparity_px", disparity_px, np.float32, _MAPS_SHAPE)
+    graph.output("confidence", _resize_map(maps.confidence, size), np.float32, _MAPS_SHAPE)
+    graph.output("right", _resize_image(right, size), np.float32, _IMAGES_SHAPE)
+    if street_probability is not None:
+        graph.output("image_confidence", street_probability, np.float32, ("batch",))
     return graph
 
 
 def pair_graph(weights: DepthWeights) -> Graph:
-    """Write a rectified pair to disparity: what ``FakestereoNet.estimate`` does with ``right=``.
+    """Make the graph of disparity of a rectified pair: ``FakestereoNet.estimate`` with ``right=``.
 
-    Inputs ``left`` and ``right`` (batch, 3, height, width; RGB in [0, 1]), and ``K`` (3, 3;
-    float64) where the weights were trained at one focal length. Outputs ``disparity_px`` and
-    ``confidence`` (batch, height, width), and of a network that knows the sky ``is_sky`` (the same;
-    bool), where disparity is 0.01 px. Elsewhere depth is ``fx * baseline / disparity``.
+    Inputs are ``left`` and ``right`` (batch, 3, height, width; RGB in [0, 1]), and ``K`` (3, 3;
+    float64) where the weights were trained at one focal length. Outputs are ``disparity_px`` and
+    ``confidence`` (batch, height, width), and with a network that recognises the sky ``is_sky``
+    (the same; bool), where disparity is 0.01 px. Elsewhere depth is ``fx * baseline / disparity``.
+
+    Raises:
+        InputError: the weights have no matcher, or one of a kind that is not exported.
     """
     if weights.matcher is None:
         raise InputError("these weights hold no matcher, only a generator; give a matcher's.")
     graph = Graph()
-    left = graph.input("left", np.float32, _IMAGES)
-    right = graph.input("right", np.float32, _IMAGES)
+    left = graph.input("left", np.float32, _IMAGES_SHAPE)
+    right = graph.input("right", np.float32, _IMAGES_SHAPE)
     focal_px = None
     if getattr(weights.matcher.config, "work_focal_px", None) is not None:
         K = graph.input("K", np.float64, (3, 3))
-        focal_px = K.op("Reshape", [-1]).op("Gather", [4, 0])
-    disparity_px, confidence, sky = _matched(left, right, focal_px, weights.matcher)
+        focal_px = K.op("Reshape", [-1]).op("Gather", [4, 0])  # fy, fx
+    disparity_px, confidence, sky = _match(left, right, focal_px, weights.matcher)
     if sky is not None:
         is_sky = sky.op("Greater", _HALF)
         disparity_px = is_sky.op("Where", np.float32(LEAST_PX), disparity_px)
-        graph.output("is_sky", is_sky, np.bool_, _MAPS)
-    graph.output("disparity_px", disparity_px, np.float32, _MAPS)
-    graph.output("confidence", confidence, np.float32, _MAPS)
+        graph.output("is_sky", is_sky, np.bool_, _MAPS_SHAPE)
+    graph.output("disparity_px", disparity_px, np.float32, _MAPS_SHAPE)
+    graph.output("confidence", confidence, np.float32, _MAPS_SHAPE)
     return graph
 
 
-def _matched(
+def _match(
     left: Value, right: Value, focal_px: Value | np.ndarray | None, matcher: StereoNetwork
 ) -> _Maps:
-    """Match at the focal length that the weights need, and resize the result to the images."""
+    """Add a matcher to a graph, at the focal length of its training; maps have the images' size.
+
+    ``focal_px``: focal lengths of the images along rows and columns, where the matcher needs them.
+    """
     if type(matcher) not in DYNAMIC_SHAPE_NETWORKS:
         kinds = ", ".join(kind.__name__ for kind in DYNAMIC_SHAPE_NETWORKS)
         raise InputError(
@@ -316,59 +388,66 @@ def _matched(
     network = DYNAMIC_SHAPE_NETWORKS[type(matcher)](matcher).eval()
     config = matcher.config
     graph = left.graph
-    size = work = left.op("Shape", start=2, end=4)
+    size = left.op("Shape", start=2, end=4)
+    work_size = size
     if config.work_focal_px is not None:
-        scaled = size.cast(np.float64) * float(config.work_focal_px) / focal_px
-        work = scaled.op("Round").op("Max", 1.0).cast(np.int64)
-    least = config.min_side_px
+        assert focal_px is not None
+        work_size = _size_at_focal_length(size, float(config.work_focal_px), focal_px)
+
+    # Normalised images, padded above and at the right to the sides that the network takes.
+    min_side = config.min_side_px
     step = config.step_px
-    lacking = ((work + (step - 1)) / step * step).op("Max", least) - work
-    above = _side(lacking, 0)
-    beside = _side(lacking, 1)
-    pads = graph.op("Concat", [0, 0], above, [0, 0, 0, 0], beside, axis=0)
-    mean, deviation = (
-        np.array(v, np.float32)[:, None, None] for v in (IMAGENET_MEAN, IMAGENET_STD)
-    )
+    padded_size = ((work_size + (step - 1)) / step * step).op("Max", min_side)
+    padding = padded_size - work_size
+    rows_above = _side(padding, 0)
+    columns_right = _side(padding, 1)
+    pads = graph.op("Concat", [0, 0], rows_above, [0, 0, 0, 0], columns_right, axis=0)
+    mean = np.array(IMAGENET_MEAN, np.float32)[:, None, None]
+    deviation = np.array(IMAGENET_STD, np.float32)[:, None, None]
     padded = [
-        ((_resized_image(view, work) - mean) / deviation).op("Pad", pads) for view in (left, right)
+        ((_resize_image(view, work_size) - mean) / deviation).op("Pad", pads)
+        for view in (left, right)
     ]
-    example = [torch.rand(2, 3, least + step, least + 2 * step) for _ in range(2)]
-    maps = graph.call(network_model(network, example, step), *padded)
-    first = graph.op("Concat", above, [0], axis=0)
-    last = graph.op("Concat", [1 << 62], _side(work, 1), axis=0)
+
+    example = [torch.rand(2, 3, min_side + step, min_side + 2 * step) for _ in range(2)]
+    outputs = graph.call(network_model(network, example, step), *padded)
+
+    # Maps without the padding, at the size of the images.
+    first = graph.op("Concat", rows_above, [0], axis=0)
+    last = graph.op("Concat", [1 << 62], _side(work_size, 1), axis=0)
     disparity_px, confidence, *sky = (
-        _resized_map(m.slice(first, last, [1, 2]), size) for m in maps
+        _resize_map(output.slice(first, last, [1, 2]), size) for output in outputs
     )
     is_sky = [values.op("Greater", _HALF).cast(np.float32) for values in sky]
-    return _Maps(disparity_px * _ratio(size, work), confidence, *is_sky)
+    return _Maps(disparity_px * _width_ratio(size, work_size), confidence, *is_sky)
 
 
 _LIMITS = {
     "depth_m": Limit(value=0.01, is_relative=True),
     "disparity_px": Limit(value=0.05),
-    # A disparity is near the answer or not: where one lies on that border, confidence jumps.
+    # A plane counts as near the disparity or not: where it lies on that border, confidence jumps.
     "confidence": Limit(value=1e-3, of="mean"),
     "right": Limit(value=1e-3),
     "image_confidence": Limit(value=1e-3),
 }
-_FLIPS = 1e-3
-"""Share of pixels that may be sky in one answer alone, with all that follows from it."""
+_FLIPPED_SHARE = 1e-3
+"""Share of pixels that may be sky in one of two results, with all that follows from it."""
 _FLIPPING_LIMITS = {
-    name: limit if limit.of == "mean" else replace(limit, flips=_FLIPS)
+    name: limit if limit.of == "mean" else replace(limit, flips=_FLIPPED_SHARE)
     for name, limit in _LIMITS.items()
-} | {"is_sky": Limit(value=_FLIPS, of="mean")}
-"""Where two scores tie, the last bit decides between candidates."""
+} | {"is_sky": Limit(value=_FLIPPED_SHARE, of="mean")}
+"""Limits of networks that choose between candidates: where two scores tie, the last bit decides."""
 _FLIPPING: tuple[type[StereoNetwork], ...] = (LightStereo,)
 """Matchers that choose between candidates."""
 
 
 @dataclass(frozen=True)
 class _Size:
-    """Of the images of a case: how many, and their focal length as a share of the network's."""
+    """Size and number of the images of a case."""
 
     rows: int
     columns: int
-    focal_share: float
+    focal_share: float  # focal length as a share of the network's
     count: int = 1
 
 
@@ -378,27 +457,37 @@ _SIZES = (
     _Size(190, 300, 0.8, count=2),
     _Size(233, 401, 1.3),
 )
-"""A multiple of what the networks take; one that is stretched to it; one that is enlarged; one that
-is padded."""
+"""Multiples of the sides that networks take; sides that are stretched to them; images that are
+enlarged; and sides that are padded."""
 _SHIFT_PX = 6
-_SKY = (0.72, 0.82, 0.95)
+"""Disparity of the scenes at the network's focal length."""
+_SKY_COLOR = (0.72, 0.82, 0.95)
 """RGB of the sky at its brightest."""
 _QUICK = MatcherConfig(speed="quick")
-"""Graphs match pairs at the focal length of the weights' training."""
-_LEAST_PX = 1.0
-"""Disparity from which depths are compared."""
+"""Graphs match pairs at the focal length of the weights' training, as this speed does."""
+_MIN_COMPARED_PX = 1.0
+"""Disparity from which depths are compared: below it depth hangs on the last bit of disparity."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Target:
-    """What a graph computes."""
+    """A kind of graph that weights are exported as."""
 
-    fits: Callable[[DepthWeights], bool]  # whether it is what weights are exported as by default
+    fits: Callable[[DepthWeights], bool]  # whether weights may be exported so by default
     export: Callable[[DepthWeights, dict[str, Any]], Export]  # of weights, and facts for its user
 
 
 def depth_export(weights: DepthWeights, what: str | None, facts: dict[str, Any]) -> Export:
-    """Describe the file that weights are exported to."""
+    """Describe the export of weights: the graph, and the cases that prove it.
+
+    Args:
+        weights: the networks.
+        what: a key of ``TARGETS``; None: the first that fits the weights.
+        facts: of the weights, for the user of the file.
+
+    Raises:
+        InputError: there is no such target.
+    """
     if what is None:
         what = next(name for name, target in TARGETS.items() if target.fits(weights))
     refuse_unknown("what", what, TARGETS)
@@ -413,15 +502,18 @@ def _pair_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
         assert weights.matcher is not None
         matcher = make_matcher(weights.matcher, _QUICK)
         if isinstance(matcher, NetworkMatcher):
-            matcher.finds_range = False  # nor does a graph
+            matcher.finds_range = False  # as in a graph
         net = FakestereoNet(matcher)
-        sky = ("is_sky",) if getattr(weights.matcher.config, "with_sky", False) else ()
-        work_px = weights.matcher.config.work_focal_px
+        outputs = ["disparity_px", "confidence"]
+        has_sky = getattr(weights.matcher.config, "with_sky", False)
+        if has_sky:
+            outputs.append("is_sky")
+        work_focal_px = weights.matcher.config.work_focal_px
         for size in _SIZES:
-            left, right, camera = _scenes(size, work_px or 1.0, with_sky=bool(sky))
+            left, right, camera = _make_scenes(size, work_focal_px or 1.0, with_sky=has_sky)
             inputs = {"left": left.numpy(), "right": right.numpy()}
             rig = None
-            if work_px is not None:
+            if work_focal_px is not None:
                 rig = StereoRig(
                     width=camera.width, height=camera.height, K=camera.K, baseline_m=0.5
                 )
@@ -431,7 +523,7 @@ def _pair_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
                 for left_view, right_view in zip(left, right, strict=True)
             )
             estimates = [net.estimate_pair(pair, with_check=False) for pair in pairs]
-            yield _case(inputs, estimates, ("disparity_px", "confidence", *sky))
+            yield _make_case(inputs, estimates, outputs)
 
     return Export(
         graph=lambda: pair_graph(weights),
@@ -451,35 +543,42 @@ def _image_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
         # The scenes of the proof need not be like the images that the weights were trained on.
         synthesiser = make_synthesiser(weights.generator, speed=_QUICK.speed)
         net = FakestereoNet(matcher, synthesiser, allow_ood=True)
-        selects = isinstance(weights.generator, SelectionGenerator)
+        outputs = ["depth_m", "disparity_px", "confidence", "right"]
         matcher_config = None if weights.matcher is None else weights.matcher.config
-        sky = ("is_sky",) if selects or getattr(matcher_config, "with_sky", False) else ()
-        street = ("image_confidence",) if getattr(weights.generator, "street", None) else ()
+        has_sky = isinstance(weights.generator, SelectionGenerator) or getattr(
+            matcher_config, "with_sky", False
+        )
+        if has_sky:
+            outputs.append("is_sky")
+        if getattr(weights.generator, "street", None):
+            outputs.append("image_confidence")
+        focal_px = weights.generator.config.virtual_focal_px
         for size in _SIZES:
-            focal_px = weights.generator.config.virtual_focal_px
-            images, _, camera = _scenes(size, focal_px, with_sky=bool(sky))
+            images, _, camera = _make_scenes(size, focal_px, with_sky=has_sky)
             inputs = {"image": images.numpy(), "K": camera.K.numpy()}
-            # A depth beyond all bounds, or none, hangs on the last bit of a disparity near zero.
             views = (
                 StereoInput(name="proof", left=view, right=None, camera=camera) for view in images
             )
             estimates = [net.estimate_pair(view) for view in views]
-            case = _case(
-                inputs, estimates, ("depth_m", "disparity_px", "confidence", "right", *sky, *street)
-            )
-            is_near = case.expected["disparity_px"] >= _LEAST_PX
-            compared = {"depth_m": is_near | case.expected["is_sky"] if sky else is_near}
-            yield replace(case, where=compared)
+            case = _make_case(inputs, estimates, outputs)
+            is_compared = case.expected["disparity_px"] >= _MIN_COMPARED_PX
+            if has_sky:
+                is_compared = is_compared | case.expected["is_sky"]
+            yield replace(case, where={"depth_m": is_compared})
 
     generator = weights.generator
-    names = ("virtual_focal_px", "virtual_baseline_m", "answer")
-    rig = {} if generator is None else {name: getattr(generator.config, name) for name in names}
-    chooses = isinstance(generator, SelectionGenerator) or isinstance(weights.matcher, _FLIPPING)
+    rig_facts: dict[str, Any] = {}
+    if generator is not None:
+        names = ("virtual_focal_px", "virtual_baseline_m", "answer")
+        rig_facts = {name: getattr(generator.config, name) for name in names}
+    is_flipping = isinstance(generator, SelectionGenerator) or isinstance(
+        weights.matcher, _FLIPPING
+    )
     return Export(
         graph=lambda: image_graph(weights),
         cases=cases,
-        limits=_FLIPPING_LIMITS if chooses else _LIMITS,
-        facts={**facts, **rig, "what": "image, RGB in [0, 1], and K [px] -> depth [m], ..."},
+        limits=_FLIPPING_LIMITS if is_flipping else _LIMITS,
+        facts={**facts, **rig_facts, "what": "image, RGB in [0, 1], and K [px] -> depth [m], ..."},
     )
 
 
@@ -490,35 +589,35 @@ TARGETS = {
 """One image to depth, a rectified pair to disparity: a new target is a function and one entry."""
 
 
-def _case(
-    inputs: dict[str, np.ndarray], estimates: list[DepthEstimate], outputs: tuple[str, ...]
+def _make_case(
+    inputs: dict[str, np.ndarray], estimates: list[DepthEstimate], outputs: Sequence[str]
 ) -> Case:
-    """Make a case of inputs and of what PyTorch estimates from them."""
-    expected = {
-        name: torch.stack(
-            [torch.as_tensor(getattr(estimate, name)) for estimate in estimates]
-        ).numpy()
-        for name in outputs
-    }
+    """Make a case of inputs and of the outputs that PyTorch estimates from them."""
+    expected: dict[str, np.ndarray] = {}
+    for output in outputs:
+        values = [torch.as_tensor(getattr(estimate, output)) for estimate in estimates]
+        expected[output] = torch.stack(values).numpy()
     shape = next(iter(inputs.values())).shape
     return Case(name="x".join(map(str, shape)), inputs=inputs, expected=expected)
 
 
-def _scenes(
+def _make_scenes(
     size: _Size, network_focal_px: float, *, with_sky: bool
 ) -> tuple[Tensor, Tensor, Camera]:
-    """Make pairs of smooth noise, the right view moved by one disparity, and their camera."""
+    """Make left and right views of smooth noise, shifted by one disparity, and their camera."""
     rows = size.rows
     columns = size.columns
-    f = size.focal_share * network_focal_px
-    K = torch.tensor([[f, 0, columns / 2], [0, f, rows / 2], [0, 0, 1]], dtype=torch.float64)
+    focal_px = size.focal_share * network_focal_px
+    K = torch.tensor(
+        [[focal_px, 0, columns / 2], [0, focal_px, rows / 2], [0, 0, 1]], dtype=torch.float64
+    )
     camera = Camera(width=columns, height=rows, K=K)
     shift = round(_SHIFT_PX * size.focal_share)
-    chance = torch.Generator().manual_seed(0)
-    noise = torch.rand(size.count, 3, rows // 6, columns // 6, generator=chance)
+    random = torch.Generator().manual_seed(0)
+    noise = torch.rand(size.count, 3, rows // 6, columns // 6, generator=random)
     scene = F.interpolate(noise, (rows, columns + shift), mode="bicubic").clamp(0, 1)
     if with_sky:  # bright and nearly without texture, over the upper two fifths
         top = rows * 2 // 5
-        sky = torch.tensor(_SKY)[:, None, None] * torch.linspace(0.9, 1.0, top)[:, None]
+        sky = torch.tensor(_SKY_COLOR)[:, None, None] * torch.linspace(0.9, 1.0, top)[:, None]
         scene[:, :, :top] = torch.lerp(scene[:, :, :top], sky, 0.97)
     return scene[..., :columns].contiguous(), scene[..., shift:].contiguous(), camera

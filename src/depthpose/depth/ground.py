@@ -1,15 +1,16 @@
-"""The road in a depth map: how high the camera stands, how it is tilted, and metres by that.
+"""The road in a depth map: height and tilt of the camera above it, and the scale that they give.
 
-A network judges depth by where the ground is, as the camera of its training saw it, and by how
-large things look. Where the ground is follows from the camera's mount, which the image itself, the
-frames before or the user know better. Both are joined for each pixel by their uncertainties.
+A network estimates depth from where the ground lies in the image, as in the images it was trained
+on, and from how large objects look. Where the ground lies follows from the camera's mount, which
+the image, earlier frames or the user tell more exactly. Both depths are averaged at each pixel,
+weighted by their inverse variances.
 """
 
 import math
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from depthpose.core.camera import Camera
@@ -18,54 +19,65 @@ from depthpose.depth.config import SelectionConfig
 from depthpose.depth.horizon import Angles, find_angles
 from depthpose.depth.types import DepthEstimate, Ground, Map, StereoInput
 
-_INLIER = 0.06
-"""Inverse depths within this share of the plane's belong to it."""
-_POINTS = 2000  # that a plane is fitted to
-_DRAWS = 200  # of three points for a plane
+_MAX_RELATIVE_ERROR = 0.06
+"""Of the inverse depth of an inlier, relative to that of the plane."""
+_MAX_POINTS = 2000
+"""Number of points that a plane is fitted to, about."""
+_RANSAC_SAMPLES = 200
+"""Planes that are tried, each through three random points."""
 _REFITS = 3
-_FEWEST_POINTS = 60  # with depth in the lower part of an image
-_FEWEST_ON_PLANE = 30  # of them
-_STRIPS = 8  # of columns, of which the jackknife leaves one out at a time
-_LEAST_SHARE = 0.25
-"""Of the points in the lower part of the image, on the plane; with less there is no ground."""
-_MOST_ROLL_DEG = 10.0
+"""Least-squares fits after the first, each to the inliers of the one before."""
+_MIN_POINTS = 60
+"""With depth in the lower part of an image, for a fit."""
+_MIN_INLIERS = 30
+_STRIPS = 8
+"""Strips of columns; the jackknife leaves one out at a time."""
+_MIN_INLIER_SHARE = 0.25
+"""Of the points in the lower part of the image; with fewer inliers there is no ground."""
+_MAX_ROLL_DEG = 10.0
 _MAX_TAN_TILT = math.tan(math.radians(25))
-_MAX_TAN_ROLL = math.tan(math.radians(_MOST_ROLL_DEG))
-_LEAST_HEIGHT_M = 0.2
-_MOST_HEIGHT_M = 20.0
-_MOST_ROAD_TILT_DEG = 15.0
+_MAX_TAN_ROLL = math.tan(math.radians(_MAX_ROLL_DEG))
+_MIN_HEIGHT_M = 0.2
+_MAX_HEIGHT_M = 20.0
+_MAX_ROAD_TILT_DEG = 15.0
 """Steeper planes were no road in any of 59 views by cameras tilted up to 7 degrees."""
-_MOST_TILT_APART_DEG = 8.0
-"""Of a given tilt and that of the road in the map, which was at most 5.5 degrees off in these."""
+_MAX_TILT_DIFFERENCE_DEG = 8.0
+"""Of the user's tilt from that of the road in the map, which was off by at most 5.5 degrees in
+these views."""
 _MAP_TILT_STD_DEG = 0.8
 _MAP_ROLL_STD_DEG = 1.2
+"""Standard deviations of tilt and roll of the road in a depth map."""
 _ROAD_STD_DEG = 0.3
-"""Of the near road's tilt against that of the far one, to which edges run."""
-_TILT_STEP_DEG = 0.3
-"""By which a vehicle tilts from frame to frame."""
-_GIVEN_TILT_STD_DEG = 0.2
-_GIVEN_HEIGHT_STD = 0.03
-"""As a share; a tape measure is better, but a loaded car stands lower."""
-_HEIGHT_PER_DEG = 0.06
-"""By how much of a share the camera stands higher, where the map's tilt is a degree too large. A
-map has the height of its training near by, and the true one far off, where things have sizes, which
-together look like a tilt: 2.4 degrees a unit of the logarithm of height on synthetic streets. Most
-of what a tilt is off has other causes, so this is the slope that remains by Bayes' rule."""
+"""Of the near road's tilt against that of the far road, along which the edges run."""
+_TILT_CHANGE_DEG = 0.3
+"""Standard deviation of a vehicle's tilt and roll from frame to frame."""
+_MEASURED_TILT_STD_DEG = 0.2
+_MEASURED_HEIGHT_STD = 0.03
+"""Standard deviations of what the user measured, of the height as a share of it: a tape measure is
+more exact, but a loaded car stands lower."""
+_LOG_HEIGHT_PER_DEG = 0.06
+"""Correction of the logarithm of the map's height for each degree by which the map's tilt is too
+large. A map has the camera height of its training near by, and the true one far away, where objects
+of known size give the depth; together this looks like a tilt: 2.4 degrees for each unit of the
+logarithm of height on synthetic streets. Most of a tilt's error has other causes, so this is the
+slope that remains by Bayes' rule."""
 _HEIGHT_STD = 0.15
 _HEIGHT_NOISE = 0.06
-"""Of an estimated height, as shares: the deviation of all frames alike, and that between them."""
-_FOOT_STD = 0.12
-"""Of the logarithm of depth by where things touch the ground."""
-_ON_PLANE = 0.1
-"""What is off the map's plane by less, in the logarithm of depth, is ground; by twice as much, it
-stands on it."""
-_FARTHEST_M = 400.0
-"""Largest depth of the ground: beyond its horizon it has none."""
-_RIG = SelectionConfig()
+"""Standard deviations of an estimated height, as shares of it: of the error that all frames have in
+common, and of that which differs between them."""
+_STANDING_STD = 0.12
+"""Standard deviation of the logarithm of an object's depth, by the ground where it stands."""
+_OFF_PLANE_LOG = 0.1
+"""Difference of a pixel from the map's plane, in the logarithm of depth: with less it is ground,
+with twice as much it stands on the ground, and between them it is partly each."""
+_MAX_GROUND_DEPTH_M = 400.0
+"""Largest depth of the ground: above its horizon it has none."""
+_DEFAULT_NETWORK = SelectionConfig()
+"""The config of networks that do not say how far their roads are off."""
 _DECIMALS = 6
-"""Of the numbers of a mount: as files hold them, so that a rerun goes on from the same."""
+"""Of the values of a mount: as files hold them, so that a rerun continues from the same values."""
 _WINDOW_PX = 5
-"""Side of the square around a pixel whose distance is known."""
+"""Side of the square around a pixel whose distance was measured."""
 
 
 def fit_ground(depth_m: Map, camera: Camera) -> Ground | None:
@@ -74,63 +86,105 @@ def fit_ground(depth_m: Map, camera: Camera) -> Ground | None:
     None where a quarter of the lower part does not lie on one that could be ground.
     """
     rays, inverse, strips = _lower_points(depth_m, camera)
-    if len(inverse) < _FEWEST_POINTS:
+    if len(inverse) < _MIN_POINTS:
+        return None
+    is_inlier = _ransac_inliers(rays, inverse)
+    if is_inlier is None:
         return None
 
-    # RANSAC: planes through three points, below the camera, and tilted and rolled as cameras of
-    # vehicles and hands are.
-    chance = torch.Generator().manual_seed(0)
-    drawn = torch.randint(len(inverse), (_DRAWS, 3), generator=chance)
-    planes = torch.linalg.solve_ex(rays[drawn], inverse[drawn])[0]
-    size = planes.norm(dim=1).clamp(min=1e-9)
-    tan_tilt = planes[:, 2].abs() / planes[:, 1]
-    tan_roll = planes[:, 0].abs() / planes[:, 1]
-    is_upright = (planes[:, 1] > 0) & (tan_tilt < _MAX_TAN_TILT) & (tan_roll < _MAX_TAN_ROLL)
-    is_near = (size > 1 / _MOST_HEIGHT_M) & (size < 1 / _LEAST_HEIGHT_M)
-    is_usable = planes.isfinite().all(1) & is_upright & is_near
-    errors = (planes[is_usable] @ rays.T / inverse - 1).abs()
-    if not len(errors):
-        return None
-    is_on = errors[int((errors < _INLIER).sum(1).argmax())] < _INLIER
-
-    # Least squares over the points on the best of them.
-    plane, angles = _fit_plane(rays[is_on], inverse[is_on])
+    # Least squares over the inliers, which are then found anew.
+    plane, angles = _fit_plane(rays[is_inlier], inverse[is_inlier])
     for _ in range(_REFITS):
-        is_on = (rays @ plane / inverse - 1).abs() < _INLIER
-        if int(is_on.sum()) < _FEWEST_ON_PLANE:
+        is_inlier = (rays @ plane / inverse - 1).abs() < _MAX_RELATIVE_ERROR
+        if int(is_inlier.sum()) < _MIN_INLIERS:
             return None
-        plane, angles = _fit_plane(rays[is_on], inverse[is_on])
-    share = float(is_on.double().mean())
+        plane, angles = _fit_plane(rays[is_inlier], inverse[is_inlier])
+    share = float(is_inlier.double().mean())
     height_m, tilt_deg, roll_deg = angles
-    is_upright = abs(tilt_deg) <= _MOST_ROAD_TILT_DEG and abs(roll_deg) < _MOST_ROLL_DEG
-    if share < _LEAST_SHARE or not (is_upright and _LEAST_HEIGHT_M < height_m < _MOST_HEIGHT_M):
+    is_upright = abs(tilt_deg) <= _MAX_ROAD_TILT_DEG and abs(roll_deg) < _MAX_ROLL_DEG
+    has_height = _MIN_HEIGHT_M < height_m < _MAX_HEIGHT_M
+    if share < _MIN_INLIER_SHARE or not is_upright or not has_height:
         return None
 
-    # The jackknife's deviation: how far the fit moves when a strip of columns is left out.
-    selections = [is_on & (strips != strip) for strip in range(_STRIPS)]
-    selections = [selection for selection in selections if int(selection.sum()) >= _FEWEST_ON_PLANE]
-    fits = torch.tensor([_fit_plane(rays[k], inverse[k])[1] for k in selections])
-    count = len(fits)
-    deviation = ((count - 1) / count * ((fits - fits.mean(0)) ** 2).sum(0)).sqrt()
+    deviations = _jackknife_deviations(rays, inverse, strips, is_inlier)
+    if deviations is None:
+        return None
+    height_std_m, tilt_std_deg = deviations
     return Ground(
         height_m=height_m,
         tilt_deg=tilt_deg,
         roll_deg=roll_deg,
         share=share,
-        height_std_m=float(deviation[0]),
-        tilt_std_deg=float(deviation[1]),
+        height_std_m=height_std_m,
+        tilt_std_deg=tilt_std_deg,
     )
+
+
+def _ransac_inliers(
+    rays: Float[Tensor, "n 3"], inverse: Float[Tensor, " n"]
+) -> Bool[Tensor, " n"] | None:
+    """Find the points on the plane through three of them that most points lie on.
+
+    Planes above the camera, or tilted or rolled more than cameras of vehicles and hands are, do not
+    count; None where no other was drawn. ``rays`` and ``inverse``: as for :func:`_fit_plane`.
+    """
+    random = torch.Generator().manual_seed(0)
+    triples = torch.randint(len(inverse), (_RANSAC_SAMPLES, 3), generator=random)
+    planes = torch.linalg.solve_ex(rays[triples], inverse[triples])[0]
+
+    # The norm of a plane is 1 / height; y is down.
+    norm = planes.norm(dim=1).clamp(min=1e-9)
+    tan_tilt = planes[:, 2].abs() / planes[:, 1]
+    tan_roll = planes[:, 0].abs() / planes[:, 1]
+    is_upright = (planes[:, 1] > 0) & (tan_tilt < _MAX_TAN_TILT) & (tan_roll < _MAX_TAN_ROLL)
+    has_height = (norm > 1 / _MAX_HEIGHT_M) & (norm < 1 / _MIN_HEIGHT_M)
+    is_usable = planes.isfinite().all(1) & is_upright & has_height
+
+    errors = (planes[is_usable] @ rays.T / inverse - 1).abs()
+    if not len(errors):
+        return None
+    is_inlier = errors < _MAX_RELATIVE_ERROR
+    return is_inlier[int(is_inlier.sum(1).argmax())]
+
+
+def _jackknife_deviations(
+    rays: Float[Tensor, "n 3"],
+    inverse: Float[Tensor, " n"],
+    strips: Int[Tensor, " n"],
+    is_inlier: Bool[Tensor, " n"],
+) -> tuple[float, float] | None:
+    """Give the standard deviations of height [m] and tilt [degrees] of a fitted plane.
+
+    They are the jackknife's: how far the fit moves when one strip of columns is left out. None
+    where too few points remain without a strip.
+    """
+    fits: list[tuple[float, float, float]] = []
+    for strip in range(_STRIPS):
+        remains = is_inlier & (strips != strip)
+        if int(remains.sum()) >= _MIN_INLIERS:
+            fits.append(_fit_plane(rays[remains], inverse[remains])[1])
+    count = len(fits)
+    if count < 2:
+        return None
+    values = torch.tensor(fits)
+    variance = (count - 1) / count * ((values - values.mean(0)) ** 2).sum(0)
+    height_std_m, tilt_std_deg, _ = variance.sqrt().tolist()
+    return height_std_m, tilt_std_deg
 
 
 def _lower_points(
     depth_m: Map, camera: Camera
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"], Int[Tensor, " n"]]:
-    """Give rays (z = 1), inverse depths and column strips of points in the lower middle."""
+    """Sample points with depth in the lower middle of a map, on a regular grid.
+
+    Returns:
+        Their rays (z = 1), inverse depths [1/m], and numbers of their strips of columns.
+    """
     height, width = depth_m.shape
     top = height * 3 // 5
     left = width // 7
     right = width * 6 // 7
-    step = max(math.isqrt((height - top) * width // _POINTS), 1)
+    step = max(math.isqrt((height - top) * width // _MAX_POINTS), 1)
     rows = torch.arange(top, height, step)
     columns = torch.arange(left, right, step)
     v, u = (part.flatten() for part in torch.meshgrid(rows, columns, indexing="ij"))
@@ -166,10 +220,10 @@ def _fit_plane(
 
 @dataclass
 class MountFilter:
-    """What the frames of one camera on one vehicle, taken in order, say of its mount together.
+    """The mount of one camera on one vehicle, filtered over frames in order.
 
-    The height is held: it is the mean of all frames. The tilt is free to change from frame to
-    frame, and smoothed (a Kalman filter whose state is the last frame's :class:`Ground`).
+    The height is constant: it is the mean of all frames. The tilt may change from frame to frame,
+    and is smoothed (a Kalman filter whose state is the last frame's :class:`Ground`).
     """
 
     last: Ground | None = None  #: of the last frame with a road
@@ -179,67 +233,111 @@ def find_mount(
     fit: Ground,
     image: StereoInput,
     before: Ground | None = None,
-    rig: SelectionConfig = _RIG,
+    network: SelectionConfig = _DEFAULT_NETWORK,
 ) -> Ground:
-    """Find the camera's height, tilt and roll above a road, with their deviations.
+    """Find the camera's height, tilt and roll above a road, with their standard deviations.
 
-    What the camera says of its mount is taken. Else three estimates of the tilt are joined by their
-    deviations: that of the road in the map, that of the frame before, and that of the edges in the
-    image (:func:`find_angles`). The height is that in the map, corrected for its wrong tilt.
+    Height and tilt that the camera states are taken as they are. Else three estimates of the tilt
+    are averaged by their inverse variances: that of the road in the map, that of the frame before,
+    and that of the edges in the image (:func:`find_angles`). The height is that in the map,
+    corrected for the error of the map's tilt, and averaged over the frames.
 
     Args:
         fit: the road in the map of the image (:func:`fit_ground`).
         image: the image and its camera.
         before: the mount by the frames before, where they are of the same camera.
-        rig: of the network that estimated the map; by how much its roads are tilted too far.
+        network: config of the network that estimated the map, which says by how much its roads are
+            tilted too far.
     """
     camera = image.camera
     assert camera is not None
-    expected = Angles(
-        tilt_deg=fit.tilt_deg - rig.road_tilt_off_deg, tilt_std_deg=_MAP_TILT_STD_DEG,
-        roll_deg=fit.roll_deg, roll_std_deg=_MAP_ROLL_STD_DEG,
-    )  # fmt: skip
-    if before is not None:
-        tilt_std_deg = math.hypot(before.tilt_std_deg, _TILT_STEP_DEG)
-        tilt = _join((expected.tilt_deg, expected.tilt_std_deg), (before.tilt_deg, tilt_std_deg))
-        # A mount does not hold the deviation of its roll: edges halve that of the map's.
-        roll_std_deg = math.hypot(_MAP_ROLL_STD_DEG / 2, _TILT_STEP_DEG)
-        roll = _join((expected.roll_deg, expected.roll_std_deg), (before.roll_deg, roll_std_deg))
-        expected = Angles(
-            tilt_deg=tilt[0], tilt_std_deg=tilt[1], roll_deg=roll[0], roll_std_deg=roll[1]
-        )
+    map_tilt_deg = fit.tilt_deg - network.road_tilt_off_deg
+    expected = _expected_angles(fit, map_tilt_deg, before)
     if camera.tilt_deg is not None:
-        expected = replace(expected, tilt_deg=camera.tilt_deg, tilt_std_deg=_GIVEN_TILT_STD_DEG)
+        expected = replace(expected, tilt_deg=camera.tilt_deg, tilt_std_deg=_MEASURED_TILT_STD_DEG)
     angles = find_angles(image.left, camera, expected)
-    tilt_deg = angles.tilt_deg
-    tilt_std_deg = math.hypot(angles.tilt_std_deg, _ROAD_STD_DEG)
+
+    # Edges estimate the roll beside a tilt that is stated, but do not change that tilt.
     if camera.tilt_deg is not None:
         tilt_deg = camera.tilt_deg
-        tilt_std_deg = _GIVEN_TILT_STD_DEG
+        tilt_std_deg = _MEASURED_TILT_STD_DEG
+    else:
+        tilt_deg = angles.tilt_deg
+        tilt_std_deg = math.hypot(angles.tilt_std_deg, _ROAD_STD_DEG)
 
     if camera.mount_height_m is not None:
         height_m = camera.mount_height_m
-        share = _GIVEN_HEIGHT_STD
+        height_std = _MEASURED_HEIGHT_STD
     else:
-        off_deg = fit.tilt_deg - rig.road_tilt_off_deg - tilt_deg
-        height_m = fit.height_m * math.exp(_HEIGHT_PER_DEG * off_deg)
-        noise = _HEIGHT_NOISE
-        if before is not None:
-            # The deviation of the frames before is larger than what they share by their noise.
-            past = math.sqrt(max((before.height_std_m / before.height_m) ** 2 - _HEIGHT_STD**2, 0))
-            mean = _join((math.log(height_m), noise), (math.log(before.height_m), past))
-            height_m = math.exp(mean[0])
-            noise = mean[1]
-        share = math.hypot(_HEIGHT_STD, noise)
-    numbers = {
-        "height_m": height_m, "tilt_deg": tilt_deg, "roll_deg": angles.roll_deg,
-        "share": fit.share, "height_std_m": share * height_m, "tilt_std_deg": tilt_std_deg,
-    }  # fmt: skip
-    return Ground(**{name: round(number, _DECIMALS) for name, number in numbers.items()})
+        height_m, height_std = _estimate_height(fit.height_m, map_tilt_deg - tilt_deg, before)
+    values = {
+        "height_m": height_m,
+        "tilt_deg": tilt_deg,
+        "roll_deg": angles.roll_deg,
+        "share": fit.share,
+        "height_std_m": height_std * height_m,
+        "tilt_std_deg": tilt_std_deg,
+    }
+    return Ground(**{name: round(value, _DECIMALS) for name, value in values.items()})
 
 
-def _join(first: tuple[float, float], second: tuple[float, float]) -> tuple[float, float]:
-    """Combine two estimates with their deviations, weighted by inverse variances."""
+def _expected_angles(fit: Ground, map_tilt_deg: float, before: Ground | None) -> Angles:
+    """Give tilt and roll by the map and the frame before, which the edges then improve.
+
+    ``map_tilt_deg``: the tilt of ``fit``, without the systematic error of the network.
+    """
+    expected = Angles(
+        tilt_deg=map_tilt_deg,
+        tilt_std_deg=_MAP_TILT_STD_DEG,
+        roll_deg=fit.roll_deg,
+        roll_std_deg=_MAP_ROLL_STD_DEG,
+    )
+    if before is None:
+        return expected
+
+    tilt_std_before_deg = math.hypot(before.tilt_std_deg, _TILT_CHANGE_DEG)
+    tilt_deg, tilt_std_deg = _weighted_mean(
+        (expected.tilt_deg, expected.tilt_std_deg), (before.tilt_deg, tilt_std_before_deg)
+    )
+    # A mount does not hold the deviation of its roll: edges halve that of the map's.
+    roll_std_before_deg = math.hypot(_MAP_ROLL_STD_DEG / 2, _TILT_CHANGE_DEG)
+    roll_deg, roll_std_deg = _weighted_mean(
+        (expected.roll_deg, expected.roll_std_deg), (before.roll_deg, roll_std_before_deg)
+    )
+    return Angles(
+        tilt_deg=tilt_deg,
+        tilt_std_deg=tilt_std_deg,
+        roll_deg=roll_deg,
+        roll_std_deg=roll_std_deg,
+    )
+
+
+def _estimate_height(
+    map_height_m: float, tilt_error_deg: float, before: Ground | None
+) -> tuple[float, float]:
+    """Correct the camera's height in a map for its error of tilt, and average it over the frames.
+
+    ``tilt_error_deg``: the tilt in the map less the true one. Gives the height [m], and its
+    standard deviation as a share of it.
+    """
+    height_m = map_height_m * math.exp(_LOG_HEIGHT_PER_DEG * tilt_error_deg)
+    noise = _HEIGHT_NOISE
+    if before is not None:
+        # The frames before have a noise of their own beside the error that all have in common.
+        variance_before = (before.height_std_m / before.height_m) ** 2
+        noise_before = math.sqrt(max(variance_before - _HEIGHT_STD**2, 0))
+        log_height, noise = _weighted_mean(
+            (math.log(height_m), noise), (math.log(before.height_m), noise_before)
+        )
+        height_m = math.exp(log_height)
+    return height_m, math.hypot(_HEIGHT_STD, noise)
+
+
+def _weighted_mean(first: tuple[float, float], second: tuple[float, float]) -> tuple[float, float]:
+    """Average two values, each with its standard deviation, weighted by inverse variances.
+
+    Gives the mean and its standard deviation.
+    """
     weights = [1 / max(std, 1e-9) ** 2 for _, std in (first, second)]
     mean = (weights[0] * first[0] + weights[1] * second[0]) / sum(weights)
     return mean, math.sqrt(1 / sum(weights))
@@ -249,26 +347,28 @@ def scale_by_mount(
     estimate: DepthEstimate,
     image: StereoInput,
     mount: MountFilter | None = None,
-    rig: SelectionConfig = _RIG,
+    network: SelectionConfig = _DEFAULT_NETWORK,
 ) -> DepthEstimate:
-    """Find the camera's mount, and correct each pixel's depth by where the ground then is.
+    """Find the camera's mount, and correct the depth of each pixel by the ground that follows.
 
     An object stands on the road, so what corrects the road at its foot corrects the object too:
-    inverse depth changes by a factor and a plane. This and the map's own depth are joined by
-    inverse variances of their logarithms. That of the ground grows with the distance, for its tilt
-    is not known exactly, and is larger for what stands on it than for the ground itself.
+    inverse depth changes by a factor and a plane. This depth and the map's own are averaged by the
+    inverse variances of their logarithms. The variance of the ground's depth grows with the
+    distance, for the tilt is not known exactly, and is larger for objects than for the ground
+    itself.
 
     Args:
-        estimate: depth as the network judges it.
-        image: what it was judged by. Height and tilt of its camera are taken where they are given.
-        mount: of the frames before, in whose place that of this frame comes.
-        rig: of the network, with the deviation of its depth.
+        estimate: depth by the network.
+        image: the image of which it is. Height and tilt that its camera states are used.
+        mount: by the frames before; it is updated by this frame.
+        network: config of the network, with the standard deviation of its depth.
 
     Returns:
-        The corrected estimate with its ``ground``, the mount; unchanged where no road is seen.
+        The corrected estimate with its ``ground``, the mount; unchanged where it shows no road.
 
     Raises:
-        InputError: a height or tilt is given, and no road is seen or its tilt is far off.
+        InputError: the camera states a height or tilt, and the map shows no road, or one of quite
+            another tilt.
     """
     camera = image.camera
     name = image.name
@@ -279,64 +379,77 @@ def scale_by_mount(
             "height": (camera.mount_height_m, "m"),
             "tilt": (camera.tilt_deg, "degrees"),
         }
-        for what, (number, unit) in mount_values.items():
-            if number is not None:
+        for quantity, (value, unit) in mount_values.items():
+            if value is not None:
                 raise InputError(
-                    f"{name}: no road is seen in its lower part, so a camera {what} of "
-                    f"{number:g} {unit} cannot set the scale; omit it, or give --known-distance"
+                    f"{name}: no road is seen in its lower part, so a camera {quantity} of "
+                    f"{value:g} {unit} cannot set the scale; omit it, or give --known-distance"
                 )
         return estimate
-    if camera.tilt_deg is not None and abs(camera.tilt_deg - fit.tilt_deg) > _MOST_TILT_APART_DEG:
+    if (
+        camera.tilt_deg is not None
+        and abs(camera.tilt_deg - fit.tilt_deg) > _MAX_TILT_DIFFERENCE_DEG
+    ):
         raise InputError(
             f"{name}: a tilt of {camera.tilt_deg:g} degrees is given, and the road that is seen "
             f"says {fit.tilt_deg:.1f}. Negative is down; correct it, or omit it"
         )
-    ground = find_mount(fit, image, None if mount is None else mount.last, rig)
+    before = None if mount is None else mount.last
+    ground = find_mount(fit, image, before, network)
     if mount is not None:
         mount.last = ground
 
+    # The depth by the ground: the road moves from its plane in the map to that of the mount.
     depth_m = estimate.depth_m
-    map_plane = _plane(fit)
-    road_plane = _plane(ground)
-    multiple = float(road_plane[1] / map_plane[1])
-    inverse = multiple / depth_m + _plane_at_pixels(
-        road_plane - multiple * map_plane, camera, depth_m
-    )
-    by_ground_m = 1 / inverse.clamp(min=1 / _FARTHEST_M)
-    off_plane = (_plane_at_pixels(map_plane, camera, depth_m) * depth_m).clamp(min=1e-3).log().abs()
-    stands = (off_plane / _ON_PLANE - 1).clamp(0, 1)
-    # A tilt that is off by an angle changes the logarithm of depth by it times depth / height. What
-    # a height is off that is estimated by the map, the map's depth is off too: it does not count.
+    map_plane = _plane_of(fit)
+    mount_plane = _plane_of(ground)
+    factor = float(mount_plane[1] / map_plane[1])
+    inverse_change = _plane_at_pixels(mount_plane - factor * map_plane, camera, depth_m)
+    inverse = factor / depth_m + inverse_change
+    ground_depth_m = 1 / inverse.clamp(min=1 / _MAX_GROUND_DEPTH_M)
+
+    # How surely a pixel is no ground but stands on it: 0..1.
+    plane_ratio = _plane_at_pixels(map_plane, camera, depth_m) * depth_m
+    off_plane = plane_ratio.clamp(min=1e-3).log().abs()
+    stands = (off_plane / _OFF_PLANE_LOG - 1).clamp(0, 1)
+
+    # A tilt that is off by an angle changes the logarithm of depth by it times depth / height. The
+    # error of a height that is estimated by the map is an error of the map too: it does not count.
     tilt_std = math.radians(ground.tilt_std_deg) / ground.height_m
     ground_variance = (
-        (torch.maximum(by_ground_m, depth_m) * tilt_std).square()
-        + stands * _FOOT_STD**2
-        + _GIVEN_HEIGHT_STD**2
+        (torch.maximum(ground_depth_m, depth_m) * tilt_std).square()
+        + stands * _STANDING_STD**2
+        + _MEASURED_HEIGHT_STD**2
     )
-    weight = rig.depth_std**2 / (rig.depth_std**2 + ground_variance)
-    return replace(rescale(estimate, (by_ground_m / depth_m) ** weight), ground=ground)
+    weight = network.depth_std**2 / (network.depth_std**2 + ground_variance)
+    return replace(rescale(estimate, (ground_depth_m / depth_m) ** weight), ground=ground)
 
 
-def _plane_at_pixels(plane: Float[Tensor, "3"], camera: Camera, example: Map) -> Map:
-    """Give the inverse depth of a plane, ``plane @ ray`` (z = 1), at every pixel of a map."""
+def _plane_at_pixels(plane: Float[Tensor, "3"], camera: Camera, like: Map) -> Map:
+    """Give the inverse depth of a plane, ``plane @ ray`` (z = 1), at every pixel [1/m].
+
+    ``like``: a map of the size, type and device of the result.
+    """
     a, b, c = (plane @ torch.linalg.inv(camera.K)).tolist()
-    height, width = example.shape
-    u = torch.arange(width, dtype=example.dtype, device=example.device)
-    v = torch.arange(height, dtype=example.dtype, device=example.device)
+    height, width = like.shape
+    u = torch.arange(width, dtype=like.dtype, device=like.device)
+    v = torch.arange(height, dtype=like.dtype, device=like.device)
     return a * u + (b * v + c)[:, None]
 
 
-def _plane(ground: Ground) -> Float[Tensor, "3"]:
+def _plane_of(ground: Ground) -> Float[Tensor, "3"]:
     """Give the plane of the ground, with ``plane @ ray = 1 / depth`` for rays with z = 1."""
-    tilt, roll = (math.tan(math.radians(angle)) for angle in (ground.tilt_deg, ground.roll_deg))
-    plane = torch.tensor([-roll, 1.0, -tilt], dtype=torch.float64)
-    return plane / plane.norm() / ground.height_m
+    tan_tilt = math.tan(math.radians(ground.tilt_deg))
+    tan_roll = math.tan(math.radians(ground.roll_deg))
+    direction = torch.tensor([-tan_roll, 1.0, -tan_tilt], dtype=torch.float64)
+    return direction / direction.norm() / ground.height_m
 
 
 def rescale(estimate: DepthEstimate, factor: float | Map) -> DepthEstimate:
-    """Multiply the depth of an estimate by ``factor``, and divide its disparity by it.
+    """Give an estimate whose depth is multiplied, and whose disparity is divided, by ``factor``.
 
-    The sky keeps its disparity. The height of the ground is multiplied by a single factor alone.
+    The sky keeps its disparity. A single factor multiplies the height of the ground too; a map of
+    factors leaves the ground as it is.
     """
     assert estimate.depth_m is not None
     ground = estimate.ground
@@ -353,12 +466,17 @@ def rescale(estimate: DepthEstimate, factor: float | Map) -> DepthEstimate:
 def scale_by_distance(
     estimate: DepthEstimate, name: str, distance: tuple[float, float, float]
 ) -> DepthEstimate:
-    """Make the depth around a pixel what was measured there: its column, its row, camera z [m].
+    """Scale an estimate so that the depth around one pixel is the measured one.
 
-    The median of 5x5 pixels counts; ``name`` is the image's, for errors.
+    Args:
+        estimate: with depth.
+        name: of the image, for errors.
+        distance: column, row [px] and camera z [m] of the measured point. Its depth in the estimate
+            is the median of the 5x5 pixels around it.
 
     Raises:
-        InputError: a pixel outside the image, no depth around it (the sky), or no distance.
+        InputError: the pixel lies outside the image or has no depth (the sky), or the distance is
+            not positive.
     """
     column, row, metres = distance
     assert estimate.depth_m is not None
@@ -371,10 +489,12 @@ def scale_by_distance(
             f"{context}: the image is {width}x{height}, columns 0 to {width - 1} and rows 0 to "
             f"{height - 1}; give X,Y,METRES of a pixel of it"
         )
-    reach = _WINDOW_PX // 2
+    radius = _WINDOW_PX // 2
     x = round(column)
     y = round(row)
-    around = estimate.depth_m[max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1]
     if not bool(estimate.depth_m[min(y, height - 1), min(x, width - 1)].isfinite()):
         raise InputError(f"{context}: there is no depth at this pixel (the sky?); take another")
-    return rescale(estimate, metres / float(around[around.isfinite()].median()))
+    rows = slice(max(y - radius, 0), y + radius + 1)
+    columns = slice(max(x - radius, 0), x + radius + 1)
+    window_m = estimate.depth_m[rows, columns]
+    return rescale(estimate, metres / float(window_m[window_m.isfinite()].median()))

@@ -1,9 +1,9 @@
 """Tilt and roll of a street's camera by the straight edges in its image, without any scale.
 
-Along a street most long edges run forward (lanes, kerbs, eaves), upright or across, so that they
-meet in three vanishing points. Of a camera's angles that predict these points, those fit best whose
-points most edges aim at (after Coughlan and Yuille 1999). Everything else, such as trees and
-shadows, is an edge of any direction.
+Along a street most long edges run forward (lanes, kerbs, eaves), upright or across, so their lines
+meet in three vanishing points. The angles of a camera predict these points; the best angles are
+those to whose points most edges run (after Coughlan and Yuille 1999). All other edges, such as
+those of trees and shadows, may have any direction.
 """
 
 import math
@@ -20,39 +20,46 @@ from depthpose.core.camera import Camera
 from depthpose.core.camera.rectified import grey_of
 from depthpose.depth.types import View
 
-_MOST_PIXELS = 500_000
+_MAX_PIXELS = 500_000
 """Larger images are halved until they have fewer: edges in a street are long."""
-_LEAST_CONTRAST = 0.012
-"""Of an edge: change of grey a pixel, of a white that is 1."""
-_MIN_COS_TURN = math.cos(math.radians(20))
-"""Cosine of the angle by which gradients of two neighbours on one segment differ at most."""
-_LEAST_LENGTH_PX = 20.0
-_MOST_WIDTH = 0.03
-"""Of a segment, as a share of its length, or 1.5 pixels: wider ones are curves."""
-_SEGMENTS = 60
-"""The longest are looked at; all of KITTI's 300 were worse: short ones are leaves and shadows."""
-_OFF_PX = 0.5
-_OFF_RAD = math.radians(0.6)
-"""Deviation of the ends of a segment, and of the directions of what is built straight."""
-_FORWARD = 0.25
-_UPRIGHT = 0.15
-_ACROSS = 0.1
-"""Shares of the segments that run in these directions; the rest has any."""
-_PER_SEGMENT = 0.2
-"""How much of an observation a segment is: those of one house or lane err together."""
+_MIN_CONTRAST = 0.012
+"""Of an edge: change of grey from pixel to pixel; white is 1."""
+_MIN_COS_ANGLE = math.cos(math.radians(20))
+"""Cosine of the largest angle between the gradients of two neighbours on one segment."""
+_MIN_LENGTH_PX = 20.0
+_MAX_WIDTH_SHARE = 0.03
+_MIN_WIDTH_LIMIT_PX = 1.5
+"""Largest width of a segment, as a share of its length but never below so many pixels: wider ones
+are curves."""
+_MAX_SEGMENTS = 60
+"""Only the longest segments are used; all of KITTI's 300 were worse: short ones are leaves and
+shadows."""
+_END_STD_PX = 0.5
+_DIRECTION_STD_RAD = math.radians(0.6)
+"""Standard deviations of the ends of a segment, and of the directions of what is built straight."""
+_FORWARD_SHARE = 0.25
+_UPRIGHT_SHARE = 0.15
+_ACROSS_SHARE = 0.1
+"""Shares of the segments that run in these directions; the others run in any direction."""
+_SEGMENT_WEIGHT = 0.2
+"""Each segment counts as this share of an independent observation: the errors of segments on one
+house or lane are correlated."""
 _PAN_STD_DEG = 2.0
-"""Of a forward camera against the street."""
-_PANS = np.arange(-5.0, 5.1, 1.0)
-_TILTS = np.linspace(-3.0, 3.0, 25)
-_ROLLS = np.linspace(-2.4, 2.4, 7)
-"""Where the angles are looked for: degrees of pan, and deviations around those expected."""
+"""Standard deviation of a forward camera's pan from the direction of the street."""
+_PANS_DEG = np.arange(-5.0, 5.1, 1.0)
+_TILT_STEPS = np.linspace(-3.0, 3.0, 25)
+_ROLL_STEPS = np.linspace(-2.4, 2.4, 7)
+"""Grid of angles: pans in degrees; tilts and rolls in standard deviations from those expected."""
 
 Segments = Float[np.ndarray, "n 5"]  # column, row of the middle; direction (x, y); length [px]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Angles:
-    """Tilt and roll of a camera against the road, signs as in :class:`~..types.Ground`."""
+    """Tilt and roll of a camera against the road, with standard deviations.
+
+    Signs are those of :class:`~depthpose.depth.types.Ground`.
+    """
 
     tilt_deg: float
     tilt_std_deg: float
@@ -61,82 +68,120 @@ class Angles:
 
 
 def find_segments(grey: Float[np.ndarray, "h w"]) -> Segments:
-    """Find straight edges, the longest first: chains of edge pixels whose gradients agree.
+    """Find straight edges: chains of edge pixels whose gradients have nearly one direction.
 
-    A line is fitted to each chain by its moments; curved ones are left out.
+    A line is fitted to each chain by its moments; curved chains are left out. The longest segments
+    come first. ``grey``: black is 0, white 1.
     """
     smooth = ndimage.gaussian_filter(grey.astype(np.float32), 1.0)
-    across = np.zeros_like(smooth)
-    across[:, 1:-1] = (smooth[:, 2:] - smooth[:, :-2]) / 2
-    down = np.zeros_like(smooth)
-    down[1:-1] = (smooth[2:] - smooth[:-2]) / 2
-    strength = np.hypot(across, down)
+    gradient_x = np.zeros_like(smooth)
+    gradient_x[:, 1:-1] = (smooth[:, 2:] - smooth[:, :-2]) / 2
+    gradient_y = np.zeros_like(smooth)
+    gradient_y[1:-1] = (smooth[2:] - smooth[:-2]) / 2
+    strength = np.hypot(gradient_x, gradient_y)
 
-    # An edge is one pixel wide, the strongest along the axis that its gradient is nearer to.
-    is_steep = np.abs(across) > np.abs(down)
+    # An edge is one pixel wide: the strongest along the axis that its gradient is nearer to.
+    is_along_x = np.abs(gradient_x) > np.abs(gradient_y)
     inner = strength[1:-1, 1:-1]
-    is_column_peak = (inner >= strength[1:-1, :-2]) & (inner > strength[1:-1, 2:])
-    is_row_peak = (inner >= strength[:-2, 1:-1]) & (inner > strength[2:, 1:-1])
-    is_peak = np.where(is_steep[1:-1, 1:-1], is_column_peak, is_row_peak)
-    rows, columns = np.nonzero(is_peak & (inner > _LEAST_CONTRAST))
+    is_peak_in_row = (inner >= strength[1:-1, :-2]) & (inner > strength[1:-1, 2:])
+    is_peak_in_column = (inner >= strength[:-2, 1:-1]) & (inner > strength[2:, 1:-1])
+    is_peak = np.where(is_along_x[1:-1, 1:-1], is_peak_in_row, is_peak_in_column)
+    rows, columns = np.nonzero(is_peak & (inner > _MIN_CONTRAST))
     rows += 1
     columns += 1
-    count = len(rows)
-    if not count:
+    if not len(rows):
         return np.zeros((0, 5))
 
-    # Neighbours of like gradients are connected.
-    number = np.full((grey.shape[0] + 2, grey.shape[1] + 2), -1)
-    number[rows + 1, columns + 1] = np.arange(count)
-    power = strength[rows, columns]
-    slope_x = across[rows, columns] / power
-    slope_y = down[rows, columns] / power
+    direction_x = gradient_x[rows, columns] / strength[rows, columns]
+    direction_y = gradient_y[rows, columns] / strength[rows, columns]
+    chain_count, chains = _connect_edges(rows, columns, direction_x, direction_y, grey.shape)
+
+    # The top of a parabola through three strengths is the edge's place between pixels.
+    is_along_x = is_along_x[rows, columns]
+    x = columns + np.where(is_along_x, _peak_offset(strength, rows, columns, 0, 1), 0)
+    y = rows + np.where(is_along_x, 0, _peak_offset(strength, rows, columns, 1, 0))
+    return _fit_segments(x, y, chains, chain_count)
+
+
+def _connect_edges(
+    rows: np.ndarray,
+    columns: np.ndarray,
+    direction_x: np.ndarray,
+    direction_y: np.ndarray,
+    shape: tuple[int, ...],
+) -> tuple[int, np.ndarray]:
+    """Connect neighbouring edge pixels of similar gradients to chains.
+
+    Args:
+        rows: of the edge pixels.
+        columns: of the edge pixels.
+        direction_x: unit vectors of their gradients.
+        direction_y: the same along the columns.
+        shape: rows and columns of the image.
+
+    Returns:
+        The number of chains, and the chain of each edge pixel.
+    """
+    count = len(rows)
+    # The index of the edge pixel at each place, -1 where there is none; a border of one pixel.
+    index_at = np.full((shape[0] + 2, shape[1] + 2), -1)
+    index_at[rows + 1, columns + 1] = np.arange(count)
+
+    # Each pixel and its neighbours at the right and below, so that no pair comes twice.
     firsts: list[np.ndarray] = []
     seconds: list[np.ndarray] = []
     for step_y, step_x in ((0, 1), (1, -1), (1, 0), (1, 1)):
-        other = number[rows + 1 + step_y, columns + 1 + step_x]
-        first = np.nonzero(other >= 0)[0]
-        second = other[first]
-        cos_turn = slope_x[first] * slope_x[second] + slope_y[first] * slope_y[second]
-        firsts.append(first[cos_turn > _MIN_COS_TURN])
-        seconds.append(second[cos_turn > _MIN_COS_TURN])
-    joined = (np.concatenate(firsts), np.concatenate(seconds))
-    links = coo_array((np.ones(len(joined[0]), np.int8), joined), shape=(count, count))
-    chains, chain = connected_components(links, directed=False)
-
-    # The top of a parabola through three strengths is the edge's place between pixels.
-    x = columns + np.where(is_steep[rows, columns], _top(strength, rows, columns, 0, 1), 0)
-    y = rows + np.where(is_steep[rows, columns], 0, _top(strength, rows, columns, 1, 0))
-    return _fit_segments(x, y, chain, chains)
+        neighbour = index_at[rows + 1 + step_y, columns + 1 + step_x]
+        first = np.nonzero(neighbour >= 0)[0]
+        second = neighbour[first]
+        cos_angle = (
+            direction_x[first] * direction_x[second] + direction_y[first] * direction_y[second]
+        )
+        is_similar = cos_angle > _MIN_COS_ANGLE
+        firsts.append(first[is_similar])
+        seconds.append(second[is_similar])
+    pairs = (np.concatenate(firsts), np.concatenate(seconds))
+    graph = coo_array((np.ones(len(pairs[0]), np.int8), pairs), shape=(count, count))
+    return connected_components(graph, directed=False)
 
 
-def _fit_segments(x: np.ndarray, y: np.ndarray, chain: np.ndarray, chains: int) -> Segments:
+def _fit_segments(x: np.ndarray, y: np.ndarray, chains: np.ndarray, chain_count: int) -> Segments:
     """Fit a line to the points of each chain by their moments; give straight ones, longest first.
 
-    ``chain``: the number of each point's chain; ``chains``: how many there are.
+    ``chains``: the number of each point's chain, below ``chain_count``.
     """
-    size = np.bincount(chain, minlength=chains).astype(float)
-    middle_x = np.bincount(chain, x, chains) / size
-    middle_y = np.bincount(chain, y, chains) / size
-    from_x = x - middle_x[chain]
-    from_y = y - middle_y[chain]
-    xx = np.bincount(chain, from_x * from_x, chains) / size
-    yy = np.bincount(chain, from_y * from_y, chains) / size
-    xy = np.bincount(chain, from_x * from_y, chains) / size
+    size = np.bincount(chains, minlength=chain_count).astype(float)
+    middle_x = np.bincount(chains, x, chain_count) / size
+    middle_y = np.bincount(chains, y, chain_count) / size
+
+    # The covariance of the points of each chain.
+    from_middle_x = x - middle_x[chains]
+    from_middle_y = y - middle_y[chains]
+    xx = np.bincount(chains, from_middle_x * from_middle_x, chain_count) / size
+    yy = np.bincount(chains, from_middle_y * from_middle_y, chain_count) / size
+    xy = np.bincount(chains, from_middle_x * from_middle_y, chain_count) / size
+
+    # Its axes: the eigenvalues are mean_variance +- difference. Of a uniform distribution over a
+    # length the variance is a twelfth of its square.
     angle = np.arctan2(2 * xy, xx - yy) / 2
-    spread = np.hypot((xx - yy) / 2, xy)
-    # Of a uniform distribution over a length the variance is a twelfth of its square.
-    length = np.sqrt(12 * ((xx + yy) / 2 + spread))
-    width = np.sqrt(12 * np.clip((xx + yy) / 2 - spread, 0, None))
-    is_straight = (length > _LEAST_LENGTH_PX) & (width < np.maximum(_MOST_WIDTH * length, 1.5))
+    mean_variance = (xx + yy) / 2
+    difference = np.hypot((xx - yy) / 2, xy)
+    length = np.sqrt(12 * (mean_variance + difference))
+    width = np.sqrt(12 * np.clip(mean_variance - difference, 0, None))
+
+    max_width = np.maximum(_MAX_WIDTH_SHARE * length, _MIN_WIDTH_LIMIT_PX)
+    is_straight = (length > _MIN_LENGTH_PX) & (width < max_width)
     segments = np.stack([middle_x, middle_y, np.cos(angle), np.sin(angle), length], 1)[is_straight]
     return segments[np.argsort(-segments[:, 4], kind="stable")]
 
 
-def _top(
+def _peak_offset(
     strength: np.ndarray, rows: np.ndarray, columns: np.ndarray, step_y: int, step_x: int
 ) -> np.ndarray:
-    """Give the offset of the maximum of a parabola through three strengths, -0.5 to 0.5."""
+    """Give where between pixels a parabola through three strengths is largest, -0.5 to 0.5.
+
+    The three are those of each pixel and of its neighbours a step before and after it.
+    """
     before = strength[rows - step_y, columns - step_x]
     after = strength[rows + step_y, columns + step_x]
     bend = before - 2 * strength[rows, columns] + after
@@ -144,45 +189,41 @@ def _top(
 
 
 def find_angles(image: View, camera: Camera, expected: Angles) -> Angles:
-    """Improve what is expected of a forward camera's tilt and roll by the edges in its image.
+    """Estimate a forward camera's tilt and roll from the edges in its image and a prior.
 
     Args:
         image: the image of the camera.
         camera: its intrinsics.
-        expected: mean and deviation before the image is looked at.
+        expected: the prior: mean and standard deviation without the image.
 
     Returns:
-        Mean and deviation of the angles by both. Where there is no edge, those expected.
+        Mean and standard deviation of the posterior; the prior where there is no edge.
     """
-    # Edges of a smaller copy, in pixels of the image.
-    halvings = max(math.ceil(math.log2(image.shape[1] * image.shape[2] / _MOST_PIXELS) / 2), 0)
+    # Segments in a smaller copy of a large image.
+    halvings = max(math.ceil(math.log2(image.shape[1] * image.shape[2] / _MAX_PIXELS) / 2), 0)
     scale = 2**halvings
     grey = grey_of(image.detach().cpu().float())
     if halvings:
         grey = torch.nn.functional.avg_pool2d(grey[None, None], scale)[0, 0]
-    segments = find_segments(grey.numpy())[:_SEGMENTS]
-    # The middle of a square of pixels is at its own place in the larger image.
+    segments = find_segments(grey.numpy())[:_MAX_SEGMENTS]
+    # In pixels of the image: a pixel of the copy lies at the middle of a square of them.
     segments[:, :2] = (segments[:, :2] + 0.5) * scale - 0.5
     segments[:, 4] *= scale
 
-    # The posterior on a grid of angles: how well edges point to their vanishing points, times the
-    # normal distributions of what is expected.
-    pans, tilts, rolls = (
-        part.ravel()
-        for part in np.meshgrid(
-            _PANS,
-            expected.tilt_deg + _TILTS * expected.tilt_std_deg,
-            expected.roll_deg + _ROLLS * expected.roll_std_deg,
-            indexing="ij",
-        )
-    )
-    log_likelihood = _log_likelihood(segments, camera, pans, tilts, rolls, _OFF_PX * scale)
+    # A grid of angles.
+    tilt_axis = expected.tilt_deg + _TILT_STEPS * expected.tilt_std_deg
+    roll_axis = expected.roll_deg + _ROLL_STEPS * expected.roll_std_deg
+    grid = np.meshgrid(_PANS_DEG, tilt_axis, roll_axis, indexing="ij")
+    pans, tilts, rolls = (angles.ravel() for angles in grid)
+
+    # Its posterior: how well edges run to their vanishing points, times the normal priors.
+    log_likelihood = _log_likelihood(segments, camera, pans, tilts, rolls, _END_STD_PX * scale)
     squared_deviation = (
         (pans / _PAN_STD_DEG) ** 2
         + ((tilts - expected.tilt_deg) / expected.tilt_std_deg) ** 2
         + ((rolls - expected.roll_deg) / expected.roll_std_deg) ** 2
     )
-    log_posterior = _PER_SEGMENT * log_likelihood - squared_deviation / 2
+    log_posterior = _SEGMENT_WEIGHT * log_likelihood - squared_deviation / 2
     weight = np.exp(log_posterior - log_posterior.max())
     weight /= weight.sum()
 
@@ -202,27 +243,36 @@ def _log_likelihood(
     pans_deg: np.ndarray,
     tilts_deg: np.ndarray,
     rolls_deg: np.ndarray,
-    off_px: float,
+    end_std_px: float,
 ) -> Float[np.ndarray, " angles"]:
-    """Give the log likelihood of the directions of all segments, for each choice of angles."""
-    pan, tilt, roll = (np.radians(angle) for angle in (pans_deg, tilts_deg, rolls_deg))
+    """Give the log likelihood of the directions of all segments, for each triple of angles.
+
+    ``end_std_px``: standard deviation of the ends of a segment, in pixels of the image.
+    """
+    # The three directions of a street in camera coordinates (x right, y down, z forward).
+    pan = np.radians(pans_deg)
+    tilt = np.radians(tilts_deg)
+    roll = np.radians(rolls_deg)
     down = np.stack([-np.tan(roll), np.ones_like(roll), -np.tan(tilt)], 1)
     down /= np.linalg.norm(down, axis=1, keepdims=True)
-    level = np.stack([np.sin(pan), np.zeros_like(pan), np.cos(pan)], 1)
-    forward = level - (level * down).sum(1, keepdims=True) * down
+    ahead = np.stack([np.sin(pan), np.zeros_like(pan), np.cos(pan)], 1)
+    forward = ahead - (ahead * down).sum(1, keepdims=True) * down
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
     right = np.cross(down, forward)
 
+    # Densities of the angles between segments and the lines to the vanishing points, relative to
+    # 1 / pi, the density of segments of any direction.
     x, y, along_x, along_y, length = segments.astype(np.float32).T
-    deviation = np.hypot(math.sqrt(12) * off_px / length, _OFF_RAD)
-    density = np.full((len(pan), len(segments)), 1 - _FORWARD - _UPRIGHT - _ACROSS, np.float32)
+    deviation = np.hypot(math.sqrt(12) * end_std_px / length, _DIRECTION_STD_RAD)
+    other_share = 1 - _FORWARD_SHARE - _UPRIGHT_SHARE - _ACROSS_SHARE
+    density = np.full((len(pan), len(segments)), other_share, np.float32)
     K = camera.K.numpy()
-    for direction, share in ((forward, _FORWARD), (down, _UPRIGHT), (right, _ACROSS)):
+    directions = ((forward, _FORWARD_SHARE), (down, _UPRIGHT_SHARE), (right, _ACROSS_SHARE))
+    for direction, share in directions:
         point = (direction @ K.T).astype(np.float32)  # homogeneous, so it may be at infinity
         to_x = point[:, :1] - x * point[:, 2:]
         to_y = point[:, 1:2] - y * point[:, 2:]
-        off = (along_x * to_y - along_y * to_x) / (np.hypot(to_x, to_y) + 1e-6)
-        # Relative to the density of segments of any direction, 1 / pi.
+        sine = (along_x * to_y - along_y * to_x) / (np.hypot(to_x, to_y) + 1e-6)
         peak = share * math.pi / (math.sqrt(2 * math.pi) * deviation)
-        density += peak * np.exp(-0.5 * (off / deviation) ** 2)
+        density += peak * np.exp(-0.5 * (sine / deviation) ** 2)
     return np.log(density).sum(1)

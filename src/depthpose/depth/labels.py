@@ -1,7 +1,8 @@
-"""Truth for pairs that have none: what a matcher finds in both views, kept where they agree."""
+"""Pseudo-truth of pairs: disparity by a matcher, where both views agree."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -21,7 +22,7 @@ from depthpose.depth.types import Map, StereoInput
 
 @dataclass(frozen=True, kw_only=True)
 class LabelConfig(Settings):
-    """What counts as known."""
+    """Where a matched disparity becomes truth."""
 
     largest_difference_px: Annotated[float, "[0, inf)"] = 1.0
     """Of the disparities of both views at one point, at the image's size."""
@@ -40,65 +41,71 @@ def label_pairs(
     *,
     failures: list[InputError] | None = None,
 ) -> Iterator[tuple[str, float]]:
-    """Write a plain folder of pairs with pseudo-truth, and yield each name and what share is known.
+    """Write pairs with pseudo-truth to a plain folder; yield each name and its labelled share.
 
     ``left/`` and ``right/`` repeat the images, ``disp_occ/`` holds the disparity, ``calib.txt``
-    the rigs. A rerun goes on where it was; pairs of another folder may be added, if their names are
-    others. Frames without right view or calibration are left out. What is wrong with a pair goes to
-    ``failures``, or without these is raised. A network that has seen evaluation frames must not be
-    used. ``config`` says what counts as known, ``settings`` all that decides the result.
+    the rigs. A rerun continues with the pairs that are not finished; pairs of another folder may be
+    added, if their names differ. Frames without right view or calibration are left out.
+
+    Args:
+        net: matches the pairs; it must not be trained on frames of an evaluation.
+        dataset: the pairs.
+        config: where a matched disparity becomes truth.
+        folder: where the labelled pairs go.
+        settings: all settings that the result depends on.
+        failures: errors of single pairs are appended to it; None: the first one is raised.
 
     Raises:
-        InputError: no frame has both, the folder holds a label of another image of that name or was
-            made by other settings, no calibration can be read, or a pair that cannot be matched.
+        InputError: no frame has a right view and a calibration, the folder holds a label of another
+            image of that name or was made by other settings, no calibration can be read, or a pair
+            that cannot be matched.
     """
     frames = dataset.frames
-    usable = [n for n, frame in enumerate(frames) if frame.right and frame.calibration]
+    usable = [index for index, frame in enumerate(frames) if frame.right and frame.calibration]
     if not usable:
         raise InputError(f"{dataset.name}: no frame has a right view and a calibration to match by")
     claim_folder(folder, settings, ("left", "right", "disp_occ", "calib.txt"))
-    sources = {frames[n].name: frames[n].seen_files() for n in usable}
-    claim_names(
-        folder, sources, is_finished=lambda name: is_whole(folder, name, [f"disp_occ/{name}.png"])
-    )
-    rigs: dict[int, StereoRig] = {}
+    sources = {frames[index].name: frames[index].seen_files() for index in usable}
+    claim_names(folder, sources, is_finished=partial(_is_labelled, folder))
 
     def fail(error: InputError) -> None:
         if failures is None:
             raise error
         failures.append(error)
 
-    # The rigs first: calib.txt names all of them before any label is there.
-    for number in usable:
-        name = frames[number].name
+    # The rigs first: calib.txt names all of them before there is any label.
+    rigs: dict[int, StereoRig] = {}
+    for index in usable:
+        name = frames[index].name
         if any("\ud800" <= letter <= "\udfff" for letter in name):  # bytes that are no UTF-8
             fail(InputError(f"{name!r}: not a name in UTF-8, as calib.txt needs; rename the file"))
             continue
         try:
-            rig = dataset.read_rig(number)
+            rig = dataset.read_rig(index)
         except InputError as error:
             fail(error)
             continue
         assert rig is not None
-        rigs[number] = rig
+        rigs[index] = rig
     if failures and not rigs:
         raise failures[0]
-    _write_calibration(folder / "calib.txt", {frames[n].name: rig for n, rig in rigs.items()})
+    rigs_by_name = {frames[index].name: rig for index, rig in rigs.items()}
+    _write_calibration(folder / "calib.txt", rigs_by_name)
 
     # Then each pair that an earlier run has not finished.
-    for number in rigs:
-        name = frames[number].name
-        if is_whole(folder, name, [f"disp_occ/{name}.png"]):
+    for index in rigs:
+        name = frames[index].name
+        if _is_labelled(folder, name):
             continue
         try:
-            pair = dataset.read_input(number)
+            pair = dataset.read_input(index)
             refuse_unrectified(pair)
             labelled_px = label_pair(net, pair, config)
         except InputError as error:
             fail(error)
             continue
         assert pair.right is not None
-        files = [folder / place / f"{name}.png" for place in ("left", "right", "disp_occ")]
+        files = [folder / part / f"{name}.png" for part in ("left", "right", "disp_occ")]
         write_image(files[0], pair.left)
         write_image(files[1], pair.right)
         write_depth_png(files[2], labelled_px)
@@ -106,38 +113,49 @@ def label_pairs(
         yield name, float(labelled_px.isfinite().float().mean())
 
 
+def _is_labelled(folder: Path, name: str) -> bool:
+    """Whether an earlier run wrote all files of a pair."""
+    return is_whole(folder, name, [f"disp_occ/{name}.png"])
+
+
 def label_pair(net: FakestereoNet, pair: StereoInput, config: LabelConfig) -> Map:
-    """Match a pair both ways [px]; NaN where they disagree, in the sky, or where it is not sure."""
+    """Match a pair from left to right and from right to left, and give the left disparity [px].
+
+    NaN where the two disagree, in the sky, and where the confidence is too low.
+    """
     assert pair.right is not None
     mirrored = replace(pair, left=pair.right.flip(-1), right=pair.left.flip(-1))
-    estimate, mirrored_estimate = (
-        net.estimate_pair(views, with_check=False) for views in (pair, mirrored)
-    )
+    estimate = net.estimate_pair(pair, with_check=False)
+    mirrored_estimate = net.estimate_pair(mirrored, with_check=False)
+
     left_px = estimate.disparity_px
     right_px = mirrored_estimate.disparity_px.flip(-1)
+    difference_px = (left_px - warp_right_to_left(right_px[None], left_px)[0]).abs()
     limit_px = (config.largest_share * left_px).clamp(min=config.largest_difference_px)
-    is_known = (left_px - warp_right_to_left(right_px[None], left_px)[0]).abs() <= limit_px
+    is_labelled = difference_px <= limit_px
     if estimate.confidence is not None:
-        is_known &= estimate.confidence >= config.least_confidence
+        is_labelled &= estimate.confidence >= config.least_confidence
     if estimate.is_sky is not None:
-        is_known &= ~estimate.is_sky
-    return torch.where(is_known, left_px, torch.nan)
+        is_labelled &= ~estimate.is_sky
+    return torch.where(is_labelled, left_px, torch.nan)
 
 
 def _write_calibration(path: Path, rigs: Mapping[str, StereoRig]) -> None:
-    """Write the line of each pair, and keep the lines of other pairs."""
+    """Write the line of each pair by its name, and keep the lines of other pairs."""
     try:
         existing_lines = read_text(path).splitlines() if path.is_file() else []
     except InputError:  # damaged: the lines of these pairs are made again
         existing_lines = []
-    parts = [line.rsplit(maxsplit=8) for line in existing_lines]
-    lines = {
-        part[0]: line for part, line in zip(parts, existing_lines, strict=True) if len(part) == 9
-    }
+    lines: dict[str, str] = {}
+    for line in existing_lines:
+        name, *numbers = line.rsplit(maxsplit=8) or [""]  # a name may hold spaces
+        if len(numbers) == 8:
+            lines[name] = line
+
     for name, rig in rigs.items():
         K = rig.K
-        shift_px = rig.cx_right_minus_left_px
-        values = (K[0, 0], K[0, 2], K[1, 2], rig.baseline_m, K[1, 1], shift_px)
+        cx_difference_px = rig.cx_right_minus_left_px
+        values = (K[0, 0], K[0, 2], K[1, 2], rig.baseline_m, K[1, 1], cx_difference_px)
         numbers = " ".join(f"{float(value):.9g}" for value in values)
         lines[name] = f"{name} {rig.width} {rig.height} {numbers}"
     if list(lines.values()) == existing_lines:

@@ -31,16 +31,17 @@ ADVERSARIAL_LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 
 
 def disparity_loss(
-    found_px: Maps, truth_px: Maps, max_px: int, *, sky_weight: float = 0.0
+    predicted_px: Maps, truth_px: Maps, max_px: int, *, sky_weight: float = 0.0
 ) -> Float[Tensor, ""]:
-    """Smooth L1 over the pixels with truth (eq. 2.6 of the thesis); 0 where there are none.
+    """Smooth L1 over the pixels with truth below ``max_px`` (eq. 2.6 of the thesis).
 
-    A pixel of the sky (truth 0) counts as ``sky_weight`` pixels of a disparity of 0.
+    The truth of the sky is 0 and such a pixel has the weight ``sky_weight``; NaN has no truth. The
+    loss is 0 where no pixel has truth.
     """
     is_valid = (truth_px > 0) & (truth_px < max_px)
     weights = is_valid.float() + sky_weight * (truth_px == 0)
     # NaN truth must not reach the subtraction: its gradient would be NaN even where masked.
-    difference = torch.where(weights > 0, found_px - truth_px.nan_to_num(0.0), 0.0)
+    difference = torch.where(weights > 0, predicted_px - truth_px.nan_to_num(0.0), 0.0)
     losses = F.smooth_l1_loss(difference, torch.zeros_like(difference), reduction="none")
     return (weights * losses).sum() / weights.sum().clamp(min=1)
 
@@ -48,32 +49,33 @@ def disparity_loss(
 def heads_loss(
     heads_px: Sequence[Maps], truth_px: Maps, max_px: int, *, sky_weight: float = 0.0
 ) -> Float[Tensor, ""]:
-    """Sum the loss of up to three heads, the later the heavier; the last has the weight 1."""
+    """Sum :func:`disparity_loss` over up to three heads, weighted by the last ``HEAD_WEIGHTS``."""
     losses = [disparity_loss(head, truth_px, max_px, sky_weight=sky_weight) for head in heads_px]
     weights = HEAD_WEIGHTS[-len(losses) :]
-    return torch.stack([w * x for w, x in zip(weights, losses, strict=True)]).sum()
+    weighted = [weight * loss for weight, loss in zip(weights, losses, strict=True)]
+    return torch.stack(weighted).sum()
 
 
 def sky_loss(probability: Maps, truth_px: Maps) -> Float[Tensor, ""]:
-    """Mean cross entropy of the class of the sky, where it is known whether it is (truth 0)."""
+    """Mean cross entropy of the probability of the sky, over the pixels with truth (0: sky)."""
     is_known = truth_px >= 0
     is_sky = truth_px == 0
-    of_truth = torch.where(is_sky, probability, 1 - probability)
+    true_probability = torch.where(is_sky, probability, 1 - probability)
     # Gradients stay finite where a probability is 0 in float32.
-    losses = torch.where(is_known, -(of_truth + 1e-4).log(), 0.0)
+    losses = torch.where(is_known, -(true_probability + 1e-4).log(), 0.0)
     return losses.sum() / is_known.sum().clamp(min=1)
 
 
 def log_disparity_loss(
-    found_log_px: Maps, truth_px: Maps, range_px: tuple[float, float]
+    predicted_log_px: Maps, truth_px: Maps, range_px: tuple[float, float]
 ) -> Float[Tensor, ""]:
-    """Mean absolute difference of the logarithm of disparity: a relative error of depth.
+    """Mean absolute error of the logarithm of disparity, which is a relative error of depth.
 
-    Each image with truth counts the same, however sparse its truth is; truth outside ``range_px``
-    counts as its end. NaN and the sky (0) do not count.
+    Each image with truth counts the same, however sparse its truth is. Truth is clamped to
+    ``range_px``; NaN and the sky (0) do not count.
     """
     truth = truth_px.nan_to_num(1.0).clamp(*range_px).log()
-    return _mean_of_images((found_log_px - truth).abs(), truth_px > 0)
+    return _mean_of_images((predicted_log_px - truth).abs(), truth_px > 0)
 
 
 def _mean_of_images(error: Tensor, is_known: Tensor) -> Tensor:
@@ -95,28 +97,36 @@ def plane_loss(
     truth_px: Float[Tensor, "b rows columns"],
     planes: Float[Tensor, " planes"],
 ) -> Float[Tensor, ""]:
-    """Cross entropy of the classes sky (0) and planes (1, 2, ...), shared between two neighbours.
+    """Cross entropy of the classes sky (0) and planes (1, 2, ...).
 
-    Each image with truth counts the same, however sparse its truth is.
+    A disparity between two planes has its probability divided between both, linearly. Each image
+    with truth counts the same, however sparse its truth is.
 
-    The truth is 0 in the sky and NaN where unknown; planes are evenly spaced in their logarithm.
+    Args:
+        logits: of the classes.
+        truth_px: 0 in the sky, NaN where it is unknown.
+        planes: disparities, evenly spaced in their logarithm.
     """
+    # The fractional number of the plane at the true disparity.
     is_sky = truth_px == 0
-    logs = planes.log()
-    place = (truth_px.nan_to_num(1.0).clamp(planes[0], planes[-1]).log() - logs[0]) / (
-        logs[1] - logs[0]
-    )
-    lower = place.floor().clamp(0, len(planes) - 2)
-    share = torch.where(is_sky, 0.0, place - lower)
-    first = torch.where(is_sky, 0, lower.long() + 1)[:, None]
-    scores = logits.float().log_softmax(1)
-    near = scores.gather(1, first)[:, 0]
-    far = scores.gather(1, first + 1)[:, 0]
-    return _mean_of_images(-(near * (1 - share) + far * share), truth_px >= 0)
+    log_planes = planes.log()
+    log_truth = truth_px.nan_to_num(1.0).clamp(planes[0], planes[-1]).log()
+    position = (log_truth - log_planes[0]) / (log_planes[1] - log_planes[0])
+
+    # The classes of the planes around it; all of the sky belongs to class 0.
+    lower_plane = position.floor().clamp(0, len(planes) - 2)
+    upper_share = torch.where(is_sky, 0.0, position - lower_plane)
+    lower_class = torch.where(is_sky, 0, lower_plane.long() + 1)[:, None]
+
+    log_probabilities = logits.float().log_softmax(1)
+    lower = log_probabilities.gather(1, lower_class)[:, 0]
+    upper = log_probabilities.gather(1, lower_class + 1)[:, 0]
+    return _mean_of_images(-(lower * (1 - upper_share) + upper * upper_share), truth_px >= 0)
 
 
 def view_loss(drawn: Views, real: Views) -> Float[Tensor, " b"]:
-    """L1 of a drawn view and of its horizontal gradient, for each image."""
+    """L1 of a synthesised view plus L1 of its horizontal gradient, for each image."""
     colour = (drawn - real).abs().mean((1, 2, 3))
-    gradient = ((drawn[..., 1:] - drawn[..., :-1]) - (real[..., 1:] - real[..., :-1])).abs()
-    return colour + gradient.mean((1, 2, 3))
+    drawn_gradient = drawn[..., 1:] - drawn[..., :-1]
+    real_gradient = real[..., 1:] - real[..., :-1]
+    return colour + (drawn_gradient - real_gradient).abs().mean((1, 2, 3))

@@ -25,7 +25,7 @@ Quantity = Literal["depth", "disparity", "disparity_noc"]
 
 @dataclass(frozen=True, kw_only=True)
 class Metric:
-    """One number over the pixels of a frame that have truth: a column of every table."""
+    """A metric over the pixels of a frame that have truth: a column of every table."""
 
     name: str  #: of the column
     of: Quantity  #: the values that are compared
@@ -36,12 +36,13 @@ class Metric:
 
 
 def measure(of: Quantity, predicted: Numbers, true: Numbers) -> dict[str, float]:
-    """Give every metric of a kind, in the order of ``METRICS``.
+    """Compute all metrics of one quantity, by name, in the order of ``METRICS``.
 
     Args:
-        of: what the values are.
-        predicted: of depth positive and finite, already clamped as the protocol says.
-        true: of depth positive and finite.
+        of: the quantity.
+        predicted: its predicted values, already clamped as the protocol says; depth is positive and
+            finite.
+        true: its true values; depth is positive and finite.
 
     Raises:
         InputError: no pixel at all, or a depth that is not positive and finite.
@@ -61,15 +62,18 @@ def measure(of: Quantity, predicted: Numbers, true: Numbers) -> dict[str, float]
 
 
 def _end_point_error(p: Tensor, t: Tensor) -> float:
+    """Mean absolute error of disparity [px]."""
     return float((p - t).abs().mean())
 
 
-def _share_bad(p: Tensor, t: Tensor) -> float:
+def _bad_share(p: Tensor, t: Tensor) -> float:
+    """Share of disparities that are wrong by more than 3 px and by more than 5 % (KITTI's D1)."""
     error = (p - t).abs()
     return float(((error > 3) & (error > 0.05 * t)).double().mean())
 
 
 def _share_within(p: Tensor, t: Tensor, factor: float) -> float:
+    """Share of depths whose ratio to the truth is below a factor."""
     return float((torch.maximum(p / t, t / p) < factor).double().mean())
 
 
@@ -89,9 +93,9 @@ METRICS = {
         Metric(name="d2", of="depth", function=_within[1], better="higher", is_printed=False),
         Metric(name="d3", of="depth", function=_within[2], better="higher", is_printed=False),
         Metric(name="epe_px", of="disparity", function=_end_point_error),
-        Metric(name="d1_all", of="disparity", function=_share_bad),
+        Metric(name="d1_all", of="disparity", function=_bad_share),
         Metric(name="epe_noc_px", of="disparity_noc", function=_end_point_error, is_printed=False),
-        Metric(name="d1_noc", of="disparity_noc", function=_share_bad, is_printed=False),
+        Metric(name="d1_noc", of="disparity_noc", function=_bad_share, is_printed=False),
     )
 }
 """Metrics by name, in the order of the columns: a new one is a function and one entry here.
@@ -105,7 +109,10 @@ RANKING: dict[Quantity, str] = {"depth": "abs_rel", "disparity": "epe_px"}
 
 
 def garg_crop(height: int, width: int) -> Bool[Tensor, "height width"]:
-    """Mask of Garg et al. (2016), its corners truncated as in the published script."""
+    """Give the mask of Garg et al. (2016): the part of a KITTI image that an evaluation counts.
+
+    Its borders are rounded down as in the published script.
+    """
     mask = torch.zeros(height, width, dtype=torch.bool)
     top = int(0.40810811 * height)
     bottom = int(0.99189189 * height)
@@ -114,11 +121,12 @@ def garg_crop(height: int, width: int) -> Bool[Tensor, "height width"]:
 
 
 def sparsification_area(error: Numbers, confidence: Numbers, steps: int = 50) -> float:
-    """AUSE: how far removing the least confident pixels is from removing the worst ones.
+    """Compute AUSE, the area under the sparsification error (Ilg et al. 2018).
 
-    Both orders remove 0 %, 2 %, ... of the pixels; the area between the two curves of the mean
-    remaining error, divided by the mean error of all pixels (Ilg et al. 2018). 0 is an oracle;
-    a confidence that knows nothing, such as a constant, gives the area under (1 - oracle).
+    Pixels are removed in ``steps`` steps (0 %, 2 %, ...), once those of least confidence first and
+    once those of largest error first (the oracle). The result is the area between both curves of
+    the mean remaining error, divided by the mean error of all pixels: 0 for an oracle; for a
+    constant confidence the area between the oracle's curve and 1.
 
     Raises:
         InputError: no pixel at all.
@@ -128,15 +136,18 @@ def sparsification_area(error: Numbers, confidence: Numbers, steps: int = 50) ->
     if float(error.double().mean()) == 0:
         return 0.0
     error = error.double()
-    curves = []
-    for keep_first in (confidence.double(), -error):
-        # The mean error of what is left, the pixels of low ``keep_first`` removed first.
-        descending = torch.argsort(keep_first, descending=True)
-        counts = torch.arange(1, len(error) + 1)
-        running = _shared_error(error, keep_first)[descending].cumsum(0) / counts
-        remaining = len(error) * (1 - torch.arange(steps, dtype=error.dtype) / steps)
-        curves.append(running[remaining.ceil().long().clamp(min=1) - 1])
-    return float(((curves[0] - curves[1]) / error.mean()).mean())
+    by_confidence = _sparsification_curve(error, confidence.double(), steps)
+    by_error = _sparsification_curve(error, -error, steps)
+    return float(((by_confidence - by_error) / error.mean()).mean())
+
+
+def _sparsification_curve(error: Numbers, score: Numbers, steps: int) -> Float[Tensor, " steps"]:
+    """Give the mean error of the pixels that remain after each step, the lowest scores removed."""
+    descending = torch.argsort(score, descending=True)
+    counts = torch.arange(1, len(error) + 1)
+    mean_of_first = _mean_of_equal(error, score)[descending].cumsum(0) / counts
+    remaining = len(error) * (1 - torch.arange(steps, dtype=error.dtype) / steps)
+    return mean_of_first[remaining.ceil().long().clamp(min=1) - 1]
 
 
 def score_confidence(error: Numbers, confidence: Numbers) -> dict[str, float]:
@@ -154,39 +165,44 @@ def score_confidence(error: Numbers, confidence: Numbers) -> dict[str, float]:
 
 
 def error_by_decile(error: Numbers, confidence: Numbers) -> Float[Tensor, "10"]:
-    """Mean error of the least sure tenth of the pixels, of the next, ..., of the surest.
+    """Give the mean error of each tenth of the pixels, from the least confidence to the largest.
 
     Pixels of equal confidence share their mean error. NaN for a tenth without a pixel.
     """
     ascending = torch.argsort(confidence)
-    tenths = _shared_error(error.double(), confidence)[ascending].tensor_split(10)
+    tenths = _mean_of_equal(error.double(), confidence)[ascending].tensor_split(10)
     return torch.stack([tenth.mean() for tenth in tenths])
 
 
-def _shared_error(error: Numbers, key: Numbers) -> Numbers:
-    """Give pixels of an equal key their mean error: their order must not matter."""
-    values, group = key.unique(return_inverse=True)
-    count = torch.zeros(len(values), dtype=error.dtype).index_add_(0, group, torch.ones_like(error))
-    mean = torch.zeros(len(values), dtype=error.dtype).index_add_(0, group, error) / count
-    return mean[group]
+def _mean_of_equal(error: Numbers, score: Numbers) -> Numbers:
+    """Give each pixel the mean error of all pixels of its score, so that ties have no order."""
+    values, group = score.unique(return_inverse=True)
+    zeros = torch.zeros(len(values), dtype=error.dtype)
+    counts = zeros.index_add(0, group, torch.ones_like(error))
+    sums = zeros.index_add(0, group, error)
+    return (sums / counts)[group]
 
 
 def view_errors(drawn: View, real: View) -> dict[str, float]:
-    """Compare a drawn right view with the real one, both RGB in [0, 1].
+    """Compare a synthesised right view with the real one, both RGB in [0, 1].
 
     Returns:
         ``right_l1``: mean absolute difference; ``right_psnr_db``: peak signal-to-noise ratio [dB];
-        ``right_sharpness``: mean size of the drawn view's gradient as a share of the real one's: 1
-        as sharp, less blurred.
+        ``right_sharpness``: mean absolute gradient as a share of that of the real view: 1 is as
+        sharp, less is blurred.
     """
     difference = drawn.double() - real.double()
     mean_square = difference.square().mean().clamp(min=1e-12)
-    gradient, real_gradient = (
-        image.diff(dim=2).abs().double().mean() + image.diff(dim=1).abs().double().mean()
-        for image in (drawn, real)
-    )
+    sharpness = _mean_gradient(drawn) / _mean_gradient(real).clamp(min=1e-12)
     return {
         "right_l1": float(difference.abs().mean()),
         "right_psnr_db": float(-10 * torch.log10(mean_square)),
-        "right_sharpness": float(gradient / real_gradient.clamp(min=1e-12)),
+        "right_sharpness": float(sharpness),
     }
+
+
+def _mean_gradient(image: View) -> Float[Tensor, ""]:
+    """Give the mean absolute difference of neighbours in a row plus that of those in a column."""
+    along_rows = image.diff(dim=2).abs().double().mean()
+    along_columns = image.diff(dim=1).abs().double().mean()
+    return along_rows + along_columns

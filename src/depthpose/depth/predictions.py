@@ -1,4 +1,4 @@
-"""Estimates as files: writing them all or nothing, and reading them back."""
+"""Estimates as files of a folder: writing them, and reading ours or those of other methods."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -24,10 +24,10 @@ from depthpose.depth.types import DepthEstimate, Ground, Map, StereoInput
 
 @runtime_checkable
 class Estimator(Protocol):
-    """What predicts: :class:`FakestereoNet`, a baseline, or anybody's."""
+    """Anything that estimates depth: :class:`FakestereoNet`, a baseline, or your own method."""
 
     def estimate_pair(self, pair: StereoInput, /) -> DepthEstimate:
-        """Estimate depth of one input whose images are read already."""
+        """Estimate depth of one input, whose images are in memory."""
         ...
 
 
@@ -41,9 +41,10 @@ EXPECTED = (
 )
 
 _NEARLY_ALL = 0.9
+"""Share of the pixels with a negative depth from which its sign is wrong."""
 CLOUD = "cloud.ply"
 LAST = "disparity_px.npy"
-"""Of the file that every estimate has, and that is written last."""
+"""Ending of the file that every estimate has, and that is written last."""
 ENDINGS = (
     "depth_m.npy", "depth.png", "confidence.npy", "right.png", "sky.png", "color.png",
     LAST, "warning.txt", "ground.json", CLOUD,
@@ -51,12 +52,12 @@ ENDINGS = (
 """What follows ``NAME.`` in the names of the files of an estimate."""
 
 _DECIMALS = 6
-"""Of the numbers of a road in its file; more change from one run to the next, as threads add up in
+"""Of the values of a road in its file: further digits differ from run to run, since threads add in
 another order."""
 CLOUD_M = 80.0
 """Distance up to which a cloud is written, unless another is given."""
 COLOR_RANGE_M = (3.0, 80.0)
-"""Near and far end of the colours of depth, one for all pictures, so that they compare."""
+"""Depths of the first and the last colour, the same for all pictures, so that they compare."""
 
 
 def write_estimate(
@@ -67,65 +68,72 @@ def write_estimate(
     cloud_m: float | None = None,
     min_confidence: float | None = None,
 ) -> list[Path]:
-    """Write the files of one estimate, and give them; the disparity comes last.
+    """Write the files of one estimate, and give their paths; the disparity comes last.
 
-    ``NAME.depth_m.npy``, ``NAME.depth.png`` (uint16, metres x 256), ``NAME.confidence.npy``,
-    ``NAME.color.png``, ``NAME.right.png`` (synthesised), ``NAME.sky.png`` (8 bit, 255 in the sky),
-    ``NAME.ground.json`` (:class:`~depthpose.depth.types.Ground`), ``NAME.warning.txt`` and
-    ``NAME.disparity_px.npy``, each where the estimate has it, and ``NAME.cloud.ply``
-    (``DepthEstimate.cloud``) of what is nearer than ``cloud_m``, if that is given, and as sure as
-    ``min_confidence``. The disparity is that of the frame's own rig.
+    Each part is written where the estimate has it: ``NAME.depth_m.npy``, ``NAME.depth.png``
+    (uint16, metres x 256), ``NAME.confidence.npy``, ``NAME.color.png``, ``NAME.right.png``
+    (synthesised), ``NAME.sky.png`` (8 bit, 255 in the sky), ``NAME.ground.json``
+    (:class:`~depthpose.depth.types.Ground`), ``NAME.warning.txt``, ``NAME.cloud.ply`` and
+    ``NAME.disparity_px.npy``, which is the disparity of the frame's own rig.
+
+    Args:
+        folder: where the files go.
+        pair: the input; its name is ``NAME``.
+        estimate: what was estimated from it.
+        range_m: depths of the first and the last colour.
+        cloud_m: distance up to which a cloud (``DepthEstimate.cloud``) has points; None: no cloud.
+        min_confidence: of the cloud's points.
     """
     depth_m = estimate.depth_m
-    is_sky = estimate.is_sky
-    color = (
-        draw_disparity(estimate.disparity_px, is_sky=is_sky)
-        if depth_m is None
-        else draw_depth(depth_m, *range_m)
-    )
+    if depth_m is None:
+        color = draw_disparity(estimate.disparity_px, is_sky=estimate.is_sky)
+    else:
+        color = draw_depth(depth_m, *range_m)
     cloud = None
     if cloud_m is not None:
         cloud = replace(estimate, input=pair).cloud(cloud_m, min_confidence)
+    warning = f"{estimate.warning}\n".encode() if estimate.warning else None
+    sky = None if estimate.is_sky is None else estimate.is_sky.float().expand(3, -1, -1)
+
+    # How each part is written; None is not.
     parts: dict[str, tuple[Callable[..., None], Any]] = {
         CLOUD: (files.write_cloud, cloud),
-        "warning.txt": (
-            write_bytes,
-            f"{estimate.warning}\n".encode() if estimate.warning else None,
-        ),
+        "warning.txt": (write_bytes, warning),
         "ground.json": (files.write_json, _rounded(estimate.ground)),
         "depth_m.npy": (files.write_map, depth_m),
         "depth.png": (files.write_depth_png, depth_m),
         "confidence.npy": (files.write_map, estimate.confidence),
         "right.png": (files.write_image, estimate.right),
-        "sky.png": (
-            files.write_image,
-            None if is_sky is None else is_sky.float().expand(3, -1, -1),
-        ),
+        "sky.png": (files.write_image, sky),
         "color.png": (files.write_image, color),
         LAST: (files.write_map, estimate.disparity_px),
     }
     written: list[Path] = []
     for ending, (write, content) in parts.items():
         if content is not None:
-            written.append(folder / f"{pair.name}.{ending}")
-            write(written[-1], content)
+            path = folder / f"{pair.name}.{ending}"
+            write(path, content)
+            written.append(path)
     return written
 
 
 def _rounded(ground: Ground | None) -> dict[str, float] | None:
-    """Give the values of a road to the digits that are the same in every run."""
+    """Give the values of a road, rounded to the digits that are the same in every run."""
     if ground is None:
         return None
     return {name: round(value, _DECIMALS) for name, value in asdict(ground).items()}
 
 
 def is_finished(folder: Path, name: str) -> bool:
-    """Whether an earlier run left the estimate of this frame whole."""
+    """Whether an earlier run wrote the whole estimate of this frame."""
     return is_whole(folder, name, [f"{name}.{LAST}"])
 
 
 def has_prediction(folder: Path, name: str, *, of_disparity: bool = False) -> bool:
-    """Whether the folder holds a prediction of this frame, or one of disparity by its name."""
+    """Whether the folder holds a prediction of this frame.
+
+    ``of_disparity``: only files whose names say that they hold disparity count.
+    """
     endings = _DISPARITY if of_disparity else (*_DISPARITY, *_DEPTH, _KITTI)
     return _find_file(folder / name, endings) is not None
 
@@ -133,10 +141,10 @@ def has_prediction(folder: Path, name: str, *, of_disparity: bool = False) -> bo
 def read_disparity(
     folder: Path, name: str, camera: Camera | None, *, with_disparity_png: bool = False
 ) -> Map:
-    """Read one predicted disparity [px at its own width], ours or anybody's.
+    """Read one predicted disparity, of ours or of another method [px at the map's own width].
 
-    ``NAME.disparity_px.npy`` (or ``.pfm``) is taken first; without it, the depth that
-    :func:`read_depth` finds is converted by the rig. A pixel without a prediction is NaN. Depth of
+    ``NAME.disparity_px.npy`` (or ``.pfm``) comes first; without it, the depth that
+    :func:`read_depth` reads is converted by the rig. A pixel without a prediction is NaN. Depth of
     zero or below is a prediction too, and becomes the smallest depth of the protocol, as in the
     published script.
 
@@ -147,11 +155,12 @@ def read_disparity(
         with_disparity_png: ``NAME.png`` is disparity x 256, else metres x 256.
 
     Raises:
-        InputError: no file is there, or depth without a rig.
+        InputError: there is no file, or there is depth and no rig, or it is nearly all negative.
     """
     base = folder / name
-    if (path := _find_file(base, _DISPARITY)) is not None:
-        return files.read_map(path)
+    disparity_path = _find_file(base, _DISPARITY)
+    if disparity_path is not None:
+        return files.read_map(disparity_path)
     path = _find_file(base, (*_DEPTH, _KITTI))
     if path is None:
         raise InputError(
@@ -159,15 +168,17 @@ def read_disparity(
         )
     if with_disparity_png and path == _find_file(base, (_KITTI,)):
         return files.read_depth_png(path)
+
+    # Depth, as disparity of the rig.
     depth_m = read_depth(folder, name)
     assert depth_m is not None
     if not isinstance(camera, StereoRig):
         raise InputError(f"{path}: depth becomes disparity by a rig, and this frame has none.")
     if float((depth_m < 0).float().mean()) > _NEARLY_ALL:
         raise InputError(f"{path}: its depth is negative; save metres in front of the camera")
-    # The map may have a size of its own: its disparity is counted in its own pixels.
-    least_m = depth_m.clamp(min=SMALLEST_DEPTH_M)
-    return disparity_from_depth(least_m, camera) * (depth_m.shape[1] / camera.width)
+    positive_m = depth_m.clamp(min=SMALLEST_DEPTH_M)
+    # A map of another size than the image has its disparity in its own pixels.
+    return disparity_from_depth(positive_m, camera) * (depth_m.shape[1] / camera.width)
 
 
 def read_depth(folder: Path, name: str) -> Map | None:
@@ -178,11 +189,12 @@ def read_depth(folder: Path, name: str) -> Map | None:
     path = _find_file(folder / name, (*_DEPTH, _KITTI))
     if path is None:
         return None
-    return files.read_depth_png(path) if path.suffix.lower() == ".png" else files.read_map(path)
+    is_png = path.suffix.lower() == ".png"
+    return files.read_depth_png(path) if is_png else files.read_map(path)
 
 
 def _find_file(base: Path, endings: tuple[str, ...]) -> Path | None:
-    """Find the first file ``BASE.ENDING`` that exists; its suffix may be in capitals."""
+    """Find the first file ``BASE.ENDING`` that exists; its suffix may be in capital letters."""
     for ending in endings:
         file = base.with_name(f"{base.name}.{ending}")
         for path in (file, file.with_suffix(file.suffix.upper())):
@@ -192,15 +204,18 @@ def _find_file(base: Path, endings: tuple[str, ...]) -> Path | None:
 
 
 def read_part(folder: Path, name: str, ending: str) -> Float[Tensor, "*c h w"] | None:
-    """Read a map or a picture of ``ENDINGS``; None where the prediction has none."""
+    """Read the map or picture ``NAME.ENDING`` of a prediction; None where there is none."""
     path = _find_file(folder / name, (ending,))
     if path is None:
         return None
-    return files.read_image(path) if path.suffix.lower() == ".png" else files.read_map(path)
+    is_png = path.suffix.lower() == ".png"
+    return files.read_image(path) if is_png else files.read_map(path)
 
 
 def read_estimate(folder: Path, name: str, camera: Camera | None) -> DepthEstimate:
-    """Read back what :func:`write_estimate` wrote.
+    """Read an estimate that :func:`write_estimate` wrote, without its input.
+
+    ``camera`` of the frame makes depth of the disparity where no depth was written.
 
     Raises:
         InputError: there is no prediction of that name, or a file of it is damaged.
@@ -208,7 +223,7 @@ def read_estimate(folder: Path, name: str, camera: Camera | None) -> DepthEstima
     disparity_px = read_part(folder, name, LAST)
     if disparity_px is None:
         raise InputError(f"{folder}: no prediction for frame {name!r}; predict it again")
-    warning = _find_file(folder / name, ("warning.txt",))
+    warning_path = _find_file(folder / name, ("warning.txt",))
     sky = read_part(folder, name, "sky.png")
     depth_m = read_part(folder, name, "depth_m.npy")
     if depth_m is None and isinstance(camera, StereoRig):
@@ -220,7 +235,7 @@ def read_estimate(folder: Path, name: str, camera: Camera | None) -> DepthEstima
         right=read_part(folder, name, "right.png"),
         is_sky=None if sky is None else sky[0] > 0,
         ground=read_ground(folder, name),
-        warning="" if warning is None else read_text(warning).strip(),
+        warning="" if warning_path is None else read_text(warning_path).strip(),
     )
 
 
@@ -242,7 +257,7 @@ def read_ground(folder: Path, name: str) -> Ground | None:
 
 @dataclass(frozen=True, kw_only=True)
 class DepthResults(Results[StereoInput, DepthEstimate]):
-    """Estimates as files of one folder, as :func:`write_estimate` names them."""
+    """Results of a run of estimates: files of one folder, as :func:`write_estimate` names them."""
 
     folder: Path  #: claimed before (:func:`depthpose.core.run.claim_folder`)
     range_m: tuple[float, float] = COLOR_RANGE_M
@@ -250,12 +265,12 @@ class DepthResults(Results[StereoInput, DepthEstimate]):
     min_confidence: float | None = None  #: of clouds
 
     def is_finished(self, job: Job[StereoInput]) -> bool:
-        """Whether an earlier run left the files whole, with the cloud if one is wanted."""
+        """Whether an earlier run wrote the whole estimate, with a cloud if there shall be one."""
         needed = (LAST,) if self.cloud_m is None else (LAST, CLOUD)
         return is_whole(self.folder, job.name, [f"{job.name}.{ending}" for ending in needed])
 
     def store(self, job: Job[StereoInput], data: StereoInput, result: DepthEstimate) -> None:
-        """Write the files of an estimate, and note that it is finished."""
+        """Write the files of an estimate, and record that it is finished."""
         written = write_estimate(
             self.folder, data, result, self.range_m, self.cloud_m, self.min_confidence
         )
@@ -269,20 +284,21 @@ def predict(
     settings: dict[str, Any],
     sources: Mapping[str, Path | Sequence[Path]],
 ) -> Iterator[str]:
-    """Estimate what is not finished yet, one frame at a time, and yield each name.
+    """Estimate and write the frames that are not finished yet, one by one, and yield their names.
 
     Args:
         net: the estimator.
-        jobs: what this process estimates.
-        folder: where the files go; refused if other settings or images made what it holds.
-        settings: what decides the results.
+        jobs: the frames of this process.
+        folder: where the files go; refused if other settings or images made the files in it.
+        settings: all settings that the results depend on.
         sources: the files behind each name, the image first, of all processes that write to the
             folder.
 
     Raises:
         InputError: an input cannot be read or estimated.
     """
-    claim_folder(folder, settings, (f"{job.name}.{end}" for job in jobs for end in ENDINGS))
+    names = (f"{job.name}.{ending}" for job in jobs for ending in ENDINGS)
+    claim_folder(folder, settings, names)
     claim_names(folder, sources, is_finished=partial(is_finished, folder))
 
     def estimate_many(pairs: Sequence[StereoInput]) -> list[DepthEstimate]:

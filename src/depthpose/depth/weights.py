@@ -1,4 +1,4 @@
-"""Weights of depth on disk: a generator, a matcher, or both in one file."""
+"""Weights files of depth: a generator, a matcher, or both in one file."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from torch import Tensor
 
 from depthpose.core import checkpoint as checkpoints
 from depthpose.core.config import config_from_dict, config_to_dict
@@ -26,15 +27,15 @@ from depthpose.depth.synthesis import Generator, SelectionGenerator, UNetGenerat
 
 @dataclass(frozen=True, kw_only=True)
 class GeneratorKind:
-    """What it takes to read and write one kind of network."""
+    """Classes of one kind of network, by which its weights are read and written."""
 
     config: type  #: dataclass of the network's sizes and conventions, which its weights file holds
-    network: type  #: makes the module of a config, and keeps it as the attribute ``config``
+    network: type  #: module that is made of a config, and has it as the attribute ``config``
 
 
 @dataclass(frozen=True, kw_only=True)
 class MatcherKind(GeneratorKind):
-    """What it takes to read, write and run one kind of matcher."""
+    """Classes of one kind of matcher, by which its weights are read, written and run."""
 
     network: type[stereo.StereoNetwork]
     #: makes a matcher of a module in eval mode
@@ -50,13 +51,20 @@ MATCHERS = {
 """Kinds of matchers with weights: a new one is a file with its three parts and one entry here."""
 
 BOTH = "fakestereo"
+"""Kind of a file with a generator and a matcher."""
 _SELECTION = "selection"
 Use = Literal["images", "pairs"]
-"""What networks are for: depth of single images, or of real pairs."""
+"""What networks are used for: depth of single images, or of real pairs."""
 GENERATORS = {
     "generator": GeneratorKind(config=GeneratorConfig, network=UNetGenerator),
     _SELECTION: GeneratorKind(config=SelectionConfig, network=SelectionGenerator),
 }
+"""Kinds of generators with weights."""
+
+
+def _kinds() -> dict[str, GeneratorKind]:
+    """Give all kinds of networks, the generators first; users may have added to ``MATCHERS``."""
+    return {**GENERATORS, **MATCHERS}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -83,62 +91,73 @@ def read_depth_weights(
         InputError: not such weights, or weights that do not fit their own config.
     """
     checkpoint = checkpoints.read_checkpoint(path)
-    kinds = {**GENERATORS, **MATCHERS}
-    if checkpoint.kind not in (*kinds, BOTH):
+    if checkpoint.kind not in (*_kinds(), BOTH):
         raise InputError(
             f"{path}: holds weights of kind {checkpoint.kind!r}; depth takes "
-            f"{', '.join(map(repr, kinds))} or {BOTH!r}."
+            f"{', '.join(map(repr, _kinds()))} or {BOTH!r}."
         )
     is_both = checkpoint.kind == BOTH
-    parts = {} if is_both else {checkpoint.kind: checkpoint}
-    for kind in kinds if is_both else ():  # its config names the networks
-        if kind not in checkpoint.config:
+    parts = _split(checkpoint, path) if is_both else {checkpoint.kind: checkpoint}
+
+    # Generators come first, for with one that answers depth itself single images need no matcher.
+    networks: dict[str, Any] = {}
+    for kind, part in parts.items():
+        is_generator = kind in GENERATORS
+        if use == "pairs" and is_both and is_generator:
             continue
-        config = checkpoint.config[kind]
-        prefix = f"{kind}."
-        if not isinstance(config, Mapping):
-            raise InputError(f"{path}: its config has no {kind!r}; the file is damaged.")
-        tensors = checkpoint.state.items()
-        state = {key.removeprefix(prefix): t for key, t in tensors if key.startswith(prefix)}
-        parts[kind] = checkpoints.Checkpoint(kind=kind, config=config, state=state)
-    if is_both and not (set(parts) & set(GENERATORS) and set(parts) & set(MATCHERS)):
-        raise InputError(
-            f"{path}: its config names {sorted(checkpoint.config)}, but it should hold a "
-            "generator and a matcher; the file is damaged."
-        )
-    built: dict[str, Any] = {}
-    for kind, part in parts.items():  # a generator first
-        if use == "pairs" and is_both and kind in GENERATORS:
-            continue
-        config = _config_of(kind, part.config, str(path))
-        make = partial(kinds[kind].network, config)
-        built[kind] = checkpoints.build_network(make, part, str(path)).eval()
-        if use == "images" and kind in GENERATORS and (answer or config.answer) == "own":
-            break  # it takes no matcher
+        config = _network_config(kind, part.config, str(path))
+        make = partial(_kinds()[kind].network, config)
+        networks[kind] = checkpoints.build_network(make, part, str(path)).eval()
+        if use == "images" and is_generator and (answer or config.answer) == "own":
+            break
     return DepthWeights(
-        generator=next((built[kind] for kind in GENERATORS if kind in built), None),
-        matcher=next((built[kind] for kind in MATCHERS if kind in built), None),
+        generator=next((networks[kind] for kind in GENERATORS if kind in networks), None),
+        matcher=next((networks[kind] for kind in MATCHERS if kind in networks), None),
         facts=checkpoint.facts,
     )
 
 
-def _config_of(kind: str, settings: Mapping[str, Any], source: str) -> Any:  # noqa: ANN401
-    """Make the config of a network from the metadata of its file."""
-    return config_from_dict(settings, {**GENERATORS, **MATCHERS}[kind].config, source=source)
+def _split(checkpoint: checkpoints.Checkpoint, path: Path) -> dict[str, checkpoints.Checkpoint]:
+    """Split the checkpoint of two networks into one for each, by kind, the generator first."""
+    parts: dict[str, checkpoints.Checkpoint] = {}
+    for kind in _kinds():
+        if kind not in checkpoint.config:
+            continue
+        config = checkpoint.config[kind]
+        if not isinstance(config, Mapping):
+            raise InputError(f"{path}: its config has no {kind!r}; the file is damaged.")
+        prefix = f"{kind}."
+        state = {
+            name.removeprefix(prefix): tensor
+            for name, tensor in checkpoint.state.items()
+            if name.startswith(prefix)
+        }
+        parts[kind] = checkpoints.Checkpoint(kind=kind, config=config, state=state)
+    if not (set(parts) & set(GENERATORS) and set(parts) & set(MATCHERS)):
+        raise InputError(
+            f"{path}: its config names {sorted(checkpoint.config)}, but it should hold a "
+            "generator and a matcher; the file is damaged."
+        )
+    return parts
+
+
+def _network_config(kind: str, settings: Mapping[str, Any], source: str) -> Any:  # noqa: ANN401
+    """Make the config of a network from the metadata of its file; ``source`` is for errors."""
+    return config_from_dict(settings, _kinds()[kind].config, source=source)
 
 
 def settings_of(checkpoint: checkpoints.Checkpoint, source: str) -> dict[str, Any]:
     """Give the settings of a file's networks, by kind where there are two.
 
-    Those that the file does not have are at their defaults.
+    Settings that the file does not hold are at their defaults. ``source``: the file, for errors.
 
     Raises:
-        InputError: a setting is unknown, or has a value that is refused.
+        InputError: a setting is unknown, or its value is not allowed.
     """
     if checkpoint.kind != BOTH:
-        return config_to_dict(_config_of(checkpoint.kind, checkpoint.config, source))
+        return config_to_dict(_network_config(checkpoint.kind, checkpoint.config, source))
     return {
-        kind: config_to_dict(_config_of(kind, settings, source))
+        kind: config_to_dict(_network_config(kind, settings, source))
         for kind, settings in checkpoint.config.items()
     }
 
@@ -184,35 +203,40 @@ def write_depth_weights(
         facts: ``trained_on``, ``licence`` and the like.
         with_half: store 16-bit floats: half the size.
     """
-    parts: dict[str, Any] = {}
-    for name, kind in (*GENERATORS.items(), *MATCHERS.items()):
-        for part in (generator, matcher):
-            if isinstance(part, kind.network):
-                parts[name] = part
-    assert parts, "a weights file holds a network at least"
-    states = {
-        k: checkpoints.half_state(part) if with_half else part.state_dict()
-        for k, part in parts.items()
-    }
-    configs = {kind: config_to_dict(part.config) for kind, part in parts.items()}
-    if len(parts) == 1:
-        kind = next(iter(parts))
+    networks: dict[str, Any] = {}
+    for kind, classes in _kinds().items():
+        for network in (generator, matcher):
+            if isinstance(network, classes.network):
+                networks[kind] = network
+    assert networks, "a weights file holds at least one network"
+    configs: dict[str, Any] = {}
+    states: dict[str, dict[str, Tensor]] = {}
+    for kind, network in networks.items():
+        configs[kind] = config_to_dict(network.config)
+        states[kind] = checkpoints.half_state(network) if with_half else network.state_dict()
+
+    if len(networks) == 1:
+        kind = next(iter(networks))
         config = configs[kind]
         state = states[kind]
     else:
         kind = BOTH
         config = configs
-        state = {f"{name}.{key}": t for name, s in states.items() for key, t in s.items()}
+        state = {
+            f"{part}.{name}": tensor
+            for part, part_state in states.items()
+            for name, tensor in part_state.items()
+        }
     checkpoints.save_checkpoint(
         path, checkpoints.Checkpoint(kind=kind, config=config, state=state, facts=facts)
     )
 
 
 def make_matcher(network: stereo.StereoNetwork, config: MatcherConfig) -> stereo.Matcher:
-    """Make the matcher of a network of any kind.
+    """Make the matcher that runs a network of any kind of ``MATCHERS``.
 
     Raises:
-        InputError: no kind has such a network.
+        InputError: the network is of no such kind.
     """
     for kind in MATCHERS.values():
         if isinstance(network, kind.network):
@@ -223,7 +247,11 @@ def make_matcher(network: stereo.StereoNetwork, config: MatcherConfig) -> stereo
 
 
 def refuse_share(images: int, alarm_share: float) -> None:
-    """Refuse a share of images that so many of them cannot tell."""
+    """Refuse a share of false alarms that is not between 0 and 1, or is less than one image.
+
+    Raises:
+        InputError: with the number of images that it takes.
+    """
     if not 0 < alarm_share < 1:
         raise InputError(f"alarm_share is {alarm_share:g}; it must be above 0 and below 1")
     if images * alarm_share < 1:
@@ -236,30 +264,33 @@ def refuse_share(images: int, alarm_share: float) -> None:
 def calibrate_weights(
     weights: Path, image_confidence: list[float], alarm_share: float, out: Path
 ) -> float:
-    """Write weights that refuse all but ``1 - alarm_share`` of images like some that are known.
+    """Write weights whose ``least_confidence`` refuses a share of images that they should accept.
 
     Args:
         weights: with a generator that selects; its tensors stay as they are.
-        image_confidence: of images that the weights shall know.
-        alarm_share: share of these that may be refused, 0..1.
-        out: the file of the weights.
+        image_confidence: of images that the weights should accept
+            (``DepthEstimate.image_confidence``).
+        alarm_share: share of these that may be refused all the same, 0..1.
+        out: the weights file that is written.
 
     Returns:
-        The ``least_confidence`` that they bear.
+        The ``least_confidence`` of the written weights.
 
     Raises:
         InputError: too few images for that share, or weights of another kind.
     """
     refuse_share(len(image_confidence), alarm_share)
-    least = min(round(float(np.quantile(image_confidence, alarm_share)), 4), 0.9999)
+    quantile = float(np.quantile(image_confidence, alarm_share))
+    least_confidence = min(round(quantile, 4), 0.9999)
     checkpoint = checkpoints.read_checkpoint(weights)
+    is_both = checkpoint.kind == BOTH
     config = dict(checkpoint.config)
-    selection = {BOTH: config.get(_SELECTION), _SELECTION: config}.get(checkpoint.kind)
-    if not isinstance(selection, dict):
+    selection = config.get(_SELECTION) if is_both else config
+    if checkpoint.kind not in (BOTH, _SELECTION) or not isinstance(selection, dict):
         raise InputError(
             f"{weights}: holds no generator that selects; take weights of 'train select'"
         )
-    changed = {**selection, "least_confidence": least}
-    config = {**config, _SELECTION: changed} if checkpoint.kind == BOTH else changed
+    changed = {**selection, "least_confidence": least_confidence}
+    config = {**config, _SELECTION: changed} if is_both else changed
     checkpoints.save_checkpoint(out, replace(checkpoint, config=config))
-    return least
+    return least_confidence

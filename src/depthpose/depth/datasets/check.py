@@ -1,4 +1,4 @@
-"""The check of a folder before hours of work: everything wrong, a line each."""
+"""The check of a dataset's files before hours of work: lists every problem."""
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -21,16 +21,17 @@ from depthpose.depth.disparity import disparity_from_depth
 from depthpose.depth.types import Map
 
 _MAX_DEPTH_M = 200
-"""KITTI's LiDAR sees 120 m."""
-_TRUTH_RADIUS = 3
-_TRUTH_PX = 2.0
-_TRUTH_SHARE = 0.03
-"""A value within so many pixels of a match may be so far from its disparity: px, and a share."""
-_MIN_TRUTH = 25
-"""Matches with truth beside them, without which a map is not judged."""
-_AGREE = 0.6
-"""Least share of these that a true map agrees with: 0.7 to 0.97 on 80 real pairs, and 0.59 at most
-of maps of another scale, shift or turn."""
+"""KITTI's LiDAR reaches 120 m."""
+_TRUTH_RADIUS_PX = 3
+"""Truth agrees with a match if any value within this distance does."""
+_TRUTH_TOLERANCE_PX = 2.0
+_TRUTH_TOLERANCE_SHARE = 0.03
+"""Largest difference of agreeing disparities: so many pixels plus a share of the disparity."""
+_MIN_MATCHES = 25
+"""Number of matches with truth near them, with fewer of which a map is not judged."""
+_MIN_AGREEMENT = 0.6
+"""Share of these matches that a true map agrees with: 0.7 to 0.97 on 80 real pairs, and at most
+0.59 with maps that are scaled, shifted or rotated."""
 _TRUTH_SCALES = (2.0, 0.5, 256.0, 1 / 256, 16.0, 1 / 16, 1000.0, 0.001)
 """Factors of disparity that are tried where a map does not agree."""
 
@@ -42,80 +43,94 @@ def check_dataset(
     with_decoding: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> CheckReport:
-    """Check every file of a dataset in any layout that ``open_dataset`` knows, or of its split.
+    """Check every file of a dataset in any layout that ``open_dataset`` recognises.
 
-    Without decoding only headers and sizes are read. ``progress`` is called with the number of
-    frames done and of all frames.
+    Args:
+        folder: the dataset's root.
+        split: name or file of a split: only its frames are checked.
+        with_decoding: decode the images; else only their headers are read.
+        progress: called with the number of frames done and of all frames.
 
     Raises:
-        InputError: no such folder, or no layout that is known.
+        InputError: no such folder, or no layout is recognised.
     """
     folder = Path(folder)
     layout, frames = find_frames(folder)
     problems: list[Problem] = []
     if split is not None:
-        chosen = read_split(split)
-        frames_here = {frame.name: frame for frame in frames}
-        missing = [name for name in chosen.names if name not in frames_here]
+        chosen_split = read_split(split)
+        frame_of = {frame.name: frame for frame in frames}
         problems += [
-            Problem(path=folder, kind="missing", message=f"frame {n} of {chosen.name}")
-            for n in missing
+            Problem(path=folder, kind="missing", message=f"frame {name} of {chosen_split.name}")
+            for name in chosen_split.names
+            if name not in frame_of
         ]
-        frames = [frames_here[name] for name in chosen.names if name in frames_here]
+        frames = [frame_of[name] for name in chosen_split.names if name in frame_of]
     problems += _check_folder(folder, frames)
     for done, frame in enumerate(frames, 1):
-        problems += _check_images(frame, with_decoding=with_decoding)
+        problems += _check_frame(frame, with_decoding=with_decoding)
         if progress is not None:
             progress(done, len(frames))
-    parts = {"right views": ("right",), "calibrations": ("calibration",),
-             "LiDAR scans": ("velodyne", "scan"), "depth maps": ("depth",),
-             "disparity maps": ("disparity",)}  # fmt: skip
-    counts = {"frames": len(frames)} | {
-        what: sum(any(getattr(frame, part) for part in names) for frame in frames)
-        for what, names in parts.items()
+
+    fields_of_parts = {
+        "right views": ("right",),
+        "calibrations": ("calibration",),
+        "LiDAR scans": ("velodyne", "scan"),
+        "depth maps": ("depth",),
+        "disparity maps": ("disparity",),
     }
+    counts = {"frames": len(frames)}
+    for part, names in fields_of_parts.items():
+        counts[part] = sum(any(getattr(frame, name) for name in names) for frame in frames)
     return make_report(layout, counts, problems)
 
 
 def _check_folder(folder: Path, frames: list[Frame]) -> Iterator[Problem]:
-    """Find duplicate names, mixed formats, lone right views, and maps without an image."""
+    """Report duplicate names, mixed formats, single right views, and maps without an image."""
     path_of: dict[str, Path] = {}
     for frame in frames:
         if frame.name in path_of:
             message = f"has the same name as {path_of[frame.name]}; rename one"
             yield Problem(path=frame.left, kind="mismatch", message=message)
         path_of[frame.name] = frame.left
+
     # Compression changes what networks predict, so a mixture is worth knowing.
     views = [path for frame in frames for path in (frame.left, frame.right) if path is not None]
     if len({path.suffix.lower() in (".jpg", ".jpeg") for path in views}) > 1:
         yield Problem(path=folder, kind="note", message="mixes PNG and JPEG images")
-    # The folders are listed, not the frames: a split leaves many pairs out on purpose.
+
+    # Right views without a left one, by all files of the folders: a split leaves pairs out on
+    # purpose.
     folders = {
-        (f.left.parent, f.right.parent)
-        for f in frames
-        if f.right and stem_of(f.right) == stem_of(f.left)
+        (frame.left.parent, frame.right.parent)
+        for frame in frames
+        if frame.right and stem_of(frame.right) == stem_of(frame.left)
     }
-    for left, right in sorted(folders):
-        if left == right or not left.is_dir():  # packed
+    for left_folder, right_folder in sorted(folders):
+        if left_folder == right_folder or not left_folder.is_dir():  # in a shard
             continue
-        stems = {stem_of(path) for path in left.iterdir()}
-        for path in sorted(right.iterdir()):
+        stems = {stem_of(path) for path in left_folder.iterdir()}
+        for path in sorted(right_folder.iterdir()):
             is_view = path.suffix.lower() in LISTED_SUFFIXES and path.name[0] != "."
             if is_view and stem_of(path) not in stems:
                 yield Problem(path=path, kind="missing", message="has no left view")
+
+    # Folders of a plain dataset of which no frame has a file.
     for name, part in (("right", "right"), ("lidar_depth", "depth"), ("disp_occ", "disparity")):
-        is_there = (folder / name).is_dir() and any((folder / name).iterdir())
-        if is_there and not any(getattr(frame, part) for frame in frames):
-            suffixes = ", ".join((*LISTED_SUFFIXES, *(() if part == "right" else MAP_SUFFIXES)))
-            message = f"holds no file of a frame's name in a format that is read: {suffixes}"
+        has_files = (folder / name).is_dir() and any((folder / name).iterdir())
+        if has_files and not any(getattr(frame, part) for frame in frames):
+            suffixes = LISTED_SUFFIXES if part == "right" else (*LISTED_SUFFIXES, *MAP_SUFFIXES)
+            formats = ", ".join(suffixes)
+            message = f"holds no file of a frame's name in a format that is read: {formats}"
             yield Problem(path=folder / name, kind="missing", message=message)
 
 
-def _check_images(frame: Frame, *, with_decoding: bool) -> Iterator[Problem]:
-    """Report views that are missing, unreadable, of two sizes or not rectified; then the truth.
+def _check_frame(frame: Frame, *, with_decoding: bool) -> Iterator[Problem]:
+    """Report problems of a frame's views, calibration, LiDAR scan and truth.
 
-    ``with_decoding``: decode the images, and compare both views; else look at their sizes alone.
+    ``with_decoding``: decode the images and compare both views; else check their sizes alone.
     """
+    # Views that are missing, unreadable or of two sizes.
     size = None
     images: list[Tensor] = []
     for path in (frame.left, frame.right):
@@ -135,18 +150,20 @@ def _check_images(frame: Frame, *, with_decoding: bool) -> Iterator[Problem]:
             message = f"is {image_px[0]}x{image_px[1]}, but its left image is {size[0]}x{size[1]}"
             yield Problem(path=path, kind="mismatch", message=message)
         size = size or image_px
+
+    # Views that are not rectified.
     rig = None
     report = None
     if frame.right is not None and len(images) == 2 and images[0].shape == images[1].shape:
-        with suppress(InputError):  # which is told by itself
+        with suppress(InputError):  # _check_measurements reports it
             rig = frame_camera(frame)
         cx_difference_px = rig.cx_right_minus_left_px if isinstance(rig, StereoRig) else 0.0
         report = check_rectified(images[0], images[1], cx_difference_px)
         if report.is_wrong or report.is_rectified is None:
             message = f"beside {frame.left.name}: {report.message}"
-            yield Problem(
-                path=frame.right, kind="mismatch" if report.is_wrong else "note", message=message
-            )
+            kind = "mismatch" if report.is_wrong else "note"
+            yield Problem(path=frame.right, kind=kind, message=message)
+
     yield from _check_measurements(frame)
     for path in (frame.scan, frame.depth, frame.disparity, frame.disparity_noc):
         if path is not None and size is not None:
@@ -155,7 +172,7 @@ def _check_images(frame: Frame, *, with_decoding: bool) -> Iterator[Problem]:
 
 
 def _check_measurements(frame: Frame) -> Iterator[Problem]:
-    """Calibration and LiDAR points."""
+    """Report a calibration or LiDAR scan that is missing, unreadable or empty."""
     if frame.calibration is None:
         if frame.velodyne is None:
             yield Problem(
@@ -190,7 +207,15 @@ def _check_truth(
     *,
     is_depth: bool,
 ) -> Iterator[Problem]:
-    """Check size and range of a map, and whether it fits the images of its pair."""
+    """Report a map of depth or disparity whose size, range or values do not fit its pair.
+
+    Args:
+        path: of the map.
+        size: width and height of the left image.
+        rig: the cameras, where they are known.
+        report: matches between the views; None: values are not compared with them.
+        is_depth: whether the map holds depth, not disparity.
+    """
     try:
         truth = read_depth(path)
     except InputError as error:
@@ -213,35 +238,50 @@ def _check_truth(
         if not isinstance(rig, StereoRig):
             return
         truth = disparity_from_depth(truth, rig)
-    best = _agreement(truth, report)
-    changed = ""
-    if best is None or best[0] >= _AGREE:
+    yield from _check_agreement(path, truth, report)
+
+
+def _check_agreement(path: Path, truth_px: Map, report: RectificationReport) -> Iterator[Problem]:
+    """Report a disparity that few matches between the views agree with, and a change that would."""
+    agreement = _agreement(truth_px, report)
+    if agreement is None:
         return
-    message = f"agrees with {best[0]:.0%} of {best[1]} matches between left and right"
-    changes = {f"{scale:g} times its disparities": truth * scale for scale in _TRUTH_SCALES}
-    changes |= {"mirrored": truth.flip(1), "upside down": truth.flip(0)}
-    for words, other in changes.items():
-        agreement = _agreement(other, report)
-        if agreement is not None and agreement[0] >= max(_AGREE, best[0]):
-            best = agreement
-            changed = f"; {words} it agrees with {agreement[0]:.0%}"
-    message = f"{message}{changed}: is it of this pair, and in which unit?"
+    share, count = agreement
+    if share >= _MIN_AGREEMENT:
+        return
+    message = f"agrees with {share:.0%} of {count} matches between left and right"
+
+    # The change of the map that agrees best.
+    changes = {f"{scale:g} times its disparities": truth_px * scale for scale in _TRUTH_SCALES}
+    changes |= {"mirrored": truth_px.flip(1), "upside down": truth_px.flip(0)}
+    best_share = max(_MIN_AGREEMENT, share)
+    hint = ""
+    for change, changed_px in changes.items():
+        changed_agreement = _agreement(changed_px, report)
+        if changed_agreement is not None and changed_agreement[0] >= best_share:
+            best_share = changed_agreement[0]
+            hint = f"; {change} it agrees with {best_share:.0%}"
+    message = f"{message}{hint}: is it of this pair, and in which unit?"
     yield Problem(path=path, kind="mismatch", message=message)
 
 
 def _agreement(disparity_px: Map, report: RectificationReport) -> tuple[float, int] | None:
-    """Give share and number of matches that agree with a map; None where these are too few."""
-    # Corners lie at edges, so a value within a window may be the one that a match saw.
-    side = 2 * _TRUTH_RADIUS + 1
-    padded = F.pad(disparity_px.float(), (_TRUTH_RADIUS,) * 4, value=float("nan"))
+    """Give the share of matches that agree with a map, of those with truth near them.
+
+    Gives the number of the latter too; None where they are too few.
+    """
+    # Matched corners lie at edges, so each value in a window may be that of the match.
+    side = 2 * _TRUTH_RADIUS_PX + 1
+    padded = F.pad(disparity_px.float(), (_TRUTH_RADIUS_PX,) * 4, value=float("nan"))
     windows = padded.unfold(0, side, 1).unfold(1, side, 1)
     column, row = report.places_px.round().long().unbind(-1)
     height, width = disparity_px.shape
-    near = windows[row.clamp(0, height - 1), column.clamp(0, width - 1)].flatten(1)
+    near_px = windows[row.clamp(0, height - 1), column.clamp(0, width - 1)].flatten(1)
     matched_px = report.disparities_px[:, None]
-    is_there = torch.isfinite(near).any(1)
-    is_near = (near - matched_px).abs() <= _TRUTH_PX + _TRUTH_SHARE * matched_px.abs()
-    count = int(is_there.sum())
-    if count < _MIN_TRUTH:
+    tolerance_px = _TRUTH_TOLERANCE_PX + _TRUTH_TOLERANCE_SHARE * matched_px.abs()
+    has_truth = torch.isfinite(near_px).any(1)
+    agrees = ((near_px - matched_px).abs() <= tolerance_px).any(1)
+    count = int(has_truth.sum())
+    if count < _MIN_MATCHES:
         return None
-    return float(is_near.any(1)[is_there].float().mean()), count
+    return float(agrees[has_truth].float().mean()), count

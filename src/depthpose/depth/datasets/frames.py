@@ -1,12 +1,11 @@
-"""One stereo frame on disk: where its parts lie, its calibration, and reading them.
+"""One stereo frame on disk: the paths of its files, its calibration, and its truth.
 
-Calibration files are those of KITTI and plain folders; the depth map of a LiDAR scan equals that of
-the published Eigen evaluation to the bit.
+Calibration files are those of KITTI and of plain folders. The depth map of a LiDAR scan equals that
+of the published Eigen evaluation to the bit.
 """
 
 import re
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -37,81 +36,115 @@ from depthpose.depth.config import TruthKind
 from depthpose.depth.types import Map
 
 _MAX_PAIRS_BYTES = 2**24
-"""Of a text with a line for each pair of a folder."""
+"""Largest calibration file with a line for each pair of a folder."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class KittiCalibration:
-    """What a KITTI calibration says of the colour pair (cameras 2 and 3) and the LiDAR."""
+    """KITTI's calibration of the colour pair (cameras 2 and 3, or the grey pair) and the LiDAR."""
 
     rig: StereoRig  #: intrinsics, baseline and difference of the principal points
-    #: homogeneous LiDAR points to homogeneous pixels of camera 2
+    #: maps homogeneous LiDAR points to homogeneous pixels of the left camera; None where the files
+    #: have no calibration of the LiDAR
     pixels_from_velodyne: Float64[np.ndarray, "3 4"] | None
 
 
 def read_object_calibration(
     path: Path, width: int, height: int, *, is_grey: bool = False
 ) -> KittiCalibration:
-    """Read a text of the object layout: P2, P3 and, for the LiDAR, R0_rect and Tr_velo_to_cam.
+    """Read a calibration of the object layout: P2, P3 and, for the LiDAR, R0_rect, Tr_velo_to_cam.
 
-    Texts of the KITTI 2012 and 2015 sets (``P2`` or ``P_rect_02``) are read too, and those of
-    odometry, whose ``Tr`` goes to the rectified camera 0; of the grey pair, P0 and P1.
+    Files of the KITTI 2012 and 2015 sets (``P2`` or ``P_rect_02``) are read too, and those of
+    odometry, whose ``Tr`` is a transform to the rectified camera 0.
+
+    Args:
+        path: the file.
+        width: of the images.
+        height: of the images.
+        is_grey: read the grey pair, P0 and P1, in place of the colour pair.
+
+    Raises:
+        InputError: a matrix is missing or damaged, or the file is of images of another size.
     """
     keys = files.read_key_values(path)
-    names = ("P2", "P3") if "P2" in keys else ("P_rect_02", "P_rect_03")
-    names = ("P0", "P1") if is_grey else names
+    if is_grey:
+        names = ("P0", "P1")
+    else:
+        names = ("P2", "P3") if "P2" in keys else ("P_rect_02", "P_rect_03")
     rig, left = _projected_rig(path, keys, names, (width, height))
-    moved = next((name for name in ("Tr_velo_to_cam", "Tr") if name in keys), None)
-    if moved is None:
+
+    # The LiDAR.
+    if "Tr_velo_to_cam" in keys:
+        camera_from_velodyne = kitti_matrix(path, keys, "Tr_velo_to_cam", (3, 4))
+        rectify = kitti_matrix(path, keys, "R0_rect", (3, 3))
+    elif "Tr" in keys:
+        camera_from_velodyne = kitti_matrix(path, keys, "Tr", (3, 4))
+        rectify = np.eye(3)
+    else:
         return KittiCalibration(rig=rig, pixels_from_velodyne=None)
-    rectify = np.eye(3) if moved == "Tr" else kitti_matrix(path, keys, "R0_rect", (3, 3))
-    composed = _composed(path, left, rectify, kitti_matrix(path, keys, moved, (3, 4)))
-    return KittiCalibration(rig=rig, pixels_from_velodyne=composed)
+    pixels_from_velodyne = _compose_projection(path, left, rectify, camera_from_velodyne)
+    return KittiCalibration(rig=rig, pixels_from_velodyne=pixels_from_velodyne)
 
 
 def read_plain_calibration(path: Path, name: str, width: int, height: int) -> StereoRig:
     """Read a plain folder's ``calib.txt``.
 
-    Either ``focal_px``, ``cx``, ``cy`` and ``baseline_m`` for all pairs, a line each, or one line
-    a pair: ``name width height focal_px cx cy baseline_m``, which may go on with ``focal_y_px
-    cx_right_minus_left_px``.
+    The file has either ``focal_px``, ``cx``, ``cy`` and ``baseline_m`` for all pairs, a line each;
+    or one line for each pair, ``name width height focal_px cx cy baseline_m``, which may continue
+    with ``focal_y_px cx_right_minus_left_px``.
+
+    Args:
+        path: the file.
+        name: of the pair.
+        width: of the images, if the file has one calibration for all pairs.
+        height: of the images, likewise.
+
+    Raises:
+        InputError: there is no calibration of the pair, several, or one that is damaged.
     """
     text = files.read_text(path, _MAX_PAIRS_BYTES)
     if re.search(r"^[ \t]*focal_px[ \t]*:", text, re.MULTILINE):
         keys = files.read_key_values(path)
         return _rig(path, plain_facts(path, keys), (width, height))
+
+    # The line of the pair; other pairs' names may begin with this one's, and a space.
     lines = re.findall(rf"^[ \t]*{re.escape(name)}[ \t]+(.+)$", text, re.MULTILINE)
-    of_frame: list[list[float]] = []
-    for line in lines:
-        numbers: list[float] = []
-        with suppress(ValueError):  # what begins the line counts
-            for word in line.split():
-                numbers.append(float(word))  # noqa: PERF401  those before an error stay
-        of_frame += [numbers] if len(numbers) >= 6 else []
-    if lines and not of_frame:
+    calibrations = [numbers for line in lines if len(numbers := _leading_numbers(line)) >= 6]
+    if lines and not calibrations:
         raise InputError(
             f"{path}: the line of {name!r} is no calibration: {lines[0][:80]!r} does not begin "
             "with six numbers, width height focal_px cx cy baseline_m"
         )
-    if len(of_frame) > 1:
-        raise InputError(f"{path}: {len(of_frame)} lines for {name!r}. Keep one of them.")
-    if not of_frame:
+    if len(calibrations) > 1:
+        raise InputError(f"{path}: {len(calibrations)} lines for {name!r}. Keep one of them.")
+    if not calibrations:
         raise InputError(
             f"{path}: neither 'focal_px: ...' nor a line '{name} width height focal_px cx cy "
             "baseline_m'. Write focal_px, cx, cy and baseline_m, a line each."
         )
+    numbers = calibrations[0] if len(calibrations[0]) == 8 else calibrations[0][:6]
+    columns = ("focal_px", "cx", "cy", "baseline_m", "focal_y_px", "cx_right_minus_left_px")
+    values = {column: [number] for column, number in zip(columns, numbers[2:], strict=False)}
     try:
-        numbers = of_frame[0] if len(of_frame[0]) == 8 else of_frame[0][:6]
         size = int(numbers[0]), int(numbers[1])
-        names = ("focal_px", "cx", "cy", "baseline_m", "focal_y_px", "cx_right_minus_left_px")
-        values: dict[str, list[float]] = {n: [v] for n, v in zip(names, numbers[2:], strict=False)}
         return _rig(path, replace(plain_facts(path, values), size=size), size)
     except (ValueError, OverflowError) as error:
         raise InputError(f"{path}: the line of {name!r} is no calibration ({error}).") from error
 
 
+def _leading_numbers(line: str) -> list[float]:
+    """Give the numbers with which a line begins, up to the first word that is none."""
+    numbers: list[float] = []
+    for word in line.split():
+        try:
+            numbers.append(float(word))
+        except ValueError:
+            break
+    return numbers
+
+
 def _rig(path: Path, facts: CameraFacts, size: Size | None) -> StereoRig:
-    """Make the rig of a calibration; the path names it in errors."""
+    """Make the rig of a calibration, whose file ``path`` is named in errors."""
     try:
         rig = camera_from_facts(facts, size)
     except InputError as error:
@@ -123,13 +156,16 @@ def _rig(path: Path, facts: CameraFacts, size: Size | None) -> StereoRig:
 def _projected_rig(
     path: Path, keys: Mapping[str, list[float]], names: tuple[str, str], size: Size
 ) -> tuple[StereoRig, Matrix]:
-    """The rig of two projections, and that of the left camera."""
+    """Make the rig of a calibration's two projections; give the left projection too.
+
+    ``names``: of both projections; ``size``: width and height of the images.
+    """
     left, right = (kitti_matrix(path, keys, name, (3, 4)) for name in names)
-    sides = keys.get("S_rect_02", [])  # of the rectified images
-    declared = (int(sides[0]), int(sides[1])) if len(sides) == 2 else size
-    if declared != size:
+    sides = keys.get("S_rect_02", [])  # width and height of the rectified images
+    stated_size = (int(sides[0]), int(sides[1])) if len(sides) == 2 else size
+    if stated_size != size:
         raise InputError(
-            f"{path}: S_rect_02 says {declared[0]}x{declared[1]}, but the image is "
+            f"{path}: S_rect_02 says {stated_size[0]}x{stated_size[1]}, but the image is "
             f"{size[0]}x{size[1]}. It was cropped or scaled: give its own calibration, in a "
             "folder of pairs."
         )
@@ -140,22 +176,25 @@ def _projected_rig(
     return _rig(path, facts, size), left
 
 
-def _composed(
+def _compose_projection(
     path: Path,
     left: Float64[np.ndarray, "3 4"],
     rectify: Float64[np.ndarray, "3 3"],
     camera_from_velodyne: Float64[np.ndarray, "3 4"],
 ) -> Float64[np.ndarray, "3 4"]:
-    """Compose the transform of LiDAR points to pixels; 3x3 and 3x4 parts are extended to 4x4."""
-    turned = np.eye(4)
-    moved = np.eye(4)
-    turned[:3, :3] = rectify
-    moved[:3] = camera_from_velodyne
+    """Multiply the projection of LiDAR points to pixels of the left camera.
+
+    ``left`` projects rectified camera coordinates, ``rectify`` rotates the camera's into them.
+    """
+    rectified_from_camera = np.eye(4)
+    rectified_from_camera[:3, :3] = rectify
+    homogeneous = np.eye(4)
+    homogeneous[:3] = camera_from_velodyne
     with np.errstate(all="ignore"):
-        composed = left @ turned @ moved
-    if not np.isfinite(composed).all():
+        projection = left @ rectified_from_camera @ homogeneous
+    if not np.isfinite(projection).all():
         raise InputError(f"{path}: its matrices multiply to infinity. Copy the file anew.")
-    return composed
+    return projection
 
 
 LidarDepth = Literal["velodyne_x", "camera_z"]
@@ -167,7 +206,7 @@ def project_lidar(
     size: tuple[int, int],
     depth: LidarDepth,
 ) -> Map:
-    """Draw a scan into camera 2; NaN where no point falls. No interpolation.
+    """Project a LiDAR scan to a sparse depth map of camera 2, as the published Eigen script does.
 
     Points behind the scanner are dropped, pixels are rounded half to even and then moved by -1
     (KITTI's Matlab indices), points are written in file order, and where several share the index
@@ -180,6 +219,9 @@ def project_lidar(
         pixels_from_velodyne: see :class:`KittiCalibration`.
         size: height and width of the image.
         depth: ``velodyne_x``, the published protocol's (about 0.27 m more), or ``camera_z``.
+
+    Returns:
+        Depth [m], NaN where no point falls; nothing is interpolated.
     """
     height, width = size
     homogeneous = points.numpy().astype(np.float32).copy()
@@ -187,29 +229,35 @@ def project_lidar(
     homogeneous = homogeneous[homogeneous[:, 0] >= 0]
     with np.errstate(all="ignore"):  # points on the plane of the camera divide by zero
         projected = (pixels_from_velodyne @ homogeneous.T.astype(np.float64)).T
-        pixel = np.round(projected[:, :2] / projected[:, 2:3]) - 1
-    value_m = homogeneous[:, 0].astype(np.float64) if depth == "velodyne_x" else projected[:, 2]
-    is_inside = ((pixel >= 0) & (pixel < (width, height))).all(1)
-    u, v = pixel[is_inside].astype(np.int64).T
-    # The last point of a pixel wins: keep one write a pixel, for NumPy promises no order.
-    value_m = value_m[is_inside]
-    written = np.zeros((height, width))
-    pixels, last = np.unique((v * width + u)[::-1], return_index=True)
-    written.flat[pixels] = value_m[::-1][last]
-    shared = v * (width - 1) + u - 1
-    index, first, count = np.unique(shared, return_index=True, return_counts=True)
-    smallest = np.full(len(index), np.inf)
-    np.minimum.at(smallest, np.searchsorted(index, shared), value_m)
-    # Colliding groups never write the same pixel twice: each pixel has one shared index.
-    again = count > 1
-    written[v[first[again]], u[first[again]]] = smallest[again]
-    written[written < 0] = 0
+        pixels = np.round(projected[:, :2] / projected[:, 2:3]) - 1
+    point_m = homogeneous[:, 0].astype(np.float64) if depth == "velodyne_x" else projected[:, 2]
+    is_inside = ((pixels >= 0) & (pixels < (width, height))).all(1)
+    u, v = pixels[is_inside].astype(np.int64).T
+    point_m = point_m[is_inside]
+
+    # The last point of a pixel counts: one write for each pixel, since NumPy promises no order.
+    depth_m = np.zeros((height, width))
+    written_pixels, last = np.unique((v * width + u)[::-1], return_index=True)
+    depth_m.flat[written_pixels] = point_m[::-1][last]
+
+    # Where several points share an index, the smallest depth goes to the pixel of the first. No
+    # pixel is written twice, for each pixel has one index.
+    shared_index = v * (width - 1) + u - 1
+    indices, first, count = np.unique(shared_index, return_index=True, return_counts=True)
+    smallest_m = np.full(len(indices), np.inf)
+    np.minimum.at(smallest_m, np.searchsorted(indices, shared_index), point_m)
+    is_shared = count > 1
+    depth_m[v[first[is_shared]], u[first[is_shared]]] = smallest_m[is_shared]
+
+    depth_m[depth_m < 0] = 0
     with np.errstate(over="ignore"):
-        as_float32 = torch.from_numpy(written.astype(np.float32))
-    return torch.where(as_float32 > 0, as_float32, torch.nan)
+        depth_map = torch.from_numpy(depth_m.astype(np.float32))
+    return torch.where(depth_map > 0, depth_map, torch.nan)
 
 
 CalibrationStyle = Literal["raw", "object", "grey", "middlebury", "plain", "camera"]
+"""Format of a frame's calibration: KITTI's raw, object, or object of the grey pair; Middlebury's;
+``calib.txt`` of a plain folder; or a camera file."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -220,20 +268,20 @@ class Frame:
     left: Path  #: left image (camera 2 of KITTI)
     right: Path | None = None  #: right image (camera 3)
     calibration: Path | None = None  #: file, or for ``raw`` the folder of the date
-    style: CalibrationStyle = "plain"  #: how the calibration is written
+    style: CalibrationStyle = "plain"  #: format of the calibration
     velodyne: Path | None = None  #: one LiDAR scan, float32 x, y, z, reflectance
-    #: a LiDAR scan that was drawn into the left image already, 16-bit camera z, metres x 256
+    #: a depth map of one LiDAR scan in the left image, 16-bit camera z, metres x 256
     #: (``velodyne_raw`` of KITTI's depth-prediction set)
     scan: Path | None = None
     #: depth of the left image, 16-bit PNG (metres x 256), or PFM or NPY in metres
     depth: Path | None = None
-    #: disparity of the left image, 16-bit PNG (x 256), PFM or NPY, hidden pixels too
+    #: disparity of the left image, 16-bit PNG (x 256), PFM or NPY, of occluded pixels too
     disparity: Path | None = None
-    disparity_noc: Path | None = None  #: that of the pixels alone that both views see
+    disparity_noc: Path | None = None  #: the same, of the pixels that both views show only
     sky: Path | None = None  #: 8-bit PNG of the left image, not 0 where it shows the sky
 
     def seen_files(self, *, with_right: bool = True) -> list[Path]:
-        """List what an estimate depends on: left image, right image, files of the calibration."""
+        """List the files an estimate depends on: left image, right image, calibration."""
         paths = [self.left]
         if with_right and self.right is not None:
             paths.append(self.right)
@@ -245,7 +293,11 @@ class Frame:
 
 
 def frame_camera(frame: Frame) -> Camera | None:
-    """Read the camera of a frame, or None where it has no calibration; of a pair, the rig."""
+    """Read the camera of a frame, for a pair its rig; None where it has no calibration.
+
+    Raises:
+        InputError: the calibration is damaged, or of images of another size.
+    """
     if frame.calibration is None:
         return None
     path = frame.calibration
@@ -274,52 +326,53 @@ def kitti_calibration(frame: Frame) -> KittiCalibration:
             f"{frame.name}: no KITTI calibration, so its LiDAR scan cannot be projected. Put "
             "calib_cam_to_cam.txt and calib_velo_to_cam.txt into the folder of its date."
         )
-    home = frame.calibration
     size = files.image_size(frame.left)
     if frame.style != "raw":
-        return read_object_calibration(home, *size, is_grey=frame.style == "grey")
-    cameras = home / "calib_cam_to_cam.txt"
-    lidar = home / "calib_velo_to_cam.txt"
-    keys = files.read_key_values(cameras)
-    rig, left = _projected_rig(cameras, keys, ("P_rect_02", "P_rect_03"), size)
-    if not lidar.is_file():
+        return read_object_calibration(frame.calibration, *size, is_grey=frame.style == "grey")
+
+    # The raw layout: two files in the folder of the date, that of the LiDAR may be missing.
+    camera_file = frame.calibration / "calib_cam_to_cam.txt"
+    lidar_file = frame.calibration / "calib_velo_to_cam.txt"
+    camera_keys = files.read_key_values(camera_file)
+    rig, left = _projected_rig(camera_file, camera_keys, ("P_rect_02", "P_rect_03"), size)
+    if not lidar_file.is_file():
         return KittiCalibration(rig=rig, pixels_from_velodyne=None)
-    rectify = kitti_matrix(cameras, keys, "R_rect_00", (3, 3))
-    of_lidar = files.read_key_values(lidar)
-    R = kitti_matrix(lidar, of_lidar, "R", (3, 3))
-    t = kitti_matrix(lidar, of_lidar, "T", (3, 1))
-    composed = _composed(lidar, left, rectify, np.hstack([R, t]))
-    return KittiCalibration(rig=rig, pixels_from_velodyne=composed)
+    rectify = kitti_matrix(camera_file, camera_keys, "R_rect_00", (3, 3))
+    lidar_keys = files.read_key_values(lidar_file)
+    R = kitti_matrix(lidar_file, lidar_keys, "R", (3, 3))
+    t = kitti_matrix(lidar_file, lidar_keys, "T", (3, 1))
+    pixels_from_velodyne = _compose_projection(lidar_file, left, rectify, np.hstack([R, t]))
+    return KittiCalibration(rig=rig, pixels_from_velodyne=pixels_from_velodyne)
 
 
 def known_truths(frame: Frame) -> tuple[TruthKind, ...]:
-    """Give the kinds of truth that a frame has."""
+    """Give the kinds of truth that a frame has files of."""
     kinds: dict[TruthKind, bool] = {
         "scan": has_lidar(frame, "camera_z"),
-        "annotated": frame.depth is not None and frame.depth != _drawn_scan(frame),
+        "annotated": frame.depth is not None and frame.depth != _scan_map(frame),
         "disparity": frame.disparity is not None,
     }
-    return tuple(kind for kind, is_there in kinds.items() if is_there)
+    return tuple(kind for kind, has_kind in kinds.items() if has_kind)
 
 
 def has_lidar(frame: Frame, depth: LidarDepth) -> bool:
-    """Whether :func:`lidar_truth` has something to draw."""
-    return frame.velodyne is not None or (depth == "camera_z" and _drawn_scan(frame) is not None)
+    """Whether a frame has a LiDAR scan, or a map of one, for :func:`lidar_truth`."""
+    return frame.velodyne is not None or (depth == "camera_z" and _scan_map(frame) is not None)
 
 
 def lidar_truth(frame: Frame, depth: LidarDepth) -> Map:
-    """Draw the LiDAR scan of a frame into its left image; NaN where no point falls.
+    """Give the depth map of a frame's LiDAR scan [m]; NaN where no point falls.
 
-    Where there is no scan but a drawn one (``lidar_depth/`` of a plain folder, ``velodyne_raw`` of
-    KITTI's depth-prediction set; camera z), it is taken for ``camera_z`` as it is.
+    Of a frame without a scan, but with a map of one (``lidar_depth/`` of a plain folder,
+    ``velodyne_raw`` of KITTI's depth-prediction set), that map is read for ``camera_z``.
 
     Raises:
         InputError: no scan (see :func:`has_lidar`), or one without calibration.
     """
-    drawn = _drawn_scan(frame)
-    if frame.velodyne is None and drawn is not None and depth == "camera_z":
-        depth_m = read_depth(drawn)
-        check_map_size(drawn, depth_m, files.image_size(frame.left))
+    scan_map = _scan_map(frame)
+    if frame.velodyne is None and scan_map is not None and depth == "camera_z":
+        depth_m = read_depth(scan_map)
+        check_map_size(scan_map, depth_m, files.image_size(frame.left))
         return depth_m
     if frame.velodyne is None:
         raise InputError(f"{frame.name}: has no LiDAR scan of the kind {depth}.")
@@ -334,14 +387,14 @@ def lidar_truth(frame: Frame, depth: LidarDepth) -> Map:
     return project_lidar(points, pixels_from_velodyne, (height, width), depth)
 
 
-def _drawn_scan(frame: Frame) -> Path | None:
-    """Give the map of a LiDAR scan: the depth of a plain folder of pairs is one."""
+def _scan_map(frame: Frame) -> Path | None:
+    """Give the depth map of a LiDAR scan, if there is one; the depth of a plain folder is such."""
     is_plain = frame.style in ("plain", "camera") and frame.scan is None
     return frame.depth if is_plain else frame.scan
 
 
 def check_map_size(path: Path, values: Shaped[Tensor, "*any h w"], size: tuple[int, int]) -> None:
-    """Refuse a map of another size than its left image, (width, height)."""
+    """Refuse a map whose size is not that of its left image, (width, height)."""
     height, width = values.shape[-2:]
     if (width, height) != size:
         raise InputError(
@@ -351,21 +404,18 @@ def check_map_size(path: Path, values: Shaped[Tensor, "*any h w"], size: tuple[i
 
 
 def read_disparity(path: Path) -> Map:
-    """Read true disparity from a 16-bit PNG or TIFF, a TIFF of floats, PFM or NPY.
+    """Read true disparity [px] from a 16-bit PNG or TIFF (x 256), a TIFF of floats, PFM or NPY.
 
-    NaN where it is unknown, 0 or below, or so large that no pixel of the right image is meant.
+    NaN where it is unknown, 0 or below, or at least the width of the image.
     """
     values = read_depth(path)
     return torch.where(values < values.shape[1], values, torch.nan)
 
 
 def read_depth(path: Path) -> Map:
-    """Read true depth [m] as :func:`read_disparity`, of 16 bits x 256; NaN where it is unknown."""
-    values = (
-        files.read_map(path)
-        if path.suffix.lower() in files.MAP_SUFFIXES
-        else files.read_stored_depth(path)
-    )
+    """Read true depth [m] from the formats of :func:`read_disparity`; NaN where it is unknown."""
+    is_map = path.suffix.lower() in files.MAP_SUFFIXES
+    values = files.read_map(path) if is_map else files.read_stored_depth(path)
     if not values.is_floating_point():
         values = values * KITTI_UNIT
     return torch.where((values > 0) & (values < torch.inf), values, torch.nan)

@@ -1,8 +1,8 @@
-"""One image, or a rectified pair, to one depth estimate in metres; and what may be given."""
+"""The estimator: one image, or a rectified pair, to depth in metres; and the checks of inputs."""
 
 import math
 import warnings
-from collections.abc import Iterable, Sequence, Sized
+from collections.abc import Iterable, Iterator, Sequence, Sized
 from dataclasses import replace
 from functools import partial
 from itertools import groupby, islice
@@ -54,38 +54,48 @@ from depthpose.depth.synthesis import (
     make_synthesiser,
 )
 from depthpose.depth.types import DepthEstimate, Match, StereoInput, Views
-from depthpose.depth.weights import Use, make_matcher, read_depth_weights
+from depthpose.depth.weights import DepthWeights, Use, make_matcher, read_depth_weights
 
 
 def as_input(
     image: object, name: str, camera: AnyLens | None, *, with_exif: bool = True
 ) -> StereoInput:
-    """Take a picture and what is known of its camera; without that, ask the picture's EXIF."""
+    """Make the input of one image, without a right view.
+
+    Args:
+        image: a picture, as :meth:`FakestereoNet.estimate` takes it.
+        name: what to call it in errors.
+        camera: its camera, or its focal length [px]; None: not known.
+        with_exif: read the focal length from the picture's EXIF where ``camera`` is None, with a
+            notice.
+    """
     left = as_tensor(image)
-    exif_focal = None
+    lens = camera
     if camera is None and with_exif and isinstance(image, str | Path | Image.Image):
         exif_focal = read_exif_focal(image)
-    if exif_focal is not None:
-        camera, source = exif_focal
-        message = f"{name}: a focal length of {camera:.0f} px, by its EXIF ({source})"
-        warnings.warn(f"{message}; of a cropped picture it is another", Notice, stacklevel=3)
-    camera = camera_of(camera, (left.shape[2], left.shape[1]))
-    return StereoInput(name=name, left=left, right=None, camera=camera)
+        if exif_focal is not None:
+            lens, source = exif_focal
+            message = f"{name}: a focal length of {lens:.0f} px, by its EXIF ({source})"
+            warnings.warn(f"{message}; of a cropped picture it is another", Notice, stacklevel=3)
+    size = (left.shape[2], left.shape[1])
+    return StereoInput(name=name, left=left, right=None, camera=camera_of(lens, size))
 
 
 def refuse_unrectified(pair: StereoInput, *, with_check: bool = True) -> str:
-    """Raise where two images are no pair, are swapped, or their rows do not correspond.
+    """Raise an error where two images are not a rectified pair; warn where that is uncertain.
 
     Args:
         pair: the images, and their rig where it is known.
-        with_check: look at what they show; else only whether they can be matched at all.
+        with_check: compare what the images show (:func:`~depthpose.core.camera.check_rectified`);
+            else check only sizes, value range and camera.
 
     Returns:
-        A warning where this cannot be told, else nothing.
+        A warning where the images do not tell whether they are rectified, else "".
 
     Raises:
-        InputError: with what was measured and what to do; there is no right view, its size is
-            another, the camera has no baseline, or an image does not lie in [0, 1].
+        InputError: there is no right view, its size is another, the camera has no baseline, an
+            image does not lie in [0, 1]; or the views are swapped, show different scenes, or their
+            rows do not correspond. The error says what was measured and what to do.
     """
     if pair.right is None:
         raise InputError(f"{pair.name}: there is no right image; give right=.")
@@ -121,10 +131,15 @@ def refuse_unrectified(pair: StereoInput, *, with_check: bool = True) -> str:
 def _match_in_range(
     matcher: NetworkMatcher, pair: StereoInput, cx_difference_px: float
 ) -> tuple[Match, str]:
-    """Measure which disparities a pair has, and search where they lie.
+    """Measure the range of a pair's disparities, then match within that range.
 
-    ``cx_difference_px``: cx of the right camera less that of the left one [px]. Gives the match,
-    and a doubt about what lies beyond the search, or "".
+    Args:
+        matcher: a network that can measure the range.
+        pair: the images, and their rig where it is known.
+        cx_difference_px: cx of the right camera less that of the left one [px].
+
+    Returns:
+        The match; and a warning about disparities beyond the searched range, or "".
     """
     assert pair.right is not None
     left = pair.left
@@ -137,28 +152,86 @@ def _match_in_range(
 
 
 def _match_moved_views(matcher: Matcher, pair: StereoInput, cx_difference_px: float) -> Match:
-    """Move the views so that a disparity of 0 is infinitely far away, match, and move back.
+    """Shift the views so that a disparity of 0 is infinitely far away, match, and shift back.
 
     ``cx_difference_px``: cx of the right camera less that of the left one [px].
     """
     assert pair.right is not None
-    first_px = -math.ceil(cx_difference_px)
-    left, right = move_views(pair.left, pair.right, first_px)
+    shift_px = -math.ceil(cx_difference_px)
+    left, right = move_views(pair.left, pair.right, shift_px)
+
+    # The rig of the shifted views.
     rig = pair.camera
-    if isinstance(rig, StereoRig) and first_px != 0:
+    if isinstance(rig, StereoRig) and shift_px != 0:
         K = rig.K.clone()
         K[0, 2] += left.shape[2] - pair.left.shape[2]
-        moved_px = cx_difference_px + first_px
-        rig = replace(rig, width=left.shape[2], K=K, cx_right_minus_left_px=moved_px)
+        remaining_px = cx_difference_px + shift_px
+        rig = replace(rig, width=left.shape[2], K=K, cx_right_minus_left_px=remaining_px)
+
     if isinstance(matcher, CameraMatcher):
         (match,) = matcher.match_many([(left, right)], rig)
     else:
         match = matcher.match(left, right)
-    return moved_back(match, first_px)
+    return moved_back(match, shift_px)
+
+
+def _choose_matcher(
+    weights: str | Path | None,
+    loaded: DepthWeights | None,
+    matcher: str | Path | Matcher | None,
+    loaded_matcher: DepthWeights | None,
+    config: MatcherConfig | SGBMConfig | None,
+) -> Matcher | None:
+    """Choose the matcher of an estimator: OpenCV's, the caller's own, that of weights, or none.
+
+    Args:
+        weights: what :meth:`FakestereoNet.load` was asked for.
+        loaded: the networks of ``weights``.
+        matcher: the matcher that :meth:`FakestereoNet.load` was asked for.
+        loaded_matcher: the networks of ``matcher``, where that names weights.
+        config: how the matcher runs.
+
+    Returns:
+        None where the generator answers depth itself and no matcher was asked for.
+
+    Raises:
+        InputError: there is no matcher, or one that the other arguments do not fit.
+    """
+    generator = None if loaded is None else loaded.generator
+    if isinstance(config, SGBMConfig) and matcher != "sgbm":
+        raise InputError(
+            f"config is of SGBM, but matcher is {matcher!r}; give matcher='sgbm' or a MatcherConfig"
+        )
+
+    # OpenCV's, or the caller's own.
+    if matcher == "sgbm":
+        if loaded is not None and generator is None:
+            raise InputError(
+                f"weights is {str(weights)!r} and matcher is 'sgbm', which takes no weights of "
+                "a matcher. Omit one of the two."
+            )
+        return SGBMMatcher(config if isinstance(config, SGBMConfig) else SGBMConfig())
+    if matcher is not None and not isinstance(matcher, str | Path):
+        return matcher
+
+    # That of weights: those that ``matcher`` names come first.
+    source = loaded if loaded_matcher is None else loaded_matcher
+    if source is not None and source.matcher is not None:
+        run_config = config if isinstance(config, MatcherConfig) else MatcherConfig()
+        return make_matcher(source.matcher, run_config)
+    if matcher is None and generator is not None and generator.config.answer == "own":
+        return None
+    raise InputError(
+        f"weights is {weights and str(weights)!r} and matcher is "
+        f"{matcher and str(matcher)!r}: there is no matcher in that. Give "
+        "weights='psmnet.safetensors' or matcher='sgbm', which needs none; a generator and "
+        "a matcher become one file by 'depthpose weights pack G --matcher S --trained-on "
+        "DATA --licence L --out W'."
+    )
 
 
 DEFAULT = "default"
-"""Name of the weights that are taken where none are named."""
+"""Name of the weights that are loaded where none are named."""
 
 
 class FakestereoNet:
@@ -172,12 +245,12 @@ class FakestereoNet:
 
     Args:
         matcher: pair to disparity; None where the synthesiser answers depth itself (its
-            ``answer`` is own), for one image alone.
-        synthesiser: left view to right view; None matches real pairs only.
-        terms: of the weights, where they bind whoever uses them.
-        weights: what they are called.
-        allow_ood: answer images that are unlike what the weights know too, with a
-            ``warning`` in the estimate, in place of refusing them.
+            ``answer`` is own), for single images only.
+        synthesiser: left view to right view; None: only real pairs are estimated.
+        terms: licence terms of the weights that bind their user; "": none.
+        weights: name of the weights, for ``repr``.
+        allow_ood: estimate images that are out of distribution for the weights too, with a
+            ``warning`` in the estimate; else they are refused.
     """
 
     def __init__(
@@ -208,11 +281,12 @@ class FakestereoNet:
     def __repr__(self) -> str:
         """Give one line: generator and matcher, weights, device."""
         parts = [part for part in (self.synthesiser, self.matcher) if part is not None]
-        parts_shown = [" + ".join(type(part).__name__ for part in parts)]
-        parts_shown += [f"weights {self.weights!r}"] if self.weights else []
+        facts = [" + ".join(type(part).__name__ for part in parts)]
+        if self.weights:
+            facts.append(f"weights {self.weights!r}")
         part_devices = (getattr(part, "device", None) for part in parts)
-        devices = {str(device) for device in part_devices if device is not None}
-        return f"FakestereoNet({', '.join(parts_shown + sorted(devices))})"
+        facts += sorted({str(device) for device in part_devices if device is not None})
+        return f"FakestereoNet({', '.join(facts)})"
 
     @classmethod
     @force_float32()
@@ -247,17 +321,20 @@ class FakestereoNet:
         """
         if weights is None and matcher is None:
             weights = DEFAULT
-        main = None
+        loaded = None
         if weights is not None:
-            main = read_depth_weights(find_weights(weights), use=use, answer=answer)
-        # Paths first: a Path has a method 'match' too, and would pass for a matcher.
-        beside = None
+            loaded = read_depth_weights(find_weights(weights), use=use, answer=answer)
+        # A Path has a method 'match', so it would pass for a matcher: it is recognised first.
+        loaded_matcher = None
         if isinstance(matcher, str | Path) and matcher != "sgbm":
-            beside = read_depth_weights(find_weights(matcher), use="pairs")
-        terms = join_terms(*(read.facts for read in (main, beside) if read is not None))
+            loaded_matcher = read_depth_weights(find_weights(matcher), use="pairs")
+        files = [(weights, loaded), (matcher, loaded_matcher)]
+        loaded_files = [(name, networks) for name, networks in files if networks is not None]
+        terms = join_terms(*(networks.facts for _, networks in loaded_files))
         warn_of_terms({"terms": terms})
 
-        generator = None if main is None else main.generator
+        # The generator, with the caller's choice of where depth comes from.
+        generator = None if loaded is None else loaded.generator
         if answer is not None and isinstance(generator, SelectionGenerator):
             generator.config = replace(generator.config, answer=answer)
         elif answer is not None and (generator is None or answer != generator.config.answer):
@@ -265,42 +342,14 @@ class FakestereoNet:
                 f"answer is {answer!r}, which takes the weights of a generator that selects; omit "
                 "it: these have no generator, or a U-Net, which estimates no disparity."
             )
-        # A matcher: OpenCV's, the caller's own, that of the weights, or none.
-        run = config if isinstance(config, MatcherConfig) else MatcherConfig()
-        holder = beside or main
-        if isinstance(config, SGBMConfig) and matcher != "sgbm":
-            raise InputError(
-                f"config is of SGBM, but matcher is {matcher!r}; give matcher='sgbm' or a "
-                "MatcherConfig"
-            )
-        if matcher == "sgbm":
-            if main is not None and generator is None:
-                raise InputError(
-                    f"weights is {str(weights)!r} and matcher is 'sgbm', which takes no weights of "
-                    "a matcher. Omit one of the two."
-                )
-            chosen = SGBMMatcher(config if isinstance(config, SGBMConfig) else SGBMConfig())
-        elif matcher is not None and not isinstance(matcher, str | Path):
-            chosen = matcher
-        elif holder is not None and holder.matcher is not None:
-            chosen = make_matcher(holder.matcher, run)
-        elif matcher is None and generator is not None and generator.config.answer == "own":
-            chosen = None
-        else:
-            raise InputError(
-                f"weights is {weights and str(weights)!r} and matcher is "
-                f"{matcher and str(matcher)!r}: there is no matcher in that. Give "
-                "weights='psmnet.safetensors' or matcher='sgbm', which needs none; a generator and "
-                "a matcher become one file by 'depthpose weights pack G --matcher S --trained-on "
-                "DATA --licence L --out W'."
-            )
 
+        chosen_matcher = _choose_matcher(weights, loaded, matcher, loaded_matcher, config)
         synthesiser = None
         if generator is not None:
-            synthesiser = make_synthesiser(generator, run.device, run.speed)
-        files = ((weights, main), (matcher, beside))
-        names = " + ".join(str(name) for name, read in files if read is not None)
-        return cls(chosen, synthesiser, terms=terms, weights=names, allow_ood=allow_ood)
+            run_config = config if isinstance(config, MatcherConfig) else MatcherConfig()
+            synthesiser = make_synthesiser(generator, run_config.device, run_config.speed)
+        names = " + ".join(str(name) for name, _ in loaded_files)
+        return cls(chosen_matcher, synthesiser, terms=terms, weights=names, allow_ood=allow_ood)
 
     from_pretrained = load
     """The same as :meth:`load`."""
@@ -346,15 +395,19 @@ class FakestereoNet:
                 needed, a pair that is none, swapped or not rectified, an image unlike what the
                 weights know.
         """
-        chosen = name or (Path(image).stem if isinstance(image, str | Path) else "image")
+        if not name:
+            name = Path(image).stem if isinstance(image, str | Path) else "image"
         lens = choose_lens(camera, focal_px, fov_deg)
-        pair = as_input(image, chosen, lens, with_exif=right is None)
+        pair = as_input(image, name, lens, with_exif=right is None)
         if right is not None:
             pair = replace(pair, right=as_tensor(right, "the right image"))
             if known_distance is not None:
-                raise InputError(f"{chosen}: a pair has metres of its own; omit known_distance")
-        depth = self.estimate_pair(pair, with_check=with_check, mount=mount)
-        return depth if known_distance is None else scale_by_distance(depth, chosen, known_distance)
+                raise InputError(f"{name}: a pair has metres of its own; omit known_distance")
+
+        estimate = self.estimate_pair(pair, with_check=with_check, mount=mount)
+        if known_distance is None:
+            return estimate
+        return scale_by_distance(estimate, name, known_distance)
 
     @torch.no_grad()
     @force_float32()
@@ -363,14 +416,14 @@ class FakestereoNet:
     ) -> DepthEstimate:
         """Estimate depth of one input whose images are read already, as :meth:`estimate` does.
 
-        Networks that find the range measure the disparities of the pair first, and search where
-        they lie; the estimate's ``warning`` names what lies beyond. For other matchers views of a
-        rig with principal points apart are moved by their difference: what is farthest then has a
-        disparity of 0 px, where matchers search. The estimate has the disparities of the views as
-        given.
+        Networks that find the range measure the disparities of the pair first, and match within
+        their range; the estimate's ``warning`` names what lies beyond it. Other matchers search
+        from 0 px upwards, so the views of a rig whose principal points differ are shifted by the
+        difference, by which the farthest point has a disparity of 0 px. The estimate holds the
+        disparities of the views as they were passed.
         """
         if pair.right is None:
-            return self._estimate_alone([pair], self.virtual_sizes(pair), mount)[0]
+            return self._estimate_single_images([pair], self.virtual_sizes(pair), mount)[0]
         if self.matcher is None:
             raise InputError(
                 f"{pair.name}: there is a right image, and these weights answer one image alone: "
@@ -379,6 +432,8 @@ class FakestereoNet:
                 "of both."
             )
         warning = refuse_unrectified(pair, with_check=with_check)
+
+        # How far apart the principal points are.
         width = pair.left.shape[2]
         cx_difference_px = 0.0
         if isinstance(pair.camera, StereoRig):
@@ -389,10 +444,11 @@ class FakestereoNet:
                 "wide: the two views share nothing that is far away. Take both principal points "
                 "from one calibration of images of this size."
             )
+
         with refused_memory(pair.name):
             if isinstance(self.matcher, NetworkMatcher) and self.matcher.finds_range:
-                match, doubt = _match_in_range(self.matcher, pair, cx_difference_px)
-                warning = "; ".join(text for text in (warning, doubt) if text)
+                match, range_warning = _match_in_range(self.matcher, pair, cx_difference_px)
+                warning = "; ".join(text for text in (warning, range_warning) if text)
             else:
                 match = _match_moved_views(self.matcher, pair, cx_difference_px)
             return disparity.estimate_from_pair(pair, match, warning)
@@ -410,20 +466,20 @@ class FakestereoNet:
         threads: int = 1,
         with_progress: bool = False,
     ) -> list[DepthEstimate | InputError]:
-        """Estimate depth of images, alone or as pairs: of each a result, or its error.
+        """Estimate depth of many images or pairs; each gives an estimate or its error.
 
         An input with a right view is matched with it, as :meth:`estimate_pair` does.
 
         Args:
-            images: inputs; or pictures, or a batch of them as one array or tensor; a generator's
-                are taken as they are needed.
+            images: inputs; or pictures, or a batch of them as one array or tensor. An iterator is
+                read as its images are needed.
             camera: of the pictures, as for :meth:`estimate`; inputs have their own.
-            focal_px: the same as its focal length alone [px].
-            fov_deg: the same as its horizontal field of view [degrees].
+            focal_px: the focal length alone [px], in place of ``camera``.
+            fov_deg: the horizontal field of view alone [degrees], in place of both.
             with_check: of pairs, as for :meth:`estimate`.
-            batch: so many neighbours of one size go through the networks together: faster on a
-                GPU, slower on a processor.
-            threads: so many batches are worked at at a time, in as many times the memory.
+            batch: how many successive images of one size go through the networks together: more
+                are faster on a GPU, slower on a processor.
+            threads: how many batches run at the same time, in as many times the memory.
             with_progress: show a bar on the terminal.
 
         Returns:
@@ -436,17 +492,17 @@ class FakestereoNet:
         if batch < 1:
             raise InputError(f"batch is {batch}; take 1 or more images")
         lens = choose_lens(camera, focal_px, fov_deg)
-        is_one = isinstance(images, str | Path | Image.Image | StereoInput)
-        if is_one or (isinstance(images, np.ndarray | Tensor) and images.ndim < 4):
+        is_single = isinstance(images, str | Path | Image.Image | StereoInput)
+        if is_single or (isinstance(images, np.ndarray | Tensor) and images.ndim < 4):
             images = [cast("Picture", images)]
-        several = cast("Iterable[object]", images)
-        named = iter((f"image {k}", image) for k, image in enumerate(several))
-        batches = iter(lambda: list(islice(named, batch)), [])
+        sequence = cast("Iterable[object]", images)
+        total = len(sequence) if isinstance(sequence, Sized) else None
+
         estimates: list[DepthEstimate | InputError] = []
-        total = len(several) if isinstance(several, Sized) else None
+        estimate_batch = partial(self.estimate_together, lens=lens, with_check=with_check)
+        batches = _named_batches(sequence, batch)
         with tqdm(total=total, unit=" images", disable=not with_progress) as bar:
-            work = partial(self.estimate_together, lens=lens, with_check=with_check)
-            for estimates_of_batch in each_in_threads(work, batches, threads):
+            for estimates_of_batch in each_in_threads(estimate_batch, batches, threads):
                 estimates += estimates_of_batch
                 bar.update(len(estimates_of_batch))
         return estimates
@@ -460,7 +516,7 @@ class FakestereoNet:
         with_check: bool = True,
         mount: MountFilter | None = None,
     ) -> list[DepthEstimate | InputError]:
-        """Estimate one batch; where an image of it is unusable, each alone.
+        """Estimate one batch; where an image of it is unusable, estimate each image by itself.
 
         Args:
             named: names and inputs, or pictures.
@@ -471,43 +527,52 @@ class FakestereoNet:
         Returns:
             As :meth:`estimate_many`.
         """
-        estimates: list[DepthEstimate | InputError] = []
-        before = None if mount is None else mount.last
+        last_mount = None if mount is None else mount.last
         try:
             inputs = [
                 image if isinstance(image, StereoInput) else as_input(image, name, lens)
                 for name, image in named
             ]
-            sized = [
-                (
-                    depth_input,
-                    None if depth_input.right is not None else self.virtual_sizes(depth_input),
-                )
-                for depth_input in inputs
-            ]
-            for sizes, group in groupby(sized, itemgetter(1)):
-                same_sizes = [depth_input for depth_input, _ in group]
-                if sizes is None:
-                    estimates += map(partial(self.estimate_pair, with_check=with_check), same_sizes)
-                else:
-                    estimates += self._estimate_alone(same_sizes, sizes, mount)
+            return self._estimate_inputs(inputs, with_check=with_check, mount=mount)
         except InputError as error:
             if len(named) == 1:
                 return [error]
-            if mount is not None:
-                mount.last = before
-            alone = (
-                self.estimate_together([depth_input], lens, with_check=with_check, mount=mount)
-                for depth_input in named
+
+        # Once more from the start, so that an error concerns its own image alone.
+        if mount is not None:
+            mount.last = last_mount
+        estimates: list[DepthEstimate | InputError] = []
+        for named_image in named:
+            estimates += self.estimate_together(
+                [named_image], lens, with_check=with_check, mount=mount
             )
-            return [estimate for (estimate,) in alone]
+        return estimates
+
+    def _estimate_inputs(
+        self, inputs: Sequence[StereoInput], *, with_check: bool, mount: MountFilter | None
+    ) -> list[DepthEstimate | InputError]:
+        """Estimate inputs in order, successive single images of one virtual size together."""
+        sizes_of_inputs = [
+            None if depth_input.right is not None else self.virtual_sizes(depth_input)
+            for depth_input in inputs
+        ]
+        sized = zip(sizes_of_inputs, inputs, strict=True)
+        estimates: list[DepthEstimate | InputError] = []
+        for sizes, group in groupby(sized, key=itemgetter(0)):
+            group_inputs = [depth_input for _, depth_input in group]
+            if sizes is None:  # pairs
+                estimates += [
+                    self.estimate_pair(pair, with_check=with_check) for pair in group_inputs
+                ]
+            else:
+                estimates += self._estimate_single_images(group_inputs, sizes, mount)
         return estimates
 
     def virtual_sizes(self, image: StereoInput) -> list[tuple[int, int]]:
-        """Rows and columns at which one image is looked at.
+        """Give the sizes (rows, columns) at which the generator sees one image.
 
-        The first is its size at the virtual focal length; larger ones follow where the image has
-        the pixels.
+        The first is the image's size at the virtual focal length; larger ones follow only where the
+        image itself is at least as large.
 
         Raises:
             InputError: there is no generator or no camera, or the focal length would make the image
@@ -532,28 +597,34 @@ class FakestereoNet:
             )
         height, width = image.left.shape[1:]
         check_image_matches_camera(image.camera, width, height, image.name)
-        rig_px = self.synthesiser.config.virtual_focal_px
+        virtual_focal_px = self.synthesiser.config.virtual_focal_px
         image_focal_px = float(image.camera.K.diagonal()[:2].min())
-        usable_scales = [
-            s for s in self.synthesiser.scales if s == 1 or s * rig_px <= image_focal_px
+        focal_lengths_px = [scale * virtual_focal_px for scale in self.synthesiser.scales]
+        usable_px = [
+            focal_px
+            for focal_px in focal_lengths_px
+            if focal_px == virtual_focal_px or focal_px <= image_focal_px
         ]
-        return [
-            disparity.size_at_focal_length(image.camera, scale * rig_px) for scale in usable_scales
-        ]
+        return [disparity.size_at_focal_length(image.camera, focal_px) for focal_px in usable_px]
 
-    def _estimate_alone(
+    def _estimate_single_images(
         self,
         images: list[StereoInput],
         sizes: list[tuple[int, int]],
         mount: MountFilter | None = None,
     ) -> list[DepthEstimate]:
-        """Estimate single images of one virtual size together; with ``mount``, frames in order."""
+        """Estimate single images of one virtual size, and correct them by the camera's mount.
+
+        ``sizes``: that virtual size, by :meth:`virtual_sizes`. With ``mount`` the images are
+        successive frames of one camera.
+        """
         estimates = self.estimate_without_mount(images, sizes)
         assert self.synthesiser is not None, "estimate_without_mount needs it"
-        rig = self.synthesiser.config
-        rig = rig if isinstance(rig, SelectionConfig) else SelectionConfig()
+        config = self.synthesiser.config
+        if not isinstance(config, SelectionConfig):
+            config = SelectionConfig()
         return [
-            scale_by_mount(estimate, image, mount, rig)
+            scale_by_mount(estimate, image, mount, config)
             for estimate, image in zip(estimates, images, strict=True)
         ]
 
@@ -563,7 +634,8 @@ class FakestereoNet:
     ) -> list[DepthEstimate]:
         """Estimate depth by the networks alone, before the camera's mount corrects it.
 
-        Images are brought to the virtual rig, their right views drawn and matched.
+        The images are resized to the virtual focal length, and their right views synthesised and
+        matched.
 
         Args:
             images: single images, all of the same virtual sizes.
@@ -575,22 +647,28 @@ class FakestereoNet:
         assert self.synthesiser is not None, "virtual_sizes checked it"
         rig = self.synthesiser.config
         with refused_memory(images[0].name):
-            left, *larger = (
+            lefts = [
                 torch.stack([disparity.resize_image(image.left.float(), *size) for image in images])
                 for size in sizes
-            )
-            views = self.synthesiser.draw(left, *larger)
-            matches = self._match_virtual(left, views)
+            ]
+            views = self.synthesiser.draw(*lefts)
+            matches = self._match_virtual(lefts[0], views)
             estimates: list[DepthEstimate] = []
-            for n, (image, match) in enumerate(zip(images, matches, strict=True)):
+            for index, image in enumerate(images):
+                match = matches[index]
                 if views.is_sky is not None:
-                    match = replace(match, is_sky=views.is_sky[n])  # noqa: PLW2901
-                estimate = disparity.estimate_from_virtual(image, rig, match, views.right[n])
-                if views.confidence is not None:
-                    street = views.street_probability
-                    score = views.confidence[n].mean() if street is None else street[n]
-                    warning = self._ood_warning(image.name, float(score))
-                    estimate = replace(estimate, image_confidence=float(score), warning=warning)
+                    match = replace(match, is_sky=views.is_sky[index])
+                estimate = disparity.estimate_from_virtual(image, rig, match, views.right[index])
+
+                # How sure the generator is of the image as a whole.
+                image_confidence = None
+                if views.street_probability is not None:
+                    image_confidence = float(views.street_probability[index])
+                elif views.confidence is not None:
+                    image_confidence = float(views.confidence[index].mean())
+                if image_confidence is not None:
+                    warning = self._ood_warning(image.name, image_confidence)
+                    estimate = replace(estimate, image_confidence=image_confidence, warning=warning)
                 estimates.append(estimate)
         return estimates
 
@@ -601,11 +679,10 @@ class FakestereoNet:
         if rig.answer != "matched":
             assert views.disparity_px is not None, "it has an answer of its own"
             assert views.confidence is not None
+            maps = zip(views.disparity_px, views.confidence, strict=True)
             return [
                 Match(disparity_px=disparity_px, confidence=confidence)
-                for disparity_px, confidence in zip(
-                    views.disparity_px, views.confidence, strict=True
-                )
+                for disparity_px, confidence in maps
             ]
         assert self.matcher is not None, "__init__ checked it"
         camera = camera_of(rig.virtual_focal_px, (left.shape[3], left.shape[2]))
@@ -615,19 +692,23 @@ class FakestereoNet:
         return [self.matcher.match(*pair) for pair in pairs]
 
     def _ood_warning(self, name: str, image_confidence: float) -> str:
-        """Warn of an image that is unlike what the weights know, or refuse it; "" of a usual one.
+        """Give the warning of an image that is out of distribution for the weights, else "".
+
+        Args:
+            name: of the image, for the error.
+            image_confidence: how sure the generator is of the image as a whole, 0..1.
 
         Raises:
-            InputError: it is unlike that, and such images are not to be answered.
+            InputError: the image is out of distribution, and ``allow_ood`` is false.
         """
         assert self.synthesiser is not None
-        rig = self.synthesiser.config
-        if not isinstance(rig, SelectionConfig) or image_confidence >= rig.least_confidence:
+        config = self.synthesiser.config
+        if not isinstance(config, SelectionConfig) or image_confidence >= config.least_confidence:
             return ""
-        what = "probability of a street" if rig.with_street else "mean confidence"
+        measure = "probability of a street" if config.with_street else "mean confidence"
         warning = (
-            f"out of distribution for these weights ({what} {image_confidence:.2f}, below "
-            f"{rig.least_confidence:.2f}), so its depth is a guess"
+            f"out of distribution for these weights ({measure} {image_confidence:.2f}, below "
+            f"{config.least_confidence:.2f}), so its depth is a guess"
         )
         if not self.allow_ood:
             raise InputError(
@@ -635,3 +716,10 @@ class FakestereoNet:
                 "own; --allow-ood (in Python, load(..., allow_ood=True)) answers it all the same."
             )
         return warning
+
+
+def _named_batches(images: Iterable[object], batch: int) -> Iterator[list[tuple[str, object]]]:
+    """Yield lists of up to ``batch`` images, each with its number as its name."""
+    named = ((f"image {number}", image) for number, image in enumerate(images))
+    while chunk := list(islice(named, batch)):
+        yield chunk

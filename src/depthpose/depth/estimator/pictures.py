@@ -1,4 +1,4 @@
-"""Pictures to depth by the interface of transformers' pipelines."""
+"""Depth of pictures, by the interface of transformers' depth pipelines."""
 
 import os
 import warnings
@@ -25,18 +25,18 @@ from depthpose.depth.estimator.net import (
     Picture,
     as_input,
 )
-from depthpose.depth.types import StereoInput
+from depthpose.depth.types import Map, StereoInput
 
-_PHONE = 0.75
+_PHONE_FOCAL_WIDTHS = 0.75
 """Focal length of a phone's main camera, in widths of the picture."""
 
 
 @dataclass(eq=False)
 class DepthPipeline:
-    """Pictures to ``{"predicted_depth", "depth"}``."""
+    """Callable that estimates depth of pictures, as transformers' pipelines do."""
 
-    net: FakestereoNet  #: estimates images
-    batch_size: int = 1  #: pictures of one size in one call of its networks
+    net: FakestereoNet  #: the estimator
+    batch_size: int = 1  #: number of pictures in one call of its networks
 
     def __call__(
         self,
@@ -73,46 +73,51 @@ class DepthPipeline:
         """
         if (inputs is None) == (images is None):
             raise InputError("give the pictures, as the first argument or as images=")
-        pictures_given = images if inputs is None else inputs
+        argument = images if inputs is None else inputs
         lens = choose_lens(camera, focal_px, fov_deg)
-        is_one = isinstance(pictures_given, str | Path | Image.Image | np.ndarray | Tensor)
-        pictures = [pictures_given] if is_one else cast("Iterable[Picture]", pictures_given)
-        estimates = self._each(pictures, lens, batch_size or self.batch_size, timeout)
-        if is_one:
+        is_single = isinstance(argument, str | Path | Image.Image | np.ndarray | Tensor)
+        pictures = [argument] if is_single else cast("Iterable[Picture]", argument)
+        estimates = self._estimate_each(pictures, lens, batch_size or self.batch_size, timeout)
+        if is_single:
             return next(estimates)
-        return list(estimates) if isinstance(pictures_given, list | tuple) else estimates
+        return list(estimates) if isinstance(argument, list | tuple) else estimates
 
-    def _each(
+    def _estimate_each(
         self, pictures: Iterable[Picture], lens: AnyLens | None, batch: int, timeout: float | None
     ) -> Iterator[dict[str, Any]]:
-        """Estimate pictures batch by batch; without a camera a phone's is assumed."""
-        left = iter(pictures)
-        while chunk := list(islice(left, batch)):
+        """Estimate pictures in batches; without a camera a phone's is assumed, with a notice."""
+        remaining = iter(pictures)
+        while chunk := list(islice(remaining, batch)):
             inputs: list[StereoInput] = []
             for picture in chunk:
-                taken = as_input(_opened(picture, timeout), "the picture", lens)
-                if taken.camera is None:
-                    height, width = taken.left.shape[1:]
-                    phone_focal_px = _PHONE * width
-                    taken = replace(taken, camera=camera_of(phone_focal_px, (width, height)))
+                depth_input = as_input(_opened(picture, timeout), "the picture", lens)
+                if depth_input.camera is None:
+                    height, width = depth_input.left.shape[1:]
+                    phone_focal_px = _PHONE_FOCAL_WIDTHS * width
+                    camera = camera_of(phone_focal_px, (width, height))
+                    depth_input = replace(depth_input, camera=camera)
                     warnings.warn(
                         f"no camera: a focal length of {phone_focal_px:g} px is taken, a phone's; "
                         "the metres are as wrong as it is. Give focal_px= or camera=",
                         Notice,
                         stacklevel=3,
                     )
-                inputs.append(taken)
+                inputs.append(depth_input)
             for estimate in self.net.estimate_many(inputs, batch=batch):
                 if isinstance(estimate, InputError):
                     raise estimate
                 assert estimate.depth_m is not None
-                # From the nearest (black) to the farthest (white); what has none is white too.
-                depth_m = estimate.depth_m
-                known_m = depth_m[depth_m.isfinite()]
-                low, high = known_m.aminmax() if len(known_m) else torch.tensor([0.0, 1.0])
-                share = ((depth_m - low) / (high - low).clamp(min=1e-6)).nan_to_num(1.0)
-                drawn = Image.fromarray((255 * share.clamp(0, 1)).byte().cpu().numpy())
-                yield {"predicted_depth": depth_m, "depth": drawn}
+                picture_of_depth = _draw_grey(estimate.depth_m)
+                yield {"predicted_depth": estimate.depth_m, "depth": picture_of_depth}
+
+
+def _draw_grey(depth_m: Map) -> Image.Image:
+    """Draw depth in grey, from black for the nearest to white for the farthest and unknown."""
+    finite_m = depth_m[depth_m.isfinite()]
+    nearest_m, farthest_m = finite_m.aminmax() if len(finite_m) else torch.tensor([0.0, 1.0])
+    share = (depth_m - nearest_m) / (farthest_m - nearest_m).clamp(min=1e-6)
+    grey = (255 * share.nan_to_num(1.0).clamp(0, 1)).byte()
+    return Image.fromarray(grey.cpu().numpy())
 
 
 def pipeline(
@@ -126,7 +131,7 @@ def pipeline(
     batch_size: int = 1,
     **others: object,
 ) -> DepthPipeline:
-    """Build what transformers' function of this name builds, for the one task that is known.
+    """Make a depth pipeline as transformers' function of this name does, of its one task here.
 
     Args:
         task: depth-estimation.
@@ -142,10 +147,10 @@ def pipeline(
         InputError: another task, precision or option, or no such weights.
     """
     refuse_unknown("task", task, ["depth-estimation"])
-    foreign = [name for name, value in others.items() if value is not None]
-    if foreign:
+    unsupported = [name for name, value in others.items() if value is not None]
+    if unsupported:
         raise InputError(
-            f"pipeline: {foreign[0]} is no option here; leave it out (a model is a name of "
+            f"pipeline: {unsupported[0]} is no option here; leave it out (a model is a name of "
             "'depthpose weights list', a file or hf://OWNER/NAME@REVISION)"
         )
     precision = torch_dtype if dtype is None else dtype
@@ -153,16 +158,17 @@ def pipeline(
         raise InputError(f"pipeline: torch_dtype is {precision}; networks run in float32, omit it")
     if device is not None and device_map is not None:
         raise InputError("pipeline: device and device_map are both given; omit one of the two")
-    chosen = device_map if device is None else device
-    if chosen == "auto":
-        chosen = "cuda" if torch.cuda.is_available() else "cpu"
-    if isinstance(chosen, int):
-        chosen = f"cuda:{chosen}" if chosen >= 0 else "cpu"
-    if isinstance(chosen, Mapping):
+    chosen_device = device_map if device is None else device
+    if chosen_device == "auto":
+        chosen_device = "cuda" if torch.cuda.is_available() else "cpu"
+    if isinstance(chosen_device, int):
+        chosen_device = f"cuda:{chosen_device}" if chosen_device >= 0 else "cpu"
+    if isinstance(chosen_device, Mapping):
         raise InputError(
             "pipeline: device_map is a mapping; the networks go to one device, as 'auto'"
         )
-    net = FakestereoNet.load(model or DEFAULT, config=MatcherConfig(device=str(chosen or "cpu")))
+    config = MatcherConfig(device=str(chosen_device or "cpu"))
+    net = FakestereoNet.load(model or DEFAULT, config=config)
     return DepthPipeline(net, batch_size)
 
 
@@ -173,8 +179,8 @@ def _opened(picture: Picture, timeout: float | None) -> Picture:
     is_address = picture.startswith(("http://", "https://"))
     try:
         if is_address:
-            with urlopen(picture, timeout=timeout) as answer:  # noqa: S310  http alone
-                content = answer.read()
+            with urlopen(picture, timeout=timeout) as response:  # noqa: S310  http alone
+                content = response.read()
         else:
             content = b64decode(picture.partition("base64,")[2] or picture, validate=True)
         return Image.open(BytesIO(content))

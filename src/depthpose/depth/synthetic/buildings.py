@@ -19,21 +19,21 @@ _AHEAD = np.array([0.0, 0, 1])
 
 
 class Style(NamedTuple):
-    """What the walls of one house have in common."""
+    """Style of the walls of one house."""
 
     wall: Surface
     storey_m: Number
     window_m: tuple[Number, Number]  # width and height
     gap_m: Number  # wall between two windows
-    recess_m: float  # how deep the panes lie
+    recess_m: float  # depth of the panes behind the wall
     frame: Color  # of the windows
-    with_details: bool  # sills, frames and gutters; left out where too far away to be seen
+    with_details: bool  # sills, frames and gutters; left out where they are finer than a pixel
 
 
 class Plot(NamedTuple):
-    """Place of a house along a straight street."""
+    """Position and size of a house along a straight street."""
 
-    x_m: Number  # its front, which looks to the street
+    x_m: Number  # its front, which faces the street
     start_m: Number  # along the street
     stop_m: Number
     side: int  # 1 on the right of the street, -1 on the left
@@ -44,7 +44,7 @@ class Plot(NamedTuple):
 
 def add_house(b: MeshBuilder, plot: Plot, *, with_details: bool) -> None:
     """Add one house: its walls, of which the back and one end have no windows, and a roof."""
-    # What the walls are of, and how windows are set in them.
+    # Material of the walls, and sizes of the windows.
     kind = str(b.rng.choice(["brick", "plaster", "stone"], p=[0.24, 0.6, 0.16]))
     base = {"brick": (0.3, 0.12, 0.08), "stone": (0.3, 0.26, 0.22)}.get(
         kind, _PLASTERS[b.rng.integers(len(_PLASTERS))]
@@ -103,13 +103,16 @@ class _Wall(NamedTuple):
     outward: Float[np.ndarray, "3"]
 
     def at(self, across_up: np.ndarray, out_m: Number = 0.0) -> np.ndarray:
-        """Points (..., 2) on the wall [m] to space."""
+        """Convert points (..., 2) on the wall [m] to space, ``out_m`` in front of it."""
         points = self.corner + across_up[..., :1] * self.along + across_up[..., 1:] * _UP
         return points + out_m * self.outward
 
 
 def _add_windows(b: MeshBuilder, wall: _Wall, style: Style, length: Number, height: Number) -> None:
-    """Cut a wall by lines across and up; the odd cells both ways are windows, the others wall."""
+    """Add a wall with windows, recessed panes and, with details, frames and sills.
+
+    The wall is divided into a grid; cells of an odd row and an odd column are windows.
+    """
     rng = b.rng
     width, tall = style.window_m
     count = max(1, int(length // (width + style.gap_m)))
@@ -164,12 +167,12 @@ def _add_windows(b: MeshBuilder, wall: _Wall, style: Style, length: Number, heig
 
 
 def _rectangles(x0: np.ndarray, x1: np.ndarray, y0: np.ndarray, y1: np.ndarray) -> np.ndarray:
-    """Corners (..., 4, 2) of rectangles, in turn."""
+    """Give the corners (..., 4, 2) of rectangles between x0 and x1, y0 and y1, in order."""
     return np.stack([np.stack(c, -1) for c in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))], -2)
 
 
 def _add_gable_roof(b: MeshBuilder, plot: Plot, style: Style) -> None:
-    """Two slopes over the eaves, the ridge along the street, and the walls' triangles below."""
+    """Add a gable roof with its ridge along the street, gables, a chimney and at times dormers."""
     rng = b.rng
     start = plot.start_m
     stop = plot.stop_m
@@ -209,7 +212,7 @@ def _add_gable_roof(b: MeshBuilder, plot: Plot, style: Style) -> None:
 
 
 def _add_trim(b: MeshBuilder, plot: Plot, style: Style) -> None:
-    """A plinth, a gutter's pipe and a door; here and there balconies or a shop."""
+    """Add a plinth, a rain pipe and a door; at times balconies or a shop."""
     rng = b.rng
     x = plot.x_m
     y = plot.ground_m

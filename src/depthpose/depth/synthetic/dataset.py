@@ -1,7 +1,7 @@
 """Synthetic street scenes as a dataset: both views, disparity, occlusion and a LiDAR scan.
 
-First what a camera sees at its pixels and the light of it; then the sensors, from light to a
-picture, and a LiDAR of 64 beams as KITTI's; then frames and the dataset of them.
+In order: visibility and light at each pixel; the sensors, from light to a picture; a LiDAR of 64
+beams as KITTI's; frames; and the dataset.
 """
 
 from dataclasses import dataclass, replace
@@ -32,120 +32,136 @@ from depthpose.depth.synthetic.shading import Hits, Stage, prepare, shade, sky_l
 from depthpose.depth.types import Map, Mask, RawFrame, StereoInput, StereoSample, StereoTruth, View
 
 NEAR_M = 0.3
+"""Depth of the near plane: nearer surfaces are not drawn."""
 
 
 class Nearest(NamedTuple):
-    """The nearest triangles on some rays: -1 where there is none, barycentric shares, depth."""
+    """The nearest triangle on each of some rays."""
 
-    primitive: Indices
-    shares: Vectors
-    depth_m: Numbers
+    primitive: Indices  # number of the triangle, -1 where there is none
+    shares: Vectors  # barycentric coordinates
+    depth_m: Numbers  # camera z
 
     def select(self, index: Indices) -> "Nearest":
-        """Give those of some rays, by their numbers."""
+        """Give those of the rays with some numbers."""
         return Nearest(*(values.index_select(0, index) for values in self))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Sight:
-    """Visibility from one camera."""
+class Visibility:
+    """Which triangles are visible from one camera."""
 
     raster: Raster  # visibility at the pixel centres
     K: Float64[Tensor, "3 3"]
-    eye: Float[Tensor, "3"]  # its place in the left camera's frame [m]; it looks along z
+    eye: Float[Tensor, "3"]  # its position in the left camera's frame [m]; it looks along z
     edges: Float64[Tensor, "n 3 3"]  # edge functions of all triangles; see ``core.render``
-    volume: Float64[Tensor, " n"]  # what they are divided by
+    volume: Float64[Tensor, " n"]  # divisors of the edge functions
 
 
 def view_from(
     stage: Stage, K: Float64[Tensor, "3 3"], size: tuple[int, int], eye: Float[Tensor, "3"]
-) -> Sight:
-    """Find what each pixel sees from ``eye`` [m]; ``size`` is height and width [px]."""
+) -> Visibility:
+    """Find the triangle that is visible at each pixel from ``eye`` [m].
+
+    ``size``: height and width of the image [px].
+    """
     corners = stage.corners - eye
     raster = rasterize(corners, K, size[1], size[0], NEAR_M, with_barycentric=False)
     edges, volume = edge_functions(corners.double() @ K.to(corners.device).mT)
     shares = barycentric_shares(edges, volume, raster.primitive)
     raster = replace(raster, barycentric=shares)
-    return Sight(raster=raster, K=K, eye=eye, edges=edges, volume=volume)
+    return Visibility(raster=raster, K=K, eye=eye, edges=edges, volume=volume)
 
 
 def nearest_at(
-    sight: Sight, candidates: Int[Tensor, "n m"], places: list[Float64[Tensor, "n 2"]]
+    visibility: Visibility, candidates: Int[Tensor, "n m"], places: list[Float64[Tensor, "n 2"]]
 ) -> list[Nearest]:
-    """Find the nearest of some candidates on the rays between the pixel centres.
+    """Find the nearest triangle on rays between the pixel centres, among candidates of each ray.
 
-    Candidates are triangles that were seen near by, -1 none; each list of pixels (u, v) [px] in
-    ``places`` shares them, and has an answer of its own.
+    Args:
+        visibility: from the camera of the rays.
+        candidates: numbers of triangles that are visible near each ray, -1 for none.
+        places: lists of pixels (u, v) [px], which share the candidates.
+
+    Returns:
+        The nearest triangles, for each list of ``places``.
     """
-    which = candidates.clamp(min=0).flatten()
-    volume = sight.volume.index_select(0, which)[:, None]
-    lines = (sight.edges.flatten(1).index_select(0, which) / volume).unflatten(0, candidates.shape)
-    missing = candidates < 0
+    index = candidates.clamp(min=0).flatten()
+    volume = visibility.volume.index_select(0, index)[:, None]
+    edges = visibility.edges.flatten(1).index_select(0, index) / volume
+    edges = edges.unflatten(0, candidates.shape)
+    is_missing = candidates < 0
     row = torch.arange(len(candidates))
-    hits = []
+    results: list[Nearest] = []
     for pixels in places:
         u = pixels[:, :1]
         v = pixels[:, 1:]
-        # Corner by corner: a sum over so short an axis would take ten times as long.
+        # Edge functions of the corners, one by one: a sum over so short an axis would take ten
+        # times as long. Their sum is the inverse depth.
         weights = [
-            torch.addcmul(lines[..., i + 2], lines[..., i], u).addcmul_(lines[..., i + 1], v)
-            for i in (0, 3, 6)
+            torch.addcmul(edges[..., k + 2], edges[..., k], u).addcmul_(edges[..., k + 1], v)
+            for k in (0, 3, 6)
         ]
         inverse = weights[0] + weights[1] + weights[2]
-        least = torch.minimum(torch.minimum(weights[0], weights[1]), weights[2])
-        is_missed = (least < -1e-9) | missing | ~(inverse < 1 / NEAR_M)
-        inverse, first = inverse.masked_fill_(is_missed, 0).clamp_(min=0).max(1)
-        primitive = torch.where(inverse > 0, candidates[row, first], -1)
-        chosen = torch.stack([weight[row, first] for weight in weights], 1)
-        shares = (chosen / inverse[:, None]).float()
-        hits.append(Nearest(primitive, shares, (1 / inverse).float()))
-    return hits
+        smallest = torch.minimum(torch.minimum(weights[0], weights[1]), weights[2])
+        is_missed = (smallest < -1e-9) | is_missing | ~(inverse < 1 / NEAR_M)
+
+        inverse, nearest = inverse.masked_fill_(is_missed, 0).clamp_(min=0).max(1)
+        primitive = torch.where(inverse > 0, candidates[row, nearest], -1)
+        nearest_weights = torch.stack([weight[row, nearest] for weight in weights], 1)
+        shares = (nearest_weights / inverse[:, None]).float()
+        results.append(Nearest(primitive, shares, (1 / inverse).float()))
+    return results
 
 
 def neighbours(primitive: Int[Tensor, "h w"], index: Indices) -> Int[Tensor, "n 5"]:
-    """Triangles seen at some pixels and at the four beside each."""
+    """Give the triangles that are visible at some pixels and at the four neighbours of each.
+
+    ``index``: of the pixels in the flattened image.
+    """
     height, width = primitive.shape
     column = index % width
     row = index // width
-    places = [
-        (row + y).clamp(0, height - 1) * width + (column + x).clamp(0, width - 1)
-        for x, y in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1))
-    ]
     flat = primitive.flatten()
-    return torch.stack([flat.index_select(0, place) for place in places], 1)
+    visible: list[Tensor] = []
+    for x, y in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)):
+        rows = (row + y).clamp(0, height - 1)
+        columns = (column + x).clamp(0, width - 1)
+        visible.append(flat.index_select(0, rows * width + columns))
+    return torch.stack(visible, 1)
 
 
 _OFFSETS = ((-0.375, -0.125), (0.125, -0.375), (0.375, 0.125), (-0.125, 0.375))
-"""Where in an edge pixel light is sampled: a turned square, which treats no direction badly."""
+"""Samples of an edge pixel: a rotated square, which has no preferred direction."""
 
 
-def draw_light(stage: Stage, sight: Sight) -> Float[Tensor, "h w 3"]:
+def draw_light(stage: Stage, visibility: Visibility) -> Float[Tensor, "h w 3"]:
     """Give the linear RGB that reaches each pixel, before any sensor.
 
-    A pixel is lit as its centre is; one at an edge by the mean of four places in it (antialiasing).
+    A pixel has the light of its centre; a pixel at an edge the mean of four samples (antialiasing).
     """
-    assert sight.raster.barycentric is not None
-    height, width = sight.raster.primitive.shape
+    assert visibility.raster.barycentric is not None
+    height, width = visibility.raster.primitive.shape
     index = torch.arange(height * width)
     centres = torch.stack([index % width, index // width], 1).double()
-    is_edge = _edge_pixels(stage, sight.raster).flatten()
+    is_edge = _edge_pixels(stage, visibility.raster).flatten()
     inner = (~is_edge).nonzero()[:, 0]
     edge = is_edge.nonzero()[:, 0]
 
     at_centre = Nearest(
-        sight.raster.primitive.flatten(),
-        sight.raster.barycentric.flatten(0, 1),
-        sight.raster.depth_m.flatten(),
+        visibility.raster.primitive.flatten(),
+        visibility.raster.barycentric.flatten(0, 1),
+        visibility.raster.depth_m.flatten(),
     )
     light = torch.zeros(height * width, 3)
-    light[inner] = _light(stage, sight, centres[inner], at_centre.select(inner))
+    light[inner] = _light(stage, visibility, centres[inner], at_centre.select(inner))
     if len(edge):
-        light[edge] = _edge_light(stage, sight, edge, centres[edge], at_centre.select(edge))
+        light[edge] = _edge_light(stage, visibility, edge, centres[edge], at_centre.select(edge))
     return light.reshape(height, width, 3)
 
 
 def _edge_pixels(stage: Stage, raster: Raster) -> Bool[Tensor, "h w"]:
-    """Find pixels beside which another kind of surface is visible, or the same one bent sharply."""
+    """Find pixels with a neighbour of another surface, or of the same one at a sharp angle."""
     visible = raster.primitive.clamp(min=0)
     kind = torch.where(raster.primitive >= 0, stage.kind[visible], -1)
     normal = stage.attributes[:, 18:21].index_select(0, visible.flatten())
@@ -166,17 +182,25 @@ def _edge_pixels(stage: Stage, raster: Raster) -> Bool[Tensor, "h w"]:
 
 def _edge_light(
     stage: Stage,
-    sight: Sight,
+    visibility: Visibility,
     index: Indices,
     centres: Float64[Tensor, "n 2"],
     at_centre: Nearest,
 ) -> Vectors:
-    """Give the mean light of four places in each edge pixel, of the triangles visible near it."""
-    candidates = neighbours(sight.raster.primitive, index)
+    """Give the mean light of four samples of each edge pixel, of the triangles visible near it.
+
+    Args:
+        stage: the scene.
+        visibility: from the camera.
+        index: of the edge pixels in the flattened image.
+        centres: (u, v) of their centres [px].
+        at_centre: the triangles at their centres.
+    """
+    candidates = neighbours(visibility.raster.primitive, index)
     places = [centres + torch.tensor(offset, dtype=torch.float64) for offset in _OFFSETS]
     hits = []
-    for hit in nearest_at(sight, candidates, places):
-        # A gap between all triangles that are visible near by: take what the pixel's centre sees.
+    for hit in nearest_at(visibility, candidates, places):
+        # A gap between the triangles that are visible near by: take that at the pixel's centre.
         is_gap = (hit.primitive < 0) & (candidates >= 0).all(1)
         hits.append(
             Nearest(
@@ -186,14 +210,19 @@ def _edge_light(
             )
         )
     nearest = Nearest(*(torch.cat(parts) for parts in zip(*hits, strict=True)))
-    light = _light(stage, sight, torch.cat(places), nearest)
+    light = _light(stage, visibility, torch.cat(places), nearest)
     # A glint in a quarter of a pixel would outshine the rest, as it does not in a sensor.
     return light.clamp(max=4).reshape(len(_OFFSETS), -1, 3).mean(0)
 
 
-def _light(stage: Stage, sight: Sight, pixels: Float64[Tensor, "n 2"], nearest: Nearest) -> Vectors:
-    """Give the linear RGB on the rays through some places (u, v) [px]: of a surface or the sky."""
-    (a, b, c), (_, d, e), _ = sight.K.inverse().tolist()
+def _light(
+    stage: Stage, visibility: Visibility, pixels: Float64[Tensor, "n 2"], nearest: Nearest
+) -> Vectors:
+    """Give the linear RGB that comes along rays, from the nearest triangle or the sky.
+
+    ``pixels``: (u, v) of the rays [px].
+    """
+    (a, b, c), (_, d, e), _ = visibility.K.inverse().tolist()
     u, v = pixels.unbind(1)
     rays = torch.stack([a * u + b * v + c, d * v + e, torch.ones_like(u)], 1).float()
     length = rays.norm(dim=1)
@@ -203,7 +232,7 @@ def _light(stage: Stage, sight: Sight, pixels: Float64[Tensor, "n 2"], nearest: 
 
     light = torch.empty_like(rays)
     light[sky] = sky_light(stage, towards[sky])
-    points_m = rays * nearest.depth_m[:, None] + sight.eye
+    points_m = rays * nearest.depth_m[:, None] + visibility.eye
     hits = Hits(
         primitive=nearest.primitive.index_select(0, hit),
         barycentric=nearest.shares.index_select(0, hit),
@@ -211,20 +240,20 @@ def _light(stage: Stage, sight: Sight, pixels: Float64[Tensor, "n 2"], nearest: 
         towards=towards.index_select(0, hit),
         distance_m=(length * nearest.depth_m).index_select(0, hit),
     )
-    light[hit] = shade(stage, hits, float(sight.K[0, 0]))
+    light[hit] = shade(stage, hits, float(visibility.K[0, 0]))
     return light
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sensor:
-    """How one camera of a pair turns light into numbers."""
+    """Properties of one camera of a pair, by which light becomes a picture."""
 
     exposure: tuple[float, float, float]  # factor of the light, by channel
-    blur: float  # share of a pixel's light that falls on its neighbours, in each direction
+    blur: float  # share of a pixel's light that falls on its neighbours, along each axis
     glare: float  # share of the light that the lens scatters widely
-    black: float  # light below which there is only black
-    vignette: float  # loss in the corners
-    noise: tuple[float, float]  # deviation of full light's noise, and of darkness'
+    black: float  # light below which all is black
+    vignette: float  # loss of light in the corners, as a share
+    noise: tuple[float, float]  # standard deviation of the shot noise of white, and of read noise
     gamma: float  # exponent of the tone curve
     jpeg_quality: int | None  # None: not compressed
     noise_seed: int  # of this picture
@@ -233,7 +262,10 @@ class Sensor:
 def draw_sensors(
     rng: np.random.Generator, light: Float[Tensor, "h w 3"], jpeg_share: float
 ) -> tuple[Sensor, Sensor]:
-    """Draw the cameras of a pair: alike, but for a little gain and colour."""
+    """Draw the cameras of a pair at random, equal but for small differences of gain and colour.
+
+    Their exposure is metered by ``light``; ``jpeg_share`` is the probability of compression.
+    """
     luminance = light.mean(-1)
     metered = luminance[len(luminance) // 3 :].clamp(max=1.2).mean() + 1e-3
     # Rounded, for the last bits of a long mean depend on how many threads took part.
@@ -259,7 +291,7 @@ def draw_sensors(
 
 
 def expose(light: Float[Tensor, "h w 3"], sensor: Sensor) -> View:
-    """Take a picture: RGB in [0, 1], in steps of 1/255."""
+    """Take a picture of the light by a sensor: RGB in [0, 1], in steps of 1/255."""
     # Exposure, and a vignette: the corners of an image of 3:1 are at a radius^2 of about 1.1.
     signal = light.permute(2, 0, 1) * torch.tensor(sensor.exposure)[:, None, None]
     height, width = signal.shape[1:]
@@ -267,8 +299,8 @@ def expose(light: Float[Tensor, "h w 3"], sensor: Sensor) -> View:
     x = torch.linspace(-1, 1, width)[None]
     signal = signal * (1 - sensor.vignette * (x**2 + y**2) / 1.1)
 
-    # Veiling glare: what is bright in blocks of 32 px spreads over their neighbours. A pixel is
-    # full at 8 times white.
+    # Veiling glare: light of blocks of 32 px spreads over their neighbours. A pixel saturates at 8
+    # times white.
     blocks = (max(height // 32, 1), max(width // 32, 1))
     small = F.avg_pool2d(F.adaptive_avg_pool2d(signal.clamp(max=6)[None], blocks), 3, 1, 1)
     wide = F.interpolate(small, (height, width), mode="bilinear")[0]
@@ -287,7 +319,7 @@ def expose(light: Float[Tensor, "h w 3"], sensor: Sensor) -> View:
     deviation = (signal * shot**2 + dark**2).sqrt()
     signal = signal + torch.randn(signal.shape, generator=generator) * deviation
 
-    # The tone curve: a shoulder before white, as cameras have; the brightest is lost all the same.
+    # The tone curve: a shoulder before white, as cameras have; beyond it light is clipped.
     signal = (signal - sensor.black) / (1 - sensor.black)
     signal = (signal * 1.12 / (1 + 0.12 * signal.clamp(min=0))).clamp(0, 1)
     picture = (signal ** (1 / sensor.gamma) * 255 + 0.5).floor() / 255
@@ -295,11 +327,11 @@ def expose(light: Float[Tensor, "h w 3"], sensor: Sensor) -> View:
 
 
 _BEAMS_RAD = np.deg2rad(np.concatenate([np.linspace(2, -8.33, 32), np.linspace(-8.87, -24.33, 32)]))
-_TURN_RAD = np.deg2rad(np.arange(-44.5, 44.5, 0.1728))
-"""Elevations of the beams, and the turns that lie in the cameras' sight."""
+_AZIMUTHS_RAD = np.deg2rad(np.arange(-44.5, 44.5, 0.1728))
+"""Elevations of the LiDAR's beams, and the azimuths in the cameras' field of view."""
 
 _ORIGIN_M = (0.056, -0.076, -0.272)
-"""Its place in the left camera's frame: a little above and behind."""
+"""Position of the LiDAR in the left camera's frame: a little above and behind."""
 
 _AXES = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
 CAMERA_FROM_VELODYNE = np.vstack([np.column_stack([_AXES, _ORIGIN_M]), [0, 0, 0, 1.0]])
@@ -307,32 +339,37 @@ CAMERA_FROM_VELODYNE = np.vstack([np.column_stack([_AXES, _ORIGIN_M]), [0, 0, 0,
 
 _SIZE_PX = (440, 1200)
 _FOCAL_PX = 600.0
+"""Rows and columns, and focal length, of the image by which triangles near the beams are found."""
 _MAX_RANGE_M = 115.0
 _NOISE_M = 0.015
+"""Standard deviation of the LiDAR's ranges."""
 
 
 def scan(stage: Stage, rng: np.random.Generator) -> Float[Tensor, "n 4"]:
-    """Scan a stage: x forward, y left, z up [m] and reflectance, a row a return.
+    """Scan a scene by the LiDAR: a row for each return, x forward, y left, z up [m], reflectance.
 
-    Hits of the beams are exact: a wide picture from the LiDAR's place shows which triangles are
-    near each beam, and these are intersected.
+    The returns are exact: an image from the LiDAR's position shows which triangles are near each
+    beam, and the beam is intersected with these.
     """
-    tilt, turn = (
-        torch.from_numpy(a.ravel()) for a in np.meshgrid(_BEAMS_RAD, _TURN_RAD, indexing="ij")
-    )
-    towards = torch.stack([tilt.cos() * turn.sin(), -tilt.sin(), tilt.cos() * turn.cos()], 1)
+    grid = np.meshgrid(_BEAMS_RAD, _AZIMUTHS_RAD, indexing="ij")
+    elevation, azimuth = (torch.from_numpy(angles.ravel()) for angles in grid)
+    across = elevation.cos() * azimuth.sin()
+    ahead = elevation.cos() * azimuth.cos()
+    towards = torch.stack([across, -elevation.sin(), ahead], 1)
+
     height, width = _SIZE_PX
     K = torch.tensor(
         [[_FOCAL_PX, 0, width / 2], [0, _FOCAL_PX, 40], [0, 0, 1]], dtype=torch.float64
     )
-    sight = view_from(stage, K, _SIZE_PX, torch.tensor(_ORIGIN_M))
+    visibility = view_from(stage, K, _SIZE_PX, torch.tensor(_ORIGIN_M))
     pixels = (towards @ K.T)[:, :2] / towards[:, 2:]
     column = pixels[:, 0].round().long().clamp(0, width - 1)
     row = pixels[:, 1].round().long().clamp(0, height - 1)
-    candidates = neighbours(sight.raster.primitive, row * width + column)
-    primitive, _, depth_m = nearest_at(sight, candidates, [pixels])[0]
+    candidates = neighbours(visibility.raster.primitive, row * width + column)
+    primitive, _, depth_m = nearest_at(visibility, candidates, [pixels])[0]
     range_m = depth_m / towards[:, 2]
-    # Few beams come back from glass, fewer from afar and from what is dark.
+
+    # Few beams return from glass, and fewer from far away and from dark surfaces.
     chance = torch.from_numpy(rng.random(len(primitive)))
     hit = primitive.clamp(min=0)
     material = stage.material[hit]
@@ -350,16 +387,16 @@ def scan(stage: Stage, rng: np.random.Generator) -> Float[Tensor, "n 4"]:
 
 
 _OCCLUSION_SHARE = 1e-4
-"""What is nearer by this share of the depth hides a point; less is the point itself, rounded."""
+"""A surface occludes a point if it is nearer by this share of the depth; less is rounding."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StreetFrame(RawFrame):
-    """A synthetic pair and everything that is known about it, exactly."""
+    """A synthetic pair with its exact truth."""
 
     right_disparity_px: Map  #: of the right image; NaN in the sky, as that of the left one
     depth_m: Map  #: of the left image, camera z; NaN in the sky
-    is_road: Mask  #: left pixels that see the carriageway
+    is_road: Mask  #: left pixels that show the carriageway
 
 
 def draw_street(config: StreetsConfig, index: int) -> StreetFrame:
@@ -380,16 +417,16 @@ def draw_street(config: StreetsConfig, index: int) -> StreetFrame:
 
 @dataclass(frozen=True, kw_only=True)
 class Projector:
-    """Throws dots onto a scene, as active stereo cameras do."""
+    """A projector of dots, as active stereo cameras have."""
 
-    place_m: tuple[float, float, float]  #: in the left camera's frame
-    dots_per_radian: float  #: how dense they are
-    strength: float  #: light of a dot as a share of the light that is there
+    place_m: tuple[float, float, float]  #: its position in the left camera's frame
+    dots_per_radian: float  #: density of the dots
+    strength: float  #: light of a dot as a share of the other light
 
 
 @cache
 def _dots() -> Float[Tensor, "1024 1024"]:
-    """Make a pattern that repeats after 341 dots: three pixels of it are a dot's cell."""
+    """Make a pattern of 341 x 341 dots that can be tiled; each dot has a cell of 3 x 3 pixels."""
     rng = np.random.default_rng(79)
     cells = 341
     pattern = torch.zeros(3 * cells + 1, 3 * cells + 1)
@@ -401,33 +438,37 @@ def _dots() -> Float[Tensor, "1024 1024"]:
 
 
 def _project_dots(
-    light: Float[Tensor, "h w 3"], sight: Sight, projector: Projector
+    light: Float[Tensor, "h w 3"], visibility: Visibility, projector: Projector
 ) -> Float[Tensor, "h w 3"]:
-    """Add the light of the dots on what a camera sees; what hides the projector is left out."""
-    height, width = sight.raster.depth_m.shape
-    depth_m = sight.raster.depth_m
+    """Add the light of the projector's dots to that which reaches a camera.
+
+    The projector has no shadows: occluded surfaces have dots too.
+    """
+    # The points that are visible at the pixels, in the projector's frame.
+    depth_m = visibility.raster.depth_m
+    height, width = depth_m.shape
     column, row = torch.meshgrid(
         torch.arange(width).double(), torch.arange(height).double(), indexing="xy"
     )
-    rays = torch.stack([column, row, torch.ones_like(row)], -1) @ sight.K.inverse().T
-    points = rays.float() * depth_m[..., None] + sight.eye - torch.tensor(projector.place_m)
+    rays = torch.stack([column, row, torch.ones_like(row)], -1) @ visibility.K.inverse().T
+    points_m = rays.float() * depth_m[..., None] + visibility.eye
+    points_m = points_m - torch.tensor(projector.place_m)
+
+    # Their places in the pattern, which is tiled and sampled bilinearly.
     pattern = _dots()
     side = len(pattern)
-    x, y = (
-        (3 * projector.dots_per_radian * points[..., k] / points[..., 2]).nan_to_num(0.0)
-        for k in (0, 1)
-    )
-    left = x.floor()
-    top = y.floor()
-    across = x - left
-    down = y - top
-    left = left.long()
-    top = top.long()
+    pixels_per_radian = 3 * projector.dots_per_radian
+    x = (pixels_per_radian * points_m[..., 0] / points_m[..., 2]).nan_to_num(0.0)
+    y = (pixels_per_radian * points_m[..., 1] / points_m[..., 2]).nan_to_num(0.0)
+    left = x.floor().long()
+    top = y.floor().long()
+    x_share = x - x.floor()
+    y_share = y - y.floor()
     upper, lower = (
-        torch.lerp(pattern[r % side, left % side], pattern[r % side, (left + 1) % side], across)
+        torch.lerp(pattern[r % side, left % side], pattern[r % side, (left + 1) % side], x_share)
         for r in (top, top + 1)
     )
-    dots = torch.lerp(upper, lower, down).where(depth_m.isfinite(), 0.0)
+    dots = torch.lerp(upper, lower, y_share).where(depth_m.isfinite(), 0.0)
     return light * (1 + projector.strength * dots[..., None])
 
 
@@ -438,33 +479,39 @@ def draw_scene(
     seed: tuple[int, ...] = (0,),
     projector: Projector | None = None,
 ) -> StreetFrame:
-    """Draw a scene with a rig.
+    """Draw a scene with a rig, and give both views with their truth.
 
-    The pictures have the rig's size, whatever the scale of ``config``. ``seed`` is that of the
-    sensors' noise, their small misalignment and the LiDAR's.
+    Args:
+        scene: the scene.
+        rig: the cameras, whose size the views have, whatever the scale of ``config``.
+        config: settings of the sensors.
+        seed: of the sensors' noise and misalignment, and of the LiDAR.
+        projector: adds dots; None: none.
     """
     rng = np.random.default_rng([73, *seed])
     stage = prepare(scene, rig.width * rig.height)
-    left = view_from(stage, rig.K, (rig.height, rig.width), torch.zeros(3))
+    size = (rig.height, rig.width)
+    left = view_from(stage, rig.K, size, torch.zeros(3))
+
     # The right camera, whose rows are off by a fraction of a pixel as real ones are.
     K = rig.K.clone()
     K[0, 2] += rig.cx_right_minus_left_px
     K[1, 2] += rng.normal(0, 1) * config.rectification_error_px
-    right = view_from(stage, K, (rig.height, rig.width), torch.tensor([rig.baseline_m, 0.0, 0.0]))
-    light = draw_light(stage, left)
-    other_light = draw_light(stage, right)
+    right = view_from(stage, K, size, torch.tensor([rig.baseline_m, 0.0, 0.0]))
+
+    left_light = draw_light(stage, left)
+    right_light = draw_light(stage, right)
     if projector is not None:
-        light = _project_dots(light, left, projector)
-        other_light = _project_dots(other_light, right, projector)
-    sensors = draw_sensors(rng, light, config.jpeg_share)
+        left_light = _project_dots(left_light, left, projector)
+        right_light = _project_dots(right_light, right, projector)
+    left_sensor, right_sensor = draw_sensors(rng, left_light, config.jpeg_share)
     points = scan(stage, rng) if config.with_lidar else None
     primitive = left.raster.primitive
     depth_m = left.raster.depth_m
-    disparity_px = disparity_from_depth(depth_m, rig)
     return StreetFrame(
-        left=expose(light, sensors[0]),
-        right=expose(other_light, sensors[1]),
-        disparity_px=disparity_px,
+        left=expose(left_light, left_sensor),
+        right=expose(right_light, right_sensor),
+        disparity_px=disparity_from_depth(depth_m, rig),
         right_disparity_px=disparity_from_depth(right.raster.depth_m, rig),
         depth_m=depth_m,
         occluded=_occluded(left, right, rig),
@@ -476,11 +523,8 @@ def draw_scene(
     )
 
 
-def _occluded(left: Sight, right: Sight, rig: StereoRig) -> Mask:
-    """Mark the left pixels that the right camera does not see: something nearer hides them there.
-
-    Those that lie outside of the right image are marked too.
-    """
+def _occluded(left: Visibility, right: Visibility, rig: StereoRig) -> Mask:
+    """Find left pixels whose point is occluded in the right image, or lies outside of it."""
     height, width = left.raster.primitive.shape
     primitive = left.raster.primitive.flatten()
     depth_m = left.raster.depth_m.flatten()
@@ -496,7 +540,7 @@ def _occluded(left: Sight, right: Sight, rig: StereoRig) -> Mask:
     near = near[:, 1].clamp(0, height - 1) * width + near[:, 0].clamp(0, width - 1)
     candidates = neighbours(right.raster.primitive, near)
 
-    # Most show the same triangle there; of the others the right camera's nearest surface decides.
+    # Most points have the same triangle there; the others are compared with the right depth.
     is_same = (candidates[:, :1] == primitive[index, None])[:, 0] & ~is_outside
     undecided = (~is_same & ~is_outside).nonzero()[:, 0]
     (nearest,) = nearest_at(right, candidates[undecided], [pixels[undecided]])
@@ -508,12 +552,12 @@ def _occluded(left: Sight, right: Sight, rig: StereoRig) -> Mask:
 
 @dataclass(frozen=True)
 class Streets:
-    """Synthetic pairs, each a function of the seed and its index alone."""
+    """A dataset of synthetic pairs, each rendered on demand from the seed and its index alone."""
 
-    config: StreetsConfig  #: what the frames are like
+    config: StreetsConfig  #: settings of the frames
 
     def __len__(self) -> int:
-        """How many there are."""
+        """Number of frames."""
         return self.config.frames
 
     def __getitem__(self, index: int) -> StereoSample:

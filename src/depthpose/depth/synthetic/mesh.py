@@ -1,8 +1,8 @@
-"""Triangles and what covers them: materials, their seamless textures, and the builder of meshes.
+"""Meshes of synthetic scenes: materials, their seamless textures, triangles and their builder.
 
-A texture modulates a surface's colour, so its mean is about 1. Textures are made from noise, once a
-process, and shared by every scene. Metres; x right, y down, z forward, as in a camera's frame. A
-model stands at the origin on y = 0 and looks along z.
+A texture modulates a surface's colour, so its mean is about 1. Textures are made from noise, once
+in a process, and shared by all scenes. Coordinates are metres; x right, y down, z forward, as in a
+camera's frame. A model stands at the origin on y = 0 and faces along z.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,10 +16,10 @@ from jaxtyping import Bool, Float, Float16, Float32, Int
 from torch import Tensor
 
 Number = float | int
-"""A length, an angle or a share, written as one likes."""
+"""A length, an angle or a share."""
 
 Values = Sequence | np.ndarray | float | int
-"""What NumPy makes an array of."""
+"""Anything that NumPy converts to an array."""
 
 Numbers = Float[Tensor, " n"]
 Vectors = Float[Tensor, "n 3"]
@@ -30,12 +30,12 @@ Color = tuple[Number, Number, Number]
 
 
 class Material(NamedTuple):
-    """How a material takes light."""
+    """Optical properties of a material."""
 
-    variants: int  # how many different textures there are of it
-    specular: float = 0.0  # mirror reflection seen straight on, 0..1
+    variants: int  # number of its different textures
+    specular: float = 0.0  # reflectance at normal incidence, 0..1
     translucency: float = 0.0  # share of the light that comes through from behind
-    glow: float = 0.0  # light of its own, as a share of its colour
+    glow: float = 0.0  # emitted light, as a share of its colour
 
 
 MATERIALS: dict[str, Material] = {
@@ -51,23 +51,23 @@ MATERIALS: dict[str, Material] = {
     "skin": Material(1), "hills": Material(2),
 }  # fmt: skip
 NUMBER = {name: number for number, name in enumerate(MATERIALS)}
-"""Numbers by which meshes name materials."""
+"""Number of each material in meshes."""
 
 _counts = [material.variants for material in MATERIALS.values()]
 FIRST_LAYER = {name: sum(_counts[:number]) for name, number in NUMBER.items()}
-"""Where the textures of each material begin in the stack of all textures."""
+"""Number of each material's first texture in the stack of all textures."""
 
 LAYERS = sum(_counts)
-"""Textures in all."""
+"""Number of all textures."""
 
 
 class Surface(NamedTuple):
-    """What a part of a mesh is covered with."""
+    """Appearance of a part of a mesh."""
 
     material: str  # a name of ``MATERIALS``
     tint: Color = (1.0, 1.0, 1.0)  # colour that the texture modulates
-    tile_m: Number = 1.0  # length that one tile of the texture covers
-    variant: int = 0  # which of the material's textures; any whole number
+    tile_m: Number = 1.0  # side of one tile of the texture
+    variant: int = 0  # number of the material's texture; larger numbers begin again
 
     @property
     def layer(self) -> int:
@@ -83,14 +83,14 @@ LEVELS = 9
 Plane = Float[np.ndarray, "256 256"]
 Picture = Float[np.ndarray, "256 256 3"]
 _y, _x = np.mgrid[:SIDE_PX, :SIDE_PX].astype(np.float32) / SIDE_PX
-"""Places in a texture, in tiles."""
+"""Coordinates of the pixels of a texture, in tiles."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Textures:
-    """Every texture at every size."""
+    """All textures at all levels of detail."""
 
-    texels: Float16[Tensor, "n 3"]  # all in one list, a level after the other
+    texels: Float16[Tensor, "n 3"]  # of all textures, level by level
     starts: Int[Tensor, " levels"]  # where each level begins
     clouds: Float[Tensor, "256 256"]  # a field of noise for clouds
     stains: Float[Tensor, "256 256"]  # a field of noise for unevenness over metres
@@ -98,7 +98,7 @@ class Textures:
 
 @cache
 def textures() -> Textures:
-    """Make all textures: a second, once a process."""
+    """Make all textures, once in a process; it takes a second."""
     rng = np.random.default_rng(5)
     stack = np.ones((LAYERS, SIDE_PX, SIDE_PX, 3), np.float32)
     for name, material in MATERIALS.items():
@@ -127,7 +127,14 @@ def textures() -> Textures:
 def sample_texture(
     textures: Textures, layer: Indices, uv: Float[Tensor, "n 2"], level: Numbers
 ) -> Vectors:
-    """Look textures up, bilinearly in the nearest level; 0 is the largest picture, 1 half of it."""
+    """Sample textures bilinearly, in the nearest level of detail.
+
+    Args:
+        textures: all of them.
+        layer: number of the texture of each sample.
+        uv: coordinates in tiles.
+        level: fractional level: 0 is the full size, 1 half of it.
+    """
     whole = level.round().clamp(0, LEVELS - 1).long()
     side = SIDE_PX >> whole
     place = uv * side[:, None] - 0.5
@@ -161,7 +168,13 @@ class _Noise:
     def smooth(
         self, fall: Number, band: tuple[Number, Number], stretch: tuple[Number, Number] = (1, 1)
     ) -> Plane:
-        """Noise whose power falls with the frequency; ``stretch`` > 1 makes it finer in y, x."""
+        """Make noise whose power falls with the frequency.
+
+        Args:
+            fall: exponent of the fall.
+            band: lowest and highest frequency, in periods per tile.
+            stretch: factors of the frequencies along y and x.
+        """
         fy = np.fft.fftfreq(SIDE_PX)[:, None] * SIDE_PX / stretch[0]
         fx = np.fft.rfftfreq(SIDE_PX)[None] * SIDE_PX / stretch[1]
         often = np.hypot(fx, fy)
@@ -176,7 +189,7 @@ class _Noise:
     broad = partialmethod(smooth, 2.4, (1, 20))  # patches
 
     def mottled(self, shares: Mapping[str, float]) -> Plane:
-        """Grey with noise of the named kinds, drawn in their order."""
+        """Make grey with noise of the named kinds, which are drawn in their order."""
         plane = np.ones((SIDE_PX, SIDE_PX), np.float32)
         for kind, share in shares.items():
             plane = plane + share * getattr(self, kind)()
@@ -185,7 +198,11 @@ class _Noise:
     def bricks(
         self, rows: int, columns: int, joint: Number, spread: Number
     ) -> tuple[Plane, Picture, Plane]:
-        """A bond: 1 on the bricks and 0 in the joints, a shade for each, the height in its row."""
+        """Make a bond of bricks in staggered rows.
+
+        Gives a mask, 1 on the bricks and 0 in the joints; a random shade of each brick; and the
+        height in its row, 0..1. ``joint``: width of the joints in rows.
+        """
         row = np.floor(_y * rows).astype(int)
         across = _x * columns + 0.5 * (row % 2)
         column = np.floor(across).astype(int) % columns
@@ -346,7 +363,7 @@ Rotation = Float[np.ndarray, "3 3"]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Mesh:
-    """Triangles, each for itself: no corner is shared."""
+    """Triangles without shared corners."""
 
     corners: Float32[np.ndarray, "n 3 3"]  # positions [m]
     uv: Float32[np.ndarray, "n 3 2"]  # place in the texture, in tiles
@@ -354,18 +371,18 @@ class Mesh:
     tint: Float32[np.ndarray, "n 3"]  # linear colour
     material: Int[np.ndarray, " n"]  # number of the material
     layer: Int[np.ndarray, " n"]  # number of the texture
-    thing: Int[np.ndarray, " n"]  # which object the triangle belongs to
+    thing: Int[np.ndarray, " n"]  # number of the object to which the triangle belongs
 
     def __len__(self) -> int:
         return len(self.corners)
 
     def part(self, is_part: Bool[np.ndarray, " n"]) -> "Mesh":
-        """Some of its triangles."""
+        """Give the mesh of the triangles of a mask."""
         return Mesh(**{field.name: getattr(self, field.name)[is_part] for field in fields(Mesh)})
 
 
 def join(meshes: Sequence[Mesh]) -> Mesh:
-    """Put meshes together as one."""
+    """Join meshes to one."""
     parts = {f.name: [getattr(mesh, f.name) for mesh in meshes] for f in fields(Mesh)}
     return Mesh(**{name: np.concatenate(values) for name, values in parts.items()})
 
@@ -377,7 +394,15 @@ def place(
     scale: Values = 1.0,
     tints: Mapping[str, Color] | None = None,
 ) -> Mesh:
-    """Copy a model to its place; a positive yaw turns z towards x, to the right."""
+    """Copy a model to a position.
+
+    Args:
+        mesh: the model, at the origin.
+        position: where it stands [m].
+        yaw_rad: rotation about y; a positive one rotates z towards x, to the right.
+        scale: factor of its size, or one for each axis.
+        tints: colours by which those of materials are multiplied.
+    """
     factor = np.broadcast_to(np.asarray(scale, np.float32), 3)
     c = np.cos(yaw_rad)
     s = np.sin(yaw_rad)
@@ -385,14 +410,14 @@ def place(
     corners = (mesh.corners * factor) @ R.T + np.asarray(position, np.float32)
     tint = mesh.tint
     for material, color in (tints or {}).items():
-        is_it = (mesh.material == NUMBER[material])[:, None]
-        tint = np.where(is_it, tint * np.asarray(color, np.float32), tint)
+        is_of_material = (mesh.material == NUMBER[material])[:, None]
+        tint = np.where(is_of_material, tint * np.asarray(color, np.float32), tint)
     return replace(mesh, corners=corners, normals=mesh.normals @ R.T, tint=tint)
 
 
 NEAREST_M = 2.5
-"""A car drives where nothing is nearer to its camera: with a baseline of 0.53 m and half of
-KITTI's resolution that is a disparity of 77 px."""
+"""Least distance of a model from the camera: with a baseline of 0.53 m and half of KITTI's
+resolution that is a disparity of 77 px."""
 
 _CUBE = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float32)
 _FACES = [[0, 1, 3, 2], [5, 4, 6, 7], [4, 5, 1, 0], [2, 3, 7, 6], [4, 0, 2, 6], [1, 5, 7, 3]]
@@ -402,15 +427,15 @@ _FACE_HEIGHT = [1, 1, 0, 0, 1, 1]
 
 @dataclass(eq=False)
 class MeshBuilder:
-    """Collects triangles; every method adds to what is there."""
+    """Builds a mesh; every method adds triangles."""
 
-    rng: np.random.Generator  # draws what is random
+    rng: np.random.Generator  # random numbers of all that is built
     thing: int = 0  # number of the object to which triangles belong
     _parts: list[Mesh] = field(default_factory=list)
     _boxes: list[tuple] = field(default_factory=list)
 
     def add(self, mesh: Mesh) -> None:
-        """Add a placed model as one object, unless it would stand against the camera."""
+        """Add a placed model as one object, unless it is nearer than ``NEAREST_M``."""
         if len(mesh) and np.hypot(mesh.corners[..., 0], mesh.corners[..., 2]).min() < NEAREST_M:
             return
         self.thing += 1
@@ -426,8 +451,9 @@ class MeshBuilder:
     ) -> None:
         """Add triangles (n, 3, 3) [m].
 
-        ``uv_m`` is the place on the surface [m], broadcast to (n, 3, 2); normals are those of the
-        planes by default; ``tint`` holds colours, one a triangle, instead of the surface's.
+        ``uv_m`` holds coordinates on the surface [m], broadcast to (n, 3, 2). Without ``normals``
+        they are those of the planes. ``tint``: a colour for each triangle, in place of the
+        surface's.
         """
         positions = np.asarray(corners, np.float32)
         uv = np.asarray(uv_m, np.float32) / surface.tile_m
@@ -521,7 +547,7 @@ class MeshBuilder:
         self.triangles(faces, places, surface)
 
     def finish(self) -> Mesh:
-        """Give all that was added, as one mesh; boxes one by one would cost more than all else."""
+        """Give the mesh of all triangles; boxes are made together, which is much faster."""
         if not self._boxes:
             return join(self._parts)
         centres, sizes, turns, tapers, surfaces, things = zip(*self._boxes, strict=True)
@@ -557,7 +583,10 @@ def _mesh(
     layer: Values,
     thing: Values,
 ) -> Mesh:
-    """Make triangles of what is broadcast to them; without normals, those of their planes."""
+    """Make a mesh of triangles; values are broadcast to them.
+
+    Without ``normals`` they are those of the planes.
+    """
     n = len(corners)
     flat = normals
     if flat is None:
@@ -577,6 +606,7 @@ def _mesh(
 
 
 def _full(values: Values, shape: tuple[int, ...]) -> Float32[np.ndarray, "..."]:
+    """Broadcast values to a shape, as a new array of float32."""
     return np.ascontiguousarray(np.broadcast_to(np.asarray(values, np.float32), shape))
 
 
@@ -586,11 +616,12 @@ def between(low: np.ndarray, high: np.ndarray) -> np.ndarray:
 
 
 def _halves(faces: np.ndarray) -> np.ndarray:
+    """Split four-cornered faces into triangles: all first halves, then all second ones."""
     return np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])
 
 
 def _perpendicular_axes(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two unit vectors at right angles to a direction; the second points up where it can."""
+    """Give two unit vectors perpendicular to a direction and to each other."""
     aside = np.array([0.0, 1, 0]) if abs(direction[1]) < 0.9 else np.array([0.0, 0, 1])
     across = np.cross(aside, direction)
     across /= np.linalg.norm(across)

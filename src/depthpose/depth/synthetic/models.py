@@ -1,7 +1,7 @@
 """Models on and beside a road: trees, hedges, lamps, signs, fences, bins, vehicles and people.
 
-Crowns are balls and clouds of leaves; vehicles are lofted from cross-sections. Models are made once
-and placed often.
+Crowns are balls and clouds of leaves; vehicles are lofted from cross-sections. A model is made once
+and placed many times.
 """
 
 from functools import cache
@@ -30,7 +30,10 @@ def add_ball(
     level: int = 2,
     dents: Number = 0.0,
 ) -> None:
-    """Add an ellipsoid, an icosahedron whose faces are cut in four ``level`` times, with dents."""
+    """Add an ellipsoid: an icosahedron whose faces are divided in four ``level`` times.
+
+    ``dents``: amplitude of random dents, as a share of the radius.
+    """
     directions = _sphere(level)
     radii = np.broadcast_to(np.asarray(radii_m, np.float64), 3)
     swell = np.ones(len(directions))
@@ -55,9 +58,16 @@ def add_leaves(
     surface: Surface,
     is_block: bool = False,
 ) -> None:
-    """Add a cloud of ``count`` triangles that stand for leaves or twigs, each of its own shade.
+    """Add a cloud of triangles that look like leaves or twigs, each of its own shade.
 
-    They fill an ellipsoid, or the surface of a block, as of a clipped hedge; centre and radii [m].
+    Args:
+        b: adds them.
+        centre: of the cloud [m].
+        radii: of the ellipsoid that they fill, or half sides of the block [m].
+        count: number of leaves.
+        length_m: mean length of a leaf.
+        surface: of the leaves.
+        is_block: fill the surface of a block, as of a clipped hedge, in place of an ellipsoid.
     """
     rng = b.rng
     if is_block:
@@ -83,12 +93,13 @@ def add_leaves(
 
 
 def _unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Scale vectors to length 1."""
     return vectors / (np.linalg.norm(vectors, axis=1, keepdims=True) + 1e-9)
 
 
 @cache
 def _sphere(level: int) -> Float[np.ndarray, "n 3"]:
-    """Give corners of triangles on the unit sphere: an icosahedron, cut ``level`` times."""
+    """Give corners of triangles on the unit sphere: an icosahedron, divided ``level`` times."""
     t = (1 + 5**0.5) / 2
     corners = [(-1, t, 0), (1, t, 0), (-1, -t, 0), (1, -t, 0), (0, -1, t), (0, 1, t),
                (0, -1, -t), (0, 1, -t), (t, 0, -1), (t, 0, 1), (-t, 0, -1), (-t, 0, 1)]  # fmt: skip
@@ -107,14 +118,14 @@ def _sphere(level: int) -> Float[np.ndarray, "n 3"]:
 TREES = 18
 BUSHES = 8
 HEDGES = 4
-"""How many different models there are of each."""
+"""Number of different models of each."""
 
 _GREENS: list[Color] = [
     (0.1, 0.16, 0.03), (0.15, 0.2, 0.04), (0.07, 0.12, 0.035), (0.22, 0.2, 0.04), (0.26, 0.14, 0.03)
 ]  # fmt: skip
 _TREE_LEAVES = ((1400, 0.33), (400, 0.52), (100, 0.85))
 _BUSH_LEAVES = ((110, 0.15), (40, 0.22))
-"""How many leaves a whole crown has, and how long one is [m]: more of them, smaller, when near."""
+"""Number of leaves of a crown and their length [m], from near to far."""
 
 _BARK: Color = (0.22, 0.18, 0.14)
 
@@ -130,7 +141,7 @@ def leaf_color(rng: np.random.Generator) -> Color:
 def tree(number: int, coarseness: int = 0) -> Mesh:
     """Give tree model ``number``, about 10 m high: round crowns, columns and conifers.
 
-    Coarseness 0 is to be seen from near, 1 from some 30 m, 2 from far away.
+    Coarseness 0 is for near trees, 1 from about 30 m on, 2 for far ones.
     """
     b = MeshBuilder(np.random.default_rng((11, number)))
     rng = b.rng
@@ -166,7 +177,7 @@ def tree(number: int, coarseness: int = 0) -> Mesh:
 def _add_clump(
     b: MeshBuilder, centre: Values, radii: np.ndarray, count: int, length_m: Number
 ) -> None:
-    """A dark core that occludes what is behind, and leaves about it."""
+    """Add a clump of leaves: a dark core that occludes the background, and leaves about it."""
     light = b.rng.uniform(0.8, 1.15)
     dark = 0.3 * light
     pale = light * 0.7
@@ -178,7 +189,7 @@ def _add_clump(
 
 @cache
 def bush(number: int, coarseness: int = 0) -> Mesh:
-    """Give bush model ``number``, about 1 m high and 1.4 m wide; coarseness 1 from far away."""
+    """Give bush model ``number``, about 1 m high and 1.4 m wide; coarseness 1 for far ones."""
     b = MeshBuilder(np.random.default_rng((12, number)))
     rng = b.rng
     for _ in range(int(rng.integers(1, 4))):
@@ -202,7 +213,7 @@ def hedge(number: int) -> Mesh:
 def add_wood_edge(
     b: MeshBuilder, start: tuple[Number, Number], stop: tuple[Number, Number], height_m: Number
 ) -> None:
-    """Add the dark, uneven front of a dense wood, which closes the view behind single trees.
+    """Add the dark, uneven edge of a dense wood, the background of single trees.
 
     Both ends are x and s [m].
     """
@@ -366,13 +377,14 @@ def fence(number: int) -> Mesh:
 
 
 class Body(NamedTuple):
-    """The shape of a kind of vehicle; lengths and heights of its parts are shares of its own."""
+    """Shape of a kind of vehicle; positions of its parts are shares of its length and height."""
 
     size_m: tuple[Number, Number, Number]  # length, width and height
-    stations: tuple[tuple[Number, Number, Number], ...]  # length (rear -0.5), belt, roof
-    glazed: tuple[int, int]  # stations between this pair have windows
-    wheels: tuple[float, ...]  # where the axles are
-    share: Number  # how often it is met
+    # of each cross-section: place along the length (rear -0.5), heights of belt line and roof
+    stations: tuple[tuple[Number, Number, Number], ...]
+    glazed: tuple[int, int]  # first and last cross-section with windows between them
+    wheels: tuple[float, ...]  # places of the axles
+    share: Number  # of all vehicles
 
 
 _HATCH = ((-0.5, 0.4, 0.45), (-0.49, 0.6, 0.62), (-0.45, 0.62, 0.66), (-0.35, 0.62, 0.96),
@@ -399,7 +411,7 @@ BODIES: dict[str, Body] = {
     "bus": Body((11.0, 2.5, 3.0), _BOXY, (1, 4), (-0.28, 0.3), 0.02),
 }
 MODELS = 4
-"""Different models of each kind."""
+"""Number of different models of each kind."""
 
 PAINTS: list[tuple[Color, float]] = [
     ((0.52, 0.53, 0.55), 0.24), ((0.02, 0.02, 0.023), 0.2), ((0.16, 0.17, 0.19), 0.16),
@@ -463,7 +475,7 @@ def vehicle(kind: str, number: int) -> Mesh:
 def _ring(
     station: Float[np.ndarray, "3"], size: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "10 3"]:
-    """One cross-section: sill, flank, belt, roof edge and roof of one side, then the other's."""
+    """Make a cross-section of a vehicle: sill, flank, belt, roof edge and roof of both sides."""
     length, width, height = size
     place = station[0]
     belt = station[1] * height
@@ -479,7 +491,7 @@ def _ring(
 
 
 def _add_trim(b: MeshBuilder, length: float, width: float, height: float) -> None:
-    """Lights, mirrors, plates and bumpers."""
+    """Add lights, mirrors, plates and bumpers of a vehicle of a size [m]."""
     low = min(height, 1.6)
     sill = 0.16 * min(height, 1.8) + 0.03
     white = Surface("lamp", (0.8, 0.81, 0.83))
@@ -497,7 +509,7 @@ def _add_trim(b: MeshBuilder, length: float, width: float, height: float) -> Non
     b.box((0, -0.28 * low, 0.503 * length), (0.52, 0.12, 0.03), plate)
     b.box((0, -0.33 * low, 0.495 * length), (width * 0.55, 0.12, 0.04), _BLACK)
     b.box((0, -0.24 * low, -0.496 * length), (width * 0.94, 0.16, 0.06), _BLACK)
-    if height > 1.9:  # what is loft from glass elsewhere stands upright here
+    if height > 1.9:  # the rear window of tall vehicles is upright
         pane = Surface("glass", (0.03, 0.03, 0.035))
         where = (0, -0.74 * height, -0.499 * length)
         b.box(where, (width * 0.72, height * 0.28, 0.02), pane)
@@ -505,7 +517,7 @@ def _add_trim(b: MeshBuilder, length: float, width: float, height: float) -> Non
 
 WALKERS = 10
 RIDERS = 5
-"""How many different models there are of each."""
+"""Number of different models of each."""
 
 _SKINS: list[Color] = [(0.5, 0.31, 0.22), (0.42, 0.25, 0.17), (0.2, 0.11, 0.07)]
 _RUBBER = Surface("tyre", (0.025, 0.025, 0.028))
@@ -513,7 +525,7 @@ _RUBBER = Surface("tyre", (0.025, 0.025, 0.028))
 
 @cache
 def walker(number: int) -> Mesh:
-    """Give a person on foot, looking along z, caught at some moment of a step."""
+    """Give a person on foot who faces along z, at a random moment of a step."""
     b = MeshBuilder(np.random.default_rng((31, number)))
     height = b.rng.uniform(1.55, 1.9)
     step = b.rng.uniform(-0.28, 0.28)
@@ -590,5 +602,6 @@ def _add_upper_body(
 
 
 def _cloth(b: MeshBuilder, light: Number) -> Surface:
+    """Draw a cloth of random colour, no brighter than ``light``."""
     color = b.rng.uniform(0.1, 1, 3) * b.rng.uniform(0.15, 1) * light
     return Surface("cloth", tuple(color), 0.6, int(b.rng.integers(4)))

@@ -1,8 +1,8 @@
-"""Near scenes: rooms, tables, bins, shelves and walls with things, from 5 cm to 20 m.
+"""Near scenes: rooms, tables, bins, shelves and walls with objects, from 5 cm to 20 m.
 
-Disparity depends on the shape of a scene and on how far away it is in baselines, not on its size in
+Disparity depends on the shape of a scene and on its distance in baselines, not on its size in
 metres. So a scene is built and lit at the scale at which its baseline is that of a street's rig,
-where textures, shadows and lenses have their usual sizes, and given in its true metres at the end.
+where textures, shadows and lenses have their usual sizes, and is scaled to its true metres last.
 """
 
 from dataclasses import dataclass, replace
@@ -28,29 +28,29 @@ from depthpose.depth.synthetic.scene import (
 from depthpose.depth.types import Mask, View
 
 NearKind = Literal["room", "table", "bin", "shelf", "wall"]
-"""What a scene shows."""
+"""Kind of a near scene."""
 
 _KINDS: tuple[NearKind, ...] = ("room", "table", "table", "bin", "shelf", "wall")
-"""One is named as often as it is met."""
+"""A kind is repeated in proportion to how often it is drawn."""
 
 _DRAWN_BASELINE_M = 0.5
-"""Baseline at which scenes are drawn; a true one of 5 cm makes everything ten times as small."""
+"""Baseline at which scenes are drawn; with a true one of 5 cm all true lengths are a tenth."""
 
 _BASELINES_M = (0.01, 0.54)
 _DISTANCES_M = (0.05, 5.0)
-"""Of the nearest thing, in true metres."""
+"""Ranges of the baseline and of the distance of the nearest object, in true metres."""
 _FARTHEST_M = 20.0
-"""Of a backdrop, in true metres."""
+"""Largest distance of a room's back wall, in true metres."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class NearScene:
-    """A near scene at the scale at which it is drawn, and the rig that sees it."""
+    """A near scene and its rig, at the scale at which it is drawn."""
 
-    scene: StreetScene  #: what is drawn, in the frame of the left camera
-    rig: StereoRig  #: its cameras at that scale
-    metres_per_unit: float  #: true metres of one of its metres
-    kind: NearKind  #: what it shows
+    scene: StreetScene  #: mesh and light, in the frame of the left camera
+    rig: StereoRig  #: the cameras, at the same scale
+    metres_per_unit: float  #: true metres per metre of the scene
+    kind: NearKind  #: kind of the scene
 
 
 def make_near(config: NearConfig, index: int) -> NearScene:
@@ -62,13 +62,16 @@ def make_near(config: NearConfig, index: int) -> NearScene:
     if index < 0:
         raise InputError(f"index is {index}, but scenes are counted from 0; take another")
     rng = np.random.default_rng([76, config.seed, index])
+
+    # The camera, and the distance of the nearest object.
     low, high = config.columns_px
     width = 16 * round(rng.uniform(low, high) / 16)
     height = 8 * round(width * float(rng.choice([3 / 4, 9 / 16, 5 / 8])) / 8)
     focal_px = width * rng.uniform(0.55, 1.6)
     largest_px = log_uniform(rng, 8, config.largest_share * width)
     near_m = focal_px * _DRAWN_BASELINE_M / largest_px
-    # A baseline that puts the nearest thing into the true range.
+
+    # The true scale: a baseline by which the nearest object is within the range of distances.
     baseline_m = log_uniform(rng, *_BASELINES_M)
     distance_m = np.clip(near_m * baseline_m / _DRAWN_BASELINE_M, *_DISTANCES_M)
     least, most = (limit_m / _DRAWN_BASELINE_M for limit_m in _BASELINES_M)
@@ -76,27 +79,31 @@ def make_near(config: NearConfig, index: int) -> NearScene:
 
     K = intrinsics(focal_px, focal_px, (width - 1) / 2, (height - 1) / 2)
     rig = StereoRig(width=width, height=height, K=K, baseline_m=_DRAWN_BASELINE_M)
+
+    # The surfaces.
     kind = _KINDS[int(rng.integers(len(_KINDS)))]
-    place = _Place(rng, near_m, (width / focal_px / 2, height / focal_px / 2), config.plain_share)
+    scene_builder = _NearSceneBuilder(
+        rng, near_m, (width / focal_px / 2, height / focal_px / 2), config.plain_share
+    )
     farthest = min(12.0, _FARTHEST_M / (near_m * metres_per_unit))
     match kind:
         case "room":
-            place.add_room(near_m * log_uniform(rng, 1.5, farthest))
-            place.scatter(int(rng.integers(6, 40)))
+            scene_builder.add_room(near_m * log_uniform(rng, 1.5, farthest))
+            scene_builder.scatter(int(rng.integers(6, 40)))
         case "table" | "bin":
-            place.add_table(is_bin=kind == "bin")
+            scene_builder.add_table(is_bin=kind == "bin")
         case "shelf":
-            place.add_shelf()
+            scene_builder.add_shelf()
         case "wall":
-            place.add_wall(near_m * log_uniform(rng, 1.2, 6))
-            place.scatter(int(rng.integers(3, 30)))
-    mesh = place.builder.finish()
-    # Nothing but a backdrop, which reaches beside the camera, may come nearer than the nearest.
+            scene_builder.add_wall(near_m * log_uniform(rng, 1.2, 6))
+            scene_builder.scatter(int(rng.integers(3, 30)))
+    mesh = scene_builder.builder.finish()
+    # Only a backdrop, which reaches beside the camera, may be nearer than the nearest object.
     is_far = mesh.corners[:, :, 2].min(1) > 0.97 * near_m
-    is_kept = is_far | (mesh.thing <= place.backdrop)
+    is_backdrop = mesh.thing <= scene_builder.backdrop
     weather = replace(draw_weather(rng), haze_m=1e5)
     scene = StreetScene(
-        mesh=mesh.part(is_kept),
+        mesh=mesh.part(is_far | is_backdrop),
         markings=Markings(
             lines=np.zeros((0, 4)), bars=np.zeros((0, 5)), brightness=0.5, wheel_tracks=(0.0, 3.0)
         ),
@@ -110,8 +117,8 @@ def make_near(config: NearConfig, index: int) -> NearScene:
 def draw_near(config: NearConfig, index: int) -> StreetFrame:
     """Draw scene ``index``, in true metres.
 
-    In a share of the pairs both cameras see infrared, in grey; in a share of these a projector
-    beside them adds dots. A share has black borders, whose truth is unknown.
+    A share of the pairs is infrared, in grey, and in a share of these a projector adds dots. A
+    share has black borders, where truth is unknown.
     """
     near = make_near(config, index)
     rng = np.random.default_rng([78, config.seed, index])
@@ -132,20 +139,20 @@ def draw_near(config: NearConfig, index: int) -> StreetFrame:
     seed = (config.seed, index, 78)
     frame = draw_scene(near.scene, near.rig, settings, seed, projector)
 
+    # Grey views: infrared is a random mixture of the channels.
     views = [frame.left, frame.right]
     if is_infrared:
         shares = torch.from_numpy(rng.dirichlet([2, 2, 2])).float()[:, None, None]
         views = [(view * shares).sum(0, keepdim=True).expand(3, -1, -1) for view in views]
     elif rng.random() < config.grey_share:
         views = [grey_of(view).expand(3, -1, -1) for view in views]
+
     left_px = frame.disparity_px
     right_px = frame.right_disparity_px
     if rng.random() < config.border_share:
-        views, unknown = _with_borders(rng, views)
-        left_px, right_px = (
-            px.masked_fill(is_black, torch.nan)
-            for px, is_black in zip((left_px, right_px), unknown, strict=True)
-        )
+        views, (is_left_black, is_right_black) = _with_borders(rng, views)
+        left_px = left_px.masked_fill(is_left_black, torch.nan)
+        right_px = right_px.masked_fill(is_right_black, torch.nan)
     true_rig = replace(frame.rig, baseline_m=frame.rig.baseline_m * near.metres_per_unit)
     return replace(
         frame,
@@ -159,28 +166,31 @@ def draw_near(config: NearConfig, index: int) -> StreetFrame:
 
 
 def _with_borders(rng: np.random.Generator, views: list[View]) -> tuple[list[View], list[Mask]]:
-    """Blacken borders, each view its own, as a rectification leaves them; say which pixels."""
+    """Blacken the borders of each view at random, as a rectification leaves them.
+
+    Gives the views, and the black pixels of each.
+    """
     height, width = views[0].shape[1:]
-    blackened = []
-    unknown = []
+    blackened: list[View] = []
+    masks: list[Mask] = []
     for view in views:
-        columns, rows = (np.round(rng.uniform(0, 0.06, 2) * side).astype(int) for side in
-                         (width, height))  # fmt: skip
+        left, right = np.round(rng.uniform(0, 0.06, 2) * width).astype(int)
+        top, bottom = np.round(rng.uniform(0, 0.06, 2) * height).astype(int)
         is_black = torch.ones(height, width, dtype=torch.bool)
-        is_black[rows[0] : height - rows[1], columns[0] : width - columns[1]] = False
+        is_black[top : height - bottom, left : width - right] = False
         blackened.append(view.masked_fill(is_black, 0.0))
-        unknown.append(is_black)
-    return blackened, unknown
+        masks.append(is_black)
+    return blackened, masks
 
 
-class _Place:
-    """Adds to a scene, within what a camera sees of it.
+class _NearSceneBuilder:
+    """Builds the surfaces of a near scene, within the camera's field of view.
 
     Args:
-        rng: decides.
-        near_m: nothing is nearer.
-        half: tangents of half of the camera's angles across and down.
-        plain_share: share of the large surfaces without texture.
+        rng: the random numbers.
+        near_m: least distance of an object.
+        half: tangents of half of the camera's horizontal and vertical angle of view.
+        plain_share: share of the large surfaces with next to no texture.
     """
 
     def __init__(
@@ -195,7 +205,7 @@ class _Place:
         self.far_m = near_m
 
     def sheet(self, corner: Values, along: Values, up: Values) -> None:
-        """Add a large rectangle; nothing of it is cut off for being near."""
+        """Add a large rectangle to the backdrop, which may be nearer than objects."""
         self.builder.thing += 1
         size_m = float(np.linalg.norm(np.asarray(along, float)))
         surface = random_near_surface(
@@ -207,19 +217,20 @@ class _Place:
         self.backdrop = self.builder.thing
 
     def add_wall(self, far_m: float) -> None:
-        """Add a plane across the view, at any slant that keeps all of it far enough."""
-        turn, nod = self.rng.normal(0, 0.45, 2)
-        # z = far + turn * x + nod * y; on the ray (u, v, 1) that is far / (1 - turn u - nod v).
-        least = 1 - abs(turn) * self.half[0] - abs(nod) * self.half[1]
-        most = 1 + abs(turn) * self.half[0] + abs(nod) * self.half[1]
-        if least < 0.15:
-            turn = 0.0
-            nod = 0.0
-            most = 1.0
-        far_m = max(far_m, self.near_m * most)
-        reach = 30 * far_m
-        along = np.array([1, 0, turn]) * 2 * reach
-        up = np.array([0, -1, -nod]) * 2 * reach
+        """Add a plane across the view, at any slant at which all of it is far enough."""
+        slope_x, slope_y = self.rng.normal(0, 0.45, 2)
+        # z = far + slope_x x + slope_y y, which is far / (1 - slope_x u - slope_y v) on the ray
+        # (u, v, 1): of the divisor's range in the view, the largest is that of the nearest point.
+        smallest = 1 - abs(slope_x) * self.half[0] - abs(slope_y) * self.half[1]
+        largest = 1 + abs(slope_x) * self.half[0] + abs(slope_y) * self.half[1]
+        if smallest < 0.15:
+            slope_x = 0.0
+            slope_y = 0.0
+            largest = 1.0
+        far_m = max(far_m, self.near_m * largest)
+        half_side = 30 * far_m
+        along = np.array([1, 0, slope_x]) * 2 * half_side
+        up = np.array([0, -1, -slope_y]) * 2 * half_side
         self.sheet(np.array([0, 0, far_m]) - (along + up) / 2, along, up)
         self.far_m = far_m
 
@@ -243,7 +254,10 @@ class _Place:
         self.far_m = far_m
 
     def add_table(self, *, is_bin: bool) -> None:
-        """Add a plane seen from anywhere above it, a wall behind, and things that lie on it."""
+        """Add a plane that is seen from above, a wall behind it, and objects that lie on it.
+
+        A bin has four sides, and many objects of one kind.
+        """
         rng = self.rng
         near_m = self.near_m
         tilt = np.deg2rad(rng.uniform(0, 75 if not is_bin else 35))
@@ -276,7 +290,7 @@ class _Place:
                 corner = middle + extent_m * (outwards - along)
                 surface = random_near_surface(rng, extent_m)
                 self.builder.rectangle(corner, 2 * extent_m * along, height_m * normal, surface)
-        # Things on it: their places by the rays that see the plane.
+        # Objects on it, where random rays meet the plane.
         common = random_kind(rng) if is_bin else None
         common_m = distance_m * self.half[0] * log_uniform(rng, 0.1, 0.5)
         for _ in range(int(rng.integers(20, 70) if is_bin else rng.integers(2, 30))):
@@ -291,7 +305,7 @@ class _Place:
         self.far_m = distance_m
 
     def add_shelf(self) -> None:
-        """Add boards and uprights before a wall, with things between them."""
+        """Add a shelf of boards and uprights before a wall, with objects on the boards."""
         rng = self.rng
         near_m = self.near_m
         depth_m = near_m * rng.uniform(0.1, 0.8)
@@ -326,7 +340,7 @@ class _Place:
         self.far_m = back_m
 
     def scatter(self, count: int) -> None:
-        """Put things anywhere between the nearest distance and the backdrop."""
+        """Add objects at random places between the nearest distance and the backdrop."""
         rng = self.rng
         for _ in range(count):
             z = log_uniform(rng, 1.05 * self.near_m, max(1.1 * self.near_m, self.far_m))
@@ -334,10 +348,10 @@ class _Place:
             self.add_thing(centre, z * self.half[0] * log_uniform(rng, 0.06, 0.7))
 
     def add_thing(self, centre: np.ndarray, size_m: float, kind: str | None = None) -> None:
-        """Add a thing about a point (3,) [m], which is moved away along its ray if too near.
+        """Add an object about a point (3,) [m], moved away along its ray if it is too near.
 
-        ``kind`` None: of any kind.
+        ``kind``: None for a random one.
         """
-        least_m = self.near_m + 0.6 * size_m
-        centre = centre * max(1.0, least_m / max(float(centre[2]), 1e-6))
+        min_m = self.near_m + 0.6 * size_m
+        centre = centre * max(1.0, min_m / max(float(centre[2]), 1e-6))
         add_thing(self.builder, kind or random_kind(self.rng), centre, size_m)

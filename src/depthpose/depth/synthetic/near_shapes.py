@@ -1,7 +1,7 @@
-"""What lies and stands in a near scene: machine parts, household things and the shapes of clutter.
+"""Objects of near scenes: machine parts, household objects and the shapes of clutter.
 
-Each ``_add_*`` function adds one thing about its centre. Its axes are those of the thing's
-rotation: ``R[:, 1]`` is the axis of what is round, and points down in what stands upright.
+Each ``_add_*`` function adds one object about its centre, of a size and rotated by ``R``:
+``R[:, 1]`` is the axis of round objects, and points down for upright ones.
 """
 
 from itertools import pairwise
@@ -12,22 +12,22 @@ from depthpose.depth.synthetic.mesh import MeshBuilder, Rotation, Surface
 from depthpose.depth.synthetic.scene import add_shape, random_rotation, random_surface
 
 PLAIN = ("paint", "skin", "plaster", "metal")
-"""Materials that show next to nothing where a tile of them is much larger than the surface."""
+"""Materials with next to no texture where a tile of them is much larger than the surface."""
 
 _KINDS = ("ball", "box", "box", "card", "pole", "fence", "wheel", "lattice", "leaves",
           "bracket", "flange", "spool", "bottle", "mug", "books", "cable", "stool")  # fmt: skip
-"""A kind is named as often as it is met."""
+"""A kind is repeated in proportion to how often it is drawn."""
 
 
 def random_kind(rng: np.random.Generator) -> str:
-    """Draw the kind of a thing."""
+    """Draw the kind of an object."""
     return _KINDS[int(rng.integers(len(_KINDS)))]
 
 
 def random_near_surface(
     rng: np.random.Generator, size_m: float, plain_share: float = 0.3
 ) -> Surface:
-    """Draw a surface of any colour for a thing of ``size_m``; a share of them without texture."""
+    """Draw a surface for an object of ``size_m``; a share of them has next to no texture."""
     surface = random_surface(rng, size_m)
     if rng.random() >= plain_share:
         return surface
@@ -36,7 +36,7 @@ def random_near_surface(
 
 
 def add_thing(b: MeshBuilder, kind: str, centre: np.ndarray, size_m: float) -> None:
-    """Add a thing of a kind about its centre (3,) [m], with a random surface and rotation."""
+    """Add an object of a kind about its centre (3,) [m], with a random surface and rotation."""
     b.thing += 1
     surface = random_near_surface(b.rng, size_m)
     R = random_rotation(b.rng) if b.rng.random() < 0.6 else np.eye(3)
@@ -130,7 +130,7 @@ def _add_mug(
 
 
 def _add_books(b: MeshBuilder, centre: np.ndarray, size_m: float, R: Rotation) -> None:
-    """Add a pile of books, each with a surface of its own and an object to itself."""
+    """Add a pile of books; each is an object with its own surface."""
     down = np.array([0.0, 1, 0])
     offset = np.zeros(3)
     for _ in range(int(b.rng.integers(2, 9))):

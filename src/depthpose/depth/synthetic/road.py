@@ -1,7 +1,7 @@
-"""The road, the ground beside it, what stands there, and its traffic.
+"""The road, the ground and the objects beside it, and its traffic.
 
-Everything is laid out along a straight street first, at (x to the right, y down, s ahead) with the
-camera's car at x = s = 0, and then bent as a whole.
+All of it is built along a straight street first, at (x to the right, y down, s ahead) with the
+camera's car at x = s = 0, and then bent to the curves of the road.
 """
 
 from dataclasses import dataclass, field, replace
@@ -19,42 +19,42 @@ Place = Literal["city", "suburb", "avenue", "rural", "forest"]
 PLACES: dict[Place, float] = {
     "city": 0.2, "suburb": 0.28, "avenue": 0.26, "rural": 0.14, "forest": 0.12
 }  # fmt: skip
-"""Kinds of places, and how often each is met."""
+"""Kinds of places, and the share of each."""
 
 BEHIND_M = 14.0
 AHEAD_M = 420.0
-"""How far the ground reaches."""
+"""Extent of the ground behind and ahead of the car."""
 
 _WIDE_M = 400.0
-"""How far it reaches to the sides, so that nothing but hills is seen beyond."""
+"""Extent of the ground to each side; only hills are visible beyond."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SideStreet:
-    """A street that joins."""
+    """A side street that joins the road."""
 
-    s_m: Number  # where, along the road
-    half_m: float  # half its width
+    s_m: Number  # its position along the road
+    half_m: float  # half of its width
     sides: tuple[int, ...]  # 1 right, -1 left
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Road:
-    """The plan of a road."""
+    """Plan of a road."""
 
-    place: Place  # what kind of place it runs through
-    edge_m: dict[int, float]  # x of its left edge (-1) and of its right one (1)
-    lanes: int  # how many there are
-    lane_m: float  # width of each
+    place: Place  # kind of its surroundings
+    edge_m: dict[int, float]  # x of its left edge (-1) and of its right edge (1)
+    lanes: int  # number of lanes
+    lane_m: float  # width of a lane
     parking_m: tuple[Number, Number]  # width of the strip for parked cars, on the left and right
     walk_m: Number  # width of the pavement; 0: none
-    curb_m: float  # how much higher the pavement is
+    curb_m: float  # height of the pavement above the road
     verge_m: Number  # width of the grass between road and pavement
     side_streets: tuple[SideStreet, ...]
     centre: Float64[np.ndarray, "n 5"]  # of the road: s, x, y, z [m] and heading [rad]
 
     def is_side_street(self, s_m: Number, side: int, margin_m: Number = 0.0) -> bool:
-        """Whether a side street joins here."""
+        """Whether a side street joins at a place, or within a margin of it."""
         return any(
             side in street.sides and abs(s_m - street.s_m) < street.half_m + margin_m
             for street in self.side_streets
@@ -127,17 +127,17 @@ def draw_road(rng: np.random.Generator) -> Road:
 
 
 def bend(mesh: Mesh, road: Road) -> Mesh:
-    """Carry what was laid out along the straight street to the real one."""
+    """Bend a mesh from the straight street to the curves and slopes of the road."""
     points = mesh.corners.reshape(-1, 3)
     curvature = np.gradient(road.centre[:, 4], road.centre[:, 0])
     table = np.column_stack([road.centre, curvature]).astype(np.float32)
-    # The table has a row a metre.
+    # The table has a row for each metre of the road.
     place = np.clip(points[:, 2] - table[0, 0], 0, len(table) - 1.001)
     row = place.astype(np.int64)
     share = (place - row)[:, None]
     here = table[row] * (1 - share) + table[row + 1] * share
     x, y, z, heading, curvature = here[:, 1:].T
-    # On the inside of a curve nothing may lie beyond its centre: the ground would fold.
+    # On the inside of a curve no point may lie beyond its centre, or the ground would fold.
     inward = np.clip(points[:, 0] * curvature, 0, None)
     across = points[:, 0] / (1 + inward**4) ** 0.25
     cos = np.cos(heading)
@@ -151,7 +151,7 @@ def bend(mesh: Mesh, road: Road) -> Mesh:
 
 def add_ground(b: MeshBuilder, road: Road) -> None:
     """Add the carriageway, pavements, verges and the land beside, side streets between them."""
-    # Surfaces of one colour each in a scene.
+    # Surfaces, each of one colour in a scene.
     rng = b.rng
     light = rng.uniform(0.7, 1.45)
     color = (0.105 * light, 0.105 * light, 0.107 * light)
@@ -171,7 +171,7 @@ def add_ground(b: MeshBuilder, road: Road) -> None:
     )
     _strip(b, (road.edge_m[-1], road.edge_m[1]), (0.0, 0.0), asphalt, even)
 
-    # Beside it, on each side, side streets and what lies between them.
+    # Side streets on each side, and the ground between them.
     land = walk if road.place == "city" and rng.random() < 0.7 else grass
     for side in (-1, 1):
         streets = [street for street in road.side_streets if side in street.sides]
@@ -199,7 +199,10 @@ def _add_side(
     land: Surface,
     stations: Float64[np.ndarray, " n"],
 ) -> None:
-    """From the road's edge outwards: kerb, verge, pavement, land; banks at both ends."""
+    """Add the ground of one side: kerb, verge, pavement and land, with banks at both ends.
+
+    ``stations``: the positions s along the road between which the strips are divided.
+    """
     rng = b.rng
     high = -road.curb_m
     curb = Surface("curb", (0.3, 0.29, 0.28), 1.0)
@@ -226,7 +229,7 @@ def _add_side(
     profile = [(edge, high), (x - side * 8, high), (x, high - 0.3 * rise),
                (x + side * _WIDE_M, high - 3 * rise)]  # fmt: skip
     for s in (stations[0], stations[-1]):
-        # Between the land and a side street at y = 0 there is a step, which one would see through.
+        # The bank closes the step between the land and a side street at y = 0.
         faces = [
             [(x0, y0, s), (x1, y1, s), (x1, 0.0, s), (x0, 0.0, s)]
             for (x0, y0), (x1, y1) in pairwise(profile)
@@ -242,7 +245,7 @@ def _strip(
     surface: Surface,
     stations: Float[np.ndarray, " n"],
 ) -> None:
-    """Add a band along the road; its texture lies in road coordinates (x, s)."""
+    """Add a strip along the road from one (x, y) to another; its texture is in road coordinates."""
     u_m = y_m if x_m[0] == x_m[1] else x_m  # a wall's texture goes up
     turns = ((0, stations[:-1]), (1, stations[:-1]), (1, stations[1:]), (0, stations[1:]))
     faces = [np.stack([0 * s + x_m[i], 0 * s + y_m[i], s], 1) for i, s in turns]
@@ -251,14 +254,15 @@ def _strip(
 
 
 _FAR_M = 130.0
+"""Distance up to which the roadside has objects."""
 _DETAIL_M = 45.0
-"""Beyond this, what is finer than a pixel is left out."""
+"""Distance up to which houses have details."""
 _WOOD = Surface("wood", (0.16, 0.12, 0.09))
 _DARK = Surface("metal", (0.03, 0.035, 0.035))
 
 
 def add_roadside(b: MeshBuilder, road: Road) -> None:
-    """Fill both sides of the road, and close the view at its end."""
+    """Add houses, plants and street furniture on both sides, and the background at the end."""
     rng = b.rng
     sides = {side: _Roadside(b, road, side) for side in (-1, 1)}
     for beside in sides.values():
@@ -291,19 +295,19 @@ def add_roadside(b: MeshBuilder, road: Road) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _Roadside:
-    """One side of a road: every method adds to the mesh of the builder."""
+    """Builds the objects on one side of a road; every method adds to the mesh of the builder."""
 
     b: MeshBuilder
     road: Road
     side: int  # 1 right, -1 left
 
     def x_m(self, beyond_m: Number) -> Number:
-        """Give x so far beyond the beginning of the plots, behind pavement and verge."""
+        """Give x at a distance behind the pavement and verge, where the plots begin."""
         plot_m = self.road.edge_m[self.side] + self.side * (self.road.verge_m + self.road.walk_m)
         return plot_m + self.side * beyond_m
 
     def add_houses(self) -> None:
-        """Houses at the pavement, wall to wall."""
+        """Add houses at the pavement, wall to wall."""
         rng = self.b.rng
         if self.road.walk_m > 2 and rng.random() < 0.55:
             self.add_tree_row(self.road.edge_m[self.side] + self.side * 0.9)
@@ -321,7 +325,7 @@ class _Roadside:
             s += length + (rng.uniform(2, 9) if rng.random() < 0.3 else 0.0)
 
     def add_gardens(self) -> None:
-        """Houses behind hedges and fences, with trees and bushes about them."""
+        """Add houses behind hedges and fences, with trees and bushes about them."""
         rng = self.b.rng
         s = rng.uniform(-12, -2)
         back = rng.uniform(2.5, 7)
@@ -345,7 +349,7 @@ class _Roadside:
             s += length + rng.uniform(1.5, 7)
 
     def add_avenue(self) -> None:
-        """A wide road: rows of trees, hedges or rails, and set-back houses or nothing behind."""
+        """Add rows of trees, hedges or rails of a wide road, and set-back houses or copses."""
         rng = self.b.rng
         has_row, has_border, has_houses = rng.random(3) < (0.7, 0.5, 0.35)
         rail = int(rng.integers(4))
@@ -366,7 +370,7 @@ class _Roadside:
             s += length + rng.uniform(0, 10)
 
     def add_country(self) -> None:
-        """Open fields with some trees, or a forest's edge."""
+        """Add open fields with some trees, or the edge of a forest."""
         rng = self.b.rng
         is_forest = self.road.place == "forest"
         is_open = not is_forest and rng.random() < 0.55
@@ -390,7 +394,7 @@ class _Roadside:
             self.add_border(-8, 90, int(rng.integers(4)))
 
     def add_copse(self, s: Number, length: Number, depth: Number) -> None:
-        """Some trees and bushes."""
+        """Add some trees and bushes on a plot of a length and depth, unless a street is there."""
         rng = self.b.rng
         is_street = self.road.is_side_street(s + length / 2, self.side, length / 2)
         for _ in range(int(rng.integers(1, 7))):
@@ -403,7 +407,7 @@ class _Roadside:
                 self.add_bush(x, s + rng.uniform(0, length), rng.uniform(0.7, 2.2))
 
     def add_kerb(self) -> None:
-        """Lamps in a row; signs, lights, posts and boxes here and there; poles with wires."""
+        """Add lamps, signs, traffic lights, boxes and poles with cables at the kerb."""
         rng = self.b.rng
         road = self.road
         side = self.side
@@ -456,7 +460,7 @@ class _Roadside:
                         self.b.tube(here, there, 0.018, _DARK, 3)
 
     def add_house(self, s: Number, length: Number, back: Number, height: float) -> None:
-        """A house so far behind the pavement."""
+        """Add a house at a distance ``back`` behind the pavement."""
         plot = Plot(
             x_m=self.x_m(back + 0.15),
             start_m=s,
@@ -469,7 +473,7 @@ class _Roadside:
         add_house(self.b, plot, with_details=s < _DETAIL_M)
 
     def add_border(self, start: Number, stop: Number, kind: int) -> None:
-        """A line of hedge or fence pieces at the back of the pavement; kind 0 is none."""
+        """Add pieces of hedge (kind 1) or fence at the back of the pavement; kind 0 adds none."""
         if kind == 0:
             return
         rng = self.b.rng
@@ -487,7 +491,7 @@ class _Roadside:
                 self.b.add(place(models.fence(number), where))
 
     def add_tree_row(self, x: Number) -> None:
-        """Trees along the road, at even distances."""
+        """Add a row of trees along the road, at nearly even distances."""
         rng = self.b.rng
         step = rng.uniform(6, 14)
         height = rng.uniform(5, 13)
@@ -497,7 +501,7 @@ class _Roadside:
                 self.add_tree(*place_m, height * rng.uniform(0.8, 1.2))
 
     def add_tree(self, x: Number, s: Number, height: Number | None) -> None:
-        """A tree of some kind, coarser where it is far away."""
+        """Add a tree of a random model, coarser where it is far away; height None: random."""
         tall = self.b.rng.uniform(5, 12) if height is None else height
         number = int(self.b.rng.integers(models.TREES))
         wide = tall * self.b.rng.uniform(0.85, 1.15)
@@ -507,7 +511,7 @@ class _Roadside:
         self.b.add(place(model, (x, 0, s), self.b.rng.uniform(0, 6.28), scale, tints))
 
     def add_bush(self, x: Number, s: Number, size: Number) -> None:
-        """A bush of some kind, coarser where it is far away."""
+        """Add a bush of a random model, coarser where it is far away."""
         model = models.bush(int(self.b.rng.integers(models.BUSHES)), int(s > 20))
         scale = size * self.b.rng.uniform(0.7, 1.3, 3)
         tints = {"leaf": models.leaf_color(self.b.rng)}
@@ -515,19 +519,19 @@ class _Roadside:
 
 
 _OWN_CAR = (0.0, 0.5, 1.5, 4.5)
-"""x, s, half width and half length of the camera's own car, and of sight before it [m]."""
+"""Rectangle of the camera's car and its free view: x, s, half width and half length [m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Traffic:
-    """Vehicles and people on a road, none where another one is; every method adds to the mesh."""
+    """Adds vehicles and people to a road, so that no two overlap."""
 
     b: MeshBuilder
     road: Road
     _taken: list[tuple[Number, float, Number, float]] = field(default_factory=lambda: [_OWN_CAR])
 
     def claim(self, x: Number, s: float, half_x: Number, half_s: float) -> bool:
-        """Take a place [m], if it is free."""
+        """Reserve a rectangle [m] if it is free; whether it was."""
         for other in self._taken:
             if abs(x - other[0]) < half_x + other[2] and abs(s - other[1]) < half_s + other[3]:
                 return False
@@ -535,7 +539,7 @@ class Traffic:
         return True
 
     def add_parked(self) -> None:
-        """Cars in the strips for them, or at the edge of streets without one."""
+        """Add parked cars in the parking strips, or at the edge of streets without one."""
         rng = self.b.rng
         road = self.road
         for side in (-1, 1):
@@ -553,7 +557,7 @@ class Traffic:
                 s += rng.uniform(5.0, 6.5)
 
     def add_driving(self) -> None:
-        """Vehicles in the lanes, and in the side streets, waiting or turning."""
+        """Add vehicles in the lanes and in the side streets."""
         rng = self.b.rng
         road = self.road
         usual = {"avenue": 1.3, "forest": 0.6, "rural": 0.6}.get(road.place, 0.9)
@@ -575,7 +579,7 @@ class Traffic:
                     self.add_vehicle(x, s, rng.choice([-1, 1]) * np.pi / 2 + rng.normal(0, 0.1))
 
     def add_vehicle(self, x: Number, s: Number, yaw: Number) -> None:
-        """A vehicle of some kind and colour, if its place is free."""
+        """Add a vehicle of a random kind and colour, if its place is free."""
         rng = self.b.rng
         shares = np.array([body.share for body in models.BODIES.values()])
         kind = list(models.BODIES)[rng.choice(len(shares), p=shares / shares.sum())]

@@ -1,8 +1,8 @@
-"""A scene to be drawn, a street or clutter: its mesh, its weather; and the rig that sees it.
+"""Synthetic scenes, streets and clutter: mesh, weather and markings; and the rigs that see them.
 
-Rigs are those of KITTI's recording days. Streets alone teach a matcher what streets
-look like: upright walls beside a plane. Clutter has thin, slanted, round, leafy, textureless,
-repetitive and mirroring things at every distance.
+Rigs are those of KITTI's recording days. By streets alone a matcher learns the shape of streets,
+upright walls beside a plane. Clutter has thin, slanted, round, leafy, textureless, repetitive and
+reflecting objects at every distance.
 """
 
 from dataclasses import dataclass, replace
@@ -32,20 +32,20 @@ Vector = Float64[np.ndarray, "3"]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Weather:
-    """What lights a scene."""
+    """The light of a scene."""
 
     sun: Vector  # unit vector towards the sun, in the world's frame (y down)
     sun_color: Vector  # linear light of the sun; small where clouds cover it
-    zenith: Vector  # light of the sky overhead
-    horizon: Vector  # light of the sky low down
+    zenith: Vector  # light of the sky at the zenith
+    horizon: Vector  # light of the sky at the horizon
     is_overcast: bool  # no shadows are cast
-    cloud: float  # 0 a clear sky, 1 covered
-    haze_m: float  # distance at which two thirds of the light are the haze's
-    shift: tuple[float, float]  # where clouds and unevenness lie in their textures
+    cloud: float  # cover of clouds: 0 a clear sky, 1 covered
+    haze_m: float  # distance at which two thirds of the light come from haze
+    shift: tuple[float, float]  # offset of the textures of clouds and stains, in tiles
 
 
 def draw_weather(rng: np.random.Generator) -> Weather:
-    """Draw a day: mostly sun, as where KITTI was recorded, else overcast; sometimes hazy."""
+    """Draw random weather: mostly sunny, as KITTI's, else overcast; sometimes hazy."""
     is_overcast = bool(rng.random() < 0.25)
     height = np.deg2rad(rng.uniform(12, 62))
     turn = rng.uniform(0, 2 * np.pi)
@@ -61,7 +61,7 @@ def draw_weather(rng: np.random.Generator) -> Weather:
         sun=sun,
         sun_color=np.array([1.0, 0.78 + 0.18 * low, 0.55 + 0.36 * low]) * strength,
         zenith=blue * sky * glare**0.5,
-        # The more it glares, the whiter it is.
+        # A brighter sky is whiter.
         horizon=(pale / glare + (1 - 1 / glare)) * sky * glare,
         is_overcast=is_overcast,
         cloud=float(rng.uniform(0.3, 1)) if is_overcast else float(rng.uniform(0, 1)) ** 2,
@@ -72,13 +72,11 @@ def draw_weather(rng: np.random.Generator) -> Weather:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Markings:
-    """Paint on the road, in its own coordinates (x across, s along) [m].
+    """Paint on the road, in road coordinates (x across, s along) [m]."""
 
-    Lines along it have a row each: x, half width, period and length of the dashes (equal where the
-    line is whole); bars across it: s, half length, first and last x, and 1 where it is striped.
-    """
-
+    # Along the road: x, half width, period and length of the dashes; both equal for a solid line.
     lines: Float64[np.ndarray, "n 4"]
+    # Across the road: s, half length, first and last x, and 1 if it is striped, else 0.
     bars: Float64[np.ndarray, "m 5"]
     brightness: float  # of the paint
     wheel_tracks: tuple[float, float]  # x of the left lane's left edge, width of the lanes
@@ -86,24 +84,24 @@ class Markings:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StreetScene:
-    """A synthetic street, in the frame of its left camera (x right, y down, z forward) [m]."""
+    """A street or clutter, in the frame of its left camera (x right, y down, z forward) [m]."""
 
-    mesh: Mesh  #: everything that is seen, but the sky
+    mesh: Mesh  #: all surfaces
     markings: Markings  #: paint on the road
     weather: Weather  #: the light, in the world's frame
     camera_from_world: Float64[np.ndarray, "3 3"]  #: rotation of the camera
-    place: roads.Place | Literal["clutter"]  #: what kind of place it is
+    place: roads.Place | Literal["clutter"]  #: kind of the scene
 
 
 def make_scene(seed: tuple[int, ...], mount_height_m: float = 1.65) -> StreetScene:
     """Make the street that belongs to ``seed``, any whole numbers.
 
-    The cameras are mounted at this height above the road, some centimetres more or less.
+    ``mount_height_m``: mean height of the cameras above the road; it varies by some centimetres.
     """
     rng = np.random.default_rng([71, *seed])
     road = roads.draw_road(rng)
     builder = MeshBuilder(rng)
-    far = MeshBuilder(rng)
+    hills_builder = MeshBuilder(rng)
     roads.add_ground(builder, road)
     roads.add_roadside(builder, road)
     traffic = roads.Traffic(builder, road)
@@ -111,61 +109,75 @@ def make_scene(seed: tuple[int, ...], mount_height_m: float = 1.65) -> StreetSce
     traffic.add_driving()
     traffic.add_people()
     street = roads.bend(builder.finish(), road)
-    # A ring of far hills or woods, 900 m away.
-    angle = np.linspace(-1.35, 1.35, 120)
-    wave = np.zeros_like(angle)
-    for often in (3, 7, 17, 43):
-        wave += np.sin(angle * often + rng.uniform(0, 6.28)) / often**0.7
-    high = rng.uniform(8, 40) * np.clip(0.55 + 0.45 * wave, 0.1, None)
-    x = 900 * np.sin(angle)
-    z = 900 * np.cos(angle)
-    along = np.arange(len(angle)) * 12.0
-    faces = between(np.stack([x, 0 * x + 90, z], 1), np.stack([x, -high, z], 1))
-    uv = between(np.stack([along, 0 * along - 90], 1), np.stack([along, high], 1))
-    far.quads(faces, uv, Surface("hills", (0.045, 0.065, 0.03), 150.0, int(rng.integers(2))))
-    hills = far.finish()
+    _add_hills(hills_builder)
+    hills = hills_builder.finish()
     hills = replace(hills, thing=hills.thing + street.thing.max() + 1)
-    # The camera's attitude: near level, now and then turned off the road's direction.
+
+    # The camera's pose: nearly level, and sometimes turned away from the road's direction.
     pitch = rng.normal(0, 0.012)
     roll = rng.normal(0, 0.009)
     yaw = rng.normal(0, 0.03) if rng.random() < 0.8 else rng.normal(0, 0.2)
+    camera_from_world = _rotation(pitch, yaw, roll)
+    position = np.array([rng.normal(0, 0.05), -mount_height_m + rng.normal(0, 0.04), 0.0])
+    world_from_camera = camera_from_world.T.astype(np.float32)
+    mesh = join([street, hills])
+    corners = (mesh.corners - position.astype(np.float32)) @ world_from_camera
+    mesh = replace(mesh, corners=corners, normals=mesh.normals @ world_from_camera)
+    is_near_view = corners[:, :, 2].max(1) > -12  # farther behind nothing casts a visible shadow
+    return StreetScene(
+        mesh=mesh.part(is_near_view),
+        markings=_draw_markings(rng, road),
+        weather=draw_weather(rng),
+        camera_from_world=camera_from_world,
+        place=road.place,
+    )
+
+
+def _add_hills(b: MeshBuilder) -> None:
+    """Add a ring of hills or woods, 900 m away."""
+    angle = np.linspace(-1.35, 1.35, 120)
+    wave = np.zeros_like(angle)
+    for frequency in (3, 7, 17, 43):
+        wave += np.sin(angle * frequency + b.rng.uniform(0, 6.28)) / frequency**0.7
+    height = b.rng.uniform(8, 40) * np.clip(0.55 + 0.45 * wave, 0.1, None)
+    x = 900 * np.sin(angle)
+    z = 900 * np.cos(angle)
+    along = np.arange(len(angle)) * 12.0
+    faces = between(np.stack([x, 0 * x + 90, z], 1), np.stack([x, -height, z], 1))
+    uv = between(np.stack([along, 0 * along - 90], 1), np.stack([along, height], 1))
+    b.quads(faces, uv, Surface("hills", (0.045, 0.065, 0.03), 150.0, int(b.rng.integers(2))))
+
+
+def _rotation(pitch: float, yaw: float, roll: float) -> Float64[np.ndarray, "3 3"]:
+    """Make a camera's rotation of angles [rad] about x, y and z; yaw first, roll last."""
     c = np.cos([pitch, yaw, roll])
     s = np.sin([pitch, yaw, roll])
     about_x = np.array([[1, 0, 0], [0, c[0], -s[0]], [0, s[0], c[0]]])
     about_y = np.array([[c[1], 0, s[1]], [0, 1, 0], [-s[1], 0, c[1]]])
     about_z = np.array([[c[2], -s[2], 0], [s[2], c[2], 0], [0, 0, 1]])
-    position = np.array([rng.normal(0, 0.05), -mount_height_m + rng.normal(0, 0.04), 0.0])
-    rotation = about_z @ about_x @ about_y
-    turn = rotation.T.astype(np.float32)
-    mesh = join([street, hills])
-    corners = (mesh.corners - position.astype(np.float32)) @ turn
-    mesh = replace(mesh, corners=corners, normals=mesh.normals @ turn)
-    return StreetScene(
-        mesh=mesh.part(corners[:, :, 2].max(1) > -12),  # far behind nothing casts a seen shadow
-        markings=_draw_markings(rng, road),
-        weather=draw_weather(rng),
-        camera_from_world=rotation,
-        place=road.place,
-    )
+    return about_z @ about_x @ about_y
 
 
 def _draw_markings(rng: np.random.Generator, road: roads.Road) -> Markings:
-    """Lines; stop lines and zebra crossings before side streets, dashes across their mouths."""
+    """Draw random markings: lines of the lanes; stop lines and zebra crossings at side streets."""
     is_marked = road.place in ("avenue", "rural", "forest") or rng.random() < 0.5
-    dash = rng.uniform(2, 6)
-    half = rng.uniform(0.05, 0.08)
-    period = dash * rng.uniform(2, 3)
-    first = road.edge_m[-1] + road.parking_m[0]
-    lines = []
-    bars = []
-    for k in range(road.lanes + 1) if is_marked else ():
-        is_edge = k in (0, road.lanes)
-        is_whole = is_edge or (k == road.lanes // 2 and rng.random() < 0.3)
-        inset = 0.15 * ((k == 0) - (k == road.lanes)) if is_edge else 0.0
+    dash_m = rng.uniform(2, 6)
+    half_width_m = rng.uniform(0.05, 0.08)
+    period_m = dash_m * rng.uniform(2, 3)
+    first_x_m = road.edge_m[-1] + road.parking_m[0]
+    lines: list[tuple[float, ...]] = []
+    bars: list[tuple[float, ...]] = []
+    for line in range(road.lanes + 1) if is_marked else ():
+        is_edge = line in (0, road.lanes)
+        is_solid = is_edge or (line == road.lanes // 2 and rng.random() < 0.3)
         if is_edge and road.curb_m and rng.random() < 0.7:
             continue
-        x = first + k * road.lane_m + inset
-        lines.append((x, half, period, period if is_whole else dash))
+        inset_m = 0.0
+        if is_edge:
+            inset_m = 0.15 if line == 0 else -0.15
+        x = first_x_m + line * road.lane_m + inset_m
+        lines.append((x, half_width_m, period_m, period_m if is_solid else dash_m))
+
     for street in road.side_streets:
         start = street.s_m - street.half_m
         if rng.random() < 0.4:
@@ -177,7 +189,7 @@ def _draw_markings(rng: np.random.Generator, road: roads.Road) -> Markings:
         lines=np.array(lines, float).reshape(-1, 4),
         bars=np.array(bars, float).reshape(-1, 5),
         brightness=rng.uniform(0.4, 0.75),
-        wheel_tracks=(first, road.lane_m),
+        wheel_tracks=(first_x_m, road.lane_m),
     )
 
 
@@ -195,7 +207,7 @@ _KITTI_SHARES = (0.6, 0.1, 0.1, 0.1, 0.1)
 
 
 def rig_number(config: StreetsConfig, index: int) -> int:
-    """Say which of KITTI's rigs a frame has."""
+    """Draw which of KITTI's rigs a frame has; most often that of the first day."""
     rng = np.random.default_rng([72, config.seed, index])
     return int(rng.choice(len(KITTI_RIGS), p=_KITTI_SHARES))
 
@@ -208,19 +220,20 @@ def kitti_rig(number: int = 0) -> StereoRig:
 
 
 def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
-    """Draw a number whose logarithm is equally likely between those of two others."""
+    """Draw a number between two others whose logarithm is uniformly distributed."""
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
 
 _DEPTHS_M = (3.5, 45.0)
-"""Nearest and farthest middle of a thing; with KITTI's rig 110 and 9 px of disparity."""
+"""Nearest and farthest centre of an object of clutter; with KITTI's rig 110 and 9 px of
+disparity."""
 
 _PLAIN = ("paint", "skin", "glass", "plaster", "metal")
 _RICH = ("pavement", "grass", "brick", "stone", "concrete", "roof", "bark", "leaf", "wood", "side",
          "pane", "plate", "sign", "poster", "cloth", "dirt", "hills")  # fmt: skip
 _PLAIN_SHARE = 0.3
 _SHAPES = ("ball", "box", "box", "card", "pole", "pole", "fence", "wheel", "lattice", "leaves")
-"""What clutter is made of; one is named as often as it is met."""
+"""Kinds of objects of clutter; a kind is repeated in proportion to how often it is drawn."""
 
 
 def make_clutter(seed: tuple[int, ...]) -> StreetScene:
@@ -232,9 +245,9 @@ def make_clutter(seed: tuple[int, ...]) -> StreetScene:
         b.thing += 1
         b.rectangle(corner, along, up, random_surface(rng, rng.uniform(0.5, 4)))
 
-    # A ground, somewhat aslant; a wall across the view and a ground; or the inside of a box.
-    kind = int(rng.integers(3))
-    if kind == 2:
+    # The backdrop: a slightly slanted ground; a ground and a wall; or the inside of a box.
+    backdrop = int(rng.integers(3))
+    if backdrop == 2:
         half = rng.uniform(3, 14)
         depth = rng.uniform(8, 45)
         floor = rng.uniform(1, 3)
@@ -246,15 +259,16 @@ def make_clutter(seed: tuple[int, ...]) -> StreetScene:
             sheet([x, floor, 0], [0, 0, depth], up)
         if rng.random() < 0.6:
             sheet([-half, top, 0], [2 * half, 0, 0], [0, 0, depth])
-    elif kind == 1:
+    elif backdrop == 1:
         turn = rng.uniform(-0.9, 0.9)
         z = rng.uniform(18, 60)
         along = np.array([np.cos(turn), rng.normal(0, 0.1), np.sin(turn)]) * 300
         sheet(np.array([0, 20, z]) - along / 2, along, [0, -40, rng.normal(0, 10)])
-    if kind != 2:
+    if backdrop != 2:
         y = rng.uniform(1.0, 3.0)
         slope = rng.normal(0, 0.02)
         sheet([-150, y, 0], [300, rng.normal(0, 8), 0], [0, slope * 300, 300])
+
     for _ in range(int(rng.integers(12, 60))):
         b.thing += 1
         z = log_uniform(rng, *_DEPTHS_M)
@@ -262,8 +276,9 @@ def make_clutter(seed: tuple[int, ...]) -> StreetScene:
         size_m = min(z, 25.0) * log_uniform(rng, 0.03, 0.3)
         add_shape(b, _SHAPES[int(rng.integers(len(_SHAPES)))], centre, size_m)
     mesh = b.finish()
-    # Nothing may come nearer than the rig's largest disparity allows; but a backdrop reaches behind
-    # the camera, and its triangles are large.
+
+    # No object may be nearer than the rig's largest disparity allows. The backdrop reaches behind
+    # the camera, and is told by its large triangles.
     is_far = mesh.corners[:, :, 2].min(1) > 0.85 * _DEPTHS_M[0]
     is_far_enough = is_far | (np.ptp(mesh.corners, axis=1).max(1) > _DEPTHS_M[0])
     return StreetScene(
@@ -278,7 +293,7 @@ def make_clutter(seed: tuple[int, ...]) -> StreetScene:
 
 
 def random_surface(rng: np.random.Generator, size_m: float) -> Surface:
-    """Anything of any colour, from nearly black to nearly white, mostly pale."""
+    """Draw a surface of any material and colour for an object of ``size_m``, mostly pale ones."""
     names = _PLAIN if rng.random() < _PLAIN_SHARE else _RICH
     tile_m = size_m * log_uniform(rng, 0.15, 3.0)
     material = names[int(rng.integers(len(names)))]
@@ -288,14 +303,14 @@ def random_surface(rng: np.random.Generator, size_m: float) -> Surface:
 
 
 def random_rotation(rng: np.random.Generator) -> Rotation:
-    """Any rotation, all equally likely."""
+    """Draw a uniformly distributed rotation."""
     q, r = np.linalg.qr(rng.normal(size=(3, 3)))
     q = q * np.sign(np.diag(r))
     return q * np.sign(np.linalg.det(q))
 
 
 def add_shape(b: MeshBuilder, kind: str, centre: np.ndarray, size_m: float) -> None:
-    """Add one of ``_SHAPES`` about a point."""
+    """Add an object of a kind of ``_SHAPES`` about a point, with a random surface and shape."""
     rng = b.rng
     match kind:
         case "ball":
@@ -318,7 +333,7 @@ def add_shape(b: MeshBuilder, kind: str, centre: np.ndarray, size_m: float) -> N
             radius = size_m * log_uniform(rng, 0.01, 0.2)
             radii = (radius, radius * rng.uniform(0.3, 1))
             b.tube(centre - half, centre + half, radii, random_surface(rng, size_m), 10)
-        case "fence":  # bars side by side: what repeats has many matches
+        case "fence":  # bars side by side: repetition has many matches
             turn = rng.uniform(-0.8, 0.8)
             along = np.array([np.cos(turn), 0, np.sin(turn)]) * size_m * rng.uniform(1, 3)
             up = np.array([0, size_m / 2, 0])
@@ -331,7 +346,7 @@ def add_shape(b: MeshBuilder, kind: str, centre: np.ndarray, size_m: float) -> N
             for height in (-0.8, 0.8):
                 middle = centre + height * up
                 b.tube(middle - along / 2, middle + along / 2, radius, surface)
-        case "wheel":  # a rim with spokes: what lies behind is seen through the gaps
+        case "wheel":  # a rim with spokes: the background is visible through the gaps
             R = random_rotation(rng) if rng.random() < 0.5 else np.eye(3)
             surface = random_surface(rng, size_m)
             radius = size_m * rng.uniform(0.5, 1.2)

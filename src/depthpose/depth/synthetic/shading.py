@@ -1,6 +1,6 @@
-"""The light (linear RGB) from each seen point and from the sky, with shadows and paint on the road.
+"""Light (linear RGB) of visible points and of the sky, with shadows and the markings of the road.
 
-A stage is a scene made ready for drawing: its triangles as tensors, shadows, openness to the sky.
+A stage is a scene prepared for drawing: its triangles as tensors, and its shadow maps.
 """
 
 from dataclasses import dataclass
@@ -18,15 +18,16 @@ from depthpose.depth.synthetic.scene import StreetScene
 
 _SUN_MAPS = ((18.0, (-3.0, 36.0), 1024), (60.0, (-5.0, 115.0), 768))
 _SKY_MAP = (28.0, (-3.0, 64.0), 512)
-"""Half width, reach [m] and side [px] of the maps that look along the light."""
+"""Half width, range ahead [m] and side [px] of the shadow maps of sun and sky."""
 
 _GROUND = ("road", "pavement", "grass", "dirt", "curb", "hills")
-"""Nearly flat: it casts no shadow that is seen, and would cover these maps several times."""
+"""Nearly flat materials: they cast no visible shadow, and would cover the shadow maps several
+times."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LightMap:
-    """How far along the light the first surface lies: what is beyond is in shadow."""
+    """A shadow map: depth of the first surface along a light; points beyond it are in shadow."""
 
     depth_m: Float[Tensor, "side side"]
     rotation: Float[Tensor, "3 3"]  # from the camera's frame to that of the light
@@ -35,62 +36,68 @@ class LightMap:
     texel_m: float  # the larger of its two pixel sizes
 
     def place(self, points: Vectors) -> tuple[Tensor, Tensor, Tensor]:
-        """Column and row [px], and depth along the light [m]."""
-        turned = points @ self.rotation.T
-        column, row = ((turned[:, :2] - self.low) * self.pixels_per_m).unbind(1)
-        return column, row, turned[:, 2]
+        """Project points to the map: column and row [px], and depth along the light [m]."""
+        rotated = points @ self.rotation.T
+        column, row = ((rotated[:, :2] - self.low) * self.pixels_per_m).unbind(1)
+        return column, row, rotated[:, 2]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Stage:
-    """What drawing looks up; vectors are unit vectors in the left camera's frame."""
+    """A scene prepared for drawing; vectors are unit vectors in the left camera's frame."""
 
     scene: StreetScene
     corners: Float[Tensor, "n 3 3"]  # triangles in the left camera's frame [m]
-    # A row a triangle: uv (6), normals (9), tint (3), plane normal (3) and texels a metre (1).
+    # For each triangle: uv (6), normals (9), tint (3), plane normal (3), texels per metre (1).
     attributes: Float[Tensor, "n 22"]
     material: Indices  # number of the material
     layer: Indices  # number of the texture
-    kind: Indices  # equal where no edge shows: same thing, same material
+    kind: Indices  # equal where there is no visible edge: same object, same material
     to_sun: Float[Tensor, "3"]
     up: Float[Tensor, "3"]  # towards the sky
-    sun_maps: list[LightMap]  # near and far shadows; none under clouds
-    sky_map: LightMap  # what lies above
+    sun_maps: list[LightMap]  # near and far shadow maps; none under clouds
+    sky_map: LightMap  # surfaces above each point
 
 
 def prepare(scene: StreetScene, pixels: int = 1242 * 375) -> Stage:
-    """Make a scene ready for drawing."""
-    share = float(np.clip((pixels / (1242 * 375)) ** (1 / 3), 0.4, 1))
+    """Prepare a scene for drawing; shadow maps are finer for pictures of more pixels."""
+    size_share = float(np.clip((pixels / (1242 * 375)) ** (1 / 3), 0.4, 1))
     mesh = scene.mesh
     corners = torch.from_numpy(mesh.corners)
-    uv = torch.from_numpy(mesh.uv)
-    turn = torch.from_numpy(scene.camera_from_world).float()
-    to_sun = turn @ torch.from_numpy(scene.weather.sun).float()
-    up = turn @ torch.tensor([0.0, -1, 0])
     material = torch.from_numpy(mesh.material.astype(np.int64))
-    hides = torch.ones(len(MATERIALS), dtype=torch.bool)
-    hides[[NUMBER[name] for name in _GROUND]] = False
-    casters = corners[hides[material]]
-    across = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+    # Attributes of the triangles; texels per metre from areas in the texture and in space.
+    uv = torch.from_numpy(mesh.uv)
+    normal_m2 = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     a = uv[:, 1] - uv[:, 0]
     b = uv[:, 2] - uv[:, 0]
-    tiles = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).abs()
-    texels_per_m = (tiles / across.norm(dim=1).clamp(min=1e-12)).sqrt().clamp(1e-4, 50) * SIDE_PX
+    uv_area = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).abs()
+    tiles_per_m = (uv_area / normal_m2.norm(dim=1).clamp(min=1e-12)).sqrt().clamp(1e-4, 50)
     normals = torch.from_numpy(mesh.normals)
     tint = torch.from_numpy(mesh.tint)
-    parts = uv.flatten(1), normals.flatten(1), tint, F.normalize(across, dim=1)
-    maps = () if scene.weather.is_overcast else _SUN_MAPS
+    plane_normal = F.normalize(normal_m2, dim=1)
+    texels_per_m = (tiles_per_m * SIDE_PX)[:, None]
+    attributes = [uv.flatten(1), normals.flatten(1), tint, plane_normal, texels_per_m]
+
+    # Shadow maps of all but the ground.
+    rotation = torch.from_numpy(scene.camera_from_world).float()
+    to_sun = rotation @ torch.from_numpy(scene.weather.sun).float()
+    up = rotation @ torch.tensor([0.0, -1, 0])
+    casts_shadow = torch.ones(len(MATERIALS), dtype=torch.bool)
+    casts_shadow[[NUMBER[name] for name in _GROUND]] = False
+    casters = corners[casts_shadow[material]]
+    sun_maps = () if scene.weather.is_overcast else _SUN_MAPS
     return Stage(
         scene=scene,
         corners=corners,
-        attributes=torch.cat([*parts, texels_per_m[:, None]], 1),
+        attributes=torch.cat(attributes, 1),
         material=material,
         layer=torch.from_numpy(mesh.layer.astype(np.int64)),
         kind=torch.from_numpy(mesh.thing.astype(np.int64)) * len(MATERIALS) + material,
         to_sun=to_sun,
         up=up,
-        sun_maps=[_light_map(casters, to_sun, *light_map, share) for light_map in maps],
-        sky_map=_light_map(casters, up, *_SKY_MAP, share),
+        sun_maps=[_light_map(casters, to_sun, *sun_map, size_share) for sun_map in sun_maps],
+        sky_map=_light_map(casters, up, *_SKY_MAP, size_share),
     )
 
 
@@ -105,12 +112,12 @@ def _light_map(
     """Draw a shadow map: the depth along a light, over a part of the scene before the camera.
 
     Args:
-        corners: of all triangles [m].
+        corners: of the triangles that cast shadows [m].
         to_light: direction to the light.
-        half_m: the part reaches so far to the left and to the right.
-        reach_m: and from so far to so far ahead.
+        half_m: extent of that part to the left and to the right.
+        reach_m: its nearest and farthest distance ahead.
         full_px: side of the map at full size.
-        share: of that size.
+        share: of the full size.
     """
     side_px = round(full_px * share)
     away = F.normalize(-to_light, dim=0)
@@ -137,11 +144,11 @@ def _light_map(
 
 
 def _sunlit_share(stage: Stage, points: Vectors, normals: Vectors) -> Numbers:
-    """How much of the sun reaches each point: 0 in shadow, 1 lit, soft over a texel."""
+    """Give the share of the sun that reaches each point: 0 in shadow, 1 lit, soft over a texel."""
     lit = torch.ones(len(points))
-    # From the far map to the near one, which is finer and has the last word.
+    # From the far map to the near one, which is finer and replaces it.
     for light in reversed(stage.sun_maps):
-        # Lifted off the surface, or its own texels would shade it in stripes.
+        # Points are lifted off their surface, or it would shade itself in stripes.
         column, row, depth_m = light.place(points + normals * (2 * light.texel_m))
         side = len(light.depth_m)
         is_inside = (column > 1) & (row > 1) & (column < side - 3) & (row < side - 3)
@@ -152,11 +159,11 @@ def _sunlit_share(stage: Stage, points: Vectors, normals: Vectors) -> Numbers:
         start = top.long() * side + left.long()
         flat = light.depth_m.flatten()
         limit = depth_m - 0.8 * light.texel_m
-        a, b, c, d = (
+        upper_left, upper_right, lower_left, lower_right = (
             (flat.index_select(0, start + step) >= limit).float() for step in (0, 1, side, side + 1)
         )
-        upper = torch.lerp(a, b, across)
-        lower = torch.lerp(c, d, across)
+        upper = torch.lerp(upper_left, upper_right, across)
+        lower = torch.lerp(lower_left, lower_right, across)
         lit = torch.where(is_inside, torch.lerp(upper, lower, down).clamp(0, 1), lit)
     return lit
 
@@ -164,7 +171,7 @@ def _sunlit_share(stage: Stage, points: Vectors, normals: Vectors) -> Numbers:
 def _open_share(light: LightMap, points: Vectors) -> Numbers:
     """Estimate how open each point is to the sky (ambient occlusion), 0 to 1.
 
-    Each of five places around it on the light map that is higher hides a part of the sky.
+    Of five texels around a point on the sky's map, each that is higher hides a part of the sky.
     """
     column, row, depth_m = light.place(points)
     side = len(light.depth_m)
@@ -187,7 +194,7 @@ _CHUNK = 1 << 17
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Hits:
-    """Where rays hit triangles."""
+    """Points where rays hit triangles."""
 
     primitive: Indices  # number of the triangle
     barycentric: Vectors  # shares of its corners
@@ -197,19 +204,21 @@ class Hits:
 
 
 def shade(stage: Stage, hits: Hits, focal_px: float) -> Vectors:
-    """Give the light from each hit towards the camera."""
-    parts = {name: values.split(_CHUNK) for name, values in vars(hits).items()}
-    chunks = (
-        Hits(**dict(zip(parts, some, strict=True))) for some in zip(*parts.values(), strict=True)
+    """Give the light from each hit towards the camera, as :func:`_shade` does, in chunks."""
+    names = vars(hits)
+    chunks = zip(*(values.split(_CHUNK) for values in names.values()), strict=True)
+    return torch.cat(
+        [_shade(stage, Hits(**dict(zip(names, chunk, strict=True))), focal_px) for chunk in chunks]
     )
-    return torch.cat([_shade(stage, some, focal_px) for some in chunks])
 
 
 def _shade(stage: Stage, hits: Hits, focal_px: float) -> Vectors:
-    """Give the linear colour of each point that a ray hits, with light, glare and haze."""
+    """Give the linear RGB from each hit towards the camera: sun, sky, reflections and haze."""
     rows = stage.attributes.index_select(0, hits.primitive)
-    material, layer = (n.index_select(0, hits.primitive) for n in (stage.material, stage.layer))
-    # The triangle's own normal, and a smooth one; both look to the camera.
+    material = stage.material.index_select(0, hits.primitive)
+    layer = stage.layer.index_select(0, hits.primitive)
+
+    # The normal of the triangle's plane, and the interpolated one; both face the camera.
     plane = rows[:, 18:21]
     facing = _dot(plane, hits.towards)
     plane = torch.where(facing[:, None] > 0, -plane, plane)
@@ -221,12 +230,13 @@ def _shade(stage: Stage, hits: Hits, focal_px: float) -> Vectors:
     normal = normal / _dot(normal, normal).sqrt()[:, None]
     normal = torch.where((_dot(normal, plane) < 0)[:, None], -normal, normal)
 
+    # The colour by texture. Its level is a compromise between the pixel footprint's width and its
+    # length, which grows with the slant.
     footprint_m = hits.distance_m / focal_px
-    # A compromise between the footprint's width and its length, which grows when seen aslant.
     level = torch.log2(footprint_m * rows[:, 21] * facing.abs().clamp(min=0.03) ** -0.6 + 1e-9)
     albedo = surfaces.sample_texture(surfaces.textures(), layer, uv, level) * rows[:, 15:18]
 
-    # Unevenness over metres hides that textures repeat.
+    # Stains over metres hide that textures repeat.
     weather = stage.scene.weather
     points = hits.points
     u = points[:, 0] * 0.021 + points[:, 1] * 0.013 + weather.shift[0]
@@ -251,16 +261,16 @@ def _shade(stage: Stage, hits: Hits, focal_px: float) -> Vectors:
         lit[reached] = _sunlit_share(stage, points[reached], plane[reached])
     sun_color = torch.from_numpy(weather.sun_color).float()
 
-    # Light of the sky, as far as it is not hidden.
+    # Light of the sky, as far as it is not occluded.
     upward = 0.5 + 0.5 * (normal @ stage.up)
     openness = _open_share(stage.sky_map, points + 0.05 * plane)
     sky = torch.from_numpy(0.5 * (weather.zenith + weather.horizon)).float()
     ambient = ((0.09 + 0.26 * upward) * openness)[:, None] * sky
-    # Light that the ground throws back.
+    # Light that the ground reflects.
     bounced = ((1 - upward) * openness * 0.045)[:, None] * sun_color
     color = albedo * ((sun * lit)[:, None] * sun_color + ambient + bounced)
     color += albedo * (2 * _GLOW[material])[:, None]
-    _add_mirrored(stage, hits.towards, normal, _SPECULAR[material], lit, color)
+    _add_reflections(stage, hits.towards, normal, _SPECULAR[material], lit, color)
 
     haze_share = 1 - torch.exp(-hits.distance_m / weather.haze_m)
     haze = torch.from_numpy(weather.horizon).float() * 0.7
@@ -268,37 +278,49 @@ def _shade(stage: Stage, hits: Hits, focal_px: float) -> Vectors:
 
 
 def _dot(a: Vectors, b: Vectors) -> Numbers:
-    """Written out: a sum over so short an axis would take ten times as long."""
+    """Give the dot product of each row; a sum over so short an axis takes ten times as long."""
     return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
 
 
-def _add_mirrored(
+def _add_reflections(
     stage: Stage, towards: Vectors, normal: Vectors, mirror: Numbers, lit: Numbers, color: Vectors
 ) -> None:
-    """Mix in what glass, paint and metal mirror: the sky, a made-up skyline, the sun."""
-    some = (mirror > 0).nonzero()[:, 0]
-    if not len(some):
+    """Add the reflections in glass, paint and metal to ``color``: sky, a skyline and the sun.
+
+    Args:
+        stage: the scene.
+        towards: unit vectors along the rays.
+        normal: unit normals of the surfaces.
+        mirror: reflectance at normal incidence.
+        lit: share of the sun that reaches the points.
+        color: linear RGB, which is changed in place.
+    """
+    glossy = (mirror > 0).nonzero()[:, 0]
+    if not len(glossy):
         return
-    normal = normal[some]
-    towards = towards[some]
-    mirror = mirror[some]
+    normal = normal[glossy]
+    towards = towards[glossy]
+    mirror = mirror[glossy]
     aligned = _dot(towards, normal)
     mirrored = towards - 2 * aligned[:, None] * normal
-    share = mirror + (1 - mirror) * (1 + aligned.clamp(-1, 0)) ** 5
+    share = mirror + (1 - mirror) * (1 + aligned.clamp(-1, 0)) ** 5  # Schlick's approximation
     light = sky_light(stage, mirrored, with_sun=False)
     turn = torch.atan2(mirrored[:, 0], mirrored[:, 2])
     shift = 6.3 * stage.scene.weather.shift[0]
     skyline = 0.14 + 0.12 * torch.sin(turn * 5 + shift) + 0.07 * torch.sin(turn * 17 + 2 * shift)
     hidden = torch.sigmoid((skyline - mirrored @ stage.up) * 25)
     light *= (1 - 0.78 * hidden)[:, None]
-    glint = 2 * lit[some] * (mirrored @ stage.to_sun).clamp(min=0) ** 300
+    glint = 2 * lit[glossy] * (mirrored @ stage.to_sun).clamp(min=0) ** 300
     sun_color = torch.from_numpy(stage.scene.weather.sun_color).float()
-    diffuse = color[some] * (1 - share)[:, None]
-    color[some] = diffuse + share[:, None] * light + glint[:, None] * sun_color
+    diffuse = color[glossy] * (1 - share)[:, None]
+    color[glossy] = diffuse + share[:, None] * light + glint[:, None] * sun_color
 
 
 def sky_light(stage: Stage, towards: Vectors, *, with_sun: bool = True) -> Vectors:
-    """Give the light of the sky (and of the ground, below) from each direction."""
+    """Give the linear RGB of the sky, or below the horizon of the ground, in each direction.
+
+    ``towards``: unit vectors away from the camera. ``with_sun``: the sun's disc too.
+    """
     weather = stage.scene.weather
     height = towards @ stage.up
     zenith, horizon, sun_color = (
@@ -324,6 +346,7 @@ def sky_light(stage: Stage, towards: Vectors, *, with_sun: bool = True) -> Vecto
 
 
 _PATCH_M = 9.0
+"""Length of the stretches of road, of which each may have a patch or a manhole."""
 
 
 def _paint_road(
@@ -333,7 +356,15 @@ def _paint_road(
     width_m: Numbers,
     length_m: Numbers,
 ) -> Vectors:
-    """Give the colour of the asphalt with what is painted on it, at places (x, s) of the road."""
+    """Add markings, wheel tracks, patches and seams to the colour of the asphalt.
+
+    Args:
+        scene: the street.
+        albedo: of the asphalt.
+        place_m: coordinates (x, s) on the road.
+        width_m: width of the pixels' footprints.
+        length_m: their length along the road.
+    """
     x, s = place_m.unbind(1)
 
     # Lines along the road and bars across it, each as a share of the pixel's footprint: far ones
@@ -377,13 +408,16 @@ def _paint_road(
 
 
 def _inside(off: Tensor, half: float, foot: Tensor) -> Tensor:
-    """Share of a footprint that lies within ``half`` of a line."""
+    """Give the share of a footprint of size ``foot`` that lies within ``half`` of a line.
+
+    ``off``: distance of the footprint's centre from the line.
+    """
     foot = foot.clamp(min=1e-3)
     return ((half - off.abs()) / foot + 0.5).clamp(0, 1) * (2 * half / foot).clamp(max=1)
 
 
 def _looked_up(field: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """Values of a field of noise, which repeats, at places in tiles."""
+    """Look up a repeating field of noise at places that are counted in tiles."""
     column = (u * SIDE_PX).long() % SIDE_PX
     row = (v * SIDE_PX).long() % SIDE_PX
     return field.flatten().index_select(0, row * SIDE_PX + column)

@@ -1,4 +1,4 @@
-"""Pairs, on disk or rendered, as training samples by index."""
+"""Training samples by index: pairs on disk, or rendered while training."""
 
 import warnings
 from collections import Counter
@@ -11,7 +11,7 @@ from depthpose.core.errors import InputError, Notice
 from depthpose.core.loop import sample_generator, shuffled_index
 from depthpose.depth.augment import TrainingPair, augment, scale_pair
 from depthpose.depth.config import PairsConfig, TruthKind
-from depthpose.depth.datasets import Dataset, known_truths, lidar_truth, open_dataset
+from depthpose.depth.datasets import Dataset, Frame, known_truths, lidar_truth, open_dataset
 from depthpose.depth.disparity import disparity_from_depth, right_disparity_from_left
 from depthpose.depth.synthetic import Streets, kitti_rig
 from depthpose.depth.types import Map
@@ -20,8 +20,8 @@ BASELINE_TOLERANCE = 0.02
 """Relative difference of baselines that one virtual rig may stand for: KITTI's differ by 1.4 %."""
 
 
-class _Place(NamedTuple):
-    """Where a pair comes from: a source, its number there, and the truth that is read."""
+class _PairRef(NamedTuple):
+    """Reference to a pair: its source, its number there, and the kind of truth that is read."""
 
     source: Dataset | Streets
     number: int
@@ -29,18 +29,18 @@ class _Place(NamedTuple):
 
 
 class TrainingPairs:
-    """Frames of several folders, each sample a random one, randomly changed.
+    """Pairs of several folders and rendered streets, shuffled and randomly changed.
 
     Args:
-        config: which pairs, and how.
-        seed: decides order and changes.
+        config: which pairs, and how they are changed.
+        seed: of the order and the changes.
         needs_truth: read truth, and leave out frames without the kind that ``config.truth`` names.
-        is_mixed: take frames without truth, and frames without a right view, too. A left image
-            alone stands for both views.
-        baseline_m: refuse pairs whose baseline is another (beyond 2 %).
+        is_mixed: use frames without truth, and frames without a right view, too. The left image of
+            the latter stands for both views.
+        baseline_m: refuse pairs whose baseline differs from it by more than 2 %.
 
     Attributes:
-        frames: those of folders, not what is rendered.
+        frames: frames of the folders, without the rendered streets.
         truths: which kind of truth each source gives, ``NAME: KIND``; empty where none is needed.
 
     Raises:
@@ -63,17 +63,17 @@ class TrainingPairs:
         if not config.folders and config.streets is None:
             raise InputError("there is nothing to train on: name a folder of pairs (--data PATH).")
 
-        # Where the pairs are: rendered streets, and frames of folders.
-        sources: list[list[_Place]] = []
+        # The pairs of each source: rendered streets, and folders.
+        sources: list[list[_PairRef]] = []
         if config.streets is not None:
             streets = Streets(config.streets)
             exact: TruthKind | None = "disparity" if needs_truth else None
-            sources.append([_Place(streets, k, exact) for k in range(len(streets))])
+            sources.append([_PairRef(streets, number, exact) for number in range(len(streets))])
         excluded = set(config.exclude)
-        for number, folder in enumerate(config.folders):
-            dataset = open_dataset(folder, config.split if number == 0 else None)
+        for folder_number, folder in enumerate(config.folders):
+            dataset = open_dataset(folder, config.split if folder_number == 0 else None)
             excluded -= {frame.name for frame in dataset.frames}
-            usable = _usable_places(dataset, config, needs_truth=needs_truth, is_mixed=is_mixed)
+            usable = _usable_pairs(dataset, config, needs_truth=needs_truth, is_mixed=is_mixed)
             sources.append(usable)
         if excluded:
             raise InputError(
@@ -81,33 +81,35 @@ class TrainingPairs:
                 "train on what should be left out"
             )
 
-        # At most so many of each source, at equal distances: neighbours in a drive look alike.
-        self._places: list[_Place] = []
-        for places in sources:
-            most = len(places) if config.limit is None else min(config.limit, len(places))
-            last = len(places) - 1
-            self._places += [places[round(k * last / max(most - 1, 1))] for k in range(most)]
+        # At most ``limit`` pairs of each source, evenly spread: neighbours in a drive look alike.
+        self._refs: list[_PairRef] = []
+        for refs in sources:
+            count = len(refs) if config.limit is None else min(config.limit, len(refs))
+            last = len(refs) - 1
+            self._refs += [refs[round(k * last / max(count - 1, 1))] for k in range(count)]
 
-        # What they are called, and which truth each source has.
-        numbered = ((source, number) for source, number, _ in self._places)
-        self.frames = [source.frames[n] for source, n in numbered if isinstance(source, Dataset)]
-        names = (
-            (source.name if isinstance(source, Dataset) else _STREETS, truth)
-            for source, _, truth in self._places
-        )
-        self.truths = tuple(dict.fromkeys(f"{name}: {truth}" for name, truth in names if truth))
+        # The frames on disk, and the truth of each source.
+        self.frames: list[Frame] = []
+        truths: dict[str, None] = {}  # in order, each once
+        for source, number, truth in self._refs:
+            if isinstance(source, Dataset):
+                self.frames.append(source.frames[number])
+            if truth is not None:
+                name = source.name if isinstance(source, Dataset) else _STREETS
+                truths[f"{name}: {truth}"] = None
+        self.truths = tuple(truths)
         self._cache: dict[int, TrainingPair] = {}
         if baseline_m is not None:
             self._refuse_other_rigs(baseline_m)
 
     def _refuse_other_rigs(self, baseline_m: float) -> None:
-        """Refuse pairs of another baseline, before any work: it would change the metric scale."""
+        """Refuse pairs of another baseline, which would change the metric scale."""
         rigs = {
             source.frames[number].name: source.read_rig(number)
-            for source, number, _ in self._places
+            for source, number, _ in self._refs
             if isinstance(source, Dataset)
         }
-        if self.config.streets is not None:  # five rigs, and perhaps millions of streets
+        if self.config.streets is not None:  # perhaps millions of streets, but of five rigs
             rigs |= {f"street with KITTI's rig {n}": kitti_rig(n) for n in range(5)}
         for name, rig in rigs.items():
             if rig is None:
@@ -123,10 +125,10 @@ class TrainingPairs:
                 )
 
     def __len__(self) -> int:
-        return len(self._places)
+        return len(self._refs)
 
     def __getitem__(self, sample_index: int) -> TrainingPair:
-        """Make the n-th sample."""
+        """Make a sample: a random pair, randomly changed."""
         index = shuffled_index(sample_index, len(self), self.seed)
         generator = sample_generator(sample_index, self.seed)
         return augment(self.read(index), self.config.augment, generator)
@@ -143,8 +145,8 @@ class TrainingPairs:
         return cached._replace(left=cached.left.float() / 255, right=cached.right.float() / 255)
 
     def _read(self, index: int) -> TrainingPair:
-        """Read a pair, and its truth if it is needed; 0 in the sky, where that is known."""
-        source, number, kind = self._places[index]
+        """Read a pair and its truth, if that is needed; disparity is 0 in the sky where known."""
+        source, number, kind = self._refs[index]
         if isinstance(source, Dataset):
             name = source.frames[number].name
             views = source.read_input(number)
@@ -162,7 +164,7 @@ class TrainingPairs:
         if left_px is None:
             left_px = torch.full_like(views.left[0], torch.nan)
         right = views.right
-        if right is None:  # of an image alone: a sample says that it has no right view
+        if right is None:  # a single image: it stands for both views
             right = views.left
             right_px = left_px
         elif right_px is None:
@@ -170,21 +172,27 @@ class TrainingPairs:
         focal_px = torch.tensor(torch.nan if rig is None else float(rig.K[0, 0]))
         pair = TrainingPair(views.left, right, left_px, right_px, focal_px)
 
-        wanted_px = self.config.focal_px
-        if wanted_px is None:
+        target_focal_px = self.config.focal_px
+        if target_focal_px is None:
             return pair
         if rig is None:
             raise InputError(
                 f"{name}: has no calibration, so it cannot be brought to a "
-                f"focal length of {wanted_px} px; add one, exclude it, or leave focal_px out"
+                f"focal length of {target_focal_px} px; add one, exclude it, or leave focal_px out"
             )
-        return scale_pair(pair, wanted_px / float(focal_px))
+        return scale_pair(pair, target_focal_px / float(focal_px))
 
 
 def _truth_of_frame(
     dataset: Dataset, number: int, kind: TruthKind | None, rig: StereoRig | None
 ) -> Map | None:
-    """Read the disparity of a frame's left view [px] from its kind of truth; None without one."""
+    """Read the true disparity of a frame's left view [px] from a kind of truth, 0 in the sky.
+
+    None where ``kind`` is None. ``rig``: of the frame, which converts depth.
+
+    Raises:
+        InputError: the truth is depth, and there is no rig.
+    """
     if kind is None:
         return None
     if kind == "disparity":
@@ -206,16 +214,22 @@ def _truth_of_frame(
 
 
 def _with_sky_at_zero(exact_px: Map | None, kind: TruthKind | None) -> Map | None:
-    """Give the exact disparity of a made view, 0 in the sky; None where no truth is wanted."""
+    """Set the disparity of a rendered view to 0 in the sky; None where no truth is needed."""
     return None if exact_px is None or kind is None else exact_px.nan_to_num(0.0)
 
 
-def _usable_places(
+def _usable_pairs(
     dataset: Dataset, config: PairsConfig, *, needs_truth: bool, is_mixed: bool
-) -> list[_Place]:
-    """Frames of a folder that can be learnt from, all with one kind of truth if it is needed."""
+) -> list[_PairRef]:
+    """List the pairs of a folder that can be learnt from, with one kind of truth if it is needed.
+
+    ``is_mixed``: frames without truth, and those without a right view, count too.
+
+    Raises:
+        InputError: no frame can be used, or none has the truth of the config, or the folder has
+            several kinds of truth and the config chooses none.
+    """
     name = dataset.name
-    wanted = config.truth
 
     # The kinds of truth of each frame that has the views.
     kinds_by_index = {
@@ -223,9 +237,9 @@ def _usable_places(
         for index, frame in enumerate(dataset.frames)
         if (frame.right is not None or is_mixed) and frame.name not in config.exclude
     }
-    alone = sum(frame.right is None for frame in dataset.frames)
-    if alone and not is_mixed and kinds_by_index:
-        message = f"{name}: {alone} of {len(dataset)} images have no right view, and are left out"
+    single = sum(frame.right is None for frame in dataset.frames)
+    if single and not is_mixed and kinds_by_index:
+        message = f"{name}: {single} of {len(dataset)} images have no right view, and are left out"
         warnings.warn(message, Notice, stacklevel=2)
 
     # One kind is learnt from: the config's, or the only one that there is.
@@ -235,31 +249,33 @@ def _usable_places(
             kind for kinds in kinds_by_index.values() for kind in kinds
         )
         listed = ", ".join(f"{kind} of {count} frames" for kind, count in counts.items())
-        if wanted is not None and counts and wanted not in counts:
-            raise InputError(f"{name}: no frame has truth: {wanted}; there is {listed}")
-        if wanted is None and len(counts) > 1:
+        if config.truth is not None and counts and config.truth not in counts:
+            raise InputError(f"{name}: no frame has truth: {config.truth}; there is {listed}")
+        if config.truth is None and len(counts) > 1:
             raise InputError(
                 f"{name}: has several kinds of truth ({listed}), and one kind alone is learnt "
                 "from; set truth in pairs (or held_out) of the config to one of "
                 f"{', '.join(counts)}"
             )
-        kind = wanted or next(iter(counts), None)
+        kind = config.truth or next(iter(counts), None)
 
     # Frames with that truth; where sources are mixed, pairs without truth too.
-    places = [
-        _Place(dataset, index, kind if kind in kinds else None)
+    refs = [
+        _PairRef(dataset, index, kind if kind in kinds else None)
         for index, kinds in kinds_by_index.items()
     ]
-    if is_mixed:  # an image alone without truth teaches nothing
-        usable = [p for p in places if p.truth or dataset.frames[p.number].right is not None]
+    if is_mixed:  # a single image without truth teaches nothing
+        usable = [ref for ref in refs if ref.truth or dataset.frames[ref.number].right is not None]
     else:
-        usable = [p for p in places if p.truth or not needs_truth]
+        usable = [ref for ref in refs if ref.truth or not needs_truth]
     if not usable:
-        what = " or ".join if is_mixed else " and ".join
-        parts = ["a right view", "a truth"] if needs_truth or is_mixed else ["a right view"]
-        raise InputError(f"{name}: no frame has {what(parts)}; nothing to train on.")
+        if is_mixed:
+            needed = "a right view or a truth"
+        else:
+            needed = "a right view and a truth" if needs_truth else "a right view"
+        raise InputError(f"{name}: no frame has {needed}; nothing to train on.")
     return usable
 
 
 _STREETS = "synthetic streets"
-"""As ``run.json`` names them: a resumed training compares the names."""
+"""Name of rendered streets in ``run.json``, which a resumed training compares."""

@@ -1,6 +1,6 @@
-"""A config to a trained weights file: how networks begin, and the stages as commands run them."""
+"""The stages of a training as commands run them: from a config to a trained weights file."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
@@ -14,8 +14,8 @@ from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.core.loop import Run, Task, held_out_text, releases_folder, write_card
 from depthpose.core.run import find_rank
-from depthpose.depth.config import GeneratorConfig, SelectionConfig
-from depthpose.depth.datasets import refuse_common
+from depthpose.depth.config import GeneratorConfig, PairsConfig, SelectionConfig
+from depthpose.depth.datasets import Frame, refuse_common
 from depthpose.depth.stereo import StereoNetwork
 from depthpose.depth.synthesis import Generator, SelectionGenerator, UNetGenerator, load_encoder
 from depthpose.depth.train import stages
@@ -28,15 +28,20 @@ from depthpose.depth.train.config import (
 from depthpose.depth.train.pairs import TrainingPairs
 from depthpose.depth.weights import MATCHERS, read_generator, read_matcher, write_depth_weights
 
-_FREE_OF_WEIGHTS = ("max_disparity_px", "with_street", "least_confidence")
-"""Settings that the weights of a training do not depend on: a matcher searches any disparities in
-the same way, and which images are refused is found after a training."""
-_CAN_BE_ADDED = ("with_sky",)
-"""Parts that begin with next to no effect, so weights without them can be trained on with them."""
+_INDEPENDENT_OF_WEIGHTS = ("max_disparity_px", "with_street", "least_confidence")
+"""Settings that may differ from those of the weights that a training begins with: a matcher
+searches any disparities in the same way, and which images are refused is calibrated later."""
+_ADDABLE = ("with_sky",)
+"""Settings of parts that begin with next to no effect, so that weights without them can be trained
+further with them."""
 
 
 def refuse_frozen_random(config: SelectTraining | StereoTraining) -> None:
-    """Refuse to keep the first layers of an encoder that begins at random."""
+    """Refuse to freeze the first layers of an encoder that begins with random weights.
+
+    Raises:
+        InputError: that is so.
+    """
     if config.with_frozen_stem and config.encoder is None and config.start is None:
         raise InputError(
             "with_frozen_stem keeps the encoder's first layers as they are, and nothing says what "
@@ -46,31 +51,42 @@ def refuse_frozen_random(config: SelectTraining | StereoTraining) -> None:
 
 
 def start_from(network: Generator | StereoNetwork, loaded: nn.Module, source: str) -> None:
-    """Copy weights whose config is the network's own, but for what no weight depends on.
+    """Copy the weights of a loaded network to the network that a config trains.
 
-    What the network has beyond them keeps its beginning, where that has no effect.
+    Parts that the network has beyond them (``with_sky``) keep their initial weights.
+
+    Args:
+        network: that is trained.
+        loaded: that holds the weights.
+        source: their file, for errors.
+
+    Raises:
+        InputError: the networks differ in their kind, or in a setting on which weights depend.
     """
     if type(loaded) is not type(network):
         raise InputError(
             f"{source}: holds weights of {type(loaded).__name__}, but the config trains "
             f"{type(network).__name__}. Give weights of that network."
         )
-    wanted = config_to_dict(network.config)
+    config = config_to_dict(network.config)
     loaded_config = config_to_dict(cast("Any", loaded).config)
-    for setting, value in wanted.items():
-        is_added = setting in _CAN_BE_ADDED and value and not loaded_config[setting]
-        if loaded_config[setting] != value and setting not in _FREE_OF_WEIGHTS and not is_added:
+    for setting, value in config.items():
+        loaded_value = loaded_config[setting]
+        is_added = setting in _ADDABLE and value and not loaded_value
+        if loaded_value != value and setting not in _INDEPENDENT_OF_WEIGHTS and not is_added:
             raise InputError(
-                f"{source}: was trained with {setting} = {loaded_config[setting]!r}, but the "
+                f"{source}: was trained with {setting} = {loaded_value!r}, but the "
                 f"config says {value!r}. Give the config the weights' own."
             )
+
     state = network.state_dict()
-    network.load_state_dict(state | {k: t for k, t in loaded.state_dict().items() if k in state})
+    common = {name: tensor for name, tensor in loaded.state_dict().items() if name in state}
+    network.load_state_dict(state | common)
 
 
 def make_matcher_network(config: StereoTraining) -> StereoNetwork:
-    """Make the network that a config trains, with the weights that it begins with."""
-    kind = next(k for k in MATCHERS.values() if isinstance(config.network, k.config))
+    """Make the matcher network that a config trains, with its initial weights."""
+    kind = next(kind for kind in MATCHERS.values() if isinstance(config.network, kind.config))
     matcher = kind.network(config.network)
     if config.encoder is not None:
         if matcher.encoder is None:
@@ -86,10 +102,10 @@ def make_matcher_network(config: StereoTraining) -> StereoNetwork:
     return matcher
 
 
-_OfGenerator = TypeVar("_OfGenerator", ViewTraining, SelectTraining, FinetuneTraining)
-_BEGINS_WITH = ("start", "encoder", "generator", "matcher")
-"""Settings that may name weights."""
-_MEASURED = {
+_GeneratorTraining = TypeVar("_GeneratorTraining", ViewTraining, SelectTraining, FinetuneTraining)
+_WEIGHTS_SETTINGS = ("start", "encoder", "generator", "matcher")
+"""Settings that may name weights which a training begins with."""
+_VALIDATION_TEXTS = {
     "view": "Drawn right views of pairs that were held out: mean difference (l1) and PSNR "
     "(dB) to the real ones.",
     "select": "Depth from left images that were held out: mean relative error (abs_rel), share "
@@ -100,12 +116,12 @@ _MEASURED = {
     "finetune": "Disparity from left images that were held out, by the drawn right view: "
     "mean error (px), and the share of pixels off by more than 3 px and 5 % (d1).",
 }
-"""What the numbers of each stage's validation are."""
+"""What the numbers of each stage's validation are, for the card."""
 
 
 @releases_folder
 def train_view(config: ViewTraining, run: Run) -> Path:
-    """Train the generator; give its weights file."""
+    """Train the U-Net generator; give its weights file."""
     torch.manual_seed(config.loop.seed)
     config = _at_virtual_focal(config, config.generator)
     baseline_m = config.generator.virtual_baseline_m
@@ -148,8 +164,8 @@ def train_select(config: SelectTraining, run: Run) -> Path:
 @releases_folder
 def train_stereo(config: StereoTraining, run: Run) -> Path:
     """Train the matcher; give its weights file."""
-    # Seen with torch 2.13: gradients of a 3x3x3 convolution over two planes in 16 bits are values
-    # near 1e35 or NaN where one, three or more planes agree with fp32 within 0.5 %.
+    # With torch 2.13, gradients of a 3x3x3 convolution over two planes in 16 bits are values near
+    # 1e35 or NaN, while those over one, three or more planes agree with fp32 within 0.5 %.
     step_px = config.network.step_px
     is_two_deep = config.network.max_disparity_px == 2 * step_px
     if is_two_deep and config.loop.precision == "bf16" and not torch.cuda.is_available():
@@ -177,7 +193,8 @@ def train_finetune(config: FinetuneTraining, run: Run) -> Path:
                 "'depth train view' and 'depth train stereo' wrote)."
             )
     generator = read_generator(find_weights(config.generator))
-    if isinstance(generator, SelectionGenerator):  # what is refused is found anew
+    if isinstance(generator, SelectionGenerator):
+        # Which images are refused has to be calibrated anew.
         generator.config = replace(generator.config, least_confidence=0.0, with_street=False)
         generator.street = None
     matcher = read_matcher(find_weights(config.matcher))
@@ -205,28 +222,38 @@ def _run_stage(
     config: Any,  # noqa: ANN401
     run: Run,
 ) -> tuple[dict[str, str], float]:
-    """Claim the folder for this config, then train; give the facts of the card, and the seconds."""
-    named = {k: name for k in _BEGINS_WITH if isinstance(name := getattr(config, k, None), str)}
+    """Claim the folder for this config, and train; give the facts of the card, and the seconds.
+
+    Raises:
+        InputError: the folder belongs to another training, or held-out pairs are trained on too.
+    """
+    # What the folder is claimed for beside the config: the initial weights, truths and frames.
+    initial_weights: dict[str, str] = {}
+    for setting in _WEIGHTS_SETTINGS:
+        name = getattr(config, setting, None)
+        if isinstance(name, str):
+            initial_weights[setting] = name
     checksums: dict[str, Any] = {
-        f"{k}_sha256": file_sha256(find_weights(v)) for k, v in named.items()
+        f"{setting}_sha256": file_sha256(find_weights(name))
+        for setting, name in initial_weights.items()
     }
     if samples.truths:
         checksums["truth"] = list(samples.truths)
     sources = samples.sources if isinstance(samples, stages.SelectionSamples) else [samples]
     frames = [frame for source in sources for frame in source.frames]
     if frames:
-        digest = sha256()  # of their names and the sizes of their left images
-        for frame in frames:
-            size = frame.left.stat().st_size if frame.left.is_file() else 0  # 0: in a shard
-            digest.update(f"{frame.name} {size}\n".encode())
-        checksums["frames_sha256"] = digest.hexdigest()
+        checksums["frames_sha256"] = _frames_sha256(frames)
+
     held_out: TrainingPairs | None = getattr(task, "held_out", None)
     if held_out is not None:
         remedy = "give --held-out other pairs, or exclude these in the config"
         refuse_common(frames, held_out.frames, "pairs held out", remedy)
-    trained = [pairs for pairs in (config.pairs, getattr(config, "more", None)) if pairs]
-    data = [Path(folder).name for pairs in trained for folder in pairs.folders]
-    data += ["synthetic streets"] if any(pairs.streets for pairs in trained) else []
+
+    # The facts of the card.
+    pair_configs = [pairs for pairs in (config.pairs, getattr(config, "more", None)) if pairs]
+    data = [Path(folder).name for pairs in pair_configs for folder in pairs.folders]
+    if any(pairs.streets for pairs in pair_configs):
+        data.append("synthetic streets")
     facts = {
         "trained_on": ", ".join(data),
         "stage": type(config).__name__,
@@ -234,13 +261,23 @@ def _run_stage(
     }
     if samples.truths:
         facts["truth"] = ", ".join(samples.truths)
-    began_with = tuple(named.values())
+    began_with = tuple(initial_weights.values())
     if began_with:
         facts["began_with"] = ", ".join(Path(name).stem for name in began_with)
     facts = bound_facts(facts, began_with)
     warn_of_terms(facts)
+
     run.claim(config, ("generator", "matcher", "fakestereo"), checksums, ("held_out",))
     return facts, run.train(task, samples, config.loop)
+
+
+def _frames_sha256(frames: Sequence[Frame]) -> str:
+    """Hash the names of frames and the sizes of their left images."""
+    digest = sha256()
+    for frame in frames:
+        size = frame.left.stat().st_size if frame.left.is_file() else 0  # 0: in a shard
+        digest.update(f"{frame.name} {size}\n".encode())
+    return digest.hexdigest()
 
 
 def _write_weights(
@@ -252,29 +289,41 @@ def _write_weights(
     generator: Generator | None = None,
     matcher: StereoNetwork | None = None,
 ) -> Path:
-    """Write the weights and their card."""
-    names = [name for name, part in (("generator", generator), ("matcher", matcher)) if part]
-    path = run.folder / f"{names[0] if len(names) == 1 else 'fakestereo'}.safetensors"
+    """Write the weights and their card, by the process of rank 0; give the file of the weights."""
+    if generator is not None and matcher is not None:
+        name = "fakestereo"
+    else:
+        name = "generator" if matcher is None else "matcher"
+    path = run.folder / f"{name}.safetensors"
     if find_rank().rank:
-        return path  # statistics of batch norm are rank 0's, and so is the file
+        return path  # the statistics of batch norm that count are those of rank 0
+
     write_depth_weights(path, generator=generator, matcher=matcher, facts=facts)
-    measured = held_out_text(run.folder, _MEASURED[stage])
+    measured = held_out_text(run.folder, _VALIDATION_TEXTS[stage])
     write_card(path, f"depth train {stage}", seconds, facts, measured)
     return path
 
 
 def _at_virtual_focal(
-    config: _OfGenerator, generator: GeneratorConfig | SelectionConfig
-) -> _OfGenerator:
-    """Bring all pairs, the held-out ones too, to the rig that the generator imitates."""
+    config: _GeneratorTraining, generator: GeneratorConfig | SelectionConfig
+) -> _GeneratorTraining:
+    """Set the focal length of all pairs that leave it open to that of the generator's rig.
+
+    Raises:
+        InputError: pairs have a focal length of their own, or a scale, which the generator cannot
+            learn from.
+    """
     focal_px = generator.virtual_focal_px
-    sources = ("pairs", "more", "held_out")
-    pair_sources = {
-        name: value for name in sources if (value := getattr(config, name, None)) is not None
-    }
-    for name, pairs in pair_sources.items():
+    pair_configs: dict[str, PairsConfig] = {}
+    for name in ("pairs", "more", "held_out"):
+        pairs = getattr(config, name, None)
+        if pairs is not None:
+            pair_configs[name] = pairs
+
+    for name, pairs in pair_configs.items():
+        # A generator that selects learns from any focal length, but is validated at its own.
         if isinstance(generator, SelectionConfig) and name != "held_out":
-            continue  # it answers pixels of any image, a U-Net those of its own rig alone
+            continue
         if pairs.focal_px not in (None, focal_px):
             raise InputError(
                 f"{name}.focal_px is {pairs.focal_px}, but the generator imitates a rig of "
@@ -285,6 +334,8 @@ def _at_virtual_focal(
                 f"augment.scale of {name} is {pairs.augment.scale}: another size is another focal "
                 "length, and the generator imitates one; leave it out"
             )
-    return replace(
-        config, **{n: replace(p, focal_px=p.focal_px or focal_px) for n, p in pair_sources.items()}
-    )
+    changed: dict[str, Any] = {
+        name: replace(pairs, focal_px=pairs.focal_px or focal_px)
+        for name, pairs in pair_configs.items()
+    }
+    return replace(config, **changed)

@@ -1,12 +1,12 @@
-"""The stages of a training as tasks of one loop: what a step learns, and what is validated.
+"""The stages of a training as tasks of one loop: the losses of a step, and the validation.
 
-Those of the thesis are a generator against a discriminator, the matcher, and one through the other.
-The generator that selects learns from pairs and single images, synthetic and real, mixed.
+The thesis has three: a generator against a discriminator, the matcher, and the generator through
+the matcher. The generator that selects learns from pairs and single images, synthetic and real.
 """
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -29,11 +29,28 @@ from depthpose.depth.train.config import (
     ViewTraining,
 )
 from depthpose.depth.train.pairs import TrainingPairs
-from depthpose.depth.types import Maps
+from depthpose.depth.types import Map, Maps, Mask, View
+
+
+def _fix_norms(module: nn.Module) -> None:
+    """Let batch norms use their stored statistics in train mode too: small batches spoil them."""
+    for part in module.modules():
+        if isinstance(part, nn.BatchNorm2d | nn.BatchNorm3d):
+            part.eval()
+
+
+def _encoder_groups(
+    network: nn.Module, encoder: nn.Module, encoder_rate: float
+) -> list[dict[str, Any]]:
+    """Group parameters for the optimiser: the encoder has a share of the learning rate."""
+    encoder_parameters = set(encoder.parameters())
+    rest = [p for p in network.parameters() if p not in encoder_parameters]
+    trained = [p for p in encoder.parameters() if p.requires_grad]
+    return [{"params": trained, "rate": encoder_rate}, {"params": rest}]
 
 
 class StereoTask:
-    """Smooth L1 on all heads (eq. 2.6)."""
+    """Trains the matcher: smooth L1 on all heads (eq. 2.6), and cross entropy of the sky."""
 
     def __init__(
         self, matcher: StereoNetwork, config: StereoTraining, held_out: TrainingPairs | None
@@ -41,123 +58,137 @@ class StereoTask:
         self.config = config
         self.held_out = held_out
         self.matcher = matcher
-        # What stays as it is: norms, or all but the head of the sky.
+        self.modules: dict[str, nn.Module] = {"matcher": matcher}
+
+        # Parts that stay as they are: norms, the encoder's stem, or all but the head of the sky.
         self._with_fixed_norms: list[nn.Module] = []
         if config.with_frozen_stem and matcher.encoder is not None:
             matcher.encoder.freeze_early()
             self._with_fixed_norms.append(matcher.encoder)
         if config.with_frozen_norms:
             self._with_fixed_norms.append(matcher)
-        self._trained_alone = matcher.sky if config.sky_alone else None
-        if self._trained_alone is not None:
+        self._only_trained = matcher.sky if config.sky_alone else None
+        if self._only_trained is not None:
             matcher.requires_grad_(False)
-            self._trained_alone.requires_grad_(True)
-        self._train()
-        self.modules: dict[str, nn.Module] = {"matcher": matcher}
+            self._only_trained.requires_grad_(True)
+        self._set_train_mode()
 
-        # What is learnt; an encoder at a share of the learning rate.
-        groups = [{"params": [p for p in matcher.parameters() if p.requires_grad]}]
-        if self._trained_alone is None and matcher.encoder is not None:
-            encoder_parameters = set(matcher.encoder.parameters())
-            rest = [p for p in matcher.parameters() if p not in encoder_parameters]
-            trained = [p for p in matcher.encoder.parameters() if p.requires_grad]
-            groups = [{"params": trained, "rate": config.encoder_rate}, {"params": rest}]
+        groups: list[dict[str, Any]]
+        if self._only_trained is None and matcher.encoder is not None:
+            groups = _encoder_groups(matcher, matcher.encoder, config.encoder_rate)
+        else:
+            groups = [{"params": [p for p in matcher.parameters() if p.requires_grad]}]
         self.optimizers = {"matcher": (make_adam(groups, config.adam), config.adam)}
 
-    def _train(self) -> None:
-        """Set the matcher to training, but for norms and parts that stay as they are."""
+    def _set_train_mode(self) -> None:
+        """Set the matcher to train mode, except for norms and parts that stay as they are."""
         self.matcher.train()
-        # Batch norm uses its stored statistics, whatever the mode: small batches spoil them.
         for module in self._with_fixed_norms:
-            for part in module.modules():
-                if isinstance(part, nn.BatchNorm2d | nn.BatchNorm3d):
-                    part.eval()
-        if self._trained_alone is not None:
+            _fix_norms(module)
+        if self._only_trained is not None:
             for part in self.matcher.children():
-                part.train(part is self._trained_alone)
+                part.train(part is self._only_trained)
 
     def step(self, batch: TrainingPair) -> Iterator[Update]:
-        """One update: match and compare."""
-        views = normalise(batch.left), normalise(batch.right)
-        heads, sky = self.matcher.forward_with_sky(*views)
+        """Match a batch, and give the one update of the matcher."""
         max_disparity_px = self.matcher.config.max_disparity_px
         sky_weight = self.config.sky_weight
+        views = normalise(batch.left), normalise(batch.right)
+        heads, sky = self.matcher.forward_with_sky(*views)
         heads = tuple(head.float() for head in heads)
-        is_valid = (batch.left_px > 0) & (batch.left_px < max_disparity_px)
-        error_px = (heads[-1].detach() - batch.left_px.nan_to_num(0.0)).abs()
-        facts = {"epe": error_px.where(is_valid, 0.0).sum() / is_valid.sum().clamp(min=1)}
+        facts = {"epe": _end_point_error(heads[-1], batch.left_px, max_disparity_px)}
         if sky is None:
             loss = losses.heads_loss(heads, batch.left_px, max_disparity_px, sky_weight=sky_weight)
         else:
-            error = losses.sky_loss(sky.float(), batch.left_px)
-            loss = losses.heads_loss(heads, batch.left_px, max_disparity_px) + sky_weight * error
-            facts["sky"] = error.detach()
+            sky_loss = losses.sky_loss(sky.float(), batch.left_px)
+            heads_loss = losses.heads_loss(heads, batch.left_px, max_disparity_px)
+            loss = heads_loss + sky_weight * sky_loss
+            facts["sky"] = sky_loss.detach()
         yield Update("matcher", loss, facts)
 
     def validate(self) -> ValidationResult:
-        """Match held-out pairs: mean error and the share of bad pixels; the first as a picture."""
+        """Match held-out pairs, and measure them by :func:`validate_pairs`."""
         if self.held_out is None:
             return ValidationResult()
         self.matcher.eval()
         result = validate_pairs(self.matcher, self.held_out)
-        self._train()
+        self._set_train_mode()
         return result
+
+
+def _end_point_error(
+    predicted_px: Maps, truth_px: Maps, max_disparity_px: int
+) -> Float[Tensor, ""]:
+    """Mean absolute error of the pixels with truth, without a gradient; 0 where there are none."""
+    is_valid = (truth_px > 0) & (truth_px < max_disparity_px)
+    error_px = (predicted_px.detach() - truth_px.nan_to_num(0.0)).abs()
+    return error_px.where(is_valid, 0.0).sum() / is_valid.sum().clamp(min=1)
 
 
 @torch.no_grad()
 def validate_pairs(
     matcher: StereoNetwork, held_out: TrainingPairs, generator: synthesis.Generator | None = None
 ) -> ValidationResult:
-    """Measure a matcher on held-out pairs, or on right views that a generator draws.
+    """Measure a matcher in eval mode on held-out pairs.
 
-    What is taken for sky has a disparity of 0. The numbers are means over pairs: end-point error
-    [px], share of bad pixels, and shares of the sky that is missed and of the rest taken for sky.
+    Args:
+        matcher: the network.
+        held_out: the pairs.
+        generator: synthesises the right views, in place of the real ones.
+
+    Returns:
+        Means over pairs: end-point error [px] and share of bad pixels; of a matcher that recognises
+        the sky, shares of the sky that is missed and of the rest that is taken for sky. Pixels
+        taken for sky have a disparity of 0. The picture is of the first pair.
     """
-    errors: list[float] = []
-    bad_shares: list[float] = []
-    missed_shares: list[float] = []
-    false_shares: list[float] = []
-    pictures = {}
+    errors: dict[str, list[float]] = {"epe_px": [], "d1": []}
+    sky_shares: dict[str, list[float]] = {"sky_missed": [], "sky_false": []}
+    pictures: dict[str, Tensor] = {}
     device = next(matcher.parameters()).device
     for index in range(len(held_out)):
         pair = held_out.read(index)
         right = pair.right
         if generator is not None:
             right = synthesis.draw_right(generator, pair.left[None].to(device))[0].cpu()
-        views = (normalise(view.to(device)) for view in (pair.left, right))
-        heads, sky = matcher.forward_with_sky(
-            *(pad_top_right(v, matcher.config)[None] for v in views)
-        )
-        height, width = pair.left.shape[-2:]
-        predicted_px = heads[-1][0, -height:, :width].float().cpu()
-        is_sky = None if sky is None else sky[0, -height:, :width].cpu() > 0.5
-        is_known = (pair.left_px > 0) & (pair.left_px < matcher.config.max_disparity_px)
-        is_true_sky = pair.left_px == 0
+        predicted_px, is_sky = _match(matcher, pair.left, right)
         if is_sky is not None:
             predicted_px = torch.where(is_sky, 0.0, predicted_px)
-            if bool(is_true_sky.any()):
-                missed_shares.append(float((~is_sky[is_true_sky]).float().mean()))
-            if bool(is_known.any()):
-                false_shares.append(float(is_sky[is_known].float().mean()))
         if index == 0:
             views = [pair.left, right, draw_disparity(predicted_px)]
             pictures["left_right_disparity"] = torch.cat(views, 1)
-        if not bool(is_known.any()):
-            continue
-        metrics = measure("disparity", predicted_px[is_known], pair.left_px[is_known])
-        errors.append(metrics["epe_px"])
-        bad_shares.append(metrics["d1_all"])
-    by_name = {"epe_px": errors, "d1": bad_shares}
-    sky_shares = {"sky_missed": missed_shares, "sky_false": false_shares}
-    by_name |= {name: shares for name, shares in sky_shares.items() if shares}
-    numbers = {
-        f"held_out/{name}": sum(values) / max(len(values), 1) for name, values in by_name.items()
+
+        is_true_sky = pair.left_px == 0
+        has_truth = (pair.left_px > 0) & (pair.left_px < matcher.config.max_disparity_px)
+        if is_sky is not None and bool(is_true_sky.any()):
+            sky_shares["sky_missed"].append(float((~is_sky[is_true_sky]).float().mean()))
+        if is_sky is not None and bool(has_truth.any()):
+            sky_shares["sky_false"].append(float(is_sky[has_truth].float().mean()))
+        if bool(has_truth.any()):
+            metrics = measure("disparity", predicted_px[has_truth], pair.left_px[has_truth])
+            errors["epe_px"].append(metrics["epe_px"])
+            errors["d1"].append(metrics["d1_all"])
+    numbers = errors | {name: shares for name, shares in sky_shares.items() if shares}
+    means = {
+        f"held_out/{name}": sum(values) / max(len(values), 1) for name, values in numbers.items()
     }
-    return ValidationResult(numbers=numbers, pictures=pictures)
+    return ValidationResult(numbers=means, pictures=pictures)
+
+
+def _match(matcher: StereoNetwork, left: View, right: View) -> tuple[Map, Mask | None]:
+    """Match one pair of any size: disparity of the left view [px], and its sky where recognised."""
+    device = next(matcher.parameters()).device
+    views = [
+        pad_top_right(normalise(view.to(device)), matcher.config)[None] for view in (left, right)
+    ]
+    heads, sky = matcher.forward_with_sky(*views)
+    height, width = left.shape[-2:]
+    disparity_px = heads[-1][0, -height:, :width].float().cpu()
+    is_sky = None if sky is None else sky[0, -height:, :width].cpu() > 0.5
+    return disparity_px, is_sky
 
 
 class ViewTask:
-    """cGAN + lambda L1 (eq. 2.3): the discriminator's update, then the generator's."""
+    """Trains the U-Net as pix2pix: cGAN + lambda L1 (eq. 2.3)."""
 
     def __init__(
         self,
@@ -176,11 +207,15 @@ class ViewTask:
                 config.discriminator, config.discriminator_width
             )
             self.modules["discriminator"] = discriminator.train()
-            adam = config.discriminator_adam
-            self.optimizers["discriminator"] = (make_adam(discriminator.parameters(), adam), adam)
+            discriminator_adam = config.discriminator_adam
+            optimizer = make_adam(discriminator.parameters(), discriminator_adam)
+            self.optimizers["discriminator"] = (optimizer, discriminator_adam)
 
     def step(self, batch: TrainingPair) -> Iterator[Update]:
-        """Draw once; the discriminator learns from it, then scores it anew."""
+        """Synthesise right views; give the update of the discriminator, then of the generator.
+
+        The discriminator scores the views anew after its update.
+        """
         left = 2 * batch.left - 1
         right = 2 * batch.right - 1
         drawn = self.generator(left)
@@ -188,44 +223,48 @@ class ViewTask:
         if self.config.discriminator == "none":
             yield Update("generator", self.config.l1_weight * l1, {"l1": l1.detach()})
             return
+
         discriminator = self.modules["discriminator"]
         mode = self.config.gan_mode
-        real = losses.adversarial_loss(discriminator(left, right), mode, is_real=True)
-        fake = discriminator(left, drawn.detach())
+        real_scores = discriminator(left, right)
+        fake_scores = discriminator(left, drawn.detach())
+        real_loss = losses.adversarial_loss(real_scores, mode, is_real=True)
+        fake_loss = losses.adversarial_loss(fake_scores, mode, is_real=False)
         # Half the sum of both slows the discriminator (pix2pix).
-        d_loss = (real + losses.adversarial_loss(fake, mode, is_real=False)) / 2
-        yield Update("discriminator", d_loss, {})
+        yield Update("discriminator", (real_loss + fake_loss) / 2, {})
+
         adversarial = losses.adversarial_loss(discriminator(left, drawn), mode, is_real=True)
         loss = adversarial + self.config.l1_weight * l1
         yield Update("generator", loss, {"l1": l1.detach(), "adversarial": adversarial.detach()})
 
     @torch.no_grad()
     def validate(self) -> ValidationResult:
-        """Draw held-out right views: L1 and PSNR, and the first as a picture."""
+        """Synthesise held-out right views: mean L1 and PSNR [dB], and a picture of the first."""
         if self.held_out is None:
             return ValidationResult()
         self.generator.eval()
-        errors = []
-        squares = []
-        pictures = {}
+        device = next(self.generator.parameters()).device
+        l1: list[float] = []
+        psnr_db: list[float] = []
+        pictures: dict[str, Tensor] = {}
         for index in range(len(self.held_out)):
             pair = self.held_out.read(index)
-            device = next(self.generator.parameters()).device
             drawn = synthesis.draw_right(self.generator, pair.left[None].to(device))[0].cpu()
-            errors.append(float((drawn - pair.right).abs().mean()))
-            squares.append(float((drawn - pair.right).square().mean()))
+            difference = drawn - pair.right
+            l1.append(float(difference.abs().mean()))
+            psnr_db.append(float(-10 * torch.log10(difference.square().mean())))
             if index == 0:
                 pictures["left_right_drawn"] = torch.cat([pair.left, pair.right, drawn], 1)
         self.generator.train()
-        mean = sum(errors) / len(errors)
-        psnr = sum(-10 * torch.log10(torch.tensor(s)).item() for s in squares) / len(squares)
-        return ValidationResult(
-            numbers={"held_out/l1": mean, "held_out/psnr": psnr}, pictures=pictures
-        )
+        numbers = {
+            "held_out/l1": sum(l1) / len(l1),
+            "held_out/psnr": sum(psnr_db) / len(psnr_db),
+        }
+        return ValidationResult(numbers=numbers, pictures=pictures)
 
 
 class FinetuneTask:
-    """Smooth L1 of the final disparity map moves the generator alone (thesis, 2.5.3).
+    """Trains the generator by the smooth L1 of the matcher's disparity (thesis, 2.5.3).
 
     The matcher keeps its weights and its batch norm statistics: it stays in eval mode.
     """
@@ -247,22 +286,20 @@ class FinetuneTask:
         }
 
     def step(self, batch: TrainingPair) -> Iterator[Update]:
-        """One update: draw, match, compare with the truth."""
+        """Synthesise right views and match them; give the one update of the generator."""
         drawn = synthesis.draw_right(self.generator, batch.left)
         (predicted_px,) = self.matcher(normalise(batch.left), normalise(drawn))
-        max_disparity_px = self.matcher.config.max_disparity_px
         predicted_px = predicted_px.float()
-        loss = losses.disparity_loss(predicted_px, batch.left_px, max_disparity_px)
-        l1 = (2 * drawn - 2 * batch.right).abs().mean()
-        is_valid = (batch.left_px > 0) & (batch.left_px < max_disparity_px)
-        error_px = (predicted_px.detach() - batch.left_px.nan_to_num(0.0)).abs()
-        epe = error_px.where(is_valid, 0.0).sum() / is_valid.sum().clamp(min=1)
+        max_disparity_px = self.matcher.config.max_disparity_px
+        disparity_loss = losses.disparity_loss(predicted_px, batch.left_px, max_disparity_px)
+        l1 = (2 * drawn - 2 * batch.right).abs().mean()  # of images in [-1, 1]
+        epe = _end_point_error(predicted_px, batch.left_px, max_disparity_px)
         facts = {"epe": epe, "l1": l1.detach()}
-        yield Update("generator", loss + self.config.l1_weight * l1, facts)
+        yield Update("generator", disparity_loss + self.config.l1_weight * l1, facts)
 
     @torch.no_grad()
     def validate(self) -> ValidationResult:
-        """Depth of held-out left images; the first drawn view as a picture."""
+        """Match held-out left images with synthesised views (:func:`validate_pairs`)."""
         if self.held_out is None:
             return ValidationResult()
         self.generator.eval()
@@ -272,10 +309,10 @@ class FinetuneTask:
 
 
 class SelectionSample(NamedTuple):
-    """What one step of the selecting generator sees; disparity is NaN if unknown, 0 in the sky."""
+    """A sample of the selecting generator's training; disparity is NaN if unknown, 0 in the sky."""
 
-    observed: Float[Tensor, "*b 3 h w"]  # the left image as a camera may deliver it: the input
-    left: Float[Tensor, "*b 3 h w"]  # the left image itself, which the right view is drawn from
+    degraded: Float[Tensor, "*b 3 h w"]  # the degraded left image: the input
+    left: Float[Tensor, "*b 3 h w"]  # the left image itself, which the right view is made of
     right: Float[Tensor, "*b 3 h w"]
     left_px: Float[Tensor, "*b h w"]
     right_px: Float[Tensor, "*b h w"]
@@ -283,10 +320,18 @@ class SelectionSample(NamedTuple):
 
 
 class SelectionSamples:
-    """Samples by index: a share of the indices draws from the second source, evenly spread.
+    """Samples by index, of which an evenly spread share comes from a second source.
 
-    The first source sets the length of an epoch; ``config`` changes the input alone.
-    ``truths`` says which kind of truth each source gives.
+    The first source sets the length of an epoch.
+
+    Args:
+        sources: one or two.
+        more_share: share of the samples from the second source.
+        config: degradation of the input.
+        seed: of the random numbers.
+
+    Attributes:
+        truths: which kind of truth each source gives, as :class:`TrainingPairs` has it.
     """
 
     def __init__(
@@ -302,19 +347,23 @@ class SelectionSamples:
         return len(self.sources[0])
 
     def __getitem__(self, sample_index: int) -> SelectionSample:
-        """Make the sample of an index, from the second source wherever its share is full again."""
-        from_second = int(sample_index * self.more_share)  # of the samples before
-        is_of_second = int((sample_index + 1) * self.more_share) > from_second
-        if is_of_second:
-            pair = self.sources[1][from_second]
+        """Make the sample of an index.
+
+        It is of the second source where the share of samples up to it reaches a new whole number.
+        """
+        second_before = int(sample_index * self.more_share)  # samples of the second source so far
+        second_after = int((sample_index + 1) * self.more_share)
+        if second_after > second_before:
+            pair = self.sources[1][second_before]
         else:
-            pair = self.sources[0][sample_index - from_second]
+            pair = self.sources[0][sample_index - second_before]
+
         # Where one image stands for both views, the right one's truth follows from the left one's.
         has_right = not torch.equal(pair.left, pair.right)
         right_px = pair.right_px if has_right else right_disparity_from_left(pair.left_px)
         generator = sample_generator(sample_index, self.seed + 1)
         return SelectionSample(
-            observed=degrade(pair.left, self.config, generator),
+            degraded=degrade(pair.left, self.config, generator),
             left=pair.left,
             right=pair.right,
             left_px=pair.left_px,
@@ -328,7 +377,11 @@ _CAP_M = 80.0
 
 
 class SelectTask:
-    """Relative error and cross entropy of both views' disparity, L1 of the drawn right view."""
+    """Trains the generator that selects.
+
+    The loss is the relative error and the cross entropy of both views' disparity, and the L1 of the
+    right view.
+    """
 
     def __init__(
         self,
@@ -342,44 +395,40 @@ class SelectTask:
         if config.with_frozen_stem:
             generator.encoder.freeze_early()
         self.modules: dict[str, nn.Module] = {"generator": generator}
-        self._train()
-        # What is trained, the encoder apart, at a share of the learning rate.
-        encoder_parameters = set(generator.encoder.parameters())
-        rest = [p for p in generator.parameters() if p not in encoder_parameters]
-        trained = [p for p in generator.encoder.parameters() if p.requires_grad]
-        groups = [{"params": trained, "rate": config.encoder_rate}, {"params": rest}]
+        self._set_train_mode()
+        groups = _encoder_groups(generator, generator.encoder, config.encoder_rate)
         self.optimizers = {"generator": (make_adam(groups, config.adam), config.adam)}
 
-    def _train(self) -> None:
-        """Set the generator to training, but for the norms of a frozen stem."""
+    def _set_train_mode(self) -> None:
+        """Set the generator to train mode, except for the encoder's norms if its stem is frozen."""
         self.generator.train()
         if self.config.with_frozen_stem:
-            # Batch norm uses its stored statistics, whatever the mode: small batches spoil them.
-            for part in self.generator.encoder.modules():
-                if isinstance(part, nn.BatchNorm2d):
-                    part.eval()
+            _fix_norms(self.generator.encoder)
 
     def step(self, batch: SelectionSample) -> Iterator[Update]:
-        """One update: predict disparity, warp the right view, compare."""
-        planes = self.generator.planes
-        left, right = self.generator(batch.observed)
-        left_loss = self._truth_loss(left, batch.left_px)
-        right_loss = self._truth_loss(right, batch.right_px)
+        """Estimate disparities and synthesise right views; give the one update of the generator."""
+        left_logits, right_logits = self.generator(batch.degraded)
+        left_loss = self._disparity_loss(left_logits, batch.left_px)
+        right_loss = self._disparity_loss(right_logits, batch.right_px)
         loss = left_loss + self.config.right_share * right_loss
         facts = {"left": left_loss.detach(), "right": right_loss.detach()}
+
+        # The right view, at half size as the logits are; where there is a real one.
         if self.config.view_weight:
-            small = [F.avg_pool2d(view, 2) for view in (batch.left, batch.right)]
-            drawn = synthesis.mix_shifts(small[0], right.float(), planes / 2)
-            views = losses.view_loss(drawn, small[1])
-            view = (views * batch.has_right).sum() / batch.has_right.sum().clamp(min=1)
-            loss = loss + self.config.view_weight * view
-            facts["view"] = view.detach()
+            left = F.avg_pool2d(batch.left, 2)
+            right = F.avg_pool2d(batch.right, 2)
+            drawn = synthesis.mix_shifts(left, right_logits.float(), self.generator.planes / 2)
+            image_losses = losses.view_loss(drawn, right)
+            pair_count = batch.has_right.sum().clamp(min=1)
+            view_loss = (image_losses * batch.has_right).sum() / pair_count
+            loss = loss + self.config.view_weight * view_loss
+            facts["view"] = view_loss.detach()
         yield Update("generator", loss, facts)
 
-    def _truth_loss(
+    def _disparity_loss(
         self, logits: Float[Tensor, "b k rows columns"], truth_px: Maps
     ) -> Float[Tensor, ""]:
-        """Losses of the disparity of one view."""
+        """Compute the loss of one view's disparity, and of its classes where they have a weight."""
         planes = self.generator.planes
         range_px = self.generator.config.disparity_px
         log_px = synthesis.read_logits(logits, planes)[0][:, None]
@@ -388,14 +437,15 @@ class SelectTask:
         loss = disparity_loss(log_px[:, 0], truth_px, range_px)
         if not self.config.plane_weight:
             return loss
-        # The nearest point of the four pixels that a logit stands for; unknown is -1.
-        coarse = F.max_pool2d(truth_px.nan_to_num(-1.0)[:, None], 2)[:, 0]
-        coarse = torch.where(coarse < 0, torch.nan, coarse)
-        return loss + self.config.plane_weight * losses.plane_loss(logits, coarse, planes)
+
+        # The truth at half size: the nearest point of the four pixels of each logit; unknown is -1.
+        half_px = F.max_pool2d(truth_px.nan_to_num(-1.0)[:, None], 2)[:, 0]
+        half_px = torch.where(half_px < 0, torch.nan, half_px)
+        return loss + self.config.plane_weight * losses.plane_loss(logits, half_px, planes)
 
     @torch.no_grad()
     def validate(self) -> ValidationResult:
-        """Relative error of held-out left images, share within 25 % (d1), share of missed sky."""
+        """Measure held-out left images: relative error, share within 25 % (d1), missed sky."""
         if self.held_out is None:
             return ValidationResult()
         self.generator.eval()
@@ -403,10 +453,8 @@ class SelectTask:
         rig = self.generator.config
         synthesiser = synthesis.SelectionSynthesiser(self.generator, device)
         far_px = rig.virtual_focal_px * rig.virtual_baseline_m / _CAP_M
-        errors = []
-        within = []
-        missed = []
-        pictures = {}
+        numbers: dict[str, list[float]] = {"abs_rel": [], "d1": [], "sky_missed": []}
+        pictures: dict[str, Tensor] = {}
         for index in range(len(self.held_out)):
             pair = self.held_out.read(index)
             drawn = synthesiser.draw(pair.left[None])
@@ -417,20 +465,23 @@ class SelectTask:
             if index == 0:
                 views = [pair.left, pair.right, drawn.right[0], draw_disparity(predicted_px)]
                 pictures["left_right_drawn_disparity"] = torch.cat(views, 1)
-            is_known = pair.left_px >= far_px
-            is_true_sky = pair.left_px == 0
-            if bool(is_known.any()):
+
+            has_truth = pair.left_px >= far_px
+            if bool(has_truth.any()):
                 metrics = {"abs_rel": math.nan, "d1": math.nan}  # of a network that diverged
                 if bool(predicted_px.isfinite().all()):
-                    # Of depth without its unit, which these do not depend on.
-                    metrics = measure(
-                        "depth", 1 / predicted_px[is_known], 1 / pair.left_px[is_known]
-                    )
-                errors.append(metrics["abs_rel"])
-                within.append(metrics["d1"])
+                    # 1 / disparity is depth in another unit, on which these metrics do not depend.
+                    true_depth = 1 / pair.left_px[has_truth]
+                    metrics = measure("depth", 1 / predicted_px[has_truth], true_depth)
+                numbers["abs_rel"].append(metrics["abs_rel"])
+                numbers["d1"].append(metrics["d1"])
+            is_true_sky = pair.left_px == 0
             if bool(is_true_sky.any()):
-                missed.append(float((~is_sky[is_true_sky]).float().mean()))
-        self._train()
-        numbers = {"abs_rel": errors, "d1": within, "sky_missed": missed}
-        means = {f"held_out/{k}": sum(v) / len(v) for k, v in numbers.items() if v}
+                numbers["sky_missed"].append(float((~is_sky[is_true_sky]).float().mean()))
+        self._set_train_mode()
+        means = {
+            f"held_out/{name}": sum(values) / len(values)
+            for name, values in numbers.items()
+            if values
+        }
         return ValidationResult(numbers=means, pictures=pictures)
