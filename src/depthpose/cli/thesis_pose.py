@@ -136,11 +136,13 @@ def reproduce_by_object(
     claim_folder(out, settings, (*results, "predictions", "detections", "figures"))
 
     # Predict what is missing, measure, and join with the published rows.
-    shown = pose_methods.find_masks(options.masks, dataset, out, options.device) if methods else []
+    all_masks: list[pose_methods.Masks] = []
+    if methods:
+        all_masks = pose_methods.prepare_masks(options.masks, dataset, out, options.device)
     folders = [
         pose_methods.predict_instances(dataset, method, masks, out)
         for method in methods
-        for masks in shown
+        for masks in all_masks
     ]
     measured = pose_evaluate.join(pose_evaluate.measure_each(dataset, [*folders, *csv], rule))
     rows = pose_tables.join_by_object(measured.rows, numbers, with_published=is_printed)
@@ -152,7 +154,7 @@ def reproduce_by_object(
     figures = [_figure_3_5(dataset, folder, out, options.pictures) for folder in folders]
     sections = [
         Section(title="Percent by object", text=f"{_HOW} {_DIFFERENCES[number]}", rows=rows),
-        Section(title="All numbers", text=pose_evaluate.HOW, rows=all_columns),
+        Section(title="All numbers", text=pose_evaluate.SCORING_NOTE, rows=all_columns),
         *(figure for figure in figures if figure.pictures),
         *pose_evaluate.write_details(measured, out),
     ]
