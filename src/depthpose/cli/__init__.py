@@ -269,7 +269,7 @@ def _run(words: list[str]) -> int:
     rest = words[len(name.split()) :]
     import tyro
 
-    from depthpose.cli import arguments
+    from depthpose.cli import arguments, ignored_options
 
     home, _, function = COMMANDS[name][0].partition(":")
     command: Callable[..., int] = getattr(import_module(f"depthpose.cli.{home}"), function)
@@ -284,7 +284,8 @@ def _run(words: list[str]) -> int:
         )
     except SystemExit as stop:  # tyro has printed help (0) or the wrong arguments (2)
         return int(stop.code or 0)
-    arguments.refuse_words(name, options, rest)
+    ignored_options.refuse_empty(options, rest)
+    ignored_options.refuse_ignored(name, rest)
     arguments.refuse_missing(options, parsed.arguments)
     if sys.platform != "win32":
         import resource

@@ -445,13 +445,13 @@ def split(files: tyro.conf.Positional[tuple[Source, ...]], out: NewPath) -> int:
         files: pictures, videos, folders or quoted patterns.
         out: folder for the results.
     """
-    from depthpose.cli.depth_predict import find_sources
+    from depthpose.cli.depth_predict import list_sources
     from depthpose.core.camera import find_two_views, halves, order_views
     from depthpose.core.files import VIDEO_SUFFIXES, read_video, write_image
     from depthpose.core.files.images import read_views
     from depthpose.core.run import claim_folder
 
-    sources = find_sources(files, out)
+    sources = list_sources(files, out)
     claim_folder(out, {"command": "data split"}, _SIDES)
     count = 0
     for source in sources:
