@@ -211,8 +211,9 @@ def measure(
     if uncalibrated:
         message = (
             f"{uncalibrated} of {len(dataset)} pairs have no calibration, so a network matches "
-            "them at their own focal length, not at the one it knows: compare no numbers with those "
-            "of frames that have one (KITTI 2015 has calib_cam_to_cam in a download of its own)"
+            "them at their own focal length, not at the one it knows: compare no numbers with "
+            "those of frames that have one (KITTI 2015 has calib_cam_to_cam in a download of its "
+            "own)"
         )
         print(f"depthpose: {message}", file=sys.stderr)
         text += f" {message}."
