@@ -83,7 +83,7 @@ _TILT_RAD = math.radians(20)
 
 
 @torch.inference_mode()
-def seen_points(
+def featured_points(
     net: GeoPoseNet, pose_input: AnyInput
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n c"]] | None:
     """Give the points that the network sees, in the camera frame, and its features of them.
