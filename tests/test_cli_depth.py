@@ -689,11 +689,11 @@ def test_a_stopped_training_is_finished_by_a_word(
     assert main([*words, "--finish"]) == 2
     assert "holds no state of a training" in capsys.readouterr().err
 
-    def stop(self: Lines, progress: Progress) -> None:
+    def stop(self: ProgressLog, progress: Progress) -> None:
         if progress.step == 1:
             raise KeyboardInterrupt
 
-    with patch.object(Lines, "show", stop):
+    with patch.object(ProgressLog, "show", stop):
         assert main(words) == 130
     assert main([*words, "--finish"]) == 0
     assert "- **Time**: " in capsys.readouterr().out
