@@ -24,7 +24,7 @@ from tests.synthetic_street import make_street
 
 from depthpose.cli import main
 from depthpose.cli.depth_predict import list_pairs
-from depthpose.cli.train import Lines
+from depthpose.cli.train import ProgressLog
 from depthpose.core.checkpoint import find_weights, read_checkpoint
 from depthpose.core.draw import draw_depth
 from depthpose.core.errors import InputError
@@ -667,10 +667,10 @@ def test_without_a_terminal_a_line_is_printed_each_minute(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     seconds = iter(range(0, 4000, 10))
-    lines = Lines(clock=lambda: float(next(seconds)))
+    log = ProgressLog(clock=lambda: float(next(seconds)))
     for step in range(1, 101):
         numbers = {"net/loss": 1 / step} if step % 50 == 0 else {}
-        lines.show(Progress(step=step, steps=100, numbers=numbers))
+        log.show(Progress(step=step, steps=100, numbers=numbers))
     said = capsys.readouterr().out.splitlines()
     assert said[:2] == ["step 1 of 100", "step 7 of 100, 16 min left"]
     assert said[-2:] == [
@@ -689,11 +689,11 @@ def test_a_stopped_training_is_finished_by_a_word(
     assert main([*words, "--finish"]) == 2
     assert "holds no state of a training" in capsys.readouterr().err
 
-    def stop(self: Lines, progress: Progress) -> None:
+    def stop(self: ProgressLog, progress: Progress) -> None:
         if progress.step == 1:
             raise KeyboardInterrupt
 
-    with patch.object(Lines, "show", stop):
+    with patch.object(ProgressLog, "show", stop):
         assert main(words) == 130
     assert main([*words, "--finish"]) == 0
     assert "- **Time**: " in capsys.readouterr().out

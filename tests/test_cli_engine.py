@@ -310,6 +310,7 @@ def test_a_cad_file_alone_is_registered_by_workers_too(
     [
         (["--workers", "2"], "--engine ray takes it, and is not given"),
         ([*RAY, "--block", "0"], "--block 0"),
+        ([*RAY, "--workers", "0"], "--workers 0"),
         ([*RAY, "--worker-cpus", "0"], "needs a core or a GPU"),
     ],
 )

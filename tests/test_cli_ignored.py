@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from depthpose.cli import lasting_streams, main
-from depthpose.cli.arguments import refuse_words
 from depthpose.cli.depth_options import MatcherOptions
+from depthpose.cli.ignored_options import refuse_ignored
 from depthpose.core.errors import InputError
 
 IGNORED = [
@@ -57,12 +57,12 @@ USED = [
 @pytest.mark.parametrize(("command", "words", "named"), IGNORED)
 def test_an_option_without_effect_is_refused(command: str, words: str, named: str) -> None:
     with pytest.raises(InputError, match=rf"^{named}: has no effect here; .* Leave {named} out$"):
-        refuse_words(command, [], words.split())
+        refuse_ignored(command, words.split())
 
 
 @pytest.mark.parametrize(("command", "words"), USED)
 def test_an_option_with_effect_is_not(command: str, words: str) -> None:
-    refuse_words(command, [], words.split())
+    refuse_ignored(command, words.split())
 
 
 def test_the_command_refuses_it_in_a_line(capsys: pytest.CaptureFixture[str]) -> None:

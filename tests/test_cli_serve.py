@@ -5,7 +5,7 @@ import sys
 import pytest
 
 from depthpose.cli import main
-from depthpose.web import Limits, known_names
+from depthpose.web import Limits, address_and_hosts
 from depthpose.web.app import LOOPBACK
 
 
@@ -87,7 +87,7 @@ def test_what_counts_is_the_address_that_was_taken(bound: str, is_open: bool) ->
             return bound, 8000
 
     with Taken() as taken:
-        _, names = known_names("My-Robot", taken)
+        _, names = address_and_hosts("My-Robot", taken)
     assert names == (None if is_open else (*LOOPBACK, "my-robot", bound))
 
 

@@ -30,18 +30,21 @@ from depthpose.pose.metrics import add_m
 from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.pose.predictions import CLOUD, Prediction, place_of, write_predictions
 from depthpose.pose.synthetic import make_frames
-from depthpose.pose.types import ObjectModel, PoseEstimate
+from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 from depthpose.report import page as pages
 from depthpose.report.depth import depth_section
 from depthpose.report.page import Layer, Picture, Scene, Section, depth_scale
 from depthpose.report.pose import draw_pose, grey_depth, object_points, pose_layers, posed_cloud
 
-_STREETS_SEED = 9  # no weights were trained on streets of this seed
+_STREETS_SEED = 9
+"""Of streets that no weights were trained on."""
 _STREET = 1
 _CAP_M = 80.0
+"""Truth beyond it is not compared."""
 _FROM_ONE = "one image"
 _FROM_PAIR = "both images"
 Nets = Mapping[str, tuple[str, FakestereoNet]]
+"""By the method's name: the images that it is given, and its estimator."""
 
 _STREET_TEXT = (
     "A synthetic street of a seed that no training used; its depth is known exactly. Distances "
@@ -69,35 +72,57 @@ def show_depth(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
     sections: list[Section] = []
     for sample, text, range_m in scenes:
         if sample is not None:
-            more, shown = _show_scene(out, sample, _nets(network, sample), text, range_m)
-            rows += more
-            sections += shown
+            scene_rows, scene_sections = _show_scene(
+                out, sample, _make_nets(network, sample), text, range_m
+            )
+            rows += scene_rows
+            sections += scene_sections
     return rows, sections
 
 
-def _nets(network: FakestereoNet, sample: StereoSample) -> Nets:
-    """Methods of a scene; the generator knows streets alone, so it draws no motorcycle."""
-    # The nearest surfaces of both scenes, in views moved by the distance of the principal points;
-    # OpenCV leaves that many columns unmatched.
+def _make_nets(network: FakestereoNet, sample: StereoSample) -> Nets:
+    """Choose the methods for a scene.
+
+    Depth from one image is only for the street: the generator was trained on streets alone.
+    """
+    nets: dict[str, tuple[str, FakestereoNet]] = {}
+    if network.matcher is not None:
+        nets["stereo network"] = (_FROM_PAIR, network)
+
+    # The disparity of the nearest surfaces of both scenes is a tenth of the width, to which the
+    # difference of the principal points adds. OpenCV leaves as many columns unmatched as it
+    # considers disparities, a multiple of 16.
     rig = sample.input.camera
     assert isinstance(rig, StereoRig)
     nearest_px = sample.input.left.shape[2] / 10 + max(rig.cx_right_minus_left_px, 0.0)
-    columns = 16 * math.ceil(nearest_px / 16)
-    sgbm = SGBMConfig(num_disparities=columns, with_filled_holes=True)
-    matched = {} if network.matcher is None else {"stereo network": (_FROM_PAIR, network)}
-    filled = FakestereoNet.load(matcher="sgbm", config=sgbm)
-    pairs = {**matched, "SGBM, holes filled": (_FROM_PAIR, filled)}
-    is_street = sample.input.name == "street"
-    return {**pairs, "selecting generator": (_FROM_ONE, network)} if is_street else pairs
+    num_disparities = 16 * math.ceil(nearest_px / 16)
+    config = SGBMConfig(num_disparities=num_disparities, with_filled_holes=True)
+    sgbm = FakestereoNet.load(matcher="sgbm", config=config)
+    nets["SGBM, holes filled"] = (_FROM_PAIR, sgbm)
+
+    if sample.input.name == "street":
+        nets["selecting generator"] = (_FROM_ONE, network)
+    return nets
 
 
 def _show_scene(
     out: Path, sample: StereoSample, nets: Nets, text: str, range_m: tuple[float, float]
 ) -> tuple[list[dict[str, Any]], list[Section]]:
-    """Write the pair as files that commands take; estimate by each method; rows and sections."""
+    """Estimate the depth of a scene by each method, and write the pair as files of a command.
+
+    Args:
+        out: folder of the demo.
+        sample: pair and truth.
+        nets: the methods; the first is shown above the others.
+        text: of the scene.
+        range_m: depth of the brightest and of the darkest colour.
+
+    Returns:
+        A row for each method, and the sections of the page.
+    """
     pair = sample.input
     truth = sample.truth
-    folder = out / sample.input.name
+    folder = out / pair.name
     assert pair.right is not None
     assert isinstance(pair.camera, StereoRig)
     assert truth.depth_m is not None
@@ -110,33 +135,37 @@ def _show_scene(
     sections: list[Section] = []
     homes = {method: out / method.lower().replace(",", "").replace(" ", "-") for method in nets}
     for method, (views, net) in nets.items():
-        views_used = pair if views == _FROM_PAIR else replace(pair, right=None)
-        estimate = net.estimate_pair(views_used, with_check=False)
+        net_input = pair if views == _FROM_PAIR else replace(pair, right=None)
+        estimate = net.estimate_pair(net_input, with_check=False)
+        write_estimate(homes[method], net_input, estimate, range_m, CLOUD_M)
+
+        # The numbers, over pixels that have a truth within the cap and an answer.
         predicted_m = clamped_depth(estimate.disparity_px, pair.camera, _CAP_M)
-        counts = truth.depth_m < _CAP_M
-        mask = counts & torch.isfinite(estimate.disparity_px)
+        is_measured = truth.depth_m < _CAP_M
+        mask = is_measured & torch.isfinite(estimate.disparity_px)
         row: dict[str, Any] = {"scene": pair.name, "method": method, "input": views}
-        row["coverage"] = float(mask.sum() / counts.sum())
+        row["coverage"] = float(mask.sum() / is_measured.sum())
         row |= measure("disparity", estimate.disparity_px[mask], truth.disparity_px[mask])
-        rows.append(row | measure("depth", predicted_m[mask], truth.depth_m[mask]))
-        write_estimate(homes[method], views_used, estimate, range_m, CLOUD_M)
+        row |= measure("depth", predicted_m[mask], truth.depth_m[mask])
+        rows.append(row)
+
         error_px = (estimate.disparity_px - truth.disparity_px).abs()
         error = DepthError(error=error_px, is_disparity=True)
         title = f"{pair.name}: {method}, {views}"
-        sections.append(
-            depth_section(
-                title, views_used, estimate, range_m=range_m, error=error, with_image=False
-            )
+        section = depth_section(
+            title, net_input, estimate, range_m=range_m, error=error, with_image=False
         )
-    best = next(iter(nets))
+        sections.append(section)
+
+    first_method = next(iter(nets))
+    estimated_picture = homes[first_method] / f"{pair.name}.color.png"
+    true_picture = folder / "depth.color.png"
     scale = depth_scale(*range_m)
-    colors = homes[best] / f"{pair.name}.color.png"
-    true = folder / "depth.color.png"
     pictures = [
         Picture(path=folder / "left.png", caption="left image"),
         Picture(path=folder / "right.png", caption="right image"),
-        Picture(path=colors, caption=f"depth from both: {best}", scale=scale),
-        Picture(path=true, caption="true depth; grey: none", scale=scale),
+        Picture(path=estimated_picture, caption=f"depth from both: {first_method}", scale=scale),
+        Picture(path=true_picture, caption="true depth; grey: none", scale=scale),
     ]
     opening = Section(title=f"The {pair.name}", text=text, rows=rows, pictures=pictures)
     return rows, [opening, *sections]
@@ -168,14 +197,14 @@ def read_motorcycle() -> StereoSample | None:
     return StereoSample(input=pair, truth=truth)
 
 
-_FRAMES_SEED = 9  # no weights were trained on frames of this seed
-
-_FRAME = 1  # the first that shows every part whole
-
+_FRAMES_SEED = 9
+"""Of frames that no weights were trained on."""
+_FRAME = 1
+"""The first that shows every part whole."""
 _SAMPLE = "flange"
 """The part whose depth image, mask and camera get a folder of their own, for a first command."""
-
 _UNIT_M = 0.0001
+"""Of that depth image."""
 _COLUMNS = ("object", "visible_fraction", "status", "copies", "metric", "error_mm", "of_diameter",
             "rotation_deg", "translation_mm", "ms_network", "ms_total", "reason")  # fmt: skip
 _TEXT = (
@@ -189,7 +218,10 @@ _TEXT = (
 
 
 def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], list[Section]]:
-    """Pose the parts of a synthetic frame; give a row for each, and the sections of the page."""
+    """Pose the parts of a synthetic frame; give a row for each, and the section of the page.
+
+    The frame is written as a data set, one of its parts as files of a first command.
+    """
     net = GeoPoseNet.load(weights)
     models = {model.number: model for model in net.weights.models}
     count = len(models)
@@ -199,20 +231,15 @@ def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
     frame = next(make_frames(tuple(models.values()), config, 1, first=_FRAME))
     assert frame.rgb is not None
 
-    # The frame as a data set, and one of its parts as files of a first command.
     write_bop_models(out / "parts", net.weights.models)
     write_bop_scene(out / "parts", "test", 0, [frame])
     dataset = open_bop(out / "parts")
     views = [dataset.view(instance).input for instance in dataset.instances]
-    sample = next(view for view in views if view.object == _SAMPLE)
-    height, width = sample.mask.shape
-    camera = Camera(width=width, height=height, K=sample.K.double(), depth_unit_m=_UNIT_M)
-    write_camera(out / "part/camera.json", camera)
-    write_depth_png(out / "part/depth.png", sample.depth_m, _UNIT_M)
-    write_mask(out / "part/mask.png", sample.mask)
+    _write_sample(next(view for view in views if view.object == _SAMPLE), out / "part")
 
-    # The poses of all parts, and their errors.
-    net.estimate_many(views)  # prepares the models: times below are those of further estimates
+    # The poses of all parts, and their errors. The first call prepares the models, so that the
+    # times are those of further estimates.
+    net.estimate_many(views)
     estimates = net.estimate_many(views)
     predictions = [
         Prediction(estimate=estimate, place=place_of(instance))
@@ -226,19 +253,20 @@ def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
     ]
     copies = {estimate.object: len(_named_copies(estimate)) for estimate in estimates}
     measured = [row.columns() for row in evaluate(dataset, nearest).per_instance]
-    rows = [_row({**row, "copies": copies[row["object"]]}) for row in measured]
+    rows = [_select_columns({**row, "copies": copies[row["object"]]}) for row in measured]
 
     # Pictures, clouds and a scene of them.
     points_m = back_project(frame.depth_m, frame.K).reshape(-1, 3)
-    is_seen = points_m.isfinite().all(-1) & (points_m[:, 2] > 0)
-    color = frame.rgb.permute(1, 2, 0).reshape(-1, 3)[is_seen]
-    table = Cloud(points=points_m[is_seen].float(), color=color)
+    has_reading = points_m.isfinite().all(-1) & (points_m[:, 2] > 0)
+    color = frame.rgb.permute(1, 2, 0).reshape(-1, 3)[has_reading]
+    table = Cloud(points=points_m[has_reading].float(), color=color)
     picture = frame.rgb
     layers = [Layer(name="table, as the sensor sees it", shape=table)]
     for view, estimate, instance in zip(views, estimates, dataset.instances, strict=True):
         model = models[instance.object_id]
         K = instance.K.double()
-        if (pose := estimate.camera_from_model) is not None:
+        pose = estimate.camera_from_model
+        if pose is not None:
             picture = draw_pose(picture, pose, model, K)
             cloud = posed_cloud(object_points(view, model.diameter_m), pose, model)
             write_cloud(folder / f"{view.object}.{CLOUD}", cloud)
@@ -256,6 +284,15 @@ def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
     return rows, [Section(title=title, text=_TEXT, rows=rows, pictures=pictures, scenes=scenes)]
 
 
+def _write_sample(view: ViewInput, folder: Path) -> None:
+    """Write depth image, mask and camera of a view as files that ``pose predict`` takes."""
+    height, width = view.mask.shape
+    camera = Camera(width=width, height=height, K=view.K.double(), depth_unit_m=_UNIT_M)
+    write_camera(folder / "camera.json", camera)
+    write_depth_png(folder / "depth.png", view.depth_m, _UNIT_M)
+    write_mask(folder / "mask.png", view.mask)
+
+
 def _named_copies(estimate: PoseEstimate) -> list[Rigid]:
     """Give the near-symmetric copies that an estimate names beside its pose."""
     return [other.camera_from_model for other in estimate.alternatives if other.is_copy]
@@ -264,23 +301,23 @@ def _named_copies(estimate: PoseEstimate) -> list[Rigid]:
 def _at_nearest_copy(
     estimate: PoseEstimate, instance: Instance, models: Mapping[int, ObjectModel]
 ) -> PoseEstimate:
-    """Give an estimate the pose, of its own and its copies, that is nearest to the truth."""
+    """Return an estimate with the nearest to the truth of its pose and that pose's copies."""
     if estimate.camera_from_model is None:
         return estimate
     points_m = models[instance.object_id].vertices_m
-    named = [estimate.camera_from_model, *_named_copies(estimate)]
-    errors_m = [float(add_m(pose, instance.camera_from_model, points_m)) for pose in named]
-    return replace(estimate, camera_from_model=named[errors_m.index(min(errors_m))])
+    poses = [estimate.camera_from_model, *_named_copies(estimate)]
+    nearest = min(poses, key=lambda pose: float(add_m(pose, instance.camera_from_model, points_m)))
+    return replace(estimate, camera_from_model=nearest)
 
 
-def _row(measured: dict[str, Any]) -> dict[str, Any]:
-    """The columns that a newcomer reads, in units that parts have."""
+def _select_columns(measured: dict[str, Any]) -> dict[str, Any]:
+    """Select the columns of an instance that the page shows, lengths in millimetres."""
     error_m = measured["error_m"]
-    moved_m = measured["translation_m"]
+    translation_m = measured["translation_m"]
     row = measured | {
         "error_mm": None if error_m is None else 1000 * error_m,
         "of_diameter": None if error_m is None else error_m / measured["diameter_m"],
-        "translation_mm": None if moved_m is None else 1000 * moved_m,
+        "translation_mm": None if translation_m is None else 1000 * translation_m,
         "ms_network": round(measured["ms_network"]),
         "ms_total": round(measured["ms_total"]),
     }
@@ -288,7 +325,7 @@ def _row(measured: dict[str, Any]) -> dict[str, Any]:
 
 
 _PAGE = "report.html"
-_FOLDERS = (
+_RESULT_FOLDERS = (
     "street", "motorcycle", "selecting-generator", "stereo-network", "sgbm-holes-filled",
     "part", "parts", "geo-posenet",
 )  # fmt: skip
@@ -311,19 +348,22 @@ def make_demo(
 ) -> DemoResult:
     """Pose synthetic parts on a table; estimate depth of a real pair and a synthetic street.
 
-    ``on_message`` is called with what is done next.
+    Args:
+        out: folder for the page, tables, pictures and poses.
+        weights: of the depth networks.
+        parts: weights of a pose network for the parts.
+        on_message: called with what is done next.
     """
-    claim_folder(
-        out, {"command": "demo"}, [*_FOLDERS, *pages.table_files("depths", "poses"), _PAGE]
-    )
+    files = [*_RESULT_FOLDERS, *pages.table_files("depths", "poses"), _PAGE]
+    claim_folder(out, {"command": "demo"}, files)
     on_message = on_message or (lambda _: None)
     on_message("synthetic parts on a table are posed from a depth image ...")
-    poses, of_pose = show_poses(out, parts)
+    poses, pose_sections = show_poses(out, parts)
     on_message("depth of a real pair and of a synthetic street ...")
-    depths, of_depth = show_depth(out, weights)
+    depths, depth_sections = show_depth(out, weights)
     pages.write_table(out, depths, name="depths")
     pages.write_table(out, poses, name="poses")
     page = out / _PAGE
     title = "depthpose: a depth sensor to poses, images to metric depth"
-    pages.write_page(page, title, [*of_pose, *of_depth], environment())
+    pages.write_page(page, title, [*pose_sections, *depth_sections], environment())
     return DemoResult(page, depths, poses)

@@ -530,7 +530,7 @@ def test_a_cad_file_that_no_weights_know_is_registered(
     page: TestClient,
     files: dict[str, str],
 ) -> None:
-    monkeypatch.setattr(pose_tab, "_SAME", -1.0)
+    monkeypatch.setattr(pose_tab, "_SAME_SHAPE", -1.0)
     cad = {"cad": f"{PART}.stl"}
     found = ask(page, "pose", samples, files | cad, object="cad", cad_unit="mm").json()
     assert dict(found["facts"])["by"].startswith("the CAD file alone")

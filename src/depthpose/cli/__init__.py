@@ -80,8 +80,8 @@ _TITLES = {
     "reproduce figure": "the tables and figures of the thesis",
 }
 """A title for each group of commands, by the first words of its commands."""
-_THESIS = ("reproduce", "figure")
-_OF_THESIS = {
+_THESIS_GROUPS = ("reproduce", "figure")
+_THESIS_SUMMARY = {
     "reproduce ID": "a table: 2.1, 2.2, 2.3, 3.1, 3.2 or 3.3, published rows beside ours",
     "figure ID": "a figure: 2-1, 2-5, 3-2, 3-4 or 3-5, from your frames and weights",
 }
@@ -93,11 +93,12 @@ _EXIT_CODES = """exit codes:
   130  interrupted"""
 
 
-_LEAST_KIB = 750_000
-"""Of address space; where torch and SciPy find less, they end the process without a reason."""
-_OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
+_MIN_ADDRESS_SPACE_KIB = 750_000
+"""Where torch and SciPy find less, they end the process without a reason."""
+_MAX_COMMAND_WORDS = 3
+_DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
 """Errors of a disk where a library or a temporary file writes; our own writers catch them."""
-_OF_A_PATH = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ELOOP, errno.EISDIR,
+_PATH_ERRORS = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ELOOP, errno.EISDIR,
               errno.ENOTDIR)  # fmt: skip
 """Errors of a path that is looked at before it is read."""
 
@@ -108,23 +109,12 @@ def main(words: Sequence[str] | None = None) -> int:
     0: done. 1: something in the input failed, or the output cannot be written. 2: unusable.
     130: interrupted. 141: nobody reads the output.
     """
-    lock = sys.modules.get("depthpose.core.run")  # not imported for --help
-    before = lock.held_folders() if lock is not None else ()
-    as_usual = warnings.formatwarning
-    shown: set[str] = set()
-
-    def in_a_line(message: Warning | str, kind: type[Warning], *place: Any, **line: Any) -> str:  # noqa: ANN401
-        """Show each of our notices once, without the file and line of the code that gives it."""
-        if not issubclass(kind, Notice):
-            return as_usual(message, kind, *place, **line)
-        text = f"depthpose: {message}\n"
-        if text in shown:  # of a file that is read once more for the report
-            return ""
-        shown.add(text)
-        return text
-
+    # Folders are released that the command claims; their module is not loaded for --help.
+    run_module = sys.modules.get("depthpose.core.run")
+    held_before = () if run_module is None else run_module.held_folders()
+    usual_format = warnings.formatwarning
     with lasting_streams() as output:
-        warnings.formatwarning = in_a_line
+        warnings.formatwarning = _notice_format(usual_format)
         try:
             code = _run(list(sys.argv[1:] if words is None else words))
         except (InputError, MissingExtraError) as error:
@@ -132,89 +122,124 @@ def main(words: Sequence[str] | None = None) -> int:
         except KeyboardInterrupt as stop:
             code = _fail(f"{str(stop) or 'interrupted'}; what was finished is kept", 130)
         except Exception as error:
-            if (reason := _explained(error)) is None:
+            reason = _explain_system_error(error)
+            if reason is None:
                 raise
             code = _fail(f"error: {reason}")
         finally:
-            warnings.formatwarning = as_usual
-            if (lock := sys.modules.get("depthpose.core.run")) is not None:
-                lock.release_folders(but=before)
+            warnings.formatwarning = usual_format
+            run_module = sys.modules.get("depthpose.core.run")
+            if run_module is not None:
+                run_module.release_folders(but=held_before)
     if output.failure is None:
         return code
     if isinstance(output.failure, BrokenPipeError):  # nobody reads it any longer, as in '| head'
         return 141
-    reason = output.failure.strerror
-    lost = f"standard output: cannot be written: {reason}; all files are written as without it"
-    return _fail(f"error: {lost}", code or 1)
+    reason = f"cannot be written: {output.failure.strerror}; all files are written as without it"
+    return _fail(f"error: standard output: {reason}", code or 1)
+
+
+def _notice_format(usual_format: Callable[..., str]) -> Callable[..., str]:
+    """Make a format of warnings that shows each :class:`Notice` once, in a line without its place.
+
+    Other warnings look as usual.
+    """
+    shown: set[str] = set()
+
+    def format_warning(
+        message: Warning | str,
+        category: type[Warning],
+        *place: Any,  # noqa: ANN401  file and line of the code
+        **source: Any,  # noqa: ANN401
+    ) -> str:
+        if not issubclass(category, Notice):
+            return usual_format(message, category, *place, **source)
+        text = f"depthpose: {message}\n"
+        if text in shown:  # a file is read once more for the report
+            return ""
+        shown.add(text)
+        return text
+
+    return format_warning
 
 
 def _fail(reason: str, code: int = 2) -> int:
+    """Print why the command failed, and give the exit code."""
     print(f"depthpose: {reason}", file=sys.stderr)
     return code
 
 
-def _explained(error: Exception) -> str | None:
-    """Explain a full memory, a full disk or an unusable path in a line; None of any other error."""
-    if (reason := full_memory(error)) is not None:
+def _explain_system_error(error: Exception) -> str | None:
+    """Explain a full memory, a full disk or an unusable path in a line; None: another error."""
+    reason = full_memory(error)
+    if reason is not None:
         return f"{reason}; what was finished is kept"
-    if not isinstance(error, OSError) or error.errno not in (*_OF_THE_DISK, *_OF_A_PATH):
+    if not isinstance(error, OSError) or error.errno not in (*_DISK_ERRORS, *_PATH_ERRORS):
         return None
     from tempfile import gettempdir
 
-    place = error.filename or f"a temporary file in {gettempdir()}"
+    path = error.filename or f"a temporary file in {gettempdir()}"
     return (
-        f"{place}: cannot be written: {error.strerror}; free the space, or choose another place "
+        f"{path}: cannot be written: {error.strerror}; free the space, or choose another place "
         "(TMPDIR names that of temporary files)"
     )
 
 
 @dataclass(eq=False)
 class Output:
-    """A standard stream that remembers why it could not be written, in place of raising it."""
+    """A standard stream that keeps the error of a write, in place of raising it."""
 
     stream: Any  #: what is written to
-    is_lost: bool = False  #: the process began without it, and ``stream`` stands in its place
-    failure: OSError | None = None
+    is_missing: bool = False  #: whether the process began without it; ``stream`` replaces it
+    failure: OSError | None = None  #: of the first write that failed
 
     def write(self, text: str) -> int:
         """Write text at once, unless an earlier write has failed."""
         if self.failure is None:
             try:
-                if self.is_lost:
+                if self.is_missing:
                     raise OSError(errno.EBADF, "it is closed")  # noqa: TRY301
                 self.stream.write(text)
                 self.stream.flush()
             except OSError as error:
                 self.failure = error
-                with suppress(OSError), open(os.devnull, "wb") as nothing:  # noqa: PTH123
-                    os.dup2(nothing.fileno(), self.stream.fileno())  # for what is buffered
+                # What is still in the stream's buffer must go somewhere when the process ends.
+                with suppress(OSError), open(os.devnull, "wb") as nowhere:  # noqa: PTH123
+                    os.dup2(nowhere.fileno(), self.stream.fileno())
         return len(text)
 
     def __getattr__(self, name: str) -> Any:  # noqa: ANN401  whatever a stream has
-        """Give what the stream has."""
+        """Give any other attribute of the stream."""
         return getattr(self.stream, name)
 
 
 @contextmanager
 def lasting_streams() -> Iterator[Output]:
-    """Let a command print though its streams are closed or full; gives standard output.
+    """Let a command run to its end even if its standard streams are closed or full.
 
-    The numbers of closed streams are taken, so that no file gets them and is written into.
+    Gives standard output, whose failure is known afterwards.
     """
-    for number in range(3):
+    # Descriptors 0, 1 and 2 of closed streams are taken: else the next file that is opened gets
+    # one of them, and what is printed is written into that file.
+    for descriptor in range(3):
         try:
-            os.fstat(number)
+            os.fstat(descriptor)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # takes the lowest free number
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest free descriptor
+
     before = sys.stdin, sys.stdout, sys.stderr
     with ExitStack() as opened:
-        names = zip(before, "rww", strict=True)
-        real = [s or opened.enter_context(open(os.devnull, mode)) for s, mode in names]  # noqa: PTH123
-        output, errors = (Output(real[k], is_lost=before[k] is None) for k in (1, 2))
+        stdin, stdout, stderr = (
+            stream or opened.enter_context(open(os.devnull, mode))  # noqa: PTH123
+            for stream, mode in zip(before, "rww", strict=True)
+        )
+        output = Output(stdout, is_missing=before[1] is None)
+        errors = Output(stderr, is_missing=before[2] is None)
         for stream in (output, errors):
-            if (reconfigure := getattr(stream, "reconfigure", None)) is not None:
+            reconfigure = getattr(stream, "reconfigure", None)
+            if reconfigure is not None:
                 reconfigure(errors="backslashreplace")  # names of files need not be UTF-8
-        sys.stdin = real[0]
+        sys.stdin = stdin
         sys.stdout = output
         sys.stderr = errors
         try:
@@ -223,73 +248,102 @@ def lasting_streams() -> Iterator[Output]:
             sys.stdin, sys.stdout, sys.stderr = before
 
 
-def _list_commands(group: str, described: Mapping[str, str]) -> str:
-    """Write the help of a group of commands, or of all of them: a line each, under titles."""
-    width = max(map(len, described)) + 2
+def _format_commands(group: str, summaries: Mapping[str, str]) -> str:
+    """Format the help of a group of commands, or of all: a line for each command, under titles.
+
+    ``group``: its first word, empty for all; ``summaries``: of the commands, by name.
+    """
+    width = max(map(len, summaries)) + 2
     lines = [f"usage: depthpose {group or 'COMMAND'} ... [--help]", ""]
     lines += ["The 6-DoF pose of a known object from a depth sensor, and metric depth from images."]
     for first_words, title in _TITLES.items():
-        names = [name for name in described if name.split()[0] in first_words.split()]
+        names = [name for name in summaries if name.split()[0] in first_words.split()]
         if names:
-            lines += ["", f"{title}:", *(f"  {name:<{width}}{described[name]}" for name in names)]
+            lines += ["", f"{title}:", *(f"  {name:<{width}}{summaries[name]}" for name in names)]
     return "\n".join([*lines, "", _EXIT_CODES])
 
 
 def _run(words: list[str]) -> int:
     """Read the words after ``depthpose`` as a command and its options, and call it."""
     if words in (["--version"], ["-V"]):
-        from importlib.metadata import version  # not for --help, which it would double
-
-        from depthpose.cli.doctor import device_names
-
-        versions = f"torch {version('torch')}, Python {platform.python_version()}"
-        print(f"depthpose {__version__} ({versions}, {device_names()})")  # for a bug report
-        return 0
-    names = (" ".join(words[:length]) for length in (3, 2, 1))
-    name = next((name for name in names if name in COMMANDS), None)
+        return _print_version()
+    lengths = range(_MAX_COMMAND_WORDS, 0, -1)
+    prefixes = (" ".join(words[:length]) for length in lengths)
+    name = next((prefix for prefix in prefixes if prefix in COMMANDS), None)
     if name is None:
-        asked_help = {"-h", "--help"} & set(words)
-        group = words[0] if words and not words[0].startswith("-") else ""
-        groups = {name.partition(" ")[0] for name in COMMANDS}
-        if group and group not in groups:
-            return _fail(f"error: no command {group!r}; {nearest_name(group, groups)}")
-        inside = {name: what for name, (_, what) in COMMANDS.items() if name.startswith(group)}
-        verb = next((word for word in words[1:] if not word.startswith("-")), "")
-        if group and verb:
-            near = nearest_name(verb, [name.partition(" ")[2] for name in inside])
-            print(f"depthpose {group}: error: no command {verb!r}; {near}", file=sys.stderr)
-            return 2
-        if not group:
-            inside = {
-                n: what for n, what in inside.items() if n.split()[0] not in _THESIS
-            } | _OF_THESIS
-        stream = sys.stdout if asked_help else sys.stderr
-        print(_list_commands(group, inside), file=stream)
-        return 0 if asked_help else 2
-    rest = words[len(name.split()) :]
+        return _list_commands(words)
+
+    option_words = words[len(name.split()) :]
     import tyro
 
-    from depthpose.cli import arguments
+    from depthpose.cli import arguments, ignored_options
 
-    home, _, function = COMMANDS[name][0].partition(":")
-    command: Callable[..., int] = getattr(import_module(f"depthpose.cli.{home}"), function)
+    module, _, function = COMMANDS[name][0].partition(":")
+    command: Callable[..., int] = getattr(import_module(f"depthpose.cli.{module}"), function)
     parse, options = arguments.parser_of(command)
     try:
         parsed = tyro.cli(
             parse,
             prog=f"depthpose {name}",
             description=arguments.description_of(command),
-            args=rest,
+            args=option_words,
             config=(tyro.conf.PositionalMetavarFromFieldName, tyro.conf.OmitArgPrefixes),
         )
     except SystemExit as stop:  # tyro has printed help (0) or the wrong arguments (2)
         return int(stop.code or 0)
-    arguments.refuse_words(name, options, rest)
+    ignored_options.refuse_empty(options, option_words)
+    ignored_options.refuse_ignored(name, option_words)
     arguments.refuse_missing(options, parsed.arguments)
-    if sys.platform != "win32":
-        import resource
-
-        if 0 <= (limit := resource.getrlimit(resource.RLIMIT_AS)[0]) < _LEAST_KIB * 1024:
-            raise InputError(f"the limit of {limit // 1024} KiB (ulimit -v) is below the "
-                             f"{_LEAST_KIB} that the libraries alone take; raise it")  # fmt: skip
+    _refuse_small_address_space()
     return command(*parsed.args, **parsed.kwargs)
+
+
+def _print_version() -> int:
+    """Print what a bug report needs: versions and devices."""
+    from importlib.metadata import version  # not for --help, which it would double
+
+    from depthpose.cli.doctor import device_names
+
+    versions = f"torch {version('torch')}, Python {platform.python_version()}"
+    print(f"depthpose {__version__} ({versions}, {device_names()})")
+    return 0
+
+
+def _list_commands(words: Sequence[str]) -> int:
+    """List the commands of a group, or of all, where the words name no command; give the exit code.
+
+    An unknown group or command of a group is an error, with the nearest name.
+    """
+    is_help = bool({"-h", "--help"} & set(words))
+    group = words[0] if words and not words[0].startswith("-") else ""
+    groups = {name.partition(" ")[0] for name in COMMANDS}
+    if group and group not in groups:
+        return _fail(f"error: no command {group!r}; {nearest_name(group, groups)}")
+    summaries = {name: summary for name, (_, summary) in COMMANDS.items() if name.startswith(group)}
+    verb = next((word for word in words[1:] if not word.startswith("-")), "")
+    if group and verb:
+        nearest = nearest_name(verb, [name.partition(" ")[2] for name in summaries])
+        print(f"depthpose {group}: error: no command {verb!r}; {nearest}", file=sys.stderr)
+        return 2
+
+    if not group:  # a line stands for all tables of the thesis, and a line for all figures
+        for name in list(summaries):
+            if name.split()[0] in _THESIS_GROUPS:
+                del summaries[name]
+        summaries |= _THESIS_SUMMARY
+    print(_format_commands(group, summaries), file=sys.stdout if is_help else sys.stderr)
+    return 0 if is_help else 2
+
+
+def _refuse_small_address_space() -> None:
+    """Refuse a limit of memory (``ulimit -v``) within which the libraries cannot be loaded."""
+    if sys.platform == "win32":
+        return
+    import resource
+
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if 0 <= limit < _MIN_ADDRESS_SPACE_KIB * 1024:
+        raise InputError(
+            f"the limit of {limit // 1024} KiB (ulimit -v) is below the {_MIN_ADDRESS_SPACE_KIB} "
+            "that the libraries alone take; raise it"
+        )

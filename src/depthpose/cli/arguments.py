@@ -1,7 +1,7 @@
-"""The options of commands: their types and how ``--help`` shows them; what is refused early.
+"""The options of commands: their types and how ``--help`` shows them.
 
 Types become words (``{None}|PATH`` is PATH), and a default that is nothing is not shown. Paths and
-weights that do not exist are refused before anything is loaded, and so is what has no effect.
+weights that do not exist are refused before anything is loaded.
 """
 
 import os
@@ -36,95 +36,124 @@ from depthpose.core.errors import InputError
 
 
 class _Names(Enum):
-    """What the value of an option names, where its type does not say so."""
+    """What the value of an option names."""
 
-    INPUT = "what is read"
-    NEW = "what need not exist"
-    WEIGHTS = "weights"
+    INPUT = "a file or folder that is read"
+    NEW = "a file or folder that need not exist"
+    WEIGHTS = "weights, by name or file"
 
 
 Source = Annotated[str, _Names.INPUT]
 """A file, folder, pattern or URL that is read; a ``Path`` is a file or folder that is read."""
 NewPath = Annotated[Path, _Names.NEW]
 """A file or folder that need not exist: it is written, or the command itself says it is missing."""
-NewPlace = Annotated[str, _Names.NEW]  # a folder or URL that is written
-WeightsName = Annotated[str, _Names.WEIGHTS]  # weights, by name or file, or a word in their place
+NewPlace = Annotated[str, _Names.NEW]
+"""A folder or URL that is written."""
+WeightsName = Annotated[str, _Names.WEIGHTS]
+"""Weights, by name or file, or one of ``_NOT_WEIGHTS``."""
 
-_WORDS = ("sgbm", "nothing", "register")  # what may be said in place of weights
+_NOT_WEIGHTS = ("sgbm", "nothing", "register")
+"""Words that may stand in place of weights."""
 _PREFIXES = "^(both|sgbm|own|matched|quick|fine):"
 """Before the name of weights: how they are used."""
 _POSITIONAL = get_args(tyro.conf.Positional[int])[1]
-_OF_TYPES = {Path: "PATH", str: "TEXT", int: "N", float: "NUMBER"}
-_NOTHING = ("", "None")
-_WIDEST = 100
+_PLACEHOLDERS = {Path: "PATH", str: "TEXT", int: "N", float: "NUMBER"}
+_EMPTY_DEFAULTS = ("", "None")
+_MAX_WIDTH = 100
 """Characters of a line of help; a wider terminal is not filled, for long lines are hard to read."""
 Config = TypeVar("Config", bound=Any)
 
 
-shown_as = partial(
-    tyro.conf.arg,
-    help_behavior_hint=lambda default: "" if default in _NOTHING else f"(default: {default})",
-)
+def _default_hint(default: str) -> str:
+    """Say in ``--help`` what the default is, if it is anything."""
+    return "" if default in _EMPTY_DEFAULTS else f"(default: {default})"
+
+
+shown_as = partial(tyro.conf.arg, help_behavior_hint=_default_hint)
 """Show an option with this ``metavar`` in the place of its value; None: as tyro does."""
 
 Device = Annotated[str, shown_as(metavar="DEVICE", help="cpu, cuda, cuda:1, ...")]
 
 
 class Option(NamedTuple):
-    """An option of a command, and what its value names, if anything."""
+    """An option of a command."""
 
-    parameter: str  #: of the command; an option of a group is a field of it
-    name: str
-    names: _Names | None
+    parameter: str  #: of the command's function; that of a group is a dataclass of several options
+    name: str  #: with underscores
+    names: _Names | None  #: what its value names; None: neither a file nor weights
 
 
 def parser_of(
     command: Callable[..., int],
 ) -> tuple[Callable[..., BoundArguments], list[Option]]:
-    """Make the parser of a command for tyro, with its options."""
+    """Make a function that tyro can parse options for, and list the options of a command.
+
+    The function has the signature and docstring of the command, with types that say how ``--help``
+    shows them, and gives the arguments that the command is called with.
+    """
     hints = get_type_hints(command, include_extras=True)
     shape = signature(command)
     options: list[Option] = []
     for parameter in shape.parameters.values():
-        group = type(parameter.default) if is_dataclass(parameter.default) else None
-        types = {parameter.name: hints[parameter.name]}
-        types = types if group is None else get_type_hints(group, include_extras=True)
-        texts = _help_texts(command if group is None else group)
-        for name, hint in types.items():
-            metavar, names = _described(hint)
-            options.append(Option(parameter.name, name, names))
-            has_metavar = any(
-                hasattr(mark, "metavar") for mark in getattr(hint, "__metadata__", ())
-            )
-            shown = shown_as(metavar=None if has_metavar else metavar, help=texts.get(name))
-            types[name] = Annotated[hint, shown]
-        if group is None:
-            hints |= types
+        if is_dataclass(parameter.default):
+            group = type(parameter.default)
+            types = get_type_hints(group, include_extras=True)
+            group.__annotations__, more = _with_help(types, parameter.name, _help_texts(group))
         else:
-            group.__annotations__ = types
-    worded = [p.replace(annotation=hints[n]) for n, p in shape.parameters.items()]
+            types = {parameter.name: hints[parameter.name]}
+            shown, more = _with_help(types, parameter.name, _help_texts(command))
+            hints |= shown
+        options += more
+    parameters = [p.replace(annotation=hints[name]) for name, p in shape.parameters.items()]
 
     def parse(*words: object, **options: object) -> BoundArguments:
         return shape.bind(*words, **options)
 
-    function = unwrap(parse)  # tyro looks behind what checks types in tests, and so do we
+    function = unwrap(parse)  # tests wrap functions to check types, and tyro reads the inner one
     function.__doc__ = command.__doc__
     function.__module__ = command.__module__
     function.__annotations__ = hints
-    vars(function)["__signature__"] = shape.replace(parameters=worded)
+    vars(function)["__signature__"] = shape.replace(parameters=parameters)
     return function, options
 
 
-def _help_texts(described: type | Callable[..., int]) -> dict[str, str]:
-    """Read what the docstrings of a command or a group of options say of each option.
+def _with_help(
+    types: Mapping[str, Any], parameter: str, texts: Mapping[str, str]
+) -> tuple[dict[str, Any], list[Option]]:
+    """Annotate the types of options with their placeholders and texts for ``--help``.
 
-    A text is one line: tyro keeps the line breaks of indented docstrings, which belong to the code.
+    Args:
+        types: of the options, by name.
+        parameter: of the command, that they are.
+        texts: of the options, by name.
+
+    Returns:
+        The annotated types, and the options.
     """
+    annotated: dict[str, Any] = {}
+    options: list[Option] = []
+    for name, hint in types.items():
+        placeholder, names = _placeholder_of(hint)
+        marks = getattr(hint, "__metadata__", ())
+        if any(hasattr(mark, "metavar") for mark in marks):  # the declaration has its own
+            placeholder = None
+        annotated[name] = Annotated[hint, shown_as(metavar=placeholder, help=texts.get(name))]
+        options.append(Option(parameter, name, names))
+    return annotated, options
+
+
+def _help_texts(described: type | Callable[..., int]) -> dict[str, str]:
+    """Read the text of each option from the docstrings of a command, or of a group's fields.
+
+    Each text becomes a single line, for tyro would keep the line breaks of the source code.
+    """
+    sources: list[Any] = [described]
+    if isinstance(described, type):  # fields may be inherited; a subclass has the last word
+        sources = [base for base in reversed(described.mro()) if base is not object]
     texts: dict[str, str] = {}
-    for source in reversed(described.mro()) if isinstance(described, type) else [described]:
-        if source is not object:
-            parameters = docstring_parser.parse_from_object(source).params
-            texts |= {p.arg_name: " ".join((p.description or "").split()) for p in parameters}
+    for source in sources:
+        for option in docstring_parser.parse_from_object(source).params:
+            texts[option.arg_name] = " ".join((option.description or "").split())
     return texts
 
 
@@ -134,7 +163,7 @@ def description_of(command: Callable[..., int]) -> str:
     Lines are indented, since tyro joins those that begin with a letter; lines that the docstring
     indents (examples, lists) stay as they are.
     """
-    width = min(shutil.get_terminal_size().columns, _WIDEST) - 2
+    width = min(shutil.get_terminal_size().columns, _MAX_WIDTH) - 2
     text = cleandoc(command.__doc__ or "").partition("\nArgs:")[0].strip()
     wrapped: list[str] = []
     for is_prose, run in groupby(text.splitlines(), lambda line: line[:1] not in ("", " ")):
@@ -143,212 +172,95 @@ def description_of(command: Callable[..., int]) -> str:
     return textwrap.indent("\n".join(wrapped), "  ")
 
 
-def _described(hint: Any) -> tuple[str | None, _Names | None]:  # noqa: ANN401  any type
-    """Give the placeholder of a value, None where tyro's will do, and what it names."""
+def _placeholder_of(hint: Any) -> tuple[str | None, _Names | None]:  # noqa: ANN401  any type
+    """Give the placeholder of a value in ``--help``, and what the value names.
+
+    The placeholder is None where tyro's own will do, the second None where it names nothing.
+    """
     origin = get_origin(hint)
     parts = get_args(hint)
     if origin is Annotated:
-        named = next((mark for mark in parts if isinstance(mark, _Names)), None)
-        if named is None:
-            return None, _described(parts[0])[1]
-        word = "NAME|FILE" if named is _Names.WEIGHTS else "PATH"
-        return None if _POSITIONAL in parts else word, named
+        names = next((mark for mark in parts if isinstance(mark, _Names)), None)
+        if names is None:
+            return None, _placeholder_of(parts[0])[1]
+        placeholder = "NAME|FILE" if names is _Names.WEIGHTS else "PATH"
+        return None if _POSITIONAL in parts else placeholder, names
     if origin in (Union, UnionType):
-        return _described(next(part for part in parts if part is not NoneType))
+        return _placeholder_of(next(part for part in parts if part is not NoneType))
     if origin is Literal:
         return f"{{{','.join(map(str, parts))}}}", None
     if origin in (tuple, list):
-        word, names = _described(parts[0])
-        many = f"{word} ..." if parts[1:] in ((), (...,)) else " ".join([str(word)] * len(parts))
-        return word and many, names
-    return _OF_TYPES.get(hint), _Names.INPUT if hint is Path else None
+        placeholder, names = _placeholder_of(parts[0])
+        has_any_length = parts[1:] in ((), (...,))
+        if placeholder is not None and has_any_length:
+            placeholder = f"{placeholder} ..."
+        elif placeholder is not None:
+            placeholder = " ".join([placeholder] * len(parts))
+        return placeholder, names
+    return _PLACEHOLDERS.get(hint), _Names.INPUT if hint is Path else None
 
 
 def refuse_missing(options: Sequence[Option], values: Mapping[str, Any]) -> None:
-    """Refuse paths and weights that do not exist; paths first: weights are looked up by torch.
+    """Refuse paths and weights that do not exist.
 
-    What need not exist is refused where a broken link is on its way.
+    ``values``: the arguments of the command by its parameters. Paths are looked up first, for
+    weights need torch, which is slow to load. Patterns and URLs are left to the command.
     """
-    for parameter, name, names in sorted(options, key=lambda option: option[2] is _Names.WEIGHTS):
-        if parameter not in values or names is None:
-            continue
-        value = values[parameter] if parameter == name else getattr(values[parameter], name)
-        for word in value if isinstance(value, list | tuple) else [value]:
-            if names is _Names.WEIGHTS and word is not None:
-                bare = re.sub(_PREFIXES, "", word)
-                if bare not in _WORDS and not bare.startswith("hf:/"):  # of the hub
-                    from depthpose.core.checkpoint import find_weights  # loads torch
+    with_paths = [option for option in options if option.names in (_Names.INPUT, _Names.NEW)]
+    for option in with_paths:
+        for word in _words_of(option, values):
+            if not any(mark in word for mark in ("://", *"*?[{")):
+                _refuse_missing_path(word, must_exist=option.names is _Names.INPUT)
+    for option in options:
+        if option.names is _Names.WEIGHTS:
+            for word in _words_of(option, values):
+                _refuse_missing_weights(word)
 
-                    find_weights(bare)
-            elif word is not None and not any(mark in str(word) for mark in ("://", *"*?[{")):
-                wanted = Path(word)
-                if wanted.exists():
-                    continue
-                if any(map(os.path.islink, (wanted, *wanted.parents))):
-                    from depthpose.core.files.disk import refuse_broken_link  # loads torch
 
-                    refuse_broken_link(wanted)
-                if names is _Names.NEW:
-                    continue
-                home = wanted.parent
-                beside = [path.name for path in home.iterdir()] if home.is_dir() else []
-                near = get_close_matches(wanted.name, beside, n=1)
-                hint = f"did you mean {str(home / near[0])!r}?" if near else "check the path"
-                raise InputError(f"{word}: there is no such file or folder; {hint}")
+def _words_of(option: Option, values: Mapping[str, Any]) -> list[str]:
+    """Give the words of an option: of several values, of one, or of none."""
+    if option.parameter not in values:
+        return []
+    value = values[option.parameter]
+    if option.parameter != option.name:  # a field of a group of options
+        value = getattr(value, option.name)
+    words = value if isinstance(value, list | tuple) else [value]
+    return [str(word) for word in words if word is not None]
+
+
+def _refuse_missing_path(word: str, *, must_exist: bool) -> None:
+    """Refuse a path that does not exist; one that need not exist only behind a broken link."""
+    path = Path(word)
+    if path.exists():
+        return
+    if any(map(os.path.islink, (path, *path.parents))):
+        from depthpose.core.files.disk import refuse_broken_link  # loads torch
+
+        refuse_broken_link(path)
+    if not must_exist:
+        return
+    folder = path.parent
+    names = [neighbour.name for neighbour in folder.iterdir()] if folder.is_dir() else []
+    near = get_close_matches(path.name, names, n=1)
+    hint = f"did you mean {str(folder / near[0])!r}?" if near else "check the path"
+    raise InputError(f"{word}: there is no such file or folder; {hint}")
+
+
+def _refuse_missing_weights(word: str) -> None:
+    """Refuse weights that do not exist, other than those of the Hugging Face hub."""
+    name = re.sub(_PREFIXES, "", word)
+    if name not in _NOT_WEIGHTS and not name.startswith("hf:/"):
+        from depthpose.core.checkpoint import find_weights  # loads torch
+
+        find_weights(name)
 
 
 def refuse_below(least: int, option: str, value: int, usual: str) -> None:
-    """Refuse a count that is too small."""
+    """Refuse a count that is too small; ``usual`` is a value that the error suggests."""
     if value < least:
         raise InputError(f"{option} {value}: give {least} or more, such as {usual}")
 
 
 def changed(config: Config, **values: object) -> Config:
-    """Return a config with other values; None leaves a setting as it is."""
-    return replace(config, **{k: v for k, v in values.items() if v is not None})
-
-
-class Typed(dict[str, list[str]]):
-    """The words after each option as they were typed, by its name; none of an absent one."""
-
-    def __missing__(self, name: str) -> list[str]:
-        """Give no words, and remember none."""
-        return []
-
-    def all_begin(self, option: str, *prefixes: str) -> bool:
-        """Whether an option has words, and all of them begin so."""
-        return bool(self[option]) and all(word.startswith(prefixes) for word in self[option])
-
-
-_NETWORK = "precision max-memory"
-_OF_FOLDER = "it chooses from a data set, and none is named; give --linemod or --bop"
-_Case = Callable[[Typed], bool]
-_RULES: tuple[tuple[str, _Case, str, str], ...] = (
-    ("pose predict, pose track",
-     lambda o: "register" in o["method"] or ("cad" in o and "method" not in o),
-     "weights voting hypotheses batch device",
-     "CAD files are posed without a network, one input after the other on the processor"),
-    ("pose predict, pose track", lambda o: "network" in o["method"], "cad symmetry",
-     "weights know their own objects; leave --method network out, or train weights of this part by "
-     "'depthpose pose train --cad'"),
-    ("pose predict, pose track", lambda o: "cad" not in o and "bin" not in o, "cad-unit",
-     "it is the unit of --cad, and no CAD file is given"),
-    ("pose predict", lambda o: "bop" in o or "cloud" in o, "bin bin-pose empty-frame",
-     "they are of a depth image; give --depth"),
-    ("pose predict", lambda o: "ray" in o["engine"],
-     "bin bin-pose empty-frame color color-camera color-from-depth labels",
-     "workers do not read it; leave --engine out"),
-    ("pose predict", lambda o: "bin" in o, "empty-frame",
-     "--bin says what there is without the parts"),
-    ("pose predict", lambda o: "bin" not in o, "bin-pose",
-     "it is of --bin; give the CAD file of the bin too"),
-    ("pose predict, pose track", lambda o: "bop" in o, "cad", "the models of --bop are taken"),
-    ("pose predict, pose track", lambda o: "bop" in o,
-     "mask box detections labels camera focal-px unit",
-     "a data set says its cameras and units itself, and its masks are chosen by --masks"),
-    ("pose predict, pose track", lambda o: "bop" in o, "base-from-camera",
-     "the cameras of a data set move"),
-    ("pose predict", lambda o: "bop" in o and "ray" in o["engine"], "engine",
-     "a data set is posed by this process, or shared by those of torchrun"),
-    ("pose predict", lambda o: "bop" not in o, "split masks targets",
-     "--bop names no data set; the mask of a depth image is given by --mask"),
-    ("pose predict, pose track", lambda o: "cloud" in o,
-     "mask box detections labels camera focal-px",
-     "a cloud is of the object alone, in the camera's frame"),
-    ("pose predict, depth predict", lambda o: "camera" in o, "focal-px fov",
-     "--camera has the focal length"),
-    ("depth predict", lambda o: "focal-px" in o, "fov", "--focal-px is the focal length"),
-    ("pose predict", lambda o: "least-squares" in o["voting"], "hypotheses",
-     "--voting least-squares draws no hypotheses"),
-    ("pose predict", lambda o: "left" not in o, "right matcher min-confidence",
-     "it is of a pair, and there is none; give --left"),
-    ("pose predict", lambda o: "left" in o and "ray" in o["engine"], "engine",
-     "pairs are matched and posed by this process"),
-    ("pose predict", lambda o: "sgbm" in o["matcher"], "min-confidence",
-     "sgbm has no confidence"),
-    ("pose predict",
-     lambda o: ("depth" in o or "left" in o) and not {"mask", "box", "detections"} & o.keys()
-     and "ray" not in o["engine"],
-     "batch register-refused labels",
-     "an image without --mask, --box or --detections is searched alone, and registers nothing; "
-     "give one of them"),
-    ("pose predict", lambda o: "box" in o, "labels",
-     "all boxes are of one object; say which by --object, or give --detections"),
-    ("pose predict", lambda o: "detections" in o or len(o["box"]) > 1, "engine",
-     "workers give one pose for each depth image, by --mask or one --box; leave --engine out"),
-    ("pose track", lambda o: "bop" not in o, "split", "it is of a data set; give --bop"),
-    ("pose track", lambda o: "bop" in o, "first",
-     "a data set has many sequences and one pose is given; give the frames of one by --depth"),
-    ("pose evaluate", lambda o: "weights" not in o, "masks voting icp device",
-     "nothing is estimated: --csv and --predictions are measured as they are"),
-    ("pose evaluate", lambda o: o.all_begin("weights", "register"), "voting device",
-     "register does not vote, and computes on the processor"),
-    ("pose predict, depth predict, depth match",
-     lambda o: "ray" not in o["engine"], "address workers worker-cpus worker-gpus block",
-     "--engine ray takes it, and is not given; add it"),
-    ("pose predict, depth predict, depth match",
-     lambda o: o["device"][:1] in ([], ["cpu"]) and o["worker-gpus"][:1] not in (["0"], ["0.0"]),
-     "worker-gpus", "the workers compute on the processor without --device cuda"),
-    ("depth predict", lambda o: "camera-height" in o, "known-distance",
-     "--camera-height sets the scale"),
-    ("depth predict", lambda o: "matcher" in o, "answer",
-     "the depth is that of --matcher on the synthesised view"),
-    ("depth predict", lambda o: "own" in o["answer"] or "sgbm" in o["matcher"], _NETWORK,
-     "no matcher with weights runs here"),
-    ("depth match", lambda o: "matcher" in o, "weights", "--matcher matches the pair"),
-    ("depth match", lambda o: "sgbm" in o["matcher"],
-     f"device speed {_NETWORK} left-right-check max-disparity",
-     "sgbm has no weights"),
-    ("depth evaluate", lambda o: "baseline" not in o, "train train-without",
-     "--baseline takes it, and is not given; add it"),
-    ("depth evaluate, reproduce", lambda o: "train" not in o, "train-without",
-     "it leaves frames out of --train, and none is given"),
-    ("depth evaluate", lambda o: "matcher" not in o, "holes", "it is for --matcher sgbm"),
-    ("depth evaluate", lambda o: "kitti-2015" in o["protocol"], "cap",
-     "--protocol kitti-2015 measures disparity, without a limit in metres"),
-    ("depth evaluate", lambda o: o.all_begin("weights", "quick:", "fine:"), "speed",
-     "'quick:' and 'fine:' say the speed of these weights"),
-    ("depth evaluate, reproduce", lambda o: o.all_begin("weights", "own:", "sgbm:"), _NETWORK,
-     "with 'own:' and 'sgbm:' no matcher with weights runs"),
-    ("depth evaluate, reproduce", lambda o: "weights" not in o, f"device {_NETWORK} speed",
-     "no network is measured"),
-    ("weights complete", lambda o: all(Path(word).is_dir() for word in o["models"]), "unit",
-     "the models of a data set are in mm; --unit is for a model file"),
-    ("reproduce 3.1, reproduce 3.2, reproduce 3.3, figure 3-2, figure 3-4, figure 3-5",
-     lambda o: "linemod" not in o and "bop" not in o, "objects split", _OF_FOLDER),
-    ("reproduce 3.1, reproduce 3.2, reproduce 3.3, figure 3-2, figure 3-4, figure 3-5",
-     lambda o: "linemod" in o, "bop", "--linemod names the data set, and one is measured"),
-    ("reproduce 3.3", lambda o: "linemod" in o or "bop" in o, "synthetic",
-     "views are rendered where no data set is given"),
-)  # fmt: skip
-"""Commands, in which case they ignore options, which, and why."""
-
-
-def refuse_words(command: str, options: Sequence[Option], words: Sequence[str]) -> None:
-    """Refuse what the command would ignore, and a file or folder without a name.
-
-    Such a name is that of a script whose variable is unset.
-    """
-    typed = Typed()
-    spelled = dict[str, str]()
-    values: list[str] = []
-    for word in words:
-        if word.startswith("--"):
-            option, sign, value = word.removeprefix("--").partition("=")
-            name = option.replace("_", "-").removeprefix("no-")
-            spelled[name] = f"--{option}"
-            values = typed.setdefault(name, [])
-            values += [value] if sign else []
-        else:
-            values.append(word)
-    for name in (option.name.replace("_", "-") for option in options if option.names is not None):
-        if typed.get(name, [])[:1] == [""]:
-            raise InputError(
-                f"{spelled[name]} is empty; name a file or folder (the current folder is '.'), or "
-                "check the variable that should hold it"
-            )
-    for commands, case, ignored_names, reason in _RULES:
-        ignored = [spelled[name] for name in ignored_names.split() if name in typed]
-        if ignored and command in commands.split(", ") and case(typed):
-            named = " and ".join(ignored)
-            raise InputError(f"{named}: has no effect here; {reason}. Leave {named} out")
+    """Return a copy of a config with other values; a value of None leaves its setting as it is."""
+    return replace(config, **{name: value for name, value in values.items() if value is not None})

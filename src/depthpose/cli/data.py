@@ -4,7 +4,6 @@ import math
 import re
 import sys
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -16,12 +15,16 @@ from depthpose.core.units import Unit, metres_of
 from depthpose.pose.config import SensorKind
 
 if TYPE_CHECKING:  # --help must not load torch
+    from collections.abc import Iterator, Sequence
+
+    from torch import Tensor
+
     from depthpose.core.camera import RectificationReport, Rectifier
 
-_FRAMES_A_SCENE = 50
-_SCENES_A_SEED = 1000
-_MOST_SEED = 10**6 - 1
-"""Of frames of objects: a scene has nine digits at most, three of them beside the seed's."""
+_FRAMES_PER_SCENE = 50
+_SCENES_PER_SEED = 1000
+_MAX_SEED = 10**6 - 1
+"""Of frames of objects: scene numbers have nine digits at most, the last three count its scenes."""
 
 
 def make_streets(
@@ -67,17 +70,25 @@ def make_streets(
         clutter_share=clutter_share,
         with_lidar=with_lidar,
     )
-    # Seeds have drives of their own, so they may share a folder.
-    days = [f"2100_01_{day:02d}" for day in range(1, 6)]
-    claim_folder(out, {k: v for k, v in asdict(config).items() if k != "seed"}, days)
+    # The frames of each seed are a drive of their own, so seeds may share the folder.
+    dates = [f"2100_01_{day:02d}" for day in range(1, 6)]
+    settings = {key: value for key, value in asdict(config).items() if key != "seed"}
+    claim_folder(out, settings, dates)
     indices = range(first, first + number)
-    drives = {k: f"{days[rig_number(config, k)]}_drive_{seed:04d}_sync" for k in indices}
-    dates = {drive[:10]: index for index, drive in drives.items()}
-    lost = {index for date, index in dates.items() if not has_calibration(out, date)}
-    wanted = [i for i in indices if i in lost or not has_raw_frame(out, drives[i], i)]
-    for index in tqdm(wanted, unit=" frames", leave=False, disable=None):
-        write_raw_frame(out, drives[index], index, draw_street(config, index))
-    print(f"{out}: {len(wanted)} frames made, {number - len(wanted)} were there")
+    date_of = {index: dates[rig_number(config, index)] for index in indices}
+    drive_of = {index: f"{date}_drive_{seed:04d}_sync" for index, date in date_of.items()}
+
+    # A frame is missing if it is not there, or if it is to bring the calibration of its date.
+    last_of_date = {date: index for index, date in date_of.items()}
+    uncalibrated = {index for date, index in last_of_date.items() if not has_calibration(out, date)}
+    missing = [
+        index
+        for index in indices
+        if index in uncalibrated or not has_raw_frame(out, drive_of[index], index)
+    ]
+    for index in tqdm(missing, unit=" frames", leave=False, disable=None):
+        write_raw_frame(out, drive_of[index], index, draw_street(config, index))
+    print(f"{out}: {len(missing)} frames made, {number - len(missing)} were there")
     return 0
 
 
@@ -114,12 +125,12 @@ def make_near(
         )
     config = NearConfig(seed=seed, plain_share=plain)
     names = {index: f"near_{seed:04d}_{index:06d}" for index in range(first, first + number)}
-    settings = {k: v for k, v in config_to_dict(config).items() if k != "seed"}
+    settings = {key: value for key, value in config_to_dict(config).items() if key != "seed"}
     claim_folder(out, settings, list(names.values()))
-    wanted = [index for index, name in names.items() if not has_scene(out, name)]
-    for index in tqdm(wanted, unit=" scenes", leave=False, disable=None):
+    missing = [index for index, name in names.items() if not has_scene(out, name)]
+    for index in tqdm(missing, unit=" scenes", leave=False, disable=None):
         write_scene(out, names[index], draw_near(config, index))
-    print(f"{out}: {len(wanted)} scenes made, {number - len(wanted)} were there")
+    print(f"{out}: {len(missing)} scenes made, {number - len(missing)} were there")
     return 0
 
 
@@ -167,10 +178,11 @@ def make_objects(
 
     if number < 1:
         raise InputError(f"--number {number}: at least 1 frame")
-    if not 0 <= seed <= _MOST_SEED or number > _SCENES_A_SEED * _FRAMES_A_SCENE:
+    max_number = _SCENES_PER_SEED * _FRAMES_PER_SCENE
+    if not 0 <= seed <= _MAX_SEED or number > max_number:
         raise InputError(
             f"--seed {seed} --number {number}: scenes are numbered by the seed; take a seed of 0 "
-            f"to {_MOST_SEED}, and at most {_SCENES_A_SEED * _FRAMES_A_SCENE} frames of each"
+            f"to {_MAX_SEED}, and at most {max_number} frames of each"
         )
     if not re.fullmatch(r"[\w-]+", split) or split == "models":
         raise InputError(f"--split {split}: a name of letters and digits, not 'models'")
@@ -182,36 +194,43 @@ def make_objects(
         frame_clutter=clutter,
         frame_pile=pile,
     )
-    # What decides the frames; of another seed, other scenes: they may share the folder.
-    settings = {k: v for k, v in config_to_dict(config).items() if k not in ("number", "seed")}
-    settings |= {"unit": unit, "symmetries": symmetries, "cad": {
+    # What decides the frames. The seed only decides the numbers of scenes, which share the folder.
+    settings = config_to_dict(config)
+    del settings["number"], settings["seed"]
+    numbered_files = list(enumerate(cad, start=1))
+    settings["unit"] = unit
+    settings["symmetries"] = symmetries
+    settings["cad"] = {
         f"object {k}": {"file": path.name, "sha256": file_sha256(path)}
-        for k, path in enumerate(cad, start=1)
-    }}  # fmt: skip
-    models = [read_model(path, unit, number=k) for k, path in enumerate(cad, start=1)]
+        for k, path in numbered_files
+    }
+    models = [read_model(path, unit, number=k) for k, path in numbered_files]
     refuse_one_name(models)
-    with_symmetries = partial(
-        with_found_symmetries, on_message=tqdm.write, is_taken=symmetries == "found"
-    )
-    models = [with_symmetries(model) for model in models]
+    models = [
+        with_found_symmetries(model, on_message=tqdm.write, is_taken=symmetries == "found")
+        for model in models
+    ]
     claim_folder(out, settings, ["models", split])
     write_bop_models(out, models)
-    scenes = {
-        seed * _SCENES_A_SEED + k: range(first, min(first + _FRAMES_A_SCENE, number))
-        for k, first in enumerate(range(0, number, _FRAMES_A_SCENE))
-    }
-    wanted = {k: scene for k, scene in scenes.items() if not _is_made(out, split, k, scene)}
-    for k, scene in wanted.items():
-        frames = make_frames(models, config, len(scene), scene.start)
-        shown = tqdm(frames, total=len(scene), unit=" frames", leave=False, disable=None)
+
+    # The scenes by their numbers, each with the numbers of its frames.
+    scenes: dict[int, range] = {}
+    for k, first in enumerate(range(0, number, _FRAMES_PER_SCENE)):
+        last = min(first + _FRAMES_PER_SCENE, number)
+        scenes[seed * _SCENES_PER_SEED + k] = range(first, last)
+    missing = [k for k, frames in scenes.items() if not _has_whole_scene(out, split, k, frames)]
+    for k in missing:
+        count = len(scenes[k])
+        frames = make_frames(models, config, count, scenes[k].start)
+        shown = tqdm(frames, total=count, unit=" frames", leave=False, disable=None)
         home = write_bop_scene(out, split, k, list(shown))
         files = sorted(path for path in home.rglob("*") if path.is_file())
         note_result(out, home.relative_to(out).as_posix(), files)
-    print(f"{out}: {len(wanted)} scenes made, {len(scenes) - len(wanted)} were there")
+    print(f"{out}: {len(missing)} scenes made, {len(scenes) - len(missing)} were there")
     return 0
 
 
-def _is_made(out: Path, split: str, scene: int, frames: range) -> bool:
+def _has_whole_scene(out: Path, split: str, scene: int, frames: range) -> bool:
     """Whether a scene exists with all of its frames, every file as it was written."""
     from depthpose.core.files import read_json
     from depthpose.core.run import is_whole
@@ -359,10 +378,14 @@ def _label_summary(shares: list[float], failures: int) -> str:
     return f"{len(shares)} pairs labelled{share}; {failed}the others were labelled before"
 
 
-_LOOKED_AT = 8  # pairs that are checked before anything is written
-_WARN_PX = 0.5
+_CHECKED_PAIRS = 8
+"""Pairs whose rows are compared before anything is written."""
+_MAX_OFFSET_PX = 0.5
+"""Largest difference of rows in a rectified pair without a warning."""
 _SIDES = ("left", "right")
-_ASK = "were the cameras moved since, or are the images scaled or cropped? Calibrate anew"
+_CALIBRATION_QUESTION = (
+    "were the cameras moved since, or are the images scaled or cropped? Calibrate anew"
+)
 
 
 def rectify(
@@ -407,19 +430,25 @@ def rectify(
     unit_m = metres_of(unit) if unit else None
     calibration = read_raw_pair(camera, unit_m=unit_m, is_fisheye=fisheye or None)
     pairs = list_pairs(left, right)
-    homes = {(out / side).resolve() for side in _SIDES}
-    if any(path.parent.resolve() in homes for pair in pairs for path in pair):
+    result_folders = {(out / side).resolve() for side in _SIDES}
+    if any(path.parent.resolve() in result_folders for pair in pairs for path in pair):
         raise InputError(
             f"--out {out}: the inputs lie in its left or right, where the results would be written "
             "over them; choose another folder"
         )
     rectifier = make_rectifier(calibration, image_size(pairs[0][0]), keep)
     _check_rows(rectifier, pairs, is_refused=check)
-    settings: dict[str, Any] = {"command": "data rectify", "keep": keep}
-    settings["right_from_left"] = calibration.right_from_left.matrix().tolist()
+    settings: dict[str, Any] = {
+        "command": "data rectify",
+        "keep": keep,
+        "right_from_left": calibration.right_from_left.matrix().tolist(),
+    }
     for side, raw in zip(_SIDES, (calibration.left, calibration.right), strict=True):
-        lens = {"K": raw.K.tolist(), "D": list(raw.distortion), "is_fisheye": raw.is_fisheye}
-        settings[side] = lens
+        settings[side] = {
+            "K": raw.K.tolist(),
+            "D": list(raw.distortion),
+            "is_fisheye": raw.is_fisheye,
+        }
     claim_folder(out, settings, [*_SIDES, "camera.json"])
     claim_names(out, {pair[0].stem: pair for pair in pairs})
     for first, second in tqdm(pairs, unit=" pairs", leave=False, disable=None):
@@ -445,87 +474,122 @@ def split(files: tyro.conf.Positional[tuple[Source, ...]], out: NewPath) -> int:
         files: pictures, videos, folders or quoted patterns.
         out: folder for the results.
     """
-    from depthpose.cli.depth_predict import find_sources
-    from depthpose.core.camera import find_two_views, halves, order_views
-    from depthpose.core.files import VIDEO_SUFFIXES, read_video, write_image
-    from depthpose.core.files.images import read_views
+    from depthpose.cli.depth_predict import list_sources
+    from depthpose.core.camera import order_views
+    from depthpose.core.files import write_image
     from depthpose.core.run import claim_folder
 
-    sources = find_sources(files, out)
+    sources = list_sources(files, out)
     claim_folder(out, {"command": "data split"}, _SIDES)
     count = 0
     for source in sources:
-        is_video = source.suffix.lower() in VIDEO_SUFFIXES
-        pictures = (
-            ((name, [frame]) for name, frame in read_video(source))
-            if is_video
-            else [(source.stem, read_views(source))]
-        )
-        for name, views in pictures:
-            if len(views) == 1:
-                layout_of_views = find_two_views(views[0])
-                if layout_of_views is None:
-                    raise InputError(
-                        f"{source}: {name} does not look like two views of one scene, side by "
-                        "side or one above the other; leave it out"
-                    )
-                views = list(halves(views[0], layout_of_views))  # noqa: PLW2901
-            for side, view in zip(_SIDES, order_views(views[0], views[1]), strict=True):
+        for name, images in _read_two_view_pictures(source):
+            first, second = images if len(images) == 2 else _split_picture(images[0], source, name)
+            for side, view in zip(_SIDES, order_views(first, second), strict=True):
                 write_image(out / side / f"{name}.png", view)
             count += 1
     print(f"{out}: {count} pairs in left and right")
     return 0
 
 
+def _read_two_view_pictures(source: Path) -> "Iterator[tuple[str, Sequence[Tensor]]]":
+    """Read a picture, or the frames of a video, with their names.
+
+    Each is one image that holds both views, or (of .mpo) two images.
+    """
+    from depthpose.core.files import VIDEO_SUFFIXES, read_video
+    from depthpose.core.files.images import read_views
+
+    if source.suffix.lower() not in VIDEO_SUFFIXES:
+        yield source.stem, read_views(source)
+        return
+    for name, frame in read_video(source):
+        yield name, [frame]
+
+
+def _split_picture(picture: "Tensor", source: Path, name: str) -> "tuple[Tensor, Tensor]":
+    """Split a picture into its two views, side by side or one above the other."""
+    from depthpose.core.camera import find_two_views, halves
+
+    layout = find_two_views(picture)
+    if layout is None:
+        raise InputError(
+            f"{source}: {name} does not look like two views of one scene, side by side or one "
+            "above the other; leave it out"
+        )
+    return halves(picture, layout)
+
+
 def _check_rows(
     rectifier: "Rectifier", pairs: list[tuple[Path, Path]], *, is_refused: bool
 ) -> None:
-    """Check some rectified pairs, spread over all, and say by how much their rows differ."""
-    from statistics import median
+    """Print by how much the rows of some rectified pairs differ.
 
-    from depthpose.core.camera import check_rectified
-    from depthpose.core.files import read_image
+    ``is_refused``: raise an error where most of them are swapped or not rectified; else warn.
+    """
+    from statistics import median
 
     rig = rectifier.rig
     x, y = rectifier.left_maps
-    is_seen = (x >= 0) & (x <= rig.width - 1) & (y >= 0) & (y <= rig.height - 1)
+    is_visible = (x >= 0) & (x <= rig.width - 1) & (y >= 0) & (y <= rig.height - 1)
     print(
         f"rectified camera: {rig.width}x{rig.height}, fx {float(rig.K[0, 0]):.1f} px, baseline "
-        f"{rig.baseline_m:.4f} m; the raw images show {is_seen.mean():.1%} of the left view"
+        f"{rig.baseline_m:.4f} m; the raw images show {is_visible.mean():.1%} of the left view"
     )
-    count = min(_LOOKED_AT, len(pairs))
-    checked_pairs = [pairs[k * len(pairs) // count] for k in range(count)]
-    reports: list[RectificationReport] = []
-    for first, second in checked_pairs:
-        names = [str(first), str(second)]
-        left, right = rectifier.rectify(read_image(first), read_image(second), names)
-        reports.append(check_rectified(left, right, rig.cx_right_minus_left_px))
+    reports = _compare_rows(rectifier, pairs)
     judged = [report for report in reports if report.is_rectified is not None]
     if not judged:
         message = f"depthpose: the rows cannot be checked: {reports[0].message}"
         print(message, file=sys.stderr)
         return
-    measured = [report for report in judged if report.matches] or judged
-    offset_px = median(abs(report.vertical_offset_px) for report in measured)
-    spread_px = median(report.vertical_spread_px for report in measured)
-    differ = f"they differ by {offset_px:.2f} px, with a spread of {spread_px:.2f} px"
+
+    # The median over pairs; pairs without any match have no offset.
+    matched = [report for report in judged if report.matches] or judged
+    offset_px = median(abs(report.vertical_offset_px) for report in matched)
+    spread_px = median(report.vertical_spread_px for report in matched)
+    difference = f"they differ by {offset_px:.2f} px, with a spread of {spread_px:.2f} px"
     if not math.isfinite(offset_px):
-        differ = "no difference is common to their matches"
-    matches = sum(report.matches for report in judged)
-    message = f"rows of {len(judged)} pairs: {differ} ({matches} matches)"
-    wrong = ""
-    if 2 * sum(bool(report.is_swapped) for report in judged) > len(judged):
-        wrong = "left and right look swapped (disparities are negative); exchange LEFT and RIGHT"
-    elif 2 * sum(report.is_wrong for report in judged) > len(judged):
-        wrong = (
+        difference = "no difference is common to their matches"
+    match_count = sum(report.matches for report in judged)
+    message = f"rows of {len(judged)} pairs: {difference} ({match_count} matches)"
+
+    # An error where it holds for most pairs, a warning where the rows differ a little.
+    swapped_count = sum(bool(report.is_swapped) for report in judged)
+    wrong_count = sum(report.is_wrong for report in judged)
+    reason = ""
+    if 2 * swapped_count > len(judged):
+        reason = "left and right look swapped (disparities are negative); exchange LEFT and RIGHT"
+    elif 2 * wrong_count > len(judged):
+        reason = (
             "they are not rectified by it, so this is not the calibration of these images, or "
-            f"LEFT and RIGHT are exchanged; {_ASK}"
+            f"LEFT and RIGHT are exchanged; {_CALIBRATION_QUESTION}"
         )
-    if wrong and is_refused:
+    if reason and is_refused:
         raise InputError(
-            f"{message}: {wrong}. Nothing was written (--no-check writes all the same)"
+            f"{message}: {reason}. Nothing was written (--no-check writes all the same)"
         )
     print(message)
-    if wrong or offset_px > _WARN_PX:
-        wrong = wrong or f"that is above {_WARN_PX:g} px, which costs depth far away; {_ASK}"
-        print(f"depthpose: {wrong}", file=sys.stderr)
+    if not reason and offset_px > _MAX_OFFSET_PX:
+        reason = (
+            f"that is above {_MAX_OFFSET_PX:g} px, which costs depth far away; "
+            f"{_CALIBRATION_QUESTION}"
+        )
+    if reason:
+        print(f"depthpose: {reason}", file=sys.stderr)
+
+
+def _compare_rows(
+    rectifier: "Rectifier", pairs: list[tuple[Path, Path]]
+) -> "list[RectificationReport]":
+    """Rectify some pairs, spread over all, and compare the rows of what matches in them."""
+    from depthpose.core.camera import check_rectified
+    from depthpose.core.files import read_image
+
+    count = min(_CHECKED_PAIRS, len(pairs))
+    checked_pairs = [pairs[k * len(pairs) // count] for k in range(count)]
+    reports: list[RectificationReport] = []
+    for first, second in checked_pairs:
+        names = [str(first), str(second)]
+        left, right = rectifier.rectify(read_image(first), read_image(second), names)
+        reports.append(check_rectified(left, right, rectifier.rig.cx_right_minus_left_px))
+    return reports

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from depthpose.cli.arguments import NewPath, WeightsName
 
-_OF_POSES = (
+_POSE_COLUMNS = (
     "object",
     "status",
     "copies",
@@ -13,7 +13,7 @@ _OF_POSES = (
     "rotation_deg",
     "translation_mm",
 )
-_OF_DEPTHS = ("scene", "method", "input", "abs_rel", "rmse", "d1", "epe_px")
+_DEPTH_COLUMNS = ("scene", "method", "input", "abs_rel", "rmse", "d1", "epe_px")
 """Columns that are printed; the page and the files hold all."""
 
 
@@ -39,7 +39,7 @@ def demo(
     from depthpose.report.page import plain_table
 
     result = make_demo(out, weights, pose_weights, on_message=partial(print, flush=True))
-    print(plain_table(result.poses, _OF_POSES))
-    print(plain_table(result.depths, _OF_DEPTHS))
+    print(plain_table(result.poses, _POSE_COLUMNS))
+    print(plain_table(result.depths, _DEPTH_COLUMNS))
     print(f"The page: {result.page}")
     return 0

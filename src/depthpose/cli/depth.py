@@ -38,7 +38,7 @@ def predict(
         images: images, folders of them, quoted patterns such as 'left/*.png', or videos.
         out: folder for the results.
     """
-    from depthpose.cli import depth_predict as work
+    from depthpose.cli import depth_predict
 
     if not images:
         raise InputError("name images, folders of them, patterns or videos to predict from")
@@ -53,7 +53,7 @@ def predict(
         raise InputError(f"--camera-height {height_m:g}: give 0.1 to 20 metres")
     if tilt_deg is not None and not -45 <= tilt_deg <= 45:
         raise InputError(f"--camera-tilt {tilt_deg:g}: give -45 to 45 degrees")
-    method = work.DepthMethodSource(
+    source = depth_predict.DepthMethodSource(
         weights=networks.weights,
         config=matching.config,
         with_right=False,
@@ -62,21 +62,24 @@ def predict(
         answer=networks.answer,
         use="images",
     )
-    method = method.packed() if engine.engine == "ray" else method
 
-    work_of = partial(work.image_work, lens, scale, output, method)
+    # By workers of a cluster, to which the weights travel.
     if engine.engine == "ray":
-        return work.predict_on_ray(images, work.IMAGES, work_of, out, engine)
-    sources = work.find_sources(images, Path(out))
-    depth_work = work_of(sources)
-    built = method.build()
-    is_plain = (matching.precision, matching.max_memory) == ("fp32", None)
-    if built.settings.get("answer") == "own" and not is_plain:
+        packed = source.with_packed_weights()
+        make_work = partial(depth_predict.image_work, lens, scale, output, packed)
+        return depth_predict.predict_on_ray(images, depth_predict.IMAGES, make_work, out, engine)
+
+    # In this process.
+    paths = depth_predict.list_sources(images, Path(out))
+    work = depth_predict.image_work(lens, scale, output, source, paths)
+    method = source.build()
+    has_matcher_options = matching.precision != "fp32" or matching.max_memory is not None
+    if method.settings.get("answer") == "own" and has_matcher_options:
         raise InputError(
             "--precision and --max-memory are for a matcher with weights, and none runs here; "
             "leave them out"
         )
-    return work.predict_files([(path,) for path in sources], depth_work, built, Path(out))
+    return depth_predict.predict_files([(path,) for path in paths], work, method, Path(out))
 
 
 def match(
@@ -106,7 +109,7 @@ def match(
             KITTI and others; for ROS and OpenCV also a folder with both cameras' files.
         out: folder for the results.
     """
-    from depthpose.cli import depth_predict as work
+    from depthpose.cli import depth_predict
     from depthpose.core.files.images import refuse_among_inputs
 
     weights = None if pairs.matcher == "sgbm" else pairs.matcher or pairs.weights or "default"
@@ -115,20 +118,24 @@ def match(
         with_left_right_check=matching.left_right_check,
         max_disparity_px=matching.max_disparity,
     )
-    method = work.DepthMethodSource(weights=weights, config=config, with_right=True, use="pairs")
-    method = method.packed() if engine.engine == "ray" else method
+    source = depth_predict.DepthMethodSource(
+        weights=weights, config=config, with_right=True, use="pairs"
+    )
 
-    work_of = partial(work.pair_work, camera, pairs, method)
+    # By workers of a cluster, to which the weights travel.
     if engine.engine == "ray":
+        packed = source.with_packed_weights()
+        make_work = partial(depth_predict.pair_work, camera, pairs, packed)
         sides = [left] if right is None else [left, right]
-        return work.predict_on_ray(sides, work.PAIRS, work_of, out, engine)
+        return depth_predict.predict_on_ray(sides, depth_predict.PAIRS, make_work, out, engine)
+
+    # In this process.
     if right is None:
         raise InputError(f"{left}: there is no right image beside it; give it second")
-    files = work.list_pairs(left, right)
+    files = depth_predict.list_pairs(left, right)
     refuse_among_inputs(Path(out), (left, right), [path for pair in files for path in pair])
-    depth_work = work_of(files[0])
-    built = method.build()
-    return work.predict_files(files, depth_work, built, Path(out))
+    work = depth_predict.pair_work(camera, pairs, source, files[0])
+    return depth_predict.predict_files(files, work, source.build(), Path(out))
 
 
 def evaluate(
@@ -179,19 +186,24 @@ def evaluate(
 
     # The folder is that of these frames and this protocol; methods may be added later.
     is_url = re.match(r"\w+:/", str(data)) is not None
-    location = str(data if is_url else data.resolve())
-    about = {"data": location, "split": None if split is None else str(split)}
-    about |= {"protocol": comparison.protocol, "cap": list(comparison.cap)}
+    settings = {
+        "command": "depth evaluate",
+        "data": str(data if is_url else data.resolve()),
+        "split": None if split is None else str(split),
+        "protocol": comparison.protocol,
+        "cap": list(comparison.cap),
+    }
     files = [*table_files("rows", "frames", "confidence"), "report.html", "predictions"]
-    claim_folder(out, {"command": "depth evaluate", **about}, files)
+    claim_folder(out, settings, files)
 
     # Predict what is missing, then measure it with the predictions that are given.
     folders = [predict_dataset(dataset, method, rule, out / "predictions") for method in chosen]
-    name = comparison.protocol
+    protocol = comparison.protocol
     caps_m = comparison.cap
     predictions = methods.predictions
     if predictions is not None and stores.exists(stores.join(predictions, PLAN)):
-        ready = measure_shards(dataset, predictions, name, caps_m)
-        return measure(dataset, folders, name, caps_m, out, [ready])
-    folders += [] if predictions is None else [Path(predictions)]
-    return measure(dataset, folders, name, caps_m, out)
+        of_shards = measure_shards(dataset, predictions, protocol, caps_m)
+        return measure(dataset, folders, protocol, caps_m, out, [of_shards])
+    if predictions is not None:
+        folders.append(Path(predictions))
+    return measure(dataset, folders, protocol, caps_m, out)

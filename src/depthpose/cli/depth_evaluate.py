@@ -40,21 +40,22 @@ from depthpose.report import page
 from depthpose.report.depth import depth_section
 from depthpose.report.page import Section
 
-_IN_THE_TABLE = ("method", "input", "speed", "weights", "protocol", "dataset")
-"""Columns that the title of a frame's part of the page says already."""
+_COLUMNS_OF_METHOD = ("method", "input", "speed", "weights", "protocol", "dataset")
+"""Columns that are the same for all frames of a method, and left out of the table of one frame."""
 
 
 def open_frames(data: Path, split: str | None) -> Dataset:
-    """Open the dataset and print what it is."""
+    """Open the dataset, and print its name, number of frames and layout."""
     dataset = open_dataset(data, split)
     print(f"{dataset.name}: {len(dataset)} frames, layout {dataset.layout}")
     return dataset
 
 
 def predict_dataset(dataset: Dataset, method: DepthMethod, rule: Protocol, folder: Path) -> Path:
-    """Predict every frame that has truth to compare with, and a right view if it is needed.
+    """Predict every frame that has truth, and a right view if the method needs it.
 
-    Of several processes each predicts its share, and the first goes on when all files are there.
+    Of several processes each predicts its share, and the first waits for the files of all. Gives
+    the folder of the method's files, ``FOLDER/METHOD``.
     """
     process = find_rank()
     home = folder / method.name
@@ -65,15 +66,16 @@ def predict_dataset(dataset: Dataset, method: DepthMethod, rule: Protocol, folde
     ]
 
     def read(index: int) -> StereoInput:
+        """Read a frame as the method may see it: without the right view for depth of one image."""
         pair = dataset.read_input(index)
-        return pair if method.with_right else replace(pair, right=None)  # what it must not see
+        return pair if method.with_right else replace(pair, right=None)
 
-    mine = process.share_of(usable)
-    frame_jobs = [Job(name=frame.name, read=partial(read, i)) for i, frame in mine]
+    share = process.share_of(usable)
+    jobs = [Job(name=frame.name, read=partial(read, i)) for i, frame in share]
     sources = {f.name: f.seen_files(with_right=method.with_right) for _, f in usable}
     net = _Unchecked(method.net) if isinstance(method.net, FakestereoNet) else method.net
-    written = predict(net, frame_jobs, home, method.settings, sources)
-    for _ in tqdm(written, method.name, total=len(frame_jobs), disable=None, unit=" frames"):
+    written = predict(net, jobs, home, method.settings, sources)
+    for _ in tqdm(written, method.name, total=len(jobs), disable=None, unit=" frames"):
         pass
     if process.rank == 0:
         wait_for(list(sources), partial(is_finished, home))
@@ -82,7 +84,7 @@ def predict_dataset(dataset: Dataset, method: DepthMethod, rule: Protocol, folde
 
 @dataclass(frozen=True)
 class _Unchecked:
-    """A network that answers every pair, as a measurement must."""
+    """A network that refuses no pair, for a measurement counts all of them."""
 
     net: FakestereoNet
 
@@ -93,7 +95,11 @@ class _Unchecked:
 def choose_methods(
     options: MethodOptions, config: MatcherConfig, dataset: Dataset
 ) -> list[DepthMethod]:
-    """Build the methods that are measured: SGBM, weights and baselines, in this order."""
+    """Build the methods that are measured: SGBM, weights and baselines, in this order.
+
+    Raises:
+        InputError: two have one name, or one needs a right view that no frame has.
+    """
     chosen: list[DepthMethod] = []
     if options.matcher == "sgbm":
         is_filled = options.holes == "fill"
@@ -101,18 +107,18 @@ def choose_methods(
         chosen.append(sgbm.build())
     chosen += [named_method(name, config) for name in options.weights]
     names = [method.name for method in chosen]
-    if twice := next((name for name in names if names.count(name) > 1), None):
+    repeated = next((name for name in names if names.count(name) > 1), None)
+    if repeated is not None:
         raise InputError(
-            f"two methods are called {twice!r}, and their predictions need two folders; name each "
-            "method once, or give files of other names"
+            f"two methods are called {repeated!r}, and their predictions need two folders; name "
+            "each method once, or give files of other names"
         )
     has_right = any(frame.right is not None for frame in dataset.frames)
-    if not has_right and (
-        matching := next((method for method in chosen if method.with_right), None)
-    ):
+    stereo_method = next((method for method in chosen if method.with_right), None)
+    if stereo_method is not None and not has_right:
         raise InputError(
-            f"{matching.name} matches both views, and {dataset.name} has no right view; leave it "
-            "out ('quick:' and 'fine:' are for both views: for one image, give --speed)"
+            f"{stereo_method.name} matches both views, and {dataset.name} has no right view; leave "
+            "it out ('quick:' and 'fine:' are for both views: for one image, give --speed)"
         )
     if options.baseline:
         training = open_training(options.train, options.train_without, dataset)
@@ -121,26 +127,30 @@ def choose_methods(
 
 
 def named_method(word: str, config: MatcherConfig) -> DepthMethod:
-    """Build the method of a name: weights by file or name, perhaps with ``both:`` and the like."""
+    """Build the method of weights by file or name, perhaps with a prefix that says how they run.
+
+    ``own:`` and ``matched:`` say what depth of one image comes from, ``sgbm:`` lets OpenCV match
+    the synthesised view; ``both:`` matches real pairs, ``quick:`` and ``fine:`` at that speed.
+    """
     prefix, _, name = word.rpartition(":")
-    source = DepthMethodSource(
-        weights=name, config=config, with_right=prefix not in get_args(Answer)
-    )
-    if prefix in get_args(Answer):  # what depth of one image comes from
-        return replace(source, answer=cast("Answer", prefix)).build()
-    if prefix == "both":
-        return source.build()
-    if prefix in get_args(Speed):  # how much time the match of a real pair may take
-        method = replace(source, config=replace(config, speed=prefix)).build()
-        return method._replace(name=f"{method.name}-{prefix}")
+    mono = DepthMethodSource(weights=name, config=config, with_right=False)
+    stereo = replace(mono, with_right=True)
+    if prefix in get_args(Answer):
+        return replace(mono, answer=cast("Answer", prefix)).build()
     if prefix == "sgbm":
-        return replace(source, with_right=False, matcher="sgbm").build()
+        return replace(mono, matcher="sgbm").build()
+    if prefix == "both":
+        return stereo.build()
+    if prefix in get_args(Speed):
+        method = replace(stereo, config=replace(config, speed=prefix)).build()
+        return method._replace(name=f"{method.name}-{prefix}")
+    # No prefix; a colon may be one of the path, as in C:/weights.safetensors.
     return DepthMethodSource(weights=word, config=config).build()
 
 
 def baseline_method(name: BaselineName, training: Dataset) -> DepthMethod:
     """Fit a baseline to the truth of training frames."""
-    kinds = {"rows": RowDepthBaseline, "nearest": NearestImageBaseline}
+    classes = {"rows": RowDepthBaseline, "nearest": NearestImageBaseline}
     names = "\n".join(frame.name for frame in training.frames)
     settings = {
         "matcher": f"baseline: {name}",
@@ -150,9 +160,8 @@ def baseline_method(name: BaselineName, training: Dataset) -> DepthMethod:
         "train_sha256": hashlib.sha256(names.encode()).hexdigest(),
     }
     show = partial(tqdm, desc=f"fit {name}", unit=" frames", disable=None)
-    return DepthMethod(
-        f"baseline-{name}", kinds[name].fit(training, show), settings, with_right=False
-    )
+    net = classes[name].fit(training, show)
+    return DepthMethod(f"baseline-{name}", net, settings, with_right=False)
 
 
 def open_training(folders: Sequence[Path], without: Sequence[str], measured: Dataset) -> Dataset:
@@ -173,37 +182,49 @@ def measure(
     protocol: str,
     caps_m: Sequence[float],
     out: Path,
-    ready: Sequence[Evaluation] = (),
+    further: Sequence[Evaluation] = (),
 ) -> int:
-    """Measure, write rows, a table and a page, and print; rows that are ``ready`` come last."""
+    """Measure folders of predictions, write rows, a table and a page, and print the table.
+
+    Of several processes the first does it. Gives the exit code.
+
+    Args:
+        dataset: frames with truth.
+        folders: predictions of a method each.
+        protocol: name of it.
+        caps_m: truth beyond a cap does not count; a row for each.
+        out: folder of the files.
+        further: evaluations that exist already; their rows come last.
+    """
     if find_rank().rank > 0:
         return 0
     evaluations = measure_each(dataset, folders, protocol, caps_m)
-    measured = join([*evaluations, *ready])
+    measured = join([*evaluations, *further])
     rows = [row.columns() for row in measured.rows]
     page.write_table(out, rows)
 
     # Numbers of pairs without a calibration compare with no others.
-    about = f"{protocol}: {PROTOCOLS[protocol].summary}."
-    unknown = sum(frame.right is not None and not frame.calibration for frame in dataset.frames)
-    if unknown:
+    text = f"{protocol}: {PROTOCOLS[protocol].summary}."
+    uncalibrated = sum(
+        frame.right is not None and not frame.calibration for frame in dataset.frames
+    )
+    if uncalibrated:
         message = (
-            f"{unknown} of {len(dataset)} pairs have no calibration, so a network matches them at "
-            "their own focal length, not at the one it knows: compare no numbers with those of "
-            "frames that have one (KITTI 2015 has calib_cam_to_cam in a download of its own)"
+            f"{uncalibrated} of {len(dataset)} pairs have no calibration, so a network matches "
+            "them at their own focal length, not at the one it knows: compare no numbers with "
+            "those of frames that have one (KITTI 2015 has calib_cam_to_cam in a download of its "
+            "own)"
         )
         print(f"depthpose: {message}", file=sys.stderr)
-        about += f" {message}."
+        text += f" {message}."
 
     # The page: the table, then the best and the worst frames of each method.
-    shares = page.share_views(len(folders))
-    frame_sections = [
-        section
-        for folder, evaluation, most in zip(folders, evaluations, shares, strict=True)
-        for section in _frame_sections(dataset, folder, evaluation.per_frame, protocol, most)
-    ]
+    view_counts = page.share_views(len(folders))
+    frame_sections: list[Section] = []
+    for folder, evaluation, count in zip(folders, evaluations, view_counts, strict=True):
+        frame_sections += _frame_sections(dataset, folder, evaluation.per_frame, protocol, count)
     sections = [
-        Section(title="Mean over frames", text=about, rows=rows),
+        Section(title="Mean over frames", text=text, rows=rows),
         *frame_sections,
         *write_details(measured, out),
     ]
@@ -211,8 +232,8 @@ def measure(
     page.write_page(out / "report.html", title, sections, environment())
 
     metrics = [metric.name for metric in METRICS.values() if metric.is_printed]
-    about_row = ["method", "weights", "speed", "cap_m", "frames", "coverage"]
-    print(page.plain_table(rows, [*about_row, *metrics, "ause"]))  # files hold every column
+    origin = ["method", "weights", "speed", "cap_m", "frames", "coverage"]
+    print(page.plain_table(rows, [*origin, *metrics, "ause"]))
     for name, reason in measured.skipped.items():
         print(f"skipped: {name}: {reason}", file=sys.stderr)
     print(f"{len(measured.skipped)} frames skipped")
@@ -225,9 +246,12 @@ def _frame_sections(
     folder: Path,
     per_frame: Sequence[EvaluationRow],
     protocol: str,
-    most: int,
+    max_count: int,
 ) -> list[Section]:
-    """Show up to ``most`` frames of a method, chosen by AbsRel or EPE, at the first cap alone."""
+    """Show the worst, the median and the best frame of a method, by AbsRel or EPE at the first cap.
+
+    ``per_frame``: rows of the method; ``max_count``: most frames that are shown.
+    """
     cap_m = per_frame[0].cap_m
     rows_at_cap = [row for row in per_frame if row.cap_m == cap_m and row.pixels]
     metric = METRICS[RANKING["disparity" if cap_m is None else "depth"]]
@@ -237,19 +261,21 @@ def _frame_sections(
     index_of = {frame.name: index for index, frame in enumerate(dataset.frames)}
     sections: list[Section] = []
     errors = [sign * row.metrics[metric.name] for row in rows_at_cap]
-    for role, k in page.choose_ranked(errors, most):
+    for role, k in page.choose_ranked(errors, max_count):
         row = rows_at_cap[k]
         index = index_of[row.frame or ""]
         estimate, error = frame_result(dataset, index, folder, protocol, row.cap_m)
+        value = row.metrics[metric.name]
         section = depth_section(
             f"{folder.name}: {row.frame}, {role}",
             dataset.read_input(index),
             estimate,
-            f"The {role} of {frame_count} by {metric.name}: "
-            f"{row.metrics[metric.name]:.4f}{cap_text}.",
+            f"The {role} of {frame_count} by {metric.name}: {value:.4f}{cap_text}.",
             error=error,
         )
-        columns = {name: v for name, v in row.columns().items() if name not in _IN_THE_TABLE}
+        columns = {
+            name: value for name, value in row.columns().items() if name not in _COLUMNS_OF_METHOD
+        }
         sections.append(replace(section, rows=[columns]))
     return sections
 
@@ -257,30 +283,32 @@ def _frame_sections(
 def measure_each(
     dataset: Dataset, folders: Sequence[Path], protocol: str, caps_m: Sequence[float]
 ) -> list[Evaluation]:
-    """Measure folders of predictions one by one; each row says whose it is."""
+    """Measure folders of predictions one by one; each row names its origin."""
     show = partial(tqdm, unit=" frames", disable=None)
-    return [
-        with_source(
-            evaluate(dataset, folder, protocol, caps_m, show), folder.name, read_settings(folder)
-        )
-        for folder in folders
-    ]
+    evaluations: list[Evaluation] = []
+    for folder in folders:
+        evaluation = evaluate(dataset, folder, protocol, caps_m, show)
+        evaluations.append(with_source(evaluation, folder.name, read_settings(folder)))
+    return evaluations
 
 
 def with_source(result: Evaluation, name: str, settings: dict[str, Any] | None) -> Evaluation:
-    """Add to each row which method, weights and input made the predictions.
+    """Return an evaluation whose rows say which method, weights and input made the predictions.
 
-    ``settings``: those of the run that made them; None of files by others, which ``name`` names.
+    ``settings``: those of the run that made them; None of files by other software, whose method is
+    ``name`` then.
     """
-    holes = {True: " (holes filled)", False: " (matched pixels)"}
-    made_by = settings or {"matcher": name, "input": ""}
+    settings = settings or {"matcher": name, "input": ""}
+    method = settings.get("matcher", "")
+    if "with_filled_holes" in settings:
+        method += " (holes filled)" if settings["with_filled_holes"] else " (matched pixels)"
     source = {
-        "method": made_by.get("matcher", "") + holes.get(made_by.get("with_filled_holes", ""), ""),
-        "input": made_by.get("input", "both views"),
-        "speed": made_by.get("speed", ""),
-        "weights": made_by.get("weights", ""),
+        "method": method,
+        "input": settings.get("input", "both views"),
+        "speed": settings.get("speed", ""),
+        "weights": settings.get("weights", ""),
     }
-    sha256 = made_by.get("weights_sha256", "")[:12]
+    sha256 = settings.get("weights_sha256", "")[:12]
     return replace(
         result,
         rows=[replace(row, weights_sha256=sha256, **source) for row in result.rows],
@@ -290,7 +318,7 @@ def with_source(result: Evaluation, name: str, settings: dict[str, Any] | None) 
 
 
 def join(evaluations: Sequence[Evaluation]) -> Evaluation:
-    """Put the rows of several evaluations below each other."""
+    """Join the rows of several evaluations into one."""
     return Evaluation(
         rows=[row for evaluation in evaluations for row in evaluation.rows],
         per_frame=[row for evaluation in evaluations for row in evaluation.per_frame],
@@ -304,14 +332,13 @@ def join(evaluations: Sequence[Evaluation]) -> Evaluation:
 
 
 def write_details(measured: Evaluation, out: Path) -> list[Section]:
-    """Write each frame's numbers, and the error by confidence; give them as parts of a page."""
-    frames, deciles = (
-        [row.columns() for row in rows] for rows in (measured.per_frame, measured.deciles)
-    )
+    """Write tables of frames and of the error by confidence; give the sections that show them."""
+    frames = [row.columns() for row in measured.per_frame]
+    deciles = [row.columns() for row in measured.deciles]
     page.write_table(out, frames, name="frames")
     if deciles:
         page.write_table(out, deciles, name="confidence")
-    else:  # those of another method that was measured here before
+    else:  # an earlier run may have measured a method with confidence here
         for file in page.table_files("confidence"):
             (out / file).unlink(missing_ok=True)
     text = "Mean error of the least sure tenth of each frame's pixels (1) to the surest (10)"
@@ -327,23 +354,28 @@ def write_details(measured: Evaluation, out: Path) -> list[Section]:
 def measure_shards(
     dataset: Dataset, predictions: str, protocol: str, caps_m: Sequence[float]
 ) -> Evaluation:
-    """Measure shards of predictions, one after the other; the rows say whose they are."""
+    """Measure shards of predictions (a folder or URL), one after the other, frame by frame."""
     name = PurePosixPath(predictions).stem
     settings = read_settings(predictions)
-    places = {frame.name: index for index, frame in enumerate(dataset.frames)}
-    rows: dict[str, list[Measured] | str] = {}
-    for done in tqdm(engine.read_results(predictions), name, disable=None, unit=" shards"):
-        for frame, files in engine.shard_results(predictions, done):
-            if frame not in places:
+    index_of = {frame.name: index for index, frame in enumerate(dataset.frames)}
+    measured: dict[str, list[Measured] | str] = {}
+    for shard in tqdm(engine.read_results(predictions), name, disable=None, unit=" shards"):
+        for frame, files in engine.shard_results(predictions, shard):
+            if frame not in index_of:
                 continue
             with tempfile.TemporaryDirectory(prefix="depthpose-") as folder:
                 for ending, content in files.items():
                     path = Path(folder) / f"{frame}.{ending}"
                     path.parent.mkdir(parents=True, exist_ok=True)
                     path.write_bytes(content)
-                rows[frame] = measure_frame(dataset, places[frame], Path(folder), protocol, caps_m)
-    with tempfile.TemporaryDirectory() as nothing:
-        for frame, index in places.items():
-            if frame not in rows:  # it has no truth, or its absence is an error
-                rows[frame] = measure_frame(dataset, index, Path(nothing), protocol, caps_m)
-    return with_source(summarise(dataset, protocol, rows), name, settings)
+                index = index_of[frame]
+                measured[frame] = measure_frame(dataset, index, Path(folder), protocol, caps_m)
+
+    # Frames without a prediction: those without truth are skipped, others are an error.
+    with tempfile.TemporaryDirectory() as empty_folder:
+        for frame, index in index_of.items():
+            if frame not in measured:
+                measured[frame] = measure_frame(
+                    dataset, index, Path(empty_folder), protocol, caps_m
+                )
+    return with_source(summarise(dataset, protocol, measured), name, settings)

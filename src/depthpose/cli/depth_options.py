@@ -10,7 +10,17 @@ from depthpose.cli.arguments import Device, Source, WeightsName, shown_as
 from depthpose.core.errors import InputError
 from depthpose.depth.config import Answer, BaselineName, MatcherConfig, Speed
 
-_POWERS = {"": 0, "K": 1, "M": 2, "G": 3, "T": 4}
+_EXPONENTS = {"": 0, "K": 1, "M": 2, "G": 3, "T": 4}
+"""Of 1000, or of 1024, by the prefix of a size in bytes."""
+
+
+def _parse_bytes(text: str) -> int:
+    """Parse ``--max-memory``, such as 1GB, 800M or 1500000 bytes; GiB and the like are of 1024."""
+    size = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)(i?)B?\s*", text, re.IGNORECASE)
+    if size is None or (size[3] and not size[2]) or not float(size[1]):
+        raise InputError(f"--max-memory {text!r}: not a size. Write, say, 1GB, 800MB or 1.5GiB.")
+    base = 1024 if size[3] else 1000
+    return int(float(size[1]) * base ** _EXPONENTS[size[2].upper()])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,18 +39,11 @@ class MatcherOptions:
     @property
     def config(self) -> MatcherConfig:
         """Settings of the networks."""
-        limit = None
-        text = self.max_memory
-        if text is not None:  # such as 1GB, 800M or 1500000; 1GiB is 1024**3
-            size = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)(i?)B?\s*", text, re.IGNORECASE)
-            if size is None or (size[3] and not size[2]) or not float(size[1]):
-                raise InputError(
-                    f"--max-memory {text!r}: not a size. Write, say, 1GB, 800MB or 1.5GiB."
-                )
-            step = 1024 if size[3] else 1000
-            limit = int(float(size[1]) * step ** _POWERS[size[2].upper()])
         return MatcherConfig(
-            device=self.device, precision=self.precision, max_memory_bytes=limit, speed=self.speed
+            device=self.device,
+            precision=self.precision,
+            max_memory_bytes=None if self.max_memory is None else _parse_bytes(self.max_memory),
+            speed=self.speed,
         )
 
 
@@ -76,7 +79,7 @@ class ScaleOptions:
 
     @property
     def measured_point(self) -> tuple[float, float, float]:
-        """The pixel of ``known_distance`` and its depth: column, row [px], metres."""
+        """``--known-distance`` parsed: column and row [px] of a pixel, and its depth [m]."""
         assert self.known_distance is not None
         try:
             column, row, metres = (float(word) for word in self.known_distance.split(","))
@@ -189,7 +192,7 @@ class ProtocolOptions:
     """metres beyond which truth does not count; a row each."""
 
     def refuse_unusable(self) -> None:
-        """Refuse caps that are no distances, a repeated one, and none at all."""
+        """Refuse caps that are not distances, a repeated one, and an empty list of them."""
         if not self.cap:
             raise InputError("--cap without a value: give a distance in metres, such as 80")
         for cap_m in self.cap:

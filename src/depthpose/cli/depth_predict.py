@@ -59,13 +59,15 @@ IMAGES = Files(roles=("image",), suffixes=LISTED_SUFFIXES)
 PAIRS = Files(roles=("left", "right"), suffixes=LISTED_SUFFIXES)
 _PAGE = "report.html"
 _VIDEO = ".color.mp4"
+"""Ending of the video of a video's depth."""
 _SAME_FOCAL = 0.01
+"""Largest relative difference of the focal lengths of images of one camera."""
 
 
 class DepthMethod(NamedTuple):
-    """An estimator, what to call it, and the JSON values that decide its results.
+    """An estimator, its name in tables, and the JSON values that decide its results.
 
-    ``with_right`` says whether it is given the real right view.
+    ``with_right``: whether it is given the real right view.
     """
 
     name: str
@@ -78,7 +80,7 @@ class DepthMethod(NamedTuple):
 class DepthMethodSource:
     """What a method is built from, in this process or by the workers of an engine."""
 
-    weights: str | Weights | None  #: by name or file, or packed to travel; None: OpenCV's matcher
+    weights: str | Weights | None  #: name or file, or their bytes; None: OpenCV's matcher
     config: MatcherConfig  #: how the networks run
     with_right: bool | None = None  #: give them the real right view; None: a matcher alone needs it
     matcher: str | None = None  #: for the synthesised view: other weights, or sgbm; None: their own
@@ -88,23 +90,29 @@ class DepthMethodSource:
     with_filled_holes: bool = False  #: of OpenCV's matcher: give every pixel an answer
 
     def build(self) -> DepthMethod:
-        """Build the networks on the device of the config."""
-        if self.weights is None:  # OpenCV's StereoSGBM with the settings of our tables
-            sgbm = SGBMConfig(with_filled_holes=self.with_filled_holes)
-            name = "sgbm-filled" if self.with_filled_holes else "sgbm"
-            net = FakestereoNet.load(matcher="sgbm", config=sgbm)
-            return DepthMethod(name, net, {"matcher": "sgbm", **asdict(sgbm)})
+        """Build the estimator on the device of the config."""
+        if self.weights is None:
+            return self._build_sgbm()
         if isinstance(self.weights, Weights):
             with self.weights.unpacked() as file:
-                return replace(self, weights=file).build()
+                return self._build_networks(file)
+        return self._build_networks(self.weights)
 
+    def _build_sgbm(self) -> DepthMethod:
+        """Build OpenCV's StereoSGBM, with the settings of our tables."""
+        config = SGBMConfig(with_filled_holes=self.with_filled_holes)
+        name = "sgbm-filled" if self.with_filled_holes else "sgbm"
+        net = FakestereoNet.load(matcher="sgbm", config=config)
+        return DepthMethod(name, net, {"matcher": "sgbm", **asdict(config)})
+
+    def _build_networks(self, weights: str) -> DepthMethod:
+        """Build the networks of a weights file, perhaps with another matcher."""
         # Refused before anything is read; the precision that is recorded is the one computed in.
         device = device_of_process(self.config.device)
         usable_device(device)
         is_bf16 = usable_precision(self.config.precision, device) == "bf16"
-        precision = "bf16" if is_bf16 else "fp32"
-        config = replace(self.config, precision=precision, device=device)
-        path = find_weights(self.weights)
+        config = replace(self.config, precision="bf16" if is_bf16 else "fp32", device=device)
+        path = find_weights(weights)
         kind = read_checkpoint(path).kind
         is_matcher = kind in MATCHERS
         with_right = is_matcher if self.with_right is None else self.with_right
@@ -114,30 +122,28 @@ class DepthMethodSource:
                 "synthesise the right view."
             )
 
-        # Its name in tables, and what decides its results.
-        facts: dict[str, Any] = {"matcher": kind, "weights": path.stem}
-        facts["weights_sha256"] = file_sha256(path)
+        # What decides the results.
+        settings: dict[str, Any] = {
+            "matcher": kind,
+            "weights": path.stem,
+            "weights_sha256": file_sha256(path),
+        }
         if not is_matcher:
-            facts["input"] = "both views" if with_right else "left view"
-        settings = asdict(config)
-        matcher = None
+            settings["input"] = "both views" if with_right else "left view"
+        settings |= asdict(config)
+
+        # Which matcher runs, and where depth of one image comes from.
+        matcher: SGBMMatcher | Path | None = None
         answer = self.answer
         if self.matcher is None:
-            name = path.stem + ("-both" if with_right and not is_matcher else "")
+            name = path.stem
+            name += "-both" if with_right and not is_matcher else ""
             name += "" if answer is None else f"-{answer}"
-        else:  # OpenCV, or other weights, match the view of the generator
-            other = self.matcher
+        else:
             answer = "matched"
-            if self.matcher == "sgbm":
-                sgbm = SGBMConfig(with_filled_holes=True)
-                matcher = SGBMMatcher(sgbm)
-                settings = {**settings, **asdict(sgbm)}
-            else:
-                matcher = find_weights(self.matcher)
-                other = matcher.stem
-                facts["matcher_sha256"] = file_sha256(matcher)
-            name = f"{path.stem}-{other}"
-            facts["matcher"] = f"{kind} with {other}"
+            matcher, matcher_name, matcher_settings = _load_other_matcher(self.matcher)
+            name = f"{path.stem}-{matcher_name}"
+            settings |= {**matcher_settings, "matcher": f"{kind} with {matcher_name}"}
 
         net = FakestereoNet.load(
             path,
@@ -153,12 +159,12 @@ class DepthMethodSource:
                 "Give weights with one, or sgbm."
             )
         if not with_right and net.synthesiser is not None:
-            facts["answer"] = net.synthesiser.config.answer
-            facts["scales"] = list(net.synthesiser.scales)
-        return DepthMethod(name, net, {**facts, **settings}, with_right)
+            settings["answer"] = net.synthesiser.config.answer
+            settings["scales"] = list(net.synthesiser.scales)
+        return DepthMethod(name, net, settings, with_right)
 
-    def packed(self) -> "DepthMethodSource":
-        """Give the same with the weights in memory."""
+    def with_packed_weights(self) -> "DepthMethodSource":
+        """Return the source with the bytes of its weights, for workers of other machines."""
         if self.matcher not in (None, "sgbm"):
             raise InputError(
                 f"--matcher {self.matcher}: --engine ray takes sgbm or the weights' own; make one "
@@ -171,8 +177,24 @@ class DepthMethodSource:
         return replace(self, weights=Weights(name=path.name, data=path.read_bytes()))
 
 
+def _load_other_matcher(matcher: str) -> tuple[SGBMMatcher | Path, str, dict[str, Any]]:
+    """Give the matcher of the synthesised view, other than the weights' own, and its settings.
+
+    Returns:
+        OpenCV's matcher or a weights file, its name, and the JSON values that decide its results.
+    """
+    if matcher == "sgbm":
+        config = SGBMConfig(with_filled_holes=True)
+        return SGBMMatcher(config), "sgbm", asdict(config)
+    path = find_weights(matcher)
+    return path, path.stem, {"matcher_sha256": file_sha256(path)}
+
+
 def read_lens(options: LensOptions, sources: Sequence[Path]) -> Camera | FieldOfView | float:
-    """Read the camera of the options; without one, the EXIF of the images."""
+    """Read the camera of single images: a file, a field of view or a focal length [px].
+
+    Without any of these options the focal length is that of the images' EXIF.
+    """
     focal_px = options.focal_px
     fov = options.fov
     if focal_px is not None and not 1 < focal_px < 1e6:
@@ -191,12 +213,12 @@ def read_lens(options: LensOptions, sources: Sequence[Path]) -> Camera | FieldOf
 
 
 def _exif_focal_px(sources: Sequence[Path]) -> float:
-    """Give the focal length [px] on which the EXIF of all images agrees, and print it."""
-    focal_of: dict[str, tuple[float, str]] = {}
+    """Read the focal length [px] on which the EXIF of all images agrees, and print it."""
+    focal_of: dict[str, tuple[float, str]] = {}  # by file name: focal length [px], EXIF's tags
     for source in sources:
         try:
             focal = None if _is_video(source) else read_exif_focal(source)
-        except InputError:  # what cannot be read fails by itself, later
+        except InputError:  # the image fails by itself, later
             continue
         if focal is None:
             raise InputError(
@@ -210,8 +232,9 @@ def _exif_focal_px(sources: Sequence[Path]) -> float:
         raise InputError(
             "no image can be read; give --camera, --focal-px or --fov, and intact ones"
         )
-    (first, (focal_px, tags)), *others = focal_of.items()
-    for other, (other_px, _) in others:
+    first = next(iter(focal_of))
+    focal_px, tags = focal_of[first]
+    for other, (other_px, _) in focal_of.items():
         if abs(other_px / focal_px - 1) > _SAME_FOCAL:
             raise InputError(
                 f"the EXIF of {first} says a focal length of {focal_px:.0f} px and that of "
@@ -228,7 +251,7 @@ def _exif_focal_px(sources: Sequence[Path]) -> float:
 def _size_of_first(sources: Sequence[Path]) -> tuple[int, int] | None:
     """Give width and height [px] of the first image or video that can be read, None if none can."""
     for source in sources:
-        with suppress(InputError):  # what cannot be read fails by itself, later
+        with suppress(InputError):  # the image fails by itself, later
             if not _is_video(source):
                 return image_size(source)
             _, frame = next(iter(read_video(source)))
@@ -240,34 +263,38 @@ def image_work(
     lens: LensOptions,
     scale: ScaleOptions,
     output: PredictOutput,
-    method: DepthMethodSource,
-    sources: Sequence[Path],
+    source: DepthMethodSource,
+    images: Sequence[Path],
 ) -> "DepthWork":
-    """Describe the work on single images, whose EXIF may be the only source of their camera."""
-    camera = read_lens(lens, sources)
-    return DepthWork(method=method, camera=camera, scale=scale, output=output)
+    """Describe the work on single images; their EXIF is read where the options have no camera."""
+    camera = read_lens(lens, images)
+    return DepthWork(source=source, camera=camera, scale=scale, output=output)
 
 
 def pair_work(
-    camera: Path, pairs: PairNetworks, method: DepthMethodSource, files: Sequence[Path]
+    camera: Path, pairs: PairNetworks, source: DepthMethodSource, first_pair: Sequence[Path]
 ) -> "DepthWork":
-    """Describe the work on pairs; the first gives the size if the camera's file has none."""
-    rig = read_rig(camera, image_size(files[0]))
+    """Describe the work on pairs; the first one has the size if the camera's file has none."""
+    rig = read_rig(camera, image_size(first_pair[0]))
     output = PredictOutput(cloud=pairs.cloud, min_confidence=pairs.min_confidence)
-    return DepthWork(method=method, camera=rig, output=output, with_check=pairs.check, files=PAIRS)
+    return DepthWork(source=source, camera=rig, output=output, with_check=pairs.check, files=PAIRS)
 
 
-def find_sources(words: Sequence[str], out: Path) -> list[Path]:
-    """List images and videos."""
+def list_sources(words: Sequence[str], out: Path) -> list[Path]:
+    """List the images and videos of files, folders and patterns.
+
+    Raises:
+        InputError: two of them would have results of one name, or ``out`` lies among them.
+    """
     sources: list[Path] = []
     for word in words:
         sources += [Path(word)] if _is_video(word) else list_images(word)
-    stems = Counter(path.stem for path in sources)
-    twice = next((stem for stem, times in stems.items() if times > 1), None)
-    if twice is not None:
-        raise InputError(f"two inputs are called {twice!r}, and so would their results be.")
+    stem_counts = Counter(path.stem for path in sources)
+    repeated = next((stem for stem, count in stem_counts.items() if count > 1), None)
+    if repeated is not None:
+        raise InputError(f"two inputs are called {repeated!r}, and so would their results be.")
     for video in filter(_is_video, sources):
-        frame = next((stem for stem in stems if _frame_of(video, stem)), None)
+        frame = next((stem for stem in stem_counts if _is_frame_name(stem, video)), None)
         if frame is not None:
             raise InputError(
                 f"an input is called {frame!r}, as a frame of a video would be, and so would their "
@@ -277,78 +304,89 @@ def find_sources(words: Sequence[str], out: Path) -> list[Path]:
     return sources
 
 
-def _frame_of(video: Path, name: str) -> bool:
-    """Whether a frame of a video has this name."""
+def _is_frame_name(name: str, video: Path) -> bool:
+    """Whether a frame of a video has this name: that of the video, and six digits."""
     return re.fullmatch(re.escape(video.stem) + r"_\d{6}", name) is not None
 
 
 def _is_video(path: str | Path) -> bool:
+    """Whether a file is a video, by its suffix."""
     return Path(path).suffix.lower() in VIDEO_SUFFIXES
 
 
 def list_pairs(left: str, right: str) -> list[tuple[Path, Path]]:
-    """List the images of both sides, paired by their names or the numbers in them."""
+    """List the images of two folders or patterns, paired by their names or the numbers in them.
+
+    Two single files are a pair, whatever their names.
+    """
     lefts = list_images(left)
     rights = list_images(right)
-    stems, others = ([path.stem for path in side] for side in (lefts, rights))
-    if len(set(stems)) != len(stems):
-        twice = next(stem for stem in stems if stems.count(stem) > 1)
-        raise InputError(f"{left}: two images are called {twice!r}, so would their results.")
-    if (lefts, rights) != ([Path(left)], [Path(right)]):
-        rights = [rights[k] for k in find_partners(stems, others, f"{left} and {right}")]
+    left_stems = [path.stem for path in lefts]
+    right_stems = [path.stem for path in rights]
+    repeated = next((stem for stem in left_stems if left_stems.count(stem) > 1), None)
+    if repeated is not None:
+        raise InputError(f"{left}: two images are called {repeated!r}, so would their results.")
+    are_files = lefts == [Path(left)] and rights == [Path(right)]
+    if not are_files:
+        partners = find_partners(left_stems, right_stems, f"{left} and {right}")
+        rights = [rights[k] for k in partners]
     return list(zip(lefts, rights, strict=True))
 
 
 @dataclass(frozen=True, kw_only=True)
 class DepthWork:
-    """Images or pairs to the files of their depth, in this process or by workers of an engine.
+    """How images or pairs become files of depth, in this process or by workers of an engine.
 
-    ``camera``: what is known of that of the images, or the rig of pairs.
+    ``camera``: of the images (a field of view or a focal length [px] will do), or the rig of pairs.
+    ``with_check``: refuse pairs that are swapped, not rectified or no pair.
     """
 
-    method: DepthMethodSource
+    source: DepthMethodSource
     camera: Camera | FieldOfView | float
     output: PredictOutput
     scale: ScaleOptions = field(default_factory=ScaleOptions)
     with_check: bool = True
     files: Files = IMAGES
 
-    def input_of(self, name: str, left: Tensor | Path, right: Path | None = None) -> StereoInput:
-        """Make the input of an image or a pair, read already or not."""
+    def make_input(self, name: str, left: Tensor | Path, right: Path | None = None) -> StereoInput:
+        """Make the input of an image or a pair; files are read, a frame of a video is there."""
         image = read_image(left) if isinstance(left, Path) else left
-        camera = camera_of(self.camera, (image.shape[2], image.shape[1]))
+        height, width = image.shape[1:]
+        camera = camera_of(self.camera, (width, height))
         assert camera is not None
-        mount = {"mount_height_m": self.scale.camera_height, "tilt_deg": self.scale.camera_tilt}
-        camera = replace(camera, **{key: v for key, v in mount.items() if v is not None})
-        other = None if right is None else read_image(right)
-        return StereoInput(name=name, left=image, right=other, camera=camera)
+        if self.scale.camera_height is not None:
+            camera = replace(camera, mount_height_m=self.scale.camera_height)
+        if self.scale.camera_tilt is not None:
+            camera = replace(camera, tilt_deg=self.scale.camera_tilt)
+        right_image = None if right is None else read_image(right)
+        return StereoInput(name=name, left=image, right=right_image, camera=camera)
 
-    def jobs_of(self, files: Sequence[Path]) -> Iterator[Job[StereoInput]]:
-        """Give the job of an image or a pair, or the jobs of all frames of a video."""
+    def make_jobs(self, files: Sequence[Path]) -> Iterator[Job[StereoInput]]:
+        """Make the job of an image or a pair, or the jobs of all frames of a video."""
         if not _is_video(files[0]):
             name = files[0].stem
-            yield Job(name=name, read=partial(self.input_of, name, *files))
+            yield Job(name=name, read=partial(self.make_input, name, *files))
             return
         for name, frame in read_video(files[0]):
-            yield Job(name=name, read=partial(self.input_of, name, frame))
+            yield Job(name=name, read=partial(self.make_input, name, frame))
 
     def estimate_many(
         self, net: FakestereoNet, inputs: Sequence[StereoInput], mount: MountFilter | None = None
     ) -> list[DepthEstimate | InputError]:
-        """Estimate inputs together; ``mount`` is that of frames of one camera."""
-        named = [(depth_input.name, depth_input) for depth_input in inputs]
-        estimates = net.estimate_together(named, with_check=self.with_check, mount=mount)
+        """Estimate inputs together; ``mount``: of the camera, where all are frames of one."""
+        named_inputs = [(depth_input.name, depth_input) for depth_input in inputs]
+        estimates = net.estimate_together(named_inputs, with_check=self.with_check, mount=mount)
         if self.scale.known_distance is None:
             return estimates
         return [
-            self._scaled(depth_input.name, estimate)
-            for depth_input, estimate in zip(inputs, estimates, strict=True)
+            self._scale_by_known_distance(name, estimate)
+            for (name, _), estimate in zip(named_inputs, estimates, strict=True)
         ]
 
-    def _scaled(
+    def _scale_by_known_distance(
         self, name: str, estimate: DepthEstimate | InputError
     ) -> DepthEstimate | InputError:
-        """Scale an estimate by the distance that the user knows."""
+        """Scale an estimate to the depth measured at a pixel; a failed one stays as it is."""
         if isinstance(estimate, InputError):
             return estimate
         try:
@@ -356,34 +394,43 @@ class DepthWork:
         except InputError as error:
             return error
 
-    def settings(self, method: dict[str, Any]) -> dict[str, Any]:
-        """Give the JSON values that decide the results, for the record of a run."""
-        camera: dict[str, Any] = {"focal_px": self.camera}
+    def settings(self, method_settings: dict[str, Any]) -> dict[str, Any]:
+        """Give the JSON values that decide the results, for the record of a run.
+
+        ``method_settings``: those of the estimator.
+        """
         if isinstance(self.camera, FieldOfView):
-            camera = {"fov_deg": self.camera.degrees}
+            camera: dict[str, Any] = {"fov_deg": self.camera.degrees}
         elif isinstance(self.camera, StereoRig):
-            camera = {"K": self.camera.K.tolist(), "baseline_m": self.camera.baseline_m}
-            camera["cx_right_minus_left_px"] = self.camera.cx_right_minus_left_px
+            camera = {
+                "K": self.camera.K.tolist(),
+                "baseline_m": self.camera.baseline_m,
+                "cx_right_minus_left_px": self.camera.cx_right_minus_left_px,
+            }
         elif isinstance(self.camera, Camera):
             keys = camera_keys(self.camera)
             camera = {key: keys[key] for key in ("K", "mount_height_m", "tilt_deg") if key in keys}
-        camera |= {key: v for key, v in asdict(self.scale).items() if v not in (None, False)}
-        output: dict[str, Any] = {}
+        else:
+            camera = {"focal_px": self.camera}
+        scale = asdict(self.scale)
+        camera |= {key: value for key, value in scale.items() if value not in (None, False)}
+
+        settings = {**method_settings, "camera": camera}
         if self.files != PAIRS:
-            output["color_range_m"] = list(self.output.color_range)
+            settings["color_range_m"] = list(self.output.color_range)
         if self.output.cloud:
-            output["min_confidence"] = self.output.min_confidence
-        return {**method, "camera": camera, **output}
+            settings["min_confidence"] = self.output.min_confidence
+        return settings
 
     def start(self) -> Function:
-        """Build the networks."""
-        method = self.method.build()
+        """Build the networks, and give the function that estimates a batch of a worker."""
+        method = self.source.build()
 
         def estimate(samples: Sequence[Sample], out: Path) -> list[str]:
-            """Estimate a batch of a worker into a folder; give of each why it failed, or ""."""
+            """Write the depth of a batch into a folder; give why each has none, "" if it has."""
             depth_run = DepthRun(work=self, method=method, out=out)
             jobs = [
-                Job(name=sample.name, read=partial(self.input_of, sample.name, *sample.files))
+                Job(name=sample.name, read=partial(self.make_input, sample.name, *sample.files))
                 for sample in samples
             ]
             depth_run.estimate(jobs, len(samples), "images")
@@ -395,60 +442,72 @@ class DepthWork:
 def predict_on_ray(
     words: Sequence[str],
     files: Files,
-    work_of: Callable[[Sequence[Path]], DepthWork],
+    make_work: Callable[[Sequence[Path]], DepthWork],
     out: str,
     engine: EngineOptions,
 ) -> int:
-    """Estimate images or pairs, manifests or tar shards, by the workers of an engine."""
-    if (video := next(filter(_is_video, words), None)) is not None:
+    """Estimate images or pairs by the workers of an engine; give the exit code.
+
+    Args:
+        words: files, folders or patterns, manifests or tar shards.
+        files: what an input is made of.
+        make_work: describes the work, given the files of the first input.
+        out: folder or URL for the shards.
+        engine: its options.
+    """
+    video = next(filter(_is_video, words), None)
+    if video is not None:
         raise InputError(f"{video}: --engine ray takes no videos; omit --engine for them")
     inputs = Inputs.find(words, files)
-    with inputs.first() as first:
-        first_work = work_of(first)
-    if first_work.scale.one_mount:
+    with inputs.first() as first_files:
+        depth_work = make_work(first_files)
+    if depth_work.scale.one_mount:
         raise InputError("--one-mount takes the images one after the other; omit it, or --engine")
-    method_settings = (
-        replace(first_work.method, config=replace(first_work.method.config, device="cpu"))
-        .build()
-        .settings
-    )
-    if "device" in method_settings:  # that of the workers, which this machine need not have
-        method_settings["device"] = first_work.method.config.device
-    settings = first_work.settings(method_settings)
-    work = Work(start=first_work.start, files=files, endings=ENDINGS, batch=first_work.output.batch)
-    what = "pairs" if files == PAIRS else "depth maps"
-    return print_shards(engine.run(work, inputs, out, settings), out, what)
+
+    # The settings are read from networks on this machine, which need not have the workers' device.
+    config = depth_work.source.config
+    on_cpu = replace(depth_work.source, config=replace(config, device="cpu"))
+    method_settings = on_cpu.build().settings
+    if "device" in method_settings:
+        method_settings["device"] = config.device
+    settings = depth_work.settings(method_settings)
+    work = Work(start=depth_work.start, files=files, endings=ENDINGS, batch=depth_work.output.batch)
+    noun = "pairs" if files == PAIRS else "depth maps"
+    return print_shards(engine.run(work, inputs, out, settings), out, noun)
 
 
 def predict_files(
     sources: Sequence[tuple[Path, ...]], work: DepthWork, method: DepthMethod, out: Path
 ) -> int:
-    """Estimate what is not finished; an input that fails is named and stops no other.
+    """Estimate what is not finished, and give the exit code.
 
-    Of several processes each takes its share, and the first writes the page.
+    An input that fails is named and stops no other. Of several processes each takes its share, and
+    the first writes the page.
     """
-    videos = [files[0].stem for files in sources if _is_video(files[0])]
+    video_stems = [files[0].stem for files in sources if _is_video(files[0])]
     run.claim_folder(out, work.settings(method.settings), [_PAGE])
     endings = [f".{end}" for end in ENDINGS] + [_VIDEO]
-    run.claim_names(out, {files[0].stem: files for files in sources}, endings, videos)
+    run.claim_names(out, {files[0].stem: files for files in sources}, endings, video_stems)
     process = run.find_rank()
     if work.scale.one_mount and process.world > 1:
         raise InputError("--one-mount takes the images one after the other; omit it, or run alone")
 
-    mine = process.share_of(sources)
+    # Images and pairs first, then videos one by one.
+    share = process.share_of(sources)
+    stills = [files for files in share if not _is_video(files[0])]
+    videos = [files[0] for files in share if _is_video(files[0])]
     depth_run = DepthRun(work=work, method=method, out=out)
-    stills = [files for files in mine if not _is_video(files[0])]
-    still_jobs = (job for files in stills for job in work.jobs_of(files))
+    still_jobs = (job for files in stills for job in work.make_jobs(files))
     mount = MountFilter() if work.scale.one_mount else None
     count = len(depth_run.estimate(still_jobs, len(stills), "images", mount))
-    count += sum(depth_run.estimate_video(video) for video, *_ in mine if _is_video(video))
+    count += sum(depth_run.estimate_video(video) for video in videos)
 
     failures = list(depth_run.failures.values())
     if failures and not count and len(sources) == 1:
         raise failures[0]
     for failure in failures:
         print(f"depthpose: failed: {failure}", file=sys.stderr)
-    total = f"{count} of {len(mine)} pairs" if work.files == PAIRS else f"{count} depth maps"
+    total = f"{count} of {len(share)} pairs" if work.files == PAIRS else f"{count} depth maps"
     print(f"{total} are in {out}")
     if process.rank == 0:
         write_depth_page(sources, work, out, failures)
@@ -459,52 +518,61 @@ def write_depth_page(
     sources: Sequence[tuple[Path, ...]], work: DepthWork, out: Path, failures: Sequence[InputError]
 ) -> None:
     """Write a page of some of the finished depth maps, of every failure and of every warning."""
-    finished_names = {
+    # The finished results of each input, and those that are shown.
+    finished = {
         name for name in run.read_results(out) if run.is_whole(out, name, [f"{name}.{LAST}"])
     }
-    names_of: dict[tuple[Path, ...], list[str]] = {}
-    for files in sources:
-        if _is_video(files[0]):
-            frames = (name for name in finished_names if _frame_of(files[0], name))
-            names_of[files] = sorted(frames)
-        else:
-            names_of[files] = [name for name in (files[0].stem,) if name in finished_names]
+    names_of = {files: _result_names(files, finished) for files in sources}
     names = [name for names_of_source in names_of.values() for name in names_of_source]
     chosen = {names[k] for k in spread_evenly(len(names), MOST_VIEWS)}
-    shown = list(_read_chosen(names_of, work, chosen))
+    shown_inputs = list(_read_chosen(names_of, work, chosen))
 
-    selection = "all" if len(shown) == len(names) else "spread evenly"
+    selection = "all" if len(shown_inputs) == len(names) else "spread evenly"
     number = f"{len(names)} depth map{'s' * (len(names) != 1)}"
-    text = f"Shown: {len(shown)} of {number} in this folder ({selection})."
+    text = f"Shown: {len(shown_inputs)} of {number} in this folder ({selection})."
     rows = [{"not estimated, because": str(reason)} for reason in failures]
-    warnings = {name: out / f"{name}.warning.txt" for name in names}
-    rows += [
-        {"warning": f"{name}: {read_text(path).strip()}"}
-        for name, path in warnings.items()
-        if path.is_file()
-    ]
+    for name in names:
+        warning_file = out / f"{name}.warning.txt"
+        if warning_file.is_file():
+            rows.append({"warning": f"{name}: {read_text(warning_file).strip()}"})
     sections = [Section(title="What is here", text=text, rows=rows)]
 
-    range_m = work.output.color_range
-    colours = f"depth, {range_m[0]:g} m bright to {range_m[1]:g} m dark"
-    films = [Film(path=p, caption=f"{p.name}: {colours}") for p in sorted(out.glob(f"*{_VIDEO}"))]
-    sections += [Section(title="Videos", films=films)] if films else []
-    for depth_input in shown:
+    near_m, far_m = work.output.color_range
+    colors = f"depth, {near_m:g} m bright to {far_m:g} m dark"
+    videos = sorted(out.glob(f"*{_VIDEO}"))
+    films = [Film(path=path, caption=f"{path.name}: {colors}") for path in videos]
+    if films:
+        sections.append(Section(title="Videos", films=films))
+    for depth_input in shown_inputs:
         estimate = read_estimate(out, depth_input.name, depth_input.camera)
-        sections.append(depth_section(depth_input.name, depth_input, estimate, range_m=range_m))
+        section = depth_section(depth_input.name, depth_input, estimate, range_m=(near_m, far_m))
+        sections.append(section)
     title = f"Depth of {len(names)} image{'s' * (len(names) != 1)}"
     write_page(out / _PAGE, title, sections, run.environment())
     print(f"the page: {out / _PAGE}")
 
 
+def _result_names(files: Sequence[Path], finished: Collection[str]) -> list[str]:
+    """Give the names of the finished results of an image, a pair or a video."""
+    if _is_video(files[0]):
+        return sorted(name for name in finished if _is_frame_name(name, files[0]))
+    name = files[0].stem
+    return [name] if name in finished else []
+
+
 def _read_chosen(
     names_of: Mapping[tuple[Path, ...], Sequence[str]], work: DepthWork, chosen: Collection[str]
 ) -> Iterator[StereoInput]:
-    """Read the chosen inputs again; what cannot be read any more is left out."""
+    """Read the inputs of chosen results again; one that is unreadable by now is left out.
+
+    ``names_of``: the results of each image, pair or video, by its files.
+    """
     for files, names in names_of.items():
         wanted = [name for name in names if name in chosen]
+        if not wanted:
+            continue
         with suppress(InputError):
-            for job in work.jobs_of(files) if wanted else ():
+            for job in work.make_jobs(files):
                 if job.name in wanted:
                     yield job.read()
                 if job.name == wanted[-1]:
@@ -513,7 +581,10 @@ def _read_chosen(
 
 @dataclass(frozen=True, kw_only=True)
 class DepthRun:
-    """Estimates of one process as files in ``out``, and its failures by the names of inputs."""
+    """Writes the estimates of one process to ``out``, and collects its failures.
+
+    ``failures``: by the names of images and pairs, or of whole videos.
+    """
 
     work: DepthWork
     method: DepthMethod
@@ -524,16 +595,16 @@ class DepthRun:
         self,
         jobs: Iterable[Job[StereoInput]],
         total: int | None,
-        what: str,
+        label: str,
         mount: MountFilter | None = None,
     ) -> list[str]:
-        """Estimate what is not finished, and give the names of all that is now.
+        """Estimate what is not finished; give the names of all inputs that have a result then.
 
         Args:
             jobs: images, pairs or the frames of a video.
             total: how many there are; None: unknown.
-            what: they are called, beside the progress.
-            mount: that of the inputs, where they are frames of one camera.
+            label: what they are called beside the progress.
+            mount: of the camera, where they are frames of one.
         """
         output = self.work.output
         results = DepthResults(
@@ -546,14 +617,14 @@ class DepthRun:
         estimate_many = partial(self.work.estimate_many, self.method.net, mount=mount)
         outcomes = run_jobs(jobs, estimate_many, results, output.batch)
         names: list[str] = []
-        for outcome in tqdm(outcomes, what, total, disable=None, unit=f" {what}"):
+        for outcome in tqdm(outcomes, label, total, disable=None, unit=f" {label}"):
             name = outcome.job.name
             try:
                 if outcome.failure is not None:
                     raise outcome.failure
                 if outcome.result is not None:
                     self._print_remarks(name, outcome.result)
-                elif mount is not None:  # of an earlier run, whose mount counts for what follows
+                elif mount is not None:  # finished by an earlier run: later frames go on from it
                     mount.last = read_ground(self.out, name) or mount.last
                 names.append(name)
             except InputError as error:
@@ -561,34 +632,35 @@ class DepthRun:
         return names
 
     def estimate_video(self, source: Path) -> int:
-        """Estimate the frames of a video, and make a video of them; give how many are done."""
+        """Estimate the frames of a video and write a video of their depth; give their number."""
         try:
             video = read_video(source)
-            jobs = self.work.jobs_of([source])
+            jobs = self.work.make_jobs([source])
             names = self.estimate(jobs, video.frames or None, source.name, MountFilter())
-            drawn = self._draw_frames(source, names) if names else ()
-            write_video(self.out / f"{source.stem}{_VIDEO}", drawn, video.fps)
+            pictures = self._draw_frames(source, names) if names else ()
+            write_video(self.out / f"{source.stem}{_VIDEO}", pictures, video.fps)
         except InputError as error:
             self.failures[source.name] = error
             return 0
         return len(names)
 
     def _draw_frames(self, source: Path, names: Sequence[str]) -> Iterator[Tensor]:
-        """Draw each frame's depth, in grey where there is none, so that none is missing."""
-        failed = {name for name in self.failures if _frame_of(source, name)}
+        """Draw the depth of each frame, and a grey picture for each frame that failed."""
+        failed = {name for name in self.failures if _is_frame_name(name, source)}
         unknown = torch.full_like(read_map(self.out / f"{names[0]}.depth_m.npy"), torch.nan)
         for name in sorted([*names, *failed]):
             depth_m = unknown if name in failed else read_map(self.out / f"{name}.depth_m.npy")
             yield draw_depth(depth_m, *self.work.output.color_range)
 
     def _print_remarks(self, name: str, estimate: DepthEstimate) -> None:
-        """Print the warning of an estimate, its mount, and how much its cloud leaves out."""
+        """Print how much the cloud of an estimate leaves out, its warning and its ground."""
         output = self.work.output
         if output.cloud and output.min_confidence > 0:
             sure_count = estimate.is_sure(output.min_confidence).sum()
-            share = 1 - float(sure_count / estimate.is_sure(0.0).sum().clamp(min=1))
+            point_count = estimate.is_sure(0.0).sum().clamp(min=1)
+            left_out = 1 - float(sure_count / point_count)
             tqdm.write(
-                f"{name}: {share:.1%} of the depth is less sure than {output.min_confidence:g} "
+                f"{name}: {left_out:.1%} of the depth is less sure than {output.min_confidence:g} "
                 "and left out of the cloud"
             )
         if estimate.warning:

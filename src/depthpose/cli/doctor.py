@@ -2,7 +2,9 @@
 
 import re
 import sys
+from collections.abc import Callable
 from importlib import metadata
+from pathlib import Path
 from time import perf_counter
 
 import tyro
@@ -11,8 +13,10 @@ from depthpose.cli.arguments import NewPath
 from depthpose.core.errors import InputError, install_command
 
 _REQUIREMENT = re.compile(r"([\w.-]+)[^;]*(?:;.*extra == ['\"](\w+)['\"])?")
-_EXTRAS_OF_OURS = ("dev",)  # extras for those who develop the package
-_SHIFT_PX = 12  # disparity of the pair that depth is tested with
+"""A package, and the extra that it belongs to, if any."""
+_DEVELOPER_EXTRAS = ("dev",)
+_SHIFT_PX = 12
+"""Disparity of the pair that depth is tested with."""
 
 
 def doctor(files: tyro.conf.Positional[tuple[NewPath, ...]] = ()) -> int:
@@ -35,49 +39,63 @@ def doctor(files: tyro.conf.Positional[tuple[NewPath, ...]] = ()) -> int:
         from depthpose.cli.doctor_files import describe_files
 
         return describe_files(files)
-    from depthpose.core.checkpoint import SHIPPED, read_checkpoint
+    from depthpose.core.checkpoint import SHIPPED
     from depthpose.core.run import environment
 
     for name, value in {**environment(), "device": device_names(), "weights in": SHIPPED}.items():
         print(f"{name}: {value}")
-    lacking: dict[str, list[str]] = {}
-    for line in metadata.requires("depthpose") or ():
-        requirement = _REQUIREMENT.match(line)
-        assert requirement is not None, line
-        package, extra = requirement.groups()
-        if extra is None or extra in _EXTRAS_OF_OURS:
-            continue
-        lacking.setdefault(extra, [])
-        try:
-            metadata.version(package)
-        except metadata.PackageNotFoundError:
-            lacking[extra].append(package)
-    for extra, packages in lacking.items():
+    for extra, packages in _missing_packages().items():
         outcome = f"lacks {', '.join(packages)}" if packages else "installed"
         print(f"extra {extra}: {outcome}")
     print(f"another extra: {install_command('EXTRA')}")
     for path in sorted(SHIPPED.glob("*.safetensors")):
+        print(f"weights {path.stem}: {_describe_weights(path)}")
+    works = [_run_trial("depth", _try_depth), _run_trial("pose", _try_pose)]
+    return 0 if all(works) else 1
+
+
+def _missing_packages() -> dict[str, list[str]]:
+    """List the packages that are not installed, by extra; empty for an extra that is whole."""
+    missing: dict[str, list[str]] = {}
+    for line in metadata.requires("depthpose") or ():
+        requirement = _REQUIREMENT.match(line)
+        assert requirement is not None, line
+        package, extra = requirement.groups()
+        if extra is None or extra in _DEVELOPER_EXTRAS:
+            continue
+        packages = missing.setdefault(extra, [])
         try:
-            checkpoint = read_checkpoint(path)
-            licence = checkpoint.facts.get("licence", "no licence")
-            print(f"weights {path.stem}: {checkpoint.kind}, {licence}")
-        except InputError as error:
-            print(f"weights {path.stem}: {error}")
-    code = 0
-    for what, work in {"depth": _try_depth, "pose": _try_pose}.items():
-        began = perf_counter()
-        try:
-            outcome = work()
-        except Exception as error:  # noqa: BLE001 - whatever it is, it is what is asked for
-            print(f"{what}: failed: {type(error).__name__}: {error}", file=sys.stderr)
-            code = 1
-        else:
-            print(f"{what}: {outcome}, {perf_counter() - began:.1f} s with loading")
-    return code
+            metadata.version(package)
+        except metadata.PackageNotFoundError:
+            packages.append(package)
+    return missing
+
+
+def _describe_weights(path: Path) -> str:
+    """Give the kind and the licence of weights, or why they cannot be read."""
+    from depthpose.core.checkpoint import read_checkpoint
+
+    try:
+        checkpoint = read_checkpoint(path)
+    except InputError as error:
+        return str(error)
+    return f"{checkpoint.kind}, {checkpoint.facts.get('licence', 'no licence')}"
+
+
+def _run_trial(name: str, trial: Callable[[], str]) -> bool:
+    """Run an estimate and print its outcome or its error; give whether it worked."""
+    start = perf_counter()
+    try:
+        outcome = trial()
+    except Exception as error:  # noqa: BLE001 - any error is what the user asks for
+        print(f"{name}: failed: {type(error).__name__}: {error}", file=sys.stderr)
+        return False
+    print(f"{name}: {outcome}, {perf_counter() - start:.1f} s with loading")
+    return True
 
 
 def device_names() -> str:
-    """Name what computes: the GPUs, or the processor alone."""
+    """Name the GPUs that torch has, or say that there is the processor alone."""
     import torch
 
     gpus = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
@@ -85,7 +103,11 @@ def device_names() -> str:
 
 
 def _try_depth() -> str:
-    """Match a pair of known disparity."""
+    """Match a synthetic pair of known disparity; give the outcome.
+
+    Raises:
+        RuntimeError: the match is more than a pixel off.
+    """
     import torch
 
     from depthpose.depth.estimator import FakestereoNet
@@ -105,7 +127,11 @@ def _try_depth() -> str:
 
 
 def _try_pose() -> str:
-    """Pose a part in a synthetic view."""
+    """Pose a part in a synthetic view; give the outcome.
+
+    Raises:
+        RuntimeError: the part is refused, or off by more than a tenth of its diameter.
+    """
     from depthpose.pose.config import ObjectsConfig
     from depthpose.pose.metrics import adds_m
     from depthpose.pose.network_pose import GeoPoseNet
@@ -117,8 +143,8 @@ def _try_pose() -> str:
     (estimate,) = net.estimate_many([view.input])
     if estimate.camera_from_model is None:
         raise RuntimeError(f"a synthetic view of a flange was refused: {estimate.reason}")
-    off_m = adds_m(estimate.camera_from_model, view.truth.camera_from_model, flange.vertices_m)
-    outcome = f"a synthetic flange was posed {1000 * float(off_m):.1f} mm off (ADD-S)"
-    if off_m > flange.diameter_m / 10:
+    error_m = adds_m(estimate.camera_from_model, view.truth.camera_from_model, flange.vertices_m)
+    outcome = f"a synthetic flange was posed {1000 * float(error_m):.1f} mm off (ADD-S)"
+    if error_m > flange.diameter_m / 10:
         raise RuntimeError(outcome)
     return outcome

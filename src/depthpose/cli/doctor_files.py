@@ -22,106 +22,133 @@ from depthpose.pose.mesh import MESH_READERS, exact_diameter, read_geometry
 
 Size = tuple[int, int]
 
-_UNITS_M = {"most sensors": 0.001, "TUM RGB-D": 0.0002, "KITTI": 1 / 256}
+_DEPTH_UNITS_M = {"most sensors": 0.001, "TUM RGB-D": 0.0002, "KITTI": 1 / 256}
+"""Metres of a step of 16-bit depth images, by where they come from."""
 _MIN_DEPTH_M = 0.05
 _MAX_DEPTH_M = 100.0
-_MAX_LENGTH_M = 20.0  # of a part, and of the way to a scan
-_MIN_LENGTH_MM = 2.0  # of a part
-_MIN_DISTANCE_MM = 150.0  # no depth camera sees what is nearer
+"""Between these lies the median of a depth image whose unit is right."""
+_MAX_LENGTH_M = 20.0
+"""Largest diameter of a part, and largest distance of a pose or a cloud; larger: not in metres."""
+_MIN_LENGTH_MM = 2.0
+"""Least diameter of a part in millimetres; a smaller number is in metres."""
+_MIN_DISTANCE_MM = 150.0
+"""Least distance that a depth camera measures; a smaller number is in centimetres."""
 _MAX_8_BIT = 255
-_MIN_UNKNOWN_SHARE = 0.02  # of depth images: of sensors 6 % and more has no reading
+_MIN_UNREAD_SHARE = 0.02
+"""Least share of pixels without a reading in a depth image; of sensors it is 6 % and more."""
 _MAX_SMOOTH_STEP = 0.012
 """Mean step between neighbours of a depth image, as a share of the range: of dense depth 0.004 at
 most, of pictures 0.024 at least."""
-_MAX_FOCAL_DIFFERENCE = 0.05  # of fx and fy, as a share
+_MAX_FOCAL_DIFFERENCE = 0.05
+"""Largest relative difference of fx and fy."""
 _HALF = 0.5
 
 
 @dataclass(kw_only=True)
 class FileFacts:
-    """A file, what it is, what is odd, and what the others are compared with."""
+    """What a file holds: one of image, depth, camera, mask, cloud and model; and what is odd."""
 
     path: Path
-    description: str = ""
+    description: str = ""  #: for the user; empty: it cannot be used
     oddities: list[str] = field(default_factory=list)
-    size: Size | None = None
+    size: Size | None = None  #: width and height [px] of an image, depth or mask
     image: Tensor | None = None
-    depth_units: Tensor | None = None
+    depth_units: Tensor | None = None  #: 16-bit depth as stored, NaN without a reading
     camera: cameras.Camera | None = None
     mask: Tensor | None = None
-    cloud: Tensor | None = None
-    model: Tensor | None = None
+    cloud: Tensor | None = None  #: points, in the file's unit
+    model: Tensor | None = None  #: vertices, in the file's unit
 
 
 def describe_files(paths: Sequence[Path]) -> int:
     """Print what each file is and what is odd about it; give the exit code."""
-    # What has a size comes first: a camera file may need it.
-    suffixes = cameras.CAMERA_SUFFIXES
-    ordered = sorted(paths, key=lambda path: path.is_dir() or path.suffix.lower() in suffixes)
+    # Images first: a camera file may lack the image size.
+    images_first = sorted(paths, key=_may_be_camera)
     all_facts: list[FileFacts] = []
-    for path in ordered:
-        size = next((other.size for other in all_facts if other.size is not None), None)
+    for path in images_first:
+        size = next((facts.size for facts in all_facts if facts.size is not None), None)
         try:
-            all_facts.append(_describe_file(path, size))
+            facts = _describe_file(path, size)
         except InputError as error:
-            all_facts.append(FileFacts(path=path, oddities=[str(error).removeprefix(f"{path}: ")]))
+            facts = FileFacts(path=path, oddities=[str(error).removeprefix(f"{path}: ")])
+        all_facts.append(facts)
 
     # What each is, and where it contradicts another.
     for facts in all_facts:
         facts.oddities += _contradictions(facts, all_facts)
     for path in paths:
-        facts = next(s for s in all_facts if s.path == path)
-        print(f"{path}: {facts.description}" if facts.description else f"{path}: cannot be used")
+        facts = next(facts for facts in all_facts if facts.path == path)
+        print(f"{path}: {facts.description or 'cannot be used'}")
         for oddity in facts.oddities:
             print(f"  odd: {oddity}")
 
-    # Two pictures may be a pair, the left one first.
-    is_odd = any(facts.oddities for facts in all_facts)
+    has_oddities = any(facts.oddities for facts in all_facts)
     pictures = [facts for facts in all_facts if facts.image is not None]
     if len(pictures) == 2 and pictures[0].size == pictures[1].size:
-        left, right = (facts.image for facts in pictures)
-        assert left is not None
-        assert right is not None
-        report = cameras.check_rectified(left, right)
-        oddity = f"\n  odd: {report.message}" if report.is_wrong else f": {report.message}"
-        print(f"{pictures[0].path.name} and {pictures[1].path.name} as a pair{oddity}")
-        is_odd = is_odd or report.is_wrong
-    return 1 if is_odd else 0
+        is_pair_wrong = _check_pair(*pictures)
+        has_oddities = has_oddities or is_pair_wrong
+    return 1 if has_oddities else 0
+
+
+def _may_be_camera(path: Path) -> bool:
+    """Whether a path is a folder, or a file with a suffix that camera files have."""
+    return path.is_dir() or path.suffix.lower() in cameras.CAMERA_SUFFIXES
+
+
+def _check_pair(left: FileFacts, right: FileFacts) -> bool:
+    """Print how two pictures match as a rectified pair; give whether something is wrong."""
+    assert left.image is not None
+    assert right.image is not None
+    report = cameras.check_rectified(left.image, right.image)
+    outcome = f"\n  odd: {report.message}" if report.is_wrong else f": {report.message}"
+    print(f"{left.path.name} and {right.path.name} as a pair{outcome}")
+    return report.is_wrong
 
 
 def _describe_file(path: Path, size: Size | None) -> FileFacts:
-    """Tell what a file holds, by its suffix: a camera, a map, a mesh, a cloud or a picture.
+    """Describe a file by what its suffix says: a camera, a map, a mesh, a cloud or a picture.
 
-    ``size``: width and height [px] of a picture beside it, for cameras that do not say theirs.
+    ``size``: width and height [px] of a picture beside it, for cameras without their own.
     """
     suffix = path.suffix.lower()
-    if path.is_dir() or suffix in cameras.CAMERA_SUFFIXES:
+    if _may_be_camera(path):
         return _describe_text_file(path, size)
     if suffix in files.MAP_SUFFIXES:
         return _describe_map(path)
     if suffix in MESH_READERS:
-        vertices, faces = read_geometry(path)
-        points = torch.from_numpy(vertices)
-        if not len(faces):
-            return _describe_points(path, points)
-        diameter = exact_diameter(points)
-        unit = "metres (--unit m)" if diameter < _MIN_LENGTH_MM else "metres, cm or mm; measure it"
-        unit = "millimetres (--unit mm)" if diameter > _MAX_LENGTH_M else unit
-        # STL repeats the points of every face, and other files those at edges.
-        count = len(np.unique(vertices, axis=0))
-        description = (
-            f"mesh of {count} points and {len(faces)} faces, {diameter:.4g} across: {unit}"
-        )
-        return FileFacts(path=path, description=description, model=points)
+        return _describe_mesh(path)
     if suffix in files.CLOUD_READERS:
         return _describe_points(path, files.read_cloud(path).points.double())
     return _describe_picture(path)
 
 
+def _describe_mesh(path: Path) -> FileFacts:
+    """Describe a mesh, with the unit that its diameter suggests; without faces, as points."""
+    vertices, faces = read_geometry(path)
+    points = torch.from_numpy(vertices)
+    if not len(faces):
+        return _describe_points(path, points)
+    diameter = exact_diameter(points)
+    if diameter > _MAX_LENGTH_M:
+        unit = "millimetres (--unit mm)"
+    elif diameter < _MIN_LENGTH_MM:
+        unit = "metres (--unit m)"
+    else:
+        unit = "metres, cm or mm; measure it"
+    # STL repeats the points of every face, and other files those at edges.
+    count = len(np.unique(vertices, axis=0))
+    description = f"mesh of {count} points and {len(faces)} faces, {diameter:.4g} across: {unit}"
+    return FileFacts(path=path, description=description, model=points)
+
+
 def _describe_text_file(path: Path, size: Size | None) -> FileFacts:
-    """Read a text file as a camera, a pose, run lengths of a mask, or points."""
-    if (posed := _describe_pose(path)) is not None:
-        return posed
+    """Describe a text file, or a folder of them: a pose, run lengths of a mask, a camera or points.
+
+    ``size``: of an image beside it [px].
+    """
+    pose_facts = _describe_pose(path)
+    if pose_facts is not None:
+        return pose_facts
     if path.suffix.lower() == ".json":
         content = files.read_json(path)
         record = content[0] if isinstance(content, list) and len(content) == 1 else content
@@ -130,20 +157,29 @@ def _describe_text_file(path: Path, size: Size | None) -> FileFacts:
     try:
         camera = cameras.read_camera(path, size)
     except InputError as error:
+        # A text file of another form than any camera's may hold points.
         if path.suffix.lower() != ".txt" or "no camera that is known" not in str(error):
             raise
         return _describe_points(path, files.read_cloud(path).points.double())
+    return _describe_camera(path, camera)
+
+
+def _describe_camera(path: Path, camera: cameras.Camera) -> FileFacts:
+    """Describe a camera: its size, field of view and baseline, and whether K is plausible."""
     fx = float(camera.K[0, 0])
     fy = float(camera.K[1, 1])
-    wide = math.degrees(2 * math.atan(camera.width / (2 * fx)))
+    fov_deg = math.degrees(2 * math.atan(camera.width / (2 * fx)))
     description = (
-        f"camera of {camera.width}x{camera.height}, fx {fx:.1f} px, {wide:.0f} degrees wide"
+        f"camera of {camera.width}x{camera.height}, fx {fx:.1f} px, {fov_deg:.0f} degrees wide"
     )
     if isinstance(camera, cameras.StereoRig):
         description += f", baseline {camera.baseline_m:.4g} m"
     if camera.depth_unit_m is not None:
         description += f", depth in units of {camera.depth_unit_m:.4g} m"
-    oddities = [oddity] if (oddity := cameras.suspicious_centre(camera)) is not None else []
+    oddities: list[str] = []
+    centre_advice = cameras.suspicious_centre(camera)
+    if centre_advice is not None:
+        oddities.append(centre_advice)
     if abs(fx / fy - 1) > _MAX_FOCAL_DIFFERENCE:
         oddities.append(
             f"fx {fx:.1f} and fy {fy:.1f} differ by {abs(fx / fy - 1):.0%}, as of an image "
@@ -153,60 +189,60 @@ def _describe_text_file(path: Path, size: Size | None) -> FileFacts:
 
 
 def _describe_pose(path: Path) -> FileFacts | None:
-    """A 4x4 matrix as ``pose track --first`` takes it; None where the file holds something else."""
+    """Describe a 4x4 matrix, as ``pose track --first`` takes it; None: the file holds none."""
     if path.is_dir():
         return None
     try:
         pose = read_pose(path)
     except InputError:
         return None
-    turn = math.degrees(float(geodesic_rad(pose.R, torch.eye(3).to(pose.R))))
-    away = float(pose.t_m.norm())
-    oddities = []
-    if away > _MAX_LENGTH_M:
-        oddities.append(f"it moves by {away:.4g}, taken as metres: is it in millimetres?")
-    return FileFacts(
-        path=path,
-        description=f"pose, turned by {turn:.1f} degrees, {away:.4g} m away",
-        oddities=oddities,
-    )
+    angle_deg = math.degrees(float(geodesic_rad(pose.R, torch.eye(3).to(pose.R))))
+    distance_m = float(pose.t_m.norm())
+    oddities: list[str] = []
+    if distance_m > _MAX_LENGTH_M:
+        oddities.append(f"it moves by {distance_m:.4g}, taken as metres: is it in millimetres?")
+    description = f"pose, turned by {angle_deg:.1f} degrees, {distance_m:.4g} m away"
+    return FileFacts(path=path, description=description, oddities=oddities)
 
 
 def _describe_picture(path: Path) -> FileFacts:
-    """Tell whether a picture is a depth image, a mask or a photograph.
-
-    One of 16 bits is a depth image where many pixels have no value, or neighbours are alike.
-    """
-    description = ""
-    units = None
+    """Describe a picture: a depth image, a mask or a photograph."""
     with opened_image(path) as image:
+        units = None
         if image.mode == "I;16":
             units = torch.from_numpy(np.asarray(image).astype(np.float32))
-    if units is not None:
-        has_reading = units > 0
-        low, high = value_range(units.numpy())
-        unknown = 1 - float(has_reading.float().mean())
-        span = max(high - low, 1)
-        rough = float((units[:, 1:] - units[:, :-1]).abs().mean()) / span
-        if unknown > _MIN_UNKNOWN_SHARE or rough < _MAX_SMOOTH_STEP:
-            return _describe_depth(path, torch.where(has_reading, units, torch.nan))
-        description = f", 16 bits a value, from {low} to {high}"
+    if units is not None and _is_depth(units):
+        return _describe_depth(path, torch.where(units > 0, units, torch.nan))
+
     picture = files.read_image(path)
-    size = (picture.shape[2], picture.shape[1])
-    description = f"picture of {size[0]}x{size[1]}{description}"
-    low, high = picture.aminmax()
-    if all(bool(((row == low) | (row == high)).all()) for row in picture):
+    darkest, brightest = picture.aminmax()
+    has_two_values = bool(((picture == darkest) | (picture == brightest)).all())
+    if has_two_values:
         return _describe_mask(path, picture[0] > 0)
-    return FileFacts(path=path, description=description, size=size, image=picture)
+    height, width = picture.shape[1:]
+    description = f"picture of {width}x{height}"
+    if units is not None:
+        low, high = value_range(units.numpy())
+        description += f", 16 bits a value, from {low} to {high}"
+    return FileFacts(path=path, description=description, size=(width, height), image=picture)
+
+
+def _is_depth(units: Tensor) -> bool:
+    """Whether 16-bit values are depth: many pixels have no reading, or neighbours are alike."""
+    low, high = value_range(units.numpy())
+    unread_share = 1 - float((units > 0).float().mean())
+    mean_step = float((units[:, 1:] - units[:, :-1]).abs().mean()) / max(high - low, 1)
+    return unread_share > _MIN_UNREAD_SHARE or mean_step < _MAX_SMOOTH_STEP
 
 
 def _describe_mask(path: Path, mask: Tensor) -> FileFacts:
     """Describe a mask: its share of the image, and whether it is empty or inverted."""
     height, width = mask.shape
     share = float(mask.float().mean())
-    edge = torch.cat([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).float().mean()
+    border = torch.cat([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
+    border_share = float(border.float().mean())
     oddities = ["it is empty: no pixel is the object"] if share == 0 else []
-    if share > _HALF and float(edge) > _HALF:
+    if share > _HALF and border_share > _HALF:
         oddities.append(f"it covers {share:.0%} of the image and its border: is it inverted?")
     description = f"mask of {width}x{height}, {share:.1%} of the image"
     return FileFacts(
@@ -225,8 +261,8 @@ def _describe_depth(path: Path, units: Tensor) -> FileFacts:
         return facts
     median = float(readings.median())
     share = len(readings) / units.numel()
-    maybe = ", ".join(f"{median * unit:.3g} m ({device})" for device, unit in _UNITS_M.items())
-    facts.description += f", {share:.0%} known, median {median:g} units: {maybe}"
+    medians = [f"{median * unit_m:.3g} m ({name})" for name, unit_m in _DEPTH_UNITS_M.items()]
+    facts.description += f", {share:.0%} known, median {median:g} units: {', '.join(medians)}"
     if share == 1:
         facts.description += "; or, as no pixel is 0, a picture of 16 bits"
     if float(readings.max()) <= _MAX_8_BIT:
@@ -236,6 +272,7 @@ def _describe_depth(path: Path, units: Tensor) -> FileFacts:
 
 def _describe_map(path: Path) -> FileFacts:
     """Describe a map of numbers (``.npy``, ``.pfm``): depth, disparity, or rows of points."""
+    # Integers are depth in the sensor's unit; other shapes than an image's are points.
     if path.suffix.lower() == ".npy":
         stored = read_numbers(path)
         if stored.dtype.kind != "f" and stored.ndim == 2:
@@ -265,20 +302,31 @@ def _describe_map(path: Path) -> FileFacts:
 
 def _describe_points(path: Path, points: Tensor) -> FileFacts:
     """Describe a cloud: the unit that its distance from the origin suggests, and its frame."""
-    away = float(points.median(0).values.norm())
-    unit = "centimetres" if away < _MIN_DISTANCE_MM else "millimetres"
-    unit = "metres" if away < _MAX_LENGTH_M else unit
-    description = f"{len(points)} points, {away:.4g} from the origin: {unit}"
-    oddities = [oddity] if (oddity := frame_advice(points)) is not None else []
-    if away < float((points - points.median(0).values).norm(dim=-1).median()):
+    centre = points.median(0).values
+    distance = float(centre.norm())
+    if distance < _MAX_LENGTH_M:
+        unit = "metres"
+    elif distance < _MIN_DISTANCE_MM:
+        unit = "centimetres"
+    else:
+        unit = "millimetres"
+    description = f"{len(points)} points, {distance:.4g} from the origin: {unit}"
+
+    oddities: list[str] = []
+    advice = frame_advice(points)
+    if advice is not None:
+        oddities = [advice]
+    radius = float((points - centre).norm(dim=-1).median())
+    if distance < radius:
         oddities = ["it lies about the origin: centred, or in a model's frame, not in the camera's"]
     return FileFacts(path=path, description=description, oddities=oddities, cloud=points)
 
 
 def _contradictions(facts: FileFacts, all_facts: Sequence[FileFacts]) -> Iterator[str]:
-    """Say what of a file contradicts the others: sizes, units, the scale of a model."""
+    """Give the contradictions of a file to the others: in size, unit, or scale of a model."""
     for other in all_facts:
-        if (camera := other.camera) is not None and facts.size is not None:
+        camera = other.camera
+        if camera is not None and facts.size is not None:
             try:
                 cameras.check_image_matches_camera(camera, *facts.size, "it")
             except InputError as error:

@@ -38,7 +38,8 @@ class EngineOptions:
         """Make the engine of these options."""
         from depthpose.core.engine import RayEngine
 
-        if (self.workers or 1) < 1 or self.block < 1 or min(self.worker_cpus, self.worker_gpus) < 0:
+        is_too_few = self.block < 1 or (self.workers is not None and self.workers < 1)
+        if is_too_few or min(self.worker_cpus, self.worker_gpus) < 0:
             raise InputError(
                 f"--workers {self.workers}, --block {self.block}, --worker-cpus {self.worker_cpus} "
                 f"and --worker-gpus {self.worker_gpus}: take at least 1, 1, 0 and 0"
@@ -76,7 +77,7 @@ class Weights:
 
     @contextmanager
     def unpacked(self) -> Iterator[str]:
-        """Give it as a file while the block runs."""
+        """Write the weights to a temporary file while the block runs, and give its path."""
         from depthpose.core.files.disk import refused_write
 
         with tempfile.TemporaryDirectory(prefix="depthpose-") as folder:
@@ -86,13 +87,19 @@ class Weights:
             yield str(path)
 
 
-def print_shards(shards: "Sequence[ShardRecord]", out: str, what: str) -> int:
-    """List what failed, print how much is done, and give the exit code."""
-    failures = [failure for done in shards for failure in done.failures]
-    for name, reason in failures[:20]:
+_MAX_LISTED_FAILURES = 20
+
+
+def print_shards(shards: "Sequence[ShardRecord]", out: str, noun: str) -> int:
+    """List failed inputs, print how many are done, and give the exit code.
+
+    ``noun``: what the inputs are called.
+    """
+    failures = [failure for shard in shards for failure in shard.failures]
+    for name, reason in failures[:_MAX_LISTED_FAILURES]:
         print(f"depthpose: failed: {name}: {reason}", file=sys.stderr)
-    if len(failures) > 20:
+    if len(failures) > _MAX_LISTED_FAILURES:
         print(f"depthpose: {len(failures)} failed; all are in manifest.csv", file=sys.stderr)
-    total = sum(len(done.entries) for done in shards)
-    print(f"{total - len(failures)} of {total} {what} are in {len(shards)} shards of {out}")
+    total = sum(len(shard.entries) for shard in shards)
+    print(f"{total - len(failures)} of {total} {noun} are in {len(shards)} shards of {out}")
     return 1 if failures else 0

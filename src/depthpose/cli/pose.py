@@ -49,12 +49,12 @@ def predict(
 
     # One kind of input; a pair is matched first, to depth images.
     pose_inputs = options.PoseInputs(**vars(inputs), **vars(details))
-    sources = (pose_inputs.cloud, pose_inputs.depth, pair.left, dataset.bop)
-    count = sum(word is not None for word in sources)
-    if count != 1:
+    input_kinds = (pose_inputs.cloud, pose_inputs.depth, pair.left, dataset.bop)
+    kind_count = sum(path is not None for path in input_kinds)
+    if kind_count != 1:
         raise InputError(
-            f"{count} of --cloud, --depth, --left and --bop are given; give one: a cloud, a depth "
-            "image with --mask and --camera, a pair with --camera, or a data set"
+            f"{kind_count} of --cloud, --depth, --left and --bop are given; give one: a cloud, a "
+            "depth image with --mask and --camera, a pair with --camera, or a data set"
         )
     if pair.left is not None:
         from depthpose.cli.pose_pairs import match_pairs
@@ -62,7 +62,7 @@ def predict(
         depth = match_pairs(pair, pose_inputs.camera, estimates.device, Path(out))
         pose_inputs = replace(pose_inputs, depth=str(depth))
 
-    # The estimator: a trained network, or registration of CAD files; a worker builds its own.
+    # The estimator: a trained network, or registration of CAD files. Workers build their own.
     register = options.RegisterOptions(
         method=estimates.method,
         cad=pose_inputs.cad,
@@ -78,7 +78,7 @@ def predict(
         return predict_on_ray(pose_inputs, source, batch, out, engine)
     method = source.build()
 
-    # The run over the inputs: of a data set, of whole images, or of clouds and parts of images.
+    # Pose a data set, or search whole images, or pose clouds and masked parts of images.
     home = Path(out)
     if dataset.bop is not None:
         if pose_inputs.color is not None:
@@ -91,8 +91,8 @@ def predict(
             f"--cloud {pose_inputs.cloud}: the weights {weights} need depth images; give --depth, "
             "--mask and --camera, or weights that vote"
         )
-    lens = pose_inputs.camera or pose_inputs.focal_px
-    if pose_inputs.depth is not None and not pose_inputs.has_regions and lens is not None:
+    has_lens = pose_inputs.lens is not None
+    if pose_inputs.depth is not None and has_lens and not pose_inputs.has_regions:
         return search_files(method, pose_inputs, home)
     return predict_files(method, pose_inputs, home, batch)
 
@@ -129,7 +129,7 @@ def evaluate(
         adds: ADD-S for declared symmetric objects (of LineMOD eggbox and glue), or for all.
     """
     from depthpose.cli.pose_evaluate import measure, open_instances
-    from depthpose.cli.pose_methods import build_methods, find_masks, predict_instances
+    from depthpose.cli.pose_methods import build_methods, predict_instances, prepare_masks
     from depthpose.core.config import config_to_dict
     from depthpose.core.run import claim_folder
     from depthpose.pose.config import EvaluationConfig
@@ -140,15 +140,17 @@ def evaluate(
     dataset = open_instances(bop, split, objects, estimates.targets)
     files = [*table_files("rows", "instances", "risk"), "report.html", "predictions", "detections"]
     rule = EvaluationConfig(diameters=estimates.diameters, with_vsd=estimates.vsd, adds=adds)
-    # More objects, or all of the targets, may be asked for later.
-    about = {"bop": str(bop.resolve()), "split": split, "rule": config_to_dict(rule)}
-    claim_folder(out, {"command": "pose evaluate", **about}, files)
+    # Objects and targets are no settings of the folder: a later run may ask for more of them.
+    settings = {"bop": str(bop.resolve()), "split": split, "rule": config_to_dict(rule)}
+    claim_folder(out, {"command": "pose evaluate", **settings}, files)
+
+    # Predict what is missing, then measure it with the predictions that are given.
     methods = build_methods(weights, estimates.config, tuple(dataset.objects.values()))
-    shown = find_masks(estimates.masks, dataset, out, estimates.device) if methods else []
-    paths = [
-        predict_instances(dataset, method, masks, out) for method in methods for masks in shown
+    all_masks = prepare_masks(estimates.masks, dataset, out, estimates.device) if methods else []
+    folders = [
+        predict_instances(dataset, method, masks, out) for method in methods for masks in all_masks
     ]
-    return measure(dataset, [*paths, *csv, *predictions], rule, out)
+    return measure(dataset, [*folders, *csv, *predictions], rule, out)
 
 
 def track(
@@ -178,7 +180,7 @@ def track(
     from depthpose.cli.pose_methods import make_method_source
     from depthpose.core.run import find_rank
 
-    if sum(place is not None for place in (frames.depth, frames.cloud, frames.bop)) != 1:
+    if sum(path is not None for path in (frames.depth, frames.cloud, frames.bop)) != 1:
         raise InputError("give one of --depth with --camera, --cloud and --bop")
     if frames.depth is not None and frames.camera is None:
         raise InputError("--depth needs --camera beside it")

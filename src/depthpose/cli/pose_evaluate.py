@@ -32,20 +32,29 @@ from depthpose.report import page
 from depthpose.report.page import Section
 from depthpose.report.pose import pose_section
 
-HOW = (
+SCORING_NOTE = (
     "Refused and wrong answers stay in every number. The row 'mean' counts each object the same, "
     "'all' each instance, as BOP does."
 )
 
-_SHOWN = ("method", "masks", "object", "instances", "success", "wrong", "refused", "auc", "ar",
-          "ap", "rotation_deg_median", "translation_m_median")  # fmt: skip
-"""Columns that are printed; the files hold all."""
+_PRINTED_COLUMNS = (
+    "method", "masks", "object", "instances", "success", "wrong", "refused", "auc", "ar", "ap",
+    "rotation_deg_median", "translation_m_median",
+)  # fmt: skip
+"""Columns of the table on the terminal; the files hold all."""
 
 
 def open_instances(
     bop: Path, split: str, objects: Sequence[str], targets: Path | None
 ) -> BopDataset:
-    """Open the instances that are measured, and print what they are."""
+    """Open the instances of a split, restricted to targets and objects; print how many there are.
+
+    Args:
+        bop: folder of the data set.
+        split: of it.
+        objects: names or numbers of those to keep; empty: all.
+        targets: BOP's list of targets; None: all instances.
+    """
     dataset = open_bop(bop, split)
     if targets is not None:
         dataset = select_targets(dataset, read_targets(targets, bop))
@@ -59,66 +68,77 @@ def open_instances(
 def measure_each(
     dataset: BopDataset, predictions: Sequence[Path], config: EvaluationConfig
 ) -> list[Evaluation]:
-    """Measure folders or csv files of predictions one by one; each row says whose it is."""
+    """Measure folders or csv files of predictions one by one; each row names its origin.
+
+    Raises:
+        InputError: predictions are of another data set or split, or two of them have one origin.
+    """
     evaluations: list[Evaluation] = []
     show = partial(tqdm, unit=" instances", disable=None)
-    for path, origin in zip(predictions, describe(predictions), strict=True):
-        settings = (read_settings(path) if path.is_dir() else None) or {}
-        for what, setting in dataset_settings(dataset).items():
-            predicted = settings.get(what, setting)
-            if predicted != setting:
-                raise InputError(
-                    f"{path}: predictions of the {what} {predicted!r}, but {setting!r} is "
-                    f"measured; give those of this very {what}, or measure that one"
-                )
-        evaluations.append(evaluate(dataset, read_any(path), config, show, origin))
-        if (advice := evaluations[-1].advice) is not None:
-            print(f"{path}: {advice}", file=sys.stderr)
+    for path, origin in zip(predictions, find_origins(predictions), strict=True):
+        _refuse_other_dataset(path, dataset)
+        evaluation = evaluate(dataset, read_any(path), config, show, origin)
+        if evaluation.advice is not None:
+            print(f"{path}: {evaluation.advice}", file=sys.stderr)
+        evaluations.append(evaluation)
     return evaluations
 
 
+def _refuse_other_dataset(path: Path, dataset: BopDataset) -> None:
+    """Refuse a folder of predictions whose record names another data set or split."""
+    predicted = (read_settings(path) if path.is_dir() else None) or {}
+    for key, measured in dataset_settings(dataset).items():
+        if predicted.get(key, measured) != measured:
+            raise InputError(
+                f"{path}: predictions of the {key} {predicted[key]!r}, but {measured!r} is "
+                f"measured; give those of this very {key}, or measure that one"
+            )
+
+
 def join(evaluations: Sequence[Evaluation]) -> Evaluation:
-    """Put the rows of several evaluations below each other."""
+    """Join the rows of several evaluations into one."""
+    advice = [evaluation.advice for evaluation in evaluations if evaluation.advice]
     return Evaluation(
         rows=[row for evaluation in evaluations for row in evaluation.rows],
         per_instance=[row for evaluation in evaluations for row in evaluation.per_instance],
         risk=[row for evaluation in evaluations for row in evaluation.risk],
-        advice="; ".join(evaluation.advice for evaluation in evaluations if evaluation.advice)
-        or None,
+        advice="; ".join(advice) or None,
     )
 
 
-def describe(predictions: Sequence[Path]) -> list[Origin]:
-    """Name whose predictions each of these are.
+def find_origins(predictions: Sequence[Path]) -> list[Origin]:
+    """Find which method, masks and weights made each folder or file of predictions.
 
-    Methods of one name that lie in two folders are two, and bear the folders' names too.
+    Methods of one name in two folders are told apart by the folders' names in front of theirs.
     """
-    origins: list[Origin] = []
-    for path in predictions:
-        settings = read_settings(path) if path.is_dir() else None
-        if settings is None:  # a file of others is its own fingerprint
-            sha256 = "" if path.is_dir() else file_sha256(path)[:12]
-            origins.append(Origin(method=path.stem, weights_sha256=sha256))
-            continue
-        masks = settings.get("masks", "")
-        origin = Origin(
-            method=path.name.removesuffix(f"_{masks}"),
-            masks=masks,
-            weights=settings.get("weights", ""),
-            weights_sha256=settings.get("weights_sha256", "")[:12],
-        )
-        origins.append(origin)
-    pairs = list(zip([path.resolve().parent for path in predictions], origins, strict=True))
-    rows = Counter((home, origin.method, origin.masks) for home, origin in pairs)
-    for (home, method, masks), count in rows.items():
+    origins = [_read_origin(path) for path in predictions]
+    homes = [path.resolve().parent for path in predictions]
+    pairs = list(zip(homes, origins, strict=True))
+    uses = Counter((home, origin.method, origin.masks) for home, origin in pairs)
+    for (home, method, masks), count in uses.items():
         if count > 1:
             raise InputError(
                 f"{home}: two predictions by {method!r}, masks {masks!r}, are given, and their "
                 "rows would be one; give one of them, or rename it"
             )
-    places = list({(home, origin.method): None for home, origin in pairs})
-    names = dict(zip(places, distinct_names(places), strict=True))
+    methods = list(dict.fromkeys((home, origin.method) for home, origin in pairs))
+    names = dict(zip(methods, distinct_names(methods), strict=True))
     return [replace(origin, method=names[home, origin.method]) for home, origin in pairs]
+
+
+def _read_origin(path: Path) -> Origin:
+    """Read the origin of predictions from the record of their folder, else from their name."""
+    settings = read_settings(path) if path.is_dir() else None
+    if settings is None:  # made by other software
+        sha256 = "" if path.is_dir() else file_sha256(path)[:12]
+        return Origin(method=path.stem, weights_sha256=sha256)
+    masks = settings.get("masks", "")
+    return Origin(
+        method=path.name.removesuffix(f"_{masks}"),
+        masks=masks,
+        weights=settings.get("weights", ""),
+        weights_sha256=settings.get("weights_sha256", "")[:12],
+    )
 
 
 def measure(
@@ -131,7 +151,9 @@ def measure(
     evaluations = measure_each(dataset, predictions, config)
     measured = join(evaluations)
     rows = [row.columns() for row in measured.rows]
-    text = HOW if measured.advice is None else f"{measured.advice}. {HOW}"
+    text = SCORING_NOTE
+    if measured.advice is not None:
+        text = f"{measured.advice}. {text}"
     page.write_table(out, rows)
 
     # Success of each method and object, a column for each kind of masks.
@@ -144,13 +166,11 @@ def measure(
         entry[f"{masks or 'their'} masks"] = row.success
 
     # The page: both tables, then some instances of each set of predictions.
-    shares = page.share_views(len(predictions))
-    instance_sections = [
-        section
-        for path, evaluation, most in zip(predictions, evaluations, shares, strict=True)
-        if most
-        for section in _instance_sections(dataset, path, evaluation.per_instance, most)
-    ]
+    view_counts = page.share_views(len(predictions))
+    instance_sections: list[Section] = []
+    for path, evaluation, count in zip(predictions, evaluations, view_counts, strict=True):
+        if count:
+            instance_sections += _instance_sections(dataset, path, evaluation.per_instance, count)
     sections = [
         Section(title="Success by masks", text=text, rows=list(by_masks.values())),
         Section(title="All numbers", rows=rows),
@@ -159,23 +179,23 @@ def measure(
     ]
     title = f"Poses on {dataset.folder.resolve().name}, {dataset.split}"
     page.write_page(out / "report.html", title, sections, environment())
-    print(page.plain_table(rows, _SHOWN))
+    print(page.plain_table(rows, _PRINTED_COLUMNS))
     print(f"every column: {out / 'table.md'}, rows.csv; the page: {out / 'report.html'}")
     return 0
 
 
 def _instance_sections(
-    dataset: BopDataset, predictions: Path, rows: Sequence[InstanceRow], most: int
+    dataset: BopDataset, predictions: Path, rows: Sequence[InstanceRow], max_count: int
 ) -> list[Section]:
-    """Show at most so many instances of a set of predictions, with their truth."""
+    """Show some instances of a folder or file of predictions, ``max_count`` at most, with truth."""
     instances = {instance.name: instance for instance in dataset.instances}
     estimates = match_instances(dataset.instances, read_any(predictions), dataset.objects)
     sections: list[Section] = []
-    for role, row in _choose(rows, most):
+    for role, row in _choose_instances(rows, max_count):
         instance = instances[row.instance]
         estimate = estimates[row.instance]
         model = dataset.objects[instance.object_id]
-        # Of copies that look alike the one nearest to the estimate.
+        # The true pose of a symmetric object has copies; the one nearest to the estimate is drawn.
         truth = instance.camera_from_model
         if (pose := estimate.camera_from_model) is not None:
             symmetries = symmetry_transforms(model.symmetries)
@@ -186,17 +206,17 @@ def _instance_sections(
             dataset.view(instance).input,
             estimate,
             model,
-            _OF_TRUTH,
+            _TRUTH_NOTE,
             image=None if instance.rgb is None else read_image(instance.rgb),
             truth=truth,
-            rows=[{name: columns[name] for name in _MEASURED}],
+            rows=[{name: columns[name] for name in _INSTANCE_COLUMNS}],
         )
         sections.append(section)
     return sections
 
 
 def write_details(measured: Evaluation, out: Path) -> list[Section]:
-    """Write each instance's numbers, and the risk by coverage; give them as parts of a page."""
+    """Write tables of instances and of the risk by coverage; give the sections that show them."""
     risk = [row.columns() for row in measured.risk]
     page.write_table(out, [row.columns() for row in measured.per_instance], name="instances")
     if risk:
@@ -210,28 +230,32 @@ def write_details(measured: Evaluation, out: Path) -> list[Section]:
     return [section for section in sections if section.rows]
 
 
-_OF_TRUTH = (
+_TRUTH_NOTE = (
     "Mask and cloud are the annotated ones; blue is the estimate, green the truth (of a symmetric "
     "object, the copy nearest to the estimate)."
 )
 
-_MEASURED = (
+_INSTANCE_COLUMNS = (
     "metric", "error_m", "diameter_m", "rotation_deg", "translation_m", "visible_fraction", "score",
     "status",
 )  # fmt: skip
+"""Columns of the table below the picture of an instance."""
 
 
-def _choose(rows: Sequence[InstanceRow], most: int) -> list[tuple[str, InstanceRow]]:
-    """Choose estimates by their error in diameters, and a middle one of the refusals."""
-    errors = {row.instance: row.error("error_m") for row in rows}
-    answers = [row for row in rows if errors[row.instance] is not None]
-    shares = [(errors[row.instance] or 0.0) / row.diameter_m for row in answers]
+def _choose_instances(rows: Sequence[InstanceRow], max_count: int) -> list[tuple[str, InstanceRow]]:
+    """Choose the worst, the median and the best answer, and a refusal; each with words for it.
+
+    Answers are ranked by their error, as a share of the diameter.
+    """
+    errors_m = {row.instance: row.error("error_m") for row in rows}
+    answers = [row for row in rows if errors_m[row.instance] is not None]
+    relative_errors = [(errors_m[row.instance] or 0.0) / row.diameter_m for row in answers]
     chosen = [
         (f"{role} answer of {len(answers)}", answers[k])
-        for role, k in page.choose_ranked(shares, min(most, 3))
+        for role, k in page.choose_ranked(relative_errors, min(max_count, 3))
     ]
-    refused = [r for r in rows if errors[r.instance] is None and r.status != "missing"]
-    refused_count = min(most - len(chosen), 1)
+    refused = [row for row in rows if errors_m[row.instance] is None and row.status != "missing"]
+    refused_count = min(max_count - len(chosen), 1)
     chosen += [
         (f"one of {len(refused)} refused", refused[k])
         for k in page.spread_evenly(len(refused), refused_count)

@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -37,7 +37,7 @@ from depthpose.pose.types import PoseEstimate, ViewInput
 
 
 class SearchResults(Results[ViewInput, list[PoseEstimate]]):
-    """The estimates of each image, perhaps several, in the ``poses.json`` of a folder.
+    """The estimates of each searched image, often several, in the ``poses.json`` of a folder.
 
     The file is written after every image, and keeps what earlier runs found in other images.
     """
@@ -50,24 +50,32 @@ class SearchResults(Results[ViewInput, list[PoseEstimate]]):
         is_of_image: Callable[[Prediction, str], bool],
         numbers: Mapping[str, int] | None = None,
     ) -> None:
-        """Sort the predictions of earlier runs by images; ``numbers``: of a data set's objects."""
+        """Sort the predictions of earlier runs by images.
+
+        Args:
+            folder: of ``poses.json``.
+            images: names of the images of this run.
+            earlier: predictions of earlier runs.
+            is_of_image: whether a prediction is of the image of this name.
+            numbers: those that a data set gives to its objects, by their names; None: no data set.
+        """
         self.by_image: dict[str, list[Prediction]] = {}
         self._folder = folder
         self._images = images
         self._numbers = numbers
-        self._of_other_images = list(earlier)
+        self._in_other_images = list(earlier)
         for image in images:
-            of_image = [p for p in self._of_other_images if is_of_image(p, image)]
-            if of_image:
-                self.by_image[image] = of_image
-                self._of_other_images = [p for p in self._of_other_images if p not in of_image]
+            in_image = [p for p in self._in_other_images if is_of_image(p, image)]
+            if in_image:
+                self.by_image[image] = in_image
+                self._in_other_images = [p for p in self._in_other_images if p not in in_image]
 
     def is_finished(self, job: Job[ViewInput]) -> bool:
         """Whether the image has been searched."""
         return job.name in self.by_image
 
     def store(self, job: Job[ViewInput], data: ViewInput, result: list[PoseEstimate]) -> None:  # noqa: ARG002
-        """Write what was found in an image."""
+        """Write the estimates of an image."""
         assert isinstance(job, PoseJob)
         self.by_image[job.name] = [
             Prediction(estimate=estimate, place=self._place_of(job, estimate))
@@ -76,7 +84,10 @@ class SearchResults(Results[ViewInput, list[PoseEstimate]]):
         self.flush()
 
     def store_failure(self, job: Job[ViewInput], error: InputError) -> None:
-        """Write why an image cannot be read; of a data set, which must be whole, it is an error."""
+        """Write why an image cannot be read.
+
+        Images of a data set must be readable, so there it is raised.
+        """
         assert isinstance(job, PoseJob)
         if job.object is None:
             raise error
@@ -88,9 +99,10 @@ class SearchResults(Results[ViewInput, list[PoseEstimate]]):
     def flush(self) -> None:
         """Write ``poses.json``."""
         predictions = [p for image in self._images for p in self.by_image.get(image, ())]
-        write_predictions(self._folder, [*predictions, *self._of_other_images])
+        write_predictions(self._folder, [*predictions, *self._in_other_images])
 
     def _place_of(self, job: PoseJob[ViewInput], estimate: PoseEstimate) -> Place | None:
+        """Give the scene, image and object number of an estimate; None outside a data set."""
         if self._numbers is None or job.place is None:
             return None
         return job.place._replace(object_id=self._numbers[estimate.object])
@@ -102,7 +114,10 @@ def _search(
     jobs: Sequence[PoseJob[Any]],
     results: SearchResults,
 ) -> tuple[list[Prediction], list[PoseJob[Any]]]:
-    """Search images for objects; give the predictions, and a job for each that shows it alone."""
+    """Search images that are not searched yet; give all predictions, and a job for each.
+
+    The job of a prediction reads its image with the mask of that object alone, for pictures.
+    """
     find = method.find
     assert find is not None
 
@@ -113,25 +128,25 @@ def _search(
     for _ in tqdm(outcomes, total=len(jobs), disable=None, unit=" images"):
         pass
     predictions: list[Prediction] = []
-    single_jobs: list[PoseJob[Any]] = []
+    object_jobs: list[PoseJob[Any]] = []
     for job in jobs:
         for prediction in results.by_image[job.name]:
-            read = partial(_read_explained, job, prediction, method)
             predictions.append(prediction)
-            single_jobs.append(replace(job, name=prediction.estimate.name, read=read))
-    return predictions, single_jobs
+            object_jobs.append(_make_masked_job(job, prediction, method))
+    return predictions, object_jobs
 
 
 def search_files(method: PoseMethod, inputs: PoseInputs, out: Path) -> int:
     """Find objects in every depth image, write the files of each, and give the exit code.
 
-    Every object that is looked for has an entry, found or not: in an image NAME they are called
-    NAME_0, NAME_1, ..., or NAME where one was looked for and not found. A rerun goes on where it
-    was, and reads again what could not be read.
+    Every object that is searched for has an entry, found or not: in an image NAME they are called
+    NAME_0, NAME_1, ..., or NAME where a single object was searched for and not found. A rerun
+    searches the images that are not finished, and those that could not be read.
     """
-    objects = tuple(model.name for model in method.models)
-    if inputs.object is not None:
-        objects = (pose_jobs.object_named(inputs.object, method),)
+    if inputs.object is None:
+        objects = [model.name for model in method.models]
+    else:
+        objects = [pose_jobs.object_named(inputs.object, method)]
     if method.find is None:
         raise InputError(
             "--depth without --mask: these weights need masked views; give --mask, --box or "
@@ -141,13 +156,7 @@ def search_files(method: PoseMethod, inputs: PoseInputs, out: Path) -> int:
         raise InputError("--depth without --mask is done by one process; give --mask, or start one")
     plan = pose_jobs.plan_searches(method, inputs, objects, out)
     jobs = plan.jobs
-    names = {job.name for job in jobs}
-    for name in sorted(names):
-        if (plain := re.sub(r"_\d+$", "", name)) != name and plain in names:
-            raise InputError(
-                f"two depth images are called {plain!r} and {name!r}, and so would be what is "
-                "found in the first; rename one"
-            )
+    _refuse_numbered_names({job.name for job in jobs})
     settings = {**method.settings, **plan.settings}
     pose_output.claim_for_jobs(out, settings, jobs, pose_output.is_result_of)
     earlier = [p for p in earlier_predictions(out).values() if p.estimate.status != "unreadable"]
@@ -156,18 +165,32 @@ def search_files(method: PoseMethod, inputs: PoseInputs, out: Path) -> int:
         return pose_output.is_result_of(prediction.estimate.name, image)
 
     results = SearchResults(out, [job.name for job in jobs], earlier, is_of_image)
-    predictions, searched = _search(method, objects, jobs, results)
-    pose_output.claim_for_jobs(out, settings, searched, pose_output.is_result_of)
-    pose_output.write_files(predictions, searched, out, method, input_count=len(jobs))
+    predictions, object_jobs = _search(method, objects, jobs, results)
+
+    # The files of results have names of their own, which are claimed once they are known.
+    pose_output.claim_for_jobs(out, settings, object_jobs, pose_output.is_result_of)
+    pose_output.write_files(predictions, object_jobs, out, method, input_count=len(jobs))
     return pose_output.print_result(predictions, out, len(jobs))
+
+
+def _refuse_numbered_names(names: Collection[str]) -> None:
+    """Refuse an image that is named as an object in another image would be: NAME_1 beside NAME."""
+    for name in sorted(names):
+        image = re.sub(r"_\d+$", "", name)
+        if image != name and image in names:
+            raise InputError(
+                f"two depth images are called {image!r} and {name!r}, and so would be what is "
+                "found in the first; rename one"
+            )
 
 
 def search_dataset(
     method: PoseMethod, options: DataSetOptions, object: str | None, out: Path
 ) -> int:
-    """Search every image of a data set for every object of it, as 6D detection; give the exit code.
+    """Search every image of a data set for each of its objects (6D detection); give the exit code.
 
-    No mask and no identity is told. A rerun goes on where it was.
+    The method is given neither masks nor which objects an image shows. A rerun searches the images
+    that are not finished.
     """
     assert options.bop is not None
     if method.find is None:
@@ -178,75 +201,83 @@ def search_dataset(
     if options.targets is not None:
         dataset = select_targets(dataset, read_targets(options.targets, options.bop))
     dataset = pose_methods.choose_objects(dataset, method, object)
-    numbers = {name: n for n, name in pose_methods.match_names(dataset, method.models).items()}
-    settings = {**method.settings, **pose_methods.dataset_settings(dataset), "masks": "search"}
-    settings["find"] = sorted(numbers)
+    names = pose_methods.match_names(dataset, method.models)
+    numbers = {name: number for number, name in names.items()}
+    settings = {
+        **method.settings,
+        **pose_methods.dataset_settings(dataset),
+        "masks": "search",
+        "find": sorted(numbers),
+    }
     pose_output.claim_for_dataset(out, settings, dataset)
+
+    # A job for each image, read by any of its instances; a view must name an object, any will do.
     images = {(i.scene_id, i.image_id): i for i in dataset.instances}
-    some_object = next(iter(numbers))
-    jobs = [
-        PoseJob(
-            name=_image_name(place),
-            read=partial(_whole_view, instance, some_object, _image_name(place)),
-            place=place_of(instance),
-        )
-        for place, instance in sorted(images.items())
-    ]
+    any_object = next(iter(numbers))
+    jobs: list[PoseJob[Any]] = []
+    for image, instance in sorted(images.items()):
+        name = _image_name(image)
+        read = partial(_read_whole_view, instance, any_object, name)
+        jobs.append(PoseJob(name=name, read=read, place=place_of(instance)))
 
     def is_of_image(prediction: Prediction, image: str) -> bool:
         return prediction.place is not None and _image_name(prediction.place[:2]) == image
 
     earlier = list(earlier_predictions(out).values())
     results = SearchResults(out, [job.name for job in jobs], earlier, is_of_image, numbers)
-    predictions, searched = _search(method, list(numbers), jobs, results)
-    pose_output.write_files(predictions, searched, out, method, dataset, input_count=len(images))
+    predictions, object_jobs = _search(method, list(numbers), jobs, results)
+    pose_output.write_files(predictions, object_jobs, out, method, dataset, input_count=len(images))
     return pose_output.print_result(predictions, out, len(images))
 
 
-def _frame_job(instance: Instance, object: str) -> PoseJob[Any]:
-    """Take the whole depth image of an instance as a frame of a sequence."""
-    read = partial(_whole_view, instance, object, instance.name)
-    return PoseJob(name=instance.name, read=read, object=object, place=place_of(instance))
-
-
-def _image_name(place: tuple[int, int]) -> str:
+def _image_name(image: tuple[int, int]) -> str:
     """Name an image of a data set by its scene and its number."""
-    scene_id, image_id = place
+    scene_id, image_id = image
     return f"{scene_id:06d}_{image_id:06d}"
 
 
-def _read_explained(job: PoseJob[Any], prediction: Prediction, method: PoseMethod) -> AnyInput:
-    """Read a whole depth image with the mask of the pixels that a predicted pose explains."""
+def _make_masked_job(job: PoseJob[Any], prediction: Prediction, method: PoseMethod) -> PoseJob[Any]:
+    """Make the job that reads an image with the mask of a predicted object."""
+    read = partial(_read_masked_by_pose, job, prediction, method)
+    return replace(job, name=prediction.estimate.name, read=read)
+
+
+def _read_masked_by_pose(job: PoseJob[Any], prediction: Prediction, method: PoseMethod) -> AnyInput:
+    """Read a whole depth image, masked to the pixels that a predicted pose explains.
+
+    A cloud, and an image whose object has no pose, are read as they are.
+    """
     view = job.read()
-    pose = prediction.estimate.camera_from_model
-    model = {model.name: model for model in method.models}.get(prediction.estimate.object)
-    if model is None or pose is None or not isinstance(view, ViewInput):
+    estimate = prediction.estimate
+    model = next((model for model in method.models if model.name == estimate.object), None)
+    if model is None or estimate.camera_from_model is None or not isinstance(view, ViewInput):
         return view
-    mask = explained_mask(view, pose, prepare_surface(model))
-    return replace(view, name=prediction.estimate.name, mask=mask, object=model.name)
+    mask = explained_mask(view, estimate.camera_from_model, prepare_surface(model))
+    return replace(view, name=estimate.name, mask=mask, object=model.name)
 
 
 def track_files(method: PoseMethod, frames: SequenceOptions, out: Path) -> int:
     """Follow one object through depth images with a camera, or clouds; give the exit code."""
-    unit = frames.unit
-    start = None if frames.first is None else pose_methods.read_pose(frames.first)
-    name = pose_jobs.object_named(frames.object, method)
-    settings = {**method.settings, "track": name, **pose_jobs.unit_facts(unit)}
+    object = pose_jobs.object_named(frames.object, method)
+    settings = {**method.settings, "track": object, **pose_jobs.unit_settings(frames.unit)}
+    first_pose = None
+    if frames.first is not None:
+        first_pose = pose_methods.read_pose(frames.first)
+        settings["first"] = pose_methods.name_with_checksum(frames.first)
     if frames.cloud is not None:
-        jobs = pose_jobs.cloud_jobs(frames.cloud, unit or "m", name, out)
+        jobs = pose_jobs.cloud_jobs(frames.cloud, frames.unit or "m", object, out)
     else:
         assert frames.depth is not None
         assert frames.camera is not None
-        jobs = pose_jobs.frame_jobs(frames.depth, frames.camera, name, unit, out)
-        settings |= pose_jobs.camera_facts(frames.camera)
-    if frames.first is not None:
-        settings |= {"first": pose_methods.name_with_checksum(frames.first)}
+        jobs = pose_jobs.frame_jobs(frames.depth, frames.camera, object, frames.unit, out)
+        settings |= pose_jobs.camera_settings(frames.camera)
     pose_output.claim_for_jobs(out, settings, jobs)
-    return _write_sequences(method, _follow(method, jobs, name, start), jobs, out)
+    followed = _follow(method, jobs, object, first_pose)
+    return _write_sequences(method, followed, jobs, out)
 
 
 def track_dataset(method: PoseMethod, frames: SequenceOptions, out: Path) -> int:
-    """Follow each known object of each scene, or one; give the exit code."""
+    """Follow each object of the method, or the one named, in each scene; give the exit code."""
     assert frames.bop is not None
     dataset = open_bop(frames.bop, frames.split)
     dataset = pose_methods.choose_objects(dataset, method, frames.object)
@@ -257,14 +288,15 @@ def track_dataset(method: PoseMethod, frames: SequenceOptions, out: Path) -> int
         "track": sorted(names.values()),
     }
     pose_output.claim_for_dataset(out, settings, dataset)
-    # The first instance of an object in each image of a scene is followed.
-    first_instances: dict[tuple[int, int], dict[int, Instance]] = {}
+
+    # A sequence for each scene and object: its first instance in each image, by image number.
+    instances_of: dict[tuple[int, int], dict[int, Instance]] = {}
     for instance in sorted(dataset.instances, key=lambda i: (i.image_id, i.index)):
-        of_object = first_instances.setdefault((instance.scene_id, instance.object_id), {})
-        of_object.setdefault(instance.image_id, instance)
+        by_image = instances_of.setdefault((instance.scene_id, instance.object_id), {})
+        by_image.setdefault(instance.image_id, instance)
     sequences = [
-        [_frame_job(instance, names[number]) for instance in by_image.values()]
-        for (_, number), by_image in sorted(first_instances.items())
+        [_make_frame_job(instance, names[number]) for instance in by_image.values()]
+        for (_, number), by_image in sorted(instances_of.items())
     ]
     jobs = [job for sequence in sequences for job in sequence]
     followed = (
@@ -275,7 +307,13 @@ def track_dataset(method: PoseMethod, frames: SequenceOptions, out: Path) -> int
     return _write_sequences(method, followed, jobs, out, dataset)
 
 
-def _whole_view(instance: Instance, object: str, name: str) -> ViewInput:
+def _make_frame_job(instance: Instance, object: str) -> PoseJob[Any]:
+    """Make the job that reads the whole depth image of an instance, as a frame of a sequence."""
+    read = partial(_read_whole_view, instance, object, instance.name)
+    return PoseJob(name=instance.name, read=read, object=object, place=place_of(instance))
+
+
+def _read_whole_view(instance: Instance, object: str, name: str) -> ViewInput:
     """Read the depth image of an instance without its mask."""
     depth_m = read_depth_png(instance.depth, instance.depth_unit_m)
     everywhere = torch.ones_like(depth_m, dtype=torch.bool)
@@ -289,10 +327,10 @@ def _write_sequences(
     out: Path,
     dataset: BopDataset | None = None,
 ) -> int:
-    """Follow sequences, write the files of their predictions, and print what became of the frames.
+    """Follow sequences, write the files of their predictions, and print a summary.
 
-    They are written where the work is interrupted, too; what an earlier run found of frames that
-    this one did not reach stays in the file.
+    ``poses.json`` is written after an interruption too; it then keeps what an earlier run had of
+    the frames that this one did not reach. Gives the exit code.
     """
     earlier = list(earlier_predictions(out).values())
     predictions: list[Prediction] = []
@@ -305,37 +343,32 @@ def _write_sequences(
         if predictions:
             others = [p for p in earlier if p.estimate.name not in names]
             write_predictions(out, [*predictions, *others])
-    pairs = zip(predictions, jobs, strict=True)
-    explained = [
-        replace(
-            job,
-            name=prediction.estimate.name,
-            read=partial(_read_explained, job, prediction, method),
-        )
-        for prediction, job in pairs
+    masked_jobs = [
+        _make_masked_job(job, prediction, method)
+        for prediction, job in zip(predictions, jobs, strict=True)
     ]
-    pose_output.write_files(predictions, explained, out, method, dataset)
+    pose_output.write_files(predictions, masked_jobs, out, method, dataset)
     code = pose_output.print_result(predictions, out)
-    kinds = Counter(p.estimate.tracking for p in predictions if p.estimate.tracking is not None)
-    print(", ".join(f"{kinds[kind]} {kind}" for kind in ("tracked", "found", "lost")))
+    counts = Counter(p.estimate.tracking for p in predictions)
+    print(", ".join(f"{counts[state]} {state}" for state in ("tracked", "found", "lost")))
     return code
 
 
 def _follow(
-    method: PoseMethod, jobs: Sequence[PoseJob[Any]], name: str, first: Rigid | None = None
+    method: PoseMethod, jobs: Sequence[PoseJob[Any]], object: str, first_pose: Rigid | None = None
 ) -> Iterator[Prediction]:
-    """Follow an object frame by frame; an unreadable frame gets an estimate that says so."""
+    """Follow an object frame by frame; an unreadable frame has an estimate with that reason."""
 
-    def frames() -> Iterator[AnyInput | PoseEstimate]:
-        """Read the frames one by one; one that cannot be read is an estimate that says so."""
+    def read_frames() -> Iterator[AnyInput | PoseEstimate]:
+        """Read the frames one by one; in place of an unreadable one, give its estimate."""
         for job in tqdm(jobs, disable=None, unit=" frames"):
             try:
                 frame = job.read()
             except InputError as error:
-                frame = unreadable_estimate(job.name, name, error)
+                frame = unreadable_estimate(job.name, object, error)
             yield frame
 
     assert method.track is not None
-    estimates = method.track(frames(), name, first)
+    estimates = method.track(read_frames(), object, first_pose)
     for job, estimate in zip(jobs, estimates, strict=True):
         yield Prediction(estimate=estimate, place=job.place)

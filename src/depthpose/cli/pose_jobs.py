@@ -2,11 +2,10 @@
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -41,14 +40,14 @@ from depthpose.pose.types import ObjectModel, ViewInput
 
 @dataclass(frozen=True, kw_only=True)
 class JobPlan:
-    """Jobs, and the JSON values that decide their results beside those of the method."""
+    """Jobs, and the JSON values that decide their results, apart from those of the method."""
 
     jobs: list[PoseJob[Any]]
     settings: dict[str, Any]
 
 
 def plan_jobs(method: PoseMethod, inputs: PoseInputs, out: Path) -> JobPlan:
-    """Plan to pose clouds, or the parts of depth images that masks, boxes or detections show."""
+    """Make the jobs of clouds, or of the masks, boxes or detections in depth images."""
     if inputs.cloud is not None:
         name = object_named(inputs.object, method)
         unit = inputs.unit or "m"
@@ -56,125 +55,152 @@ def plan_jobs(method: PoseMethod, inputs: PoseInputs, out: Path) -> JobPlan:
         plan = JobPlan(jobs=jobs, settings={"object": name, "unit": unit})
     else:
         plan = _plan_regions(method, inputs, out)
-    posed = {job.object for job in plan.jobs}
-    models = [model for model in method.models if model.name in posed]
-    return _with_color(_with_background(plan, inputs), inputs, models, out)
+    objects = {job.object for job in plan.jobs}
+    models = [model for model in method.models if model.name in objects]
+    plan = _with_background(plan, inputs)
+    return _with_color(plan, inputs, models, out)
 
 
 def plan_searches(
     method: PoseMethod, inputs: PoseInputs, objects: Sequence[str], out: Path
 ) -> JobPlan:
-    """Plan to search whole depth images for objects."""
-    lens = inputs.camera or inputs.focal_px
+    """Make the jobs of whole depth images, which are searched for objects."""
     assert inputs.depth is not None
-    assert lens is not None
-    jobs = frame_jobs(Path(inputs.depth), lens, objects[0], inputs.unit, out)
-    settings = {"find": sorted(objects), **camera_facts(lens), **unit_facts(inputs.unit)}
+    assert inputs.lens is not None
+    jobs = frame_jobs(Path(inputs.depth), inputs.lens, objects[0], inputs.unit, out)
+    settings = {
+        "find": sorted(objects),
+        **camera_settings(inputs.lens),
+        **unit_settings(inputs.unit),
+    }
     plan = JobPlan(jobs=jobs, settings=settings)
     models = [model for model in method.models if model.name in objects]
-    return _with_color(_with_background(plan, inputs), inputs, models, out)
+    plan = _with_background(plan, inputs)
+    return _with_color(plan, inputs, models, out)
 
 
 def _plan_regions(method: PoseMethod, inputs: PoseInputs, out: Path) -> JobPlan:
-    """Plan to pose what masks, boxes or detections show in depth images."""
-    lens = inputs.camera or inputs.focal_px
-    unit = inputs.unit
+    """Make the jobs of what masks, boxes or detections show in depth images."""
     regions = {"mask": inputs.mask, "box": inputs.box, "detections": inputs.detections}
     options = [f"--{name}" for name, value in regions.items() if value]
-    if inputs.depth is None or lens is None or not options:
+    if inputs.depth is None or inputs.lens is None or not options:
         raise InputError(
             "--depth needs --camera or --focal-px beside it, and --mask, --box or --detections "
             "unless it is to be found"
         )
     if len(options) > 1:
         raise InputError(f"{' and '.join(options)} say where objects are; give one of them")
-    depth = Path(inputs.depth)
-    known_names = [model.name for model in method.models]
-    labels = None if inputs.labels is None else parse_labels(inputs.labels, known_names)
-    is_one = inputs.object is not None or len(known_names) == 1
-    wanted = object_named(inputs.object, method) if is_one else None
-    settings = {**camera_facts(lens), **unit_facts(unit)}
+
+    # Which objects may be there: one by name or because the method has no other, or labelled ones.
+    names = [model.name for model in method.models]
+    labels = None if inputs.labels is None else parse_labels(inputs.labels, names)
+    object = None
+    if inputs.object is not None or len(names) == 1:
+        object = object_named(inputs.object, method)
+    settings = {**camera_settings(inputs.lens), **unit_settings(inputs.unit)}
     if labels is not None:
         settings["labels"] = labels
-    if wanted is not None:
-        settings["object"] = wanted
+    if object is not None:
+        settings["object"] = object
 
+    depth = Path(inputs.depth)
     if inputs.detections is not None:
-        settings["detections"] = str(Path(inputs.detections).resolve())
-        objects = (labels or {}, known_names, wanted)
-        file = Path(inputs.detections)
-        if wanted is not None:
-            asked = [wanted]
-        elif labels is not None:
-            asked = [name for name in dict.fromkeys(labels.values()) if name]
-        else:  # CAD files are asked for by being given, objects of weights are not
-            asked = known_names if method.expects_all else []
-        jobs = detection_file_jobs(depth, file, lens, objects, asked, unit, out)
-        return JobPlan(jobs=jobs, settings=settings)
-    if inputs.box:
+        detections = Path(inputs.detections)
+        settings["detections"] = str(detections.resolve())
+        wanted = _wanted_objects(method, labels, object)
+        jobs = detection_file_jobs(depth, detections, inputs.lens, wanted, inputs.unit, out)
+    elif inputs.box:
         settings["box"] = list(inputs.box)
-        name = object_named(inputs.object, method)
-        jobs = box_jobs(depth, inputs.box, lens, name, unit, out)
-        return JobPlan(jobs=jobs, settings=settings)
-    assert inputs.mask is not None
-    mask = Path(inputs.mask)
-    settings["mask"] = str(mask.resolve())
-    if wanted is None and labels is None:
-        raise InputError(
-            f"the {method.holder} know {', '.join(known_names)}; say which by --object, or which "
-            f"number of the mask is which by --labels 1={known_names[0]},2={known_names[1]}"
-        )
-    jobs = mask_jobs(depth, mask, lens, wanted, unit, out, labels)
+        box_object = object_named(inputs.object, method)
+        jobs = box_jobs(depth, inputs.box, inputs.lens, box_object, inputs.unit, out)
+    else:
+        assert inputs.mask is not None
+        mask = Path(inputs.mask)
+        settings["mask"] = str(mask.resolve())
+        if object is None and labels is None:
+            raise InputError(
+                f"the {method.holder} know {', '.join(names)}; say which by --object, or which "
+                f"number of the mask is which by --labels 1={names[0]},2={names[1]}"
+            )
+        jobs = mask_jobs(depth, mask, inputs.lens, object, inputs.unit, out, labels)
     return JobPlan(jobs=jobs, settings=settings)
 
 
+@dataclass(frozen=True, kw_only=True)
+class WantedObjects:
+    """Which detections are posed, by their objects.
+
+    ``names``: of all objects of the method. ``labels``: the object of a detector's class, where it
+    is not named so. ``only``: the single object that is wanted; None: all. ``expected``: objects
+    that have a result in every image, detected there or not.
+    """
+
+    names: Sequence[str]
+    labels: Mapping[str, str]
+    only: str | None
+    expected: Sequence[str]
+
+
+def _wanted_objects(
+    method: PoseMethod, labels: Mapping[str, str] | None, only: str | None
+) -> WantedObjects:
+    """Say which detections are posed: those of one object, of labelled ones, or of all."""
+    names = [model.name for model in method.models]
+    if only is not None:
+        expected = [only]
+    elif labels is not None:
+        expected = [name for name in dict.fromkeys(labels.values()) if name]
+    else:
+        expected = names if method.expects_all else []
+    return WantedObjects(names=names, labels=labels or {}, only=only, expected=expected)
+
+
 def object_named(name: str | None, method: PoseMethod) -> str:
-    """Give the object of this name, or the only one; refuse unknown names."""
-    known_names = [model.name for model in method.models]
-    if name is None and len(known_names) > 1:
+    """Give the object of ``--object``, which the method must have, or its only object."""
+    names = [model.name for model in method.models]
+    if name is None and len(names) > 1:
+        raise InputError(f"the {method.holder} know {', '.join(names)}; say which by --object")
+    if name is not None and name not in names:
         raise InputError(
-            f"the {method.holder} know {', '.join(known_names)}; say which by --object"
+            f"--object {name}: the {method.holder} do not know it; {nearest_name(name, names)}"
         )
-    if name is not None and name not in known_names:
-        raise InputError(
-            f"--object {name}: the {method.holder} do not know it; "
-            f"{nearest_name(name, known_names)}"
-        )
-    return known_names[0] if name is None else name
+    return names[0] if name is None else name
 
 
-def camera_facts(camera: Path | float) -> dict[str, Any]:
-    """Give the values of a camera file or a focal length that decide the poses, for the record."""
+def camera_settings(camera: Path | float) -> dict[str, Any]:
+    """Give the settings of a run that a camera file, or a focal length [px], stands for."""
     if not isinstance(camera, Path):
         return {"focal_px": camera}
     return {"camera": str(camera.resolve()), "camera_sha256": file_sha256(camera)}
 
 
-def unit_facts(unit: Unit | None) -> dict[str, Any]:
-    """Give the unit of clouds or depth images for the record, where one is given."""
+def unit_settings(unit: Unit | None) -> dict[str, Any]:
+    """Give the settings of a run that ``--unit`` stands for; none where it was left out."""
     return {} if unit is None else {"unit": unit}
 
 
 def cloud_jobs(cloud: Path, unit: Unit, object: str, out: Path) -> list[PoseJob[Any]]:
     """Make a job of a cloud, or of every cloud of a folder."""
     suffixes = tuple(CLOUD_READERS)
-    files = [cloud]
-    if cloud.is_dir():
-        named = [path for path in cloud.iterdir() if not path.name.startswith(".")]
-        files = [path for path in named if path.suffix.lower() in suffixes]
+    files = _list_visible(cloud, suffixes) if cloud.is_dir() else [cloud]
     files.sort(key=natural_order)
     if not files:
         raise InputError(f"{cloud}: no {', '.join(suffixes)} file there; give a cloud, or a folder")
-    _refuse_one_name(files)
+    _refuse_equal_stems(files)
     refuse_among_inputs(out, [cloud], files)
+    jobs: list[PoseJob[Any]] = []
+    for path in files:
+        read = partial(cloud_input, path, unit, object, path.stem)
+        jobs.append(PoseJob(name=path.stem, read=read, object=object, source=path))
+    return jobs
+
+
+def _list_visible(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
+    """List the files of a folder with one of these suffixes, without hidden ones."""
     return [
-        PoseJob(
-            name=p.stem,
-            read=partial(cloud_input, p, unit, object, p.stem),
-            object=object,
-            source=p,
-        )
-        for p in files
+        path
+        for path in folder.iterdir()
+        if path.suffix.lower() in suffixes and not path.name.startswith(".")
     ]
 
 
@@ -187,41 +213,61 @@ def mask_jobs(
     out: Path,
     labels: Mapping[str, str] | None = None,
 ) -> list[PoseJob[Any]]:
-    """Take a depth image, its mask and its camera, or images and masks of one name in two folders.
+    """Make a job of each object that masks show in depth images.
 
-    Of a mask that numbers several objects each is an input: NAME_1, NAME_2, ... All are of
-    ``object``, or each of the object that ``labels`` names by its number.
+    ``depth`` and ``mask`` are files, or folders whose files have the same names. A mask that
+    numbers several objects gives a job for each: NAME_1, NAME_2, ... All are of ``object``, or each
+    of the object that ``labels`` has for its number.
     """
-    runs = sorted(mask.glob("*.json")) if mask.is_dir() else []  # of run lengths
+    run_length_files = sorted(mask.glob("*.json")) if mask.is_dir() else []
     depths = _list_depths(depth)
-    pictures = runs or list_images(mask)
-    refuse_among_inputs(out, [depth, mask], [*depths, *pictures])
-    masks = _beside_depths(depths, pictures, depth, mask, "mask")
+    mask_files = run_length_files or list_images(mask)
+    refuse_among_inputs(out, [depth, mask], [*depths, *mask_files])
+    masks = _match_to_depths(depths, mask_files, depth, mask, "mask")
+
     jobs: list[PoseJob[Any]] = []
     for path in depths:
-        shown: dict[str, tuple[str, AnyMask]] = {}
+        mask_file = masks[path.stem]
         if labels is not None:
-            shown = _labelled_masks(masks[path.stem], labels, object)
+            parts = _labelled_parts(mask_file, labels, object)
         else:
             assert object is not None
-            shown[""] = object, masks[path.stem]
-            with suppress(InputError):  # it will be said where the mask is read
-                numbered = read_labels(masks[path.stem])
-                numbers = numbered[numbered != 0].unique().tolist()
-                several = numbers if len(numbers) > 1 else []
-                shown = {f"_{k}": (object, _run_lengths(numbered == k)) for k in several} or shown
-        for end, (name, pixels) in shown.items():
-            read = partial(view_input, path, pixels, camera, name, path.stem + end, unit)
-            files = (path, masks[path.stem])
-            jobs.append(PoseJob(name=path.stem + end, read=read, object=name, source=files))
-    _refuse_twice(jobs, depth)
+            parts = _numbered_parts(mask_file, object)
+        for part in parts:
+            name = path.stem + part.ending
+            read = partial(view_input, path, part.mask, camera, part.object, name, unit)
+            files = (path, mask_file)
+            jobs.append(PoseJob(name=name, read=read, object=part.object, source=files))
+    _refuse_equal_names(jobs, depth)
     return jobs
 
 
-def _labelled_masks(
-    mask: Path, labels: Mapping[str, str], wanted: str | None
-) -> dict[str, tuple[str, AnyMask]]:
-    """Give the object and the run lengths of each number of a label map that is there."""
+class _MaskPart(NamedTuple):
+    """An object that a mask shows: what the name of its result ends in, its name, its pixels."""
+
+    ending: str
+    object: str
+    mask: AnyMask
+
+
+def _numbered_parts(mask: Path, object: str) -> list[_MaskPart]:
+    """Give a part for each number of a mask that has several, all of one object; else the mask."""
+    whole_mask = [_MaskPart("", object, mask)]
+    try:
+        label_map = read_labels(mask)
+    except InputError:  # the job reads the mask again, and is the one to fail
+        return whole_mask
+    numbers = label_map[label_map != 0].unique().tolist()
+    if len(numbers) <= 1:
+        return whole_mask
+    return [_MaskPart(f"_{k}", object, _run_lengths(label_map == k)) for k in numbers]
+
+
+def _labelled_parts(mask: Path, labels: Mapping[str, str], wanted: str | None) -> list[_MaskPart]:
+    """Give a part for each number that ``--labels`` names; only of ``wanted``, if given.
+
+    A number that the mask lacks has an empty part, whose pose is then refused.
+    """
     words = [label for label in labels if not label.isdecimal()]
     if words:
         raise InputError(
@@ -229,17 +275,18 @@ def _labelled_masks(
             "1=OBJECT,2=OBJECT"
         )
     objects = {int(label): name for label, name in labels.items()}
-    numbered = read_labels(mask, list(objects))
-    # What is asked for and is not there has an empty mask, and so a refusal.
-    shown = [k for k in sorted(objects) if objects[k]]
-    return {
-        f"_{k}": (objects[k], _run_lengths(numbered == k))
-        for k in shown
-        if wanted in (None, objects[k])
-    }
+    label_map = read_labels(mask, list(objects))
+    parts: list[_MaskPart] = []
+    for number in sorted(objects):
+        object = objects[number]
+        is_left_out = not object  # "3=" leaves number 3 out
+        if not is_left_out and wanted in (None, object):
+            parts.append(_MaskPart(f"_{number}", object, _run_lengths(label_map == number)))
+    return parts
 
 
 def _run_lengths(pixels: Tensor) -> AnyMask:
+    """Encode a mask by run lengths, which take less memory than pixels."""
     counts, height, width = encode_rle(pixels)
     return {"size": [height, width], "counts": list(counts)}
 
@@ -255,12 +302,12 @@ def box_jobs(
     """Make a job of each box in each depth image: NAME, or of several NAME_1, NAME_2, ..."""
     depths = _list_depths(depth)
     refuse_among_inputs(out, [depth], depths)
-    _refuse_one_name(depths)
+    _refuse_equal_stems(depths)
     detections = [Detection(object=object, box=parse_box(text)) for text in boxes]
-    jobs = [
-        job for path in depths for job in _detection_jobs(path, detections, (path,), camera, unit)
-    ]
-    _refuse_twice(jobs, depth)
+    jobs: list[PoseJob[Any]] = []
+    for path in depths:
+        jobs += _detection_jobs(path, detections, (path,), camera, unit)
+    _refuse_equal_names(jobs, depth)
     return jobs
 
 
@@ -268,55 +315,58 @@ def detection_file_jobs(
     depth: Path,
     detections: Path,
     camera: Path | float,
-    objects: tuple[Mapping[str, str], Sequence[str], str | None],
-    asked: Sequence[str],
+    wanted: WantedObjects,
     unit: Unit | None,
     out: Path,
 ) -> list[PoseJob[Any]]:
-    """Take what a detector found in depth images: NAME, or of several NAME_1 (the surest), ...
+    """Make a job of each detection in depth images: NAME, or of several NAME_1 (the surest), ...
 
-    ``detections``: a file, or a folder of files with the names of the images. ``objects``: labels,
-    known names and the wanted one, as :func:`name_objects` takes them. ``asked``: objects that have
-    a job in every image, whether they are detected there or not.
+    ``detections``: a file, or a folder of files with the names of the images.
     """
     depths = _list_depths(depth)
-    _refuse_one_name(depths)
+    _refuse_equal_stems(depths)
     files = [detections]
     if detections.is_dir():
-        named = [p for p in detections.iterdir() if p.suffix.lower() in (".json", ".txt")]
-        files = [p for p in named if not p.name.startswith(".")]
+        files = _list_visible(detections, (".json", ".txt"))
     refuse_among_inputs(out, [depth, detections], [*depths, *files])
 
-    # The detections of each image, from one file of all or from a file for each.
+    # The detections of each image, from one file of all images or from a file for each.
     by_image: dict[str, list[Detection]] = {}
     if len(files) == 1 and files[0].suffix.lower() == ".json":
-        read = read_detections(files[0])
-        beside = dict.fromkeys((path.stem for path in depths), files[0])
-        by_image = group_by_image(read, [path.stem for path in depths], str(files[0]))
+        file_of = dict.fromkeys((path.stem for path in depths), files[0])
+        images = [path.stem for path in depths]
+        by_image = group_by_image(read_detections(files[0]), images, str(files[0]))
     else:
-        beside = _beside_depths(depths, files, depth, detections, "file of detections")
+        file_of = _match_to_depths(depths, files, depth, detections, "file of detections")
         for path in depths:
-            file = beside[path.stem]
-            size = None
-            if file.suffix.lower() == ".txt":
-                height, width = read_stored_depth(path).shape
-                size = (width, height)
-            by_image[path.stem] = read_detections(file, size)
+            by_image[path.stem] = _read_detections_of(path, file_of[path.stem])
 
     # Those of the wanted objects, the surest first.
     jobs: list[PoseJob[Any]] = []
-    is_any = False
+    has_detection = False
     for path in depths:
-        of_image = name_objects(by_image[path.stem], *objects, source=str(beside[path.stem]))
-        of_image.sort(key=lambda detection: -detection.score)
-        is_any |= bool(of_image)
-        detected = {detection.object for detection in of_image}
-        absent = [name for name in asked if name not in detected]
-        jobs += _detection_jobs(path, of_image, (path, beside[path.stem]), camera, unit, absent)
-    if not is_any:
+        file = file_of[path.stem]
+        in_image = name_objects(
+            by_image[path.stem], wanted.labels, wanted.names, wanted.only, source=str(file)
+        )
+        in_image.sort(key=lambda detection: -detection.score)
+        has_detection |= bool(in_image)
+        detected = {detection.object for detection in in_image}
+        undetected = [name for name in wanted.expected if name not in detected]
+        jobs += _detection_jobs(path, in_image, (path, file), camera, unit, undetected)
+    if not has_detection:
         raise InputError(f"{detections}: holds no detection of what is asked for in {depth}")
-    _refuse_twice(jobs, depth)
+    _refuse_equal_names(jobs, depth)
     return jobs
+
+
+def _read_detections_of(depth: Path, file: Path) -> list[Detection]:
+    """Read the detections of one depth image; YOLO's text files need its size for their shares."""
+    size = None
+    if file.suffix.lower() == ".txt":
+        height, width = read_stored_depth(depth).shape
+        size = (width, height)
+    return read_detections(file, size)
 
 
 def _detection_jobs(
@@ -325,18 +375,18 @@ def _detection_jobs(
     files: tuple[Path, ...],
     camera: Path | float,
     unit: Unit | None,
-    absent: Sequence[str] = (),
+    undetected: Sequence[str] = (),
 ) -> list[PoseJob[Any]]:
     """Make a job of each detection in a depth image: NAME, or of several NAME_1, NAME_2, ...
 
-    ``absent``: objects that are not detected there, which have one too.
+    ``undetected``: further objects, which get a job without a detection, and so a refusal.
     """
     jobs: list[PoseJob[Any]] = []
-    every = [(detection.object, detection) for detection in detections]
-    every += [(object, None) for object in absent]
-    for k, (object, detection) in enumerate(every, 1):
+    targets = [(detection.object, detection) for detection in detections]
+    targets += [(object, None) for object in undetected]
+    for k, (object, detection) in enumerate(targets, 1):
         assert object is not None
-        name = path.stem + (f"_{k}" if len(every) > 1 else "")
+        name = path.stem + (f"_{k}" if len(targets) > 1 else "")
         read = partial(read_detection, path, object, detection, camera, name, unit)
         jobs.append(PoseJob(name=name, read=read, object=object, source=files))
     return jobs
@@ -350,7 +400,7 @@ def read_detection(
     name: str,
     unit: Unit | None,
 ) -> ViewInput:
-    """Read a depth image with the pixels of a detection; with no pixel where there is none."""
+    """Read a depth image with the mask or box of a detection; None: with an empty mask."""
     view = view_input(path, None, camera, object, name, unit)
     if detection is None:
         return replace(view, mask=torch.zeros_like(view.mask), is_region=True)
@@ -358,24 +408,35 @@ def read_detection(
     return replace(view, mask=mask, is_region=detection.box is not None)
 
 
-def _beside_depths(
-    depths: Sequence[Path], others: Sequence[Path], depth: Path, place: Path, what: str
+def _match_to_depths(
+    depths: Sequence[Path], files: Sequence[Path], depth: Path, source: Path, kind: str
 ) -> dict[str, Path]:
-    """Give the file of each depth image that has its name."""
-    _refuse_one_name(depths)
-    _refuse_one_name(others)
-    by_name = {path.stem: path for path in others}
-    if len(depths) == len(by_name) == 1 and not depth.is_dir():
-        by_name = {depths[0].stem: next(iter(by_name.values()))}
-    lost = [path.stem for path in depths if path.stem not in by_name]
-    if lost:
+    """Match files to depth images of the same name; a single file to a single image of any name.
+
+    Args:
+        depths: the depth images.
+        files: masks, detections or pictures.
+        depth: option that names the depth images: one file, or a folder.
+        source: option that names the files, for errors.
+        kind: of the files, for errors.
+
+    Returns:
+        The file of each depth image, by its stem.
+    """
+    _refuse_equal_stems(depths)
+    _refuse_equal_stems(files)
+    by_name = {path.stem: path for path in files}
+    if len(depths) == len(files) == 1 and not depth.is_dir():
+        by_name = {depths[0].stem: files[0]}
+    missing = [path.stem for path in depths if path.stem not in by_name]
+    if missing:
         raise InputError(
-            f"{place}: no {what} called {lost[0]!r}; a {what} has the name of its depth image"
+            f"{source}: no {kind} called {missing[0]!r}; a {kind} has the name of its depth image"
         )
     return by_name
 
 
-def _refuse_twice(jobs: Sequence[PoseJob[Any]], depth: Path) -> None:
+def _refuse_equal_names(jobs: Sequence[PoseJob[Any]], depth: Path) -> None:
     """Refuse jobs of one name: their results would overwrite each other."""
     twice = [name for name, count in Counter(job.name for job in jobs).items() if count > 1]
     if twice:
@@ -388,24 +449,19 @@ def _refuse_twice(jobs: Sequence[PoseJob[Any]], depth: Path) -> None:
 def frame_jobs(
     depth: Path, camera: Path | float, object: str, unit: Unit | None, out: Path
 ) -> list[PoseJob[Any]]:
-    """Take whole depth images, without masks."""
+    """Make a job of a whole depth image, or of every one of a folder, without masks."""
     depths = _list_depths(depth)
     refuse_among_inputs(out, [depth], depths)
-    _refuse_one_name(depths)
-    return [
-        PoseJob(
-            name=p.stem,
-            read=partial(view_input, p, None, camera, object, p.stem, unit),
-            object=object,
-            source=p,
-        )
-        for p in depths
-    ]
+    _refuse_equal_stems(depths)
+    jobs: list[PoseJob[Any]] = []
+    for path in depths:
+        read = partial(view_input, path, None, camera, object, path.stem, unit)
+        jobs.append(PoseJob(name=path.stem, read=read, object=object, source=path))
+    return jobs
 
 
 def _with_background(plan: JobPlan, inputs: PoseInputs) -> JobPlan:
-    """Give each depth image the known bin or empty frame, if there is one."""
-    lens = inputs.camera or inputs.focal_px
+    """Return a plan whose depth images have the bin or the empty frame, if either is given."""
     background: AnyBackground
     settings = dict(plan.settings)
     if inputs.bin is not None:
@@ -424,10 +480,10 @@ def _with_background(plan: JobPlan, inputs: PoseInputs) -> JobPlan:
         settings["empty_frame"] = pose_methods.name_with_checksum(background)
     else:
         return plan
-    jobs = [
-        replace(job, read=partial(_read_with_background, job.read, background, lens, inputs.unit))
-        for job in plan.jobs
-    ]
+    jobs: list[PoseJob[Any]] = []
+    for job in plan.jobs:
+        read = partial(_read_with_background, job.read, background, inputs.lens, inputs.unit)
+        jobs.append(replace(job, read=read))
     return JobPlan(jobs=jobs, settings=settings)
 
 
@@ -437,15 +493,16 @@ def _read_with_background(
     camera: Path | float | None,
     unit: Unit | None,
 ) -> ViewInput:
+    """Read a depth image together with its background."""
     return with_background(read(), background, camera, unit)
 
 
 def _with_color(
     plan: JobPlan, inputs: PoseInputs, models: Sequence[ObjectModel], out: Path
 ) -> JobPlan:
-    """Give each depth image the colour picture of its name, where such pictures are given.
+    """Return a plan whose depth images have the colour pictures of their names, if any are given.
 
-    ``models``: those that may be there.
+    ``models``: of the objects that may be visible.
     """
     if inputs.color is None:
         if inputs.color_camera is not None or inputs.color_from_depth is not None:
@@ -457,7 +514,7 @@ def _with_color(
     depth = Path(inputs.depth)
     pictures = list_images(color)
     refuse_among_inputs(out, [color], pictures)
-    beside = _beside_depths(_list_depths(depth), pictures, depth, color, "colour picture")
+    picture_of = _match_to_depths(_list_depths(depth), pictures, depth, color, "colour picture")
     settings = {**plan.settings, "color": str(color.resolve())}
 
     # The camera of the pictures, and where the depth camera is in its frame.
@@ -475,7 +532,7 @@ def _with_color(
     for job in plan.jobs:
         sources = job.source if isinstance(job.source, tuple) else (job.source,)
         assert sources[0] is not None
-        picture = beside[sources[0].stem]
+        picture = picture_of[sources[0].stem]
         read = partial(_read_colored, job.read, models, picture, camera, color_from_depth)
         colored.append(replace(job, read=read, source=(*sources, picture)))
     return JobPlan(jobs=colored, settings=settings)
@@ -493,7 +550,7 @@ def _read_colored(
 
 
 def _list_depths(depth: Path) -> list[Path]:
-    """List depth images: pictures; in a folder without pictures, maps."""
+    """List depth images: a file, or the pictures of a folder; in one without pictures, its maps."""
     try:
         return list_images(depth)
     except InputError:
@@ -503,11 +560,11 @@ def _list_depths(depth: Path) -> list[Path]:
         return sorted(maps, key=natural_order)
 
 
-def _refuse_one_name(files: Sequence[Path]) -> None:
-    """Refuse files of one stem: results bear the stems of their inputs."""
-    first: dict[str, Path] = {}
+def _refuse_equal_stems(files: Sequence[Path]) -> None:
+    """Refuse files of equal stems, which their results would share."""
+    first_of: dict[str, Path] = {}
     for path in files:
-        other = first.setdefault(path.stem, path)
+        other = first_of.setdefault(path.stem, path)
         if other != path:
             raise InputError(
                 f"{path.parent}: {other.name} and {path.name} would both be {path.stem!r} in the "

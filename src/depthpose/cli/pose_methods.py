@@ -40,52 +40,79 @@ from depthpose.pose.weights import read_pose_weights
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Masks:
-    """The pixels that a method is given: their name in tables, and the jobs that they make."""
+    """One kind of masks of a data set, its name in tables, and what decides which masks they are.
+
+    ``make_jobs`` makes a job for each mask; it takes the names that the method has for the objects,
+    by their numbers in the data set.
+    """
 
     name: str
-    jobs: Callable[[Mapping[int, str]], list[predictions.PoseJob[ViewInput]]]
+    make_jobs: Callable[[Mapping[int, str]], list[predictions.PoseJob[ViewInput]]]
     settings: Mapping[str, Any]
 
 
-def find_masks(
+def prepare_masks(
     kinds: Sequence[str], dataset: datasets.BopDataset, out: Path, device: str = "cpu"
 ) -> list[Masks]:
-    """Understand ``truth``, ``predicted``, files of BOP detections and segmentation weights."""
+    """Prepare each kind of masks; images are segmented now where a kind is a segmentation.
+
+    Args:
+        kinds: each ``truth`` (annotated masks), ``predicted`` (those that came with
+            Linemod_preprocessed), a JSON file of BOP detections, or weights of a segmentation.
+        dataset: whose instances are masked.
+        out: folder of the run; segmented masks are written below it.
+        device: that segments.
+    """
     paths = [mask_path(kind) for kind in kinds]
-    names = _file_names(kinds, paths)
+    names = _names_of_files(kinds, paths)
     masks: list[Masks] = []
     for kind, path, name in zip(kinds, paths, names, strict=True):
-        settings: dict[str, Any] = {}
-        jobs = partial(predictions.instance_jobs, dataset)
         if path is not None:
-            if path.suffix == ".json":
-                detections = datasets.read_detections(path)
-            else:
-                detections = _segmented(path, name, dataset, out, device)
-            jobs = partial(predictions.detection_jobs, dataset, detections=detections)
-            settings = {"masks_sha256": file_sha256(path)}
+            masks.append(_detected_masks(path, name, dataset, out, device))
         elif kind == "predicted":
-            file = datasets.LAYOUTS[dataset.layout].predicted_mask
-            if file is None:
-                raise InputError(
-                    f"{dataset.folder}: came without predicted masks, as Linemod_preprocessed has "
-                    "them; give --masks a file of BOP detections, or weights of a segmentation"
-                )
-            jobs = partial(predictions.instance_jobs, dataset, predicted_mask=file)
-            settings = {"masks_of": "segnet_results"}
-        masks.append(Masks(name=name, jobs=jobs, settings=settings))
+            masks.append(_predicted_masks(dataset))
+        else:
+            make_jobs = partial(predictions.instance_jobs, dataset)
+            masks.append(Masks(name=name, make_jobs=make_jobs, settings={}))
     return masks
 
 
+def _detected_masks(
+    path: Path, name: str, dataset: datasets.BopDataset, out: Path, device: str
+) -> Masks:
+    """Take masks from a JSON file of BOP detections, or segment the images by weights."""
+    if path.suffix == ".json":
+        detections = datasets.read_detections(path)
+    else:
+        detections = _segment_dataset(path, name, dataset, out, device)
+    make_jobs = partial(predictions.detection_jobs, dataset, detections=detections)
+    return Masks(name=name, make_jobs=make_jobs, settings={"masks_sha256": file_sha256(path)})
+
+
+def _predicted_masks(dataset: datasets.BopDataset) -> Masks:
+    """Take the masks that a segmentation network left in the data set, as it was published."""
+    predicted_mask = datasets.LAYOUTS[dataset.layout].predicted_mask
+    if predicted_mask is None:
+        raise InputError(
+            f"{dataset.folder}: came without predicted masks, as Linemod_preprocessed has "
+            "them; give --masks a file of BOP detections, or weights of a segmentation"
+        )
+    make_jobs = partial(predictions.instance_jobs, dataset, predicted_mask=predicted_mask)
+    return Masks(name="predicted", make_jobs=make_jobs, settings={"masks_of": "segnet_results"})
+
+
 def mask_path(kind: str) -> Path | None:
-    """Give the file of a kind of masks as :func:`find_masks` takes it; None where it is a word."""
+    """Give the file of a kind of masks, as :func:`prepare_masks` takes it.
+
+    None for ``truth`` and ``predicted``, which are in the data set.
+    """
     if kind in ("truth", "predicted"):
         return None
     return Path(kind) if kind.endswith(".json") else find_weights(kind)
 
 
 def name_with_checksum(path: Path) -> str:
-    """Name a file with the start of its SHA-256, so that another file of that name differs."""
+    """Give a file's name with the start of its SHA-256, so that a changed file is told apart."""
     try:
         return f"{path.name} {file_sha256(path)[:12]}"
     except OSError as error:
@@ -101,119 +128,155 @@ def dataset_settings(dataset: datasets.BopDataset) -> dict[str, Any]:
     }
 
 
-def _segmented(
+def _segment_dataset(
     path: Path, name: str, dataset: datasets.BopDataset, out: Path, device: str
 ) -> list[datasets.Detection]:
-    """Segment the images that are not segmented yet, for every object that the weights know.
+    """Segment the images of a data set by weights, except those that an earlier run segmented.
 
-    Other objects or images may be asked for next time: what is there stays, what lacks is added.
+    Detections of all objects of the weights are written to ``OUT/detections/NAME.json``, so that a
+    later run may ask for other objects, or for more images.
     """
-    # The numbers that the data set gives to the objects of the weights: by name, else by number.
     segmenter = Segmenter.load(path, device)
-    names = datasets.object_names(dataset.folder)
-    by_name = {name: number for number, name in names.items()}
-    numbers_of = dict(zip(segmenter.weights.objects, segmenter.weights.numbers, strict=True))
-    numbers = {
-        name: by_name.get(name, number)
-        for name, number in numbers_of.items()
-        if name in by_name or names.get(number) not in numbers_of
-    }
-    wanted = {instance.object_id for instance in dataset.instances}
-    lost = sorted(wanted - set(numbers.values()))
-    if len(lost) == len(wanted):
-        known_objects = ", ".join(f"{name} ({number})" for name, number in numbers_of.items())
-        raise InputError(
-            f"{path}: segments {known_objects}, but {dataset.folder} shows objects {lost}; give "
-            "weights of its objects"
-        )
-    if lost:
-        print(f"{path}: segments no objects {lost}; each is missing", file=sys.stderr)
+    numbers = _numbers_in_dataset(segmenter, dataset, path)
 
-    # What an earlier run found, and in which images.
     home = out / "detections" / name
     claim_folder(home, {"weights_sha256": file_sha256(path), **dataset_settings(dataset)})
-    file = home.parent / f"{name}.json"
-    record = home / "images.json"
-    done: set[tuple[int, int]] = set()
+    detections_file = home.parent / f"{name}.json"
+    images_file = home / "images.json"
+    segmented: set[tuple[int, int]] = set()
     detections: list[datasets.Detection] = []
     with suppress(InputError):  # damaged or missing: all is segmented again
-        earlier = datasets.read_detections(file)
-        record_name = str(record)
-        rows = read_rows(record)
-        done = {
-            (integer(row, "scene_id", record_name), integer(row, "im_id", record_name))
-            for row in rows
-        }
-        detections = [d for d in earlier if (d.scene_id, d.image_id) in done]
+        earlier = datasets.read_detections(detections_file)
+        segmented = _read_segmented_images(images_file)
+        detections = [d for d in earlier if (d.scene_id, d.image_id) in segmented]
 
     images = {(i.scene_id, i.image_id): i for i in dataset.instances}
-    unsegmented = [images[place] for place in sorted(images.keys() - done)]
+    unsegmented = [images[image] for image in sorted(images.keys() - segmented)]
     if unsegmented:
         for instance in tqdm(unsegmented, "segmentation", disable=None, unit=" images"):
             detections += _segment_image(segmenter, instance, numbers)
-        datasets.write_detections(file, detections)
-        places = sorted(done | images.keys())
-        write_json(record, [{"scene_id": scene, "im_id": image} for scene, image in places])
+        datasets.write_detections(detections_file, detections)
+        rows = [
+            {"scene_id": scene, "im_id": image}
+            for scene, image in sorted(segmented | images.keys())
+        ]
+        write_json(images_file, rows)
     return detections
+
+
+def _numbers_in_dataset(
+    segmenter: Segmenter, dataset: datasets.BopDataset, path: Path
+) -> dict[str, int]:
+    """Give the data set's number of each object of the weights: by its name, else by its number.
+
+    Objects of the data set that the weights do not segment are printed; it is an error if they
+    segment none.
+    """
+    names = datasets.object_names(dataset.folder)
+    number_by_name = {name: number for number, name in names.items()}
+    weights_numbers = dict(zip(segmenter.weights.objects, segmenter.weights.numbers, strict=True))
+    numbers: dict[str, int] = {}
+    for name, number in weights_numbers.items():
+        if name in number_by_name:
+            numbers[name] = number_by_name[name]
+        elif names.get(number) not in weights_numbers:  # the number is no other object's
+            numbers[name] = number
+
+    wanted = {instance.object_id for instance in dataset.instances}
+    missing = sorted(wanted - set(numbers.values()))
+    if len(missing) == len(wanted):
+        weights_objects = ", ".join(f"{name} ({k})" for name, k in weights_numbers.items())
+        raise InputError(
+            f"{path}: segments {weights_objects}, but {dataset.folder} shows objects {missing}; "
+            "give weights of its objects"
+        )
+    if missing:
+        print(f"{path}: segments no objects {missing}; each is missing", file=sys.stderr)
+    return numbers
+
+
+def _read_segmented_images(path: Path) -> set[tuple[int, int]]:
+    """Read which images an earlier run segmented: scene and image numbers."""
+    source = str(path)
+    return {
+        (integer(row, "scene_id", source), integer(row, "im_id", source)) for row in read_rows(path)
+    }
 
 
 def _segment_image(
     segmenter: Segmenter, instance: datasets.Instance, numbers: Mapping[str, int]
 ) -> list[datasets.Detection]:
-    """Segment the image of an instance; ``numbers``: those of the objects by name."""
+    """Segment the image of an instance; ``numbers``: of the data set's objects, by their names."""
     if instance.rgb is None:
         raise InputError(f"{instance.name}: has no picture, and a segmentation needs pictures")
     start = perf_counter()
-    objects = segmenter.segment(read_image(instance.rgb))
-    spent_s = perf_counter() - start
-    return [
-        datasets.Detection(
-            scene_id=instance.scene_id,
-            image_id=instance.image_id,
-            object_id=numbers[object],
-            score=score,
-            segmentation=datasets.encode_rle(mask),
-            seconds=spent_s,
-        )
-        for object in objects.masks
-        if object in numbers
-        for mask, score in zip(objects.masks[object], objects.scores[object].tolist(), strict=True)
-    ]
+    segmented = segmenter.segment(read_image(instance.rgb))
+    seconds = perf_counter() - start
+
+    detections: list[datasets.Detection] = []
+    for object, masks in segmented.masks.items():
+        if object not in numbers:
+            continue
+        scores = segmented.scores[object].tolist()
+        for mask, score in zip(masks, scores, strict=True):
+            detection = datasets.Detection(
+                scene_id=instance.scene_id,
+                image_id=instance.image_id,
+                object_id=numbers[object],
+                score=score,
+                segmentation=datasets.encode_rle(mask),
+                seconds=seconds,
+            )
+            detections.append(detection)
+    return detections
 
 
-def _file_names(words: Sequence[str], paths: Sequence[Path | None]) -> list[str]:
+def _names_of_files(words: Sequence[str], paths: Sequence[Path | None]) -> list[str]:
     """Name files by their stems, with folders where stems are equal; words stay as they are."""
-    return distinct_names(
-        [(None, w) if p is None else (p.parent, p.stem) for w, p in zip(words, paths, strict=True)]
-    )
+    placed_names = [
+        (None, word) if path is None else (path.parent, path.stem)
+        for word, path in zip(words, paths, strict=True)
+    ]
+    return distinct_names(placed_names)
 
 
-def distinct_names(files: Sequence[tuple[Path | None, str]]) -> list[str]:
-    """Give each its own name; of equal ones, with as many folders above it as distinguish them.
+def distinct_names(placed_names: Sequence[tuple[Path | None, str]]) -> list[str]:
+    """Make names distinct: equal ones get as many folders in front as it takes to tell them apart.
 
-    ``files``: the folder that something lies in, None where it lies in none, and its name.
+    ``placed_names``: the folder that each lies in, None where it lies in none, and its name.
     """
-    parts = [(*(folder.resolve().parts[1:] if folder else ()), name) for folder, name in files]
+    parts = [
+        (*(folder.resolve().parts[1:] if folder else ()), name) for folder, name in placed_names
+    ]
     for path_parts, count in Counter(parts).items():
         if count > 1:
             raise InputError(
                 f"{'/'.join(path_parts[-2:])}: {count} that are given have this name, and their "
                 "results would be one; give it once, or rename a file"
             )
+
+    # Equal names are lengthened by a folder, all at once, until none are equal.
     names: list[str] = []
-    depths = [1] * len(parts)
+    part_counts = [1] * len(parts)
     for _ in range(max(map(len, parts), default=0)):
         names = [
-            "-".join(path_parts[-depth:]) for path_parts, depth in zip(parts, depths, strict=True)
+            "-".join(path_parts[-count:])
+            for path_parts, count in zip(parts, part_counts, strict=True)
         ]
-        counts = Counter(names)
-        depths = [d + (counts[name] > 1) for d, name in zip(depths, names, strict=True)]
+        uses = Counter(names)
+        part_counts = [
+            count + 1 if uses[name] > 1 else count
+            for count, name in zip(part_counts, names, strict=True)
+        ]
     return names
 
 
-REGISTER = "register"  # the name of our own registration, which needs no training
+REGISTER = "register"
+"""In place of weights: our own registration, which needs no training."""
 _SAME_DIAMETER = 0.05
-_FARTHEST_BASE_M = 50.0  # of a camera from the base of its robot
+"""Largest relative difference of the diameters of one object in a data set and in weights."""
+_FARTHEST_BASE_M = 50.0
+"""Largest distance of a camera from the base of its robot; a larger one is in millimetres."""
 
 EstimateMany = Callable[[Sequence[ViewInput]], Sequence[PoseEstimate]]
 
@@ -223,8 +286,8 @@ class PoseMethod:
     """An estimator, what to call it, the objects it knows, and what decides its results.
 
     ``find`` gives the poses of named objects in a view without a mask, ``track`` follows one
-    through frames; None: it cannot. ``holder``: what knows the objects, in messages.
-    ``expects_all``: whether each object is expected in each image, as CAD files are that are given.
+    through frames; None: it cannot. ``holder``: what messages call the source of the objects.
+    ``expects_all``: whether every object is expected in every image, as that of a CAD file is.
     """
 
     name: str
@@ -244,18 +307,19 @@ class PoseMethod:
 def build_methods(
     names: Sequence[str], config: EstimateConfig, models: Sequence[ObjectModel] = ()
 ) -> list[PoseMethod]:
-    """Build the estimators of weights files of any kinds, given by their paths or by names.
+    """Build the estimator of each weights file (a path or a name), or of ``register``.
 
-    Files of one name are distinguished by their folders.
+    Files of one name are distinguished by their folders. ``models``: what is registered.
     """
     paths = [None if name == REGISTER else find_weights(name) for name in names]
-    labels = _file_names(names, paths)
-    return [
-        _network_method(path, label, config)
-        if path
-        else _registration_method(label, models, config)
-        for path, label in zip(paths, labels, strict=True)
-    ]
+    labels = _names_of_files(names, paths)
+    methods: list[PoseMethod] = []
+    for path, label in zip(paths, labels, strict=True):
+        if path is None:
+            methods.append(_registration_method(label, models, config))
+        else:
+            methods.append(_network_method(path, label, config))
+    return methods
 
 
 def _registration_method(
@@ -268,13 +332,7 @@ def _registration_method(
             "models it takes"
         )
     net = Registration(models, config)
-    fingerprints: dict[str, str] = {}
-    for model in models:  # a shape is named by its bytes, and by what is declared of it
-        digest = sha256(model.vertices_m.contiguous().numpy().tobytes())
-        digest.update(model.faces.contiguous().numpy().tobytes())
-        if not model.symmetries.is_found and not model.symmetries.is_none:
-            digest.update(json.dumps(symmetries_to_bop(model.symmetries)).encode())
-        fingerprints[model.name] = digest.hexdigest()[:16]
+    fingerprints = {model.name: _model_fingerprint(model) for model in models}
     return PoseMethod(
         name=name,
         estimate_many=net.estimate_many,
@@ -288,36 +346,57 @@ def _registration_method(
     )
 
 
+def _model_fingerprint(model: ObjectModel) -> str:
+    """Give the start of the SHA-256 of a model's mesh and of its declared symmetries."""
+    digest = sha256(model.vertices_m.contiguous().numpy().tobytes())
+    digest.update(model.faces.contiguous().numpy().tobytes())
+    if not model.symmetries.is_found and not model.symmetries.is_none:
+        digest.update(json.dumps(symmetries_to_bop(model.symmetries)).encode())
+    return digest.hexdigest()[:16]
+
+
 def _network_method(path: Path, name: str, config: EstimateConfig) -> PoseMethod:
     """Make the method of a weights file: a network that votes, or the regressor.
 
-    Its name in tables says how it departs from the defaults.
+    Its name in tables also says which settings differ from the defaults.
     """
     pose_weights = read_pose_weights(path)
     warn_of_terms(pose_weights.facts)
-    is_regressor = isinstance(pose_weights.network, DepthImageNet)
-    net = (
-        DepthImageRegressor(pose_weights, config)
-        if is_regressor
-        else GeoPoseNet(pose_weights, config)
-    )
-    name += "" if config.voting.method == "ransac" else "-least-squares"
-    name += "" if config.with_icp else "-without-icp"
-    facts = {"kind": read_checkpoint(path).kind, "weights": path.stem}
-    facts |= {"weights_sha256": file_sha256(path)}
+    if config.voting.method != "ransac":
+        name += "-least-squares"
+    if not config.with_icp:
+        name += "-without-icp"
+    settings = {
+        "kind": read_checkpoint(path).kind,
+        "weights": path.stem,
+        "weights_sha256": file_sha256(path),
+        "estimate": config_to_dict(config),
+    }
+    if isinstance(pose_weights.network, DepthImageNet):
+        return PoseMethod(
+            name=name,
+            estimate_many=DepthImageRegressor(pose_weights, config).estimate_many,
+            takes_clouds=False,
+            models=pose_weights.models,
+            settings=settings,
+        )
+    net = GeoPoseNet(pose_weights, config)
     return PoseMethod(
         name=name,
         estimate_many=net.estimate_many,
-        takes_clouds=not is_regressor,
+        takes_clouds=True,
         models=pose_weights.models,
-        settings={**facts, "estimate": config_to_dict(config)},
-        find=None if isinstance(net, DepthImageRegressor) else net.find_in,
-        track=None if isinstance(net, DepthImageRegressor) else net.track_in,
+        settings=settings,
+        find=net.find_in,
+        track=net.track_in,
     )
 
 
-def _with_base_pose(method: PoseMethod, base: Rigid) -> PoseMethod:
-    """Make a method add ``base_from_model`` to its estimates."""
+def _with_base(method: PoseMethod, base: Rigid) -> PoseMethod:
+    """Return a method whose estimates also have the pose in the robot's frame, ``base_from_model``.
+
+    ``base``: the transform ``base_from_camera``.
+    """
     find = method.find
     track = method.track
 
@@ -345,10 +424,11 @@ def _with_base_pose(method: PoseMethod, base: Rigid) -> PoseMethod:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PoseMethodSource:
-    """What an estimator is made from, in this process or by the workers of an engine.
+    """What an estimator is built from, in this process or by the workers of an engine.
 
-    ``weights``: of a network, by name or file, or packed to travel; None: ``models`` are registered
-    without training. ``base_from_camera``: adds the pose in a robot's frame to every estimate.
+    ``weights``: of a network, by name or file, or as bytes to be sent to workers; None: ``models``
+    are registered without training. ``base_from_camera``: if given, every estimate has the pose
+    from the robot's base too.
     """
 
     config: EstimateConfig
@@ -357,13 +437,13 @@ class PoseMethodSource:
     base_from_camera: Rigid | None = None
 
     def build(self, device: str | None = None) -> PoseMethod:
-        """Build the estimator, on a device or on that of the config."""
-        method = self._build(device)
+        """Build the estimator; ``device`` takes the place of the config's."""
+        method = self._build_in_camera(device)
         base = self.base_from_camera
-        return method if base is None else _with_base_pose(method, base)
+        return method if base is None else _with_base(method, base)
 
-    def _build(self, device: str | None) -> PoseMethod:
-        """Build the estimator without what is added to its estimates."""
+    def _build_in_camera(self, device: str | None) -> PoseMethod:
+        """Build the estimator of poses from the camera alone."""
         config = self.config if device is None else replace(self.config, device=device)
         if self.weights is None or self.weights == REGISTER:
             return _registration_method(REGISTER, self.models, config)
@@ -375,11 +455,15 @@ class PoseMethodSource:
 
 
 def unit_of_cad(files: Sequence[str], cad_unit: Unit | None, unit: Unit | None) -> Unit | None:
-    """Give the unit of CAD files: their option, else that of clouds, unless each has its own."""
-    has_own = all(Path(path).suffix.lower() in FIXED_UNITS for path in files)
-    cad_unit = cad_unit or (None if has_own else unit)
+    """Give the unit of CAD files: ``--cad-unit``, else ``--unit``; None if their format fixes it.
+
+    Raises:
+        InputError: a file's format does not fix the unit, and none is given.
+    """
+    if cad_unit is None and not all(Path(path).suffix.lower() in FIXED_UNITS for path in files):
+        cad_unit = unit
     for path in files:
-        unit_of(path, cad_unit)
+        unit_of(path, cad_unit)  # raises where there is none
     return cad_unit
 
 
@@ -391,7 +475,10 @@ def make_method_source(
     config: EstimateConfig,
     base: Sequence[str] = (),
 ) -> PoseMethodSource:
-    """Say what the options of a command make an estimator from."""
+    """Read what an estimator is built from: weights, or the models of a data set or of CAD files.
+
+    ``base``: the words of ``--base-from-camera``.
+    """
     base_from_camera = read_base(base)
     cad_unit = unit_of_cad(register.cad, register.cad_unit, unit)
     if register.symmetry and (not register.is_register or not register.cad):
@@ -406,15 +493,19 @@ def make_method_source(
         return PoseMethodSource(config=config, models=models)
     if not register.cad:
         return PoseMethodSource(config=config, base_from_camera=base_from_camera)
-    loaded = Registration.load(*register.cad, unit=cad_unit, symmetry=register.symmetry or None)
-    return PoseMethodSource(config=config, models=loaded.models, base_from_camera=base_from_camera)
+    registration = Registration.load(
+        *register.cad, unit=cad_unit, symmetry=register.symmetry or None
+    )
+    return PoseMethodSource(
+        config=config, models=registration.models, base_from_camera=base_from_camera
+    )
 
 
 def predict_instances(
     dataset: datasets.BopDataset, method: PoseMethod, masks: Masks, out: Path, batch: int = 1
 ) -> Path:
     """Estimate every instance that is not estimated yet, and write ``poses.json`` and BOP's csv."""
-    jobs = masks.jobs(match_names(dataset, method.models))
+    jobs = masks.make_jobs(match_names(dataset, method.models))
     home = out / "predictions" / f"{method.name}_{masks.name}"
     settings = {
         **method.settings,
@@ -433,7 +524,13 @@ def predict_instances(
 
 
 def match_names(dataset: datasets.BopDataset, models: Sequence[ObjectModel]) -> dict[int, str]:
-    """Find what a method calls each object of a data set: by its name, else by its number."""
+    """Give the name that a method has for each object of a data set, by the object's number.
+
+    Objects are matched by name, else by number.
+
+    Raises:
+        InputError: the method has no such object, or one of another diameter.
+    """
     by_name = {model.name: model for model in models}
     by_number = {model.number: model for model in models}
     names: dict[int, str] = {}
@@ -455,10 +552,11 @@ def match_names(dataset: datasets.BopDataset, models: Sequence[ObjectModel]) -> 
     return names
 
 
-def read_pose(path: Path, option: str = "--first", what: str = "camera_from_model") -> Rigid:
-    """Read a pose: that of a ``poses.json`` of one, or a 4x4 matrix in a text file.
+def read_pose(path: Path, option: str = "--first", transform: str = "camera_from_model") -> Rigid:
+    """Read a pose: the only one of a ``poses.json``, or a 4x4 matrix in a text file, in metres.
 
-    Brackets and commas in it do no harm.
+    Brackets, commas and semicolons between its numbers are skipped. ``option`` and ``transform``
+    name the file and the matrix in errors.
     """
     if path.name == predictions.POSES:
         return _read_only_pose(path, option)
@@ -467,16 +565,22 @@ def read_pose(path: Path, option: str = "--first", what: str = "camera_from_mode
     except (OSError, ValueError) as error:
         raise InputError(
             f"{option} {path}: cannot be read ({error}); give a text file with the 4x4 matrix "
-            f"{what} in metres"
+            f"{transform} in metres"
         ) from error
-    return _rigid_of(text, f"{option} {path}", what)
+    return _parse_rigid(text, f"{option} {path}", transform)
 
 
 def _read_only_pose(path: Path, option: str) -> Rigid:
-    """Read the pose of a ``poses.json`` that holds one."""
-    rows = enumerate(read_rows(path))
-    read = [predictions.parse_prediction(row, f"{path}: entry {i}") for i, row in rows]
-    poses = [p.estimate.camera_from_model for p in read if p.estimate.camera_from_model is not None]
+    """Read the pose of a ``poses.json`` that holds exactly one."""
+    estimates = [
+        predictions.parse_prediction(row, f"{path}: entry {i}").estimate
+        for i, row in enumerate(read_rows(path))
+    ]
+    poses = [
+        estimate.camera_from_model
+        for estimate in estimates
+        if estimate.camera_from_model is not None
+    ]
     if len(poses) != 1:
         raise InputError(
             f"{option} {path}: holds {len(poses)} poses; give a poses.json of one, or a text file "
@@ -490,33 +594,37 @@ def read_base(words: Sequence[str]) -> Rigid | None:
     if not words:
         return None
     option = "--base-from-camera"
-    what = "base_from_camera"
+    transform = "base_from_camera"
     if len(words) == 1 and Path(words[0]).is_file():
-        base = read_pose(Path(words[0]), option, what)
+        base = read_pose(Path(words[0]), option, transform)
     else:
-        base = _rigid_of(" ".join(words), option, what)
-    if float(base.t_m.norm()) > _FARTHEST_BASE_M:
+        base = _parse_rigid(" ".join(words), option, transform)
+    distance_m = float(base.t_m.norm())
+    if distance_m > _FARTHEST_BASE_M:
         raise InputError(
-            f"{option}: the camera is {float(base.t_m.norm()):.0f} m from the base; is that in "
+            f"{option}: the camera is {distance_m:.0f} m from the base; is that in "
             "millimetres? Give metres"
         )
     return base
 
 
-def _rigid_of(text: str, source: str, what: str) -> Rigid:
-    """Read the 16 numbers of a 4x4 matrix row by row; ``source`` and ``what`` name it in errors."""
+def _parse_rigid(text: str, source: str, transform: str) -> Rigid:
+    """Parse a rigid transform: the 16 numbers of its 4x4 matrix, row by row, in metres.
+
+    ``source`` and ``transform`` name it in errors.
+    """
     try:
         words = re.sub(r"[\[\],;]", " ", text).split()
         values = torch.tensor([float(word) for word in words], dtype=torch.float64)
     except ValueError as error:
         raise InputError(
             f"{source}: cannot be read as numbers ({error}); give a text file with the 4x4 matrix "
-            f"{what} in metres"
+            f"{transform} in metres"
         ) from error
     if len(values) != 16:
         raise InputError(f"{source}: {len(values)} numbers; give the 16 of a 4x4 matrix")
     try:
-        return rigid_input(values.reshape(4, 4), what, what)
+        return rigid_input(values.reshape(4, 4), transform, transform)
     except InputError as error:
         raise InputError(f"{source}: {error}") from error
 
@@ -524,11 +632,14 @@ def _rigid_of(text: str, source: str, what: str) -> Rigid:
 def choose_objects(
     dataset: datasets.BopDataset, method: PoseMethod, object: str | None
 ) -> datasets.BopDataset:
-    """Keep the objects of a data set that the weights know, or the one named; print the others."""
+    """Restrict a data set to the objects that a method poses, or to the one named.
+
+    Objects that the method does not have are printed.
+    """
     numbers = {model.name: model.number for model in method.models}
     if object is not None:
-        is_theirs = object in datasets.object_names(dataset.folder).values()
-        return dataset.of_objects(object if is_theirs else numbers.get(object, object))
+        is_name_in_dataset = object in datasets.object_names(dataset.folder).values()
+        return dataset.of_objects(object if is_name_in_dataset else numbers.get(object, object))
     object_ids = sorted({instance.object_id for instance in dataset.instances})
     estimable = [
         n for n in object_ids if n in numbers.values() or dataset.objects[n].name in numbers

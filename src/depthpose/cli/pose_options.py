@@ -29,7 +29,7 @@ class PoseDataOptions:
 
     @property
     def folder(self) -> Path | None:
-        """The data set that was named, if any."""
+        """The data set's folder, by either option; None: neither is given."""
         return self.linemod or self.bop
 
 
@@ -140,12 +140,17 @@ class InputDetailOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class PoseInputs(InputOptions, InputDetailOptions):
-    """Clouds or depth images of known objects, and all that is known of them."""
+    """All options of ``pose predict`` about clouds and depth images, and the objects in them."""
 
     @property
     def has_regions(self) -> bool:
         """Whether masks, boxes or detections are given."""
         return self.mask is not None or bool(self.box) or self.detections is not None
+
+    @property
+    def lens(self) -> Path | float | None:
+        """The camera file of the depth images, or their focal length [px]; None: neither."""
+        return self.camera or self.focal_px
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,7 +188,7 @@ class DataSetOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class EstimateOptions:
-    """How poses are estimated; the last ones are of networks alone."""
+    """How poses are estimated; options from ``weights`` on have no effect on registration."""
 
     min_certainty: float = 0.9
     """below it the status is ambiguous, not ok: the likeliest pose with its alternatives."""
@@ -245,7 +250,7 @@ class RegisterOptions:
 
     @property
     def is_register(self) -> bool:
-        """Whether poses are registered: by --method, or because CAD files are given."""
+        """Whether models are registered without a network: by ``--method``, or as CAD files are."""
         return self.method == "register" or (self.method is None and bool(self.cad))
 
 

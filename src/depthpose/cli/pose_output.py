@@ -32,20 +32,27 @@ from depthpose.report import pose as drawn
 from depthpose.report.page import Section, choose_answers, plain_table, write_page
 
 _PAGE = "report.html"
-_WITH_ALTERNATIVES = "depthpose-alternatives"  # the method of a csv that has them too
-_MOST_SHOWN = 20  # of the answers, on the terminal; poses.json holds all
-_MOST_PRINTED = 5  # inputs whose alternatives are printed; poses.json holds those of all
-_MOST_ROWS = 1000  # of the answers, in the table of the page
-_PRINTED = ("input", "object", "status", "x, y, z [m]", "qx, qy, qz, qw", "base x, y, z [m]",
-            "base qx, qy, qz, qw", "agreement", "certainty", "of this copy", "identity",
-            "visible", "pick rank", "tracking")  # fmt: skip
-"""Columns on the terminal."""
-_BASE_COLUMNS = ("base_x_m", "base_y_m", "base_z_m")
-_FRAME = """camera_from_model: x right, y down, z forward
+_WITH_ALTERNATIVES = "depthpose-alternatives"
+"""Name of the method in BOP's csv that holds alternatives too."""
+_MAX_PRINTED_POSES = 20  # in the table on the terminal; poses.json holds all
+_MAX_EXPLAINED = 5  # results whose refusals and alternatives are printed; poses.json holds all
+_MAX_PAGE_ROWS = 1000  # in the table of the page
+_PRINTED_COLUMNS = (
+    "input", "object", "status", "x, y, z [m]", "qx, qy, qz, qw", "base x, y, z [m]",
+    "base qx, qy, qz, qw", "agreement", "certainty", "of this copy", "identity", "visible",
+    "pick rank", "tracking",
+)  # fmt: skip
+_SHARES = ("agreement", "certainty", "of this copy", "visible")
+"""Columns of numbers from 0 to 1."""
+_POSITION_COLUMNS = ("x_m", "y_m", "z_m")
+_BASE_POSITION_COLUMNS = ("base_x_m", "base_y_m", "base_z_m")
+_LEGEND = """camera_from_model: x right, y down, z forward
 certainty: the probability that the pose is right, up to the near-symmetries of the model
 of this copy: that it is this very copy of a nearly symmetric model
 visible: share of the surface that faces the camera on which readings lie"""
-_RANKED = "pick rank: what lies before another comes first, then what is surer and more visible"
+_PICK_RANK_LEGEND = (
+    "pick rank: what lies before another comes first, then what is surer and more visible"
+)
 
 
 def claim_for_jobs(
@@ -63,16 +70,20 @@ def claim_for_jobs(
         out: the folder.
         settings: JSON values that decide the poses.
         jobs: each with the files that it reads.
-        is_result: whether a result of the first name is of the input of the second.
+        is_result: whether the result of the first name is one of the input of the second name.
     """
     run.claim_folder(out, settings, [POSES, _PAGE])
     if run.find_rank().world == 1 and not run.read_sources(out):
         (out / POSES).unlink(missing_ok=True)
 
     def is_finished(name: str) -> bool:
-        predictions = earlier_predictions(out).values()
-        done = [p.estimate.name for p in predictions if p.estimate.status != "unreadable"]
-        return any(is_result(result_name, name) for result_name in done)
+        """Whether an earlier run has a result of an input, which could be read."""
+        estimates = [prediction.estimate for prediction in earlier_predictions(out).values()]
+        return any(
+            is_result(estimate.name, name)
+            for estimate in estimates
+            if estimate.status != "unreadable"
+        )
 
     run.claim_names(
         out,
@@ -83,12 +94,12 @@ def claim_for_jobs(
 
 
 def is_result_of(name: str, image: str) -> bool:
-    """Whether a result is of an image without a mask: its name, or that and a number."""
+    """Whether a result of a searched image has this name: the image's, perhaps with a number."""
     return re.fullmatch(rf"{re.escape(image)}(_\d+)?", name) is not None
 
 
 def claim_for_dataset(out: Path, settings: dict[str, Any], dataset: BopDataset) -> None:
-    """Claim a folder for the poses of a data set."""
+    """Claim a folder for the poses of a data set, with its tables and pictures."""
     images = sorted({(i.scene_id, i.image_id) for i in dataset.instances})
     pictures = [f"{scene:06d}_{image:06d}.{PICTURE}" for scene, image in images]
     tables = [results_name(dataset), results_name(dataset, _WITH_ALTERNATIVES)]
@@ -103,7 +114,16 @@ def write_files(
     dataset: BopDataset | None = None,
     input_count: int | None = None,
 ) -> None:
-    """Write the page of poses, and the files of each input, or of a data set."""
+    """Write the files of each input or of a data set, and the page.
+
+    Args:
+        predictions: all that are shown.
+        jobs: one for each prediction, which reads its input.
+        out: the folder.
+        method: that made them.
+        dataset: that they are of; None: of clouds or depth images.
+        input_count: number of inputs where it may differ from that of the predictions.
+    """
     models = {model.name: model for model in method.models}
     if dataset is None:
         _write_job_files(predictions, jobs, out, models)
@@ -129,15 +149,16 @@ def _write_dataset_files(
     for prediction in predictions:
         if prediction.place is not None and prediction.estimate.is_posed:
             posed[prediction.place[:2]].append(prediction.estimate)
-    for image, estimates in posed.items():
-        name = f"{image[0]:06d}_{image[1]:06d}.{PICTURE}"
+    for (scene_id, image_id), estimates in posed.items():
+        name = f"{scene_id:06d}_{image_id:06d}.{PICTURE}"
         if is_whole(out, name, [name]):
             continue
-        picture = drawn.picture_of(image_of[image])
+        instance = image_of[scene_id, image_id]
+        picture = drawn.picture_of(instance)
         for estimate in estimates:
             pose = estimate.camera_from_model
             assert pose is not None
-            picture = drawn.draw_pose(picture, pose, models[estimate.object], image_of[image].K)
+            picture = drawn.draw_pose(picture, pose, models[estimate.object], instance.K)
         write_image(out / name, picture)
         note_result(out, name, [out / name])
 
@@ -159,12 +180,15 @@ def _write_job_files(
         except InputError:  # unreadable by now
             continue
         points_m = drawn.object_points(view, model.diameter_m)
-        files = [out / f"{job.name}.{CLOUD}"]
-        write_cloud(files[0], drawn.posed_cloud(points_m, pose.double(), model))
+        cloud_file = out / f"{job.name}.{CLOUD}"
+        write_cloud(cloud_file, drawn.posed_cloud(points_m, pose.double(), model))
+        files = [cloud_file]
         if isinstance(view, ViewInput):
-            files.append(out / f"{job.name}.{PICTURE}")
             picture = drawn.draw_region(drawn.grey_depth(view.depth_m), view, pose)
-            write_image(files[1], drawn.draw_pose(picture, pose, model, view.K))
+            picture = drawn.draw_pose(picture, pose, model, view.K)
+            picture_file = out / f"{job.name}.{PICTURE}"
+            write_image(picture_file, picture)
+            files.append(picture_file)
         note_result(out, job.name, files)
 
 
@@ -173,89 +197,100 @@ def print_result(predictions: list[Prediction], out: Path, input_count: int | No
 
     ``input_count``: where an input may have several estimates; None: one each.
     """
-    failed = [p.estimate for p in predictions if p.estimate.status == "unreadable"]
-    shown = [p.estimate for p in predictions if p.estimate.status != "unreadable"]
-    for estimate in failed:
+    estimates = [prediction.estimate for prediction in predictions]
+    unreadable = [estimate for estimate in estimates if estimate.status == "unreadable"]
+    readable = [estimate for estimate in estimates if estimate.status != "unreadable"]
+    for estimate in unreadable:
         print(f"depthpose: failed: {estimate.name}: {estimate.reason}", file=sys.stderr)
-
-    # A table of the first estimates.
-    if shown:
-        rows: list[dict[str, Any]] = []
-        for estimate in shown[:_MOST_SHOWN]:
-            row = _row(estimate)
-            row |= _pose_words(estimate.camera_from_model, "")
-            row |= _pose_words(estimate.base_from_model, "base ")
-            certain = {
-                key: value
-                for key in ("agreement", "certainty", "of this copy", "visible")
-                if (value := row[key]) is not None
-            }
-            rows.append(row | {key: f"{value:.3f}" for key, value in certain.items()})
-        print(plain_table(rows, _PRINTED), end="")
-        print(_FRAME)
-        if any(estimate.pick_rank is not None for estimate in shown):
-            print(_RANKED)
+    if readable:
+        _print_table(readable)
 
     # Why there is no sure pose, and what else fits.
-    if len(shown) == 1 and not shown[0].is_ok:
-        what = "refused" if shown[0].camera_from_model is None else shown[0].status
-        print(f"{what}: {shown[0].reason}")
-    refused = [estimate for estimate in shown if not estimate.is_posed]
-    for estimate in refused[:_MOST_PRINTED] if len(shown) > 1 else ():
-        print(f"{estimate.name}: no {estimate.object}: {estimate.reason}")
-    for prediction in predictions[:_MOST_PRINTED]:
-        for other in prediction.estimate.alternatives:
-            print(f"{prediction.estimate.name}: {other}")
+    if len(readable) == 1 and not readable[0].is_ok:
+        estimate = readable[0]
+        status = "refused" if estimate.camera_from_model is None else estimate.status
+        print(f"{status}: {estimate.reason}")
+    if len(readable) > 1:
+        refused = [estimate for estimate in readable if not estimate.is_posed]
+        for estimate in refused[:_MAX_EXPLAINED]:
+            print(f"{estimate.name}: no {estimate.object}: {estimate.reason}")
+    for estimate in estimates[:_MAX_EXPLAINED]:
+        for alternative in estimate.alternatives:
+            print(f"{estimate.name}: {alternative}")
 
-    counts = Counter(estimate.status for estimate in shown)
+    counts = Counter(estimate.status for estimate in readable)
     statuses = ", ".join(f"{count} {status}" for status, count in sorted(counts.items()))
     total = _count_inputs(predictions, input_count)
     print(f"{total}: {statuses or 'none readable'}; {out / 'poses.json'}")
-    return 1 if failed else 0
+    return 1 if unreadable else 0
 
 
-def _pose_words(pose: Rigid | None, before: str) -> dict[str, str]:
-    """Format position and quaternion of a pose for the columns of a table."""
+def _print_table(estimates: Sequence[PoseEstimate]) -> None:
+    """Print a table of the first estimates, and what its columns mean."""
+    rows: list[dict[str, Any]] = []
+    for estimate in estimates[:_MAX_PRINTED_POSES]:
+        row = _row(estimate)
+        row |= _pose_cells(estimate.camera_from_model)
+        row |= _pose_cells(estimate.base_from_model, prefix="base ")
+        row |= {name: f"{row[name]:.3f}" for name in _SHARES if row[name] is not None}
+        rows.append(row)
+    print(plain_table(rows, _PRINTED_COLUMNS), end="")
+    print(_LEGEND)
+    if any(estimate.pick_rank is not None for estimate in estimates):
+        print(_PICK_RANK_LEGEND)
+
+
+def _pose_cells(pose: Rigid | None, prefix: str = "") -> dict[str, str]:
+    """Format the position and the quaternion of a pose, each for a column of the terminal."""
     if pose is None:
         return {}
     quaternion = Rotation.from_matrix(pose.R.double()).as_quat()
     return {
-        f"{before}x, y, z [m]": ", ".join(f"{value:.4f}" for value in pose.t_m.tolist()),
-        f"{before}qx, qy, qz, qw": ", ".join(f"{value:.4f}" for value in quaternion.tolist()),
+        f"{prefix}x, y, z [m]": ", ".join(f"{value:.4f}" for value in pose.t_m.tolist()),
+        f"{prefix}qx, qy, qz, qw": ", ".join(f"{value:.4f}" for value in quaternion.tolist()),
     }
 
 
 def _count_inputs(predictions: Sequence[Prediction], input_count: int | None) -> str:
-    """Give the number of inputs, and that of estimates where it is another."""
-    count = len(predictions) if input_count is None else input_count
+    """Say how many inputs there were, and how many estimates where that number differs."""
     answers = len(predictions)
-    total = f"{count} input{'s' * (count != 1)}"
-    return total if count == answers else f"{total}, {answers} answer{'s' * (answers != 1)}"
+    count = answers if input_count is None else input_count
+    text = f"{count} input{'s' * (count != 1)}"
+    if count != answers:
+        text += f", {answers} answer{'s' * (answers != 1)}"
+    return text
 
 
 def _row(estimate: PoseEstimate) -> dict[str, Any]:
     """Give the row of an estimate for the page and the terminal."""
-    pose = estimate.camera_from_model
-    evidence = estimate.evidence
-    identity = estimate.identity
-    place = [None] * 3 if pose is None else pose.t_m.double().tolist()
-    base = estimate.base_from_model
-    return {
+    row: dict[str, Any] = {
         "input": estimate.name,
         "object": estimate.object,
         "status": estimate.status,
-        **({} if estimate.tracking is None else {"tracking": estimate.tracking}),
-        **dict(zip(("x_m", "y_m", "z_m"), place, strict=True)),
-        **({} if base is None else dict(zip(_BASE_COLUMNS, base.t_m.tolist(), strict=True))),
+    }
+    if estimate.tracking is not None:
+        row["tracking"] = estimate.tracking
+    pose = estimate.camera_from_model
+    position = [None] * 3 if pose is None else pose.t_m.double().tolist()
+    row |= zip(_POSITION_COLUMNS, position, strict=True)
+    if estimate.base_from_model is not None:
+        base_position = estimate.base_from_model.t_m.tolist()
+        row |= zip(_BASE_POSITION_COLUMNS, base_position, strict=True)
+
+    evidence = estimate.evidence
+    identity = estimate.identity
+    row |= {
         "agreement": None if evidence is None else evidence.agreement,
         "identity": None if identity is None else identity.status,
         "certainty": estimate.certainty,
         "of this copy": estimate.copy_certainty,
         "visible": estimate.visible_share,
-        **({} if estimate.pick_rank is None else {"pick rank": estimate.pick_rank}),
-        "alternatives": "; ".join(map(str, estimate.alternatives)),
-        "reason": estimate.reason,
     }
+    if estimate.pick_rank is not None:
+        row["pick rank"] = estimate.pick_rank
+    row["alternatives"] = "; ".join(map(str, estimate.alternatives))
+    row["reason"] = estimate.reason
+    return row
 
 
 def _write_page(
@@ -269,42 +304,52 @@ def _write_page(
     """Write a page with some of the predictions and the reason of every refusal."""
     # The table: refusals first, for they are what is looked for.
     estimates = [prediction.estimate for prediction in predictions]
-    numbers = Counter(estimate.status for estimate in estimates)
-    counts = ", ".join(f"{count} {status}" for status, count in sorted(numbers.items()))
-    rows = [
-        _row(listed)
-        for listed in sorted(estimates, key=lambda listed: listed.is_posed)[:_MOST_ROWS]
-    ]
+    refusals_first = sorted(estimates, key=lambda estimate: estimate.is_posed)
+    rows = [_row(estimate) for estimate in refusals_first[:_MAX_PAGE_ROWS]]
+    sections = _pose_sections(predictions, jobs, models, dataset)
 
-    # Some inputs with their poses, and some that were refused.
-    instances = () if dataset is None else dataset.instances
-    image_of = {(i.scene_id, i.image_id): i.rgb for i in instances}
-    readable = [k for k, listed in enumerate(estimates) if listed.status != "unreadable"]
-    sections: list[Section] = []
-    for k in choose_answers([predictions[k].estimate.is_posed for k in readable]):
-        estimate = predictions[readable[k]].estimate
-        place = predictions[readable[k]].place
-        try:
-            shown_input = jobs[readable[k]].read()
-        except InputError:  # unreadable by now
-            continue
-        is_searched = isinstance(shown_input, ViewInput) and bool(shown_input.mask.all())
-        if is_searched and not estimate.is_posed:  # a whole image; its row says why
-            continue
-        rgb = None if place is None else image_of[place[:2]]
-        model = models[estimate.object]
-        image = None if rgb is None else read_image(rgb)
-        section = drawn.pose_section(estimate.name, shown_input, estimate, model, image=image)
-        sections.append(section)
-
-    number = len(predictions)
+    status_counts = Counter(estimate.status for estimate in estimates)
+    counts = ", ".join(f"{count} {status}" for status, count in sorted(status_counts.items()))
     total = _count_inputs(predictions, input_count)
     text = f"{total}: {counts}. Shown below: {len(sections)}"
-    text += "." if len(sections) == number else ", answers and refusals spread evenly."
-    if number > _MOST_ROWS:
-        text += f" The table holds the first {_MOST_ROWS}, refusals before answers; all are in "
+    text += "." if len(sections) == len(predictions) else ", answers and refusals spread evenly."
+    if len(predictions) > _MAX_PAGE_ROWS:
+        text += f" The table holds the first {_MAX_PAGE_ROWS}, refusals before answers; all are in "
         text += "poses.json."
     results = Section(title="What was found", text=text, rows=rows)
-    title = f"Poses of {total}"
-    write_page(out / _PAGE, title, [results, *sections], run.environment())
+    write_page(out / _PAGE, f"Poses of {total}", [results, *sections], run.environment())
     print(f"the page: {out / _PAGE}")
+
+
+def _pose_sections(
+    predictions: Sequence[Prediction],
+    jobs: Sequence[PoseJob[Any]],
+    models: Mapping[str, ObjectModel],
+    dataset: BopDataset | None,
+) -> list[Section]:
+    """Show some inputs with their poses, and some that were refused."""
+    instances = () if dataset is None else dataset.instances
+    rgb_of = {(i.scene_id, i.image_id): i.rgb for i in instances}
+    readable = [
+        (prediction, job)
+        for prediction, job in zip(predictions, jobs, strict=True)
+        if prediction.estimate.status != "unreadable"
+    ]
+    sections: list[Section] = []
+    for k in choose_answers([prediction.estimate.is_posed for prediction, _ in readable]):
+        prediction, job = readable[k]
+        estimate = prediction.estimate
+        try:
+            pose_input = job.read()
+        except InputError:  # unreadable by now
+            continue
+        is_whole_image = isinstance(pose_input, ViewInput) and bool(pose_input.mask.all())
+        if is_whole_image and not estimate.is_posed:
+            continue  # there is no part of the image to show; the row says why
+        rgb = None if prediction.place is None else rgb_of[prediction.place[:2]]
+        image = None if rgb is None else read_image(rgb)
+        section = drawn.pose_section(
+            estimate.name, pose_input, estimate, models[estimate.object], image=image
+        )
+        sections.append(section)
+    return sections

@@ -1,11 +1,11 @@
-"""A rectified pair as the depth image of a pose: matched, without what the match is unsure of."""
+"""Rectified pairs in place of depth images: they are matched, and unsure depth is left out."""
 
 import sys
 from pathlib import Path
 
 import torch
 
-from depthpose.cli import depth_predict as work
+from depthpose.cli import depth_predict
 from depthpose.cli.depth_options import PairNetworks
 from depthpose.cli.pose_options import PairOptions
 from depthpose.core.camera import StereoRig, read_rig
@@ -17,16 +17,25 @@ from depthpose.depth.config import MatcherConfig
 from depthpose.depth.disparity import depth_deviation
 
 MATCHED = "matched"
+"""Folder of the files that 'depth match' writes."""
 DEPTH = "depth"
+"""Folder of the depth that is posed."""
 DEVIATION = "depth_std"
-"""Folders of what 'depth match' writes, of the depth that is posed, and of its deviation."""
+"""Folder of the standard deviation of that depth."""
 
 
 def match_pairs(pair: PairOptions, camera: Path | None, device: str, out: Path) -> Path:
-    """Match pairs, and give their depth for pose commands: NAME.npy in metres, or its folder.
+    """Match pairs, write their depth, and give its path: of one pair NAME.npy, else the folder.
 
-    OUT/matched has what 'depth match' writes, OUT/depth the depth that is as sure as
-    ``pair.min_confidence``, and OUT/depth_std its standard deviation. A rerun does not match again.
+    OUT/matched gets what 'depth match' writes, OUT/depth the depth [m] whose confidence is
+    ``pair.min_confidence`` at least, and OUT/depth_std its standard deviation [m]. A rerun does not
+    match again.
+
+    Args:
+        pair: left and right images, what matches them, and the least confidence.
+        camera: file of the rig, with its baseline.
+        device: that the matcher runs on.
+        out: the folder.
 
     Raises:
         InputError: no right image, a camera without a baseline, or no depth that is sure enough.
@@ -40,28 +49,36 @@ def match_pairs(pair: PairOptions, camera: Path | None, device: str, out: Path) 
         raise InputError(
             f"--min-confidence {pair.min_confidence:g}: a confidence lies in 0 to 1; 0 keeps all"
         )
-    pairs = work.list_pairs(pair.left, pair.right)
-    refuse_among_inputs(out, (pair.left, pair.right), [path for both in pairs for path in both])
-    networks = PairNetworks(matcher=pair.matcher)
-    weights = None if pair.matcher == "sgbm" else pair.matcher or "default"
-    method = work.DepthMethodSource(
-        weights=weights, config=MatcherConfig(device=device), with_right=True, use="pairs"
+    pairs = depth_predict.list_pairs(pair.left, pair.right)
+    images = [path for both in pairs for path in both]
+    refuse_among_inputs(out, (pair.left, pair.right), images)
+    source = depth_predict.DepthMethodSource(
+        weights=None if pair.matcher == "sgbm" else pair.matcher or "default",
+        config=MatcherConfig(device=device),
+        with_right=True,
+        use="pairs",
     )
-    depth_work = work.pair_work(camera, networks, method, pairs[0])
-    built = method.build()
-    work.predict_files(pairs, depth_work, built, out / MATCHED)
+    networks = PairNetworks(matcher=pair.matcher)
+    work = depth_predict.pair_work(camera, networks, source, pairs[0])
+    depth_predict.predict_files(pairs, work, source.build(), out / MATCHED)
+
     rig = read_rig(camera, image_size(pairs[0][0]))
-    for first, _ in pairs:
-        _keep_sure(first.stem, rig, pair.min_confidence, out)
-    # One pair is one depth image, whose mask may have any name.
-    return out / DEPTH / f"{pairs[0][0].stem}.npy" if len(pairs) == 1 else out / DEPTH
+    names = [left.stem for left, _ in pairs]
+    for name in names:
+        _write_sure_depth(name, rig, pair.min_confidence, out)
+    if len(names) == 1:  # a single depth image may have a mask of any name
+        return out / DEPTH / f"{names[0]}.npy"
+    return out / DEPTH
 
 
-def _keep_sure(name: str, rig: StereoRig, min_confidence: float, out: Path) -> None:
-    """Write the depth of a pair where it is sure enough, and its standard deviation."""
+def _write_sure_depth(name: str, rig: StereoRig, min_confidence: float, out: Path) -> None:
+    """Write the depth of a matched pair where it is sure enough, and its standard deviation.
+
+    Nothing is written of a pair that could not be matched, or that an earlier run has finished.
+    """
     home = out / MATCHED
     if not is_whole(home, name, [f"{name}.depth_m.npy"]):
-        return  # it failed, as was said
+        return
     settings = {"min_confidence": min_confidence}
     folders = [out / DEPTH, out / DEVIATION]
     for folder in folders:
@@ -73,18 +90,19 @@ def _keep_sure(name: str, rig: StereoRig, min_confidence: float, out: Path) -> N
     if (home / f"{name}.confidence.npy").is_file():
         confidence = read_map(home / f"{name}.confidence.npy")
     is_sure = confidence >= min_confidence
-    kept_m = torch.where(is_sure, depth_m, torch.nan)
-    if not bool(kept_m.isfinite().any()):
+    sure_m = torch.where(is_sure, depth_m, torch.nan)
+    if not bool(sure_m.isfinite().any()):
         raise InputError(
             f"{name}: no depth is as sure as {min_confidence:g}, so there is nothing to pose; "
             "give a lower --min-confidence"
         )
-    left_out = 1 - float(kept_m.isfinite().sum() / depth_m.isfinite().sum())
+    left_out = 1 - float(sure_m.isfinite().sum() / depth_m.isfinite().sum())
     print(
         f"{name}: {left_out:.1%} of the depth is less sure than {min_confidence:g} and left out",
         file=sys.stderr,
     )
     deviation_m = depth_deviation(depth_m, confidence, rig)
-    for folder, values in zip(folders, (kept_m, deviation_m), strict=True):
-        write_map(folder / f"{name}.npy", torch.where(is_sure, values, torch.nan))
+    sure_deviation_m = torch.where(is_sure, deviation_m, torch.nan)
+    for folder, values_m in zip(folders, (sure_m, sure_deviation_m), strict=True):
+        write_map(folder / f"{name}.npy", values_m)
         note_result(folder, name, [folder / f"{name}.npy"])

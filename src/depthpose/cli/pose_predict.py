@@ -45,11 +45,12 @@ from depthpose.pose.predictions import (
 )
 from depthpose.pose.types import PoseEstimate
 
-ENDING = "pose.json"  # of the one file of a result: an entry of poses.json
+ENDING = "pose.json"
+"""Of the file of one estimate in a shard: an entry of ``poses.json``."""
 
 
 def predict_files(method: PoseMethod, inputs: PoseInputs, out: Path, batch: int) -> int:
-    """Pose clouds, or parts of depth images, in this process; give the exit code."""
+    """Pose clouds, or masked parts of depth images, in this process; give the exit code."""
     plan = plan_jobs(method, inputs, out)
     settings = {**method.settings, **plan.settings}
     claim_for_jobs(out, settings, plan.jobs)
@@ -68,21 +69,27 @@ def predict_dataset(
     out: Path,
     batch: int,
 ) -> int:
-    """Pose the objects of a data set, or one; give the exit code."""
+    """Pose all objects of a data set, or the one named ``object``; give the exit code."""
     assert options.bop is not None
     dataset = open_bop(options.bop, options.split)
     if options.targets is not None:
         dataset = select_targets(dataset, read_targets(options.targets, options.bop))
     dataset = pose_methods.choose_objects(dataset, method, object)
-    (masks,) = pose_methods.find_masks([options.masks], dataset, out, config.device)
+    (masks,) = pose_methods.prepare_masks([options.masks], dataset, out, config.device)
     names = pose_methods.match_names(dataset, method.models)
+    # A job with an object gives an estimate, and no error, where its input cannot be read.
     jobs: list[PoseJob[Any]] = [
         replace(job, object=names[job.place.object_id])
-        for job in masks.jobs(names)
+        for job in masks.make_jobs(names)
         if job.place is not None
     ]
-    settings = {**method.settings, "estimate": config_to_dict(config)}
-    settings |= {**pose_methods.dataset_settings(dataset), "masks": masks.name, **masks.settings}
+    settings = {
+        **method.settings,
+        "estimate": config_to_dict(config),
+        **pose_methods.dataset_settings(dataset),
+        "masks": masks.name,
+        **masks.settings,
+    }
     if object is not None:
         settings["objects"] = sorted({i.object_id for i in dataset.instances})
     claim_for_dataset(out, settings, dataset)
@@ -100,24 +107,23 @@ def estimate_jobs(
     settings: dict[str, Any],
     batch: int,
 ) -> list[Prediction] | None:
-    """Estimate what is not finished; several processes share the work through the files.
+    """Estimate what is not finished; several processes each write their share to a folder.
 
-    Gives all predictions in the first of them, None in the others.
+    The first process gives the predictions of all jobs, every other one None.
     """
     process = run.find_rank()
     home = out if process.world == 1 else out / f"part-{process.rank}"
     by_name = earlier_predictions(out)
-    unreadable = {name for name, p in by_name.items() if p.estimate.status == "unreadable"}
-    finished = by_name.keys() - unreadable
+    finished = {name for name, p in by_name.items() if p.estimate.status != "unreadable"}
     unfinished = [job for job in process.share_of(jobs) if job.name not in finished]
     if unfinished:
         written = predict(method.estimate_many, unfinished, home, settings, batch)
         for prediction in tqdm(written, total=len(unfinished), disable=None, unit=" poses"):
             by_name[prediction.estimate.name] = prediction
-
-    # The first process puts the files of all together, with the inputs of earlier runs.
-    if process.rank:
+    if process.rank > 0:
         return None
+
+    # The first process joins the files of all, and keeps what earlier runs posed of other inputs.
     if process.world > 1:
         _wait_for_predictions(out, jobs)
         by_name = earlier_predictions(out)
@@ -128,24 +134,24 @@ def estimate_jobs(
 
 def _wait_for_predictions(out: Path, jobs: Sequence[PoseJob[Any]]) -> None:
     """Wait until the files of all processes together hold a prediction of every job."""
-    names: set[str] = set()
+    written_names: set[str] = set()
     last_read_s = -math.inf
 
     def is_written(name: str) -> bool:
         """Whether a prediction of this name is in the files."""
-        nonlocal names, last_read_s
+        nonlocal written_names, last_read_s
         # The files are read for all names at once, every second.
-        if name not in names and time.monotonic() - last_read_s > 1:
-            names = set(earlier_predictions(out))
+        if name not in written_names and time.monotonic() - last_read_s > 1:
+            written_names = set(earlier_predictions(out))
             last_read_s = time.monotonic()
-        return name in names
+        return name in written_names
 
     run.wait_for([job.name for job in jobs], is_written)
 
 
 @dataclass(frozen=True)
 class EntryFiles(Results[Any, PoseEstimate]):
-    """A file for each estimate, for the shards of an engine."""
+    """A file for each estimate, as a worker puts it into a shard."""
 
     folder: Path
 
@@ -155,76 +161,110 @@ class EntryFiles(Results[Any, PoseEstimate]):
         write_json(self.folder / f"{job.name}.{ENDING}", row)
 
 
-def start_files(
-    source: PoseMethodSource,
-    object: str,
-    unit: Unit | None,
-    camera: Camera | None,
-    box: Box | None = None,
-) -> Function:
-    """Build the estimator; clouds or depth images to poses or the reasons for none.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PoseTask:
+    """What a worker of an engine estimates, and from which kind of files.
 
-    Depth images have masks, or are all searched in one box.
+    Without a camera the files are clouds; with one they are depth images, each with its mask, or
+    all with one box.
     """
-    method = source.build()
 
-    def job_of(sample: Sample) -> Job[Any]:
-        """Make the job of a cloud, or of a depth image and its mask."""
-        if camera is None:
-            cloud = sample.files[0]
-            read = partial(cloud_input, cloud, unit or "m", object, sample.name)
-        elif box is not None:
-            detection = Detection(object=object, box=box)
-            read = partial(
-                read_detection, sample.files[0], object, detection, camera, sample.name, unit
-            )
-        else:
+    source: PoseMethodSource
+    object: str
+    unit: Unit | None
+    camera: Camera | None
+    box: Box | None
+
+    def start(self) -> Function:
+        """Build the estimator, and give the function that poses a batch of a worker."""
+        method = self.source.build()
+
+        def estimate(samples: Sequence[Sample], out: Path) -> list[str]:
+            """Write the poses of a batch into a folder; give why each has none, "" if it has."""
+            jobs = [self._make_job(sample) for sample in samples]
+            results = EntryFiles(out)
+            outcomes = run_jobs(jobs, method.estimate_many, results, max(1, len(jobs)))
+            failures = [outcome.failure for outcome in outcomes]
+            return ["" if error is None else f"cannot be read: {error}" for error in failures]
+
+        return estimate
+
+    def _make_job(self, sample: Sample) -> Job[Any]:
+        """Make the job of a cloud, or of a depth image and its mask or box."""
+        name = sample.name
+        if self.camera is None:
+            read = partial(cloud_input, sample.files[0], self.unit or "m", self.object, name)
+        elif self.box is None:
             depth, mask = sample.files
-            read = partial(view_input, depth, mask, camera, object, sample.name, unit)
-        return Job(name=sample.name, read=read)
-
-    def estimate(samples: Sequence[Sample], out: Path) -> list[str]:
-        jobs = [job_of(sample) for sample in samples]
-        outcomes = run_jobs(jobs, method.estimate_many, EntryFiles(out), max(1, len(jobs)))
-        return ["" if o.failure is None else f"cannot be read: {o.failure}" for o in outcomes]
-
-    return estimate
+            read = partial(view_input, depth, mask, self.camera, self.object, name, self.unit)
+        else:
+            depth = sample.files[0]
+            detection = Detection(object=self.object, box=self.box)
+            read = partial(
+                read_detection, depth, self.object, detection, self.camera, name, self.unit
+            )
+        return Job(name=name, read=read)
 
 
 def predict_on_ray(
     options: PoseInputs, source: PoseMethodSource, batch: int, out: str, engine: EngineOptions
 ) -> int:
-    """Pose clouds, depth images with masks or a box, manifests or tar shards by an engine."""
-    if options.depth is not None and (options.camera or options.focal_px) is None:
+    """Pose clouds, or depth images with masks or a box, by the workers of an engine.
+
+    The inputs are files, manifests or tar shards. Gives the exit code.
+    """
+    # What the files are: clouds, depth images with masks, or depth images alone.
+    if options.depth is not None and options.lens is None:
         raise InputError("--depth needs --camera or --focal-px beside it")
     if options.box and options.mask is not None:
         raise InputError("--mask and --box say where objects are; give one of them")
     box = parse_box(options.box[0]) if options.box else None
-    views = Files(roles=("depth", "mask"), suffixes=(*LISTED_SUFFIXES, ".json"))
-    if box is not None:
-        views = Files(roles=("depth",), suffixes=LISTED_SUFFIXES)
-    clouds = Files(roles=("cloud",), suffixes=tuple(CLOUD_READERS))
-    files = clouds if options.depth is None else views
-    words = [word for word in (options.cloud, options.depth, options.mask) if word is not None]
-    inputs = Inputs.find(words, files)
-    for item in inputs.items if len(words) == 2 else ():  # one manifest pairs as it likes
-        depth, mask = (PurePosixPath(file).stem for file in item.files)
-        if depth != mask and len(inputs.items) > 1:
-            raise InputError(
-                f"{words[1]}: no mask called {depth!r}; a mask has the name of its depth image"
-            )
+    if options.depth is None:
+        files = Files(roles=("cloud",), suffixes=tuple(CLOUD_READERS))
+    elif box is None:
+        files = Files(roles=("depth", "mask"), suffixes=(*LISTED_SUFFIXES, ".json"))
+    else:
+        files = Files(roles=("depth",), suffixes=LISTED_SUFFIXES)
+    paths = [path for path in (options.cloud, options.depth, options.mask) if path is not None]
+    inputs = Inputs.find(paths, files)
+    if len(paths) == 2:  # a single path is a manifest, which pairs files of any names
+        _refuse_other_mask_names(inputs, paths[1])
+
+    # What is estimated; the weights travel to the workers.
     if isinstance(source.weights, str):
         path = find_weights(source.weights)
         source = replace(source, weights=Weights(name=path.name, data=path.read_bytes()))
     method = source.build("cpu")
     object = object_named(options.object or None, method)
-    with inputs.first() as first:
-        lens = options.camera or options.focal_px
-        camera = None if lens is None else camera_of(lens, image_size(first[0]))
-    start = partial(start_files, source, object, options.unit, camera, box)
-    work = Work(start=start, files=files, endings=(ENDING,), batch=batch)
-    settings = {**method.settings, "estimate": config_to_dict(source.config), "object": object}
-    settings |= {"unit": options.unit} | ({} if box is None else {"box": box})
+    camera = None
+    if options.lens is not None:
+        with inputs.first() as first:
+            camera = camera_of(options.lens, image_size(first[0]))
+    task = PoseTask(source=source, object=object, unit=options.unit, camera=camera, box=box)
+
+    # All that decides the poses, for the record of the run.
+    settings = {
+        **method.settings,
+        "estimate": config_to_dict(source.config),
+        "object": object,
+        "unit": options.unit,
+    }
+    if box is not None:
+        settings["box"] = box
     if camera is not None:
-        settings |= {"K": camera.K.tolist(), "depth_unit_m": camera.depth_unit_m}
+        settings["K"] = camera.K.tolist()
+        settings["depth_unit_m"] = camera.depth_unit_m
+    work = Work(start=task.start, files=files, endings=(ENDING,), batch=batch)
     return print_shards(engine.run(work, inputs, out, settings), out, "inputs")
+
+
+def _refuse_other_mask_names(inputs: Inputs, masks: str) -> None:
+    """Refuse masks that are not named after their depth images; a single pair may differ."""
+    if len(inputs.items) == 1:
+        return
+    for item in inputs.items:
+        depth, mask = (PurePosixPath(file).stem for file in item.files)
+        if depth != mask:
+            raise InputError(
+                f"{masks}: no mask called {depth!r}; a mask has the name of its depth image"
+            )

@@ -92,24 +92,30 @@ def _build_methods(
     matcher: str | None,
     beside: Sequence[str] | None,
 ) -> list[tuple[str, "DepthMethod"]]:
-    """Build each method, with the thesis's row that it reproduces; "" where it is only beside."""
-    own_row = table.own_rows[0]
-    row_names = table.own_rows if len(table.own_rows) > 1 else [own_row] * len(weights)
+    """Build each method, with the row of the thesis that it reproduces, or "" for none.
+
+    ``source``: of a method without weights, with the settings that all share.
+    """
+    first_row = table.own_rows[0]
+    row_names = table.own_rows if len(table.own_rows) > 1 else [first_row] * len(weights)
     methods = [
         (row_name, replace(source, weights=file).build())
         for row_name, file in zip(row_names, weights, strict=True)
     ]
     names = [method.name for _, method in methods]
-    if len(set(names)) < len(names):
+    repeated = next((name for name in names if names.count(name) > 1), None)
+    if repeated is not None:
         raise InputError(
-            f"two weights are called {names[0]!r}, and so would their predictions be: rename one."
+            f"two weights are called {repeated!r}, and so would their predictions be: rename one."
         )
     if matcher is not None:
-        methods.append((own_row, replace(source, with_filled_holes=True).build()))
+        methods.append((first_row, replace(source, with_filled_holes=True).build()))
+
+    # Methods beside them reproduce no row of the thesis.
     if not table.with_right:
         files = ("default",) if beside is None else beside
-        built = [replace(source, weights=file).build() for file in files]
-        methods += [("", method) for method in built if method.name not in names]
+        others = [replace(source, weights=file).build() for file in files]
+        methods += [("", method) for method in others if method.name not in names]
     return methods
 
 

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from jaxtyping import Float
+from torch import Tensor
 from tqdm import tqdm
 
 from depthpose.cli import depth_evaluate as evaluation
@@ -13,7 +15,7 @@ from depthpose.cli.depth_predict import DepthMethod
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import write_image
 from depthpose.core.run import claim_folder, environment, find_rank
-from depthpose.depth.datasets import Dataset, has_lidar, lidar_truth
+from depthpose.depth.datasets import Dataset, Frame, has_lidar, lidar_truth
 from depthpose.depth.evaluate import find_protocol
 from depthpose.depth.predictions import has_prediction, read_estimate
 from depthpose.report import page
@@ -28,7 +30,8 @@ from depthpose.thesis.depth import (
     shrink_to_width,
 )
 
-_PICTURE_WIDTH_PX = 621
+_PANEL_WIDTH_PX = 621
+"""Of panels on a page: half of a frame of KITTI."""
 
 
 def reproduce_table(
@@ -40,14 +43,23 @@ def reproduce_table(
     caps_m: Sequence[float],
     pictures: int,
 ) -> int:
-    """Predict what is missing, measure, join with the published rows, and write everything."""
+    """Predict what is missing, measure, join with the published rows, and write everything.
+
+    Args:
+        table: the printed table.
+        dataset: frames with truth.
+        methods: each with the name of the printed row that it reproduces, or "" for none.
+        out: folder of the files.
+        protocol: by which the predictions are measured.
+        caps_m: truth beyond a cap does not count; a row for each.
+        pictures: frames of each method that the page shows.
+    """
     # All that decides the numbers.
-    listed = "".join(f"{frame.left.resolve()}\n" for frame in dataset.frames)
     settings = {
         "table": table.number,
         "dataset": dataset.name,
         "frames": len(dataset),
-        "frames_sha256": hashlib.sha256(listed.encode()).hexdigest(),
+        "frames_sha256": _frames_sha256(dataset.frames),
         "protocol": protocol,
         "caps_m": list(caps_m),
         "methods": {method.name: method.settings for _, method in methods},
@@ -72,24 +84,15 @@ def reproduce_table(
         "eigen-test. Difference: ours minus the thesis's own row. A row of another protocol, or of "
         "other frames (see the columns), does not compare with the printed ones."
     )
-    figures = [
-        section
-        for _, method in methods
-        if pictures > 0
-        for section in _figures_of(method, dataset, out, pictures)
-    ]
+    figures: list[Section] = []
+    if pictures > 0:
+        for _, method in methods:
+            figures += _figure_sections(method, dataset, out, pictures)
     sections = [
         Section(title="Published rows, ours, and difference", text=method_note, rows=rows),
         *figures,
         *evaluation.write_details(measured, out),
-        Section(
-            title="Settings",
-            rows=[
-                {"method": method.name, "setting": name, "value": str(value)}
-                for _, method in methods
-                for name, value in method.settings.items()
-            ],
-        ),
+        _settings_section([method for _, method in methods]),
     ]
     write_report(f"{table.title}, on {dataset.name}", sections, out)
     for name, reason in measured.skipped.items():
@@ -98,26 +101,51 @@ def reproduce_table(
     return 0
 
 
-def _figures_of(method: DepthMethod, dataset: Dataset, out: Path, number: int) -> list[Section]:
-    """Draw figure 2-5 of some frames that a method predicted, and figure 2-1 of the first."""
+def _frames_sha256(frames: Sequence[Frame]) -> str:
+    """Give the SHA-256 of the paths of the left images."""
+    paths = "".join(f"{frame.left.resolve()}\n" for frame in frames)
+    return hashlib.sha256(paths.encode()).hexdigest()
+
+
+def _settings_section(methods: Sequence[DepthMethod]) -> Section:
+    """Show what decides the results of each method, a row for each setting."""
+    rows = [
+        {"method": method.name, "setting": name, "value": str(value)}
+        for method in methods
+        for name, value in method.settings.items()
+    ]
+    return Section(title="Settings", rows=rows)
+
+
+def _figure_sections(
+    method: DepthMethod, dataset: Dataset, out: Path, number: int
+) -> list[Section]:
+    """Draw figure 2-5 of some frames that a method predicted, and figure 2-1 of the first.
+
+    Figure 2-1 is left out where the method synthesised no right view, or there is no real one.
+    """
     predictions = out / "predictions" / method.name
     home = out / "figures" / method.name
     frames = [frame for frame in dataset.frames if has_prediction(predictions, frame.name)]
     predicted = replace(dataset, frames=frames)
     sections: list[Section] = []
-    for place, index in enumerate(choose_frames(predicted, (), number)):
+    for k, index in enumerate(choose_frames(predicted, (), number)):
         pair = predicted.read_input(index)
-        frame = frames[index]
-        lidar_m = lidar_truth(frame, "camera_z") if has_lidar(frame, "camera_z") else None
+        lidar_m = _read_lidar(frames[index])
         estimate = read_estimate(predictions, pair.name, pair.camera)
         figures = {"2-5": draw_figure_2_5(pair, lidar_m, estimate)}
-        if place == 0 and estimate.right is not None and pair.right is not None:
+        if k == 0 and estimate.right is not None and pair.right is not None:
             stereo = method.net.estimate_pair(pair)
             figures["2-1"] = draw_figure_2_1(pair, lidar_m, estimate, stereo)
         for figure, panels in figures.items():
             title = f"Figure {figure}: {method.name}, {pair.name}"
             sections.append(_panel_section(title, panels, home / f"{figure}_{pair.name}"))
     return sections
+
+
+def _read_lidar(frame: Frame) -> Float[Tensor, "h w"] | None:
+    """Read the LiDAR depth (camera z) of a frame; None where it has none."""
+    return lidar_truth(frame, "camera_z") if has_lidar(frame, "camera_z") else None
 
 
 def write_report(title: str, sections: Sequence[Section], out: Path) -> None:
@@ -129,9 +157,9 @@ def write_report(title: str, sections: Sequence[Section], out: Path) -> None:
 
 
 def choose_frames(dataset: Dataset, names: Sequence[str], number: int) -> list[int]:
-    """Give the indices of the frames that were named, or of some from all over the dataset.
+    """Give the indices of the named frames, or else of some from all over the dataset.
 
-    Frames chosen by us have a right view, and LiDAR where any frame has both.
+    The latter have a right view, and LiDAR too if any frame has both.
     """
     if names:
         index_of = {frame.name: i for i, frame in enumerate(dataset.frames)}
@@ -141,10 +169,10 @@ def choose_frames(dataset: Dataset, names: Sequence[str], number: int) -> list[i
             raise InputError(f"{dataset.name}: no frame {unknown[0]!r}; {hint}")
         return [index_of[name] for name in names]
     pairs = [i for i, frame in enumerate(dataset.frames) if frame.right is not None]
-    chosen = [i for i in pairs if has_lidar(dataset.frames[i], "camera_z")] or pairs
-    if not chosen:
+    candidates = [i for i in pairs if has_lidar(dataset.frames[i], "camera_z")] or pairs
+    if not candidates:
         raise InputError(f"{dataset.name}: no frame has a right view, which the figures show.")
-    return [chosen[place] for place in page.spread_evenly(len(chosen), max(1, number))]
+    return [candidates[k] for k in page.spread_evenly(len(candidates), max(1, number))]
 
 
 def write_figure(
@@ -152,11 +180,10 @@ def write_figure(
 ) -> int:
     """Estimate the frames, draw the figure, and write it with a page that explains it."""
     frames = [dataset.frames[index] for index in indices]
-    listed = "".join(f"{frame.left.resolve()}\n" for frame in frames)
     settings = {
         "command": f"figure {number}",
         "frames": [frame.name for frame in frames],
-        "frames_sha256": hashlib.sha256(listed.encode()).hexdigest(),
+        "frames_sha256": _frames_sha256(frames),
         "method": method.settings,
     }
     claim_folder(out, settings, (f"figure-{number}.png", "panels", "report.html"))
@@ -164,33 +191,30 @@ def write_figure(
     sections: list[Section] = []
     for index, frame in zip(tqdm(indices, unit=" frames", disable=None), frames, strict=True):
         pair = dataset.read_input(index)
-        lidar_m = lidar_truth(frame, "camera_z") if has_lidar(frame, "camera_z") else None
+        lidar_m = _read_lidar(frame)
         views = pair if method.with_right else replace(pair, right=None)
         estimate = method.net.estimate_pair(views)
         if number == "2-5":
-            columns.append(draw_figure_2_5(pair, lidar_m, estimate))
+            panels = draw_figure_2_5(pair, lidar_m, estimate)
         else:
             stereo = method.net.estimate_pair(pair)
-            columns.append(draw_figure_2_1(pair, lidar_m, estimate, stereo))
-        sections.append(_panel_section(frame.name, columns[-1], out / "panels" / frame.name))
+            panels = draw_figure_2_1(pair, lidar_m, estimate, stereo)
+        columns.append(panels)
+        sections.append(_panel_section(frame.name, panels, out / "panels" / frame.name))
     path = out / f"figure-{number}.png"
     write_image(path, arrange(columns))
-    rows = [
-        {"method": method.name, "setting": name, "value": str(value)}
-        for name, value in method.settings.items()
-    ]
-    sections.append(Section(title="Settings", rows=rows))
+    sections.append(_settings_section([method]))
     page.write_page(out / "report.html", f"Figure {number}", sections, environment())
     captions = "; ".join(panel.caption for panel in columns[0])
     print(f"{path}: each column from top to bottom: {captions}. {DEPTH_SCALE}; see the bar below.")
     return 0
 
 
-def _panel_section(title: str, panels: Sequence[Drawing], home: Path) -> Section:
-    """Write each panel as a file, small enough for a page of many."""
+def _panel_section(title: str, panels: Sequence[Drawing], stem: Path) -> Section:
+    """Write each panel as a file, STEM.1.jpg, ..., small enough for a page of many; show them."""
     pictures: list[Picture] = []
     for k, panel in enumerate(panels, 1):
-        path = home.with_name(f"{home.name}.{k}.jpg")
-        write_image(path, shrink_to_width(panel.image, _PICTURE_WIDTH_PX))
+        path = stem.with_name(f"{stem.name}.{k}.jpg")
+        write_image(path, shrink_to_width(panel.image, _PANEL_WIDTH_PX))
         pictures.append(Picture(path=path, caption=panel.caption, scale=panel.scale))
     return Section(title=title, text=DEPTH_SCALE, pictures=pictures)

@@ -1,5 +1,6 @@
 """Tables and figures of chapter 3: predict, measure, join with the printed rows, draw, write."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,10 +34,13 @@ from depthpose.report.page import Drawing, Picture, Section
 from depthpose.report.pose import close_up, draw_pose, grey_depth, picture_of
 from depthpose.thesis import pose_figures, pose_tables
 
-_SYNTHETIC_SEED = 3303  # of synthetic views for tables and figures; no training uses it
-_MOST_POINTS = 4000  # of a t-SNE: its time grows with the square
-_SCAN_POINTS = 1500
-_TEXTS = {
+_SYNTHETIC_SEED = 3303
+"""Of synthetic views for tables and figures; no training uses it."""
+_MAX_TSNE_POINTS = 4000
+"""The time of t-SNE grows with the square of the points."""
+_MAX_VOTES = 1500
+"""Points of a view that vote in figure 3-4."""
+_FIGURE_TEXTS = {
     "3-2": "Alike features have alike colours (t-SNE to one number for all clouds, Spectral); the "
     "model is black, each cloud posed on it by the truth.",
     "3-4": "Plane of x (right) and y (down); star: true keypoint; cross: voted, by RANSAC.",
@@ -47,24 +51,33 @@ _TEXTS = {
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Views:
-    """Views with truth, what to write beside numbers of them, and what decides which they are."""
+    """Views with truth, of a data set or synthetic."""
 
     samples: Sequence[ViewSample]
-    instances: Sequence[Instance | None]
-    facts: dict[str, Any]
-    settings: dict[str, Any]
+    instances: Sequence[Instance | None]  #: of the data set; None: a synthetic view
+    facts: dict[str, Any]  #: columns beside numbers that were measured on the views
+    settings: dict[str, Any]  #: what decides which views they are
 
     def close_up(self, index: int) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "3 3"]]:
-        """Give the picture of a view near its object, or its depth in grey, and its camera."""
+        """Draw a close-up of the object in a view, in grey depth without a picture; give its K."""
         instance = self.instances[index]
         view = self.samples[index].input
-        picture = None if instance is None or instance.rgb is None else picture_of(instance)
-        picture = grey_depth(view.depth_m) if picture is None else picture
+        if instance is None or instance.rgb is None:
+            picture = grey_depth(view.depth_m)
+        else:
+            picture = picture_of(instance)
         return close_up(picture, view.mask, view.K)
 
 
 def open_views(net: GeoPoseNet, data: PoseDataOptions, number: int | None, synthetic: int) -> Views:
-    """Read views of a data set (all, or a number of them), or render some of the net's objects."""
+    """Read views of a data set, or render synthetic ones of the network's objects.
+
+    Args:
+        net: whose names the objects get.
+        data: the data set; without a folder the views are synthetic.
+        number: of the data set's views, spread evenly; None: all.
+        synthetic: number of synthetic views.
+    """
     if data.folder is None:
         config = ObjectsConfig(number=synthetic, seed=_SYNTHETIC_SEED)
         objects = Objects(net.weights.models, config, net.weights.cloud)
@@ -104,7 +117,16 @@ def reproduce_by_object(
     csv: Sequence[Path],
     out: Path,
 ) -> int:
-    """Make table 3.1 or 3.2: predict what is missing, measure, join with published rows, write."""
+    """Make table 3.1 or 3.2: predict what is missing, measure, join with published rows, write.
+
+    Args:
+        number: of the table; 3.2 has published rows.
+        data: the data set.
+        options: how poses are estimated, measured and shown.
+        weights: files or names, each a method.
+        csv: BOP results of other methods.
+        out: folder of the files.
+    """
     refuse_below(0, "--pictures", options.pictures, "4")
     if data.folder is None:
         raise InputError(f"table {number}: give --linemod FOLDER, or --bop FOLDER.")
@@ -112,9 +134,11 @@ def reproduce_by_object(
     # The instances, the methods, and all that decides the numbers.
     dataset = pose_evaluate.open_instances(data.folder, data.split, data.objects, options.targets)
     models = tuple(dataset.objects.values())
-    is_printed = number == "3.2"
-    numbers = {model.name: pose_tables.linemod_number(model) if is_printed else model.number
-               for model in models}  # fmt: skip
+    with_published = number == "3.2"
+    if with_published:
+        numbers = {model.name: pose_tables.linemod_number(model) for model in models}
+    else:
+        numbers = {model.name: model.number for model in models}
     methods = pose_methods.build_methods(weights, options.config, models)
     rule = EvaluationConfig(diameters=options.diameters, with_vsd=options.vsd)
     settings = {
@@ -124,35 +148,33 @@ def reproduce_by_object(
         "frames_sha256": frames_hash(dataset.instances),
         "rule": config_to_dict(rule),
         "methods": {method.name: dict(method.settings) for method in methods},
-        "masks": [
-            kind
-            if (path := pose_methods.mask_path(kind)) is None
-            else pose_methods.name_with_checksum(path)
-            for kind in (options.masks if methods else ())
-        ],
+        "masks": [_mask_setting(kind) for kind in options.masks] if methods else [],
         "csv": [pose_methods.name_with_checksum(path) for path in csv],
     }
     results = (*page.table_files("rows", "all", "instances", "risk"), "report.md", "report.html")
     claim_folder(out, settings, (*results, "predictions", "detections", "figures"))
 
     # Predict what is missing, measure, and join with the published rows.
-    shown = pose_methods.find_masks(options.masks, dataset, out, options.device) if methods else []
+    all_masks: list[pose_methods.Masks] = []
+    if methods:
+        all_masks = pose_methods.prepare_masks(options.masks, dataset, out, options.device)
     folders = [
         pose_methods.predict_instances(dataset, method, masks, out)
         for method in methods
-        for masks in shown
+        for masks in all_masks
     ]
     measured = pose_evaluate.join(pose_evaluate.measure_each(dataset, [*folders, *csv], rule))
-    rows = pose_tables.join_by_object(measured.rows, numbers, with_published=is_printed)
+    rows = pose_tables.join_by_object(measured.rows, numbers, with_published=with_published)
     all_columns = [row.columns() for row in measured.rows]
     page.write_table(out, rows)
     page.write_table(out, all_columns, name="all")
 
     # The page: tables, then some instances of each method.
-    figures = [_figure_3_5(dataset, folder, out, options.pictures) for folder in folders]
+    figures = [_draw_figure_3_5(dataset, folder, out, options.pictures) for folder in folders]
+    text = f"{_PERCENT_NOTE} {_DIFFERENCE_NOTES[number]}"
     sections = [
-        Section(title="Percent by object", text=f"{_HOW} {_DIFFERENCES[number]}", rows=rows),
-        Section(title="All numbers", text=pose_evaluate.HOW, rows=all_columns),
+        Section(title="Percent by object", text=text, rows=rows),
+        Section(title="All numbers", text=pose_evaluate.SCORING_NOTE, rows=all_columns),
         *(figure for figure in figures if figure.pictures),
         *pose_evaluate.write_details(measured, out),
     ]
@@ -161,14 +183,27 @@ def reproduce_by_object(
     return 0
 
 
-def _figure_3_5(dataset: BopDataset, predictions: Path, out: Path, number: int) -> Section:
-    """Draw true and estimated poses of some instances that a method estimated."""
+def _mask_setting(kind: str) -> str:
+    """Give a kind of masks for the record of a run: its word, or its file with a checksum."""
+    path = pose_methods.mask_path(kind)
+    return kind if path is None else pose_methods.name_with_checksum(path)
+
+
+def _draw_figure_3_5(dataset: BopDataset, predictions: Path, out: Path, number: int) -> Section:
+    """Draw true and estimated poses of some instances, and write the pictures.
+
+    Args:
+        dataset: with the instances.
+        predictions: folder of a method's ``poses.json``.
+        out: folder of the report.
+        number: of instances, spread evenly; one that the method has no estimate of is left out.
+    """
     estimates = {p.estimate.name: p.estimate for p in read_predictions(predictions)}
     pictures: list[Picture] = []
     for index in page.spread_evenly(len(dataset), number):
         instance = dataset.instances[index]
         estimate = estimates.get(instance.name)
-        if estimate is None:  # of a detection: it bears no instance's name
+        if estimate is None:  # estimates of detections do not have the names of instances
             continue
         picture, K = close_up(picture_of(instance), read_instance_mask(instance), instance.K)
         model = dataset.objects[instance.object_id]
@@ -178,16 +213,16 @@ def _figure_3_5(dataset: BopDataset, predictions: Path, out: Path, number: int) 
         caption = instance.name if estimate.is_posed else f"{instance.name}: {estimate.reason}"
         pictures.append(Picture(path=path, caption=caption))
     title = f"Figure 3-5: {predictions.name}"
-    return Section(title=title, text=_TEXTS["3-5"], pictures=pictures)
+    return Section(title=title, text=_FIGURE_TEXTS["3-5"], pictures=pictures)
 
 
-_HOW = (
+_PERCENT_NOTE = (
     "Percent of instances whose ADD (ADD-S where there is a star, or a declared symmetry) is "
     "below 10 % of the diameter. Ours: a missing or refused estimate is a failure; see the "
     "columns for masks, diameters and the list of frames."
 )
 
-_DIFFERENCES = {
+_DIFFERENCE_NOTES = {
     "3.1": "Differences: the first weights less each of the others.",
     "3.2": (
         "Published rows: as printed, of the 13 objects; those with RGB see what ours does "
@@ -201,23 +236,23 @@ _DIFFERENCES = {
 def reproduce_voting(
     weights: str, data: PoseDataOptions, synthetic: int, points: Sequence[int], out: Path
 ) -> int:
-    """Make table 3.3: ways of voting on the same directions, block by block of points."""
+    """Make table 3.3: ways of voting on the same directions, a block for each number of points."""
     path = find_weights(weights)
     net = GeoPoseNet.load(path)
     views = open_views(net, data, None, synthetic)
     sha256 = file_sha256(path)
     facts = {"weights": path.stem, "weights_sha256": sha256[:12], **views.facts}
-    command = {"command": "reproduce 3.3", "weights_sha256": sha256, "points": list(points)}
-    claim_folder(
-        out, command | views.settings, [*page.table_files("rows"), "report.md", "report.html"]
-    )
+    settings = {
+        "command": "reproduce 3.3",
+        "weights_sha256": sha256,
+        "points": list(points),
+        **views.settings,
+    }
+    claim_folder(out, settings, [*page.table_files("rows"), "report.md", "report.html"])
     rows: list[dict[str, Any]] = []
     for count in points:
-        cases = list(
-            pose_tables.voting_cases(
-                net, tqdm(views.samples, f"{count} points", disable=None), count
-            )
-        )
+        samples = tqdm(views.samples, f"{count} points", disable=None)
+        cases = list(pose_tables.voting_cases(net, samples, count))
         rows += [row | facts for row in pose_tables.compare_voting(cases, count)]
     page.write_table(out, rows)
     text = (
@@ -237,21 +272,27 @@ def write_figure(
     data: PoseDataOptions,
     number: int,
     out: Path,
-    draw: Callable[..., list[Drawing]],
+    draw_panels: Callable[..., list[Drawing]],
     columns: int,
-    **settings: object,
+    **drawing_settings: object,
 ) -> int:
-    """Draw panels of so many views by the network and the settings; write them, figure and page."""
+    """Draw the panels of a figure, arrange them in columns, and write figure, panels and page.
+
+    ``draw_panels`` takes the network, ``number`` views of ``data`` and the ``drawing_settings``.
+    """
     refuse_below(1, "--number", number, "4")
     net = GeoPoseNet.load(weights)
     views = open_views(net, data, number, number)
-    command = {"command": f"figure {figure}", "weights_sha256": file_sha256(find_weights(weights))}
     path = out / f"figure-{figure}.png"
-    text = _TEXTS[figure]
-    claim_folder(
-        out, {**command, **views.settings, **settings}, (path.name, "panels", "report.html")
-    )
-    panels = draw(net, views, **settings)
+    text = _FIGURE_TEXTS[figure]
+    settings = {
+        "command": f"figure {figure}",
+        "weights_sha256": file_sha256(find_weights(weights)),
+        **views.settings,
+        **drawing_settings,
+    }
+    claim_folder(out, settings, (path.name, "panels", "report.html"))
+    panels = draw_panels(net, views, **drawing_settings)
     write_image(path, pose_figures.arrange_grid([panel.image for panel in panels], columns))
     pictures: list[Picture] = []
     for k, panel in enumerate(panels, 1):
@@ -265,60 +306,96 @@ def write_figure(
 
 
 def feature_panels(net: GeoPoseNet, views: Views, perplexity: float) -> list[Drawing]:
-    """Draw the features of each view, in one colour scale for all."""
+    """Draw the features of each view as colours, of one t-SNE for all views (figure 3-2)."""
     models = {model.name: model for model in net.weights.models}
-    pairs = [(view, pose_figures.seen_points(net, view.input)) for view in views.samples]
-    featured = [(view, *pair) for view, pair in pairs if pair is not None]
-    if not featured:
+    usable: list[ViewSample] = []
+    points_m: list[Tensor] = []
+    features: list[Tensor] = []
+    for view in views.samples:
+        featured = pose_figures.featured_points(net, view.input)
+        if featured is not None:
+            usable.append(view)
+            points_m.append(featured[0])
+            features.append(featured[1])
+    if not usable:
         raise InputError(f"none of the {len(views.samples)} views has enough points to be posed")
-    step = -(-sum(len(features) for _, _, features in featured) // _MOST_POINTS)
-    thinned = [features[::step] for _, _, features in featured]
-    shares = pose_figures.embed_line(torch.cat(thinned), perplexity).split(
-        [len(part) for part in thinned]
-    )
+
+    # Every so many-th point, so that all views together have at most so many as t-SNE takes.
+    step = math.ceil(sum(map(len, features)) / _MAX_TSNE_POINTS)
+    thinned = [part[::step] for part in features]
+    embedded = pose_figures.embed_line(torch.cat(thinned), perplexity)
+    values = embedded.split([len(part) for part in thinned])
+
     panels: list[Drawing] = []
-    for (view, points_m, _), share in zip(featured, shares, strict=True):
+    for view, view_points_m, view_values in zip(usable, points_m, values, strict=True):
         model_from_camera = view.truth.camera_from_model.inverse()
-        local = model_from_camera.apply(points_m[::step].to(model_from_camera.R))
-        image = pose_figures.draw_features(local, share, models[view.input.object])
+        local_m = model_from_camera.apply(view_points_m[::step].to(model_from_camera.R))
+        image = pose_figures.draw_features(local_m, view_values, models[view.input.object])
         panels.append(Drawing(image=image, caption=view.input.name))
     return panels
 
 
 def field_panels(net: GeoPoseNet, views: Views, keypoint: int | None) -> list[Drawing]:
-    """Draw the field of one keypoint of one view: the one whose vote errs most."""
-    errors: list[tuple[float, int, int, pose_tables.VotingCase, Tensor, Tensor]] = []
-    for index, case in enumerate(pose_tables.voting_cases(net, views.samples, _SCAN_POINTS)):
+    """Draw the directions to the keypoint whose vote errs most, of all views (figure 3-4).
+
+    ``keypoint``: only this one of each view, from 0 on; None: all.
+    """
+    votes: list[_KeypointVote] = []
+    for index, case in enumerate(pose_tables.voting_cases(net, views.samples, _MAX_VOTES)):
         if case is None:
             continue
-        vote = vote_ransac(case.points_m, case.directions, None, net.config.voting)
+        voted_m = vote_ransac(case.points_m, case.directions, None, net.config.voting).keypoints_m
         true_m = case.truth.float().apply(case.model.keypoints_m.float())
         if keypoint is not None and not 0 <= keypoint < len(true_m):
             raise InputError(f"--keypoint {keypoint}: there are {len(true_m)}, from 0 on")
-        error_m = (vote.keypoints_m - true_m).norm(dim=-1)
-        k = int(error_m.argmax()) if keypoint is None else keypoint
-        errors.append((float(error_m[k]), index, k, case, true_m[k], vote.keypoints_m[k]))
-    if not errors:
+        errors_m = (voted_m - true_m).norm(dim=-1)
+        k = int(errors_m.argmax()) if keypoint is None else keypoint
+        vote = _KeypointVote(
+            view=index,
+            case=case,
+            keypoint=k,
+            true_m=true_m[k],
+            voted_m=voted_m[k],
+            error_m=float(errors_m[k]),
+        )
+        votes.append(vote)
+    if not votes:
         raise InputError(f"none of the {len(views.samples)} views has enough points to be posed")
-    error_m, index, k, case, true_m, voted_m = max(errors, key=lambda row: row[0])
-    exact = torch.nn.functional.normalize(true_m - case.points_m, dim=-1)
-    view = views.samples[index]
-    image, _ = views.close_up(index)
+
+    worst = max(votes, key=lambda vote: vote.error_m)
+    points_m = worst.case.points_m
+    true_directions = torch.nn.functional.normalize(worst.true_m - points_m, dim=-1)
+    predicted = worst.case.directions[:, worst.keypoint]
+    image, _ = views.close_up(worst.view)
+    name = views.samples[worst.view].input.name
+    error_mm = 1000 * worst.error_m
     return [
-        Drawing(image=image, caption=f"(a) {view.input.name}, keypoint {k}"),
+        Drawing(image=image, caption=f"(a) {name}, keypoint {worst.keypoint}"),
         Drawing(
-            image=pose_figures.draw_field(case.points_m, exact, true_m),
+            image=pose_figures.draw_field(points_m, true_directions, worst.true_m),
             caption="(b) true directions and keypoint",
         ),
         Drawing(
-            image=pose_figures.draw_field(case.points_m, case.directions[:, k], true_m, voted_m),
-            caption=f"(c) predicted directions; the voted keypoint errs by {1000 * error_m:.1f} mm",
+            image=pose_figures.draw_field(points_m, predicted, worst.true_m, worst.voted_m),
+            caption=f"(c) predicted directions; the voted keypoint errs by {error_mm:.1f} mm",
         ),
     ]
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _KeypointVote:
+    """A keypoint of a view: where it is and where the votes meet [m, camera frame]."""
+
+    view: int  #: its index
+    case: pose_tables.VotingCase
+    keypoint: int
+    true_m: Float[Tensor, "3"]
+    voted_m: Float[Tensor, "3"]
+    error_m: float
+
+
 def box_panels(net: GeoPoseNet, views: Views) -> list[Drawing]:
-    """Draw the boxes of true and estimated poses."""
+    """Draw the boxes of true and estimated poses over close-ups (figure 3-5)."""
     models = {model.name: model for model in net.weights.models}
     panels: list[Drawing] = []
     for k, view in enumerate(views.samples):

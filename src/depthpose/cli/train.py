@@ -46,13 +46,25 @@ class TrainingOptions:
     def read(
         self, path: Path | None, kind: type, default: object = None, workers: int | None = None
     ) -> Any:  # noqa: ANN401 - an instance of kind
-        """Read the config of a training, or take its defaults, and apply these options."""
+        """Read the config of a training, or take its defaults, and apply these options.
+
+        Args:
+            path: of the config; None: ``default``.
+            kind: class of the config.
+            default: an instance of it; None: one with its own defaults.
+            workers: processes that render views; None: as the config says.
+        """
         from depthpose.core.config import read_config
 
         config: Any = (default or kind()) if path is None else read_config(path, kind)
         self._refuse_long_warmup(config)
-        values = {"seed": self.seed, "device": self.device, "precision": self.precision}
-        loop = changed(config.loop, workers=workers, **values)
+        loop = changed(
+            config.loop,
+            workers=workers,
+            seed=self.seed,
+            device=self.device,
+            precision=self.precision,
+        )
         if self.steps is not None:
             loop = replace(loop, steps=self.steps, epochs=None)
         return replace(config, loop=loop)
@@ -85,7 +97,10 @@ class TrainingOptions:
         *,
         with_messages: bool = False,
     ) -> int:
-        """Train, show how far it is, and print where the weights and their card are."""
+        """Train, show the progress, and print the path of the weights and their card.
+
+        ``with_messages``: print what the training reports besides its progress.
+        """
         from tqdm import tqdm
 
         from depthpose.core.loop import Run
@@ -93,19 +108,21 @@ class TrainingOptions:
 
         is_first = find_rank().rank == 0  # other processes never show a step
         is_logged = is_first and not (sys.stdout.isatty() and sys.stderr.isatty())
-        lines = Lines() if is_logged else None
+        log = ProgressLog() if is_logged else None
         with tqdm(unit=" steps", disable=None if is_first else True) as bar:
 
             def show(progress: "Progress") -> None:
-                """Move the bar, and print a line where one is due."""
-                if bar.total is None:
+                """Move the bar, and print a line of the log where one is due."""
+                if bar.total is None:  # the first step, of a resumed run not number 1
                     bar.reset(progress.steps)
-                    bar.initial = bar.n = progress.step - 1
+                    bar.initial = progress.step - 1
+                    bar.n = progress.step - 1
                 bar.update(progress.step - bar.n)
                 if progress.numbers:
-                    bar.set_postfix({k: f"{v:.4g}" for k, v in progress.numbers.items()})
-                if lines is not None:
-                    lines.show(progress)
+                    postfix = {name: f"{value:.4g}" for name, value in progress.numbers.items()}
+                    bar.set_postfix(postfix)
+                if log is not None:
+                    log.show(progress)
 
             run = Run(
                 folder=out,
@@ -123,34 +140,41 @@ class TrainingOptions:
 
 
 @dataclass(kw_only=True)
-class Lines:
-    """Prints a line a minute for a log, and the first and the last step."""
+class ProgressLog:
+    """Prints the first step, the last one, and a line a minute between them.
 
-    every_s: float = 60.0
+    ``first_step``: the first that was shown, done at ``first_s``; None: none was.
+    ``printed_s``: when the last line was printed. ``numbers``: the latest losses and metrics.
+    """
+
+    interval_s: float = 60.0
     clock: Callable[[], float] = time.monotonic
-    began: tuple[int, float] | None = None  #: the first step, and when it was done
-    last_s: float = 0.0  #: when the last line was printed
+    first_step: int | None = None
+    first_s: float = 0.0
+    printed_s: float = 0.0
     numbers: dict[str, float] = field(default_factory=dict)
 
     def show(self, progress: "Progress") -> None:
-        """Print a line where one is due; the latest numbers stand in it."""
+        """Print a line if one is due: step, minutes left, and the latest numbers."""
         now_s = self.clock()
         self.numbers = progress.numbers or self.numbers
-        if self.began is None:
-            self.began = (progress.step, now_s)
-        elif progress.step < progress.steps and now_s - self.last_s < self.every_s:
+        if self.first_step is None:
+            self.first_step = progress.step
+            self.first_s = now_s
+        elif progress.step < progress.steps and now_s - self.printed_s < self.interval_s:
             return
-        self.last_s = now_s
-        first, began_s = self.began
+        self.printed_s = now_s
         parts = [f"step {progress.step} of {progress.steps}"]
-        if first < progress.step < progress.steps:
-            left_s = (progress.steps - progress.step) * (now_s - began_s) / (progress.step - first)
+        if self.first_step < progress.step < progress.steps:
+            s_per_step = (now_s - self.first_s) / (progress.step - self.first_step)
+            left_s = (progress.steps - progress.step) * s_per_step
             parts.append(f"{left_s / 60:.0f} min left")
         parts += [f"{name} {value:.4g}" for name, value in self.numbers.items()]
         print(", ".join(parts), flush=True)
 
 
-_HELD_OUT = 20  # pairs of a folder that validate, by default
+_HELD_OUT = 20
+"""Pairs of a folder that validate, by default."""
 
 
 def depth_train(
@@ -203,13 +227,15 @@ def depth_train(
         default_pairs = PairsConfig(focal_px=focal_px, truth=settings.pairs.truth, limit=_HELD_OUT)
         pairs = replace(settings.held_out or default_pairs, folders=held_out)
         settings = replace(settings, held_out=pairs)
-    setting_names = {field.name for field in fields(settings)}
-    setting_names -= set() if stage == "finetune" else {"generator", "matcher"}
-    begin = {"generator": generator, "matcher": matcher, "start": start, "encoder": encoder}
-    for name, value in begin.items():
-        if value is not None and name not in setting_names:
+    # The weights to begin with; each stage takes other ones.
+    usable_names = {field.name for field in fields(settings)}
+    if stage != "finetune":
+        usable_names -= {"generator", "matcher"}
+    weights = {"generator": generator, "matcher": matcher, "start": start, "encoder": encoder}
+    for name, value in weights.items():
+        if value is not None and name not in usable_names:
             raise InputError(f"--{name} has no meaning for '{stage}'; see --help.")
-    return training.run(run_stage, changed(settings, **begin), out)
+    return training.run(run_stage, changed(settings, **weights), out)
 
 
 def calibrate(
@@ -254,14 +280,16 @@ def calibrate(
     net = FakestereoNet.load(path, config=MatcherConfig(device=device), allow_ood=True)
     shown = tqdm(range(len(dataset)), unit=" images", disable=None)
     confidences = measure_image_confidence(net, map(dataset.read_input, shown))
-    least = calibrate_weights(path, confidences, alarm_share, out)
+    threshold = calibrate_weights(path, confidences, alarm_share, out)
     print(f"{len(confidences)} images: confidence {min(confidences):.3f} to {max(confidences):.3f}")
-    print(f"refused below {least:.3f}; calibrated weights: {out}")
+    print(f"refused below {threshold:.3f}; calibrated weights: {out}")
     return 0
 
 
-_START = "parts"  # weights that ship, under a licence that allows any use
-_NO_START = "nothing"  # as --start: begin without weights
+_START = "parts"
+"""Weights that a CAD file begins with by default: they ship, under a licence for any use."""
+_NO_START = "nothing"
+"""As ``--start``: begin without weights."""
 
 
 def pose_train(
@@ -311,7 +339,7 @@ def pose_train(
     if start is not None:
         settings = replace(settings, start=None if start == _NO_START else start)
 
-    # The options replace what the config says of models ...
+    # Options of models take the place of the config's.
     if cad or unit or symmetries:
         if what == "segmentation":
             raise InputError(
@@ -325,16 +353,28 @@ def pose_train(
             models = replace(models, bop=None, objects=(), parts=())
         settings = replace(settings, models=models)
 
-    # ... and of the folders of a data set.
     if data is not None:
-        changes = {}
-        if (models := getattr(settings, "models", None)) is not None and models.bop is not None:
-            changes["models"] = replace(models, bop=data)
-        for part in ("frames", "images", "held_out"):
-            if hasattr(getattr(settings, part, None), "folder"):
-                changes[part] = replace(getattr(settings, part), folder=data)
-        if not changes:
-            message = "the config learns from no data set; see --cad and --what"
-            raise InputError(f"--data {data}: {message}")
-        settings = replace(settings, **changes)
+        settings = _with_dataset(settings, data)
     return training.run(run_stage, settings, out, with_messages=True)
+
+
+def _with_dataset(config: Any, folder: str) -> Any:  # noqa: ANN401 - of any training of poses
+    """Return a config whose models and frames are those of another folder.
+
+    Only the parts that come from a data set are changed.
+
+    Raises:
+        InputError: no part does.
+    """
+    changes: dict[str, Any] = {}
+    models = getattr(config, "models", None)
+    if models is not None and models.bop is not None:
+        changes["models"] = replace(models, bop=folder)
+    for name in ("frames", "images", "held_out"):
+        part: Any = getattr(config, name, None)
+        if hasattr(part, "folder"):
+            changes[name] = replace(part, folder=folder)
+    if not changes:
+        message = "the config learns from no data set; see --cad and --what"
+        raise InputError(f"--data {folder}: {message}")
+    return replace(config, **changes)

@@ -17,6 +17,11 @@ if TYPE_CHECKING:
     from depthpose.core.export import Export
 
 
+_LICENCE_WIDTH = 31
+_DATA_WIDTH = 33
+"""Characters of the columns 'licence' and 'trained on' of the list of weights."""
+
+
 def list_weights(folder: Path | None = None) -> int:
     """List the weights that came with depthpose, or those in a folder.
 
@@ -31,16 +36,19 @@ def list_weights(folder: Path | None = None) -> int:
     if not files:
         print(f"No weights in {home}. 'depthpose weights import' imports a published checkpoint.")
         return 0
-    rows = [
-        {
+    rows: list[dict[str, str]] = []
+    for path in files:
+        checkpoint = read_checkpoint(path)
+        licence = checkpoint.facts.get("licence", "")
+        trained_on = checkpoint.facts.get("trained_on", "")
+        row = {
             "name": path.stem,
-            "kind": (read := read_checkpoint(path)).kind,
+            "kind": checkpoint.kind,
             "MB": f"{path.stat().st_size / 1e6:.1f}",
-            "licence": shorten(read.facts.get("licence", ""), 31, placeholder=" ..."),
-            "trained on": shorten(read.facts.get("trained_on", ""), 33, placeholder=" ..."),
+            "licence": shorten(licence, _LICENCE_WIDTH, placeholder=" ..."),
+            "trained on": shorten(trained_on, _DATA_WIDTH, placeholder=" ..."),
         }
-        for path in files
-    ]
+        rows.append(row)
     print(plain_table(rows), end="")
     print("'depthpose weights show NAME' prints origin, terms and settings of one.")
     return 0
@@ -56,32 +64,38 @@ def show_weights(weights: tyro.conf.Positional[WeightsName]) -> int:
 
     path = find_weights(weights)
     checkpoint = read_checkpoint(path)
+    # Statistics of batch normalisation and meshes are stored too, but are not learnt.
     statistics = ("running_mean", "running_var", "num_batches_tracked")
     learnt = [
         tensor
         for name, tensor in checkpoint.state.items()
         if not name.endswith(statistics) and not name.startswith("models.")
     ]
-    config = _settings_of(checkpoint, str(path))
+    settings = _settings_of(checkpoint, str(path))
     if "models" in checkpoint.config:
         models = checkpoint.config["models"]
-        config["objects"] = ", ".join(f"{model['name']} ({model['number']})" for model in models)
-    facts = {"file": path, "sha256": file_sha256(path), "kind": checkpoint.kind,
-             "parameters": sum(tensor.numel() for tensor in learnt)}  # fmt: skip
-    for name, value in {**facts, **checkpoint.facts, **config}.items():
+        settings["objects"] = ", ".join(f"{model['name']} ({model['number']})" for model in models)
+    about_file = {
+        "file": path,
+        "sha256": file_sha256(path),
+        "kind": checkpoint.kind,
+        "parameters": sum(tensor.numel() for tensor in learnt),
+    }
+    for name, value in {**about_file, **checkpoint.facts, **settings}.items():
         print(f"{name}: {value}")
     return 0
 
 
 def _settings_of(checkpoint: "Checkpoint", source: str) -> dict[str, Any]:
-    """Give the settings of weights with today's defaults; of an encoder those of its file."""
-    from depthpose.depth import weights as of_depth
-    from depthpose.pose import weights as of_pose
+    """Give all settings of networks, defaults too; of an encoder those that its file holds."""
+    from depthpose.depth import weights as depth_weights
+    from depthpose.pose import weights as pose_weights
 
-    if checkpoint.kind in of_pose.POSE_NETWORKS:
-        return of_pose.settings_of(checkpoint, source)
-    if checkpoint.kind in (of_depth.BOTH, *of_depth.GENERATORS, *of_depth.MATCHERS):
-        return of_depth.settings_of(checkpoint, source)
+    if checkpoint.kind in pose_weights.POSE_NETWORKS:
+        return pose_weights.settings_of(checkpoint, source)
+    depth_kinds = (depth_weights.BOTH, *depth_weights.GENERATORS, *depth_weights.MATCHERS)
+    if checkpoint.kind in depth_kinds:
+        return depth_weights.settings_of(checkpoint, source)
     return dict(checkpoint.config)
 
 
@@ -164,12 +178,12 @@ def pack_weights(
     refuse_to_replace(out)
     refuse_to_replace(card)
     depth_weights = read_depth_weights(find_weights(weights))
-    made_of = [weights] if matcher is None else [weights, matcher]
-    warn_of_terms(bound_facts({}, made_of))
-    terms_of_file = {"trained_on": trained_on, "licence": licence} | (
-        {"terms": terms} if terms else {}
-    )
-    facts = bound_facts(terms_of_file, made_of)
+    parts = [weights] if matcher is None else [weights, matcher]
+    warn_of_terms(bound_facts({}, parts))
+    own_facts = {"trained_on": trained_on, "licence": licence}
+    if terms:
+        own_facts["terms"] = terms
+    facts = bound_facts(own_facts, parts)
     write_depth_weights(
         out,
         generator=depth_weights.generator,
@@ -177,8 +191,8 @@ def pack_weights(
         facts=facts,
         with_half=half,
     )
-    with atomic_write(card) as part:
-        part.write_text(card_text(out.stem, dict(sorted(facts.items()))))
+    with atomic_write(card) as unfinished:
+        unfinished.write_text(card_text(out.stem, dict(sorted(facts.items()))))
     print(f"card: {card}")
     return show_weights(str(out))
 
@@ -244,9 +258,8 @@ def export_depth(out: NewPath, weights: WeightsName = "default", what: str | Non
 
     path = find_weights(weights)
     depth_weights = read_depth_weights(path)
-    return _freeze(
-        out, weights, path, depth_weights.facts, partial(depth_export, depth_weights, what)
-    )
+    make_export = partial(depth_export, depth_weights, what)
+    return _write_graph(out, weights, path, depth_weights.facts, make_export)
 
 
 def export_pose(out: NewPath, weights: WeightsName = "parts") -> int:
@@ -269,28 +282,39 @@ def export_pose(out: NewPath, weights: WeightsName = "parts") -> int:
 
     path = find_weights(weights)
     pose_weights = read_pose_weights(path)
-    return _freeze(out, weights, path, pose_weights.facts, partial(pose_export, pose_weights))
+    make_export = partial(pose_export, pose_weights)
+    return _write_graph(out, weights, path, pose_weights.facts, make_export)
 
 
-def _freeze(
+def _write_graph(
     out: Path,
     weights: str,
     path: Path,
     facts: Mapping[str, str],
-    export_of: Callable[[dict[str, str]], "Export"],
+    make_export: Callable[[dict[str, str]], "Export"],
 ) -> int:
-    """Print the terms of weights, write their graph, and print how it differs from PyTorch."""
+    """Print the terms of weights, write their graph, and print how it differs from PyTorch.
+
+    Args:
+        out: the .onnx file.
+        weights: name or file, as the user gave it.
+        path: of their file.
+        facts: of the weights: licence, terms, ...
+        make_export: makes the graph, given the facts that it is to hold.
+    """
     from depthpose.core.checkpoint import file_sha256, warn_of_terms
     from depthpose.core.export import freeze
     from depthpose.report.page import markdown_table
 
     warn_of_terms(facts)
     origin = {"format": "onnx", "weights": Path(weights).name, "weights_sha256": file_sha256(path)}
+    differences = freeze(out, make_export({**facts, **origin}))
     rows = [
-        {name: f"{v:.1e}" if isinstance(v, float) else v for name, v in row.items()}
-        for row in freeze(out, export_of({**facts, **origin}))
+        {name: f"{value:.1e}" if isinstance(value, float) else value for name, value in row.items()}
+        for row in differences
     ]
     print(markdown_table(rows), end="")
-    print(f"{out}: {out.stat().st_size / 1e6:.1f} MB; the differences are in "
-          f"{out.with_suffix('.proof.json').name}")  # fmt: skip
+    size_mb = out.stat().st_size / 1e6
+    proof = out.with_suffix(".proof.json").name
+    print(f"{out}: {size_mb:.1f} MB; the differences are in {proof}")
     return 0

@@ -31,11 +31,13 @@ WORST_PX = 4.0
 WORST_SHARE = 0.3
 """Error of depth, as a share of the truth, that gets the brightest colour."""
 
-_SPARSE = 0.25
-"""Below this share of known pixels, LiDAR's, points are grown to be seen."""
-_RADIUS_PX = 2
-_TRUE = (0.1, 0.8, 0.2)
-_TRUE_POINTS = 20_000
+_SPARSE_SHARE = 0.25
+"""Share of pixels with truth below which they are drawn as points: it is LiDAR's."""
+_POINT_RADIUS_PX = 2
+_WIDEST_DISPARITY_PX = 96.0
+"""Of the bar of disparity; a larger one is as bright."""
+_TRUE_COLOR = (0.1, 0.8, 0.2)
+_MAX_TRUE_POINTS = 20_000
 
 
 def depth_section(
@@ -50,7 +52,14 @@ def depth_section(
 ) -> Section:
     """Show one estimate: the facts, pictures with the bars of their colours, the cloud in 3D.
 
-    The colours of depth go from bright to dark over ``range_m``.
+    Args:
+        title: of the section.
+        pair: the input.
+        estimate: its depth.
+        text: a paragraph below the title.
+        range_m: depth of the brightest and of the darkest colour.
+        error: of each pixel, and the truth, where they are known.
+        with_image: show the left image too.
     """
     _, far_m = range_m
     grey = "grey: none" if estimate.is_sky is None else "grey: sky or no answer"
@@ -59,7 +68,7 @@ def depth_section(
         disparity = Drawing(
             image=draw_disparity(estimate.disparity_px, is_sky=estimate.is_sky),
             caption=f"estimated disparity, large (near) bright; {grey}",
-            scale=rising_scale("disparity [px]", 96.0, has_more=True),
+            scale=rising_scale("disparity [px]", _WIDEST_DISPARITY_PX, has_more=True),
         )
         pictures.append(disparity)
     else:
@@ -99,12 +108,12 @@ def _error_drawings(
     Few pixels, as of LiDAR, are drawn as points over the dimmed image.
     """
     near_m, far_m = range_m
-    is_sparse = float(error.error.isfinite().double().mean()) < _SPARSE
+    is_sparse = float(error.error.isfinite().double().mean()) < _SPARSE_SHARE
     note = "over the dimmed image" if is_sparse else "grey: not compared"
     drawings: list[Drawing] = []
     if error.true_depth_m is not None:
         if is_sparse:
-            image = draw_points(pair.left, error.true_depth_m, far_m, _RADIUS_PX, near_m)
+            image = draw_points(pair.left, error.true_depth_m, far_m, _POINT_RADIUS_PX, near_m)
         else:
             image = draw_depth(error.true_depth_m, near_m, far_m)
         scale = depth_scale(near_m, far_m)
@@ -112,27 +121,27 @@ def _error_drawings(
 
     if error.is_disparity:
         worst = WORST_PX
-        what = "disparity error"
+        noun = "disparity error"
         scale = rising_scale("disparity error [px]", worst, has_more=True)
     else:
         worst = WORST_SHARE
-        what = "depth error as a share of the truth"
+        noun = "depth error as a share of the truth"
         scale = rising_scale("depth error [%]", 100 * worst, has_more=True)
     if is_sparse:
-        image = draw_error_points(pair.left, error.error, worst, _RADIUS_PX)
+        image = draw_error_points(pair.left, error.error, worst, _POINT_RADIUS_PX)
     else:
         image = draw_share(1 - error.error / worst)
-    caption = f"{what}: dark is right, bright is wrong; {note}"
+    caption = f"{noun}: dark is right, bright is wrong; {note}"
     drawings.append(Drawing(image=image, caption=caption, scale=scale))
     return drawings
 
 
 def _with_truth(scene: Scene, true_m: Map, camera: Camera, far_m: float) -> Scene:
-    """Add the points of the true depth to a scene, in green, up to ``far_m``."""
+    """Return a scene with the points of the true depth up to ``far_m`` too, in green."""
     points_m = back_project(true_m, camera.K).reshape(-1, 3).float()
     points_m = points_m[points_m.isfinite().all(-1) & (points_m[:, 2] <= far_m)]
-    points_m = take_evenly(points_m, _TRUE_POINTS)
-    color = torch.tensor(_TRUE).expand(len(points_m), 3)
+    points_m = take_evenly(points_m, _MAX_TRUE_POINTS)
+    color = torch.tensor(_TRUE_COLOR).expand(len(points_m), 3)
     layer = Layer(name="true points", shape=Cloud(points=points_m, color=color))
     caption = f"{scene.caption}; the truth in green"
     return Scene(caption=caption, layers=[*scene.layers, layer])
@@ -141,7 +150,10 @@ def _with_truth(scene: Scene, true_m: Map, camera: Camera, far_m: float) -> Scen
 def depth_facts(
     pair: StereoInput, estimate: DepthEstimate, focal: str = ""
 ) -> list[tuple[str, str]]:
-    """List sizes and metres of an estimate; ``focal``: words behind the focal length."""
+    """List the facts of an estimate: names and values.
+
+    ``focal``: words after the focal length, such as its origin.
+    """
     camera = pair.camera
     depth_m = estimate.depth_m
     height, width = pair.left.shape[1:]
@@ -154,8 +166,8 @@ def depth_facts(
         known_m = depth_m[depth_m.isfinite()]
         facts.append(("pixels with depth", f"{len(known_m) / depth_m.numel():.1%}"))
         if len(known_m):
-            low, middle, high = np.percentile(known_m.numpy(), (1, 50, 99))
-            facts.append(("1, 50, 99 % are nearer than", f"{low:.2f}, {middle:.2f}, {high:.2f} m"))
+            near, median, far = np.percentile(known_m.numpy(), (1, 50, 99))
+            facts.append(("1, 50, 99 % are nearer than", f"{near:.2f}, {median:.2f}, {far:.2f} m"))
     if estimate.is_sky is not None:
         facts.append(("sky", f"{float(estimate.is_sky.float().mean()):.1%} of the pixels"))
     if estimate.ground is not None:
@@ -164,18 +176,21 @@ def depth_facts(
         facts.insert(0, ("warning", estimate.warning))
     if estimate.confidence is not None:
         facts.append(("mean confidence", f"{float(estimate.confidence.nanmean()):.2f}"))
-        shown = replace(estimate, input=pair)
-        doubted = 1 - float(shown.is_sure().sum() / shown.is_sure(0.0).sum().clamp(min=1))
         if pair.right is not None:
-            facts.append(("unsure, not in the cloud", f"{doubted:.1%} of the depth"))
+            of_pair = replace(estimate, input=pair)
+            sure_count = of_pair.is_sure().sum()
+            point_count = of_pair.is_sure(0.0).sum().clamp(min=1)
+            unsure = 1 - float(sure_count / point_count)
+            facts.append(("unsure, not in the cloud", f"{unsure:.1%} of the depth"))
     return facts
 
 
 def depth_scene(
     pair: StereoInput, estimate: DepthEstimate, far_m: float, caption: str = "The cloud"
 ) -> Scene:
-    """Show the points nearer than ``far_m`` in the colours of the image."""
+    """Make the 3D view of the points nearer than ``far_m``, in the colours of the image."""
+    cloud = replace(estimate, input=pair).cloud(far_m)
     return Scene(
         caption=f"{caption} up to {far_m:g} m, in the camera's frame",
-        layers=[Layer(name="points", shape=replace(estimate, input=pair).cloud(far_m))],
+        layers=[Layer(name="points", shape=cloud)],
     )

@@ -16,7 +16,7 @@ from urllib.parse import quote
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from torch import Tensor
 from torch.nn import functional as F
@@ -28,8 +28,12 @@ from depthpose.core.files.disk import write_bytes
 MOST_POINTS = 60_000
 """Most points of one cloud on a page: 0.7 MB of text."""
 MOST_LINES = 20_000
+"""Most pieces of line of one layer on a page."""
 
-_GREY = 0.55  # grey of points without a colour: visible on white and on black
+_GREY = 0.55
+"""Of points without a colour: visible on white and on black."""
+_STEPS = 65535
+"""Into which the extent of a layer is divided along each axis, for 16 bits."""
 _RED_GREEN_BLUE = ((0.85, 0.2, 0.2), (0.15, 0.65, 0.25), (0.25, 0.45, 0.95))
 
 
@@ -63,48 +67,66 @@ class Scene:
         Places are steps of 1/65535 of their extent: of a street of 80 m, 1.2 mm. ``note`` says
         which layers are thinned.
         """
-        layers: list[dict[str, Any]] = []
-        thinned: list[str] = []
+        encoded_layers: list[dict[str, Any]] = []
+        notes: list[str] = []
         for layer in self.layers:
             shape = layer.shape
             if isinstance(shape, Cloud):
                 kind = "points"
-                most = MOST_POINTS
+                max_count = MOST_POINTS
                 places = shape.points
                 color = shape.color
                 color = torch.full_like(places, _GREY) if color is None else color
             else:
                 kind = "lines"
-                most = MOST_LINES
+                max_count = MOST_LINES
                 places = shape.ends_m
                 color = shape.color
-            if len(places) > most:
-                thinned.append(f"{layer.name}: {most} of {len(places)}, thinned evenly")
-                # One of each of equal runs, by chance, always the same ones: equal steps through
-                # the rows of a depth image would leave lines of points.
-                fixed = torch.Generator().manual_seed(0)
-                chance = torch.rand(most, generator=fixed, dtype=torch.float64)
-                sampled = ((torch.arange(most) + chance) * (len(places) / most)).long()
-                sampled = sampled.clamp(max=len(places) - 1)
+            if len(places) > max_count:
+                notes.append(f"{layer.name}: {max_count} of {len(places)}, thinned evenly")
+                sampled = _sample_runs(len(places), max_count)
                 places = places[sampled]
                 color = color[sampled]
-            bytes_of_color = (color.detach().cpu().clamp(0, 1) * 255).round().byte().numpy()
-            flat_m = places.detach().cpu().numpy().astype(np.float64).reshape(-1, 3)
-            low = flat_m.min(0) if len(flat_m) else np.zeros(3)
-            step = (flat_m.max(0) - low) / 65535 if len(flat_m) else np.zeros(3)
-            steps = np.round((flat_m - low) / np.where(step > 0, step, 1))
             encoded = {
                 "name": layer.name,
                 "kind": kind,
                 "shown": layer.is_shown,
                 "count": len(places),
-                "low": low.tolist(),
-                "step": step.tolist(),
-                "places": base64.b64encode(steps.astype("<u2").tobytes()).decode(),
-                "colors": base64.b64encode(bytes_of_color.tobytes()).decode(),
+                **_encode_places(places),
+                "colors": _encode_colors(color),
             }
-            layers.append(encoded)
-        return {"caption": self.caption, "note": "; ".join(thinned), "layers": layers}
+            encoded_layers.append(encoded)
+        return {"caption": self.caption, "note": "; ".join(notes), "layers": encoded_layers}
+
+
+def _sample_runs(total: int, count: int) -> Int64[Tensor, " count"]:
+    """Choose ``count`` of ``total`` rows: one at random of each of equal runs, always the same.
+
+    Equal steps through the rows of a depth image would leave lines of points.
+    """
+    generator = torch.Generator().manual_seed(0)
+    offsets = torch.rand(count, generator=generator, dtype=torch.float64)
+    chosen = ((torch.arange(count) + offsets) * (total / count)).long()
+    return chosen.clamp(max=total - 1)
+
+
+def _encode_places(places: Float[Tensor, "*shape 3"]) -> dict[str, Any]:
+    """Encode places as 16-bit steps from their least coordinates, with ``low`` and ``step``."""
+    flat_m = places.detach().cpu().numpy().astype(np.float64).reshape(-1, 3)
+    low = flat_m.min(0) if len(flat_m) else np.zeros(3)
+    step = (flat_m.max(0) - low) / _STEPS if len(flat_m) else np.zeros(3)
+    steps = np.round((flat_m - low) / np.where(step > 0, step, 1))
+    return {
+        "low": low.tolist(),
+        "step": step.tolist(),
+        "places": base64.b64encode(steps.astype("<u2").tobytes()).decode(),
+    }
+
+
+def _encode_colors(color: Float[Tensor, "n 3"]) -> str:
+    """Encode colours in [0, 1] by 8 bits a channel."""
+    values = (color.detach().cpu().clamp(0, 1) * 255).round().byte()
+    return base64.b64encode(values.numpy().tobytes()).decode()
 
 
 def page_file(name: Literal["viewer.js", "page.css"]) -> str:
@@ -118,91 +140,106 @@ def colored_lines(ends_m: Float[Tensor, "n 2 3"], color: tuple[float, float, flo
 
 
 def frame_axes(origin_m: Float[Tensor, "3"], R: Float[Tensor, "3 3"], length_m: float) -> Lines:
-    """Draw the axes (columns of R) of a frame at a place of the camera: x red, y green, z blue."""
+    """Draw the axes of a frame (columns of R) in the camera frame: x red, y green, z blue.
+
+    ``length_m``: of each axis.
+    """
     tips_m = origin_m + length_m * R.mT
     ends_m = torch.stack([origin_m.expand(3, 3), tips_m], 1)
     return Lines(ends_m=ends_m.float(), color=torch.tensor(_RED_GREEN_BLUE))
 
 
 MOST_VIEWS = 6
-_REFUSED = 2  # refusals shown at least, where there are so many
+"""Most inputs that a page shows by pictures."""
+_LEAST_REFUSALS = 2
+"""Refusals that are shown at least, if there are as many."""
 
 
 def spread_evenly(total: int, count: int) -> list[int]:
-    """Choose ``count`` of 0 .. total - 1, the middle of each equal part; all where there are fewer.
+    """Choose ``count`` numbers of 0 .. total - 1, the middle of each of equal parts.
 
-    None where ``count`` is 0.
+    All of them where there are fewer.
     """
     count = min(count, total)
     return [(2 * k + 1) * total // (2 * count) for k in range(count)]
 
 
 def choose_answers(is_ok: Sequence[bool]) -> list[int]:
-    """Choose answers and some refusals, each spread evenly; give their places in order."""
+    """Choose answers and some refusals to show, each spread evenly; give their indices in order."""
     answered = [k for k, ok in enumerate(is_ok) if ok]
     refused = [k for k, ok in enumerate(is_ok) if not ok]
-    refused_count = min(len(refused), max(_REFUSED, MOST_VIEWS - len(answered)))
+    refused_count = min(len(refused), max(_LEAST_REFUSALS, MOST_VIEWS - len(answered)))
     chosen = [refused[i] for i in spread_evenly(len(refused), refused_count)]
     chosen += [answered[i] for i in spread_evenly(len(answered), MOST_VIEWS - refused_count)]
     return sorted(chosen)
 
 
 def choose_ranked(errors: Sequence[float], most: int = 3) -> list[tuple[str, int]]:
-    """Choose the worst, the median and the best of finite errors; at most ``most``, each once."""
+    """Choose the worst, the median and the best of finite errors, ``most`` of them at most.
+
+    Gives the role of each and its index; of two errors there is no median, and one is the only.
+    """
     order = sorted(range(len(errors)), key=errors.__getitem__)
     if len(order) <= 1:
-        return [("only", place) for place in order][:most]
-    places = [("worst", order[-1]), ("median", order[(len(order) - 1) // 2]), ("best", order[0])]
-    if len(order) == 2:
-        del places[1]
-    return places[:most]
+        return [("only", index) for index in order][:most]
+    chosen = [("worst", order[-1]), ("best", order[0])]
+    if len(order) > 2:
+        chosen.insert(1, ("median", order[(len(order) - 1) // 2]))
+    return chosen[:most]
 
 
 def share_views(sets: int) -> list[int]:
-    """Give each of several sets of predictions its number of views; the last may get none."""
+    """Give the number of views of each of several sets of predictions on a page.
+
+    Of many sets the last get none.
+    """
     each = max(1, MOST_VIEWS // max(1, sets))
     return [each if k * each < MOST_VIEWS else 0 for k in range(sets)]
 
 
 Row = Mapping[str, Any]
 
-_LEAST_GAP = 0.08  # of two marks on a bar, as a share of its length: nearer ones would touch
+_LEAST_GAP = 0.08
+"""Between two marks of a bar, as a share of its length: nearer ones would touch."""
 _MOST_PIXELS = 480_000
 """Most pixels of a drawing on a page of many; a frame of KITTI keeps its size."""
-_QUALITY = 85
-_ERRORS = "backslashreplace"  # of names of files whose bytes are no UTF-8
-_MOST_BYTES = 250_000  # largest picture file that goes onto a page as it is
-_MOST_FILM_BYTES = 8_000_000  # largest video file on a page; a larger one is shown from beside it
+_JPEG_QUALITY = 85
+_ENCODING_ERRORS = "backslashreplace"
+"""How names of files are written whose bytes are no UTF-8."""
+_MOST_BYTES = 250_000
+"""Of a picture file that goes onto a page as it is."""
+_MOST_FILM_BYTES = 8_000_000
+"""Of a video file on a page; a larger one is shown from its own file."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scale:
     """What the colours of a picture mean, for a colour bar."""
 
-    title: str  #: of what, with its unit
+    title: str  #: the quantity, with its unit
     colors: Sequence[tuple[float, float, float]]  #: RGB in [0, 1] at even steps from left to right
-    marks: Sequence[tuple[float, str]]  #: places, 0 (left) to 1, and what is written there
+    marks: Sequence[tuple[float, str]]  #: positions, 0 (left) to 1, and the text at each
 
 
 def depth_scale(near_m: float = 3.0, far_m: float = 80.0) -> Scale:
-    """Give the bar of ``core.draw.draw_depth``, with round metres between its ends."""
-    whole = math.log(far_m / near_m)
-    ends = [(0.0, f"{near_m:g}"), (1.0, f"{far_m:g}")]
+    """Make the colour bar of ``core.draw.draw_depth``: logarithmic, with marks at round metres."""
+    marks = [(0.0, f"{near_m:g}"), (1.0, f"{far_m:g}")]
     exponents = range(math.floor(math.log10(near_m)), math.ceil(math.log10(far_m)) + 1)
-    for round_m in (digit * 10.0**k for k in exponents for digit in (1, 2, 5)):
-        place = math.log(round_m / near_m) / whole
-        if all(abs(place - other) >= _LEAST_GAP for other, _ in ends) and 0 < place < 1:
-            ends.append((place, f"{round_m:g}"))
-    return Scale(title="depth [m]", colors=NEAR_TO_FAR, marks=sorted(ends))
+    for round_m in (digit * 10.0**exponent for exponent in exponents for digit in (1, 2, 5)):
+        position = math.log(round_m / near_m) / math.log(far_m / near_m)
+        has_room = all(abs(position - other) >= _LEAST_GAP for other, _ in marks)
+        if has_room and 0 < position < 1:
+            marks.append((position, f"{round_m:g}"))
+    return Scale(title="depth [m]", colors=NEAR_TO_FAR, marks=sorted(marks))
 
 
 def rising_scale(title: str, top: float, *, has_more: bool = False) -> Scale:
-    """Give the bar of what is dark at 0 and bright at ``top``.
+    """Make the colour bar of a quantity that is dark at 0 and bright at ``top``.
 
     Args:
-        title: of what, with its unit.
-        top: the brightest.
-        has_more: whether what is beyond it is as bright.
+        title: the quantity, with its unit.
+        top: value of the brightest colour.
+        has_more: larger values have that colour too.
     """
     marks = [(0.0, "0"), (0.5, f"{top / 2:g}"), (1.0, f"{top:g}{'+' if has_more else ''}")]
     return Scale(title=title, colors=NEAR_TO_FAR[::-1], marks=marks)
@@ -210,11 +247,11 @@ def rising_scale(title: str, top: float, *, has_more: bool = False) -> Scale:
 
 @dataclass(frozen=True, kw_only=True)
 class Picture:
-    """A picture file with a caption, and with the bar of its colours where they are numbers."""
+    """A picture file with a caption."""
 
     path: Path
     caption: str
-    scale: Scale | None = None
+    scale: Scale | None = None  #: what its colours mean; None: they are no numbers
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -227,10 +264,10 @@ class Drawing:
 
 
 def embedded(picture: Picture | Drawing, most_pixels: int = _MOST_PIXELS) -> tuple[int, int, str]:
-    """Give a picture's width and height [px], and the picture as a ``data:`` address.
+    """Give a picture's width and height [px], and its data as a ``data:`` address.
 
-    So the page needs no other file, and does not move when the picture comes. A small file's own
-    bytes are taken; another picture is shrunk to about so many pixels, its proportions kept.
+    With these the page needs no other file, and does not move while a picture loads. A small file
+    is taken as it is; another picture is shrunk to about ``most_pixels``, its proportions kept.
     """
     if isinstance(picture, Picture) and picture.path.stat().st_size <= _MOST_BYTES:
         kind = "jpeg" if picture.path.suffix.lower() in (".jpg", ".jpeg") else "png"
@@ -242,7 +279,7 @@ def embedded(picture: Picture | Drawing, most_pixels: int = _MOST_PIXELS) -> tup
     if scale < 1:
         size = (max(1, int(height * scale)), max(1, int(width * scale)))
         image = F.interpolate(image[None], size, mode="area")[0]
-    data = base64.b64encode(encode_image(image, "drawing.jpg", _QUALITY)).decode()
+    data = base64.b64encode(encode_image(image, "drawing.jpg", _JPEG_QUALITY)).decode()
     return width, height, f"data:image/jpeg;base64,{data}"
 
 
@@ -255,7 +292,7 @@ class Film:
 
     @property
     def address(self) -> str:
-        """Its bytes as a ``data:`` address, or its name."""
+        """Address of the video on the page: its bytes (``data:``), or its name if it is large."""
         if self.path.stat().st_size > _MOST_FILM_BYTES:
             return quote(self.path.name)
         return "data:video/mp4;base64," + base64.b64encode(self.path.read_bytes()).decode()
@@ -263,44 +300,45 @@ class Film:
 
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """A part of a page, in this order: its heading, a paragraph, names and values, pictures, films.
-
-    Then a table that sorts, small tables by what they show (rows of equal length), and 3D views.
-    """
+    """A part of a page; what it holds is shown in this order."""
 
     title: str
-    text: str = ""
-    facts: Sequence[tuple[str, str]] = ()
+    text: str = ""  #: a paragraph
+    facts: Sequence[tuple[str, str]] = ()  #: names and values
     pictures: Sequence[Picture | Drawing] = field(default_factory=tuple)
     films: Sequence[Film] = ()
-    rows: Sequence[Row] = ()
+    rows: Sequence[Row] = ()  #: of a table that can be sorted
     tables: Mapping[str, Sequence[Sequence[str]]] = field(default_factory=dict)
-    scenes: Sequence[Scene] = field(default_factory=tuple)
+    """Small tables by their captions; the rows of each are of equal length."""
+    scenes: Sequence[Scene] = field(default_factory=tuple)  #: 3D views
 
 
 def table_files(*names: str) -> list[str]:
-    """Name the files that :func:`write_table` writes."""
-    return [
-        file
-        for name in names
-        for file in (f"{name}.json", f"{name}.csv", f"{'table' if name == 'rows' else name}.md")
-    ]
+    """Give the names of the files that :func:`write_table` writes for tables of these names."""
+    files: list[str] = []
+    for name in names:
+        markdown_stem = "table" if name == "rows" else name
+        files += [f"{name}.json", f"{name}.csv", f"{markdown_stem}.md"]
+    return files
 
 
 def write_table(folder: Path, rows: Sequence[Row], name: str = "rows") -> None:
-    """Write ``NAME.json``, ``NAME.csv`` (with every digit) and ``table.md``, else ``NAME.md``."""
+    """Write rows as ``NAME.json``, ``NAME.csv`` with every digit and ``NAME.md``.
+
+    The last is ``table.md`` where the name is ``rows``.
+    """
     as_json, as_csv, as_markdown = table_files(name)
     write_json(folder / as_json, [dict(row) for row in rows])
     text = io.StringIO()
     writer = csv.DictWriter(text, column_names(rows), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    write_bytes(folder / as_csv, text.getvalue().encode(errors=_ERRORS))
-    write_bytes(folder / as_markdown, markdown_table(rows).encode(errors=_ERRORS))
+    write_bytes(folder / as_csv, text.getvalue().encode(errors=_ENCODING_ERRORS))
+    write_bytes(folder / as_markdown, markdown_table(rows).encode(errors=_ENCODING_ERRORS))
 
 
 def markdown_table(rows: Sequence[Row]) -> str:
-    """Format rows as a Markdown table, columns by first appearance; no rows are the word none."""
+    """Format rows as a Markdown table; "none" if there are no rows."""
     if not rows:
         return "none\n"
     names = column_names(rows)
@@ -310,19 +348,23 @@ def markdown_table(rows: Sequence[Row]) -> str:
 
 
 def plain_table(rows: Sequence[Row], names: Sequence[str] = ()) -> str:
-    """Format rows for a terminal, in columns of their own width: all, or those of some names.
+    """Format rows as a table for a terminal, with the columns of these names, by default all.
 
     Columns without a value are left out.
     """
-    wanted = [
-        n for n in names or column_names(rows) if any(row.get(n) not in (None, "") for row in rows)
+    shown_names = [
+        name
+        for name in names or column_names(rows)
+        if any(row.get(name) not in (None, "") for row in rows)
     ]
-    cells = [wanted, *([show_value(row.get(name)) for name in wanted] for row in rows)]
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    return "".join(
-        "  ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)).rstrip() + "\n"
-        for line in cells
-    )
+    lines = [shown_names]
+    lines += [[show_value(row.get(name)) for name in shown_names] for row in rows]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    text = ""
+    for line in lines:
+        cells = [cell.ljust(width) for cell, width in zip(line, widths, strict=True)]
+        text += "  ".join(cells).rstrip() + "\n"
+    return text
 
 
 def write_markdown(
@@ -331,18 +373,21 @@ def write_markdown(
     """Write the text and tables of :func:`write_page` as Markdown, without pictures."""
     parts = [f"# {title}\n"]
     for section in sections:
-        parts += [f"## {section.title}\n"] + ([f"{section.text}\n"] if section.text else [])
-        parts += [markdown_table(section.rows)] if section.rows else []
+        parts.append(f"## {section.title}\n")
+        if section.text:
+            parts.append(f"{section.text}\n")
+        if section.rows:
+            parts.append(markdown_table(section.rows))
     parts.append(" · ".join(f"{name} {value}" for name, value in environment.items()) + "\n")
-    write_bytes(path, "\n".join(parts).encode(errors=_ERRORS))
+    write_bytes(path, "\n".join(parts).encode(errors=_ENCODING_ERRORS))
 
 
 def column_names(rows: Sequence[Row]) -> list[str]:
-    """Give the union of the rows' names, in order of their first appearance."""
+    """Give the names of all columns that any row has, in order of their first appearance."""
     return list(dict.fromkeys(name for row in rows for name in row))
 
 
-_ABOUT = {
+_COLUMN_MEANINGS = {
     "abs_rel": "mean of |predicted - true| / true",
     "alternatives": "other poses that fit as well, and their probability",
     "ar": "BOP's average recall: the mean of ar_vsd, ar_mssd and ar_mspd",
@@ -365,11 +410,11 @@ _ABOUT = {
     "visible_fraction": "share of the part's pixels that nothing hides",
     "wrong": "share with an answer that is no success",
 }
-"""What the head of a column says of it when it is pointed at."""
+"""Shown when the pointer is on the head of a column."""
 
 
 def show_value(value: object) -> str:
-    """Show a value to a person: four digits after the point, nothing for None."""
+    """Format a value for a person: four decimals, whole numbers without any, nothing for None."""
     match value:
         case None:
             return ""
@@ -398,9 +443,9 @@ def write_page(
         column_names=column_names,
         page_file=page_file,
         embedded=embedded,
-        about=_ABOUT,
+        about=_COLUMN_MEANINGS,
     )
     html = pages.get_template("report.html").render(
         title=title, sections=sections, environment=environment
     )
-    write_bytes(path, html.encode(errors=_ERRORS))
+    write_bytes(path, html.encode(errors=_ENCODING_ERRORS))

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
-from depthpose.core.camera import project
+from depthpose.core.camera import Camera, crop_camera, project, resize_camera
 from depthpose.core.draw import draw_lines, draw_outline
 from depthpose.core.files import Cloud, read_depth_png, read_image
 from depthpose.core.render import rasterize
@@ -37,11 +37,17 @@ VOTED: Color = (1.0, 0.55, 0.1)
 """Colour of voted keypoints: orange."""
 ALTERNATIVE: Color = (0.6, 0.3, 0.85)
 """Colour of an alternative: violet."""
-_SURFACE = 5000
-_BEND = math.radians(30)
-_CROSS = 0.04  # half of the mark of a keypoint, in diameters of the object
-_VOTES = 40  # points whose votes are drawn
+_SURFACE_POINTS = 5000
+"""Of the posed model in a cloud."""
+_SHARP_RAD = math.radians(30)
+"""Least angle between the faces at an edge that is drawn."""
+_CROSS_ARM = 0.04
+"""Half of the cross at a keypoint, in diameters of the object."""
+_DRAWN_VOTES = 40
+"""Points whose votes are drawn."""
 _DASH_PX = 6.0
+_GREY = 0.6
+"""Of the points of an observed cloud."""
 
 
 def picture_of(instance: Instance) -> Float[Tensor, "3 h w"]:
@@ -68,14 +74,15 @@ def draw_pose(
         truth: ``camera_from_model``, whose box is drawn too, green and dashed; None: it is unknown.
     """
     K = K.double()
+    box_m = box_edges(model).double()
     if pose is not None:
-        ends_px = project(pose.double().apply(box_edges(model).double()), K)
+        ends_px = project(pose.double().apply(box_m), K)
         posed_m = pose.double().apply(drawn_triangles(model).double())
         raster = rasterize(posed_m, K, image.shape[2], image.shape[1], with_barycentric=False)
         image = draw_outline(image, raster.depth_m.isfinite(), ESTIMATED)
         image = draw_lines(image, ends_px, ESTIMATED)
     if truth is not None:
-        ends_px = project(truth.double().apply(box_edges(model).double()), K)
+        ends_px = project(truth.double().apply(box_m), K)
         image = draw_lines(image, ends_px, TRUTH, dash_px=_DASH_PX)
     return image
 
@@ -83,15 +90,17 @@ def draw_pose(
 def draw_region(
     image: Float[Tensor, "3 h w"], view: ViewInput, pose: Rigid | None
 ) -> Float[Tensor, "3 h w"]:
-    """Draw the border of where an object was looked for, in yellow: a box; without a pose a mask.
+    """Draw the border of the box in which an object was searched, or of its mask, in yellow.
+
+    A mask is drawn only where there is no pose, whose silhouette would cover it.
 
     Args:
         image: of the camera; it is not changed.
         view: with its mask or box.
-        pose: that was estimated, if any.
+        pose: that was estimated; None: it was refused.
     """
     if pose is None or view.is_region:
-        return draw_outline(image, view.mask, _MASKED)
+        return draw_outline(image, view.mask, _REGION_COLOR)
     return image
 
 
@@ -100,21 +109,28 @@ def box_edges(model: ObjectModel) -> Float[Tensor, "12 2 3"]:
     low = model.vertices_m.amin(0)
     high = model.vertices_m.amax(0)
     corners = torch.cartesian_prod(*torch.stack([low, high], -1))
-    pairs = [(a, a | bit) for bit in (1, 2, 4) for a in range(8) if not a & bit]
+    # The three bits of a corner's number say for each axis whether it is low or high; corners with
+    # an edge between them differ in one bit.
+    pairs = [(corner, corner | bit) for bit in (1, 2, 4) for corner in range(8) if not corner & bit]
     return corners[torch.tensor(pairs)]
 
 
 def pose_layers(
     pose: Rigid, model: ObjectModel, *, is_true: bool = False, with_box: bool = False
 ) -> list[Layer]:
-    """Show a posed object in space: surface, edges, box and axes; the truth by edges and box.
+    """Make the layers of a posed object: surface, edges, box and axes.
 
-    Edges are where the surface ends, or bends by more than 30 degrees. ``with_box``: whether an
-    estimate's box is seen at first; that of a truth is.
+    Edges are where the surface ends, or bends by more than 30 degrees.
+
+    Args:
+        pose: ``camera_from_model``.
+        model: the object.
+        is_true: the pose is the truth: it is shown by edges and box alone, in green.
+        with_box: the box of an estimate is shown at first, and not only when it is switched on.
     """
     pose = pose.double()
     box_m = pose.apply(box_edges(model).double()).float()
-    edges_m = _bent_edges(model)
+    edges_m = _sharp_edges(model)
     if edges_m is not None:
         edges_m = pose.apply(edges_m).float()
     if is_true:
@@ -130,40 +146,46 @@ def pose_layers(
     return [*layers, box, Layer(name="its axes (x red, y green, z blue)", shape=axes)]
 
 
-def _bent_edges(model: ObjectModel) -> Float64[Tensor, "n 2 3"] | None:
-    """Give both ends of the edges where a mesh ends, or bends by more than ``_BEND`` [m].
+def _sharp_edges(model: ObjectModel) -> Float64[Tensor, "n 2 3"] | None:
+    """Give both ends of the edges where a mesh ends, or bends by more than ``_SHARP_RAD`` [m].
 
     None of a model without faces.
     """
     if not len(model.faces):
         return None
-    # By place, not by number: STL repeats the points of every face.
-    places_m, place = torch.unique(model.vertices_m, dim=0, return_inverse=True)
-    ends = place[model.faces]
-    sides = torch.cat([ends[:, [0, 1]], ends[:, [1, 2]], ends[:, [2, 0]]]).sort(-1).values
-    edges, edge_of, count = torch.unique(sides, dim=0, return_inverse=True, return_counts=True)
+    # Vertices at one place are one: STL repeats the points of every face.
+    places_m, place_of_vertex = torch.unique(model.vertices_m, dim=0, return_inverse=True)
+    corners = place_of_vertex[model.faces]
+    sides = torch.cat([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
+    edges, edge_of_side, face_count = torch.unique(
+        sides.sort(-1).values, dim=0, return_inverse=True, return_counts=True
+    )
 
     # Two unit normals at an angle have a mean as long as the cosine of half of it.
     a, b, c = model.vertices_m[model.faces].double().unbind(1)
-    normal = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
-    total = normal.new_zeros(len(edges), 3).index_add_(0, edge_of, normal.repeat(3, 1))
-    is_bent = total.norm(dim=-1) / count < math.cos(_BEND / 2)
-    return places_m[edges[is_bent | (count == 1)]].double()
+    normals = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
+    normal_sum = normals.new_zeros(len(edges), 3)
+    normal_sum.index_add_(0, edge_of_side, normals.repeat(3, 1))
+    is_sharp = normal_sum.norm(dim=-1) / face_count < math.cos(_SHARP_RAD / 2)
+    is_border = face_count == 1
+    return places_m[edges[is_sharp | is_border]].double()
 
 
 def keypoint_layers(
     voted_m: Float[Tensor, "k 3"], pose: Rigid | None, model: ObjectModel
 ) -> list[Layer]:
-    """Show the keypoints as voted, and as the model has them if it was posed (camera frame)."""
-    marks = [("keypoints, voted", voted_m, VOTED)]
+    """Draw crosses at the voted keypoints, and at those of the posed model, in the camera frame."""
+    keypoints = [("keypoints, voted", voted_m, VOTED)]
     if pose is not None:
         posed_m = pose.apply(model.keypoints_m.to(pose.R))
-        marks.append(("keypoints, of the posed model", posed_m, ESTIMATED))
-    layers = []
-    for name, at_m, color in marks:
-        arms_m = _CROSS * model.diameter_m * torch.eye(3).to(at_m)
-        ends_m = torch.stack([at_m[:, None] - arms_m, at_m[:, None] + arms_m], 2).flatten(0, 1)
-        layers.append(Layer(name=name, shape=colored_lines(ends_m.float(), color)))
+        keypoints.append(("keypoints, of the posed model", posed_m, ESTIMATED))
+    layers: list[Layer] = []
+    for name, centres_m, color in keypoints:
+        arms_m = _CROSS_ARM * model.diameter_m * torch.eye(3).to(centres_m)
+        starts_m = centres_m[:, None] - arms_m
+        ends_m = centres_m[:, None] + arms_m
+        lines_m = torch.stack([starts_m, ends_m], 2).flatten(0, 1).float()
+        layers.append(Layer(name=name, shape=colored_lines(lines_m, color)))
     return layers
 
 
@@ -172,14 +194,17 @@ def vote_layer(
     directions: Float[Tensor, "n k 3"],
     voted_m: Float[Tensor, "k 3"],
 ) -> Layer:
-    """Show votes: from some points, along directions of any length, past the voted keypoints."""
-    from_m = take_evenly(points_m, _VOTES)
-    toward = take_evenly(directions, _VOTES)
-    toward = torch.nn.functional.normalize(toward, dim=-1)
-    way_m = ((voted_m - from_m[:, None]) * toward).sum(-1, keepdim=True).clamp(min=0)
-    starts_m = from_m[:, None].expand_as(toward)
-    ends_m = torch.stack([starts_m, starts_m + way_m * toward], -2).flatten(0, 1)
-    return Layer(name="votes", shape=colored_lines(ends_m.float(), VOTED), is_shown=False)
+    """Draw the votes of some points: lines along their directions to beside the voted keypoints.
+
+    A line ends where it is nearest to the keypoint. ``directions`` need not be of unit length.
+    """
+    points_m = take_evenly(points_m, _DRAWN_VOTES)
+    directions = torch.nn.functional.normalize(take_evenly(directions, _DRAWN_VOTES), dim=-1)
+    starts_m = points_m[:, None].expand_as(directions)
+    lengths_m = ((voted_m - starts_m) * directions).sum(-1, keepdim=True).clamp(min=0)
+    ends_m = starts_m + lengths_m * directions
+    lines_m = torch.stack([starts_m, ends_m], -2).flatten(0, 1).float()
+    return Layer(name="votes", shape=colored_lines(lines_m, VOTED), is_shown=False)
 
 
 def posed_cloud(cloud_m: Float[Tensor, "n 3"], pose: Rigid | None, model: ObjectModel) -> Cloud:
@@ -187,15 +212,22 @@ def posed_cloud(cloud_m: Float[Tensor, "n 3"], pose: Rigid | None, model: Object
 
     Without a pose, the cloud alone.
     """
+    cloud_color = torch.full((len(cloud_m), 3), _GREY)
     if pose is None:
-        return Cloud(points=cloud_m.float(), color=torch.full((len(cloud_m), 3), 0.6))
-    surface_m = pose.apply(sample_surface(model, _SURFACE)[0].to(pose.R))
-    colors = [torch.full((len(cloud_m), 3), 0.6), torch.tensor(ESTIMATED).expand(len(surface_m), 3)]
-    return Cloud(points=torch.cat([cloud_m.float(), surface_m.float()]), color=torch.cat(colors))
+        return Cloud(points=cloud_m.float(), color=cloud_color)
+    surface_m = pose.apply(sample_surface(model, _SURFACE_POINTS)[0].to(pose.R))
+    surface_color = torch.tensor(ESTIMATED).expand(len(surface_m), 3)
+    return Cloud(
+        points=torch.cat([cloud_m.float(), surface_m.float()]),
+        color=torch.cat([cloud_color, surface_color]),
+    )
 
 
 def object_points(pose_input: CloudInput | ViewInput, diameter_m: float) -> Float[Tensor, "n 3"]:
-    """Give the points of an input that are readings, of a depth image without flying pixels."""
+    """Give the valid points of a cloud, or of a masked depth image without its flying pixels [m].
+
+    ``diameter_m``: of the object, by which flying pixels are told.
+    """
     if isinstance(pose_input, ViewInput):
         return cloud_from_depth(
             pose_input.depth_m, pose_input.mask, pose_input.K, diameter_m
@@ -204,27 +236,31 @@ def object_points(pose_input: CloudInput | ViewInput, diameter_m: float) -> Floa
 
 
 def grey_depth(depth_m: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
-    """Show depth by its grey, near bright and far dark, black where nothing was read.
+    """Draw depth in grey, near bright and far dark, black without a reading.
 
-    From the 1st to the 99th percentile of the readings: a stray one does not set the scale.
+    The scale goes from the 1st to the 99th percentile of the readings, so stray ones do not set it.
     """
-    depths_m = depth_m[depth_m.isfinite() & (depth_m > 0)].sort().values
-    if len(depths_m) == 0:
+    readings_m = depth_m[depth_m.isfinite() & (depth_m > 0)].sort().values
+    if len(readings_m) == 0:
         return torch.zeros(3, *depth_m.shape)
-    last = len(depths_m) - 1
-    low = float(depths_m[round(0.01 * last)])
-    high = float(depths_m[round(0.99 * last)])
-    share = 1 - ((depth_m - low) / max(high - low, 1e-6)).clamp(0, 1)
-    grey = torch.where(depth_m > 0, 0.15 + 0.85 * share, 0.0)
+    last = len(readings_m) - 1
+    near_m = float(readings_m[round(0.01 * last)])
+    far_m = float(readings_m[round(0.99 * last)])
+    nearness = 1 - ((depth_m - near_m) / max(far_m - near_m, 1e-6)).clamp(0, 1)
+    grey = torch.where(depth_m > 0, _DARKEST_GREY + (1 - _DARKEST_GREY) * nearness, 0.0)
     return grey.nan_to_num(0.0).float().expand(3, -1, -1)
 
 
-_SEEN = (0.55, 0.55, 0.55)
-_AROUND = (0.7, 0.66, 0.6)
-_BACKGROUND = (0.45, 0.6, 0.75)
-_MASKED = (1.0, 0.85, 0.1)
-_AROUND_POINTS = 20_000
-_MARGIN = 0.6  # about an object in a close-up, in its own width
+_DARKEST_GREY = 0.15
+"""Of the farthest depth; black has no reading."""
+_OBJECT_COLOR = (0.55, 0.55, 0.55)
+_SURROUNDINGS_COLOR = (0.7, 0.66, 0.6)
+_BACKGROUND_COLOR = (0.45, 0.6, 0.75)
+_REGION_COLOR = (1.0, 0.85, 0.1)
+_MAX_SURROUNDINGS = 20_000
+"""Points of all that is not the object, and of the known background."""
+_MARGIN = 0.6
+"""Of a close-up about the object, as a share of the object's extent."""
 _CLOSE_UP_PX = 360
 
 
@@ -242,30 +278,21 @@ def pose_section(
     """Show one estimate: sentence and numbers, the picture, the cloud with the model in 3D.
 
     Pictures are of the whole view and of the object from near by, with the box in which it was
-    looked for, and the mask where there is no pose. ``image`` is what the pose is drawn over, of
-    the view's camera; None: its depth in grey. ``text`` comes before the sentence,
-    ``rows`` are those of a table.
+    searched, and the mask where there is no pose.
+
+    Args:
+        title: of the section.
+        pose_input: cloud or view that was posed.
+        estimate: its pose, or why there is none.
+        model: the object.
+        text: before the sentence about the pose.
+        image: that the pose is drawn over, of the view's camera; None: the view's depth in grey.
+        truth: ``camera_from_model``; None: it is unknown.
+        rows: of a table below.
     """
     drawings: list[Drawing] = []
     if isinstance(pose_input, ViewInput):
-        pose = estimate.camera_from_model
-        mask = pose_input.mask
-        K = pose_input.K
-        what = "depth image, near bright" if image is None else "picture"
-        image = grey_depth(pose_input.depth_m) if image is None else image
-        image = draw_region(image, pose_input, pose)
-        colors = [] if pose is None else ["the estimated pose blue"]
-        if pose is None or pose_input.is_region:
-            colors.append(f"the {'box' if pose_input.is_region else 'mask'} yellow")
-        caption = f"{what}; {', '.join(colors)}"
-        caption += ", the box of the truth green and dashed" if truth is not None else ""
-        whole = draw_pose(image, pose, model, K, truth)
-        drawings.append(Drawing(image=whole, caption=caption))
-        if bool(mask.any()):
-            near, K = close_up(image, mask, K)
-            near = draw_pose(near, pose, model, K, truth)
-            caption = f"the object from near by; {caption.partition('; ')[2]}"
-            drawings.append(Drawing(image=near, caption=caption))
+        drawings = _pose_drawings(pose_input, estimate, model, image, truth)
     points_m = object_points(pose_input, model.diameter_m)
     return Section(
         title=title,
@@ -278,8 +305,42 @@ def pose_section(
     )
 
 
+def _pose_drawings(
+    view: ViewInput,
+    estimate: PoseEstimate,
+    model: ObjectModel,
+    image: Float[Tensor, "3 h w"] | None,
+    truth: Rigid | None,
+) -> list[Drawing]:
+    """Draw a pose over the whole view, and over a close-up of the object."""
+    pose = estimate.camera_from_model
+    if image is None:
+        subject = "depth image, near bright"
+        image = grey_depth(view.depth_m)
+    else:
+        subject = "picture"
+    image = draw_region(image, view, pose)
+
+    colors: list[str] = []
+    if pose is not None:
+        colors.append("the estimated pose blue")
+    if pose is None or view.is_region:
+        colors.append(f"the {'box' if view.is_region else 'mask'} yellow")
+    if truth is not None:
+        colors.append("the box of the truth green and dashed")
+    legend = ", ".join(colors)
+
+    whole = draw_pose(image, pose, model, view.K, truth)
+    drawings = [Drawing(image=whole, caption=f"{subject}; {legend}")]
+    if bool(view.mask.any()):
+        near, near_K = close_up(image, view.mask, view.K)
+        near = draw_pose(near, pose, model, near_K, truth)
+        drawings.append(Drawing(image=near, caption=f"the object from near by; {legend}"))
+    return drawings
+
+
 def pose_sentence(estimate: PoseEstimate) -> str:
-    """Give where the object is, or why it is refused."""
+    """Say in a sentence where the object is, or why it is refused."""
     if estimate.camera_from_model is None:
         return f"Refused ({estimate.status}): {estimate.reason}."
     x, y, z = estimate.camera_from_model.t_m.tolist()
@@ -302,14 +363,15 @@ def pose_facts(
     method: str = "",
     agreeing: str = "votes or points that agree",
 ) -> list[tuple[str, str]]:
-    """List the facts of an estimate besides its pose.
+    """List the facts of an estimate other than its pose: names and values.
 
-    ``method``: what estimated it, if not empty; ``agreeing``: what its ``inlier_share`` is of.
+    ``method``: that estimated it, if not empty; ``agreeing``: the name of its ``inlier_share``.
     """
     facts = [("object", f"{estimate.object}, {model.diameter_m:.4f} m long")]
     if method:
         facts.append(("by", method))
-    if (evidence := estimate.evidence) is not None:
+    evidence = estimate.evidence
+    if evidence is not None:
         facts += [
             ("agreement", f"{evidence.agreement:.1%} of what was compared supports the pose"),
             ("visible", f"{evidence.supported_share:.0%} of the surface that faces the camera"),
@@ -344,7 +406,7 @@ def pose_facts(
 
 
 def pose_tables(estimate: PoseEstimate) -> dict[str, Sequence[Sequence[str]]]:
-    """Show the pose, and how far it may be off along each axis."""
+    """Give the tables of a pose, by title: its matrix, standard deviations and covariance."""
     tables: dict[str, Sequence[Sequence[str]]] = {}
     pose = estimate.camera_from_model
     if pose is not None:
@@ -360,10 +422,7 @@ def pose_tables(estimate: PoseEstimate) -> dict[str, Sequence[Sequence[str]]]:
         }
         tables["standard deviations about this answer alone"] = [
             ["", "x", "y", "z"],
-            *(
-                [what, *(f"{v:.3f}" if math.isfinite(v) else "free" for v in std.tolist())]
-                for what, std in stds.items()
-            ),
+            *([name, *map(_format_std, std.tolist())] for name, std in stds.items()),
         ]
         tables["covariance at the camera's origin, of rotation [rad] and translation [m]"] = [
             [f"{v:.2e}" for v in row] for row in estimate.covariance.tolist()
@@ -371,7 +430,13 @@ def pose_tables(estimate: PoseEstimate) -> dict[str, Sequence[Sequence[str]]]:
     return tables
 
 
+def _format_std(value: float) -> str:
+    """Format a standard deviation; along a free motion, of a declared symmetry, it is infinite."""
+    return f"{value:.3f}" if math.isfinite(value) else "free"
+
+
 def _matrix_rows(pose: Rigid) -> list[list[str]]:
+    """Format the rows of a transform's 3x4 matrix."""
     rows = torch.cat([pose.R, pose.t_m[:, None]], 1).tolist()
     return [[f"{value:.5f}" for value in row] for row in rows]
 
@@ -383,43 +448,67 @@ def pose_scene(
     model: ObjectModel,
     truth: Rigid | None = None,
 ) -> Scene:
-    """Show what was seen, the posed model, its keypoints, and the truth where it is known."""
+    """Make the 3D view of an estimate: the object's points, the posed model, and the rest.
+
+    Args:
+        pose_input: cloud or view that was posed.
+        points_m: those of the object in it (:func:`object_points`).
+        estimate: its pose, or why there is none.
+        model: the object.
+        truth: ``camera_from_model``, shown in green; None: it is unknown.
+    """
     pose = estimate.camera_from_model
-    layers = list[Layer]()
+    layers = [_point_layer("the object, as seen", points_m, _OBJECT_COLOR)]
     if pose is not None:
         layers += pose_layers(pose, model, with_box=truth is not None)
-    for other in estimate.alternatives:  # by axes and box, not shown at first
-        placed = other.camera_from_model.double()
+    for alternative in estimate.alternatives:
+        placed = alternative.camera_from_model.double()
         box_m = placed.apply(box_edges(model).double()).float()
         box = colored_lines(box_m, ALTERNATIVE)
-        layers.append(Layer(name=f"box if {other}", shape=box, is_shown=False))
+        layers.append(Layer(name=f"box if {alternative}", shape=box, is_shown=False))
         axes = frame_axes(placed.t_m, placed.R, model.diameter_m / 2)
-        layers.append(Layer(name=f"axes if {other}", shape=axes, is_shown=False))
+        layers.append(Layer(name=f"axes if {alternative}", shape=axes, is_shown=False))
     if truth is not None:
         layers += pose_layers(truth, model, is_true=True)
     if estimate.keypoints_m is not None:
         layers += keypoint_layers(estimate.keypoints_m, pose, model)
-    color = torch.tensor(_SEEN).expand(len(points_m), 3)
-    observed = Layer(name="the object, as seen", shape=Cloud(points=points_m, color=color))
-    layers.insert(0, observed)
     if isinstance(pose_input, ViewInput):
-        around_m = cloud_from_depth(pose_input.depth_m, ~pose_input.mask, pose_input.K).float()
-        around_m = take_evenly(around_m, _AROUND_POINTS)
-        around = Cloud(points=around_m, color=torch.tensor(_AROUND).expand(len(around_m), 3))
-        layers.append(Layer(name="all else", shape=around, is_shown=False))
-    if isinstance(pose_input, ViewInput) and (known := pose_input.background) is not None:
-        bin_m = cloud_from_depth(known.depth_m, known.depth_m > 0, pose_input.K).float()
-        bin_m = take_evenly(bin_m, _AROUND_POINTS)
-        drawn = Cloud(points=bin_m, color=torch.tensor(_BACKGROUND).expand(len(bin_m), 3))
-        layers.append(Layer(name="the known background", shape=drawn, is_shown=False))
+        layers += _surroundings_layers(pose_input)
     caption = "The cloud and the posed model" if pose is not None else "The cloud; there is no pose"
     return Scene(caption=caption, layers=layers)
+
+
+def _surroundings_layers(view: ViewInput) -> list[Layer]:
+    """Make the layers of all that is not the object, and of the known background; both hidden."""
+    around_m = cloud_from_depth(view.depth_m, ~view.mask, view.K).float()
+    around_m = take_evenly(around_m, _MAX_SURROUNDINGS)
+    layers = [_point_layer("all else", around_m, _SURROUNDINGS_COLOR, is_shown=False)]
+    if view.background is not None:
+        depth_m = view.background.depth_m
+        background_m = cloud_from_depth(depth_m, depth_m > 0, view.K).float()
+        background_m = take_evenly(background_m, _MAX_SURROUNDINGS)
+        layer = _point_layer(
+            "the known background", background_m, _BACKGROUND_COLOR, is_shown=False
+        )
+        layers.append(layer)
+    return layers
+
+
+def _point_layer(
+    name: str, points_m: Float[Tensor, "n 3"], color: Color, *, is_shown: bool = True
+) -> Layer:
+    """Make a layer of points of one colour."""
+    colors = torch.tensor(color).expand(len(points_m), 3)
+    return Layer(name=name, shape=Cloud(points=points_m, color=colors), is_shown=is_shown)
 
 
 def close_up(
     image: Float[Tensor, "3 h w"], mask: Bool[Tensor, "h w"], K: Float[Tensor, "3 3"]
 ) -> tuple[Float[Tensor, "3 _ _"], Float[Tensor, "3 3"]]:
-    """Cut out a square about the mask and enlarge it to a panel, with its camera."""
+    """Cut out a square about the mask, black beyond the image, and enlarge it.
+
+    Gives the picture and its intrinsic matrix (float64); without a mask, image and K as they are.
+    """
     rows, columns = mask.nonzero(as_tuple=True)
     if len(rows) == 0:
         return image, K
@@ -427,14 +516,17 @@ def close_up(
     high = torch.stack([columns.amax(), rows.amax()]) + 1
     side = int((1 + _MARGIN) * float((high - low).max()))
     left, top = ((low + high - side) // 2).tolist()
-    # Beyond the picture there is black.
+
+    # The image with a black border, within which the square lies.
     padded = torch.nn.functional.pad(image, (side, side, side, side))
-    part = padded[:, top + side : top + 2 * side, left + side : left + 2 * side]
+    padded_K = K.double().clone()
+    padded_K[:2, 2] += side
+    camera = Camera(width=padded.shape[2], height=padded.shape[1], K=padded_K)
+
+    left += side
+    top += side
+    square = padded[:, top : top + side, left : left + side]
     size = (_CLOSE_UP_PX, _CLOSE_UP_PX)
-    grown = torch.nn.functional.interpolate(part[None], size=size)[0]
-    scale = _CLOSE_UP_PX / side
-    moved = K.double().clone()
-    moved[:2, 2] -= torch.tensor([left - 0.5, top - 0.5], dtype=torch.float64)
-    moved[:2] *= scale
-    moved[:2, 2] -= 0.5
-    return grown, moved
+    enlarged = torch.nn.functional.interpolate(square[None], size=size)[0]
+    camera = resize_camera(crop_camera(camera, left, top, side, side), *size)
+    return enlarged, camera.K

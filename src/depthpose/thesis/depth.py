@@ -1,7 +1,7 @@
 """Chapter 2 of the thesis: its printed tables joined to our rows, and figures 2-1 and 2-5."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -17,22 +17,18 @@ from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.report.page import Drawing, depth_scale
 
 _METRICS = tuple(name for name, metric in METRICS.items() if metric.of == "depth")
-_FIRST = ("source", "method", "weights", "cap_m", *_METRICS, "protocol")
+_FIRST_COLUMNS = ("source", "method", "weights", "cap_m", *_METRICS, "protocol")
 
 
 @dataclass(frozen=True)
 class PublishedRow:
-    """One printed row: the seven numbers of a method for truth up to ``cap_m``.
-
-    ``protocol`` is what they were measured by: the thesis says ``eigen-raw`` of all but one;
-    ``note`` is the row's footnote.
-    """
+    """One printed row: the seven numbers of a method for truth up to ``cap_m``."""
 
     method: str
     cap_m: float
-    printed: str
-    protocol: str = "eigen-raw"
-    note: str = ""
+    printed: str  #: the numbers, in the order of our metrics of depth
+    protocol: str = "eigen-raw"  #: by which they were measured
+    note: str = ""  #: the row's footnote
 
     @property
     def errors(self) -> dict[str, float]:
@@ -70,29 +66,36 @@ def join_published(
     Returns:
         The columns of each row; ``source`` is ``published``, ``ours`` or ``difference``.
     """
-    printed = [
-        {
-            **dict.fromkeys(_FIRST, ""),
-            **{"source": "published", "method": row.method, "cap_m": row.cap_m},
-            **row.errors,
-            **{"protocol": row.protocol, "note": row.note},
-        }
-        for row in table.rows
-    ]
-    rows: list[dict[str, Any]] = [*printed]
+    published: list[dict[str, Any]] = []
+    for row in table.rows:
+        columns: dict[str, Any] = dict.fromkeys(_FIRST_COLUMNS, "")
+        columns |= {"source": "published", "method": row.method, "cap_m": row.cap_m}
+        columns |= row.errors
+        columns |= {"protocol": row.protocol, "note": row.note}
+        published.append(columns)
+
+    rows = list(published)
     for counterpart, row in our_rows:
         assert row.cap_m is not None, "the tables are of depth, and reproduce takes no disparity"
-        our_row = {**dict.fromkeys(_FIRST, ""), **row.columns(), "source": "ours"}
-        rows.append(our_row)
-        for other in printed:
-            if (other["method"], other["cap_m"]) == (counterpart, row.cap_m):
-                difference = {name: our_row[name] for name in _FIRST}
-                difference |= {"source": "difference", "method": f"{row.method} - {counterpart}"}
-                difference |= {name: our_row[name] - other[name] for name in _METRICS}
-                if row.protocol != other["protocol"]:
-                    difference["protocol"] = f"{row.protocol} against {other['protocol']}"
-                rows.append(difference)
+        ours = {**dict.fromkeys(_FIRST_COLUMNS, ""), **row.columns(), "source": "ours"}
+        rows.append(ours)
+        rows += [
+            _difference(ours, theirs)
+            for theirs in published
+            if theirs["method"] == counterpart and theirs["cap_m"] == row.cap_m
+        ]
     return sorted(rows, key=lambda row: -row["cap_m"])
+
+
+def _difference(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> dict[str, Any]:
+    """Subtract the thesis's row from one of ours."""
+    row = {name: ours[name] for name in _FIRST_COLUMNS}
+    row["source"] = "difference"
+    row["method"] = f"{ours['method']} - {theirs['method']}"
+    row |= {name: ours[name] - theirs[name] for name in _METRICS}
+    if ours["protocol"] != theirs["protocol"]:
+        row["protocol"] = f"{ours['protocol']} against {theirs['protocol']}"
+    return row
 
 
 _Row = PublishedRow
@@ -158,8 +161,10 @@ TABLES = {table.number: table for table in (
 
 _NEAR_M = 3.0
 _FAR_M = 80.0
+"""Depth of the brightest and of the darkest colour."""
 _GAP_PX = 8
 _BAR_PX = 18
+"""Height of the bar of colours."""
 
 DEPTH_SCALE = (
     f"Depth in every panel: {_NEAR_M:.0f} m (bright) to {_FAR_M:.0f} m (dark), logarithmic"
@@ -178,10 +183,10 @@ def draw_figure_2_5(
     panels = [Drawing(caption="left image", image=pair.left)]
     if pair.right is not None:
         panels.append(Drawing(caption="real right image", image=pair.right))
-    panels.append(_depth("predicted depth", pair, estimate))
+    panels.append(_depth_panel("predicted depth", pair, estimate))
     if estimate.right is not None:
         panels.append(Drawing(caption="predicted right image", image=estimate.right))
-    return panels + _lidar(pair, lidar_m)
+    return panels + _lidar_panels(pair, lidar_m)
 
 
 def draw_figure_2_1(
@@ -192,22 +197,25 @@ def draw_figure_2_1(
 ) -> list[Drawing]:
     """Make the six panels of figure 2-1, in its order.
 
-    The LiDAR is one scan drawn into the left image, NaN where no point falls. ``mono`` is of the
-    left view and the right one that it synthesised, ``stereo`` of the real pair by that matcher.
+    Args:
+        pair: left and right view.
+        lidar_m: one scan drawn into the left image, NaN where no point falls; None: left out.
+        mono: depth from the left view and the right one that was synthesised of it.
+        stereo: depth from the real pair, by the same matcher.
 
     Raises:
         InputError: the frame has no right view, or the estimate no synthesised one.
     """
     if pair.right is None or mono.right is None:
-        lacking = "the frame has no right view" if pair.right is None else "no view was synthesised"
-        raise InputError(f"{pair.name}: figure 2-1 compares two right views, but {lacking}.")
+        reason = "the frame has no right view" if pair.right is None else "no view was synthesised"
+        raise InputError(f"{pair.name}: figure 2-1 compares two right views, but {reason}.")
     return [
         Drawing(caption="(a) left image", image=pair.left),
         Drawing(caption="(b) real right image", image=pair.right),
         Drawing(caption="(c) synthesised right image", image=mono.right),
-        _depth("(d) depth from left and synthesised right", pair, mono),
-        _depth("(e) depth from left and real right", pair, stereo),
-        *(replace(panel, caption=f"(f) {panel.caption}") for panel in _lidar(pair, lidar_m)),
+        _depth_panel("(d) depth from left and synthesised right", pair, mono),
+        _depth_panel("(e) depth from left and real right", pair, stereo),
+        *_lidar_panels(pair, lidar_m, "(f) LiDAR"),
     ]
 
 
@@ -220,34 +228,45 @@ def arrange(columns: Sequence[Sequence[Drawing]], width_px: int = 621) -> Float[
     if not any(columns):
         raise InputError("a figure of no panel cannot be arranged; give a frame at least.")
     shrunk = [[shrink_to_width(panel.image, width_px) for panel in column] for column in columns]
-    count = max(map(len, shrunk))
-    heights = [max(c[k].shape[1] for c in shrunk if k < len(c)) + _GAP_PX for k in range(count)]
-    tall = []
+
+    # The panels of one row have equal height; a shorter column is filled up with white.
+    row_heights: list[int] = []
+    for k in range(max(map(len, shrunk))):
+        heights = [column[k].shape[1] for column in shrunk if k < len(column)]
+        row_heights.append(max(heights) + _GAP_PX)
+    filled_columns: list[Tensor] = []
     for column in shrunk:
-        cells = [F.pad(p, (0, _GAP_PX, 0, h - p.shape[1]), value=1.0)
-                 for p, h in zip(column, heights, strict=False)]  # fmt: skip
-        whole = torch.cat(cells, 1)
-        tall.append(F.pad(whole, (0, 0, 0, sum(heights) - whole.shape[1]), value=1.0))
-    grid = torch.cat(tall, 2)[..., :-_GAP_PX]
+        cells = [
+            F.pad(panel, (0, _GAP_PX, 0, height - panel.shape[1]), value=1.0)
+            for panel, height in zip(column, row_heights, strict=False)
+        ]
+        stacked = torch.cat(cells, 1)
+        missing_px = sum(row_heights) - stacked.shape[1]
+        filled_columns.append(F.pad(stacked, (0, 0, 0, missing_px), value=1.0))
+    grid = torch.cat(filled_columns, 2)[..., :-_GAP_PX]
+
     ramp_m = torch.logspace(0, 1, grid.shape[2], base=_FAR_M / _NEAR_M) * _NEAR_M
     bar = draw_depth(ramp_m[None], _NEAR_M, _FAR_M).expand(-1, _BAR_PX, -1)
     return torch.cat([grid, bar], 1)
 
 
-def _depth(caption: str, pair: StereoInput, estimate: DepthEstimate) -> Drawing:
+def _depth_panel(caption: str, pair: StereoInput, estimate: DepthEstimate) -> Drawing:
+    """Draw estimated depth, in the colours of every panel."""
     if estimate.depth_m is None:
         raise InputError(f"{pair.name}: a figure shows metres; give a camera with a baseline.")
     image = draw_depth(estimate.depth_m, _NEAR_M, _FAR_M)
     return Drawing(caption=caption, image=image, scale=depth_scale(_NEAR_M, _FAR_M))
 
 
-def _lidar(pair: StereoInput, lidar_m: Float[Tensor, "h w"] | None) -> list[Drawing]:
-    """Draw the LiDAR points over the left image, where there are any."""
+def _lidar_panels(
+    pair: StereoInput, lidar_m: Float[Tensor, "h w"] | None, caption: str = "LiDAR"
+) -> list[Drawing]:
+    """Draw the LiDAR points over the left image; no panel without a scan."""
     if lidar_m is None:
         return []
     # Figures show frames at half their size, where a single pixel would fade: points are 5 wide.
     image = draw_points(pair.left, lidar_m, _FAR_M, radius_px=2)
-    return [Drawing(caption="LiDAR", image=image, scale=depth_scale(_NEAR_M, _FAR_M))]
+    return [Drawing(caption=caption, image=image, scale=depth_scale(_NEAR_M, _FAR_M))]
 
 
 def shrink_to_width(image: Float[Tensor, "3 _ _"], width_px: int) -> Float[Tensor, "3 _ _"]:

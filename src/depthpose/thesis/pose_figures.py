@@ -68,25 +68,26 @@ def draw_discs(
 
     ``places`` are (u, v) in pixels and the distance: near ones cover far ones.
     """
-    order = places[:, 2].argsort(descending=True, stable=True)
-    inks = (255 * colors[order]).round().int().tolist()
-    for (u, v, _), ink in zip(places[order].tolist(), inks, strict=True):
+    far_to_near = places[:, 2].argsort(descending=True, stable=True)
+    rgb = (255 * colors[far_to_near]).round().int().tolist()
+    for (u, v, _), color in zip(places[far_to_near].tolist(), rgb, strict=True):
         box = (u - radius_px, v - radius_px, u + radius_px, v + radius_px)
-        pen.ellipse(box, fill=tuple(ink))
+        pen.ellipse(box, fill=tuple(color))
 
 
-_SURFACE = 4000
+_SURFACE_POINTS = 4000
 _MARGIN = 1.08
-_TURN_RAD = math.radians(35)
-_TILT_RAD = math.radians(20)
-"""From where models are looked at: from the side and somewhat from above."""
+"""Side of the picture, in diameters of the model."""
+_AZIMUTH_OFFSET_RAD = math.radians(35)
+_TILT_OFFSET_RAD = math.radians(20)
+"""By which the view departs from the side that a cloud was seen from: sideways and upwards."""
 
 
 @torch.inference_mode()
-def seen_points(
+def featured_points(
     net: GeoPoseNet, pose_input: AnyInput
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n c"]] | None:
-    """Give the points that the network sees, in the camera frame, and its features of them.
+    """Give the points that the network takes, in the camera frame, and its features of them.
 
     The features are those before the last layer; None where the input cannot be posed.
     """
@@ -109,42 +110,59 @@ def draw_features(
     model: ObjectModel,
     size_px: int = 400,
 ) -> Float[Tensor, "3 size size"]:
-    """Draw a cloud in the frame of its model, which is black, each point's share as its colour.
+    """Draw a cloud in colours over its model in black, both in the model's frame.
 
-    Looked at along parallel lines from the side that the cloud was seen from, so that the model
-    does not occlude it; the model's z axis is up.
+    The projection is parallel, from the side that the cloud was seen from, so that the model does
+    not occlude it; the model's z axis is up.
+
+    Args:
+        points_m: the cloud, in the model's frame.
+        share: value of each point, 0 to 1, for its colour (:func:`spectral`).
+        model: the object.
+        size_px: width and height of the picture.
     """
-    surface_m = sample_surface(model, _SURFACE)[0].double()
-    middle_m = (surface_m.amin(0) + surface_m.amax(0)) / 2
-    out = (points_m.double() - middle_m).mean(0)  # the side that the cloud was seen from
-    azimuth = math.atan2(float(out[1]), float(out[0])) + _TURN_RAD
-    level = math.hypot(float(out[0]), float(out[1]))
-    tilt = math.atan2(float(out[2]), level) * 0.5 + _TILT_RAD
+    surface_m = sample_surface(model, _SURFACE_POINTS)[0].double()
+    centre_m = (surface_m.amin(0) + surface_m.amax(0)) / 2
+    cloud_m = points_m.double()
+    view_from_model = _look_at_cloud((cloud_m - centre_m).mean(0))
+    scale = size_px / (_MARGIN * model.diameter_m)
+    centre_px = torch.tensor([size_px / 2, size_px / 2, 0.0], dtype=torch.float64)
+    surface_px = (surface_m - centre_m) @ view_from_model.T * scale + centre_px
+    cloud_px = (cloud_m - centre_m) @ view_from_model.T * scale + centre_px
+
+    canvas = Image.new("RGB", (size_px, size_px), "white")
+    pen = ImageDraw.Draw(canvas)
+    draw_discs(pen, surface_px, torch.zeros(len(surface_m), 3), 1.0)
+    draw_discs(pen, cloud_px, spectral(share), max(2.0, size_px / 110))
+    return picture_tensor(canvas, "figure 3-2")
+
+
+def _look_at_cloud(outward: Float64[Tensor, "3"]) -> Float64[Tensor, "3 3"]:
+    """Give the rotation ``view_from_model`` that looks at the side ``outward`` of a model.
+
+    The view is turned sideways and upwards from it, and half as steep.
+    """
+    x, y, z = outward.tolist()
+    azimuth = math.atan2(y, x) + _AZIMUTH_OFFSET_RAD
+    tilt = math.atan2(z, math.hypot(x, y)) * 0.5 + _TILT_OFFSET_RAD
     forward = -torch.tensor([
         math.cos(azimuth) * math.cos(tilt), math.sin(azimuth) * math.cos(tilt), math.sin(tilt),
     ], dtype=torch.float64)  # fmt: skip
     right = torch.tensor([-math.sin(azimuth), math.cos(azimuth), 0.0], dtype=torch.float64)
-    view_from_model = torch.stack([right, torch.linalg.cross(forward, right), forward])
-    scale = size_px / (_MARGIN * model.diameter_m)
-    centre_px = torch.tensor([size_px / 2, size_px / 2, 0.0], dtype=torch.float64)
-    back, front = (
-        (of_m - middle_m) @ view_from_model.T * scale + centre_px
-        for of_m in (surface_m, points_m.double())
-    )
-    canvas = Image.new("RGB", (size_px, size_px), "white")
-    pen = ImageDraw.Draw(canvas)
-    draw_discs(pen, back, torch.zeros(len(surface_m), 3), 1.0)
-    draw_discs(pen, front, spectral(share), max(2.0, size_px / 110))
-    return picture_tensor(canvas, "figure 3-2")
+    return torch.stack([right, torch.linalg.cross(forward, right), forward])
 
 
 _ARROWS = 220
 _ARROW_PX = 22.0
-_HEAD = 0.35
+_BARB = 0.35
+"""Length of the two lines of an arrow's head, as a share of the arrow."""
+_STAR_TIPS = 5
+_STAR_PX = (12, 5)
+"""Outer and inner radius of the star."""
+_CROSS_STROKES = (((255, 255, 255), 6, 11), ((217, 13, 13), 4, 9))
+"""Colour, width and reach [px] of a red cross on a white one."""
 _YELLOW = (242, 191, 0)
-_RED = (217, 13, 13)
-_INK = (38, 64, 140)
-_WHITE = (255, 255, 255)
+_ARROW_COLOR = (38, 64, 140)
 
 
 def draw_field(
@@ -156,53 +174,81 @@ def draw_field(
 ) -> Float[Tensor, "3 size size"]:
     """Draw directions of some points; a yellow star at the true keypoint, a red cross at the voted.
 
-    All are in the camera frame, directions of unit length. An arrow is as long as its direction
-    lies in the plane: one that points away from the viewer is short. The part that is shown holds
-    the cloud and both keypoints.
+    All are in the camera frame, directions of unit length, and drawn in the plane of x and y: an
+    arrow that points away from the viewer is short. The picture holds the cloud and both keypoints.
     """
-    marks = torch.stack([true_m, true_m if voted_m is None else voted_m]).double()[:, :2]
-    plane = points_m.double()[:, :2]
-    everything = torch.cat([plane, marks])
-    low = everything.amin(0)
-    high = everything.amax(0)
+    keypoints_xy = torch.stack([true_m, true_m if voted_m is None else voted_m]).double()[:, :2]
+    points_xy = points_m.double()[:, :2]
+    all_xy = torch.cat([points_xy, keypoints_xy])
+    low = all_xy.amin(0)
+    high = all_xy.amax(0)
     scale = (size_px - 3 * _ARROW_PX) / float((high - low).max().clamp(min=1e-9))
-    middle = (low + high) / 2
-    plane, marks = ((xy - middle) * scale + size_px / 2 for xy in (plane, marks))
+    centre = (low + high) / 2
+    points_px = (points_xy - centre) * scale + size_px / 2
+    keypoints_px = (keypoints_xy - centre) * scale + size_px / 2
+
     canvas = Image.new("RGB", (size_px, size_px), "white")
     pen = ImageDraw.Draw(canvas)
-    starts = take_evenly(plane, _ARROWS)
-    shafts = take_evenly(directions.double(), _ARROWS)
-    shafts = _ARROW_PX * shafts[:, :2]
-    for (x, y), (dx, dy) in zip(starts.tolist(), shafts.tolist(), strict=True):
-        tip = (x + dx, y + dy)
-        pen.line([(x, y), tip], _INK)
-        for side in (-0.5, 0.5):
-            barb = tip[0] - _HEAD * (dx + side * dy), tip[1] - _HEAD * (dy - side * dx)
-            pen.line([tip, barb], _INK)
-    (x, y), (u, v) = marks.tolist()
-    rim = [(math.radians(36 * k - 90), 5 if k % 2 else 12) for k in range(10)]
-    star = [(x + reach * math.cos(way), y + reach * math.sin(way)) for way, reach in rim]
-    pen.polygon(star, fill=_YELLOW, outline=(0, 0, 0))
-    for ink, width, reach in ((_WHITE, 6, 11), (_RED, 4, 9)) if voted_m is not None else ():
-        pen.line([(u - reach, v - reach), (u + reach, v + reach)], ink, width)
-        pen.line([(u - reach, v + reach), (u + reach, v - reach)], ink, width)
+    starts = take_evenly(points_px, _ARROWS)
+    shafts = _ARROW_PX * take_evenly(directions.double(), _ARROWS)[:, :2]
+    for start, shaft in zip(starts.tolist(), shafts.tolist(), strict=True):
+        _draw_arrow(pen, start, shaft)
+    true_px, voted_px = keypoints_px.tolist()
+    _draw_star(pen, true_px)
+    if voted_m is not None:
+        _draw_cross(pen, voted_px)
     return picture_tensor(canvas, "figure 3-4")
 
 
+def _draw_arrow(pen: ImageDraw.ImageDraw, start: Sequence[float], shaft: Sequence[float]) -> None:
+    """Draw an arrow from a pixel along a vector [px]."""
+    x, y = start
+    dx, dy = shaft
+    tip = (x + dx, y + dy)
+    pen.line([(x, y), tip], _ARROW_COLOR)
+    for side in (-0.5, 0.5):
+        barb = (tip[0] - _BARB * (dx + side * dy), tip[1] - _BARB * (dy - side * dx))
+        pen.line([tip, barb], _ARROW_COLOR)
+
+
+def _draw_star(pen: ImageDraw.ImageDraw, centre: Sequence[float]) -> None:
+    """Draw a yellow star about a pixel, a tip upwards."""
+    x, y = centre
+    corners: list[tuple[float, float]] = []
+    for k in range(2 * _STAR_TIPS):
+        angle = math.radians(180 / _STAR_TIPS * k - 90)
+        radius = _STAR_PX[k % 2]
+        corners.append((x + radius * math.cos(angle), y + radius * math.sin(angle)))
+    pen.polygon(corners, fill=_YELLOW, outline=(0, 0, 0))
+
+
+def _draw_cross(pen: ImageDraw.ImageDraw, centre: Sequence[float]) -> None:
+    """Draw a red cross with a white border about a pixel."""
+    u, v = centre
+    for color, width, reach in _CROSS_STROKES:
+        pen.line([(u - reach, v - reach), (u + reach, v + reach)], color, width)
+        pen.line([(u - reach, v + reach), (u + reach, v - reach)], color, width)
+
+
 _STEPS = 300
-_EXAGGERATED = 100
-"""First steps, in which neighbours attract each other twelve times as much: groups form early."""
+_EARLY_STEPS = 100
+"""First steps, in which neighbours attract each other more: groups form early."""
 _EXAGGERATION = 12.0
-_SEARCH = 40
+"""Factor of that attraction."""
+_BISECTIONS = 40
+"""Steps of the search of a neighbourhood's width."""
 
 
 def embed_line(features: Float[Tensor, "n c"], perplexity: float = 40.0) -> Float64[Tensor, " n"]:
     """Map features to numbers from 0 to 1, so that alike features get near numbers.
 
-    Begins along the principal component, and so always gives the same answer; gradient descent
-    with momentum and gains. Time and memory grow with the square of ``n``: thousands, not more.
+    Exact t-SNE in one dimension, by gradient descent with momentum and gains. It begins along the
+    principal component, and so always gives the same answer. Time and memory grow with the square
+    of ``n``: it is for thousands of points, not more.
 
-    A point has about ``perplexity`` neighbours.
+    Args:
+        features: of each point.
+        perplexity: about how many neighbours a point has.
 
     Raises:
         InputError: there are fewer points than three neighbourhoods.
@@ -216,19 +262,22 @@ def embed_line(features: Float[Tensor, "n c"], perplexity: float = 40.0) -> Floa
         )
     P = joint_probabilities(features, perplexity)
     centred = features.double() - features.double().mean(0)
-    y = centred @ torch.linalg.svd(centred, full_matrices=False)[2][0]
+    principal_axis = torch.linalg.svd(centred, full_matrices=False)[2][0]
+    y = centred @ principal_axis
     y = 1e-4 * y / y.std().clamp(min=1e-12)
     speed = torch.zeros_like(y)
     gain = torch.ones_like(y)
-    # A larger one than the curvature at the start allows tears groups apart, and on a line they
+    # A rate beyond what the curvature at the start allows tears groups apart, and on a line they
     # never come together again.
     rate = len(y) / (4 * _EXAGGERATION)
     for step in range(_STEPS):
-        is_early = step < _EXAGGERATED
-        gradient = kl_gradient(P * (_EXAGGERATION if is_early else 1.0), y)
-        agrees = gradient.sign() != speed.sign()
-        gain = torch.where(agrees, gain + 0.2, gain * 0.8).clamp(min=0.01)
-        speed = (0.5 if is_early else 0.8) * speed - rate * gain * gradient
+        is_early = step < _EARLY_STEPS
+        exaggeration = _EXAGGERATION if is_early else 1.0
+        momentum = 0.5 if is_early else 0.8
+        gradient = kl_gradient(P * exaggeration, y)
+        goes_on_downhill = gradient.sign() != speed.sign()
+        gain = torch.where(goes_on_downhill, gain + 0.2, gain * 0.8).clamp(min=0.01)
+        speed = momentum * speed - rate * gain * gradient
         y = y + speed
     low = y.amin()
     high = y.amax()
@@ -238,30 +287,38 @@ def embed_line(features: Float[Tensor, "n c"], perplexity: float = 40.0) -> Floa
 def joint_probabilities(
     features: Float[Tensor, "n c"], perplexity: float
 ) -> Float64[Tensor, "n n"]:
-    """Give the similarity of each pair: Gaussian neighbourhoods of equal perplexity, symmetric."""
+    """Give the similarities P of t-SNE: Gaussian neighbourhoods of one perplexity, symmetric.
+
+    They sum to 1 over all pairs.
+    """
     x = features.double()
     squares = torch.cdist(x, x, compute_mode="donot_use_mm_for_euclid_dist").square()
     squares.fill_diagonal_(torch.inf)
-    near = squares.amin(1, keepdim=True)
-    shifted = squares - near  # the nearest counts 1, so nothing vanishes
-    low = torch.full_like(near, 1e-12)
-    high = torch.full_like(near, 1e12)
-    for _ in range(_SEARCH):
+    nearest = squares.amin(1, keepdim=True)
+    shifted = squares - nearest  # the nearest neighbour weighs 1, so no row vanishes
+
+    # The precision of each Gaussian, by bisection of its logarithm: the wider it is, the larger is
+    # the entropy of its row, whose exponential is the perplexity.
+    low = torch.full_like(nearest, 1e-12)
+    high = torch.full_like(nearest, 1e12)
+    for _ in range(_BISECTIONS):
         precision = (low * high).sqrt()
-        rows = torch.exp(-shifted * precision)
-        total = rows.sum(1, keepdim=True)
-        mean = torch.where(rows > 0, shifted * rows, 0).sum(1, keepdim=True) / total
-        is_wide = total.log() + precision * mean > math.log(perplexity)  # entropy over its limit
-        low = torch.where(is_wide, precision, low)
-        high = torch.where(is_wide, high, precision)
-    rows = torch.exp(-shifted * high)
-    rows = rows / rows.sum(1, keepdim=True)
-    return (rows + rows.T) / (2 * len(x))
+        weights = torch.exp(-shifted * precision)
+        total = weights.sum(1, keepdim=True)
+        mean = torch.where(weights > 0, shifted * weights, 0).sum(1, keepdim=True) / total
+        entropy = total.log() + precision * mean
+        is_too_wide = entropy > math.log(perplexity)
+        low = torch.where(is_too_wide, precision, low)
+        high = torch.where(is_too_wide, high, precision)
+    weights = torch.exp(-shifted * high)
+    conditional = weights / weights.sum(1, keepdim=True)
+    return (conditional + conditional.T) / (2 * len(x))
 
 
 def kl_gradient(P: Float64[Tensor, "n n"], y: Float64[Tensor, " n"]) -> Float64[Tensor, " n"]:
-    """Gradient of the divergence of P from the Student neighbourhoods of y."""
-    gap = y[:, None] - y
-    near = 1 / (1 + gap.square())
-    near.fill_diagonal_(0)
-    return 4 * ((P - near / near.sum()) * near * gap).sum(1)
+    """Give the gradient by y of the divergence of P from the similarities of y (Student's t)."""
+    differences = y[:, None] - y
+    weights = 1 / (1 + differences.square())
+    weights.fill_diagonal_(0)
+    Q = weights / weights.sum()
+    return 4 * ((P - Q) * weights * differences).sum(1)

@@ -7,7 +7,8 @@ import statistics
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -225,6 +226,7 @@ def _difference(
 
 
 _ADD_POINTS = 1000
+"""About how many vertices of a model ADD(-S) is measured at."""
 LOOP_HYPOTHESES = 50
 """Hypotheses of the loop, as published ones take."""
 OUR_HYPOTHESES = (50, 128, 1024)
@@ -247,10 +249,15 @@ class VotingCase:
 def voting_cases(
     net: GeoPoseNet, views: Iterable[ViewSample], points: int
 ) -> Iterator[VotingCase | None]:
-    """Give the votes of up to so many points of each view; None where it has too few to be posed.
+    """Give the votes of some points of each view; None where it has too few to be posed.
 
-    The points are chosen at random, the same each time. Each votes from its own place; points of
-    one voxel share the network's direction. The net's objects have the names in the views.
+    The points are chosen at random, the same each time. Each votes from its own position; points of
+    one voxel share the network's direction.
+
+    Args:
+        net: the network, whose objects have the names in the views.
+        views: with truth.
+        points: most points of a view that vote.
 
     Raises:
         InputError: the weights are of another kind.
@@ -272,15 +279,15 @@ def voting_cases(
             yield None
             continue
         grid = voxelise(points_m, net.weights.cloud)
-        places = torch.nn.functional.pad(grid.coordinates, (1, 0))
-        seen_points = VotingPoints(
+        coordinates = torch.nn.functional.pad(grid.coordinates, (1, 0))  # all of cloud 0
+        voxels = VotingPoints(
             points_m=grid.points_m,
-            coordinates=places,
+            coordinates=coordinates,
             features=grid.features,
-            class_of_point=torch.full((len(places),), number),
+            class_of_point=torch.full((len(coordinates),), number),
         )
         with torch.inference_mode():
-            outputs = network.directions(seen_points) @ grid.grid_from_camera
+            outputs = network.directions(voxels) @ grid.grid_from_camera
             directions = torch.nn.functional.normalize(outputs, dim=-1)[grid.row_of_point]
         yield VotingCase(
             points_m=points_m,
@@ -295,64 +302,107 @@ def compare_voting(cases: Sequence[VotingCase | None], points: int) -> list[dict
     """Compare methods of voting on the same cases; give the columns of a row for each method.
 
     The pose follows from the keypoints by the same fit for all, without covariances, which only our
-    methods give. A view with too few points counts as a failure of every method. The time is the
-    median of the vote alone, on one thread. ``points``: the most of a cloud, for its column.
+    methods give. The time is the median of the vote alone, on one thread.
+
+    Args:
+        cases: of :func:`voting_cases`; None counts as a failure of every method.
+        points: most points of a view, for its column.
+
+    Raises:
+        InputError: every case is None.
     """
     usable = [case for case in cases if case is not None]
     if not usable:
         raise InputError(f"none of the {len(cases)} views has enough points to be posed")
-    # From the name, the number of hypotheses and the test for inliers to the function that votes.
-    voting_methods: dict[tuple[str, int | None, str], Callable[[VotingCase], Tensor]] = {
-        ("RANSAC, one by one (NumPy)", LOOP_HYPOTHESES, "angle"): lambda case: torch.from_numpy(
-            ransac_one_by_one(
-                case.points_m.double().numpy(), case.directions.double().numpy(), LOOP_HYPOTHESES
-            )
-        )
-    }
-    for hypotheses in OUR_HYPOTHESES:
-        for test in ("angle", "distance"):
-            config = VotingConfig(hypotheses=hypotheses, inlier_test=test)
-            voting_methods["RANSAC, ours", hypotheses, test] = lambda case, config=config: (
-                vote_ransac(case.points_m, case.directions, None, config).keypoints_m
-            )
-    for name, steps in (("least squares, published", 0), ("least squares, ours", 3)):
-        voting_methods[name, None, ""] = lambda case, steps=steps: (
-            meet_lines(case.points_m, case.directions, None, steps).keypoints_m
-        )
     rows: list[dict[str, Any]] = []
-    threads = torch.get_num_threads()
-    for (method, hypotheses, test), vote in voting_methods.items():
-        successes = 0
-        seconds = []
-        torch.set_num_threads(1)
-        try:
-            vote(usable[0])  # warm
-            for case in usable:
-                # Processor time of the one thread: other work on the machine does not count.
-                start = time.thread_time()
-                keypoints_m = vote(case)
-                seconds.append(time.thread_time() - start)
-                isotropic = torch.eye(3, dtype=torch.float64).expand(len(keypoints_m), 3, 3)
-                fit = fit_pose(keypoints_m.double(), isotropic, case.model.keypoints_m)
-                some_m = case.model.vertices_m[:: max(1, len(case.model.vertices_m) // _ADD_POINTS)]
-                pose = fit.camera_from_model
-                diameter_m = case.model.diameter_m
-                error_m = (adds_m if case.is_adds else add_m)(pose, case.truth, some_m)
-                successes += float(error_m) / diameter_m < SUCCESS_SHARE
-        finally:
-            torch.set_num_threads(threads)
+    for voting in _voting_methods():
+        successes, seconds = _time_votes(usable, voting.vote)
         row = {
             "points": points,
             "votes": sum(len(case.points_m) for case in usable) / len(usable),
-            "method": method,
-            "hypotheses": hypotheses,
-            "inliers by": test,
+            "method": voting.name,
+            "hypotheses": voting.hypotheses,
+            "inliers by": voting.inlier_test,
             "instances": len(cases),
             "success": 100 * successes / len(cases),
             "milliseconds": 1000 * statistics.median(seconds),
         }
         rows.append(row)
-    return [row | {"times faster": rows[0]["milliseconds"] / row["milliseconds"]} for row in rows]
+    loop_ms = rows[0]["milliseconds"]
+    return [row | {"times faster": loop_ms / row["milliseconds"]} for row in rows]
+
+
+class _Voting(NamedTuple):
+    """A method of voting: its columns of table 3.3, and the function from votes to keypoints."""
+
+    name: str
+    hypotheses: int | None
+    inlier_test: str
+    vote: Callable[[VotingCase], Tensor]
+
+
+def _voting_methods() -> list[_Voting]:
+    """List the methods of table 3.3; the loop, which the others are compared with, is the first."""
+    methods = [_Voting("RANSAC, one by one (NumPy)", LOOP_HYPOTHESES, "angle", _vote_by_loop)]
+    for hypotheses in OUR_HYPOTHESES:
+        for inlier_test in ("angle", "distance"):
+            config = VotingConfig(hypotheses=hypotheses, inlier_test=inlier_test)
+            vote = partial(_vote_by_ransac, config=config)
+            methods.append(_Voting("RANSAC, ours", hypotheses, inlier_test, vote))
+    for name, steps in (("least squares, published", 0), ("least squares, ours", 3)):
+        methods.append(_Voting(name, None, "", partial(_vote_by_least_squares, steps=steps)))
+    return methods
+
+
+def _vote_by_loop(case: VotingCase) -> Tensor:
+    """Find keypoints by the loop of :func:`ransac_one_by_one`."""
+    points_m = case.points_m.double().numpy()
+    directions = case.directions.double().numpy()
+    return torch.from_numpy(ransac_one_by_one(points_m, directions, LOOP_HYPOTHESES))
+
+
+def _vote_by_ransac(case: VotingCase, config: VotingConfig) -> Tensor:
+    """Find keypoints by our RANSAC."""
+    return vote_ransac(case.points_m, case.directions, None, config).keypoints_m
+
+
+def _vote_by_least_squares(case: VotingCase, steps: int) -> Tensor:
+    """Find keypoints by least squares, reweighted in ``steps`` steps."""
+    return meet_lines(case.points_m, case.directions, None, steps).keypoints_m
+
+
+def _time_votes(
+    cases: Sequence[VotingCase], vote: Callable[[VotingCase], Tensor]
+) -> tuple[int, list[float]]:
+    """Count the cases that a method of voting poses right, and measure the seconds of each vote.
+
+    Seconds are the processor time of one thread: other work on the machine does not count.
+    """
+    success_count = 0
+    seconds: list[float] = []
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        vote(cases[0])  # warms up
+        for case in cases:
+            start = time.thread_time()
+            keypoints_m = vote(case)
+            seconds.append(time.thread_time() - start)
+            success_count += _is_right(keypoints_m, case)
+    finally:
+        torch.set_num_threads(threads)
+    return success_count, seconds
+
+
+def _is_right(keypoints_m: Float[Tensor, "k 3"], case: VotingCase) -> bool:
+    """Whether the pose of voted keypoints has an ADD(-S) below a tenth of the diameter."""
+    isotropic = torch.eye(3, dtype=torch.float64).expand(len(keypoints_m), 3, 3)
+    fit = fit_pose(keypoints_m.double(), isotropic, case.model.keypoints_m)
+    step = max(1, len(case.model.vertices_m) // _ADD_POINTS)
+    points_m = case.model.vertices_m[::step]
+    measure = adds_m if case.is_adds else add_m
+    error_m = float(measure(fit.camera_from_model, case.truth, points_m))
+    return error_m / case.model.diameter_m < SUCCESS_SHARE
 
 
 def ransac_one_by_one(
@@ -365,30 +415,30 @@ def ransac_one_by_one(
     """Find every keypoint with a loop over keypoints and hypotheses.
 
     A hypothesis is the point nearest to the lines of two random points; its inliers are the points
-    whose unit direction comes within an angle of it; the best is refitted on its inliers.
-
-    Published practice is 50 hypotheses for each keypoint.
+    from which the cosine between unit direction and hypothesis is more than ``min_cosine``. The one
+    with the most is refitted to its inliers. Published practice is 50 hypotheses for each keypoint.
     """
     random = np.random.default_rng(seed)
     keypoints = []
     for k in range(directions.shape[1]):
         n = directions[:, k]
-        best = -1
-        chosen = np.ones(len(n), bool)
+        most_inliers = -1
+        best_inliers = np.ones(len(n), bool)
         for _ in range(hypotheses):
             pair = random.choice(len(points_m), 2, replace=False)
             try:
-                tried = np.linalg.solve(*_normal_equations(points_m[pair], n[pair]))
+                hypothesis = np.linalg.solve(*_normal_equations(points_m[pair], n[pair]))
             except np.linalg.LinAlgError:
                 continue
-            way = tried - points_m
-            inliers = (way * n).sum(1) / np.sqrt((way * way).sum(1)).clip(1e-300) > min_cosine
+            offsets = hypothesis - points_m
+            distances = np.sqrt((offsets * offsets).sum(1)).clip(1e-300)
+            inliers = (offsets * n).sum(1) / distances > min_cosine
             count = np.count_nonzero(inliers)
-            if count > best:
-                best = count
-                chosen = inliers
+            if count > most_inliers:
+                most_inliers = count
+                best_inliers = inliers
         try:
-            refitted = np.linalg.solve(*_normal_equations(points_m[chosen], n[chosen]))
+            refitted = np.linalg.solve(*_normal_equations(points_m[best_inliers], n[best_inliers]))
         except np.linalg.LinAlgError:  # no inlier but parallel ones, or none: all votes count
             refitted = np.linalg.lstsq(*_normal_equations(points_m, n), rcond=None)[0]
         keypoints.append(refitted)
@@ -396,6 +446,10 @@ def ransac_one_by_one(
 
 
 def _normal_equations(points_m: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of the point nearest to the lines through ``points_m`` along ``n``; singular if parallel."""
+    """Give A and b of the normal equations ``A x = b`` of the point nearest to lines.
+
+    The lines go through ``points_m`` along the unit directions ``n``; A is singular if they are
+    parallel.
+    """
     A = len(points_m) * np.eye(3) - n.T @ n
     return A, points_m.sum(0) - n.T @ (n * points_m).sum(1)

@@ -19,36 +19,31 @@ from depthpose.report.page import Scale, Scene
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Shown:
-    """A picture among the files, with what its colours mean.
-
-    ``values``: file with a number for each pixel, which the page shows under the pointer.
-    """
+    """A picture that the page shows, by its name among the files of the answer."""
 
     file: str
     caption: str
-    values: str | None = None
-    unit: str = ""
-    scale: Scale | None = None
+    values: str | None = None  #: file with a number for each pixel, shown under the pointer
+    unit: str = ""  #: of these numbers
+    scale: Scale | None = None  #: what the colours mean; None: they are no numbers
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Answer:
-    """An estimate, or a refusal: a sentence and what is shown below it, and files to download.
+    """An estimate or a refusal, as the page shows it, with files to download."""
 
-    ``terms``: of the weights, where they restrict use.
-    """
-
-    is_ok: bool
+    is_ok: bool  #: neither refused nor warned of
     sentence: str
-    facts: Sequence[tuple[str, str]]
+    facts: Sequence[tuple[str, str]]  #: names and values
     scene: Scene
-    terms: str = ""
-    tables: Mapping[str, Sequence[Sequence[str]]] = field(default_factory=dict)
+    terms: str = ""  #: of the weights, where they restrict use
+    tables: Mapping[str, Sequence[Sequence[str]]] = field(default_factory=dict)  #: by captions
     pictures: Sequence[Shown] = ()
-    files: Mapping[str, bytes] = field(default_factory=dict)
+    files: Mapping[str, bytes] = field(default_factory=dict)  #: by names
 
 
-MOST_PIXELS = 12_500_000  # most pixels of a picture: those of a phone's
+MOST_PIXELS = 12_500_000
+"""Of a picture that is sent: those of a phone's camera."""
 KINDS: dict[str, tuple[str, tuple[str, ...]]] = {
     "image": ("a picture", LISTED_SUFFIXES),
     "right": ("a picture", LISTED_SUFFIXES),
@@ -58,15 +53,17 @@ KINDS: dict[str, tuple[str, tuple[str, ...]]] = {
     "cloud": ("a point cloud", tuple(CLOUD_READERS)),
     "cad": ("a model file", tuple(MESH_READERS)),
 }
-"""What each field of the forms takes."""
+"""The files that each field of the forms takes: in words, and their suffixes."""
 
-_FIELDS = "the camera fields"
+_CAMERA_OF_FIELDS = "the camera fields"
+"""Name of the file that is written of these fields, as errors show it."""
 _LONGEST_NAME = 60
+"""Characters of the name that a file keeps."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Form:
-    """Fields as typed, and files, of one request, whose folder is removed with it."""
+    """Fields as typed, and files, of one request; its folder is deleted when it is answered."""
 
     folder: Path
     fields: Mapping[str, str]
@@ -75,8 +72,8 @@ class Form:
     def file(self, field: str) -> Path:
         """Give the file of a field."""
         if field not in self.files:
-            what, suffixes = KINDS[field]
-            raise InputError(f"{field}: no file; choose {what} ({', '.join(suffixes)})")
+            noun, suffixes = KINDS[field]
+            raise InputError(f"{field}: no file; choose {noun} ({', '.join(suffixes)})")
         return self.files[field]
 
     def number(self, field: str) -> float | None:
@@ -93,16 +90,21 @@ class Form:
         return value
 
     def camera(self, keys: Mapping[str, Any], size: tuple[int, int] | None = None) -> Camera:
-        """Read the camera file that was sent, or make a camera of the fields."""
+        """Read the camera file that was sent, or make a camera of fields.
+
+        Args:
+            keys: of a camera file, from the fields; None: left empty.
+            size: of the image [px], for a camera file without it.
+        """
         if "camera" in self.files:
             return read_camera(self.files["camera"], size)
-        path = self.folder / _FIELDS
-        # The same way as a file, so that the same mistakes are found.
-        write_json(path, {k: v for k, v in keys.items() if v is not None})
+        # Written and read as a file is, so that the same mistakes are found.
+        path = self.folder / _CAMERA_OF_FIELDS
+        write_json(path, {key: value for key, value in keys.items() if value is not None})
         return read_camera(path)
 
     def pinhole_keys(self, size: tuple[int, int], focal_px: float | None) -> dict[str, Any]:
-        """Give size and K of a camera from the fields; the principal point may be the centre."""
+        """Give size and K as keys of a camera file; an empty principal point is the centre."""
         cx = self.number("cx_px")
         cy = self.number("cy_px")
         cx = (size[0] - 1) / 2 if cx is None else cx
@@ -112,7 +114,7 @@ class Form:
 
 
 def without_paths(text: str, folder: Path) -> str:
-    """Take this machine's folders out of a message: a user knows the names of the files."""
+    """Remove the folder of a request from a message, so that files have their own names in it."""
     fields = "|".join(KINDS)
     return re.sub(f"{re.escape(str(folder))}/(({fields})/)?", "", text)
 
@@ -127,29 +129,36 @@ def refuse_large(name: str, width: int, height: int) -> None:
 
 
 def keep_file(folder: Path, field: str, sent_name: str, data: bytes) -> Path:
-    """Write an uploaded file, under its own name where that is harmless."""
+    """Write an uploaded file into the folder of a request, and give its path.
+
+    It keeps its name, shortened and without characters that are not safe in names.
+
+    Raises:
+        InputError: the field takes no files, or none of this suffix.
+    """
     if field not in KINDS:
         raise InputError(f"{field!r} is no file field of this page; known are {', '.join(KINDS)}")
-    what, suffixes = KINDS[field]
+    noun, suffixes = KINDS[field]
     # ASCII alone: results bear the name too, and go into the header of an answer.
     name = re.sub(r"[^A-Za-z0-9_.-]+", "_", sent_name.replace("\\", "/").rpartition("/")[2])
     path = Path(name.lstrip(".-"))
     if path.suffix.lower() not in suffixes or not path.stem:
         raise InputError(
-            f"{field}: {sent_name!r} is not {what}; this field takes {', '.join(suffixes)}"
+            f"{field}: {sent_name!r} is not {noun}; this field takes {', '.join(suffixes)}"
         )
-    path_of_copy = folder / field / f"{path.stem[:_LONGEST_NAME]}{path.suffix}"
-    write_bytes(path_of_copy, data)
-    return path_of_copy
+    written = folder / field / f"{path.stem[:_LONGEST_NAME]}{path.suffix}"
+    write_bytes(written, data)
+    return written
 
 
-EXAMPLE_SEED = 9  # no weights were trained on streets or views of this seed
+EXAMPLE_SEED = 9
+"""Of streets and views that no weights were trained on."""
 
 
 def example_form(folder: Path, fields: dict[str, str]) -> dict[str, Any]:
-    """Give the content of a form as the page takes it; each file is named after its field."""
-    files = [
-        {"field": p.stem, "name": f"example-{p.name}", "data": b64encode(p.read_bytes()).decode()}
-        for p in sorted(folder.iterdir())
-    ]
+    """Give the content of a form as JSON for the page; files in ``folder`` have fields' names."""
+    files: list[dict[str, str]] = []
+    for path in sorted(folder.iterdir()):
+        data = b64encode(path.read_bytes()).decode()
+        files.append({"field": path.stem, "name": f"example-{path.name}", "data": data})
     return {"files": files, "fields": fields}

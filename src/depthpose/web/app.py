@@ -47,7 +47,7 @@ from depthpose.web.depth import answer_depth, depth_example
 from depthpose.web.pose import answer_pose, pose_example
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
-_SAFE = {
+_SAFE_HEADERS = {
     # Nothing is loaded from elsewhere, and nobody else may show the page in a frame.
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
     "img-src 'self' data:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
@@ -59,11 +59,15 @@ _SAFE = {
 _MOST_FILES = 6
 _MOST_FIELDS = 30
 _LONGEST_FIELD = 4096
+"""Limits of a form; a field's in bytes."""
 
 
 @dataclass(frozen=True)
 class HostCheck:
-    """Refuses requests from other pages, and tells the browser what this page may load."""
+    """Refuses requests from other pages, and tells the browser what this page may load.
+
+    ``hosts``: names under which this page may be requested; None: any.
+    """
 
     app: ASGIApp
     hosts: tuple[str, ...] | None
@@ -73,7 +77,7 @@ class HostCheck:
 
         async def send_safely(message: Message) -> None:
             if message["type"] == "http.response.start":
-                MutableHeaders(scope=message).update(_SAFE)
+                MutableHeaders(scope=message).update(_SAFE_HEADERS)
             await send(message)
 
         is_request = scope["type"] == "http"
@@ -82,7 +86,7 @@ class HostCheck:
 
 
 def refuse_other_host(request: Request, hosts: tuple[str, ...] | None) -> Response | None:
-    """Refuse a request under another name than ours, or sent by another web page."""
+    """Give the refusal of a request under another host name, or sent by another page; else None."""
     host = request.headers.get("host", "")
     try:
         name = urlsplit(f"//{host}").hostname
@@ -102,7 +106,7 @@ def refuse_other_host(request: Request, hosts: tuple[str, ...] | None) -> Respon
 
 
 async def error_response(_: Request, error: Exception) -> Response:
-    """Answer a refusal with its message; the trace of another error is on the server's terminal."""
+    """Answer a refusal or an error with its message; an error's trace is on the terminal."""
     if isinstance(error, HTTPException):
         return JSONResponse({"error": error.detail}, error.status_code, error.headers)
     message = f"depthpose failed ({type(error).__name__}: {error}); see the server's terminal"
@@ -112,11 +116,14 @@ async def error_response(_: Request, error: Exception) -> Response:
 Result = TypeVar("Result")
 
 GRACE_S = 10.0
+"""Seconds after which an upload must have come at the least rate."""
 LEAST_BYTES_S = 20_000
-"""An upload with fewer bytes a second, after so many seconds, is ended: it keeps others waiting."""
-MOMENT_S = 0.02
-_FULL = "too many requests wait for one computation; try again later"
-_STOP_S = 10.0  # so long a computation has to end once it was stopped: one step of it may be long
+"""Least bytes a second of an upload; a slower one is ended, for it keeps others waiting."""
+DISCONNECT_WAIT_S = 0.02
+"""Seconds in which the server sees that a connection was closed."""
+_QUEUE_FULL = "too many requests wait for one computation; try again later"
+_STOP_S = 10.0
+"""Seconds that a computation has to end once it was stopped: one step of it may be long."""
 
 
 class _Stopped(BaseException):
@@ -130,11 +137,11 @@ class TookTooLong(Exception):  # noqa: N818  what happened
 def run_in_time(work: Callable[[], Result], most_s: float) -> Result:
     """Compute in a thread, and stop it after a time limit.
 
-    It ends at the next step of Python's; one that is in a long call of a library then goes on
-    beside what comes after it, until that call ends.
+    A stopped computation ends at the next step of the interpreter. If it is within a long call of a
+    library, it is left to run on beside later computations until that call returns.
 
     Raises:
-        TookTooLong: it did not end before.
+        TookTooLong: it did not end within ``most_s`` seconds.
     """
     results = list[Result]()
     errors = list[BaseException]()
@@ -142,7 +149,7 @@ def run_in_time(work: Callable[[], Result], most_s: float) -> Result:
     def run() -> None:
         try:
             results.append(work())
-        except BaseException as error:  # noqa: BLE001  raised where it was asked for
+        except BaseException as error:  # noqa: BLE001  raised again in the caller's thread
             errors.append(error)
 
     thread = threading.Thread(target=run, daemon=True)
@@ -150,9 +157,8 @@ def run_in_time(work: Callable[[], Result], most_s: float) -> Result:
     thread.join(most_s)
     if thread.is_alive():
         assert thread.ident is not None
-        ident = ctypes.c_ulong(thread.ident)
-        kind = ctypes.py_object(_Stopped)
-        ctypes.pythonapi.PyThreadState_SetAsyncExc(ident, kind)
+        thread_id = ctypes.c_ulong(thread.ident)
+        ctypes.pythonapi.PyThreadState_SetAsyncExc(thread_id, ctypes.py_object(_Stopped))
         thread.join(_STOP_S)
     if results:
         return results[0]
@@ -165,25 +171,41 @@ def run_in_time(work: Callable[[], Result], most_s: float) -> Result:
 class Queue:
     """Computations, one at a time; a limited number of requests may wait for one."""
 
-    most: int
-    most_s: float  #: of one computation; it is stopped then
-    one: anyio.CapacityLimiter = field(default_factory=partial(anyio.CapacityLimiter, 1))
-    tickets: list[str] = field(default_factory=list)
+    max_waiting: int
+    most_s: float  #: of one computation, which is stopped then
+    limiter: anyio.CapacityLimiter = field(default_factory=partial(anyio.CapacityLimiter, 1))
+    tickets: list[str] = field(default_factory=list)  #: of the one that computes, and who waits
+
+    @property
+    def is_full(self) -> bool:
+        """Whether no further request may wait."""
+        return len(self.tickets) > self.max_waiting
 
     async def compute(
-        self, ticket: str, work: Callable[[], Result], is_gone: Callable[[], Awaitable[bool]]
+        self,
+        ticket: str,
+        work: Callable[[], Result],
+        has_client_gone: Callable[[], Awaitable[bool]],
     ) -> Result | None:
-        """Compute in a thread once all earlier computations are done; None: the client has left.
+        """Compute in a thread once all earlier computations are done.
 
-        By the ticket the client asks for its place in the queue; 503 where too many wait, and where
-        the computation takes too long.
+        Args:
+            ticket: by which the client asks for its position in the queue.
+            work: the computation.
+            has_client_gone: whether nobody waits for the result any longer.
+
+        Returns:
+            The result; None if the client has gone before its turn.
+
+        Raises:
+            HTTPException: 503: too many wait, or the computation takes too long.
         """
-        if len(self.tickets) > self.most:  # one of them is at work
-            raise HTTPException(503, _FULL)
+        if self.is_full:
+            raise HTTPException(503, _QUEUE_FULL)
         self.tickets.append(ticket)
         try:
-            async with self.one:
-                if await is_gone():
+            async with self.limiter:
+                if await has_client_gone():
                     return None
                 return await anyio.to_thread.run_sync(run_in_time, work, self.most_s)
         except TookTooLong as error:
@@ -198,9 +220,9 @@ class Queue:
 
 async def has_gone(receive: Receive) -> bool:
     """Whether the client of a request that was read whole has closed its connection."""
-    # What is still to come of the request is read first, and the server gets a moment to see the
-    # end of a connection from which it had stopped reading.
-    with anyio.move_on_after(MOMENT_S):
+    # The rest of the request is read first, and the server gets a moment to see the end of a
+    # connection from which it had stopped reading.
+    with anyio.move_on_after(DISCONNECT_WAIT_S):
         while (await receive())["type"] != "http.disconnect":
             pass
         return True
@@ -208,12 +230,12 @@ async def has_gone(receive: Receive) -> bool:
 
 
 def paced(receive: Receive) -> Receive:
-    """Give a request's body as long as it arrives fast enough."""
+    """Make a function that receives a request's body, and refuses one that comes too slowly."""
     start = time.monotonic()
     size = 0
 
     async def receive_in_time() -> MutableMapping[str, Any]:
-        """Receive a part of the request; refuse an upload that comes too slowly."""
+        """Receive a part of the body; 408 if it comes too late for the bytes before it."""
         nonlocal size
         left_s = start + GRACE_S + size / LEAST_BYTES_S - time.monotonic()
         try:
@@ -224,7 +246,7 @@ def paced(receive: Receive) -> Receive:
                 408,
                 f"the upload came too slowly ({size} bytes in {time.monotonic() - start:.0f} s, "
                 f"less than {LEAST_BYTES_S} a second); send smaller files",
-                # What is still to come is not waited for.
+                # The rest of the body is not waited for.
                 headers={"Connection": "close"},
             ) from error
         size += len(message.get("body", b""))
@@ -233,11 +255,13 @@ def paced(receive: Receive) -> Receive:
     return receive_in_time
 
 
-_MOST_DIGITS = 18  # of a Content-Length
+_MOST_DIGITS = 18
+"""Of a Content-Length: Python reads no number of thousands of digits."""
 TICKET = "x-ticket"
-"""Header of a request: a random name, by which the page asks for its place in the queue."""
-_RESULTS = 3  # answers whose files are kept in memory for downloads
-_TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".json": "application/json",
+"""Header of a request: a random name, by which the page asks for its position in the queue."""
+_STORED_ANSWERS = 3
+"""Answers whose files stay in memory for downloads."""
+_MEDIA_TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".json": "application/json",
           ".zip": "application/zip"}  # fmt: skip
 
 
@@ -258,12 +282,12 @@ class Limits:
     in the same browser from reading answers by a name of their own (DNS rebinding)."""
 
 
-class Pages:
-    """Handlers of the routes, with the networks and the latest answers' files."""
+class Handlers:
+    """Handlers of the routes, with the networks and the files of the latest answers."""
 
     def __init__(self, depth: FakestereoNet, pose: GeoPoseNet, limits: Limits) -> None:
         self._limits = limits
-        self._kinds: dict[str, Callable[[Form], Answer]] = {
+        self._estimators: dict[str, Callable[[Form], Answer]] = {
             "depth": partial(answer_depth, net=depth),
             "pose": partial(answer_pose, net=pose),
         }
@@ -272,8 +296,8 @@ class Pages:
             "pose": cache(partial(pose_example, pose)),
         }
         self._queue = Queue(limits.waiting, limits.compute_s)
-        self._uploads = 0
-        self._kept: OrderedDict[str, Mapping[str, bytes]] = OrderedDict()
+        self._upload_count = 0
+        self._stored_files: OrderedDict[str, Mapping[str, bytes]] = OrderedDict()
         loader = PackageLoader("depthpose.web", ".")
         template = Environment(loader=loader, autoescape=True, undefined=StrictUndefined)
         page = template.get_template("page.html").render(
@@ -302,62 +326,75 @@ class Pages:
 
     async def example(self, request: Request) -> Response:
         """Give files and fields to fill a form with; they are made at the first request."""
-        if (kind := request.path_params["kind"]) not in self._examples:
+        kind = request.path_params["kind"]
+        if kind not in self._examples:
             raise HTTPException(404, f"only {' and '.join(self._examples)} are estimated here")
-        make = self._examples[kind]
+        make_example = self._examples[kind]
         try:
-            fields = await self._queue.compute("", make, partial(has_gone, request.receive))
+            content = await self._queue.compute(
+                "", make_example, partial(has_gone, request.receive)
+            )
         except InputError as error:
             raise HTTPException(400, str(error)) from error
-        return JSONResponse(fields)
+        return JSONResponse(content)
 
-    async def place(self, request: Request) -> Response:
+    async def position(self, request: Request) -> Response:
         """Give the number of computations before that of a ticket; null: it does not wait here."""
         ticket = request.path_params["ticket"]
         waiting = self._queue.tickets
         return JSONResponse({"before": waiting.index(ticket) if ticket in waiting else None})
 
     async def estimate(self, request: Request) -> Response:
-        """Answer a form."""
-        # What is too large is refused unread: a server reads no more than is announced.
-        text = request.headers.get("content-length", "")
-        most = self._limits.upload_bytes
-        if not text.isdecimal() or "transfer-encoding" in request.headers:
-            raise HTTPException(
-                411, "the request has no Content-Length, or comes in chunks; send it whole, with "
-                "its size",
-            )  # fmt: skip
-        # Of more digits than these Python makes no number.
-        size = int(text) if len(text) <= _MOST_DIGITS else 10**_MOST_DIGITS
-        if size > most:
-            raise HTTPException(
-                413,
-                f"the files are {size / 1e6:.1f} MB together, more than the {most / 1e6:.0f} "
-                "MB allowed; send smaller ones, or start 'depthpose serve' with a larger "
-                "--max-upload-mb",
-            )
-        if (kind := request.path_params["kind"]) not in self._kinds:
-            raise HTTPException(404, f"only {' and '.join(self._kinds)} are estimated here")
-        estimate = self._kinds[kind]
-        if len(self._queue.tickets) > self._queue.most:
-            raise HTTPException(503, _FULL)
+        """Estimate for a form, and give the answer as JSON; 400 if the client has gone."""
+        self._refuse_large_body(request)
+        kind = request.path_params["kind"]
+        if kind not in self._estimators:
+            raise HTTPException(404, f"only {' and '.join(self._estimators)} are estimated here")
+        if self._queue.is_full:  # before the files are received in vain
+            raise HTTPException(503, _QUEUE_FULL)
         with TemporaryDirectory(prefix="depthpose-") as folder:
             try:
-                form = await self._upload(request, Path(folder))
+                form = await self._receive_form(request, Path(folder))
                 ticket = request.headers.get(TICKET, "")
-                work = partial(estimate, form)
+                work = partial(self._estimators[kind], form)
                 answer = await self._queue.compute(ticket, work, partial(has_gone, request.receive))
             except (InputError, MissingExtraError) as error:
                 raise HTTPException(400, without_paths(str(error), Path(folder))) from error
             except ClientDisconnect:
                 answer = None
-        return Response(status_code=400) if answer is None else JSONResponse(self._keep(answer))
+        if answer is None:
+            return Response(status_code=400)
+        return JSONResponse(self._store(answer))
 
-    async def _upload(self, request: Request, folder: Path) -> Form:
-        """Read the form, one of a few at the same time, as long as it keeps coming."""
-        if self._uploads >= self._limits.uploads:
+    def _refuse_large_body(self, request: Request) -> None:
+        """Refuse a body that is too large before it is read, by the size that is announced.
+
+        A server reads no more than that.
+        """
+        text = request.headers.get("content-length", "")
+        if not text.isdecimal() or "transfer-encoding" in request.headers:
+            raise HTTPException(
+                411, "the request has no Content-Length, or comes in chunks; send it whole, with "
+                "its size",
+            )  # fmt: skip
+        size = int(text) if len(text) <= _MOST_DIGITS else 10**_MOST_DIGITS
+        max_size = self._limits.upload_bytes
+        if size > max_size:
+            raise HTTPException(
+                413,
+                f"the files are {size / 1e6:.1f} MB together, more than the {max_size / 1e6:.0f} "
+                "MB allowed; send smaller ones, or start 'depthpose serve' with a larger "
+                "--max-upload-mb",
+            )
+
+    async def _receive_form(self, request: Request, folder: Path) -> Form:
+        """Receive the fields of a form, and write its files into a folder.
+
+        503 where too many uploads arrive at the same time, 408 where this one is too slow.
+        """
+        if self._upload_count >= self._limits.uploads:
             raise HTTPException(503, "too many uploads at the same time; try again later")
-        self._uploads += 1
+        self._upload_count += 1
         try:
             fields: dict[str, str] = {}
             files: dict[str, Path] = {}
@@ -373,41 +410,35 @@ class Pages:
                         files[name] = keep_file(folder, name, value.filename, await value.read())
             return Form(folder=folder, fields=fields, files=files)
         finally:
-            self._uploads -= 1
+            self._upload_count -= 1
 
     async def download(self, request: Request) -> Response:
         """Give a file of one of the latest answers, or all of them as a ZIP."""
         key = request.path_params["key"]
         name = request.path_params["name"]
-        files = self._kept.get(key)
+        files = self._stored_files.get(key)
         if files is None or name not in {*files, "all.zip"}:
             raise HTTPException(
-                404, f"only the last {_RESULTS} answers are kept, and not {name!r}; ask again"
+                404,
+                f"only the last {_STORED_ANSWERS} answers are kept, and not {name!r}; ask again",
             )
-        if name == "all.zip" and name not in files:
-            packed = io.BytesIO()
-            with zipfile.ZipFile(packed, "w") as archive:  # most files are compressed already
-                for file_name, data in files.items():
-                    archive.writestr(file_name, data)
-            files = {name: packed.getvalue()}
-        media_type = _TYPES.get(Path(name).suffix, "application/octet-stream")
+        data = files[name] if name in files else _pack_files(files)
+        media_type = _MEDIA_TYPES.get(Path(name).suffix, "application/octet-stream")
         headers = {"Content-Disposition": f'attachment; filename="{name}"'}
-        return Response(files[name], media_type=media_type, headers=headers)
+        return Response(data, media_type=media_type, headers=headers)
 
-    def _keep(self, answer: Answer) -> dict[str, Any]:
-        """Keep the files of an answer, the latest few alone; give what the page shows."""
+    def _store(self, answer: Answer) -> dict[str, Any]:
+        """Store the files of an answer in place of the oldest ones; give what the page shows."""
         key = secrets.token_urlsafe(12)
-        self._kept[key] = answer.files
-        while len(self._kept) > _RESULTS:
-            self._kept.popitem(last=False)
-        pictures = []
-        for picture in answer.pictures:  # with their sizes, so that nothing moves when they come
-            with Image.open(io.BytesIO(answer.files[picture.file])) as image:  # a file of our own
-                size_and_scale = {
-                    "scale": picture.scale and vars(picture.scale),
-                    "size": list(image.size),
-                }
-            pictures.append({**vars(picture), **size_and_scale})
+        self._stored_files[key] = answer.files
+        while len(self._stored_files) > _STORED_ANSWERS:
+            self._stored_files.popitem(last=False)
+        pictures: list[dict[str, Any]] = []
+        for picture in answer.pictures:
+            with Image.open(io.BytesIO(answer.files[picture.file])) as image:
+                size = list(image.size)  # with it, the page does not move while pictures load
+            scale = None if picture.scale is None else vars(picture.scale)
+            pictures.append({**vars(picture), "scale": scale, "size": size})
         return {
             "ok": answer.is_ok,
             "said": answer.sentence,
@@ -416,24 +447,32 @@ class Pages:
             "tables": dict(answer.tables),
             "pictures": pictures,
             "scene": answer.scene.encoded(),
-            "files": [{"name": n, "bytes": len(data)} for n, data in answer.files.items()],
+            "files": [{"name": name, "bytes": len(data)} for name, data in answer.files.items()],
             "folder": f"results/{key}/",
         }
+
+
+def _pack_files(files: Mapping[str, bytes]) -> bytes:
+    """Pack files into a ZIP, uncompressed: most of them are compressed already."""
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
+        for name, data in files.items():
+            archive.writestr(name, data)
+    return packed.getvalue()
 
 
 def make_app(depth: FakestereoNet, pose: GeoPoseNet, limits: Limits | None = None) -> Starlette:
     """Build the application, with networks for the tabs Depth and Pose."""
     limits = Limits() if limits is None else limits
-    pages = Pages(depth, pose, limits)
-
+    handlers = Handlers(depth, pose, limits)
     return Starlette(
         routes=[
-            Route("/", pages.asset),
-            Route("/assets/{name}", pages.asset),
-            Route("/examples/{kind}", pages.example),
-            Route("/estimate/{kind}", pages.estimate, methods=["POST"]),
-            Route("/queue/{ticket}", pages.place),
-            Route("/results/{key}/{name}", pages.download),
+            Route("/", handlers.asset),
+            Route("/assets/{name}", handlers.asset),
+            Route("/examples/{kind}", handlers.example),
+            Route("/estimate/{kind}", handlers.estimate, methods=["POST"]),
+            Route("/queue/{ticket}", handlers.position),
+            Route("/results/{key}/{name}", handlers.download),
         ],
         middleware=[Middleware(HostCheck, hosts=limits.hosts)],
         exception_handlers={HTTPException: error_response, Exception: error_response},
@@ -442,29 +481,30 @@ def make_app(depth: FakestereoNet, pose: GeoPoseNet, limits: Limits | None = Non
 
 _CONNECTIONS = 400
 """Connections at once; more are answered with 503 before anything of them is read."""
-_LEAVE_S = 2  # seconds that open connections have to finish after Ctrl+C
+_SHUTDOWN_S = 2
+"""Seconds that open connections have to finish after Ctrl+C."""
 HEAD_S = 10.0
 """Seconds in which the head of a request must come: a connection that sends none counts among
 those that are open at once."""
 
 
 class TimedProtocol(H11Protocol):
-    """Closes a connection whose request's head does not come in time; uvicorn would wait for it."""
+    """Closes a connection on which no head of a request comes in time; uvicorn would wait on."""
 
     _closing: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Begin to wait for the first request."""
+        """Start to wait for the head of the first request."""
         super().connection_made(transport)  # pyright: ignore[reportArgumentType]
         self._wait_for_head()
 
     def data_received(self, data: bytes) -> None:
-        """Read on; half of a head changes nothing."""
+        """Pass data on; a head that is not whole does not stop the timer."""
         super().data_received(data)
         self._wait_for_head()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Wait for nothing more."""
+        """Stop the timer."""
         super().connection_lost(exc)
         if self._closing is not None:
             self._closing.cancel()
@@ -480,7 +520,11 @@ class TimedProtocol(H11Protocol):
 
 
 def open_socket(host: str, port: int) -> socket.socket:
-    """Take a port before anything heavy is loaded; port 0 takes a free one."""
+    """Open a listening socket; port 0 takes a free one.
+
+    Raises:
+        InputError: the host or port cannot be used.
+    """
     if not 0 <= port < 2**16:
         raise InputError(f"port {port}: there are 0 (any that is free) to 65535; 8000 is usual")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
@@ -494,18 +538,20 @@ def open_socket(host: str, port: int) -> socket.socket:
         ) from error
 
 
-def known_names(
+def address_and_hosts(
     host: str, listener: socket.socket
 ) -> tuple[IPv4Address | IPv6Address, tuple[str, ...] | None]:
-    """Give the address that was taken, and the host names under which the page may be requested.
+    """Give the address of a socket, and the host names under which its page may be requested.
 
-    None: any, it is open to all. How the address was written does not say that: '', '0' and '0x0'
-    mean all addresses too.
+    These are None (any) where the socket listens on all addresses. That is told by the socket and
+    not by ``host``: '', '0' and '0x0' mean all addresses too.
     """
     address = ip_address(listener.getsockname()[0])
     if isinstance(address, IPv6Address):
         address = address.ipv4_mapped or address
-    return address, None if address.is_unspecified else (*LOOPBACK, host.lower(), str(address))
+    if address.is_unspecified:
+        return address, None
+    return address, (*LOOPBACK, host.lower(), str(address))
 
 
 def run(app: Starlette, listener: socket.socket) -> None:
@@ -517,6 +563,6 @@ def run(app: Starlette, listener: socket.socket) -> None:
         access_log=False,
         server_header=False,
         limit_concurrency=_CONNECTIONS,
-        timeout_graceful_shutdown=_LEAVE_S,
+        timeout_graceful_shutdown=_SHUTDOWN_S,
     )
     uvicorn.Server(config).run(sockets=[listener])

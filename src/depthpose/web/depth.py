@@ -29,28 +29,20 @@ from depthpose.web.answer import (
 
 _MOST_WORK_PIXELS = 8_000_000
 """Most pixels of the image as networks get it, resized to their focal length."""
-_GUESSED = " (guessed as 0.75 widths: the metres are as wrong as the guess)"
-_ALL_SKY = 0.5
-"""Share of the sky from which a pair without a depth is not taken for a wrong one."""
-_PHONE = 0.75
+_PHONE_FOCAL_WIDTHS = 0.75
 """Focal length of a phone's main camera, in widths of the image."""
+_GUESSED = f" (guessed as {_PHONE_FOCAL_WIDTHS} widths: the metres are as wrong as the guess)"
+_MOSTLY_SKY = 0.5
+"""Share of the sky from which a pair without a depth is not taken for a wrong one."""
 
 
 def answer_depth(form: Form, net: FakestereoNet) -> Answer:
     """Estimate depth for a form."""
-    began = time.perf_counter()
-    pair, focal = _read_input(form)
+    start = time.perf_counter()
+    pair, focal_origin = _read_input(form)
 
     # Refuse what cannot be drawn or matched, and what would take too long.
-    near_m, far_m = (
-        default if (typed := form.number(end)) is None else typed
-        for end, default in zip(("near_m", "far_m"), COLOR_RANGE_M, strict=True)
-    )
-    if not 0 < near_m < far_m:
-        raise InputError(
-            f"the colours go from {near_m:g} m to {far_m:g} m; give a near end above 0, and a far "
-            "end beyond it"
-        )
+    near_m, far_m = _read_range(form)
     if pair.right is not None and net.matcher is None:
         raise InputError(
             "the weights of this page take one image alone: remove the right image, or start "
@@ -59,7 +51,7 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
     _refuse_large_work(pair, net)
 
     estimate = net.estimate_pair(pair)
-    seconds = time.perf_counter() - began
+    seconds = time.perf_counter() - start
     assert estimate.depth_m is not None
 
     # The files for download, and what the page shows.
@@ -70,7 +62,9 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
     pictures = _pictures(pair, estimate, (near_m, far_m))
     if estimate.confidence is not None:
         write_image(folder / f"{pair.name}.confidence.png", draw_share(1 - estimate.confidence))
-    facts = [fact for fact in depth_facts(pair, estimate, focal) if fact[0] != "warning"]
+    # The warning is in the sentence already.
+    facts = depth_facts(pair, estimate, focal_origin)
+    facts = [(name, value) for name, value in facts if name != "warning"]
     return Answer(
         is_ok=not estimate.warning,
         sentence=_sentence(pair, estimate),
@@ -82,21 +76,44 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
     )
 
 
+def _read_range(form: Form) -> tuple[float, float]:
+    """Read the depth [m] of the brightest and of the darkest colour."""
+    near_m = form.number("near_m")
+    far_m = form.number("far_m")
+    near_m = COLOR_RANGE_M[0] if near_m is None else near_m
+    far_m = COLOR_RANGE_M[1] if far_m is None else far_m
+    if not 0 < near_m < far_m:
+        raise InputError(
+            f"the colours go from {near_m:g} m to {far_m:g} m; give a near end above 0, and a far "
+            "end beyond it"
+        )
+    return near_m, far_m
+
+
 def _refuse_large_work(pair: StereoInput, net: FakestereoNet) -> None:
-    """Refuse images whose size at work, which follows from their focal length, is too large."""
+    """Refuse images that the networks would take in too large a size.
+
+    The size follows from the focal length: networks resize images to the one they know.
+    """
     assert pair.camera is not None
-    camera = pair.camera
-    focal_px = float(pair.camera.K[0, 0])
-    rig = None if pair.right is not None or net.synthesiser is None else net.synthesiser.config
     height, width = pair.left.shape[1:]
-    sizes = []
-    if rig is not None:
+    focal_px = float(pair.camera.K[0, 0])
+
+    # Rows and columns as the generator takes one image, and as the matcher takes both.
+    sizes: list[tuple[int, int]] = []
+    camera = pair.camera
+    is_matched = True
+    if pair.right is None and net.synthesiser is not None:
+        config = net.synthesiser.config
         sizes += net.virtual_sizes(pair)
-        camera = camera_of(rig.virtual_focal_px, (sizes[0][1], sizes[0][0])) or camera
-    if rig is None or rig.answer != "own":
-        full_size = (camera.height, camera.width)
-        matcher = net.matcher
-        sizes.append(matcher.work_size(camera) if isinstance(matcher, CameraMatcher) else full_size)
+        virtual_height, virtual_width = sizes[0]
+        virtual_size = (virtual_width, virtual_height)
+        camera = camera_of(config.virtual_focal_px, virtual_size) or camera
+        is_matched = config.answer != "own"
+    if is_matched and isinstance(net.matcher, CameraMatcher):
+        sizes.append(net.matcher.work_size(camera))
+    elif is_matched:
+        sizes.append((camera.height, camera.width))
     rows, columns = max(sizes, key=math.prod)
     if (rows, columns) == (height, width) and rows * columns > _MOST_WORK_PIXELS:
         raise InputError(
@@ -108,12 +125,15 @@ def _refuse_large_work(pair: StereoInput, net: FakestereoNet) -> None:
         raise InputError(
             f"a focal length of {focal_px:g} px for {width}x{height} pixels "
             f"would be resized to {columns}x{rows}, more than this page computes; is it in "
-            f"millimetres? A phone's is about {_PHONE} widths"
+            f"millimetres? A phone's is about {_PHONE_FOCAL_WIDTHS} widths"
         )
 
 
 def _read_input(form: Form) -> tuple[StereoInput, str]:
-    """Read the picture or pair; give the origin of its focal length too, if the user gave none."""
+    """Read the picture or pair with its camera, and say where its focal length is from.
+
+    The origin is words for the page; empty where the user gave the focal length.
+    """
     path = form.file("image")
     width, height = image_size(path)
     refuse_large(path.name, width, height)
@@ -129,13 +149,15 @@ def _read_input(form: Form) -> tuple[StereoInput, str]:
     origin = ""
     if focal_px is None and "camera" not in form.files:
         exif = None if has_right else read_exif_focal(path)
-        focal_px, tags = (_PHONE * width, "") if exif is None else exif
+        focal_px, tags = (_PHONE_FOCAL_WIDTHS * width, "") if exif is None else exif
         origin = f" (EXIF: {tags})" if tags else _GUESSED
     doffs_px = form.number("cx_right_minus_left_px")
-    rig = {"baseline_m": baseline_m}
-    rig["cx_right_minus_left_px"] = None if baseline_m is None else doffs_px
-    rig |= {key: form.number(key) for key in ("mount_height_m", "tilt_deg")}
-    keys = form.pinhole_keys((width, height), focal_px) | rig
+    keys = form.pinhole_keys((width, height), focal_px) | {
+        "baseline_m": baseline_m,
+        "cx_right_minus_left_px": None if baseline_m is None else doffs_px,
+        "mount_height_m": form.number("mount_height_m"),
+        "tilt_deg": form.number("tilt_deg"),
+    }
     camera = form.camera(keys, (width, height))
     if baseline_m is not None and not isinstance(camera, StereoRig):  # of a file without one
         camera = StereoRig(
@@ -145,9 +167,11 @@ def _read_input(form: Form) -> tuple[StereoInput, str]:
             baseline_m=baseline_m,
             cx_right_minus_left_px=doffs_px or 0.0,
         )
+    right = None
     if has_right:
-        refuse_large(form.file("right").name, *image_size(form.file("right")))
-    right = read_image(form.file("right")) if has_right else None
+        right_path = form.file("right")
+        refuse_large(right_path.name, *image_size(right_path))
+        right = read_image(right_path)
     pair = StereoInput(name=path.stem, left=read_image(path), right=right, camera=camera)
     return pair, origin
 
@@ -191,14 +215,15 @@ def _sentence(pair: StereoInput, estimate: DepthEstimate) -> str:
     warning = f"Careful: {estimate.warning}. " if estimate.warning else ""
     if len(known_m) == 0:
         doubt = f"; {sky:.0%} of the image is taken for sky." if is_sky is not None else "."
-        if pair.right is not None and sky < _ALL_SKY:
+        if pair.right is not None and sky < _MOSTLY_SKY:
             doubt = ": is the pair rectified, and are left and right as they should be?"
         return f"{warning}No pixel got a depth from {images}{doubt}"
     share = len(known_m) / estimate.depth_m.numel()
-    middle_m = float(known_m.median())
+    median_m = float(known_m.median())
+    sky_text = f" {sky:.0%} are sky." if is_sky is not None else ""
     return (
         f"{warning}Depth from {images} for {share:.0%} of the pixels; half of these are nearer "
-        f"than {middle_m:.2f} m.{f' {sky:.0%} are sky.' if is_sky is not None else ''}"
+        f"than {median_m:.2f} m.{sky_text}"
     )
 
 

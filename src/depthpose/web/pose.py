@@ -35,23 +35,26 @@ from depthpose.web.answer import (
     refuse_large,
 )
 
-OWN_CAD = "cad"  # the value of the field object that means the CAD file
-_SAME = 0.02
+OWN_CAD = "cad"
+"""Value of the field ``object`` that means the CAD file."""
+_SAME_SHAPE = 0.02
 """Largest difference [diameters] of size and surface of a CAD file and the weights' own object."""
+_SURFACE_POINTS = 500
+"""Of a CAD file, whose distance to that object is measured."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Target:
-    """The object, what poses it, and what the page says of that."""
+    """The object of a form, and its estimator."""
 
     model: ObjectModel
     net: GeoPoseNet | Registration
-    how: str
+    method: str  #: the estimator, in words for the page
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _ShownPose:
-    """What was posed, and its answer."""
+    """A pose and its input: of a searched image, with the mask of the pixels that it explains."""
 
     input: CloudInput | ViewInput
     estimate: PoseEstimate
@@ -62,8 +65,9 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
     target = _find_target(form, net)
     pose_input = _read_input(form, target.model)
     shown_poses, votes = _estimate(form, target, pose_input)
-    if (least := form.number("min_certainty")) is not None:
-        limit = EstimateConfig(min_certainty=least).min_certainty
+    min_certainty = form.number("min_certainty")
+    if min_certainty is not None:
+        limit = EstimateConfig(min_certainty=min_certainty).min_certainty  # refuses what is none
         shown_poses = [
             replace(shown, estimate=with_status(shown.estimate, limit)) for shown in shown_poses
         ]
@@ -84,7 +88,7 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
     return Answer(
         is_ok=best.estimate.is_posed,
         sentence=report.pose_sentence(best.estimate),
-        facts=report.pose_facts(best.estimate, target.model, target.how, agreeing),
+        facts=report.pose_facts(best.estimate, target.model, target.method, agreeing),
         tables=tables,
         pictures=pictures,
         scene=_make_scene(shown_poses, votes, target.model),
@@ -100,25 +104,17 @@ def _estimate(
 
     Boxes are searched, one pose in each; a depth image without a mask is searched as a whole.
     """
-    boxes = _box_views(form, pose_input)
-    if boxes:
-        estimates = target.net.estimate_many(boxes)
+    views = _box_views(form, pose_input)
+    if views:
+        estimates = target.net.estimate_many(views)
         shown_poses = [
             _ShownPose(input=view, estimate=estimate)
-            for view, estimate in zip(boxes, estimates, strict=True)
+            for view, estimate in zip(views, estimates, strict=True)
         ]
         return sorted(shown_poses, key=lambda shown: -(shown.estimate.certainty or 0.0)), None
     if "depth" in form.files and "mask" not in form.files:
         assert isinstance(pose_input, ViewInput)
-        shown_poses = []
-        for estimate in target.net.find_in(pose_input, [target.model.name]):
-            view = replace(pose_input, name=estimate.name)
-            if estimate.camera_from_model is not None:  # with the pixels that it explains
-                surface = prepare_surface(target.model)
-                mask = explained_mask(pose_input, estimate.camera_from_model, surface)
-                view = replace(view, mask=mask)
-            shown_poses.append(_ShownPose(input=view, estimate=estimate))
-        return shown_poses, None
+        return _search(target, pose_input), None
     if isinstance(target.net, GeoPoseNet):
         estimate, votes = target.net.estimate_with_votes(pose_input)
         return [_ShownPose(input=pose_input, estimate=estimate)], votes
@@ -126,6 +122,19 @@ def _estimate(
     if estimate.status == "unreadable":
         raise InputError(estimate.reason)
     return [_ShownPose(input=pose_input, estimate=estimate)], None
+
+
+def _search(target: _Target, view: ViewInput) -> list[_ShownPose]:
+    """Search a whole depth image for the object."""
+    surface = prepare_surface(target.model)
+    shown_poses: list[_ShownPose] = []
+    for estimate in target.net.find_in(view, [target.model.name]):
+        shown_view = replace(view, name=estimate.name)
+        if estimate.camera_from_model is not None:
+            mask = explained_mask(view, estimate.camera_from_model, surface)
+            shown_view = replace(shown_view, mask=mask)
+        shown_poses.append(_ShownPose(input=shown_view, estimate=estimate))
+    return shown_poses
 
 
 def _make_scene(
@@ -164,22 +173,24 @@ def _box_views(form: Form, pose_input: CloudInput | ViewInput) -> list[ViewInput
 
 
 def _table_row(estimate: PoseEstimate) -> list[str]:
-    """Give the row of an estimate in the table of an image; empty is what it does not have."""
+    """Format the row of an estimate in the table of an image; empty where it has no value."""
     pose = estimate.camera_from_model
-    place = [""] * 3 if pose is None else [f"{v:.4f}" for v in pose.t_m.tolist()]
+    position = [""] * 3 if pose is None else [f"{v:.4f}" for v in pose.t_m.tolist()]
     shares = (estimate.certainty, estimate.visible_share)
     numbers = ["" if share is None else f"{share:.3f}" for share in shares]
     rank = "" if estimate.pick_rank is None else str(estimate.pick_rank)
-    return [estimate.status, *place, *numbers, rank]
+    return [estimate.status, *position, *numbers, rank]
 
 
 def _write_results(
     folder: Path, name: str, shown_poses: list[_ShownPose], model: ObjectModel
 ) -> list[Shown]:
-    """Write ``poses.json``, each cloud with the posed model, and the picture that is shown."""
-    write_predictions(
-        folder, [Prediction(estimate=shown_pose.estimate) for shown_pose in shown_poses]
-    )
+    """Write ``poses.json``, a cloud with each posed model, and a picture of all of them.
+
+    Gives the picture, if the input is a depth image.
+    """
+    predictions = [Prediction(estimate=shown_pose.estimate) for shown_pose in shown_poses]
+    write_predictions(folder, predictions)
     for shown_pose in shown_poses:
         points_m = object_points(shown_pose.input, model.diameter_m)
         cloud = report.posed_cloud(points_m, shown_pose.estimate.camera_from_model, model)
@@ -189,15 +200,15 @@ def _write_results(
         return []
     picture = report.grey_depth(pose_input.depth_m)
     caption = "depth image, near bright"
-    poses = 0
+    pose_count = 0
     for shown_pose in shown_poses:
         pose = shown_pose.estimate.camera_from_model
         if isinstance(shown_pose.input, ViewInput) and shown_pose.input.is_region:
             picture = report.draw_region(picture, shown_pose.input, pose)
         picture = report.draw_pose(picture, pose, model, pose_input.K)
-        poses += pose is not None
-    if poses:
-        caption += f", with the posed model{'s' * (poses > 1)}"
+        pose_count += pose is not None
+    if pose_count:
+        caption += f", with the posed model{'s' * (pose_count > 1)}"
     if pose_input.is_region:
         caption += ", boxes yellow"
     files.write_image(folder / f"{name}.{PICTURE}", picture)
@@ -205,7 +216,10 @@ def _write_results(
 
 
 def _find_target(form: Form, net: GeoPoseNet) -> _Target:
-    """Find the object among those of the weights, or in a CAD file."""
+    """Find the object and its estimator: an object of the weights, or a CAD file.
+
+    A CAD file of an object that the weights know is posed by the network, another one registered.
+    """
     name = form.fields.get("object", "")
     models = net.weights.models
     if name != OWN_CAD:
@@ -214,26 +228,31 @@ def _find_target(form: Form, net: GeoPoseNet) -> _Target:
                 f"object {name!r} and the CAD file {form.files['cad'].name} are both given; choose "
                 "'the CAD file above' as the object, or take the file out"
             )
-        same_name = [model for model in models if model.name == name]
-        if not same_name:
+        model = next((model for model in models if model.name == name), None)
+        if model is None:
             raise InputError(f"object {name!r}: the weights know {', '.join(net.objects)}")
-        return _Target(model=same_name[0], net=net, how="network, by the weights' own model")
+        return _Target(model=model, net=net, method="network, by the weights' own model")
     cad = form.file("cad")
     unit = mesh.FIXED_UNITS.get(cad.suffix.lower()) or form.fields.get("cad_unit", "")
     refuse_unknown("cad_unit", unit, METRES)
-    model = mesh.read_model(cad, cast(Unit, unit))
-    for known_model in models:  # of which the file may be one, in the same frame
-        is_same = abs(model.diameter_m / known_model.diameter_m - 1) <= _SAME
-        if is_same:
-            off_m = mesh.gap_to_surface_m(known_model.keypoints_m, model)
-            back_m = mesh.gap_to_surface_m(mesh.sample_surface(model, 500)[0], known_model)
-            is_same = max(off_m, back_m) < _SAME * known_model.diameter_m
-        if is_same:
-            how = f"network; the CAD file is the weights' {known_model.name!r}"
-            return _Target(model=known_model, net=net, how=how)
-    model = mesh.with_found_symmetries(model, None, is_taken=True)
-    how = "the CAD file alone, without training"
-    return _Target(model=model, net=Registration([model], net.config), how=how)
+    cad_model = mesh.read_model(cad, cast(Unit, unit))
+    for model in models:
+        if _is_same_shape(cad_model, model):
+            method = f"network; the CAD file is the weights' {model.name!r}"
+            return _Target(model=model, net=net, method=method)
+    cad_model = mesh.with_found_symmetries(cad_model, None, is_taken=True)
+    registration = Registration([cad_model], net.config)
+    return _Target(model=cad_model, net=registration, method="the CAD file alone, without training")
+
+
+def _is_same_shape(cad_model: ObjectModel, model: ObjectModel) -> bool:
+    """Whether a CAD file is an object of the weights, in the same frame: size and surface agree."""
+    if abs(cad_model.diameter_m / model.diameter_m - 1) > _SAME_SHAPE:
+        return False
+    cad_points_m = mesh.sample_surface(cad_model, _SURFACE_POINTS)[0]
+    to_cad_m = mesh.gap_to_surface_m(model.keypoints_m, cad_model)
+    from_cad_m = mesh.gap_to_surface_m(cad_points_m, model)
+    return max(to_cad_m, from_cad_m) < _SAME_SHAPE * model.diameter_m
 
 
 def _read_input(form: Form, model: ObjectModel) -> CloudInput | ViewInput:
@@ -273,6 +292,7 @@ def _read_input(form: Form, model: ObjectModel) -> CloudInput | ViewInput:
 
 
 _UNIT_M = 0.0001
+"""Unit of the depth image of the example."""
 
 
 def pose_example(net: GeoPoseNet) -> dict[str, Any]:

@@ -1,0 +1,444 @@
+"""Options that a command would ignore: they are refused before it runs, with the reason."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from depthpose.cli.arguments import Option
+from depthpose.core.errors import InputError
+
+
+class TypedOptions(dict[str, list[str]]):
+    """The words after each option as they were typed, by the option's name.
+
+    An option that was not typed has no words.
+    """
+
+    def __missing__(self, name: str) -> list[str]:
+        """Give no words, and do not store them: ``in`` tells which options were typed."""
+        return []
+
+
+Condition = Callable[[TypedOptions], bool]
+
+
+def given(*names: str) -> Condition:
+    """Make the condition that any of these options is typed."""
+    return lambda typed: any(name in typed for name in names)
+
+
+def absent(*names: str) -> Condition:
+    """Make the condition that none of these options is typed."""
+    return lambda typed: not any(name in typed for name in names)
+
+
+def has_word(name: str, word: str) -> Condition:
+    """Make the condition that an option is typed with this word."""
+    return lambda typed: word in typed[name]
+
+
+def all_begin(name: str, *prefixes: str) -> Condition:
+    """Make the condition that an option has words, all of which begin with one of the prefixes."""
+    return lambda typed: (
+        bool(typed[name]) and all(word.startswith(prefixes) for word in typed[name])
+    )
+
+
+def both(first: Condition, second: Condition) -> Condition:
+    """Make the condition that two conditions hold."""
+    return lambda typed: first(typed) and second(typed)
+
+
+_is_on_ray = has_word("engine", "ray")
+
+
+def _is_not_on_ray(typed: TypedOptions) -> bool:
+    """Whether the command does the work itself, without workers."""
+    return not _is_on_ray(typed)
+
+
+def _is_registered(typed: TypedOptions) -> bool:
+    """Whether poses come from CAD files without a network."""
+    return "register" in typed["method"] or ("cad" in typed and "method" not in typed)
+
+
+def _is_searched(typed: TypedOptions) -> bool:
+    """Whether whole depth images are searched: nothing says where objects are in them."""
+    has_images = "depth" in typed or "left" in typed
+    has_regions = bool({"mask", "box", "detections"} & typed.keys())
+    return has_images and not has_regions and not _is_on_ray(typed)
+
+
+def _has_many_regions(typed: TypedOptions) -> bool:
+    """Whether a depth image may have several objects, by detections or boxes."""
+    return "detections" in typed or len(typed["box"]) > 1
+
+
+def _has_unused_gpus(typed: TypedOptions) -> bool:
+    """Whether workers get a GPU, but compute on the processor."""
+    is_on_cpu = typed["device"][:1] in ([], ["cpu"])
+    has_gpus = typed["worker-gpus"][:1] not in (["0"], ["0.0"])
+    return is_on_cpu and has_gpus
+
+
+def _has_no_matcher_network(typed: TypedOptions) -> bool:
+    """Whether depth of one image is that of the generator, or of OpenCV's matcher."""
+    return "own" in typed["answer"] or "sgbm" in typed["matcher"]
+
+
+def _are_models_folders(typed: TypedOptions) -> bool:
+    """Whether ``--models`` names the folder of a data set, and no model file."""
+    return all(Path(word).is_dir() for word in typed["models"])
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Rule:
+    """Options that some commands ignore under a condition, and the reason for the user."""
+
+    commands: tuple[str, ...]
+    when: Condition
+    ignored: tuple[str, ...]
+    reason: str
+
+
+_POSE = ("pose predict", "pose track")
+_ON_ENGINES = ("pose predict", "depth predict", "depth match")
+_POSES_OF_THESIS = (
+    "reproduce 3.1", "reproduce 3.2", "reproduce 3.3", "figure 3-2", "figure 3-4", "figure 3-5",
+)  # fmt: skip
+_NETWORK = ("precision", "max-memory")
+"""Options of a matcher with weights."""
+
+_RULES = (
+    _Rule(
+        commands=_POSE,
+        when=_is_registered,
+        ignored=("weights", "voting", "hypotheses", "batch", "device"),
+        reason="CAD files are posed without a network, one input after the other on the processor",
+    ),
+    _Rule(
+        commands=_POSE,
+        when=has_word("method", "network"),
+        ignored=("cad", "symmetry"),
+        reason="weights know their own objects; leave --method network out, or train weights "
+        "of this part by 'depthpose pose train --cad'",
+    ),
+    _Rule(
+        commands=_POSE,
+        when=absent("cad", "bin"),
+        ignored=("cad-unit",),
+        reason="it is the unit of --cad, and no CAD file is given",
+    ),
+    _Rule(
+        commands=("pose predict",),
+        when=given("bop", "cloud"),
+        ignored=("bin", "bin-pose", "empty-frame"),
+        reason="they are of a depth image; give --depth",
+    ),
+    _Rule(
+        commands=("pose predict",),
+        when=_is_on_ray,
+        ignored=(
+            "bin",
+            "bin-pose",
+            "empty-frame",
+            "color",
+            "color-camera",
+            "color-from-depth",
+            "labels",
+        ),
+        reason="workers do not read it; leave --engine out",
+    ),
+    _Rule(
+        commands=("pose predict",),
+        when=given("bin"),
+        ignored=("empty-frame",),
+        reason="--bin says what there is without the parts",
+    ),
+    _Rule(
+        commands=("pose predict",),
+        when=absent("bin"),
+        ignored=("bin-pose",),
+        reason="it is of --bin; give the CAD file of the bin too",
+    ),
+    _Rule(
+        commands=_POSE,
+        when=given("bop"),
+        ignored=("cad",),
+        reason="the models of --bop are taken",
+    ),
+    _Rule(
+        commands=_POSE,
+        when=given("bop"),
+        ignored=("mask", "box", "detections", "labels", "camera", "focal-px", "unit"),
+        reason="a data set says its cameras and units itself, and its masks are chosen by --masks",
+    ),
+    _Rule(
+        commands=_POSE,
+        when=given("bop"),
+        ignored=("base-from-camera",),
+        reason="the cameras of a data set move",
+    ),
+    _Rule(
+        commands=("pose predict",),
+        when=both(given("bop"), _is_on_ray),
+        ignored=("engine",),
+        reason="a data set is posed by this process, or shared by those of torchrun",
+    ),
+    _Rule(
+        commands=("pose predict",),
+        when=absent("bop"),
+        ignored=("split", "masks", "targets"),
+        reason="--bop names no data set; the mask of a depth image is given by --mask",
+    ),
+    _Rule(
+        commands=_POSE,
+        when=given("cloud"),
+        ignored=("mask", "box", "detections", "labels", "camera", "focal-px"),
+        reason="a cloud is of the object alone, in the camera's frame",
+    ),
+    _Rule(
+        commands=("pose predict", "depth predict"),
+        when=given("camera"),
+        ignored=("focal-px", "fov"),
+        reason="--camera has the focal length",
+    ),
+    _Rule(
+        commands=("depth predict",),
+        when=given("focal-px"),
+        ignored=("fov",),
+        reason="--focal-px is the focal length",
+    ),
+    _Rule(
+        commands=("pose predict",),
+        when=has_word("voting", "least-squares"),
+        ignored=("hypotheses",),
+        reason="--voting least-squares draws no hypotheses",
+    ),
+    _Rule(
+        commands=("pose predict",),
+        when=absent("left"),
+        ignored=("right", "matcher", "min-confidence"),
+        reason="it is of a pair, and there is none; give --left",
+    ),
+    _Rule(
+        commands=("pose predict",),
+        when=both(given("left"), _is_on_ray),
+        ignored=("engine",),
+        reason="pairs are matched and posed by this process",
+    ),
+    _Rule(
+        commands=("pose predict",),
+        when=has_word("matcher", "sgbm"),
+        ignored=("min-confidence",),
+        reason="sgbm has no confidence",
+    ),
+    _Rule(
+        commands=("pose predict",),
+        when=_is_searched,
+        ignored=("batch", "register-refused", "labels"),
+        reason="an image without --mask, --box or --detections is searched alone, and "
+        "registers nothing; give one of them",
+    ),
+    _Rule(
+        commands=("pose predict",),
+        when=given("box"),
+        ignored=("labels",),
+        reason="all boxes are of one object; say which by --object, or give --detections",
+    ),
+    _Rule(
+        commands=("pose predict",),
+        when=_has_many_regions,
+        ignored=("engine",),
+        reason="workers give one pose for each depth image, by --mask or one --box; leave "
+        "--engine out",
+    ),
+    _Rule(
+        commands=("pose track",),
+        when=absent("bop"),
+        ignored=("split",),
+        reason="it is of a data set; give --bop",
+    ),
+    _Rule(
+        commands=("pose track",),
+        when=given("bop"),
+        ignored=("first",),
+        reason="a data set has many sequences and one pose is given; give the frames of one by"
+        " --depth",
+    ),
+    _Rule(
+        commands=("pose evaluate",),
+        when=absent("weights"),
+        ignored=("masks", "voting", "icp", "device"),
+        reason="nothing is estimated: --csv and --predictions are measured as they are",
+    ),
+    _Rule(
+        commands=("pose evaluate",),
+        when=all_begin("weights", "register"),
+        ignored=("voting", "device"),
+        reason="register does not vote, and computes on the processor",
+    ),
+    _Rule(
+        commands=_ON_ENGINES,
+        when=_is_not_on_ray,
+        ignored=("address", "workers", "worker-cpus", "worker-gpus", "block"),
+        reason="--engine ray takes it, and is not given; add it",
+    ),
+    _Rule(
+        commands=_ON_ENGINES,
+        when=_has_unused_gpus,
+        ignored=("worker-gpus",),
+        reason="the workers compute on the processor without --device cuda",
+    ),
+    _Rule(
+        commands=("depth predict",),
+        when=given("camera-height"),
+        ignored=("known-distance",),
+        reason="--camera-height sets the scale",
+    ),
+    _Rule(
+        commands=("depth predict",),
+        when=given("matcher"),
+        ignored=("answer",),
+        reason="the depth is that of --matcher on the synthesised view",
+    ),
+    _Rule(
+        commands=("depth predict",),
+        when=_has_no_matcher_network,
+        ignored=_NETWORK,
+        reason="no matcher with weights runs here",
+    ),
+    _Rule(
+        commands=("depth match",),
+        when=given("matcher"),
+        ignored=("weights",),
+        reason="--matcher matches the pair",
+    ),
+    _Rule(
+        commands=("depth match",),
+        when=has_word("matcher", "sgbm"),
+        ignored=("device", "speed", *_NETWORK, "left-right-check", "max-disparity"),
+        reason="sgbm has no weights",
+    ),
+    _Rule(
+        commands=("depth evaluate",),
+        when=absent("baseline"),
+        ignored=("train", "train-without"),
+        reason="--baseline takes it, and is not given; add it",
+    ),
+    _Rule(
+        commands=("depth evaluate", "reproduce"),
+        when=absent("train"),
+        ignored=("train-without",),
+        reason="it leaves frames out of --train, and none is given",
+    ),
+    _Rule(
+        commands=("depth evaluate",),
+        when=absent("matcher"),
+        ignored=("holes",),
+        reason="it is for --matcher sgbm",
+    ),
+    _Rule(
+        commands=("depth evaluate",),
+        when=has_word("protocol", "kitti-2015"),
+        ignored=("cap",),
+        reason="--protocol kitti-2015 measures disparity, without a limit in metres",
+    ),
+    _Rule(
+        commands=("depth evaluate",),
+        when=all_begin("weights", "quick:", "fine:"),
+        ignored=("speed",),
+        reason="'quick:' and 'fine:' say the speed of these weights",
+    ),
+    _Rule(
+        commands=("depth evaluate", "reproduce"),
+        when=all_begin("weights", "own:", "sgbm:"),
+        ignored=_NETWORK,
+        reason="with 'own:' and 'sgbm:' no matcher with weights runs",
+    ),
+    _Rule(
+        commands=("depth evaluate", "reproduce"),
+        when=absent("weights"),
+        ignored=("device", *_NETWORK, "speed"),
+        reason="no network is measured",
+    ),
+    _Rule(
+        commands=("weights complete",),
+        when=_are_models_folders,
+        ignored=("unit",),
+        reason="the models of a data set are in mm; --unit is for a model file",
+    ),
+    _Rule(
+        commands=_POSES_OF_THESIS,
+        when=absent("linemod", "bop"),
+        ignored=("objects", "split"),
+        reason="it chooses from a data set, and none is named; give --linemod or --bop",
+    ),
+    _Rule(
+        commands=_POSES_OF_THESIS,
+        when=given("linemod"),
+        ignored=("bop",),
+        reason="--linemod names the data set, and one is measured",
+    ),
+    _Rule(
+        commands=("reproduce 3.3",),
+        when=given("linemod", "bop"),
+        ignored=("synthetic",),
+        reason="views are rendered where no data set is given",
+    ),
+)
+"""Looked through in this order; the first rule that applies gives the reason."""
+
+
+def refuse_ignored(command: str, words: Sequence[str]) -> None:
+    """Refuse options that a command would ignore.
+
+    Args:
+        command: its name, such as ``pose predict``.
+        words: the words that were typed after it.
+
+    Raises:
+        InputError: names the options, as they were typed, and the reason.
+    """
+    typed, spelling = _parse_words(words)
+    for rule in _RULES:
+        ignored = [spelling[name] for name in rule.ignored if name in typed]
+        if ignored and command in rule.commands and rule.when(typed):
+            options = " and ".join(ignored)
+            raise InputError(f"{options}: has no effect here; {rule.reason}. Leave {options} out")
+
+
+def refuse_empty(options: Sequence[Option], words: Sequence[str]) -> None:
+    """Refuse an empty file or folder name, as a script gives whose variable is unset.
+
+    ``options``: of the command; ``words``: typed after it.
+    """
+    typed, spelling = _parse_words(words)
+    for option in options:
+        name = option.name.replace("_", "-")
+        if option.names is not None and typed[name][:1] == [""]:
+            raise InputError(
+                f"{spelling[name]} is empty; name a file or folder (the current folder is '.'), or "
+                "check the variable that should hold it"
+            )
+
+
+def _parse_words(words: Sequence[str]) -> tuple[TypedOptions, dict[str, str]]:
+    """Sort words by the option that they follow, and give each option as it was typed.
+
+    Names of options have hyphens, and no ``no-`` in front; ``--name=word`` is taken apart.
+    """
+    typed = TypedOptions()
+    spelling: dict[str, str] = {}
+    values: list[str] = []  # of the option before; those before any option are left out
+    for word in words:
+        if not word.startswith("--"):
+            values.append(word)
+            continue
+        option, sign, value = word.removeprefix("--").partition("=")
+        name = option.replace("_", "-").removeprefix("no-")
+        spelling[name] = f"--{option}"
+        values = typed.setdefault(name, [])
+        if sign:
+            values.append(value)
+    return typed, spelling
