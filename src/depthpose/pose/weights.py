@@ -155,8 +155,8 @@ def complete_weights(path: Path, meshes: Mapping[int, ObjectModel], out: Path) -
         if gap_m > _KEYPOINT_GAP * diameter_m or is_other_size:
             raise InputError(
                 f"{path}: a keypoint of object {number} ({record['name']}, {diameter_m:.3g} m "
-                f"long) lies {gap_m:.3g} m off the model {model.name} ({model.diameter_m:.3g} m long): "
-                "another object, frame or unit. Give the models that it was trained on."
+                f"long) lies {gap_m:.3g} m off the model {model.name} ({model.diameter_m:.3g} m "
+                "long): another object, frame or unit. Give the models that it was trained on."
             )
         for name in _SURFACE:
             tensor = getattr(model, name)
