@@ -1,4 +1,4 @@
-"""Baselines: PointNet, a regressed depth image."""
+"""Baselines of the thesis: PointNet for directions, and a pose regressed from a depth image."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from depthpose.pose.types import ViewInput, VotingPoints
 
 @dataclass(frozen=True, kw_only=True)
 class DepthImageConfig(Settings):
-    """A masked crop of the depth image, regressed to a pose."""
+    """Settings of the network that regresses a pose from a masked crop of the depth image."""
 
     classes: Annotated[int, "[1, inf)"] = 1
     """Objects that one network knows."""
@@ -68,13 +68,12 @@ EMPTY = -2.0  #: of a pixel without the object: below all that a depth can be, -
 
 
 class DepthCrop(NamedTuple):
-    """A crop, and where it lies; batched with leading axes."""
+    """A crop of a depth image and its place; leading axes are of a batch."""
 
     #: depth over its mean, less one, over the contrast; ``EMPTY`` beside the object.
     image: Float[Tensor, "*b 1 size size"]
-    #: ``camera_from_crop``: turns the optical axis onto the ray through the crop's middle. An
-    #: object looks alike in the crop wherever in the image it is, if its rotation is said in this
-    #: frame.
+    #: ``camera_from_crop``: rotates the optical axis to the ray through the crop's middle. In this
+    #: frame the rotation of an object does not depend on where in the image it is.
     R: Float[Tensor, "*b 3 3"]
     middle_m: Float[Tensor, "*b 3"]  #: the point of that ray at the mean depth, in the camera frame
     side_m: Float[Tensor, "*b"]  #: width of the crop at the mean depth
@@ -83,9 +82,9 @@ class DepthCrop(NamedTuple):
 def cut_depth(
     view: ViewInput, config: DepthImageConfig, diameter_m: float | None = None
 ) -> DepthCrop | None:
-    """Cut the object out of a view; None where fewer pixels than ``min_points`` have a depth.
+    """Crop a view to its object; None where fewer pixels than ``min_points`` have a depth.
 
-    Pixels farther than the diameter from the median depth belong to something else; None keeps all.
+    Pixels farther than the diameter from the median depth are left out; with None all are kept.
     """
     depth_m = torch.where(view.mask, view.depth_m, torch.nan)
     is_seen = depth_m.isfinite() & (depth_m > 0)
@@ -101,7 +100,8 @@ def cut_depth(
     mean_m = depth_m[is_seen].mean()
     relief = ((depth_m / mean_m - 1) / config.contrast).clamp(-1, 1)
     relief = torch.where(is_seen, relief, EMPTY)
-    # Resized by nearest neighbour: depth is not mixed over edges.
+
+    # Resized by nearest neighbour, so that depth is not mixed across edges.
     steps = (torch.arange(config.crop_px) + 0.5) / config.crop_px - 0.5
     column, row = ((middle_px[axis] + side_px * steps).round().long() for axis in (0, 1))
     height, width = relief.shape
@@ -117,11 +117,11 @@ def cut_depth(
     )
 
 
-_NUMBERS = 9
+_NUMBERS = 9  # outputs of a class: two columns of a rotation, and an offset
 
 
 class DepthImageNet(nn.Module):
-    """A crop to nine numbers of each class: two columns of a rotation, and an offset.
+    """A network from a crop to nine numbers of each class: two columns of a rotation, an offset.
 
     The encoder of ResNet-18 with one channel in, its mean over the crop, and a linear layer.
     """
@@ -139,18 +139,18 @@ class DepthImageNet(nn.Module):
     def forward(
         self, image: Float[Tensor, "b 1 h w"], number: Int[Tensor, " b"]
     ) -> Float[Tensor, "b 9"]:
-        """Answer for each crop's own class."""
+        """Give the numbers of each crop for its own class, whose ``number`` is given."""
         features = self.encoder(image)[-1].mean((-2, -1))
-        every = self.heads(features).view(len(image), self.config.classes, _NUMBERS)
-        return every[torch.arange(len(image), device=image.device), number]
+        outputs = self.heads(features).view(len(image), self.config.classes, _NUMBERS)
+        return outputs[torch.arange(len(image), device=image.device), number]
 
 
 def poses_of(outputs: Float[Tensor, "b 9"], crop: DepthCrop) -> Rigid:
-    """Turn what the network says of crops into poses ``camera_from_model``.
+    """Convert outputs of the network to poses ``camera_from_model``.
 
-    Six numbers are the first two columns of a rotation, not yet of unit length nor orthogonal, made
-    one by Gram and Schmidt: continuous, as no form of three or four numbers is (Zhou et al., CVPR
-    2019). Undefined where the columns are parallel or zero.
+    The first six numbers are two columns of a rotation, which Gram and Schmidt's method makes
+    orthonormal: a continuous representation, which none of three or four numbers is (Zhou et al.,
+    CVPR 2019). It is undefined where the columns are parallel or zero.
     """
     first = F.normalize(outputs[:, :3], dim=-1)
     second = outputs[:, 3:6]
@@ -166,10 +166,10 @@ _TRANSFORM_HEAD = (512, 256)  # and after it
 
 
 class PointNet(nn.Module):
-    """Points to raw directions, each from itself and the maximum over its cloud.
+    """A network from points to raw directions, by each point and the maximum over its cloud.
 
-    Qi et al. (CVPR 2017), network for segmentation; clouds of any size, one after the other in
-    rows. Answers in the form that the sparse network gives, so that the same voting follows.
+    The network for segmentation of Qi et al. (CVPR 2017). Clouds of any size are rows one after the
+    other. Outputs have the form of those of the sparse network, so that the same voting follows.
     """
 
     def __init__(self, config: PointNetConfig | None = None) -> None:
@@ -204,7 +204,7 @@ class PointNet(nn.Module):
         return outputs.view(len(outputs), self.config.classes, self.config.keypoints, 3)
 
     def directions(self, points: VotingPoints) -> Float[Tensor, "points keypoints 3"]:
-        """Answer for each point's own class: what every network that votes offers."""
+        """Give the directions of each point for its own class, as all networks that vote do."""
         points_m = points.points_m
         cloud = points.coordinates[:, 0].long()
         sizes = torch.bincount(cloud)

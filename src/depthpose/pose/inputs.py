@@ -1,4 +1,4 @@
-"""Files, arrays or tensors to the inputs of a pose estimate."""
+"""Conversion of files, arrays or tensors to the inputs of a pose estimate."""
 
 import math
 from collections.abc import Mapping
@@ -39,7 +39,7 @@ _SMALLEST_INSTANCE = 0.2
 
 
 def cloud_input(cloud: AnyCloud, unit: Unit, object: str, name: str) -> CloudInput:
-    """Take points in a unit to a cloud in metres."""
+    """Convert points of any unit to a cloud in metres."""
     if is_shape(cloud):
         cloud = shape_geometry(cloud)[0]
     points = read_cloud(cloud).points if isinstance(cloud, str | Path) else _tensor(cloud)
@@ -56,13 +56,13 @@ def cloud_input(cloud: AnyCloud, unit: Unit, object: str, name: str) -> CloudInp
 def depth_input(
     depth: AnyArray, camera: AnyLens | None, name: str, unit: Unit | None = None
 ) -> tuple[Float[Tensor, "h w"], AnyLens | None]:
-    """Take a depth image to metres, NaN where there is no reading; give it and its camera, read.
+    """Convert a depth image to metres, NaN where there is no reading; give it, and its camera.
 
     Args:
-        depth: whole numbers in the unit of the camera or ``unit``, or metres.
-        camera: of the image.
+        depth: whole numbers in the unit of the camera or ``unit``, or metres as floats.
+        camera: of the image; a file or description of one is read.
         name: of the image in errors, where it is no file.
-        unit: where the camera says none.
+        unit: of whole numbers, where the camera has none.
     """
     values = read_stored_depth(depth) if isinstance(depth, str | Path) else _tensor(depth)
     if values.ndim != 2:
@@ -101,7 +101,7 @@ def view_input(
     name: str,
     unit: Unit | None = None,
 ) -> ViewInput:
-    """Take a depth image, a mask and a camera to a view in metres."""
+    """Convert a depth image, a mask and a camera to a view in metres."""
     depth_m, lens = depth_input(depth, camera, name, unit)
     height, width = depth_m.shape
 
@@ -136,7 +136,7 @@ def view_input(
 def rigid_input(
     pose: Rigid | AnyArray, name: str = "first", what: str = "camera_from_model"
 ) -> Rigid:
-    """Take a transform, or its 4x4 matrix in metres; in errors it is called ``name``."""
+    """Convert a transform, or its 4x4 matrix in metres; ``name`` and ``what`` name it in errors."""
     if isinstance(pose, Rigid):
         return pose
     matrix = torch.zeros(0) if isinstance(pose, str | Path) else _tensor(pose).double()
@@ -157,10 +157,10 @@ def rigid_input(
 
 
 def split_instances(labels: Int64[Tensor, "h w"]) -> list[Bool[Tensor, "h w"]]:
-    """Split a mask into one for each object, from the largest down.
+    """Split labels into one mask for each object, the largest first.
 
-    Where it numbers several, they are these; else its connected pieces: pixels that touch at a
-    corner are connected, and a piece below a fifth of the largest is a fragment, left out.
+    Objects are the labels where there are several. Else they are the connected pieces, by corners
+    too; those below a fifth of the largest are fragments, and left out.
     """
     numbers, pixels = labels[labels != 0].unique(return_counts=True)
     if len(numbers) > 1:
@@ -173,9 +173,9 @@ def split_instances(labels: Int64[Tensor, "h w"]) -> list[Bool[Tensor, "h w"]]:
 
 
 def labels_input(mask: AnyMask, name: str) -> Int64[Tensor, "_ _"]:
-    """Take a mask to the numbers of its objects, as :func:`read_labels` gives them.
+    """Convert a mask to labels of its objects, as :func:`read_labels` gives them.
 
-    Of fractions in [0, 1], which are probabilities, those above a half are the object.
+    Fractions in [0, 1] are probabilities: those above a half are the object.
     """
     if isinstance(mask, str | Path):
         return read_labels(Path(mask))
@@ -194,9 +194,9 @@ def labels_input(mask: AnyMask, name: str) -> Int64[Tensor, "_ _"]:
 
 
 def _tensor(values: Any) -> Tensor:  # noqa: ANN401  whatever a caller has
-    """Turn numbers of any library into a tensor on the CPU, of a type that torch computes with."""
+    """Convert numbers of any library to a tensor on the CPU, of a type that torch computes with."""
     if isinstance(values, Tensor) and not values.is_complex():
-        # Of unsigned numbers torch computes little but with bytes.
+        # Of unsigned numbers torch supports few operations, but for bytes.
         is_odd = values.dtype in (torch.uint16, torch.uint32, torch.uint64)
         return (values.long() if is_odd else values).detach().cpu()
     array = np.asarray(values)

@@ -1,4 +1,4 @@
-"""The sparse ResUNet of directions."""
+"""The sparse ResUNet that predicts directions to keypoints."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -104,17 +104,17 @@ class Block(nn.Module):
                 self.second.conv.weight.mul_(BRANCH_SCALE)
 
     def forward(self, voxels: Voxels) -> Voxels:
-        """Add to what comes in; the answer is not negative."""
+        """Add the branch to the input, and apply ReLU."""
         inner = self.first(voxels)
         branch = self.second(inner.with_features(F.relu(inner.features)))
         return voxels.with_features(F.relu(branch.features + voxels.features))
 
 
 class ResUNet(nn.Module):
-    """A partial cloud to raw directions from each of its points to each keypoint.
+    """A network from a partial cloud to raw directions from each of its points to each keypoint.
 
-    Four levels down and up again, a residual block on each, what was seen going down beside what
-    comes up.
+    A U-Net of four levels with a residual block on each, down and up; the features of the way down
+    are concatenated with those of the way up.
     """
 
     def __init__(self, config: ResUNetConfig | None = None) -> None:
@@ -133,7 +133,7 @@ class ResUNet(nn.Module):
         # No norm and no neighbours: the skip of the finest level is mixed point by point.
         self.mix = SparseConv(e[0] + d[1], d[0], 1, has_bias=config.with_bias)
         self.final = SparseConv(d[0], config.classes * config.keypoints * 3, 1, has_bias=True)
-        # The answers are parts of unit vectors: begin near nothing, not twice too long.
+        # The outputs are components of unit vectors: they begin near 0, not twice as long.
         with torch.no_grad():
             self.final.weight.mul_(0.5)
             if config.norm == "batch":
@@ -141,47 +141,50 @@ class ResUNet(nn.Module):
                 self.final.weight.mul_(NORMED_SCALE)
 
     def forward(self, voxels: Voxels) -> Float[Tensor, "points classes keypoints 3"]:
-        """Give the raw directions of each point given.
+        """Give the directions of each point, for every class.
 
-        They are not normalised: the loss pulls them to unit length, and the vote normalises.
+        They are not normalised: the loss draws them to unit length, and voting normalises them.
         """
         outputs = self.final(self.features(voxels)).at_points()
-        c = self.config
-        return outputs.view(len(outputs), c.classes, c.keypoints, 3)
+        return outputs.view(len(outputs), self.config.classes, self.config.keypoints, 3)
 
     def directions(self, points: VotingPoints) -> Float[Tensor, "points keypoints 3"]:
-        """Answer for each point's own class: what every network that votes offers."""
+        """Give the directions of each point for its own class, as all networks that vote do."""
         voxels = Voxels.from_points(points.coordinates, points.features)
         mixed = self.features(voxels)
         features = mixed.features[mixed.row_of_point]
-        answers = features.new_empty(len(features), self.config.keypoints, 3)
+        directions = features.new_empty(len(features), self.config.keypoints, 3)
         assert self.final.bias is not None
         size = self.config.keypoints * 3
-        for number in points.class_of_point.unique().tolist():  # without the other classes
+        # The last layer is computed for the classes that occur alone.
+        for number in points.class_of_point.unique().tolist():
             assert 0 <= number < self.config.classes, f"class {number} of {self.config.classes}"
-            mine = points.class_of_point == number
-            part = slice(number * size, (number + 1) * size)
-            outputs = features[mine] @ self.final.weight[0, :, part] + self.final.bias[part]
-            answers[mine] = outputs.view(len(outputs), self.config.keypoints, 3).to(answers)
-        return answers
+            is_of_class = points.class_of_point == number
+            channels = slice(number * size, (number + 1) * size)
+            weight = self.final.weight[0, :, channels]
+            outputs = features[is_of_class] @ weight + self.final.bias[channels]
+            outputs = outputs.view(len(outputs), self.config.keypoints, 3)
+            directions[is_of_class] = outputs.to(directions)
+        return directions
 
     def features(self, voxels: Voxels) -> Voxels:
-        """Give what the last layer sees: the features of figure 3-2."""
-        seen: list[Voxels] = []
+        """Give the input of the last layer: the features of figure 3-2 of the thesis."""
+        skips: list[Voxels] = []
         for down, block in zip(self.down, self.down_blocks, strict=True):
             voxels = block(down(voxels))
-            seen.append(voxels)
-        voxels = seen.pop()
+            skips.append(voxels)
+        voxels = skips.pop()
         for up, block in zip(self.up, self.up_blocks, strict=True):
             voxels = block(up(voxels))
-            voxels = voxels.with_features(torch.cat([voxels.features, seen.pop().features], 1))
+            skip = skips.pop()
+            voxels = voxels.with_features(torch.cat([voxels.features, skip.features], 1))
         mixed = self.mix(voxels)
         return mixed.with_features(F.relu(mixed.features))
 
 
 @torch.no_grad()
 def fold_norms(network: ResUNet) -> ResUNet:
-    """Give a norm-free network, in eval mode, that answers what ``network.eval()`` answers.
+    """Give a network without norms, in eval mode, with the outputs of ``network.eval()``.
 
     In eval mode batch norm is ``(x - mean) * scale + shift`` with constant numbers, and a
     convolution before it absorbs them: ``weight * scale``, ``shift + (bias - mean) * scale``.
@@ -210,12 +213,17 @@ def fold_norms(network: ResUNet) -> ResUNet:
 
 @torch.no_grad()
 def unfold_norms(folded: ResUNet, network: ResUNet, voxels: Voxels) -> None:
-    """Give a network with batch norm the weights of one without, so that it can learn on.
+    """Copy the weights of a network without norms into one with batch norm, for further training.
 
-    The statistics that folding took are lost; those of ``voxels`` replace them. On these the
-    network answers in training and in eval mode what ``folded`` does. They are clouds like those to
-    come. If the network has other classes, its last layer stays.
+    The statistics that folding removed are replaced by those of ``voxels``, on which ``network``
+    then has the outputs of ``folded``, in training and in eval mode.
+
+    Args:
+        folded: of :func:`fold_norms`.
+        network: changed; if it has another number of classes its last layer stays.
+        voxels: clouds like those of the training.
     """
+    # The output of each convolution with a norm.
     outputs: dict[ConvNorm, Tensor] = {}
 
     def remember(module: ConvNorm, _inputs: object, out: Voxels) -> None:

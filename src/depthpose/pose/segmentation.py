@@ -37,7 +37,8 @@ WIDTHS = (64, 128, 256, 512)  #: channels of the four stages in the published ne
 Widths = tuple[int, int, int, int]
 MEAN = (0.485, 0.456, 0.406)
 STD = (0.229, 0.224, 0.225)
-"""Of ImageNet's colours in [0, 1], by which published weights expect images to be normalised."""
+"""Mean and deviation of ImageNet's colours in [0, 1]: published weights expect images normalised by
+them."""
 
 
 class BasicBlock(nn.Module):
@@ -56,15 +57,15 @@ class BasicBlock(nn.Module):
             )
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b d i j"]:
-        """Add to what comes in, or to its projection; the answer is not negative."""
+        """Add the branch to the input, or to its projection, and apply ReLU."""
         branch = self.bn2(self.conv2(F.relu(self.bn1(self.conv1(x)))))
         return F.relu(branch + (x if self.downsample is None else self.downsample(x)))
 
 
 class ResNet18(nn.Module):
-    """An image to features at 1/8, 1/16 and 1/32 of its size.
+    """A network from an image to features at 1/8, 1/16 and 1/32 of its size.
 
-    Parts carry the names that published state dicts give them, so that those load as they are.
+    Its modules have the names of published state dicts, so that those load unchanged.
     """
 
     def __init__(self, inputs: int = 3, widths: Widths = WIDTHS) -> None:
@@ -92,7 +93,7 @@ class ResNet18(nn.Module):
 
 
 def normalise_colors(image: Float[Tensor, "*b 3 h w"]) -> Float[Tensor, "*b 3 h w"]:
-    """Take ImageNet's mean off RGB in [0, 1], and divide by its spread."""
+    """Subtract ImageNet's mean from RGB in [0, 1], and divide by its standard deviation."""
     mean, std = (image.new_tensor(values)[:, None, None] for values in (MEAN, STD))
     return (image - mean) / std
 
@@ -111,9 +112,9 @@ def import_resnet18(file: Path, out: Path) -> None:
     tensors = {name.removeprefix("module."): value for name, value in state.items()}
     tensors = {name: value for name, value in tensors.items() if not name.startswith("fc.")}
     network = ResNet18()
-    # The count of batches steers nothing at inference, and old files do not hold it.
-    spare = {k: t for k, t in network.state_dict().items() if k.endswith("num_batches_tracked")}
-    checkpoint = Checkpoint(kind=ENCODER_KIND, config={}, state={**spare, **tensors})
+    # The count of batches is not used at inference, and old files do not hold it.
+    counts = {k: t for k, t in network.state_dict().items() if k.endswith("num_batches_tracked")}
+    checkpoint = Checkpoint(kind=ENCODER_KIND, config={}, state={**counts, **tensors})
     try:
         load_weights(network, checkpoint, ENCODER_KIND)
     except InputError as error:
@@ -130,7 +131,7 @@ KIND = "segmentation"
 
 @dataclass(frozen=True, kw_only=True)
 class SegmentationConfig(Settings):
-    """The network, how an image is brought to it, and what becomes of its answer."""
+    """Settings of the network, of its input image, and of the masks made of its output."""
 
     stride: Literal[8, 16, 32] = 8
     """FCN-8s, 16s or 32s: stride in pixels of the finest features that are used."""
@@ -151,11 +152,11 @@ class SegmentationConfig(Settings):
 
 
 class FCN(nn.Module):
-    """An image to the logits of background and objects at each of its pixels.
+    """A network from an image to the logits of background and objects at each pixel.
 
-    Each level scores classes by a 1x1 convolution; the coarse scores are enlarged twice by a
-    learned convolution that begins bilinear, and added to the next finer ones, which begin at zero
-    (section 4.1 of the paper). The last enlargement, to pixels, is bilinear and fixed.
+    Each level scores classes by a 1x1 convolution. Coarse scores are enlarged twice by a learned
+    convolution, initially bilinear, and added to the next finer ones, initially zero (section 4.1
+    of the paper). The last enlargement, to pixels, is bilinear and fixed.
     """
 
     def __init__(self, objects: int, config: SegmentationConfig | None = None) -> None:
@@ -172,18 +173,18 @@ class FCN(nn.Module):
         with torch.no_grad():
             for parameter in self.scores[1:].parameters():
                 parameter.zero_()
-            # An enlargement begins as the bilinear one, each class by itself.
+            # An enlargement is initially bilinear, each class by itself.
             ramp = torch.tensor([0.25, 0.75, 0.75, 0.25])
-            each = torch.arange(classes)
+            index = torch.arange(classes)
             for weight in self.enlarge.parameters():
                 weight.zero_()
-                weight[each, each] = ramp[:, None] * ramp
+                weight[index, index] = ramp[:, None] * ramp
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b classes h w"]:
-        """Give logits, background first; both sides of the image are multiples of 32.
+        """Give logits, background first.
 
-        Colours have ImageNet's mean and spread taken off
-        (:func:`normalise_colors`).
+        Args:
+            image: colours normalised by :func:`normalise_colors`; its sides are multiples of 32.
         """
         features = self.encoder(image)[::-1]
         scores = self.scores[0](features[0])
@@ -197,7 +198,7 @@ class FCN(nn.Module):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SegmentationWeights:
-    """What a weights file of this kind holds."""
+    """The contents of a weights file of this kind."""
 
     network: FCN  #: in eval mode; class 0 is the background, class ``1 + i`` is ``objects[i]``
     objects: tuple[str, ...]  #: names, in the order of the classes
@@ -235,16 +236,16 @@ def write_segmentation(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Segmentation:
-    """What one image shows."""
+    """The objects that were found in an image."""
 
-    #: of the instances of each object that was found, the surest first; an object that was not
+    #: of the instances of each object, those of the highest scores first; an object that was not
     #: found has no entry.
     masks: Mapping[str, Bool[Tensor, "n h w"]]
     scores: Mapping[str, Float[Tensor, " n"]]  #: mean probability of the object on each mask, 0..1
 
 
 class Segmenter:
-    """Finds known objects in an image: sizes, colours and connected parts are its concern.
+    """Segments known objects in images of any size.
 
     ::
 
@@ -283,7 +284,7 @@ class Segmenter:
         """Find the objects of an image of any size, a tensor of RGB in [0, 1] (not OpenCV's BGR).
 
         Raises:
-            InputError: it is no such image.
+            InputError: the tensor is no such image.
         """
         check_image(image, "the image")
         probability = class_probabilities(self._network, image)
@@ -305,8 +306,8 @@ class Segmenter:
 def class_probabilities(network: FCN, image: Image) -> Float[Tensor, "classes h w"]:
     """Give the probability of background and objects at each pixel of an image of any size.
 
-    The image is brought to the network's long side, both sides padded at the bottom and right to
-    multiples of 32 by its last rows and columns; the logits are cut and brought back.
+    The image is resized to the network's long side, and padded at the bottom and right to multiples
+    of 32 by its last rows and columns. The logits are cropped and resized back.
     """
     device = next(network.parameters()).device
     height, width = image.shape[-2:]
@@ -323,24 +324,24 @@ def class_probabilities(network: FCN, image: Image) -> Float[Tensor, "classes h 
 
 
 def connected_parts(mask: Bool[Tensor, "h w"], config: SegmentationConfig) -> Bool[Tensor, "n h w"]:
-    """Split a mask into parts whose pixels touch; those that are large enough.
+    """Give the connected parts of a mask that are large enough; the largest alone if so configured.
 
-    With one instance an image, the largest alone.
+    ``config`` has the least share of the image, and whether it shows each object once.
     """
     label, pixels = label_parts(mask)
-    least = max(1, math.ceil(config.min_share * mask.numel()))
-    large = (pixels >= least).nonzero()[:, 0]
+    least_px = max(1, math.ceil(config.min_share * mask.numel()))
+    large = (pixels >= least_px).nonzero()[:, 0]
     if config.with_one_instance and len(large):
         large = pixels.argmax()[None]
     return label == large[:, None, None]
 
 
 def label_parts(mask: Bool[Tensor, "h w"]) -> tuple[Int64[Tensor, "h w"], Int64[Tensor, " n"]]:
-    """Number the parts of a mask whose pixels touch, at corners too.
+    """Label the connected parts of a mask; pixels that touch at a corner are connected.
 
     Returns:
-        The number of each pixel's part, 0 beside the mask; and by number how many pixels a part
-        has, 0 for number 0.
+        The label of each pixel, 0 outside the mask; and the number of pixels of each label, 0 for
+        label 0.
     """
     numbered = np.empty(mask.shape, np.int32)
     ndimage.label(mask.cpu().numpy(), structure=[[1] * 3] * 3, output=numbered)
@@ -359,7 +360,7 @@ def count_overlap(
 
 
 def intersection_over_union(table: Int64[Tensor, "c c"]) -> Float[Tensor, " c"]:
-    """Sum up a table of :func:`count_overlap`; NaN for a class that is neither found nor true."""
+    """Give the ratio of each class in a table of :func:`count_overlap`; NaN if it never occurs."""
     both = table.diagonal()
     either = table.sum(0) + table.sum(1) - both
     return torch.where(either > 0, both / either, torch.nan)

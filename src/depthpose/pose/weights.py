@@ -42,15 +42,15 @@ POSE_NETWORKS: dict[str, tuple[type[AnyNetwork], type]] = {
     "depth-image": (DepthImageNet, DepthImageConfig),
 }
 """Network and config of each kind of file: the method's, and those of its baselines."""
-_OFF = 0.02  # keypoints lie on the surface; so many diameters off the mesh, it is another one
-_OTHER_SIZE = 0.05  # so much longer or shorter is another mesh; declared diameters are off by less
+_KEYPOINT_GAP = 0.02  # largest distance of a keypoint from the right mesh, in diameters
+_SIZE_GAP = 0.05  # largest difference of the right mesh's diameter from the declared one, its share
 _SURFACE = ("vertices_m", "faces", "normals")
 _TENSORS = (*_SURFACE, "keypoints_m")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PoseWeights:
-    """What a file of pose weights contains: enough to pose an object without its CAD file."""
+    """The contents of a file of pose weights: enough to pose an object without its CAD file."""
 
     network: AnyNetwork  #: partial cloud to directions, in eval mode where read; or a baseline
     models: tuple[ObjectModel, ...]  #: the objects; class k of the network is ``models[k]``
@@ -71,11 +71,11 @@ class PoseWeights:
                 f"the network takes {config.inputs} features of a voxel, but its clouds give "
                 f"{inputs}. Set with_shape of the cloud as it was in training."
             )
-        wanted = None if isinstance(config, DepthImageConfig) else config.keypoints
+        keypoints = None if isinstance(config, DepthImageConfig) else config.keypoints
         for model in self.models:
-            if wanted not in (None, len(model.keypoints_m)):
+            if keypoints not in (None, len(model.keypoints_m)):
                 raise InputError(
-                    f"the network points at {wanted} keypoints, but object {model.name!r} has "
+                    f"the network points at {keypoints} keypoints, but object {model.name!r} has "
                     f"{len(model.keypoints_m)}. Make the model with as many."
                 )
         refuse_one_name(self.models)
@@ -86,9 +86,12 @@ def write_pose_weights(
 ) -> None:
     """Write a network and its objects to one ``.safetensors`` file.
 
-    With half, the network's numbers have 16 bits: half the size; models stay exact. Without
-    meshes, which a licence may not let pass on, the file cannot be used until
-    :func:`complete_weights` has put the models' surfaces in again.
+    Args:
+        path: of the file.
+        weights: the network and its objects.
+        with_half: write the network in 16 bits, at half the size; models stay exact.
+        with_meshes: write the models' surfaces. A licence may forbid it; then the file cannot be
+            used until :func:`complete_weights` has added them again.
     """
     network = weights.network
     learnt = half_state(network) if with_half else network.state_dict()
@@ -123,9 +126,14 @@ def write_pose_weights(
 
 
 def complete_weights(path: Path, meshes: Mapping[int, ObjectModel], out: Path) -> None:
-    """Put surfaces into weights that were written without; ``meshes`` are by number.
+    """Add surfaces to weights that were written without them.
 
     Names, keypoints and symmetries stay those of the weights.
+
+    Args:
+        path: of the weights.
+        meshes: models with surfaces, by number.
+        out: path of the completed weights.
 
     Raises:
         InputError: an object is missing, or is not the one that the weights were trained on.
@@ -141,13 +149,14 @@ def complete_weights(path: Path, meshes: Mapping[int, ObjectModel], out: Path) -
                 f"among {sorted(meshes)}. Give the data set that it was trained on."
             )
         model = meshes[number]
-        off_m = gap_to_surface_m(keypoints_m, model)
-        own_m = record["diameter_m"]
-        if off_m > _OFF * own_m or abs(model.diameter_m / own_m - 1) > _OTHER_SIZE:
+        gap_m = gap_to_surface_m(keypoints_m, model)
+        diameter_m = record["diameter_m"]
+        is_other_size = abs(model.diameter_m / diameter_m - 1) > _SIZE_GAP
+        if gap_m > _KEYPOINT_GAP * diameter_m or is_other_size:
             raise InputError(
-                f"{path}: a keypoint of object {number} ({record['name']}, {own_m:.3g} m long) "
-                f"lies {off_m:.3g} m off the model {model.name} ({model.diameter_m:.3g} m long): "
-                "another object, frame or unit. Give the models that it was trained on."
+                f"{path}: a keypoint of object {number} ({record['name']}, {diameter_m:.3g} m "
+                f"long) lies {gap_m:.3g} m off the model {model.name} ({model.diameter_m:.3g} m "
+                "long): another object, frame or unit. Give the models that it was trained on."
             )
         for name in _SURFACE:
             tensor = getattr(model, name)
@@ -157,11 +166,11 @@ def complete_weights(path: Path, meshes: Mapping[int, ObjectModel], out: Path) -
     save_checkpoint(out, dataclasses.replace(checkpoint, state=state))
 
 
-_COLORS = "colors."  # begins the names of a model's coloured points
+_COLORS = "colors."  # prefix of the names of a model's coloured points
 
 
 def _color_tensors(k: int, model: ObjectModel) -> dict[str, Tensor]:
-    """Give the colours of model k by the names that a file has them under, a byte a channel."""
+    """Give the tensors of the colours of model k by their names in a file; a byte a channel."""
     colors = model.colors
     if colors is None:
         return {}
@@ -169,7 +178,7 @@ def _color_tensors(k: int, model: ObjectModel) -> dict[str, Tensor]:
         "points_m": colors.points_m.clone(),
         "normals": colors.normals.half(),
         "rgb": (255 * colors.rgb).round().clamp(0, 255).to(torch.uint8),
-        # A row as all tensors of a model are; its columns are one number.
+        # A row of three columns, as all tensors of a model are; each holds the number.
         "spacing_m": torch.full((1, 3), colors.spacing_m),
     }
     return {f"models.{k}.{_COLORS}{name}": tensor for name, tensor in tensors.items()}
@@ -253,10 +262,10 @@ def read_pose_weights(path: Path) -> PoseWeights:
 
 def _model_of(record: Any, state: Mapping[str, Tensor], source: str) -> ObjectModel:  # noqa: ANN401
     """Make an object of its entry in the config and its tensors; ``source`` is for errors."""
-    lost = [name for name in _TENSORS if name not in state]
-    lost += [name for name in ("name", "number", "diameter_m") if name not in record]
-    if lost:
-        raise InputError(f"{source} has no {lost[0]!r}; the file is of another version.")
+    missing = [name for name in _TENSORS if name not in state]
+    missing += [name for name in ("name", "number", "diameter_m") if name not in record]
+    if missing:
+        raise InputError(f"{source} has no {missing[0]!r}; the file is of another version.")
     vertices = state["vertices_m"]
     faces = state["faces"].long()
     shapes = {name: tuple(tensor.shape[1:]) for name, tensor in state.items()}
@@ -281,9 +290,7 @@ def _model_of(record: Any, state: Mapping[str, Tensor], source: str) -> ObjectMo
 
 
 def settings_of(checkpoint: Checkpoint, source: str) -> dict[str, Any]:
-    """Give the settings of a file's network, clouds and refusal as they are used today.
-
-    Those that the file does not have are at their defaults.
+    """Give the settings of a file's network, clouds and refusal, with defaults for missing ones.
 
     Raises:
         InputError: a setting is unknown, or has a value that is refused.

@@ -1,4 +1,4 @@
-"""What detectors find, from any of their files: boxes or masks, with a class and a score."""
+"""Detections from files of detectors: boxes or masks, with a class and a score."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -24,21 +24,22 @@ _YOLO = "class cx cy w h [confidence]"
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Detection:
-    """One object that was found in an image: a mask, or a box about it.
+    """One object that a detector found in an image: a mask, or a box about it.
 
     Raises:
         InputError: it has neither or both, or a box whose edges are not in order.
     """
 
-    object: str | None = None  # name of its class, where it is said
-    object_id: int | None = None  #: number of its class (``category_id``), where it is said
-    score: float = 1.0  #: how sure; 1 where that is not said
+    # All but box or mask is None where the file does not give it.
+    object: str | None = None  # name of its class
+    object_id: int | None = None  #: number of its class (``category_id``)
+    score: float = 1.0  #: confidence; 1 where the file gives none
     box: Box | None = None  #: edges; may reach beyond the image
     segmentation: Runs | None = None  #: run lengths as in the file, checked
     scene_id: int | None = None  #: number of the scene, of BOP's data sets
-    image_id: int | None = None  #: number of the image, where it is said
-    image: str | None = None  #: name of the image's file without its ending, where it is said
-    seconds: float | None = None  #: what the image took, where it is said
+    image_id: int | None = None  #: number of the image
+    image: str | None = None  #: name of the image's file without its ending
+    seconds: float | None = None  #: time that the detector took for the image
 
     def __post_init__(self) -> None:
         if (self.box is None) == (self.segmentation is None):
@@ -52,7 +53,7 @@ class Detection:
 
     @property
     def label(self) -> str:
-        """The class as it is said: its name, or else its number."""
+        """The name of the class, or its number where there is no name."""
         return str(self.object_id) if self.object is None else self.object
 
     def mask(self, height: int, width: int) -> Bool[Tensor, "height width"]:
@@ -91,10 +92,10 @@ def parse_box(text: str) -> Box:
 
 
 def check_box(box: Box) -> None:
-    """Refuse a box whose edges are no finite numbers, or not in order.
+    """Check that the edges of a box are finite and in order.
 
     Raises:
-        InputError: that is so.
+        InputError: they are not.
     """
     x0, y0, x1, y1 = box
     if not all(math.isfinite(edge) for edge in box) or not x0 < x1 or not y0 < y1:
@@ -152,56 +153,74 @@ def read_detections(path: str | Path, size: tuple[int, int] | None = None) -> li
 
 
 def _read_coco(path: Path) -> list[Detection]:
-    """Read entries of BOP or COCO; where one has a mask, its box says nothing new."""
+    """Read entries of BOP or COCO."""
     content = read_json(path)
-    names: dict[int, str] = {}  # of classes
-    files: dict[int, str] = {}  # of images
+    class_names: dict[int, str] = {}
+    image_files: dict[int, str] = {}
     if isinstance(content, dict) and "annotations" in content:
         for category in _entries(content.get("categories", []), f"{path}: categories"):
-            names[integer(category, "id", f"{path}: categories")] = str(category.get("name"))
+            class_names[integer(category, "id", f"{path}: categories")] = str(category.get("name"))
         for image in _entries(content.get("images", []), f"{path}: images"):
-            files[integer(image, "id", f"{path}: images")] = str(image.get("file_name"))
+            image_files[integer(image, "id", f"{path}: images")] = str(image.get("file_name"))
         content = content["annotations"]
-    detections: list[Detection] = []
-    for place, row in enumerate(_entries(content, str(path))):
-        source = f"{path}: entry {place}"
-        name = row.get("name", row.get("category_name"))
-        object_id = None
-        if "category_id" in row or name is None:
-            object_id = integer(row, "category_id", source)
-        name = names.get(object_id) if name is None and object_id is not None else name
-        image_id = integer(row, "image_id", source) if _is_number(row, "image_id") else None
-        file = row.get("file_name", row.get("image_id") if image_id is None else None)
-        file = files.get(image_id) if file is None and image_id is not None else file
-        seconds = number(row, "time", -1.0, source)
-        segmentation = row.get("segmentation")
-        box = None
-        if row.get("bbox") is not None and not segmentation:
-            left, top, width, height = numbers(row, "bbox", 4, source)
+    return [
+        _parse_coco_entry(row, class_names, image_files, f"{path}: entry {place}")
+        for place, row in enumerate(_entries(content, str(path)))
+    ]
+
+
+def _parse_coco_entry(
+    row: dict[str, Any], class_names: dict[int, str], image_files: dict[int, str], source: str
+) -> Detection:
+    """Read one entry of BOP or COCO; where it has a mask, its box is ignored.
+
+    Args:
+        row: the entry.
+        class_names: by number.
+        image_files: by number.
+        source: of the entry, for errors.
+    """
+    # The class, by name or number.
+    name = row.get("name", row.get("category_name"))
+    object_id = None
+    if "category_id" in row or name is None:
+        object_id = integer(row, "category_id", source)
+    if name is None and object_id is not None:
+        name = class_names.get(object_id)
+
+    # The image, by number or by the name of its file.
+    image_id = integer(row, "image_id", source) if _is_number(row, "image_id") else None
+    file = row.get("file_name", row.get("image_id") if image_id is None else None)
+    if file is None and image_id is not None:
+        file = image_files.get(image_id)
+
+    # The mask, or the box.
+    seconds = number(row, "time", -1.0, source)
+    segmentation = row.get("segmentation")
+    box = None
+    if row.get("bbox") is not None and not segmentation:
+        left, top, width, height = numbers(row, "bbox", 4, source)
+        if [left, top, width, height] != _NO_BOX:
             box = (left, top, left + width, top + height)
-            box = None if [left, top, width, height] == _NO_BOX else box
-        try:
-            detections.append(
-                Detection(
-                    object=None if name is None else str(name),
-                    object_id=object_id,
-                    score=number(row, "score", 1.0, source),
-                    box=box,
-                    segmentation=read_runs(segmentation, source) if segmentation else None,
-                    scene_id=integer(row, "scene_id", source) if "scene_id" in row else None,
-                    image_id=image_id,
-                    image=None if file is None else PurePosixPath(str(file)).stem,
-                    seconds=seconds if seconds >= 0 else None,
-                )
-            )
-        except InputError as error:
-            reason = str(error)
-            raise InputError(reason if source in reason else f"{source}: {reason}") from error
-    return detections
+    try:
+        return Detection(
+            object=None if name is None else str(name),
+            object_id=object_id,
+            score=number(row, "score", 1.0, source),
+            box=box,
+            segmentation=read_runs(segmentation, source) if segmentation else None,
+            scene_id=integer(row, "scene_id", source) if "scene_id" in row else None,
+            image_id=image_id,
+            image=None if file is None else PurePosixPath(str(file)).stem,
+            seconds=seconds if seconds >= 0 else None,
+        )
+    except InputError as error:
+        reason = str(error)
+        raise InputError(reason if source in reason else f"{source}: {reason}") from error
 
 
 def _read_yolo(path: Path, size: tuple[int, int] | None) -> list[Detection]:
-    """Read boxes of YOLO: a line each of class, centre, size (shares of ``size``) and score."""
+    """Read boxes of YOLO: in each line class, centre and size (shares of the image), and score."""
     if size is None:
         raise InputError(
             f"{path}: its boxes are shares of an image whose size is not known here; give JSON, or "
@@ -230,8 +249,10 @@ def _read_yolo(path: Path, size: tuple[int, int] | None) -> list[Detection]:
                 f"{source}: {text.strip()[:80]!r} is not {_YOLO}, a class of 0 or more, and shares "
                 "of the image from 0 to 1; boxes in pixels go into JSON as COCO's bbox"
             )
-        wide, high = size
-        box = ((cx - w / 2) * wide, (cy - h / 2) * high, (cx + w / 2) * wide, (cy + h / 2) * high)
+        width, height = size
+        left, right = (cx - w / 2) * width, (cx + w / 2) * width
+        top, bottom = (cy - h / 2) * height, (cy + h / 2) * height
+        box = (left, top, right, bottom)
         score = shares[4] if len(shares) == 5 else 1.0
         detections.append(Detection(object_id=object_id, score=score, box=box, image=path.stem))
     return detections
@@ -270,12 +291,12 @@ def write_detections(path: str | Path, detections: Sequence[Detection]) -> None:
 
 
 def parse_labels(text: str, objects: Sequence[str]) -> dict[str, str]:
-    """Read ``1=bracket,2=gear``: classes, by number or name, and the objects that they are.
+    """Read ``1=bracket,2=gear``: the object of each class, which is given by number or name.
 
-    ``3=`` leaves class 3 out: its name is empty.
+    ``3=`` leaves class 3 out: the name of its object is empty.
 
     Raises:
-        InputError: it is written otherwise, a class is given twice, or an object is not known.
+        InputError: the text is not of this form, names a class twice, or an unknown object.
     """
     labels: dict[str, str] = {}
     for part in text.split(","):
@@ -302,14 +323,14 @@ def name_objects(
     wanted: str | None,
     source: str,
 ) -> list[Detection]:
-    """Give each detection the name of its object; those of no wanted object are left out.
+    """Give each detection the name of its object, and leave out those of other objects.
 
     Args:
         detections: of any classes.
         labels: of :func:`parse_labels`.
-        objects: names of those that are known; a class of such a name is that object.
-        wanted: the only object that is asked for, if any; where no class has a name and all are one
-            class, it is this object.
+        objects: names of the known objects; a class of such a name is that object.
+        wanted: the only object to keep, if any; where all detections are of one class without a
+            name, it is this object.
         source: of the detections, in errors.
 
     Raises:
@@ -340,13 +361,13 @@ def name_objects(
 def group_by_image(
     detections: Sequence[Detection], images: Sequence[str], source: str
 ) -> dict[str, list[Detection]]:
-    """Share detections among images, by the names of their files without endings.
+    """Group detections by image, which are given by the names of their files without endings.
 
-    A detection is of the image of its ``image``, or of that whose name is its ``image_id``. Where
-    there is one image, and all detections are of one, these are the same.
+    A detection belongs to the image named ``image``, or to that whose name is the number
+    ``image_id``. Where one image is given, and all detections are of one image, it is that.
 
     Raises:
-        InputError: a detection says no image, or none of the detections is of one of these.
+        InputError: a detection names no image, or no detection is of a given image.
     """
     places = {(detection.scene_id, detection.image_id, detection.image) for detection in detections}
     if len({detection.scene_id for detection in detections}) > 1:
@@ -356,7 +377,7 @@ def group_by_image(
         )
     if len(images) == 1 and len(places) <= 1:
         return {images[0]: list(detections)}
-    shares: dict[str, list[Detection]] = {image: [] for image in images}
+    groups: dict[str, list[Detection]] = {image: [] for image in images}
     by_number = {int(image): image for image in images if image.isascii() and image.isdecimal()}
     for place, detection in enumerate(detections):
         if detection.image is None and detection.image_id is None:
@@ -365,18 +386,18 @@ def group_by_image(
                 "number that the depth image has for a name, or file_name"
             )
         image = detection.image
-        if image not in shares and detection.image_id is not None:
+        if image not in groups and detection.image_id is not None:
             image = by_number.get(detection.image_id)
-        if image in shares:
-            shares[image].append(detection)
-    if detections and not any(shares.values()):
+        if image in groups:
+            groups[image].append(detection)
+    if detections and not any(groups.values()):
         detection = detections[0]
         raise InputError(
             f"{source}: no detection is of {images[0]!r}{' or another image' * (len(images) > 1)}; "
             f"the first is of {detection.image or detection.image_id!r}. Name the depth images as "
             "the detections say (image_id 12 is 12.png or 000012.png), or correct the file"
         )
-    return shares
+    return groups
 
 
 def _entries(content: object, source: str) -> list[dict[str, Any]]:

@@ -30,7 +30,7 @@ MOST = 10**9  #: of scenes, images and objects: their numbers name files
 
 
 def entry_number(key: object) -> int | None:
-    """Take the number that names a scene, an image or an object; None where it is none."""
+    """Parse the number that names a scene, an image or an object; None where it is no number."""
     text = str(key)
     return int(text) if len(text) <= 9 and text.isascii() and text.isdecimal() else None
 
@@ -57,7 +57,7 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
 
 
 def numbers(entry: object, key: str, count: int, source: str) -> list[float]:
-    """Take ``count`` finite numbers."""
+    """Get a list of ``count`` finite numbers from an entry."""
     values = entry.get(key) if isinstance(entry, Mapping) else None
     # A whole number beyond 1e300 has no float.
     if (
@@ -70,7 +70,7 @@ def numbers(entry: object, key: str, count: int, source: str) -> list[float]:
 
 
 def integer(entry: object, key: str, source: str) -> int:
-    """Take a whole number of 0 or more."""
+    """Get a whole number of 0 or more from an entry."""
     value = entry.get(key) if isinstance(entry, Mapping) else None
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= MOST:
         raise InputError(
@@ -80,7 +80,7 @@ def integer(entry: object, key: str, source: str) -> int:
 
 
 def number(entry: object, key: str, default: float | None, source: str) -> float:
-    """Take a finite number; ``default`` where it is missing and there is one."""
+    """Get a finite number from an entry; ``default``, if any, where it is missing."""
     value = entry.get(key, default) if isinstance(entry, Mapping) else None
     if not isinstance(value, int | float) or isinstance(value, bool) or not abs(value) < 1e300:
         raise InputError(f"{source}: {key} is {_short(value)}, where a number belongs")
@@ -88,7 +88,10 @@ def number(entry: object, key: str, default: float | None, source: str) -> float
 
 
 def make_pose(R: list[float], t_mm: list[float], source: str) -> Rigid:
-    """Make a pose of nine numbers row by row and three in mm, its rotation made exact."""
+    """Make a pose of a rotation matrix, row by row, and a translation in mm.
+
+    The rotation is replaced by the nearest exact one, for published numbers are rounded.
+    """
     rough = torch.tensor(R, dtype=torch.float64).reshape(3, 3)
     u, sizes, vh = torch.linalg.svd(rough)
     if float((sizes - 1).abs().max()) > _ROTATION_SLACK or float(torch.linalg.det(rough)) < 0:
@@ -145,11 +148,11 @@ class Instance:
 
 
 def bop_splits(folder: Path) -> dict[str, tuple[str, str]]:
-    """Give the splits of a data set by name: the folder of each, and the end of its files' names.
+    """Give the splits of a data set by name, with the folder and the suffix of file names of each.
 
-    Where the scenes are of several sensors, as in BOP-Industrial, each has files of its own, such
-    as ``scene_camera_photoneo.json`` beside ``depth_photoneo``. The split ``test`` by that sensor
-    is called ``test_photoneo``; a sensor without depth images is none.
+    Where the scenes are of several sensors, as in BOP-Industrial, each sensor has its own files,
+    such as ``scene_camera_photoneo.json`` beside ``depth_photoneo``. The split ``test`` of that
+    sensor is called ``test_photoneo``. Sensors without depth images are left out.
     """
     splits = {
         path.parent.parent.name: (path.parent.parent.name, "")
@@ -164,7 +167,7 @@ def bop_splits(folder: Path) -> dict[str, tuple[str, str]]:
 
 
 def bop_scenes(folder: Path, split: str) -> tuple[list[Path], str]:
-    """List the scenes of a split, and give the end of the names of its files."""
+    """List the scenes of a split, and give the suffix of its files' names."""
     splits = bop_splits(folder)
     if split not in splits:
         sensors = [name for name, (home, end) in splits.items() if home == split and end]
@@ -186,7 +189,7 @@ def bop_scenes(folder: Path, split: str) -> tuple[list[Path], str]:
 
 
 def bop_instances(scene: Path, end: str = "") -> Iterator[Instance]:
-    """Read the annotations of one scene; ``end``: of the names of its files, as _photoneo."""
+    """Read the annotations of one scene; ``end`` is the suffix of its files' names (_photoneo)."""
     camera_path = scene / f"scene_camera{end}.json"
     truth_path = scene / f"scene_gt{end}.json"
     info_path = scene / f"scene_gt_info{end}.json"
@@ -250,22 +253,22 @@ def _bop_split(folder: Path, split: str) -> Iterator[Instance]:
 
 @dataclass(frozen=True, kw_only=True)
 class BopTarget:
-    """So many instances of an object in an image; without an object, all that it shows."""
+    """An entry of a list of targets: instances that are to be posed in an image."""
 
     scene_id: int
     image_id: int
-    object_id: int | None = None
-    count: int | None = None
+    object_id: int | None = None  #: None: all objects in the image
+    count: int | None = None  #: number of instances of the object; None: all
 
 
 def read_targets(path: str | Path, folder: str | Path = ".") -> list[BopTarget]:
     """Read a list of targets: a file, or the name of one in the folder of its data set.
 
-    ``test_targets_bop19.json`` asks for so many instances of an object; ``test_targets_bop24.json``
-    may name images alone, of which everything is asked for.
+    Entries of ``test_targets_bop19.json`` name an object and the number of its instances; those of
+    ``test_targets_bop24.json`` may name images alone, with all their objects.
 
     Raises:
-        InputError: it is missing or damaged.
+        InputError: the file is missing or damaged.
     """
     path = Path(path) if Path(path).is_file() else Path(folder, path)
     targets = []
@@ -292,8 +295,8 @@ SYMMETRIC = (10, 11)  #: Eggbox and glue: measured by ADD-S ever since Hintersto
 def linemod_instances(folder: Path, split: str) -> Iterator[Instance]:
     """Read the annotations of a split: ``train`` or ``test``, by the lists beside the data.
 
-    The folder of an object shows others too (in object 2's they are annotated): its own alone
-    counts, as in every published number.
+    The folder of an object shows others too (in that of object 2 they are annotated); only its own
+    object counts, as in every published number.
     """
     for scene in sorted(folder.glob("data/[0-9][0-9]")):
         listed = scene / f"{split}.txt"
@@ -370,7 +373,7 @@ split in it."""
 
 
 def layout_of(folder: Path) -> tuple[str, Layout]:
-    """Give the layout of a folder by name, BOP's where none fits."""
+    """Give the name and the layout of a folder; BOP's where none fits."""
     name = next((name for name, layout in LAYOUTS.items() if layout.splits(folder)), "BOP")
     return name, LAYOUTS[name]
 
@@ -379,9 +382,9 @@ _MODEL_FOLDERS = ("models", "models_eval", "models_points")
 
 
 def read_models_info(folder: Path) -> tuple[Path, dict[int, dict[str, Any]]]:
-    """Find a data set's folder of models, and read what it says of each object, by number.
+    """Find a data set's folder of models, and read its entries of objects, by number.
 
-    Nothing is said where there is neither ``models_info.json`` nor ``.yml``.
+    There are no entries where there is neither ``models_info.json`` nor ``.yml``.
 
     Raises:
         InputError: there is no such folder, or the file is damaged.
@@ -437,7 +440,7 @@ def read_bop_models(
 
 
 def object_names(folder: Path, numbers: Iterable[int] | None = None) -> dict[int, str]:
-    """Say what samples call objects, by number; None: all that ``models_info`` lists.
+    """Give the names of objects by number; of all in ``models_info`` where none are given.
 
     Raises:
         InputError: there is no folder of models, or the file is damaged.

@@ -1,4 +1,4 @@
-"""Masks of one object: pictures, and COCO's run lengths."""
+"""Masks of objects: pictures, and COCO's run lengths."""
 
 from collections.abc import Collection, Mapping
 from pathlib import Path
@@ -14,7 +14,7 @@ from depthpose.core.files import read_json
 from depthpose.core.files.images import MAX_PIXELS, opened_image
 
 Runs = tuple[tuple[int, ...], int, int]  #: run lengths, height and width
-_MOST_LABELS = 64  # different values of an image of labels; of more, it is a picture
+_MOST_LABELS = 64  # different values of an image of labels; one of more is a picture
 _HALF = 127  # of 255: values above it are the object, in masks with soft edges
 _SOFT = 32  # of 255: values farther than this from black and white are grey
 _MOST_BITS = 40  # of a run length in text: no image has as many pixels
@@ -34,19 +34,19 @@ def read_labels(
 ) -> Int64[Tensor, "mask_h mask_w"]:
     """Read a mask image of any kind: 0 where it is black or transparent, a number for each object.
 
-    Of a picture in colour they are 1, 2, ... in the order of the colours. Where an alpha channel
-    leaves a photograph or one colour, what is opaque is the object. A ``.json`` file holds COCO's
-    run lengths (``size`` and ``counts``, compressed or not), an annotation or a detection with such
-    a ``segmentation``, or a list of one of these.
+    Of a picture in colour they are 1, 2, ... in the order of the colours. In a photograph, or a
+    picture of one colour, with an alpha channel the opaque pixels are the object. A ``.json`` file
+    holds COCO's run lengths (``size`` and ``counts``, compressed or not), an annotation or a
+    detection with such a ``segmentation``, or a list of one of these.
 
     Args:
         path: picture or ``.json``.
-        labels: numbers of a label map that have a meaning: each keeps its value, also where it is
-            alone, and another number is refused; None: what the picture shows is numbered.
+        labels: numbers of a label map: each keeps its value, also where it is alone, and another
+            number is refused; None: the objects of the picture are numbered.
 
     Raises:
-        InputError: it is missing, no picture, a JPEG of numbered objects, or no list of one mask;
-            or it holds a number that is none of the labels.
+        InputError: the file is missing, no picture, a JPEG of numbered objects, or no list of one
+            mask; or it holds a number that is not among the labels.
     """
     if path.suffix.lower() == ".json":
         if labels is not None:
@@ -64,7 +64,7 @@ def read_labels(
         return decode_rle(*read_runs(entries[0], str(path))).long()
     pixels = _mask_pixels(path, with_palette=labels is None)
 
-    # Each colour is a number.
+    # Each colour becomes a number.
     values = pixels[..., 0]
     if pixels.shape[2] > 1 and (pixels[..., :3] != values[..., None]).any():
         colour = values.astype(np.int32)
@@ -74,18 +74,18 @@ def read_labels(
         # Not by the inverse of np.unique, which takes five times the memory.
         values = np.searchsorted(colours, colour).astype(np.int32) + (colours[0] != 0)
 
-    # An alpha channel may be the mask: what is opaque, in a photograph or in one colour.
+    # An alpha channel is the mask where the opaque pixels have one colour, or too many for labels.
     is_opaque = pixels[..., 3] > _HALF if pixels.shape[2] == 4 else values != 0
     if pixels.shape[2] == 4 and 0 < is_opaque.sum() < is_opaque.size:
-        is_shape = len(np.unique(values[is_opaque])) not in range(2, _MOST_LABELS)
-        values = np.where(is_opaque, 1 if is_shape else values, 0)
-    return number_objects(values) if labels is None else _labelled(values, labels, path)
+        is_one_object = len(np.unique(values[is_opaque])) not in range(2, _MOST_LABELS)
+        values = np.where(is_opaque, 1 if is_one_object else values, 0)
+    return number_objects(values) if labels is None else _keep_labels(values, labels, path)
 
 
 def _mask_pixels(path: Path, *, with_palette: bool) -> np.ndarray:
     """Read the pixels of a mask image (h, w, channels): 1 of numbers, 3 of colours, 4 with alpha.
 
-    ``with_palette``: take the colours of a palette; else its numbers.
+    ``with_palette`` gives the colours of a palette, else its indices.
     """
     with opened_image(path) as image:
         if image.mode in ("LA", "PA", "RGBA", "RGBa", "La") or "transparency" in image.info:
@@ -97,7 +97,7 @@ def _mask_pixels(path: Path, *, with_palette: bool) -> np.ndarray:
             pixels = np.asarray(image).astype(kind)[..., None]
         else:
             pixels = np.asarray(image.convert("RGB"))
-        if image.format == "JPEG":  # what compression leaves about an edge is no object
+        if image.format == "JPEG":  # compression leaves grey pixels at edges, which are no object
             is_grey = (pixels > _SOFT) & (pixels < 255 - _SOFT)
             if is_grey.sum() > (pixels >= 255 - _SOFT).sum():
                 raise InputError(
@@ -108,10 +108,14 @@ def _mask_pixels(path: Path, *, with_palette: bool) -> np.ndarray:
     return pixels
 
 
-def _labelled(
+def _keep_labels(
     values: np.ndarray, labels: Collection[int], path: Path
 ) -> Int64[Tensor, "mask_h mask_w"]:
-    """Keep the pixels of the labels; refuse another number that fills a square of three pixels."""
+    """Set pixels of no label to 0.
+
+    Raises:
+        InputError: another number fills a square of three by three pixels somewhere.
+    """
     for other in sorted(_solid_numbers(values) - set(labels)):
         raise InputError(
             f"{path}: {int((values == other).sum())} pixels have the number {other}, which the "
@@ -121,7 +125,7 @@ def _labelled(
 
 
 def _solid_numbers(values: np.ndarray) -> set[int]:
-    """Give the numbers but 0 that fill a square of three pixels somewhere."""
+    """Give the numbers other than 0 that fill a square of three by three pixels somewhere."""
     middle = values[1:-1, 1:-1]
     is_solid = middle != 0
     for row, column in np.ndindex(3, 3):
@@ -131,10 +135,10 @@ def _solid_numbers(values: np.ndarray) -> set[int]:
 
 
 def number_objects(values: np.ndarray) -> Int64[Tensor, "h w"]:
-    """Give each object of a mask (h, w) of whole numbers its number; 1 where there is one alone.
+    """Label the objects of a mask (h, w) of whole numbers by these; one object gets the number 1.
 
-    A number is an object where it fills a square of three pixels: between the values of a mask
-    with soft borders lie others, which do not. Of more than 64 numbers all are one object.
+    A number is an object where it fills a square of three by three pixels; the values at the soft
+    borders of a mask do not. A mask of more than 64 numbers is one object.
     """
     shown = values[values != 0]
     if len(shown) == 0 or (shown == shown[0]).all():
@@ -146,10 +150,10 @@ def number_objects(values: np.ndarray) -> Int64[Tensor, "h w"]:
 
 
 def one_mask(labels: Int64[Tensor, "h w"], name: str) -> Bool[Tensor, "h w"]:
-    """Take the mask of one object.
+    """Turn labels into the mask of their only object.
 
     Raises:
-        InputError: there are several; which, and how large they are.
+        InputError: there are several objects.
     """
     numbers = np.unique(labels.cpu().numpy())
     numbers = numbers[numbers != 0]
@@ -180,9 +184,9 @@ def encode_rle(mask: Bool[Tensor, "h w"]) -> Runs:
 
 
 def read_runs(entry: object, source: str) -> Runs:
-    """Take COCO's run lengths, compressed (text) or not, and their size; no mask is made of them.
+    """Read and check COCO's run lengths, compressed (text) or not, and their size.
 
-    They may be the ``segmentation`` of an entry.
+    The entry may also be one that holds them as its ``segmentation``.
 
     Raises:
         InputError: there are none, or they do not add up to their size.
@@ -241,7 +245,7 @@ def _decompress_runs(text: str, what: str) -> list[int]:
 
 
 def mask_box(mask: Bool[Tensor, "h w"]) -> list[int]:
-    """Left, top, width and height; BOP writes -1 four times where there is nothing."""
+    """Give left, top, width and height of a mask [px]; -1 four times, as BOP, for an empty one."""
     rows, columns = mask.nonzero(as_tuple=True)
     if len(rows) == 0:
         return [-1] * 4

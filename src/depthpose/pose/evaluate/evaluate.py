@@ -41,17 +41,17 @@ Number = float | None
 
 @dataclass(frozen=True, kw_only=True)
 class Origin:
-    """Whose predictions a row measures; the first columns of its row."""
+    """The method whose predictions a row measures: the first columns of the row."""
 
     method: str  #: its name
-    masks: str = ""  #: kind of masks that it was given
+    masks: str = ""  #: kind of masks that it used
     weights: str = ""  #: file or name, where it has any
     weights_sha256: str = ""  #: its first digits; of a file of predictions by others the file's own
 
 
 @dataclass(frozen=True, kw_only=True)
 class Conditions:
-    """What a number cannot be compared without; the last columns of its row."""
+    """The conditions under which numbers can be compared: the last columns of a row."""
 
     diameters: str  #: whose table of diameters
     frames: str  #: data set and split
@@ -60,11 +60,13 @@ class Conditions:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Row:
+    """A row of a table of results."""
+
     conditions: Conditions | None = None  #: of the evaluation
     origin: Origin | None = None  #: whose predictions it measures
 
     def columns(self) -> dict[str, Any]:
-        """Give the columns of a table, in its order."""
+        """Give the values of the row by column, in the order of the table."""
         columns = {} if self.origin is None else asdict(self.origin)
         if not isinstance(self, ObjectRow):
             columns = {name: columns[name] for name in ("method", "masks") if name in columns}
@@ -130,7 +132,7 @@ class ObjectRow(_Row):
 
 @dataclass(frozen=True, kw_only=True)
 class RiskRow(_Row):
-    """How many answers are wrong if only the surest are given."""
+    """The share of wrong estimates among those of the highest scores."""
 
     coverage: float  #: share of all instances that is answered
     answers: int  #: their number
@@ -146,8 +148,8 @@ _DECILES = 10
 def object_row(name: str, rows: Sequence[InstanceRow]) -> ObjectRow:
     """Sum up the instances of an object, or of all objects.
 
-    ``success``, ``refused`` and ``wrong`` add up to 1: an instance without an answer is refused.
-    Medians are of the answers alone; all else counts everything.
+    ``success``, ``refused`` and ``wrong`` add up to 1: an instance without a pose is refused.
+    Medians are over the instances with a pose, all else over all instances.
     """
     count = len(rows)
     success = sum(row.is_success for row in rows) / count
@@ -171,8 +173,8 @@ def mean_row(rows: Sequence[ObjectRow]) -> ObjectRow:
     scores: dict[str, Number] = {}
     for name in rows[0].scores:
         values = [row.scores[name] for row in rows]
-        # A recall of some objects alone would pass for that of all; a median is of the estimates,
-        # and BOP's precision of the objects of which enough is visible somewhere.
+        # A recall needs all objects. A median may lack those without a pose, and BOP's precision
+        # those of which too little is visible.
         may_lack = name in _PRECISIONS or name.endswith("_median")
         scores[name] = _mean(values) if may_lack or None not in values else None
     return ObjectRow(
@@ -189,9 +191,9 @@ def mean_row(rows: Sequence[ObjectRow]) -> ObjectRow:
 
 
 def risk_rows(rows: Sequence[InstanceRow]) -> list[RiskRow]:
-    """Say how many answers are wrong if only the surest are given: ten shares of all instances.
+    """Measure the share of wrong poses among those of the highest scores, at ten coverages.
 
-    ``coverage`` 0.1 is the surest tenth of the instances. It ends with the answers.
+    A ``coverage`` of 0.1 is a tenth of all instances. The rows end where there are no more poses.
     """
     answered = [row for row in rows if row.status in POSED and row.score is not None]
     answered.sort(key=lambda row: -(row.score or 0.0))
@@ -243,16 +245,16 @@ def _mean(values: Sequence[Number]) -> Number:
 
 
 def frames_hash(instances: Sequence[Instance]) -> str:
-    """Give the SHA-256 of the list of instances, a line each: scene, image, object, place."""
+    """Give the SHA-256 of a list of instances: scene, image, object and place, each in a line."""
     lines = (f"{i.scene_id} {i.image_id} {i.object_id} {i.index}\n" for i in instances)
     return hashlib.sha256("".join(sorted(lines)).encode()).hexdigest()
 
 
 def select_targets(dataset: BopDataset, targets: Sequence[BopTarget]) -> BopDataset:
-    """Keep the instances that a list of targets asks for, the most visible where it takes fewer.
+    """Keep the instances of a list of targets, the most visible ones of each.
 
     Raises:
-        InputError: a target is not annotated so many times, or nothing of any.
+        InputError: a target has fewer annotations than its count, or none of them has any.
     """
     of_place: dict[Place, list[Instance]] = defaultdict(list)
     of_image: dict[tuple[int, int], list[Instance]] = defaultdict(list)
@@ -292,7 +294,7 @@ _OTHER_DATA_SET = 0.25
 
 
 def error_context(model: ObjectModel, config: EvaluationConfig) -> ErrorContext:
-    """Say what the errors of an object depend on: the thresholds' diameter, ADD or ADD-S, VSD.
+    """Prepare an object for the measurement of errors, by the settings of an evaluation.
 
     Raises:
         InputError: PVNet's table is asked for an object that it does not have.
@@ -356,7 +358,7 @@ def evaluate(
     progress: Callable[[Sequence[Instance]], Iterable[Instance]] = iter,
     origin: Origin | None = None,
 ) -> Evaluation:
-    """Measure predictions; an instance without an answer is a failure and stays in every number.
+    """Measure predictions; an instance without an estimate counts as a failure in every number.
 
     A success is an ADD (ADD-S of a symmetric object) below a tenth of the diameter, ``auc`` the
     area to 10 cm; BOP's errors and recalls as ``pose.metrics`` has them, and its precision of 6D
@@ -387,9 +389,9 @@ def evaluate(
             "this very split"
         )
     contexts = {number: error_context(model, config) for number, model in dataset.objects.items()}
-    # In the order of work; what a method of its own calls otherwise comes last.
-    seen = dict.fromkeys(stage for p in predictions for stage in p.estimate.seconds)
-    stages = [s for s in STAGES if s in seen] + [s for s in seen if s not in STAGES]
+    # Stages in the order of work; those of other methods come last.
+    timed = dict.fromkeys(stage for p in predictions for stage in p.estimate.seconds)
+    stages = [s for s in STAGES if s in timed] + [s for s in timed if s not in STAGES]
     rows = [
         _instance_row(instance, matched.get(instance.name), contexts[instance.object_id], stages)
         for instance in progress(dataset.instances)
@@ -399,25 +401,30 @@ def evaluate(
         frames=f"{dataset.folder.resolve().name} {dataset.split}",
         frames_sha256=frames_hash(dataset.instances)[:12],
     )
+
+    # Rows of objects, with BOP's precision of detection.
     measured = {
         (matched[row.instance].name, row.instance): row.errors
         for row in rows
         if row.instance in matched
     }
     precision = detection_scores(dataset, predictions, contexts, measured)
-    summed: list[ObjectRow] = []
-    numbers = [instance.object_id for instance in dataset.instances]
+    rows_of_object: dict[int, list[InstanceRow]] = defaultdict(list)
+    for row, instance in zip(rows, dataset.instances, strict=True):
+        rows_of_object[instance.object_id].append(row)
+    object_rows: list[ObjectRow] = []
     for number, context in sorted(contexts.items()):
-        of_object = [row for row, of in zip(rows, numbers, strict=True) if of == number]
-        row = object_row(context.model.name, of_object)
+        row = object_row(context.model.name, rows_of_object[number])
         row = replace(row, scores={**row.scores, **precision[number]})
-        summed.append(replace(row, metric=of_object[0].metric, diameter_m=context.diameter_m))
-    if len(summed) > 1:
-        every = object_row("all", rows)  # BOP's precision is of an object, or the mean of objects
-        every = replace(every, scores={**every.scores, **dict.fromkeys(_PRECISIONS)})
-        summed += [mean_row(summed), every]
+        metric = rows_of_object[number][0].metric
+        object_rows.append(replace(row, metric=metric, diameter_m=context.diameter_m))
+    if len(object_rows) > 1:
+        # BOP's precision is that of an object, or the mean over objects: "all" has none.
+        all_row = object_row("all", rows)
+        all_row = replace(all_row, scores={**all_row.scores, **dict.fromkeys(_PRECISIONS)})
+        object_rows += [mean_row(object_rows), all_row]
     return Evaluation(
-        rows=[replace(row, conditions=conditions, origin=origin) for row in summed],
+        rows=[replace(row, conditions=conditions, origin=origin) for row in object_rows],
         per_instance=[replace(row, origin=origin) for row in rows],
         risk=[replace(r, conditions=conditions, origin=origin) for r in risk_rows(rows)],
         advice=convention_advice(dataset, predictions, contexts),
@@ -427,7 +434,7 @@ def evaluate(
 def _instance_row(
     instance: Instance, estimate: PoseEstimate | None, context: ErrorContext, stages: list[str]
 ) -> InstanceRow:
-    """Measure one instance; without a pose all its errors are those of a missed one."""
+    """Measure one instance; without a pose its errors are those of a missing estimate."""
     pose = None if estimate is None else estimate.camera_from_model
     errors: dict[str, Errors] = {}
     for name, metric in METRICS.items():
