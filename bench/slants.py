@@ -24,7 +24,8 @@ from score_scenes import bins_of, part_of
 from depthpose import Registration
 from depthpose.core.rigid import Rigid
 from depthpose.pose import evidence, hypotheses
-from depthpose.pose.evidence import Observation, draw_surface
+from depthpose.pose.evidence import Observation
+from depthpose.pose.rendering import render_surface
 from depthpose.pose.surface import Surface
 from depthpose.pose.types import PoseEstimate, ViewInput
 from depthpose.report.page import markdown_table
@@ -106,7 +107,7 @@ def of_estimates(estimates: list[PoseEstimate], compared: list[Compared]) -> Ite
 def residuals(observation: Observation, pose: Rigid, surface: Surface) -> Residuals:
     """Average the readings less the posed surface over squares, as evidence does."""
     K = observation.K
-    drawn_m, cosine, window = draw_surface(surface, pose, K, *observation.depth_m.shape)
+    drawn_m, cosine, window = render_surface(surface, pose, K, *observation.depth_m.shape)
     step = observation.step
     inner = evidence._without_edges(drawn_m, np.isfinite(drawn_m), surface.diameter_m, step)
     residual_m = observation.depth_m[window] - drawn_m

@@ -12,7 +12,7 @@ round a corner of one body, does not end there.
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple, cast
+from typing import cast
 
 import numpy as np
 import torch
@@ -25,6 +25,7 @@ from depthpose.core.arrays import take_evenly
 from depthpose.core.camera.pinhole import crop_intrinsics
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import grow_mask
+from depthpose.pose.rendering import Rendering, render_surface
 from depthpose.pose.sensor import (
     AVERAGED_PER_WHITE,
     CORRELATION_PX,
@@ -53,7 +54,6 @@ _MEETING = 2.0
 """Deviations of the noise: sides of a silhouette that are farther apart do not meet there, and an
 edge that bends more toward the camera is concave."""
 _LEAST_INNER = 0.25  # share of the silhouette that must remain without its borders
-_DISK = 1.3  # radius of the disk drawn for a sample, in median distances of samples
 _OBJECT_PX = 8000  # pixels of an object that are compared; the window of a larger one is thinned
 _NEIGHBOURS = 4  # the one whose distance is the spacing of a cloud's points
 _POINT_PX = 1.5  # side of a pixel of a drawn cloud, in spacings of its points
@@ -181,83 +181,6 @@ def _camera_of_cloud(cloud_m: Float64[Tensor, "n 3"]) -> Float64[Tensor, "3 3"]:
     return torch.diag(torch.tensor([focal_px, focal_px, 1.0], dtype=torch.float64))
 
 
-class Drawing(NamedTuple):
-    """A drawn surface, in the part of an image that it covers."""
-
-    depth_m: np.ndarray  #: (h, w), along the optical axis; NaN where nothing is drawn
-    cosine: np.ndarray  #: (h, w), between ray and normal
-    window: _Window  #: rows and columns of the part
-
-
-def draw_surface(
-    surface: Surface, pose: Rigid, K: Float64[Tensor, "3 3"], height: int, width: int
-) -> Drawing:
-    """Draw a surface as a camera sees it: each sample as a disk in its tangent plane.
-
-    Args:
-        surface: of the model.
-        pose: ``camera_from_model``.
-        K: intrinsic matrix of the image.
-        height: rows of the image.
-        width: its columns.
-    """
-    # The samples that the camera may see.
-    R = pose.R.double()
-    points_m = surface.points_m @ R.mT + pose.t_m.double()
-    is_facing = ((surface.outward @ R.mT) * points_m).sum(-1) <= 0
-    is_drawn = (points_m[:, 2] > 0) & is_facing & ~surface.is_hidden
-    pixel = ((points_m @ K.mT)[:, :2] / points_m[:, 2:]).round()
-    is_drawn &= ((pixel >= 0) & (pixel < torch.tensor([width, height]))).all(-1)
-    if not bool(is_drawn.any()):
-        return Drawing(np.empty((0, 0)), np.empty((0, 0)), (slice(0, 0), slice(0, 0)))
-    # Single precision: the depth of a pixel is exact to a ten-millionth.
-    points_m = points_m[is_drawn].float()
-    normals = (surface.normals @ R.mT)[is_drawn].float()
-    pixel = pixel[is_drawn].long()
-
-    # The window that the disks cover.
-    radius_m = _DISK * surface.spacing_m
-    radius_px = radius_m * float(K[0, 0]) / float(points_m[:, 2].median())
-    reach = math.ceil(radius_px)
-    low = (pixel.amin(0) - reach).clamp(min=0)
-    high = torch.minimum(pixel.amax(0) + reach + 1, torch.tensor([width, height]))
-    drawn_width, drawn_height = (high - low).tolist()
-
-    # The pixels that each disk may cover, and where their rays meet its plane.
-    steps = torch.arange(-reach, reach + 1)
-    offsets = torch.cartesian_prod(steps, steps)
-    offsets = offsets[offsets.square().sum(-1) <= (radius_px + 0.71) ** 2]
-    column = pixel[:, 0, None] - low[0] + offsets[:, 0]
-    row = pixel[:, 1, None] - low[1] + offsets[:, 1]
-    (fx, skew, cx), (_, fy, cy), _ = K.tolist()
-    y = (row.float() + (float(low[1]) - cy)) / fy
-    x = (column.float() + (float(low[0]) - cx) - skew * y) / fx
-    along = normals[:, :1] * x + normals[:, 1:2] * y + normals[:, 2:]
-    depth_m = (normals * points_m).sum(-1, keepdim=True) / along
-    distance_m2 = (x * depth_m - points_m[:, :1]).square()
-    distance_m2 += (y * depth_m - points_m[:, 1:2]).square()
-    distance_m2 += (depth_m - points_m[:, 2:]).square()
-    is_hit = distance_m2 < radius_m**2
-    is_hit &= (column >= 0) & (column < drawn_width) & (row >= 0) & (row < drawn_height)
-
-    # The nearest disk of each pixel is visible.
-    place = (row * drawn_width + column)[is_hit]
-    depth_m = depth_m[is_hit]
-    cosine = along[is_hit].abs() / (x[is_hit].square() + y[is_hit].square() + 1).sqrt()
-    nearest_m = torch.full((drawn_height * drawn_width,), torch.inf)
-    nearest_m.scatter_reduce_(0, place, depth_m, "amin")
-    is_nearest = depth_m <= nearest_m[place]
-    drawn_cosine = torch.ones(drawn_height * drawn_width)
-    drawn_cosine[place[is_nearest]] = cosine[is_nearest]
-    drawn_m = torch.where(nearest_m.isfinite(), nearest_m, torch.nan)
-    (left, top), (right, bottom) = low.tolist(), high.tolist()
-    return Drawing(
-        depth_m=drawn_m.view(drawn_height, drawn_width).numpy(),
-        cosine=drawn_cosine.view(drawn_height, drawn_width).numpy(),
-        window=(slice(top, bottom), slice(left, right)),
-    )
-
-
 def compare(observation: Observation, pose: Rigid, surface: Surface) -> Evidence:
     """Compare a posed surface with an observation.
 
@@ -266,23 +189,23 @@ def compare(observation: Observation, pose: Rigid, surface: Surface) -> Evidence
         pose: ``camera_from_model``.
         surface: of the model.
     """
-    drawing = draw_surface(surface, pose, observation.K, *observation.depth_m.shape)
-    is_drawn = np.isfinite(drawing.depth_m)
-    inner = _without_edges(drawing.depth_m, is_drawn, surface.diameter_m, observation.step)
-    deviations, is_compared = _residual_deviations(observation, drawing, inner)
+    rendering = render_surface(surface, pose, observation.K, *observation.depth_m.shape)
+    is_drawn = np.isfinite(rendering.depth_m)
+    inner = _without_edges(rendering.depth_m, is_drawn, surface.diameter_m, observation.step)
+    deviations, is_compared = _residual_deviations(observation, rendering, inner)
     is_supported = is_compared & (np.abs(deviations) <= THRESHOLD)
 
     # Patches that contradict the pose. Beside the silhouette a mask says which readings are the
     # object's; without one, those count that go on where the model ends.
     patch_area_px2 = observation.patch_px**2
-    is_bulging = (deviations < -THRESHOLD) & observation.is_object[drawing.window]
+    is_bulging = (deviations < -THRESHOLD) & observation.is_object[rendering.window]
     seen_through = _patch_area(deviations > THRESHOLD, patch_area_px2)
     bulging = _patch_area(is_bulging, patch_area_px2)
     if observation.is_masked:
-        is_beside = _is_beside_silhouette(observation, is_drawn, drawing.window)
+        is_beside = _is_beside_silhouette(observation, is_drawn, rendering.window)
         beside = _patch_area(is_beside, patch_area_px2)
     else:
-        is_beside = _is_continued(observation, is_drawn, is_supported, drawing.window)
+        is_beside = _is_continued(observation, is_drawn, is_supported, rendering.window)
         # A patch beside the silhouette is as long as others, and half as wide.
         beside = _patch_area(is_beside, patch_area_px2 / 2)
 
@@ -303,7 +226,7 @@ def compare(observation: Observation, pose: Rigid, surface: Surface) -> Evidence
 
 
 def _residual_deviations(
-    observation: Observation, drawing: Drawing, inner: np.ndarray
+    observation: Observation, rendering: Rendering, inner: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Average residuals over neighbours, in standard deviations of their mean.
 
@@ -311,7 +234,7 @@ def _residual_deviations(
 
     Args:
         observation: the readings.
-        drawing: of the posed surface.
+        rendering: of the posed surface.
         inner: its pixels without those near edges, which alone are compared.
 
     Returns:
@@ -319,11 +242,11 @@ def _residual_deviations(
         are compared.
     """
     noise = observation.noise
-    depth_m = observation.depth_m[drawing.window]
+    depth_m = observation.depth_m[rendering.window]
     has_residual = np.isfinite(depth_m) & inner
-    residual_m = np.where(has_residual, depth_m - drawing.depth_m, 0).astype(np.float32)
+    residual_m = np.where(has_residual, depth_m - rendering.depth_m, 0).astype(np.float32)
     # Clipped, so that a reading of the background at an edge does not decide for its neighbours.
-    limit_m = _CUT_OFF * noise.deviation_m(drawing.cosine, 1).astype(np.float32)
+    limit_m = _CUT_OFF * noise.deviation_m(rendering.cosine, 1).astype(np.float32)
     residual_m = np.clip(residual_m, -limit_m, limit_m)
 
     side = _averaged_side(observation.step)
@@ -333,7 +256,7 @@ def _residual_deviations(
     mean_m = mean_m[is_compared] / filled_share[is_compared]
     independent = side**2 // _CORRELATED_READINGS
     deviations = np.zeros_like(residual_m)
-    deviations[is_compared] = mean_m / noise.deviation_m(drawing.cosine[is_compared], independent)
+    deviations[is_compared] = mean_m / noise.deviation_m(rendering.cosine[is_compared], independent)
     return deviations, is_compared
 
 
@@ -364,9 +287,9 @@ def _is_continued(
 
     Args:
         observation: its readings, (h, w).
-        is_drawn: pixels of the silhouette, in the window of the drawing.
+        is_drawn: pixels of the silhouette, in the window of the rendering.
         is_supported: of these the ones whose readings support the pose.
-        window: rows and columns of the drawing in the observation.
+        window: rows and columns of the rendering in the observation.
     """
     # The silhouette, in a window with a margin.
     border = math.ceil(EDGE_PX / observation.step + observation.patch_px / 2)
@@ -468,7 +391,7 @@ def _without_edges(
 ) -> np.ndarray:
     """Mark the drawn pixels that are not near an edge, which a sensor moves by some pixels.
 
-    The border left out is narrowed where less than a quarter of the drawing would remain.
+    The border left out is narrowed where less than a quarter of the rendering would remain.
     """
     jump_m = max(_JUMP_M, _JUMP_DIAMETERS * diameter_m)
     nearest_m = ndimage.minimum_filter(np.where(is_drawn, drawn_m, _FAR_M), 3)

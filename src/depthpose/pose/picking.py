@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from depthpose.pose.evidence import Drawing, draw_surface
+from depthpose.pose.rendering import Rendering, render_surface
 from depthpose.pose.surface import Surface
 from depthpose.pose.types import PoseEstimate, ViewInput
 
@@ -26,12 +26,12 @@ def with_pick_ranks(
         view: the image.
         surfaces: of the objects, by their names.
     """
-    drawings: dict[int, Drawing] = {}
+    drawings: dict[int, Rendering] = {}
     for number, estimate in enumerate(estimates):
         if estimate.camera_from_model is not None:
             surface = surfaces[estimate.object]
             pose = estimate.camera_from_model.double()
-            drawings[number] = draw_surface(surface, pose, view.K.double(), *view.depth_m.shape)
+            drawings[number] = render_surface(surface, pose, view.K.double(), *view.depth_m.shape)
     occluders = _find_occluders(drawings, view.depth_m.shape)
     ranks: dict[int, int] = {}
     remaining = set(drawings)
@@ -50,7 +50,9 @@ def _visible_certainty(estimate: PoseEstimate) -> float:
     return (estimate.certainty or 0.0) * (estimate.visible_share or 0.0)
 
 
-def _find_occluders(drawings: Mapping[int, Drawing], shape: tuple[int, ...]) -> dict[int, set[int]]:
+def _find_occluders(
+    drawings: Mapping[int, Rendering], shape: tuple[int, ...]
+) -> dict[int, set[int]]:
     """Give for each drawn object those that lie before more of it than it does of them.
 
     Args:

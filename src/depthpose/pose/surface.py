@@ -10,12 +10,12 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from scipy.spatial import KDTree
 from torch import Tensor
-from torch.nn.functional import max_pool2d, pad
+from torch.nn.functional import max_pool2d, normalize, pad
 
 from depthpose.core.rigid import Rigid
 from depthpose.pose.compiled import use_numba
 from depthpose.pose.mesh import sample_surface, symmetry_transforms
-from depthpose.pose.mesh.models import fibonacci_directions
+from depthpose.pose.mesh.models import disc_triangles, drawn_triangles, fibonacci_directions
 from depthpose.pose.types import ObjectModel
 
 NEAR = 0.05  #: of the diameter: a point of the cloud within this distance lies on the posed surface
@@ -29,6 +29,8 @@ _BOXES = 48  # boxes along the longest side of a model, to look up near samples 
 _BOX_MARGIN = 0.15  # by which the boxes reach beyond the model, in diameters
 _VIEWS = 256  # directions from which a model is viewed
 _POINTS = 160  # points of a view, at most
+_MOST_FACES = 100_000
+"""Of a model with more faces its samples are rendered, which are fewer."""
 _EDGE_STEP = 0.08
 """Of the diameter: neighbouring cells that differ in depth by more are the two sides of an edge."""
 
@@ -71,6 +73,7 @@ class Surface:
     normals: Float64[Tensor, "m 3"]  #: of these points, to either side
     outward: Float64[Tensor, "m 3"]  #: normals on the outer side, 0 where none is known
     is_hidden: Bool[Tensor, " m"]  #: samples not visible from afar, as faces inside a part
+    triangles_m: Float64[Tensor, "f 3 3"]  #: corners of what is rendered, in the model frame
     across: Int64[Tensor, " m"]  #: index of the sample on the other side of a wall, or -1
     diameter_m: float  #: of the object
     spacing_m: float  #: distance from a point to the third nearest, in the median
@@ -89,6 +92,24 @@ class Surface:
             index, _ = nearest_many(points, self.target.tree)
             return torch.from_numpy(index).reshape(points_m.shape[:-1])
         return torch.from_numpy(self.tree.query(points_m.numpy(), workers=1)[1])
+
+    @cached_property
+    def plane_normals(self) -> Float64[Tensor, "f 3"]:
+        """Unit normals of the triangles, to either side."""
+        first, second, third = self.triangles_m.unbind(1)
+        return normalize(torch.linalg.cross(second - first, third - first), dim=-1, eps=1e-300)
+
+    @cached_property
+    def plane_offsets_m(self) -> Float64[Tensor, " f"]:
+        """Distances of the triangles' planes from the model's origin, along their normals."""
+        return (self.plane_normals * self.triangles_m[:, 0]).sum(-1)
+
+    @cached_property
+    def box_corners_m(self) -> Float64[Tensor, "8 3"]:
+        """Corners of the box about the triangles, along the axes of the model."""
+        low_m = self.triangles_m.amin((0, 1))
+        high_m = self.triangles_m.amax((0, 1))
+        return torch.cartesian_prod(*torch.stack([low_m, high_m], -1))
 
     @cached_property
     def views(self) -> Views:
@@ -211,6 +232,8 @@ def _pad_rows(rows: Float64[Tensor, "n 3"], count: int) -> Float64[Tensor, "{cou
 def prepare_surface(model: ObjectModel, count: int = 10_000) -> Surface:
     """Sample the surface of a model once for many clouds, by ``count`` points."""
     points_m, normals = (part.double() for part in sample_surface(model, count))
+    is_large = len(model.faces) > _MOST_FACES
+    triangles_m = disc_triangles(points_m, normals) if is_large else drawn_triangles(model).double()
     tree = KDTree(points_m.numpy(), copy_data=True)  # for other processes, as in Surface.target
 
     # The outer side of each sample, by cells that hold about four samples.
@@ -230,6 +253,7 @@ def prepare_surface(model: ObjectModel, count: int = 10_000) -> Surface:
         normals=normals,
         outward=outward,
         is_hidden=is_hidden,
+        triangles_m=triangles_m,
         across=across,
         diameter_m=model.diameter_m,
         spacing_m=float(np.median(near_m[:, -1])),

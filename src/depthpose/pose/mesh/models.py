@@ -219,19 +219,26 @@ where the points are twice as far apart as usual."""
 
 
 def drawn_triangles(model: ObjectModel) -> Float[Tensor, "n 3 3"]:
-    """Give the faces of a model, or a disc at each point of one that has no faces.
+    """Give the faces of a model, or a disc at each point of one that has no faces."""
+    if len(model.faces):
+        return model.vertices_m[model.faces]
+    return disc_triangles(model.vertices_m, model.normals)
+
+
+def disc_triangles(
+    points_m: Float[Tensor, "p 3"], normals: Float[Tensor, "p 3"]
+) -> Float[Tensor, "n 3 3"]:
+    """Give the triangles of a disc at each point of a surface.
 
     A disc is flat and six-cornered, across its normal (Pfister et al. 2000), and as large as its
     own neighbourhood is sparse: the distance to the third nearest point, but no more than twice the
     usual one, so that a stray point makes no plate.
     """
-    if len(model.faces):
-        return model.vertices_m[model.faces]
-    points = model.vertices_m.double()
+    points = points_m.double()
     distance, _ = KDTree(points.numpy()).query(points.numpy(), k=min(4, len(points)))
     spacing = torch.from_numpy(distance[:, -1])
     radius = _DISC_RADIUS * spacing.clamp(max=2 * float(spacing.median())) / 2**0.5
-    normal = model.normals.double()
+    normal = normals.double()
 
     # Corners about each point, from two tangents.
     helper = torch.eye(3, dtype=torch.float64)[normal.abs().argmin(1)]
@@ -241,7 +248,7 @@ def drawn_triangles(model: ObjectModel) -> Float[Tensor, "n 3 3"]:
     spokes = first[:, None] * angle.cos()[:, None] + second[:, None] * angle.sin()[:, None]
     corners = points[:, None] + radius[:, None, None] * spokes
     fan = torch.tensor([[0, i, i + 1] for i in range(1, _DISC_CORNERS - 1)])
-    return corners[:, fan].flatten(0, 1).to(model.vertices_m)
+    return corners[:, fan].flatten(0, 1).to(points_m)
 
 
 def gap_to_surface_m(points_m: Float[Tensor, "n 3"], model: ObjectModel) -> float:
