@@ -1,4 +1,4 @@
-"""Known objects found in depth alone, without masks, on synthetic tables and in piles.
+"""Search for known objects in depth alone, without masks, on synthetic tables and in piles.
 
     python bench/find_tables.py --weights parts --tables 20
     python bench/find_tables.py --weights parts --register --piles 20
@@ -7,11 +7,11 @@
 ``bench/real.py``.
 
 A synthetic table has two to all of the objects, each at most once, between other things, with a
-sensor's errors. An instance counts if half its silhouette and 200 pixels are visible. Right is an
-answer of that object with ADD (ADD-S where symmetries are declared or were found) below 10 % of the
-diameter; an answer is wrong where neither it nor an alternative that it names fits an instance,
-however occluded. A pile has 20 of one object; of these an instance counts if 70 % of its silhouette
-is visible.
+sensor's errors. An instance is to be found if half its silhouette and 200 pixels are visible. Right
+is an answer of that object with ADD (ADD-S where symmetries are declared or were found) below 10 %
+of the diameter; an answer is wrong where neither it nor an alternative that it names fits an
+instance, however occluded. A pile has 20 of one object; of these an instance is to be found if 70 %
+of its silhouette is visible.
 """
 
 import argparse
@@ -33,121 +33,143 @@ from depthpose.pose.synthetic import make_frames
 from depthpose.pose.types import ObjectModel, PoseEstimate
 from depthpose.report.page import markdown_table
 
-SEED = 0x7AB1E
+SEED = 0x7AB1E  # of the synthetic frames; no training has it
+RIGHT = 0.1  # largest error of a right answer, in diameters
+PILE = 20  # objects of a pile
+MIN_VISIBLE_PX = 200
+MIN_VISIBLE = 0.5  # share of the silhouette of an object on a table
+MIN_VISIBLE_IN_PILE = 0.7
+SURFACE_POINTS = 1000
 Row = dict[str, Any]
 
 
-class Shown(NamedTuple):
-    """An instance of a frame: its object, its pose, and whether it must be found.
+class Instance(NamedTuple):
+    """An object in a frame.
 
-    ``is_adds``: it is measured by ADD-S, though no symmetry is declared. ``visible``: the share of
-    its silhouette that is seen.
+    ``is_wanted``: whether it is visible enough to be found. ``is_adds``: whether it is measured by
+    ADD-S, though no symmetry is declared.
     """
 
     model: ObjectModel
     pose: Rigid
-    counts: bool
+    is_wanted: bool
     is_adds: bool = False
-    visible: float = 1.0
 
 
 class Frame(NamedTuple):
-    """Depth, camera, the true instances, and which objects may be there; None: those shown."""
+    """Depth, camera, the true instances, and the models to search for; None: those of instances."""
 
     name: str
     depth_m: torch.Tensor
     K: torch.Tensor
-    shown: list[Shown]
-    known: list[ObjectModel] | None = None
+    instances: list[Instance]
+    searched: list[ObjectModel] | None = None
+
+    @property
+    def models(self) -> list[ObjectModel]:
+        """The models to search for, each once."""
+        models = self.searched or [instance.model for instance in self.instances]
+        return list({model.name: model for model in models}.values())
 
 
-def synthetic_frames(
-    models: Sequence[ObjectModel], number: int, pile: int, clutter: tuple[int, int] = (0, 4),
-    first: int = 0,
-) -> Iterator[Frame]:  # fmt: skip
-    """Generate tables, or piles of so many, of another seed than any training."""
-    config = ObjectsConfig(
-        seed=SEED, distance_m=(0.6, 1.0), frame_pile=pile, frame_clutter=clutter
-    )  # fmt: skip
-    least = 0.7 if pile else 0.5
-    by_number = {model.number: model for model in models}
-    for frame in make_frames(models, config, number, first):
-        shown = []
-        for thing in frame.objects:
-            pixels = int(thing.visible.sum())
-            share = pixels / int(thing.silhouette.sum())
-            counts = pixels >= 200 and share >= least
-            model = by_number[thing.number]
-            shown.append(Shown(model, thing.camera_from_model, counts, visible=share))
-        known = None if pile else list(models)
-        yield Frame(f"frame {frame.number}", frame.depth_m, frame.K, shown, known)
+def synthetic_frames(models: Sequence[ObjectModel], count: int, pile: int) -> Iterator[Frame]:
+    """Generate frames of tables, or of piles of ``pile`` objects where that is not 0."""
+    config = ObjectsConfig(seed=SEED, distance_m=(0.6, 1.0), frame_pile=pile)
+    min_visible = MIN_VISIBLE_IN_PILE if pile else MIN_VISIBLE
+    model_of_number = {model.number: model for model in models}
+    for frame in make_frames(models, config, count, 0):
+        instances: list[Instance] = []
+        for frame_object in frame.objects:
+            visible_px = int(frame_object.visible.sum())
+            visible_share = visible_px / int(frame_object.silhouette.sum())
+            is_wanted = visible_px >= MIN_VISIBLE_PX and visible_share >= min_visible
+            model = model_of_number[frame_object.number]
+            instances.append(Instance(model, frame_object.camera_from_model, is_wanted))
+        searched = None if pile else list(models)
+        yield Frame(f"frame {frame.number}", frame.depth_m, frame.K, instances, searched)
 
 
-def measure(frame: Frame, found: Sequence[PoseEstimate]) -> Row:
-    """Count found instances and answers that fit none."""
-    right: set[int] = set()
-    wrong = []
-    for estimate in found:
+def count_answers(frame: Frame, estimates: Sequence[PoseEstimate]) -> Row:
+    """Count the instances that are found, and the answers that fit none."""
+    found: set[int] = set()
+    wrong: list[str] = []
+    for estimate in estimates:
         pose = estimate.camera_from_model
         assert pose is not None
-        same = {k: thing for k, thing in enumerate(frame.shown)
-                if thing.model.name == estimate.object}  # fmt: skip
-        right |= {k for k, thing in same.items() if error_of(pose, thing) < 0.1}
-        named = [pose, *(other.camera_from_model for other in estimate.alternatives)]
-        if not any(error_of(one, thing) < 0.1 for thing in same.values() for one in named):
+        poses = [pose, *(alternative.camera_from_model for alternative in estimate.alternatives)]
+        has_match = False
+        for index, instance in enumerate(frame.instances):
+            if instance.model.name != estimate.object:
+                continue
+            errors = [error_in_diameters(pose, instance) for pose in poses]
+            if errors[0] < RIGHT:
+                found.add(index)
+            has_match = has_match or min(errors) < RIGHT
+        if not has_match:
             wrong.append(f"{estimate.object} ({estimate.certainty or 0:.2f})")
-    counted = {k for k, thing in enumerate(frame.shown) if thing.counts}
-    missed = [frame.shown[k].model.name for k in sorted(counted - right)]
+
+    wanted = {index for index, instance in enumerate(frame.instances) if instance.is_wanted}
+    missed = [frame.instances[index].model.name for index in sorted(wanted - found)]
     return {
-        "frame": frame.name, "instances": len(counted), "right": len(counted & right),
-        "missed": len(missed), "wrong": len(wrong),
-        "which": "; ".join([*(f"missed {m}" for m in missed), *(f"wrong {w}" for w in wrong)]),
-    }  # fmt: skip
+        "frame": frame.name,
+        "instances": len(wanted),
+        "right": len(wanted & found),
+        "missed": len(missed),
+        "wrong": len(wrong),
+        "which": "; ".join(
+            [*(f"missed {name}" for name in missed), *(f"wrong {w}" for w in wrong)]
+        ),
+    }
 
 
-def error_of(pose: Rigid, thing: Shown) -> float:
-    """ADD(-S) in diameters."""
-    points_m = sample_surface(thing.model, 1000)[0]
-    is_adds = thing.is_adds or not thing.model.symmetries.is_none
-    measure = adds_m if is_adds else add_m
-    return float(measure(pose, thing.pose, points_m)) / thing.model.diameter_m
+def error_in_diameters(pose: Rigid, instance: Instance) -> float:
+    """Compute ADD, or ADD-S of a symmetric object, in diameters."""
+    points_m, _ = sample_surface(instance.model, SURFACE_POINTS)
+    is_adds = instance.is_adds or not instance.model.symmetries.is_none
+    metric = adds_m if is_adds else add_m
+    return float(metric(pose, instance.pose, points_m)) / instance.model.diameter_m
 
 
 def main() -> None:
-    """Find the objects of every frame, and print what was found."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    """Search all frames for their objects, and print what was found."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--weights", nargs="+", default=["parts"])
     parser.add_argument("--register", action="store_true", help="without the network")
     parser.add_argument("--tables", type=int, default=20)
     parser.add_argument("--piles", type=int, default=0, help="in place of tables")
-    words = parser.parse_args()
+    options = parser.parse_args()
+
     torch.set_num_threads(1)
-    for name in words.weights:
-        net = GeoPoseNet.load(find_weights(name))
-        models = net.weights.models
-        rows = list[Row]()
-        number = words.piles or words.tables
-        for frame in synthetic_frames(models, number, 20 * bool(words.piles)):
+    count = options.piles or options.tables
+    pile = PILE if options.piles else 0
+    for name in options.weights:
+        network = GeoPoseNet.load(find_weights(name))
+        rows: list[Row] = []
+        for frame in synthetic_frames(network.weights.models, count, pile):
             height, width = frame.depth_m.shape
             camera = Camera(width=width, height=height, K=frame.K)
-            known = frame.known or [thing.model for thing in frame.shown]
-            used = registration(known) if words.register else net
-            asked = sorted({model.name for model in known})
-            began, cpu = time.perf_counter(), time.process_time()
-            found = used.find(frame.depth_m, camera, asked)
-            spent = {"s": time.perf_counter() - began, "cpu s": time.process_time() - cpu}
-            rows.append({**measure(frame, found), **spent})
+            estimator = prepared_registration(frame.models) if options.register else network
+            names = sorted(model.name for model in frame.models)
+            began_s = time.perf_counter()
+            began_cpu_s = time.process_time()
+            estimates = estimator.find(frame.depth_m, camera, names)
+            spent = {
+                "s": time.perf_counter() - began_s, "cpu s": time.process_time() - began_cpu_s
+            }  # fmt: skip
+            rows.append({**count_answers(frame, estimates), **spent})
             print(rows[-1], flush=True)
-        kinds = ("instances", "right", "missed", "wrong", "s", "cpu s")
-        total = {key: sum(row[key] for row in rows) for key in kinds}
+        columns = ("instances", "right", "missed", "wrong", "s", "cpu s")
+        total = {column: sum(row[column] for row in rows) for column in columns}
         print(markdown_table([{"weights": name, "frames": len(rows), **total}]))
 
 
 _PREPARED: dict[tuple[str, ...], Registration] = {}
 
 
-def registration(models: Sequence[ObjectModel]) -> Registration:
-    """Prepare models once."""
+def prepared_registration(models: Sequence[ObjectModel]) -> Registration:
+    """Prepare the registration of some models, once for each choice of them."""
     by_name = {model.name: model for model in models}
     key = tuple(sorted(by_name))
     if key not in _PREPARED:

@@ -4,10 +4,10 @@
     python bench/real.py $DEPTHPOSE_DATA --before out/real.json
     python bench/real.py $DEPTHPOSE_DATA --only masks scans --seeds 20
 
-A figure of the earlier run stands in brackets where it was another. ``use`` says of each set
-whether it takes part when a method or a limit is chosen (choice), or is only looked at afterwards
-(held). What is right each section's module (``score_*.py``) says. CPU seconds leave out the
-preparation of models. Each process computes with one thread.
+A number of the earlier run stands in brackets where it differs. ``use`` says of each set whether
+methods and limits are chosen by it (choice), or it is only measured afterwards (held). The module
+of a section (``score_*.py``) says which answers are right. CPU seconds leave out the preparation of
+models. Each process computes with one thread.
 """
 
 import argparse
@@ -90,13 +90,13 @@ def main() -> None:
 
 
 def describe_run(section: Row) -> str:
-    """Say of what an earlier section was measured."""
+    """Describe what an earlier section was measured with: commit, date and seeds."""
     facts = section["environment"]
     return f"commit {facts.get('commit', 'unknown')} of {facts['date']}, {section['seeds']} seeds"
 
 
 def run_jobs(jobs: Sequence[Job], processes: int) -> tuple[list[Row], float]:
-    """Run jobs in so many processes; give all their rows in order, and the CPU seconds of all."""
+    """Run jobs in some processes; return all their rows in order, and their CPU seconds."""
     with multiprocessing.get_context("spawn").Pool(
         processes, initializer=torch.set_num_threads, initargs=(1,)
     ) as pool:
@@ -105,14 +105,14 @@ def run_jobs(jobs: Sequence[Job], processes: int) -> tuple[list[Row], float]:
 
 
 def timed(job: Job) -> tuple[list[Row], float]:
-    """Run a job, and give its CPU seconds too."""
+    """Run a job; return its rows and its CPU seconds."""
     began = time.process_time()
     rows = job()
     return rows, time.process_time() - began
 
 
 def with_earlier(table: Sequence[Row], before: Sequence[Row]) -> list[Row]:
-    """Write what differs in an earlier table in brackets; a line is known by its first column."""
+    """Add the cells of an earlier table that differ in brackets; lines are named by column one."""
     earlier = {next(iter(line.values())): line for line in before}
     lines = list[Row]()
     for line in table:
@@ -126,14 +126,14 @@ def with_earlier(table: Sequence[Row], before: Sequence[Row]) -> list[Row]:
 
 
 def format_cell(value: object, old: object) -> str:
-    """Write a cell, and what it was if that was something else."""
+    """Format a cell, with the earlier value in brackets where it differs."""
     now = format_value(value)
     before = format_value(old)
     return now if now == before else f"{now} ({before or 'none'})"
 
 
 def format_value(value: object) -> str:
-    """Write three digits of a fraction, and nothing for None."""
+    """Format a value: a fraction with three digits, None as nothing."""
     match value:
         case None:
             return ""

@@ -29,22 +29,22 @@ from depthpose.pose.types import (
 )
 from depthpose.report.pose import object_points
 
-_MASKED_M = 0.03
+_MASK_TOLERANCE_M = 0.03  # by which the depth may differ from the annotated pose, inside a mask
 _SCANNER_M = 0.7
 """The bunny's scanner looks along -z, our camera along +z, from about this distance."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RealCase:
-    """An instance with its truth and model.
+    """A real instance with its true pose and its model.
 
     Attributes:
-        sample: the cloud or the view, and its pose.
-        model: of its object.
-        is_symmetric: evaluated by ADD-S. All of YCB are: geometry alone does not show the sides of
-            boxes, nor how a can is turned.
-        frame: the image that shows it; images of tables show several.
-        color: the picture of the depth camera's frame, where there is one.
+        sample: the cloud or the view, and the true pose.
+        model: of the object.
+        is_symmetric: whether it is measured by ADD-S. All of YCB are: geometry alone does not show
+            the sides of boxes, nor how a can is rotated.
+        frame: the image that shows it; images of tables show several instances.
+        color: the colour image registered to the depth, where there is one.
     """
 
     sample: CloudSample | ViewSample
@@ -83,13 +83,14 @@ def bunny_cases(folder: Path, every: int = 5) -> Iterator[RealCase]:
         scan = folder / "bunny/scans" / words[1] if words[:1] == ["bmesh"] else None
         if scan is None or not scan.is_file():
             continue
-        t, q = np.array(words[2:5], float), np.array(words[5:9], float)
-        R = Rotation.from_quat(q).as_matrix()
-        pose = Rigid(torch.from_numpy(R).float(), torch.from_numpy(-R @ t).float())
+        t_m = np.array(words[2:5], float)
+        quaternion = np.array(words[5:9], float)
+        R = Rotation.from_quat(quaternion).as_matrix()
+        pose = Rigid(torch.from_numpy(R).float(), torch.from_numpy(-R @ t_m).float())
         points_m = flip.apply(read_cloud(scan).points[::every].float())
         truth = PoseTruth(camera_from_model=flip @ pose)
-        given = CloudInput(name=scan.stem, points_m=points_m, object="bunny")
-        sample = CloudSample(input=given, truth=truth)
+        cloud = CloudInput(name=scan.stem, points_m=points_m, object="bunny")
+        sample = CloudSample(input=cloud, truth=truth)
         yield _case(f"bunny {scan.stem}", sample, model, is_symmetric=False)
 
 
@@ -114,7 +115,7 @@ def basket_cases(folder: Path) -> Iterator[RealCase]:
     pose = Rigid(R, torch.tensor(truth["cam_t_m2c_mm"]).double() / 1000)
     K = torch.tensor(json.loads((home / "camera.json").read_text())["K"]).double()
     depth_m = read_depth_png(home / "depth.png", 0.001)
-    yield _case("basket", _drawn(depth_m, K, model, pose), model, is_symmetric=True)
+    yield _case("basket", _view_with_mask(depth_m, K, model, pose), model, is_symmetric=True)
 
 
 def bottle_cases(folder: Path) -> Iterator[RealCase]:
@@ -122,32 +123,35 @@ def bottle_cases(folder: Path) -> Iterator[RealCase]:
     home = folder / "real_frames/bottle"
     model = read_model(home / "bottle.obj", "m", name="bottle")
     model = with_found_symmetries(model, None, is_taken=True)
-    told = json.loads((home / "poses.json").read_text())
-    color_from_model = torch.tensor(told["model_to_color_camera_authors_test_pose"]).double()
-    color_from_depth = torch.tensor(told["depth_camera_to_color_camera"]).double()
+    annotation = json.loads((home / "poses.json").read_text())
+    color_from_model = torch.tensor(annotation["model_to_color_camera_authors_test_pose"]).double()
+    color_from_depth = torch.tensor(annotation["depth_camera_to_color_camera"]).double()
     matrix = torch.linalg.inv(color_from_depth) @ color_from_model
     pose = Rigid(matrix[:3, :3], matrix[:3, 3])
-    fx, fy, cx, cy = told["depth_K"]
+    fx, fy, cx, cy = annotation["depth_K"]
     K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
-    for frame in told["frames"]:
-        depth_m = read_depth_png(home / f"depth_{frame}.png", told["depth_scale_m"])
-        view = _drawn(depth_m, K, model, pose)
+    for frame in annotation["frames"]:
+        depth_m = read_depth_png(home / f"depth_{frame}.png", annotation["depth_scale_m"])
+        view = _view_with_mask(depth_m, K, model, pose)
         yield _case(f"bottle {frame}", view, model, is_symmetric=True)
 
 
-def _drawn(depth_m: torch.Tensor, K: torch.Tensor, model: ObjectModel, pose: Rigid) -> ViewSample:
+def _view_with_mask(
+    depth_m: torch.Tensor, K: torch.Tensor, model: ObjectModel, pose: Rigid
+) -> ViewSample:
+    """Make the view of an instance whose mask is its rendered pose, where the depth agrees."""
     corners = pose.apply(model.vertices_m.double())[model.faces]
     height, width = depth_m.shape
     raster = rasterize(corners, K, width, height, with_barycentric=False)
-    mask = (depth_m.double() - raster.depth_m).abs() < _MASKED_M
-    given = ViewInput(name="", depth_m=depth_m, mask=mask, K=K, object=model.name)
-    return ViewSample(input=given, truth=PoseTruth(camera_from_model=pose))
+    mask = (depth_m.double() - raster.depth_m).abs() < _MASK_TOLERANCE_M
+    view = ViewInput(name="", depth_m=depth_m, mask=mask, K=K, object=model.name)
+    return ViewSample(input=view, truth=PoseTruth(camera_from_model=pose))
 
 
 def real_cases(folder: Path) -> list[RealCase]:
-    """All instances."""
-    every = (lm_cases, bunny_cases, ycb_cases, basket_cases, bottle_cases)
-    return [case for cases in every for case in cases(folder)]
+    """Load all instances of all data sets."""
+    loaders = (lm_cases, bunny_cases, ycb_cases, basket_cases, bottle_cases)
+    return [case for load in loaders for case in load(folder)]
 
 
 def _case(
@@ -157,6 +161,7 @@ def _case(
     is_symmetric: bool,
     frame: str | None = None,
 ) -> RealCase:
+    """Make an instance and name its sample; without a ``frame`` it is alone in its image."""
     return RealCase(
         sample=replace(sample, input=replace(sample.input, name=name)),
         model=model,

@@ -1,4 +1,4 @@
-"""What the sections of ``bench/real.py`` have in common: a section, and the errors of a pose.
+"""What the sections of ``bench/real.py`` share: their type, and the errors of a pose.
 
 Errors are of points of the model's surface, in diameters: ADD, to the nearest copy of the true pose
 by the symmetries that the data set declares, and ADD-S, from each true point to the nearest posed
@@ -25,16 +25,16 @@ Job = Callable[[], list[Row]]
 Use = Literal["choice", "held"]
 """Whether a set takes part when a method or a limit is chosen, or is only looked at afterwards."""
 
-RIGHT = 0.1
-"""Of the diameter."""
-POINTS = 1000
+RIGHT = 0.1  # largest error of a right answer, in diameters
+POINTS = 1000  # of the surface, by which errors are measured
 
 
 class Section(NamedTuple):
-    """What ``bench/real.py`` runs and prints.
+    """A part of the scoreboard, which ``bench/real.py`` runs and prints.
 
-    ``jobs``: from the folder of the data and the number of seeds; each runs in one process and
-    gives rows. ``table``: of the rows of all jobs, its lines named by their first column.
+    ``jobs`` makes its jobs from the folder of the data and the number of seeds; each runs in one
+    process and returns rows. ``table`` sums up the rows of all jobs to lines, which are named by
+    their first column.
     """
 
     title: str
@@ -43,9 +43,9 @@ class Section(NamedTuple):
 
 
 def errors_of(estimate: PoseEstimate, truth: Rigid, model: ObjectModel) -> Row:
-    """Give the status and the errors of an answer, and whether the true pose is named.
+    """Measure an answer: its status and errors (None without a pose).
 
-    ``named``: the answer or an alternative is right by ADD.
+    ``named`` says whether the answer or one of its alternatives is right by ADD.
     """
     row: Row = {
         "status": estimate.status, "certainty": estimate.certainty,
@@ -57,13 +57,13 @@ def errors_of(estimate: PoseEstimate, truth: Rigid, model: ObjectModel) -> Row:
         return row
     row["add"] = add_to_copy(pose, truth, model)
     row["adds"] = float(adds_m(pose, truth, surface_points(model))) / model.diameter_m
-    others = [other.camera_from_model for other in estimate.alternatives]
-    row["named"] = any(add_to_copy(one, truth, model) < RIGHT for one in [pose, *others])
+    poses = [pose, *(alternative.camera_from_model for alternative in estimate.alternatives)]
+    row["named"] = any(add_to_copy(candidate, truth, model) < RIGHT for candidate in poses)
     return row
 
 
 def add_to_copy(pose: Rigid, truth: Rigid, model: ObjectModel) -> float:
-    """ADD in diameters to the nearest copy of the truth by the declared symmetries."""
+    """Compute ADD, in diameters, to the nearest copy of the truth by the declared symmetries."""
     copies = symmetry_transforms(model.symmetries)
     error_m = add_of_nearest_m(pose, truth, surface_points(model), copies)
     return float(error_m) / model.diameter_m
@@ -71,7 +71,7 @@ def add_to_copy(pose: Rigid, truth: Rigid, model: ObjectModel) -> float:
 
 @lru_cache(maxsize=64)
 def surface_points(model: ObjectModel) -> Tensor:
-    """Give points of a model's surface; of bare points a part."""
+    """Sample points of a model's surface; of a model of bare points, some of them."""
     return sample_surface(model, POINTS)[0]
 
 
@@ -81,16 +81,16 @@ def is_right(error: float | None) -> bool:
 
 
 def accepts(function: Callable[..., Any], argument: str) -> bool:
-    """Whether a function has an argument: a section leaves out what the package does not offer."""
+    """Whether a function has an argument, so that earlier versions can be measured too."""
     return argument in inspect.signature(function).parameters
 
 
 def use_seed(estimator: Registration | GeoPoseNet, seed: int) -> None:
-    """Set what an estimator draws its points by."""
+    """Set the seed by which an estimator samples points."""
     config = estimator.config
     estimator.config = replace(config, voting=replace(config.voting, seed=seed))
 
 
 def median(values: Sequence[float]) -> float | None:
-    """Give the middle value; None of none."""
+    """Return the middle value, of two the larger; None of no values."""
     return sorted(values)[len(values) // 2] if values else None

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from find_tables import Frame, Shown, measure
+from find_tables import Frame, Instance, count_answers
 from PIL import Image
 from real_poses import RealCase
 from score import POINTS, RIGHT, Job, Row, Section, add_to_copy
@@ -142,7 +142,7 @@ def frame_jobs(samples: Path, seeds: int) -> list[Job]:
 def search_frames(samples: Path, names: tuple[str, ...]) -> list[Row]:
     """Search the frames that may show some objects for them."""
     wanted = [part for part in frame_searches(samples) if names_of(part) == names]
-    registration = Registration(models_of(wanted[0]))
+    registration = Registration(wanted[0].models)
     registration.prepare()
     return [search_frame(part, registration) for part in wanted]
 
@@ -152,12 +152,12 @@ def search_frame(frame: Frame, registration: Registration) -> Row:
     began = time.process_time()
     found = registration.find(frame.depth_m, frame.K)
     cpu_s = time.process_time() - began
-    counts = measure(frame, found)
+    counts = count_answers(frame, found)
     sure = [one for one in found if one.is_ok]
     return {
         "search": frame.name, "objects": "one" if len(registration.objects) == 1 else "several",
         **{key: counts[key] for key in ("instances", "right", "wrong", "which")},
-        "answers": len(found), "ok": len(sure), "ok, wrong": measure(frame, sure)["wrong"],
+        "answers": len(found), "ok": len(sure), "ok, wrong": count_answers(frame, sure)["wrong"],
         "cpu_s": cpu_s,
     }  # fmt: skip
 
@@ -179,24 +179,25 @@ def frame_searches(samples: Path) -> list[Frame]:
     return alone + together
 
 
-def frame_of(name: str, shown: Sequence[RealCase], known: list[ObjectModel] | None = None) -> Frame:
-    """Make a frame of the instances that are counted in it, and of which objects may be there."""
-    view = shown[0].sample.input
+def frame_of(
+    name: str, frame_cases: Sequence[RealCase], searched: list[ObjectModel] | None = None
+) -> Frame:
+    """Make the frame of some instances of one image, all of which are to be found.
+
+    ``searched`` are the models to search for; None: those of the instances.
+    """
+    view = frame_cases[0].sample.input
     assert isinstance(view, ViewInput)
-    instances = [Shown(case.model, case.sample.truth.camera_from_model, True, case.is_symmetric)
-                 for case in shown]  # fmt: skip
-    return Frame(name, view.depth_m, view.K, instances, known)
-
-
-def models_of(frame: Frame) -> list[ObjectModel]:
-    """Give the models that are searched in a frame, each once."""
-    models = frame.known or [thing.model for thing in frame.shown]
-    return list({model.name: model for model in models}.values())
+    instances = [
+        Instance(case.model, case.sample.truth.camera_from_model, True, case.is_symmetric)
+        for case in frame_cases
+    ]
+    return Frame(name, view.depth_m, view.K, instances, searched)
 
 
 def names_of(frame: Frame) -> tuple[str, ...]:
-    """Name what is searched in a frame."""
-    return tuple(model.name for model in models_of(frame))
+    """List the names of the objects that a frame is searched for."""
+    return tuple(model.name for model in frame.models)
 
 
 def frame_table(rows: Sequence[Row]) -> list[Row]:

@@ -1,6 +1,6 @@
-"""What the scripts here share: where they write, their tables, processor time, memory.
+"""Tables, processor time and memory for the scripts of this folder.
 
-Real instances and frames are loaded by ``real_poses`` and ``find_tables``.
+Real instances are loaded by ``real_poses``, synthetic frames by ``find_tables``.
 """
 
 import json
@@ -25,36 +25,47 @@ def report(name: str, rows: Sequence[Row]) -> None:
 
 
 def setting() -> str:
-    """Name what a time depends on beside the processor."""
+    """Describe what a time depends on besides the processor: threads and version of torch."""
     return f"{torch.get_num_threads()} threads, torch {torch.__version__}"
 
 
 def size_of(text: str) -> tuple[int, int]:
-    """Read ``256x512`` as rows and columns."""
+    """Read a size such as ``256x512``, rows and columns."""
     rows, columns = text.split("x")
     return int(rows), int(columns)
 
 
 def least_seconds(run: Callable[[], object], repeats: int) -> float:
-    """Least processor time of some runs [s], all threads together; the caller has warmed up."""
-    times = []
+    """Measure the least processor time of some runs [s], of all threads together.
+
+    The caller has run it before, so that nothing is loaded or compiled meanwhile.
+    """
+    times_s: list[float] = []
     for _ in range(repeats):
-        began = time.process_time()
+        began_s = time.process_time()
         run()
-        times.append(time.process_time() - began)
-    return min(times)
+        times_s.append(time.process_time() - began_s)
+    return min(times_s)
 
 
 def resident_bytes(field: str) -> int:
-    """Read a line of this process's memory, VmRSS or VmHWM [bytes]. Linux only."""
+    """Read this process's resident memory: now (``VmRSS``) or at its peak (``VmHWM``) [bytes].
+
+    Linux only.
+    """
     status = Path("/proc/self/status").read_text()
-    return 1024 * int(next(line for line in status.splitlines() if field in line).split()[1])
+    line = next(line for line in status.splitlines() if field in line)
+    kibibytes = int(line.split()[1])
+    return 1024 * kibibytes
 
 
 def peak_growth_bytes(run: Callable[[], object]) -> int:
-    """How far a call raises this process's peak above what it holds before [bytes]. Linux only."""
+    """Measure by how much the peak memory of a call exceeds the memory before it [bytes].
+
+    Linux only.
+    """
     before = resident_bytes("VmRSS")
-    # What came before may have peaked higher: 5 resets the peak (Linux, proc_pid_clear_refs).
+    # Earlier work may have peaked higher: 5 resets the peak (Linux, proc_pid_clear_refs).
     Path("/proc/self/clear_refs").write_text("5")
     run()
     return resident_bytes("VmHWM") - before

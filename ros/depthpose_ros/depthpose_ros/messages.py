@@ -15,7 +15,11 @@ from scipy.spatial.transform import Rotation
 
 from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.camera.pinhole import CameraFacts, camera_from_facts
-from depthpose.core.camera.stored_camera import facts_from_names, facts_from_ros_pair, named
+from depthpose.core.camera.stored_camera import (
+    facts_from_fields,
+    facts_from_ros_pair,
+    normalise_keys,
+)
 from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.core.files.images import from_16_bit
 from depthpose.core.rigid import Rigid, cross_matrix
@@ -179,7 +183,7 @@ def _names(info: Any) -> dict[str, Any]:  # noqa: ANN401
     window = {key: getattr(roi, key, 0) for key in ("x_offset", "y_offset", "width", "height")}
     fields = {"width": info.width, "height": info.height, "p": list(info.p), "k": list(info.k)}
     binning = {key: getattr(info, key, 0) for key in ("binning_x", "binning_y")}
-    return named({**fields, **binning, "roi": window})
+    return normalise_keys({**fields, **binning, "roi": window})
 
 
 def _facts(info: Any) -> CameraFacts:  # noqa: ANN401
@@ -189,7 +193,7 @@ def _facts(info: Any) -> CameraFacts:  # noqa: ANN401
         )
     if not (info.p[0] > 0 or info.k[0] > 0):
         raise InputError("camera_info holds no K and no P: the camera is not calibrated")
-    found = facts_from_names(_names(info) | ({} if info.p[0] > 0 else {"p": None}))
+    found = facts_from_fields(_names(info) | ({} if info.p[0] > 0 else {"p": None}))
     assert found is not None
     return replace(found, baseline_m=None)
 

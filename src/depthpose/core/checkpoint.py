@@ -1,4 +1,4 @@
-"""Weights with the config that made them: safetensors, loaded strictly; others' files, safely.
+"""Weights files: safetensors with the network's config inside, and published PyTorch checkpoints.
 
 Weights are named by a file, a folder, a name in the package, or one on the Hugging Face hub:
 ``hf://OWNER/NAME``, ``hf://OWNER/NAME@REVISION`` or ``hf://OWNER/NAME/FILE.safetensors``, as
@@ -28,27 +28,32 @@ from depthpose.core.errors import InputError, Notice, import_extra, nearest_name
 from depthpose.core.files.disk import finite_number, refused_as, write_bytes
 
 NetworkT = TypeVar("NetworkT", bound=nn.Module)
-_DRAWS = (nn.init.normal_, nn.init.uniform_, nn.init.kaiming_normal_, nn.init.kaiming_uniform_)
-"""Functions that draw random weights, and may be skipped as a whole."""
+_RANDOM_INITS = (
+    nn.init.normal_, nn.init.uniform_, nn.init.kaiming_normal_, nn.init.kaiming_uniform_
+)  # fmt: skip
+"""Functions that fill a tensor with random weights, and do nothing else."""
 _SAFETENSORS = (
     "safetensors file", "a published checkpoint is imported by 'depthpose weights import'"
 )  # fmt: skip
 """What a file should be, and what to do where it is not."""
 
 WEIGHTS_FILE = "model.safetensors"
-"""Name of the weights in a repository, as others on the hub call theirs."""
+"""Usual name of the weights file in a repository on the hub."""
 
-_NAME = r"[\w-][\w.-]*/[\w-][\w.-]*"
-# One slash is left of the two where the name was made a path.
-_REFERENCE = re.compile(rf"hf://?(?P<repository>{_NAME})(@(?P<revision>[^/@]+))?(/(?P<file>.+))?")
-
+_REPOSITORY = r"[\w-][\w.-]*/[\w-][\w.-]*"
+# A pathlib.Path of the name has one slash where the name has two.
+_HUB_NAME = re.compile(
+    rf"hf://?(?P<repository>{_REPOSITORY})(@(?P<revision>[^/@]+))?(/(?P<file>.+))?"
+)
 
 ON_HUB = "hf:/"
-"""Begins a name of the hub."""
+"""What the names of weights on the hub begin with, also as paths."""
 SHIPPED = Path(__file__).parents[1] / "weights"
 """Folder of the weights that come with the package."""
 
-_IN_REPOSITORY = ("kitti-nc", "linemod-nc", "bunny-nc", "ycb")  # weights that stay out of the wheel
+_NOT_IN_WHEEL = ("kitti-nc", "linemod-nc", "bunny-nc", "ycb")
+"""Weights that are in the repository of the source alone."""
+_LONGEST_REASON = 200  # letters that are shown of another library's message
 
 
 class LicenceNotice(Notice):
@@ -74,15 +79,22 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     metadata = {"kind": checkpoint.kind, "config": json.dumps(dict(checkpoint.config))}
     state = {name: tensor.detach().cpu().contiguous() for name, tensor in checkpoint.state.items()}
     content = save(state, metadata={**checkpoint.facts, **metadata})
-    # Its header has the metadata in random order, so equal weights would get different checksums.
+    # Not by safetensors' own writer, whose error does not name a full disk.
+    write_bytes(path, _with_sorted_header(content))
+
+
+def _with_sorted_header(content: bytes) -> bytes:
+    """Sort the JSON header of a safetensors file, so that equal weights have equal checksums.
+
+    safetensors writes the metadata in random order. A file is the length of its header (8 bytes),
+    the header, and the tensors.
+    """
     size = int.from_bytes(content[:8], "little")
-    header = json.dumps(
-        json.loads(content[8 : 8 + size]), sort_keys=True, separators=(",", ":"), ensure_ascii=False
-    ).encode()
+    entries = json.loads(content[8 : 8 + size])
+    header = json.dumps(entries, sort_keys=True, separators=(",", ":"), ensure_ascii=False).encode()
     assert len(header) <= size, "the same entries, no longer than before"
-    # safetensors' own writer does not name a full disk.
-    rest = memoryview(content)[8 + size :]
-    write_bytes(path, b"".join([content[:8], header.ljust(size), rest]))
+    tensors = memoryview(content)[8 + size :]
+    return b"".join([content[:8], header.ljust(size), tensors])
 
 
 def find_weights(name: str | Path) -> Path:
@@ -93,7 +105,7 @@ def find_weights(name: str | Path) -> Path:
             weights, or with ``model.safetensors``; or ``hf://OWNER/NAME``.
 
     Raises:
-        InputError: none of these; the nearest name is said.
+        InputError: none of these; the message suggests the nearest name.
     """
     path = Path(name)
     shipped = {file.stem: file for file in SHIPPED.glob("*.safetensors")}
@@ -102,18 +114,10 @@ def find_weights(name: str | Path) -> Path:
     if str(name) in shipped:
         return shipped[str(name)]
     if path.is_dir():
-        files = sorted(path.glob("*.safetensors"))
-        named = [file for file in files if file.name == WEIGHTS_FILE] or files
-        if len(named) == 1:
-            return named[0]
-        file_names = ", ".join(file.name for file in files) or "none"
-        raise InputError(
-            f"{path}: a folder of weights holds one .safetensors file, or one called "
-            f"{WEIGHTS_FILE}; here: {file_names}. Name the file."
-        )
+        return _weights_in_folder(path)
     if str(name).startswith(ON_HUB):
         return fetch_weights(str(name))
-    if str(name) in _IN_REPOSITORY:
+    if str(name) in _NOT_IN_WHEEL:
         raise InputError(
             f"weights {str(name)!r}: not in the wheel, for their terms or their size. Take "
             f"src/depthpose/weights/{name}.safetensors from the repository and give its path."
@@ -125,17 +129,35 @@ def find_weights(name: str | Path) -> Path:
     )
 
 
+def _weights_in_folder(folder: Path) -> Path:
+    """Find the only ``.safetensors`` file of a folder, or the one with the usual name.
+
+    Raises:
+        InputError: there is none, or several of other names.
+    """
+    files = sorted(folder.glob("*.safetensors"))
+    usual = [file for file in files if file.name == WEIGHTS_FILE]
+    candidates = usual or files
+    if len(candidates) == 1:
+        return candidates[0]
+    file_names = ", ".join(file.name for file in files) or "none"
+    raise InputError(
+        f"{folder}: a folder of weights holds one .safetensors file, or one called "
+        f"{WEIGHTS_FILE}; here: {file_names}. Name the file."
+    )
+
+
 @cache
 def fetch_weights(name: str) -> Path:
-    """Give the local file of weights on the hub, downloaded if the cache has not got them.
+    """Return the local file of weights on the hub, downloaded where it is not in the cache.
 
-    Asked again, one process gets the same file: what is fingerprinted is what is loaded.
+    A process gets the same file each time, so that a checksum of it is that of what is loaded.
 
     Raises:
         InputError: no such name, repository, revision or file; no access; no connection.
         MissingExtraError: the extra ``hub`` is not installed.
     """
-    reference = _REFERENCE.fullmatch(name)
+    reference = _HUB_NAME.fullmatch(name)
     if reference is None:
         raise InputError(
             f"{name!r}: weights on the hub are hf://OWNER/NAME, hf://OWNER/NAME@REVISION or "
@@ -145,34 +167,53 @@ def fetch_weights(name: str) -> Path:
     if not file.endswith(".safetensors"):
         raise InputError(f"{name!r}: only .safetensors are fetched: they cannot run code.")
     hub = import_extra("huggingface_hub", "huggingface_hub", "hub", "weights on the hub")
-    errors = import_module("huggingface_hub.errors")
-    remedies = {
-        errors.HFValidationError: "no name that the hub allows: {reason}",
-        errors.GatedRepoError: "its owner asks for consent; give it on the repository's page, then "
-        "'hf auth login'.",
-        errors.RepositoryNotFoundError: "there is no such repository, or it is private: check the "
-        "name, or 'hf auth login' with an account that may read it.",
-        errors.RevisionNotFoundError: "the repository has no such revision.",
-        (errors.LocalEntryNotFoundError, errors.OfflineModeIsEnabled): "the hub cannot be reached, "
-        "and it is not in the cache. Connect once, unset HF_HUB_OFFLINE, or copy the repository's "
-        "folder here and give its path.",
-        errors.EntryNotFoundError: f"the repository has no such file ({WEIGHTS_FILE} by default); "
-        "name it: hf://OWNER/NAME/FILE.safetensors.",
-        # Of the connection, of access, of a full disk. Base classes of the library's errors: of
-        # requests, of httpx or its successor.
-        (OSError, *(k for k in errors.HfHubHTTPError.__mro__[1:] if k.__module__ != "builtins")): (
-            "the hub refused: {reason}; try again, or copy the file here and give its path."
-        ),
-    }
     try:
         path = hub.hf_hub_download(reference["repository"], file, revision=reference["revision"])
     except Exception as error:
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        for kinds, remedy in remedies.items():
-            if isinstance(error, kinds):
-                raise InputError(f"{name}: {remedy.replace('{reason}', reason)}") from error
-        raise
+        refusal = _hub_refusal(error)
+        if refusal is None:
+            raise
+        raise InputError(f"{name}: {refusal}") from error
     return Path(path)
+
+
+def _hub_refusal(error: Exception) -> str | None:
+    """Say why the hub gave no file, and what to do; None where the error has another origin."""
+    errors = import_module("huggingface_hub.errors")
+    reason = " ".join(str(error).split())[:_LONGEST_REASON] or type(error).__name__
+    # The library's errors derive from those of the HTTP library that it is built on: requests,
+    # httpx or its successor.
+    http_errors = [
+        base for base in errors.HfHubHTTPError.__mro__[1:] if base.__module__ != "builtins"
+    ]
+    refusals = (  # of the first that fits; special errors come before their base classes
+        (errors.HFValidationError, f"no name that the hub allows: {reason}"),
+        (
+            errors.GatedRepoError,
+            "its owner asks for consent; give it on the repository's page, then 'hf auth login'.",
+        ),
+        (
+            errors.RepositoryNotFoundError,
+            "there is no such repository, or it is private: check the name, or 'hf auth login' "
+            "with an account that may read it.",
+        ),
+        (errors.RevisionNotFoundError, "the repository has no such revision."),
+        (
+            (errors.LocalEntryNotFoundError, errors.OfflineModeIsEnabled),
+            "the hub cannot be reached, and it is not in the cache. Connect once, unset "
+            "HF_HUB_OFFLINE, or copy the repository's folder here and give its path.",
+        ),
+        (
+            errors.EntryNotFoundError,
+            f"the repository has no such file ({WEIGHTS_FILE} by default); "
+            "name it: hf://OWNER/NAME/FILE.safetensors.",
+        ),
+        (
+            (OSError, *http_errors),  # of the connection, of access, of a full disk
+            f"the hub refused: {reason}; try again, or copy the file here and give its path.",
+        ),
+    )
+    return next((refusal for kinds, refusal in refusals if isinstance(error, kinds)), None)
 
 
 def read_checkpoint(path: Path, kind: str | None = None) -> Checkpoint:
@@ -189,9 +230,7 @@ def read_checkpoint(path: Path, kind: str | None = None) -> Checkpoint:
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: there is no such weights file.")
-    with refused_as(path, *_SAFETENSORS), safe_open(path, framework="pt") as file:
-        metadata = dict(file.metadata() or {})
-        state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    state, metadata = _read_safetensors(path)
     if "kind" not in metadata or "config" not in metadata:
         raise InputError(
             f"{path}: no 'kind' and 'config' in its metadata, so no depthpose weights. A "
@@ -208,20 +247,29 @@ def read_checkpoint(path: Path, kind: str | None = None) -> Checkpoint:
         raise InputError(f"{path}: its 'config' is not JSON ({error}).") from error
     if not isinstance(config, dict):
         raise InputError(f"{path}: its 'config' is not a mapping.")
-    return Checkpoint(kind=stored_kind, config=config, state=_finite(path, state), facts=metadata)
+    _refuse_impossible_numbers(path, state)
+    return Checkpoint(kind=stored_kind, config=config, state=state, facts=metadata)
+
+
+def _read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Read the tensors of a safetensors file by name, and its metadata."""
+    with refused_as(path, *_SAFETENSORS), safe_open(path, framework="pt") as file:
+        state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        return state, dict(file.metadata() or {})
 
 
 def file_sha256(path: Path) -> str:
-    """Compute a file's sha256, recorded beside every number that was made with it."""
+    """Compute the SHA-256 of a file, in hexadecimal."""
     with Path(path).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def load_weights(network: nn.Module, checkpoint: Checkpoint, source: str) -> None:
-    """Copy the weights into ``network``; every name and shape must agree.
+    """Copy the weights of ``checkpoint`` into ``network``; every name and shape must agree.
 
     Raises:
-        InputError: the first names that are missing, unexpected or of another shape.
+        InputError: they do not; it names ``source`` and the first tensors that are missing,
+            unexpected or of another shape.
     """
     problems = misfits(network.state_dict(), checkpoint.state)
     if problems:
@@ -235,19 +283,19 @@ def load_weights(network: nn.Module, checkpoint: Checkpoint, source: str) -> Non
 def build_network(make: Callable[[], NetworkT], checkpoint: Checkpoint, source: str) -> NetworkT:
     """Make a network and copy the weights into it, as :func:`load_weights` does.
 
-    Its shapes are compared before it takes memory: a config may say any size.
+    Shapes are compared before the network takes memory: a damaged config may name any size.
 
     Args:
         make: makes the network of the checkpoint's config.
         checkpoint: its weights.
-        source: what to call them in errors.
+        source: the name of the weights in errors.
 
     Raises:
-        InputError: as there, or a config of which no network can be made.
+        InputError: as :func:`load_weights`, or no network can be made of the config.
     """
     with (
         refused_as(source, "config of a network", "file and config are of different versions"),
-        _WithoutDrawing(),
+        _SkipRandomInit(),
     ):
         with torch.device("meta"):
             load_weights(make(), checkpoint, source)  # compares shapes, and copies nothing
@@ -256,8 +304,11 @@ def build_network(make: Callable[[], NetworkT], checkpoint: Checkpoint, source: 
     return network
 
 
-class _WithoutDrawing(TorchFunctionMode):
-    """Draws no random weights: on the meta device torch would import its compiler for that, 1 s."""
+class _SkipRandomInit(TorchFunctionMode):
+    """Leaves tensors as they are where torch would fill them with random weights.
+
+    On the meta device torch would import its compiler for that, which takes 1 s.
+    """
 
     def __torch_function__(
         self,
@@ -267,13 +318,17 @@ class _WithoutDrawing(TorchFunctionMode):
         kwargs: Mapping[str, Any] | None = None,
     ) -> Any:  # noqa: ANN401
         options = kwargs or {}
-        if func in _DRAWS:
+        if func in _RANDOM_INITS:
             return args[0] if args else options["tensor"]
         return func(*args, **options)
 
 
 def misfits(wanted: Mapping[str, Tensor], tensors: Mapping[str, Tensor]) -> list[str]:
-    """List the tensors that are missing, unexpected or of another shape, by name."""
+    """Compare named tensors with the wanted ones: those missing, unexpected or of another shape.
+
+    Returns:
+        A phrase for each, such as ``conv.bias is missing``, sorted; none where all agree.
+    """
     problems = [f"{name} is missing" for name in wanted.keys() - tensors.keys()]
     problems += [f"{name} is unexpected" for name in tensors.keys() - wanted.keys()]
     problems += [
@@ -296,7 +351,7 @@ def read_torch_file(path: Path) -> Mapping[str, Any]:
     if not path.is_file():
         raise InputError(f"{path}: there is no such checkpoint file.")
     try:
-        # An open file, not a path: by a path's ending torch would choose another format.
+        # An open file, because torch would choose another format by the suffix of a path.
         with path.open("rb") as file:
             content = torch.load(file, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
@@ -304,7 +359,7 @@ def read_torch_file(path: Path) -> Mapping[str, Any]:
             f"{path}: refused, as no checkpoint of tensors alone: it is broken, or holds "
             "pickled objects that could run code on loading. Ask its author for one of tensors."
         ) from error
-    except Exception as error:  # an unpickler raises whatever broken bytes lead it to
+    except Exception as error:  # on damaged bytes an unpickler may raise anything
         raise InputError(f"{path}: not a readable PyTorch checkpoint ({error}).") from error
     if not isinstance(content, Mapping):
         raise InputError(
@@ -314,9 +369,9 @@ def read_torch_file(path: Path) -> Mapping[str, Any]:
 
 
 def read_published(path: Path, network: str) -> Mapping[str, Tensor]:
-    """Read the tensors of a foreign checkpoint: safetensors by its suffix, or else a PyTorch file.
+    """Read the tensors of a published checkpoint: safetensors by its suffix, else a PyTorch file.
 
-    Errors say that it should hold ``network``.
+    ``network`` is the name of the network in errors.
 
     Raises:
         InputError: missing, damaged, holding pickled code, no tensors by name, or numbers that are
@@ -324,24 +379,25 @@ def read_published(path: Path, network: str) -> Mapping[str, Tensor]:
     """
     path = Path(path)
     if path.suffix == ".safetensors":
-        with refused_as(path, *_SAFETENSORS), safe_open(path, framework="pt") as file:
-            return _finite(path, {name: file.get_tensor(name) for name in file.keys()})  # noqa: SIM118
-    content = read_torch_file(path)
-    state = content.get("state_dict", content)
-    if not isinstance(state, Mapping) or not all(isinstance(v, Tensor) for v in state.values()):
-        raise InputError(
-            f"{path}: holds no tensors by name, so it is no {network}. Its entries are "
-            f"{', '.join(map(repr, list(content)[:5]))}."
-        )
-    return _finite(path, state)
+        state, _ = _read_safetensors(path)
+    else:
+        content = read_torch_file(path)
+        state = content.get("state_dict", content)
+        if not isinstance(state, Mapping) or not all(isinstance(v, Tensor) for v in state.values()):
+            raise InputError(
+                f"{path}: holds no tensors by name, so it is no {network}. Its entries are "
+                f"{', '.join(map(repr, list(content)[:5]))}."
+            )
+    _refuse_impossible_numbers(path, state)
+    return state
 
 
 def save_imported(
     out: Path, kind: str, network: nn.Module, source: Path, facts: Mapping[str, str]
 ) -> None:
-    """Write the weights of an imported network, with the checksum of the file that they are from.
+    """Write the weights of an imported network, with the checksum of ``source``, their file.
 
-    The card's ``facts`` say ``trained_on`` and ``licence``.
+    ``facts`` are those of its card: ``trained_on``, ``licence`` and, if there are any, ``terms``.
     """
     origin = {"origin": f"imported from a file with sha256 {file_sha256(source)}"}
     state = network.state_dict()
@@ -349,34 +405,42 @@ def save_imported(
 
 
 def half_state(network: nn.Module) -> dict[str, Tensor]:
-    """Give the state of a network with its floating-point numbers in 16 bits."""
+    """Return the state of a network with its floating-point tensors converted to float16."""
     state = network.state_dict()
-    return {k: t.to(torch.float16) if t.is_floating_point() else t for k, t in state.items()}
+    return {
+        name: tensor.to(torch.float16) if tensor.is_floating_point() else tensor
+        for name, tensor in state.items()
+    }
 
 
 def warn_of_terms(facts: Mapping[str, str]) -> None:
-    """Warn of the terms of use of weights that have any."""
+    """Warn (:class:`LicenceNotice`) where the card of weights holds terms of use."""
     if terms := facts.get("terms", ""):
         warnings.warn(terms, LicenceNotice, stacklevel=3)
 
 
 def join_terms(*cards: Mapping[str, str]) -> str:
-    """Give the terms of all cards together: those of the parts bind the whole; none comes twice."""
+    """Join the terms of use of all cards, each once: the terms of every part bind the whole."""
+
+    def contains(text: str, part: str) -> bool:
+        """Whether a text holds a part as whole words: "commercial" is not "non-commercial"."""
+        return f" {part} " in f" {text} "
+
     joined = ""
-    for terms in filter(None, (card.get("terms", "") for card in cards)):
-        if f" {joined} " in f" {terms} ":  # whole words: "commercial" is not "non-commercial"
-            joined = terms
-        elif f" {terms} " not in f" {joined} ":
-            joined = f"{joined} {terms}".strip()
+    for card in cards:
+        terms = card.get("terms", "")
+        if not terms or contains(joined, terms):
+            continue
+        joined = terms if contains(terms, joined) else f"{joined} {terms}".strip()
     return joined
 
 
 def bound_facts(facts: Mapping[str, str], made_of: Iterable[str | Path]) -> dict[str, str]:
-    """Add to a card the terms of the weights that something is made of.
+    """Return a copy of a card with the terms of all weights that the new weights are made of.
 
     Args:
         facts: the card, with terms of its own if it has any.
-        made_of: what names weights, as for :func:`find_weights`.
+        made_of: names of these weights, as :func:`find_weights` takes them.
 
     Raises:
         InputError: there are no such weights.
@@ -386,19 +450,24 @@ def bound_facts(facts: Mapping[str, str], made_of: Iterable[str | Path]) -> dict
     return {**facts, "terms": terms} if terms else dict(facts)
 
 
-def _finite(path: Path, state: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
-    """Refuse tensors with NaN or infinity, of which a network would make plausible nonsense."""
+def _refuse_impossible_numbers(path: Path, state: Mapping[str, Tensor]) -> None:
+    """Refuse tensors with NaN or infinity, and negative variances of batch norm.
+
+    A network would make plausible nonsense of them.
+    """
     for name, tensor in state.items():
-        # A sum takes no memory; a large one may overflow though every number is finite.
-        is_finite = not tensor.is_floating_point() or tensor.sum(dtype=torch.float32).isfinite()
-        if not is_finite and (bad := tensor.numel() - int(tensor.isfinite().sum())):
+        # A sum takes no memory; where it overflows the numbers themselves are looked at.
+        has_finite_sum = (
+            not tensor.is_floating_point() or tensor.sum(dtype=torch.float32).isfinite()
+        )
+        bad_count = 0 if has_finite_sum else tensor.numel() - int(tensor.isfinite().sum())
+        if bad_count:
             raise InputError(
-                f"{path}: {bad} of the {tensor.numel()} numbers of {name!r} are NaN or infinite, "
-                "so its training diverged or the file is damaged; take other weights"
+                f"{path}: {bad_count} of the {tensor.numel()} numbers of {name!r} are NaN or "
+                "infinite, so its training diverged or the file is damaged; take other weights"
             )
         if name.endswith("running_var") and (tensor < 0).any():
             raise InputError(
                 f"{path}: {name!r} holds a variance below 0, so the file is damaged; take other "
                 "weights"
             )
-    return state

@@ -1,4 +1,4 @@
-"""YAML to frozen dataclass and back. The dataclass has defaults, checks and help."""
+"""Settings: YAML to a frozen dataclass and back, with the dataclass's defaults and checks."""
 
 import dataclasses
 import json
@@ -16,67 +16,97 @@ from depthpose.core.errors import InputError, nearest_name, refuse_unknown
 
 ConfigT = TypeVar("ConfigT")
 _LONGEST = 500  # letters of a value that an error shows
-_MAX_BYTES = 2**17  # largest config file: a hundred times the largest of ours
+_MAX_BYTES = 2**17  # largest config file: a hundred times the largest that comes with depthpose
 
 
 Seed = Annotated[int, "[0, 9223372036854775808)"]
-"""What random numbers begin with: 63 bits."""
+"""Seed of a generator of random numbers, 63 bits."""
 ASCENDING = "ascending"
-"""Of a setting of two numbers: they are a range."""
+"""Annotation of a setting of two numbers: a range, whose lower end comes first."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Rule:
+    """What the values of a setting must fulfil."""
+
+    words: tuple[str, ...]  # the allowed words; none: any value
+    interval: str  # such as "[16, inf)", for each number of the setting; "": any number
+    multiples_of: tuple[Any, ...]  # the setting must be a multiple of each
+    is_ascending: bool  # whether the first of two numbers may not exceed the second
 
 
 class Settings:
     """Base of settings whose types say ranges: ``Annotated[int, "[16, inf)", 16]``.
 
-    A number behind the range is one that the setting is a multiple of; ``ASCENDING`` there says
-    that the lower end of a range comes first.
+    A number behind the range is one that the setting must be a multiple of; ``ASCENDING`` there
+    says that the lower end of a range comes first.
 
     Raises:
         InputError: a number that breaks these rules, or a word that the type does not know.
     """
 
     def __post_init__(self) -> None:
-        for name, (words, interval, notes) in _rules_of(type(self)).items():
+        for name, rule in _rules_of(type(self)).items():
             value = getattr(self, name)
             default = getattr(type(self), name, None)
-            several = value if isinstance(value, tuple) else (value,)
-            for single in (each for each in several if each is not None):
-                if words and single not in words:
-                    refuse_unknown(name, single, words)
-                if interval:
-                    low, high = (float(end) for end in interval[1:-1].split(", "))
-                    is_above = single >= low if interval[0] == "[" else single > low
-                    is_below = single <= high if interval[-1] == "]" else single < high
-                    if not (is_above and is_below):
-                        remedy = "" if default is None else f"; the default is {default}"
-                        raise InputError(
-                            f"{name} must be in {interval}, got {value!r:.{_LONGEST}}{remedy}"
-                        )
-            if ASCENDING in notes and value is not None and value[0] > value[1]:
+
+            # The words and the interval apply to each entry of a tuple.
+            entries = value if isinstance(value, tuple) else (value,)
+            for entry in entries:
+                if entry is None:
+                    continue
+                if rule.words and entry not in rule.words:
+                    refuse_unknown(name, entry, rule.words)
+                if rule.interval and not _is_in_interval(entry, rule.interval):
+                    remedy = "" if default is None else f"; the default is {default}"
+                    raise InputError(
+                        f"{name} must be in {rule.interval}, got {value!r:.{_LONGEST}}{remedy}"
+                    )
+
+            if rule.is_ascending and value is not None and value[0] > value[1]:
                 raise InputError(
                     f"{name} must be a range, the lower end first, got {value}; turn it"
                 )
-            steps = [step for step in notes if step != ASCENDING]
-            if any(value % step for step in steps):
-                raise InputError(
-                    f"{name} must be a multiple of {steps[0]}, got {value}; take {default}"
-                )
+            for divisor in rule.multiples_of:
+                if value % divisor:
+                    raise InputError(
+                        f"{name} must be a multiple of {divisor}, got {value}; take {default}"
+                    )
+
+
+def _is_in_interval(number: float, interval: str) -> bool:
+    """Whether a number lies in an interval such as ``[16, inf)``; "[" and "]" include the end."""
+    low, high = (float(end) for end in interval[1:-1].split(", "))
+    is_above = number >= low if interval[0] == "[" else number > low
+    is_below = number <= high if interval[-1] == "]" else number < high
+    return is_above and is_below
 
 
 @cache
-def _rules_of(kind: type) -> dict[str, tuple[tuple[Any, ...], str, tuple[Any, ...]]]:
-    """Give the allowed words, the interval and the notes of each setting, from its type."""
-    rules: dict[str, tuple[tuple[Any, ...], str, tuple[Any, ...]]] = {}
+def _rules_of(kind: type) -> dict[str, _Rule]:
+    """Read the rules of the settings of a class from their type hints, by name."""
+    rules: dict[str, _Rule] = {}
     for name, hint in get_type_hints(kind, include_extras=True).items():
-        is_annotated = get_origin(hint) is Annotated
-        interval, *notes = hint.__metadata__ if is_annotated else ("",)
-        plain = get_args(hint)[0] if is_annotated else hint
-        choices = (choice for choice in (plain, *get_args(plain)) if get_origin(choice) is Literal)
-        words = get_args(next(choices, None))
+        interval = ""
+        notes: list[Any] = []
+        plain = hint
+        if get_origin(hint) is Annotated:
+            interval, *notes = hint.__metadata__
+            plain = get_args(hint)[0]
+
+        # A Literal may be the type itself, or a part of it, as in ``Literal["a", "b"] | None``.
+        parts = (plain, *get_args(plain))
+        literal = next((part for part in parts if get_origin(part) is Literal), None)
+        words = get_args(literal)
         if not all(isinstance(word, str) for word in words):
             words = ()
         if words or interval or notes:
-            rules[name] = words, interval, tuple(notes)
+            rules[name] = _Rule(
+                words=words,
+                interval=interval,
+                multiples_of=tuple(note for note in notes if note != ASCENDING),
+                is_ascending=ASCENDING in notes,
+            )
     return rules
 
 
@@ -84,33 +114,43 @@ def read_config(path: Path, kind: type[ConfigT]) -> ConfigT:
     """Read a YAML file that holds the differences from the defaults of ``kind``.
 
     Raises:
-        InputError: not YAML, an unknown key (its nearest name is said), or a value refused.
+        InputError: not YAML, an unknown key (the message suggests the nearest), or a value that
+            ``kind`` refuses.
     """
-    from depthpose.core.files import read_text  # here: options load without torch
+    # Imported here, so that the command line knows its options without loading torch.
+    from depthpose.core.files import read_text
     from depthpose.core.files.disk import parse_yaml
 
     content = parse_yaml(path, read_text(path, _MAX_BYTES))
-    content = {} if content is None else content
+    if content is None:  # an empty file
+        content = {}
     if not isinstance(content, Mapping):
         raise InputError(
             f"{path}: holds a {type(content).__name__}, but a config is a mapping of names to "
             "values, one 'name: value' a line."
         )
-    return config_from_dict(_over_defaults(content, kind), kind, source=str(path))
+    return config_from_dict(_merge_nested_defaults(content, kind), kind, source=str(path))
 
 
-def _over_defaults(content: Mapping[Any, Any], kind: type) -> dict[Any, Any]:
-    """Merge nested differences into the defaults of ``kind``."""
+def _merge_nested_defaults(content: Mapping[Any, Any], kind: type) -> dict[Any, Any]:
+    """Complete the nested settings in ``content`` by the defaults that ``kind`` has for them.
+
+    A nested dataclass may have other defaults as a field of ``kind`` than by itself. Its class
+    variable ``INSTEAD`` maps a setting to the one whose default it removes.
+    """
     merged = dict(content)
     for field in dataclasses.fields(kind):
-        nested = content.get(field.name)
-        make = field.default_factory
-        default = field.default if make is dataclasses.MISSING else make()
-        if isinstance(nested, Mapping) and dataclasses.is_dataclass(default):
-            rivals = getattr(default, "INSTEAD", {})  # given, it removes the other's default
-            left_out = {rivals[key] for key in nested if key in rivals}
-            defaults = {k: v for k, v in config_to_dict(default).items() if k not in left_out}
-            merged[field.name] = defaults | _over_defaults(nested, type(default))
+        differences = content.get(field.name)
+        default = field.default
+        if field.default_factory is not dataclasses.MISSING:
+            default = field.default_factory()
+        if not isinstance(differences, Mapping) or not dataclasses.is_dataclass(default):
+            continue
+        removes = getattr(default, "INSTEAD", {})
+        removed = {removes[key] for key in differences if key in removes}
+        defaults = config_to_dict(default)
+        kept = {key: value for key, value in defaults.items() if key not in removed}
+        merged[field.name] = kept | _merge_nested_defaults(differences, type(default))
     return merged
 
 
@@ -122,8 +162,8 @@ def config_from_dict(
     Args:
         content: settings by name; what is left out has its default.
         kind: a dataclass.
-        source: names the mapping in errors.
-        prefix: begins the names of its settings there.
+        source: what the mapping is called in errors, such as the path of its file.
+        prefix: what the names of its settings begin with in errors, such as ``loop.``.
 
     Raises:
         InputError: an unknown key, a wrong type, or a value that ``kind`` refuses.
@@ -140,77 +180,119 @@ def config_from_dict(
             )
         # A default may be infinite, where no other number may.
         is_default = isinstance(value, float) and value == defaults[key]
-        name = f"{prefix}{key}"
-        values[key] = value if is_default else _value_of(value, hints[key], source, name)
+        values[key] = value
+        if not is_default:
+            values[key] = _convert(value, hints[key], source, f"{prefix}{key}")
     try:
         return kind(**values)
     except (ValueError, TypeError, OverflowError, AttributeError) as error:
         raise InputError(f"{source}: {str(error)[:_LONGEST]}") from error
 
 
-def _value_of(value: Any, hint: Any, source: str, name: str) -> Any:  # noqa: ANN401, C901, PLR0911, PLR0912
-    """Convert a value to the type of a setting; only lossless conversions are done."""
+def _convert(value: Any, hint: Any, source: str, name: str) -> Any:  # noqa: ANN401, PLR0911
+    """Convert a value from YAML or JSON to the type of a setting, where that loses nothing.
+
+    Args:
+        value: what the file holds.
+        hint: type of the setting.
+        source: what the file is called in errors.
+        name: of the setting, in errors.
+
+    Raises:
+        InputError: it cannot be converted without loss.
+    """
     origin = get_origin(hint)
-    parts = get_args(hint)
+    shown = f"{source}: {name} is {value!r:.{_LONGEST}}"
     if origin in (Union, types.UnionType):
-        if value is None and type(None) in parts:
-            return None
-        *others, last = (part for part in parts if part is not type(None))
-        for other in others:
-            with suppress(InputError):
-                return _value_of(value, other, source, name)
-        return _value_of(value, last, source, name)
-    context = f"{source}: {name} is {value!r:.{_LONGEST}}"
+        return _convert_to_union(value, get_args(hint), source, name)
     if origin in (tuple, list):
-        is_free = origin is list or parts[-1] is Ellipsis
-        times = 1 if is_free else len(parts)
-        if not isinstance(value, list | tuple):
-            count = "a list" if is_free else f"a list of {times} values"
-            remedy = "write its values in brackets, or leave the key out"
-            if isinstance(value, str | int | float):
-                remedy = f"write [{', '.join([str(value)[:_LONGEST]] * times)}]"
-            raise InputError(f"{context}, but {count} is needed: {remedy}")
-        if not is_free and len(value) != times:
-            raise InputError(f"{context}, but {times} values are needed: give so many")
-        pairs = zip(value, parts[:1] * len(value) if is_free else parts, strict=True)
-        items = [_value_of(v, part, source, f"{name}[{k}]") for k, (v, part) in enumerate(pairs)]
-        return items if origin is list else tuple(items)
+        return _convert_to_sequence(value, hint, source, name)
     if origin is dict and isinstance(value, Mapping):
-        return {k: _value_of(item, parts[1], source, f"{name}.{k}") for k, item in value.items()}
-    if origin is Literal and value in parts:
+        _, value_hint = get_args(hint)
+        return {k: _convert(v, value_hint, source, f"{name}.{k}") for k, v in value.items()}
+    if origin is Literal and value in get_args(hint):
         return value
     if dataclasses.is_dataclass(hint) and isinstance(value, Mapping):
         assert isinstance(hint, type)
         return config_from_dict(value, hint, source=source, prefix=f"{name}.")
     if hint is float:
-        what = "finite number is needed: write one, or leave the key out for the default"
-        try:
-            number = float("none" if isinstance(value, bool) else value)
-        except OverflowError:
-            number = math.inf
-        except (TypeError, ValueError):
-            number = math.nan
-            what = "number is needed: write one"
-        if not math.isfinite(number):
-            raise InputError(f"{context}, but a {what}")
-        return number
+        return _convert_to_float(value, shown)
     if hint is int and isinstance(value, bool):
-        raise InputError(f"{context}, but a whole number is needed: write one")
+        raise InputError(f"{shown}, but a whole number is needed: write one")
     if hint is Path and isinstance(value, str):
         return Path(value)
     if isinstance(hint, type) and isinstance(value, hint):
         return value
-    raise InputError(f"{context}, which is not of type {hint}. Give a value of that type.")
+    raise InputError(f"{shown}, which is not of type {hint}. Give a value of that type.")
+
+
+def _convert_to_union(value: Any, hints: tuple[Any, ...], source: str, name: str) -> Any:  # noqa: ANN401
+    """Convert a value to the first type that takes it, or raise the error of the last type."""
+    if value is None and type(None) in hints:
+        return None
+    *first_hints, last_hint = (hint for hint in hints if hint is not type(None))
+    for hint in first_hints:
+        with suppress(InputError):
+            return _convert(value, hint, source, name)
+    return _convert(value, last_hint, source, name)
+
+
+def _convert_to_sequence(
+    value: Any,  # noqa: ANN401
+    hint: Any,  # noqa: ANN401
+    source: str,
+    name: str,
+) -> list[Any] | tuple[Any, ...]:
+    """Convert a value to a list or a tuple, of any or of a fixed length, entry by entry."""
+    shown = f"{source}: {name} is {value!r:.{_LONGEST}}"
+    is_list = get_origin(hint) is list
+    entry_hints = get_args(hint)
+    has_any_length = is_list or entry_hints[-1] is Ellipsis
+    length = 1 if has_any_length else len(entry_hints)
+    if not isinstance(value, list | tuple):
+        needed = "a list" if has_any_length else f"a list of {length} values"
+        remedy = "write its values in brackets, or leave the key out"
+        if isinstance(value, str | int | float):
+            repeated = ", ".join([str(value)[:_LONGEST]] * length)
+            remedy = f"write [{repeated}]"
+        raise InputError(f"{shown}, but {needed} is needed: {remedy}")
+    if has_any_length:
+        entry_hints = entry_hints[:1] * len(value)
+    elif len(value) != length:
+        raise InputError(f"{shown}, but {length} values are needed: give so many")
+    entries = [
+        _convert(entry, entry_hint, source, f"{name}[{index}]")
+        for index, (entry, entry_hint) in enumerate(zip(value, entry_hints, strict=True))
+    ]
+    return entries if is_list else tuple(entries)
+
+
+def _convert_to_float(value: Any, shown: str) -> float:  # noqa: ANN401
+    """Convert a number, or text such as ``1e-4`` (no number in YAML 1.1), to a finite float.
+
+    ``shown`` begins the error.
+    """
+    needed = "finite number is needed: write one, or leave the key out for the default"
+    try:
+        number = float("none" if isinstance(value, bool) else value)
+    except OverflowError:
+        number = math.inf
+    except (TypeError, ValueError):
+        number = math.nan
+        needed = "number is needed: write one"
+    if not math.isfinite(number):
+        raise InputError(f"{shown}, but a {needed}")
+    return number
 
 
 def config_to_dict(config: object) -> dict[str, Any]:
-    """Give every setting of a config with its value, nested, ready for YAML and JSON."""
+    """Convert a config to nested mappings of every setting, as YAML and JSON hold them."""
     return json.loads(json.dumps(dataclasses.asdict(config), default=str))  # pyright: ignore[reportArgumentType]
 
 
 def write_config(path: Path, config: object) -> None:
     """Write every setting of ``config``, defaults too, so that the file is a full record."""
-    from depthpose.core.files import atomic_write  # here: options load without torch
+    from depthpose.core.files import atomic_write  # as in read_config
 
     with atomic_write(path) as temporary:
         temporary.write_text(yaml.safe_dump(config_to_dict(config), sort_keys=False))

@@ -1,4 +1,4 @@
-"""What this machine computes on, and in which arithmetic."""
+"""Devices, threads and precision of the computation on this machine."""
 
 import os
 import warnings
@@ -12,7 +12,7 @@ import torch
 
 from depthpose.core.errors import InputError, Notice, full_memory
 
-_PROCESS = os.getpid()  # that loaded torch: one that is forked from it has another number
+_IMPORTING_PROCESS = os.getpid()  # a process that is forked later has another number
 Item = TypeVar("Item")
 Made = TypeVar("Made")
 
@@ -23,38 +23,41 @@ class PrecisionNotice(Notice):
 
 @contextmanager
 def force_float32() -> Iterator[None]:
-    """Make float32 on the processor torch's default, without autocast, whatever the caller has set.
+    """Make float32 on the processor torch's default, without autocast, inside the block.
 
     With a caller's autocast, default dtype or default device, weights and inputs would differ in
-    dtype or device. In a process that was forked after this module was imported, torch computes
-    with one thread: OpenMP's other threads do not exist there, and torch would wait for them
-    forever.
+    dtype or device; the caller's settings hold again afterwards. In a process that was forked after
+    this module was imported, torch computes with one thread: OpenMP's other threads do not exist
+    there, and torch would wait for them forever.
     """
-    if os.getpid() != _PROCESS:
+    if os.getpid() != _IMPORTING_PROCESS:
         torch.set_num_threads(1)
-    dtype = torch.get_default_dtype()
-    device = torch.get_default_device()
-    on_cpu = nullcontext() if device.type == "cpu" else torch.device("cpu")
-    if dtype != torch.float32:
+    callers_dtype = torch.get_default_dtype()
+    callers_device = torch.get_default_device()
+    on_cpu = nullcontext() if callers_device.type == "cpu" else torch.device("cpu")
+    if callers_dtype != torch.float32:
         torch.set_default_dtype(torch.float32)
-    kinds = [kind for kind in ("cpu", "cuda") if torch.is_autocast_enabled(kind)]
+    autocast_devices = [name for name in ("cpu", "cuda") if torch.is_autocast_enabled(name)]
     try:
-        with on_cpu, ExitStack() as off:
-            for kind in kinds:
-                off.enter_context(torch.autocast(kind, enabled=False))
+        with on_cpu, ExitStack() as autocast_off:
+            for name in autocast_devices:
+                autocast_off.enter_context(torch.autocast(name, enabled=False))
             yield
     finally:
-        if dtype != torch.float32:
-            torch.set_default_dtype(dtype)
+        if callers_dtype != torch.float32:
+            torch.set_default_dtype(callers_dtype)
 
 
 def each_in_float32(items: Iterator[Made]) -> Iterator[Made]:
-    """Give the items of a generator, each made inside :func:`force_float32`."""
-    nothing = object()
+    """Yield the items of a generator, each of which is computed inside :func:`force_float32`.
+
+    Between two items the caller's own settings hold.
+    """
+    end = object()
     while True:
         with force_float32():
-            item = next(items, nothing)
-        if item is nothing:
+            item = next(items, end)
+        if item is end:
             return
         yield cast(Made, item)
 
@@ -62,56 +65,64 @@ def each_in_float32(items: Iterator[Made]) -> Iterator[Made]:
 def each_in_threads(
     work: Callable[[Item], Made], items: Iterable[Item], threads: int
 ) -> Iterator[Made]:
-    """Do work for each item without gradients, and give the results in the order of the items.
+    """Apply ``work`` to items in several threads, and yield the results in the order of the items.
 
-    Items are taken only as threads become free. The threads share torch's processor cores.
+    It runs without gradients. At most ``threads`` items are in work or wait to be yielded, so that
+    the inputs of a long run need not fit into memory. The threads share torch's processor cores.
 
     Raises:
         InputError: fewer than one thread.
     """
     if threads < 1:
         raise InputError(f"threads is {threads}; take 1 or more, 2 where two cores are free")
-    without_gradients = torch.no_grad()(work)
+    work_without_gradients = torch.no_grad()(work)
     if threads == 1:
-        yield from map(without_gradients, items)
+        yield from map(work_without_gradients, items)
         return
+
     cores = torch.get_num_threads()
-    waiting: deque[Future[Made]] = deque()
-    thread_cores = max(1, cores // threads)
-    with ThreadPoolExecutor(threads, "", torch.set_num_threads, (thread_cores,)) as pool:
+    cores_per_thread = max(1, cores // threads)
+    futures: deque[Future[Made]] = deque()
+    with ThreadPoolExecutor(
+        threads, initializer=torch.set_num_threads, initargs=(cores_per_thread,)
+    ) as pool:
         try:
             for item in items:
-                waiting.append(pool.submit(without_gradients, item))
-                if len(waiting) == threads:
-                    yield waiting.popleft().result()
-            while waiting:
-                yield waiting.popleft().result()
-        finally:
-            for future in waiting:
+                futures.append(pool.submit(work_without_gradients, item))
+                if len(futures) == threads:
+                    yield futures.popleft().result()
+            while futures:
+                yield futures.popleft().result()
+        finally:  # also where the caller takes no more results
+            for future in futures:
                 future.cancel()
             torch.set_num_threads(cores)
 
 
 @contextmanager
 def refused_memory(name: str) -> Iterator[None]:
-    """Turn an out-of-memory error into an :class:`InputError`: other inputs may be smaller."""
+    """Turn an out-of-memory error into an :class:`InputError` that begins with ``name``.
+
+    A run over many inputs then goes on with the next, which may be smaller.
+    """
     try:
         yield
     except (MemoryError, RuntimeError) as error:
-        if (reason := full_memory(error)) is None:
+        reason = full_memory(error)
+        if reason is None:
             raise
         raise InputError(f"{name}: {reason}") from error
 
 
 def usable_device(name: str | torch.device) -> torch.device:
-    """Give the device of a name, such as ``cpu`` or ``cuda:1``.
+    """Return the device of a name, such as ``cpu`` or ``cuda:1``, once it has computed something.
 
     Raises:
-        InputError: this machine has none of that name, or it computes no float64.
+        InputError: this machine has no such device, or it cannot compute in float64.
     """
     try:
         device = torch.device(name)
-    except (RuntimeError, TypeError) as error:  # torch lists its 20 kinds
+    except (RuntimeError, TypeError) as error:  # its text would list all 20 kinds of torch
         raise InputError(
             f"device {str(name)!r} cannot be used here (no such name); take cpu, cuda or cuda:1"
         ) from error
@@ -126,30 +137,38 @@ def usable_device(name: str | torch.device) -> torch.device:
 
 
 def device_of_process(device: str) -> str:
-    """Give the device of this process: of ``cuda``, that which a launcher chose (LOCAL_RANK)."""
+    """Replace ``cuda`` by the GPU that a launcher chose for this process (``LOCAL_RANK``).
+
+    Any other device, and ``cuda`` without a launcher, is returned as it is.
+    """
     local_rank = os.environ.get("LOCAL_RANK", "")
-    return f"cuda:{local_rank}" if device == "cuda" and local_rank.isdecimal() else device
+    if device == "cuda" and local_rank.isdecimal():
+        return f"cuda:{local_rank}"
+    return device
 
 
 def computes_bf16(device: str | torch.device) -> bool:
     """Whether a device has instructions for bfloat16.
 
-    Any accelerator does; of processors those for which oneDNN has such kernels: with AVX-512 (BW,
-    VL and DQ), AMX or AVX-NE-CONVERT, and ARM's with BF16. Elsewhere oneDNN refuses bfloat16, or
-    PyTorch computes it 20 to 30 times slower than float32.
+    Every accelerator is taken to have them. Of processors those count for which oneDNN has such
+    kernels: with AVX-512 (BW, VL and DQ), AMX or AVX-NE-CONVERT, and ARM's with BF16. On others
+    oneDNN refuses bfloat16, or PyTorch computes it 20 to 30 times slower than float32.
     """
     if usable_device(device).type != "cpu":
         return True
-    supports = getattr(torch.ops.mkldnn, "_is_mkldnn_bf16_supported", None)
-    return supports is not None and bool(supports())
+    is_supported = getattr(torch.ops.mkldnn, "_is_mkldnn_bf16_supported", None)
+    return is_supported is not None and bool(is_supported())
 
 
 def usable_precision(wanted: str, device: str | torch.device) -> str:
-    """Give ``wanted``; ``fp32`` and a :class:`PrecisionNotice` where this machine has no bf16.
+    """Return the wanted precision, or ``fp32`` in place of ``bf16`` where the device lacks it.
 
     Args:
         wanted: fp32, bf16 or fp16.
         device: where it is computed.
+
+    Warns:
+        PrecisionNotice: fp32 is taken in place of bf16.
     """
     if wanted != "bf16" or computes_bf16(device):
         return wanted

@@ -1,4 +1,7 @@
-"""Maps as pictures. A picture is for eyes only: values are read from the NPY beside it."""
+"""Depth, disparity and error maps as colour pictures, and marks drawn on images.
+
+Such a picture is to be looked at; values are read from the NPY file beside it.
+"""
 
 import math
 
@@ -13,9 +16,11 @@ NEAR_TO_FAR = (
     (1.00, 0.97, 0.70), (0.99, 0.76, 0.35), (0.94, 0.49, 0.28), (0.80, 0.26, 0.38),
     (0.57, 0.16, 0.47), (0.33, 0.12, 0.45), (0.14, 0.08, 0.30), (0.02, 0.02, 0.10),
 )  # fmt: skip
-_INVALID = (0.5, 0.5, 0.5)
+_INVALID = (0.5, 0.5, 0.5)  # RGB of pixels without a value
 _LARGEST_PX = 96.0  # disparity of the brightest colour
-_DIMMED = 0.35  # brightness of a picture under points
+_DIMMED = 0.35  # brightness of an image under points, as a share of its own
+_LONGEST_LINE_PX = 1e5  # a longer line has an end beyond any picture
+_LINE_STEP_PX = 0.5  # between the samples of a line: no pixel on its way is missed
 
 
 def draw_depth(
@@ -33,15 +38,21 @@ def draw_disparity(
 ) -> Float[Tensor, "3 h w"]:
     """Colour disparity, large (near) bright, on the fixed scale 0..96 px; sky is grey."""
     share = 1 - disparity_px / _LARGEST_PX
-    return draw_share(share if is_sky is None else torch.where(is_sky, torch.nan, share))
+    if is_sky is not None:
+        share = torch.where(is_sky, torch.nan, share)
+    return draw_share(share)
 
 
 def draw_share(share: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
-    """Colour numbers in 0 (bright) to 1 (dark); NaN becomes grey."""
+    """Colour a map by its share of the colour scale, 0 (bright) to 1 (dark); NaN becomes grey."""
     anchors = torch.tensor(NEAR_TO_FAR, dtype=torch.float32)
     position = share.nan_to_num(0.0).clamp(0, 1) * (len(anchors) - 1)
-    below = position.long().clamp(max=len(anchors) - 2)
-    color = torch.lerp(anchors[below], anchors[below + 1], (position - below)[..., None].float())
+
+    # Interpolate between the colours before and behind that position.
+    lower = position.long().clamp(max=len(anchors) - 2)
+    fraction = (position - lower)[..., None].float()
+    color = torch.lerp(anchors[lower], anchors[lower + 1], fraction)
+
     color[~torch.isfinite(share)] = torch.tensor(_INVALID)
     return color.permute(2, 0, 1)
 
@@ -53,32 +64,32 @@ def draw_points(
     radius_px: int = 1,
     near_m: float = 3.0,
 ) -> Float[Tensor, "3 h w"]:
-    """Lay sparse depth (LiDAR) over a darkened image, each point grown to a square.
+    """Draw sparse depth (LiDAR) on a darkened image, each point as a square.
 
-    Its side is ``2 radius_px + 1`` pixels; where squares overlap the nearest point is seen.
+    Its side is ``2 radius_px + 1`` pixels; where squares overlap the nearest point is visible.
     """
-    grown_m = -_grow(-depth_m, radius_px)
-    return torch.where(
-        torch.isnan(grown_m), _DIMMED * image, draw_depth(grown_m, near_m=near_m, far_m=far_m)
-    )
+    squares_m = -_dilate(-depth_m, radius_px)
+    colors = draw_depth(squares_m, near_m=near_m, far_m=far_m)
+    return torch.where(torch.isnan(squares_m), _DIMMED * image, colors)
 
 
 def draw_error_points(
     image: Float[Tensor, "3 h w"], error: Float[Tensor, "h w"], top: float, radius_px: int = 1
 ) -> Float[Tensor, "3 h w"]:
-    """Lay sparse errors over a darkened image as :func:`draw_points` does; the largest is seen.
+    """Draw sparse errors on a darkened image as :func:`draw_points` does: 0 dark, ``top`` bright.
 
-    0 is dark and ``top`` bright.
+    Where squares overlap the largest error is visible.
     """
-    grown = _grow(error, radius_px)
-    return torch.where(torch.isnan(grown), _DIMMED * image, draw_share(1 - grown / top))
+    squares = _dilate(error, radius_px)
+    colors = draw_share(1 - squares / top)
+    return torch.where(torch.isnan(squares), _DIMMED * image, colors)
 
 
-def _grow(values: Float[Tensor, "h w"], radius_px: int) -> Float[Tensor, "h w"]:
-    """Grow each number to a square; where squares overlap the largest wins."""
+def _dilate(values: Float[Tensor, "h w"], radius_px: int) -> Float[Tensor, "h w"]:
+    """Grow each value of a sparse map to a square; the largest wins, NaN is between squares."""
     filled = values.nan_to_num(-torch.inf)[None]
-    grown = F.max_pool2d(filled, 2 * radius_px + 1, 1, radius_px)[0]
-    return torch.where(torch.isfinite(grown), grown, torch.nan)
+    largest = F.max_pool2d(filled, 2 * radius_px + 1, 1, radius_px)[0]
+    return torch.where(torch.isfinite(largest), largest, torch.nan)
 
 
 def draw_lines(
@@ -90,35 +101,40 @@ def draw_lines(
     """Draw lines two pixels wide, clipped to the picture; a line with a NaN end is not drawn.
 
     Args:
-        image: what they are drawn on; it is not changed.
-        ends_px: (u, v) of both ends of each.
+        image: RGB; the lines are drawn on a copy of it.
+        ends_px: (u, v) of both ends of each line.
         color: RGB in [0, 1].
-        dash_px: length of the dashes, and of the gaps between them; None: no gap.
+        dash_px: length of the dashes, and of the gaps between them; None: solid lines.
     """
     height, width = image.shape[1:]
     drawn = image.clone()
-    ink = torch.tensor(color).to(image)[:, None]
-    brush = torch.cartesian_prod(torch.arange(2), torch.arange(2))
+    pixel_color = torch.tensor(color).to(image)[:, None]
+    brush = torch.cartesian_prod(torch.arange(2), torch.arange(2))  # 2x2 pixels
     for start, end in ends_px.double().tolist():
-        length = math.dist(start, end)
-        if not 0 < length < 1e5:  # NaN, a point, or beyond any picture
+        length_px = math.dist(start, end)
+        if not 0 < length_px < _LONGEST_LINE_PX:  # False for NaN too
             continue
-        way = torch.arange(0.0, length, 0.5, dtype=torch.float64)
+
+        # Sample the line densely, without its gaps.
+        along_px = torch.arange(0.0, length_px, _LINE_STEP_PX, dtype=torch.float64)
         if dash_px is not None:
-            way = way[(way / dash_px).floor() % 2 == 0]
-        share = (way / length)[:, None]
-        line = torch.tensor(start) * (1 - share) + torch.tensor(end) * share
-        cells = (line.round().long()[:, None] + brush).flatten(0, 1)
-        inside = ((cells >= 0) & (cells < torch.tensor([width, height]))).all(-1)
-        u, v = cells[inside].unbind(-1)
-        drawn[:, v, u] = ink
+            is_dash = (along_px / dash_px).floor() % 2 == 0
+            along_px = along_px[is_dash]
+        share = (along_px / length_px)[:, None]
+        samples = torch.tensor(start) * (1 - share) + torch.tensor(end) * share
+
+        # Colour the pixels of the brush around each sample.
+        pixels = (samples.round().long()[:, None] + brush).flatten(0, 1)
+        is_inside = ((pixels >= 0) & (pixels < torch.tensor([width, height]))).all(-1)
+        u, v = pixels[is_inside].unbind(-1)
+        drawn[:, v, u] = pixel_color
     return drawn
 
 
 def draw_outline(
     image: Float[Tensor, "3 h w"], mask: Bool[Tensor, "h w"], color: tuple[float, float, float]
 ) -> Float[Tensor, "3 h w"]:
-    """Draw the border of a mask, inside it, one pixel wide."""
-    grown = F.max_pool2d((~mask).float()[None], 3, 1, 1)[0] > 0
-    ink = torch.tensor(color).to(image)[:, None, None]
-    return torch.where(mask & grown, ink, image)
+    """Draw the border of a mask on a copy of an image: its outermost pixels, one pixel wide."""
+    is_near_outside = F.max_pool2d((~mask).float()[None], 3, 1, 1)[0] > 0
+    border_color = torch.tensor(color).to(image)[:, None, None]
+    return torch.where(mask & is_near_outside, border_color, image)

@@ -1,4 +1,4 @@
-"""The one error that bad input raises, the notice that stops nothing, and the nearest name."""
+"""The error that bad input raises, the notice that stops nothing, and parts of their messages."""
 
 import re
 from collections.abc import Iterable
@@ -10,8 +10,8 @@ from typing import Any
 class InputError(ValueError):
     """Something the user gave cannot be used.
 
-    The message names the value, the rule it breaks and the remedy. Nothing else escapes from a
-    reader, whatever bytes it is given; the command line turns it into exit code 2.
+    The message names the value, the rule it breaks and the remedy. A reader of files raises no
+    other error, whatever bytes it reads; the command line turns this one into exit code 2.
     """
 
 
@@ -25,7 +25,7 @@ class MissingExtraError(ImportError):
 
 
 def install_command(extra: str) -> str:
-    """Give the command that installs an extra; the package index has no release yet."""
+    """Say how an extra is installed: from a clone or a wheel, as no package index has a release."""
     clone = f"pip install -e '.[{extra}]' in the clone of depthpose"
     return f"{clone}, or pip install 'WHEEL[{extra}]' with the file of the wheel"
 
@@ -34,18 +34,22 @@ class Notice(UserWarning):
     """A warning that stops nothing; the command line prints it as one line."""
 
 
-_OF_MEMORY = re.compile(
+_OUT_OF_MEMORY = re.compile(
     r"(out of|not enough|insufficient) memory|(can't|cannot|unable to|failed to) (allocate|map)"
     r"|bad_alloc",
     re.IGNORECASE,
 )
+_LONGEST_CAUSE = 200  # letters that are shown of another library's message
 
 
 def full_memory(error: BaseException) -> str | None:
-    """Give the message of an out-of-memory error of any library, with the remedy; else None."""
-    if not isinstance(error, MemoryError) and _OF_MEMORY.search(str(error)) is None:
+    """Describe an out-of-memory error of any library, with remedies; None for any other error.
+
+    Libraries raise errors of many types, which are recognised by their message.
+    """
+    if not isinstance(error, MemoryError) and _OUT_OF_MEMORY.search(str(error)) is None:
         return None
-    cause = " ".join(str(error).split())[:200] or "no more is given"
+    cause = " ".join(str(error).split())[:_LONGEST_CAUSE] or "no more is given"
     return (
         f"the memory is full ({cause}); end other programs, raise the limit (ulimit -v), take "
         "smaller images, or give a stereo matcher --max-memory"
@@ -58,8 +62,8 @@ def import_extra(module: str, package: str, extra: str, purpose: str) -> Any:  #
     Args:
         module: its name in Python.
         package: its name for pip.
-        extra: of depthpose, which brings it.
-        purpose: what needs it.
+        extra: the extra of depthpose that installs it.
+        purpose: what needs it, for the message.
 
     Raises:
         MissingExtraError: it is not installed.
@@ -68,10 +72,12 @@ def import_extra(module: str, package: str, extra: str, purpose: str) -> Any:  #
     try:
         return import_module(module)
     except (ImportError, OSError) as error:  # OSError: of a library that ctypes loads
-        names = (module, module.partition(".")[0])
-        if isinstance(error, ModuleNotFoundError) and error.name in names:
+        top_module = module.partition(".")[0]
+        # A module of another name that is missing is one which this dependency needs itself.
+        if isinstance(error, ModuleNotFoundError) and error.name in (module, top_module):
             raise MissingExtraError(package, extra, purpose) from error
-        if (reason := full_memory(error)) is not None:
+        reason = full_memory(error)
+        if reason is not None:
             raise InputError(f"{purpose} needs {package}: {reason}") from error
         raise InputError(
             f"{purpose} needs {package}, which is installed and does not load: {error}; a library "
@@ -80,28 +86,30 @@ def import_extra(module: str, package: str, extra: str, purpose: str) -> Any:  #
 
 
 def import_opencv(purpose: str) -> Any:  # noqa: ANN401  OpenCV's classes carry no types
-    """Import OpenCV, as :func:`import_extra`."""
+    """Import OpenCV's ``cv2``, the extra ``opencv``, as :func:`import_extra` does."""
     return import_extra("cv2", "opencv-python-headless", "opencv", purpose)
 
 
 def refuse_unknown(what: str, name: object, names: Iterable[str]) -> None:
-    """Refuse a word that is none of the known ones.
+    """Refuse a name that is not among the known ``names``.
+
+    ``what`` says in the message what the name is that of, such as ``unit``.
 
     Raises:
-        InputError: that is so; the nearest is said.
+        InputError: it is not among them; the message suggests the nearest.
     """
-    names = tuple(names)
-    if name not in names:
-        raise InputError(f"{what} is {name!r}; {nearest_name(str(name), names)}")
+    known_names = tuple(names)
+    if name not in known_names:
+        raise InputError(f"{what} is {name!r}; {nearest_name(str(name), known_names)}")
 
 
 def nearest_name(name: str, candidates: Iterable[str]) -> str:
-    """Give the end of an error message: the name that was probably meant, and all names.
+    """Word the end of an error message: the candidate nearest to ``name``, and all candidates.
 
     Returns:
-        ``did you mean 'x'? Known: 'a', 'x'.``, or only the list where nothing is near.
+        ``did you mean 'x'? Known: 'a', 'x'.``, or only the list where no candidate is similar.
     """
-    names = sorted(candidates)
-    near = get_close_matches(name, names, n=1)
-    hint = f"did you mean {near[0]!r}? " if near else ""
-    return f"{hint}Known: {', '.join(map(repr, names)) or 'none'}."
+    known_names = sorted(candidates)
+    similar = get_close_matches(name, known_names, n=1)
+    suggestion = f"did you mean {similar[0]!r}? " if similar else ""
+    return f"{suggestion}Known: {', '.join(map(repr, known_names)) or 'none'}."

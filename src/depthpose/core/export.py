@@ -1,7 +1,8 @@
-"""A network to an ONNX file that runs without torch, and the proof that both answer alike.
+"""Export of networks to ONNX files that run without torch, and the proof that outputs agree.
 
 Operators are those of opset 18 (https://onnx.ai/onnx/operators), the first whose Resize averages
-where it shrinks. The proof: largest and mean difference to PyTorch's answers, and their limit.
+where it shrinks. The proof: the largest and the mean difference between the outputs of onnxruntime
+and PyTorch, and the limit that they are held to.
 """
 
 import json
@@ -26,30 +27,35 @@ from depthpose.core.files import atomic_write, write_json
 from depthpose.core.run import environment, refuse_to_replace
 
 OPSET = 18
+_IR_VERSION = 10  # of onnx 1.16: younger ones would shut out older runtimes
 Shape = Sequence[int | str]  # text names a side that is known only when the graph runs
 
 
 def import_export() -> Any:  # noqa: ANN401  what protobuf generates carries no types
-    """Import ONNX, and check that the packages that it needs are installed."""
-    parts = ("onnx.compose", "onnx.inliner", "onnx.numpy_helper", "onnxscript", "onnxruntime")
-    for name in ("onnx", *parts):
+    """Import ``onnx`` with the submodules and packages that an export needs.
+
+    Raises:
+        MissingExtraError: the extra ``export`` is not installed.
+    """
+    submodules = ("onnx.compose", "onnx.inliner", "onnx.numpy_helper")
+    for name in ("onnx", *submodules, "onnxscript", "onnxruntime"):
         import_extra(name, "onnx, onnxruntime and onnxscript", "export", "export")
     return import_module("onnx")
 
 
 @dataclass(frozen=True, eq=False)
 class Value:
-    """A tensor of a graph; arithmetic on it adds nodes."""
+    """A tensor of a graph; arithmetic on it adds nodes to the graph."""
 
     graph: "Graph"
     name: str
 
     def op(self, kind: str, *others: Any, **attributes: Any) -> "Value":  # noqa: ANN401
-        """Feed it to an operator, first of its inputs."""
+        """Add an operator whose first input is this tensor, and return its first output."""
         return self.graph.op(kind, self, *others, **attributes)
 
     def cast(self, dtype: type) -> "Value":
-        """Give the same numbers in another type."""
+        """Add a conversion to another type of numbers, and return the converted tensor."""
         return self.op("Cast", to=self.graph.onnx.helper.np_dtype_to_tensor_dtype(np.dtype(dtype)))
 
     slice = partialmethod(op, "Slice")  # starts, ends, axes: lists, or values of int64
@@ -62,7 +68,7 @@ class Value:
 
 @dataclass(kw_only=True, eq=False)
 class Graph:
-    """Nodes in the order in which they are written.
+    """An ONNX graph that is built node by node, in the order in which nodes are added.
 
     Inputs of an operator are values, arrays, or numbers: an int becomes int64, a float float64.
     """
@@ -72,58 +78,64 @@ class Graph:
     constants: list[Any] = field(default_factory=list)
     inputs: list[Any] = field(default_factory=list)
     outputs: list[Any] = field(default_factory=list)
-    names: Iterator[int] = field(default_factory=partial(count, 1))
+    numbers: Iterator[int] = field(default_factory=partial(count, 1))  # make names unique
 
     def input(self, name: str, dtype: type, shape: Shape) -> Value:
         """Add an input of the graph."""
         helper = self.onnx.helper
-        kind = helper.np_dtype_to_tensor_dtype(np.dtype(dtype))
-        self.inputs.append(helper.make_tensor_value_info(name, kind, list(shape)))
+        element_type = helper.np_dtype_to_tensor_dtype(np.dtype(dtype))
+        self.inputs.append(helper.make_tensor_value_info(name, element_type, list(shape)))
         return Value(self, name)
 
     def output(self, name: str, value: Value, dtype: type, shape: Shape) -> None:
         """Make a value an output of the graph."""
         helper = self.onnx.helper
-        kind = helper.np_dtype_to_tensor_dtype(np.dtype(dtype))
+        element_type = helper.np_dtype_to_tensor_dtype(np.dtype(dtype))
         self.nodes.append(helper.make_node("Identity", [value.name], [name]))
-        self.outputs.append(helper.make_tensor_value_info(name, kind, list(shape)))
+        self.outputs.append(helper.make_tensor_value_info(name, element_type, list(shape)))
 
     def op(self, kind: str, *inputs: Any, **attributes: Any) -> Value:  # noqa: ANN401
-        """Add an operator and give its first output; None leaves an optional input out."""
-        out = f"{kind}_{next(self.names)}"
-        names: list[str] = []
+        """Add an operator and return its first output; None leaves an optional input out."""
+        output_name = f"{kind}_{next(self.numbers)}"
+        input_names: list[str] = []
         for value in inputs:
-            if value is None or isinstance(value, Value):
-                names.append("" if value is None else value.name)
-                continue
-            names.append(f"constant_{next(self.names)}")
-            tensor = self.onnx.numpy_helper.from_array(np.asarray(value), names[-1])
-            self.constants.append(tensor)
-        self.nodes.append(self.onnx.helper.make_node(kind, names, [out], **attributes))
-        return Value(self, out)
+            if value is None:
+                input_names.append("")
+            elif isinstance(value, Value):
+                input_names.append(value.name)
+            else:
+                name = f"constant_{next(self.numbers)}"
+                self.constants.append(self.onnx.numpy_helper.from_array(np.asarray(value), name))
+                input_names.append(name)
+        node = self.onnx.helper.make_node(kind, input_names, [output_name], **attributes)
+        self.nodes.append(node)
+        return Value(self, output_name)
 
     def call(self, network: Any, *inputs: Value) -> tuple[Value, ...]:  # noqa: ANN401
-        """Put a whole model's nodes here and give its outputs."""
-        prefix = f"network_{next(self.names)}/"
+        """Add all nodes of another model, fed by ``inputs``, and return its outputs."""
+        prefix = f"network_{next(self.numbers)}/"
         inner = self.onnx.compose.add_prefix(network, prefix).graph
-        for value, wanted in zip(inputs, inner.input, strict=True):
-            node = self.onnx.helper.make_node("Identity", [value.name], [wanted.name])
+        for value, inner_input in zip(inputs, inner.input, strict=True):
+            node = self.onnx.helper.make_node("Identity", [value.name], [inner_input.name])
             self.nodes.append(node)
         self.nodes += inner.node
         self.constants += inner.initializer
         return tuple(Value(self, output.name) for output in inner.output)
 
     def model(self, facts: Mapping[str, Any]) -> Any:  # noqa: ANN401
-        """Close the graph."""
+        """Assemble and check the ONNX model, with ``facts`` as its metadata."""
         helper = self.onnx.helper
         graph = helper.make_graph(
             self.nodes, "depthpose", self.inputs, self.outputs, self.constants
         )
         opsets = [helper.make_opsetid("", OPSET)]
         model = helper.make_model(graph, opset_imports=opsets, producer_name="depthpose")
-        model.ir_version = 10  # of onnx 1.16: younger ones would shut out older runtimes
-        texts = {k: v if isinstance(v, str) else json.dumps(v) for k, v in facts.items()}
-        helper.set_model_props(model, texts)
+        model.ir_version = _IR_VERSION
+        metadata = {
+            name: fact if isinstance(fact, str) else json.dumps(fact)
+            for name, fact in facts.items()
+        }
+        helper.set_model_props(model, metadata)
         self.onnx.checker.check_model(model, full_check=True)
         return model
 
@@ -133,66 +145,71 @@ Row = dict[str, str | float]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Case:
-    """One input and what PyTorch answers, by the names of the graph's inputs and outputs."""
+    """One input and PyTorch's outputs for it, by the names of the graph's inputs and outputs."""
 
     name: str  # its size, for the table
     inputs: Mapping[str, np.ndarray]
-    expected: Mapping[str, np.ndarray]  # what is not named is not compared
-    where: Mapping[str, np.ndarray] = field(default_factory=dict)  # the part that is, if not all
+    expected: Mapping[str, np.ndarray]  # outputs that are not named here are not compared
+    where: Mapping[str, np.ndarray] = field(default_factory=dict)  # masks: only there, if not all
 
 
 @dataclass(frozen=True, kw_only=True)
 class Limit:
-    """How far an output may be off.
+    """How far an output may differ from PyTorch's.
 
-    ``flips`` may be off by more, or be NaN in one answer alone, where a decision is at its limit;
-    they are left out of the differences.
+    Where a discrete decision depends on a rounding, numbers flip: they differ by more, or are NaN
+    in one output alone. A share of ``flips`` may do so, and is left out of the differences.
     """
 
     value: float  #: the limit, in the output's unit
     of: Literal["largest", "mean"] = "largest"  #: mean where the output is discontinuous
-    is_relative: bool = False  #: differences are shares of what PyTorch answers
-    flips: float = 0.0  #: share of the numbers that may be off by more
+    is_relative: bool = False  #: differences are shares of PyTorch's numbers
+    flips: float = 0.0  #: share of the numbers that may differ by more
 
 
-def _row(
-    case: str, output: str, output_values: np.ndarray, expected: np.ndarray, limit: Limit
+def _compare_output(
+    case: str, output: str, onnx_output: np.ndarray, torch_output: np.ndarray, limit: Limit
 ) -> Row:
-    """Compare an output of the graph with that of PyTorch; give the row that proves they agree.
+    """Compare an output of onnxruntime with PyTorch's; return the row of the proof.
 
-    NaN must be in the same places. Of an output that may flip (a discrete choice on a rounding), a
-    share of ``limit.flips`` may differ by more than ``limit.value``.
+    NaN must be in the same places, but for the share of ``limit.flips``. Whether the differences
+    keep to ``limit.value`` is left to the caller.
 
     Raises:
-        InputError: they do not agree, or there is nothing to compare.
+        InputError: shapes or places of NaN differ, too many numbers flip, or there is nothing to
+            compare.
     """
-    output_values, expected = (
-        np.asarray(values, np.float64) for values in (output_values, expected)
-    )
-    is_nan = np.isnan(output_values), np.isnan(expected)
-    is_other = output_values.shape != expected.shape
-    if is_other or ((is_nan[0] != is_nan[1]).any() and not limit.flips):
+    onnx_values = np.asarray(onnx_output, np.float64)
+    torch_values = np.asarray(torch_output, np.float64)
+    onnx_nan = np.isnan(onnx_values)
+    torch_nan = np.isnan(torch_values)
+    has_other_shape = onnx_values.shape != torch_values.shape
+    if has_other_shape or ((onnx_nan != torch_nan).any() and not limit.flips):
         raise InputError(
-            f"{output} of {case}: onnxruntime answers {output_values.shape} with "
-            f"{is_nan[0].sum()} NaN, PyTorch {expected.shape} with "
-            f"{is_nan[1].sum()}; nothing is written."
+            f"{output} of {case}: onnxruntime answers {onnx_values.shape} with "
+            f"{onnx_nan.sum()} NaN, PyTorch {torch_values.shape} with "
+            f"{torch_nan.sum()}; nothing is written."
         )
-    difference = np.abs(output_values - expected)
+
+    # Differences of all numbers that are not NaN in both outputs.
+    difference = np.abs(onnx_values - torch_values)
     if limit.is_relative:
-        difference /= np.abs(expected)
-    difference = np.where(is_nan[0] != is_nan[1], np.inf, difference)
+        difference /= np.abs(torch_values)
+    difference = np.where(onnx_nan != torch_nan, np.inf, difference)
     difference = difference[~np.isnan(difference)]
+
+    # Numbers that flipped are counted and left out.
     flipped: Row = {}
     if limit.flips:
         is_within = difference <= limit.value
         difference = difference[is_within]
-        share = 1.0 - float(is_within.mean()) if is_within.size else 0.0
-        if share > limit.flips:
+        flipped_share = 1.0 - float(is_within.mean()) if is_within.size else 0.0
+        if flipped_share > limit.flips:
             raise InputError(
                 f"{output} of {case}: PyTorch and onnxruntime differ by more than {limit.value:g} "
-                f"on {share:.3%} of the numbers, {limit.flips:.3%} may; nothing is written."
+                f"on {flipped_share:.3%} of the numbers, {limit.flips:.3%} may; nothing is written."
             )
-        flipped = {"flipped": share}
+        flipped = {"flipped": flipped_share}
     if not difference.size:
         raise InputError(
             f"{output} of {case}: PyTorch gives not one number that could be compared, and what is "
@@ -213,16 +230,24 @@ def _row(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Export:
-    """What is written, and what it is compared with."""
+    """What is written, and the cases by which it is compared with PyTorch."""
 
     graph: Callable[[], Graph]
     cases: Callable[[], Iterable[Case]]
-    limits: Mapping[str, Limit]
+    limits: Mapping[str, Limit]  # by the name of the output
     facts: Mapping[str, Any]  # for users of the file, in its metadata
 
 
 def freeze(path: Path, export: Export) -> list[Row]:
-    """Write ``NAME.onnx``, once it agrees with PyTorch, and ``NAME.proof.json`` beside it."""
+    """Write ``NAME.onnx``, and the proof ``NAME.proof.json``, if its outputs agree with PyTorch's.
+
+    Returns:
+        The rows of the proof: the differences of each output of each case, and their limit.
+
+    Raises:
+        InputError: outputs differ, or one of the files exists or cannot be written.
+        MissingExtraError: the extra ``export`` is not installed.
+    """
     if path.suffix != ".onnx":
         raise InputError(f"{path}: the graph is written as ONNX; end the name in .onnx.")
     proof = path.with_suffix(".proof.json")  # NAME.json may be a camera
@@ -233,32 +258,7 @@ def freeze(path: Path, export: Export) -> list[Row]:
         part.touch()  # a place that cannot be written is refused before the work
         facts = {**export.facts, "depthpose": version("depthpose")}
         onnx.save(export.graph().model(facts), str(part))
-        session = import_module("onnxruntime").InferenceSession(
-            str(part), providers=["CPUExecutionProvider"]
-        )
-        rows: list[Row] = []
-        for case in export.cases():
-            answers = session.run(list(case.expected), dict(case.inputs))
-            for (name, expected), output_values in zip(case.expected.items(), answers, strict=True):
-                if name in case.where and output_values.shape == expected.shape:
-                    mask = case.where[name]
-                    output_values = output_values[mask]  # noqa: PLW2901
-                    expected = expected[mask]  # noqa: PLW2901
-                rows.append(_row(case.name, name, output_values, expected, export.limits[name]))
-        if not rows:
-            raise InputError(
-                "no output is compared with PyTorch's; nothing is written. Name a case."
-            )
-        for row in rows:
-            difference = row[f"{row['limited']} difference"]
-            limit = row["limit"]
-            if not difference <= limit:  # pyright: ignore[reportOperatorIssue]  NaN fails too
-                raise InputError(
-                    f"{row['output']} of {row['input']}: PyTorch and onnxruntime differ by "
-                    f"{difference:.3g} ({row['limited']}), the limit is {limit:.3g}; nothing is "
-                    "written. Install other versions of onnxscript and onnxruntime, and report "
-                    "this."
-                )
+        rows = _compare_with_torch(part, export)
         runtimes = {name: version(name) for name in ("onnx", "onnxscript", "onnxruntime")}
         record = {
             "file": path.name,
@@ -272,20 +272,61 @@ def freeze(path: Path, export: Export) -> list[Row]:
     return rows
 
 
-MOST = 1 << 10  # multiple of a side for the exporter; the graph itself has no bound
+def _compare_with_torch(onnx_file: Path, export: Export) -> list[Row]:
+    """Run an ONNX file on all cases; return the rows of the proof that it agrees with PyTorch.
+
+    Raises:
+        InputError: an output differs by more than its limit, or there is no case.
+    """
+    session = import_module("onnxruntime").InferenceSession(
+        str(onnx_file), providers=["CPUExecutionProvider"]
+    )
+    rows: list[Row] = []
+    for case in export.cases():
+        onnx_outputs = session.run(list(case.expected), dict(case.inputs))
+        for name, onnx_output in zip(case.expected, onnx_outputs, strict=True):
+            torch_output = case.expected[name]
+            if name in case.where and onnx_output.shape == torch_output.shape:
+                mask = case.where[name]
+                onnx_output = onnx_output[mask]  # noqa: PLW2901
+                torch_output = torch_output[mask]
+            limit = export.limits[name]
+            rows.append(_compare_output(case.name, name, onnx_output, torch_output, limit))
+    if not rows:
+        raise InputError("no output is compared with PyTorch's; nothing is written. Name a case.")
+    for row in rows:
+        difference = row[f"{row['limited']} difference"]
+        limit = row["limit"]
+        if not difference <= limit:  # pyright: ignore[reportOperatorIssue]  NaN fails too
+            raise InputError(
+                f"{row['output']} of {row['input']}: PyTorch and onnxruntime differ by "
+                f"{difference:.3g} ({row['limited']}), the limit is {limit:.3g}; nothing is "
+                "written. Install other versions of onnxscript and onnxruntime, and report this."
+            )
+    return rows
+
+
+_MAX_SIZE = 1 << 10
+"""Largest batch, and multiple of a side, for the exporter; the graph itself has no limit."""
 
 
 def network_model(module: nn.Module, images: Sequence[Tensor], multiple: int) -> Any:  # noqa: ANN401
-    """Turn a module of images, in eval mode, into an ONNX model of free batch, rows and columns.
+    """Convert a network of images to an ONNX model whose batch, rows and columns are variable.
 
-    ``images``, (b, c, h, w) each, are examples: more than one image, sides of more than one
-    ``multiple``, so that no size of theirs is taken for a law. All sides are such multiples.
+    Args:
+        module: in eval mode.
+        images: examples of its inputs, (b, c, h, w) each, with b, h and w larger than the least
+            possible: else the exporter would take them for constants.
+        multiple: every height and width is a multiple of it.
     """
     onnx = import_export()
-    batch = torch.export.Dim("batch", min=1, max=MOST)
-    rows, columns = (torch.export.Dim(name, min=1, max=MOST) for name in ("rows", "columns"))
-    free = {0: batch, 2: multiple * rows, 3: multiple * columns}
-    logger = logging.getLogger("torch.onnx")  # its messages are of the exporter's inside
+    batch = torch.export.Dim("batch", min=1, max=_MAX_SIZE)
+    rows = torch.export.Dim("rows", min=1, max=_MAX_SIZE)
+    columns = torch.export.Dim("columns", min=1, max=_MAX_SIZE)
+    variable_sides = {0: batch, 2: multiple * rows, 3: multiple * columns}
+
+    # The exporter's log and warnings are about its own inner workings.
+    logger = logging.getLogger("torch.onnx")
     level = logger.level
     logger.setLevel(logging.ERROR)
     try:
@@ -295,14 +336,15 @@ def network_model(module: nn.Module, images: Sequence[Tensor], multiple: int) ->
                 tuple(images),
                 dynamo=True,
                 opset_version=OPSET,
-                dynamic_shapes=tuple(free for _ in images),
+                dynamic_shapes=tuple(variable_sides for _ in images),
                 verbose=False,
             )
     finally:
         logger.setLevel(level)
     assert program is not None
+
+    # Without stack traces and paths, which would identify the exporting machine.
     model = onnx.inliner.inline_local_functions(program.model_proto)
-    # Stack traces, paths and names of lines would identify the exporting machine.
     for part in (*model.graph.node, *model.graph.initializer, *model.graph.input):
         del part.metadata_props[:]
         part.doc_string = ""

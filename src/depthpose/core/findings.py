@@ -1,4 +1,4 @@
-"""What the check of a folder finds: everything wrong, a line each."""
+"""What the check of a data set finds: its problems and notices, one line each."""
 
 from contextlib import suppress
 from dataclasses import dataclass
@@ -41,7 +41,7 @@ class CheckReport:
 
 
 def make_report(layout: str, counts: dict[str, int], remarks: list[Problem]) -> CheckReport:
-    """Separate faults from facts that are only worth knowing."""
+    """Make the report of a check: ``remarks`` of the kind ``note`` are notices, others problems."""
     return CheckReport(
         layout=layout,
         counts=counts,
@@ -51,9 +51,13 @@ def make_report(layout: str, counts: dict[str, int], remarks: list[Problem]) -> 
 
 
 def unreadable(path: Path, error: InputError) -> Problem:
-    """Describe a file that cannot be read, and why: mostly it is a Git LFS pointer."""
+    """Make the problem of a file that could not be read: ``error``, unless it is a Git LFS pointer.
+
+    A pointer is a short text that stands for a large file until ``git lfs pull``.
+    """
     message = str(error).removeprefix(f"{path}: ")
     with suppress(OSError), path.open("rb") as file:
-        if file.read(len(_LFS_POINTER)) == _LFS_POINTER:
+        is_pointer = file.read(len(_LFS_POINTER)) == _LFS_POINTER
+        if is_pointer:
             message = "is a Git LFS pointer, not the file; run 'git lfs pull' at its source"
     return Problem(path=path, kind="unreadable", message=message)

@@ -1,4 +1,4 @@
-"""Rows as a data frame of pandas, which is no dependency."""
+"""Rows as a data frame of pandas, which is not a dependency of depthpose."""
 
 from collections.abc import Iterable, Mapping
 from importlib import import_module
@@ -6,7 +6,13 @@ from typing import Any
 
 
 def data_frame(rows: Iterable[Mapping[str, Any]]) -> Any:  # noqa: ANN401  pandas is no dependency
-    """Give rows as a ``pandas.DataFrame``; a mapping is a column ``NAME.ENTRY`` for each entry."""
+    """Convert rows to a ``pandas.DataFrame``.
+
+    A mapping inside a row becomes one column for each of its entries, called ``NAME.ENTRY``.
+
+    Raises:
+        ImportError: pandas is not installed.
+    """
     try:
         pandas = import_module("pandas")
     except ImportError as error:

@@ -29,50 +29,54 @@ class Rigid:
         return Rigid(self.R @ other.R, moved_m + self.t_m)
 
     def inverse(self) -> "Rigid":
-        """Give ``source_from_target``."""
+        """Invert: ``source_from_target``."""
         return Rigid(self.R.mT, -(self.R.mT @ self.t_m[..., None]).squeeze(-1))
 
     def double(self) -> "Rigid":
-        """Give it in float64."""
+        """Convert rotation and translation to float64."""
         return Rigid(self.R.double(), self.t_m.double())
 
     def float(self) -> "Rigid":
-        """Give it in float32."""
+        """Convert rotation and translation to float32."""
         return Rigid(self.R.float(), self.t_m.float())
 
     def __getitem__(
         self, index: int | list[int] | Tensor | slice | tuple[slice | None, ...] | None
     ) -> "Rigid":
-        """Give one of a batch or several as a batch; each None is a new axis of one."""
+        """Index the batch axes like a tensor's; None inserts an axis of length 1."""
         return Rigid(self.R[index], self.t_m[index])
 
     @classmethod
     def stack(cls, poses: Sequence["Rigid"]) -> "Rigid":
-        """Make a batch; at least of one."""
+        """Stack one or more transforms along a new first axis."""
         return cls(torch.stack([p.R for p in poses]), torch.stack([p.t_m for p in poses]))
 
     @classmethod
     def cat(cls, batches: Sequence["Rigid"]) -> "Rigid":
-        """Join batches; at least one."""
+        """Concatenate one or more batches along their first axis."""
         return cls(torch.cat([b.R for b in batches]), torch.cat([b.t_m for b in batches]))
 
     def matrix(self) -> Float64[Tensor, "*batch 4 4"]:
-        """Give ``[[R, t], [0, 1]]``, the translation in metres."""
-        top = torch.cat([self.R, self.t_m[..., None]], -1).double()
-        last = top.new_tensor([0, 0, 0, 1]).expand(*top.shape[:-2], 1, 4)
-        return torch.cat([top, last], -2)
+        """Make the homogeneous matrix ``[[R, t], [0, 1]]``, the translation in metres."""
+        upper_rows = torch.cat([self.R, self.t_m[..., None]], -1).double()
+        last_row = upper_rows.new_tensor([0, 0, 0, 1]).expand(*upper_rows.shape[:-2], 1, 4)
+        return torch.cat([upper_rows, last_row], -2)
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:  # noqa: ANN401
-        """Give :meth:`matrix` to numpy, whose ``asarray`` and functions then take a transform."""
+        """Convert :meth:`matrix` for numpy, so that ``np.asarray`` takes a transform."""
         return np.array(self.matrix().detach().cpu().numpy(), dtype=dtype, copy=copy)
 
     def __repr__(self) -> str:
-        """Say it in one line: of a batch its size alone."""
+        """Show R and t to four decimals; of a batch only its shape."""
         if self.t_m.ndim > 1:
             return f"Rigid(a batch of {tuple(self.t_m.shape[:-1])})"
-        rows = (*self.R.tolist(), self.t_m.tolist())
-        x, y, z, t = (", ".join(f"{number:.4f}" for number in row) for row in rows)
-        return f"Rigid(R=[[{x}], [{y}], [{z}]], t_m=[{t}])"
+
+        def decimals(vector: list[float]) -> str:
+            """Print a vector with its brackets."""
+            return f"[{', '.join(f'{number:.4f}' for number in vector)}]"
+
+        R_rows = ", ".join(decimals(row) for row in self.R.tolist())
+        return f"Rigid(R=[{R_rows}], t_m={decimals(self.t_m.tolist())})"
 
 
 def fit_rigid(
@@ -89,16 +93,20 @@ def fit_rigid(
     Raises:
         InputError: fewer than three points of some batch entry carry weight.
     """
-    supported = (weight > 0).sum(-1)
-    if bool((supported < 3).any()):
+    weighted_count = (weight > 0).sum(-1)
+    if bool((weighted_count < 3).any()):
         raise InputError(
-            f"fit_rigid: {int(supported.min())} points carry weight, but a rotation is fixed by 3 "
-            "or more. Give more points or a positive weight to more of them."
+            f"fit_rigid: {int(weighted_count.min())} points carry weight, but a rotation is fixed "
+            "by 3 or more. Give more points or a positive weight to more of them."
         )
-    share = (weight / weight.sum(-1, keepdim=True))[..., None]
-    source_mean_m = (share * source_m).sum(-2, keepdim=True)
-    target_mean_m = (share * target_m).sum(-2, keepdim=True)
-    covariance = (target_m - target_mean_m).mT @ (share * (source_m - source_mean_m))
+
+    # The cross-covariance of both point sets about their weighted means.
+    normalised = (weight / weight.sum(-1, keepdim=True))[..., None]
+    source_mean_m = (normalised * source_m).sum(-2, keepdim=True)
+    target_mean_m = (normalised * target_m).sum(-2, keepdim=True)
+    covariance = (target_m - target_mean_m).mT @ (normalised * (source_m - source_mean_m))
+
+    # Its polar rotation; the least singular direction is flipped where that would be a reflection.
     u, _, vh = torch.linalg.svd(covariance)
     sign = torch.ones_like(u[..., 0])
     sign[..., -1] = torch.where(torch.linalg.det(u @ vh) < 0, -1.0, 1.0)
@@ -109,33 +117,40 @@ def fit_rigid(
 def geodesic_rad(
     first: Float[Tensor, "*batch 3 3"], second: Float[Tensor, "*batch 3 3"]
 ) -> Float[Tensor, "*batch"]:
-    """Angle between two rotations [rad].
+    """Compute the angle between two rotations [rad].
 
-    By the chord, ``|A - B|_F = 2 sqrt(2) sin(angle / 2)``: accurate near zero, where the usual
-    arc cosine of the trace loses half of the digits, and less so near pi.
+    It follows from the chord, ``|A - B|_F = 2 sqrt(2) sin(angle / 2)``: accurate near zero, where
+    the usual arc cosine of the trace loses half of the digits, and less so near pi.
     """
     chord = torch.linalg.matrix_norm(first - second) / 8**0.5
     return 2 * torch.asin(chord.clamp(max=1.0))
 
 
 def perturb(pose: Rigid, motion: Float[Tensor, "*batch 6"]) -> Rigid:
-    """Move a pose by (rotation vector [rad], translation [m]) in the camera frame."""
+    """Move a pose by ``motion``, a rotation vector [rad] and a translation [m] in its target frame.
+
+    It is rotated about the origin of that frame (the camera) first, then translated.
+    """
     return Rigid(rotation_by(motion[..., :3]), motion[..., 3:]) @ pose
 
 
 def rotation_by(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Give the rotation by a rotation vector [rad]: Rodrigues' formula, exact down to no turn."""
+    """Make the rotation matrix of a rotation vector, axis times angle [rad].
+
+    Rodrigues' formula, in a form that stays accurate down to an angle of 0.
+    """
     angle = torch.linalg.vector_norm(vector, dim=-1)[..., None, None]
     cross = cross_matrix(vector)
     eye = torch.eye(3, dtype=vector.dtype, device=vector.device)
-    # torch.sinc(x) is sin(pi x) / (pi x); (1 - cos a) / a^2 is half of the square of sinc(a / 2).
-    half = torch.sinc(angle / (2 * torch.pi))
-    return eye + torch.sinc(angle / torch.pi) * cross + half.square() / 2 * (cross @ cross)
+    # torch.sinc(x) is sin(pi x) / (pi x), which is defined at 0 too.
+    sine_term = torch.sinc(angle / torch.pi)  # sin(a) / a
+    cosine_term = torch.sinc(angle / (2 * torch.pi)).square() / 2  # (1 - cos(a)) / a^2
+    return eye + sine_term * cross + cosine_term * (cross @ cross)
 
 
 def cross_matrix(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Give ``[v]_x``, with ``[v]_x w = v x w``."""
+    """Make the skew matrix ``[v]_x`` of a vector, by which ``[v]_x w`` is the product ``v x w``."""
     x, y, z = vector.unbind(-1)
     zero = torch.zeros_like(x)
-    rows = [zero, -z, y, z, zero, -x, -y, x, zero]
-    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+    entries = [zero, -z, y, z, zero, -x, -y, x, zero]
+    return torch.stack(entries, -1).unflatten(-1, (3, 3))

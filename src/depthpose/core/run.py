@@ -1,6 +1,7 @@
-"""One folder per run: what made it (settings, versions, machine, commit), its lock, its results.
+"""The output folder of a run: the record of what made it, its lock, and the list of its results.
 
-A line of ``results.jsonl`` names a result, and size and time of its files, which a rerun compares.
+``run.json`` records settings, versions, machine and commit. A line of ``results.jsonl`` names a
+finished result, with size and time of its files, by which the next run tells that it is whole.
 """
 
 import json
@@ -33,13 +34,16 @@ RECORD = "run.json"
 RESULTS = "results.jsonl"
 _SOURCES = "sources.json"
 _LOCK = ".lock"
-_OF_RUNS = (RECORD, _SOURCES, _LOCK)  # what a folder holds before its first result
+_FILES_BEFORE_RESULTS = (RECORD, _SOURCES, _LOCK)  # what a folder holds before its first result
 NOT_OURS = (
     "is there already, and no run of this command wrote it; choose another --out, or move it away"
 )
-"""Of a file that a run would write over."""
-_FRAME = re.compile(r"_\d{6}$")
+"""Error about a file that a run would write over."""
+_FRAME = re.compile(r"_\d{6}$")  # ends the name of a result of a frame of a video
 _PACKAGES = ("depthpose", "torch", "numpy", "opencv-python-headless")
+_LOCK_POLL_S = 0.1  # between two tries to lock a folder
+_RESULTS_POLL_S = 0.2  # between two looks at what other processes have finished
+_GIT_TIMEOUT_S = 5
 
 Item = TypeVar("Item")
 
@@ -49,19 +53,19 @@ _locks: dict[Path, int] = {}  # folders that are locked, and the descriptors of 
 def lock_folder(folder: Path, *, is_shared: bool, timeout_s: float = 10.0) -> bool:
     """Lock a folder against other commands until :func:`release_folders`, or the process ends.
 
-    Where the file system or the machine has no locks, nothing is held.
+    Where the file system or the machine has no locks, other commands are not kept out.
 
     Args:
         folder: made where it is missing.
-        is_shared: let other processes of the same launch in.
-        timeout_s: how long another command may take to end.
+        is_shared: admit other processes of the same launch.
+        timeout_s: how long to wait for another command that has locked the folder.
 
     Returns:
-        Whether the folder is this process's from now on, and was not before.
+        Whether the lock is new; False where this process holds it already.
 
     Raises:
-        InputError: another command holds the folder, and goes on holding it; or nothing can be
-            written there.
+        InputError: another command still holds the lock after that time, or nothing can be written
+            there.
     """
     refuse_broken_link(folder)
     if folder.resolve() in _locks:
@@ -69,19 +73,20 @@ def lock_folder(folder: Path, *, is_shared: bool, timeout_s: float = 10.0) -> bo
     with refused_write(folder / _LOCK):
         folder.mkdir(parents=True, exist_ok=True)
         file = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT, 0o666)
-    last = time.monotonic() + timeout_s
+    deadline = time.monotonic() + timeout_s
     while fcntl is not None:
         try:
-            fcntl.flock(file, (fcntl.LOCK_SH if is_shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+            kind = fcntl.LOCK_SH if is_shared else fcntl.LOCK_EX
+            fcntl.flock(file, kind | fcntl.LOCK_NB)
             break
         except BlockingIOError as error:
-            if time.monotonic() > last:
+            if time.monotonic() > deadline:
                 os.close(file)
                 raise InputError(
                     f"{folder}: another command is writing there; wait until it has ended, or "
                     "choose another folder"
                 ) from error
-            time.sleep(0.1)
+            time.sleep(_LOCK_POLL_S)
         except OSError:  # no locks on this file system
             break
     _locks[folder.resolve()] = file
@@ -89,29 +94,30 @@ def lock_folder(folder: Path, *, is_shared: bool, timeout_s: float = 10.0) -> bo
 
 
 def held_folders() -> frozenset[Path]:
-    """Give the folders that this process has locked."""
+    """Return the folders that this process has locked."""
     return frozenset(_locks)
 
 
 def release_folders(but: Collection[Path] = ()) -> None:
-    """Let other commands into the folders that this process has claimed, but for these."""
+    """Unlock the folders that this process has locked, except those in ``but``."""
     for folder in _locks.keys() - set(but):
         file = _locks.pop(folder)
         with suppress(OSError):
             if fcntl is not None:
-                fcntl.flock(file, fcntl.LOCK_UN)  # processes that were forked have the file too
+                # Closing is not enough: forked processes have the file open too.
+                fcntl.flock(file, fcntl.LOCK_UN)
         os.close(file)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProcessRank:
-    """Rank of this process among several that share the work through files."""
+    """Rank of this process among those of a launch, which exchange results through files."""
 
     rank: int = 0  #: 0 .. world - 1
     world: int = 1  #: how many processes there are
 
     def share_of(self, items: Sequence[Item]) -> Sequence[Item]:
-        """Give the part of a list that this process does: every ``world``-th item."""
+        """Take this process's part of a list: every ``world``-th item, beginning with ``rank``."""
         return items[self.rank :: self.world]
 
 
@@ -119,44 +125,49 @@ def find_rank() -> ProcessRank:
     """Read RANK and WORLD_SIZE, as ``torchrun`` and ``accelerate launch`` set them.
 
     Raises:
-        InputError: they are no numbers that go together.
+        InputError: they are not whole numbers, or the rank is not below the number of processes.
     """
-    variables = (os.environ.get("RANK", "0"), os.environ.get("WORLD_SIZE", "1"))
-    if not all(word.isdecimal() for word in variables) or not int(variables[0]) < int(variables[1]):
+    rank = os.environ.get("RANK", "0")
+    world = os.environ.get("WORLD_SIZE", "1")
+    if not (rank.isdecimal() and world.isdecimal() and int(rank) < int(world)):
         raise InputError(
-            f"RANK is {variables[0]!r} and WORLD_SIZE {variables[1]!r}, but a rank is "
+            f"RANK is {rank!r} and WORLD_SIZE {world!r}, but a rank is "
             "0 .. WORLD_SIZE - 1; let torchrun or accelerate launch set them, or unset both"
         )
-    return ProcessRank(rank=int(variables[0]), world=int(variables[1]))
+    return ProcessRank(rank=int(rank), world=int(world))
 
 
 def wait_for(
     names: Sequence[str], is_there: Callable[[str], bool], timeout_s: float = 3600.0
 ) -> None:
-    """Wait until other processes have finished all of these.
+    """Wait until other processes have finished the results of all ``names``.
 
-    ``timeout_s`` is how long nothing new may appear: a process that died finishes nothing.
+    Args:
+        names: of the results.
+        is_there: whether the result of a name is finished.
+        timeout_s: how long no further result may appear, as where a process has died.
 
     Raises:
-        InputError: the time is up; what is missing is named.
+        InputError: the time is up; the message names the first result that is missing.
     """
     missing = [name for name in names if not is_there(name)]
-    last_news = time.monotonic()
+    last_progress = time.monotonic()
     while missing:
-        if time.monotonic() - last_news > timeout_s:
+        if time.monotonic() - last_progress > timeout_s:
             raise InputError(
                 f"nothing new for {timeout_s:.0f} s and {len(missing)} of {len(names)} are "
                 f"missing, first {missing[0]!r}: another process may have failed. Start again; "
                 "what is finished is kept."
             )
-        time.sleep(min(0.2, timeout_s))
-        still = [name for name in missing if not is_there(name)]
-        last_news = time.monotonic() if len(still) < len(missing) else last_news
-        missing = still
+        time.sleep(min(_RESULTS_POLL_S, timeout_s))
+        still_missing = [name for name in missing if not is_there(name)]
+        if len(still_missing) < len(missing):
+            last_progress = time.monotonic()
+        missing = still_missing
 
 
 def environment() -> dict[str, str]:
-    """Give what a number was measured with: versions, device, threads, commit, date."""
+    """Describe what a result is computed with: versions, machine, threads, GPU, commit, date."""
     facts = {"date": datetime.now(UTC).strftime("%Y-%m-%d"), "python": platform.python_version()}
     for name in _PACKAGES:
         with suppress(PackageNotFoundError):
@@ -166,13 +177,23 @@ def environment() -> dict[str, str]:
     )
     if torch.cuda.is_available():
         facts["gpu"] = torch.cuda.get_device_name()
+    commit = _commit_of_package()
+    if commit:
+        facts["commit"] = commit
+    return facts
+
+
+def _commit_of_package() -> str:
+    """Ask Git for the commit of the running code; "" where it is not in a repository."""
     package_folder = str(Path(__file__).resolve().parent)
     command = ["git", "-C", package_folder, "describe", "--always", "--dirty", "--exclude", "*"]
-    with suppress(OSError, subprocess.TimeoutExpired):
-        commit = subprocess.run(command, capture_output=True, text=True, check=False, timeout=5)  # noqa: S603
-        if commit.returncode == 0 and commit.stdout.strip():
-            facts["commit"] = commit.stdout.strip()
-    return facts
+    try:
+        answer = subprocess.run(  # noqa: S603
+            command, capture_output=True, text=True, check=False, timeout=_GIT_TIMEOUT_S
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return answer.stdout.strip() if answer.returncode == 0 else ""
 
 
 def claim_folder(
@@ -183,15 +204,15 @@ def claim_folder(
 ) -> None:
     """Make ``folder`` the output folder of a run with these settings, or continue such a run.
 
-    It is this process's until :func:`depthpose.core.run.release_folders`, and that of all
-    processes of one launch. What a killed run left half written in it is removed.
+    It is locked for this process, or for all processes of one launch, until
+    :func:`depthpose.core.run.release_folders`. What a killed run left half written is removed.
 
     Args:
         folder: made where it is missing.
         settings: JSON values that decide the results; compared with those of an earlier run.
-        results: files and folders that the run will write. They are its own where an earlier run
-            has left its record; without a record, something else wrote what is there.
-        remedy: what to do about a folder of other settings.
+        results: files and folders that the run will write. Those that exist already must be of an
+            earlier run, which has left its record.
+        remedy: what the user can do about a folder of other settings, for the error.
 
     Raises:
         InputError: the folder holds a run with other settings (the first difference is named), or
@@ -203,8 +224,8 @@ def claim_folder(
     existing = [name for name in (_SOURCES, *results) if os.path.lexists(folder / name)]
     if existing and not record.exists():
         raise InputError(f"{folder / existing[0]}: {NOT_OURS}")
-    is_alone = find_rank().world == 1
-    is_new = lock_folder(folder, is_shared=not is_alone)
+    is_only_process = find_rank().world == 1
+    is_newly_locked = lock_folder(folder, is_shared=not is_only_process)
     try:
         try:
             earlier = read_settings(folder)
@@ -213,18 +234,19 @@ def claim_folder(
                 f"{error}. What made the results is not known any more: choose another folder, or "
                 "delete this one"
             ) from error
-        # A run that failed before its first result binds no other to its settings.
-        is_free = is_alone and all(path.name in _OF_RUNS for path in folder.iterdir())
-        if earlier is None or (is_free and earlier != settings):
+        # The settings of a run that failed before its first result may be replaced.
+        has_no_results = all(path.name in _FILES_BEFORE_RESULTS for path in folder.iterdir())
+        is_replaceable = is_only_process and has_no_results
+        if earlier is None or (is_replaceable and earlier != settings):
             (folder / _SOURCES).unlink(missing_ok=True)
             write_json(record, {"settings": dict(settings), "environment": environment()})
         elif earlier != settings:
             refuse_other_settings(folder, earlier, settings, remedy)
     except InputError:
-        if is_new:
+        if is_newly_locked:
             release_folders(but=held_folders() - {folder.resolve()})
         raise
-    if is_new and is_alone:
+    if is_newly_locked and is_only_process:
         remove_parts(folder)
 
 
@@ -235,13 +257,14 @@ def claim_names(
     videos: Collection[str] = (),
     is_finished: Callable[[str], bool] | None = None,
 ) -> None:
-    """Reserve names of results for the files that they are made from.
+    """Reserve names of results for the files that they are made from, in ``sources.json``.
 
     Args:
         folder: where the results go, claimed before (:func:`claim_folder`).
-        sources: the file behind each name; of several, the first gives it, and all decide it.
-        endings: what follows a name in the names of its results.
-        videos: those of the names whose results bear the number of a frame too.
+        sources: the source file of each name, or several: the first identifies the source, and a
+            change of any is noticed.
+        endings: what follows a name in the names of its result files.
+        videos: those of the names whose result files also have the number of a frame.
         is_finished: whether a name has a result; None: whether there is a file of the name and one
             of the endings.
 
@@ -250,63 +273,75 @@ def claim_names(
             changed since, or a file that no run wrote has the name of a result.
     """
     record = folder / _SOURCES
-    # Listed before the record is read: what another process writes, its record names by then.
-    results = {
-        file.name.removesuffix(ending): file
-        for file in (sorted(folder.iterdir()) if folder.is_dir() else ())
-        for ending in endings
-        if file.name.endswith(ending)
-    }
+    # Listed before the record is read, which other processes write before their results.
+    results = _files_by_stem(folder, endings)
     recorded = read_sources(folder)
     finished = {*results, *(_FRAME.sub("", stem) for stem in results)}
-
-    # The file behind each name, and the size and time by which a change of it is noticed.
-    wanted: dict[str, list[str]] = {}
-    for name, files in sources.items():
-        files_of_name = [files] if isinstance(files, Path) else list(files)
-        stamps: list[str] = []
-        for path in files_of_name:
-            with suppress(OSError):
-                facts = path.stat()
-                if path.is_file():
-                    stamps.append(f"{facts.st_size} bytes of {facts.st_mtime_ns}")
-        wanted[name] = [str(files_of_name[0].resolve()), ", ".join(stamps)]
+    wanted = {name: _source_entry(files) for name, files in sources.items()}
 
     # Refuse a name that an earlier run gave to another file, and a file that has changed since.
     for name, (path, stamp) in wanted.items():
-        earlier, before = recorded.get(name, [path, stamp])
-        if earlier != path:
+        recorded_path, recorded_stamp = recorded.get(name, [path, stamp])
+        if recorded_path != path:
             raise InputError(
-                f"{folder}: {name!r} is the result of {earlier}, not of {path}; two files of "
+                f"{folder}: {name!r} is the result of {recorded_path}, not of {path}; two files of "
                 "one name need two folders: choose another"
             )
-        is_other = before and stamp and before != stamp
-        if is_other and (name in finished if is_finished is None else is_finished(name)):
+        has_changed = recorded_stamp and stamp and recorded_stamp != stamp
+        if not has_changed:
+            continue
+        has_result = name in finished if is_finished is None else is_finished(name)
+        if has_result:
             files = sources[name]
-            named = path if isinstance(files, Path) else " or ".join(map(str, files))
+            shown = path if isinstance(files, Path) else " or ".join(map(str, files))
             raise InputError(
-                f"{named}: has changed since its result {name!r} in {folder} was "
+                f"{shown}: has changed since its result {name!r} in {folder} was "
                 "made; choose another folder, or delete this one"
             )
 
-    # Of a name that is new, refuse files that no run wrote; what runs wrote is made again.
-    new = wanted.keys() - recorded.keys()
+    # Refuse files of a new name that no run wrote. Those that a run did write, from a source that
+    # is not recorded any more, are to be made again.
+    new_names = wanted.keys() - recorded.keys()
+    new_videos = new_names & set(videos)
     noted = read_results(folder)
     for stem, file in results.items():
-        is_frame = _FRAME.sub("", stem) in new & set(videos)
-        if stem not in recorded and (stem in new or is_frame):
+        has_new_name = stem in new_names or _FRAME.sub("", stem) in new_videos
+        if has_new_name and stem not in recorded:
             if file.relative_to(folder).as_posix() not in noted.get(stem, {}):
                 raise InputError(f"{file}: {NOT_OURS}")
             note_result(folder, stem, [])
-    for name in filter(noted.get, new):  # of which source is not known any more
-        note_result(folder, name, [])
+    for name in new_names:
+        if noted.get(name):
+            note_result(folder, name, [])
 
     if any(recorded.get(name) != entry for name, entry in wanted.items()):
         write_json(record, recorded | wanted)
 
 
+def _files_by_stem(folder: Path, endings: Sequence[str]) -> dict[str, Path]:
+    """List the files of a folder that have one of the endings, by their names without it."""
+    files: dict[str, Path] = {}
+    for file in sorted(folder.iterdir()) if folder.is_dir() else ():
+        for ending in endings:
+            if file.name.endswith(ending):
+                files[file.name.removesuffix(ending)] = file
+    return files
+
+
+def _source_entry(files: Path | Sequence[Path]) -> list[str]:
+    """Make the entry of a source in the record: its path, and size and time of all its files."""
+    paths = [files] if isinstance(files, Path) else list(files)
+    stamps: list[str] = []
+    for path in paths:
+        with suppress(OSError):
+            status = path.stat()
+            if path.is_file():
+                stamps.append(f"{status.st_size} bytes of {status.st_mtime_ns}")
+    return [str(paths[0].resolve()), ", ".join(stamps)]
+
+
 def read_sources(folder: Path) -> dict[str, list[str]]:
-    """Give the path and stamp (size and time) of each result's source, by the result's name.
+    """Read the path and stamp (size and time) of each result's source, by the result's name.
 
     Empty where the record is missing or damaged.
     """
@@ -317,26 +352,29 @@ def read_sources(folder: Path) -> dict[str, list[str]]:
         content = read_json(folder / _SOURCES)
     if not isinstance(content, dict):
         return {}
-    return {name: entry for name, entry in content.items() if _is_source(entry)}
+    return {name: entry for name, entry in content.items() if _is_source_entry(entry)}
 
 
-def _is_source(entry: object) -> bool:
+def _is_source_entry(entry: object) -> bool:
     """Whether an entry of the record is a path and a stamp."""
     return isinstance(entry, list) and len(entry) == 2 and all(isinstance(v, str) for v in entry)
 
 
 def refuse_to_replace(path: Path) -> None:
-    """Refuse to write over a file that exists.
+    """Refuse to write over something that exists, a broken link too.
 
     Raises:
-        InputError: there is one.
+        InputError: ``path`` exists.
     """
     if os.path.lexists(path):
         raise InputError(f"{path}: is there already; delete it, or give another name")
 
 
 def read_settings(folder: Path | str) -> dict[str, Any] | None:
-    """Give the settings that made a folder, by path or URL, or None where no run claimed it.
+    """Read the settings of the run that claimed a folder, or None where no run did.
+
+    Args:
+        folder: path, or URL of a folder in an object store.
 
     Raises:
         InputError: its record is damaged.
@@ -364,16 +402,23 @@ def refuse_other_settings(
     settings: Mapping[str, Any],
     remedy: str = "choose another, or delete this one",
 ) -> None:
-    """Refuse a folder that was made by other settings.
+    """Refuse a folder whose results were made with other settings.
+
+    Args:
+        folder: path or URL, for the error.
+        earlier: settings that the results were made with.
+        settings: settings of the present run.
+        remedy: what the user can do, for the error.
 
     Raises:
-        InputError: the first difference is named.
+        InputError: two settings differ; the first difference is named.
     """
-    before = _flat(earlier)
-    now = _flat(settings)
+    before = _flatten(earlier)
+    now = _flatten(settings)
     for name in sorted(before.keys() | now.keys()):
-        # A later version may add settings: one that either does not know counts as off.
-        is_off = (name not in before or name not in now) and not (before | now)[name]
+        # A later version may add settings: where one side lacks it, it counts as switched off.
+        is_missing = name not in before or name not in now
+        is_off = is_missing and not (before | now)[name]
         if before.get(name) != now.get(name) and not is_off:
             raise InputError(
                 f"{folder}: holds results made with {name} = {before.get(name)!r}, but now it is "
@@ -381,71 +426,94 @@ def refuse_other_settings(
             )
 
 
-def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Name nested settings by their path: ``pairs.limit``."""
+def _flatten(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Name nested settings by their path, such as ``pairs.limit``."""
     flat: dict[str, Any] = {}
     for name, value in settings.items():
-        is_nested = isinstance(value, Mapping)
-        flat |= _flat(value, f"{prefix}{name}.") if is_nested else {f"{prefix}{name}": value}
+        if isinstance(value, Mapping):
+            flat |= _flatten(value, f"{prefix}{name}.")
+        else:
+            flat[f"{prefix}{name}"] = value
     return flat
 
 
-_read: dict[Path, tuple[int, int, dict[str, dict[str, Any]]]] = {}
-"""Cache by results file: its inode, up to which byte it was read, and the results in it."""
+@dataclass(frozen=True, kw_only=True)
+class _ReadResults:
+    """How far a results file has been read, and the results in it."""
+
+    inode: int
+    end: int  # byte up to which it was read
+    results: dict[str, dict[str, list[int]]]
+
+
+_read_results: dict[Path, _ReadResults] = {}  # by results file, so that only new lines are read
 
 
 def note_result(folder: Path, name: str, files: Iterable[Path]) -> None:
-    """Record that a result is finished, with its files; with none, that it is to be made again."""
-    stats = {file.relative_to(folder).as_posix(): file.stat() for file in files}
-    stamps = {file: [status.st_size, status.st_mtime_ns] for file, status in stats.items()}
-    # In one piece, and apart from what a killed process may have left of its last line.
+    """Append to ``results.jsonl`` that a result is finished, with its files and their stamps.
+
+    Without files it is noted that the result is to be made again.
+    """
+    stamps = {file.relative_to(folder).as_posix(): _stamp(file) for file in files}
+    # The line break in front separates it from what a killed process may have left of a line.
     line = f"\n{json.dumps({'name': name, 'files': stamps})}\n".encode()
     with refused_write(folder / RESULTS), (folder / RESULTS).open("ab", buffering=0) as file:
-        while line:  # a full disk takes a part of it, and refuses the rest
-            line = line[file.write(line) :]
+        while line:  # a full disk writes a part of it, and fails at the next try
+            written = file.write(line)
+            line = line[written:]
+
+
+def _stamp(file: Path) -> list[int]:
+    """Return size [bytes] and time of the last change [ns] of a file."""
+    status = file.stat()
+    return [status.st_size, status.st_mtime_ns]
 
 
 def is_whole(folder: Path, name: str, needed: Collection[str]) -> bool:
-    """Whether a result exists, and every file of it is as it was written, by size and time.
+    """Whether a result is noted as finished and its files are as they were written.
 
     Args:
-        folder: of the results.
-        name: of the result.
-        needed: files, relative to the folder, without which it is not finished. Of a result of
-            which nothing is noted, as after a loss of the notes, no file is known to be whole.
+        folder: folder of the results.
+        name: name of the result.
+        needed: files, relative to the folder, that must be among those of the result.
     """
     noted = read_results(folder).get(name, {})
+    if not noted:
+        return False
     try:
-        stats = {file: (folder / file).stat() for file in {*noted, *needed}}
+        stamps = {file: _stamp(folder / file) for file in {*noted, *needed}}
     except OSError:
         return False
-    stamps = {file: [status.st_size, status.st_mtime_ns] for file, status in stats.items()}
-    return bool(noted) and stamps == noted
+    return stamps == noted
 
 
 def read_results(folder: Path) -> dict[str, dict[str, list[int]]]:
-    """Give the files of each result and their stamps: size [bytes], time of the last change [ns].
+    """Read the finished results of a folder, by name: their files, relative to the folder.
 
-    What has been noted since it was asked last is read.
+    Each file has its stamp: size [bytes] and time of the last change [ns]. A repeated call reads
+    only the lines that were added since. Empty where nothing is noted or it cannot be read.
     """
     path = (folder / RESULTS).absolute()
     try:
         status = path.stat()
-        number, end, results = _read.get(path, (status.st_ino, 0, {}))
-        if number != status.st_ino or status.st_size < end:
-            end = 0
-            results = {}
+        earlier = _read_results.get(path)
+        end = 0
+        results: dict[str, dict[str, list[int]]] = {}
+        # Unless the file was replaced or cut since, it is read on from where it was read to.
+        if earlier and earlier.inode == status.st_ino and earlier.end <= status.st_size:
+            end = earlier.end
+            results = earlier.results
         if status.st_size > end:
             with path.open("rb") as file:
                 file.seek(end)
                 text = file.read()
-            whole = text.rfind(b"\n") + 1  # of another process, that may be writing
-            for line in filter(None, text[:whole].split(b"\n")):
-                with suppress(ValueError, KeyError, TypeError, AttributeError):
+            whole_lines = text.rfind(b"\n") + 1  # another process may be writing the last line
+            for line in filter(None, text[:whole_lines].split(b"\n")):
+                with suppress(ValueError, KeyError, TypeError, AttributeError):  # a damaged line
                     row = json.loads(line)
                     results[str(row["name"])] = dict(row["files"].items())
-            end += whole
-        _read[path] = (status.st_ino, end, results)
+            end += whole_lines
+        _read_results[path] = _ReadResults(inode=status.st_ino, end=end, results=results)
     except OSError:
         return {}
     return results

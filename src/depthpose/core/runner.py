@@ -1,7 +1,7 @@
-"""One loop for every command over many inputs: depth, poses, searches and measurements.
+"""The loop of every command over many inputs: depth, poses, searches and measurements.
 
-What an earlier run finished is skipped, and an input that fails stops no other. How inputs are
-estimated is a function; where results are stored is a :class:`Results`.
+Inputs that an earlier run finished are skipped, and one that fails does not stop the others. What
+is computed for an input is a function; where results are stored is a :class:`Results`.
 """
 
 from abc import ABC, abstractmethod
@@ -18,18 +18,18 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Job(Generic[Input]):
-    """One input: what it is called, how it is read, and the files that it is read from."""
+    """One input of a run: its name, how it is read, and the files that it is read from."""
 
-    name: str  #: unique in a run; its results bear it
+    name: str  #: unique in a run; the name of its results
     read: Callable[[], Input]  #: called only where there is no result yet
-    source: Path | tuple[Path, ...] | None = None  #: file or files; None: not of files
+    source: Path | tuple[Path, ...] | None = None  #: file or files; None: not read from files
 
 
 class Results(ABC, Generic[Input, Result]):
-    """Where the results of a run are stored, and which are there already."""
+    """Where the results of a run are stored, and which of them an earlier run has finished."""
 
-    def is_finished(self, job: Job[Input]) -> bool:  # noqa: ARG002  for classes to say
-        """Whether an earlier run left the result of a job whole; by default none did."""
+    def is_finished(self, job: Job[Input]) -> bool:  # noqa: ARG002  for subclasses
+        """Whether the result of a job is there from an earlier run; by default it never is."""
         return False
 
     @abstractmethod
@@ -37,19 +37,19 @@ class Results(ABC, Generic[Input, Result]):
         """Store a result.
 
         Raises:
-            InputError: it cannot be stored; the job has failed then.
+            InputError: it cannot be stored, so that the job has failed.
         """
 
     def store_failure(self, job: Job[Input], error: InputError) -> None:
-        """Store why a job has no result, where that is stored; raise the error to stop the run."""
+        """Store why a job failed; by default nothing is stored. Raising stops the whole run."""
 
     def flush(self) -> None:
-        """Write what is still in memory: the run has ended, or was interrupted."""
+        """Write what is still in memory; called when the run ends or is interrupted."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Outcome(Generic[Input, Result]):
-    """What became of a job: a new result, a failure, or neither, as an earlier run finished it."""
+    """The outcome of a job: a new result, a failure, or neither if an earlier run finished it."""
 
     job: Job[Input]
     result: Result | None = None
@@ -62,50 +62,50 @@ def run_jobs(
     results: Results[Input, Result],
     batch: int = 1,
 ) -> Generator[Outcome[Input, Result], None, None]:
-    """Do the jobs that are not finished, and yield what became of each, in the order of the jobs.
+    """Run the jobs that are not finished, in batches, and yield the outcome of every job in order.
 
     Args:
-        jobs: all that there are to do, the finished ones too; taken one by one, so that frames of a
-            video need not fit into memory.
-        estimate_many: gives a result, or the reason why there is none, for each input.
+        jobs: all jobs, the finished ones too; taken one by one, so that the frames of a video need
+            not fit into memory.
+        estimate_many: computes for each input a result, or the reason why there is none.
         results: where they are stored.
         batch: how many inputs are estimated together.
     """
-    waiting: list[tuple[Job[Input], Input | InputError]] = []
+    read_jobs: list[tuple[Job[Input], Input | InputError]] = []
 
-    def finish_waiting() -> Generator[Outcome[Input, Result], None, None]:
+    def estimate_read_jobs() -> Generator[Outcome[Input, Result], None, None]:
         """Estimate the inputs that were read, store the results, and yield the outcomes."""
-        inputs = [data for _, data in waiting if not isinstance(data, InputError)]
-        estimated = iter(estimate_many(inputs) if inputs else ())
-        for job, data in waiting:
-            result = data if isinstance(data, InputError) else next(estimated)
-            yield _stored(job, data, result, results)
-        waiting.clear()
+        inputs = [data for _, data in read_jobs if not isinstance(data, InputError)]
+        estimates = iter(estimate_many(inputs) if inputs else ())
+        for job, data in read_jobs:
+            result = data if isinstance(data, InputError) else next(estimates)
+            yield _store_outcome(job, data, result, results)
+        read_jobs.clear()
 
     try:
         for job in jobs:
             if results.is_finished(job):
-                yield from finish_waiting()
+                yield from estimate_read_jobs()  # outcomes keep the order of the jobs
                 yield Outcome(job=job)
                 continue
             try:
-                waiting.append((job, job.read()))
+                read_jobs.append((job, job.read()))
             except InputError as error:
-                waiting.append((job, error))
-            if len(waiting) == batch:
-                yield from finish_waiting()
-        yield from finish_waiting()
+                read_jobs.append((job, error))
+            if len(read_jobs) == batch:
+                yield from estimate_read_jobs()
+        yield from estimate_read_jobs()
     finally:
         results.flush()
 
 
-def _stored(
+def _store_outcome(
     job: Job[Input],
     data: Input | InputError,
     result: Result | InputError,
     results: Results[Input, Result],
 ) -> Outcome[Input, Result]:
-    """Store the result of a job, or why there is none."""
+    """Store the result of a job, or its failure: of reading, of estimating or of storing."""
     try:
         if isinstance(data, InputError):
             raise data

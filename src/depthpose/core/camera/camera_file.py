@@ -1,7 +1,7 @@
-"""Camera files of any known format to :class:`Camera` or :class:`StereoRig`; ours is written.
+"""Reading of camera files of any known format, and writing of depthpose's own JSON.
 
-Text and JSON are read here, files of ROS and OpenCV by ``stored_camera``. What a caller has in
-place of a file, a matrix, a mapping or a focal length, is a camera too.
+Text and JSON are read here, files of ROS and OpenCV by ``stored_camera``. A caller may also give a
+matrix, a mapping or a focal length in place of a file.
 """
 
 import math
@@ -35,16 +35,16 @@ from depthpose.core.camera.pinhole import (
     refuse_apart,
 )
 from depthpose.core.camera.stored_camera import (
-    Names,
-    baseline_of,
-    coefficients_of,
+    Fields,
+    facts_from_fields,
     facts_from_folder,
-    facts_from_names,
+    find_distortion,
+    find_number,
     is_ros,
-    named,
-    read_storage,
-    scalar,
-    with_lens,
+    normalise_keys,
+    parse_storage,
+    read_baseline_m,
+    with_fisheye,
 )
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import AnyPath, read_json, read_key_values, read_text, write_json
@@ -55,7 +55,7 @@ Matrix = Float64[np.ndarray, "rows columns"]
 _KITTI_NAMES = (("P2", "P3"), ("P_rect_02", "P_rect_03"), ("P0", "P1"), ("P_rect_00", "P_rect_01"))
 _KITTI = re.compile(r"^(?:P|P_rect_0)[0-3]\s*:\s*[-+.\d]", re.MULTILINE)
 _MIDDLEBURY = re.compile(r"^cam0\s*=", re.MULTILINE)
-_PLAIN = re.compile(r"^[ \t]*focal_px[ \t]*:", re.MULTILINE)
+_FOCAL_LINES = re.compile(r"^[ \t]*focal_px[ \t]*:", re.MULTILINE)
 _COLMAP = re.compile(r"^\d+ ([A-Z_]{3,}) (\d{1,7}) (\d{1,7}) ([-+.\deE ]+)$", re.MULTILINE)
 _FOREIGN = {
     r"^\[(LEFT|RIGHT)_CAM_": "the factory calibration of a ZED, which is that of its raw images: "
@@ -64,20 +64,23 @@ _FOREIGN = {
     r"^[ \t]*Intrinsic of ": "a list of a RealSense's cameras: take that of your stream and size",
 }
 """Signs of camera files that are not read."""
-_WRITE = (
+_OWN_FORMAT = (
     'Write {"width": .., "height": .., "K": [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]}, and '
     '"baseline_m" (metres) of a pair'
 )
 _TUM = {(517.3, 516.5, 318.6, 255.3), (520.9, 521.0, 325.1, 249.7), (535.4, 539.2, 320.1, 247.6)}
-"""Published intrinsics of TUM RGB-D's three cameras, which belong to no other data."""
+"""Published fx, fy, cx, cy of TUM RGB-D's three cameras, which belong to no other data."""
 _TUM_SIZE = (640, 480)
 _TUM_UNIT_M = 1 / 5000
 _DOFFS = "cx_right_minus_left_px"
-_PLAIN_KEYS = ("width", "height", "focal_y_px", _DOFFS)
+_OPTIONAL_LINES = ("width", "height", "focal_y_px", _DOFFS)
+_MAX_FOCAL_PX = 1e6  # larger numbers are no focal length
+_LARGEST_NUMBER = 1e300  # of JSON: larger whole numbers have no float
+_BARE_NUMBERS = 20  # that are read of a file of bare numbers: more than any format has
 
 
 def _middlebury_facts(path: AnyPath) -> CameraFacts:
-    """Middlebury's ``calib.txt``: cam0, doffs, baseline in millimetres, size; cam1 is checked."""
+    """Read Middlebury's ``calib.txt``: cam0, doffs, baseline [mm], size; cam1 is only checked."""
     keys = read_key_values(path)
     K = kitti_matrix(path, keys, "cam0", (3, 3))
     right = kitti_matrix(path, keys, "cam1", (3, 3)) if "cam1" in keys else K
@@ -105,8 +108,17 @@ def _middlebury_facts(path: AnyPath) -> CameraFacts:
 
 
 def plain_facts(path: AnyPath, keys: Mapping[str, list[float]]) -> CameraFacts:
-    """Take the keys, a line each: ``_PLAIN_KEYS`` where they are given, the others always."""
-    wanted = ("focal_px", "cx", "cy", "baseline_m", *(key for key in _PLAIN_KEYS if key in keys))
+    """Read the rig of ``KEY: number`` lines: focal_px, cx, cy, baseline_m, and optional ones.
+
+    Args:
+        path: the file, for errors.
+        keys: its numbers by key.
+
+    Raises:
+        InputError: a key is missing, or has not one number.
+    """
+    optional = [key for key in _OPTIONAL_LINES if key in keys]
+    wanted = ("focal_px", "cx", "cy", "baseline_m", *optional)
     values = {key: _number(path, keys, key) for key in wanted}
     focal_px = values["focal_px"]
     has_size = {"width", "height"} <= values.keys()
@@ -123,7 +135,17 @@ def plain_facts(path: AnyPath, keys: Mapping[str, list[float]]) -> CameraFacts:
 def kitti_matrix(
     path: AnyPath, keys: Mapping[str, list[float]], name: str, shape: tuple[int, int]
 ) -> Matrix:
-    """Take a matrix of a calibration of ``KEY: numbers`` lines, as KITTI's."""
+    """Read a matrix of a calibration of ``KEY: numbers`` lines, such as KITTI's.
+
+    Args:
+        path: the file, for errors.
+        keys: its numbers by key.
+        name: key of the matrix.
+        shape: its rows and columns.
+
+    Raises:
+        InputError: it is missing, or of another number of values.
+    """
     if name not in keys:
         raise InputError(f"{path}: has no line '{name}:', which such a calibration holds.")
     if len(keys[name]) != shape[0] * shape[1]:
@@ -135,26 +157,27 @@ def kitti_matrix(
 
 
 def _colmap_facts(text: str) -> CameraFacts:
-    """COLMAP's ``cameras.txt``: number, model, size, parameters; (0.5, 0.5) is the first pixel."""
+    """Read COLMAP's ``cameras.txt``, a line a camera: number, model, size, parameters."""
     cameras = {match.groups() for match in _COLMAP.finditer(text)}
     if len(cameras) > 1:
         raise InputError(
             f"a cameras.txt of COLMAP with {len(cameras)} different cameras; keep the line of one"
         )
-    model, width, height, listed = cameras.pop()
+    model, width, height, parameters = cameras.pop()
     is_fisheye = bool(is_fisheye_lens({"cameramodel": model}))
     try:
-        values = [float(word) for word in listed.split()]
+        values = [float(word) for word in parameters.split()]
     except ValueError as error:
-        raise InputError(f"a camera of COLMAP whose parameters are {listed:.60}") from error
-    if model.startswith(("SIMPLE_", "RADIAL")):
+        raise InputError(f"a camera of COLMAP whose parameters are {parameters:.60}") from error
+    has_one_focal_length = model.startswith(("SIMPLE_", "RADIAL"))
+    if has_one_focal_length:
         values.insert(0, values[0])
     if len(values) < 4:
         raise InputError(f"a camera of COLMAP with {len(values)} parameters; copy it anew")
     fx, fy, cx, cy = values[:4]
     return CameraFacts(
         kind=f"a {model} camera of COLMAP",
-        K=intrinsics(fx, fy, cx - 0.5, cy - 0.5),
+        K=intrinsics(fx, fy, cx - 0.5, cy - 0.5),  # its first pixel is centred at (0.5, 0.5)
         size=(int(width), int(height)),
         distortion=tuple(values[4:]),
         is_fisheye=is_fisheye,
@@ -163,26 +186,34 @@ def _colmap_facts(text: str) -> CameraFacts:
 
 
 def _bare_facts(text: str) -> CameraFacts | None:
-    """Read bare numbers: ``fx fy cx cy`` and distortion; K, perhaps with a baseline; or P."""
+    """Read bare numbers: ``fx fy cx cy`` and distortion; K, perhaps with a baseline; or P.
+
+    None where they are none of these.
+    """
     lines = (line.partition("#")[0] for line in text.splitlines())
     words = " ".join(lines).replace(",", " ").split()
     try:
-        numbers = [float(word) for word in words[:20]]
+        numbers = [float(word) for word in words[:_BARE_NUMBERS]]
     except ValueError:
         return None
     count = len(numbers)
-    baseline_m = None
-    if count == 10:
-        baseline_m = numbers[9]
-    elif count in (12, 16) and numbers[3] and numbers[0]:
-        baseline_m = -numbers[3] / numbers[0]
-    is_projection = count in (12, 16) and numbers[8:11] == [0, 0, 1]
+
+    # A transposed K is taken too: the check of a matrix says what is wrong with it.
     is_K = count in (9, 10) and [0, 0, 1] in (numbers[6:9], numbers[2:9:3])
-    if is_projection or is_K:
-        width = 4 if is_projection else 3
-        rows = torch.tensor(numbers[: 3 * width], dtype=torch.float64).reshape(3, width)
-        return CameraFacts(kind="a matrix", K=rows[:, :3].contiguous(), baseline_m=baseline_m)
-    if len(numbers) not in (4, 8, 9, 12):
+    if is_K:
+        K = torch.tensor(numbers[:9], dtype=torch.float64).reshape(3, 3)
+        baseline_m = numbers[9] if count == 10 else None
+        return CameraFacts(kind="a matrix", K=K, baseline_m=baseline_m)
+
+    is_projection = count in (12, 16) and numbers[8:11] == [0, 0, 1]
+    if is_projection:
+        P = torch.tensor(numbers[:12], dtype=torch.float64).reshape(3, 4)
+        fx = numbers[0]
+        minus_fx_baseline = numbers[3]
+        baseline_m = -minus_fx_baseline / fx if minus_fx_baseline and fx else None
+        return CameraFacts(kind="a matrix", K=P[:, :3].contiguous(), baseline_m=baseline_m)
+
+    if count not in (4, 8, 9, 12):
         return None
     is_tum = tuple(numbers[:4]) in _TUM
     return CameraFacts(
@@ -195,6 +226,7 @@ def _bare_facts(text: str) -> CameraFacts | None:
 
 
 def _number(path: AnyPath, keys: Mapping[str, list[float]], name: str) -> float:
+    """Return the number of a key of a calibration, which must be there and be only one."""
     if len(keys.get(name, [])) != 1:
         raise InputError(f"{path}: {name!r} is missing, or is not one number; copy the file anew")
     return keys[name][0]
@@ -206,7 +238,11 @@ _BOP = ("fx", "fy", "cx", "cy")
 
 
 def facts_from_json(content: object) -> CameraFacts:
-    """Read the camera of a JSON file: ours, or a known one of other systems."""
+    """Read the camera of a JSON file: depthpose's own, or a known one of other systems.
+
+    Raises:
+        InputError: it is none, or a key is unknown, missing or of another type.
+    """
     if not isinstance(content, dict) or not content.keys() <= set(_KEYS):
         facts = _foreign_facts(content)
         if facts is not None:
@@ -234,7 +270,10 @@ def facts_from_json(content: object) -> CameraFacts:
 
 
 def _foreign_facts(content: object) -> CameraFacts | None:
-    """Take a bare matrix, the names of ROS and OpenCV, or the JSON of Open3D and BOP."""
+    """Read the JSON of other systems: a bare matrix, ROS, OpenCV, RealSense, Open3D or BOP.
+
+    None where it is of none of them.
+    """
     if isinstance(content, list) and len(content) in (3, 9):
         return CameraFacts(kind="a matrix", K=_matrix(content))
     if not isinstance(content, dict):
@@ -242,48 +281,58 @@ def _foreign_facts(content: object) -> CameraFacts | None:
             f"a camera is a JSON object with the keys {', '.join(_KEYS)}, "
             f"not a {type(content).__name__}"
         )
-    names = named(content)
+    fields = normalise_keys(content)
     facts = None
-    is_fisheye = bool(is_fisheye_lens(names))
+    is_fisheye = bool(is_fisheye_lens(fields))
     # Matrices of OpenCV are objects with ``data``.
-    is_storage = any(isinstance(value, dict) and "data" in value for value in content.values())
-    if is_storage or is_ros(names) or {"ppx", "cameramatrix"} & names.keys():
-        facts = _with_json_keys(facts_from_names(names), names)
+    is_opencv = any(isinstance(value, dict) and "data" in value for value in content.values())
+    if is_opencv or is_ros(fields) or {"ppx", "cameramatrix"} & fields.keys():
+        facts = _with_json_keys(facts_from_fields(fields), fields)
     if facts is not None or "K" in content:
         return facts
-    inner = content.get("intrinsic", content)
+    open3d_intrinsic = content.get("intrinsic", content)
     if "cam_K" in content:
-        facts = _from_scene({"0": content})
-    elif isinstance(inner, dict) and "intrinsic_matrix" in inner:
-        K = _matrix(inner["intrinsic_matrix"])
-        is_by_columns = isinstance(inner["intrinsic_matrix"][0], int | float)
-        size = _size(inner) if {"width", "height"} <= inner.keys() else None
-        K = K.T.contiguous() if is_by_columns else K
-        facts = CameraFacts(kind="a camera of Open3D", K=K, size=size)
+        facts = _from_scene_camera({"0": content})
+    elif isinstance(open3d_intrinsic, dict) and "intrinsic_matrix" in open3d_intrinsic:
+        facts = _from_open3d(open3d_intrinsic)
     elif content.keys() >= set(_BOP):
         fx, fy, cx, cy = (_json_number(content, key) for key in _BOP)
         facts = CameraFacts(
             kind="a camera of BOP",
             K=intrinsics(fx, fy, cx, cy),
             size=_size(content) if {"width", "height"} <= content.keys() else None,
-            baseline_m=baseline_of(names),
+            baseline_m=read_baseline_m(fields),
             depth_unit_m=_bop_unit_m(content),
-            distortion=coefficients_of(names),
+            distortion=find_distortion(fields),
         )
-    elif content and all(isinstance(v, dict) and "cam_K" in v for v in content.values()):
-        facts = _from_scene(content)
-    return None if facts is None else with_lens(facts, is_fisheye=is_fisheye)
+    elif content and all(
+        isinstance(image, dict) and "cam_K" in image for image in content.values()
+    ):
+        facts = _from_scene_camera(content)
+    return None if facts is None else with_fisheye(facts, is_fisheye=is_fisheye)
 
 
-def _from_scene(images: dict[str, dict[str, Any]]) -> CameraFacts:
-    """Take the one camera of BOP's scene_camera.json, whose images must agree."""
+def _from_open3d(keys: dict[str, Any]) -> CameraFacts:
+    """Read Open3D's ``PinholeCameraIntrinsic``, whose flat matrix is stored column by column."""
+    K = _matrix(keys["intrinsic_matrix"])
+    is_by_columns = isinstance(keys["intrinsic_matrix"][0], int | float)
+    if is_by_columns:
+        K = K.T.contiguous()
+    size = _size(keys) if {"width", "height"} <= keys.keys() else None
+    return CameraFacts(kind="a camera of Open3D", K=K, size=size)
+
+
+def _from_scene_camera(images: dict[str, dict[str, Any]]) -> CameraFacts:
+    """Read the camera of BOP's scene_camera.json, which must be the same for all images."""
     entries = list(images.values())
     first = entries[0]
-    if any(e["cam_K"] != first["cam_K"] or _bop_unit_m(e) != _bop_unit_m(first) for e in entries):
-        raise InputError(
-            f"a scene_camera.json of BOP whose {len(entries)} images have several cameras; write "
-            "that of one image into a file, or open the data set by --bop"
-        )
+    for entry in entries:
+        has_same_K = entry["cam_K"] == first["cam_K"]
+        if not has_same_K or _bop_unit_m(entry) != _bop_unit_m(first):
+            raise InputError(
+                f"a scene_camera.json of BOP whose {len(entries)} images have several cameras; "
+                "write that of one image into a file, or open the data set by --bop"
+            )
     flat = first["cam_K"]
     if not isinstance(flat, list) or len(flat) != 9:
         raise InputError(f"'cam_K' is {flat!r:.80}, where 9 numbers belong")
@@ -295,13 +344,14 @@ def _from_scene(images: dict[str, dict[str, Any]]) -> CameraFacts:
 
 
 def _bop_unit_m(keys: dict[str, Any]) -> float | None:
+    """Read the unit of depth images [m] of a camera of BOP; None where it has none."""
     if "depth_scale" in keys:
         return 0.001 * _json_number(keys, "depth_scale")  # millimetres a unit
     return _json_number(keys, "depth_unit_m") if "depth_unit_m" in keys else None
 
 
 def _size(keys: dict[str, Any]) -> Size:
-    """Take width and height [px] of a JSON file."""
+    """Read width and height [px], which must be whole numbers."""
     what = "a whole number of pixels"
     for key in ("width", "height"):
         value = _json_number(keys, key, what)
@@ -311,16 +361,16 @@ def _size(keys: dict[str, Any]) -> Size:
 
 
 def _json_number(keys: dict[str, Any], key: str, what: str = "a number") -> float:
-    """Take a number of a JSON file; ``what`` belongs there, for the error."""
+    """Read a number of a JSON file; ``what`` says in the error what belongs there."""
     value = keys[key]
-    # A whole number beyond 1e300 has no float.
-    if type(value) not in (int, float) or not abs(value) < 1e300:
+    is_number = type(value) in (int, float)  # a bool is none
+    if not is_number or not abs(value) < _LARGEST_NUMBER:
         raise InputError(f"{key!r} is {repr(value)[:80]}; give {what}")
     return float(value)
 
 
 def _matrix(value: object) -> Float[Tensor, "3 3"]:
-    """Take the 9 numbers of K, nested or flat."""
+    """Read the 9 numbers of K, nested or flat."""
     try:
         return torch.from_numpy(np.array(value, dtype=np.float64).reshape(3, 3))
     except (TypeError, ValueError, OverflowError) as error:
@@ -331,8 +381,8 @@ def _matrix(value: object) -> Float[Tensor, "3 3"]:
 
 
 @contextmanager
-def naming(path: AnyPath) -> Iterator[None]:
-    """Begin the message of an :class:`InputError` with the file that it is of."""
+def errors_naming(path: AnyPath) -> Iterator[None]:
+    """Begin the message of an :class:`InputError` raised inside the block with the file's path."""
     try:
         yield
     except InputError as error:
@@ -356,7 +406,7 @@ def read_camera(path: AnyPath, size: Size | None = None) -> Camera | StereoRig:
             without a size where none is given, or a value cannot be that of a camera in pixels
             and metres.
     """
-    with naming(path):
+    with errors_naming(path):
         return camera_from_facts(_read_facts(path), size)
 
 
@@ -393,16 +443,14 @@ def check_image_matches_camera(camera: Camera, width: int, height: int, name: st
     """
     if (width, height) == (camera.width, camera.height):
         return
-    # Scaled sizes are rounded to whole pixels, so the aspect agrees to within one.
-    is_scaled = abs(width * camera.height - height * camera.width) <= max(
-        camera.width, camera.height
-    )
-    remedy = (
-        f"the aspect agrees: resize the image to {camera.width}x{camera.height}, or the camera "
-        f"with resize_camera(camera, {width}, {height})"
-        if is_scaled
-        else "the aspect differs too: follow a crop with crop_camera, or give that image's camera"
-    )
+    # The sizes of a scaled image are rounded to whole pixels: the aspect agrees to within one.
+    aspect_error = abs(width * camera.height - height * camera.width)
+    remedy = "the aspect differs too: follow a crop with crop_camera, or give that image's camera"
+    if aspect_error <= max(camera.width, camera.height):
+        remedy = (
+            f"the aspect agrees: resize the image to {camera.width}x{camera.height}, or the camera "
+            f"with resize_camera(camera, {width}, {height})"
+        )
     raise InputError(
         f"{name} is {width}x{height} but its camera is {camera.width}x{camera.height}; {remedy}"
     )
@@ -420,41 +468,53 @@ def _read_facts(path: AnyPath) -> CameraFacts:
     facts: CameraFacts | None
     if _MIDDLEBURY.search(text):
         facts = _middlebury_facts(path)
-    elif _KITTI.search(text):  # the colour pair (cameras 2 and 3), or the grey one; or one camera
-        keys = read_key_values(path)
-        left, right = next((pair for pair in _KITTI_NAMES if pair[0] in keys), _KITTI_NAMES[0])
-        P = kitti_matrix(path, keys, left, (3, 4))
-        other = kitti_matrix(path, keys, right, (3, 4)) if right in keys else None
-        size_px = keys.get(f"S_rect_{left[-2:]}", [])  # the size of the rectified images
-        size = (int(size_px[0]), int(size_px[1])) if len(size_px) == 2 else None
-        facts = facts_from_projections("a KITTI calibration", P, other, size)
-    elif _PLAIN.search(text):
+    elif _KITTI.search(text):
+        facts = _kitti_facts(path)
+    elif _FOCAL_LINES.search(text):
         facts = plain_facts(path, read_key_values(path))
     elif _COLMAP.search(text):
         facts = _colmap_facts(text)
     else:
-        for sign, what in _FOREIGN.items():
+        for sign, description in _FOREIGN.items():
             if re.search(sign, text, re.MULTILINE):
-                raise InputError(f"{what}. {_WRITE}")
+                raise InputError(f"{description}. {_OWN_FORMAT}")
         facts = _bare_facts(text)
-        if facts is None and (names := read_storage(path, text)) is not None:
-            facts = _with_json_keys(facts_from_names(names), names)
+        if facts is None:
+            fields = parse_storage(path, text)
+            if fields is not None:
+                facts = _with_json_keys(facts_from_fields(fields), fields)
     if facts is None:
         shown = " ".join(text[:200].split())[:40]
         raise InputError(f"no camera that is known; it begins with {shown!r}. Known: {KNOWN_FILES}")
     return facts
 
 
-def _with_json_keys(facts: CameraFacts | None, names: Names) -> CameraFacts | None:
-    """Add the keys of our JSON that stand in a file of ROS or OpenCV, which has no such values."""
+def _kitti_facts(path: AnyPath) -> CameraFacts:
+    """Read KITTI's colour pair (cameras 2 and 3), else its grey pair; or the left camera alone."""
+    keys = read_key_values(path)
+    present = [pair for pair in _KITTI_NAMES if pair[0] in keys]
+    left, right = present[0] if present else _KITTI_NAMES[0]
+    left_P = kitti_matrix(path, keys, left, (3, 4))
+    right_P = kitti_matrix(path, keys, right, (3, 4)) if right in keys else None
+    rectified_size = keys.get(f"S_rect_{left[-2:]}", [])
+    size = None
+    if len(rectified_size) == 2:
+        size = (int(rectified_size[0]), int(rectified_size[1]))
+    return facts_from_projections("a KITTI calibration", left_P, right_P, size)
+
+
+def _with_json_keys(facts: CameraFacts | None, fields: Fields) -> CameraFacts | None:
+    """Add values under keys of depthpose's JSON, which a file of ROS or OpenCV may have besides."""
     if facts is None:
         return None
     added: dict[str, float] = {}
     for key in ("baseline_m", _DOFFS, *OPTIONAL_KEYS):
-        value = names.get(key.replace("_", ""))
-        if value is None or (key != _DOFFS and getattr(facts, key) is not None):
+        field = key.replace("_", "")
+        value = fields.get(field)
+        is_set = key != _DOFFS and getattr(facts, key) is not None
+        if value is None or is_set:
             continue
-        number = scalar(names, key.replace("_", ""))
+        number = find_number(fields, field)
         if number is None:
             raise InputError(f"{key} is {value!r}; write a number")
         added[key] = number
@@ -464,7 +524,7 @@ def _with_json_keys(facts: CameraFacts | None, names: Names) -> CameraFacts | No
 AnyCamera = (
     str | Path | Camera | Mapping[str, Any] | Sequence[Sequence[float]] | np.ndarray | Tensor
 )
-"""A camera, its file, what our JSON or BOP's holds as a dict, or its 3x3 matrix K alone."""
+"""A camera, its file, a dict of the keys of our JSON or of BOP's, or its 3x3 matrix K alone."""
 
 
 @dataclass(frozen=True)
@@ -488,11 +548,11 @@ image's centre."""
 
 
 def camera_of(camera: AnyLens | None, size: Size) -> Camera | None:
-    """Make the camera of an image from what the caller knows; None where the caller knows nothing.
+    """Make the camera of an image from any form that a caller may have it in; None stays None.
 
     Args:
-        camera: what is known. A dict without width and height, a matrix and a focal length take
-            the size of the image.
+        camera: a camera, its file, a dict, a matrix, a focal length or a field of view. A dict
+            without width and height, a matrix and a focal length take the size of the image.
         size: width and height of the image.
 
     Raises:
@@ -506,34 +566,40 @@ def camera_of(camera: AnyLens | None, size: Size) -> Camera | None:
         camera = size[0] / 2 / math.tan(math.radians(camera.degrees / 2))
     if isinstance(camera, np.generic | np.ndarray | Tensor) and camera.ndim == 0:
         camera = float(camera)
-    if isinstance(camera, int | float):  # its axis meets the centre
-        if not 1 < camera < 1e6:
-            raise InputError(
-                f"focal_px is {camera}: not a focal length in pixels; KITTI's is 721.5"
-            )
-        width, height = size
-        K = intrinsics(camera, camera, (width - 1) / 2, (height - 1) / 2)
-        return Camera(width=width, height=height, K=K)
+    if isinstance(camera, int | float):
+        return _camera_of_focal_length(camera, size)
     if isinstance(camera, Mapping):
         keys = {key: np.asarray(value).tolist() for key, value in camera.items()}
-        has_size = bool({"width", "height"} & keys.keys())
-        facts = facts_from_json(keys if has_size else {"width": size[0], "height": size[1], **keys})
-        # Without a size of its own the matrix may be that of another resolution: that is checked.
-        return camera_from_facts(facts if has_size else replace(facts, size=None), size)
+        if {"width", "height"} & keys.keys():
+            return camera_from_facts(facts_from_json(keys), size)
+        facts = facts_from_json({"width": size[0], "height": size[1], **keys})
+        # The size is not of the dict: whether K is of another resolution is to be checked.
+        return camera_from_facts(replace(facts, size=None), size)
     return camera_from_facts(CameraFacts(kind="a matrix K", K=intrinsics_of(camera)), size)
+
+
+def _camera_of_focal_length(focal_px: float, size: Size) -> Camera:
+    """Make the camera of a focal length, whose principal point is the centre of the image."""
+    if not 1 < focal_px < _MAX_FOCAL_PX:
+        raise InputError(f"focal_px is {focal_px}: not a focal length in pixels; KITTI's is 721.5")
+    width, height = size
+    K = intrinsics(focal_px, focal_px, (width - 1) / 2, (height - 1) / 2)
+    return Camera(width=width, height=height, K=K)
 
 
 def choose_lens(
     camera: AnyLens | None, focal_px: float | None, fov_deg: float | None = None
 ) -> AnyLens | None:
-    """Give the one of these arguments that is set; None where none is.
+    """Return the argument that is not None, the field of view as :class:`FieldOfView`.
+
+    None where all are None.
 
     Raises:
-        InputError: several were, or the field of view is none.
+        InputError: more than one is set, or no pinhole has such a field of view.
     """
     fov = None if fov_deg is None else FieldOfView(fov_deg)
-    named = {"camera": camera, "focal_px": focal_px, "fov_deg": fov}
-    chosen = {name: lens for name, lens in named.items() if lens is not None}
+    arguments = {"camera": camera, "focal_px": focal_px, "fov_deg": fov}
+    chosen = {name: lens for name, lens in arguments.items() if lens is not None}
     if len(chosen) > 1:
         first, second = list(chosen)[:2]
         raise InputError(f"{first} and {second} are both given; omit one of the two")
@@ -541,9 +607,14 @@ def choose_lens(
 
 
 def intrinsics_of(K: object) -> Float[Tensor, "3 3"]:
-    """Take a 3x3 list, array or tensor of any real numbers as an intrinsic matrix, in float64."""
+    """Convert a 3x3 list, array or tensor of any real numbers to an intrinsic matrix in float64.
+
+    Raises:
+        InputError: it is no intrinsic matrix.
+    """
     values = K.detach().cpu().numpy() if isinstance(K, Tensor) else K
     try:
+        # numpy would read None as NaN.
         matrix = torch.from_numpy(np.array("none" if K is None else values, dtype=np.float64))
         matrix = matrix.reshape(3, 3) if matrix.shape == (9,) else matrix
     except (TypeError, ValueError) as error:

@@ -1,6 +1,6 @@
-"""Which lens a camera file names: a pinhole, a fisheye that can be undistorted, or none of both.
+"""The lens that a camera file names: a pinhole, an equidistant fisheye, or one that is refused.
 
-The coefficients do not say it: four numbers are k1, k2, p1, p2 of a pinhole as well as k1 to k4 of
+The coefficients do not tell it: four numbers are k1, k2, p1, p2 of a pinhole as well as k1 to k4 of
 a fisheye, and a fisheye whose coefficients are 0 still bends what it shows.
 """
 
@@ -42,8 +42,8 @@ _REFUSED = {
     "panoramic": _CUBE, "spherical": _CUBE, "cylindrical": _CUBE,
 }  # fmt: skip
 """Lenses that are neither, and how their images become those of a pinhole."""
-_STRANGE = re.compile("fisheye|omnidir|omnicam|equirect|equidist|panoram|spherical|cylind")
-"""Parts of names of lenses that no list holds, and that are no pinhole's."""
+_OTHER_LENS = re.compile("fisheye|omnidir|omnicam|equirect|equidist|panoram|spherical|cylind")
+"""Parts of names that are no pinhole's, for lenses that are in no list."""
 _SURE_KEYS = ("distortionmodel", "distortiontype", "projectionmodel")
 """Keys that name the lens alone; others may name the maker's product too."""
 _KEYS = (
@@ -56,11 +56,11 @@ _REALSENSE = ("none", "modifiedbrownconrady", "inversebrownconrady", "ftheta", "
 """Models of librealsense (``rs2_distortion``) in the order of their numbers."""
 
 
-def is_fisheye_lens(names: Mapping[str, Any], owner: str = "its") -> bool | None:
+def is_fisheye_lens(fields: Mapping[str, Any], owner: str = "its") -> bool | None:
     """Say whether the lens that a camera file names is an equidistant fisheye, or a pinhole.
 
     Args:
-        names: values of the file by name; names in small letters and digits alone.
+        fields: values of the file by its keys, in lower case, letters and digits only.
         owner: whose lens it is, for the error.
 
     Returns:
@@ -69,42 +69,54 @@ def is_fisheye_lens(names: Mapping[str, Any], owner: str = "its") -> bool | None
     Raises:
         InputError: the lens is neither, or two names contradict each other.
     """
-    kind_of: dict[str, tuple[str, bool]] = {}
+    named_lenses: dict[str, tuple[str, bool]] = {}  # name, and whether a fisheye, by key
     for key in (*_SURE_KEYS, *_KEYS):
-        value = names.get(key)
-        if isinstance(value, int) and not isinstance(value, bool) and "ppx" in names:
+        value = fields.get(key)
+        if isinstance(value, int) and not isinstance(value, bool) and "ppx" in fields:
             value = _REALSENSE[value] if 0 <= value < len(_REALSENSE) else None
         if not isinstance(value, str):
             continue
-        word = re.sub(r"[^a-z0-9]", "", value.lower())
-        word = re.sub(r"^(rs2?)?distortion|(camera|lens|model)+$", "", word)
-        if word in _REFUSED or word.startswith("mei") or _is_strange(word, key):
-            raise _refused(f"{owner} {_shown(key)} is {value!r}", _REFUSED.get(word, _BY_ITS_TOOL))
-        if word in _RADIAL or word in _FISHEYE:
-            kind_of[key] = value, word in _FISHEYE
-    kind_of |= {key: (str(names[key]), True) for key in _FLAGS if _is_set(names.get(key))}
-    for key, value in names.items():
-        inner = value.get("xi") if isinstance(value, Mapping) else value if key == "xi" else None
-        if _is_set(inner):
-            raise _refused(
-                f"{owner} xi is {inner}, of MEI's omnidirectional model", _OMNIDIRECTIONAL
+        lens = re.sub(r"[^a-z0-9]", "", value.lower())
+        lens = re.sub(r"^(rs2?)?distortion|(camera|lens|model)+$", "", lens)
+        if lens in _REFUSED or lens.startswith("mei") or _is_other_lens(lens, key):
+            remedy = _REFUSED.get(lens, _BY_ITS_TOOL)
+            raise _refused_lens(f"{owner} {_spell_key(key)} is {value!r}", remedy)
+        if lens in _RADIAL or lens in _FISHEYE:
+            named_lenses[key] = (value, lens in _FISHEYE)
+    for key in _FLAGS:
+        if _is_set(fields.get(key)):
+            named_lenses[key] = (str(fields[key]), True)
+
+    # The coefficient xi, alone or among those of a lens, is of MEI's model.
+    for key, value in fields.items():
+        xi = value if key == "xi" else None
+        if isinstance(value, Mapping):
+            xi = value.get("xi")
+        if _is_set(xi):
+            raise _refused_lens(
+                f"{owner} xi is {xi}, of MEI's omnidirectional model", _OMNIDIRECTIONAL
             )
-    kinds = {is_fisheye for _, is_fisheye in kind_of.values()}
+
+    kinds = {is_fisheye for _, is_fisheye in named_lenses.values()}
     if len(kinds) == 2:
-        named_kinds = " and ".join(
-            f"{_shown(key)} {value!r}" for key, (value, _) in kind_of.items()
+        shown = " and ".join(
+            f"{_spell_key(key)} {name!r}" for key, (name, _) in named_lenses.items()
         )
-        raise InputError(f"{owner} lens is named twice, as {named_kinds}; keep the true one")
+        raise InputError(f"{owner} lens is named twice, as {shown}; keep the true one")
     return kinds.pop() if kinds else None
 
 
-def _is_strange(word: str, key: str) -> bool:
-    is_known = word in _PINHOLE or word in _RADIAL or word in _FISHEYE
-    return not is_known and (key in _SURE_KEYS or _STRANGE.search(word) is not None)
+def _is_other_lens(lens: str, key: str) -> bool:
+    """Whether a name that is in no list is that of a lens which is no pinhole.
+
+    Under a key that names the lens alone any unknown name is.
+    """
+    is_known = lens in _PINHOLE or lens in _RADIAL or lens in _FISHEYE
+    return not is_known and (key in _SURE_KEYS or _OTHER_LENS.search(lens) is not None)
 
 
 def _is_set(value: object) -> bool:
-    """Whether a flag is true or a coefficient is not 0; OpenCV writes either as a matrix too."""
+    """Whether a flag is true or a coefficient is not 0; of a matrix or list the first number."""
     if isinstance(value, Mapping):
         value = value.get("data")
     if isinstance(value, list):
@@ -115,16 +127,16 @@ def _is_set(value: object) -> bool:
         return str(value).strip().lower() in ("true", "yes", "on")
 
 
-def _shown(key: str) -> str:
-    """Spell a normalised key as files do."""
+def _spell_key(key: str) -> str:
+    """Spell a normalised key as files do, with underscores."""
     words = re.sub("(distortion|camera1?|lens|projection|fisheye)(?=model|type)", r"\1_", key)
     return re.sub("^is", "is_", words)
 
 
-def _refused(what: str, remedy: str) -> InputError:
+def _refused_lens(described: str, remedy: str) -> InputError:
     """Make the error of a lens that is no pinhole and no equidistant fisheye."""
     return InputError(
-        f"{what}, and only pinholes and the equidistant fisheye (Kannala and Brandt, cv2.fisheye) "
-        f"are understood; {remedy}, and give the camera of the result, or calibrate it as one of "
-        "the two (in Kalibr: pinhole-radtan, pinhole-equi)"
+        f"{described}, and only pinholes and the equidistant fisheye (Kannala and Brandt, "
+        f"cv2.fisheye) are understood; {remedy}, and give the camera of the result, or calibrate "
+        "it as one of the two (in Kalibr: pinhole-radtan, pinhole-equi)"
     )

@@ -1,7 +1,7 @@
-"""Cameras, a pinhole and the left one of a rectified pair: their geometry, and what is refused.
+"""The pinhole camera and the rectified stereo rig: geometry, and checks of their values.
 
-Projection, back-projection, and what cropping and scaling do to a camera. Values of a camera file,
-checked: from any format to one :class:`Camera`.
+Projection, back-projection, cropping and scaling; and the values of a camera file of any format,
+from which a plausible :class:`Camera` is made.
 """
 
 import json
@@ -39,30 +39,32 @@ class Camera:
     tilt_deg: float | None = None  #: of the optical axis against the road; up is > 0
 
     def __post_init__(self) -> None:
-        for name, (least, most, rule) in _RULES.items():
+        for name, (smallest, largest, reason) in _RANGES.items():
             value = getattr(self, name, None)
-            if value is not None and not least <= value <= most:
-                raise InputError(f"{name} is {str(value)[:24]}, but {rule}")
+            if value is not None and not smallest <= value <= largest:
+                raise InputError(f"{name} is {str(value)[:24]}, but {reason}")
         check_intrinsics(self.K)
 
 
 _SIDE = (1, MAX_SIDE_PX, f"an image has 1 to {MAX_SIDE_PX} pixels in a row or column; correct it")
-_TINY = math.ulp(0.0)
-_HUGE = sys.float_info.max
-_RULES = {
+_SMALLEST_POSITIVE = math.ulp(0.0)
+_LARGEST_FINITE = sys.float_info.max
+_RANGES = {
     "width": _SIDE,
     "height": _SIDE,
     "depth_unit_m": (
-        _TINY, _HUGE, "a unit is a positive number of metres; 0.001 means millimetres"
+        _SMALLEST_POSITIVE, _LARGEST_FINITE,
+        "a unit is a positive number of metres; 0.001 means millimetres"
     ),
     "mount_height_m": (0.1, 20, "a camera stands 0.1 to 20 m above the road; give metres"),
     "tilt_deg": (-45, 45, "a road is seen at -45 to 45 degrees; negative looks down"),
     "baseline_m": (
-        _TINY, _HUGE, "the right camera stands at a positive x; are left and right exchanged? Give "
+        _SMALLEST_POSITIVE, _LARGEST_FINITE,
+        "the right camera stands at a positive x; are left and right exchanged? Give "
         "its distance from the left one in metres"
     ),
 }  # fmt: skip
-"""Least and most of a camera's numbers, and why."""
+"""Smallest and largest value of a camera's numbers, and the reason for them."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -97,7 +99,12 @@ class StereoRig(Camera):
 
 
 def check_intrinsics(K: Tensor) -> None:
-    """Refuse a matrix that is no intrinsic matrix."""
+    """Refuse a matrix that is no intrinsic matrix.
+
+    Raises:
+        InputError: it is not a finite float64 tensor ``[[fx, skew, cx], [0, fy, cy], [0, 0, 1]]``
+            with positive fx and fy.
+    """
     form = "[[fx, skew, cx], [0, fy, cy], [0, 0, 1]]"
     if not isinstance(K, Tensor):
         raise InputError(
@@ -135,7 +142,7 @@ def pixel_grid(
     dtype: torch.dtype = torch.float32,
     device: torch.device | str | None = None,
 ) -> Float[Tensor, "{height} {width} 2"]:
-    """List the (u, v) of every pixel centre [px]; the first is (0, 0)."""
+    """Make the map of the pixel centres (u, v) [px] of an image; the first is (0, 0)."""
     u = torch.arange(width, dtype=dtype, device=device)
     v = torch.arange(height, dtype=dtype, device=device)
     return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
@@ -147,14 +154,14 @@ def project(
     """Project camera-frame points to pixels: ``(u, v, 1) ~ K @ (x, y, z)``.
 
     Any unit of length gives the same pixels. A point that is not in front of the camera
-    (``z <= 0``) has no picture: its pixel is NaN, and no gradient flows through it. Near
+    (``z <= 0``) has no image: its pixel is NaN, and no gradient flows through it. Near
     ``z = 0`` pixels and gradients grow without bound.
     """
     z = points_m[..., 2:]
-    is_seen = z > 0
-    rays = points_m / torch.where(is_seen, z, 1)
+    is_in_front = z > 0
+    rays = points_m / torch.where(is_in_front, z, 1)
     pixels = (rays @ K.to(points_m).mT)[..., :2]
-    return torch.where(is_seen, pixels, torch.nan)
+    return torch.where(is_in_front, pixels, torch.nan)
 
 
 def back_project(
@@ -165,10 +172,10 @@ def back_project(
     ``depth * K^-1 @ (u, v, 1)``: the inverse of :func:`project` where depth is positive.
     """
     height, width = depth_m.shape[-2:]
-    intrinsic = K.to(depth_m)
-    pixels = pixel_grid(height, width, depth_m.dtype, depth_m.device)
-    y = (pixels[..., 1] - intrinsic[1, 2]) / intrinsic[1, 1]
-    x = (pixels[..., 0] - intrinsic[0, 2] - intrinsic[0, 1] * y) / intrinsic[0, 0]
+    (fx, skew, cx), (_, fy, cy), _ = K.to(depth_m)
+    u, v = pixel_grid(height, width, depth_m.dtype, depth_m.device).unbind(-1)
+    y = (v - cy) / fy
+    x = (u - cx - skew * y) / fx
     return torch.stack([x, y, torch.ones_like(x)], -1) * depth_m[..., None]
 
 
@@ -182,7 +189,7 @@ def crop_intrinsics(K: Float[Tensor, "3 3"], left: int, top: int) -> Float[Tenso
 def crop_camera(camera: AnyCamera, left: int, top: int, width: int, height: int) -> AnyCamera:
     """Make the camera of a window of the image.
 
-    ``left`` and ``top`` are the first column and row that are kept [px].
+    ``left`` and ``top`` are the first column and row of the window [px].
 
     Raises:
         InputError: the window does not lie inside the image.
@@ -228,23 +235,23 @@ KNOWN_FILES = (
 
 OPTIONAL_KEYS = ("depth_unit_m", "mount_height_m", "tilt_deg")  # beside the matrix
 
-_NORMALISED_FX = 2
+_NORMALISED_FX = 2  # a smaller fx is divided by the width
 _MM_FX_SHARE = 0.1  # a focal length below a tenth of the width sees 157 degrees: no pinhole does
-_MAX_FX_SHARE = 200
-_LEAST_UNIT_M = 1e-6  # of depth images: with a smaller unit 16 bits would end before 7 cm
-_FILE_BASELINE_M = 5.0  # rigs of 50 to 120, in mm or cm, pass as a plane's, never in a file
+_MAX_FX_SHARE = 200  # of the width: less than 0.3 degrees
+_MIN_UNIT_M = 1e-6  # of depth images: with a smaller unit 16 bits would end before 7 cm
+_FILE_BASELINE_M = 5.0  # a file's number of 50 to 120 is in mm or cm, though a plane may be as wide
 WIDE_BASELINE_M = 2.0  # wider than cars' rigs: cm, or squares of a board, where no unit is named
-_LEAST_FILE_BASELINE_M = 1e-3
-_MAX_CM = 30  # a longer baseline, less the unit, is in millimetres
-_SAME_FOCAL = 1e-3
-_SAME_ROW_PX = 0.5
-SAME_DIFFERENCE_PX = 1.0
+_MIN_FILE_BASELINE_M = 1e-3
+_MAX_CM = 30  # a larger number without a unit is in millimetres
+_SAME_FOCAL_SHARE = 1e-3  # by which the focal lengths of a rectified pair may differ
+_SAME_ROW_PX = 0.5  # by which cy of a rectified pair may differ
+SAME_DIFFERENCE_PX = 1.0  # by which doffs may differ from that of the two matrices
 _MAX_SQUEEZE = 1.8  # of fx to fy, or fy to fx; KITTI's images squeezed to 512x256 have 1.66
-_NO_DISTORTION = 1e-8
+_NO_DISTORTION = 1e-8  # largest coefficient that counts as 0
 _OFF_CENTRE = 0.1  # share of the size that a principal point may be off; KITTI's is below 0.04
-_SAME_SHARE = 0.05  # of two shares (along x, along y) that still mean another resolution
+_SAME_SHARE = 0.05  # by which shares along x and y may differ and still mean another resolution
 _QUARTER = 0.25  # share of the size beyond which a point off the centre is doubted anyway
-_CORNER = 0.1
+_CORNER = 0.1  # share of the size at which a principal point is in the corner
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -272,7 +279,13 @@ def facts_from_projections(
     right: Float64[np.ndarray, "3 4"] | None,
     size: Size | None = None,
 ) -> CameraFacts:
-    """Read the rectified projections of a pair or of one camera: ``P[0, 3] = -fx x``."""
+    """Read the rectified projections P of a pair, or of a single camera.
+
+    ``P[0, 3]`` is -fx times the x of the camera [m].
+
+    Raises:
+        InputError: the two are not those of one rectified pair.
+    """
     K = torch.from_numpy(left[:, :3].copy())
     if right is None:
         return CameraFacts(kind=kind, K=K, size=size)
@@ -297,10 +310,13 @@ def facts_from_projections(
 
 def refuse_apart(left: Float64[np.ndarray, "3 _"], right: Float64[np.ndarray, "3 _"]) -> None:
     """Refuse two matrices that are not of one rectified pair: only cx may differ."""
-    within = {"fx": ((0, 0), _SAME_FOCAL * left[0, 0]), "fy": ((1, 1), _SAME_FOCAL * left[1, 1]),
-              "cy": ((1, 2), _SAME_ROW_PX)}  # fmt: skip
-    for name, (index, most) in within.items():
-        if not math.isclose(left[index], right[index], rel_tol=0, abs_tol=abs(most)):
+    shared = (
+        ("fx", (0, 0), _SAME_FOCAL_SHARE * left[0, 0]),
+        ("fy", (1, 1), _SAME_FOCAL_SHARE * left[1, 1]),
+        ("cy", (1, 2), _SAME_ROW_PX),
+    )
+    for name, index, tolerance in shared:
+        if not math.isclose(left[index], right[index], rel_tol=0, abs_tol=abs(tolerance)):
             raise InputError(
                 f"{name} of the left camera is {left[index]:g} and of the right one "
                 f"{right[index]:g}, but a rectified pair shares fx, fy and cy; are they of two "
@@ -310,49 +326,31 @@ def refuse_apart(left: Float64[np.ndarray, "3 _"], right: Float64[np.ndarray, "3
 
 
 def camera_from_facts(facts: CameraFacts, size: Size | None) -> Camera:
-    """Make the camera of a file; refuse what cannot be that of an undistorted image in pixels."""
-    if facts.is_fisheye or not all(abs(k) <= _NO_DISTORTION for k in facts.distortion):
-        next_step = "and give the camera of the result"
-        if facts.size or size:
-            next_step += f": {json.dumps(camera_keys(make_camera(facts, size)))}"
-        fisheye = " of a fisheye" if facts.is_fisheye else ""
-        coefficients = ", ".join(f"{k:g}" for k in facts.distortion) or "no coefficients"
-        raise InputError(
-            f"{facts.kind} with lens distortion{fisheye} ({coefficients}), and only images without "
-            f"are understood; undistort them by {facts.undistort}, {next_step}"
-        )
+    """Make the camera of a file, once its values are plausible.
 
-    # A focal length and a centre in pixels of this image.
+    Args:
+        facts: values of the file.
+        size: width and height of the image, where the file does not say it.
+
+    Raises:
+        InputError: the values cannot be those of an undistorted image, in pixels and metres.
+
+    Warns:
+        Notice: they are doubtful.
+    """
+    _refuse_distortion(facts, size)
     camera = make_camera(facts, size)
-    fx = float(camera.K[0, 0])
-    shown = f"{camera.width}x{camera.height}"
-    _refuse_normalised(camera.K, camera.width, camera.height)
-    if not _MM_FX_SHARE <= fx / camera.width <= _MAX_FX_SHARE:
-        what = "which sees less than 0.3 degrees; give it in pixels of this image"
-        if fx < _MM_FX_SHARE * camera.width:
-            what = "so it looks like millimetres; divide by the width of a pixel in mm"
-        raise InputError(f"K has fx {fx:g} for {shown} pixels, {what}")
+    _refuse_focal_length(camera)
     refuse_squeezed(camera.K)
     refuse_outside(camera.K, camera.width, camera.height)
-
-    # A baseline in metres, and a unit of depth images.
     if isinstance(camera, StereoRig):
-        how = 'written as ours: width, height, K, "baseline_m"'
-        if facts.is_metric:
-            how = "made in Python, as a StereoRig"
-        most_m = _FILE_BASELINE_M if facts.is_metric else WIDE_BASELINE_M
-        refuse_baseline(camera.baseline_m, f"a rig that is truly this wide is {how}", most_m)
-        if abs(camera.cx_right_minus_left_px) >= camera.width:
-            raise InputError(
-                f"the principal points differ by {camera.cx_right_minus_left_px:g} px, more than "
-                f"the image of {shown} is wide; are both cameras of one size? Copy them anew"
-            )
+        _refuse_rig(camera, is_metric=facts.is_metric)
     unit_m = camera.depth_unit_m or 1.0
-    if not _LEAST_UNIT_M <= unit_m <= 1:
-        what = "finer than any sensor's; it is metres a unit: 0.001 means millimetres"
+    if not _MIN_UNIT_M <= unit_m <= 1:
+        finding = "finer than any sensor's; it is metres a unit: 0.001 means millimetres"
         if unit_m > 1:
-            what = f"which looks like units a metre; it is metres a unit: write {1 / unit_m:g}"
-        raise InputError(f"depth_unit_m is {unit_m:g}, {what}")
+            finding = f"which looks like units a metre; it is metres a unit: write {1 / unit_m:g}"
+        raise InputError(f"depth_unit_m is {unit_m:g}, {finding}")
 
     # A centre far off is of another resolution, unless the file names this very size.
     doubt = facts.doubt
@@ -365,6 +363,52 @@ def camera_from_facts(facts: CameraFacts, size: Size | None) -> Camera:
     if doubt:
         warnings.warn(f"{facts.kind}: {doubt}", Notice, stacklevel=2)
     return camera
+
+
+def _refuse_distortion(facts: CameraFacts, size: Size | None) -> None:
+    """Refuse a lens with distortion, and say how to undistort and which camera results."""
+    if not facts.is_fisheye and all(abs(k) <= _NO_DISTORTION for k in facts.distortion):
+        return
+    next_step = "and give the camera of the result"
+    if facts.size or size:
+        next_step += f": {json.dumps(camera_keys(make_camera(facts, size)))}"
+    fisheye = " of a fisheye" if facts.is_fisheye else ""
+    coefficients = ", ".join(f"{k:g}" for k in facts.distortion) or "no coefficients"
+    raise InputError(
+        f"{facts.kind} with lens distortion{fisheye} ({coefficients}), and only images without "
+        f"are understood; undistort them by {facts.undistort}, {next_step}"
+    )
+
+
+def _refuse_focal_length(camera: Camera) -> None:
+    """Refuse a focal length that is not in pixels of the camera's image."""
+    _refuse_normalised(camera.K, camera.width, camera.height)
+    fx = float(camera.K[0, 0])
+    if _MM_FX_SHARE <= fx / camera.width <= _MAX_FX_SHARE:
+        return
+    finding = "which sees less than 0.3 degrees; give it in pixels of this image"
+    if fx < _MM_FX_SHARE * camera.width:
+        finding = "so it looks like millimetres; divide by the width of a pixel in mm"
+    raise InputError(f"K has fx {fx:g} for {camera.width}x{camera.height} pixels, {finding}")
+
+
+def _refuse_rig(rig: StereoRig, *, is_metric: bool) -> None:
+    """Refuse a baseline that is not in metres, and principal points that are too far apart.
+
+    Where ``is_metric``, the format names metres, and a wider rig is believed.
+    """
+    way = 'written as ours: width, height, K, "baseline_m"'
+    max_baseline_m = WIDE_BASELINE_M
+    if is_metric:
+        way = "made in Python, as a StereoRig"
+        max_baseline_m = _FILE_BASELINE_M
+    refuse_baseline(rig.baseline_m, f"a rig that is truly this wide is {way}", max_baseline_m)
+    if abs(rig.cx_right_minus_left_px) >= rig.width:
+        raise InputError(
+            f"the principal points differ by {rig.cx_right_minus_left_px:g} px, more than the "
+            f"image of {rig.width}x{rig.height} is wide; are both cameras of one size? Copy them "
+            "anew"
+        )
 
 
 def make_camera(facts: CameraFacts, size: Size | None) -> Camera:
@@ -384,7 +428,7 @@ def make_camera(facts: CameraFacts, size: Size | None) -> Camera:
 
 
 def camera_keys(camera: Camera) -> dict[str, Any]:
-    """Give the values of a camera by the keys of our JSON."""
+    """Convert a camera to the mapping that depthpose's JSON holds; absent values are left out."""
     keys: dict[str, Any] = {"width": camera.width, "height": camera.height, "K": camera.K.tolist()}
     if isinstance(camera, StereoRig):
         keys["baseline_m"] = camera.baseline_m
@@ -395,11 +439,10 @@ def camera_keys(camera: Camera) -> dict[str, Any]:
 
 
 def refuse_other_resolution(K: Float[Tensor, "3 3"], width: int, height: int) -> None:
-    """Refuse a K whose principal point is that of the same picture at another resolution.
+    """Refuse a K that looks like that of the same picture at another resolution.
 
-    The point of a lens lies near the centre; scaled with another resolution it leaves the centre
-    by the same share in both directions. A crop seldom does that, and has a file that says its
-    size.
+    The principal point of a lens lies near the centre. With K of another resolution it is off the
+    centre by the same share in both directions, which a crop seldom is.
 
     Raises:
         InputError: that is so, or the point lies outside the image.
@@ -408,11 +451,11 @@ def refuse_other_resolution(K: Float[Tensor, "3 3"], width: int, height: int) ->
     refuse_outside(K, width, height)
     cx = float(K[0, 2])
     cy = float(K[1, 2])
-    across = (cx + 0.5) / width - 0.5
-    down = (cy + 0.5) / height - 0.5
-    scale = 1 + across + down
-    is_alike = abs(across - down) <= _SAME_SHARE * max(scale, 1)
-    if min(abs(across), abs(down)) < _OFF_CENTRE or not is_alike:
+    x_share = (cx + 0.5) / width - 0.5
+    y_share = (cy + 0.5) / height - 0.5
+    scale = 1 + x_share + y_share  # of the resolution of K to that of the image
+    is_same_share = abs(x_share - y_share) <= _SAME_SHARE * max(scale, 1)
+    if min(abs(x_share), abs(y_share)) < _OFF_CENTRE or not is_same_share:
         return
     if scale < _CORNER:
         raise InputError(
@@ -430,7 +473,7 @@ def refuse_outside(K: Float[Tensor, "3 3"], width: int, height: int) -> None:
     """Refuse a K whose principal point lies outside the image.
 
     Raises:
-        InputError: that is so.
+        InputError: it does.
     """
     cx = float(K[0, 2])
     cy = float(K[1, 2])
@@ -442,9 +485,9 @@ def refuse_outside(K: Float[Tensor, "3 3"], width: int, height: int) -> None:
 
 
 def suspicious_centre(camera: Camera) -> str | None:
-    """Warn where K looks like that of another image size than the camera's; else None.
+    """Describe a principal point that looks like that of another image size; else None.
 
-    The principal point is doubted as well where it is more than a quarter off the centre.
+    It is doubted as well where it is more than a quarter of the size off the centre.
     """
     try:
         refuse_other_resolution(camera.K, camera.width, camera.height)
@@ -452,18 +495,20 @@ def suspicious_centre(camera: Camera) -> str | None:
         return str(error)
     cx = float(camera.K[0, 2])
     cy = float(camera.K[1, 2])
-    across = (cx + 0.5) / camera.width
-    down = (cy + 0.5) / camera.height
-    if max(abs(across - 0.5), abs(down - 0.5)) <= _QUARTER:
+    x_share = (cx + 0.5) / camera.width
+    y_share = (cy + 0.5) / camera.height
+    if max(abs(x_share - 0.5), abs(y_share - 0.5)) <= _QUARTER:
         return None
     return (
-        f"the principal point ({cx:g}, {cy:g}) lies at {across:.0%} of the width and {down:.0%} of "
-        f"the height of {camera.width}x{camera.height}, more than a quarter off the centre: is K "
-        "of another size? Scale fx, fy, cx and cy as the image was. Of a crop it may be right"
+        f"the principal point ({cx:g}, {cy:g}) lies at {x_share:.0%} of the width and "
+        f"{y_share:.0%} of the height of {camera.width}x{camera.height}, more than a quarter off "
+        "the centre: is K of another size? Scale fx, fy, cx and cy as the image was. Of a crop it "
+        "may be right"
     )
 
 
 def _refuse_normalised(K: Float[Tensor, "3 3"], width: int, height: int) -> None:
+    """Refuse a K whose rows are divided by the size of the image."""
     if K[0, 0] <= _NORMALISED_FX < width / 10:
         raise InputError(
             f"K has fx {float(K[0, 0]):g} for {width}x{height} pixels, so it looks normalised; "
@@ -472,8 +517,17 @@ def _refuse_normalised(K: Float[Tensor, "3 3"], width: int, height: int) -> None
 
 
 def refuse_baseline(length: float, remedy: str, most_m: float = WIDE_BASELINE_M) -> None:
-    """Refuse a distance between two cameras that no rig has."""
-    if length < _LEAST_FILE_BASELINE_M:
+    """Refuse a distance between two cameras, said to be in metres, that no rig has.
+
+    Args:
+        length: the distance.
+        remedy: what to do if it is true, for the error.
+        most_m: distances from here on are refused.
+
+    Raises:
+        InputError: it is too short or too long; the message suggests the unit it may be in.
+    """
+    if length < _MIN_FILE_BASELINE_M:
         raise InputError(
             f"baseline_m is {length:g}, less than two lenses can stand apart; write metres, once "
             f"({length * 1000:g} if it was divided by 1000 without need)"

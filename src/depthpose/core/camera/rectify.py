@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float32, Float64
 from torch import Tensor
 
-from depthpose.core.camera.camera_file import naming
+from depthpose.core.camera.camera_file import errors_naming
 from depthpose.core.camera.lens import is_fisheye_lens
 from depthpose.core.camera.pinhole import (
     WIDE_BASELINE_M,
@@ -25,15 +25,15 @@ from depthpose.core.camera.pinhole import (
     refuse_squeezed,
 )
 from depthpose.core.camera.stored_camera import (
-    Names,
+    Fields,
+    find_matrix,
+    find_size,
     is_ros,
-    matrix,
-    named,
-    numbers,
-    read_storage,
-    read_two_files,
-    ros_pair,
-    size_of,
+    normalise_keys,
+    order_ros_pair,
+    parse_numbers,
+    parse_storage,
+    read_pair_files,
 )
 from depthpose.core.errors import InputError, Notice, import_opencv
 from depthpose.core.files import AnyPath, read_json, read_text
@@ -52,12 +52,13 @@ _D = {
 }  # fmt: skip
 _R = ("r", "rotation", "rotationmatrix")
 _T = ("t", "translation", "translationvector")
-_COUNTS = {False: (4, 5, 8, 12, 14), True: (4,)}
+_PINHOLE_COUNTS = (4, 5, 8, 12, 14)  # of distortion coefficients, as OpenCV takes them
+_FISHEYE_COUNTS = (4,)
 _MAX_BASELINE_M = 10.0
-_LEAST_TURN_DEG = 0.2  # a difference in turn that can be told from an error of the calibration
-_CLEARLY = 0.5  # R looks transposed if its transpose turns the cameras by less than this share
-_MAX_ENLARGED = 4  # of a raw image by its rectification
-_MAX_FOCAL_RATIO = 1.5  # of the two cameras of a pair; more are of images of two sizes
+_MIN_ROTATION_DEG = 0.2  # a difference that can be told from an error of the calibration
+_TRANSPOSED_SHARE = 0.5  # R looks transposed if its transpose rotates the cameras by less of that
+_MAX_ENLARGEMENT = 4  # of a raw image by its rectification
+_MAX_FOCAL_RATIO = 1.5  # of the two cameras of a pair; more is of images of two sizes
 _KNOWN = (
     "a camchain of Kalibr, OpenCV's K1, D1, K2, D2, R and T (in one file, or intrinsics.yml and "
     "extrinsics.yml in a folder), or a folder with left.yaml and right.yaml of ROS"
@@ -103,7 +104,7 @@ def read_raw_pair(
         InputError: the file is missing or damaged, describes no two cameras, is of a lens of
             another model, or a value cannot be right: the rotation, the distance, the order.
     """
-    with naming(path):
+    with errors_naming(path):
         pair = _read_pair(Path(path), unit_m or 1.0, is_fisheye)
         R = pair.right_from_left.R
         length = float(pair.right_from_left.t_m.norm())
@@ -129,134 +130,145 @@ def read_raw_pair(
 
 
 def _warn_if_transposed(path: AnyPath, right_from_left: Rigid) -> None:
-    """Warn where R turns both cameras far more from the line between them than its transpose does.
+    """Warn where R rotates the cameras far more from the baseline than its transpose would.
 
-    A wrong turn about the vertical moves disparities alone, which no comparison of rows can see.
+    A wrong rotation about the vertical changes only disparities, so that rows still agree and the
+    check of a rectified pair finds nothing.
     """
     R = right_from_left.R
     t_m = right_from_left.t_m
-    of_right = _off_axis_deg(t_m)
-    as_read = _off_axis_deg(R.mT @ t_m) + of_right
-    transposed = _off_axis_deg(R @ t_m) + of_right
-    if transposed < _CLEARLY * as_read and as_read - transposed > _LEAST_TURN_DEG:
+    right_deg = _baseline_angle_deg(t_m)
+    as_read_deg = _baseline_angle_deg(R.mT @ t_m) + right_deg
+    transposed_deg = _baseline_angle_deg(R @ t_m) + right_deg
+    is_far_less = transposed_deg < _TRANSPOSED_SHARE * as_read_deg
+    if is_far_less and as_read_deg - transposed_deg > _MIN_ROTATION_DEG:
         message = (
-            f"{path}: is R transposed? By it the cameras are turned {as_read:.2f} degrees from "
-            f"the line between them, with its transpose by {transposed:.2f}; it carries points of "
-            "camera 1 to camera 2. Compare a measured distance"
+            f"{path}: is R transposed? By it the cameras are turned {as_read_deg:.2f} degrees from "
+            f"the line between them, with its transpose by {transposed_deg:.2f}; it carries points "
+            "of camera 1 to camera 2. Compare a measured distance"
         )
         warnings.warn(message, Notice, stacklevel=3)
 
 
-def _off_axis_deg(t_m: Tensor) -> float:
-    """Angle between the line of both cameras and the rows of one [degrees]."""
-    return math.degrees(math.atan2(float(t_m[1:].norm()), abs(float(t_m[0]))))
+def _baseline_angle_deg(baseline_m: Tensor) -> float:
+    """Compute the angle between the baseline, in a camera's frame, and the camera's rows [deg]."""
+    off_axis_m = float(baseline_m[1:].norm())
+    return math.degrees(math.atan2(off_axis_m, abs(float(baseline_m[0]))))
 
 
 def _read_pair(path: Path, unit_m: float, is_fisheye: bool | None) -> RawPair:
     """Read the calibration of a pair: two files of ROS or OpenCV in a folder, or one file of both.
 
-    ``unit_m``: metres of the unit of its translations.
+    ``unit_m`` is the unit of its translations [m].
     """
     if path.is_dir():
-        first, second = read_two_files(path)
+        first, second = read_pair_files(path)
         if is_ros(first) and is_ros(second) and "p2" not in first | second:
             return _from_ros(first, second, unit_m, is_fisheye)
         return _from_opencv(first | second, unit_m, is_fisheye)
     text = read_text(path, MAX_LIST_BYTES)
-    content = read_json(path) if text.lstrip()[:1] == "{" else None
-    names = named(content) if isinstance(content, Mapping) else read_storage(path, text)
-    if names is None:
+    is_json = text.lstrip()[:1] == "{"
+    content = read_json(path) if is_json else None
+    fields = normalise_keys(content) if isinstance(content, Mapping) else parse_storage(path, text)
+    if fields is None:
         raise InputError(f"no calibration of two cameras; known are {_KNOWN}")
-    if "cam0" in names:
-        return _from_kalibr(names, unit_m, is_fisheye)
-    return _from_opencv(names, unit_m, is_fisheye)
+    if "cam0" in fields:
+        return _from_kalibr(fields, unit_m, is_fisheye)
+    return _from_opencv(fields, unit_m, is_fisheye)
 
 
-def _from_ros(first: Names, second: Names, unit_m: float, is_fisheye: bool | None) -> RawPair:
-    """ROS's two ``camera_info``, whose R and P describe the rectified pair.
+def _from_ros(first: Fields, second: Fields, unit_m: float, is_fisheye: bool | None) -> RawPair:
+    """Read ROS's two ``camera_info``, whose R and P describe the rectified pair.
 
-    Each R turns a raw camera to its rectified one, and the rectified cameras stand apart along x
-    alone: so ``right_from_left`` has the rotation ``R_right^T R_left`` and the translation
-    ``R_right^T (baseline, 0, 0)``.
+    Each R rotates a raw camera to its rectified one, and the rectified cameras differ by x alone:
+    so ``right_from_left`` has the rotation ``R_right^T R_left`` and the translation
+    ``R_right^T (x_left - x_right, 0, 0)``.
     """
-    both = ros_pair(first, second)
-    xs = []  # of the two rectified cameras, from the left one or from a third [m]
-    for names in both:
-        P = matrix(names, ("projectionmatrix", "p"), 12)
+    pair = order_ros_pair(first, second)
+    xs: list[float] = []  # x of the rectified cameras, from the left one or from a third
+    for fields in pair:
+        P = find_matrix(fields, ("projectionmatrix", "p"), 12)
         if P is None or P[0, 0] <= 0:
             raise InputError("no projection_matrix with a focal length; calibrate as a pair")
         xs.append(-P[0, 3] / P[0, 0])
-    cameras = []
-    turns = []
-    for side, names in zip(("left", "right"), both, strict=True):
-        K = matrix(names, ("cameramatrix", "k"), 9)
-        D = _first_numbers(names, ("distortioncoefficients", "d"))
-        kind = _is_fisheye(names, is_fisheye)
-        cameras.append(_make_camera(K, D, kind, f"the {side} camera"))
-        turn = matrix(names, ("rectificationmatrix", "r"), 9)
-        if turn is None:
+    cameras: list[RawCamera] = []
+    rotations: list[np.ndarray] = []
+    for side, fields in zip(("left", "right"), pair, strict=True):
+        K = find_matrix(fields, ("cameramatrix", "k"), 9)
+        D = _find_numbers(fields, ("distortioncoefficients", "d"))
+        has_fisheye = _choose_lens_model(fields, is_fisheye)
+        cameras.append(_make_camera(K, D, has_fisheye, f"the {side} camera"))
+        R = find_matrix(fields, ("rectificationmatrix", "r"), 9)
+        if R is None:
             raise InputError(f"no rectification_matrix of the {side} camera; write the whole pair")
-        turns.append(turn)
-    baseline = np.array([unit_m * (xs[0] - xs[1]), 0, 0])
-    motion = (turns[1].T @ turns[0], turns[1].T @ baseline)
-    return _make_pair(cameras[0], cameras[1], motion, size_of(first))
+        rotations.append(R)
+    left_R, right_R = rotations
+    translation_m = np.array([unit_m * (xs[0] - xs[1]), 0, 0])
+    motion = (right_R.T @ left_R, right_R.T @ translation_m)
+    return _make_pair(cameras[0], cameras[1], motion, find_size(first))
 
 
-def _from_opencv(names: Names, unit_m: float, is_fisheye: bool | None) -> RawPair:
-    """OpenCV's ``stereoCalibrate``: points of camera 1 to camera 2 by R and T."""
-    if not any(name in names for keys in _K.values() for name in keys):
-        reason = "it describes one camera" if is_ros(names) or "cameramatrix" in names else "no K1"
+def _from_opencv(fields: Fields, unit_m: float, is_fisheye: bool | None) -> RawPair:
+    """Read OpenCV's ``stereoCalibrate``, whose R and T carry points of camera 1 to camera 2."""
+    if not any(key in fields for side_keys in _K.values() for key in side_keys):
+        reason = "no K1"
+        if is_ros(fields) or "cameramatrix" in fields:
+            reason = "it describes one camera"
         raise InputError(f"{reason}, not two as they were calibrated; known are {_KNOWN}")
-    kind = _is_fisheye(names, is_fisheye)
-    left, right = (
-        _make_camera(
-            matrix(names, _K[side], 9), _first_numbers(names, _D[side]), kind, f"the {side} camera"
-        )
-        for side in ("left", "right")
-    )
-    R = matrix(names, _R, 9)
-    T = _first_numbers(names, _T)
+    have_fisheyes = _choose_lens_model(fields, is_fisheye)
+    cameras: list[RawCamera] = []
+    for side in ("left", "right"):
+        K = find_matrix(fields, _K[side], 9)
+        D = _find_numbers(fields, _D[side])
+        cameras.append(_make_camera(K, D, have_fisheyes, f"the {side} camera"))
+    left, right = cameras
+    R = find_matrix(fields, _R, 9)
+    T = _find_numbers(fields, _T)
     if R is None or T is None or len(T) != 3:
         raise InputError("no R of 9 numbers and T of 3, from camera 1 to 2; write both")
-    return _make_pair(left, right, (R, unit_m * np.array(T)), size_of(names))
+    return _make_pair(left, right, (R, unit_m * np.array(T)), find_size(fields))
 
 
-def _from_kalibr(names: Names, unit_m: float, is_fisheye: bool | None) -> RawPair:
-    """Kalibr's camchain: ``T_cn_cnm1`` carries points of cam0 to cam1."""
-    if not all(isinstance(names.get(owner), Mapping) for owner in ("cam0", "cam1")):
+def _from_kalibr(fields: Fields, unit_m: float, is_fisheye: bool | None) -> RawPair:
+    """Read Kalibr's camchain, whose ``T_cn_cnm1`` carries points of cam0 to cam1."""
+    if not all(isinstance(fields.get(owner), Mapping) for owner in ("cam0", "cam1")):
         raise InputError("a camchain without cam0 and cam1; calibrate both cameras together")
-    first = named(names["cam0"])
-    second = named(names["cam1"])
-    motion = matrix(second, ("tcncnm1",), 16)
+    first = normalise_keys(fields["cam0"])
+    second = normalise_keys(fields["cam1"])
+    motion = find_matrix(second, ("tcncnm1",), 16)
     if motion is None:
         raise InputError("cam1 has no T_cn_cnm1 of 16 numbers; calibrate both cameras together")
-    sizes = [numbers(camera_names.get("resolution")) for camera_names in (first, second)]
-    if sizes[0] != sizes[1]:
+    resolution = parse_numbers(first.get("resolution"))
+    if resolution != parse_numbers(second.get("resolution")):
         raise InputError("cam0 and cam1 have images of two sizes; a pair has one")
-    size = None if sizes[0] is None else (int(sizes[0][0]), int(sizes[0][-1]))
-    cameras = []
-    for camera_names, owner in ((first, "cam0"), (second, "cam1")):
-        kind = _is_fisheye(camera_names, is_fisheye, f"{owner}'s")
-        values = numbers(camera_names.get("intrinsics"))
+    size = None if resolution is None else (int(resolution[0]), int(resolution[-1]))
+    cameras: list[RawCamera] = []
+    for camera, owner in ((first, "cam0"), (second, "cam1")):
+        has_fisheye = _choose_lens_model(camera, is_fisheye, f"{owner}'s")
+        values = parse_numbers(camera.get("intrinsics"))
         if values is None or len(values) != 4:
             raise InputError(f"{owner} has no intrinsics [fx, fy, cx, cy]; copy the camchain anew")
-        lens = numbers(camera_names.get("distortioncoeffs"))
-        cameras.append(_make_camera(intrinsics(*values).numpy(), lens, kind, owner))
+        D = parse_numbers(camera.get("distortioncoeffs"))
+        cameras.append(_make_camera(intrinsics(*values).numpy(), D, has_fisheye, owner))
     return _make_pair(cameras[0], cameras[1], (motion[:3, :3], unit_m * motion[:3, 3]), size)
 
 
-def _first_numbers(fields: Names, keys: tuple[str, ...]) -> list[float] | None:
-    """Give the numbers of the first of some fields that a file has; None where it has none."""
+def _find_numbers(fields: Fields, keys: tuple[str, ...]) -> list[float] | None:
+    """Read the numbers of the first of some keys that has any; None where none has."""
     for key in keys:
-        values = numbers(fields.get(key))
+        values = parse_numbers(fields.get(key))
         if values:
             return values
     return None
 
 
-def _is_fisheye(names: Names, is_fisheye: bool | None, owner: str = "its") -> bool:
-    """Say whether a lens is a fisheye: as its file says, else as the user says."""
-    is_named_fisheye = is_fisheye_lens(names, owner)
+def _choose_lens_model(fields: Fields, is_fisheye: bool | None, owner: str = "its") -> bool:
+    """Decide whether a lens is a fisheye: by its file, or else by ``is_fisheye``, the user's word.
+
+    Raises:
+        InputError: the user calls a lens a fisheye that the file calls a pinhole.
+    """
+    is_named_fisheye = is_fisheye_lens(fields, owner)
     if is_fisheye and is_named_fisheye is False:
         raise InputError(
             f"{owner} distortion model is that of a pinhole, no fisheye; omit --fisheye"
@@ -267,28 +279,36 @@ def _is_fisheye(names: Names, is_fisheye: bool | None, owner: str = "its") -> bo
 def _make_camera(
     K: np.ndarray | None, distortion: list[float] | None, is_fisheye: bool, owner: str
 ) -> RawCamera:
-    """Make one raw camera, whose coefficients must be as many as its lens model has."""
+    """Make a raw camera; ``owner`` names it in errors.
+
+    Raises:
+        InputError: K or the distortion is missing, or not of the lens model.
+    """
     if K is None:
         raise InputError(f"no camera matrix of 9 numbers of {owner}; write K1 and K2")
     if distortion is None:
         raise InputError(f"no distortion of {owner}; write D1 and D2, zeros where a lens has none")
-    counts = _COUNTS[is_fisheye]
+    counts = _FISHEYE_COUNTS if is_fisheye else _PINHOLE_COUNTS
     if len(distortion) not in counts:
         model = "a fisheye lens" if is_fisheye else "a pinhole with distortion"
         raise InputError(
             f"{owner} has {len(distortion)} coefficients of distortion, and {model} has "
             f"{' or '.join(map(str, counts))}; look at its model"
         )
-    intrinsic = torch.from_numpy(np.ascontiguousarray(K, np.float64))
-    check_intrinsics(intrinsic)
-    refuse_squeezed(intrinsic)
-    return RawCamera(K=intrinsic, distortion=tuple(distortion), is_fisheye=is_fisheye)
+    matrix = torch.from_numpy(np.ascontiguousarray(K, np.float64))
+    check_intrinsics(matrix)
+    refuse_squeezed(matrix)
+    return RawCamera(K=matrix, distortion=tuple(distortion), is_fisheye=is_fisheye)
 
 
 def _make_pair(
     left: RawCamera, right: RawCamera, motion: tuple[np.ndarray, np.ndarray], size: Size | None
 ) -> RawPair:
-    """Put two raw cameras and their motion (R, t [m], right from left) together as a pair."""
+    """Make a pair of two raw cameras and their motion, R and t [m] from left to right.
+
+    Raises:
+        InputError: the cameras cannot be those of one pair.
+    """
     if left.is_fisheye != right.is_fisheye:
         raise InputError("one lens is a fisheye and the other is none; calibrate both as one kind")
     left_fx = float(left.K[0, 0])
@@ -298,7 +318,7 @@ def _make_pair(
             f"fx is {left_fx:g} on the left and {right_fx:g} on the right, as of images of two "
             "sizes; scale one camera matrix and its images to those of the other"
         )
-    R, t_m = (torch.from_numpy(np.array(part, np.float64)) for part in motion)
+    R, t_m = (torch.from_numpy(np.array(array, np.float64)) for array in motion)
     return RawPair(left=left, right=right, right_from_left=Rigid(R, t_m), size=size)
 
 
@@ -309,8 +329,8 @@ Maps = tuple[np.ndarray, np.ndarray]
 class Rectifier:
     """Maps from the images of a calibrated pair to rectified ones.
 
-    What is known of the raw left camera, such as where a LiDAR stands, is carried along by
-    ``rectified_from_raw``, a rotation alone.
+    ``rectified_from_raw``, a rotation, carries along what is calibrated to the raw left camera,
+    such as the pose of a LiDAR.
     """
 
     rig: StereoRig  #: the camera of the rectified pair
@@ -346,10 +366,12 @@ class Rectifier:
 
 
 def make_rectifier(pair: RawPair, size: Size, keep: float = 0.0) -> Rectifier:
-    """Choose the rectified cameras (Bouguet's method, as OpenCV's ``stereoRectify`` has it).
+    """Compute the rectification of a pair by Bouguet's method (OpenCV's ``stereoRectify``).
 
-    ``size`` is width and height of the images [px], for calibrations without it. ``keep`` 0 crops
-    to what both raw images show, 1 keeps all that they show, with black borders.
+    Args:
+        pair: the calibration.
+        size: width and height of the images [px], for calibrations without it.
+        keep: 0 crops to what both raw images show, 1 keeps all that they show, with black borders.
 
     Raises:
         InputError: ``keep`` is out of range, or a distortion that no lens has.
@@ -378,7 +400,7 @@ def make_rectifier(pair: RawPair, size: Size, keep: float = 0.0) -> Rectifier:
     assert isinstance(rig, StereoRig), "two projections have a baseline"
     raw_px = float(pair.left.K[0, 0])
     rectified_px = float(rig.K[0, 0])
-    if rectified_px > _MAX_ENLARGED * raw_px:
+    if rectified_px > _MAX_ENLARGEMENT * raw_px:
         raise InputError(
             f"rectified, fx would be {rectified_px:.0f} px where the raw lens has {raw_px:.0f}: so "
             f"much no lens bends; check the distortion {pair.left.distortion} and the rotation, or "

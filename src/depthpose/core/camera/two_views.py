@@ -9,15 +9,14 @@ from torch.nn import functional
 from depthpose.core.camera.rectified import check_rectified, grey_of
 
 Arrangement = Literal["side by side", "top and bottom"]
-_ROWS = 32
+_ROWS = 32  # of the small copies of both halves, which are compared
 _COLUMNS = 64
-_REACH = 12
-"""Of the small copies of both halves, and by how many columns they are moved."""
-_ALIKE = 0.6
-"""Least correlation of the halves, less what is common to whole rows and columns: 0.77 to 0.95 of
-both views of 25 KITTI pairs put together, -0.2 to 0.43 of the halves of their left images."""
-_LEAST_DEVIATION = 0.01
-_MIN_MATCHES = 25
+_MAX_SHIFT = 12  # columns by which the copies are shifted
+_MIN_CORRELATION = 0.6
+"""Of the halves without the means of rows and columns: it is 0.77 to 0.95 for the two views of 25
+KITTI pairs put together, and -0.2 to 0.43 for the halves of their left images."""
+_MIN_DEVIATION = 0.01  # standard deviation of the grey values of a copy in [0, 1]
+_MIN_MATCHES = 25  # of corners of both halves
 
 
 def halves(image: Float[Tensor, "3 h w"], arrangement: Arrangement) -> tuple[Tensor, Tensor]:
@@ -30,21 +29,21 @@ def halves(image: Float[Tensor, "3 h w"], arrangement: Arrangement) -> tuple[Ten
 
 
 def find_two_views(image: Float[Tensor, "3 h w"]) -> Arrangement | None:
-    """Give the arrangement of two views of one scene in a picture; None where it is one view."""
+    """Find how a picture holds two views of one scene; None where it is a single view."""
     if min(image.shape[1:]) < 2 * _ROWS:
         return None
     for arrangement in ("side by side", "top and bottom"):
         first_half, second_half = halves(image, arrangement)
         if (
-            _likeness(first_half, second_half) > _ALIKE
+            _best_correlation(first_half, second_half) > _MIN_CORRELATION
             and check_rectified(first_half, second_half).matches >= _MIN_MATCHES
         ):
             return arrangement
     return None
 
 
-def _likeness(first_half: Tensor, second_half: Tensor) -> float:
-    """Give the correlation of small copies of both halves, at the shift where it is largest."""
+def _best_correlation(first_half: Tensor, second_half: Tensor) -> float:
+    """Correlate small copies of both halves, at the shift along rows where it is largest."""
     small_copies: list[Tensor] = []
     for half in (first_half, second_half):
         grey = grey_of(half).float()[None, None]
@@ -52,21 +51,23 @@ def _likeness(first_half: Tensor, second_half: Tensor) -> float:
         small_copies.append(copy[0, 0])
     first, second = small_copies
     best = 0.0
-    for shift in range(-_REACH, _REACH + 1):
-        a = _centred(first[:, max(shift, 0) : _COLUMNS + min(shift, 0)])
-        b = _centred(second[:, max(-shift, 0) : _COLUMNS + min(-shift, 0)])
-        if min(float(a.std()), float(b.std())) > _LEAST_DEVIATION:
-            best = max(best, float((a * b).sum() / (a.norm() * b.norm())))
+    for shift in range(-_MAX_SHIFT, _MAX_SHIFT + 1):
+        a = _without_means(first[:, max(shift, 0) : _COLUMNS + min(shift, 0)])
+        b = _without_means(second[:, max(-shift, 0) : _COLUMNS + min(-shift, 0)])
+        if min(float(a.std()), float(b.std())) > _MIN_DEVIATION:
+            correlation = float((a * b).sum() / (a.norm() * b.norm()))
+            best = max(best, correlation)
     return best
 
 
-def _centred(grey: Tensor) -> Tensor:
-    """Subtract the mean of each row and column: bright sky above a road is common to all halves."""
+def _without_means(grey: Tensor) -> Tensor:
+    """Subtract the means of rows and columns: any two halves share a bright sky above a road."""
     return grey - grey.mean(0) - grey.mean(1, keepdim=True) + grey.mean()
 
 
 def order_views(
     first: Float[Tensor, "3 h w"], second: Float[Tensor, "3 h w"]
 ) -> tuple[Tensor, Tensor]:
-    """Put the left view first: files for crossed eyes, such as JPS, begin with the right one."""
-    return (second, first) if check_rectified(first, second).is_swapped else (first, second)
+    """Put the left view before the right one: files such as JPS begin with the right one."""
+    is_swapped = check_rectified(first, second).is_swapped
+    return (second, first) if is_swapped else (first, second)

@@ -1,6 +1,6 @@
-"""Big jobs: inputs divided into blocks, done by many workers, each block one shard of results.
+"""Big jobs: inputs divided into blocks, which many workers turn into one shard of results each.
 
-The engine knows files and names; what a worker does with them is a function that it is given.
+The engine deals with files and names; what a worker computes from them is a function.
 """
 
 from depthpose.core.engine.job import PLAN as PLAN

@@ -1,8 +1,8 @@
-"""A job: the folder of the results claimed, blocks done by an engine, one list of all.
+"""A sharded job: an engine processes the blocks of its inputs, and a manifest lists the results.
 
 Ray Data maps blocks over a pool of workers, each of which starts once. Ray restarts a worker that
-dies and does its block again; where a node is lost, others take over. A block's outcome is a line
-of text, so that neither queues nor results fill the memory.
+dies and processes its block again; where a node is lost, others take over. A block's record is a
+line of text, so that neither queues nor results fill the memory.
 """
 
 import csv
@@ -12,7 +12,7 @@ import os
 import secrets
 import socket
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib import import_module
@@ -46,14 +46,14 @@ from depthpose.core.run import (
 MANIFEST = "manifest.csv"
 
 Engine = Callable[[Sequence[Block], Work, str], Iterable[ShardRecord]]
-"""Processes blocks, on any machine, and yields the outcome of each, in any order."""
+"""Processes blocks, on any machine, and yields the record of each, in any order."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ShardedJob:
-    """What is done, to which inputs, and where the results go."""
+    """What is computed, for which inputs, and where the results go."""
 
-    work: Work  #: what is done
+    work: Work  #: what is computed
     items: Sequence[Item] = ()  #: listed inputs
     tars: Sequence[str] = ()  #: tar shards of inputs
     out: str  #: folder of the results, by path or URL
@@ -62,70 +62,88 @@ class ShardedJob:
 
 
 def run_job(job: ShardedJob, engine: Engine) -> list[ShardRecord]:
-    """Do what is not finished of a job, and write ``manifest.csv``, the list of all its inputs.
+    """Process the unfinished blocks of a job, and write ``manifest.csv``, the list of its inputs.
 
     Returns:
-        What became of every block, in the order of the shards.
+        The records of all blocks, in the order of the shards.
 
     Raises:
-        InputError: the folder holds results of other settings or inputs, or refuses; or two
-            samples of tar shards have one name.
+        InputError: the folder holds results of other settings or inputs, or cannot be written; or
+            two samples of tar shards have one name.
     """
     out = stores.absolute(job.out)
     stores.refuse_unsafe(out)
     claim(out, {**job.settings, "shards": "tar"})
     blocks = make_plan(out, job.items, job.tars, job.block)
-    done = _finished_shards(out, blocks)
-    unfinished = [block for block in blocks if block.shard not in done]
+
+    records = _finished_shards(out, blocks)
+    unfinished = [block for block in blocks if block.shard not in records]
     if unfinished:
-        new = engine(unfinished, job.work, out)
-        done |= {shard.shard.removesuffix(".tar"): shard for shard in new}
-    lost = [block.shard for block in blocks if block.shard not in done]
-    if lost:
+        for record in engine(unfinished, job.work, out):
+            records[record.shard.removesuffix(".tar")] = record
+    missing = [block.shard for block in blocks if block.shard not in records]
+    if missing:
         raise InputError(
-            f"{out}: {len(lost)} of {len(blocks)} shards are missing, first {lost[0]}; start "
+            f"{out}: {len(missing)} of {len(blocks)} shards are missing, first {missing[0]}; start "
             "again: what is finished is kept"
         )
-    if (folder := stores.local_path(stores.join(out, SHARDS))) is not None:
-        remove_parts(folder)  # of killed workers: all have ended
-    shards = [done[block.shard] for block in blocks]
-    _write_manifest(out, shards)
-    return shards
+
+    # Partial files of killed workers: by now all workers have ended.
+    local_folder = stores.local_path(stores.join(out, SHARDS))
+    if local_folder is not None:
+        remove_parts(local_folder)
+    ordered = [records[block.shard] for block in blocks]
+    _write_manifest(out, ordered)
+    return ordered
 
 
 def _finished_shards(out: str, blocks: Sequence[Block]) -> dict[str, ShardRecord]:
-    """Find the blocks whose shards are whole and without failures; give their records by name.
+    """Find the blocks whose shards are whole and without failures: their records, by shard.
 
-    The record of a shard that is not whole is removed.
+    The record of a shard that is not whole is deleted. Where only the time of a shard differs, as
+    of a copy, its record is updated.
     """
     folder = stores.join(out, SHARDS)
     sizes = stores.list_sizes(folder)
-    records = {shard.shard: shard for shard in read_results(out)}
-    done: dict[str, ShardRecord] = {}
+    records = {record.shard: record for record in read_results(out)}
+    finished: dict[str, ShardRecord] = {}
     for block in blocks:
-        shard = records.get(f"{block.shard}.tar")
-        record = stores.join(folder, f"{block.shard}.json")
-        path = None if shard is None else stores.local_path(stores.join(folder, shard.shard))
-        if shard is None or shard.block != zlib.crc32(block.to_json().encode()):
-            is_whole = False
-        elif path is None:  # of a store sizes alone are compared
-            is_whole = sizes.get(shard.shard) == shard.stamp[0]
-        else:
-            is_whole = is_unchanged(path, shard.stamp)
-            if is_whole and (time_ns := path.stat().st_mtime_ns) != shard.stamp[1]:  # a copy
-                shard = replace(shard, stamp=(shard.stamp[0], time_ns, shard.stamp[2]))
-                stores.publish(shard.to_json().encode(), record)
-        if shard is not None and is_whole:
-            if not shard.failures:
-                done[block.shard] = shard
-        elif f"{block.shard}.json" in sizes:
-            with file_system(record, "removed") as (fs, inner):
-                fs.rm_file(inner)
-    return done
+        record = records.get(f"{block.shard}.tar")
+        record_url = stores.join(folder, f"{block.shard}.json")
+        if record is None or not _is_shard_whole(folder, block, record, sizes):
+            if f"{block.shard}.json" in sizes:
+                with file_system(record_url, "removed") as (fs, inner):
+                    fs.rm_file(inner)
+            continue
+        path = stores.local_path(stores.join(folder, record.shard))
+        if path is not None:
+            size, recorded_time_ns, checksum = record.stamp
+            time_ns = path.stat().st_mtime_ns
+            if time_ns != recorded_time_ns:
+                record = replace(record, stamp=(size, time_ns, checksum))
+                stores.publish(record.to_json().encode(), record_url)
+        if not record.failures:
+            finished[block.shard] = record
+    return finished
+
+
+def _is_shard_whole(
+    folder: str, block: Block, record: ShardRecord, sizes: Mapping[str, int]
+) -> bool:
+    """Whether a shard is of this block and as it was written.
+
+    Of an object store only the ``sizes`` of the files are compared.
+    """
+    if record.block != zlib.crc32(block.to_json().encode()):
+        return False
+    path = stores.local_path(stores.join(folder, record.shard))
+    if path is None:
+        return sizes.get(record.shard) == record.stamp[0]
+    return is_unchanged(path, record.stamp)
 
 
 def _write_manifest(out: str, shards: Sequence[ShardRecord]) -> None:
-    """Write ``manifest.csv``: each input with its shard, or the reason why it has no result.
+    """Write ``manifest.csv``: the name, the shard and the reason of failure, if any, of each input.
 
     Raises:
         InputError: two results have one name.
@@ -163,84 +181,87 @@ def claim(out: str, settings: Mapping[str, Any]) -> None:
 def read_results(out: str) -> list[ShardRecord]:
     """Read the records of the shards that earlier runs left; damaged records are skipped."""
     records: list[ShardRecord] = []
-    for _, text in sorted(
-        stores.read_all(stores.join(stores.absolute(out), SHARDS), ".json").items()
-    ):
+    record_files = stores.read_all(stores.join(stores.absolute(out), SHARDS), ".json")
+    for _, content in sorted(record_files.items()):
         with suppress(ValueError, KeyError, TypeError):
-            records.append(ShardRecord.from_json(text))
+            records.append(ShardRecord.from_json(content))
     return records
 
 
 def shard_results(out: str, done: ShardRecord) -> Iterator[tuple[str, dict[str, bytes]]]:
-    """Read the results of a shard one by one: the name, and the content of each ending.
+    """Read the results of a shard one by one: the name, and the content of its files by ending.
 
     Raises:
-        InputError: the shard is not there, or is damaged.
+        InputError: the shard is missing or damaged.
     """
     url = stores.join(stores.absolute(out), SHARDS, done.shard)
     names = {name for name, reason in done.entries if not reason}
-    name = ""
-    files = dict[str, bytes]()
+    result_name = ""
+    files: dict[str, bytes] = {}
     for member, data in read_tar(url):
-        # A tar does not separate the names of the results from the endings of their files.
-        dots = (k for k, letter in enumerate(member) if letter == ".")
-        pairs = ((member[:k], member[k + 1 :]) for k in dots)
-        parts = next((pair for pair in pairs if pair[0] in names and pair[1] in done.endings), None)
-        if parts is None:
+        name, ending = _split_member(member, names, done.endings)
+        if not name:
             raise InputError(
                 f"{url}: holds {member!r}, which its record does not name; make it anew"
             )
-        if files and parts[0] != name:
-            yield name, files
+        if files and name != result_name:
+            yield result_name, files
             files = {}
-        name = parts[0]
-        files[parts[1]] = data
+        result_name = name
+        files[ending] = data
     if files:
-        yield name, files
+        yield result_name, files
+
+
+def _split_member(member: str, names: Collection[str], endings: Collection[str]) -> tuple[str, str]:
+    """Split a file name into the name of a result and an ending, each of which may hold points.
+
+    Both are "" where the file is of no result.
+    """
+    for place, letter in enumerate(member):
+        name = member[:place]
+        ending = member[place + 1 :]
+        if letter == "." and name in names and ending in endings:
+            return name, ending
+    return "", ""
 
 
 _LEAST_VERSION = (2, 52)  # the first version of Ray that has passwords
+_CONNECT_TIMEOUT_S = 10
 
 
 @dataclass(frozen=True, kw_only=True)
 class RayEngine:
-    """Does blocks by Ray Data."""
+    """Processes blocks with Ray Data, on this machine or a cluster."""
 
     address: str | None = None  #: of a running cluster, or ``auto``; None starts one for this job
     workers: int | None = None  #: at most; None: as many as fit when the job begins
     worker_cpus: float = 1.0  #: cores that a worker asks for
-    worker_gpus: float = 0.0  #: GPUs that it asks for; a part lets workers share one
+    worker_gpus: float = 0.0  #: GPUs that it asks for; a fraction lets workers share one
 
     def __call__(self, blocks: Sequence[Block], work: Work, out: str) -> Iterator[ShardRecord]:
-        """Do blocks, and give what became of each as it is done.
+        """Process blocks, and yield the record of each as it is finished.
 
         Raises:
             InputError: no cluster at the address, or one worker does not fit into it.
             MissingExtraError: Ray is not installed.
         """
         if self.address is None:
-            # A cluster that is started here listens to this machine alone, and asks for a password:
-            # whoever reaches a port of Ray may run any code. Ray reads these as it is imported.
-            # Without clusters of several machines, which is what its name is about, a node is
-            # 127.0.0.1.
-            os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
-            os.environ.setdefault("RAY_AUTH_MODE", "token")
-            if "RAY_AUTH_TOKEN_PATH" not in os.environ:
-                os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
+            _protect_local_cluster()
         ray = _import_ray()
-        is_ours = not ray.is_initialized()
-        if is_ours:
+        starts_ray = not ray.is_initialized()
+        if starts_ray:
             self._connect(ray)
         try:
-            # In a list the work stays a reference, which a worker that starts again reads again.
-            shipped = [ray.put(work)]
+            # In a list the work stays a reference, which a restarted worker reads again.
+            work_reference = [ray.put(work)]
             lines = [{"block": block.to_json()} for block in blocks]
             rows = (
                 ray.data.from_items(lines, override_num_blocks=len(lines))
                 .map_batches(
                     _Worker,
                     batch_size=1,
-                    fn_constructor_args=(shipped, out),
+                    fn_constructor_args=(work_reference, out),
                     compute=ray.data.ActorPoolStrategy(
                         min_size=1,
                         max_size=min(self.workers or self._capacity(ray), len(lines)),
@@ -253,16 +274,14 @@ class RayEngine:
             )
             try:
                 for row in rows:
-                    yield ShardRecord.from_json(row["done"])
+                    yield ShardRecord.from_json(row["record"])
             except ray.exceptions.RayError as error:
-                inner: BaseException | None = error  # one of ours may be behind Ray's own
-                while inner is not None and not isinstance(inner, InputError):
-                    inner = getattr(inner, "cause", None) or inner.__cause__
-                if inner is None:
+                input_error = _find_input_error(error)
+                if input_error is None:
                     raise
-                raise InputError(str(getattr(inner, "cause", inner))) from error
+                raise InputError(str(getattr(input_error, "cause", input_error))) from error
         finally:
-            if is_ours:
+            if starts_ray:
                 ray.shutdown()
 
     def _connect(self, ray: Any) -> None:  # noqa: ANN401  Ray is loaded where it is used
@@ -274,8 +293,8 @@ class RayEngine:
         try:
             host, _, port = (self.address or "").rpartition(":")
             if host and "/" not in host and port.isdecimal():
-                # Ray waits for minutes where nothing answers.
-                socket.create_connection((host, int(port)), timeout=10).close()
+                # Tried first, because Ray waits for minutes where nothing answers.
+                socket.create_connection((host, int(port)), timeout=_CONNECT_TIMEOUT_S).close()
             ray.init(address=self.address or "local", **options)
         except (OSError, ValueError, RuntimeError) as error:
             raise InputError(
@@ -284,37 +303,69 @@ class RayEngine:
             ) from error
 
     def _capacity(self, ray: Any) -> int:  # noqa: ANN401
-        """Say how many workers fit into the cluster."""
+        """Compute how many workers fit into the cluster.
+
+        Raises:
+            InputError: not even one does.
+        """
         resources: Mapping[str, float] = ray.cluster_resources()
         needs = {"CPU": self.worker_cpus, "GPU": self.worker_gpus}
-        most = min(int(resources.get(name, 0) / n) for name, n in needs.items() if n > 0)
-        if most < 1:
+        workers = min(
+            int(resources.get(name, 0) / need) for name, need in needs.items() if need > 0
+        )
+        if workers < 1:
             had = ", ".join(f"{resources.get(name, 0):g} {name}" for name in needs)
-            wanted = ", ".join(f"{n:g} {name}" for name, n in needs.items())
+            wanted = ", ".join(f"{need:g} {name}" for name, need in needs.items())
             raise InputError(
                 f"a worker asks for {wanted}, but the cluster has {had}; ask for less by "
                 "--worker-cpus and --worker-gpus"
             )
-        return most
+        return workers
+
+
+def _protect_local_cluster() -> None:
+    """Make a cluster that Ray starts listen to this machine alone, and ask for a password.
+
+    Whoever reaches a port of Ray may run any code. Ray reads these variables as it is imported.
+    """
+    # Ray's switch for clusters of several machines: without them a node is 127.0.0.1.
+    os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
+    os.environ.setdefault("RAY_AUTH_MODE", "token")
+    if "RAY_AUTH_TOKEN_PATH" not in os.environ:
+        os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
+
+
+def _find_input_error(error: BaseException) -> InputError | None:
+    """Find the :class:`InputError` behind an error of Ray, through its causes."""
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(cause, InputError):
+        cause = getattr(cause, "cause", None) or cause.__cause__
+    return cause
 
 
 class _Worker:
-    """What a worker of Ray runs; it keeps its runner for all its blocks."""
+    """A worker of Ray, which starts its work once for all of its blocks."""
 
-    def __init__(self, shipped: list[Any], out: str) -> None:
-        self._runner = Runner(_import_ray().get(shipped[0]), out)
+    def __init__(self, work_reference: list[Any], out: str) -> None:
+        self._runner = Runner(_import_ray().get(work_reference[0]), out)
 
     def __call__(self, batch: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Process the blocks of a batch; return their records, as lines of JSON."""
         lines = [self._runner.run(Block.from_json(str(line))).to_json() for line in batch["block"]]
-        return {"done": np.array(lines, dtype=object)}
+        return {"record": np.array(lines, dtype=object)}
 
 
 def _import_ray() -> Any:  # noqa: ANN401  Ray is loaded where it is used
-    """Import Ray, with its statistics of use switched off unless the user switched them on."""
+    """Import Ray, with its usage statistics switched off unless the user switched them on.
+
+    Raises:
+        MissingExtraError: Ray is not installed, or too old to have passwords.
+    """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     import_extra("ray.data", "ray[data]", "ray", "--engine ray")
     ray = import_module("ray")
-    if tuple(map(int, ray.__version__.split(".")[:2])) < _LEAST_VERSION:
+    major_and_minor = tuple(map(int, ray.__version__.split(".")[:2]))
+    if major_and_minor < _LEAST_VERSION:
         raise MissingExtraError(
             f"ray[data] 2.52 or later, not {ray.__version__}, which lets anybody in", "ray",
             "--engine ray",

@@ -35,21 +35,22 @@ from depthpose.core.files.points import (
 
 _ENCODERS = {".ply": encode_ply, ".pcd": encode_pcd}
 _COLOR = ("red", "green", "blue")
-_PARTS = re.compile(r"[\s,;]+")
-_LOOKED_AT = 100  # rows by which a table is understood
-_MOST_COLUMNS = 12  # of so few rows that more are points, side by side
+_SEPARATORS = re.compile(r"[\s,;]+")
+_INSPECTED_ROWS = 100  # by which the layout of a table is recognised
+_MANY_ROWS = 5  # a table of fewer rows and more columns than the next looks transposed
+_MAX_COLUMNS = 12
 _MAX_SCAN_BYTES = 2**26  # largest scan of a LiDAR that is read, thirty times KITTI's
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Cloud:
-    """Points as a file holds them: its unit and frame are known to the caller alone."""
+    """Points as a file holds them; their unit and frame are not in the file."""
 
     points: Float32[Tensor, "n 3"]  #: coordinates
     color: Float32[Tensor, "n 3"] | None = None  #: RGB in [0, 1], one a point, or None
 
     def to_open3d(self) -> Any:  # noqa: ANN401  Open3D's classes carry no types
-        """Give the same points, and colours where there are, as ``open3d.geometry.PointCloud``.
+        """Convert points, and colours where there are any, to ``open3d.geometry.PointCloud``.
 
         Raises:
             MissingExtraError: Open3D is not installed.
@@ -65,10 +66,11 @@ class Cloud:
 def read_cloud(path: AnyPath) -> Cloud:
     """Read a point cloud: ``.ply``, ``.pcd``, ``.npy`` or text (``.xyz``, ``.txt``).
 
-    NPY and text hold a point a row. Columns after the third are ignored, and so is a first column
-    that numbers the points. Text may begin with a line of column names (``x y z`` among them) or
-    with the number of points, and may have decimal commas if blanks or semicolons separate the
-    numbers. Points with a NaN coordinate, as organised clouds have without a reading, are left out.
+    NPY and text hold one point a row. Columns after x, y and z are ignored, and so is a first
+    column that numbers the points. Text may begin with a line of column names (``x y z`` among
+    them) or with the number of points, and may have decimal commas if blanks or semicolons separate
+    the numbers. Points with a NaN coordinate, as organised clouds have without a reading, are left
+    out.
 
     Raises:
         InputError: the file is missing, damaged, without x, y and z, or no point is finite; a
@@ -115,34 +117,15 @@ def read_points_bin(path: AnyPath, columns: int = 4) -> Float32[Tensor, "n colum
     return torch.from_numpy(rows)
 
 
-def _from_columns(path: AnyPath, columns: Columns) -> Cloud:
-    """Make a cloud of columns x, y, z and perhaps colours; rows with NaN are left out.
-
-    Colours are packed as PCL packs them (``rgb``, ``rgba``), or a column each.
-    """
+def _cloud_from_columns(path: AnyPath, columns: Columns) -> Cloud:
+    """Make a cloud of columns x, y, z and perhaps colours; points with NaN are left out."""
     missing = [name for name in "xyz" if name not in columns]
     if missing and columns:
         raise InputError(f"{path}: no {missing} among the columns {list(columns)}; name them x y z")
     points = np.empty((0, 3), np.float32)
     if columns:
         points = np.stack([to_float32(columns[name]) for name in "xyz"], -1)
-    packed = columns.get("rgb", columns.get("rgba"))
-    color = None
-    if packed is not None and packed.dtype.itemsize == 4:
-        if packed.dtype.kind == "f":
-            bits = packed.astype(np.float32).view(np.uint32)
-        else:
-            bits = packed.astype(np.int64).astype(np.uint32)
-        color = to_float32(
-            np.stack([(bits >> shift) & 255 for shift in (16, 8, 0)], -1).astype(np.uint8)
-        ) / np.float32(255)
-    elif columns.keys() >= set(_COLOR):
-        color = np.stack([columns[name] for name in _COLOR], -1)
-        if color.dtype.kind != "f":
-            color = color / np.iinfo(color.dtype).max
-        if not ((color >= 0) & (color <= 1)).all():
-            raise InputError(f"{path}: colours beyond [0, 1]; store floats in [0, 1], or uchar")
-        color = to_float32(color)
+    color = _color_from_columns(path, columns)
     if np.isinf(points).any():
         raise InputError(f"{path}: a coordinate is infinite or beyond float32; leave it out")
     is_complete = ~np.isnan(points).any(-1)
@@ -154,100 +137,159 @@ def _from_columns(path: AnyPath, columns: Columns) -> Cloud:
     )
 
 
-def _from_rows(path: AnyPath, table: np.ndarray) -> Cloud:
-    """Make a cloud of a table without names, whose first column may number the rows."""
+def _color_from_columns(path: AnyPath, columns: Columns) -> np.ndarray | None:
+    """Read colours (n, 3) in [0, 1], packed as PCL packs them (``rgb``) or in three columns.
+
+    None where there are neither.
+    """
+    packed = columns.get("rgb", columns.get("rgba"))
+    if packed is not None and packed.dtype.itemsize == 4:
+        if packed.dtype.kind == "f":
+            bits = packed.astype(np.float32).view(np.uint32)
+        else:
+            bits = packed.astype(np.int64).astype(np.uint32)
+        channels = [(bits >> shift) & 255 for shift in (16, 8, 0)]
+        return to_float32(np.stack(channels, -1)) / np.float32(255)
+    if not columns.keys() >= set(_COLOR):
+        return None
+    color = np.stack([columns[name] for name in _COLOR], -1)
+    if color.dtype.kind != "f":
+        color = color / np.iinfo(color.dtype).max
+    if not ((color >= 0) & (color <= 1)).all():
+        raise InputError(f"{path}: colours beyond [0, 1]; store floats in [0, 1], or uchar")
+    return to_float32(color)
+
+
+def _cloud_from_table(path: AnyPath, table: np.ndarray) -> Cloud:
+    """Make a cloud of a table without names: x, y, z, perhaps behind a column of point numbers."""
     if table.ndim != 2 or table.shape[1] < 3:
         raise InputError(f"{path}: points are rows of 3 numbers or more, got shape {table.shape}")
-    if len(table) < 5 and table.shape[1] > _MOST_COLUMNS:
+    rows, columns = table.shape
+    if rows < _MANY_ROWS and columns > _MAX_COLUMNS:
         raise InputError(
-            f"{path}: {len(table)} rows of {table.shape[1]} numbers, where each row is a point; "
+            f"{path}: {rows} rows of {columns} numbers, where each row is a point; "
             "save the transpose (array.T)"
         )
-    # Columns that number the points, or say where in an image they were, are no coordinates.
+
+    # Whole numbers at the beginning of rows may be no coordinates, but pixels or point numbers.
     with np.errstate(invalid="ignore"):
-        is_whole = (table[:_LOOKED_AT] == np.trunc(table[:_LOOKED_AT])).all(0)
+        inspected = table[:_INSPECTED_ROWS]
+        is_whole = (inspected == np.trunc(inspected)).all(0)
         steps = np.diff(table[:, 0])
-    is_long = table.shape[1] > 3 and len(table) > 3 and bool(is_whole[0])
-    if is_long and table.shape[1] > 4 and is_whole[1] and not is_whole[2:5].any():
+    has_whole_first = columns > 3 and rows > 3 and bool(is_whole[0])
+    if has_whole_first and columns > 4 and is_whole[1] and not is_whole[2:5].any():
         raise InputError(
             f"{path}: rows begin by two whole numbers ({table[0, 0]:g} and {table[0, 1]:g}), which "
             "look like a pixel's place; leave them out, or name the columns in a first line "
             "(u v x y z)"
         )
-    counts = (steps > 0).all() and ((steps == 1).all() or not is_whole[1:4].any())
-    first = int(is_long and counts)
-    return _from_columns(path, {axis: table[:, first + k] for k, axis in enumerate("xyz")})
+    is_ascending = (steps > 0).all()
+    is_count = is_ascending and ((steps == 1).all() or not is_whole[1:4].any())
+    first = 1 if has_whole_first and is_count else 0
+    return _cloud_from_columns(path, {axis: table[:, first + k] for k, axis in enumerate("xyz")})
 
 
 def _read_text(path: AnyPath) -> Cloud:
     """Read a cloud of text: rows of numbers, perhaps below names, a count or comments."""
     text = TextIOWrapper(BytesIO(read_bytes(path, MAX_TEXT_BYTES)), "utf-8-sig")
-    noted: list[str] = []
-    rows = _rows_of(text, noted)
+    comments: list[str] = []
+    rows = _rows_without_comments(text, comments)
     with refused_as(path, "text", "save it as UTF-8"):
-        head = list(islice(rows, _LOOKED_AT))
+        head = list(islice(rows, _INSPECTED_ROWS))
+
+    # Names of columns in the first line.
     names: list[str] = []
-    first, *comments = (
-        [word.strip("\"'").lower() for word in _PARTS.split(line.strip())]
-        for line in (head[0] if head else "", *noted)
-    )
-    try:
-        list(map(float, filter(None, first)))
-    except ValueError:  # no row of numbers
-        names = first
-    if names and not set("xyz") <= set(names):
-        raise InputError(
-            f"{path}: begins by {head[0][:60]!r}, neither numbers nor names of columns with x, y "
-            "and z; take that line out"
-        )
-    head = head[1:] if names else head
-    is_count = len(head) > 1 and head[0].isdecimal() and len(_PARTS.split(head[1])) > 2
-    count = int(head[0]) if is_count else None
-    body = head[1:] if is_count else head
-    width = len(_PARTS.split(body[0])) if body else 0
-    if not names:
-        fitting = (words for words in comments if len(words) == width and set("xyz") <= set(words))
-        names = next(fitting, [])
-    rows = chain(body, rows)
-    table = parse_rows(path, map(_blank_separated(path, body, names), rows))
+    if head and not _is_row_of_numbers(head[0]):
+        names = _column_names(head[0])
+        if not set("xyz") <= set(names):
+            raise InputError(
+                f"{path}: begins by {head[0][:60]!r}, neither numbers nor names of columns with x, "
+                "y and z; take that line out"
+            )
+        head = head[1:]
+
+    # The number of points, alone in a line.
+    count = None
+    if len(head) > 1 and head[0].isdecimal() and len(_SEPARATORS.split(head[1])) > 2:
+        count = int(head[0])
+        head = head[1:]
+
+    # Or names in a comment that has as many words as a row.
+    width = len(_SEPARATORS.split(head[0])) if head else 0
+    for comment in comments if not names else ():
+        words = _column_names(comment)
+        if len(words) == width and set("xyz") <= set(words):
+            names = words
+            break
+
+    table = parse_rows(path, map(_separator_blanker(path, head, names), chain(head, rows)))
     if count not in (None, len(table)):
         raise InputError(f"{path}: declares {count} points but {len(table)} rows follow")
-    if not names:
-        return _from_rows(path, table)
-    if table.shape[1] != len(names):
-        raise InputError(f"{path}: names {len(names)} columns, but rows have {table.shape[1]}")
-    return _from_rows(path, table[:, [names.index(axis) for axis in "xyz"]])
+    if names:
+        if table.shape[1] != len(names):
+            raise InputError(f"{path}: names {len(names)} columns, but rows have {table.shape[1]}")
+        table = table[:, [names.index(axis) for axis in "xyz"]]
+    return _cloud_from_table(path, table)
 
 
-def _rows_of(text: Iterable[str], noted: list[str]) -> Iterator[str]:
-    """Give rows without comments; comments before the first row are added to ``noted``."""
-    is_begun = False
+def _column_names(line: str) -> list[str]:
+    """Split a line into names of columns, in lower case and without quotation marks."""
+    return [word.strip("\"'").lower() for word in _SEPARATORS.split(line.strip())]
+
+
+def _is_row_of_numbers(line: str) -> bool:
+    """Whether all words of a line are numbers."""
+    try:
+        for word in filter(None, _column_names(line)):
+            float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _rows_without_comments(text: Iterable[str], comments: list[str]) -> Iterator[str]:
+    """Yield the rows of a text without comments, and collect comments before the first row.
+
+    A comment begins with ``#``, or at the beginning of a line with ``//``.
+    """
+    has_row = False
     for line in text:
         if line.isspace():
             continue
         row, _, comment = plain_numbers(line).partition("#")
-        if row.lstrip().startswith("//"):
-            comment = row.strip().removeprefix("//")
+        row = row.strip()
+        if row.startswith("//"):
+            comment = row.removeprefix("//")
             row = ""
-        if row := row.strip():
-            is_begun = True
+        if row:
+            has_row = True
             yield row
-        elif not is_begun:
-            noted.append(comment)
+        elif not has_row:
+            comments.append(comment)
 
 
-def _blank_separated(path: AnyPath, head: list[str], names: list[str]) -> Callable[[str], str]:
-    """Tell from the first rows what commas mean; give a function that blanks separators."""
-    text = " ".join(head)
-    words = [re.split(r"[\s;]+", row.strip(" ;,")) for row in head]
-    commas = [word.rstrip(",").count(",") for row in words for word in row]
-    most = max(commas, default=0)
-    is_decimal = most == 1 and all(len(row) > 2 for row in words)
-    if most == 1 and "." not in text:
+def _separator_blanker(path: AnyPath, head: list[str], names: list[str]) -> Callable[[str], str]:
+    """Make the function that replaces the separators of a row by blanks.
+
+    From the first rows it is decided whether commas separate numbers or are decimal signs, which
+    become points.
+
+    Raises:
+        InputError: commas may be either.
+    """
+    has_points = "." in " ".join(head)
+    words_of_rows = [re.split(r"[\s;]+", row.strip(" ;,")) for row in head]
+    commas = [word.rstrip(",").count(",") for words in words_of_rows for word in words]
+    most_commas = max(commas, default=0)
+    if most_commas == 1 and not has_points:
         return lambda row: re.sub(r",(?=\s|$)|;", " ", row).replace(",", ".")
-    # Of 0,1,0,2,0,7 nobody knows whether there are six numbers or three.
-    is_both = not names and most > 4 and most % 2 == 1 and "." not in text
-    if (is_decimal and min(commas) == 1) or is_both:
+
+    # Every word is two numbers, or one with a decimal comma and points elsewhere.
+    has_three_words = all(len(words) > 2 for words in words_of_rows)
+    is_each_word_ambiguous = most_commas == 1 and min(commas) == 1 and has_three_words
+    # 0,1,0,2,0,7 may be six numbers or three.
+    is_row_ambiguous = not names and not has_points and most_commas > 4 and most_commas % 2 == 1
+    if is_each_word_ambiguous or is_row_ambiguous:
         raise InputError(
             f"{path}: commas may part numbers or be decimal signs ({head[-1][:60]!r}); save it "
             "with decimal points, or with a first line of names (x,y,z,...)"
@@ -256,10 +298,10 @@ def _blank_separated(path: AnyPath, head: list[str], names: list[str]) -> Callab
 
 
 CLOUD_READERS: dict[str, Callable[[AnyPath], Cloud]] = {
-    ".ply": lambda path: _from_columns(path, read_ply_elements(path, "vertex")[0]),
-    ".pcd": lambda path: _from_columns(path, read_pcd(path)),
-    ".npy": lambda path: _from_rows(path, read_npy(path)),
+    ".ply": lambda path: _cloud_from_columns(path, read_ply_elements(path, "vertex")[0]),
+    ".pcd": lambda path: _cloud_from_columns(path, read_pcd(path)),
+    ".npy": lambda path: _cloud_from_table(path, read_npy(path)),
     ".xyz": _read_text,
     ".txt": _read_text,
 }
-"""Suffix to reader: one more entry, and every command, folder and page takes the new format."""
+"""Reader of each suffix; every command, folder and page takes a format that is added here."""

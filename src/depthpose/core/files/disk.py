@@ -1,7 +1,7 @@
-"""Bytes, text, JSON and YAML from and to disks; names of files, and which belong together.
+"""Bytes, text, JSON and YAML from and to disks; the order of file names, and their pairing.
 
-Reading is guarded, writing atomic. A path through a tar shard, ``000000.tar/a.left.png``, is read
-as through a folder.
+Readers refuse what is too large, writers leave a whole file or none. A path through a tar shard,
+``000000.tar/a.left.png``, is read as through a folder.
 """
 
 import errno
@@ -31,16 +31,18 @@ AnyPath = str | os.PathLike[str]
 MAX_FILE_BYTES = 2**28  # largest file that is read whole; a bigger one is a mistake or an attack
 MAX_TEXT_BYTES = 2**26  # a table of a million points, annotations of ten thousand images
 MAX_LIST_BYTES = 2**20  # largest text that lists a few numbers: a calibration, a camera, a config
-_MOST_MEMORY = 700_000_000  # [bytes] of JSON or YAML once it is read, by counting its signs
-_MOST_DEPTH = 50
-_MOST_VALUES = 2_000_000  # most values of YAML whose references are written out
-_PLAIN: type[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_MAX_MEMORY = 700_000_000  # [bytes] of JSON once it is read, estimated from its text
+_MAX_YAML_DEPTH = 50  # lists in lists of YAML
+_MAX_YAML_VALUES = 2_000_000  # of YAML whose references are written out
+_SAFE_LOADER: type[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 """Ten times faster where PyYAML was built with libyaml, as its wheels are."""
-_MERGE = "tag:yaml.org,2002:merge"
-_OF_JSON = {b",": 60, b"[": 100, b"{": 100, b":": 200}
+_MERGE = "tag:yaml.org,2002:merge"  # tag of the key ``<<``
+_JSON_SIGN_BYTES = {b",": 60, b"[": 100, b"{": 100, b":": 200}
+"""Memory that a sign of JSON stands for once it is read [bytes]."""
+_LONGEST_CAUSE = 200  # letters that are shown of another library's message
 
 _KEY_VALUE = re.compile(r"([^\s:=]+)\s*[:=](.*)")
-_BRACKETS = str.maketrans("[];,", "    ")
+_BRACKETS_TO_BLANKS = str.maketrans("[];,", "    ")
 
 
 _ADDRESS = re.compile(r"<[^<>]* at 0x[0-9a-fA-F]+>")  # what Python shows of an object in memory
@@ -51,8 +53,8 @@ _PART = ".part-"  # begins the names of files that are being written
 def refused_as(path: AnyPath, kind: str, remedy: str) -> Iterator[None]:
     """Turn whatever a decoder raises on bad bytes into an :class:`InputError`.
 
-    Decoders' warnings are silenced on purpose: they speak of metadata that is not read here, and
-    sizes are checked by us.
+    It says that ``path`` is not a readable ``kind``, and ends with ``remedy``. Warnings of decoders
+    are silenced: they are about metadata that is not read here, and sizes are checked here.
     """
     try:
         with warnings.catch_warnings(action="ignore"):
@@ -61,28 +63,29 @@ def refused_as(path: AnyPath, kind: str, remedy: str) -> Iterator[None]:
         raise
     except Exception as error:  # a decoder fed with random bytes may raise anything
         text = _ADDRESS.sub("", f"{type(error).__name__}: {error}")
-        cause = " ".join(text.split())[:200]
+        cause = " ".join(text.split())[:_LONGEST_CAUSE]
         raise InputError(f"{path}: not a readable {kind} ({cause}); {remedy}") from error
 
 
 def refuse_broken_link(path: AnyPath) -> None:
-    """Refuse a path on whose way a link leads nowhere, or in a circle.
+    """Refuse a path that leads through a broken symbolic link.
 
     Raises:
-        InputError: the link, and where it leads.
+        InputError: a link on the way leads nowhere, or in a circle.
     """
-    for place in (Path(path), *Path(path).parents):
-        if not os.path.islink(place) or os.path.exists(place):  # noqa: PTH110, PTH114 - never raise
+    for link in (Path(path), *Path(path).parents):
+        if not os.path.islink(link) or os.path.exists(link):  # noqa: PTH110, PTH114 - never raise
             continue
         try:
-            place.stat()
+            link.stat()
         except OSError as error:
-            is_circle = error.errno == errno.ELOOP
-            leads = "in a circle" if is_circle else f"to {os.readlink(place)!r}, which is not there"  # noqa: PTH115
-        else:  # made by another process meanwhile
+            leads = f"to {os.readlink(link)!r}, which is not there"  # noqa: PTH115
+            if error.errno == errno.ELOOP:
+                leads = "in a circle"
+        else:  # another process has made its target meanwhile
             return
         raise InputError(
-            f"{place}: is a link that leads {leads}; remove it, or choose another place"
+            f"{link}: is a link that leads {leads}; remove it, or choose another place"
         )
 
 
@@ -93,11 +96,11 @@ def refused_write(path: AnyPath) -> Iterator[None]:
         yield
     except OSError as error:
         refuse_broken_link(path)
-        file = next((folder for folder in Path(path).parents if os.path.isfile(folder)), None)  # noqa: PTH113 - which never raises
-        if file is not None:
-            raise InputError(
-                f"{file}: is a file, but a folder is needed there; choose another place"
-            ) from error
+        for parent in Path(path).parents:
+            if os.path.isfile(parent):  # noqa: PTH113 - which never raises
+                raise InputError(
+                    f"{parent}: is a file, but a folder is needed there; choose another place"
+                ) from error
         raise InputError(
             f"{path}: cannot be written: {error.strerror or error}; "
             "free the space, or choose another place"
@@ -105,12 +108,12 @@ def refused_write(path: AnyPath) -> Iterator[None]:
 
 
 def cache_folder() -> Path:
-    """Give the folder for files that can be downloaded or computed again.
+    """Return the folder for files that can be downloaded or computed again.
 
     It is ``$DEPTHPOSE_CACHE``, by default ``~/.cache/depthpose``; it need not exist.
     """
-    named = os.environ.get("DEPTHPOSE_CACHE")
-    return Path(named) if named else Path("~/.cache/depthpose").expanduser()
+    chosen = os.environ.get("DEPTHPOSE_CACHE")
+    return Path(chosen) if chosen else Path("~/.cache/depthpose").expanduser()
 
 
 @contextmanager
@@ -162,27 +165,30 @@ def refused_suffix(path: AnyPath, kind: str, suffixes: tuple[str, ...]) -> Input
     return InputError(f"{path}: {suffix} is no {kind} format; use {', '.join(suffixes)}")
 
 
-SOURCE = "source.json"  # beside shards fetched when first read: {"url": ...}, where from
+SOURCE = "source.json"
+"""File beside shards that are fetched when they are first read: ``{"url": FOLDER}``."""
 
 
 def read_bytes(path: AnyPath, most: int = MAX_FILE_BYTES) -> bytes:
-    """Read a regular file whole, or one in a shard; more than ``most`` bytes are refused unread.
+    """Read the bytes of a regular file, or of one in a tar shard.
 
-    A shard that is not here yet is fetched first, from where its folder's ``source.json`` says.
+    A shard that is not on the disk is fetched first, from the store that ``source.json`` beside it
+    names.
+
+    Args:
+        path: the file, or ``SHARD.tar/NAME``.
+        most: size [bytes] above which the file is refused without reading it.
 
     Raises:
-        InputError: there is no such file, or it is none that can be read; the shard is damaged, or
-            the store that it comes from does not answer.
+        InputError: the file is missing, too large, unreadable or not regular; the shard is
+            damaged, or its store does not answer.
     """
-    inside = Path(path)
+    file = Path(path)
     try:
-        if ".tar/" in inside.as_posix():
-            shards = (folder for folder in inside.parents if folder.suffix == ".tar")
-            if (
-                shard := next((candidate for candidate in shards if not candidate.is_dir()), None)
-            ) is not None:
-                return _read_in_shard(shard, inside.relative_to(shard).as_posix(), most)
-        status = inside.stat()
+        shard = _find_shard(file)
+        if shard is not None:
+            return _read_in_shard(shard, file.relative_to(shard).as_posix(), most)
+        status = file.stat()
         reason = ""
         if stat.S_ISDIR(status.st_mode):
             reason = "a folder where a file is needed; name a file inside it"
@@ -194,7 +200,7 @@ def read_bytes(path: AnyPath, most: int = MAX_FILE_BYTES) -> bytes:
                 "it out or split it"
             )
         if not reason:
-            return inside.read_bytes()
+            return file.read_bytes()
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such file; check the path") from error
     except (OSError, MemoryError) as error:
@@ -206,8 +212,16 @@ def read_bytes(path: AnyPath, most: int = MAX_FILE_BYTES) -> bytes:
     raise InputError(f"{path}: {reason}")
 
 
+def _find_shard(path: Path) -> Path | None:
+    """Find the tar shard that a path leads through, on the disk or not yet; None where none."""
+    for parent in path.parents:
+        if parent.suffix == ".tar" and not parent.is_dir():
+            return parent
+    return None
+
+
 def _read_in_shard(shard: Path, name: str, most: int) -> bytes:
-    """Read a file of a tar shard, which is fetched if it is not here."""
+    """Read a file of a tar shard, which is fetched where it is not on the disk."""
     if not shard.exists():
         source = shard.parent / SOURCE
         if not source.is_file():
@@ -215,10 +229,10 @@ def _read_in_shard(shard: Path, name: str, most: int) -> bytes:
         folder = json.loads(source.read_text())["url"].rstrip("/")
         fetch(f"{folder}/{shard.name}", shard)
     status = shard.stat()
-    place = _places(shard, status.st_mtime_ns, status.st_size).get(name)
-    if place is None:
+    extent = _index_shard(shard, status.st_mtime_ns, status.st_size).get(name)
+    if extent is None:
         raise InputError(f"{shard}: holds no file {name!r}; pack the data set again")
-    offset, size = place
+    offset, size = extent
     if size > most:
         raise InputError(f"{shard}/{name}: {size} bytes, more than the {most} that are read of it")
     with shard.open("rb") as file:
@@ -230,24 +244,35 @@ def _read_in_shard(shard: Path, name: str, most: int) -> bytes:
 
 
 @lru_cache(maxsize=4096)
-def _places(shard: Path, _changed_ns: int, _size: int) -> dict[str, tuple[int, int]]:
-    """Give offset and size [bytes] of each file of a shard."""
+def _index_shard(shard: Path, _changed_ns: int, _size: int) -> dict[str, tuple[int, int]]:
+    """List offset and size [bytes] of each file of a shard, by name.
+
+    Time and size of the shard are part of the cache's key, so that a changed shard is read again.
+    """
     try:
         with tarfile.open(shard, "r:") as tar:
-            return {m.name: (m.offset_data, m.size) for m in tar if m.isfile() and not m.sparse}
+            return {
+                member.name: (member.offset_data, member.size)
+                for member in tar
+                if member.isfile() and not member.sparse
+            }
     except (tarfile.TarError, OSError, EOFError) as error:
         raise InputError(f"{shard}: not a readable tar shard ({error}); pack it again") from error
 
 
 def fetch(url: str, path: Path) -> None:
-    """Copy a file to the disk, whole or not at all."""
+    """Copy the file of a URL to the disk, whole or not at all."""
     with atomic_write(path) as part, file_system(url, "read") as (fs, inner):
         fs.get_file(inner, str(part))
 
 
 @contextmanager
 def file_system(url: str, done: str) -> Iterator[tuple[Any, str]]:
-    """Give the file system of a URL and the path there; its errors become :class:`InputError`."""
+    """Open fsspec's file system of a URL; yields it and the path of the URL there.
+
+    Errors inside the block become :class:`InputError`; ``done`` says in it what could not be done,
+    such as ``read``.
+    """
     try:
         from fsspec.core import url_to_fs  # takes time to load
 
@@ -261,25 +286,25 @@ def file_system(url: str, done: str) -> Iterator[tuple[Any, str]]:
     except ImportError as error:
         raise InputError(f"{url}: its file system is not installed: {error}") from error
     except Exception as error:  # each file system raises errors of its own
-        cause = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        cause = " ".join(f"{type(error).__name__}: {error}".split())[:_LONGEST_CAUSE]
         raise InputError(
             f"{url}: cannot be {done} ({cause}); check the address and the credentials"
         ) from error
 
 
-class YamlLoader(_PLAIN):
-    """Plain values alone, and no key twice."""
+class YamlLoader(_SAFE_LOADER):
+    """Loads plain values, never objects, and refuses a repeated key."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """Give a mapping; of a key that stands twice the first value would be lost."""
-        keys_of_map: set[tuple[str, str]] = set()
+        """Make a mapping; a repeated key, whose first value would be lost, is an error."""
+        earlier_keys: set[tuple[str, str]] = set()
         for key, _ in node.value:
             if not isinstance(key, yaml.ScalarNode) or key.tag == _MERGE:
                 continue
-            if (key.tag, key.value) in keys_of_map:
+            if (key.tag, key.value) in earlier_keys:
                 line = key.start_mark.line + 1
                 raise ValueError(f"line {line}: key {key.value!r} is given twice")
-            keys_of_map.add((key.tag, key.value))
+            earlier_keys.add((key.tag, key.value))
         return super().construct_mapping(node, deep)
 
 
@@ -302,17 +327,17 @@ def read_text(path: AnyPath, most: int = MAX_TEXT_BYTES) -> str:
 
 
 def read_json(path: AnyPath) -> object:
-    """Read JSON strictly.
+    """Read JSON as the standard defines it, unlike Python's own parser.
 
     Raises:
         InputError: the file is missing or no JSON, holds NaN, infinity or a number beyond float64,
             gives a key twice, or would fill the memory.
     """
     text = read_text(path, MAX_FILE_BYTES)
-    refuse_heavy(path, text.encode(), _OF_JSON)
+    refuse_heavy(path, text.encode(), _JSON_SIGN_BYTES)
 
-    def once_each(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        """Make an object of JSON, in which no key may stand twice."""
+    def make_object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        """Make the dict of a JSON object, and refuse a repeated key."""
         members: dict[str, Any] = {}
         for key, value in pairs:
             if key in members:
@@ -325,18 +350,22 @@ def read_json(path: AnyPath) -> object:
             text,
             parse_constant=finite_number,
             parse_float=finite_number,
-            object_pairs_hook=once_each,
+            object_pairs_hook=make_object,
         )
 
 
 def refuse_heavy(path: AnyPath, data: bytes, memory_of: Mapping[bytes, int]) -> None:
-    """Refuse a tree in text that would fill the memory."""
-    a_letter = 2 if data.isascii() else 5
-    need = a_letter * len(data) + sum(size * data.count(sign) for sign, size in memory_of.items())
-    if need > _MOST_MEMORY:
+    """Refuse JSON that would fill the memory, before it is parsed.
+
+    ``memory_of`` estimates the memory [bytes] of the object that a sign of the text stands for.
+    """
+    bytes_a_letter = 2 if data.isascii() else 5
+    need = bytes_a_letter * len(data)
+    need += sum(size * data.count(sign) for sign, size in memory_of.items())
+    if need > _MAX_MEMORY:
         raise InputError(
             f"{path}: {len(data)} bytes that would take about {need / 1e6:.0f} MB of memory, more "
-            f"than the {_MOST_MEMORY / 1e6:.0f} MB allowed; split it"
+            f"than the {_MAX_MEMORY / 1e6:.0f} MB allowed; split it"
         )
 
 
@@ -348,21 +377,27 @@ def parse_yaml(path: AnyPath, text: str) -> object:
 
 
 def refuse_yaml_bomb(path: AnyPath, text: str) -> None:
-    """Refuse YAML that refers to itself, is too deep, or grows beyond all bounds by references."""
-    sizes: dict[str, int] = {}
-    unfinished: list[tuple[str | None, int]] = []
-    with suppress(yaml.YAMLError):  # what is no YAML the parser refuses
+    """Refuse YAML that is too deep, refers to itself, or grows beyond all bounds by references.
+
+    The number of values is counted as if each reference (``*name``) were written out, without
+    doing so.
+    """
+    sizes: dict[str, int] = {}  # values in the part of each anchor (``&name``)
+    open_collections: list[tuple[str | None, int]] = []  # anchor, and values so far
+    with suppress(yaml.YAMLError):  # raised again where the text is parsed
         for event in yaml.parse(text, YamlLoader):
             anchor = getattr(event, "anchor", None)
             size = 0
             match event:
                 case yaml.CollectionStartEvent():
-                    unfinished.append((anchor, 1))
-                    if len(unfinished) > _MOST_DEPTH:
-                        raise InputError(f"{path}: lists of lists, {_MOST_DEPTH} deep; correct it")
+                    open_collections.append((anchor, 1))
+                    if len(open_collections) > _MAX_YAML_DEPTH:
+                        raise InputError(
+                            f"{path}: lists of lists, {_MAX_YAML_DEPTH} deep; correct it"
+                        )
                     continue
                 case yaml.CollectionEndEvent():
-                    anchor, size = unfinished.pop()
+                    anchor, size = open_collections.pop()
                 case yaml.AliasEvent():
                     if anchor not in sizes:
                         raise InputError(f"{path}: refers to itself (*{anchor}); write it out")
@@ -372,17 +407,18 @@ def refuse_yaml_bomb(path: AnyPath, text: str) -> None:
                     size = 1
             if anchor is not None:
                 sizes[anchor] = size
-            if unfinished:
-                unfinished[-1] = (unfinished[-1][0], unfinished[-1][1] + size)
-            if size > _MOST_VALUES:
+            if open_collections:
+                outer_anchor, outer_size = open_collections[-1]
+                open_collections[-1] = (outer_anchor, outer_size + size)
+            if size > _MAX_YAML_VALUES:
                 raise InputError(
-                    f"{path}: its references (*name) make more than {_MOST_VALUES} values of it; "
-                    "write them out"
+                    f"{path}: its references (*name) make more than {_MAX_YAML_VALUES} values of "
+                    "it; write them out"
                 )
 
 
 def write_json(path: AnyPath, obj: object) -> None:
-    """Write JSON with an indent of 2, keys in the order they were put in, ending in a newline.
+    """Write JSON with an indent of 2, keys in the order of ``obj``, ending in a newline.
 
     Raises:
         InputError: something in ``obj`` has no JSON form, NaN among them, or the disk refuses.
@@ -418,7 +454,7 @@ def read_key_values(path: AnyPath) -> dict[str, list[float]]:
             raise InputError(f"{path}: line {number} gives {match[1]!r} again; keep one of them")
         numbers: list[float] = []
         with suppress(ValueError):  # a date, or other words
-            numbers = [float(word) for word in match[2].translate(_BRACKETS).split()]
+            numbers = [float(word) for word in match[2].translate(_BRACKETS_TO_BLANKS).split()]
         if not all(map(math.isfinite, numbers)):
             raise InputError(f"{path}: line {number}, {match[1]!r}, holds NaN or infinity")
         if numbers:
@@ -427,37 +463,43 @@ def read_key_values(path: AnyPath) -> dict[str, list[float]]:
 
 
 def finite_number(text: str) -> float:
-    """Read a number of JSON; NaN and infinity, which Python's parser would take, are none."""
+    """Convert a number of JSON to float; NaN and infinity, which JSON has not, are errors."""
     value = float(text)
     if not math.isfinite(value):
         raise ValueError(f"{text} is not a JSON number")
     return value
 
 
-_MOST_SHOWN = 6
+_MOST_SHOWN = 6  # file names without a partner that an error lists
 
 
 _NUMBER = re.compile(r"((?<![\d.])\d+\.\d+(?!\d|\.\d)|\d+)")
 
 
 def natural_order(path: Path) -> tuple[list[list[str | tuple[int, str]]], Path]:
-    """Give the key that sorts paths by name, and numbers in names by value: 2 before 10.
+    """Make the key that sorts paths by name, and numbers in names by value: 2 before 10.
 
     Two runs of digits with a point between them are a decimal, as of a time in seconds: 0.45 comes
-    before 0.5. Three are none (1.2.10).
+    before 0.5. Three are separate numbers (1.2.10).
     """
-    pieces = [_NUMBER.split(part) for part in (*path.parent.parts, path.stem)]
 
-    def value(piece: str) -> tuple[int, str]:
-        whole, _, decimals = piece.partition(".")
-        return int(whole), decimals  # digits behind the point sort as letters do
+    def key_of(part: str) -> list[str | tuple[int, str]]:
+        """Make the key of a folder or file name: text and numbers in turn, beginning with text."""
+        key: list[str | tuple[int, str]] = []
+        for index, piece in enumerate(_NUMBER.split(part)):
+            is_number = index % 2 == 1
+            if is_number:
+                whole, _, decimals = piece.partition(".")
+                key.append((int(whole), decimals))  # digits behind the point sort as letters do
+            else:
+                key.append(piece)
+        return key
 
-    # Every second piece is a number, so that like is compared with like.
-    return [[value(p) if k % 2 else p for k, p in enumerate(part)] for part in pieces], path
+    return [key_of(part) for part in (*path.parent.parts, path.stem)], path
 
 
 def stem_of(path: Path) -> str:
-    """Give a file's name without its suffix, normalised to one Unicode form.
+    """Return a file's name without its suffix, normalised to one Unicode form (NFC).
 
     A letter with an accent may be stored as one character (NFC) or two (NFD: disks of macOS).
     """
@@ -465,55 +507,103 @@ def stem_of(path: Path) -> str:
 
 
 def find_partners(first: Sequence[str], second: Sequence[str], sides: str) -> list[int]:
-    """Give for each name of one side the index of its partner on the other.
+    """Pair the names of two sides: for each name of the first, the index of its partner.
 
     Names belong together that are equal; else those that are equal without what all names of their
     side share (``left_0004`` and ``right_0004``, ``1_L`` and ``1_R``), numbers by value. Two lone
     names belong together unless each has numbers and none of them is the other's.
+
+    Args:
+        first: names of files, without suffixes.
+        second: names of the files on the other side.
+        sides: what both sides are called, for the error.
+
+    Raises:
+        InputError: a name has no partner, or several.
     """
-    first, second = (
-        [unicodedata.normalize("NFC", name) for name in side] for side in (first, second)
-    )
-    keys: tuple[Sequence[Hashable], Sequence[Hashable]] = first, second
+    first = [unicodedata.normalize("NFC", name) for name in first]
+    second = [unicodedata.normalize("NFC", name) for name in second]
+    first_keys: Sequence[Hashable] = first
+    second_keys: Sequence[Hashable] = second
     if not set(first) & set(second):
-        keys = _own_parts(first, second)
-    places = {key: place for place, key in enumerate(keys[1])}
-    counts = [Counter(side) for side in keys]
-    both = [*zip(first, keys[0], strict=True), *zip(second, keys[1], strict=True)]
-    lone = [name for name, key in both if counts[0][key] != 1 or counts[1][key] != 1]
-    if lone:
-        shown = ", ".join(map(repr, lone[:_MOST_SHOWN])) + (", ..." if lone[_MOST_SHOWN:] else "")
+        first_keys, second_keys = _pairing_keys(first, second)
+
+    first_counts = Counter(first_keys)
+    second_counts = Counter(second_keys)
+    named_keys = [
+        *zip(first, first_keys, strict=True),
+        *zip(second, second_keys, strict=True),
+    ]
+    unpaired = [
+        name for name, key in named_keys if first_counts[key] != 1 or second_counts[key] != 1
+    ]
+    if unpaired:
+        shown = ", ".join(map(repr, unpaired[:_MOST_SHOWN]))
+        if len(unpaired) > _MOST_SHOWN:
+            shown += ", ..."
         raise InputError(
             f"{sides} hold {len(first)} and {len(second)} files, and no partner of the same name "
             f"or number is there for {shown}; remove these, add their partners, or rename them"
         )
-    return [places[key] for key in keys[0]]
+    index_of_key = {key: index for index, key in enumerate(second_keys)}
+    return [index_of_key[key] for key in first_keys]
 
 
-def _own_parts(first: Sequence[str], second: Sequence[str]) -> tuple[list[Any], list[Any]]:
-    """Remove from each name what all names of its side share, and read numbers by value."""
-    split = [[re.split(r"(\d+)", name) for name in side] for side in (first, second)]
+def _pairing_keys(
+    first: Sequence[str], second: Sequence[str]
+) -> tuple[list[Hashable], list[Hashable]]:
+    """Remove from each name what all names of its side share, and read numbers by value.
+
+    Returns:
+        Keys of the first and the second names; equal where two names belong together.
+    """
+    # Text and numbers in turn, beginning with text.
+    pieces = [[re.split(r"(\d+)", name) for name in side] for side in (first, second)]
+
     if len(first) == len(second) == 1:
-        numbers = [{int(piece) for piece in side[0][1::2]} for side in split]
-        is_other = all(numbers) and not numbers[0] & numbers[1]
-        return [first[0] if is_other else ""], [second[0] if is_other else ""]
-    if len({len(pieces) for side in split for pieces in side}) > 1:
-        split = [[[name] for name in side] for side in (first, second)]
-    keys: list[list[tuple[str, ...]]] = [[() for _ in side] for side in split]
-    for k in range(len(split[0][0])):
-        columns = [[pieces[k] for pieces in side] for side in split]
+        first_numbers, second_numbers = (
+            {int(number) for number in side[0][1::2]} for side in pieces
+        )
+        has_other_number = first_numbers and second_numbers and not first_numbers & second_numbers
+        return ([first[0]], [second[0]]) if has_other_number else ([""], [""])
+
+    # Names of differing structure are compared as a whole.
+    piece_counts = {len(split_name) for side in pieces for split_name in side}
+    if len(piece_counts) > 1:
+        pieces = [[[name] for name in side] for side in (first, second)]
+
+    keys: list[list[tuple[str, ...]]] = [[() for _ in side] for side in pieces]
+    for index in range(len(pieces[0][0])):
+        columns = [[split_name[index] for split_name in side] for side in pieces]
         if all(len(set(column)) == 1 for column in columns):
-            continue  # the side, or what both share
+            continue  # it names the side, or is common to both
         for side, column in enumerate(columns):
-            texts = column
-            for turn in (1, -1):
-                turned = [text[::turn] for text in texts]
-                # what these two share, all share
-                low = min(turned)
-                high = max(turned)
-                ends = (k for k, (a, b) in enumerate(zip(low, high, strict=False)) if a != b)
-                shared = re.sub(r"\d+$", "", low[: next(ends, len(low))])
-                texts = [text[len(shared) :][::turn] for text in turned]
-            parts = [re.sub(r"\d+", lambda match: str(int(match[0])), text) for text in texts]
-            keys[side] = [(*key, part) for key, part in zip(keys[side], parts, strict=True)]
-    return keys[0], keys[1]
+            keys_of_pieces = map(_strip_leading_zeros, _remove_common_ends(column))
+            keys[side] = [
+                (*key, piece) for key, piece in zip(keys[side], keys_of_pieces, strict=True)
+            ]
+    return [*keys[0]], [*keys[1]]
+
+
+def _remove_common_ends(texts: Sequence[str]) -> list[str]:
+    """Remove the beginning and the ending that all texts share; digits at their border are kept."""
+    without_prefix = _remove_common_prefix(texts)
+    reversed_texts = _remove_common_prefix([text[::-1] for text in without_prefix])
+    return [text[::-1] for text in reversed_texts]
+
+
+def _remove_common_prefix(texts: Sequence[str]) -> list[str]:
+    """Remove the beginning that all texts share, without digits that it ends with."""
+    # What the first and the last in alphabetical order share, all share.
+    first = min(texts)
+    last = max(texts)
+    length = 0
+    while length < len(first) and first[: length + 1] == last[: length + 1]:
+        length += 1
+    prefix = re.sub(r"\d+$", "", first[:length])
+    return [text[len(prefix) :] for text in texts]
+
+
+def _strip_leading_zeros(text: str) -> str:
+    """Write the numbers in a text without leading zeros."""
+    return re.sub(r"\d+", lambda match: str(int(match[0])), text)

@@ -52,9 +52,13 @@ _FORMATS = ("PNG", "JPEG", "BMP", "PPM", "TIFF", "WEBP", "GIF")
 _JPEG_COLOURS = {"RGB": "RGB", "L": "GRAY"}
 """Modes of Pillow's, and what simplejpeg calls them."""
 _HOLE = bytes(16)
-"""More zeros than 2,600 compressed pictures of all qualities hold in a row, which is 6."""
+"""Zeros of a damaged JPEG: 2,600 pictures of all qualities hold no more than 6 in a row."""
 _NEXT_MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 """The end of a JPEG's compressed pixels."""
+_FILL = 0xFF  # JPEG markers: padding before a marker
+_PROGRESSIVE = 0xC2  # start of a progressive frame
+_HUFFMAN_TABLES = 0xC4
+_START_OF_SCAN = 0xDA
 _GREY_16 = ("I;16", "I;16L", "I;16B", "I;16N")
 _EXIF_ORIENTATION = 0x0112
 _PHOTOMETRIC = 0x0106  # of TIFF: 0 where the value 0 is white
@@ -81,15 +85,15 @@ def read_image(path: AnyPath) -> Float32[Tensor, "3 h w"]:
             stereo camera.
     """
     with opened_image(path) as image:
-        pixels = _decoded(path, image)
+        pixels = _decode(path, image)
         count = getattr(image, "n_frames", 1) if image.format != "MPO" else 1
-    if count > 1 and _is_new(path, "several"):
+    if count > 1 and _is_first_notice(path, "several"):
         message = (
             f"{path}: holds {count} pictures, of which the first is read (so it is of other files "
             "there); save each in a file of its own to have them all"
         )
         warnings.warn(message, Notice, stacklevel=2)
-    return _tensor_of(pixels, path)
+    return _rgb_tensor(pixels, path)
 
 
 def picture_tensor(image: Image.Image, name: AnyPath) -> Float32[Tensor, "3 h w"]:
@@ -99,64 +103,93 @@ def picture_tensor(image: Image.Image, name: AnyPath) -> Float32[Tensor, "3 h w"
         InputError: it has 32 bits a pixel, or its file is damaged.
     """
     with refused_as(name, "picture", "give an intact one"):
-        pixels = _decoded(name, image)
-    return _tensor_of(pixels, name)
+        pixels = _decode(name, image)
+    return _rgb_tensor(pixels, name)
 
 
-def _decoded(name: AnyPath, image: Image.Image) -> np.ndarray:
-    """Decode to RGB or grey of 8 or 16 bits, turned upright by EXIF."""
-    turn = _UPRIGHT.get(_orientation(image))
-    parts = [image]
-    opened: Any = image  # a picture that is not of a file has neither
-    tiles = [] if getattr(image, "fp", None) is None else getattr(image, "tile", None) or []
-    raws = [tile.args if isinstance(tile.args, str) else tile.args[0] for tile in tiles]
-    if raws and all(re.fullmatch("RGBA?;16[BLN]", str(raw)) for raw in raws):
-        # Pillow keeps the upper byte of a colour; opened again, bytes exchanged, the lower one.
-        file = opened.fp
-        at = file.tell()
-        file.seek(0)
-        other: Any = Image.open(BytesIO(file.read()), formats=_FORMATS)
-        file.seek(at)
-        little = "LN" if sys.byteorder == "little" else "L"
-        swapped = [raw[:-1] + ("B" if raw[-1] in little else "L") for raw in raws]
-        other.tile = [
-            tile._replace(args=raw if isinstance(tile.args, str) else (raw, *tile.args[1:]))
-            for tile, raw in zip(tiles, swapped, strict=True)
-        ]
-        parts.append(other)
-    elif raws and image.format == "PPM" and image.mode == "RGB" and tiles[0].codec_name == "ppm":
-        most = tiles[0].args[1] if isinstance(tiles[0].args, tuple) else 255
-        if most > 255:  # of which Pillow keeps 8 bits too
-            opened.fp.seek(tiles[0].offset)
-            values = np.frombuffer(opened.fp.read(6 * image.width * image.height), ">u2")
-            whole = values.reshape(image.height, image.width, 3).astype(np.float64)
-            return (whole * (65535 / most)).round().clip(0, 65535).astype(np.uint16)
-    elif tiles and image.format == "JPEG" and image.mode in _JPEG_COLOURS:
+def _decode(name: AnyPath, image: Image.Image) -> np.ndarray:
+    """Decode a picture of Pillow's to RGB or grey, of 8 or 16 bits, turned upright by EXIF.
+
+    Pillow keeps 8 bits of colours of 16, and decodes damaged JPEGs without a word: those formats
+    are decoded in other ways.
+    """
+    rotation = _UPRIGHT.get(_orientation(image))
+    opened: Any = image  # a picture that is not of a file has neither ``fp`` nor ``tile``
+    is_of_file = getattr(image, "fp", None) is not None
+    tiles = (getattr(image, "tile", None) or []) if is_of_file else []
+    raw_modes = [tile.args if isinstance(tile.args, str) else tile.args[0] for tile in tiles]
+
+    if raw_modes and all(re.fullmatch("RGBA?;16[BLN]", str(mode)) for mode in raw_modes):
+        lower = _open_with_bytes_exchanged(opened, raw_modes)
+        upper_bytes, lower_bytes = (
+            _upright_pixels(name, part, rotation).astype(np.uint16) for part in (image, lower)
+        )
+        return upper_bytes * 256 + lower_bytes
+
+    is_binary_ppm = image.format == "PPM" and image.mode == "RGB" and raw_modes
+    if is_binary_ppm and tiles[0].codec_name == "ppm":
+        largest = tiles[0].args[1] if isinstance(tiles[0].args, tuple) else 255
+        if largest > 255:
+            return _decode_ppm_16(opened, tiles[0].offset, largest)
+
+    if tiles and image.format == "JPEG" and image.mode in _JPEG_COLOURS:
         opened.fp.seek(0)
-        parts = [_decoded_jpeg(name, opened.fp.read(), _JPEG_COLOURS[image.mode])]
-    read: list[np.ndarray] = []
-    for part in parts:
-        picture = part if turn is None else part.transpose(turn)
-        # Pillow scales 16-bit PGM to 65535.
-        if picture.mode in _GREY_16 or (picture.mode == "I" and image.format == "PPM"):
-            values = np.asarray(picture).astype(np.uint16)
-            # Of 8 bits Pillow does this itself.
-            is_inverted = image.format == "TIFF" and opened.tag_v2.get(_PHOTOMETRIC) == 0
-            read.append(65535 - values if is_inverted else values)
-            continue
-        if picture.mode in ("I", "F"):
-            raise InputError(f"{name}: 32 bits a pixel; save it with 8 or 16 bits a channel")
-        if picture.mode == "P" and "transparency" in picture.info:
-            picture = picture.convert("RGBA")
-        read.append(np.asarray(picture.convert("RGB")))
-    pixels, *low = read
-    return pixels.astype(np.uint16) * 256 + low[0] if low else pixels
+        image = _decode_jpeg(name, opened.fp.read(), _JPEG_COLOURS[image.mode])
+        return _upright_pixels(name, image, rotation)
+    return _upright_pixels(name, image, rotation)
 
 
-def _decoded_jpeg(name: AnyPath, data: bytes, colours: str) -> Image.Image:
+def _open_with_bytes_exchanged(image: Any, raw_modes: list[str]) -> Image.Image:  # noqa: ANN401
+    """Open a picture of 16 bits a colour again, so that Pillow keeps the lower byte of each colour.
+
+    Pillow keeps the upper byte in the byte order of ``raw_modes``, which is exchanged here.
+    """
+    position = image.fp.tell()
+    image.fp.seek(0)
+    opened_again: Any = Image.open(BytesIO(image.fp.read()), formats=_FORMATS)
+    image.fp.seek(position)
+
+    little_endian = "LN" if sys.byteorder == "little" else "L"  # N: the machine's own order
+    tiles: list[Any] = []
+    for tile, mode in zip(image.tile, raw_modes, strict=True):
+        exchanged = mode[:-1] + ("B" if mode[-1] in little_endian else "L")
+        args = exchanged if isinstance(tile.args, str) else (exchanged, *tile.args[1:])
+        tiles.append(tile._replace(args=args))
+    opened_again.tile = tiles
+    return opened_again
+
+
+def _decode_ppm_16(image: Any, offset: int, largest: int) -> np.ndarray:  # noqa: ANN401
+    """Decode a binary PPM of two bytes a colour, from ``offset``; ``largest`` becomes 65535."""
+    image.fp.seek(offset)
+    values = np.frombuffer(image.fp.read(6 * image.width * image.height), ">u2")
+    pixels = values.reshape(image.height, image.width, 3).astype(np.float64)
+    return (pixels * (65535 / largest)).round().clip(0, 65535).astype(np.uint16)
+
+
+def _upright_pixels(
+    name: AnyPath, image: Image.Image, rotation: Image.Transpose | None
+) -> np.ndarray:
+    """Turn a picture of Pillow's by ``rotation``; return its pixels as RGB, or grey of 16 bits."""
+    picture = image if rotation is None else image.transpose(rotation)
+    # Pillow scales 16-bit PGM to 65535.
+    if picture.mode in _GREY_16 or (picture.mode == "I" and image.format == "PPM"):
+        values = np.asarray(picture).astype(np.uint16)
+        tiff: Any = image
+        # Where white is 0, grey is inverted; of 8 bits Pillow does this itself.
+        is_inverted = image.format == "TIFF" and tiff.tag_v2.get(_PHOTOMETRIC) == 0
+        return 65535 - values if is_inverted else values
+    if picture.mode in ("I", "F"):
+        raise InputError(f"{name}: 32 bits a pixel; save it with 8 or 16 bits a channel")
+    if picture.mode == "P" and "transparency" in picture.info:
+        picture = picture.convert("RGBA")
+    return np.asarray(picture.convert("RGB"))
+
+
+def _decode_jpeg(name: AnyPath, data: bytes, colours: str) -> Image.Image:
     """Decode a JPEG by the same library as Pillow, and refuse what its decoder warns of.
 
-    Of damaged pixels libjpeg warns alone, and goes on with shifted, wrong or grey ones; Pillow does
+    Of damaged pixels libjpeg only warns, and goes on with shifted, wrong or grey ones; Pillow does
     not pass its warnings on.
     """
     try:
@@ -169,6 +202,7 @@ def _decoded_jpeg(name: AnyPath, data: bytes, colours: str) -> Image.Image:
 
 
 def _damaged_jpeg(name: AnyPath, reason: str) -> InputError:
+    """Make the error of a JPEG whose pixels are damaged."""
     return InputError(
         f"{name}: a damaged JPEG ({reason}), whose pixels are wrong from there on; copy it anew, "
         "or save it again where it looks whole"
@@ -176,41 +210,46 @@ def _damaged_jpeg(name: AnyPath, reason: str) -> InputError:
 
 
 def _has_hole(data: bytes) -> bool:
-    """Whether zeros stand in place of compressed pixels, as of a file that was not copied whole.
+    """Whether zeros stand in place of compressed pixels of a JPEG, as after an incomplete copy.
 
     Zeros are the first code of a Huffman table. Where that is a coefficient of 1, sixteen bytes of
-    them are forty such in a row, which no picture has. Where it ends a block, as in progressive
-    files, zeros are a plain surface, and nothing can be said.
+    them are forty such coefficients in a row, which no picture has. Where it ends a block, as in
+    progressive files, zeros are a plain surface, and damage cannot be told from it.
     """
     if _HOLE not in data:
         return False
-    first_codes: dict[int, int] = {}
-    place = 2
-    while data[place : place + 1] == b"\xff" and place + 4 < len(data):
-        marker = data[place + 1]
-        if marker == 0xFF:  # filling
-            place += 1
+    first_symbols: dict[int, int] = {}  # the symbol of the first code of each Huffman table
+    position = 2
+    while data[position : position + 1] == b"\xff" and position + 4 < len(data):
+        marker = data[position + 1]
+        if marker == _FILL:
+            position += 1
             continue
-        end = place + 2 + int.from_bytes(data[place + 2 : place + 4], "big")
-        segment = data[place + 4 : end]
-        if marker == 0xC2:  # progressive
+        end = position + 2 + int.from_bytes(data[position + 2 : position + 4], "big")
+        segment = data[position + 4 : end]
+        if marker == _PROGRESSIVE:
             return False
-        while marker == 0xC4 and len(segment) > 17:  # Huffman tables: kind, 16 counts, symbols
-            first_codes[segment[0]] = segment[17]
-            segment = segment[17 + sum(segment[1:17]) :]
-        if marker == 0xDA and len(segment) > 2:
-            # The table of the first component's coefficients, 16 and up.
+        if marker == _HUFFMAN_TABLES:
+            while len(segment) > 17:  # a table: its number, 16 counts of codes, the symbols
+                first_symbols[segment[0]] = segment[17]
+                segment = segment[17 + sum(segment[1:17]) :]
+        if marker == _START_OF_SCAN and len(segment) > 2:
+            # Tables of coefficients begin at 16; the scan names that of its first component.
             table = 16 + (segment[2] & 15)
-            stop = _NEXT_MARKER.search(data, end)
-            is_coefficient = first_codes.get(table, 0) & 15 > 0
-            return is_coefficient and _HOLE in data[end : stop.start() if stop else None]
-        place = end
+            is_coefficient = first_symbols.get(table, 0) & 15 > 0
+            next_marker = _NEXT_MARKER.search(data, end)
+            compressed = data[end : next_marker.start() if next_marker else None]
+            return is_coefficient and _HOLE in compressed
+        position = end
     return False
 
 
-def _tensor_of(pixels: np.ndarray, name: AnyPath) -> Float32[Tensor, "3 h w"]:
-    """Convert pixels to RGB in [0, 1]; apart from decoding, where warnings are silenced."""
-    # Channels are parted while a pixel is an integer: the floats are there once.
+def _rgb_tensor(pixels: np.ndarray, name: AnyPath) -> Float32[Tensor, "3 h w"]:
+    """Convert decoded pixels to RGB in [0, 1].
+
+    Not done while decoding, where warnings are silenced: this may warn of the range of 16 bits.
+    """
+    # Channels are separated while a pixel is an integer, so that the floats exist only once.
     planes = np.ascontiguousarray(pixels[None] if pixels.ndim == 2 else pixels.transpose(2, 0, 1))
     if planes.dtype.itemsize == 2:
         rgb = torch.from_numpy(from_16_bit(planes, name))
@@ -220,16 +259,19 @@ def _tensor_of(pixels: np.ndarray, name: AnyPath) -> Float32[Tensor, "3 h w"]:
 
 
 def from_16_bit(values: np.ndarray, name: AnyPath) -> np.ndarray:
-    """Convert 16-bit numbers to floats in [0, 1]; a notice names a divisor other than 65535.
+    """Scale 16-bit numbers to floats in [0, 1]: by 65535, or by the part of the range in use.
 
-    Cameras of 10, 12 or 14 bits, and thermal ones, use a part of the range: black and white are
-    then what 0.1 % of the values lie below and above; black is 0 unless all lie far from it.
+    Cameras of 10, 12 or 14 bits, and thermal ones, use a part of it: white is then the value that
+    only 0.1 % exceed, and black 0, or the like value at the dark end where all lie far above 0.
+
+    Warns:
+        Notice: black or white is another value than 0 and 65535; once for a folder.
     """
     low, high = value_range(values)
     if not _LEAST_SPAN <= high - low < _FULL_SPAN:
         return values.astype(np.float32) / 65535
     black = low if low > high - low else 0
-    if _is_new(name, "range"):
+    if _is_first_notice(name, "range"):
         message = (
             f"{name}: of 16 bits, and its values are {low} to {high}: {black} is taken as black "
             f"and {high} as white; so are those of other pictures there"
@@ -239,7 +281,11 @@ def from_16_bit(values: np.ndarray, name: AnyPath) -> np.ndarray:
 
 
 def check_image(image: object, name: str, slack: float = 0.5) -> Float[Tensor, "3 h w"]:
-    """Return an RGB image, or refuse what is not one; values may leave [0, 1] by ``slack``."""
+    """Return ``image`` if it is an RGB image; its values may leave [0, 1] by ``slack``.
+
+    Raises:
+        InputError: it is not a float tensor (3, h, w), is empty, not finite, or out of range.
+    """
     if not isinstance(image, Tensor):
         raise InputError(
             f"{name} must be a tensor, got {type(image).__name__}; read files with "
@@ -267,26 +313,26 @@ def check_image(image: object, name: str, slack: float = 0.5) -> Float[Tensor, "
 
 
 def value_range(values: np.ndarray) -> tuple[int, int]:
-    """Give the values that all but 0.1 % lie above, and below; defective pixels do not count."""
+    """Find the darkest and the brightest value but for the extreme 0.1 %, which may be defects."""
     low, high = np.quantile(values, (0.001, 0.999), method="nearest")
     return int(low), int(high)
 
 
 _LEAST_SPAN = 64  # values between the darkest and the brightest; a mask has fewer
-_FULL_SPAN = 2**14  # what spans more is taken for 16 bits
-_REPORTED: set[tuple[Path, str]] = set()  # folders, and what has been reported of them
+_FULL_SPAN = 2**14  # values that span more are taken for 16 bits
+_NOTICED: set[tuple[Path, str]] = set()  # folders, and topics of which a notice was given there
 
 
-def _is_new(name: AnyPath, what: str) -> bool:
-    """Whether this has not been reported of a folder yet; it counts as reported from now on."""
-    key = Path(name).parent, what
-    is_new = key not in _REPORTED
-    _REPORTED.add(key)
-    return is_new
+def _is_first_notice(name: AnyPath, topic: str) -> bool:
+    """Whether no notice on a topic was given of the folder of a file; remembers that one is now."""
+    key = Path(name).parent, topic
+    is_first = key not in _NOTICED
+    _NOTICED.add(key)
+    return is_first
 
 
 def image_size(path: AnyPath) -> tuple[int, int]:
-    """Give (width, height) of a picture as :func:`read_image` returns it, without decoding.
+    """Read (width, height) of a picture, as :func:`read_image` returns it, without decoding it.
 
     Raises:
         InputError: the file is missing, too large or not a picture.
@@ -299,7 +345,7 @@ def image_size(path: AnyPath) -> tuple[int, int]:
 def write_image(path: AnyPath, image: Tensor) -> None:
     """Write RGB ``(3, h, w)`` in [0, 1] as 8-bit PNG or JPEG, by suffix, rounding to the nearest.
 
-    What resampling overshoots (a quarter of the range at most) is clipped.
+    Values beyond [0, 1], as resampling makes them, are clipped: by a quarter of the range at most.
 
     Raises:
         InputError: the shape, the values or the suffix are wrong, or the disk refuses.
@@ -308,11 +354,11 @@ def write_image(path: AnyPath, image: Tensor) -> None:
 
 
 def encode_image(image: Tensor, name: AnyPath, quality: int = 95) -> bytes:
-    """Give the bytes that :func:`write_image` writes to a file of this name.
+    """Encode an image as PNG or JPEG, as :func:`write_image` writes it to a file of this name.
 
     Args:
-        image: see there.
-        name: decides the format by its suffix.
+        image: RGB ``(3, h, w)`` in [0, 1].
+        name: its suffix decides the format.
         quality: of a JPEG, 1 to 95.
 
     Raises:
@@ -323,14 +369,14 @@ def encode_image(image: Tensor, name: AnyPath, quality: int = 95) -> bytes:
         raise refused_suffix(name, "picture", WRITTEN_SUFFIXES)
     check_image(image, f"{name}: the image", slack=0.25)
     pixels = image.detach().cpu().float().clamp(0, 1).mul(255).round().byte().permute(1, 2, 0)
-    form = "PNG"
+    format_name = "PNG"
     options = FAST_PNG
     if suffix != ".png":
-        form = "JPEG"
+        format_name = "JPEG"
         options = {"quality": quality, "subsampling": 0}
     encoded = BytesIO()
     with refused_as(name, "picture", "check its size"):
-        Image.fromarray(pixels.contiguous().numpy()).save(encoded, form, **options)
+        Image.fromarray(pixels.contiguous().numpy()).save(encoded, format_name, **options)
     return encoded.getvalue()
 
 
@@ -346,32 +392,35 @@ def list_images(path: AnyPath) -> list[Path]:
     Raises:
         InputError: nothing was found.
     """
-    wanted = Path(path)
+    named = Path(path)
     try:
-        if wanted.is_file() and wanted.suffix.lower() not in _ARCHIVES:
-            return [wanted]
-        if wanted.is_dir():
-            files = list(wanted.iterdir())
-        else:
-            home = Path(wanted.anchor)
-            parts = list(wanted.relative_to(wanted.anchor).parts)
-            while len(parts) > 1 and (home / parts[0]).is_dir():  # its brackets are no pattern
-                home /= parts.pop(0)
-            files = [p for p in home.glob("/".join(parts)) if p.is_file()]
+        if named.is_file() and named.suffix.lower() not in _ARCHIVES:
+            return [named]
+        files = list(named.iterdir()) if named.is_dir() else _glob_files(named)
     except (OSError, ValueError, NotImplementedError) as error:
         raise InputError(f"{str(path)!r}: cannot be listed: {error}") from error
-    shown = (p for p in files if p.suffix.lower() in LISTED_SUFFIXES and p.name[0] != ".")
-    pictures = sorted(shown, key=natural_order)
-    unread = [p.name for p in files if _UNREAD.fullmatch(p.suffix) and p.name[0] != "."]
+    visible = [file for file in files if file.name[0] != "."]
+    pictures = [file for file in visible if file.suffix.lower() in LISTED_SUFFIXES]
+    pictures.sort(key=natural_order)
+    unread = [file.name for file in visible if _UNREAD.fullmatch(file.suffix)]
     if unread and pictures:
         message = f"{path}: {len(unread)} files are left out, {min(unread)} first: save them as PNG"
         warnings.warn(message, Notice, stacklevel=2)
     if not pictures:
         remedy = "give a picture, a folder of pictures or a pattern such as 'left/*.png'"
-        if any(p.suffix.lower() in _ARCHIVES for p in files):
+        if any(file.suffix.lower() in _ARCHIVES for file in files):
             remedy = "unpack the archive (with --engine ray, .tar and .tar.gz are read)"
         raise InputError(f"{path}: no {', '.join(LISTED_SUFFIXES)} file there; {remedy}")
     return pictures
+
+
+def _glob_files(pattern: Path) -> list[Path]:
+    """List the files that match a pattern, in which names of existing folders stand as they are."""
+    folder = Path(pattern.anchor)
+    parts = list(pattern.relative_to(pattern.anchor).parts)
+    while len(parts) > 1 and (folder / parts[0]).is_dir():
+        folder /= parts.pop(0)
+    return [path for path in folder.glob("/".join(parts)) if path.is_file()]
 
 
 def refuse_among_inputs(out: Path, words: Iterable[str | Path], files: Iterable[Path]) -> None:
@@ -379,8 +428,8 @@ def refuse_among_inputs(out: Path, words: Iterable[str | Path], files: Iterable[
 
     Args:
         out: where the results go.
-        words: as given: files, folders or patterns.
-        files: that they name.
+        words: files, folders or patterns, as the user named them.
+        files: the files that these words stand for.
 
     Raises:
         InputError: ``out`` holds such files, and they were not named one by one.
@@ -394,24 +443,24 @@ def refuse_among_inputs(out: Path, words: Iterable[str | Path], files: Iterable[
 
 
 def read_views(path: AnyPath) -> list[Float32[Tensor, "3 _ _"]]:
-    """Read the pictures of a file as :func:`read_image` does: two of an MPO, else one.
+    """Read the two views of an MPO, or the picture of another file, as :func:`read_image` does.
 
     Raises:
-        InputError: as there; a file of a stereo camera is none here.
+        InputError: as there, but not for files of a stereo camera.
     """
     with opened_image(path, with_views=True) as image:
-        pixels = [_decoded(path, image)]
+        pixels = [_decode(path, image)]
         if image.format == "MPO":
             image.seek(1)
-            pixels.append(_decoded(path, image))
-    return [_tensor_of(view, path) for view in pixels]
+            pixels.append(_decode(path, image))
+    return [_rgb_tensor(view, path) for view in pixels]
 
 
 @contextmanager
 def opened_image(path: AnyPath, *, with_views: bool = False) -> Iterator[Image.Image]:
-    """Open a picture's header; whatever decoding raises inside the block is an input error.
+    """Open a picture, decoding only its header; errors inside the block become :class:`InputError`.
 
-    Files of stereo cameras are refused, unless ``with_views``.
+    Files that hold both views of a stereo camera are refused, unless ``with_views``.
     """
     data = read_bytes(path)
     with (
@@ -433,13 +482,15 @@ def _refuse_two_views(path: AnyPath, image: Image.Image) -> None:
     """Refuse the formats of stereo cameras, which hold both views in one file."""
     file_name = Path(path).name
     segments = getattr(image, "applist", ())  # of a JPEG
-    has_jps_segment = any(what == "APP3" and b"_JPSJPS_" in data for what, data in segments)
+    has_jps_segment = any(
+        segment_name == "APP3" and b"_JPSJPS_" in data for segment_name, data in segments
+    )
     layout = ""
     if has_jps_segment or file_name.lower().endswith(".jps"):
         layout = "JPS, side by side"
     elif image.format == "MPO":
-        # Telephones keep smaller pictures in an MPO, such as maps of gain; a second view is as
-        # large as the first.
+        # Telephones keep smaller pictures in an MPO, such as gain maps; a second view is as large
+        # as the first.
         frames: Any = image
         first_size = image.size
         other_sizes = []
@@ -447,7 +498,8 @@ def _refuse_two_views(path: AnyPath, image: Image.Image) -> None:
             frames.seek(frame)
             other_sizes.append(frames.size)
         frames.seek(0)
-        layout = "MPO, one after the other" if first_size in other_sizes else ""
+        if first_size in other_sizes:
+            layout = "MPO, one after the other"
     if layout:
         raise InputError(
             f"{path}: holds both views of a stereo camera ({layout}); "
@@ -457,10 +509,16 @@ def _refuse_two_views(path: AnyPath, image: Image.Image) -> None:
 
 
 def _orientation(image: Image.Image) -> int:
-    # Pillow turns TIFF itself, and would decode a PNG to look for EXIF behind the pixels.
-    is_turned = image.format == "TIFF"
-    is_hidden = image.format == "PNG" and "exif" not in image.info
-    return 1 if is_turned or is_hidden else image.getexif().get(_EXIF_ORIENTATION, 1)
+    """Read the EXIF orientation that is still to be applied, 1 (upright) to 8."""
+    is_turned_by_pillow = image.format == "TIFF"
+    if is_turned_by_pillow or _has_hidden_exif(image):
+        return 1
+    return image.getexif().get(_EXIF_ORIENTATION, 1)
+
+
+def _has_hidden_exif(image: Image.Image) -> bool:
+    """Whether EXIF could only stand behind the pixels of a PNG, which Pillow would decode first."""
+    return image.format == "PNG" and "exif" not in image.info
 
 
 _EXIF_IFD = 0x8769
@@ -476,15 +534,15 @@ _DIAGONAL_MM = math.hypot(36, 24)
 
 
 def read_exif_focal(picture: AnyPath | Image.Image) -> tuple[float, str] | None:
-    """Read the focal length of a photograph [px], and the tags that it follows from.
+    """Read the focal length of a photograph [px] from EXIF, and a text that names the tags.
 
-    ``FocalLengthIn35mmFilm`` is compared by the diagonal, as CIPA DC-008 defines it; else
+    ``FocalLengthIn35mmFilm`` is scaled by the diagonal, as CIPA DC-008 defines it; else
     ``FocalLength`` is divided by the width of a pixel on the sensor (``FocalPlaneXResolution``),
     times the ratio of this width and the one that was taken (``PixelXDimension``).
 
     Returns:
         None where the picture has no such tags, or zeros, which mean unknown; and, with a notice,
-        where they are of a picture of another aspect, from which this one was cut.
+        where they are of a picture of another aspect, from which this one was cropped.
 
     Raises:
         InputError: the file is no picture.
@@ -500,39 +558,44 @@ def read_exif_focal(picture: AnyPath | Image.Image) -> tuple[float, str] | None:
 
 
 def _exif_focal(picture: Image.Image) -> tuple[tuple[float, str] | None, str]:
-    """Read the focal length; or say why there is none although its tags are present."""
-    if picture.format == "PNG" and "exif" not in picture.info:
+    """Read the focal length [px] and its tags; or None, with a doubt where tags do not fit."""
+    if _has_hidden_exif(picture):
         return None, ""
     tags = picture.getexif().get_ifd(_EXIF_IFD)
-    film_mm = _positive(tags.get(_FOCAL_35MM))
-    focal_mm = _positive(tags.get(_FOCAL_MM))
-    across = _positive(tags.get(_PIXELS))
-    down = _positive(tags.get(_PIXELS_DOWN))
-    if (film_mm or focal_mm) and across and down:
-        taken = max(across, down) / min(across, down)
+    film_mm = _positive_number(tags.get(_FOCAL_35MM))
+    focal_mm = _positive_number(tags.get(_FOCAL_MM))
+
+    # A crop has another aspect than the picture that was taken.
+    taken_width = _positive_number(tags.get(_PIXELS))
+    taken_height = _positive_number(tags.get(_PIXELS_DOWN))
+    if (film_mm or focal_mm) and taken_width and taken_height:
+        taken_aspect = max(taken_width, taken_height) / min(taken_width, taken_height)
         aspect = max(picture.size) / min(picture.size)
-        if not 1 / _SAME_ASPECT < taken / aspect < _SAME_ASPECT:
-            message = (
-                f"EXIF of a picture of {across:g}x{down:g}, and this one is {picture.size[0]}x"
-                f"{picture.size[1]}, cut from it: the focal length there is not that of this one"
+        if not 1 / _SAME_ASPECT < taken_aspect / aspect < _SAME_ASPECT:
+            doubt = (
+                f"EXIF of a picture of {taken_width:g}x{taken_height:g}, and this one is "
+                f"{picture.size[0]}x{picture.size[1]}, cut from it: the focal length there is not "
+                "that of this one"
             )
-            return None, message
+            return None, doubt
+
+    # By the diagonal of 35 mm film, or else by the pixels of the sensor in a unit of length.
     if film_mm is not None:
         focal_px = film_mm / _DIAGONAL_MM * math.hypot(*picture.size)
         return (focal_px, f"FocalLengthIn35mmFilm {film_mm:g} mm"), ""
-    per_unit = _positive(tags.get(_RESOLUTION))
+    pixels_per_unit = _positive_number(tags.get(_RESOLUTION))
     unit_mm = _MM.get(tags.get(_RESOLUTION_UNIT, 2))
-    if focal_mm is None or per_unit is None or unit_mm is None:
+    if focal_mm is None or pixels_per_unit is None or unit_mm is None:
         return None, ""
-    taken = _positive(tags.get(_PIXELS)) or max(picture.size)
-    # A picture stored turned has the sensor's width along its longer side.
-    focal_px = focal_mm * per_unit / unit_mm * max(picture.size) / taken
-    sensor_mm = taken * unit_mm / per_unit
+    # The longer side, because a picture may be stored turned.
+    sensor_px = taken_width or max(picture.size)
+    focal_px = focal_mm * pixels_per_unit / unit_mm * max(picture.size) / sensor_px
+    sensor_mm = sensor_px * unit_mm / pixels_per_unit
     return (focal_px, f"FocalLength {focal_mm:g} mm, {sensor_mm:.1f} mm of sensor"), ""
 
 
-def _positive(value: Any) -> float | None:  # noqa: ANN401  whatever a file holds
-    """Give a value of a file as a positive finite number, else None."""
+def _positive_number(value: Any) -> float | None:  # noqa: ANN401  whatever a file holds
+    """Convert a value of a file to a positive finite number; None where it is none."""
     try:
         number = float(value)
     except (TypeError, ValueError, ZeroDivisionError):
@@ -566,30 +629,7 @@ def read_map(path: AnyPath) -> Float32[Tensor, "h w"]:
     """
     suffix = Path(path).suffix.lower()
     if suffix == ".pfm":
-        data = read_bytes(path)
-        header = _PFM_HEADER.match(data)
-        if header is None:
-            raise InputError(
-                f"{path}: no PFM header ('Pf', width, height, scale); is it a PFM file?"
-            )
-        if header[1] == b"F":
-            raise InputError(f"{path}: a colour PFM (PF), not a map; save one channel (Pf)")
-        width = int(header[2])
-        height = int(header[3])
-        body = memoryview(data)[header.end() :]
-        if width * height == 0 or width * height * 4 != len(body):
-            raise InputError(
-                f"{path}: declares {width}x{height} floats but {len(body)} bytes follow; it is "
-                "truncated or damaged, save it again"
-            )
-        with refused_as(path, "PFM scale", "it must be a number other than 0"):
-            scale = float(header[4])
-        if scale == 0 or not math.isfinite(scale):
-            raise InputError(f"{path}: PFM scale {scale}; its sign gives the byte order, so not 0")
-        rows = np.frombuffer(body, "<f4" if scale < 0 else ">f4").reshape(height, width)
-        array = to_float32(rows[::-1])
-        array[~np.isfinite(array)] = np.nan
-        return torch.from_numpy(array)
+        return torch.from_numpy(_read_pfm(path))
     if suffix != ".npy":
         raise refused_suffix(path, "map", MAP_SUFFIXES)
     array = read_npy(path)
@@ -598,6 +638,32 @@ def read_map(path: AnyPath) -> Float32[Tensor, "h w"]:
     if np.isinf(array).any():
         raise InputError(f"{path}: holds infinity; mark invalid pixels by NaN")
     return torch.from_numpy(array)
+
+
+def _read_pfm(path: AnyPath) -> np.ndarray:
+    """Read a one-channel PFM file, (h, w) from the upper row down; NaN where it is not finite."""
+    data = read_bytes(path)
+    header = _PFM_HEADER.match(data)
+    if header is None:
+        raise InputError(f"{path}: no PFM header ('Pf', width, height, scale); is it a PFM file?")
+    if header[1] == b"F":
+        raise InputError(f"{path}: a colour PFM (PF), not a map; save one channel (Pf)")
+    width = int(header[2])
+    height = int(header[3])
+    body = memoryview(data)[header.end() :]
+    if width * height == 0 or width * height * 4 != len(body):
+        raise InputError(
+            f"{path}: declares {width}x{height} floats but {len(body)} bytes follow; it is "
+            "truncated or damaged, save it again"
+        )
+    with refused_as(path, "PFM scale", "it must be a number other than 0"):
+        scale = float(header[4])
+    if scale == 0 or not math.isfinite(scale):
+        raise InputError(f"{path}: PFM scale {scale}; its sign gives the byte order, so not 0")
+    rows_upwards = np.frombuffer(body, "<f4" if scale < 0 else ">f4").reshape(height, width)
+    array = to_float32(rows_upwards[::-1])
+    array[~np.isfinite(array)] = np.nan
+    return array
 
 
 def write_map(path: AnyPath, map: Float[Tensor, "h w"]) -> None:
@@ -623,7 +689,7 @@ def write_map(path: AnyPath, map: Float[Tensor, "h w"]) -> None:
 
 
 def read_npy(path: AnyPath) -> np.ndarray:
-    """Read a float array of any shape as float32; never unpickles."""
+    """Read a float array of any shape from ``.npy`` as float32; pickled objects are refused."""
     array = read_numbers(path)
     if array.dtype.kind != "f":
         raise InputError(
@@ -635,7 +701,7 @@ def read_npy(path: AnyPath) -> np.ndarray:
 
 
 def read_numbers(path: AnyPath) -> np.ndarray:
-    """Read an array of floats or whole numbers of any shape as it is; never unpickles."""
+    """Read numbers of any shape and type from ``.npy``; pickled objects are refused."""
     stream = BytesIO(read_bytes(path))
     with refused_as(path, "NPY file", "save it again with numpy.save"):
         version = np.lib.format.read_magic(stream)
@@ -665,7 +731,7 @@ def read_numbers(path: AnyPath) -> np.ndarray:
 
 
 def to_float32(array: np.ndarray) -> np.ndarray:
-    """Copy to native contiguous float32; what float32 cannot hold becomes infinity."""
+    """Copy an array to contiguous float32; numbers beyond its range become infinite."""
     with np.errstate(over="ignore", invalid="ignore"):
         return np.array(array, dtype=np.float32, order="C")
 
@@ -679,7 +745,7 @@ def read_depth_png(path: AnyPath, unit_m: float = KITTI_UNIT) -> Float32[Tensor,
 
     Args:
         path: a 16-bit greyscale PNG, or a TIFF of that kind, as BOP's ITODD has.
-        unit_m: metres (or pixels) a unit.
+        unit_m: length of one stored unit [m], or its pixels of disparity.
 
     Raises:
         InputError: the file is missing, damaged, 8-bit or coloured, or the unit makes no sense.
@@ -697,20 +763,24 @@ def read_depth_png(path: AnyPath, unit_m: float = KITTI_UNIT) -> Float32[Tensor,
 
 
 def read_stored_depth(path: AnyPath) -> Shaped[Tensor, "h w"]:
-    """Read depth as it is stored: whole numbers of a 16-bit PNG, TIFF or NPY; floats of the others.
+    """Read depth in the unit of its file: whole numbers of a 16-bit PNG, TIFF or NPY, else floats.
 
-    Whole numbers are 0 where there is no reading, floats NaN.
+    Where there is no reading, whole numbers are 0 and floats NaN.
 
     Raises:
-        InputError: the file is missing, damaged, no map, or a picture of one.
+        InputError: the file is missing, damaged, no map, or a picture of a map.
     """
     suffix = Path(path).suffix.lower()
     if suffix not in DEPTH_SUFFIXES:
         raise refused_suffix(path, "depth image", DEPTH_SUFFIXES)
-    if suffix == ".npy" and (array := read_numbers(path)).dtype.kind != "f":
-        if array.ndim != 2:
-            raise InputError(f"{path}: depth is (H, W), got {array.shape}; save one channel alone")
-        return torch.from_numpy(array.astype(np.int64))
+    if suffix == ".npy":
+        array = read_numbers(path)
+        if array.dtype.kind != "f":
+            if array.ndim != 2:
+                raise InputError(
+                    f"{path}: depth is (H, W), got {array.shape}; save one channel alone"
+                )
+            return torch.from_numpy(array.astype(np.int64))
     if suffix in MAP_SUFFIXES:
         return read_map(path)
     if suffix != ".png":

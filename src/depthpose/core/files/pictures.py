@@ -15,7 +15,7 @@ Picture = str | Path | Image.Image | Shaped[Tensor, "..."] | Shaped[np.ndarray, 
 """A file, a picture of Pillow's, an array or a tensor: RGB, RGBA (alpha is dropped) or grey, whole
 numbers of 8 bits or floats in [0, 1], (H, W, C), (C, H, W) or (H, W). The order of the channels
 cannot be seen in the values: OpenCV reads BGR, which ``image[..., ::-1]`` turns into RGB."""
-_CHANNELS = (1, 3, 4)
+_CHANNEL_COUNTS = (1, 3, 4)  # grey, RGB, RGBA
 _VALUES = (
     "give 8-bit numbers, or floats in [0, 1]: divide by the largest value that it can hold (65535 "
     "of 16 bits)"
@@ -23,7 +23,11 @@ _VALUES = (
 
 
 def as_tensor(image: object, name: str = "the image") -> Float[Tensor, "3 h w"]:
-    """Read a :data:`Picture`, or bring it to RGB in [0, 1]; a batch of one is its image."""
+    """Read a :data:`Picture`, or convert it to RGB in [0, 1]; a batch of one image is that image.
+
+    Raises:
+        InputError: it is no picture; ``name`` is what the message calls it.
+    """
     match image:
         case str() | Path():
             return read_image(Path(image))
@@ -34,29 +38,44 @@ def as_tensor(image: object, name: str = "the image") -> Float[Tensor, "3 h w"]:
         case np.ndarray():
             kind = np.uint8 if image.dtype == np.uint8 else np.float32
             values = torch.from_numpy(np.require(image, kind, requirements=["C", "W"]))
-            return _rgb(values, (-1, 0), f"{name} is an array")
+            return _to_rgb(values, (-1, 0), f"{name} is an array")
         case Tensor() if image.dtype != torch.uint8 and not image.is_floating_point():
             raise InputError(f"{name} is a tensor of {image.dtype}; {_VALUES}")
         case Tensor():
-            return _rgb(image, (0, -1), f"{name} is a tensor")
+            return _to_rgb(image, (0, -1), f"{name} is a tensor")
         case _:
             return check_image(image, name)
 
 
-def _rgb(values: Tensor, sides: tuple[int, int], what: str) -> Float[Tensor, "3 h w"]:
-    """Move the channel axis to the front, as three channels in [0, 1]."""
+def _to_rgb(
+    values: Tensor, channel_axes: tuple[int, int], described: str
+) -> Float[Tensor, "3 h w"]:
+    """Convert an array of an image to three channels in [0, 1], in front of rows and columns.
+
+    Args:
+        values: grey (H, W), or with a channel axis, or a batch of one such image.
+        channel_axes: where the channel axis may be; the first that fits is taken.
+        described: begins an error, as ``NAME is a tensor``.
+    """
     shape = tuple(values.shape)
-    if values.ndim == 4 and shape[0] != 1:
-        raise InputError(
-            f"{what} of shape {shape}, a batch; give one image, or the batch to "
-            "estimate_many(batch, camera)"
-        )
-    values_3d = values[0] if values.ndim == 4 else values
-    planes = values_3d[None] if values_3d.ndim == 2 else values_3d
-    channel_axes = (k for k in sides if planes.ndim == 3 and planes.shape[k] in _CHANNELS)
-    side = 0 if values_3d.ndim == 2 else next(channel_axes, None)
-    if side is None:
-        raise InputError(f"{what} of shape {shape}; give (H, W, 3), (3, H, W) or grey (H, W)")
-    planes = planes.movedim(side, 0)[:3]
-    scaled = planes.float() / 255 if planes.dtype == torch.uint8 else planes.float()
-    return check_image(scaled.expand(3, -1, -1), what.partition(" is ")[0])
+    if values.ndim == 4:
+        if shape[0] != 1:
+            raise InputError(
+                f"{described} of shape {shape}, a batch; give one image, or the batch to "
+                "estimate_many(batch, camera)"
+            )
+        values = values[0]
+
+    channel_axis = None
+    if values.ndim == 2:
+        values = values[None]
+        channel_axis = 0
+    elif values.ndim == 3:
+        fitting = (axis for axis in channel_axes if values.shape[axis] in _CHANNEL_COUNTS)
+        channel_axis = next(fitting, None)
+    if channel_axis is None:
+        raise InputError(f"{described} of shape {shape}; give (H, W, 3), (3, H, W) or grey (H, W)")
+
+    channels = values.movedim(channel_axis, 0)[:3]
+    scaled = channels.float() / 255 if channels.dtype == torch.uint8 else channels.float()
+    return check_image(scaled.expand(3, -1, -1), described.partition(" is ")[0])

@@ -18,24 +18,25 @@ import numpy as np
 from depthpose.core.errors import InputError, Notice
 from depthpose.core.files.disk import MAX_TEXT_BYTES, AnyPath, read_bytes, refused_as
 
-_WORDS = re.compile(r"[-+]?(?:nan\(\w*\)|1[.,]#(?:QNAN|SNAN|IND|INF)\w*)")
-_FEW = "declares {} but {} rows follow; it is truncated, save it again"
+_MICROSOFT_NAN = re.compile(r"[-+]?(?:nan\(\w*\)|1[.,]#(?:QNAN|SNAN|IND|INF)\w*)")
+"""NaN and infinity as Microsoft's C library prints them."""
+_TOO_FEW_ROWS = "declares {} but {} rows follow; it is truncated, save it again"
 Columns = dict[str, np.ndarray]  # one array a name, all equally long
 
 
 @dataclass(frozen=True, kw_only=True)
 class Field:
-    """One named column of a record."""
+    """A named column of a record."""
 
     name: str
-    code: str  # numpy's, without byte order, as "f4"
-    count: int = 1  # numbers a record; a field of several is stepped over
+    code: str  # numpy's type code without byte order, such as "f4"
+    count: int = 1  # numbers a record; of several only the first is read
     size_code: str | None = None  # of a list, the type of its length; None: it is no list
 
 
 @dataclass(frozen=True, eq=False)
 class Ragged:
-    """Lists of differing length: how many values each has, and all values one after the other."""
+    """Lists of differing length: the number of values of each, and all values in a row."""
 
     sizes: np.ndarray
     values: np.ndarray
@@ -44,7 +45,10 @@ class Ragged:
 def split_records(
     path: AnyPath, body: memoryview, fields: list[Field], count: int, order: str = "<"
 ) -> Columns:
-    """Take ``count`` packed records apart into columns, without a copy."""
+    """Split ``count`` packed binary records into columns, as views of ``body``.
+
+    ``order`` is numpy's sign of the byte order.
+    """
     # Named by place, since a file may use one name for several fields of padding.
     with refused_as(path, "list of fields", "save it again"):
         dtype = np.dtype([(f"{i}", order + f.code, (f.count,)) for i, f in enumerate(fields)])
@@ -54,7 +58,7 @@ def split_records(
 
 
 def text_rows(path: AnyPath, body: memoryview) -> Iterator[str]:
-    """Give the lines of a body in text; empty ones do not count."""
+    """Yield the lines of points in text, without empty ones; NaN is spelled ``nan``."""
     if len(body) > MAX_TEXT_BYTES:
         raise InputError(
             f"{path}: {len(body)} bytes of points in text, more than {MAX_TEXT_BYTES}; save it as "
@@ -65,23 +69,25 @@ def text_rows(path: AnyPath, body: memoryview) -> Iterator[str]:
 
 
 def plain_numbers(line: str) -> str:
-    """Write ``nan`` and ``inf`` for the words by which Microsoft's C library prints them."""
+    """Replace NaN and infinity as Microsoft's C library prints them by ``nan`` and ``inf``."""
     if "#" not in line and "(" not in line:
         return line
-    return _WORDS.sub(lambda match: "inf" if "INF" in match[0] else "nan", line)
+    return _MICROSOFT_NAN.sub(lambda match: "inf" if "INF" in match[0] else "nan", line)
 
 
 def split_rows(path: AnyPath, rows: Iterator[str], fields: list[Field], count: int) -> Columns:
-    """Take the next ``count`` rows of text apart into columns of the declared types."""
+    """Split the next ``count`` rows of text into columns of the declared types."""
     table = parse_rows(path, islice(rows, count))
     if len(table) < count:
-        raise InputError(f"{path}: {_FEW.format(f'{count} points', len(table))}")
+        raise InputError(f"{path}: {_TOO_FEW_ROWS.format(f'{count} points', len(table))}")
+    if count == 0:
+        return {}
     width = sum(f.count for f in fields)
-    if count and table.shape[1] != width:
+    if table.shape[1] != width:
         raise InputError(f"{path}: rows of {table.shape[1]} values where {width} are declared")
     columns: Columns = {}
     starts = accumulate((f.count for f in fields), initial=0)
-    for f, start in zip(fields if count else (), starts, strict=False):
+    for f, start in zip(fields, starts, strict=False):
         column = table[:, start]
         dtype = np.dtype(f.code)
         if dtype.kind != "f":
@@ -98,14 +104,20 @@ def split_rows(path: AnyPath, rows: Iterator[str], fields: list[Field], count: i
 
 
 def parse_rows(path: AnyPath, rows: Iterable[str]) -> np.ndarray:
-    """Parse rows of equally many numbers, parted by blanks, to float64; taken one at a time."""
+    """Parse rows of equally many numbers, separated by blanks, to a float64 table.
+
+    Rows are taken one at a time, so that their text need not fit into memory.
+    """
     with refused_as(path, "table of numbers", "give every row as many values, with decimal points"):
         table = np.loadtxt(rows, dtype=np.float64, comments=None, ndmin=2)
     return table if table.size else np.empty((0, 0))
 
 
 def need_bytes(path: AnyPath, have: int, need: int, what: str) -> None:
-    """Refuse a body that is shorter than its header says, before anything is allocated."""
+    """Refuse a body that is shorter than its header declares, before memory is allocated for it.
+
+    ``what`` is what the header declares, such as ``100 points``.
+    """
     if have < need:
         raise InputError(
             f"{path}: declares {what} of {need} bytes but {have} follow; it is truncated or "
@@ -119,22 +131,37 @@ _CODES = {
     **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
 }
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-_MAX_HEADER = 2**16
+_MAX_HEADER = 2**16  # bytes in which the end of a header is looked for
 _END = re.compile(rb"(?:^|[\r\n])end_header[ \t]*(?:\r\n|\n|\r)")
 
 
-_MOST_RUNS = 500_000  # of equally long binary lists, each read at once; more take over 10 s
+_MAX_RUNS = 500_000  # of binary lists of equal lengths, each read at once; more take over 10 s
+_LEAST_ROWS_AHEAD = 64  # rows of binary lists that are taken to be as long as the first of a run
+_SURPLUS_BYTES = 3  # behind binary data do no harm: a line end
 
 
 @dataclass(kw_only=True)
 class _Element:
+    """An element of a PLY header, such as ``vertex`` or ``face``."""
+
     name: str
     count: int
     fields: list[Field] = field(default_factory=list)
 
 
 def read_ply_elements(path: AnyPath, last: str | None = None) -> tuple[Columns, dict[str, Ragged]]:
-    """Read the columns of the ``vertex`` element, and the lists of the others."""
+    """Read the columns of the ``vertex`` element, and the lists of the others.
+
+    Args:
+        path: the file.
+        last: element after which reading ends; None: the whole file.
+
+    Returns:
+        Columns by name, and lists by ``ELEMENT PROPERTY``, such as ``face vertex_indices``.
+
+    Raises:
+        InputError: the file is missing, damaged, or not what its header declares.
+    """
     data = read_bytes(path)
     end = _END.search(data, 0, _MAX_HEADER)
     if not data.startswith(b"ply") or end is None:
@@ -147,116 +174,144 @@ def read_ply_elements(path: AnyPath, last: str | None = None) -> tuple[Columns, 
     for element in elements:
         if element.name == "vertex" and rows is None:
             columns = split_records(path, body, element.fields, element.count, order)
-            row_bytes = sum(np.dtype(f.code).itemsize for f in element.fields)
-            body = body[element.count * row_bytes :]
+            record_bytes = sum(np.dtype(f.code).itemsize for f in element.fields)
+            body = body[element.count * record_bytes :]
         elif element.name == "vertex":
             assert rows is not None
             columns = split_rows(path, rows, element.fields, element.count)
         elif rows is None:
-            more_lists, used_bytes = _binary_lists(path, body, element, order)
+            element_lists, used_bytes = _read_binary_lists(path, body, element, order)
             body = body[used_bytes:]
-            lists = lists | more_lists
+            lists |= element_lists
         else:
-            sizes = {f.name: array("q") for f in element.fields if f.size_code}
-            values = {name: array("d") for name in sizes}
-            row_count = 0
-            for row_count, row in enumerate(islice(rows, element.count), 1):
-                words = row.split()
-                at = 0
-                try:
-                    for f in element.fields:
-                        if f.size_code:
-                            count = int(words[at])
-                            sizes[f.name].append(count)
-                            values[f.name].extend(map(float, words[at + 1 : at + 1 + count]))
-                            at += max(count, 0)
-                        at += 1
-                except (ValueError, IndexError, OverflowError):
-                    at = -1
-                if at != len(words):
-                    raise InputError(
-                        f"{path}: row {row_count} of {element.name}, {row.strip()[:60]!r}, is not "
-                        "what the header declares (the number of values, then as many); save it "
-                        "again"
-                    )
-            if row_count < element.count:
-                what = f"{element.count} {element.name}"
-                raise InputError(f"{path}: {_FEW.format(what, row_count)}")
-            lists |= {
-                f"{element.name} {name}": Ragged(
-                    np.array(sizes[name], np.int64), np.array(values[name])
-                )
-                for name in sizes
-            }
+            lists |= _read_text_lists(path, rows, element)
         if element.name == last:
             return columns, lists
+
     surplus = len(body) if rows is None else sum(1 for _ in rows)
-    if surplus > (3 if rows is None else 0):  # a line end behind binary data does no harm
-        what = "bytes" if rows is None else "rows"
+    if surplus > (_SURPLUS_BYTES if rows is None else 0):
+        unit = "bytes" if rows is None else "rows"
+        declared = ", ".join(f"{element.count} {element.name}" for element in elements)
         raise InputError(
-            f"{path}: {surplus} {what} follow what its header declares "
-            f"({', '.join(f'{e.count} {e.name}' for e in elements)}); correct it, or save it again"
+            f"{path}: {surplus} {unit} follow what its header declares ({declared}); correct it, "
+            "or save it again"
         )
     return columns, lists
 
 
-def _binary_lists(
+def _read_text_lists(path: AnyPath, rows: Iterator[str], element: _Element) -> dict[str, Ragged]:
+    """Read the lists of an element from its rows of text: the length of a list, then its values."""
+    sizes = {f.name: array("q") for f in element.fields if f.size_code}
+    values = {name: array("d") for name in sizes}
+    row_count = 0
+    for row_count, row in enumerate(islice(rows, element.count), 1):
+        words = row.split()
+        position = 0
+        try:
+            for f in element.fields:
+                if f.size_code:
+                    size = int(words[position])
+                    sizes[f.name].append(size)
+                    first = position + 1
+                    values[f.name].extend(map(float, words[first : first + size]))
+                    position += max(size, 0)
+                position += 1
+        except (ValueError, IndexError, OverflowError):
+            position = -1
+        if position != len(words):
+            raise InputError(
+                f"{path}: row {row_count} of {element.name}, {row.strip()[:60]!r}, is not what the "
+                "header declares (the number of values, then as many); save it again"
+            )
+    if row_count < element.count:
+        declared = f"{element.count} {element.name}"
+        raise InputError(f"{path}: {_TOO_FEW_ROWS.format(declared, row_count)}")
+    return {
+        f"{element.name} {name}": Ragged(np.array(sizes[name], np.int64), np.array(values[name]))
+        for name in sizes
+    }
+
+
+def _read_binary_lists(
     path: AnyPath, body: memoryview, element: _Element, order: str
 ) -> tuple[dict[str, Ragged], int]:
-    """Read the lists of an element, rows of equal length at once; give the bytes read."""
-    what = f"{element.count} {element.name}"
-    steps = [(f, np.dtype(order + (f.size_code or "u1")), np.dtype(order + f.code))
-             for f in element.fields]  # fmt: skip
-    runs: list[Any] = []
-    dtypes: dict[tuple[int, ...], np.dtype] = {}
-    at = 0
-    left = element.count
-    ahead = 64
-    while left:
-        lengths = []
-        end = at
-        for f, size, value in steps:
-            length = 1
-            if f.size_code:
-                need_bytes(path, len(body), end + size.itemsize, what)
-                length = int(np.frombuffer(body, size, 1, end)[0])
-                if length < 0:
-                    raise InputError(f"{path}: a list of {what} has {length} values; save it anew")
-                end += size.itemsize
-            lengths.append(length)
-            end += length * value.itemsize
-        need_bytes(path, len(body), end, what)
-        key = tuple(lengths)
-        if key not in dtypes:
-            kinds: list[Any] = []
-            for (f, size, value), length in zip(steps, key, strict=True):
-                kinds += [(f"{f.name} size", size)] if f.size_code else []
-                kinds.append((f.name, value, (length,)))
-            dtypes[key] = np.dtype(kinds)
-        dtype = dtypes[key]
-        rows = min(left, ahead, (len(body) - at) // dtype.itemsize)
-        records: Any = np.frombuffer(body, dtype, rows, at)
+    """Read the lists of an element from binary rows, and count the bytes that they take.
+
+    A run of rows whose lists have equal lengths is read at once: the lengths of its first row give
+    the type of its records.
+    """
+    declared = f"{element.count} {element.name}"
+    runs: list[Any] = []  # structured arrays, one row each record
+    record_types: dict[tuple[int, ...], np.dtype] = {}
+    position = 0
+    rows_left = element.count
+    rows_ahead = _LEAST_ROWS_AHEAD
+    while rows_left:
+        lengths = _read_list_lengths(path, body, position, element, order)
+        if lengths not in record_types:
+            record_types[lengths] = _record_type(element.fields, lengths, order)
+        record_type = record_types[lengths]
+
+        # Rows up to the first whose lists have other lengths.
+        rows = min(rows_left, rows_ahead, (len(body) - position) // record_type.itemsize)
+        records: Any = np.frombuffer(body, record_type, rows, position)
         sizes = [records[f"{f.name} size"] for f in element.fields if f.size_code]
         is_equal = np.array([size == size[0] for size in sizes] or [[True]]).all(0)
-        records = records if is_equal.all() else records[: int(is_equal.argmin())]
+        if not is_equal.all():
+            records = records[: int(is_equal.argmin())]
         runs.append(records)
-        if len(runs) > _MOST_RUNS:
-            raise InputError(f"{path}: {what} of ever other lengths; export triangles alone")
-        at = at + records.nbytes
-        left = left - len(records)
-        ahead = 2 * len(records) + 64
-    return {
-        f"{element.name} {f.name}": Ragged(
-            sizes=np.concatenate([np.empty(0, int), *(r[f"{f.name} size"] for r in runs)]),
-            values=np.concatenate([np.empty(0, f.code), *(r[f.name].reshape(-1) for r in runs)]),
-        )
-        for f in element.fields
-        if f.size_code
-    }, at
+        if len(runs) > _MAX_RUNS:
+            raise InputError(f"{path}: {declared} of ever other lengths; export triangles alone")
+        position += records.nbytes
+        rows_left -= len(records)
+        rows_ahead = 2 * len(records) + _LEAST_ROWS_AHEAD
+
+    lists: dict[str, Ragged] = {}
+    for f in element.fields:
+        if f.size_code:
+            sizes = [run[f"{f.name} size"] for run in runs]
+            values = [run[f.name].reshape(-1) for run in runs]
+            lists[f"{element.name} {f.name}"] = Ragged(
+                sizes=np.concatenate([np.empty(0, int), *sizes]),
+                values=np.concatenate([np.empty(0, f.code), *values]),
+            )
+    return lists, position
+
+
+def _read_list_lengths(
+    path: AnyPath, body: memoryview, position: int, element: _Element, order: str
+) -> tuple[int, ...]:
+    """Read the number of values of each field of the binary row at ``position``; 1 of no list."""
+    declared = f"{element.count} {element.name}"
+    lengths: list[int] = []
+    end = position
+    for f in element.fields:
+        length = 1
+        if f.size_code:
+            size_type = np.dtype(order + f.size_code)
+            need_bytes(path, len(body), end + size_type.itemsize, declared)
+            length = int(np.frombuffer(body, size_type, 1, end)[0])
+            if length < 0:
+                raise InputError(f"{path}: a list of {declared} has {length} values; save it anew")
+            end += size_type.itemsize
+        lengths.append(length)
+        end += length * np.dtype(f.code).itemsize
+    need_bytes(path, len(body), end, declared)
+    return tuple(lengths)
+
+
+def _record_type(fields: list[Field], lengths: tuple[int, ...], order: str) -> np.dtype:
+    """Make numpy's type of a binary row whose fields have these numbers of values."""
+    parts: list[Any] = []
+    for f, length in zip(fields, lengths, strict=True):
+        if f.size_code:
+            parts.append((f"{f.name} size", order + f.size_code))
+        parts.append((f.name, order + f.code, (length,)))
+    return np.dtype(parts)
 
 
 def encode_ply(points: np.ndarray, color: np.ndarray | None) -> bytes:
-    """Encode points, and colours as bytes where there are any, as little-endian PLY."""
+    """Encode points (n, 3), and colours of 8 bits where there are any, as little-endian PLY."""
     columns = [(name, "<f4", "float", points[:, i]) for i, name in enumerate("xyz")]
     if color is not None:
         names = ("red", "green", "blue")
@@ -314,14 +369,16 @@ _PCD_CODES = {
     **{("I", size): f"i{size}" for size in "1248"},
     **{("U", size): f"u{size}" for size in "1248"},
 }
-# of compressed points: eight million, byte by byte
-_MAX_PACKED = 2**25
-_MAX_UNPACKED = 2**27
+_MAX_PACKED = 2**25  # bytes of compressed points, which are decompressed byte by byte
+_MAX_UNPACKED = 2**27  # bytes of them decompressed: eight million points
 _DATA = re.compile(rb"(?:^|\n)DATA[ \t]+(ascii|binary|binary_compressed)[ \t]*(?:\r\n|\n)")
 
 
 def read_pcd(path: AnyPath) -> Columns:
     """Read the columns of a PCD file; ``rgb`` stays packed.
+
+    Raises:
+        InputError: the file is missing, damaged, or not what its header declares.
 
     Warns:
         Notice: its ``VIEWPOINT`` is not the identity, so that the points may be in a frame that is
@@ -366,39 +423,52 @@ def read_pcd(path: AnyPath) -> Columns:
     if end[1] == b"binary":
         return split_records(path, body, fields, count)
     if end[1] == b"binary_compressed":
-        need_bytes(path, len(body), 8, "the two compressed sizes")
-        packed_size, size = (int(n) for n in np.frombuffer(body, "<u4", 2))
-        need_bytes(path, len(body) - 8, packed_size, "compressed points")
-        declared = count * sum(f.count * np.dtype(f.code).itemsize for f in fields)
-        if size != declared or size > _MAX_UNPACKED or packed_size > _MAX_PACKED:
-            raise InputError(
-                f"{path}: {packed_size} bytes, {size} unpacked, where the header needs {declared} "
-                f"(and {_MAX_PACKED} and {_MAX_UNPACKED} are allowed); save it as DATA binary"
-            )
-        try:
-            unpacked = memoryview(decompress_lzf(body[8 : 8 + packed_size], size))
-        except ValueError as error:
-            raise InputError(f"{path}: damaged: {error}; save it as DATA binary") from error
-        columns: Columns = {}
-        for f in fields:  # one field after the other, each for all points
-            values = np.frombuffer(unpacked, f"<{f.code}", count * f.count)
-            columns[f.name] = values.reshape(count, f.count)[:, 0]
-            unpacked = unpacked[values.nbytes :]
-        return columns
+        return _split_compressed(path, body, fields, count)
     return split_rows(path, text_rows(path, body), fields, count)
 
 
-def _is_identity(viewpoint: str) -> bool:
-    """Whether a viewpoint, ``x y z qw qx qy qz``, moves nothing; writers without one put 0."""
+def _split_compressed(path: AnyPath, body: memoryview, fields: list[Field], count: int) -> Columns:
+    """Split the body of a ``binary_compressed`` PCD file into columns.
+
+    It is the compressed and the uncompressed size (4 bytes each), then the columns of all points,
+    one after the other, compressed by LZF.
+    """
+    need_bytes(path, len(body), 8, "the two compressed sizes")
+    packed_size, size = (int(n) for n in np.frombuffer(body, "<u4", 2))
+    need_bytes(path, len(body) - 8, packed_size, "compressed points")
+    declared = count * sum(f.count * np.dtype(f.code).itemsize for f in fields)
+    if size != declared or size > _MAX_UNPACKED or packed_size > _MAX_PACKED:
+        raise InputError(
+            f"{path}: {packed_size} bytes, {size} unpacked, where the header needs {declared} "
+            f"(and {_MAX_PACKED} and {_MAX_UNPACKED} are allowed); save it as DATA binary"
+        )
     try:
-        *moved, qw, qx, qy, qz = (float(word) for word in viewpoint.split())
+        unpacked = memoryview(decompress_lzf(body[8 : 8 + packed_size], size))
+    except ValueError as error:
+        raise InputError(f"{path}: damaged: {error}; save it as DATA binary") from error
+    columns: Columns = {}
+    for f in fields:
+        values = np.frombuffer(unpacked, f"<{f.code}", count * f.count)
+        columns[f.name] = values.reshape(count, f.count)[:, 0]
+        unpacked = unpacked[values.nbytes :]
+    return columns
+
+
+def _is_identity(viewpoint: str) -> bool:
+    """Whether a viewpoint, ``x y z qw qx qy qz``, is the identity.
+
+    Its quaternion may be 0, as programs write it that know no viewpoint.
+    """
+    try:
+        *translation, qw, qx, qy, qz = (float(word) for word in viewpoint.split())
     except ValueError:
         return False
-    return len(moved) == 3 and not any((*moved, qx, qy, qz)) and math.isfinite(qw)
+    is_unmoved = len(translation) == 3 and not any(translation)
+    return is_unmoved and not any((qx, qy, qz)) and math.isfinite(qw)
 
 
 def encode_pcd(points: np.ndarray, color: np.ndarray | None) -> bytes:
-    """Encode points, and colours as one packed ``rgb`` where there are any, as binary PCD."""
+    """Encode points (n, 3), and colours of 8 bits as one packed ``rgb``, as binary PCD."""
     table = np.ascontiguousarray(points, dtype="<f4")
     if color is not None:
         red, green, blue = color.astype("<u4").T
@@ -415,30 +485,40 @@ def encode_pcd(points: np.ndarray, color: np.ndarray | None) -> bytes:
 
 
 def decompress_lzf(packed: memoryview, size: int) -> bytes:
-    """Undo LZF, the compression of ``binary_compressed`` files.
+    """Decompress LZF, the compression of ``binary_compressed`` files, to ``size`` bytes.
 
-    A control byte below 32 announces that many literal bytes and one; any other holds a length
-    (3 bits, 7: a further byte is added) and a distance (13 bits) back into what is there already.
+    A control byte c below 32 announces c + 1 literal bytes. Any other begins a reference to bytes
+    that are decompressed already: its upper 3 bits hold the length less 2 (7: the next byte is
+    added), its lower 5 bits and the last byte the distance less 1.
+
+    Raises:
+        ValueError: the compressed bytes are damaged, or decompress to another size.
     """
     out = bytearray()
-    at = 0
-    while at < len(packed) and len(out) <= size:
-        control = packed[at]
-        at += 1
+    position = 0
+    while position < len(packed) and len(out) <= size:
+        control = packed[position]
+        position += 1
         if control < 32:
-            out += packed[at : at + control + 1]
-            at += control + 1
+            out += packed[position : position + control + 1]
+            position += control + 1
             continue
-        more_bytes = (control >> 5) // 7  # bytes of the length that follow
-        if at + more_bytes >= len(packed):
+
+        has_length_byte = control >> 5 == 7
+        if position + has_length_byte >= len(packed):
             raise ValueError("the compressed bytes end in the middle of a reference")
-        length = (control >> 5) + more_bytes * packed[at]
-        start = len(out) - ((control & 31) << 8) - packed[at + more_bytes] - 1
-        at += more_bytes + 1
+        length = (control >> 5) + 2
+        if has_length_byte:
+            length += packed[position]
+            position += 1
+        distance = ((control & 31) << 8) + packed[position] + 1
+        position += 1
+        start = len(out) - distance
         if start < 0:
             raise ValueError("the compressed bytes refer to before their beginning")
-        piece = out[start : start + length + 2]  # shorter where source and target overlap
-        out += (piece * ((length + 2) // len(piece) + 1))[: length + 2]
-    if len(out) != size or at > len(packed):
+        # Where the reference reaches beyond the end, its bytes repeat.
+        piece = out[start : start + length]
+        out += (piece * (length // len(piece) + 1))[:length]
+    if len(out) != size or position > len(packed):
         raise ValueError(f"the compressed bytes do not unpack to {size}")
     return bytes(out)

@@ -14,7 +14,7 @@ _STORES = ("s3", "s3a", "gs", "gcs", "az", "abfs", "abfss")
 
 
 def local_path(url: str) -> Path | None:
-    """Give the local path behind a path or ``file://`` URL; None in an object store."""
+    """Return the local path that a path or ``file://`` URL names; None for an object store."""
     if "://" not in url:
         return Path(url)
     protocol, _, rest = url.partition("://")
@@ -27,13 +27,17 @@ def join(folder: str, *names: str) -> str:
 
 
 def absolute(path: str) -> str:
-    """Give a path that means the same in every process; URLs do already."""
+    """Make a local path absolute; a URL is returned as it is."""
     local = local_path(path)
     return path if local is None else str(local.absolute())
 
 
 def read_from(url: str) -> bytes:
-    """Read a file whole."""
+    """Read the bytes of a file, by path or URL.
+
+    Raises:
+        InputError: it is missing or cannot be read.
+    """
     path = local_path(url)
     if path is not None:
         return read_bytes(path)
@@ -42,7 +46,7 @@ def read_from(url: str) -> bytes:
 
 
 def exists(url: str) -> bool:
-    """Whether there is a file."""
+    """Whether a path or URL names a file."""
     path = local_path(url)
     if path is not None:
         return path.is_file()
@@ -51,18 +55,23 @@ def exists(url: str) -> bool:
 
 
 def read_all(folder: str, suffix: str) -> dict[str, bytes]:
-    """Read the files of a folder, not below it, by suffix; none where there is no folder."""
+    """Read the files with a suffix in a folder, not below it: their contents by their names.
+
+    Empty where there is no such folder.
+    """
     path = local_path(folder)
     if path is not None:
-        files = sorted(p for p in path.glob(f"*{suffix}") if not p.name.startswith("."))
+        files = sorted(file for file in path.glob(f"*{suffix}") if not file.name.startswith("."))
         return {file.name: read_bytes(file) for file in files}
     with file_system(folder, "listed") as (fs, inner):
-        names = sorted(e["name"] for e in _details(fs, inner) if e["name"].endswith(suffix))
-        return {PurePosixPath(name).name: fs.cat_file(name) for name in names}
+        paths = sorted(entry["name"] for entry in _list_entries(fs, inner))
+        return {
+            PurePosixPath(path).name: fs.cat_file(path) for path in paths if path.endswith(suffix)
+        }
 
 
 def publish(content: bytes | Path, url: str) -> None:
-    """Put bytes, or a finished local file, under a final name, whole or not at all."""
+    """Write bytes, or copy a local file, to a path or URL, whole or not at all."""
     path = local_path(url)
     if path is not None:
         with atomic_write(path) as part:
@@ -80,7 +89,7 @@ def publish(content: bytes | Path, url: str) -> None:
 
 
 def refuse_unsafe(url: str) -> None:
-    """Refuse a place for results where a killed upload may leave half a file."""
+    """Refuse a URL for results whose store may show half a file after a killed upload."""
     protocol = url.partition("://")[0]
     if local_path(url) is None and protocol not in _STORES:
         raise InputError(
@@ -90,7 +99,9 @@ def refuse_unsafe(url: str) -> None:
 
 
 def local_copy(url: str, scratch: Path) -> Path:
-    """Give a file as a local path: itself on a disk, else a copy in a new folder in ``scratch``.
+    """Return the local path of a file, of one in a store after copying it below ``scratch``.
+
+    Each copy has a folder of its own.
 
     Raises:
         InputError: it is in a store and cannot be read there.
@@ -104,45 +115,62 @@ def local_copy(url: str, scratch: Path) -> Path:
 
 
 def list_files(path: str, suffixes: Sequence[str]) -> list[str]:
-    """List files, not hidden ones, by their suffixes: one, those of a folder or of a pattern."""
+    """List the files of some suffixes that a file, folder or pattern names, sorted by name.
+
+    Hidden files are left out; numbers in names are sorted by their value.
+
+    Raises:
+        InputError: there is no such file.
+    """
     with file_system(path, "listed") as (fs, inner):
         if fs.isfile(inner):
-            files = [inner]
-        elif fs.isdir(inner) or not any(mark in inner for mark in "*?["):
-            files = [entry["name"] for entry in _details(fs, inner)]
+            listed = [inner]
+        elif fs.isdir(inner) or not any(sign in inner for sign in "*?["):
+            listed = [entry["name"] for entry in _list_entries(fs, inner)]
         else:
-            # Brackets in the name of a folder that is there stand for themselves.
-            home, _, rest = inner.rpartition("/")
-            while "[" in home and not fs.isdir(home):
-                home, _, last = home.rpartition("/")
-                rest = f"{last}/{rest}"
-            files = fs.glob(f"{home.replace('[', '[[]')}/{rest}" if "[" in home else inner)
-    shown = (p for p in files if not PurePosixPath(p).name.startswith("."))
-    files = [p for p in shown if PurePosixPath(p).suffix.lower() in suffixes]
-    files.sort(key=lambda p: natural_order(Path(p)))
+            listed = fs.glob(_escape_folder(fs, inner))
+    files: list[str] = []
+    for file in listed:
+        is_hidden = PurePosixPath(file).name.startswith(".")
+        if not is_hidden and PurePosixPath(file).suffix.lower() in suffixes:
+            files.append(file)
+    files.sort(key=lambda file: natural_order(Path(file)))
     if not files:
         raise InputError(
             f"{path}: no {', '.join(suffixes)} file there; give a file, a folder or a pattern"
         )
-    prefix = f"{path.partition('://')[0]}://" if "://" in path else ""
-    return [f"{prefix}{p}" for p in files]
+    protocol = f"{path.partition('://')[0]}://" if "://" in path else ""
+    return [f"{protocol}{file}" for file in files]
+
+
+def _escape_folder(fs: Any, pattern: str) -> str:  # noqa: ANN401  fsspec has no types
+    """Escape brackets in the folder of a pattern, as far as a folder of that very name exists."""
+    folder, _, rest = pattern.rpartition("/")
+    while "[" in folder and not fs.isdir(folder):
+        folder, _, last = folder.rpartition("/")
+        rest = f"{last}/{rest}"
+    if "[" not in folder:
+        return pattern
+    return f"{folder.replace('[', '[[]')}/{rest}"
 
 
 def list_sizes(folder: str) -> dict[str, int]:
-    """Give the sizes [bytes] of the files of a folder, by name; none where there is no folder."""
+    """List the sizes [bytes] of the files of a folder, by name; empty where there is no folder."""
     with file_system(folder, "listed") as (fs, inner):
-        return {PurePosixPath(e["name"]).name: int(e["size"]) for e in _details(fs, inner)}
+        entries = _list_entries(fs, inner)
+    return {PurePosixPath(entry["name"]).name: int(entry["size"]) for entry in entries}
 
 
 def list_tree(url: str) -> dict[str, str]:
-    """List all files below a folder: their URLs by their names in it; none without a folder."""
+    """List all files below a folder: their URLs by their paths in it; empty without a folder."""
     with file_system(url, "listed") as (fs, inner):
         root = inner.rstrip("/")
         names = [path.removeprefix(root).lstrip("/") for path in fs.find(inner)]
     return {name: join(url, name) for name in sorted(names)}
 
 
-def _details(fs: Any, folder: str) -> list[dict[str, Any]]:  # noqa: ANN401  fsspec has no types
+def _list_entries(fs: Any, folder: str) -> list[dict[str, Any]]:  # noqa: ANN401  fsspec has no types
+    """List name, size and more of each file of a folder; none where there is no folder."""
     try:
         return [entry for entry in fs.ls(folder, detail=True) if entry["type"] == "file"]
     except FileNotFoundError:

@@ -5,6 +5,7 @@ import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -60,10 +61,10 @@ class Video:
 
 
 def read_video(path: AnyPath) -> Video:
-    """Open a video and look at its first frame.
+    """Open a video, decoding only its first frame.
 
-    Where the file says that pixels are wider than high, frames are widened until they are square,
-    with a notice; where they are higher than wide, heightened.
+    Where the file says that pixels are not square, frames are stretched until they are, with a
+    notice: widened where pixels are wider than high, else heightened.
 
     Raises:
         InputError: no such file, no video, or not one frame can be decoded.
@@ -80,19 +81,21 @@ def read_video(path: AnyPath) -> Video:
         raise InputError(f"{path}: {_NO_VIDEO}")
     fps = capture.get(cv2.CAP_PROP_FPS)
     frames = capture.get(cv2.CAP_PROP_FRAME_COUNT)
-    aspect = capture.get(cv2.CAP_PROP_SAR_NUM), capture.get(cv2.CAP_PROP_SAR_DEN)
-    is_read, first = capture.read()
+    pixel_width = capture.get(cv2.CAP_PROP_SAR_NUM)
+    pixel_height = capture.get(cv2.CAP_PROP_SAR_DEN)
+    is_read, first_frame = capture.read()
     capture.release()
     if not is_read or not 0 < fps < math.inf:
         raise InputError(f"{path}: {_NO_VIDEO}")
-    height, width = first.shape[:2]
-    size = width, height
-    if min(aspect) > 0 and aspect[0] != aspect[1]:
-        wide = aspect[0] / aspect[1]
-        size = round(width * max(wide, 1)), round(height * max(1 / wide, 1))
+    height, width = first_frame.shape[:2]
+    size = (width, height)
+    if pixel_width > 0 and pixel_height > 0 and pixel_width != pixel_height:
+        aspect = pixel_width / pixel_height
+        size = (round(width * max(aspect, 1)), round(height * max(1 / aspect, 1)))
         message = (
-            f"{path}: its pixels are {aspect[0]:g}:{aspect[1]:g}, so frames of {width}x{height} "
-            f"become {size[0]}x{size[1]}; a focal length or camera is taken to be of that size"
+            f"{path}: its pixels are {pixel_width:g}:{pixel_height:g}, so frames of "
+            f"{width}x{height} become {size[0]}x{size[1]}; a focal length or camera is taken to be "
+            "of that size"
         )
         warnings.warn(message, Notice, stacklevel=2)
     if size[0] * size[1] > MAX_PIXELS:
@@ -101,13 +104,16 @@ def read_video(path: AnyPath) -> Video:
 
 
 def write_video(path: AnyPath, images: Iterable[Float[Tensor, "3 _ _"]], fps: float) -> int:
-    """Write RGB images in [0, 1] as a video, whole or not at all; give how many there were.
+    """Write RGB images in [0, 1] as a video, whole or not at all.
 
     Args:
         path: ``.mp4`` (VP9, which browsers play) or ``.avi`` (motion JPEG). An OpenCV without
             VP9 writes MPEG-4 in its place, with a :class:`Notice`.
         images: the frames, all of one size; taken one at a time.
         fps: frames a second.
+
+    Returns:
+        The number of frames.
 
     Raises:
         InputError: another suffix, no frame, frames of two sizes, or the encoder refuses.
@@ -120,43 +126,62 @@ def write_video(path: AnyPath, images: Iterable[Float[Tensor, "3 _ _"]], fps: fl
         raise InputError(f"{path}: fps is {fps:g}, but a video has a positive rate; give, say, 10")
     cv2 = import_opencv("writing a video")
     writer = None
-    first = (0, 0)
+    first_size = (0, 0)
     count = 0
-    readable = 0
     with atomic_write(path) as part:
         try:
             for image in images:
                 size = (image.shape[2], image.shape[1])
                 if writer is None:
-                    first = size
-                    codec = cv2.VideoWriter_fourcc(*_CODECS[suffix])
-                    writer = cv2.VideoWriter(str(part), codec, float(fps), size)
-                    if suffix == ".mp4" and not writer.isOpened():
-                        message = (
-                            "OpenCV encodes no VP9 here, so it is MPEG-4, which no browser plays"
-                        )
-                        warnings.warn(f"{path}: {message}", Notice, stacklevel=2)
-                        codec = cv2.VideoWriter_fourcc(*"mp4v")
-                        writer = cv2.VideoWriter(str(part), codec, float(fps), size)
-                if size != first:
+                    first_size = size
+                    writer = _open_writer(cv2, path, part, fps, size)
+                if size != first_size:
                     raise InputError(
                         f"{path}: frame {count} is {size[0]}x{size[1]}, but the first one is "
-                        f"{first[0]}x{first[1]}; a video has one size"
+                        f"{first_size[0]}x{first_size[1]}; a video has one size"
                     )
                 pixels = image.detach().cpu().clamp(0, 1).mul(255).round().byte().permute(1, 2, 0)
-                writer.write(np.ascontiguousarray(pixels.numpy()[..., ::-1]))
+                blue_green_red = np.ascontiguousarray(pixels.numpy()[..., ::-1])
+                writer.write(blue_green_red)
                 count += 1
         finally:
             if writer is not None:
                 writer.release()
-        if part.is_file() and part.stat().st_size:  # the encoder does not report a full disk
-            capture = cv2.VideoCapture(str(part))
-            while capture.isOpened() and capture.grab():
-                readable += 1
-            capture.release()
+        # The encoder does not report a full disk, so the frames of the file are counted.
+        readable = _count_frames(cv2, part)
         if count == 0 or readable != count:
             raise InputError(
                 f"{path}: the encoder wrote {readable} of {count} frames; free the space if the "
                 "disk is full, else try .avi, or PNGs"
             )
+    return count
+
+
+def _open_writer(
+    cv2: Any,  # noqa: ANN401  OpenCV's classes carry no types
+    path: AnyPath,
+    part: Path,
+    fps: float,
+    size: tuple[int, int],
+) -> Any:  # noqa: ANN401
+    """Open OpenCV's encoder of ``part``, which becomes ``path``; MPEG-4 where it has no VP9."""
+    codec = cv2.VideoWriter_fourcc(*_CODECS[part.suffix.lower()])
+    writer = cv2.VideoWriter(str(part), codec, float(fps), size)
+    if part.suffix.lower() == ".mp4" and not writer.isOpened():
+        message = "OpenCV encodes no VP9 here, so it is MPEG-4, which no browser plays"
+        warnings.warn(f"{path}: {message}", Notice, stacklevel=3)
+        codec = cv2.VideoWriter_fourcc(*"mp4v")
+        writer = cv2.VideoWriter(str(part), codec, float(fps), size)
+    return writer
+
+
+def _count_frames(cv2: Any, path: Path) -> int:  # noqa: ANN401
+    """Count the frames of a video that can be read; 0 where the file is missing or empty."""
+    if not path.is_file() or not path.stat().st_size:
+        return 0
+    capture = cv2.VideoCapture(str(path))
+    count = 0
+    while capture.isOpened() and capture.grab():
+        count += 1
+    capture.release()
     return count

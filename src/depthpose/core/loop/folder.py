@@ -1,4 +1,4 @@
-"""The run folder: metrics, pictures, TensorBoard, the states to resume from, and the card."""
+"""The folder of a training: metrics, pictures, TensorBoard, saved states, and the card."""
 
 import json
 import os
@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass
 from io import BytesIO, StringIO
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 from zipfile import ZipFile
 
 import torch
@@ -22,29 +22,30 @@ from depthpose.core.files.disk import refuse_heavy, refused_as, refused_write
 from depthpose.core.loop.task import ValidationResult
 from depthpose.core.run import environment
 
-# the last, and the one before, if that is damaged
-STATE = "state.pt"
-BEFORE = "state.before.pt"
-_NEEDED = ("step", "modules", "optimizers", "scaler", "average")
+STATE = "state.pt"  # the last saved state of a training
+BEFORE = "state.before.pt"  # the one before, for the case that the last is damaged
+_STATE_KEYS = ("step", "modules", "optimizers", "scaler", "average")
 _METRICS = "metrics.jsonl"
 _PICTURES = "pictures"
 RUN_FILES = ("config.yaml", _METRICS, _PICTURES, "tensorboard", STATE, BEFORE)
 """What a training leaves in its folder beside weights."""
-_HELD_OUT = "held_out/"  # begins the names of numbers that validation found
+_HELD_OUT = "held_out/"  # begins the names of metrics of the validation
+_METRICS_SIGN_BYTES = {b"{": 250, b",": 60}
+"""Memory that a sign of the metrics file stands for once it is read [bytes]."""
 
 
 @dataclass(eq=False)
 class RunLogger:
-    """Writes one run; only the main process of a training has one that writes."""
+    """Writes metrics, pictures and states of a training, in its main process alone."""
 
     folder: Path
     _: KW_ONLY
-    is_writer: bool
-    has_good_last: bool = True  #: else the state before it is kept when the next is saved
-    board: Any = None  #: TensorBoard's, once opened
+    is_writer: bool  #: whether this is the main process; in others nothing is written
+    has_good_last: bool = True  #: else the next save keeps the state before the last
+    board: Any = None  #: TensorBoard's writer, once opened
 
     def open(self, step: int) -> None:
-        """Begin at ``step``: remove what a killed run left: later lines and partial files."""
+        """Begin at ``step``: later metrics and partial files of a killed run are removed."""
         if not self.is_writer:
             return
         for folder in (self.folder, self.folder / _PICTURES):
@@ -59,7 +60,7 @@ class RunLogger:
             self.board = SummaryWriter(str(self.folder / "tensorboard"), purge_step=step + 1)
 
     def log(self, step: int, numbers: Mapping[str, float]) -> None:
-        """Append one line of metrics."""
+        """Append the metrics of a step."""
         if not self.is_writer:
             return
         with refused_write(self.folder / _METRICS):
@@ -69,7 +70,7 @@ class RunLogger:
                 self.board.add_scalar(name, value, step)
 
     def show(self, step: int, result: ValidationResult) -> None:
-        """Write what validation found."""
+        """Write the metrics and the images of a validation."""
         if not self.is_writer:
             return
         if result.numbers:
@@ -83,23 +84,23 @@ class RunLogger:
         """Write the last state, all or nothing; the previous one is kept beside it."""
         if not self.is_writer:
             return
-        packed = BytesIO()  # on a full disk torch.save would say anything but that
-        torch.save(dict(state), packed)
+        encoded = BytesIO()  # in memory, as errors of torch.save do not name a full disk
+        torch.save(dict(state), encoded)
         last = self.folder / STATE
         before = self.folder / BEFORE
         with atomic_write(last) as part:
-            part.write_bytes(packed.getbuffer())
+            part.write_bytes(encoded.getbuffer())
             if self.has_good_last and last.is_file():
                 before.unlink(missing_ok=True)
                 try:
-                    os.link(last, before)  # a second name: there is a last state at any moment
+                    os.link(last, before)  # not a move, so that there is always a last state
                 except OSError:  # a disk without links
                     with suppress(OSError):
                         last.replace(before)
         self.has_good_last = True
 
     def close(self) -> None:
-        """Flush what TensorBoard holds back."""
+        """Close TensorBoard's writer, which writes what it still holds in memory."""
         if self.board is not None:
             with refused_write(self.folder):
                 self.board.close()
@@ -116,17 +117,12 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
         return []
     rows: list[dict[str, Any]] = []
     text = read_text(path)
-    refuse_heavy(path, text.encode(), {b"{": 250, b",": 60})  # bytes of memory
+    refuse_heavy(path, text.encode(), _METRICS_SIGN_BYTES)
     for number, line in enumerate(StringIO(text), 1):
         row = None
         with suppress(ValueError, RecursionError):
             row = json.loads(line)
-        if (
-            isinstance(row, dict)
-            and isinstance(row.get("step"), int)
-            # A whole number of 2**63 and beyond is no count, and none that is shown.
-            and all(type(v) is float or (type(v) is int and abs(v) < 2**63) for v in row.values())
-        ):
+        if _is_metrics_row(row):
             rows.append(row)
         elif line.endswith("\n"):
             raise InputError(
@@ -136,60 +132,91 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
     return rows
 
 
+def _is_metrics_row(row: object) -> TypeGuard[dict[str, Any]]:
+    """Whether a line of the metrics file is a step and numbers by name."""
+    if not isinstance(row, dict) or not isinstance(row.get("step"), int):
+        return False
+    for value in row.values():
+        is_count = type(value) is int and abs(value) < 2**63  # what TensorBoard can show
+        if type(value) is not float and not is_count:
+            return False
+    return True
+
+
 def card_text(name: str, facts: Mapping[str, str], measured: str = "") -> str:
-    """Say what weights of this name are, a line a fact, and in Markdown what was measured."""
-    lines = [f"- **{key.replace('_', ' ').capitalize()}**: {value}" for key, value in facts.items()]
-    return "\n".join([f"# {name}", "", *lines, *(["", measured.strip()] if measured else []), ""])
+    """Word the card of weights in Markdown: their name, a line for each fact, and ``measured``."""
+    lines = [f"# {name}", ""]
+    lines += [f"- **{key.replace('_', ' ').capitalize()}**: {fact}" for key, fact in facts.items()]
+    if measured:
+        lines += ["", measured.strip()]
+    return "\n".join([*lines, ""])
 
 
 def write_card(
     weights: Path, words: str, seconds: float, facts: Mapping[str, str], measured: str
 ) -> None:
-    """Write ``W.md`` beside the weights: what they are, the command, its time, what was measured.
+    """Write the card of trained weights, ``NAME.md`` beside their file.
 
-    ``words`` are those of the command, as ``depth train view``; ``measured`` is Markdown, as
-    :func:`held_out_text` where validation measured.
+    Args:
+        weights: the file of the weights, in the folder of the training.
+        words: those of the command, such as ``depth train view``.
+        seconds: duration of the training.
+        facts: what the card says, besides the command and the time.
+        measured: Markdown of what was measured, such as :func:`held_out_text`.
     """
     folder = weights.parent
     versions = environment()
     machine = ", ".join(versions[name] for name in ("machine", "gpu") if name in versions)
-    took = f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
-    took = took if seconds < 7200 else f"{seconds / 3600:.1f} h"
-    step = 0  # of the last state that is whole
+    step = 0  # of the last state that is not damaged
     for path in reversed(saved_states(folder)):
         with suppress(InputError):
             step = _read_state(path)["step"]
+    duration = _duration_text(seconds)
     record = {
         "command": f"`depthpose {words} --config config.yaml --out {shlex.quote(folder.name)}`",
-        "time": f"{step} steps in {took} on {machine}; {versions['date']}",
+        "time": f"{step} steps in {duration} on {machine}; {versions['date']}",
     }
     with atomic_write(weights.with_suffix(".md")) as part:
         part.write_text(card_text(weights.stem, {**facts, **record}, measured))
 
 
+def _duration_text(seconds: float) -> str:
+    """Word a duration in seconds, minutes or hours."""
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    if seconds < 7200:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.1f} h"
+
+
 def held_out_text(folder: Path, sentence: str) -> str:
-    """Describe a run's last validation; ``sentence``: of what, and what the numbers mean."""
-    lines: list[str] = []
+    """Make a Markdown table of a training's last validation, below a sentence.
+
+    ``sentence`` says on what it was measured, and what the numbers mean.
+    """
+    last_metrics: dict[str, float] = {}
     for row in read_metrics(folder):
-        measured = {k: value for k, value in row.items() if k.startswith(_HELD_OUT)}
-        if measured:
-            lines = [f"| {k.removeprefix(_HELD_OUT)} | {v:.4g} |" for k, v in measured.items()]
-    if not lines:
+        metrics = {name: value for name, value in row.items() if name.startswith(_HELD_OUT)}
+        last_metrics = metrics or last_metrics
+    if not last_metrics:
         return "Nothing was held out, so nothing was measured."
+    lines = [
+        f"| {name.removeprefix(_HELD_OUT)} | {value:.4g} |" for name, value in last_metrics.items()
+    ]
     return "\n".join([sentence, "", "| held out | |", "| --- | --- |", *lines])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Parts:
-    """Everything of a training that its steps change, by name: what a saved state holds."""
+    """The parts of a training that its steps change, by name: what a saved state holds."""
 
     modules: Mapping[str, nn.Module]
     optimizers: Mapping[str, Any]
-    scaler: torch.amp.GradScaler  # its state is empty but in fp16
+    scaler: torch.amp.GradScaler  # its state is empty except in fp16
     average: Mapping[str, dict[str, Tensor]]  # moving averages of the weights
 
     def state(self) -> dict[str, Any]:
-        """Give what is written."""
+        """Collect the state that is saved."""
         return {
             "modules": {name: module.state_dict() for name, module in self.modules.items()},
             "optimizers": {name: adam.state_dict() for name, adam in self.optimizers.items()},
@@ -198,14 +225,18 @@ class Parts:
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Take over a state; one that does not fit is refused with what differs."""
+        """Load a saved state into all parts.
+
+        Raises:
+            InputError: it does not fit; the message names the first tensors that differ.
+        """
         present = self.state()
-        problems = [
-            f"{words}{key}: {fault}"
-            for words, name in (("", "modules"), ("average of ", "average"))
-            for key, tensors in present[name].items()
-            for fault in misfits(tensors, state[name][key])
-        ]
+        problems: list[str] = []
+        for prefix, part in (("", "modules"), ("average of ", "average")):
+            for name, tensors in present[part].items():
+                problems += [
+                    f"{prefix}{name}: {fault}" for fault in misfits(tensors, state[part][name])
+                ]
         for name, optimizer in self.optimizers.items():
             saved = state["optimizers"][name]
             counts = [len(group["params"]) for group in optimizer.param_groups]
@@ -244,7 +275,17 @@ def saved_states(folder: Path) -> list[Path]:
 
 
 def restore_last(folder: Path, parts: Parts) -> tuple[Path, int, float]:
-    """Restore the last state that is intact; give its path, step and seconds of training."""
+    """Restore the last state that is not damaged.
+
+    Returns:
+        Its path, its step, and the duration of the training until then [s].
+
+    Raises:
+        InputError: all states are damaged or of another network.
+
+    Warns:
+        Notice: the last state is damaged, and the one before is taken.
+    """
     damages: list[str] = []
     for path in saved_states(folder):
         try:
@@ -270,12 +311,14 @@ def restore_last(folder: Path, parts: Parts) -> tuple[Path, int, float]:
 
 
 def _read_state(path: Path) -> Mapping[str, Any]:
-    """Read a saved state of a training whose checksums are right and which has all parts."""
+    """Read a saved state, and check its checksums and that it has all parts."""
     with refused_as(path, "state of a training", "it is damaged"), ZipFile(path) as archive:
-        if (part := archive.testzip()) is not None:  # torch reads over flipped bits
-            raise ValueError(f"{part} is not as it was written")
+        damaged_part = archive.testzip()  # torch itself ignores flipped bits
+        if damaged_part is not None:
+            raise ValueError(f"{damaged_part} is not as it was written")
     state = read_torch_file(path)
-    if missing := [name for name in _NEEDED if name not in state]:
+    missing = [key for key in _STATE_KEYS if key not in state]
+    if missing:
         raise InputError(f"{path}: has no {missing}, so it is no state of a training")
     step = state["step"]
     if not isinstance(step, int) or isinstance(step, bool) or step < 0:

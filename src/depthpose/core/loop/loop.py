@@ -1,7 +1,7 @@
-"""The loop itself, on Hugging Face accelerate, and the claim of a folder for one training.
+"""The training loop, on Hugging Face accelerate, and the claim of a folder for one training.
 
-Accelerate brings devices and processes, torch the precision. Gradients are averaged here, after the
-backward pass: that way a step may run any network any number of times (a discriminator is given a
+Accelerate provides devices and processes, torch the precision. Gradients are averaged here, after
+the backward pass: that way a step may run any network any number of times (a discriminator judges a
 real and a fake pair), and N processes equal one that accumulates N micro-batches.
 """
 
@@ -34,13 +34,16 @@ from depthpose.core.loop.folder import (
     restore_last,
     saved_states,
 )
-from depthpose.core.loop.task import LoopConfig, Samples, Task, mixed_seed
+from depthpose.core.loop.task import LoopConfig, Samples, Task, Update, mixed_seed
 from depthpose.core.run import claim_folder, find_rank, held_folders, release_folders
 
 SECOND_CTRL_C_S = 3.0  # between the first Ctrl-C, which stops, and the second, which finishes
+_POLL_S = 0.05  # between two looks for the second Ctrl-C
 
-_TYPES = {"fp32": None, "bf16": torch.bfloat16, "fp16": torch.float16}
-_NOT_DECISIVE = ("workers", "device", "save_every_steps", "validate_every_steps", "log_every_steps")
+_AUTOCAST_TYPES = {"fp32": None, "bf16": torch.bfloat16, "fp16": torch.float16}
+_WITHOUT_EFFECT = (
+    "workers", "device", "save_every_steps", "validate_every_steps", "log_every_steps"
+)  # fmt: skip
 """Settings of the loop that change no weight: a resumed run may have others."""
 
 _Config = TypeVar("_Config")
@@ -61,11 +64,11 @@ class Progress:
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """Folder of a training, and callbacks."""
+    """A training in its folder, and callbacks."""
 
-    folder: Path  #: the run folder; weights, named after what was trained, and card lie in it
-    resume: bool = False  #: go on from its last state
-    finish: bool = False  #: make weights of its last state, without another step
+    folder: Path  #: gets states, metrics, weights (named after what was trained) and their card
+    resume: bool = False  #: go on from the last state in it
+    finish: bool = False  #: export the weights of that state, without another step
     on_step: Callable[[Progress], None] | None = None  #: called after each optimiser step
     on_message: Callable[[str], None] | None = None  #: called with each message for the user
 
@@ -76,45 +79,49 @@ class Run:
         more: Mapping[str, Any] | None = None,
         without: Sequence[str] = (),
     ) -> None:
-        """Make the folder this config's own, and write the config into it.
+        """Claim the folder for a training with this config, and write the config into it.
 
         Args:
             config: of any training; it has ``loop``.
-            weights: names of the weights that such a training leaves.
-            more: what decides the weights beside the config, such as checksums of files.
-            without: settings of the config from which no weight follows.
+            weights: names of the weights that such a training writes.
+            more: what decides the weights besides the config, such as checksums of files.
+            without: settings of the config that change no weight.
 
         Raises:
-            InputError: the folder is another config's.
+            InputError: the folder is that of another config.
         """
         settings = {"stage": type(config).__name__, **config_to_dict(config), **(more or {})}
-        decisive = {k: v for k, v in settings["loop"].items() if k not in _NOT_DECISIVE}
-        settings["loop"] = decisive | {"processes": find_rank().world}
-        compared = {k: v for k, v in settings.items() if k not in without}
-        ends = ("safetensors", "md", "json")
-        files = [*RUN_FILES, *(f"{name}.{end}" for name in weights for end in ends)]
+        settings = {name: value for name, value in settings.items() if name not in without}
+        loop = {
+            name: value for name, value in settings["loop"].items() if name not in _WITHOUT_EFFECT
+        }
+        settings["loop"] = loop | {"processes": find_rank().world}
+
+        files = list(RUN_FILES)
         remedy = "choose another, or delete this one"
-        for path in (self.folder / f"{name}.safetensors" for name in weights):
+        for name in weights:
+            files += [f"{name}.{suffix}" for suffix in ("safetensors", "md", "json")]
+            path = self.folder / f"{name}.safetensors"
             if path.is_file():
                 option = "--start" if hasattr(config, "start") else "--generator"
                 remedy += f"; to train on from its weights, give a new --out and {option} {path}"
-        claim_folder(self.folder, compared, files, remedy)
+        claim_folder(self.folder, settings, files, remedy)
         write_config(self.folder / "config.yaml", config)
 
     def train(self, task: Task, samples: Samples, config: LoopConfig) -> float:
-        """Train ``task`` in the folder until its last step; its modules hold the result.
+        """Train ``task`` until its last step; its modules hold the result.
 
         A resumed training goes on from the folder's last state; if that is damaged, with a notice
         from the one before. The result equals that of an uninterrupted run. Under ``accelerate
         launch`` every process calls this; batch norm statistics are rank 0's.
 
         Args:
-            task: what is trained.
+            task: the networks, their losses and optimisers.
             samples: training samples by index.
-            config: how long and how.
+            config: how long and how it is trained.
 
         Returns:
-            What it took, in seconds, together with the runs that it resumed.
+            The duration of the training, with the runs that it resumed [s].
 
         Raises:
             InputError: nothing to train on, a folder with a state and no ``resume``, states that
@@ -136,11 +143,11 @@ class Run:
 
 
 def releases_folder(stage: Callable[[_Config, Run], Path]) -> Callable[[_Config, Run], Path]:
-    """Let other commands into the folder of a training when its weights are written."""
+    """Decorate a training stage so that it unlocks its folder for other commands when it ends."""
 
     @wraps(stage)
     def run_stage(config: _Config, run: Run) -> Path:
-        """Run the stage, and release the folders that it claimed, also where it fails."""
+        """Run the stage, and unlock the folders that it claimed, also where it fails."""
         before = held_folders()
         try:
             return stage(config, run)
@@ -151,60 +158,41 @@ def releases_folder(stage: Callable[[_Config, Run], Path]) -> Callable[[_Config,
 
 
 class _Training:
+    """A training in progress: its parts, its step, and what is logged."""
+
     def __init__(
         self, task: Task, samples: Samples, config: LoopConfig, folder: Path, *, resume: bool
     ) -> None:
-        """Bring everything to the device and, where asked, to the state of an earlier run."""
+        """Move the networks to the device and, with ``resume``, restore the folder's last state."""
         self.task = task
         self.samples = samples
         self.config = config
-        accelerate = import_extra("accelerate", "accelerate", "train", "training")
-        # The other processes wait while rank 0 validates.
-        patience = accelerate.InitProcessGroupKwargs(timeout=timedelta(hours=2))
-        try:  # without precision: accelerate keeps that of a process's first training
-            self.accelerator = accelerate.Accelerator(
-                mixed_precision="no", cpu=config.device == "cpu", kwargs_handlers=[patience]
-            )
-        except ValueError as error:
-            raise InputError(
-                f"device {config.device!r} cannot be used in this process, which has trained on "
-                f"another; start this training in a process of its own ({error})"
-            ) from error
+        self.accelerator = _make_accelerator(config)
         device = self.accelerator.device
         if config.precision == "fp16" and device.type == "cpu":
             raise InputError(
                 "precision 'fp16' cannot be used here: it needs a GPU. Take bf16, which a CPU has "
                 "too."
             )
-        self.precision = _TYPES[usable_precision(config.precision, device)]  # None: fp32
-        scaler = torch.amp.GradScaler(device.type, enabled=self.precision is torch.float16)
+        self.autocast_type = _AUTOCAST_TYPES[usable_precision(config.precision, device)]
         self.world = self.accelerator.num_processes
         self.steps = config.total_steps(len(samples), self.world)
         self.logger = RunLogger(folder, is_writer=self.accelerator.is_main_process)
         self.step = 0
         self.began = time.monotonic()
-        self.sums: dict[str, tuple[float, int]] = {}
+        self.sums: dict[str, tuple[float, int]] = {}  # sum and number of terms of each metric
         saved = saved_states(folder)
         if saved and not resume:
             raise InputError(f"{folder}: holds a training. Add --resume, or take another folder.")
         for module in task.modules.values():
             module.to(device)
-        if not saved and self.world > 1:  # every process begins with rank 0's weights
-            from accelerate.utils import broadcast
-
-            for module in task.modules.values():
-                for tensor in module.state_dict().values():
-                    tensor.copy_(broadcast(tensor))
-        has_average = config.ema_decay is not None
+        if not saved and self.world > 1:
+            _copy_weights_of_rank_0(task)
         self.parts = Parts(
             modules=task.modules,
             optimizers={name: adam for name, (adam, _) in task.optimizers.items()},
-            scaler=scaler,
-            average={
-                name: {key: tensor.clone() for key, tensor in m.state_dict().items()}
-                for name, m in task.modules.items()
-                if has_average
-            },
+            scaler=torch.amp.GradScaler(device.type, enabled=self.autocast_type is torch.float16),
+            average={} if config.ema_decay is None else _copy_weights(task),
         )
         if saved:
             path, self.step, seconds = restore_last(folder, self.parts)
@@ -215,9 +203,14 @@ class _Training:
     def take_steps(
         self, on_step: Callable[[Progress], None] | None, requests: Sequence[tuple[int, float]]
     ) -> float:
-        """Take the remaining steps; give the seconds of the whole training.
+        """Take the remaining steps, with their log, validations and saved states.
 
-        ``requests``: signals that ask it to stop, by number and time; the list grows meanwhile.
+        Args:
+            on_step: called after each step.
+            requests: signals that ask to stop, by number and time; the list grows meanwhile.
+
+        Returns:
+            The duration of the whole training [s].
 
         Raises:
             Interrupted: it was asked to stop, and its state is saved.
@@ -226,65 +219,55 @@ class _Training:
         while self.step < self.steps:
             self._take_step([next(batches) for _ in range(self.config.accumulate)])
             self.step += 1
-
-            # One Ctrl-C stops; a second one within seconds makes this step the last.
-            stop = self._any_process(bool(requests))
-            presses = [at for number, at in requests if number == signal.SIGINT]
-            while len(presses) == 1 and time.monotonic() - presses[0] < SECOND_CTRL_C_S:
-                time.sleep(0.05)
-                presses = [at for number, at in requests if number == signal.SIGINT]
-            if stop and self._any_process(len(presses) > 1):
+            is_stopped = self._any_process(bool(requests))
+            is_finish_requested = _wait_for_second_press(requests)
+            if is_stopped and self._any_process(is_finish_requested):
                 self.steps = self.step
 
-            numbers: dict[str, float] = {}
+            metrics: dict[str, float] = {}
             is_last = self.step == self.steps
             if is_last or self.step % self.config.log_every_steps == 0:
-                numbers = {name: total / terms for name, (total, terms) in self.sums.items()}
+                metrics = {name: total / terms for name, (total, terms) in self.sums.items()}
                 self.sums = {}
-                self.logger.log(self.step, numbers)
+                self.logger.log(self.step, metrics)
             if is_last or self.step % self.config.validate_every_steps == 0:
                 if self.accelerator.is_main_process:
                     self._validate()
                 self.accelerator.wait_for_everyone()
-            if stop or is_last or self.step % self.config.save_every_steps == 0:
+            if is_stopped or is_last or self.step % self.config.save_every_steps == 0:
                 seconds = time.monotonic() - self.began
                 self.logger.save({"step": self.step, "seconds": seconds, **self.parts.state()})
             if on_step is not None and self.accelerator.is_main_process:
-                on_step(Progress(step=self.step, steps=self.steps, numbers=numbers))
-            if stop and self.step < self.steps:
+                on_step(Progress(step=self.step, steps=self.steps, numbers=metrics))
+            if is_stopped and self.step < self.steps:
                 self.logger.close()
                 self.accelerator.wait_for_everyone()  # rank 0 may still be writing
                 raise Interrupted(
                     f"stopped after step {self.step} of {self.steps}, --resume goes on from there, "
                     "--finish makes weights of it"
                 )
-        self.accelerator.wait_for_everyone()  # none leaves while another still needs it
-        self._load_weights(self.parts.average)  # what is exported
+        self.accelerator.wait_for_everyone()  # no process ends while another still needs it
+        self._load_weights(self.parts.average)  # where there is an average, it is exported
         self.logger.close()
         return time.monotonic() - self.began
 
     def _validate(self) -> None:
         """Validate with the averaged weights, if there are any, and log the result."""
-        average = self.parts.average
-        trained = {
-            name: {key: tensor.clone() for key, tensor in m.state_dict().items()}
-            for name, m in self.task.modules.items()
-            if average
-        }
-        self._load_weights(average)
+        trained = _copy_weights(self.task) if self.parts.average else {}
+        self._load_weights(self.parts.average)
         self.logger.show(self.step, self.task.validate())
         self._load_weights(trained)
 
     def _batches(self) -> Iterator[Any]:
-        """Load this process's micro-batches, from the first that is still to do."""
+        """Load this process's micro-batches of the remaining steps to the device."""
         from accelerate.utils import send_to_device
 
-        # Micro-batch m of a step belongs to place m // world of process m % world: N processes see
-        # in a step what one process sees that accumulates N times as much.
+        # Processes take micro-batches in turn: N processes use in a step the same samples as one
+        # process that accumulates N times as many.
         rank = self.accelerator.process_index
         size = self.config.batch_size
-        places = range(self.step * self.config.accumulate, self.steps * self.config.accumulate)
-        starts = ((place * self.world + rank) * size for place in places)
+        micro_steps = range(self.step * self.config.accumulate, self.steps * self.config.accumulate)
+        starts = ((micro_step * self.world + rank) * size for micro_step in micro_steps)
         loader = DataLoader(
             self.samples,  # pyright: ignore[reportArgumentType]
             batch_sampler=(list(range(start, start + size)) for start in starts),
@@ -296,47 +279,55 @@ class _Training:
         return (send_to_device(batch, self.accelerator.device) for batch in loader)
 
     def _take_step(self, micro_batches: list[Any]) -> None:
-        """Take one step: the first optimiser's update for all micro-batches, then the second's.
+        """Take a step: the first optimiser's update for all micro-batches, then the second's.
 
         A task yields one loss for each of its optimisers (``Task.step``).
         """
-        iterators = [iter(self.task.step(batch)) for batch in micro_batches]
-        for number in count():
-            owner = None
-            for place, iterator in enumerate(iterators):
-                # Dropout follows the micro-batch, not the process that happens to hold it.
-                micro = place * self.world + self.accelerator.process_index
-                torch.manual_seed(mixed_seed(self.config.seed, self.step, micro, number))
-                device = self.accelerator.device.type
-                precision = self.precision
-                with torch.autocast(device, precision, enabled=precision is not None):
-                    update = next(iterator, None)
-                if update is None:
-                    continue
-                name = update.optimizer
-                loss = update.loss.detach()
-                # fp16 overflows now and then, and its scaler skips such steps by itself.
-                if self.config.precision != "fp16" and not math.isfinite(float(loss)):
-                    raise InputError(
-                        f"the {name}'s loss is {float(loss)} at step {self.step}. Start anew in "
-                        "another folder with a lower learning_rate, with clip_norm, or in "
-                        "precision fp32; 'start' can take weights from before."
-                    )
-                share = self.parts.scaler.scale(update.loss / len(iterators))
-                groups = self.parts.optimizers[name].param_groups
-                share.backward(inputs=[p for group in groups for p in group["params"]])
-                for fact, value in {"loss": loss, **update.facts}.items():
-                    total, terms = self.sums.get(f"{name}/{fact}", (0.0, 0))
-                    self.sums[f"{name}/{fact}"] = (total + float(value), terms + 1)
-                owner = owner or name
-            if owner is None:
+        updates_of_batches = [iter(self.task.step(batch)) for batch in micro_batches]
+        for update_number in count():
+            optimizer_name = None
+            for index, updates in enumerate(updates_of_batches):
+                # Dropout depends on the micro-batch, not on the process that computes it.
+                micro_batch = index * self.world + self.accelerator.process_index
+                seed = mixed_seed(self.config.seed, self.step, micro_batch, update_number)
+                torch.manual_seed(seed)
+                with torch.autocast(
+                    self.accelerator.device.type,
+                    self.autocast_type,
+                    enabled=self.autocast_type is not None,
+                ):
+                    update = next(updates, None)
+                if update is not None:
+                    self._backpropagate(update, len(micro_batches))
+                    optimizer_name = optimizer_name or update.optimizer
+            if optimizer_name is None:  # the task has no further update
                 break
-            self._step_optimizer(owner)
+            self._step_optimizer(optimizer_name)
         if self.config.ema_decay is not None:
             self._update_average(self.config.ema_decay)
 
+    def _backpropagate(self, update: Update, micro_batches: int) -> None:
+        """Add the gradients of the loss of a micro-batch, and its numbers to the log."""
+        name = update.optimizer
+        loss = update.loss.detach()
+        # fp16 overflows now and then, and its scaler skips such steps by itself.
+        if self.config.precision != "fp16" and not math.isfinite(float(loss)):
+            raise InputError(
+                f"the {name}'s loss is {float(loss)} at step {self.step}. Start anew in "
+                "another folder with a lower learning_rate, with clip_norm, or in "
+                "precision fp32; 'start' can take weights from before."
+            )
+        scaled_loss = self.parts.scaler.scale(update.loss / micro_batches)
+        scaled_loss.backward(inputs=_parameters_of(self.parts.optimizers[name]))
+        for fact, value in {"loss": loss, **update.facts}.items():
+            total, terms = self.sums.get(f"{name}/{fact}", (0.0, 0))
+            self.sums[f"{name}/{fact}"] = (total + float(value), terms + 1)
+
     def _update_average(self, ema_decay: float) -> None:
-        """Move the average of the weights towards them; at first faster, as it begins at random."""
+        """Move the average of the weights towards them.
+
+        The first steps move it faster, so that the random initial weights are soon forgotten.
+        """
         decay = min(ema_decay, (1 + self.step) / (10 + self.step))
         with torch.no_grad():
             for name, module in self.task.modules.items():
@@ -352,14 +343,14 @@ class _Training:
         optimizer, adam = self.task.optimizers[name]
         for group in optimizer.param_groups:
             group["lr"] = adam.rate_at(self.step, self.steps) * group.get("rate", 1.0)
-        parameters = [p for group in optimizer.param_groups for p in group["params"]]
+        parameters = _parameters_of(optimizer)
         if self.world > 1:
-            grads = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
-            flat = torch.cat([grad.flatten() for grad in grads])
+            gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
+            flat = torch.cat([gradient.flatten() for gradient in gradients])
             mean: Tensor = self.accelerator.reduce(flat, "mean")
-            parts = mean.split([grad.numel() for grad in grads])
-            for parameter, part in zip(parameters, parts, strict=True):
-                parameter.grad = part.view_as(parameter)
+            means = mean.split([gradient.numel() for gradient in gradients])
+            for parameter, gradient in zip(parameters, means, strict=True):
+                parameter.grad = gradient.view_as(parameter)
         scaler = self.parts.scaler
         if self.config.clip_norm is not None:
             scaler.unscale_(optimizer)
@@ -369,45 +360,101 @@ class _Training:
         optimizer.zero_grad()
 
     def _load_weights(self, states: Mapping[str, dict[str, Tensor]]) -> None:
+        """Load weights into the task's networks of these names."""
         for name, state in states.items():
             self.task.modules[name].load_state_dict(state)
 
-    def _any_process(self, is_asked: bool) -> bool:
+    def _any_process(self, is_true: bool) -> bool:
+        """Whether something is true in any process; all of them must ask at the same point."""
         if self.world == 1:
-            return is_asked
-        flag = torch.tensor([float(is_asked)], device=self.accelerator.device)
+            return is_true
+        flag = torch.tensor([float(is_true)], device=self.accelerator.device)
         return bool(float(self.accelerator.reduce(flag, "sum")) > 0)
+
+
+def _make_accelerator(config: LoopConfig) -> Any:  # noqa: ANN401  accelerate is loaded where it is used
+    """Make accelerate's view of the device and the processes of this launch.
+
+    Raises:
+        InputError: this process has trained on another device.
+        MissingExtraError: accelerate is not installed.
+    """
+    accelerate = import_extra("accelerate", "accelerate", "train", "training")
+    # The other processes wait while rank 0 validates.
+    process_group = accelerate.InitProcessGroupKwargs(timeout=timedelta(hours=2))
+    try:
+        # Without its own precision, since it would keep that of a process's first training.
+        return accelerate.Accelerator(
+            mixed_precision="no", cpu=config.device == "cpu", kwargs_handlers=[process_group]
+        )
+    except ValueError as error:
+        raise InputError(
+            f"device {config.device!r} cannot be used in this process, which has trained on "
+            f"another; start this training in a process of its own ({error})"
+        ) from error
+
+
+def _copy_weights_of_rank_0(task: Task) -> None:
+    """Copy the initial weights of rank 0 to all processes."""
+    from accelerate.utils import broadcast
+
+    for module in task.modules.values():
+        for tensor in module.state_dict().values():
+            tensor.copy_(broadcast(tensor))
+
+
+def _copy_weights(task: Task) -> dict[str, dict[str, Tensor]]:
+    """Copy the weights of all networks of a task, by network and tensor."""
+    return {
+        name: {key: tensor.clone() for key, tensor in module.state_dict().items()}
+        for name, module in task.modules.items()
+    }
+
+
+def _parameters_of(optimizer: Any) -> list[Tensor]:  # noqa: ANN401
+    """List the parameters of an optimiser."""
+    return [parameter for group in optimizer.param_groups for parameter in group["params"]]
+
+
+def _wait_for_second_press(requests: Sequence[tuple[int, float]]) -> bool:
+    """Whether Ctrl-C was pressed twice; after one press, wait some seconds for the second."""
+    while True:
+        presses = [pressed_s for number, pressed_s in requests if number == signal.SIGINT]
+        if len(presses) != 1 or time.monotonic() - presses[0] >= SECOND_CTRL_C_S:
+            return len(presses) > 1
+        time.sleep(_POLL_S)
 
 
 @contextmanager
 def stop_requests() -> Iterator[list[tuple[int, float]]]:
-    """Let SIGTERM and Ctrl-C end the training after the step, with its state saved.
+    """Collect SIGTERM and Ctrl-C inside the block, in place of ending the process.
 
-    Gives a list that grows by the number and the time of each signal.
+    Yields a list that grows by the number and the time of each signal; the loop looks at it after
+    each step.
     """
     requests: list[tuple[int, float]] = []
 
-    def remember(number: int, _: FrameType | None) -> None:
-        """Note a signal and when it came; the loop looks after each step."""
+    def record_signal(number: int, _: FrameType | None) -> None:
+        """Add a signal to the list; at the first Ctrl-C tell the user what a second one does."""
         if not requests and number == signal.SIGINT:
             message = (
                 "\ndepthpose: stopping after this step. Press Ctrl-C again within 3 s to finish "
                 "now: the weights of the steps so far are written.\n"
             )
-            os.write(2, message.encode())  # print may be at work itself
+            os.write(2, message.encode())  # the signal may have interrupted a print
         requests.append((number, time.monotonic()))
 
-    handlers = {}
-    with suppress(ValueError):  # not the main thread: whoever runs us handles signals
+    earlier_handlers = {}
+    with suppress(ValueError):  # outside the main thread the caller handles signals
         numbers = (signal.SIGTERM, signal.SIGINT)
-        handlers = {number: signal.signal(number, remember) for number in numbers}
+        earlier_handlers = {number: signal.signal(number, record_signal) for number in numbers}
     try:
         yield requests
     finally:
-        for number, handler in handlers.items():
+        for number, handler in earlier_handlers.items():
             signal.signal(number, handler)
 
 
 def _leave_process_group(_: int) -> None:
-    """Leave the job's process group: a signal to it must not end workers before a save."""
+    """Start a session of its own for a data worker: a signal to the job must not end it too."""
     os.setsid()

@@ -1,4 +1,4 @@
-"""What a training is given: settings of the loop and of Adam, a task, and samples by index."""
+"""The inputs of a training: settings of the loop and of Adam, the task, and samples by index."""
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
@@ -39,16 +39,16 @@ class AdamConfig(Settings):
     """Share of the weights taken off at a rate of 1, apart from the gradient (AdamW)."""
 
     def rate_at(self, step: int, steps: int) -> float:
-        """Learning rate of ``step`` (0, 1, ...) in a training of ``steps``."""
-        done = step / steps
+        """Compute the learning rate of ``step`` (0, 1, ...) in a training of ``steps``."""
+        progress = step / steps
         factors = {
             "constant": 1.0,
-            "constant-linear": min(1.0, 2 * (1 - done)),
-            "halving": 0.5 ** math.floor(self.halvings * done),
-            "cosine": 0.5 * (1 + math.cos(math.pi * done)),
+            "constant-linear": min(1.0, 2 * (1 - progress)),
+            "halving": 0.5 ** math.floor(self.halvings * progress),
+            "cosine": 0.5 * (1 + math.cos(math.pi * progress)),
         }
-        warm = min(1.0, (step + 1) / self.warmup_steps) if self.warmup_steps else 1.0
-        return self.learning_rate * factors[self.schedule] * warm
+        warmup = min(1.0, (step + 1) / self.warmup_steps) if self.warmup_steps else 1.0
+        return self.learning_rate * factors[self.schedule] * warmup
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,7 +108,7 @@ class LoopConfig(Settings):
             )
 
     def total_steps(self, samples: int, processes: int) -> int:
-        """Number of optimiser steps for a dataset of ``samples`` on ``processes``."""
+        """Compute the optimiser steps of a training on ``samples`` with ``processes``."""
         if self.steps is not None:
             return self.steps
         assert self.epochs is not None
@@ -192,20 +192,21 @@ class Samples(Protocol):
 
 
 def shuffled_index(sample_index: int, count: int, seed: int) -> int:
-    """Map an index in the whole training to one in the data; each epoch is shuffled anew."""
+    """Map an index in the whole training to one of ``count`` data, in a new order each epoch."""
     epoch, position = divmod(sample_index, count)
     generator = torch.Generator().manual_seed(mixed_seed(seed, epoch, 1))
     return int(torch.randperm(count, generator=generator)[position])
 
 
 def sample_generator(sample_index: int, seed: int) -> torch.Generator:
-    """Random numbers for the augmentation of one sample."""
+    """Make the generator of random numbers for the augmentation of one sample."""
     return torch.Generator().manual_seed(mixed_seed(seed, sample_index, 2))
 
 
 def mixed_seed(*numbers: int) -> int:
-    """Mix numbers into one seed, so that neighbours have nothing in common (splitmix64)."""
+    """Mix numbers into one seed (splitmix64), so that similar numbers make unrelated seeds."""
     state = 0
+    # Shifts and constants are those of splitmix64.
     for number in numbers:
         state = (state + number + 0x9E3779B97F4A7C15) % 2**64
         state = ((state ^ (state >> 30)) * 0xBF58476D1CE4E5B9) % 2**64
