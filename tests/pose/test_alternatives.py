@@ -250,7 +250,7 @@ def test_a_mug_is_turned_to_its_handle_and_by_any_angle_where_none_is_seen(handl
     if handle == "at the side":
         assert found.camera_from_model is not None, found.reason
         assert float(add_m(found.camera_from_model, truth, mug.vertices_m)) < 0.003
-        assert (found.certainty or 0) > 0.9
+        assert (found.certainty or 0) > 0.8
     elif found.camera_from_model is not None:
         poses = [found.camera_from_model, *(a.camera_from_model for a in found.alternatives)]
         assert len(poses) > 3

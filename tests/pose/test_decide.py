@@ -28,11 +28,14 @@ from depthpose.pose.probability import (
 from depthpose.pose.types import Alternative, Evidence, PoseEstimate
 
 GOOD = Evidence(
-    visible=40.0, supported=38.0, unobserved=2.0, seen_through=0.0, bulging=0.0, beside=0.0,
+    visible=40.0, supported=38.0, explained=38.0,
+    unobserved=2.0, seen_through=0.0, bulging=0.0, beside=0.0,
     rms=0.5, noise_m=0.001,
 )  # fmt: skip
 """What a right pose leaves."""
-BAD = replace(GOOD, supported=20.0, unobserved=6.0, seen_through=8.0, bulging=6.0, rms=1.3)
+BAD = replace(
+    GOOD, supported=20.0, explained=20.0, unobserved=6.0, seen_through=8.0, bulging=6.0, rms=1.3
+)
 """What a wrong one leaves."""
 
 
@@ -79,13 +82,13 @@ def test_each_kind_of_contradiction_lowers_the_probability() -> None:
 
 
 def test_what_was_not_observed_lowers_it_less_than_what_contradicts() -> None:
-    hidden = replace(GOOD, supported=20.0, unobserved=20.0)
-    through = replace(GOOD, supported=20.0, seen_through=18.0)
+    hidden = replace(GOOD, supported=20.0, explained=20.0, unobserved=20.0)
+    through = replace(GOOD, supported=20.0, explained=20.0, seen_through=18.0)
     assert log_odds_right(through) < log_odds_right(hidden) < log_odds_right(GOOD)
 
 
 def test_a_pose_that_a_search_proposed_needs_more_evidence_than_one_in_a_mask() -> None:
-    evidence = replace(GOOD, supported=28.0, unobserved=10.0, seen_through=2.0)
+    evidence = replace(GOOD, supported=28.0, explained=28.0, unobserved=10.0, seen_through=2.0)
     masked, proposed = (
         probability_right(evidence, odds) for odds in (PRIOR_MASKED, PRIOR_PROPOSED)
     )
@@ -109,8 +112,10 @@ def test_without_a_mask_the_pose_that_explains_more_of_the_same_readings_is_like
     shares = share_among_poses([hypothesis(small), hypothesis(few)], is_masked=False)
     assert float(shares[1]) > 0.8
     # Also one that nothing contradicts; within a mask it is the readings beside it that count.
-    clean = replace(GOOD, visible=20.0, supported=20.0, unobserved=0.0)
-    most = replace(GOOD, visible=60.0, supported=40.0, unobserved=10.0, seen_through=10.0)
+    clean = replace(GOOD, visible=20.0, supported=20.0, explained=20.0, unobserved=0.0)
+    most = replace(
+        GOOD, visible=60.0, supported=40.0, explained=40.0, unobserved=10.0, seen_through=10.0
+    )
     both = [hypothesis(clean), hypothesis(most)]
     assert float(share_among_poses(both, is_masked=False)[1]) > 0.9
     assert float(share_among_poses(both, is_masked=True)[0]) > 0.9
@@ -118,12 +123,12 @@ def test_without_a_mask_the_pose_that_explains_more_of_the_same_readings_is_like
 
 def test_copies_share_by_a_patch_that_tells_them_apart() -> None:
     """A keyway where the model has none contradicts a copy by a few patches, of very many."""
-    keyway = replace(GOOD, supported=35.0, bulging=1.5, seen_through=1.5)
+    keyway = replace(GOOD, supported=35.0, explained=35.0, bulging=1.5, seen_through=1.5)
     shares = share_among_copies([hypothesis(GOOD), *[hypothesis(keyway)] * 3], is_masked=True)
     assert float(shares.sum()) == pytest.approx(1)
     assert float(shares[0]) > float(shares[1])
     # A handle that should be seen and is not: another copy has it on the far side.
-    unseen = replace(GOOD, supported=30.0, unobserved=10.0)
+    unseen = replace(GOOD, supported=30.0, explained=30.0, unobserved=10.0)
     assert (
         float(share_among_copies([hypothesis(GOOD), hypothesis(unseen)], is_masked=True)[0]) > 0.6
     )
@@ -133,7 +138,7 @@ def test_copies_share_by_a_patch_that_tells_them_apart() -> None:
 
 def test_without_a_mask_a_copy_that_leaves_a_handle_unexplained_is_unlikely() -> None:
     """Nothing contradicts it: its own handle would be hidden behind the mug."""
-    left_out = replace(GOOD, visible=34.0, supported=34.0, unobserved=0.0)
+    left_out = replace(GOOD, visible=34.0, supported=34.0, explained=34.0, unobserved=0.0)
     both = [hypothesis(GOOD), hypothesis(left_out)]
     in_a_mask = share_among_copies(both, is_masked=True)
     without = share_among_copies(both, is_masked=False)
@@ -170,7 +175,7 @@ def test_a_pose_and_its_copies_have_the_share_of_the_group() -> None:
     ],
 )
 def test_a_refusal_says_what_contradicts_the_pose_most(kind: str, words: str) -> None:
-    evidence = replace(GOOD, supported=20.0, unobserved=0.0)
+    evidence = replace(GOOD, supported=20.0, explained=20.0, unobserved=0.0)
     evidence = replace(evidence, **{kind: 20.0})
     reason = contradiction(evidence, 0.125)
     assert reason.startswith("the best pose is right with a probability of 12%: ")

@@ -236,6 +236,18 @@ def test_a_small_hole_is_one_observation(side_px: int, through: float) -> None:
     assert evidence_of(view, BAR, pose).seen_through == through
 
 
+def test_readings_near_an_edge_are_explained_and_support_nothing() -> None:
+    """A bar shows more of its edges than a plate, and explains its readings as well."""
+    pose = Rigid(torch.eye(3), torch.tensor([0.0, 0.0, 0.6]))
+    view = view_before_wall(BAR, pose)
+    evidence = evidence_of(view, BAR, pose, is_masked=False)
+    all_readings = float(view.mask.sum()) / 10**2  # in patches of 10 px
+    assert evidence.explained == pytest.approx(all_readings, rel=0.02)
+    assert evidence.supported < 0.9 * evidence.explained
+    moved = Rigid(pose.R, pose.t_m + torch.tensor([0.0, 0.0, 0.02]))
+    assert evidence_of(view, BAR, moved, is_masked=False).explained == 0
+
+
 @pytest.mark.parametrize(("grow_px", "is_beside"), [(7, False), (11, True)])
 def test_a_mask_may_end_a_few_pixels_beside_the_silhouette(grow_px: int, is_beside: bool) -> None:
     """Of its border 3 px are left out, and 4 px beside the silhouette may be its edge."""

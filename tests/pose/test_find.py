@@ -169,7 +169,8 @@ def test_which_object_a_cloud_shows_is_answered() -> None:
 
 def test_another_object_that_fits_too_lowers_the_probability_of_every_pose() -> None:
     evidence = Evidence(
-        visible=20.0, supported=18.0, unobserved=1.0, seen_through=1.0, bulging=0.0, beside=0.0,
+        visible=20.0, supported=18.0, explained=18.0,
+        unobserved=1.0, seen_through=1.0, bulging=0.0, beside=0.0,
         rms=0.6, noise_m=0.001,
     )  # fmt: skip
     copy = Alternative(
@@ -179,7 +180,7 @@ def test_another_object_that_fits_too_lowers_the_probability_of_every_pose() -> 
         name="a", object="bracket", status="ok", camera_from_model=TRUTHS[0], certainty=0.9,
         copy_certainty=0.5, alternatives=(copy,), evidence=evidence,
     )  # fmt: skip
-    less = replace(evidence, supported=16.0, seen_through=3.0)
+    less = replace(evidence, supported=16.0, explained=16.0, seen_through=3.0)
     found = choose_object([likely, replace(likely, object="bottle", evidence=less)])
     assert found.certainty is not None
     share = found.certainty / 0.9

@@ -47,6 +47,7 @@ def answer(name: str = "a", seed: int = 0) -> PoseEstimate:
         evidence=Evidence(
             visible=40.0,
             supported=30.5,
+            explained=30.5,
             unobserved=8.0,
             seen_through=1.5,
             bulging=0.0,

@@ -209,12 +209,14 @@ def compare(observation: Observation, pose: Rigid, surface: Surface) -> Evidence
         # A patch beside the silhouette is as long as others, and half as wide.
         beside = _patch_area(is_beside, patch_area_px2 / 2)
 
+    is_explained = _lies_on_rendering(observation, rendering)
     visible = float(inner.sum()) / patch_area_px2
     supported = float(is_supported.sum()) / patch_area_px2
     squares = deviations[is_supported] ** 2
     return Evidence(
         visible=visible,
         supported=supported,
+        explained=float(is_explained.sum()) / patch_area_px2,
         # What neither supports the pose nor contradicts it has no reading, or is hidden.
         unobserved=max(0.0, visible - supported - seen_through - bulging),
         seen_through=seen_through,
@@ -258,6 +260,12 @@ def _residual_deviations(
     deviations = np.zeros_like(residual_m)
     deviations[is_compared] = mean_m / noise.deviation_m(rendering.cosine[is_compared], independent)
     return deviations, is_compared
+
+
+def _lies_on_rendering(observation: Observation, rendering: Rendering) -> Bool[np.ndarray, "h w"]:
+    """Mark the pixels whose own reading lies on the rendered surface, those near its edges too."""
+    residual_m = np.abs(observation.depth_m[rendering.window] - rendering.depth_m)
+    return residual_m <= THRESHOLD * observation.noise.deviation_m(rendering.cosine, 1)
 
 
 def _is_beside_silhouette(

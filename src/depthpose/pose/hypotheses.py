@@ -178,16 +178,16 @@ def share_among_copies(
 
 
 def _against_each_other(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Count what another pose of the same readings explains, and a pose does not, against it.
+    """Count readings that another pose explains, and a pose does not, against it.
 
     Where no mask says which readings are the object's, nothing else does: a mug's handle that one
     copy leaves out may be of a neighbour.
     """
-    most = max(hypothesis.evidence.supported for hypothesis in hypotheses)
+    most = max(hypothesis.evidence.explained for hypothesis in hypotheses)
     compared: list[Hypothesis] = []
     for hypothesis in hypotheses:
         evidence = hypothesis.evidence
-        unexplained = max(evidence.beside, most - evidence.supported)
+        unexplained = max(evidence.beside, most - evidence.explained)
         compared.append(replace(hypothesis, evidence=replace(evidence, beside=unexplained)))
     return compared
 

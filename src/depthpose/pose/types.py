@@ -251,6 +251,7 @@ class Evidence:
 
     visible: float  #: area of the model that the camera would see, edges left out
     supported: float  #: part of it on which readings lie, within three standard deviations
+    explained: float  #: area of the readings that lie on the model, those near its edges too
     unobserved: float  #: part of it without a reading, or hidden by something nearer
     seen_through: float  #: patches behind which the camera saw: free-space violations
     bulging: float  #: patches of the object's own readings before the model
