@@ -63,6 +63,20 @@ def test_the_truth_itself_is_perfect(synthetic: BopDataset) -> None:
     assert columns(result.rows)[2]["instances"] == columns(result.rows)[3]["instances"] == 6
 
 
+def test_the_time_of_a_search_is_divided_among_its_estimates(synthetic: BopDataset) -> None:
+    predictions = [
+        replace(
+            prediction,
+            estimate=replace(prediction.estimate, seconds={"icp": 0.5, "search": 3.0}),
+        )
+        for prediction in predictions_of(synthetic, lambda i: i.camera_from_model)
+    ]
+    rows = columns(evaluate(synthetic, predictions).per_instance)
+    images = len({(i.scene_id, i.image_id) for i in synthetic.instances})
+    assert sum(row["ms_total"] for row in rows) == pytest.approx(3000 * images)
+    assert {row["ms_icp"] for row in rows} == {500.0}, "an estimate's own stages are shown"
+
+
 def test_a_turn_about_the_axis_of_a_bottle_is_no_error(synthetic: BopDataset) -> None:
     turn = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]).double()
     quarter = Rigid(turn, torch.zeros(3).double())

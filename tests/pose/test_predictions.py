@@ -100,6 +100,22 @@ def test_estimates_go_out_and_come_back(tmp_path: Path) -> None:
                 assert value == after[name], name
 
 
+def test_the_time_of_a_search_counts_once_for_its_image(tmp_path: Path) -> None:
+    # Two objects of one search that took 2 s, in which one was registered, then a loose box.
+    stages = {"cloud": 0.25, "icp": 0.5, "search": 2.0}
+    in_box = {"segmentation": 0.125, "icp": 0.5, "search": 1.0}
+    sent = [
+        Prediction(estimate=replace(answer("a"), seconds=stages), place=Place(1, 20, 6)),
+        Prediction(estimate=replace(refusal(), seconds={"search": 2.0}), place=Place(1, 20, 5)),
+        Prediction(estimate=replace(answer("c", 1), seconds=in_box), place=Place(1, 20, 6)),
+        Prediction(estimate=replace(answer("d", 2), seconds=stages), place=Place(1, 21, 6)),
+    ]
+    path = tmp_path / "ours_lm-test.csv"
+    write_bop_results(path, sent)
+    times = [float(line.rsplit(",", 1)[1]) for line in path.read_text().splitlines()[1:]]
+    assert times == [3.125, 3.125, 2.0]
+
+
 def test_a_distance_that_is_none_is_no_number_in_the_file(tmp_path: Path) -> None:
     lost = replace(answer(), residual_m=float("inf"))
     write_predictions(tmp_path, [Prediction(estimate=lost)])

@@ -45,6 +45,8 @@ STAGES = (
     "tracking",
 )  # fmt: skip
 """What an estimate's ``seconds`` are of, in order; a stage that was not run is missing."""
+_STAGES_WITHIN_SEARCH = frozenset({"cloud", "proposal", "icp", "evidence", "decision"})
+"""Stages of the registrations that a search makes: the time of ``search`` includes theirs."""
 
 _ROTATION_SLACK = 1e-4  # of a rotation matrix times its transpose
 _PLACE = ("scene_id", "im_id", "obj_id")  # keys of a :class:`Place`
@@ -498,6 +500,31 @@ def detection_jobs(
     return jobs
 
 
+def additive_seconds(predictions: Sequence[Prediction]) -> list[dict[str, float]]:
+    """Give seconds of each prediction whose sum is the time that all predictions took together.
+
+    The estimates of one search all hold the time of the whole search, which is divided among them
+    here. The stages that ran within a search are left out beside it.
+    """
+    # Estimates of one image that hold the very same time come from one search: regions of an image
+    # are searched one by one, and take different times.
+    searches = [
+        (prediction.place[:2] if prediction.place else prediction.estimate.name,
+         prediction.estimate.seconds.get("search"))
+        for prediction in predictions
+    ]  # fmt: skip
+    estimate_count = Counter(searches)
+
+    rows: list[dict[str, float]] = []
+    for prediction, search in zip(predictions, searches, strict=True):
+        seconds = dict(prediction.estimate.seconds)
+        if "search" in seconds:
+            seconds = {s: t for s, t in seconds.items() if s not in _STAGES_WITHIN_SEARCH}
+            seconds["search"] /= estimate_count[search]
+        rows.append(seconds)
+    return rows
+
+
 _HEADER = ["scene_id", "im_id", "obj_id", "score", "R", "t", "time"]
 _SAME_TIME_S = 0.001  # BOP's toolkit refuses rows of an image whose times differ by more
 
@@ -580,7 +607,9 @@ def _parse_bop_row(
 def write_bop_results(
     path: str | Path, predictions: Iterable[Prediction], *, with_alternatives: bool = False
 ) -> None:
-    """Write BOP's csv, without refusals. An image's time is the sum over its estimates.
+    """Write BOP's csv, without refusals.
+
+    An image's time is the sum over its estimates, in which a search of the image counts once.
 
     Args:
         path: the csv. Numbers keep all their digits.
@@ -593,9 +622,9 @@ def write_bop_results(
     """
     entries = list(predictions)
     image_s: dict[tuple[int, int], float] = defaultdict(float)
-    for prediction in entries:
+    for prediction, seconds in zip(entries, additive_seconds(entries), strict=True):
         if prediction.place is not None:
-            image_s[prediction.place[:2]] += sum(prediction.estimate.seconds.values())
+            image_s[prediction.place[:2]] += sum(seconds.values())
     text = StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(_HEADER)

@@ -29,6 +29,7 @@ from depthpose.pose.predictions import (
     STAGES,
     Place,
     Prediction,
+    additive_seconds,
     place_of,
     read_bop_results,
     read_predictions,
@@ -100,7 +101,8 @@ class InstanceRow(_Row):
     diameter_m: float  #: of the table that was asked for
     metric: str  #: ``ADD`` or ``ADD-S``
     errors: Mapping[str, Errors]  #: by the names of ``METRICS``; what is not measured is left out
-    #: milliseconds of each stage and in ``total``; None where it has not run.
+    #: milliseconds of each stage and in ``total``; None where it has not run. The time of a search
+    #: is divided among the estimates of its image.
     ms: Mapping[str, Number]
     reason: str  #: of a refusal
 
@@ -392,10 +394,17 @@ def evaluate(
     # Stages in the order of work; those of other methods come last.
     timed = dict.fromkeys(stage for p in predictions for stage in p.estimate.seconds)
     stages = [s for s in STAGES if s in timed] + [s for s in timed if s not in STAGES]
-    rows = [
-        _instance_row(instance, matched.get(instance.name), contexts[instance.object_id], stages)
-        for instance in progress(dataset.instances)
-    ]
+    seconds_of = {
+        prediction.estimate: seconds
+        for prediction, seconds in zip(predictions, additive_seconds(predictions), strict=True)
+    }
+    rows: list[InstanceRow] = []
+    for instance in progress(dataset.instances):
+        estimate = matched.get(instance.name)
+        row = _instance_row(instance, estimate, contexts[instance.object_id])
+        ms = {} if estimate is None else _stage_ms(estimate, seconds_of[estimate])
+        columns = [*stages, "total"]
+        rows.append(replace(row, ms={column: ms.get(column) for column in columns}))
     conditions = Conditions(
         diameters=config.diameters,
         frames=f"{dataset.folder.resolve().name} {dataset.split}",
@@ -432,17 +441,18 @@ def evaluate(
 
 
 def _instance_row(
-    instance: Instance, estimate: PoseEstimate | None, context: ErrorContext, stages: list[str]
+    instance: Instance, estimate: PoseEstimate | None, context: ErrorContext
 ) -> InstanceRow:
-    """Measure one instance; without a pose its errors are those of a missing estimate."""
+    """Measure one instance, without its times.
+
+    Without a pose its errors are those of a missing estimate.
+    """
     pose = None if estimate is None else estimate.camera_from_model
     errors: dict[str, Errors] = {}
     for name, metric in METRICS.items():
         if metric.is_wanted(context):
             error = metric.missing if pose is None else metric.measure(pose, instance, context)
             errors[name] = torch.as_tensor(error, dtype=torch.float64).reshape(-1)
-    seconds = {} if estimate is None else estimate.seconds
-    ms = {stage: 1000 * seconds[stage] if stage in seconds else None for stage in stages}
     return InstanceRow(
         instance=instance.name,
         object=context.model.name,
@@ -454,6 +464,17 @@ def _instance_row(
         diameter_m=context.diameter_m,
         metric="ADD-S" if context.is_adds else "ADD",
         errors=errors,
-        ms={**ms, "total": 1000 * sum(seconds.values()) if seconds else None},
+        ms={},
         reason="" if estimate is None else estimate.reason,
     )
+
+
+def _stage_ms(estimate: PoseEstimate, additive: Mapping[str, float]) -> dict[str, float]:
+    """Give the milliseconds of each stage of an estimate, and in ``total``, if it has any.
+
+    ``additive``: its seconds of :func:`additive_seconds`, whose sum is the total.
+    """
+    if not estimate.seconds:
+        return {}
+    seconds = {**estimate.seconds, **additive, "total": sum(additive.values())}
+    return {stage: 1000 * stage_s for stage, stage_s in seconds.items()}
