@@ -135,6 +135,23 @@ def test_a_cad_file_begins_with_the_weights_that_ship(
     assert dataclasses.replace(own, models=configs[0].models) == configs[0]
 
 
+def test_a_config_may_hold_the_unit_of_a_cad_file(
+    part: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    configs: list[PoseTraining] = []
+
+    def stand_in(config: PoseTraining, run: Run) -> Path:
+        configs.append(config)
+        return run.folder / "pose.safetensors"
+
+    monkeypatch.setitem(STAGES, "pose", (PoseTraining, stand_in))
+    config = tmp_path / "c.yaml"
+    config.write_text("models: {unit: mm}")
+    words = ["pose", "train", "--cad", str(part), "--config", str(config)]
+    assert main([*words, "--out", str(tmp_path / "run")]) == 0
+    assert (configs[0].models.cad, configs[0].models.unit) == ((str(part),), "mm")
+
+
 @pytest.mark.parametrize("words", [["--seed", "99999999999999999999"], ["--number", "50001"]])
 def test_scenes_that_no_reader_could_number_are_not_written(
     part: Path, tmp_path: Path, words: list[str], capsys: pytest.CaptureFixture[str]

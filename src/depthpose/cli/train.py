@@ -326,7 +326,6 @@ def pose_train(
             'parts'; 'nothing' begins anew and takes twice the steps.
         workers: processes that render views beside the one that trains.
     """
-    from depthpose.pose.mesh import unit_of
     from depthpose.pose.train import STAGES
     from depthpose.pose.train.config import own_part
 
@@ -334,8 +333,6 @@ def pose_train(
     is_fine_tuned = what == "pose" and cad and start != _NO_START
     default = own_part(start or _START) if is_fine_tuned else None
     settings = training.read(config, kind, default=default, workers=workers)
-    for path in cad:
-        unit_of(path, unit)
     if start is not None:
         settings = replace(settings, start=None if start == _NO_START else start)
 
