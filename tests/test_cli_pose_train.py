@@ -61,6 +61,8 @@ def test_a_cad_file_becomes_weights_with_a_card(
             ["--what", "segmentation", "--cad", ".", "--unit", "mm"],
             "--cad has no meaning for 'segmentation', which learns from pictures",
         ),
+        (["--what", "segmentation", "--unit", "mm"], "--unit has no meaning for 'segmentation'"),
+        (["--what", "segmentation", "--symmetries", "found"], "--symmetries has no meaning for"),
         (["--cad", "nowhere.stl", "--unit", "mm"], "nowhere.stl"),
     ],
 )

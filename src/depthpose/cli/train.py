@@ -339,9 +339,10 @@ def pose_train(
     # Options of models take the place of the config's.
     if cad or unit or symmetries:
         if what == "segmentation":
+            option = "--cad" if cad else "--unit" if unit else "--symmetries"
             raise InputError(
-                "--cad has no meaning for 'segmentation', which learns from pictures: make them by "
-                "'depthpose data make objects --cad ...' and name the folder in the config"
+                f"{option} has no meaning for 'segmentation', which learns from pictures: make "
+                "them by 'depthpose data make objects --cad ...' and name the folder in the config"
             )
         with_found = None if symmetries is None else symmetries == "found"
         values = {"cad": cad or None, "unit": unit, "with_found_symmetries": with_found}
