@@ -329,31 +329,47 @@ def pose_train(
     from depthpose.pose.train import STAGES
     from depthpose.pose.train.config import own_part
 
+    # A CAD file without a config has the defaults of a training from trained weights.
     kind, run_stage = STAGES[what]
-    is_fine_tuned = what == "pose" and cad and start != _NO_START
-    default = own_part(start or _START) if is_fine_tuned else None
+    is_fine_tuned = what == "pose" and bool(cad) and start != _NO_START
+    default = own_part(_START) if is_fine_tuned else kind()
     settings = training.read(config, kind, default=default, workers=workers)
+
+    # Options take the place of what the config says.
     if start is not None:
         settings = replace(settings, start=None if start == _NO_START else start)
-
-    # Options of models take the place of the config's.
-    if cad or unit or symmetries:
-        if what == "segmentation":
-            option = "--cad" if cad else "--unit" if unit else "--symmetries"
-            raise InputError(
-                f"{option} has no meaning for 'segmentation', which learns from pictures: make "
-                "them by 'depthpose data make objects --cad ...' and name the folder in the config"
-            )
-        with_found = None if symmetries is None else symmetries == "found"
-        values = {"cad": cad or None, "unit": unit, "with_found_symmetries": with_found}
-        models = changed(settings.models, **values)
-        if cad:  # they take the place of a data set's models
-            models = replace(models, bop=None, objects=(), parts=())
-        settings = replace(settings, models=models)
-
+    settings = _with_models(settings, cad, unit, symmetries)
     if data is not None:
         settings = _with_dataset(settings, data)
     return training.run(run_stage, settings, out, with_messages=True)
+
+
+def _with_models(
+    config: Any,  # noqa: ANN401 - of any training of poses
+    cad: tuple[str, ...],
+    unit: Unit | None,
+    symmetries: Literal["none", "found"] | None,
+) -> Any:  # noqa: ANN401
+    """Return a config with the models of the options of :func:`pose_train`.
+
+    Raises:
+        InputError: an option is set, but the training is a segmentation's, which has no models.
+    """
+    options = {"cad": cad, "unit": unit, "symmetries": symmetries}
+    option = next((name for name, value in options.items() if value), None)
+    if option is None:
+        return config
+    if not hasattr(config, "models"):
+        raise InputError(
+            f"--{option} has no meaning for 'segmentation', which learns from pictures: make them "
+            "by 'depthpose data make objects --cad ...' and name the folder in the config"
+        )
+    models = changed(config.models, cad=cad or None, unit=unit)
+    if symmetries is not None:
+        models = replace(models, with_found_symmetries=symmetries == "found")
+    if cad:  # they take the place of a data set's models
+        models = replace(models, bop=None, objects=(), parts=())
+    return replace(config, models=models)
 
 
 def _with_dataset(config: Any, folder: str) -> Any:  # noqa: ANN401 - of any training of poses
