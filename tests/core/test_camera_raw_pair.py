@@ -92,8 +92,11 @@ KALIBR: dict[str, Any] = {
     "T_cn_cnm1": [[1, 0, 0, -0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
 }
 WRONG: dict[str, tuple[dict[str, Any], str]] = {
-    "no camera": ({"a": 1}, "no K1, not two as they were calibrated; known are a camchain"),
-    "one camera": ({"camera_matrix": GOOD["K1"]}, "it describes one camera, not two"),
+    "no camera": ({"a": 1}, "it has no camera matrices K1 and K2; give .* a camchain"),
+    "one camera": (
+        {"camera_matrix": GOOD["K1"]},
+        "it describes a single camera; give the calibration of a pair",
+    ),
     "one matrix": ({**GOOD, "K2": [1, 2]}, "no camera matrix of 9 numbers of the right camera"),
     "no distortion": ({**GOOD, "D1": None}, "no distortion of the left camera; write D1 and D2"),
     "six coefficients": ({**GOOD, "D2": [0.1] * 6}, "right camera has 6 coefficients .* 4 or 5 or"),
@@ -107,7 +110,7 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
         "looks like millimetres; divide by 1000 .--unit cm or mm",
     ),
     "centimetres": ({**GOOD, "T": [-6, 0, 0]}, "looks like centimetres; .*--unit cm or mm"),
-    "squeezed": ({**GOOD, "K1": [500, 0, 320, 0, 1000, 240, 0, 0, 1]}, "K has fx 500 and fy 1000"),
+    "squeezed": ({**GOOD, "K1": [500, 0, 320, 0, 1000, 240, 0, 0, 1]}, "2 times wider than high"),
     "other size": (
         {**GOOD, "K2": [250, 0, 160, 0, 250, 120, 0, 0, 1]},
         "fx is 500 on the left and 250 on the right, as of images of two sizes",

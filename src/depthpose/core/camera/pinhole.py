@@ -341,7 +341,7 @@ def camera_from_facts(facts: CameraFacts, size: Size | None) -> Camera:
     _refuse_distortion(facts, size)
     camera = make_camera(facts, size)
     _refuse_focal_length(camera)
-    refuse_squeezed(camera.K)
+    refuse_unequal_focal_lengths(camera.K)
     refuse_outside(camera.K, camera.width, camera.height)
     if isinstance(camera, StereoRig):
         _refuse_rig(camera, is_metric=facts.is_metric)
@@ -543,13 +543,15 @@ def refuse_baseline(length: float, remedy: str, most_m: float = WIDE_BASELINE_M)
     raise InputError(f"baseline_m is {length:g}, which looks like {unit} ({remedy})")
 
 
-def refuse_squeezed(K: Float[Tensor, "3 3"]) -> None:
+def refuse_unequal_focal_lengths(K: Float[Tensor, "3 3"]) -> None:
     """Refuse a K whose two focal lengths differ too much for one lens."""
     fx = float(K[0, 0])
     fy = float(K[1, 1])
     if not 1 / _MAX_SQUEEZE < fy / fx < _MAX_SQUEEZE:
+        shape = "higher than wide" if fx > fy else "wider than high"
         raise InputError(
             f"K has fx {fx:g} and fy {fy:g}, as if pixels were {max(fx / fy, fy / fx):.2g} times "
-            "longer than wide; multiply both by what its direction was scaled by. Where pixels "
-            "truly are so, scale the image, and K with it, until they are square"
+            f"{shape}; if the image was resized, multiply fx by the horizontal and fy by the "
+            "vertical factor of the resize. If its pixels truly are so, resize the image, and K "
+            "with it, until they are square"
         )

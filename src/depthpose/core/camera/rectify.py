@@ -22,7 +22,7 @@ from depthpose.core.camera.pinhole import (
     facts_from_projections,
     intrinsics,
     refuse_baseline,
-    refuse_squeezed,
+    refuse_unequal_focal_lengths,
 )
 from depthpose.core.camera.stored_camera import (
     Fields,
@@ -211,10 +211,10 @@ def _from_ros(first: Fields, second: Fields, unit_m: float, is_fisheye: bool | N
 def _from_opencv(fields: Fields, unit_m: float, is_fisheye: bool | None) -> RawPair:
     """Read OpenCV's ``stereoCalibrate``, whose R and T carry points of camera 1 to camera 2."""
     if not any(key in fields for side_keys in _K.values() for key in side_keys):
-        reason = "no K1"
+        reason = "it has no camera matrices K1 and K2"
         if is_ros(fields) or "cameramatrix" in fields:
-            reason = "it describes one camera"
-        raise InputError(f"{reason}, not two as they were calibrated; known are {_KNOWN}")
+            reason = "it describes a single camera"
+        raise InputError(f"{reason}; give the calibration of a pair: {_KNOWN}")
     have_fisheyes = _choose_lens_model(fields, is_fisheye)
     cameras: list[RawCamera] = []
     for side in ("left", "right"):
@@ -297,7 +297,7 @@ def _make_camera(
         )
     matrix = torch.from_numpy(np.ascontiguousarray(K, np.float64))
     check_intrinsics(matrix)
-    refuse_squeezed(matrix)
+    refuse_unequal_focal_lengths(matrix)
     return RawCamera(K=matrix, distortion=tuple(distortion), is_fisheye=is_fisheye)
 
 
