@@ -409,6 +409,25 @@ def test_an_unreadable_image_stops_no_other_and_is_read_when_mended(
     assert poses_of(out)["hidden"]["reason"] == "the mask is empty: no pixel of it is the object"
 
 
+def test_the_first_process_takes_no_failure_of_an_earlier_run(
+    weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ["pose", "predict", *frames(tmp_path), "--weights", str(weights)]
+    words += ["--out", str(tmp_path / "out")]
+    names = sorted(path.stem for path in (tmp_path / "depth").glob("*.png"))
+    content = {name: (tmp_path / "depth" / f"{name}.png").read_bytes() for name in names}
+    for name in names:
+        (tmp_path / "depth" / f"{name}.png").write_bytes(b"no picture")
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    for rank in "10":
+        monkeypatch.setenv("RANK", rank)
+        main(words)
+    for name in names:
+        (tmp_path / "depth" / f"{name}.png").write_bytes(content[name])
+    assert main(words) == 0, "the other process has not tried again yet"
+    assert "unreadable" not in {row["status"] for row in poses_of(tmp_path / "out").values()}
+
+
 def test_a_data_set_gives_the_csv_and_pictures(
     synthetic: BopDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -115,11 +115,15 @@ def estimate_jobs(
     home = out if process.world == 1 else out / f"part-{process.rank}"
     by_name = earlier_predictions(out)
     finished = {name for name, p in by_name.items() if p.estimate.status != "unreadable"}
-    unfinished = [job for job in process.share_of(jobs) if job.name not in finished]
-    if unfinished:
+
+    def estimate(unfinished: Sequence[PoseJob[Any]]) -> dict[str, Prediction]:
+        """Estimate jobs into the folder of this process; give their predictions by name."""
         written = predict(method.estimate_many, unfinished, home, settings, batch)
-        for prediction in tqdm(written, total=len(unfinished), disable=None, unit=" poses"):
-            by_name[prediction.estimate.name] = prediction
+        shown = tqdm(written, total=len(unfinished), disable=None, unit=" poses")
+        return {prediction.estimate.name: prediction for prediction in shown}
+
+    unfinished = [job for job in process.share_of(jobs) if job.name not in finished]
+    estimated = estimate(unfinished) if unfinished else {}
     if process.rank > 0:
         return None
 
@@ -127,6 +131,15 @@ def estimate_jobs(
     if process.world > 1:
         _wait_for_predictions(out, jobs)
         by_name = earlier_predictions(out)
+        # What another process could not read may be a failure of an earlier run, which that
+        # process is still to try again: it is tried here too.
+        failed = [
+            job
+            for job in jobs
+            if job.name not in estimated and by_name[job.name].estimate.status == "unreadable"
+        ]
+        estimated |= estimate(failed) if failed else {}
+    by_name |= estimated
     predictions = [by_name.pop(job.name) for job in jobs]
     write_predictions(out, [*by_name.values(), *predictions])
     return predictions
