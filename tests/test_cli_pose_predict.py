@@ -26,8 +26,9 @@ from tests.pose.synthetic_objects import (
 )
 
 from depthpose.cli import main, pose_methods
-from depthpose.cli.pose_methods import choose_objects
+from depthpose.cli.pose_methods import choose_objects, match_names
 from depthpose.core.camera import Camera, write_camera
+from depthpose.core.errors import InputError
 from depthpose.core.files import (
     CLOUD_READERS,
     Cloud,
@@ -469,6 +470,19 @@ def test_the_name_of_the_weights_serves_where_the_data_set_has_none(synthetic: B
     method = make_method([replace(bracket("part"), number=7)])
     chosen = choose_objects(synthetic, method, "part")
     assert {instance.object_id for instance in chosen.instances} == {7}
+
+
+def test_a_model_of_another_name_in_the_data_set_is_not_matched_by_its_number(
+    synthetic: BopDataset, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # The data set calls its object 7 bracket and its object 10 bottle.
+    models = [replace(bottle(), number=7)]
+    chosen = choose_objects(synthetic, make_method(models), None)
+    assert {instance.object_id for instance in chosen.instances} == {10}
+    assert "do not know them: objects [7]" in capsys.readouterr().err
+    assert match_names(chosen, models) == {10: "bottle"}
+    with pytest.raises(InputError, match=r"object 7 \(bracket\) is none of those"):
+        match_names(synthetic, models)
 
 
 def test_two_processes_share_the_work(

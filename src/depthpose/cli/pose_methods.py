@@ -531,11 +531,10 @@ def match_names(dataset: datasets.BopDataset, models: Sequence[ObjectModel]) -> 
     Raises:
         InputError: the method has no such object, or one of another diameter.
     """
-    by_name = {model.name: model for model in models}
-    by_number = {model.number: model for model in models}
+    matched_models = _match_models(dataset, models)
     names: dict[int, str] = {}
     for number, dataset_model in dataset.objects.items():
-        model = by_name.get(dataset_model.name) or by_number.get(number)
+        model = matched_models.get(number)
         if model is None:
             model_names = ", ".join(f"{m.name} ({m.number})" for m in models)
             raise InputError(
@@ -550,6 +549,25 @@ def match_names(dataset: datasets.BopDataset, models: Sequence[ObjectModel]) -> 
             )
         names[number] = model.name
     return names
+
+
+def _match_models(
+    dataset: datasets.BopDataset, models: Sequence[ObjectModel]
+) -> dict[int, ObjectModel]:
+    """Give the method's model of each object of a data set that has one, by the object's number.
+
+    It is that of the object's name, else that of its number, unless the data set has another object
+    of that model's name.
+    """
+    names_in_dataset = set(datasets.object_names(dataset.folder).values())
+    by_name = {model.name: model for model in models}
+    by_number = {model.number: model for model in models if model.name not in names_in_dataset}
+    matched_models: dict[int, ObjectModel] = {}
+    for number, dataset_model in dataset.objects.items():
+        model = by_name.get(dataset_model.name) or by_number.get(number)
+        if model is not None:
+            matched_models[number] = model
+    return matched_models
 
 
 def read_pose(path: Path, option: str = "--first", transform: str = "camera_from_model") -> Rigid:
@@ -638,12 +656,14 @@ def choose_objects(
     """
     numbers = {model.name: model.number for model in method.models}
     if object is not None:
-        is_name_in_dataset = object in datasets.object_names(dataset.folder).values()
-        return dataset.of_objects(object if is_name_in_dataset else numbers.get(object, object))
+        names_in_dataset = datasets.object_names(dataset.folder).values()
+        if object not in names_in_dataset and object in numbers:
+            return dataset.of_objects(numbers[object])  # the method's own name of the object
+        return dataset.of_objects(object)  # the data set's name or number of it
+
     object_ids = sorted({instance.object_id for instance in dataset.instances})
-    estimable = [
-        n for n in object_ids if n in numbers.values() or dataset.objects[n].name in numbers
-    ]
+    matched_models = _match_models(dataset, method.models)
+    estimable = [number for number in object_ids if number in matched_models]
     left_out = sorted(set(object_ids) - set(estimable))
     if not estimable:
         raise InputError(
