@@ -369,20 +369,21 @@ def group_by_image(
     Raises:
         InputError: a detection names no image, or no detection is of a given image.
     """
-    places = {(detection.scene_id, detection.image_id, detection.image) for detection in detections}
     if len({detection.scene_id for detection in detections}) > 1:
         raise InputError(
             f"{source}: holds detections of several scenes; name the data set by --bop, and the "
             "file by --masks"
         )
-    if len(images) == 1 and len(places) <= 1:
+    detected_images = {(detection.image_id, detection.image) for detection in detections}
+    if len(images) == 1 and len(detected_images) <= 1:
         return {images[0]: list(detections)}
+
     groups: dict[str, list[Detection]] = {image: [] for image in images}
     by_number = {int(image): image for image in images if image.isascii() and image.isdecimal()}
-    for place, detection in enumerate(detections):
+    for entry, detection in enumerate(detections):
         if detection.image is None and detection.image_id is None:
             raise InputError(
-                f"{source}: entry {place} does not say of which image it is; add image_id, the "
+                f"{source}: entry {entry} does not say of which image it is; add image_id, the "
                 "number that the depth image has for a name, or file_name"
             )
         image = detection.image
@@ -390,12 +391,16 @@ def group_by_image(
             image = by_number.get(detection.image_id)
         if image in groups:
             groups[image].append(detection)
+
     if detections and not any(groups.values()):
-        detection = detections[0]
+        first = detections[0]
+        wanted = repr(images[0])
+        if len(images) > 1:
+            wanted += " or another image"
         raise InputError(
-            f"{source}: no detection is of {images[0]!r}{' or another image' * (len(images) > 1)}; "
-            f"the first is of {detection.image or detection.image_id!r}. Name the depth images as "
-            "the detections say (image_id 12 is 12.png or 000012.png), or correct the file"
+            f"{source}: no detection is of {wanted}; the first is of "
+            f"{first.image or first.image_id!r}. Name the depth images as the detections say "
+            "(image_id 12 is 12.png or 000012.png), or correct the file"
         )
     return groups
 
