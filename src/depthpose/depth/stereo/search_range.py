@@ -152,7 +152,7 @@ def choose_search_range(
         size: rows and columns of the images.
         camera: of the left image, where it is known.
     """
-    scale, usual_span_px = _usual_size(matcher, size, camera)
+    scale, usual_span_px = _usual_scale_and_span(matcher, size, camera)
     high_px = measured.high_px
     if matcher.config.max_disparity_px is not None:
         high_px = matcher.config.max_disparity_px
@@ -167,12 +167,14 @@ def choose_search_range(
     return SearchRange(scale=scale, first_px=first_px, span_px=searched_px)
 
 
-def _usual_size(
+def _usual_scale_and_span(
     matcher: NetworkMatcher, size: Sequence[int], camera: Camera | None
 ) -> tuple[float, int]:
-    """Give the usual scale of a match beside the images, and how many disparities it searches.
+    """Give the scale and the span of a match, where the disparities need no wider span.
 
-    Without a camera, a fine match has a fixed number of pixels.
+    The scale is the size at which the images are matched relative to their own; the span is how
+    many disparities are searched [px at that size]. With a camera, the scale follows from the focal
+    length; without one, a fine match has a fixed number of pixels.
     """
     trained = matcher.network_config
     if camera is not None and trained.work_focal_px is not None:
