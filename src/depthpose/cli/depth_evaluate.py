@@ -300,7 +300,7 @@ def with_source(result: Evaluation, name: str, settings: dict[str, Any] | None) 
     """
     settings = settings or {"matcher": name, "input": ""}
     method = settings.get("matcher", "")
-    if "with_filled_holes" in settings:
+    if "with_filled_holes" in settings:  # OpenCV's matcher ran; no other has holes
         method += " (holes filled)" if settings["with_filled_holes"] else " (matched pixels)"
     source = {
         "method": method,
@@ -308,6 +308,7 @@ def with_source(result: Evaluation, name: str, settings: dict[str, Any] | None) 
         "speed": settings.get("speed", ""),
         "weights": settings.get("weights", ""),
     }
+    # Rows of frames and deciles stand beside the rows of means, which have the checksum.
     sha256 = settings.get("weights_sha256", "")[:12]
     return replace(
         result,

@@ -67,9 +67,10 @@ def _width_ratio(size: Value, other: Value) -> Value:
 
 
 def _size_at_focal_length(size: Value, target_px: float, focal_px: Value | np.ndarray) -> Value:
-    """Give rows and columns at which images have a focal length, as ``size_at_focal_length`` does.
+    """Give (rows, columns) at which images have a focal length, as ``size_at_focal_length`` does.
 
-    ``size``: rows and columns of the images; ``focal_px``: their focal lengths along both.
+    ``size``: (rows, columns) of the images; ``target_px``: that focal length; ``focal_px``: those
+    of the images in the same order, (fy, fx).
     """
     scaled = size.cast(np.float64) * target_px / focal_px
     return scaled.op("Round").op("Max", 1.0).cast(np.int64)

@@ -130,7 +130,7 @@ def _error_drawings(
     if is_sparse:
         image = draw_error_points(pair.left, error.error, worst, _POINT_RADIUS_PX)
     else:
-        image = draw_share(1 - error.error / worst)
+        image = draw_share(1 - error.error / worst)  # no error is 1, the dark end of the colours
     caption = f"{noun}: dark is right, bright is wrong; {note}"
     drawings.append(Drawing(image=image, caption=caption, scale=scale))
     return drawings

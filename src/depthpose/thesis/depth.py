@@ -177,8 +177,13 @@ def draw_figure_2_5(
 ) -> list[Drawing]:
     """Make a column of figure 2-5: left, real right, predicted depth, predicted right, LiDAR.
 
-    The predicted right view is left out where a real one was matched, and each of the real right
-    view and the LiDAR (one scan drawn into the left image, NaN elsewhere) where there is none.
+    A panel whose image does not exist is left out. Where the real right view was matched, no right
+    view is predicted.
+
+    Args:
+        pair: left view, and the real right one if there is one.
+        lidar_m: one scan drawn into the left image, NaN where no point falls, if there is one.
+        estimate: of this pair, or of its left view alone.
     """
     panels = [Drawing(caption="left image", image=pair.left)]
     if pair.right is not None:

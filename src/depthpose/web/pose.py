@@ -249,6 +249,9 @@ def _is_same_shape(cad_model: ObjectModel, model: ObjectModel) -> bool:
     """Whether a CAD file is an object of the weights, in the same frame: size and surface agree."""
     if abs(cad_model.diameter_m / model.diameter_m - 1) > _SAME_SHAPE:
         return False
+    # Points of the whole CAD surface must lie on the model: the file has no part that the model
+    # lacks. Of the model the keypoints suffice: they lie far apart, so one is off a CAD file that
+    # lies in another frame or lacks one of the model's ends.
     cad_points_m = mesh.sample_surface(cad_model, _SURFACE_POINTS)[0]
     to_cad_m = mesh.gap_to_surface_m(model.keypoints_m, cad_model)
     from_cad_m = mesh.gap_to_surface_m(cad_points_m, model)
