@@ -142,6 +142,7 @@ def judge(
                 object=prepared.model.name,
                 status="doubtful",
                 reason=contradiction(evidence, probability),
+                evidence=evidence,
                 seconds=watch.seconds,
             )
 
