@@ -157,6 +157,18 @@ def test_the_right_pose_is_not_contradicted(model: ObjectModel, noise_m: float, 
         assert evidence.noise_m == pytest.approx(noise_m, rel=0.3)
 
 
+def test_exact_readings_of_an_exact_model_support_its_pose() -> None:
+    """A flat side from the front, without noise and without deviation of the real object."""
+    pose = Rigid(torch.eye(3), torch.tensor([0.0, 0.0, 0.8]))
+    view = view_before_wall(BAR, pose)
+    cloud_m = cloud_from_depth(view.depth_m, view.mask, K)
+    exact = observe(cloud_m, view, BAR.diameter_m, 0.0, is_masked=True)
+    with np.errstate(divide="raise", invalid="raise"):
+        evidence = compare(exact, pose, prepare_surface(BAR))
+    assert evidence.agreement == 1.0
+    assert 0 <= evidence.rms < 1
+
+
 @pytest.mark.parametrize(
     ("grow_px", "right_px", "offset_m"), [(2, 0, 0.0), (-3, 0, 0.0), (0, 2, 0.0), (0, 0, 0.002)]
 )
