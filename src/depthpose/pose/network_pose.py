@@ -386,7 +386,7 @@ class DepthImageRegressor(PoseEstimator):
     def _estimate(self, pose_input: AnyInput) -> PoseEstimate:
         """Regress the pose from a crop of the depth image, and refine it by ICP."""
         prepared = self._object(pose_input.object)
-        if not isinstance(pose_input, ViewInput):
+        if not isinstance(pose_input, ViewInput) or pose_input.is_region:
             raise InputError(_NEEDS_MASK)
         config = self._network.config
         model = prepared.model
@@ -395,7 +395,9 @@ class DepthImageRegressor(PoseEstimator):
             crop = cut_depth(pose_input, config, model.diameter_m)
         if crop is None:
             reason = f"fewer than {config.min_points} masked pixels have a depth"
-            return refused(pose_input, Refusal(status="too few points", reason=reason), {})
+            return refused(
+                pose_input, Refusal(status="too few points", reason=reason), watch.seconds
+            )
         with watch.stage("network"):
             batch = DepthCrop(*(part[None].to(self.config.device) for part in crop))
             numbers = torch.tensor([prepared.number], device=self.config.device)
