@@ -22,7 +22,7 @@ from depthpose.pose.probability import (
     PRIOR_MASKED,
     PRIOR_PROPOSED,
     GammaShare,
-    log_odds_right,
+    log_likelihood_ratio,
     probability_right,
 )
 from depthpose.pose.types import Alternative, Evidence, PoseEstimate
@@ -84,7 +84,7 @@ def test_each_kind_of_contradiction_lowers_the_probability() -> None:
 def test_what_was_not_observed_lowers_it_less_than_what_contradicts() -> None:
     hidden = replace(GOOD, supported=20.0, explained=20.0, unobserved=20.0)
     through = replace(GOOD, supported=20.0, explained=20.0, seen_through=18.0)
-    assert log_odds_right(through) < log_odds_right(hidden) < log_odds_right(GOOD)
+    assert log_likelihood_ratio(through) < log_likelihood_ratio(hidden) < log_likelihood_ratio(GOOD)
 
 
 def test_a_pose_that_a_search_proposed_needs_more_evidence_than_one_in_a_mask() -> None:

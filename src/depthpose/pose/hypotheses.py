@@ -15,7 +15,12 @@ from depthpose.pose.config import IcpConfig
 from depthpose.pose.copies import PreparedObject
 from depthpose.pose.evidence import Observation, compare
 from depthpose.pose.icp import RefinedPose, refine_pose, refine_roughly
-from depthpose.pose.probability import LEAST_AREA, VOTES_RAD, log_fit_right, log_odds_right
+from depthpose.pose.probability import (
+    LEAST_AREA,
+    VOTES_RAD,
+    log_likelihood_of_copy,
+    log_likelihood_ratio,
+)
 from depthpose.pose.surface import NEAR, Surface
 from depthpose.pose.types import Evidence, ViewInput
 
@@ -158,7 +163,7 @@ def share_among_poses(
     """
     if not is_masked:
         hypotheses = _against_each_other(hypotheses)
-    weights = [log_odds_right(h.evidence) + _log_beside_depth(h) for h in hypotheses]
+    weights = [log_likelihood_ratio(h.evidence) + _log_beside_depth(h) for h in hypotheses]
     return torch.tensor(weights, dtype=torch.float64).softmax(0)
 
 
@@ -173,7 +178,7 @@ def share_among_copies(
     area = max(LEAST_AREA, *(hypothesis.evidence.visible for hypothesis in hypotheses))
     if not is_masked:
         hypotheses = _against_each_other(hypotheses)
-    weights = [log_fit_right(h.evidence, area) + h.log_color for h in hypotheses]
+    weights = [log_likelihood_of_copy(h.evidence, area) + h.log_color for h in hypotheses]
     return torch.tensor(weights, dtype=torch.float64).softmax(0)
 
 

@@ -38,7 +38,7 @@ from depthpose.pose.probability import (
     LEAST_POSSIBLE,
     PRIOR_MANY,
     PRIOR_PROPOSED,
-    log_odds_right,
+    log_likelihood_ratio,
     probability_of_instances,
     probability_right,
 )
@@ -342,7 +342,7 @@ def _judge(
                 pose=pose,
                 explained=explained_frame_mask(frame, pose, surface),
                 estimate=estimate,
-                log_odds=math.log(targets.prior_odds) + log_odds_right(evidence),
+                log_odds=math.log(targets.prior_odds) + log_likelihood_ratio(evidence),
             )
         )
     return judged, misses

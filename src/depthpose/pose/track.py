@@ -22,7 +22,7 @@ from depthpose.pose.evidence import compare, observe
 from depthpose.pose.frame import is_on_plane, largest_plane
 from depthpose.pose.icp import refine_best
 from depthpose.pose.observability import free_motions, without_motions
-from depthpose.pose.probability import PRIOR_MASKED, log_odds_right, probability_right
+from depthpose.pose.probability import PRIOR_MASKED, log_likelihood_ratio, probability_right
 from depthpose.pose.surface import NEAR, Surface
 from depthpose.pose.types import (
     Alternative,
@@ -206,7 +206,7 @@ def _follow(
     probability = probability_right(evidence, PRIOR_MASKED)
     if probability < target.refusal.min_probability:
         return Refusal(status="doubtful", reason=contradiction(evidence, probability))
-    log_odds = current.log_odds + _NEW_EVIDENCE * log_odds_right(evidence)
+    log_odds = current.log_odds + _NEW_EVIDENCE * log_likelihood_ratio(evidence)
     log_odds = min(max(log_odds, -_MOST_LOG_ODDS), _MOST_LOG_ODDS)
     certainty = 1 / (1 + math.exp(-log_odds))
     if certainty < target.refusal.min_probability:
