@@ -18,6 +18,7 @@ from depthpose.pose.hypotheses import (
     share_among_copies,
     share_among_poses,
 )
+from depthpose.pose.icp import RefinedPose
 from depthpose.pose.probability import (
     PRIOR_MASKED,
     PRIOR_PROPOSED,
@@ -40,10 +41,13 @@ BAD = replace(
 
 
 def hypothesis(evidence: Evidence, votes_rad: float | None = None, color: float = 0) -> Hypothesis:
-    return Hypothesis(
-        pose=pose_at().double(), covariance=torch.eye(6), residual_m=0.001, evidence=evidence,
-        votes_rad=votes_rad, log_color=color,
-    )  # fmt: skip
+    refined = RefinedPose(
+        camera_from_model=pose_at().double(),
+        covariance=torch.eye(6),
+        residual_m=torch.tensor(0.001),
+        inlier_share=torch.tensor(1.0),
+    )
+    return Hypothesis(refined=refined, evidence=evidence, votes_rad=votes_rad, log_color=color)
 
 
 @pytest.mark.parametrize(

@@ -89,7 +89,7 @@ def decide(
     facts: dict[str, Any] = {
         "name": cloud.name,
         "object": model.name,
-        "residual_m": best.residual_m,
+        "residual_m": float(best.refined.residual_m),
         "evidence": best.evidence,
         "identity": identity,
     }
@@ -102,7 +102,7 @@ def decide(
     estimate = PoseEstimate(
         status="ok",
         camera_from_model=best.pose.float(),  # computed in double precision
-        covariance=without_motions(best.covariance, free).float(),
+        covariance=without_motions(best.refined.covariance, free).float(),
         free_motions=free.float(),
         certainty=probability * competition.group_share,
         copy_certainty=probability * competition.best_share,
