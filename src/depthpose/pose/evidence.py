@@ -91,6 +91,11 @@ class Observation:
     step: int = 1
     patch_px: float = CORRELATION_PX
 
+    @property
+    def focal_px(self) -> float:
+        """Focal length of the image itself, before it was thinned."""
+        return self.step * float(self.K[0, 0])
+
 
 def observe(
     cloud_m: Float[Tensor, "n 3"],
