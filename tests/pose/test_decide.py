@@ -181,9 +181,13 @@ def test_a_pose_and_its_copies_have_the_share_of_the_group() -> None:
 def test_a_refusal_says_what_contradicts_the_pose_most(kind: str, words: str) -> None:
     evidence = replace(GOOD, supported=20.0, explained=20.0, unobserved=0.0)
     evidence = replace(evidence, **{kind: 20.0})
-    reason = contradiction(evidence, 0.125)
+    reason = contradiction(evidence, 0.125, is_masked=True)
     assert reason.startswith("the best pose is right with a probability of 12%: ")
     assert words in reason
+    assert "a mask of more than the object" in reason
+    searched = contradiction(evidence, 0.125, is_masked=False)
+    assert words in searched
+    assert "mask" not in searched, "a search was given none"
 
 
 def test_an_answer_below_the_wanted_certainty_is_ambiguous() -> None:

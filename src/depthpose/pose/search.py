@@ -269,7 +269,7 @@ def _refine(
     for place, (pose, evidence) in zip(places, refined, strict=True):
         probability = probability_right(evidence, targets.prior_odds)
         if probability < LEAST_POSSIBLE:
-            reason = contradiction(evidence, probability)
+            reason = contradiction(evidence, probability, is_masked=False)
             hopeless.append(_miss_at(place, evidence, reason, targets))
             continue
         explained = explained_frame_mask(frame, pose, targets.objects[place.object].surface)

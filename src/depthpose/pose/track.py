@@ -228,12 +228,17 @@ def _follow(
     evidence = compare(observation, pose, surface)
     probability = probability_right(evidence, PRIOR_MASKED)
     if probability < target.refusal.min_probability:
-        return Refusal(status="doubtful", reason=contradiction(evidence, probability))
+        reason = contradiction(evidence, probability, is_masked=False)
+        return Refusal(status="doubtful", reason=reason)
     log_odds = current.log_odds + _NEW_EVIDENCE * log_likelihood_ratio(evidence)
     log_odds = min(max(log_odds, -_MOST_LOG_ODDS), _MOST_LOG_ODDS)
     certainty = 1 / (1 + math.exp(-log_odds))
     if certainty < target.refusal.min_probability:
-        return Refusal(status="doubtful", reason=contradiction(evidence, certainty))
+        reason = (
+            f"together with the frames before it the pose is right with a probability of "
+            f"{certainty:.0%}, though by this frame alone with {probability:.0%}"
+        )
+        return Refusal(status="doubtful", reason=reason)
 
     # Does what is seen of it determine its pose?
     free = free_motions(target.prepared.model.symmetries.continuous, pose)
