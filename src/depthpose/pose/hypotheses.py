@@ -123,7 +123,7 @@ def compete(
     winner = different[winner_number]
 
     # And which of its copies?
-    if view is not None:  # its colours had become those of its best copy
+    if view is not None:  # its own colours again, in place of those of its best copy
         winner = replace(winner, log_color=_log_color(winner.pose, prepared, view))
     copies = _refine_distinct_copies(cloud_m, winner.refined, prepared, icp, view)
     group = [winner, *map(hypothesize, copies)]
