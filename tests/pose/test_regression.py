@@ -77,9 +77,13 @@ def test_a_box_is_no_mask(weights: PoseWeights) -> None:
         )
 
 
-def test_a_refusal_of_too_few_pixels_says_what_it_took(weights: PoseWeights) -> None:
+@pytest.mark.parametrize("is_region", [False, True])
+def test_a_refusal_of_too_few_pixels_says_what_it_took(
+    weights: PoseWeights, is_region: bool
+) -> None:
+    """Of an empty region too, which stands for an object that was not detected."""
     view = seen()
-    empty = replace(view, mask=torch.zeros_like(view.mask))
+    empty = replace(view, mask=torch.zeros_like(view.mask), is_region=is_region)
     (refused,) = DepthImageRegressor(weights).estimate_many([empty])
     assert refused.status == "too few points"
     assert list(refused.seconds) == ["network"]

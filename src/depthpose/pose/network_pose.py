@@ -383,7 +383,10 @@ class DepthImageRegressor(PoseEstimator):
     def _estimate(self, pose_input: AnyInput) -> PoseEstimate:
         """Regress the pose from a crop of the depth image, and refine it by ICP."""
         prepared = self._object(pose_input.object)
-        if not isinstance(pose_input, ViewInput) or pose_input.is_region:
+        if not isinstance(pose_input, ViewInput):
+            raise InputError(_NEEDS_MASK)
+        # An empty region says that nothing was detected: of that too few pixels are refused below.
+        if pose_input.is_region and bool(pose_input.mask.any()):
             raise InputError(_NEEDS_MASK)
         config = self._network.config
         model = prepared.model
