@@ -153,7 +153,7 @@ def view_of(group: str, registration: Registration, arguments: Any, truth: Rigid
 
     with patch.object(hypotheses, "share_among_poses", remember):
         registration.estimate(**arguments)
-    copies = registration._prepared_object(registration.objects[0]).copies
+    copies = registration._object(registration.objects[0]).prepare().copies
     alike = Rigid.cat([copies.symmetries, copies.near_copies])
     true_pose = truth.double()[None]
     is_right = [bool(copies.is_same(h.pose, true_pose, alike).any()) for h in competing]
@@ -214,10 +214,10 @@ def judge(view: View, coefficients: Coefficients) -> tuple[float, bool]:
         "WRONG_RMS": coefficients.wrong_rms,
     }
     with patch.multiple(probability, **names):
-        odds = [probability.log_odds_right(evidence) for evidence in view.evidences]
-    best = max(range(len(odds)), key=odds.__getitem__)
-    shares = torch.tensor(odds, dtype=torch.float64).softmax(0)
-    log_odds = math.log(coefficients.prior_masked) + odds[best]
+        log_ratios = [probability.log_likelihood_ratio(evidence) for evidence in view.evidences]
+    best = max(range(len(log_ratios)), key=log_ratios.__getitem__)
+    shares = torch.tensor(log_ratios, dtype=torch.float64).softmax(0)
+    log_odds = math.log(coefficients.prior_masked) + log_ratios[best]
     probable = 1 / (1 + math.exp(-max(-50.0, min(log_odds, 50.0))))
     if view.evidences[best].agreement < LEAST_AGREEMENT:
         probable = 0.0

@@ -1,5 +1,6 @@
 """An object whose sides all differ, its views, and a network that answers what a test says."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -163,15 +164,12 @@ class Oracle(GeoPoseNet):
         self.wrong = changes.get("wrong", 0.0)
         self.calls: list[int] = []
 
-    def _ask_network(
-        self, group: list[CloudToPose | PoseEstimate]
-    ) -> list[CloudToPose | PoseEstimate]:
+    def _ask_network(self, group: Sequence[CloudToPose | PoseEstimate]) -> None:
         ready = [one for one in group if isinstance(one, CloudToPose)]
         self.calls += [len(ready)] if ready else []
         for one in ready:
             one.directions = self._true(one.voxels.points_m, one.prepared.number)
             one.watch.seconds["network"] = 0.01
-        return group
 
     def _true(self, points_m: Tensor, number: int) -> Tensor:
         middle = points_m.mean(0)

@@ -204,7 +204,7 @@ def test_whole_numbers_stay_below_their_count() -> None:
         (
             {"centre_px": (-5000.0, 9000.0)},
             "centre_px is (-5000.0, 9000.0), but the principal point lies within the image, and "
-            "image_px is (640, 480); leave it out for the middle, (319.5, 239.5)",
+            "image_px is (640, 480); leave it out for the default, (325.2611, 242.04899)",
         ),
         ({"image_px": (320, 240), "centre_px": (325.3, 242.0)}, "centre_px is (325.3, 242.0)"),
         ({"image_px": (0, 480)}, "image_px must be in (0, inf), got (0, 480)"),

@@ -18,11 +18,12 @@ from depthpose.pose.hypotheses import (
     share_among_copies,
     share_among_poses,
 )
+from depthpose.pose.icp import RefinedPose
 from depthpose.pose.probability import (
     PRIOR_MASKED,
     PRIOR_PROPOSED,
     GammaShare,
-    log_odds_right,
+    log_likelihood_ratio,
     probability_right,
 )
 from depthpose.pose.types import Alternative, Evidence, PoseEstimate
@@ -40,10 +41,13 @@ BAD = replace(
 
 
 def hypothesis(evidence: Evidence, votes_rad: float | None = None, color: float = 0) -> Hypothesis:
-    return Hypothesis(
-        pose=pose_at().double(), covariance=torch.eye(6), residual_m=0.001, evidence=evidence,
-        votes_rad=votes_rad, log_color=color,
-    )  # fmt: skip
+    refined = RefinedPose(
+        camera_from_model=pose_at().double(),
+        covariance=torch.eye(6),
+        residual_m=torch.tensor(0.001),
+        inlier_share=torch.tensor(1.0),
+    )
+    return Hypothesis(refined=refined, evidence=evidence, votes_rad=votes_rad, log_color=color)
 
 
 @pytest.mark.parametrize(
@@ -84,7 +88,7 @@ def test_each_kind_of_contradiction_lowers_the_probability() -> None:
 def test_what_was_not_observed_lowers_it_less_than_what_contradicts() -> None:
     hidden = replace(GOOD, supported=20.0, explained=20.0, unobserved=20.0)
     through = replace(GOOD, supported=20.0, explained=20.0, seen_through=18.0)
-    assert log_odds_right(through) < log_odds_right(hidden) < log_odds_right(GOOD)
+    assert log_likelihood_ratio(through) < log_likelihood_ratio(hidden) < log_likelihood_ratio(GOOD)
 
 
 def test_a_pose_that_a_search_proposed_needs_more_evidence_than_one_in_a_mask() -> None:
@@ -177,9 +181,13 @@ def test_a_pose_and_its_copies_have_the_share_of_the_group() -> None:
 def test_a_refusal_says_what_contradicts_the_pose_most(kind: str, words: str) -> None:
     evidence = replace(GOOD, supported=20.0, explained=20.0, unobserved=0.0)
     evidence = replace(evidence, **{kind: 20.0})
-    reason = contradiction(evidence, 0.125)
+    reason = contradiction(evidence, 0.125, is_masked=True)
     assert reason.startswith("the best pose is right with a probability of 12%: ")
     assert words in reason
+    assert "a mask of more than the object" in reason
+    searched = contradiction(evidence, 0.125, is_masked=False)
+    assert words in searched
+    assert "mask" not in searched, "a search was given none"
 
 
 def test_an_answer_below_the_wanted_certainty_is_ambiguous() -> None:

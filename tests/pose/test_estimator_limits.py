@@ -1,6 +1,7 @@
 """Estimates at the limits: clouds of millions of points, and covariances that must be honest."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import pytest
@@ -59,14 +60,12 @@ class _Noisy(Oracle):
 
     generator = torch.Generator().manual_seed(0)
 
-    def _ask_network(
-        self, group: list[CloudToPose | PoseEstimate]
-    ) -> list[CloudToPose | PoseEstimate]:
-        for one in super()._ask_network(group):
+    def _ask_network(self, group: Sequence[CloudToPose | PoseEstimate]) -> None:
+        super()._ask_network(group)
+        for one in group:
             assert isinstance(one, CloudToPose)
             noise = torch.randn(one.directions.shape, generator=self.generator)
             one.directions = one.directions + 0.03 * noise
-        return group
 
 
 def _misfit(found: PoseEstimate, truth: Rigid) -> float:

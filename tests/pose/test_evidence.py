@@ -157,6 +157,21 @@ def test_the_right_pose_is_not_contradicted(model: ObjectModel, noise_m: float, 
         assert evidence.noise_m == pytest.approx(noise_m, rel=0.3)
 
 
+def test_exact_readings_of_an_exact_model_support_its_pose() -> None:
+    """A side across the optical axis, without noise and without deviation of the real object."""
+    plate = boxes("plate", ((0.25, 0.125, 1 / 32), (0.0, 0.0, 0.0)))
+    pose = Rigid(torch.eye(3), torch.tensor([0.0, 0.0, 0.75 + 1 / 64]))
+    _, mask = view_of(plate, pose)
+    depth_m = torch.where(mask, 0.75, WALL_M)
+    view = ViewInput(name="a", depth_m=depth_m, mask=mask, K=K, object="plate")
+    cloud_m = cloud_from_depth(view.depth_m, view.mask, K)
+    exact = observe(cloud_m, view, plate.diameter_m, 0.0, is_masked=True)
+    with np.errstate(divide="raise", invalid="raise"):
+        evidence = compare(exact, pose, prepare_surface(plate))
+    assert evidence.agreement == 1.0
+    assert 0 <= evidence.rms < 1
+
+
 @pytest.mark.parametrize(
     ("grow_px", "right_px", "offset_m"), [(2, 0, 0.0), (-3, 0, 0.0), (0, 2, 0.0), (0, 0, 0.002)]
 )

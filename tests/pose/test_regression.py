@@ -1,6 +1,7 @@
 """The regressed depth image as an estimator: its refinement, and what it refuses."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -65,3 +66,24 @@ def test_blobs_far_from_their_middle_are_refused_and_stop_no_other(weights: Pose
     assert (refused.name, refused.status) == ("blobs", "too few points")
     assert refused.reason.startswith("the cloud has 0 points, fewer than the ")
     assert found.is_ok
+
+
+def test_a_box_is_no_mask(weights: PoseWeights) -> None:
+    """What is in a box beside the object would be regressed with it, and nothing be refused."""
+    view = seen()
+    with pytest.raises(InputError, match="takes a depth image with a mask; give both"):
+        DepthImageRegressor(weights).estimate(
+            depth=view.depth_m.numpy(), box=(0, 0, 320, 240), camera=K.numpy()
+        )
+
+
+@pytest.mark.parametrize("is_region", [False, True])
+def test_a_refusal_of_too_few_pixels_says_what_it_took(
+    weights: PoseWeights, is_region: bool
+) -> None:
+    """Of an empty region too, which stands for an object that was not detected."""
+    view = seen()
+    empty = replace(view, mask=torch.zeros_like(view.mask), is_region=is_region)
+    (refused,) = DepthImageRegressor(weights).estimate_many([empty])
+    assert refused.status == "too few points"
+    assert list(refused.seconds) == ["network"]

@@ -8,6 +8,7 @@ import torch
 
 from depthpose.pose.sensor import (
     FLAT_M,
+    LEAST_DEVIATION_M,
     NOISE_PER_M2,
     SHARED_PER_WHITE,
     DepthNoise,
@@ -62,6 +63,12 @@ def test_averaging_lowers_independent_noise_alone() -> None:
     assert noise.deviation_m(np.ones(1), 9) == pytest.approx(0.001)
     shared = DepthNoise(white_std_m=0.0, shared_std_m=0.003, lateral_std_m=0.0, object_std_m=0.004)
     assert shared.deviation_m(np.ones(1), 900) == pytest.approx(0.005)
+
+
+def test_nothing_is_measured_exactly() -> None:
+    """Residuals are divided by the deviation: without noise, from the front, it is not 0."""
+    exact = DepthNoise(white_std_m=0.0, shared_std_m=0.0, lateral_std_m=0.001, object_std_m=0.0)
+    assert exact.deviation_m(np.ones(2), 9).tolist() == [LEAST_DEVIATION_M] * 2
 
 
 def test_a_slanted_surface_deviates_more_along_the_ray() -> None:

@@ -10,12 +10,14 @@ from tests.pose.synthetic_objects import CAMERA, K, Oracle, bracket, pose_at, ti
 from depthpose.core.camera import back_project
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, rotation_by
+from depthpose.pose import track as track_module
+from depthpose.pose.config import EstimateConfig
 from depthpose.pose.copies import PreparedObject
 from depthpose.pose.metrics import add_m
 from depthpose.pose.predictions import Prediction, parse_prediction, prediction_row
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.track import TrackedObject, track
-from depthpose.pose.types import Alternative, PoseEstimate
+from depthpose.pose.types import Alternative, PoseEstimate, Refusal, ViewInput
 
 HIDDEN = 0.68
 
@@ -89,6 +91,25 @@ def test_it_is_lost_where_it_is_taken_away_or_covered_and_found_when_back() -> N
     assert [e.tracking for e in found] == kinds
     assert all(e.reason for e in found if e.tracking == "lost")
     assert max(error_of(found[k], poses[k]) for k in (0, 1, 4, 5, 7)) < 0.003
+
+
+def test_a_track_that_its_history_ends_does_not_blame_the_frame() -> None:
+    pose = pose_at(z_m=0.7, seed=3)
+    weights = tiny_weights(bracket())
+    target = TrackedObject(
+        prepared=PreparedObject(number=0, model=bracket(), surface=prepare_surface(bracket())),
+        refusal=weights.refusal,
+        config=EstimateConfig(),
+        search=lambda _: pytest.fail("not looked for anew"),
+    )
+    doubted = track_module._Track(pose=pose.double(), motion=None, log_odds=-9.0, origin=None)
+    depth_m = frame(pose)
+    everywhere = torch.ones_like(depth_m, dtype=torch.bool)
+    view = ViewInput(name="a", depth_m=depth_m, mask=everywhere, K=K.float(), object="bracket")
+    refusal = track_module._follow(view, doubted, target)
+    assert isinstance(refusal, Refusal)
+    assert refusal.reason.startswith("together with the frames before it the pose is right with a")
+    assert refusal.reason.endswith("though by this frame alone with 100%")
 
 
 def test_a_part_that_is_hidden_does_not_lose_it() -> None:

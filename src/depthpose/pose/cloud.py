@@ -80,9 +80,7 @@ def prepare_cloud(
     if len(readings_m) == 0:
         return Refusal(status="too few points", reason=_why_empty(pose_input))
 
-    # Points far from the median are background at the mask's border.
-    offset_m = (readings_m - readings_m.median(0).values).norm(dim=-1)
-    cloud_m = readings_m[~(offset_m > cloud_config.max_offset_diameters * model.diameter_m)]
+    cloud_m = _without_flying_pixels(readings_m, model.diameter_m, cloud_config)
     refusal = _why_refused(pose_input, readings_m, cloud_m, model, cloud_config)
     if refusal is not None:
         return refusal
@@ -125,12 +123,14 @@ def _why_refused(
 
     ``readings_m`` are all readings in the mask, ``cloud_m`` those without flying pixels.
     """
+    # First of all readings: few of them do not say whether the unit or the frame is another.
     too_few = why_too_few(readings_m, cloud_config)
     if too_few is not None:
         return Refusal(status="too few points", reason=too_few)
     unusable = _why_unusable(pose_input, readings_m, cloud_m, model)
     if unusable is not None:
         return Refusal(status="unusable input", reason=unusable)
+    # Then without flying pixels: in a wrong unit nearly all seem to be such, so it is asked last.
     too_few = why_too_few(cloud_m, cloud_config)
     if too_few is not None:
         return Refusal(status="too few points", reason=too_few)
@@ -229,7 +229,13 @@ def cloud_from_depth(
     points_m = torch.stack([x, y, torch.ones_like(x)], -1) * depth_m[is_read][:, None]
     if diameter_m is None or len(points_m) == 0:
         return points_m
-    config = CloudConfig() if config is None else config
+    return _without_flying_pixels(points_m, diameter_m, config or CloudConfig())
+
+
+def _without_flying_pixels(
+    points_m: Float[Tensor, "n 3"], diameter_m: float, config: CloudConfig
+) -> Float[Tensor, "m 3"]:
+    """Drop points far from the median of one point or more: background at the mask's border."""
     offset_m = (points_m - points_m.median(0).values).norm(dim=-1)
     return points_m[~(offset_m > diameter_m * config.max_offset_diameters)]
 

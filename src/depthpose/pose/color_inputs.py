@@ -4,6 +4,9 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 
+from jaxtyping import Float
+from torch import Tensor
+
 from depthpose.core.camera import AnyLens, Camera, camera_of, check_image_matches_camera
 from depthpose.core.camera.camera_file import intrinsics_of
 from depthpose.core.errors import InputError, Notice
@@ -61,28 +64,41 @@ def color_input(
     camera: AnyLens | None = None,
     color_from_depth: Rigid | AnyArray | None = None,
 ) -> ColorImage:
-    """Take the colour image of a view, as :func:`with_color` does."""
+    """Take the colour image of a view: of its own camera, or else aligned to the depth image.
+
+    With a camera of its own it may be of any size and place. Without one it has the pixels and the
+    intrinsic matrix of the depth image, and no transform. Arguments and errors are those of
+    :func:`with_color`.
+    """
     rgb = as_tensor(color, f"{view.name}: the colour image")
     height, width = rgb.shape[1:]
-    if camera is None:
+    if camera is not None:
+        K = _color_intrinsics(camera, width, height, view)
+        transform = None
         if color_from_depth is not None:
-            raise InputError(
-                f"{view.name}: color_from_depth is given, so the colour image is of another "
-                "camera; give that too: color_camera= (--color-camera)"
-            )
-        if (height, width) != tuple(view.depth_m.shape):
-            rows, columns = view.depth_m.shape
-            raise InputError(
-                f"{view.name}: the colour image is {width}x{height} and the depth image "
-                f"{columns}x{rows}; give the image aligned to the depth, or the colour camera: "
-                "color_camera= (--color-camera)"
-            )
-        return ColorImage(rgb=rgb, K=view.K)
-    is_lens = not isinstance(camera, Camera)
-    lens = camera_of(camera, (width, height)) if is_lens else camera
+            transform = rigid_input(color_from_depth, "color_from_depth", "color_from_depth")
+        return ColorImage(rgb=rgb, K=K, color_from_depth=transform)
+
+    if color_from_depth is not None:
+        raise InputError(
+            f"{view.name}: color_from_depth is given, so the colour image is of another "
+            "camera; give that too: color_camera= (--color-camera)"
+        )
+    rows, columns = view.depth_m.shape
+    if (height, width) != (rows, columns):
+        raise InputError(
+            f"{view.name}: the colour image is {width}x{height} and the depth image "
+            f"{columns}x{rows}; give the image aligned to the depth, or the colour camera: "
+            "color_camera= (--color-camera)"
+        )
+    return ColorImage(rgb=rgb, K=view.K)
+
+
+def _color_intrinsics(
+    camera: AnyLens, width: int, height: int, view: ViewInput
+) -> Float[Tensor, "3 3"]:
+    """Give the intrinsic matrix of a colour camera; raise if its images are of another size."""
+    lens = camera if isinstance(camera, Camera) else camera_of(camera, (width, height))
     assert lens is not None
     check_image_matches_camera(lens, width, height, f"{view.name}: the colour image")
-    moved = None
-    if color_from_depth is not None:
-        moved = rigid_input(color_from_depth, "color_from_depth", "color_from_depth")
-    return ColorImage(rgb=rgb, K=intrinsics_of(lens.K).to(view.K), color_from_depth=moved)
+    return intrinsics_of(lens.K).to(view.K)

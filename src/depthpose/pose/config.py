@@ -328,12 +328,13 @@ class ObjectsConfig(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         width, height = self.image_px
-        middle = ((width - 1) / 2, (height - 1) / 2)
-        usual = _LINEMOD_CENTRE_PX if self.image_px == _LINEMOD_PX else middle
-        x, y = usual if self.centre_px is None else self.centre_px
+        default = ((width - 1) / 2, (height - 1) / 2)
+        if self.image_px == _LINEMOD_PX:  # of LineMOD's size, so its Kinect is meant
+            default = _LINEMOD_CENTRE_PX
+        x, y = default if self.centre_px is None else self.centre_px
         object.__setattr__(self, "centre_px", (x, y))
         if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
             raise InputError(
                 f"centre_px is {(x, y)}, but the principal point lies within the image, and "
-                f"image_px is {self.image_px}; leave it out for the middle, {middle}"
+                f"image_px is {self.image_px}; leave it out for the default, {default}"
             )

@@ -106,6 +106,11 @@ class PreparedObject:
     model: ObjectModel
     surface: Surface
 
+    def prepare(self) -> "PreparedObject":
+        """Compute now what else is computed when first asked for, in the seconds of no input."""
+        _ = self.copies, self.pairs
+        return self
+
     @cached_property
     def copies(self) -> SymmetricCopies:
         """Poses at which it looks alike."""
@@ -139,30 +144,34 @@ def find_copies(model: ObjectModel) -> SymmetricCopies:
     offset_m = points_m - points_m.mean(0)
     axes = torch.linalg.eigh(offset_m.T @ offset_m).eigenvectors.T.flip(0)
     along_m = points_m @ axes.T
-    exact = true_symmetries(model)
-    symmetries = symmetry_transforms(exact, _STEP_RAD).double()
-    compared_m = take_evenly(points_m, _COMPARED)
-    # Symmetries that were found within a tolerance, but for the exact ones, are near-symmetries.
-    declared = symmetry_transforms(model.symmetries, _FOUND_STEP_RAD).double()
-    near = near_symmetries(model)
-    alike = [n.model_from_model[None] for n in near if n.deviation <= _COPY_DIAMETERS]
-    unlike = [n.model_from_model[None] for n in near if n.deviation > _COPY_DIAMETERS]
-    copies = Rigid.cat([declared, *alike])
-    proposed = cached(model, find_turns, "turns")
-    rows = torch.tensor(proposed["turns"], dtype=torch.float64).reshape(-1, 4, 4)
-    turns = Rigid(rows[:, :3, :3], rows[:, :3, 3])
-    # Half turns about the principal axes: the usual mistake about a long or flat part.
-    half = 2 * axes[:, :, None] * axes[:, None] - torch.eye(3).double()
-    halves = Rigid(half, middle_m - half @ middle_m)
-    lookalikes = Rigid.cat([*unlike, turns[proposed["near"] :], halves])
-    copies = Rigid.cat([copies, turns[: proposed["near"]]])
-    centre_m = exact.ball_centre_m
-    if centre_m is not None:  # every rotation of a ball is the same pose: its centre says where
-        compared_m = centre_m.to(points_m)[None]
-        copies = _empty()
-        lookalikes = _empty()
-    prepared = SymmetricCopies(
-        symmetries=symmetries,
+
+    # Of a ball every rotation is the same pose, of which its centre alone says where it is.
+    centre_m = true_symmetries(model).ball_centre_m
+    compared_m = (
+        take_evenly(points_m, _COMPARED) if centre_m is None else centre_m.to(points_m)[None]
+    )
+    exact = _exact_copies(model, compared_m, middle_m, axes, along_m.amax(0) - along_m.amin(0))
+    if centre_m is not None:
+        return exact
+
+    # Each motion is kept once: as a near-symmetry, or else as a look-alike.
+    near_motions, lookalike_motions = _propose_motions(model, middle_m, axes)
+    identity = Rigid(torch.eye(3)[None].double(), torch.zeros(1, 3).double())
+    near_copies = _distinct(near_motions, identity, exact)
+    lookalikes = _distinct(lookalike_motions, Rigid.cat([identity, near_copies]), exact)
+    return replace(exact, near_copies=near_copies, lookalikes=lookalikes)
+
+
+def _exact_copies(
+    model: ObjectModel,
+    compared_m: Float64[Tensor, "n 3"],
+    middle_m: Float64[Tensor, "3"],
+    axes: Float64[Tensor, "3 3"],
+    lengths_m: Float64[Tensor, "3"],
+) -> SymmetricCopies:
+    """Give the exact symmetries of a model, without near-symmetries or look-alikes yet."""
+    return SymmetricCopies(
+        symmetries=symmetry_transforms(true_symmetries(model), _STEP_RAD).double(),
         near_copies=_empty(),
         lookalikes=_empty(),
         trained=symmetry_transforms(model.symmetries, 4 * _STEP_RAD).double(),
@@ -170,20 +179,46 @@ def find_copies(model: ObjectModel) -> SymmetricCopies:
         points_m=compared_m,
         middle_m=middle_m,
         axes=axes,
-        lengths_m=along_m.amax(0) - along_m.amin(0),
+        lengths_m=lengths_m,
         diameter_m=model.diameter_m,
     )
-    identity = Rigid(torch.eye(3)[None].double(), torch.zeros(1, 3).double())
-    copies = _distinct(copies, identity, prepared)
-    lookalikes = _distinct(lookalikes, Rigid.cat([identity, copies]), prepared)
-    return replace(prepared, near_copies=copies, lookalikes=lookalikes)
 
 
-def _distinct(motions: Rigid, others: Rigid, prepared: SymmetricCopies) -> Rigid:
+def _propose_motions(
+    model: ObjectModel, middle_m: Float64[Tensor, "3"], axes: Float64[Tensor, "3 3"]
+) -> tuple[Rigid, Rigid]:
+    """Give motions that may be near-symmetries, and those that may be look-alikes.
+
+    They hold exact symmetries too, and the same motion several times.
+    """
+    # Symmetries that were found within a tolerance, but for the exact ones, are near-symmetries.
+    found = symmetry_transforms(model.symmetries, _FOUND_STEP_RAD).double()
+    near_symmetric: list[Rigid] = []
+    less_alike: list[Rigid] = []
+    for near in near_symmetries(model):
+        motions = near_symmetric if near.deviation <= _COPY_DIAMETERS else less_alike
+        motions.append(near.model_from_model[None])
+
+    # Rotations that point pairs of the model propose: the first of them are near-symmetries.
+    by_pairs = cached(model, find_turns, "turns")
+    matrices = torch.tensor(by_pairs["turns"], dtype=torch.float64).reshape(-1, 4, 4)
+    rotations = Rigid(matrices[:, :3, :3], matrices[:, :3, 3])
+    near_count = by_pairs["near"]
+
+    # Half turns about the principal axes: the usual mistake about a long or flat part.
+    half_R = 2 * axes[:, :, None] * axes[:, None] - torch.eye(3).double()
+    half_turns = Rigid(half_R, middle_m - half_R @ middle_m)
+
+    near_motions = Rigid.cat([found, *near_symmetric, rotations[:near_count]])
+    lookalike_motions = Rigid.cat([*less_alike, rotations[near_count:], half_turns])
+    return near_motions, lookalike_motions
+
+
+def _distinct(motions: Rigid, others: Rigid, exact: SymmetricCopies) -> Rigid:
     """Leave out motions that are, up to a symmetry, one before them or one of others."""
     chosen = others
     for k in range(len(motions.R)):
-        if not bool(prepared.is_same(motions[k], chosen, prepared.symmetries).any()):
+        if not bool(exact.is_same(motions[k], chosen, exact.symmetries).any()):
             chosen = Rigid.cat([chosen, motions[k][None]])
     return chosen[len(others.R) :]
 

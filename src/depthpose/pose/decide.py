@@ -30,6 +30,10 @@ OTHER_FRAME = (
     "the world have z up: give it as the camera saw it"
 )
 """What may be wrong with a cloud that fits no pose: its origin is not where the camera was."""
+_UNOBSERVED_WEIGHT = 0.5
+"""Of an area that was not observed beside one that contradicts: it may only be hidden."""
+_LEAST_CONTRADICTING = LEAST_AREA / 4
+"""Independent patches: a smaller area does not explain why a pose is doubted."""
 LEAST_NAMED = 0.01
 """Alternatives of a smaller probability are not named."""
 LEAST_SHARE = 0.8
@@ -70,7 +74,8 @@ def decide(
         cloud.cloud_m, prepared, best.pose, free, refusal.min_observability
     )
     if withheld is None and probability < refusal.min_probability:
-        withheld = Refusal(status="doubtful", reason=contradiction(best.evidence, probability))
+        doubt = contradiction(best.evidence, probability, is_masked=observation.is_masked)
+        withheld = Refusal(status="doubtful", reason=doubt)
     if withheld is None and is_refined and refusal.max_size_error < 1:
         identity = identify(
             cloud.cloud_m,
@@ -79,7 +84,7 @@ def decide(
             prepared.surface,
             prepared.copies.mirror,
             best.evidence,
-            observation.step * float(observation.K[0, 0]),
+            observation.focal_px,
             refusal.max_size_error,
             config.object_deviation_m,
         )
@@ -89,7 +94,7 @@ def decide(
     facts: dict[str, Any] = {
         "name": cloud.name,
         "object": model.name,
-        "residual_m": best.residual_m,
+        "residual_m": float(best.refined.residual_m),
         "evidence": best.evidence,
         "identity": identity,
     }
@@ -102,7 +107,7 @@ def decide(
     estimate = PoseEstimate(
         status="ok",
         camera_from_model=best.pose.float(),  # computed in double precision
-        covariance=without_motions(best.covariance, free).float(),
+        covariance=without_motions(best.refined.covariance, free).float(),
         free_motions=free.float(),
         certainty=probability * competition.group_share,
         copy_certainty=probability * competition.best_share,
@@ -172,8 +177,14 @@ def _alternatives(
     )
 
 
-def contradiction(evidence: Evidence, probability: float) -> str:
-    """Say what contradicts a pose most."""
+def contradiction(evidence: Evidence, probability: float, *, is_masked: bool) -> str:
+    """Say what contradicts a pose most, and what may be the cause.
+
+    Args:
+        evidence: of the pose.
+        probability: of its being right, too low.
+        is_masked: whether all points were taken for the object's, as a mask gives them.
+    """
     compared = max(evidence.supported + evidence.contradicted, 1e-9)
     visible = max(evidence.visible, 1e-9)
     reasons = [
@@ -191,19 +202,19 @@ def contradiction(evidence: Evidence, probability: float) -> str:
             "silhouette",
         ),
         (
-            evidence.unobserved / 2,
+            _UNOBSERVED_WEIGHT * evidence.unobserved,
             f"{evidence.unobserved / visible:.0%} of the posed surface was not observed",
         ),
     ]
     area, worst = max(reasons, key=lambda reason: reason[0])
-    if area < LEAST_AREA / 4:
+    if area < _LEAST_CONTRADICTING:
         worst = "too little of the object was observed"
         if evidence.rms > WRONG_RMS:
             worst = f"its residuals are {evidence.rms:.1f} times what the sensor explains"
-    return (
-        f"the best pose is right with a probability of {probability:.0%}: {worst}. Another object, "
-        "a mask of more than the object, or too little of it"
-    )
+    causes = "Another object, or too little of it"
+    if is_masked:
+        causes = "Another object, a mask of more than the object, or too little of it"
+    return f"the best pose is right with a probability of {probability:.0%}: {worst}. {causes}"
 
 
 def with_status(estimate: PoseEstimate, min_certainty: float) -> PoseEstimate:

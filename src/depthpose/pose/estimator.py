@@ -122,7 +122,7 @@ class PoseEstimator:
         """Register one object to the points of its mask; search the region if the mask is loose."""
         if isinstance(pose_input, ViewInput) and pose_input.is_region:
             return self._search_region(pose_input)
-        prepared = self._prepared_object(pose_input.object)
+        prepared = self._object(pose_input.object).prepare()
         estimate = register(pose_input, prepared, self.config, self.refusal)
         if estimate.status != "doubtful" or not isinstance(pose_input, ViewInput):
             return estimate
@@ -133,7 +133,7 @@ class PoseEstimator:
     def _search_region(self, view: ViewInput) -> PoseEstimate:
         """Search the one object that is somewhere in the mask of a view, as in a box."""
         targets = SearchTargets(
-            objects={view.object: self._prepared_object(view.object)},
+            objects={view.object: self._object(view.object).prepare()},
             config=self.config,
             refusal=self.refusal,
             prior_odds=PRIOR_REGION,
@@ -305,7 +305,7 @@ class PoseEstimator:
             is_single: search once, without further rounds for more of the same object.
         """
         targets = SearchTargets(
-            objects={name: self._prepared_object(name) for name in objects},
+            objects={name: self._object(name).prepare() for name in objects},
             config=self.config,
             refusal=self.refusal,
             is_single=is_single,
@@ -413,12 +413,6 @@ class PoseEstimator:
             surface = prepare_surface(model, self.config.icp.surface_points)
             self._objects[name] = PreparedObject(number=number, model=model, surface=surface)
         return self._objects[name]
-
-    def _prepared_object(self, name: str) -> PreparedObject:
-        """Give an object by its name, with all that is computed once: in no input's seconds."""
-        prepared = self._object(name)
-        _ = prepared.copies, prepared.pairs
-        return prepared
 
 
 def unreadable_on_error(

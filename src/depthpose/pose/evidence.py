@@ -91,6 +91,11 @@ class Observation:
     step: int = 1
     patch_px: float = CORRELATION_PX
 
+    @property
+    def focal_px(self) -> float:
+        """Focal length of the image itself, before it was thinned."""
+        return self.step * float(self.K[0, 0])
+
 
 def observe(
     cloud_m: Float[Tensor, "n 3"],
@@ -299,6 +304,9 @@ def _is_continued(
         is_supported: of these the ones whose readings support the pose.
         window: rows and columns of the rendering in the observation.
     """
+    if not is_drawn.any():  # no silhouette
+        return np.zeros(observation.depth_m.shape, bool)
+
     # The silhouette, in a window with a margin.
     border = math.ceil(EDGE_PX / observation.step + observation.patch_px / 2)
     reach = border + max(1, round(observation.patch_px / 2))

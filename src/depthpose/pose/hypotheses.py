@@ -5,17 +5,22 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float64
 from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid
 from depthpose.pose.color import color_agreement, color_copies, settle_spin
 from depthpose.pose.config import IcpConfig
-from depthpose.pose.copies import PreparedObject
+from depthpose.pose.copies import PreparedObject, SymmetricCopies
 from depthpose.pose.evidence import Observation, compare
 from depthpose.pose.icp import RefinedPose, refine_pose, refine_roughly
-from depthpose.pose.probability import LEAST_AREA, VOTES_RAD, log_fit_right, log_odds_right
+from depthpose.pose.probability import (
+    LEAST_AREA,
+    VOTES_RAD,
+    log_likelihood_of_copy,
+    log_likelihood_ratio,
+)
 from depthpose.pose.surface import NEAR, Surface
 from depthpose.pose.types import Evidence, ViewInput
 
@@ -33,21 +38,22 @@ class Hypothesis:
     """A refined pose and the evidence for it.
 
     Attributes:
-        pose: ``camera_from_model``.
-        covariance: 6x6, as :class:`~depthpose.pose.types.PoseFit` says.
-        residual_m: root mean square distance of the points to the surface.
+        refined: the pose, with its covariance and residual.
         evidence: of the pose.
         votes_rad: mean angle between a network's directions and those to the keypoints of the
             pose; None without a network.
         log_color: log likelihood of the colour image; 0 without one.
     """
 
-    pose: Rigid
-    covariance: Float[Tensor, "6 6"]
-    residual_m: float
+    refined: RefinedPose
     evidence: Evidence
     votes_rad: float | None = None
     log_color: float = 0.0
+
+    @property
+    def pose(self) -> Rigid:
+        """``camera_from_model``, in double precision."""
+        return self.refined.camera_from_model.double()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -82,7 +88,7 @@ def compete(
     view: ViewInput | None = None,
     votes_rad: Callable[[Rigid], float] | None = None,
 ) -> Competition:
-    """Compare a refined pose with others, with its look-alikes and with its near-symmetric copies.
+    """Compare a refined pose with others and its look-alikes, and the winner with its copies.
 
     Args:
         cloud_m: points of the object, in the camera frame.
@@ -94,58 +100,75 @@ def compete(
         view: whose colour image tells copies apart; None: depth alone.
         votes_rad: mean angle between a network's directions and those to the keypoints of a pose.
     """
-    copies = prepared.copies
-    surface = prepared.surface
 
-    def hypothesis(source: RefinedPose) -> Hypothesis:
+    def hypothesize(pose: RefinedPose) -> Hypothesis:
         """Compare a refined pose with all that was observed."""
-        pose = source.camera_from_model.double()
+        camera_from_model = pose.camera_from_model.double()
         return Hypothesis(
-            pose=pose,
-            covariance=source.covariance,
-            residual_m=float(source.residual_m),
-            evidence=compare(observation, pose, surface),
-            votes_rad=None if votes_rad is None else votes_rad(pose),
-            log_color=0.0 if view is None else _log_color(pose, prepared, view),
+            refined=pose,
+            evidence=compare(observation, camera_from_model, prepared.surface),
+            votes_rad=None if votes_rad is None else votes_rad(camera_from_model),
+            log_color=0.0 if view is None else _log_color(camera_from_model, prepared, view),
         )
 
     # Which pose is it, up to near-symmetric copies?
-    first = refined.camera_from_model.double()
-    starts = Rigid.cat([others.double(), first @ copies.lookalikes])
-    alike = Rigid.cat([copies.symmetries, copies.near_copies])
-    leading = [hypothesis(refined)]
-    for candidate in _refine_competitors(cloud_m, refined, starts, surface, icp, _MOST_LEADING):
-        before = Rigid.stack([h.pose for h in leading])
-        pose = candidate.refined.camera_from_model
-        if not bool(copies.is_same(pose, before, alike).any()):
-            leading.append(hypothesis(candidate.refined))
+    different = [
+        hypothesize(pose)
+        for pose in _refine_different_poses(cloud_m, refined, others, prepared, icp)
+    ]
     if view is not None:  # one of its copies may have the surface colours that are observed
-        leading = _with_color_of_best_copy(leading, prepared, view, alike)
-    shares = share_among_poses(leading, is_masked=observation.is_masked)
-    winner = int(shares.argmax())
-    others_shares = [(h, float(shares[k])) for k, h in enumerate(leading) if k != winner]
+        different = _with_color_of_best_copy(different, prepared, view)
+    shares = share_among_poses(different, is_masked=observation.is_masked)
+    winner_number = int(shares.argmax())
+    winner = different[winner_number]
 
     # And which of its copies?
-    winning_pose = replace(
-        refined,
-        camera_from_model=leading[winner].pose,
-        covariance=leading[winner].covariance,
-        residual_m=refined.residual_m.new_tensor(leading[winner].residual_m),
-    )
-    group = [leading[winner]]
-    if view is not None:
-        log_color = _log_color(leading[winner].pose, prepared, view)
-        group = [replace(leading[winner], log_color=log_color)]
-    for copy in _distinct_copies(cloud_m, winning_pose, prepared, icp, view):
-        group.append(hypothesis(copy))
-    copy_shares = float(shares[winner]) * share_among_copies(group, is_masked=observation.is_masked)
+    if view is not None:  # its own colours again, in place of those of its best copy
+        winner = replace(winner, log_color=_log_color(winner.pose, prepared, view))
+    copies = _refine_distinct_copies(cloud_m, winner.refined, prepared, icp, view)
+    group = [winner, *map(hypothesize, copies)]
+    share_in_group = share_among_copies(group, is_masked=observation.is_masked)
+    copy_shares = float(shares[winner_number]) * share_in_group
     best = int(copy_shares.argmax())
+
     return Competition(
         best=group[best],
         best_share=float(copy_shares[best]),
         copies=[(h, float(copy_shares[k])) for k, h in enumerate(group) if k != best],
-        others=others_shares,
+        others=[(h, float(shares[k])) for k, h in enumerate(different) if k != winner_number],
     )
+
+
+def _refine_different_poses(
+    cloud_m: Float64[Tensor, "n 3"],
+    leading: RefinedPose,
+    others: Rigid,
+    prepared: PreparedObject,
+    icp: IcpConfig | None,
+) -> list[RefinedPose]:
+    """Give the leading pose, and refined others that are neither it nor a copy of one before.
+
+    Others are the ones given, and the look-alikes of the leading pose.
+    """
+    copies = prepared.copies
+    leading_pose = leading.camera_from_model.double()
+    starts = Rigid.cat([others.double(), leading_pose @ copies.lookalikes])
+    competitors = _refine_competitors(
+        cloud_m, leading, starts, prepared.surface, icp, _MOST_LEADING
+    )
+
+    different = [leading]
+    for competitor in competitors:
+        pose = competitor.refined.camera_from_model
+        before = Rigid.stack([other.camera_from_model.double() for other in different])
+        if not bool(copies.is_same(pose, before, _all_symmetries(prepared)).any()):
+            different.append(competitor.refined)
+    return different
+
+
+def _all_symmetries(prepared: PreparedObject) -> Rigid:
+    """Exact and near-symmetries of an object, which lead from a pose to its copies."""
+    return Rigid.cat([prepared.copies.symmetries, prepared.copies.near_copies])
 
 
 def share_among_poses(
@@ -158,7 +181,7 @@ def share_among_poses(
     """
     if not is_masked:
         hypotheses = _against_each_other(hypotheses)
-    weights = [log_odds_right(h.evidence) + _log_beside_depth(h) for h in hypotheses]
+    weights = [log_likelihood_ratio(h.evidence) + _log_beside_depth(h) for h in hypotheses]
     return torch.tensor(weights, dtype=torch.float64).softmax(0)
 
 
@@ -173,7 +196,7 @@ def share_among_copies(
     area = max(LEAST_AREA, *(hypothesis.evidence.visible for hypothesis in hypotheses))
     if not is_masked:
         hypotheses = _against_each_other(hypotheses)
-    weights = [log_fit_right(h.evidence, area) + h.log_color for h in hypotheses]
+    weights = [log_likelihood_of_copy(h.evidence, area) + h.log_color for h in hypotheses]
     return torch.tensor(weights, dtype=torch.float64).softmax(0)
 
 
@@ -198,51 +221,64 @@ def _log_beside_depth(hypothesis: Hypothesis) -> float:
     return log_votes + hypothesis.log_color
 
 
-def _distinct_copies(
+def _refine_distinct_copies(
     cloud_m: Float64[Tensor, "n 3"],
-    winning_pose: RefinedPose,
+    winner: RefinedPose,
     prepared: PreparedObject,
     icp: IcpConfig | None,
     view: ViewInput | None,
 ) -> list[RefinedPose]:
-    """Refine the near-symmetric copies of a pose; give those that are no exact copies of others."""
-    copies = prepared.copies
-    pose = winning_pose.camera_from_model
-    starts = pose @ copies.near_copies
+    """Refine the near-symmetric copies of the winning pose; leave out exact copies of others."""
+    winner_pose = winner.camera_from_model.double()
+    starts = winner_pose @ prepared.copies.near_copies
     if view is not None:  # colours show finer rotations about an axis than shape does
-        starts = Rigid.cat([color_copies(pose, prepared.model, view), starts])
+        starts = Rigid.cat([color_copies(winner_pose, prepared.model, view), starts])
+    competitors = _refine_competitors(cloud_m, winner, starts, prepared.surface, icp, _MOST_COPIES)
+
     distinct: list[RefinedPose] = []
-    distinct_poses = [pose]
-    for candidate in _refine_competitors(
-        cloud_m, winning_pose, starts, prepared.surface, icp, _MOST_COPIES
-    ):
-        refined_copy = candidate.refined
+    distinct_poses = [winner_pose]
+    for competitor in competitors:
+        refined = competitor.refined
         if view is not None:
-            settled = settle_spin(refined_copy.camera_from_model, prepared.model, view)
-            refined_copy = replace(refined_copy, camera_from_model=settled)
-        # Refinement may slide a copy onto another, where nothing observed tells them apart: then
-        # it stays where the symmetry has it.
-        before = Rigid.stack(distinct_poses)
-        for copy in (refined_copy, candidate.unrefined):
-            if not bool(copies.is_same(copy.camera_from_model, before, copies.symmetries).any()):
-                distinct.append(copy)
-                distinct_poses.append(copy.camera_from_model.double())
-                break
+            # Depth lets a copy drift about an axis of its shape, where its print fixes the angle.
+            settled = settle_spin(refined.camera_from_model, prepared.model, view)
+            refined = replace(refined, camera_from_model=settled)
+        copy = _first_distinct(
+            (refined, competitor.unrefined), Rigid.stack(distinct_poses), prepared.copies
+        )
+        if copy is not None:
+            distinct.append(copy)
+            distinct_poses.append(copy.camera_from_model.double())
     return distinct
 
 
+def _first_distinct(
+    preferred: Sequence[RefinedPose], before: Rigid, copies: SymmetricCopies
+) -> RefinedPose | None:
+    """Give the first of several forms of a copy that is no exact copy of a pose before it.
+
+    Refinement may slide a copy onto another, where nothing observed tells them apart: then it stays
+    where the symmetry has it.
+    """
+    for pose in preferred:
+        if not bool(copies.is_same(pose.camera_from_model, before, copies.symmetries).any()):
+            return pose
+    return None
+
+
 def _with_color_of_best_copy(
-    leading: list[Hypothesis], prepared: PreparedObject, view: ViewInput, alike: Rigid
+    hypotheses: Sequence[Hypothesis], prepared: PreparedObject, view: ViewInput
 ) -> list[Hypothesis]:
     """Give each pose the colour evidence of the best of its copies, for it stands for all of them.
 
     Poses whose best copies are one pose are copies of each other: the first stands for them.
     """
     copies = prepared.copies
+    symmetries = _all_symmetries(prepared)
     distinct: list[Hypothesis] = []
     best_copies: list[Rigid] = []
-    for hypothesis in leading:
-        colored = color_copies(hypothesis.pose, prepared.model, view, turns=alike)
+    for hypothesis in hypotheses:
+        colored = color_copies(hypothesis.pose, prepared.model, view, turns=symmetries)
         likelihood = color_agreement(colored, prepared.model, view).log_likelihood
         best = colored[int(likelihood.argmax())]
         if best_copies and copies.is_same(best, Rigid.stack(best_copies), copies.symmetries).any():
@@ -252,7 +288,7 @@ def _with_color_of_best_copy(
     return distinct
 
 
-class _Candidate(NamedTuple):
+class _Competitor(NamedTuple):
     """A competing pose, refined and as it was proposed."""
 
     refined: RefinedPose
@@ -271,11 +307,11 @@ def _refine_competitors(
     surface: Surface,
     icp: IcpConfig | None,
     most: int,
-) -> list[_Candidate]:
+) -> list[_Competitor]:
     """Refine competing poses, but for those that explain much less than the leading one."""
     unrefined = [replace(leading, camera_from_model=starts[k]) for k in range(len(starts.R))]
     if icp is None:
-        return [_Candidate(candidate, candidate) for candidate in unrefined]
+        return [_Competitor(pose, pose) for pose in unrefined]
     if len(starts.R) == 0:
         return []
     # Roughly. Such steps let a pose drift along what little constrains it, so it stays at its start
@@ -304,7 +340,7 @@ def _refine_competitors(
         start_distance_diameters=icp.end_distance_diameters,
     )
     batch = refine_pose(cloud_m, improved[order], surface, short)
-    candidates: list[_Candidate] = []
+    competitors: list[_Competitor] = []
     for k, number in enumerate(order.tolist()):
         refined = RefinedPose(
             camera_from_model=batch.camera_from_model[k],
@@ -312,8 +348,8 @@ def _refine_competitors(
             residual_m=batch.residual_m[k],
             inlier_share=batch.inlier_share[k],
         )
-        candidates.append(_Candidate(refined, unrefined[number]))
-    return candidates
+        competitors.append(_Competitor(refined, unrefined[number]))
+    return competitors
 
 
 def _unexplained(

@@ -56,7 +56,6 @@ class BestStart(NamedTuple):
     """The best of several refined poses."""
 
     refined: RefinedPose  #: the best
-    start: int  #: index of the initial pose that it began from
     others: Rigid  #: the best poses beside it, three at most, roughly refined
 
 
@@ -186,7 +185,7 @@ def refine_best(
     start = initial[best] if is_initial else None
     refined = _refine_exactly(points_m, start, rough[best], surface, config)
     others = _distinct_poses(rough, score, refined.camera_from_model.double(), surface)
-    return BestStart(refined, start=best % len(initial.R), others=others)
+    return BestStart(refined=refined, others=others)
 
 
 def _refine_exactly(

@@ -7,7 +7,6 @@ the pose is fitted, refined by ICP, and checked. A baseline regresses the pose f
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import NamedTuple, NoReturn
 
@@ -172,9 +171,10 @@ class GeoPoseNet(PoseEstimator):
         network's sums. Where the config wants it, what is expected and doubted is registered.
         """
         prepared = each_in_threads(partial(unreadable_on_error, self._prepare), inputs, threads)
-        groups = map(self._ask_network, _batches(prepared, self.config.batch_voxels))
         pose = partial(self._pose, is_expected=is_expected)
-        return chain.from_iterable(map(partial(each_in_threads, pose, threads=threads), groups))
+        for group in _batches(prepared, self.config.batch_voxels):
+            self._ask_network(group)
+            yield from each_in_threads(pose, group, threads)
 
     @torch.no_grad()
     @force_float32()
@@ -221,13 +221,11 @@ class GeoPoseNet(PoseEstimator):
             pose_input=pose_input, prepared=prepared, cloud=cloud, voxels=voxels, watch=watch
         )
 
-    def _ask_network(
-        self, group: list[CloudToPose | PoseEstimate]
-    ) -> list[CloudToPose | PoseEstimate]:
-        """Ask together for the directions of a group's clouds, in the camera frame."""
+    def _ask_network(self, group: Sequence[CloudToPose | PoseEstimate]) -> None:
+        """Ask together for the directions of a group's clouds, and set them in the camera frame."""
         ready = [job for job in group if isinstance(job, CloudToPose)]
         if not ready:
-            return group
+            return
         watch = Stopwatch()
         with watch.stage("network"):
             grids = [job.voxels for job in ready]
@@ -248,7 +246,6 @@ class GeoPoseNet(PoseEstimator):
             job.directions = of_cloud @ job.voxels.grid_from_camera
             # Each has a share of the time.
             job.watch.seconds["network"] = watch.seconds["network"] * count / sum(counts)
-        return group
 
     def _pose(self, job: CloudToPose | PoseEstimate, *, is_expected: bool) -> PoseEstimate:
         """Pose a cloud by its votes, or by registration where these are doubted."""
@@ -288,7 +285,7 @@ class GeoPoseNet(PoseEstimator):
             residual_m=fits.residual_m[0],
             inlier_share=torch.ones(()),
         )
-        refinement = BestStart(refined=fitted, start=0, others=poses[:0])
+        refinement = BestStart(refined=fitted, others=poses[:0])
         icp = None
         if config.with_icp:
             with watch.stage("icp"):
@@ -388,6 +385,9 @@ class DepthImageRegressor(PoseEstimator):
         prepared = self._object(pose_input.object)
         if not isinstance(pose_input, ViewInput):
             raise InputError(_NEEDS_MASK)
+        # An empty region says that nothing was detected: of that too few pixels are refused below.
+        if pose_input.is_region and bool(pose_input.mask.any()):
+            raise InputError(_NEEDS_MASK)
         config = self._network.config
         model = prepared.model
         watch = Stopwatch()
@@ -395,7 +395,9 @@ class DepthImageRegressor(PoseEstimator):
             crop = cut_depth(pose_input, config, model.diameter_m)
         if crop is None:
             reason = f"fewer than {config.min_points} masked pixels have a depth"
-            return refused(pose_input, Refusal(status="too few points", reason=reason), {})
+            return refused(
+                pose_input, Refusal(status="too few points", reason=reason), watch.seconds
+            )
         with watch.stage("network"):
             batch = DepthCrop(*(part[None].to(self.config.device) for part in crop))
             numbers = torch.tensor([prepared.number], device=self.config.device)

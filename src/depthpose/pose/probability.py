@@ -78,11 +78,11 @@ def probability_right(evidence: Evidence, prior_odds: float) -> float:
     """
     if evidence.agreement < LEAST_AGREEMENT:
         return 0.0
-    log_odds = math.log(prior_odds) + log_odds_right(evidence)
+    log_odds = math.log(prior_odds) + log_likelihood_ratio(evidence)
     return 1 / (1 + math.exp(-min(log_odds, 50.0)))
 
 
-def log_odds_right(evidence: Evidence) -> float:
+def log_likelihood_ratio(evidence: Evidence) -> float:
     """Log likelihood ratio of a right and a wrong pose: contradicted, unobserved, residuals.
 
     It grows with the area that was compared: a pose that shows little has little to support it.
@@ -96,11 +96,12 @@ def log_odds_right(evidence: Evidence) -> float:
     unobserved = RIGHT_UNOBSERVED.log_likelihood(evidence.unobserved, rest)
     unobserved -= WRONG_UNOBSERVED.log_likelihood(evidence.unobserved, rest)
     # Residuals are of the supported part alone.
-    fit = evidence.supported_share * (_log_fit(evidence.rms) - _log_fit(WRONG_RMS))
-    return contradicted + unobserved + fit
+    residuals = _log_likelihood_of_residuals(evidence.rms)
+    residuals -= _log_likelihood_of_residuals(WRONG_RMS)
+    return contradicted + unobserved + evidence.supported_share * residuals
 
 
-def log_fit_right(evidence: Evidence, area: float) -> float:
+def log_likelihood_of_copy(evidence: Evidence, area: float) -> float:
     """Log likelihood of the evidence at a right pose, of one of several copies.
 
     Args:
@@ -109,10 +110,10 @@ def log_fit_right(evidence: Evidence, area: float) -> float:
     """
     contradicted = COPY_CONTRADICTED.log_likelihood(evidence.contradicted, area)
     unobserved = RIGHT_UNOBSERVED.log_likelihood(evidence.unobserved, area)
-    return contradicted + unobserved + _log_fit(evidence.rms)
+    return contradicted + unobserved + _log_likelihood_of_residuals(evidence.rms)
 
 
-def _log_fit(rms: float) -> float:
+def _log_likelihood_of_residuals(rms: float) -> float:
     """Log likelihood of residuals, up to a constant: normal, of the variance 1 + rms^2.
 
     The variance is fitted to them, and at least 1, that of the sensor and the object.
@@ -145,5 +146,5 @@ def share_among_objects(evidences: Sequence[Evidence]) -> Float64[Tensor, " n"]:
 
     Each is weighed by the evidence of its best pose.
     """
-    log_odds = [log_odds_right(evidence) for evidence in evidences]
-    return torch.tensor(log_odds, dtype=torch.float64).softmax(0)
+    log_ratios = [log_likelihood_ratio(evidence) for evidence in evidences]
+    return torch.tensor(log_ratios, dtype=torch.float64).softmax(0)

@@ -141,7 +141,7 @@ def judge(
                 name=cloud.name,
                 object=prepared.model.name,
                 status="doubtful",
-                reason=contradiction(evidence, probability),
+                reason=contradiction(evidence, probability, is_masked=False),
                 evidence=evidence,
                 seconds=watch.seconds,
             )

@@ -83,7 +83,7 @@ class Registration(PoseEstimator):
             cad: PLY, STL, OBJ, GLB, or meshes of trimesh or Open3D; an object is called as its
                 file, or as :func:`~depthpose.pose.mesh.read_model` says.
             unit: of the numbers in the files; None where all are GLB, which has metres.
-            config: as above.
+            config: ICP, limits; the seed is that of voting.
             symmetry: that a part has, in place of those that are found: ``"z,18"`` looks alike
                 after each of 18 equal turns about an axis along z, ``"z,free"`` after any, and
                 ``"z,6+x,2"`` has two axes; BOP's entry of an object, or a JSON file of it. The axis
@@ -108,7 +108,7 @@ class Registration(PoseEstimator):
     def prepare(self) -> None:
         """Prepare every model now, about a second each; else it is done when first asked for."""
         for name in self.objects:
-            self._prepared_object(name)
+            self._object(name).prepare()
 
     def _estimate(self, pose_input: AnyInput) -> PoseEstimate:
         return self._register(pose_input)

@@ -67,8 +67,8 @@ def render_surface(
     # of the plane from the camera: distance = depth * |ray| * cosine.
     is_drawn = face >= 0
     depth_m = np.where(is_drawn, depth_m, np.nan)
-    camera_m = pose.R.mT @ pose.t_m  # from the camera to the model's origin, in the model frame
-    distance_m = (surface.plane_offsets_m + surface.plane_normals @ camera_m).abs().numpy()
+    camera_m = -(pose.R.mT @ pose.t_m)  # in the model frame
+    distance_m = (surface.plane_offsets_m - surface.plane_normals @ camera_m).abs().numpy()
     cosine = np.ones(shape)
     ray_length = _ray_lengths(window_K.numpy(), *shape)
     cosine[is_drawn] = distance_m[face[is_drawn]] / (depth_m * ray_length)[is_drawn]

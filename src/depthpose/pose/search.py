@@ -38,7 +38,7 @@ from depthpose.pose.probability import (
     LEAST_POSSIBLE,
     PRIOR_MANY,
     PRIOR_PROPOSED,
-    log_odds_right,
+    log_likelihood_ratio,
     probability_of_instances,
     probability_right,
 )
@@ -71,7 +71,11 @@ class SearchTargets:
         config: of ICP, and of what a real object is off from its model.
         refusal: when a pose is withheld.
         prior_odds: of the best pose at a place being right.
-        is_single: search once, for one instance of each object.
+        is_single: at most one instance of each object is expected, as in a detector's box or a
+            frame of a track. Then (1) one round searches the image, (2) a place is left out that
+            lies mostly beside the mask, (3) places of one object are weighed without the case that
+            there are many of it (prior odds 0 in place of ``PRIOR_MANY``), and (4) no order of
+            picking is given.
     """
 
     objects: Mapping[str, PreparedObject]
@@ -152,8 +156,8 @@ def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
     for _ in range(1 if targets.is_single else _ROUNDS):
         proposals = _propose(frame, is_unclaimed, names, claimed, targets)
         likely, hopeless = _refine(proposals, frame, window, targets)
-        judged, refused = _judge(_group(likely), frame, window, targets)
-        misses += hopeless + refused
+        judged, rejected = _judge(_group(likely), frame, window, targets)
+        misses += hopeless + rejected
         if targets.is_single:
             judged, outside = _within(judged, is_unclaimed, targets)
             misses += outside
@@ -269,7 +273,7 @@ def _refine(
     for place, (pose, evidence) in zip(places, refined, strict=True):
         probability = probability_right(evidence, targets.prior_odds)
         if probability < LEAST_POSSIBLE:
-            reason = contradiction(evidence, probability)
+            reason = contradiction(evidence, probability, is_masked=False)
             hopeless.append(_miss_at(place, evidence, reason, targets))
             continue
         explained = explained_frame_mask(frame, pose, targets.objects[place.object].surface)
@@ -342,7 +346,7 @@ def _judge(
                 pose=pose,
                 explained=explained_frame_mask(frame, pose, surface),
                 estimate=estimate,
-                log_odds=math.log(targets.prior_odds) + log_odds_right(evidence),
+                log_odds=math.log(targets.prior_odds) + log_likelihood_ratio(evidence),
             )
         )
     return judged, misses

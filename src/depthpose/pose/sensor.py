@@ -52,6 +52,9 @@ CORRELATION_PX = 10
 a Kinect's, is as many independent readings as squares of 4 pi 3^2 pixels; a RealSense smooths by
 5 px."""
 CORRELATION_RAD = CORRELATION_PX / 570  #: the same as an angle, for a Kinect of 640 columns
+LEAST_DEVIATION_M = 1e-5
+"""No reading is taken to be surer than a hundredth of a millimetre: depth cameras measure no finer,
+and rounding of some metres to single precision is less than a tenth of it."""
 INDEPENDENT_SIDES = 6.0
 """A real object deviates from its model by whole sides, of which a body has about six: they are so
 few independent deviations, however many readings there are."""
@@ -86,6 +89,8 @@ class DepthNoise:
     def deviation_m(self, cosine: np.ndarray, readings: int) -> np.ndarray:
         """Standard deviation of the mean of neighbouring readings, along the optical axis.
 
+        It is ``LEAST_DEVIATION_M`` at least, so that residuals can be counted in it.
+
         Args:
             cosine: between the ray and the surface normal, any shape.
             readings: how many independent ones are averaged.
@@ -95,7 +100,7 @@ class DepthNoise:
         # On a slanted surface, what is off across the axis or along the normal is off in depth.
         place_m = self.lateral_std_m * np.sqrt(1 / cosine**2 - 1)
         object_m = self.object_std_m / cosine
-        return np.sqrt(noise_m2 + place_m**2 + object_m**2)
+        return np.maximum(np.sqrt(noise_m2 + place_m**2 + object_m**2), LEAST_DEVIATION_M)
 
 
 def measure_noise(

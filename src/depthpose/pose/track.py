@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
+from depthpose.core.camera.pinhole import crop_intrinsics
 from depthpose.core.rigid import Rigid
 from depthpose.core.stopwatch import Stopwatch
 from depthpose.pose.cloud import cloud_from_depth
@@ -22,7 +23,7 @@ from depthpose.pose.evidence import compare, observe
 from depthpose.pose.frame import is_on_plane, largest_plane
 from depthpose.pose.icp import refine_best
 from depthpose.pose.observability import free_motions, without_motions
-from depthpose.pose.probability import PRIOR_MASKED, log_odds_right, probability_right
+from depthpose.pose.probability import PRIOR_MASKED, log_likelihood_ratio, probability_right
 from depthpose.pose.surface import NEAR, Surface
 from depthpose.pose.types import (
     Alternative,
@@ -58,7 +59,7 @@ def scene_about(pose_input: AnyInput, poses: Rigid, surface: Surface) -> Float64
     if isinstance(pose_input, ViewInput):
         # The square about a ball, cut out of the view.
         z_m = float(middle_m[2])
-        K = pose_input.K.double().clone()
+        K = pose_input.K.double()
         near_m = max(z_m - radius_m, 0.1 * z_m)
         u, v = (K @ (middle_m / z_m))[:2].tolist()
         across, down = (float(K[k, k]) * radius_m / near_m for k in range(2))
@@ -66,9 +67,9 @@ def scene_about(pose_input: AnyInput, poses: Rigid, surface: Surface) -> Float64
         left, right = (min(max(round(u + s * across), 0), width) for s in (-1, 1))
         top, bottom = (min(max(round(v + s * down), 0), height) for s in (-1, 1))
         part = (slice(top, bottom), slice(left, right))
-        K[0, 2] -= left
-        K[1, 2] -= top
-        points_m = cloud_from_depth(pose_input.depth_m[part], pose_input.mask[part], K).double()
+        part_K = crop_intrinsics(K, left, top)
+        depth_m = pose_input.depth_m[part]
+        points_m = cloud_from_depth(depth_m, pose_input.mask[part], part_K).double()
         return take_evenly(points_m, _MOST_POINTS)
     points_m = pose_input.points_m.double()
     points_m = points_m[points_m.isfinite().all(-1) & (points_m[:, 2] > 0)]
@@ -88,18 +89,40 @@ class TrackedObject:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class _FrameMotion:
+    """How an object moved between two frames: rotated about its own origin, and shifted.
+
+    Attributes:
+        R: rotation of the object, in the axes of the camera.
+        shift_m: of its origin, in the camera frame.
+    """
+
+    R: Float64[Tensor, "3 3"]
+    shift_m: Float64[Tensor, "3"]
+
+    @classmethod
+    def between(cls, before: Rigid, after: Rigid) -> "_FrameMotion":
+        """Give the motion from one pose to the next."""
+        return cls(R=after.R @ before.R.mT, shift_m=after.t_m - before.t_m)
+
+    def move(self, pose: Rigid) -> Rigid:
+        """Give the pose after the same motion again."""
+        return Rigid(self.R @ pose.R, pose.t_m + self.shift_m)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class _Track:
     """What is known of an object that is followed.
 
     Attributes:
         pose: in the last frame.
-        moved: how it moved from the frame before; None: not known.
+        motion: from the frame before to it; None: not known.
         log_odds: of the pose being right, up to near-symmetries, by all frames.
         origin: the estimate that the track began with; None: a pose that was given.
     """
 
     pose: Rigid
-    moved: Rigid | None
+    motion: _FrameMotion | None
     log_odds: float
     origin: PoseEstimate | None
 
@@ -115,17 +138,18 @@ def track(
     current = None
     if first is not None:
         current = _Track(
-            pose=first.double(), moved=None, log_odds=math.log(PRIOR_MASKED), origin=None
+            pose=first.double(), motion=None, log_odds=math.log(PRIOR_MASKED), origin=None
         )
     for pose_input in frames:
         if isinstance(pose_input, PoseEstimate):
             yield pose_input
             continue
         estimate, following = _follow_or_search(pose_input, current, target)
-        # In a cloud of a whole scene an object that is lost can be looked for only where it was.
-        is_scene = isinstance(pose_input, CloudInput) and pose_input.view is None
-        if following is None and is_scene and current is not None:
-            following = replace(current, moved=None)
+        # In a cloud without its depth image an object that is lost can be looked for only where it
+        # was. It did not go on as it moved before, or it would have been found there.
+        is_bare_cloud = isinstance(pose_input, CloudInput) and pose_input.view is None
+        if following is None and is_bare_cloud and current is not None:
+            following = replace(current, motion=None)
         current = following
         yield estimate
 
@@ -156,7 +180,7 @@ def _follow_or_search(
         return estimate, None
     certainty = min(max(searched.certainty or 0.0, _LEAST_CERTAINTY), 1 - _LEAST_CERTAINTY)
     log_odds = math.log(certainty / (1 - certainty))
-    return estimate, _Track(pose=pose.double(), moved=None, log_odds=log_odds, origin=searched)
+    return estimate, _Track(pose=pose.double(), motion=None, log_odds=log_odds, origin=searched)
 
 
 def _follow(
@@ -166,9 +190,8 @@ def _follow(
     # Where it may be: at its last pose, or going on as it moved last.
     surface = target.prepared.surface
     starts = [current.pose]
-    if current.moved is not None:
-        R = current.moved.R @ current.pose.R
-        starts.insert(0, Rigid(R, current.pose.t_m + current.moved.t_m))
+    if current.motion is not None:
+        starts.insert(0, current.motion.move(current.pose))
     poses = Rigid.stack(starts)
 
     # The points near these poses, without the plane that the object lies on.
@@ -205,12 +228,17 @@ def _follow(
     evidence = compare(observation, pose, surface)
     probability = probability_right(evidence, PRIOR_MASKED)
     if probability < target.refusal.min_probability:
-        return Refusal(status="doubtful", reason=contradiction(evidence, probability))
-    log_odds = current.log_odds + _NEW_EVIDENCE * log_odds_right(evidence)
+        reason = contradiction(evidence, probability, is_masked=False)
+        return Refusal(status="doubtful", reason=reason)
+    log_odds = current.log_odds + _NEW_EVIDENCE * log_likelihood_ratio(evidence)
     log_odds = min(max(log_odds, -_MOST_LOG_ODDS), _MOST_LOG_ODDS)
     certainty = 1 / (1 + math.exp(-log_odds))
     if certainty < target.refusal.min_probability:
-        return Refusal(status="doubtful", reason=contradiction(evidence, certainty))
+        reason = (
+            f"together with the frames before it the pose is right with a probability of "
+            f"{certainty:.0%}, though by this frame alone with {probability:.0%}"
+        )
+        return Refusal(status="doubtful", reason=reason)
 
     # Does what is seen of it determine its pose?
     free = free_motions(target.prepared.model.symmetries.continuous, pose)
@@ -236,9 +264,8 @@ def _follow(
     )
     estimate = _with_copies(estimate, pose, current.origin)
     estimate = with_status(estimate, target.config.min_certainty)
-    turned = pose.R @ current.pose.R.mT  # about the object's origin
-    moved = Rigid(turned, pose.t_m - current.pose.t_m)
-    following = replace(current, pose=pose, moved=moved, log_odds=log_odds)
+    motion = _FrameMotion.between(current.pose, pose)
+    following = replace(current, pose=pose, motion=motion, log_odds=log_odds)
     return estimate, following
 
 
@@ -254,9 +281,11 @@ def _with_copies(estimate: PoseEstimate, pose: Rigid, origin: PoseEstimate | Non
     copies: list[Alternative] = []
     for copy in origin.alternatives:
         if copy.is_copy:
-            moved = pose @ (model_from_origin @ copy.camera_from_model.double())
+            copy_pose = pose @ (model_from_origin @ copy.camera_from_model.double())
             probability = scale * copy.probability
-            copies.append(replace(copy, camera_from_model=moved.float(), probability=probability))
+            copies.append(
+                replace(copy, camera_from_model=copy_pose.float(), probability=probability)
+            )
     return replace(
         estimate, copy_certainty=scale * origin.copy_certainty, alternatives=tuple(copies)
     )

@@ -280,8 +280,9 @@ class Evidence:
 
 IdentityStatus = Literal["confirmed", "not excluded", "contradicted"]
 """Confirmed: neither another size nor the mirror image fits, and no reading contradicts the model.
-Not excluded: one of them fits as well, something contradicts it, or it was not tested.
-Contradicted: one of them fits better by more than the sensor explains."""
+Not excluded: the size is not fixed, one of them fits as well, or something contradicts the model.
+Contradicted: one of them fits better by more than the sensor explains. What was not tested has no
+:class:`Identity` at all."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -325,7 +326,9 @@ class PoseEstimate:
     certainty: float | None = None
     #: probability that this very pose is right, and none of its near-symmetric copies.
     copy_certainty: float | None = None
-    identity: Identity | None = None  #: whether it is this object; None where that was not asked
+    #: whether it is this object; None where that was not tested: of a pose that was refused before,
+    #: without ICP, of a frame that was tracked, or with ``max_size_error=1``.
+    identity: Identity | None = None
     alternatives: tuple[Alternative, ...] = ()  #: competing poses, the likeliest first
     seconds: dict[str, float] = field(default_factory=dict)  #: time of each stage
     tracking: Tracking | None = None  #: how it came about, in a sequence; None elsewhere
