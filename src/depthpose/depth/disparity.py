@@ -271,7 +271,7 @@ def resized_map(
 def estimate_from_pair(pair: StereoInput, match: Match, warning: str = "") -> DepthEstimate:
     """Make the estimate of a rectified pair from its match; metres where the camera has a baseline.
 
-    Pixels where the left image is blank (:func:`~depthpose.depth.visible.without_picture`) have no
+    Pixels where the left image is blank (``without_picture`` of ``depth/visible.py``) have no
     depth. The confidence is 0 where either view is blank, and falls to 0 where the left view has no
     texture, for nothing can be matched there.
     """

@@ -107,7 +107,7 @@ class StereoTask:
         yield Update("matcher", loss, facts)
 
     def validate(self) -> ValidationResult:
-        """Match held-out pairs, and measure them by :func:`validate_pairs`."""
+        """Match held-out pairs, and measure them by ``validate_pairs``."""
         if self.held_out is None:
             return ValidationResult()
         self.matcher.eval()
@@ -299,7 +299,7 @@ class FinetuneTask:
 
     @torch.no_grad()
     def validate(self) -> ValidationResult:
-        """Match held-out left images with synthesised views (:func:`validate_pairs`)."""
+        """Match held-out left images with synthesised views (``validate_pairs``)."""
         if self.held_out is None:
             return ValidationResult()
         self.generator.eval()
