@@ -175,7 +175,7 @@ MISTAKES: dict[str, tuple[Work, Work, str]] = {
     "K scaled in one direction alone": (
         lambda folder: camera(folder, K=[[500, 0, 320], [0, 1000, 240], [0, 0, 1]]),
         camera,
-        "K has fx 500 and fy 1000, as if pixels were 2 times longer than wide",
+        "K has fx 500 and fy 1000, as if pixels were 2 times wider than high",
     ),
     "baseline of the wrong sign": (
         lambda folder: camera(folder, ros(Tx=60.0)),

@@ -4,7 +4,6 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from unittest.mock import MagicMock
 
 import pytest
 import torch
@@ -346,9 +345,7 @@ def judged(
     )
 
 
-PREPARED = MagicMock()
-PREPARED.surface.middle_m = torch.zeros(3)
-PREPARED.surface.diameter_m = 0.1
+PREPARED = PreparedObject(number=0, model=bracket(), surface=prepare_surface(bracket()))
 TARGETS = SearchTargets(
     objects={"a": PREPARED, "b": PREPARED, "c": PREPARED},
     config=EstimateConfig(),
