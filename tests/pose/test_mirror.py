@@ -1,6 +1,9 @@
 """A mirrored copy is not the object, unless the object is its own mirror image."""
 
+from dataclasses import replace
+
 import pytest
+import torch
 from bench.negatives import mirrored, negative_kinds
 from tests.pose.synthetic_objects import (
     Oracle,
@@ -37,10 +40,14 @@ def test_the_mirror_image_of_a_model_is_measured(model: ObjectModel, is_alike: b
     assert ("mirrored" in negative_kinds(model)) != is_alike
 
 
-def gain(seen: ObjectModel, seed: int) -> float:
-    truth, surface = pose_at(seed=seed), prepare_surface(bracket())
+def gain(seen: ObjectModel, seed: int, origin_m: float = 0.0) -> float:
+    """Mirror gain of a bracket's file whose origin lies so far to each side of the part."""
+    truth = pose_at(seed=seed)
     cloud_m = noisy(cloud_of(seen, truth)).double()
-    begun = Rigid(truth.R.double(), truth.t_m.double())
+    shift_m = torch.full((3,), origin_m)
+    model = replace(bracket(), vertices_m=bracket().vertices_m + shift_m)
+    surface = prepare_surface(model)
+    begun = Rigid(truth.R.double(), (truth.t_m - truth.R @ shift_m).double())
     return mirror_gain(cloud_m, refine_pose(cloud_m, begun, surface).camera_from_model, surface)
 
 
@@ -48,6 +55,12 @@ def gain(seen: ObjectModel, seed: int) -> float:
 def test_the_mirror_image_fits_a_mirrored_copy_better_and_the_object_worse(seed: int) -> None:
     assert gain(bracket(), seed) < 0.005
     assert gain(mirrored(bracket()), seed) > 0.05
+
+
+def test_where_the_origin_of_a_file_lies_changes_no_mirror_gain() -> None:
+    """In an assembly it may be a metre from the part, where no camera was."""
+    near = gain(mirrored(bracket()), 1)
+    assert gain(mirrored(bracket()), 1, origin_m=1.0) == pytest.approx(near, abs=0.02)
 
 
 def estimated(model: ObjectModel, seen: ObjectModel) -> PoseEstimate:

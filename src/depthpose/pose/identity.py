@@ -217,19 +217,24 @@ def mirror_gain(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) ->
         The gain in root mean square distance, in limits of nearness; negative where the mirror
         image fits worse. It is measured roughly where the mirror image is clearly worse.
     """
-    # The mirrored cloud, and starts that together with it are reflections at many planes.
-    local_m = pose.inverse().apply(take_evenly(cloud_m.double(), POINTS))
-    middle_m = surface.middle_m
-    mirrored_m = (local_m - middle_m) * _FLIP + middle_m
-    config = IcpConfig()
+    # The cloud, mirrored across the camera's x axis: the camera stays where it is, and so does which
+    # sides it sees.
+    cloud_m = take_evenly(cloud_m.double(), POINTS)
+    mirrored_m = cloud_m * _FLIP
+
+    # Starts: the model reflected at many planes through its middle, and mirrored as the cloud was.
     normals = fibonacci_directions(_MIRROR_PLANES)
     reflections = torch.eye(3).double() - 2 * normals[:, :, None] * normals[:, None]
-    R = _FLIP[:, None] * reflections
-    rough = refine_roughly(mirrored_m, Rigid(R, middle_m - R @ middle_m), surface, config)
+    R = _FLIP[:, None] * pose.R.double() @ reflections
+    middle_m = _FLIP * pose.double().apply(surface.middle_m[None])[0]
+    starts = Rigid(R, middle_m - R @ surface.middle_m)
+    config = IcpConfig()
+    rough = refine_roughly(mirrored_m, starts, surface, config)
 
     # Is the mirror image clearly worse?
     few_m = take_evenly(mirrored_m, _ROUGH_MIRROR_POINTS).expand(len(rough.R), -1, -1)
     distance = distance_to(rough.inverse().apply(few_m), surface, is_exact=False)
+    local_m = pose.double().inverse().apply(cloud_m)
     few_m = take_evenly(local_m, _ROUGH_MIRROR_POINTS)
     unmirrored = distance_to(few_m, surface, is_exact=False)
     if float(distance.min() - unmirrored) > _CLEARLY_WORSE:
