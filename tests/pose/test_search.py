@@ -334,11 +334,11 @@ def judged(
     """An answer that explains some columns of an image of 4 x 40, of a certainty of 1."""
     explained = torch.zeros(4, 40, dtype=torch.bool)
     explained[:, columns] = True
-    pose = pose_at(0.01 * number, 0.7, seed=number)
+    pose = pose_at(0.01 * number, 0.7, seed=number).double()
     evidence = replace(EVIDENCE, seen_through=seen_through, supported=20.0 - seen_through)
     estimate = PoseEstimate(
         name="", object=object, status="ok", certainty=1.0, copy_certainty=1.0,
-        camera_from_model=pose, evidence=evidence,
+        camera_from_model=pose.float(), evidence=evidence,
     )  # fmt: skip
     return search._Judged(
         object=object, pose=pose, explained=explained, estimate=estimate, log_odds=log_odds
