@@ -217,8 +217,7 @@ def mirror_gain(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) ->
         The gain in root mean square distance, in limits of nearness; negative where the mirror
         image fits worse. It is measured roughly where the mirror image is clearly worse.
     """
-    # The cloud, mirrored across the camera's x axis: the camera stays where it is, and sees the same
-    # sides.
+    # The cloud, mirrored across the x axis of the camera, which stays where it is.
     cloud_m = take_evenly(cloud_m.double(), POINTS)
     mirrored_m = cloud_m * _FLIP
 
