@@ -345,7 +345,7 @@ class NetworkMatcher(ABC):
         camera: Camera | None = None,
         search: SearchRange | None = None,
     ) -> list[Match]:
-        """Match pairs; those of one size together, unless memory is bounded.
+        """Match pairs: together if all become one size and memory is unbounded, else one by one.
 
         Pairs of a known camera are matched at the size of :meth:`work_size`, or all at that of
         ``search``. A processor is busy with one pair; it is a GPU that gains from several.
