@@ -26,6 +26,10 @@ from depthpose.depth.config import MatcherConfig, NetworkConfig, SGBMConfig
 from depthpose.depth.synthesis import LiteEncoder
 from depthpose.depth.types import Map, Maps, Match, View, Views
 
+STEP_PX = 4
+"""Between neighbouring disparities that have a score, of every network here: their volumes are of a
+quarter of the image's size."""
+
 
 @runtime_checkable
 class Matcher(Protocol):
