@@ -39,6 +39,18 @@ def test_the_deviation_of_depth_is_what_that_of_its_disparity_does_to_it() -> No
         torch.testing.assert_close(found_m, moved_m, rtol=1e-3, atol=0)
 
 
+@pytest.mark.parametrize("offset_px", [-6.0, 6.0])
+def test_principal_points_do_not_change_the_deviation_of_depth(offset_px: float) -> None:
+    """They shift the disparities of the images, below zero even, and not how sure a match is."""
+    depth_m = torch.tensor([[2.0, 10.0, 40.0, torch.nan]])
+    confidence = torch.full_like(depth_m, 0.3)
+    torch.testing.assert_close(
+        depth_deviation(depth_m, confidence, rig(offset_px)),
+        depth_deviation(depth_m, confidence, rig()),
+        equal_nan=True,
+    )
+
+
 def test_pixels_that_are_not_square_become_so() -> None:
     """A wheel is round at the size where both focal lengths are alike."""
     squeezed = Camera(width=640, height=480, K=intrinsics(400, 800, 319.5, 239.5))

@@ -83,6 +83,30 @@ def test_the_sky_of_a_prediction_is_shown_as_sky(pairs: Dataset, tmp_path: Path)
     assert torch.equal(shown.isnan(), is_sky)
 
 
+def test_a_prediction_of_another_size_is_shown_at_that_of_the_truth(
+    pairs: Dataset, tmp_path: Path
+) -> None:
+    """Its sky and its right view as well, so that the pictures of a report lie over each other."""
+    is_sky = torch.zeros(H // 2, W // 2, dtype=torch.bool)
+    is_sky[:5] = True
+    estimate = DepthEstimate(
+        depth_m=None,
+        disparity_px=truth_px(0)[::2, ::2] / 2,
+        confidence=torch.ones(H // 2, W // 2),
+        right=torch.rand(3, H // 2, W // 2),
+        is_sky=is_sky,
+    )
+    write_estimate(tmp_path / "p", pairs.read_input(0), estimate)
+    without_right = replace(pairs.frames[0], right=None)  # a right image must have the drawn size
+    single = replace(pairs, frames=[without_right])
+    shown, error = frame_result(single, 0, tmp_path / "p", "kitti-2015", None)
+    maps = (shown.depth_m, shown.confidence, shown.is_sky, shown.right, error.error)
+    assert [None if values is None else values.shape[-2:] for values in maps] == 5 * [(H, W)]
+    assert shown.depth_m is not None
+    assert bool(shown.depth_m[:10].isnan().all())
+    assert not bool(shown.depth_m[10:].isnan().any())
+
+
 def test_perfect_disparity_has_no_error(pairs: Dataset, tmp_path: Path) -> None:
     folder = write_predictions(tmp_path / "p", lambda d: d)
     result = evaluate(pairs, folder, "kitti-2015")

@@ -264,8 +264,12 @@ def test_a_bent_polygon_is_cut_as_it_is_seen_from_above() -> None:
 @pytest.mark.parametrize(("factor", "said"), [(0.01, "is it in cm?"), (0.001, "is it in mm?")])
 def test_a_model_in_centimetres_is_not_called_inches(factor: float, said: str) -> None:
     diameter, seen = float(np.linalg.norm(POINTS.max(0))), torch.from_numpy(0.6 * POINTS)
-    assert said in (unit_advice(diameter, factor * seen) or "")
-    assert "mask fit it? Or is the model in cm?" in (unit_advice(diameter / 10, seen) or "")
+    smaller = unit_advice(diameter, factor * seen)
+    larger = unit_advice(diameter / 10, seen)
+    assert smaller is not None
+    assert larger is not None
+    assert said in smaller.message
+    assert "mask fit it? Or is the model in cm?" in larger.message
 
 
 def part_and(*others: tuple[float, float]) -> Any:  # noqa: ANN401  a mesh of trimesh's

@@ -344,4 +344,4 @@ def _contradictions(facts: FileFacts, all_facts: Sequence[FileFacts]) -> Iterato
         if facts.model is not None and other.cloud is not None:
             advice = unit_advice(exact_diameter(facts.model), other.cloud)
             if advice is not None:
-                yield f"beside {other.path.name}: {advice}"
+                yield f"beside {other.path.name}: {advice.message}"

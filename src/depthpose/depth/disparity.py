@@ -151,8 +151,8 @@ def depth_deviation(
 ) -> Float[Tensor, "*batch h w"]:
     """Give the standard deviation of a matched depth [m].
 
-    It is ``z^2 / (fx B)`` times that of the disparity, which follows from the confidence as
-    measured on synthetic scenes. NaN where depth is.
+    It is ``z^2 / (fx B)`` times that of the disparity, which is a share of ``fx B / z`` that falls
+    with the confidence, as measured on synthetic scenes. NaN where depth is NaN or not positive.
     """
     # The deviation of the disparity: linear between the measured confidences.
     table = torch.tensor(_RELATIVE_STD_BY_CONFIDENCE, dtype=depth_m.dtype, device=depth_m.device)
@@ -162,10 +162,12 @@ def depth_deviation(
     lower = upper - 1
     weight = (confidence - confidences[lower]) / (confidences[upper] - confidences[lower])
     relative_std = torch.lerp(relative_stds[lower], relative_stds[upper], weight)
-    disparity_px = disparity_from_depth(depth_m, rig)
+    # Without the offset of the principal points, which shifts a disparity and does not blur it.
+    focal_m_px = float(rig.K[0, 0]) * rig.baseline_m
+    disparity_px = torch.where(depth_m > 0, focal_m_px / depth_m, torch.nan)
     disparity_std_px = (relative_std * disparity_px).clamp(min=_MIN_STD_PX)
 
-    return depth_m.square() / (float(rig.K[0, 0]) * rig.baseline_m) * disparity_std_px
+    return depth_m.square() / focal_m_px * disparity_std_px
 
 
 def warp_right_to_left(right: Float[Tensor, "c h w"], disparity_px: Map) -> Float[Tensor, "c h w"]:

@@ -57,6 +57,11 @@ class Protocol:
     truth: Literal["velodyne_x", "camera_z", "depth", "disparity"]
     with_crop: bool = False  #: only truth inside the crop of Garg et al. counts
 
+    @property
+    def is_disparity(self) -> bool:
+        """Whether disparity [px] is compared, which has no cap, and not depth [m]."""
+        return self.truth == "disparity"
+
 
 PROTOCOLS = {
     "eigen-raw": Protocol(
@@ -214,7 +219,7 @@ def measure_frame(
     prepared = _prepare(dataset, index, predictions, rule)
     if isinstance(prepared, str):
         return prepared
-    caps: Sequence[float | None] = [None] if rule.truth == "disparity" else caps_m
+    caps: Sequence[float | None] = [None] if rule.is_disparity else caps_m
     results = [_measure_at_cap(prepared, rule, cap_m) for cap_m in caps]
     measured = [result for result in results if result is not None]
     return measured or "no truth within the caps and the crop"
@@ -232,7 +237,7 @@ def _measure_at_cap(prepared: _Prepared, rule: Protocol, cap_m: float | None) ->
     deciles = None
     if bool(is_compared.any()):
         error = (predicted - truth).abs()
-        if cap_m is None:
+        if rule.is_disparity:
             metrics |= measure("disparity", predicted[is_compared], truth[is_compared])
             metrics |= _measure_non_occluded(prepared)
         else:
@@ -299,6 +304,7 @@ def summarise(
         )
         for result in measured
     ]
+    ranking_metric = RANKING["disparity" if find_protocol(protocol).is_disparity else "depth"]
     rows: list[EvaluationRow] = []
     deciles: list[EvaluationRow] = []
     for cap_m in dict.fromkeys(result.cap_m for result in measured):
@@ -319,13 +325,12 @@ def summarise(
         by_decile = [result.deciles for result in at_cap if result.deciles is not None]
         if by_decile:
             errors = torch.tensor(by_decile, dtype=torch.float64).nanmean(0).tolist()
-            metric = RANKING["disparity" if cap_m is None else "depth"]
             deciles += [
                 make_row(
                     cap_m=cap_m,
                     frames=len(by_decile),
                     confidence_decile=decile,
-                    metrics={metric: error},
+                    metrics={ranking_metric: error},
                 )
                 for decile, error in enumerate(errors, 1)
             ]
@@ -365,8 +370,8 @@ def frame_result(
 ) -> tuple[DepthEstimate, DepthError]:
     """Read the estimate of one frame, and its error at each pixel, as :func:`evaluate` has them.
 
-    Both have the size of the truth. With ``cap_m`` None, for a protocol of disparity, the error is
-    that of disparity [px]; else it is that of depth as a share of the true depth.
+    Every map and picture has the size of the truth. By a protocol of disparity the error is that of
+    disparity [px], and ``cap_m`` None; else it is that of depth as a share of the true depth.
 
     Raises:
         InputError: the frame does not count, or a file is damaged.
@@ -377,20 +382,24 @@ def frame_result(
     if isinstance(prepared, str):
         raise InputError(f"{name}: {prepared}; choose a frame that counts")
     rig = prepared.rig
+    size = prepared.truth.shape
 
     # The whole prediction, without the sky.
     depth_m = None if rig is None else disparity.depth_from_disparity(prepared.disparity_px, rig)
     sky = files.read_part(predictions, name, "sky.png")
-    is_sky = None if sky is None else sky[0] > 0
-    if is_sky is not None and depth_m is not None and is_sky.shape == depth_m.shape:
+    is_sky = None if sky is None else disparity.resized_map((sky[0] > 0).float(), *size) > 0.5
+    if is_sky is not None and depth_m is not None:
         depth_m = torch.where(is_sky, torch.nan, depth_m)
+    right = files.read_part(predictions, name, "right.png")
+    if right is not None:
+        right = disparity.resize_image(right, *size)
 
     # The error at the pixels that count.
     predicted, truth = _apply_protocol(prepared, rule, cap_m)
     error = (predicted - truth).abs()
-    if cap_m is not None:
+    true_m: Map | None = truth
+    if not rule.is_disparity:
         error = error / truth
-        true_m = truth
     else:
         true_m = None if rig is None else disparity.depth_from_disparity(truth, rig)
 
@@ -398,10 +407,10 @@ def frame_result(
         depth_m=depth_m,
         disparity_px=prepared.disparity_px,
         confidence=prepared.confidence,
-        right=files.read_part(predictions, name, "right.png"),
+        right=right,
         is_sky=is_sky,
     )
-    return estimate, DepthError(error=error, is_disparity=cap_m is None, true_depth_m=true_m)
+    return estimate, DepthError(error=error, is_disparity=rule.is_disparity, true_depth_m=true_m)
 
 
 def clamped_depth(disparity_px: Map, rig: StereoRig, cap_m: float) -> Map:
@@ -421,7 +430,6 @@ def _prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) ->
         InputError: the prediction is missing or damaged, or of another unit, sign or size.
     """
     frame = dataset.frames[index]
-    is_disparity = rule.truth == "disparity"
     if not has_truth(frame, rule):
         return f"no truth of the kind {rule.truth}"
     if frame.right is None and not files.has_prediction(predictions, frame.name):
@@ -432,7 +440,7 @@ def _prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) ->
         truth = lidar_truth(frame, rule.truth)
     else:
         stored_truth = dataset.read_truth(index)
-        truth = stored_truth.disparity_px if is_disparity else stored_truth.depth_m
+        truth = stored_truth.disparity_px if rule.is_disparity else stored_truth.depth_m
     assert truth is not None, "has_truth said so"
     height, width = truth.shape
 
@@ -440,9 +448,9 @@ def _prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) ->
     rig = dataset.read_rig(index)
     depth_m = None
     has_disparity = files.has_prediction(predictions, frame.name, of_disparity=True)
-    if not is_disparity and (rig is None or not has_disparity):
+    if not rule.is_disparity and (rig is None or not has_disparity):
         depth_m = files.read_depth(predictions, frame.name)
-    if not is_disparity and rig is None:
+    if not rule.is_disparity and rig is None:
         if depth_m is None:
             raise InputError(
                 f"{frame.name}: no calibration of a pair, so its disparity cannot become metres; "
@@ -451,8 +459,12 @@ def _prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) ->
         # Any rig will do: it is undone where depth is compared.
         K = torch.tensor([[width, 0, 0], [0, width, 0], [0, 0, 1]], dtype=torch.float64)
         rig = StereoRig(width=width, height=height, K=K, baseline_m=1.0)
-    stored_px = files.read_disparity(predictions, frame.name, rig, with_disparity_png=is_disparity)
-    true_px = truth if is_disparity or rig is None else disparity.disparity_from_depth(truth, rig)
+    stored_px = files.read_disparity(
+        predictions, frame.name, rig, with_disparity_png=rule.is_disparity
+    )
+    true_px = truth
+    if not rule.is_disparity and rig is not None:
+        true_px = disparity.disparity_from_depth(truth, rig)
     predicted_px = _resize_to_truth(true_px, stored_px, predictions / frame.name)
 
     # Units and signs; where principal points differ, the disparity of far points is negative.
@@ -552,12 +564,13 @@ def _refuse_crop(
 def _apply_protocol(prepared: _Prepared, rule: Protocol, cap_m: float | None) -> tuple[Map, Map]:
     """Clamp the prediction and mask the truth as the protocol says.
 
-    Both are disparity [px] where ``cap_m`` is None, else depth [m]; NaN where there is no
-    prediction, and where there is no truth or it does not count.
+    Both are disparity [px] or depth [m], as the protocol compares; NaN where there is no
+    prediction, and where there is no truth or it does not count. Only depth has a ``cap_m``.
     """
     truth = prepared.truth
-    if cap_m is None:
+    if rule.is_disparity:
         return prepared.disparity_px, truth
+    assert cap_m is not None, "depth is compared up to a cap"
     is_counted = (truth > SMALLEST_DEPTH_M) & (truth < cap_m)
     if rule.with_crop:
         is_counted &= garg_crop(*truth.shape)

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -127,7 +128,7 @@ def _why_refused(
     too_few = why_too_few(readings_m, cloud_config)
     if too_few is not None:
         return Refusal(status="too few points", reason=too_few)
-    unusable = _why_unusable(pose_input, readings_m, cloud_m, model)
+    unusable = _why_other_frame_or_unit(pose_input, readings_m, cloud_m, model)
     if unusable is not None:
         return Refusal(status="unusable input", reason=unusable)
     # Then without flying pixels: in a wrong unit nearly all seem to be such, so it is asked last.
@@ -151,7 +152,7 @@ def _why_refused(
     return Refusal(status="not observable", reason=reason)
 
 
-def _why_unusable(
+def _why_other_frame_or_unit(
     pose_input: CloudInput | ViewInput,
     readings_m: Float[Tensor, "n 3"],
     cloud_m: Float[Tensor, "m 3"],
@@ -180,10 +181,10 @@ def _why_unusable(
     if size_advice is None:
         return None
     # Some background in the mask makes a cloud larger, and does not mean another unit.
-    if are_few_flying and "larger than the model" in size_advice:
+    if are_few_flying and size_advice.is_cloud_larger:
         return None
     hint = _size_hint(pose_input.mask) if isinstance(pose_input, ViewInput) else ""
-    return f"{size_advice} (the object is {model.diameter_m:.3g} m long{hint})"
+    return f"{size_advice.message} (the object is {model.diameter_m:.3g} m long{hint})"
 
 
 def _size_hint(mask: Bool[Tensor, "h w"]) -> str:
@@ -300,7 +301,14 @@ _USUAL_RATIO = 0.7  # of a usual view of an object
 _AS_LIKELY = 0.3  # difference of log ratios, up to which a unit fits nearly as well as the best
 
 
-def unit_advice(model_diameter_m: float, points_m: Float[Tensor, "n 3"]) -> str | None:
+class UnitAdvice(NamedTuple):
+    """That a model and a cloud of it seem to be of different units."""
+
+    is_cloud_larger: bool  #: than the model; else it is too small
+    message: str  #: how much larger or smaller it is, and the likely units
+
+
+def unit_advice(model_diameter_m: float, points_m: Float[Tensor, "n 3"]) -> UnitAdvice | None:
     """Say that the model and the cloud seem to be of different units; None where they agree.
 
     The size of a cloud is twice the distance from its median that 95 % of the points stay within:
@@ -330,7 +338,8 @@ def unit_advice(model_diameter_m: float, points_m: Float[Tensor, "n 3"]) -> str 
     units = _likely_units(ratio, least)
     if units:
         times = max(ratio, 1 / ratio)
-        return f"your {larger} is {times:.0f} times larger than the {smaller}: is it in {units}?"
+        message = f"your {larger} is {times:.0f} times larger than the {smaller}: is it in {units}?"
+        return UnitAdvice(is_cloud_larger, message)
 
     # Or the smaller one in a larger unit, where the other is in mm?
     units = " or ".join(
@@ -339,11 +348,12 @@ def unit_advice(model_diameter_m: float, points_m: Float[Tensor, "n 3"]) -> str 
         if _LIKELY_RATIO <= (ratio / mm if is_cloud_larger else ratio * mm) <= _LARGEST_RATIO
     )
     relation = "larger" if is_cloud_larger else "smaller"
-    return (
+    message = (
         f"the cloud is {max(ratio, 1 / ratio):.1f} times {relation} than the model: is this the "
         "right object, and does the mask fit it?"
         f"{f' Or is the {smaller} in {units}?' if units else ''}"
     )
+    return UnitAdvice(is_cloud_larger, message)
 
 
 def _likely_units(ratio: float, least: float) -> str:

@@ -95,8 +95,7 @@ class PoseEstimator:
         """Give each input's estimate, in order.
 
         ``is_expected``: whether the inputs are meant to show their objects; else each is one try of
-        several. A network's prior odds depend on it; by models alone each try is judged as if it
-        were expected, and the best of them is chosen by its evidence.
+        several. Ignored here: every try is judged alike.
         """
         del is_expected
         return each_in_threads(partial(unreadable_on_error, self._estimate), inputs, threads)
@@ -118,8 +117,11 @@ class PoseEstimator:
             answers.append(estimate)
         return answers
 
-    def _register(self, pose_input: AnyInput) -> PoseEstimate:
-        """Register one object to the points of its mask; search the region if the mask is loose."""
+    def _register_or_search(self, pose_input: AnyInput) -> PoseEstimate:
+        """Register one object to the points of its mask, or search it in the mask as in a box.
+
+        It is searched if the mask is a region, or if the registration is doubtful.
+        """
         if isinstance(pose_input, ViewInput) and pose_input.is_region:
             return self._search_region(pose_input)
         prepared = self._object(pose_input.object).prepare()

@@ -168,7 +168,11 @@ class GeoPoseNet(PoseEstimator):
         """Ask the network for several clouds together, and register what it doubts.
 
         The answer for an input does not depend on those beside it, but for the rounding of the
-        network's sums. Where the config wants it, what is expected and doubted is registered.
+        network's sums.
+
+        ``is_expected``: whether the inputs are meant to show their objects, which makes their prior
+        odds higher; what is then doubted is registered, where the config wants it. Else each input
+        is one try of several, whose best is chosen by its evidence: none is registered.
         """
         prepared = each_in_threads(partial(unreadable_on_error, self._prepare), inputs, threads)
         pose = partial(self._pose, is_expected=is_expected)
@@ -258,7 +262,7 @@ class GeoPoseNet(PoseEstimator):
             return voted
         watch = Stopwatch()
         with watch.stage("registration"):
-            registered = unreadable_on_error(self._register, job.pose_input)
+            registered = unreadable_on_error(self._register_or_search, job.pose_input)
         best = registered if registered.is_posed else voted
         return replace(best, seconds={**voted.seconds, **watch.seconds})
 

@@ -111,4 +111,4 @@ class Registration(PoseEstimator):
             self._object(name).prepare()
 
     def _estimate(self, pose_input: AnyInput) -> PoseEstimate:
-        return self._register(pose_input)
+        return self._register_or_search(pose_input)

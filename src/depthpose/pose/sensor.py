@@ -149,23 +149,26 @@ def _second_differences(depth_m: np.ndarray) -> np.ndarray:
 
 
 def measure_noise_per_m2(depth_m: Float64[Tensor, "h w"]) -> float:
-    """Measure the noise of a whole image, for the square of the depth in metres.
+    """Measure the noise of a whole image: standard deviation of a reading = result * depth^2.
 
-    The median of second differences, as :func:`measure_noise` takes it on one object.
+    It is the median of second differences, as :func:`measure_noise` takes it on one object, each
+    over the square of its depth; where there are none, the noise of a Kinect.
 
     Args:
         depth_m: 0 where there is no reading.
     """
-    scaled = torch.where(depth_m > 0, depth_m, torch.nan)
-    bends: list[Tensor] = []
-    for along in (scaled, scaled.T):
-        middle = along[:, LAG_PX:-LAG_PX]
-        bend = (along[:, : -2 * LAG_PX] + along[:, 2 * LAG_PX :] - 2 * middle) / middle.square()
-        bends.append(bend[bend.isfinite()])
-    bend = torch.cat(bends).abs()
-    if len(bend) == 0:
+    read_m = torch.where(depth_m > 0, depth_m, torch.nan)
+    bends_per_m2: list[Tensor] = []
+    for along_m in (read_m, read_m.T):
+        middle_m = along_m[:, LAG_PX:-LAG_PX]
+        bend_m = along_m[:, : -2 * LAG_PX] + along_m[:, 2 * LAG_PX :] - 2 * middle_m
+        bend_per_m2 = bend_m / middle_m.square()
+        bends_per_m2.append(bend_per_m2[bend_per_m2.isfinite()])
+    bend_per_m2 = torch.cat(bends_per_m2).abs()
+    if len(bend_per_m2) == 0:
         return NOISE_PER_M2
-    return _MEDIAN_TO_DEVIATION * float(bend.median()) / math.sqrt(6)
+    # A second difference of independent readings has six times their variance: 1 + 1 + 2^2.
+    return _MEDIAN_TO_DEVIATION * float(bend_per_m2.median()) / math.sqrt(6)
 
 
 def plane_tolerance_m(depth_m: Float64[Tensor, "*n"], noise_per_m2: float) -> Float64[Tensor, "*n"]:

@@ -44,7 +44,10 @@ def as_tensor(image: object, name: str = "the image") -> Float[Tensor, "3 h w"]:
         case Tensor():
             return _to_rgb(image, (0, -1), f"{name} is a tensor")
         case _:
-            return check_image(image, name)
+            raise InputError(
+                f"{name} must be a tensor, got {type(image).__name__}; or give a file, an array "
+                "or a picture of Pillow's"
+            )
 
 
 def _to_rgb(

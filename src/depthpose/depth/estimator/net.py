@@ -69,7 +69,7 @@ def as_input(
         with_exif: read the focal length from the picture's EXIF where ``camera`` is None, with a
             notice.
     """
-    left = as_tensor(image)
+    left = as_tensor(image, f"{name}: the image")
     lens = camera
     if camera is None and with_exif and isinstance(image, str | Path | Image.Image):
         exif_focal = read_exif_focal(image)
@@ -400,7 +400,7 @@ class FakestereoNet:
         lens = choose_lens(camera, focal_px, fov_deg)
         pair = as_input(image, name, lens, with_exif=right is None)
         if right is not None:
-            pair = replace(pair, right=as_tensor(right, "the right image"))
+            pair = replace(pair, right=as_tensor(right, f"{name}: the right image"))
             if known_distance is not None:
                 raise InputError(f"{name}: a pair has metres of its own; omit known_distance")
 

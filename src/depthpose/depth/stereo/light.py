@@ -28,6 +28,7 @@ from depthpose.depth.stereo.layers import ConvNorm, Features, Volume, by_rows
 from depthpose.depth.stereo.matcher import (
     IMAGENET_MEAN,
     IMAGENET_STD,
+    STEP_PX,
     NetworkMatcher,
     StereoNetwork,
 )
@@ -174,8 +175,6 @@ def unit_groups(features: Float[Tensor, "b c h w"], groups: int) -> Float[Tensor
 
 Scores = Float[Tensor, "b d h4 w4"]
 
-STEP_PX = 4
-"""Distance of neighbouring disparities that have a score."""
 _CANDIDATES = 2
 """Disparities of the highest scores whose mean is the answer."""
 _WINDOW = 0.15

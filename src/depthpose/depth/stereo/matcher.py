@@ -26,6 +26,10 @@ from depthpose.depth.config import MatcherConfig, NetworkConfig, SGBMConfig
 from depthpose.depth.synthesis import LiteEncoder
 from depthpose.depth.types import Map, Maps, Match, View, Views
 
+STEP_PX = 4
+"""Between neighbouring disparities that have a score, of every network here: their volumes are of a
+quarter of the image's size."""
+
 
 @runtime_checkable
 class Matcher(Protocol):
@@ -345,7 +349,7 @@ class NetworkMatcher(ABC):
         camera: Camera | None = None,
         search: SearchRange | None = None,
     ) -> list[Match]:
-        """Match pairs; those of one size together, unless memory is bounded.
+        """Match pairs: together if all become one size and memory is unbounded, else one by one.
 
         Pairs of a known camera are matched at the size of :meth:`work_size`, or all at that of
         ``search``. A processor is busy with one pair; it is a GPU that gains from several.

@@ -18,7 +18,12 @@ from torch.nn import functional as F
 
 from depthpose.core.camera import Camera
 from depthpose.depth.disparity import changed_match, warp_right_to_left
-from depthpose.depth.stereo.matcher import NetworkMatcher, SearchRange, lower_where_disagreeing
+from depthpose.depth.stereo.matcher import (
+    STEP_PX,
+    NetworkMatcher,
+    SearchRange,
+    lower_where_disagreeing,
+)
 from depthpose.depth.types import Map, Match
 from depthpose.depth.visible import without_picture
 
@@ -27,8 +32,6 @@ _TAIL = 0.001
 _SURE = 0.5
 """Confidence from which a near place counts: it is more probable than not. Every far place counts,
 for its confidence is low by construction: few disparities are within 15 % of a small one."""
-STEP_PX = 4
-"""Between disparities that have a score, of every network here: volumes are of a quarter's size."""
 _NAMED = 0.001
 """Share of the image beyond the search from which it is named."""
 

@@ -245,12 +245,30 @@ def _strip(
     surface: Surface,
     stations: Float[np.ndarray, " n"],
 ) -> None:
-    """Add a strip along the road from one (x, y) to another; its texture is in road coordinates."""
-    u_m = y_m if x_m[0] == x_m[1] else x_m  # a wall's texture goes up
-    turns = ((0, stations[:-1]), (1, stations[:-1]), (1, stations[1:]), (0, stations[1:]))
-    faces = [np.stack([0 * s + x_m[i], 0 * s + y_m[i], s], 1) for i, s in turns]
-    places = [np.stack([0 * s + u_m[i], s], 1) for i, s in turns]
-    b.quads(np.stack(faces, 1), np.stack(places, 1), surface)
+    """Add a flat strip along the straight road, a face between each two neighbouring stations.
+
+    Its texture lies along (x, s), on an upright strip along (y, s).
+
+    Args:
+        b: takes the faces.
+        x_m: of the strip's two long edges, to the right.
+        y_m: of the same edges, down.
+        surface: material and colour.
+        stations: ascending positions s ahead, along the road [m].
+    """
+    u_m = y_m if x_m[0] == x_m[1] else x_m
+    near_m = stations[:-1]
+    far_m = stations[1:]
+
+    # The corners of all faces in turn: number of the edge, and position along the road.
+    corners = ((0, near_m), (1, near_m), (1, far_m), (0, far_m))
+    positions: list[np.ndarray] = []
+    uvs: list[np.ndarray] = []
+    for edge, s_m in corners:
+        x, y, u = (np.full(len(s_m), float(edges[edge])) for edges in (x_m, y_m, u_m))
+        positions.append(np.stack([x, y, s_m], 1))
+        uvs.append(np.stack([u, s_m], 1))
+    b.quads(np.stack(positions, 1), np.stack(uvs, 1), surface)
 
 
 _FAR_M = 130.0

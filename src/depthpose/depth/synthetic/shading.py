@@ -168,21 +168,40 @@ def _sunlit_share(stage: Stage, points: Vectors, normals: Vectors) -> Numbers:
     return lit
 
 
-def _open_share(light: LightMap, points: Vectors) -> Numbers:
-    """Estimate how open each point is to the sky (ambient occlusion), 0 to 1.
+_OCCLUDER_OFFSETS_PX = ((5, 2), (-2, 5), (-5, -2), (2, -5), (1, 1))
+"""Columns and rows from a point on the sky's map to the texels that may hide the sky from it: one
+in each direction, and a neighbour."""
+_OCCLUSION_MARGIN_PX = 10
+"""So near the border of the sky's map nothing is hidden: surfaces beyond it are not known."""
+_OCCLUDER_CLEARANCE_M = 0.08
+"""A surface hides the sky if it is so much higher than the point: a slope does not hide its own."""
+_OCCLUSION_DECAY_PER_M = 0.25
+"""The higher above the point an occluder is, the less it hides: half as much at 4 m."""
+_OCCLUSION_OF_TEXEL = 0.17
+"""Share of the sky that an occluder just above the point hides. Like the decay it is not measured,
+but was chosen, with the other light, until streets looked like KITTI's."""
+
+
+def _sky_openness(sky_map: LightMap, points: Vectors) -> Numbers:
+    """Estimate how open each point is to the sky (ambient occlusion), 1 where none is hidden.
 
     Of five texels around a point on the sky's map, each that is higher hides a part of the sky.
     """
-    column, row, depth_m = light.place(points)
-    side = len(light.depth_m)
-    is_inside = (column > 10) & (row > 10) & (column < side - 11) & (row < side - 11)
-    start = row.clamp(10, side - 11).long() * side + column.clamp(10, side - 11).long()
-    flat = light.depth_m.flatten()
+    column, row, depth_m = sky_map.place(points)
+    side = len(sky_map.depth_m)
+    low = _OCCLUSION_MARGIN_PX
+    high = side - 1 - _OCCLUSION_MARGIN_PX
+    is_inside = (column > low) & (row > low) & (column < high) & (row < high)
+    texel = row.clamp(low, high).long() * side + column.clamp(low, high).long()
+
+    top_m = sky_map.depth_m.flatten()
     hidden = torch.zeros(len(points))
-    for x, y in ((5, 2), (-2, 5), (-5, -2), (2, -5), (1, 1)):
-        above_m = depth_m - flat.index_select(0, start + (y * side + x)) - 0.08
-        hidden += torch.where(above_m > 0, 1 / (1 + 0.25 * above_m.clamp(min=0)), 0)
-    return torch.where(is_inside, 1 - 0.17 * hidden, 1.0)
+    for x, y in _OCCLUDER_OFFSETS_PX:
+        occluder_m = top_m.index_select(0, texel + (y * side + x))
+        above_m = depth_m - occluder_m - _OCCLUDER_CLEARANCE_M
+        weight = 1 / (1 + _OCCLUSION_DECAY_PER_M * above_m.clamp(min=0))
+        hidden += torch.where(above_m > 0, weight, 0)
+    return torch.where(is_inside, 1 - _OCCLUSION_OF_TEXEL * hidden, 1.0)
 
 
 _SPECULAR, _TRANSLUCENCY, _GLOW = torch.tensor(
@@ -263,7 +282,7 @@ def _shade(stage: Stage, hits: Hits, focal_px: float) -> Vectors:
 
     # Light of the sky, as far as it is not occluded.
     upward = 0.5 + 0.5 * (normal @ stage.up)
-    openness = _open_share(stage.sky_map, points + 0.05 * plane)
+    openness = _sky_openness(stage.sky_map, points + 0.05 * plane)
     sky = torch.from_numpy(0.5 * (weather.zenith + weather.horizon)).float()
     ambient = ((0.09 + 0.26 * upward) * openness)[:, None] * sky
     # Light that the ground reflects.

@@ -299,11 +299,13 @@ def _check_instance(instance: Instance, model: ObjectModel | None) -> Iterator[P
     away_m = float((cloud.double().median(0).values - centre_m).norm())
     if away_m > _FAR_DIAMETERS * model.diameter_m:
         advice = unit_advice(model.diameter_m, cloud[cloud[:, 2] < 3 * cloud[:, 2].median()])
-        advice = advice or (
+        message = (
             f"the cloud lies {away_m:.2f} m from the annotated pose; are depth_scale and "
             "cam_t_m2c both for millimetres?"
         )
-        yield Problem(path=instance.depth, kind="mismatch", message=f"{instance.name}: {advice}")
+        if advice is not None:
+            message = advice.message
+        yield Problem(path=instance.depth, kind="mismatch", message=f"{instance.name}: {message}")
     elif instance.visible_fraction is None or instance.visible_fraction >= _FEW_IN_MASK:
         # The share of the model's points whose pixel is in the mask, grown by a pixel or two.
         points = instance.camera_from_model.apply(sample_surface(model, 500)[0].double())
