@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from depthpose.core.camera import back_project, project
-from depthpose.core.camera.pinhole import crop_intrinsics
+from depthpose.core.camera.pinhole import clip_window, crop_intrinsics
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import grow_mask
 from depthpose.pose.frame import Frame, is_on_plane, largest_plane, share_behind
@@ -89,9 +89,7 @@ def _window_of_pose(
     margin = 0.1 * (high - low) + 2 * EDGE_PX
     left, top = (int(value) for value in (low - margin).floor().tolist())
     right, bottom = (int(value) for value in (high + margin).ceil().tolist())
-    rows = slice(min(max(top, 0), height), min(max(bottom + 1, 0), height))
-    columns = slice(min(max(left, 0), width), min(max(right + 1, 0), width))
-    return rows, columns
+    return clip_window(left, top, right + 1, bottom + 1, height, width)
 
 
 def window_of_region(view: ViewInput) -> ViewInput:

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float64
 from torch import Tensor
 
-from depthpose.core.camera.pinhole import crop_intrinsics, project
+from depthpose.core.camera.pinhole import clip_window, crop_intrinsics, project
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid
 from depthpose.pose.compiled import use_numba
@@ -92,8 +92,6 @@ def _window_about(
     if float(corners_m[:, 2].amin()) < _NEAR_M:
         return slice(0, height), slice(0, width)
     pixels = project(corners_m, K)
-    left, top = pixels.amin(0).floor().tolist()
-    right, bottom = pixels.amax(0).ceil().tolist()
-    rows = slice(min(max(int(top), 0), height), min(max(int(bottom) + 1, 0), height))
-    columns = slice(min(max(int(left), 0), width), min(max(int(right) + 1, 0), width))
-    return rows, columns
+    left, top = (int(value) for value in pixels.amin(0).floor().tolist())
+    right, bottom = (int(value) for value in pixels.amax(0).ceil().tolist())
+    return clip_window(left, top, right + 1, bottom + 1, height, width)

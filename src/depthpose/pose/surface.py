@@ -72,7 +72,6 @@ class Surface:
     points_m: Float64[Tensor, "m 3"]  #: of the surface, in the model frame
     normals: Float64[Tensor, "m 3"]  #: of these points, to either side
     outward: Float64[Tensor, "m 3"]  #: normals on the outer side, 0 where none is known
-    is_hidden: Bool[Tensor, " m"]  #: samples not visible from afar, as faces inside a part
     triangles_m: Float64[Tensor, "f 3 3"]  #: corners of what is rendered, in the model frame
     across: Int64[Tensor, " m"]  #: index of the sample on the other side of a wall, or -1
     diameter_m: float  #: of the object
@@ -242,7 +241,7 @@ def prepare_surface(model: ObjectModel, count: int = 10_000) -> Surface:
     cell_m = _CELL_SPACINGS * float(np.median(near_m[:, -1])) * np.sqrt(np.pi) / 2
     limit_m = 3 * NEAR * model.diameter_m
     sides = outer_sides(points_m.numpy(), normals.numpy(), cell_m, limit_m)
-    outward, across, is_hidden = (torch.from_numpy(part) for part in sides)
+    outward, across = (torch.from_numpy(part) for part in sides)
 
     some_m = points_m.numpy()[:: max(1, len(points_m) // 1000)]
     near_m, _ = tree.query(some_m, k=4, workers=1)
@@ -252,7 +251,6 @@ def prepare_surface(model: ObjectModel, count: int = 10_000) -> Surface:
         points_m=points_m,
         normals=normals,
         outward=outward,
-        is_hidden=is_hidden,
         triangles_m=triangles_m,
         across=across,
         diameter_m=model.diameter_m,
@@ -287,7 +285,7 @@ _MOST_INNER = 0.4  # largest share for the inner side, over that of the outer si
 
 def outer_sides(
     points: np.ndarray, normals: np.ndarray, cell: float, limit: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray]:
     """Flip normals to the side from which the surface is visible from afar.
 
     Walls thinner than half the distance of the samples, open sheets and hidden surfaces have no
@@ -300,8 +298,8 @@ def outer_sides(
         limit: farthest distance to a sample of an opposite side.
 
     Returns:
-        The normals (n, 3); for each sample the index of the nearest one of an opposite side, or
-        -1; and which samples are never visible.
+        The normals (n, 3); and for each sample the index of the nearest one of an opposite side, or
+        -1.
     """
     share = _visible_shares(points, normals, cell)
     # The outer side is visible from clearly more directions than the inner one.
@@ -310,7 +308,7 @@ def outer_sides(
     is_clear &= share.min(0) < _MOST_INNER * share.max(0)
     outward = normals * ((1 - 2 * outer) * is_clear)[:, None]
     across = _nearest_opposite(points, outward, limit)
-    return outward, across, share.max(0) <= _LEAST_VISIBLE
+    return outward, across
 
 
 def _visible_shares(points: np.ndarray, normals: np.ndarray, cell: float) -> np.ndarray:

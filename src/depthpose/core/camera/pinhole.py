@@ -179,6 +179,18 @@ def back_project(
     return torch.stack([x, y, torch.ones_like(x)], -1) * depth_m[..., None]
 
 
+def clip_window(
+    left: int, top: int, right: int, bottom: int, height: int, width: int
+) -> tuple[slice, slice]:
+    """Give the rows and columns of a window [px], as far as they lie in an image.
+
+    ``right`` and ``bottom`` are the first column and row beyond the window.
+    """
+    rows = slice(min(max(top, 0), height), min(max(bottom, 0), height))
+    columns = slice(min(max(left, 0), width), min(max(right, 0), width))
+    return rows, columns
+
+
 def crop_intrinsics(K: Float[Tensor, "3 3"], left: int, top: int) -> Float[Tensor, "3 3"]:
     """Make the intrinsic matrix of a window that begins at column ``left`` and row ``top`` [px]."""
     K = K.clone()
