@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from unittest.mock import patch
 
@@ -37,8 +37,9 @@ from depthpose.core.files import (
     write_video,
 )
 from depthpose.core.loop import Progress, read_metrics
-from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.stereo import PSMNet, SGBMMatcher
+from depthpose.depth.estimator import single_image
+from depthpose.depth.stereo import Matcher, PSMNet, SGBMMatcher
+from depthpose.depth.synthesis import Synthesiser
 from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.depth.weights import write_depth_weights
 
@@ -282,17 +283,18 @@ def test_a_frame_of_a_video_that_is_refused_leaves_the_others(
     frames = [torch.full((3, 48, 64), 0.2 + 0.1 * k) for k in range(4)]
     write_video(tmp_path / "drive.avi", frames, 5.0)
     refused = InputError("drive_000001: a black frame")
-    judge = FakestereoNet.estimate_without_mount
+    estimate = single_image.depth_before_mount
 
     def refuse_one(
-        net: FakestereoNet, images: list[StereoInput], sizes: list[tuple[int, int]]
-    ) -> list[DepthEstimate]:
+        synthesiser: Synthesiser, matcher: Matcher | None, images: Sequence[StereoInput],
+        sizes: Sequence[tuple[int, int]], *, allow_ood: bool,
+    ) -> list[DepthEstimate]:  # fmt: skip
         if any(image.name == "drive_000001" for image in images):
             raise refused
-        return judge(net, images, sizes)
+        return estimate(synthesiser, matcher, images, sizes, allow_ood=allow_ood)
 
     out = tmp_path / "out"
-    with patch.object(FakestereoNet, "estimate_without_mount", refuse_one):
+    with patch.object(single_image, "depth_before_mount", refuse_one):
         assert predict(home, out, str(tmp_path / "drive.avi"), "--focal-px", "70") == 1
     assert "failed: drive_000001: a black frame" in capsys.readouterr().err
     assert len(list(out.glob("*.depth_m.npy"))) == 3
@@ -304,9 +306,10 @@ def test_a_frame_of_a_video_that_is_refused_leaves_the_others(
 def roads() -> Iterator[None]:
     """Let networks see a road in every image, as high and tilted as its name says."""
 
-    def judge(
-        net: FakestereoNet, images: list[StereoInput], sizes: list[tuple[int, int]]
-    ) -> list[DepthEstimate]:
+    def estimate(
+        synthesiser: Synthesiser, matcher: Matcher | None, images: Sequence[StereoInput],
+        sizes: Sequence[tuple[int, int]], *, allow_ood: bool,
+    ) -> list[DepthEstimate]:  # fmt: skip
         estimates: list[DepthEstimate] = []
         for image in images:
             number = int(image.name[-1])
@@ -316,7 +319,7 @@ def roads() -> Iterator[None]:
             estimates.append(DepthEstimate(depth_m=depth_m, disparity_px=35 / depth_m))
         return estimates
 
-    with patch.object(FakestereoNet, "estimate_without_mount", judge):
+    with patch.object(single_image, "depth_before_mount", estimate):
         yield
 
 

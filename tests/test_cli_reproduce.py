@@ -35,7 +35,7 @@ class FlatMono:
         self.depth_m = depth_m
         self.seen: list[str] = []
 
-    def estimate_pair(self, pair: StereoInput) -> DepthEstimate:
+    def estimate_input(self, pair: StereoInput) -> DepthEstimate:
         assert isinstance(pair.camera, StereoRig)
         is_mono = pair.right is None
         self.seen.append("left" if is_mono else "both")

@@ -136,7 +136,7 @@ def _show_scene(
     homes = {method: out / method.lower().replace(",", "").replace(" ", "-") for method in nets}
     for method, (views, net) in nets.items():
         net_input = pair if views == _FROM_PAIR else replace(pair, right=None)
-        estimate = net.estimate_pair(net_input, with_check=False)
+        estimate = net.estimate_input(net_input, with_check=False)
         write_estimate(homes[method], net_input, estimate, range_m, CLOUD_M)
 
         # The numbers, over pixels that have a truth within the cap and an answer.

@@ -41,7 +41,7 @@ def pair_of(image: torch.Tensor, camera: StereoRig | None = None) -> StereoInput
 
 def test_rows_learn_a_road(tmp_path: Path) -> None:
     data = write_frames(tmp_path, {"a": (torch.rand(3, H, W), road_m())})
-    estimate = RowDepthBaseline.fit(data).estimate_pair(pair_of(torch.rand(3, H, W)))
+    estimate = RowDepthBaseline.fit(data).estimate_input(pair_of(torch.rand(3, H, W)))
     assert estimate.depth_m is not None
     inside = (road_m() > 1.0) & (road_m() < 80)
     known_m = road_m()[inside]
@@ -53,7 +53,7 @@ def test_rows_learn_a_road(tmp_path: Path) -> None:
 def test_rows_follow_the_camera_and_not_the_size(tmp_path: Path) -> None:
     data = write_frames(tmp_path, {"a": (torch.rand(3, H, W), road_m())})
     larger = resize_camera(rig(), 2 * W, 2 * H)
-    estimate = RowDepthBaseline.fit(data).estimate_pair(
+    estimate = RowDepthBaseline.fit(data).estimate_input(
         pair_of(torch.rand(3, 2 * H, 2 * W), larger)
     )
     assert estimate.depth_m is not None
@@ -67,7 +67,7 @@ def test_a_row_takes_the_constant_of_least_relative_error(tmp_path: Path) -> Non
     sparse_m = torch.full((H, W), torch.nan)
     sparse_m[20, :8] = depths_m
     data = write_frames(tmp_path, {"a": (torch.rand(3, H, W), sparse_m)})
-    estimate = RowDepthBaseline.fit(data).estimate_pair(pair_of(torch.rand(3, H, W)))
+    estimate = RowDepthBaseline.fit(data).estimate_input(pair_of(torch.rand(3, H, W)))
     assert estimate.depth_m is not None
     candidates_m = torch.linspace(1, 80, 7901)
     loss = ((candidates_m[:, None] - depths_m).abs() / depths_m).mean(1)
@@ -80,7 +80,7 @@ def test_a_frame_with_more_points_has_no_louder_voice(tmp_path: Path) -> None:
     few[20, :2], many[20, :40] = 5.0, 20.0
     images = torch.rand(2, 3, H, W)
     data = write_frames(tmp_path, {"a": (images[0], few), "b": (images[1], many)})
-    estimate = RowDepthBaseline.fit(data).estimate_pair(pair_of(images[0]))
+    estimate = RowDepthBaseline.fit(data).estimate_input(pair_of(images[0]))
     assert estimate.depth_m is not None
     assert float(estimate.depth_m[20, 0]) == pytest.approx(5.0, 2e-3)
 
@@ -90,11 +90,11 @@ def test_the_nearest_image_gives_its_own_depth(tmp_path: Path) -> None:
     frames = {n: (images[k], torch.full((H, W), 4.0 + k)) for k, n in enumerate("abc")}
     baseline = NearestImageBaseline.fit(write_frames(tmp_path, frames))
     darker = (0.6 * images[1] + 0.02 * torch.rand(3, H, W)).clamp(0, 1)
-    estimate = baseline.estimate_pair(pair_of(darker))
+    estimate = baseline.estimate_input(pair_of(darker))
     assert estimate.depth_m is not None
     assert torch.allclose(estimate.depth_m, torch.full((H, W), 5.0), rtol=1e-3)
     twice_as_long = replace(rig(), K=rig().K * torch.tensor([[2.0], [2.0], [1.0]]))
-    farther = baseline.estimate_pair(pair_of(darker, twice_as_long)).depth_m
+    farther = baseline.estimate_input(pair_of(darker, twice_as_long)).depth_m
     assert farther is not None
     assert torch.allclose(farther, torch.full((H, W), 10.0), rtol=1e-3)
 
@@ -105,7 +105,7 @@ def test_haze_changes_nothing_about_what_looks_most_alike(tmp_path: Path) -> Non
     grey = 0.6 + 0.02 * (other - 0.5)
     frames = {"a": (pattern, torch.full((H, W), 4.0)), "b": (grey, torch.full((H, W), 9.0))}
     baseline = NearestImageBaseline.fit(write_frames(tmp_path, frames))
-    depth_m = baseline.estimate_pair(pair_of(0.2 * pattern + 0.5)).depth_m
+    depth_m = baseline.estimate_input(pair_of(0.2 * pattern + 0.5)).depth_m
     assert depth_m is not None
     assert torch.allclose(depth_m, torch.full((H, W), 4.0), rtol=1e-3)
 
@@ -147,7 +147,7 @@ def test_a_baseline_needs_a_rig(tmp_path: Path) -> None:
     pair = StereoInput(name="x", left=torch.rand(3, H, W), right=None, camera=None)
     for baseline in (RowDepthBaseline.fit(data), NearestImageBaseline.fit(data)):
         with pytest.raises(InputError, match="x: has no rig"):
-            baseline.estimate_pair(pair)
+            baseline.estimate_input(pair)
 
 
 def test_frames_are_kept_out_by_name(tmp_path: Path) -> None:

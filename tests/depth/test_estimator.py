@@ -188,7 +188,7 @@ def test_principal_points_farther_apart_than_the_images_are_refused(columns: int
         net.estimate(image, apart_rig(columns), right=image, with_check=False)
 
 
-@pytest.mark.parametrize("how", ["estimate", "estimate_pair", "estimate_many"])
+@pytest.mark.parametrize("how", ["estimate", "estimate_input", "estimate_many"])
 def test_every_way_refuses_a_pair_that_is_none_and_warns_of_doubt(how: str) -> None:
     net = FakestereoNet(CallableMatcher(lambda left, _: left.mean(0) * 0 + 3))
 
@@ -196,8 +196,8 @@ def test_every_way_refuses_a_pair_that_is_none_and_warns_of_doubt(how: str) -> N
         pair = StereoInput(name="street", left=left, right=right, camera=None)
         if how == "estimate":
             return net.estimate(left, right=right, name="street", with_check=with_check)
-        if how == "estimate_pair":
-            return net.estimate_pair(pair, with_check=with_check)
+        if how == "estimate_input":
+            return net.estimate_input(pair, with_check=with_check)
         found = net.estimate_many([pair], with_check=with_check)[0]
         if isinstance(found, InputError):
             raise found

@@ -234,7 +234,7 @@ def test_many_images_give_what_each_gives_alone(generator: UNetGenerator, tmp_pa
     many = each_of(net, inputs, batch=3)
     assert len(many) == 4
     for given, together in zip(inputs, many, strict=True):
-        alone = net.estimate_pair(given)
+        alone = net.estimate_input(given)
         torch.testing.assert_close(together.disparity_px, alone.disparity_px, rtol=1e-4, atol=1e-4)
         assert together.right is not None
         assert alone.right is not None
@@ -254,7 +254,7 @@ def test_among_many_a_pair_is_matched_with_its_right_view(
     pair = StereoInput(name="pair", left=left, right=right, camera=rig)
     many = each_of(net, [alone, pair, pair, alone], with_check=False, batch=4)
     for given, found in zip([alone, pair, pair, alone], many, strict=True):
-        one = net.estimate_pair(given, with_check=False)
+        one = net.estimate_input(given, with_check=False)
         torch.testing.assert_close(found.disparity_px, one.disparity_px, rtol=1e-4, atol=1e-4)
         assert (found.right is None) == (given.right is not None)
 
@@ -332,7 +332,7 @@ def test_values_that_are_no_picture_are_refused(
         sees = StereoInput(
             name="street", left=given, right=given.flip(-1) if with_right else None, camera=rig
         )
-        for estimate in (net.estimate_pair, lambda one: each_of(net, [one])):
+        for estimate in (net.estimate_input, lambda one: each_of(net, [one])):
             with pytest.raises(InputError, match="street: the .*" + message):
                 estimate(sees)
     slightly_above = image * 1.2 - 0.1  # as bicubic resizing leaves it
@@ -560,7 +560,7 @@ def test_a_generator_with_an_answer_of_its_own_needs_no_matcher(tmp_path: Path) 
     assert found is not None
     assert float(found.mean()) == pytest.approx(FOCAL_PX * BASELINE_M / 4, rel=1e-4)
     pair = StereoInput(name="street", left=image, right=image.flip(-1), camera=rig)
-    for estimate in (net.estimate_pair, lambda one: each_of(net, [one])):
+    for estimate in (net.estimate_input, lambda one: each_of(net, [one])):
         with pytest.raises(InputError, match=r"street: .*a pair needs a matcher.*matcher='sgbm'"):
             estimate(pair)
 

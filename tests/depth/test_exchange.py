@@ -33,7 +33,7 @@ class KnowsDepth:
 
 def test_an_estimate_holds_its_coloured_cloud_up_to_a_distance() -> None:
     seen = pair()
-    cloud = FakestereoNet(KnowsDepth()).estimate_pair(seen).cloud(far_m=80.0)
+    cloud = FakestereoNet(KnowsDepth()).estimate_input(seen).cloud(far_m=80.0)
     is_near = DEPTH_M.flatten() <= 80
     assert torch.allclose(cloud.points[:, 2], DEPTH_M.flatten()[is_near])
     assert cloud.color is not None
@@ -49,14 +49,14 @@ def test_an_estimate_from_files_says_that_it_has_no_colours() -> None:
 
 def test_without_open3d_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "open3d", None)
-    found = FakestereoNet(KnowsDepth()).estimate_pair(pair())
+    found = FakestereoNet(KnowsDepth()).estimate_input(pair())
     with pytest.raises(MissingExtraError, match=r"pip install -e '.\[open3d\]'"):
         found.to_open3d()
 
 
 @pytest.mark.skipif(importlib.util.find_spec("open3d") is None, reason="open3d is not installed")
 def test_open3d_gets_the_same_points_and_colours() -> None:
-    found = FakestereoNet(KnowsDepth()).estimate_pair(pair())
+    found = FakestereoNet(KnowsDepth()).estimate_input(pair())
     cloud, theirs = found.cloud(), found.to_open3d()
     assert type(theirs).__name__ == "PointCloud"
     assert np.allclose(np.asarray(theirs.points), cloud.points.numpy())

@@ -103,7 +103,7 @@ def test_extending_matchers_with_weights(
     write_depth_weights(weights, matcher=FlatNetwork(FlatConfig(most_px=20.0)), facts=FACTS)
     dataset = open_dataset(pairs)
     for net in (FakestereoNet.load(weights), FakestereoNet.load(matcher=weights)):
-        found = net.estimate_pair(dataset.read_input(0))
+        found = net.estimate_input(dataset.read_input(0))
         assert torch.equal(found.disparity_px, torch.full((H, W), 8.0))
         assert found.depth_m is not None
     given = [str(pairs / "left"), str(pairs / "right")]

@@ -106,7 +106,7 @@ def test_a_pair_is_matched_wherever_its_disparities_lie(near_px: int, far_px: in
     left, right, truth_px = planes(near_px, far_px, width=640)
     net = FakestereoNet(matcher())
     pair = StereoInput(name="planes", left=left, right=right, camera=None)
-    found = net.estimate_pair(pair, with_check=False)
+    found = net.estimate_input(pair, with_check=False)
     is_seen = truth_px <= torch.arange(640)
     is_seen[:, :320] &= torch.arange(320) >= far_px
     # The wall is hidden beside the strip where the right view sees the strip.
@@ -153,7 +153,7 @@ def test_what_lies_beyond_the_search_is_named_and_has_no_confidence() -> None:
     left, right, truth_px = planes(250, 16, width=640)
     net = FakestereoNet(matcher(60.0))
     pair = StereoInput(name="planes", left=left, right=right, camera=rig(640))
-    found = net.estimate_pair(pair, with_check=False)
+    found = net.estimate_input(pair, with_check=False)
     # At the camera's usual size a search holds more than what was asked for, but not 250 px.
     assert "disparities beyond" in found.warning
     assert "--max-disparity" in found.warning
@@ -243,7 +243,7 @@ def test_principal_points_apart_move_the_search() -> None:
     net = FakestereoNet(matcher())
     camera: Camera = rig(320, apart_px=30.0)
     pair = StereoInput(name="apart", left=left, right=right, camera=camera)
-    found = net.estimate_pair(pair, with_check=False)
+    found = net.estimate_input(pair, with_check=False)
     is_wall = truth_px < 0
     is_wall[:, 110:160] = False
     is_wall[:, 290:] = False

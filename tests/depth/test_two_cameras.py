@@ -31,7 +31,7 @@ def rig(focal_px: float, width: int, height: int) -> StereoRig:
 def depth_m(net: FakestereoNet, camera: StereoRig) -> Tensor:
     config = StreetsConfig(seed=9, jpeg_share=0.0, rectification_error_px=0.0)
     frame = draw_scene(make_scene((9, 2)), camera, config, (9, 2))
-    estimate = net.estimate_pair(
+    estimate = net.estimate_input(
         StereoInput(name="street", left=frame.left, right=None, camera=camera)
     )
     assert estimate.depth_m is not None

@@ -75,6 +75,6 @@ def test_a_larger_size_needs_the_pixels_along_both_sides(
 def test_an_image_of_other_numbers_is_taken(kind: torch.dtype) -> None:
     camera = Camera(width=192, height=128, K=torch.diag(torch.tensor([240.0, 240.0, 1.0]).double()))
     image = StereoInput(name="a", left=torch.rand(3, 128, 192).to(kind), right=None, camera=camera)
-    found = two_sizes(3).estimate_pair(image)
+    found = two_sizes(3).estimate_input(image)
     assert found.depth_m is not None
     assert found.depth_m.dtype == torch.float32

@@ -124,7 +124,7 @@ def test_a_pair_has_no_depth_where_there_is_no_picture(change: Callable[[Tensor]
     scene = torch.nn.functional.pad(noise(), (8, 0, 0, 0))
     left, right = change(scene[..., :W]), change(scene[..., 8:])
     net = FakestereoNet(CallableMatcher(lambda *_: torch.full((H, W), 8.0)))
-    found = net.estimate_pair(
+    found = net.estimate_input(
         StereoInput(name="x", left=left, right=right, camera=rig()), with_check=False
     )
     blank = without_picture(left)

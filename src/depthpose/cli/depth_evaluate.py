@@ -88,8 +88,8 @@ class _Unchecked:
 
     net: FakestereoNet
 
-    def estimate_pair(self, pair: StereoInput, /) -> DepthEstimate:
-        return self.net.estimate_pair(pair, with_check=False)
+    def estimate_input(self, pair: StereoInput, /) -> DepthEstimate:
+        return self.net.estimate_input(pair, with_check=False)
 
 
 def choose_methods(

@@ -135,7 +135,7 @@ def _figure_sections(
         estimate = read_estimate(predictions, pair.name, pair.camera)
         figures = {"2-5": draw_figure_2_5(pair, lidar_m, estimate)}
         if k == 0 and estimate.right is not None and pair.right is not None:
-            stereo = method.net.estimate_pair(pair)
+            stereo = method.net.estimate_input(pair)
             figures["2-1"] = draw_figure_2_1(pair, lidar_m, estimate, stereo)
         for figure, panels in figures.items():
             title = f"Figure {figure}: {method.name}, {pair.name}"
@@ -193,11 +193,11 @@ def write_figure(
         pair = dataset.read_input(index)
         lidar_m = _read_lidar(frame)
         views = pair if method.with_right else replace(pair, right=None)
-        estimate = method.net.estimate_pair(views)
+        estimate = method.net.estimate_input(views)
         if number == "2-5":
             panels = draw_figure_2_5(pair, lidar_m, estimate)
         else:
-            stereo = method.net.estimate_pair(pair)
+            stereo = method.net.estimate_input(pair)
             panels = draw_figure_2_1(pair, lidar_m, estimate, stereo)
         columns.append(panels)
         sections.append(_panel_section(frame.name, panels, out / "panels" / frame.name))

@@ -83,7 +83,7 @@ class RowDepthBaseline:
         rows = np.arange(_ROWS)
         return cls(1 / np.interp(rows, rows[has_truth], 1 / median_m[has_truth]))
 
-    def estimate_pair(self, pair: StereoInput) -> DepthEstimate:
+    def estimate_input(self, pair: StereoInput) -> DepthEstimate:
         """Give every pixel the depth of its row.
 
         Raises:
@@ -137,7 +137,7 @@ class NearestImageBaseline:
         thumbnails = [_thumbnail(read_image(lefts[k])) for k in progress(range(len(lefts)))]
         return cls(dataset, indices, torch.stack(thumbnails))
 
-    def estimate_pair(self, pair: StereoInput) -> DepthEstimate:
+    def estimate_input(self, pair: StereoInput) -> DepthEstimate:
         """Give the left image the depth of the most similar training image.
 
         Raises:

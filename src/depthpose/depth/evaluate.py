@@ -590,7 +590,7 @@ def measure_image_confidence(net: FakestereoNet, images: Iterable[StereoInput]) 
     """
     confidences: list[float] = []
     for image in images:
-        image_confidence = net.estimate_pair(replace(image, right=None)).image_confidence
+        image_confidence = net.estimate_input(replace(image, right=None)).image_confidence
         if image_confidence is None:
             raise InputError(
                 "these weights have no generator with a confidence of its own; take those of "

@@ -523,7 +523,7 @@ def _pair_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
                 StereoInput(name="proof", left=left_view, right=right_view, camera=rig)
                 for left_view, right_view in zip(left, right, strict=True)
             )
-            estimates = [net.estimate_pair(pair, with_check=False) for pair in pairs]
+            estimates = [net.estimate_input(pair, with_check=False) for pair in pairs]
             yield _make_case(inputs, estimates, outputs)
 
     return Export(
@@ -560,7 +560,7 @@ def _image_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
             views = (
                 StereoInput(name="proof", left=view, right=None, camera=camera) for view in images
             )
-            estimates = [net.estimate_pair(view) for view in views]
+            estimates = [net.estimate_input(view) for view in views]
             case = _make_case(inputs, estimates, outputs)
             is_compared = case.expected["disparity_px"] >= _MIN_COMPARED_PX
             if has_sky:

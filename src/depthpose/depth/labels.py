@@ -125,8 +125,8 @@ def label_pair(net: FakestereoNet, pair: StereoInput, config: LabelConfig) -> Ma
     """
     assert pair.right is not None
     mirrored = replace(pair, left=pair.right.flip(-1), right=pair.left.flip(-1))
-    estimate = net.estimate_pair(pair, with_check=False)
-    mirrored_estimate = net.estimate_pair(mirrored, with_check=False)
+    estimate = net.estimate_input(pair, with_check=False)
+    mirrored_estimate = net.estimate_input(mirrored, with_check=False)
 
     left_px = estimate.disparity_px
     right_px = mirrored_estimate.disparity_px.flip(-1)

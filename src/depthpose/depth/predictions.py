@@ -26,7 +26,7 @@ from depthpose.depth.types import DepthEstimate, Ground, Map, StereoInput
 class Estimator(Protocol):
     """Anything that estimates depth: :class:`FakestereoNet`, a baseline, or your own method."""
 
-    def estimate_pair(self, pair: StereoInput, /) -> DepthEstimate:
+    def estimate_input(self, pair: StereoInput, /) -> DepthEstimate:
         """Estimate depth of one input, whose images are in memory."""
         ...
 
@@ -302,7 +302,7 @@ def predict(
     claim_names(folder, sources, is_finished=partial(is_finished, folder))
 
     def estimate_many(pairs: Sequence[StereoInput]) -> list[DepthEstimate]:
-        return [net.estimate_pair(pair) for pair in pairs]
+        return [net.estimate_input(pair) for pair in pairs]
 
     for outcome in run_jobs(jobs, estimate_many, DepthResults(folder=folder)):
         if outcome.failure is not None:

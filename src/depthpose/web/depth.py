@@ -50,7 +50,7 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
         )
     _refuse_large_work(pair, net)
 
-    estimate = net.estimate_pair(pair)
+    estimate = net.estimate_input(pair)
     seconds = time.perf_counter() - start
     assert estimate.depth_m is not None
 

@@ -2,6 +2,6 @@
 
 from depthpose.depth.estimator.net import FakestereoNet as FakestereoNet
 from depthpose.depth.estimator.net import Picture as Picture
-from depthpose.depth.estimator.net import refuse_unrectified as refuse_unrectified
+from depthpose.depth.estimator.pair import refuse_unrectified as refuse_unrectified
 from depthpose.depth.estimator.pictures import DepthPipeline as DepthPipeline
 from depthpose.depth.estimator.pictures import pipeline as pipeline

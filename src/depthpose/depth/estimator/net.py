@@ -1,6 +1,9 @@
-"""The estimator: one image, or a rectified pair, to depth in metres; and the checks of inputs."""
+"""The estimator: one image, or a rectified pair, to depth in metres.
 
-import math
+What is computed of a pair :mod:`depthpose.depth.estimator.pair` says, and of one image
+:mod:`depthpose.depth.estimator.single_image`; here networks are loaded and inputs read.
+"""
+
 import warnings
 from collections.abc import Iterable, Iterator, Sequence, Sized
 from dataclasses import replace
@@ -11,7 +14,6 @@ from pathlib import Path
 from typing import cast
 
 import numpy as np
-import torch
 from PIL import Image
 from torch import Tensor
 from tqdm import tqdm
@@ -19,41 +21,28 @@ from tqdm import tqdm
 from depthpose.core.camera import (
     AnyCamera,
     AnyLens,
-    StereoRig,
     camera_of,
-    check_image_matches_camera,
-    check_rectified,
     choose_lens,
-    find_two_views,
 )
 from depthpose.core.checkpoint import find_weights, join_terms, warn_of_terms
-from depthpose.core.devices import each_in_threads, force_float32, refused_memory
+from depthpose.core.devices import each_in_threads, force_float32
 from depthpose.core.errors import InputError, Notice
 from depthpose.core.files import Picture as Picture
 from depthpose.core.files import as_tensor, read_exif_focal
-from depthpose.core.files.images import check_image
-from depthpose.depth import disparity
-from depthpose.depth.config import Answer, MatcherConfig, SelectionConfig, SGBMConfig
-from depthpose.depth.ground import MountFilter, scale_by_distance, scale_by_mount
+from depthpose.depth.config import Answer, MatcherConfig, SGBMConfig
+from depthpose.depth.estimator.pair import depth_from_pair
+from depthpose.depth.estimator.single_image import depth_from_images, virtual_sizes
+from depthpose.depth.ground import MountFilter, scale_by_distance
 from depthpose.depth.stereo import (
-    CameraMatcher,
     Matcher,
-    NetworkMatcher,
     SGBMMatcher,
-    choose_search_range,
-    doubt_hidden,
-    doubt_outside,
-    measure_disparity_range,
-    move_views,
-    moved_back,
 )
 from depthpose.depth.synthesis import (
     SelectionGenerator,
-    SynthesisedViews,
     Synthesiser,
     make_synthesiser,
 )
-from depthpose.depth.types import DepthEstimate, Match, StereoInput, Views
+from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.depth.weights import DepthWeights, Use, make_matcher, read_depth_weights
 
 
@@ -79,100 +68,6 @@ def as_input(
             warnings.warn(f"{message}; of a cropped picture it is another", Notice, stacklevel=3)
     size = (left.shape[2], left.shape[1])
     return StereoInput(name=name, left=left, right=None, camera=camera_of(lens, size))
-
-
-def refuse_unrectified(pair: StereoInput, *, with_check: bool = True) -> str:
-    """Raise an error where two images are not a rectified pair; warn where that is uncertain.
-
-    Args:
-        pair: the images, and their rig where it is known.
-        with_check: compare what the images show (:func:`~depthpose.core.camera.check_rectified`);
-            else check only sizes, value range and camera.
-
-    Returns:
-        A warning where the images do not tell whether they are rectified, else "".
-
-    Raises:
-        InputError: there is no right view, its size is another, the camera has no baseline, an
-            image does not lie in [0, 1]; or the views are swapped, show different scenes, or their
-            rows do not correspond. The error says what was measured and what to do.
-    """
-    if pair.right is None:
-        raise InputError(f"{pair.name}: there is no right image; give right=.")
-    check_image(pair.left, f"{pair.name}: the left image")
-    check_image(pair.right, f"{pair.name}: the right image")
-    if pair.right.shape != pair.left.shape:
-        left = pair.left.shape[1:]
-        right = pair.right.shape[1:]
-        raise InputError(
-            f"{pair.name}: the left image is {left[1]}x{left[0]} and the right one "
-            f"{right[1]}x{right[0]}; a rectified pair has one size. Rectify the pair again."
-        )
-    if pair.camera is not None:
-        height, width = pair.left.shape[1:]
-        check_image_matches_camera(pair.camera, width, height, pair.name)
-        if not isinstance(pair.camera, StereoRig):
-            raise InputError(
-                f"{pair.name}: the camera has no baseline, so disparity cannot become metres. Add "
-                '"baseline_m" (the distance between the two cameras in metres) to its file.'
-            )
-    if not with_check:
-        return ""
-    cx_difference_px = 0.0 if pair.camera is None else pair.camera.cx_right_minus_left_px
-    report = check_rectified(pair.left, pair.right, cx_difference_px)
-    if report.is_wrong:
-        raise InputError(
-            f"{pair.name}: {report.message} (--no-check, in Python with_check=False, matches them "
-            "all the same.)"
-        )
-    return report.message if report.is_rectified is None else ""
-
-
-def _match_in_range(
-    matcher: NetworkMatcher, pair: StereoInput, cx_difference_px: float
-) -> tuple[Match, str]:
-    """Measure the range of a pair's disparities, then match within that range.
-
-    Args:
-        matcher: a network that can measure the range.
-        pair: the images, and their rig where it is known.
-        cx_difference_px: cx of the right camera less that of the left one [px].
-
-    Returns:
-        The match; and a warning about disparities beyond the searched range, or "".
-    """
-    assert pair.right is not None
-    left = pair.left
-    measured = measure_disparity_range(matcher, left, pair.right, -cx_difference_px)
-    search = choose_search_range(matcher, measured, left.shape[1:], pair.camera)
-    (match,) = matcher.match_many([(left, pair.right)], pair.camera, search)
-    if not matcher.config.with_left_right_check:
-        match = doubt_hidden(match, measured)
-    return doubt_outside(match, measured, search)
-
-
-def _match_moved_views(matcher: Matcher, pair: StereoInput, cx_difference_px: float) -> Match:
-    """Shift the views so that a disparity of 0 is infinitely far away, match, and shift back.
-
-    ``cx_difference_px``: cx of the right camera less that of the left one [px].
-    """
-    assert pair.right is not None
-    shift_px = -math.ceil(cx_difference_px)
-    left, right = move_views(pair.left, pair.right, shift_px)
-
-    # The rig of the shifted views.
-    rig = pair.camera
-    if isinstance(rig, StereoRig) and shift_px != 0:
-        K = rig.K.clone()
-        K[0, 2] += left.shape[2] - pair.left.shape[2]
-        remaining_px = cx_difference_px + shift_px
-        rig = replace(rig, width=left.shape[2], K=K, cx_right_minus_left_px=remaining_px)
-
-    if isinstance(matcher, CameraMatcher):
-        (match,) = matcher.match_many([(left, right)], rig)
-    else:
-        match = matcher.match(left, right)
-    return moved_back(match, shift_px)
 
 
 def _choose_matcher(
@@ -404,54 +299,35 @@ class FakestereoNet:
             if known_distance is not None:
                 raise InputError(f"{name}: a pair has metres of its own; omit known_distance")
 
-        estimate = self.estimate_pair(pair, with_check=with_check, mount=mount)
+        estimate = self.estimate_input(pair, with_check=with_check, mount=mount)
         if known_distance is None:
             return estimate
         return scale_by_distance(estimate, name, known_distance)
 
-    @torch.no_grad()
     @force_float32()
-    def estimate_pair(
-        self, pair: StereoInput, *, with_check: bool = True, mount: MountFilter | None = None
+    def estimate_input(
+        self,
+        depth_input: StereoInput,
+        *,
+        with_check: bool = True,
+        mount: MountFilter | None = None,
     ) -> DepthEstimate:
         """Estimate depth of one input whose images are read already, as :meth:`estimate` does.
 
-        Networks that find the range measure the disparities of the pair first, and match within
-        their range; the estimate's ``warning`` names what lies beyond it. Other matchers search
-        from 0 px upwards, so the views of a rig whose principal points differ are shifted by the
-        difference, by which the farthest point has a disparity of 0 px. The estimate holds the
-        disparities of the views as they were passed.
+        How is said by :func:`~depthpose.depth.estimator.pair.depth_from_pair` and
+        :func:`~depthpose.depth.estimator.single_image.depth_from_images`.
         """
-        if pair.right is None:
-            return self._estimate_single_images([pair], self.virtual_sizes(pair), mount)[0]
+        if depth_input.right is None:
+            sizes = self.virtual_sizes(depth_input)
+            return self._estimate_single_images([depth_input], sizes, mount)[0]
         if self.matcher is None:
             raise InputError(
-                f"{pair.name}: there is a right image, and these weights answer one image alone: "
-                "a pair needs a matcher. Give matcher='sgbm', or weights of a matcher; 'depthpose "
-                "weights pack G --matcher S --trained-on DATA --licence L --out W' makes one file "
-                "of both."
+                f"{depth_input.name}: there is a right image, and these weights answer one image "
+                "alone: a pair needs a matcher. Give matcher='sgbm', or weights of a matcher; "
+                "'depthpose weights pack G --matcher S --trained-on DATA --licence L --out W' "
+                "makes one file of both."
             )
-        warning = refuse_unrectified(pair, with_check=with_check)
-
-        # How far apart the principal points are.
-        width = pair.left.shape[2]
-        cx_difference_px = 0.0
-        if isinstance(pair.camera, StereoRig):
-            cx_difference_px = pair.camera.cx_right_minus_left_px
-        if abs(math.ceil(cx_difference_px)) >= width:
-            raise InputError(
-                f"cx_right_minus_left_px is {cx_difference_px:g}, and the images are {width} px "
-                "wide: the two views share nothing that is far away. Take both principal points "
-                "from one calibration of images of this size."
-            )
-
-        with refused_memory(pair.name):
-            if isinstance(self.matcher, NetworkMatcher) and self.matcher.finds_range:
-                match, range_warning = _match_in_range(self.matcher, pair, cx_difference_px)
-                warning = "; ".join(text for text in (warning, range_warning) if text)
-            else:
-                match = _match_moved_views(self.matcher, pair, cx_difference_px)
-            return disparity.estimate_from_pair(pair, match, warning)
+        return depth_from_pair(self.matcher, depth_input, with_check=with_check)
 
     @force_float32()
     def estimate_many(
@@ -468,7 +344,7 @@ class FakestereoNet:
     ) -> list[DepthEstimate | InputError]:
         """Estimate depth of many images or pairs; each gives an estimate or its error.
 
-        An input with a right view is matched with it, as :meth:`estimate_pair` does.
+        An input with a right view is matched with it, as :meth:`estimate_input` does.
 
         Args:
             images: inputs; or pictures, or a batch of them as one array or tensor. An iterator is
@@ -562,7 +438,7 @@ class FakestereoNet:
             group_inputs = [depth_input for _, depth_input in group]
             if sizes is None:  # pairs
                 estimates += [
-                    self.estimate_pair(pair, with_check=with_check) for pair in group_inputs
+                    self.estimate_input(pair, with_check=with_check) for pair in group_inputs
                 ]
             else:
                 estimates += self._estimate_single_images(group_inputs, sizes, mount)
@@ -571,41 +447,16 @@ class FakestereoNet:
     def virtual_sizes(self, image: StereoInput) -> list[tuple[int, int]]:
         """Give the sizes (rows, columns) at which the generator sees one image.
 
-        The first is the image's size at the virtual focal length; larger ones follow only where the
-        image itself is at least as large.
-
         Raises:
-            InputError: there is no generator or no camera, or the focal length would make the image
-                too large.
+            InputError: there is no generator, or what
+                :func:`~depthpose.depth.estimator.single_image.virtual_sizes` raises.
         """
         if self.synthesiser is None:
             raise InputError(
                 f"{image.name}: there is no right image, and these weights match pairs only; give "
                 "right=, or weights with a generator ('depthpose weights list')."
             )
-        check_image(image.left, f"{image.name}: the image")
-        if not self.allow_ood and (layout := find_two_views(image.left)) is not None:
-            raise InputError(
-                f"{image.name}: holds two views of one scene, {layout}; 'depthpose data split' "
-                "parts them, and a pair has metres by itself (--allow-ood takes it for one image)"
-            )
-        if image.camera is None:
-            raise InputError(
-                f"{image.name}: metres from one image need its focal length, and its EXIF has "
-                'none. Give a camera: {"width", "height", "K"}, focal_px=, or fov_deg=, the angle '
-                "from left to right; a phone's main camera has about 0.75 widths, or 67 degrees."
-            )
-        height, width = image.left.shape[1:]
-        check_image_matches_camera(image.camera, width, height, image.name)
-        virtual_focal_px = self.synthesiser.config.virtual_focal_px
-        image_focal_px = float(image.camera.K.diagonal()[:2].min())
-        focal_lengths_px = [scale * virtual_focal_px for scale in self.synthesiser.scales]
-        usable_px = [
-            focal_px
-            for focal_px in focal_lengths_px
-            if focal_px == virtual_focal_px or focal_px <= image_focal_px
-        ]
-        return [disparity.size_at_focal_length(image.camera, focal_px) for focal_px in usable_px]
+        return virtual_sizes(self.synthesiser, image, allow_ood=self.allow_ood)
 
     def _estimate_single_images(
         self,
@@ -613,109 +464,11 @@ class FakestereoNet:
         sizes: list[tuple[int, int]],
         mount: MountFilter | None = None,
     ) -> list[DepthEstimate]:
-        """Estimate single images of one virtual size, and correct them by the camera's mount.
-
-        ``sizes``: that virtual size, by :meth:`virtual_sizes`. With ``mount`` the images are
-        successive frames of one camera.
-        """
-        estimates = self.estimate_without_mount(images, sizes)
-        assert self.synthesiser is not None, "estimate_without_mount needs it"
-        config = self.synthesiser.config
-        if not isinstance(config, SelectionConfig):
-            config = SelectionConfig()
-        return [
-            scale_by_mount(estimate, image, mount, config)
-            for estimate, image in zip(estimates, images, strict=True)
-        ]
-
-    @torch.no_grad()
-    def estimate_without_mount(
-        self, images: list[StereoInput], sizes: list[tuple[int, int]]
-    ) -> list[DepthEstimate]:
-        """Estimate depth by the networks alone, before the camera's mount corrects it.
-
-        The images are resized to the virtual focal length, and their right views synthesised and
-        matched.
-
-        Args:
-            images: single images, all of the same virtual sizes.
-            sizes: these sizes, by :meth:`virtual_sizes`.
-
-        Raises:
-            InputError: an image unlike what the weights know.
-        """
+        """Estimate single images, all of the same virtual sizes."""
         assert self.synthesiser is not None, "virtual_sizes checked it"
-        rig = self.synthesiser.config
-        with refused_memory(images[0].name):
-            lefts = [
-                torch.stack([disparity.resize_image(image.left.float(), *size) for image in images])
-                for size in sizes
-            ]
-            views = self.synthesiser.draw(*lefts)
-            matches = self._match_virtual(lefts[0], views)
-            estimates: list[DepthEstimate] = []
-            for index, image in enumerate(images):
-                match = matches[index]
-                if views.is_sky is not None:
-                    match = replace(match, is_sky=views.is_sky[index])
-                estimate = disparity.estimate_from_virtual(image, rig, match, views.right[index])
-
-                # How sure the generator is of the image as a whole.
-                image_confidence = None
-                if views.street_probability is not None:
-                    image_confidence = float(views.street_probability[index])
-                elif views.confidence is not None:
-                    image_confidence = float(views.confidence[index].mean())
-                if image_confidence is not None:
-                    warning = self._ood_warning(image.name, image_confidence)
-                    estimate = replace(estimate, image_confidence=image_confidence, warning=warning)
-                estimates.append(estimate)
-        return estimates
-
-    def _match_virtual(self, left: Views, views: SynthesisedViews) -> list[Match]:
-        """Match images with their synthesised views, or take the synthesiser's own disparity."""
-        assert self.synthesiser is not None
-        rig = self.synthesiser.config
-        if rig.answer != "matched":
-            assert views.disparity_px is not None, "it has an answer of its own"
-            assert views.confidence is not None
-            maps = zip(views.disparity_px, views.confidence, strict=True)
-            return [
-                Match(disparity_px=disparity_px, confidence=confidence)
-                for disparity_px, confidence in maps
-            ]
-        assert self.matcher is not None, "__init__ checked it"
-        camera = camera_of(rig.virtual_focal_px, (left.shape[3], left.shape[2]))
-        pairs = list(zip(left, views.right, strict=True))
-        if isinstance(self.matcher, CameraMatcher):
-            return self.matcher.match_many(pairs, camera)
-        return [self.matcher.match(*pair) for pair in pairs]
-
-    def _ood_warning(self, name: str, image_confidence: float) -> str:
-        """Give the warning of an image that is out of distribution for the weights, else "".
-
-        Args:
-            name: of the image, for the error.
-            image_confidence: how sure the generator is of the image as a whole, 0..1.
-
-        Raises:
-            InputError: the image is out of distribution, and ``allow_ood`` is false.
-        """
-        assert self.synthesiser is not None
-        config = self.synthesiser.config
-        if not isinstance(config, SelectionConfig) or image_confidence >= config.least_confidence:
-            return ""
-        measure = "probability of a street" if config.with_street else "mean confidence"
-        warning = (
-            f"out of distribution for these weights ({measure} {image_confidence:.2f}, below "
-            f"{config.least_confidence:.2f}), so its depth is a guess"
+        return depth_from_images(
+            self.synthesiser, self.matcher, images, sizes, mount=mount, allow_ood=self.allow_ood
         )
-        if not self.allow_ood:
-            raise InputError(
-                f"{name}: {warning}. Check that it is upright and that the focal length is its "
-                "own; --allow-ood (in Python, load(..., allow_ood=True)) answers it all the same."
-            )
-        return warning
 
 
 def _named_batches(images: Iterable[object], batch: int) -> Iterator[list[tuple[str, object]]]:

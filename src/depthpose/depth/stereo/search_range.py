@@ -24,7 +24,7 @@ from depthpose.depth.stereo.matcher import (
     SearchRange,
     lower_where_disagreeing,
 )
-from depthpose.depth.types import Map, Match
+from depthpose.depth.types import Map, Mask, Match
 from depthpose.depth.visible import without_picture
 
 _TAIL = 0.001
@@ -91,44 +91,40 @@ def measure_disparity_range(
         infinity_px: disparity of what is infinitely far away: 0, or less where the principal point
             of the right camera lies farther to the right.
     """
-    trained = matcher.network_config
-    width = left.shape[2]
-    span_px = matcher.whole_steps(trained.max_disparity_px * matcher.largest_span_factor)
-    scale = min(1.0, span_px / (width + abs(infinity_px)))
-    step_px = STEP_PX / scale
-    first_px = STEP_PX * math.floor(infinity_px * scale / STEP_PX)
-    search = SearchRange(scale=scale, first_px=first_px, span_px=span_px)
-    views = (left, right)
+    # A copy so narrow that the network reaches every disparity, matched both ways.
+    search = _search_of_narrow_copy(matcher, left.shape[2], infinity_px)
     mirrored = (right.flip(-1), left.flip(-1))
-    coarse, other = matcher.match_many([views, mirrored], search=search)
+    coarse, mirrored_match = matcher.match_many([(left, right), mirrored], search=search)
+    disparity_px = coarse.disparity_px
+    right_px = mirrored_match.disparity_px.flip(-1)
+
+    # Borders without a picture match each other at any disparity.
+    is_picture = _shows_picture(left, right, disparity_px)
+    confidence = coarse.confidence
+    if confidence is not None:
+        confidence = confidence.where(is_picture, 0.0)
+        coarse = replace(coarse, confidence=confidence)
 
     # The farthest point is measured where both views agree, which excludes hidden places and the
     # left border. The nearest is measured wherever the right view can show it: near things are
     # often in one view alone, so there the views need not agree.
-    right_px = other.disparity_px.flip(-1)[None]
-    there_px = warp_right_to_left(right_px, coarse.disparity_px)[0]
-    agrees = (coarse.disparity_px - there_px).abs() <= step_px
-    # Borders without a picture match each other at any disparity.
-    left_blank, right_blank = (without_picture(view).to(agrees.device) for view in (left, right))
-    matched_blank = warp_right_to_left(right_blank.to(right_px)[None], coarse.disparity_px)[0]
-    is_picture = ~left_blank & ~(matched_blank > 0)
-    if coarse.confidence is not None:
-        coarse = replace(coarse, confidence=coarse.confidence.where(is_picture, 0.0))
+    step_px = STEP_PX / search.scale
+    other_px = warp_right_to_left(right_px[None], disparity_px)[0]
+    counts_as_far = is_picture & ((disparity_px - other_px).abs() <= step_px)
+    columns = torch.arange(disparity_px.shape[1], device=disparity_px.device)
+    counts_as_near = is_picture & (disparity_px <= columns)
+    if confidence is not None:
+        counts_as_near &= confidence >= _SURE
 
     # The maps have the size of the images: one sample for each pixel of the narrow copy.
-    stride = max(1, round(1 / scale))
+    stride = max(1, round(1 / search.scale))
     samples = (slice(None, None, stride), slice(None, None, stride))
-    sampled_px = coarse.disparity_px[samples]
-    counts_as_far = agrees[samples] & is_picture[samples]
-    counts_as_near = sampled_px <= torch.arange(width, device=sampled_px.device)[::stride]
-    counts_as_near &= is_picture[samples]
-    if coarse.confidence is not None:
-        counts_as_near &= coarse.confidence[samples] >= _SURE
+    sampled_px = disparity_px[samples]
+    far_px = sampled_px[counts_as_far[samples]].sort().values
+    near_px = sampled_px[counts_as_near[samples]].sort().values
 
     # The range, without the outermost samples, which may be wrong matches.
     tail = int(_TAIL * sampled_px.numel())
-    far_px = sampled_px[counts_as_far].sort().values
-    near_px = sampled_px[counts_as_near].sort().values
     if min(len(far_px), len(near_px)) <= tail:  # too few are left: all samples count
         far_px = near_px = sampled_px.flatten().sort().values
     low_px = max(float(far_px[tail]) - step_px, infinity_px)
@@ -138,8 +134,25 @@ def measure_disparity_range(
         high_px=high_px,
         step_px=step_px,
         coarse=coarse,
-        right_px=right_px[0],
+        right_px=right_px,
     )
+
+
+def _search_of_narrow_copy(matcher: NetworkMatcher, width: int, infinity_px: float) -> SearchRange:
+    """Give the search of a copy in which every disparity of a pair is within reach of a network."""
+    trained_px = matcher.network_config.max_disparity_px
+    span_px = matcher.whole_steps(trained_px * matcher.largest_span_factor)
+    scale = min(1.0, span_px / (width + abs(infinity_px)))
+    first_px = STEP_PX * math.floor(infinity_px * scale / STEP_PX)
+    return SearchRange(scale=scale, first_px=first_px, span_px=span_px)
+
+
+def _shows_picture(left: Tensor, right: Tensor, disparity_px: Map) -> Mask:
+    """Mark where neither a pixel nor what it is matched with lies in a border without a picture."""
+    left_blank = without_picture(left).to(disparity_px.device)
+    right_blank = without_picture(right).to(disparity_px)
+    matched_blank = warp_right_to_left(right_blank[None], disparity_px)[0]
+    return ~left_blank & ~(matched_blank > 0)
 
 
 def choose_search_range(

@@ -1,0 +1,202 @@
+"""One image to depth: synthesise its right view, match both, give metres, correct by the mount.
+
+Images are brought to the virtual rig that the generator imitates: its focal length and baseline.
+Those of one size go through the networks together.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+
+from depthpose.core.camera import camera_of, check_image_matches_camera, find_two_views
+from depthpose.core.devices import refused_memory
+from depthpose.core.errors import InputError
+from depthpose.core.files.images import check_image
+from depthpose.depth.config import SelectionConfig
+from depthpose.depth.disparity import estimate_from_virtual, resize_image, size_at_focal_length
+from depthpose.depth.ground import MountFilter, scale_by_mount
+from depthpose.depth.stereo import CameraMatcher, Matcher
+from depthpose.depth.synthesis import SynthesisedViews, Synthesiser
+from depthpose.depth.types import DepthEstimate, Match, StereoInput, Views
+
+
+def depth_from_images(
+    synthesiser: Synthesiser,
+    matcher: Matcher | None,
+    images: Sequence[StereoInput],
+    sizes: Sequence[tuple[int, int]],
+    *,
+    mount: MountFilter | None = None,
+    allow_ood: bool = False,
+) -> list[DepthEstimate]:
+    """Estimate depth of single images, and correct it by the mount of their camera.
+
+    Args:
+        synthesiser: left view to right view.
+        matcher: pair to disparity; None where the synthesiser answers disparity itself.
+        images: without right views, all of the same virtual sizes.
+        sizes: these sizes, by :func:`virtual_sizes`.
+        mount: of one camera, whose successive frames the images then are.
+        allow_ood: as for :func:`depth_before_mount`.
+
+    Raises:
+        InputError: an image unlike what the weights know, or too little memory.
+    """
+    estimates = depth_before_mount(synthesiser, matcher, images, sizes, allow_ood=allow_ood)
+    config = synthesiser.config
+    if not isinstance(config, SelectionConfig):
+        config = SelectionConfig()
+    return [
+        scale_by_mount(estimate, image, mount, config)
+        for estimate, image in zip(estimates, images, strict=True)
+    ]
+
+
+@torch.no_grad()
+def depth_before_mount(
+    synthesiser: Synthesiser,
+    matcher: Matcher | None,
+    images: Sequence[StereoInput],
+    sizes: Sequence[tuple[int, int]],
+    *,
+    allow_ood: bool = False,
+) -> list[DepthEstimate]:
+    """Estimate depth by the networks alone, before the camera's mount corrects it.
+
+    Args:
+        synthesiser: left view to right view.
+        matcher: pair to disparity; None where the synthesiser answers disparity itself.
+        images: without right views, all of the same virtual sizes.
+        sizes: these sizes, by :func:`virtual_sizes`.
+        allow_ood: estimate images unlike what the weights know too, with a ``warning``.
+
+    Raises:
+        InputError: an image unlike what the weights know, or too little memory.
+    """
+    with refused_memory(images[0].name):
+        # Resize to the virtual focal length, synthesise the right views, match.
+        lefts = [
+            torch.stack([resize_image(image.left.float(), *size) for image in images])
+            for size in sizes
+        ]
+        views = synthesiser.draw(*lefts)
+        matches = _match_views(synthesiser, matcher, lefts[0], views)
+
+        # Metres.
+        estimates: list[DepthEstimate] = []
+        for index, image in enumerate(images):
+            match = matches[index]
+            if views.is_sky is not None:
+                match = replace(match, is_sky=views.is_sky[index])
+            estimate = estimate_from_virtual(image, synthesiser.config, match, views.right[index])
+            image_confidence = _image_confidence(views, index)
+            if image_confidence is not None:
+                warning = _refuse_ood(synthesiser, image.name, image_confidence, allow_ood)
+                estimate = replace(estimate, image_confidence=image_confidence, warning=warning)
+            estimates.append(estimate)
+    return estimates
+
+
+def virtual_sizes(
+    synthesiser: Synthesiser, image: StereoInput, *, allow_ood: bool = False
+) -> list[tuple[int, int]]:
+    """Give the sizes (rows, columns) at which the generator sees one image.
+
+    The first is the image's size at the virtual focal length; larger ones follow only where the
+    image itself is at least as large.
+
+    Args:
+        synthesiser: left view to right view.
+        image: the image and its camera.
+        allow_ood: take an image that holds two views of one scene for one view.
+
+    Raises:
+        InputError: there is no camera, it does not fit the image, the image holds two views, or the
+            focal length would make it too large.
+    """
+    check_image(image.left, f"{image.name}: the image")
+    if not allow_ood and (layout := find_two_views(image.left)) is not None:
+        raise InputError(
+            f"{image.name}: holds two views of one scene, {layout}; 'depthpose data split' "
+            "parts them, and a pair has metres by itself (--allow-ood takes it for one image)"
+        )
+    if image.camera is None:
+        raise InputError(
+            f"{image.name}: metres from one image need its focal length, and its EXIF has "
+            'none. Give a camera: {"width", "height", "K"}, focal_px=, or fov_deg=, the angle '
+            "from left to right; a phone's main camera has about 0.75 widths, or 67 degrees."
+        )
+    height, width = image.left.shape[1:]
+    check_image_matches_camera(image.camera, width, height, image.name)
+    virtual_focal_px = synthesiser.config.virtual_focal_px
+    image_focal_px = float(image.camera.K.diagonal()[:2].min())
+    focal_lengths_px = [scale * virtual_focal_px for scale in synthesiser.scales]
+    usable_px = [
+        focal_px
+        for focal_px in focal_lengths_px
+        if focal_px == virtual_focal_px or focal_px <= image_focal_px
+    ]
+    return [size_at_focal_length(image.camera, focal_px) for focal_px in usable_px]
+
+
+def _match_views(
+    synthesiser: Synthesiser, matcher: Matcher | None, left: Views, views: SynthesisedViews
+) -> list[Match]:
+    """Match images with their synthesised views, or take the synthesiser's own disparity."""
+    if synthesiser.config.answer != "matched":
+        assert views.disparity_px is not None, "it has an answer of its own"
+        assert views.confidence is not None
+        maps = zip(views.disparity_px, views.confidence, strict=True)
+        return [
+            Match(disparity_px=disparity_px, confidence=confidence)
+            for disparity_px, confidence in maps
+        ]
+    assert matcher is not None, "without an answer of the synthesiser's there is one"
+    camera = camera_of(synthesiser.config.virtual_focal_px, (left.shape[3], left.shape[2]))
+    pairs = list(zip(left, views.right, strict=True))
+    if isinstance(matcher, CameraMatcher):
+        return matcher.match_many(pairs, camera)
+    return [matcher.match(*pair) for pair in pairs]
+
+
+def _image_confidence(views: SynthesisedViews, index: int) -> float | None:
+    """Say how sure the generator is of an image as a whole, 0..1; None where it does not say."""
+    if views.street_probability is not None:
+        return float(views.street_probability[index])
+    if views.confidence is not None:
+        return float(views.confidence[index].mean())
+    return None
+
+
+def _refuse_ood(
+    synthesiser: Synthesiser, name: str, image_confidence: float, allow_ood: bool
+) -> str:
+    """Refuse an image that is out of distribution for the weights, or warn of it.
+
+    Args:
+        synthesiser: whose config has the limit.
+        name: of the image, for the error.
+        image_confidence: how sure the generator is of the image as a whole, 0..1.
+        allow_ood: warn, and do not refuse.
+
+    Returns:
+        A warning, or "" where the image is in distribution.
+
+    Raises:
+        InputError: it is out of distribution, and ``allow_ood`` is false.
+    """
+    config = synthesiser.config
+    if not isinstance(config, SelectionConfig) or image_confidence >= config.least_confidence:
+        return ""
+    measure = "probability of a street" if config.with_street else "mean confidence"
+    warning = (
+        f"out of distribution for these weights ({measure} {image_confidence:.2f}, below "
+        f"{config.least_confidence:.2f}), so its depth is a guess"
+    )
+    if not allow_ood:
+        raise InputError(
+            f"{name}: {warning}. Check that it is upright and that the focal length is its "
+            "own; --allow-ood (in Python, load(..., allow_ood=True)) answers it all the same."
+        )
+    return warning
