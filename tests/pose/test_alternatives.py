@@ -25,7 +25,7 @@ from tests.pose.synthetic_objects import (
 
 from depthpose.core.rigid import Rigid, geodesic_rad, rotation_by
 from depthpose.pose.cloud import cloud_from_depth
-from depthpose.pose.config import IcpConfig
+from depthpose.pose.config import EstimateConfig, IcpConfig
 from depthpose.pose.copies import PreparedObject
 from depthpose.pose.evidence import observe
 from depthpose.pose.hypotheses import compete
@@ -145,7 +145,7 @@ def test_copies_of_a_plate_stay_where_its_symmetry_has_them(seed: int) -> None:
     refined = refine_pose(cloud_m, leading, prepared.surface, config)
     observation = observe(cloud_m, view, plate.diameter_m, 0.001, is_masked=True)
     none = Rigid(torch.zeros(0, 3, 3).double(), torch.zeros(0, 3).double())
-    competition = compete(cloud_m, refined, none, prepared, observation, IcpConfig())
+    competition = compete(cloud_m, refined, none, prepared, observation, EstimateConfig())
     poses = [competition.best.pose, *(copy.pose for copy, _ in competition.copies)]
     errors = [float(add_m(pose.float(), truth.float(), plate.vertices_m)) for pose in poses]
     assert min(errors) < 0.004

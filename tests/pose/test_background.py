@@ -20,7 +20,7 @@ from depthpose.pose.metrics import add_m
 from depthpose.pose.registration import Registration
 from depthpose.pose.sensor import NOISE_PER_M2
 from depthpose.pose.surface import prepare_surface
-from depthpose.pose.types import ObjectModel, PoseEstimate
+from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 
 TRUTH = pose_at(-0.12, 0.75, seed=1)
 FIXTURE = pose_at(0.13, 0.78, seed=2)
@@ -175,14 +175,14 @@ def test_a_plate_that_lies_flush_in_its_tray_is_not_cut_out_of_it() -> None:
     assert is_cut_out(plain, pose, surface, NOISE_PER_M2)
     assert not is_cut_out(known, pose, surface, NOISE_PER_M2)
     cloud_m = cloud_from_depth(depth_m, mask, K)
-    beside = [
-        compare(
-            observe(cloud_m, view, surface.diameter_m, 0.001, is_masked=False), pose, surface
-        ).beside
-        for view in (plain, known)
-    ]
-    assert beside[0] > 10
-    assert beside[1] < 1
+
+    def continued_area(view: ViewInput, *, is_masked: bool) -> float:
+        observation = observe(cloud_m, view, surface.diameter_m, 0.001, is_masked=is_masked)
+        return compare(observation, pose, surface).continued
+
+    assert continued_area(plain, is_masked=False) > 10
+    assert continued_area(known, is_masked=False) < 1
+    assert continued_area(plain, is_masked=True) < 1, "the mask says where it ends"
 
 
 def test_backgrounds_that_cannot_be_are_refused() -> None:

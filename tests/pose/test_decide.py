@@ -30,7 +30,7 @@ from depthpose.pose.types import Alternative, Evidence, PoseEstimate
 
 GOOD = Evidence(
     visible=40.0, supported=38.0, explained=38.0,
-    unobserved=2.0, seen_through=0.0, bulging=0.0, beside=0.0,
+    unobserved=2.0, seen_through=0.0, bulging=0.0, beside=0.0, continued=0.0,
     rms=0.5, noise_m=0.001,
 )  # fmt: skip
 """What a right pose leaves."""
@@ -72,7 +72,7 @@ def test_the_seconds_of_several_tries_add_up() -> None:
 def test_each_kind_of_contradiction_lowers_the_probability() -> None:
     right = probability_right(GOOD, PRIOR_MASKED)
     assert right > 0.99
-    for kind in ("seen_through", "bulging", "beside"):
+    for kind in ("seen_through", "bulging", "beside", "continued"):
         before = right
         evidence = GOOD
         for patches in (2.0, 8.0, 20.0):
@@ -175,6 +175,7 @@ def test_a_pose_and_its_copies_have_the_share_of_the_group() -> None:
         ("seen_through", "the camera saw through 50% of the posed surface"),
         ("bulging", "50% of its readings lie before the posed surface"),
         ("beside", "50% of the object's readings lie beside the posed silhouette"),
+        ("continued", "the surface within the posed silhouette goes on beyond it"),
         ("unobserved", "50% of the posed surface was not observed"),
     ],
 )

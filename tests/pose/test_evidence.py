@@ -306,7 +306,7 @@ def test_without_a_mask_a_surface_that_goes_on_contradicts(
     more = boxes("more", ((0.1, 0.05, 0.04), (0, 0, 0)), ((0.1, 0.05, 0.04), (0.1, 0, step_m)))
     pose = Rigid(torch.eye(3), torch.tensor([0.0, 0.0, 0.7]))
     evidence = evidence_of(view_before_wall(more, pose, 0.001), bar, pose, is_masked=False)
-    assert (evidence.beside > 1) == is_continued
+    assert (evidence.continued > 1) == is_continued
     assert evidence.seen_through == evidence.bulging == 0
 
 
@@ -327,7 +327,7 @@ def test_without_a_mask_a_surface_that_bends_away_at_the_silhouette_goes_on(
     pose = Rigid(R, torch.tensor([0.0, 0.0, 0.7]))
     evidence = evidence_of(view_before_wall(more, pose, 0.001), plate, pose, is_masked=False)
     assert evidence.supported > 0.9 * evidence.visible
-    assert (evidence.beside > 1) == is_continued
+    assert (evidence.continued > 1) == is_continued
 
 
 @pytest.mark.parametrize("reading_m", [math.nan, 0.45], ids=["no reading", "something before it"])

@@ -54,6 +54,8 @@ class ObjectCloud:
     name: str  #: that of the input
     cloud_m: Float[Tensor, "n 3"]  #: all usable points, without flying pixels
     view: ViewInput | None  #: the depth image that shows the cloud; None of a cloud alone
+    #: the points are exactly the object's: those which a pose does not explain contradict it
+    is_masked: bool
 
 
 def prepare_cloud(
@@ -70,12 +72,14 @@ def prepare_cloud(
         cloud_config: limits: the fewest points, and how far flying pixels are.
         config: how many points of a larger cloud are taken.
     """
+    is_masked = True
     if isinstance(pose_input, ViewInput):
         view = pose_input
         mask = view.mask if view.background is None else view.mask & ~view.background.is_seen
         points_m = cloud_from_depth(view.depth_m, mask, view.K).float()
     else:
         view = pose_input.view
+        is_masked = pose_input.is_masked
         points_m = pose_input.points_m.float()
     readings_m = take_evenly(points_m[is_reading(points_m)], config.max_cloud_points)
     if len(readings_m) == 0:
@@ -85,7 +89,7 @@ def prepare_cloud(
     refusal = _why_refused(pose_input, readings_m, cloud_m, model, cloud_config)
     if refusal is not None:
         return refusal
-    return ObjectCloud(name=pose_input.name, cloud_m=cloud_m, view=view)
+    return ObjectCloud(name=pose_input.name, cloud_m=cloud_m, view=view, is_masked=is_masked)
 
 
 def _why_empty(pose_input: CloudInput | ViewInput) -> str:

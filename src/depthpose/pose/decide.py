@@ -49,7 +49,6 @@ def decide(
     refusal: RefusalConfig,
     config: EstimateConfig,
     prior_odds: float,
-    is_refined: bool,
 ) -> PoseEstimate:
     """Give the likeliest of competing poses as the estimate, or say why it is withheld.
 
@@ -59,9 +58,8 @@ def decide(
         competition: of its poses.
         observation: that they were compared with.
         refusal: limits.
-        config: settings of the estimate.
+        config: settings of the estimate; without ICP size and mirror image are not tested.
         prior_odds: of the best pose being right, before its evidence is seen.
-        is_refined: whether ICP refined the poses; else size and mirror image are not tested.
     """
     model = prepared.model
     best = competition.best
@@ -76,7 +74,7 @@ def decide(
     if withheld is None and probability < refusal.min_probability:
         doubt = contradiction(best.evidence, probability, is_masked=observation.is_masked)
         withheld = Refusal(status="doubtful", reason=doubt)
-    if withheld is None and is_refined and refusal.max_size_error < 1:
+    if withheld is None and config.with_icp and refusal.max_size_error < 1:
         identity = identify(
             cloud.cloud_m,
             best.pose,
@@ -200,6 +198,10 @@ def contradiction(evidence: Evidence, probability: float, *, is_masked: bool) ->
             evidence.beside,
             f"{evidence.beside / compared:.0%} of the object's readings lie beside the posed "
             "silhouette",
+        ),
+        (
+            evidence.continued,
+            "the surface within the posed silhouette goes on beyond it",
         ),
         (
             _UNOBSERVED_WEIGHT * evidence.unobserved,

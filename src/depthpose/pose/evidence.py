@@ -200,19 +200,18 @@ def compare(observation: Observation, pose: Rigid, surface: Surface) -> Evidence
     deviations, is_compared = _residual_deviations(observation, rendering, inner)
     is_supported = is_compared & (np.abs(deviations) <= THRESHOLD)
 
-    # Patches that contradict the pose. Beside the silhouette a mask says which readings are the
-    # object's; without one, those count that go on where the model ends.
+    # Patches that contradict the pose. Only a mask says which readings are the object's.
     patch_area_px2 = observation.patch_px**2
     is_bulging = (deviations < -THRESHOLD) & observation.is_object[rendering.window]
+    is_beside = _is_beside_silhouette(observation, is_drawn, rendering.window)
+    is_continued = _is_continued(observation, is_drawn, is_supported, rendering.window)
+    if observation.is_masked:  # what lies outside of the mask is of something else
+        is_continued &= observation.is_object
     seen_through = _patch_area(deviations > THRESHOLD, patch_area_px2)
     bulging = _patch_area(is_bulging, patch_area_px2)
-    if observation.is_masked:
-        is_beside = _is_beside_silhouette(observation, is_drawn, rendering.window)
-        beside = _patch_area(is_beside, patch_area_px2)
-    else:
-        is_beside = _is_continued(observation, is_drawn, is_supported, rendering.window)
-        # A patch beside the silhouette is as long as others, and half as wide.
-        beside = _patch_area(is_beside, patch_area_px2 / 2)
+    beside = _patch_area(is_beside, patch_area_px2)
+    # A patch in which the surface goes on is as long as others, and half as wide.
+    continued = _patch_area(is_continued, patch_area_px2 / 2)
 
     is_explained = _lies_on_rendering(observation, rendering)
     visible = float(inner.sum()) / patch_area_px2
@@ -227,6 +226,7 @@ def compare(observation: Observation, pose: Rigid, surface: Surface) -> Evidence
         seen_through=seen_through,
         bulging=bulging,
         beside=beside,
+        continued=continued,
         rms=float(np.sqrt(squares.mean())) if len(squares) else THRESHOLD,
         noise_m=observation.noise.white_std_m,
     )

@@ -11,7 +11,7 @@ from torch import Tensor
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid
 from depthpose.pose.color import color_agreement, color_copies, settle_spin
-from depthpose.pose.config import IcpConfig
+from depthpose.pose.config import EstimateConfig
 from depthpose.pose.copies import PreparedObject, SymmetricCopies
 from depthpose.pose.evidence import Observation, compare
 from depthpose.pose.icp import RefinedPose, refine_pose, refine_roughly
@@ -84,7 +84,7 @@ def compete(
     others: Rigid,
     prepared: PreparedObject,
     observation: Observation,
-    icp: IcpConfig | None,
+    config: EstimateConfig,
     view: ViewInput | None = None,
     votes_rad: Callable[[Rigid], float] | None = None,
 ) -> Competition:
@@ -96,7 +96,7 @@ def compete(
         others: at which refinement ended elsewhere.
         prepared: the object.
         observation: of it.
-        icp: of the refinement; None: poses stay where they are.
+        config: of the refinement; without ICP poses stay where they are.
         view: whose colour image tells copies apart; None: depth alone.
         votes_rad: mean angle between a network's directions and those to the keypoints of a pose.
     """
@@ -114,7 +114,7 @@ def compete(
     # Which pose is it, up to near-symmetric copies?
     different = [
         hypothesize(pose)
-        for pose in _refine_different_poses(cloud_m, refined, others, prepared, icp)
+        for pose in _refine_different_poses(cloud_m, refined, others, prepared, config)
     ]
     if view is not None:  # one of its copies may have the surface colours that are observed
         different = _with_color_of_best_copy(different, prepared, view)
@@ -125,7 +125,7 @@ def compete(
     # And which of its copies?
     if view is not None:  # its own colours again, in place of those of its best copy
         winner = replace(winner, log_color=_log_color(winner.pose, prepared, view))
-    copies = _refine_distinct_copies(cloud_m, winner.refined, prepared, icp, view)
+    copies = _refine_distinct_copies(cloud_m, winner.refined, prepared, config, view)
     group = [winner, *map(hypothesize, copies)]
     share_in_group = share_among_copies(group, is_masked=observation.is_masked)
     copy_shares = float(shares[winner_number]) * share_in_group
@@ -144,7 +144,7 @@ def _refine_different_poses(
     leading: RefinedPose,
     others: Rigid,
     prepared: PreparedObject,
-    icp: IcpConfig | None,
+    config: EstimateConfig,
 ) -> list[RefinedPose]:
     """Give the leading pose, and refined others that are neither it nor a copy of one before.
 
@@ -154,7 +154,7 @@ def _refine_different_poses(
     leading_pose = leading.camera_from_model.double()
     starts = Rigid.cat([others.double(), leading_pose @ copies.lookalikes])
     competitors = _refine_competitors(
-        cloud_m, leading, starts, prepared.surface, icp, _MOST_LEADING
+        cloud_m, leading, starts, prepared.surface, config, _MOST_LEADING
     )
 
     different = [leading]
@@ -210,7 +210,8 @@ def _against_each_other(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     compared: list[Hypothesis] = []
     for hypothesis in hypotheses:
         evidence = hypothesis.evidence
-        unexplained = max(evidence.beside, most - evidence.explained)
+        # Part of it is counted already, where the surface goes on beyond the silhouette.
+        unexplained = max(0.0, most - evidence.explained - evidence.continued)
         compared.append(replace(hypothesis, evidence=replace(evidence, beside=unexplained)))
     return compared
 
@@ -225,7 +226,7 @@ def _refine_distinct_copies(
     cloud_m: Float64[Tensor, "n 3"],
     winner: RefinedPose,
     prepared: PreparedObject,
-    icp: IcpConfig | None,
+    config: EstimateConfig,
     view: ViewInput | None,
 ) -> list[RefinedPose]:
     """Refine the near-symmetric copies of the winning pose; leave out exact copies of others."""
@@ -233,7 +234,9 @@ def _refine_distinct_copies(
     starts = winner_pose @ prepared.copies.near_copies
     if view is not None:  # colours show finer rotations about an axis than shape does
         starts = Rigid.cat([color_copies(winner_pose, prepared.model, view), starts])
-    competitors = _refine_competitors(cloud_m, winner, starts, prepared.surface, icp, _MOST_COPIES)
+    competitors = _refine_competitors(
+        cloud_m, winner, starts, prepared.surface, config, _MOST_COPIES
+    )
 
     distinct: list[RefinedPose] = []
     distinct_poses = [winner_pose]
@@ -305,18 +308,19 @@ def _refine_competitors(
     leading: RefinedPose,
     starts: Rigid,
     surface: Surface,
-    icp: IcpConfig | None,
+    config: EstimateConfig,
     most: int,
 ) -> list[_Competitor]:
     """Refine competing poses, but for those that explain much less than the leading one."""
     unrefined = [replace(leading, camera_from_model=starts[k]) for k in range(len(starts.R))]
-    if icp is None:
+    if not config.with_icp:
         return [_Competitor(pose, pose) for pose in unrefined]
     if len(starts.R) == 0:
         return []
+
     # Roughly. Such steps let a pose drift along what little constrains it, so it stays at its start
     # where that explains as much.
-    rough = refine_roughly(cloud_m, starts, surface, icp)
+    rough = refine_roughly(cloud_m, starts, surface, config.icp)
     unexplained_before = _unexplained(cloud_m, starts, surface)
     unexplained_after = _unexplained(cloud_m, rough, surface)
     is_better = unexplained_after < unexplained_before
@@ -332,12 +336,13 @@ def _refine_competitors(
     order = order[unexplained[order] <= leading_unexplained + _UNEXPLAINED_MORE]
     if len(order) == 0:
         return []
+
     # Then exactly, a few steps for each.
     short = replace(
-        icp,
+        config.icp,
         iterations=_STEPS,
-        cloud_points=min(_POINTS, icp.cloud_points),
-        start_distance_diameters=icp.end_distance_diameters,
+        cloud_points=min(_POINTS, config.icp.cloud_points),
+        start_distance_diameters=config.icp.end_distance_diameters,
     )
     batch = refine_pose(cloud_m, improved[order], surface, short)
     competitors: list[_Competitor] = []

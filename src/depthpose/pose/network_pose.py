@@ -290,14 +290,12 @@ class GeoPoseNet(PoseEstimator):
             inlier_share=torch.ones(()),
         )
         refinement = BestStart(refined=fitted, others=poses[:0])
-        icp = None
         if config.with_icp:
             with watch.stage("icp"):
                 cloud_m = job.cloud.cloud_m.double()
                 by_icp = refine_best(cloud_m, poses, prepared.surface, config.icp)
             if float(by_icp.refined.inlier_share) > 0:
                 refinement = by_icp
-                icp = config.icp
 
         # Compare, compete, decide.
         estimate = judge(
@@ -307,9 +305,7 @@ class GeoPoseNet(PoseEstimator):
             config,
             self.weights.refusal,
             watch,
-            icp=icp,
             prior_odds=PRIOR_MASKED if is_expected else PRIOR_PROPOSED,
-            is_masked=True,
             votes_rad=partial(self._disagreement, job),
         )
         return replace(

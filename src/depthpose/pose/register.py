@@ -13,7 +13,7 @@ from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid
 from depthpose.core.stopwatch import Stopwatch
 from depthpose.pose.cloud import ObjectCloud, local_planes, prepare_cloud, thin
-from depthpose.pose.config import CloudConfig, EstimateConfig, IcpConfig, RefusalConfig
+from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig
 from depthpose.pose.copies import PreparedObject
 from depthpose.pose.decide import contradiction, decide, refused
 from depthpose.pose.evidence import compare, observe
@@ -44,11 +44,9 @@ def register(
         prepared: the object.
         config: of ICP, and of what a real object is off from its model.
         refusal: when the estimate is withheld.
-        proposals: poses of a search, whose points need not be the object's alone; None: point pairs
-            of a mask's points propose.
+        proposals: poses of a search; None: point pairs of the points propose.
         prior_odds: of the best pose being right, before its evidence is seen.
     """
-    is_masked = proposals is None
     watch = Stopwatch()
 
     # The usable points of the object.
@@ -63,25 +61,15 @@ def register(
             proposals = propose_by_pairs(cloud, prepared, config.voting.seed)
 
     # Refine, from each pose alone: the proposals are many.
-    icp = replace(config.icp, starts=1)
     with watch.stage("icp"):
+        icp = replace(config.icp, starts=1)
         refinement = refine_best(cloud.cloud_m.double(), proposals, prepared.surface, icp)
     if float(refinement.refined.inlier_share) == 0:
         reason = "no pose brings the model near the points: another object, or too little of it"
         return refused(pose_input, Refusal(status="no pose found", reason=reason), watch.seconds)
 
     # Compare, compete, decide.
-    return judge(
-        cloud,
-        prepared,
-        refinement,
-        config,
-        refusal,
-        watch,
-        icp=icp,
-        prior_odds=prior_odds,
-        is_masked=is_masked,
-    )
+    return judge(cloud, prepared, refinement, config, refusal, watch, prior_odds=prior_odds)
 
 
 def propose_by_pairs(cloud: ObjectCloud, prepared: PreparedObject, seed: int) -> Rigid:
@@ -102,9 +90,7 @@ def judge(
     refusal: RefusalConfig,
     watch: Stopwatch,
     *,
-    icp: IcpConfig | None,
     prior_odds: float,
-    is_masked: bool,
     votes_rad: Callable[[Rigid], float] | None = None,
 ) -> PoseEstimate:
     """Compare a refined pose with the depth image and with its competitors, and decide.
@@ -113,12 +99,10 @@ def judge(
         cloud: points of the object.
         prepared: the object.
         refinement: the best pose, and others at which refinement ended.
-        config: settings of the estimate.
+        config: settings of the estimate; without ICP competing poses stay where they are.
         refusal: when it is withheld.
         watch: of the stages before, to which this one's are added.
-        icp: by which competing poses are refined; None: they stay where they are.
         prior_odds: of the best pose being right, before its evidence is seen.
-        is_masked: whether all points of the cloud are the object's, as a mask gives them.
         votes_rad: angle between a network's directions and a pose, as :func:`compete` takes it.
     """
     with watch.stage("evidence"):
@@ -127,11 +111,11 @@ def judge(
             cloud.view,
             prepared.surface.diameter_m,
             config.object_deviation_m,
-            is_masked=is_masked,
+            is_masked=cloud.is_masked,
         )
 
     # A search proposes much: what the depth image plainly contradicts goes no further.
-    if not is_masked:
+    if not cloud.is_masked:
         with watch.stage("evidence"):
             pose = refinement.refined.camera_from_model
             evidence = compare(observation, pose, prepared.surface)
@@ -155,7 +139,7 @@ def judge(
             refinement.others,
             prepared,
             observation,
-            icp,
+            config,
             cloud.view if has_color else None,
             votes_rad,
         )
@@ -169,6 +153,5 @@ def judge(
             refusal=refusal,
             config=config,
             prior_odds=prior_odds,
-            is_refined=icp is not None,
         )
     return replace(estimate, seconds=watch.seconds)

@@ -315,6 +315,7 @@ def _judge(
             points_m=_readings_of(leader, frame, view),
             object=leader.object,
             view=view,
+            is_masked=False,
         )
         return register(
             cloud,

@@ -55,6 +55,8 @@ class CloudInput:
     #: the depth image that the points are of, where there is one: what the camera saw through a
     #: pose is evidence against it.
     view: "ViewInput | None" = None
+    #: the points are exactly the object's; not where a search chose them.
+    is_masked: bool = True
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -255,16 +257,15 @@ class Evidence:
     unobserved: float  #: part of it without a reading, or hidden by something nearer
     seen_through: float  #: patches behind which the camera saw: free-space violations
     bulging: float  #: patches of the object's own readings before the model
-    #: patches beside the model's silhouette: of the object's own readings; without a mask, of those
-    #: in which the surface within the silhouette goes on
-    beside: float
+    beside: float  #: patches of the object's own readings beside the model's silhouette
+    continued: float  #: patches in which the surface within the silhouette goes on beyond it
     rms: float  #: root mean square residual of the supported part, in standard deviations
     noise_m: float  #: standard deviation of a reading on the object, estimated from the image
 
     @property
     def contradicted(self) -> float:
         """Area that contradicts the pose."""
-        return self.seen_through + self.bulging + self.beside
+        return self.seen_through + self.bulging + self.beside + self.continued
 
     @property
     def agreement(self) -> float:
