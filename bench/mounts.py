@@ -102,7 +102,7 @@ def camera_of_fov(fov_deg: float) -> Camera:
 
 def draw_street(
     street: int, height_m: float, tilt_deg: int, roll_deg: int, fov_deg: int
-) -> dict[str, np.ndarray]:
+) -> dict[str, Any]:
     """Draw one street from a mount: 8-bit picture and depth [m]."""
     scene = make_scene((STREET_SEED, street), SCENE_HEIGHT_M)
     raised_m = np.array([0, height_m - SCENE_HEIGHT_M, 0])
