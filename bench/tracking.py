@@ -327,8 +327,8 @@ def main() -> None:
             tracked.append(track(net, model, frames))
             print(tracked[-1], flush=True)
             if options.anew:
-                every = frames[options.anew // 2 :: options.anew]
-                searched.append(search_each(net, model, every))
+                every_nth = frames[options.anew // 2 :: options.anew]
+                searched.append(search_each(net, model, every_nth))
         print(f"{name}, followed\n{markdown_table(tracked)}")
         if searched:
             print(f"{name}, every {options.anew} frames anew\n{markdown_table(searched)}")
