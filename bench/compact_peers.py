@@ -2,20 +2,20 @@
 
     python bench/compact_peers.py [--threads 2] [--repeats 7] [--size 375 1242]
 
-StereoNet (Khamis et al., ECCV 2018; 8 times smaller, three refinements) and CoEx (Bangunharcana et
-al., IROS 2021; MobileNetV2) by the sizes that their papers give, for 192 disparities, with random
-weights: for time alone, their accuracy is not measured. They run in eager mode, batch norms
-included, as their authors run them, on normalised images; ours runs as it ships, from images to
+StereoNet (Khamis et al., ECCV 2018; matching at 1/8, three refinements) and CoEx (Bangunharcana et
+al., IROS 2021; MobileNetV2) have the sizes that their papers give, for 192 disparities. Their
+weights are random: only time is measured, not accuracy. They run in eager mode with their batch
+norms, as their authors run them, on normalised images; ours runs as it ships, from images to
 disparity. The methods alternate.
 """
 
-import argparse
 import time
 from collections.abc import Callable
 from typing import Literal
 
 import torch
 import torch.nn.functional as F
+from shared import make_parser
 from torch import Tensor, nn
 
 from depthpose.core.camera import StereoRig
@@ -30,27 +30,28 @@ FOCAL_PX = 721.5
 
 
 def conv(dims: Literal[2, 3], ins: int, outs: int, k: int = 3, s: int = 1, d: int = 1) -> nn.Module:
-    """Convolution, batch norm, leaky ReLU."""
-    kind, norm = (nn.Conv2d, nn.BatchNorm2d) if dims == 2 else (nn.Conv3d, nn.BatchNorm3d)
-    layers = kind(ins, outs, k, s, d * (k // 2), d, bias=False), norm(outs)
-    return nn.Sequential(*layers, nn.LeakyReLU(0.2))
+    """Build a convolution of size k, stride s and dilation d, with batch norm and leaky ReLU."""
+    convolution = nn.Conv2d if dims == 2 else nn.Conv3d
+    norm = nn.BatchNorm2d if dims == 2 else nn.BatchNorm3d
+    return nn.Sequential(
+        convolution(ins, outs, k, s, d * (k // 2), d, bias=False), norm(outs), nn.LeakyReLU(0.2)
+    )
 
 
 def deconv(dims: Literal[2, 3], ins: int, outs: int) -> nn.Module:
-    """Twice the size."""
-    kind, norm = (
-        (nn.ConvTranspose2d, nn.BatchNorm2d) if dims == 2 else (nn.ConvTranspose3d, nn.BatchNorm3d)
-    )
-    return nn.Sequential(kind(ins, outs, 4, 2, 1, bias=False), norm(outs), nn.LeakyReLU(0.2))
+    """Build a transposed convolution that doubles the size, with batch norm and leaky ReLU."""
+    convolution = nn.ConvTranspose2d if dims == 2 else nn.ConvTranspose3d
+    norm = nn.BatchNorm2d if dims == 2 else nn.BatchNorm3d
+    return nn.Sequential(convolution(ins, outs, 4, 2, 1, bias=False), norm(outs), nn.LeakyReLU(0.2))
 
 
 def shifted(right: Tensor, count: int) -> list[Tensor]:
-    """Right features moved by each disparity, zeros at the left."""
+    """Shift the right features by each disparity, with zeros at the left."""
     return [F.pad(right, (k, 0))[..., : right.shape[-1]] for k in range(count)]
 
 
 class Residual(nn.Module):
-    """Two dilated convolutions beside the identity."""
+    """Residual block of two dilated convolutions."""
 
     def __init__(self, width: int, dilation: int = 1) -> None:
         super().__init__()
@@ -61,12 +62,12 @@ class Residual(nn.Module):
         )
 
     def forward(self, x: Tensor) -> Tensor:
-        """Add."""
+        """Add the convolved features."""
         return F.leaky_relu(x + self.body(x), 0.2)
 
 
 class StereoNet(nn.Module):
-    """Differences of features at 1/8, five 3D convolutions, three refinements by the image."""
+    """Feature differences at 1/8, five 3D convolutions, three refinements by the image."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -87,36 +88,38 @@ class StereoNet(nn.Module):
 
     def forward(self, left: Tensor, right: Tensor) -> Tensor:
         """Match at 1/8, then enlarge in three steps."""
-        near, far = self.features(left), self.features(right)
+        left_features = self.features(left)
+        right_features = self.features(right)
         count = DISPARITIES // 8
-        volume = torch.stack([near - moved for moved in shifted(far, count)], 2)
-        chance = (-self.filter(volume)[:, 0]).softmax(1)
-        bins = torch.arange(count, dtype=chance.dtype)[:, None, None]
-        found = (chance * bins).sum(1, keepdim=True)
-        for refine, share in zip(self.refine, (4, 2, 1), strict=True):
-            size = (left.shape[-2] // share, left.shape[-1] // share)
-            found = 2 * F.interpolate(found, size, mode="bilinear")
+        differences = [left_features - features for features in shifted(right_features, count)]
+        cost = self.filter(torch.stack(differences, 2))[:, 0]
+        probability = (-cost).softmax(1)
+        disparities = torch.arange(count, dtype=probability.dtype)[:, None, None]
+        disparity = (probability * disparities).sum(1, keepdim=True)
+        for refine, divisor in zip(self.refine, (4, 2, 1), strict=True):
+            size = (left.shape[-2] // divisor, left.shape[-1] // divisor)
+            disparity = 2 * F.interpolate(disparity, size, mode="bilinear")
             image = F.interpolate(left, size, mode="bilinear")
-            found = F.relu(found + refine(torch.cat([found, image], 1)))
-        return found[:, 0]
+            disparity = F.relu(disparity + refine(torch.cat([disparity, image], 1)))
+        return disparity[:, 0]
 
 
 class Inverted(nn.Module):
     """Block of MobileNetV2."""
 
-    def __init__(self, ins: int, outs: int, s: int, grow: int) -> None:
+    def __init__(self, ins: int, outs: int, s: int, expansion: int) -> None:
         super().__init__()
-        wide = ins * grow
-        first = [nn.Conv2d(ins, wide, 1, bias=False), nn.BatchNorm2d(wide), nn.ReLU6()]
+        wide = ins * expansion
+        expand = [nn.Conv2d(ins, wide, 1, bias=False), nn.BatchNorm2d(wide), nn.ReLU6()]
         self.body = nn.Sequential(
-            *(first if grow > 1 else []),
+            *(expand if expansion > 1 else []),
             nn.Conv2d(wide, wide, 3, s, 1, groups=wide, bias=False), nn.BatchNorm2d(wide),
             nn.ReLU6(), nn.Conv2d(wide, outs, 1, bias=False), nn.BatchNorm2d(outs),
         )  # fmt: skip
         self.is_residual = s == 1 and ins == outs
 
     def forward(self, x: Tensor) -> Tensor:
-        """Give the block's features."""
+        """Compute the block's features."""
         return x + self.body(x) if self.is_residual else self.body(x)
 
 
@@ -127,24 +130,30 @@ class MobileNet(nn.Module):
         ((16, 1, 1, 1), (24, 2, 2, 6)), ((32, 3, 2, 6),), ((64, 4, 2, 6), (96, 3, 1, 6)),
         ((160, 3, 2, 6),),
     )  # fmt: skip
+    """Of each stage: output channels, number of blocks, stride, expansion."""
 
     def __init__(self) -> None:
         super().__init__()
-        ins, stages = 32, []
+        ins = 32
+        stages = []
         self.stem = conv(2, 3, ins, s=2)
         for stage in self.STAGES:
             blocks = []
-            for outs, count, stride, grow in stage:
+            for outs, count, stride, expansion in stage:
                 for k in range(count):
-                    blocks.append(Inverted(ins, outs, stride if k == 0 else 1, grow))
+                    blocks.append(Inverted(ins, outs, stride if k == 0 else 1, expansion))
                     ins = outs
             stages.append(nn.Sequential(*blocks))
         self.stages = nn.ModuleList(stages)
 
     def forward(self, image: Tensor) -> list[Tensor]:
-        """Give the four levels."""
+        """Compute the four levels."""
         x = self.stem(image)
-        return [x := stage(x) for stage in self.stages]
+        levels = []
+        for stage in self.stages:
+            x = stage(x)
+            levels.append(x)
+        return levels
 
 
 class Excite(nn.Module):
@@ -157,7 +166,7 @@ class Excite(nn.Module):
         )
 
     def forward(self, volume: Tensor, image: Tensor) -> Tensor:
-        """Multiply."""
+        """Multiply each channel by its weight."""
         return torch.sigmoid(self.weights(image))[:, :, None] * volume
 
 
@@ -194,10 +203,11 @@ class CoEx(nn.Module):
         self.weights = nn.Sequential(deconv(2, 32, 32), conv(2, 64, 32), deconv(2, 32, 9))
 
     def describe_image(self, image: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """Features of 1/2, descriptors of 1/4, and the features that excite."""
-        four, eight, sixteen, last = self.backbone(image)
-        levels, x = [last], last
-        for up, join, skip in zip(self.up, self.join, (sixteen, eight, four), strict=True):
+        """Compute features of 1/2 and of 1/4, and those of all levels that excite the volume."""
+        quarter, eighth, sixteenth, last = self.backbone(image)
+        levels = [last]
+        x = last
+        for up, join, skip in zip(self.up, self.join, (sixteenth, eighth, quarter), strict=True):
             x = join(torch.cat([up(x), skip], 1))
             levels.insert(0, x)
         half = self.stem_2(image)
@@ -205,32 +215,39 @@ class CoEx(nn.Module):
         return half, quarter, [quarter, *levels[1:]]
 
     def forward(self, left: Tensor, right: Tensor) -> Tensor:
-        """Match."""
+        """Correlate at 1/4, filter the volume, and enlarge the two best disparities."""
         half, quarter, levels = self.describe_image(left)
-        near = F.normalize(self.describe(quarter), dim=1)
-        far = F.normalize(self.describe(self.describe_image(right)[1]), dim=1)
-        moved = shifted(far, DISPARITIES // 4)
-        volume = torch.stack([(near * other).sum(1) for other in moved], 1)[:, None]
+        _, right_quarter, _ = self.describe_image(right)
+        left_descriptor = F.normalize(self.describe(quarter), dim=1)
+        right_descriptor = F.normalize(self.describe(right_quarter), dim=1)
+        shifted_right = shifted(right_descriptor, DISPARITIES // 4)
+        correlations = [(left_descriptor * descriptor).sum(1) for descriptor in shifted_right]
+        volume = torch.stack(correlations, 1)[:, None]
         x = self.excite[0](self.stem_3d(volume), levels[0])
-        kept = [x]
+        skips = [x]
         for down, excite, level in zip(self.down, list(self.excite)[1:], levels[1:], strict=True):
-            kept.append(x := excite(down(x), level))
+            x = excite(down(x), level)
+            skips.append(x)
         steps = zip(self.rise, self.merge, self.excite_up, (2, 1), strict=True)
         for rise, merge, excite, level in steps:
-            x = excite(merge(torch.cat([rise(x), kept[level]], 1)), levels[level])
+            merged = merge(torch.cat([rise(x), skips[level]], 1))
+            x = excite(merged, levels[level])
         scores = self.last(x)[:, 0]
         best = scores.topk(2, 1)
-        found = (best.values.softmax(1) * best.indices).sum(1, keepdim=True)
-        spread = self.weights[0](self.spread(quarter))
-        weights = self.weights[2](self.weights[1](torch.cat([spread, half], 1))).softmax(1)
-        b, _, h, w = found.shape
-        near_by = F.unfold(found, 3, padding=1).reshape(b, 9, h, w)
-        wide = F.interpolate(near_by, (4 * h, 4 * w), mode="nearest")
-        return 4 * (weights * wide).sum(1)
+        disparity = (best.values.softmax(1) * best.indices).sum(1, keepdim=True)
+        enlarged = self.weights[0](self.spread(quarter))
+        logits = self.weights[2](self.weights[1](torch.cat([enlarged, half], 1)))
+        weights = logits.softmax(1)
+        batch, _, height, width = disparity.shape
+        neighbours = F.unfold(disparity, 3, padding=1).reshape(batch, 9, height, width)
+        neighbours = F.interpolate(neighbours, (4 * height, 4 * width), mode="nearest")
+        return 4 * (weights * neighbours).sum(1)
 
 
-def plain(network: nn.Module, size: tuple[int, int], precision: str) -> Callable[[], object]:
-    """Give a match of random images, padded to sides that the network takes."""
+def match_by_peer(
+    network: nn.Module, size: tuple[int, int], precision: str
+) -> Callable[[], object]:
+    """Make a call that matches random images, padded to sides that the network takes."""
     height, width = (32 * -(-side // 32) for side in size)
     views = torch.rand(2, 1, 3, height, width)
     network.eval()
@@ -242,8 +259,10 @@ def plain(network: nn.Module, size: tuple[int, int], precision: str) -> Callable
     return match
 
 
-def shipped(config: MatcherConfig | SGBMConfig, size: tuple[int, int]) -> Callable[[], object]:
-    """Give a match as users run it, from images to disparity."""
+def match_by_ours(
+    config: MatcherConfig | SGBMConfig, size: tuple[int, int]
+) -> Callable[[], object]:
+    """Make a call that matches as users run it, from images to disparity."""
     height, width = size
     K = torch.tensor([[FOCAL_PX, 0, width / 2], [0, FOCAL_PX, height / 2], [0, 0, 1]])
     rig = StereoRig(width=width, height=height, K=K.double(), baseline_m=0.54)
@@ -253,12 +272,12 @@ def shipped(config: MatcherConfig | SGBMConfig, size: tuple[int, int]) -> Callab
         net = FakestereoNet.load(matcher="sgbm", config=config)
     else:
         net = FakestereoNet.load(find_weights("default"), config=config)
-    return lambda: net.estimate_pair(pair, with_check=False)
+    return lambda: net.estimate_input(pair, with_check=False)
 
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser = make_parser(__doc__)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--size", type=int, nargs=2, default=(375, 1242), metavar=("H", "W"))
@@ -266,30 +285,31 @@ def main() -> None:
     torch.set_num_threads(options.threads)
     torch.manual_seed(0)
     size = (options.size[0], options.size[1])
-    ways: dict[str, Callable[[], object]] = {
-        "SGBM, 192 disparities": shipped(SGBMConfig(num_disparities=192), size)
+    matchers: dict[str, Callable[[], object]] = {
+        "SGBM, 192 disparities": match_by_ours(SGBMConfig(num_disparities=192), size)
     }
     for precision in ("fp32", "bf16"):
         for speed in ("quick", "fine"):
             config = MatcherConfig(speed=speed, precision=precision)
-            ways[f"`default`, {speed}, {precision}"] = shipped(config, size)
+            matchers[f"`default`, {speed}, {precision}"] = match_by_ours(config, size)
         for peer in (StereoNet(), CoEx()):
-            ways[f"{type(peer).__name__}, {precision}"] = plain(peer, size, precision)
-    wall: dict[str, list[float]] = {name: [] for name in ways}
-    spent: dict[str, list[float]] = {name: [] for name in ways}
+            matchers[f"{type(peer).__name__}, {precision}"] = match_by_peer(peer, size, precision)
+    wall_s: dict[str, list[float]] = {name: [] for name in matchers}
+    cpu_s: dict[str, list[float]] = {name: [] for name in matchers}
     for _ in range(options.repeats + 1):
-        for name, run in ways.items():
-            began, used = time.perf_counter(), time.process_time()
-            run()
-            wall[name].append(time.perf_counter() - began)
-            spent[name].append(time.process_time() - used)
+        for name, match in matchers.items():
+            start_s = time.perf_counter()
+            start_cpu_s = time.process_time()
+            match()
+            wall_s[name].append(time.perf_counter() - start_s)
+            cpu_s[name].append(time.process_time() - start_cpu_s)
     rows = [
         {
             "matcher": name,
-            "seconds": f"{min(wall[name][1:]):.2f}",
-            "processor seconds": f"{min(spent[name][1:]):.2f}",
+            "seconds": f"{min(wall_s[name][1:]):.2f}",  # the first run compiles
+            "processor seconds": f"{min(cpu_s[name][1:]):.2f}",
         }
-        for name in ways
+        for name in matchers
     ]
     print(f"{options.threads} threads, {size[0]}x{size[1]}, least of {options.repeats}")
     print(markdown_table(rows))

@@ -1,25 +1,26 @@
-"""Whether poses err as much as they say, for four kinds of sensor.
+"""Whether the covariance of a pose agrees with its errors, for four kinds of sensor.
 
     python bench/covariance.py [--views 2] [--repeats 8] [--offset-m 0.005]
 
-Parts of the shipped weights ``parts`` are rendered 0.7 m away and measured again and again by each
-kind of synthetic sensor; ICP begins at the true pose. All readings of a measurement are off by up
-to ``--offset-m`` along the ray; where that is given, the covariance has the product's default for
-it, and none where it is 0. Bias is how far the mean of the poses is off
-at the middle of the object, along the ray and in all [mm], the mean over views; scatter and claimed
-are standard deviations there, all three axes together. Squares are squared errors in units of the
-covariance (Mahalanobis), whose median is 5.3 where errors are normal. Coverage is the share of
-errors within what should hold 68 and 95 %: of the whole pose, and of the place along each axis of
-the camera.
-"""
+Parts of the shipped weights ``parts`` are rendered 0.7 m away and measured repeatedly by each kind
+of synthetic sensor; ICP starts from the true pose. With ``--offset-m`` all readings of a
+measurement are off by up to so much along the ray, and the covariance allows for the product's
+default offset; else for none. Columns, at the middle of the object:
 
-import argparse
+- bias along the ray, bias: error of the mean pose [mm], the mean over views
+- scatter, claimed: standard deviation [mm] of the errors and by the covariance, of all three axes
+- squares: median squared error in units of the covariance (Mahalanobis); 5.3 for normal errors
+- pose within, axis within: share of errors in the region that should hold 68 and 95 %, of the whole
+  pose and of the position along each axis of the camera
+"""
 
 import torch
 from scipy.stats import chi2
+from shared import make_parser
 from torch import Tensor
 
 from depthpose import GeoPoseNet
+from depthpose.core.camera.pinhole import intrinsics
 from depthpose.core.checkpoint import find_weights
 from depthpose.core.loop import sample_generator
 from depthpose.core.render import rasterize
@@ -33,90 +34,116 @@ from depthpose.pose.synthetic.views import random_rotation, simulate_depth
 from depthpose.report.page import markdown_table
 
 KINDS: tuple[SensorKind, ...] = ("structured light", "active stereo", "time of flight", "laser")
-WIDTH, HEIGHT, FOCAL_PX, AWAY_M, BEHIND_M = 640, 480, 600.0, 0.7, 0.9
-K = torch.tensor([[FOCAL_PX, 0, 319.5], [0, FOCAL_PX, 239.5], [0, 0, 1]], dtype=torch.float64)
+WIDTH, HEIGHT, FOCAL_PX = 640, 480, 600.0
+DISTANCE_M = 0.7
+WALL_M = 0.9
+K = intrinsics(FOCAL_PX, FOCAL_PX, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
 SEED = 0xC0FA
+SHARES = (0.68, 0.95)
 
 
-def errors_of(found: Rigid, true: Rigid) -> Tensor:
-    """The motion (rotation, translation) by which the truth differs from what was found."""
-    turn = true.R @ found.R.mT
-    about = torch.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-    return torch.cat([about / 2, true.t_m - turn @ found.t_m])
+def motion_to_truth(pose: Rigid, truth: Rigid) -> Tensor:
+    """Compute the small motion (rotation, translation) from an estimated pose to the true one."""
+    R = truth.R @ pose.R.mT
+    rotation = torch.stack([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2
+    return torch.cat([rotation, truth.t_m - R @ pose.t_m])
 
 
-def view_rows(
+def measure_view(
     kind: SensorKind, number: int, seed: int, repeats: int, noise: float, offset_m: float
 ) -> dict[str, Tensor]:
-    """Measure one view of a part again and again; errors at its middle, and what was claimed."""
+    """Measure one view of a part repeatedly; return errors and claimed deviations at its middle."""
     model = PARTS[number]
-    surface, generator = SURFACES[number], sample_generator(seed, SEED)
-    R, middle_m = random_rotation(generator).double(), surface.points_m.mean(0)
-    true = Rigid(R, torch.tensor([0.02, -0.03, AWAY_M]).double() - R @ middle_m)
-    at_m = true.apply(middle_m[None])[0]
-    by = torch.cat([-cross_matrix(at_m), torch.eye(3).double()], 1)
-    clean_m = rasterize(true.apply(drawn_triangles(model).double()), K, WIDTH, HEIGHT).depth_m
-    mask = clean_m.isfinite()
-    clean_m = torch.where(mask, clean_m, BEHIND_M).float()
-    offs, squares, spreads = [], [], []
+    surface = SURFACES[number]
+    generator = sample_generator(seed, SEED)
+    R = random_rotation(generator).double()
+    middle_m = surface.points_m.mean(0)
+    truth = Rigid(R, torch.tensor([0.02, -0.03, DISTANCE_M]).double() - R @ middle_m)
+    middle_in_camera_m = truth.apply(middle_m[None])[0]
+    # Times a small motion, the shift of the middle.
+    jacobian = torch.cat([-cross_matrix(middle_in_camera_m), torch.eye(3).double()], 1)
+    part_m = rasterize(truth.apply(drawn_triangles(model).double()), K, WIDTH, HEIGHT).depth_m
+    mask = part_m.isfinite()
+    scene_m = torch.where(mask, part_m, WALL_M).float()
     sensor = SyntheticSensorConfig(
         kinds=(kind,), noise=(noise, noise), offset_m=(-offset_m, offset_m)
     )
     icp = IcpConfig() if offset_m else IcpConfig(sensor_offset_m=0.0)
+    squares, errors_mm, deviations_mm = [], [], []
     for _ in range(repeats):
-        depth_m = simulate_depth(clean_m, (FOCAL_PX, FOCAL_PX), sensor, generator)
+        depth_m = simulate_depth(scene_m, (FOCAL_PX, FOCAL_PX), sensor, generator)
         cloud_m = cloud_from_depth(depth_m, mask & depth_m.isfinite(), K.float())
-        refined = refine_pose(cloud_m.double(), true, surface, icp)
-        off = errors_of(refined.camera_from_model, true)
-        squares.append(off @ torch.linalg.solve(refined.covariance, off))
-        offs.append(1000 * by @ off)
-        spreads.append(1000 * (by @ refined.covariance @ by.mT).diagonal().sqrt())
-    off_mm, ray = torch.stack(offs), at_m / at_m.norm()
+        refined = refine_pose(cloud_m.double(), truth, surface, icp)
+        motion = motion_to_truth(refined.camera_from_model, truth)
+        squares.append(motion @ torch.linalg.solve(refined.covariance, motion))
+        errors_mm.append(1000 * jacobian @ motion)
+        covariance_m2 = jacobian @ refined.covariance @ jacobian.mT
+        deviations_mm.append(1000 * covariance_m2.diagonal().sqrt())
+    error_mm = torch.stack(errors_mm)
+    mean_mm = error_mm.mean(0)
+    ray = middle_in_camera_m / middle_in_camera_m.norm()
     return {
-        "off": off_mm, "std": torch.stack(spreads), "squares": torch.stack(squares),
-        "ray": (off_mm.mean(0) @ ray)[None], "bias": off_mm.mean(0).norm()[None],
-        "scatter": off_mm.var(0).sum().sqrt()[None],
-    }  # fmt: skip
+        "error": error_mm,
+        "deviation": torch.stack(deviations_mm),
+        "squares": torch.stack(squares),
+        "bias along the ray": (mean_mm @ ray)[None],
+        "bias": mean_mm.norm()[None],
+        "scatter": error_mm.var(0).sum().sqrt()[None],
+    }
+
+
+def coverage(squares: Tensor, share: float, degrees_of_freedom: int) -> str:
+    """Compute the share of squared errors in the region that should hold ``share`` of them."""
+    limit = float(chi2.ppf(share, degrees_of_freedom))
+    return f"{float((squares < limit).double().mean()):.0%}"
 
 
 def main() -> None:
     """Print a row for each kind of sensor."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--views", type=int, default=2)
     parser.add_argument("--repeats", type=int, default=8)
     parser.add_argument("--noise", type=float, default=1.0, help="times the noise of the kind")
     parser.add_argument("--offset-m", type=float, default=0.0, help="of all readings, at most")
-    words = parser.parse_args()
+    options = parser.parse_args()
     torch.set_num_threads(1)
     rows = []
     for kind in KINDS:
-        every = [
-            view_rows(kind, number, 100 * number + view, words.repeats, words.noise, words.offset_m)
-            for number in range(len(PARTS))
-            for view in range(words.views)
+        views = [
+            measure_view(
+                kind, part, 100 * part + view, options.repeats, options.noise, options.offset_m
+            )
+            for part in range(len(PARTS))
+            for view in range(options.views)
         ]
-        one = {name: torch.cat([row[name] for row in every]) for name in every[0]}
-        times = (one["off"] / one["std"]).abs()
-        rows.append({
-            "sensor": kind,
-            "bias along the ray": round(float(one["ray"].mean()), 2),
-            "bias": round(float(one["bias"].mean()), 2),
-            "scatter": round(float(one["scatter"].mean()), 2),
-            "claimed": round(float(one["std"].norm(dim=-1).mean()), 2),
-            "squares": round(float(one["squares"].median()), 1),
-            **{f"pose within {share:.0%}":
-               f"{float((one['squares'] < float(chi2.ppf(share, 6))).double().mean()):.0%}"
-               for share in (0.68, 0.95)},
-            **{f"axis within {share:.0%}":
-               f"{float((times < float(chi2.ppf(share, 1)) ** 0.5).double().mean()):.0%}"
-               for share in (0.68, 0.95)},
-        })  # fmt: skip
+        values = {name: torch.cat([view[name] for view in views]) for name in views[0]}
+        axis_squares = (values["error"] / values["deviation"]).square()
+        rows.append(
+            {
+                "sensor": kind,
+                "bias along the ray": round(float(values["bias along the ray"].mean()), 2),
+                "bias": round(float(values["bias"].mean()), 2),
+                "scatter": round(float(values["scatter"].mean()), 2),
+                "claimed": round(float(values["deviation"].norm(dim=-1).mean()), 2),
+                "squares": round(float(values["squares"].median()), 1),
+                **{
+                    f"pose within {share:.0%}": coverage(values["squares"], share, 6)
+                    for share in SHARES
+                },
+                **{
+                    f"axis within {share:.0%}": coverage(axis_squares, share, 1) for share in SHARES
+                },
+            }
+        )
         print(rows[-1], flush=True)
     print(markdown_table(rows))
 
 
-PARTS = [m for m in GeoPoseNet.load(find_weights("parts")).weights.models
-         if not m.symmetries.continuous]  # fmt: skip
+PARTS = [
+    model
+    for model in GeoPoseNet.load(find_weights("parts")).weights.models
+    if not model.symmetries.continuous
+]
 SURFACES = [prepare_surface(model) for model in PARTS]
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Plots of the benchmarks, each a PNG."""
+"""Plots of other scripts of this folder, each a PNG."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 
 mpl.use("Agg")
 
-_MOST_INSIDE = 5
-"""Largest number of names inside a plot; a longer legend is placed beside it."""
+_MAX_NAMES_INSIDE = 5
+"""Largest number of names in a legend inside a plot; a longer one is placed beside it."""
 
 Curves = Mapping[str, Sequence[tuple[float, float]]]
 
@@ -28,7 +28,7 @@ def draw_curves(
         log: horizontal axes in powers of ten, with a place for 0.
     """
     names = list(dict.fromkeys(name for curves in axes_of.values() for name in curves))
-    is_beside = len(names) > _MOST_INSIDE
+    is_beside = len(names) > _MAX_NAMES_INSIDE
     width = 1.5 + 4 * len(axes_of) + (2.5 if is_beside else 0)
     figure = Figure(figsize=(width, 3.8), layout="constrained")
     plots = figure.subplots(1, len(axes_of), sharey=True, squeeze=False)[0]
@@ -47,10 +47,10 @@ def draw_curves(
 
 def _draw(axes: Axes, curves: Curves) -> None:
     for name, points in curves.items():
-        found: dict[float, list[float]] = {}
+        values_at: dict[float, list[float]] = {}
         for x, y in sorted(points):
-            found.setdefault(x, []).append(y)
-        means = [sum(values) / len(values) for values in found.values()]
-        (line,) = axes.plot(list(found), means, "o-", label=name)
-        if len(points) > len(found):
+            values_at.setdefault(x, []).append(y)
+        means = [sum(values) / len(values) for values in values_at.values()]
+        (line,) = axes.plot(list(values_at), means, "o-", label=name)
+        if len(points) > len(values_at):
             axes.plot(*zip(*points, strict=True), ".", color=line.get_color())

@@ -3,8 +3,9 @@
     python bench/duplicates.py TRAINED_ON EVALUATION
 
 Training on frames of the evaluation's drives makes every number too good. Left images are compared
-by their fine structure over small shifts and zooms: 1 is the same image, two streets stay below
-0.3. Check the list by eye. Folders in any layout that ``depthpose data check`` knows.
+by their fine structure over small shifts and zooms: similarity is 1 for the same image and stays
+below 0.3 for two different streets. Check the list by eye. Folders may have any layout that
+``depthpose data check`` knows.
 """
 
 import argparse
@@ -27,8 +28,8 @@ _ROWS, _COLUMNS = 40, 128
 _SHIFT_ROWS, _SHIFT_COLUMNS = 2, 6
 _BLUR = 9
 _ZOOMS = (1.0, 1.12, 1.25, 1.4)
-LEAST = 0.3
-"""Similarity from which two images count as near-duplicates."""
+MIN_SIMILARITY = 0.3
+"""Of two images that count as near-duplicates."""
 
 Progress = Callable[[Sequence[int]], Iterable[int]]
 
@@ -45,7 +46,7 @@ class Duplicate:
 def find_duplicates(
     first: Dataset,
     second: Dataset,
-    at_least: float = LEAST,
+    at_least: float = MIN_SIMILARITY,
     progress: Progress = iter,
 ) -> list[Duplicate]:
     """List the pairs of left images, one of either set, that look alike, the most similar first.
@@ -54,63 +55,75 @@ def find_duplicates(
     The others have a similarity of ``at_least`` or more; ``progress`` wraps the sequence of frames.
     """
     similarity = similarity_matrix(first, second, progress)
-    pairs = (similarity >= min(at_least, float(similarity.max()))).nonzero().tolist()
-    found = [
+    limit = min(at_least, float(similarity.max()))
+    duplicates = [
         Duplicate(
             first=first.frames[i].name,
             second=second.frames[j].name,
             similarity=float(similarity[i, j]),
         )
-        for i, j in pairs
+        for i, j in (similarity >= limit).nonzero().tolist()
     ]
-    return sorted(found, key=lambda pair: (-pair.similarity, pair.first, pair.second))
+    return sorted(duplicates, key=lambda pair: (-pair.similarity, pair.first, pair.second))
 
 
 def similarity_matrix(
     first: Dataset, second: Dataset, progress: Progress = iter
 ) -> Float[Tensor, "n m"]:
-    """Largest correlation of fine structure over small shifts and zooms, for every pair.
-
-    Compared are grey thumbnails of each image and of its middle, one a zoom, contrast evened out.
-    """
-    found: list[Float[Tensor, "zooms n rows columns"]] = []
-    blur = nn.AvgPool2d(_BLUR, 1, _BLUR // 2, count_include_pad=False)
-    for images in (first, second):
-        details = []
-        for index in progress(range(len(images))):
-            image = read_image(images.frames[index].left).mean(0, keepdim=True)
-            height, width = image.shape[1:]
-            parts = []
-            for zoom in _ZOOMS:
-                top, left = (round(side * (1 - 1 / zoom) / 2) for side in (height, width))
-                middle = image[:, top : height - top, left : width - left]
-                parts.append(F.interpolate(middle[None], (_ROWS, _COLUMNS), mode="area"))
-            grey = torch.cat(parts)
-            detail = grey - blur(grey)
-            details.append((detail / (blur(detail**2).sqrt() + 0.01))[:, 0])
-        found.append(torch.stack(details, 1))
-    ours, theirs = found
+    """Compute the largest correlation over small shifts and zooms, for every pair of images."""
+    first_details = _read_details(first, progress)
+    second_details = _read_details(second, progress)
     best = torch.full((len(first), len(second)), -1.0)
-    for zoomed in range(len(_ZOOMS)):
-        best = torch.maximum(best, _best_shift(ours[0], theirs[zoomed]))
-        best = torch.maximum(best, _best_shift(theirs[0], ours[zoomed]).T)
+    for zoom in range(len(_ZOOMS)):
+        best = torch.maximum(best, _best_correlation(first_details[0], second_details[zoom]))
+        best = torch.maximum(best, _best_correlation(second_details[0], first_details[zoom]).T)
     return best
 
 
-def _best_shift(
-    ours: Float[Tensor, "n h w"], theirs: Float[Tensor, "m h w"]
+def _read_details(images: Dataset, progress: Progress) -> Float[Tensor, "zooms n rows columns"]:
+    """Read the fine structure of each image and of its middle, one for each zoom.
+
+    These are grey thumbnails minus their local mean, divided by the local deviation.
+    """
+    blur = nn.AvgPool2d(_BLUR, 1, _BLUR // 2, count_include_pad=False)
+    details = []
+    for index in progress(range(len(images))):
+        image = read_image(images.frames[index].left).mean(0, keepdim=True)
+        height, width = image.shape[1:]
+        thumbnails = []
+        for zoom in _ZOOMS:
+            top = round(height * (1 - 1 / zoom) / 2)
+            left = round(width * (1 - 1 / zoom) / 2)
+            middle = image[:, top : height - top, left : width - left]
+            thumbnails.append(F.interpolate(middle[None], (_ROWS, _COLUMNS), mode="area"))
+        grey = torch.cat(thumbnails)
+        detail = grey - blur(grey)
+        deviation = blur(detail**2).sqrt()
+        details.append((detail / (deviation + 0.01))[:, 0])
+    return torch.stack(details, 1)
+
+
+def _best_correlation(
+    first: Float[Tensor, "n rows columns"], second: Float[Tensor, "m rows columns"]
 ) -> Float[Tensor, "n m"]:
-    height, width = _ROWS - 2 * _SHIFT_ROWS, _COLUMNS - 2 * _SHIFT_COLUMNS
-    middle = theirs[:, _SHIFT_ROWS : _SHIFT_ROWS + height, _SHIFT_COLUMNS : _SHIFT_COLUMNS + width]
-    best = torch.full((len(ours), len(theirs)), -1.0)
+    """Compute the largest correlation of each pair over small shifts of the first image."""
+    height = _ROWS - 2 * _SHIFT_ROWS
+    width = _COLUMNS - 2 * _SHIFT_COLUMNS
+    middle = second[:, _SHIFT_ROWS : _SHIFT_ROWS + height, _SHIFT_COLUMNS : _SHIFT_COLUMNS + width]
+    normalised_middle = _normalise(middle)
+    best = torch.full((len(first), len(second)), -1.0)
     for top in range(2 * _SHIFT_ROWS + 1):
         for left in range(2 * _SHIFT_COLUMNS + 1):
-            window = ours[:, top : top + height, left : left + width]
-            one, other = (part.flatten(1) for part in (window, middle))
-            one, other = (part - part.mean(1, keepdim=True) for part in (one, other))
-            lengths = [part.norm(dim=1, keepdim=True).clamp(min=1e-9) for part in (one, other)]
-            best = torch.maximum(best, (one / lengths[0]) @ (other / lengths[1]).T)
+            window = first[:, top : top + height, left : left + width]
+            best = torch.maximum(best, _normalise(window) @ normalised_middle.T)
     return best
+
+
+def _normalise(images: Float[Tensor, "n rows columns"]) -> Float[Tensor, "n pixels"]:
+    """Shift and scale each image to mean 0 and length 1."""
+    pixels = images.flatten(1)
+    pixels = pixels - pixels.mean(1, keepdim=True)
+    return pixels / pixels.norm(dim=1, keepdim=True).clamp(min=1e-9)
 
 
 def main() -> None:
@@ -120,15 +133,22 @@ def main() -> None:
     )
     parser.add_argument("first", type=Path, help="folder of the first set")
     parser.add_argument("second", type=Path, help="folder of the second set")
-    parser.add_argument("--at-least", type=float, default=LEAST, help="least similarity listed")
-    words = parser.parse_args()
-    sets = open_dataset(words.first), open_dataset(words.second)
-    ranked = find_duplicates(*sets, words.at_least, partial(tqdm, unit=" frames", disable=None))
-    rows = [asdict(pair) for pair in ranked if pair.similarity >= words.at_least]
+    parser.add_argument(
+        "--at-least", type=float, default=MIN_SIMILARITY, help="least similarity listed"
+    )
+    options = parser.parse_args()
+    first = open_dataset(options.first)
+    second = open_dataset(options.second)
+    progress = partial(tqdm, unit=" frames", disable=None)
+    duplicates = find_duplicates(first, second, options.at_least, progress)
+    rows = [asdict(pair) for pair in duplicates if pair.similarity >= options.at_least]
     print(markdown_table(rows) if rows else "none")
-    best = f"{ranked[0].first} and {ranked[0].second}, {ranked[0].similarity:.3f}"
-    print(f"{len(sets[0])} x {len(sets[1])} images: {len(rows)} pairs of similarity "
-          f"{words.at_least:g} or more; the most similar: {best}")  # fmt: skip
+    best = duplicates[0]
+    print(
+        f"{len(first)} x {len(second)} images: {len(rows)} pairs of similarity "
+        f"{options.at_least:g} or more; the most similar: {best.first} and {best.second}, "
+        f"{best.similarity:.3f}"
+    )
 
 
 if __name__ == "__main__":

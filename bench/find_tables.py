@@ -6,20 +6,20 @@
 ``--register`` searches by the models alone, without the network. Real frames are those of
 ``bench/real.py``.
 
-A synthetic table has two to all of the objects, each at most once, between other things, with a
-sensor's errors. An instance is to be found if half its silhouette and 200 pixels are visible. Right
-is an answer of that object with ADD (ADD-S where symmetries are declared or were found) below 10 %
-of the diameter; an answer is wrong where neither it nor an alternative that it names fits an
-instance, however occluded. A pile has 20 of one object; of these an instance is to be found if 70 %
-of its silhouette is visible.
+A synthetic table has two to all of the objects, each at most once, between other things; depth has
+a sensor's errors. An instance counts if half its silhouette and 200 pixels are visible. An answer
+is right if ADD (ADD-S where symmetries are declared or were found) to an instance of its object is
+below 10 % of the diameter; it is wrong if neither it nor an alternative that it names is right for
+any instance, however occluded. A pile has 20 of one object; an instance of it counts if 70 % of its
+silhouette is visible.
 """
 
-import argparse
 import time
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
+from shared import make_parser
 
 from depthpose.core.camera import Camera
 from depthpose.core.checkpoint import find_weights
@@ -117,7 +117,7 @@ def count_answers(frame: Frame, estimates: Sequence[PoseEstimate]) -> Row:
         "missed": len(missed),
         "wrong": len(wrong),
         "which": "; ".join(
-            [*(f"missed {name}" for name in missed), *(f"wrong {w}" for w in wrong)]
+            [*(f"missed {name}" for name in missed), *(f"wrong {name}" for name in wrong)]
         ),
     }
 
@@ -131,10 +131,8 @@ def error_in_diameters(pose: Rigid, instance: Instance) -> float:
 
 
 def main() -> None:
-    """Search all frames for their objects, and print what was found."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    """Search all frames for their objects; print the counts of each frame and of all."""
+    parser = make_parser(__doc__)
     parser.add_argument("--weights", nargs="+", default=["parts"])
     parser.add_argument("--register", action="store_true", help="without the network")
     parser.add_argument("--tables", type=int, default=20)
@@ -155,10 +153,9 @@ def main() -> None:
             began_s = time.perf_counter()
             began_cpu_s = time.process_time()
             estimates = estimator.find(frame.depth_m, camera, names)
-            spent = {
-                "s": time.perf_counter() - began_s, "cpu s": time.process_time() - began_cpu_s
-            }  # fmt: skip
-            rows.append({**count_answers(frame, estimates), **spent})
+            wall_s = time.perf_counter() - began_s
+            cpu_s = time.process_time() - began_cpu_s
+            rows.append({**count_answers(frame, estimates), "s": wall_s, "cpu s": cpu_s})
             print(rows[-1], flush=True)
         columns = ("instances", "right", "missed", "wrong", "s", "cpu s")
         total = {column: sum(row[column] for row in rows) for column in columns}

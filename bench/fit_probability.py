@@ -2,19 +2,20 @@
 
     python bench/fit_probability.py [--samples SAMPLES] [--views 20]
 
-Every pose that competes for a view is collected with its evidence, and called right if it is the
-true one up to a near-symmetry. Views: the ten parts of ``twenty_parts.py`` that take part in
+The fit is to all poses that compete for a view, each with its evidence and with whether it is right
+(the true pose up to a near-symmetry). Views: the ten parts of ``twenty_parts.py`` that take part in
 choices, by four simulated sensors; with SAMPLES also the real instances of ``real_poses.py``. The
-shares of the area that contradict a pose, or are not observed, are gamma distributed from view to
-view, so that counts of patches are negative binomial: mean and shape by maximum likelihood.
+share of the area that contradicts a pose, or is not observed, is taken to be gamma distributed from
+view to view, so that counts of patches are negative binomial; mean and shape are fitted by maximum
+likelihood.
 
-Each part, and the real instances, are left out in turn: the range of each coefficient, and how well
-the probability of the best pose predicts whether it is right (mean log loss, and how many of those
-that are given 0.9 and more are right) by the file and by fits without them. The ten parts that are
-held back from choices are judged at the end, by the file and by the fit to all others.
+Printed are the coefficients and their range in fits that leave out one group (a part, or the real
+instances); then how well the probability of the best pose predicts whether it is right: the mean
+log loss, and how many of the poses with a probability of 0.9 and more are right. Each group is
+judged by the file and by the fit without it, the ten parts that are held back from choices by the
+file and by the fit to all others.
 """
 
-import argparse
 import math
 import multiprocessing
 from collections.abc import Callable, Sequence
@@ -25,10 +26,10 @@ from typing import Any
 from unittest.mock import patch
 
 import torch
-from real_poses import RealCase
 from scipy.optimize import minimize
 from score_instances import EXACT, arguments_of, cases, registration_of
 from score_parts import model_of
+from shared import make_parser
 from twenty_parts import PARTS, K, views
 
 from depthpose import Registration
@@ -40,12 +41,13 @@ from depthpose.pose.types import Evidence
 from depthpose.report.page import markdown_table
 
 REAL = "real instances"
-SURE = 0.9
+SURE = 0.9  # least probability of a sure pose
+Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Coefficients:
-    """What is fitted."""
+    """The coefficients that are fitted, as ``pose/probability.py`` has them."""
 
     right_contradicted: GammaShare = probability.RIGHT_CONTRADICTED
     wrong_contradicted: GammaShare = probability.WRONG_CONTRADICTED
@@ -66,48 +68,57 @@ class View:
 
 def main() -> None:
     """Collect, fit, leave out in turn, and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("--samples", type=Path, help="folder with pose/: real instances as well")
     parser.add_argument("--views", type=int, default=20, help="of each part")
     parser.add_argument("--processes", type=int, default=2)
     options = parser.parse_args()
 
-    jobs: list[Callable[[], list[View]]] = [partial(part_views, name, options.views)
-                                            for name in PARTS]  # fmt: skip
+    jobs: list[Callable[[], list[View]]] = []
+    jobs += [partial(part_views, name, options.views) for name in PARTS]
     if options.samples is not None:
         jobs.append(partial(real_views, options.samples))
     with multiprocessing.get_context("spawn").Pool(
         options.processes, initializer=torch.set_num_threads, initargs=(1,)
     ) as pool:
-        collected = [view for part in pool.imap(call, jobs) for view in part]
+        collected = [view for job_views in pool.imap(call, jobs) for view in job_views]
     held_out = [view for view in collected if is_held_out(view)]
     choice = [view for view in collected if not is_held_out(view)]
 
-    # The coefficients, and their range when a group is left out.
     fitted = fit(choice)
-    groups = list(dict.fromkeys(view.group for view in choice))
-    fitted_without = {group: fit([v for v in choice if v.group != group]) for group in groups}
-    rows: list[dict[str, Any]] = []
-    for name in vars(fitted):
-        values = sorted((getattr(other, name) for other in fitted_without.values()), key=mean_of)
-        rows.append({
-            "coefficient": name, "file": format_coefficient(getattr(Coefficients(), name)),
-            "fit": format_coefficient(getattr(fitted, name)),
-            "without a group":
-                f"{format_coefficient(values[0])} to {format_coefficient(values[-1])}",
-        })  # fmt: skip
-    print(markdown_table(rows))
+    groups = dict.fromkeys(view.group for view in choice)
+    fitted_without = {
+        group: fit([view for view in choice if view.group != group]) for group in groups
+    }
+    print(markdown_table(coefficient_rows(fitted, list(fitted_without.values()))))
 
-    # What they predict of views that took no part in the fit.
     left_out = [(view, fitted_without[view.group]) for view in choice]
-    print(markdown_table([
-        row("choice, file", [(view, Coefficients()) for view in choice]),
-        row("choice, each group by the others", left_out),
-        row("held back, file", [(view, Coefficients()) for view in held_out]),
-        row("held back, fit", [(view, fitted) for view in held_out]),
-    ]))  # fmt: skip
+    prediction_rows = [
+        prediction_row("choice, file", [(view, Coefficients()) for view in choice]),
+        prediction_row("choice, each group by the others", left_out),
+        prediction_row("held back, file", [(view, Coefficients()) for view in held_out]),
+        prediction_row("held back, fit", [(view, fitted) for view in held_out]),
+    ]
+    print(markdown_table(prediction_rows))
+
+
+def coefficient_rows(fitted: Coefficients, without_a_group: Sequence[Coefficients]) -> list[Row]:
+    """List the coefficients of the file and of the fit, and their range without a group."""
+    rows: list[Row] = []
+    for name in vars(fitted):
+        values = [getattr(coefficients, name) for coefficients in without_a_group]
+        values.sort(key=mean_of_share)
+        least = format_coefficient(values[0])
+        most = format_coefficient(values[-1])
+        rows.append(
+            {
+                "coefficient": name,
+                "file": format_coefficient(getattr(Coefficients(), name)),
+                "fit": format_coefficient(getattr(fitted, name)),
+                "without a group": f"{least} to {most}",
+            }
+        )
+    return rows
 
 
 def is_held_out(view: View) -> bool:
@@ -126,68 +137,73 @@ def part_views(name: str, number: int) -> list[View]:
     registration = Registration.load(part.as_trimesh(), unit="mm")
     model = model_of(part, is_twin=False)
     seed = 2 * list(PARTS).index(name)
-    return [
-        view_of(name, registration, {"depth": v.depth_m, "mask": v.mask, "camera": K}, v.truth)
-        for v in views(model, number, seed)
-    ]
+    collected = []
+    for view in views(model, number, seed):
+        arguments = {"depth": view.depth_m, "mask": view.mask, "camera": K}
+        collected.append(view_of(name, registration, arguments, view.truth))
+    return collected
 
 
 def real_views(samples: Path) -> list[View]:
     """Collect the real instances."""
-
-    def view(name: str, case: RealCase) -> View:
+    collected = []
+    for name, case in cases(samples).items():
         truth = case.sample.truth.camera_from_model
-        return view_of(REAL, registration_of(samples, name), arguments_of(case, EXACT), truth)
-
-    return [view(name, case) for name, case in cases(samples).items()]
+        registration = registration_of(samples, name)
+        collected.append(view_of(REAL, registration, arguments_of(case, EXACT), truth))
+    return collected
 
 
 def view_of(group: str, registration: Registration, arguments: Any, truth: Rigid) -> View:  # noqa: ANN401
-    """Estimate a view, and collect the poses that compete before their copies do."""
+    """Estimate a view, and collect the poses that compete, before their copies are added."""
     competing: list[Hypothesis] = []
-    share = hypotheses.share_among_poses
+    share_among_poses = hypotheses.share_among_poses
 
     def remember(poses: Sequence[Hypothesis], *, is_masked: bool) -> torch.Tensor:
         competing[:] = poses
-        return share(poses, is_masked=is_masked)
+        return share_among_poses(poses, is_masked=is_masked)
 
     with patch.object(hypotheses, "share_among_poses", remember):
         registration.estimate(**arguments)
     copies = registration._object(registration.objects[0]).prepare().copies
-    alike = Rigid.cat([copies.symmetries, copies.near_copies])
+    symmetries = Rigid.cat([copies.symmetries, copies.near_copies])
     true_pose = truth.double()[None]
-    is_right = [bool(copies.is_same(h.pose, true_pose, alike).any()) for h in competing]
-    return View(group, tuple(h.evidence for h in competing), tuple(is_right))
+    is_right = [
+        bool(copies.is_same(hypothesis.pose, true_pose, symmetries).any())
+        for hypothesis in competing
+    ]
+    evidences = [hypothesis.evidence for hypothesis in competing]
+    return View(group, tuple(evidences), tuple(is_right))
 
 
 def fit(collected: Sequence[View]) -> Coefficients:
     """Fit all coefficients to some views."""
-    labelled = [
-        pair for view in collected for pair in zip(view.evidences, view.is_right, strict=True)
-    ]
-    right = [evidence for evidence, is_right in labelled if is_right]
-    wrong = [evidence for evidence, is_right in labelled if not is_right]
-    has_right = sum(any(view.is_right) for view in collected)
+    right: list[Evidence] = []
+    wrong: list[Evidence] = []
+    for view in collected:
+        for evidence, is_right in zip(view.evidences, view.is_right, strict=True):
+            (right if is_right else wrong).append(evidence)
+    views_with_right = sum(any(view.is_right) for view in collected)
     # The root mean square whose log likelihood is the mean of those of wrong poses.
-    mean_log = sum(math.log(1 + e.rms**2) for e in wrong) / len(wrong)
+    mean_log = sum(math.log(1 + evidence.rms**2) for evidence in wrong) / len(wrong)
     return Coefficients(
-        right_contradicted=fit_share([contradicted(e) for e in right]),
-        wrong_contradicted=fit_share([contradicted(e) for e in wrong]),
-        right_unobserved=fit_share([unobserved(e) for e in right]),
-        wrong_unobserved=fit_share([unobserved(e) for e in wrong]),
+        right_contradicted=fit_share(list(map(contradicted, right))),
+        wrong_contradicted=fit_share(list(map(contradicted, wrong))),
+        right_unobserved=fit_share(list(map(unobserved, right))),
+        wrong_unobserved=fit_share(list(map(unobserved, wrong))),
         wrong_rms=math.sqrt(math.exp(mean_log) - 1),
-        prior_masked=has_right / max(1, len(collected) - has_right),
+        prior_masked=views_with_right / max(1, len(collected) - views_with_right),
     )
 
 
 def contradicted(evidence: Evidence) -> tuple[float, float]:
-    """Give the contradicting patches, and the area in which they may lie."""
+    """Return the contradicting patches, and the area in which they may lie."""
     area = max(LEAST_AREA, evidence.visible)
     return evidence.contradicted, max(LEAST_AREA, area - evidence.unobserved)
 
 
 def unobserved(evidence: Evidence) -> tuple[float, float]:
-    """Give the patches that are not observed, and the area in which they may lie."""
+    """Return the patches that are not observed, and the area in which they may lie."""
     area = max(LEAST_AREA, evidence.visible)
     return evidence.unobserved, max(LEAST_AREA, area - evidence.seen_through - evidence.bulging)
 
@@ -205,7 +221,7 @@ def fit_share(counts: Sequence[tuple[float, float]]) -> GammaShare:
 
 
 def judge(view: View, coefficients: Coefficients) -> tuple[float, bool]:
-    """Give the probability of the best pose, and whether it is right."""
+    """Return the probability of the best pose, and whether it is right."""
     names = {
         "RIGHT_CONTRADICTED": coefficients.right_contradicted,
         "WRONG_CONTRADICTED": coefficients.wrong_contradicted,
@@ -218,26 +234,30 @@ def judge(view: View, coefficients: Coefficients) -> tuple[float, bool]:
     best = max(range(len(log_ratios)), key=log_ratios.__getitem__)
     shares = torch.tensor(log_ratios, dtype=torch.float64).softmax(0)
     log_odds = math.log(coefficients.prior_masked) + log_ratios[best]
-    probable = 1 / (1 + math.exp(-max(-50.0, min(log_odds, 50.0))))
+    log_odds = max(-50.0, min(log_odds, 50.0))
+    probability_of_object = 1 / (1 + math.exp(-log_odds))
     if view.evidences[best].agreement < LEAST_AGREEMENT:
-        probable = 0.0
-    return probable * float(shares[best]), view.is_right[best]
+        probability_of_object = 0.0
+    return probability_of_object * float(shares[best]), view.is_right[best]
 
 
-def row(title: str, judged: Sequence[tuple[View, Coefficients]]) -> dict[str, Any]:
-    """Say how well probabilities predict what is right."""
+def prediction_row(title: str, judged: Sequence[tuple[View, Coefficients]]) -> Row:
+    """Measure how well the probabilities of best poses predict whether they are right."""
     pairs = [judge(view, coefficients) for view, coefficients in judged if view.evidences]
     losses = [-math.log(max(p if is_right else 1 - p, 1e-4)) for p, is_right in pairs]
     sure = [is_right for p, is_right in pairs if p >= SURE]
     return {
-        "views": title, "number": len(pairs), "right": sum(is_right for _, is_right in pairs),
-        "log loss": f"{sum(losses) / len(losses):.3f}", "sure": len(sure),
+        "views": title,
+        "number": len(pairs),
+        "right": sum(is_right for _, is_right in pairs),
+        "log loss": f"{sum(losses) / len(losses):.3f}",
+        "sure": len(sure),
         "sure and right": sum(sure),
-    }  # fmt: skip
+    }
 
 
-def mean_of(value: GammaShare | float) -> float:
-    """Give the mean of a share, or the number itself, to sort by."""
+def mean_of_share(value: GammaShare | float) -> float:
+    """Return the mean of a share, or the number itself, to sort by."""
     return value.mean if isinstance(value, GammaShare) else value
 
 

@@ -3,16 +3,17 @@
     python bench/matchers.py [--data PAIRS] [--weights default kitti-nc] [--number 25] [--threads 2]
 
 Without --data the only pair is Middlebury's Motorcycle, from scikit-image's package. SGBM is given
-the largest true disparity of each pair, ours are not. Methods alternate, pair by pair, in
-one process, so their ratios are valid on a busy machine too.
+the largest true disparity of each pair, ours are not. Methods alternate, pair by pair, in one
+process, so that their ratios are valid on a busy machine too.
 """
 
-import argparse
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 
 import torch
+from indoor import is_outlier
+from shared import make_parser, mean_of
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.camera import StereoRig
@@ -28,7 +29,7 @@ LIMITS_PX = (1.0, 2.0, 3.0)
 
 
 def samples(data: Path | None, number: int) -> Iterator[StereoSample]:
-    """Give pairs with true disparity, spread evenly over a data set."""
+    """Read pairs with true disparity, spread evenly over a data set."""
     if data is None:
         motorcycle = read_motorcycle()
         assert motorcycle is not None, "pip install -e '.[demo]'"
@@ -54,64 +55,74 @@ def sgbm_for(sample: StereoSample) -> FakestereoNet:
     truth_px = sample.truth.disparity_px
     assert truth_px is not None
     camera = sample.input.camera
-    apart_px = camera.cx_right_minus_left_px if isinstance(camera, StereoRig) else 0.0
-    reach_px = float(truth_px[truth_px.isfinite()].max()) + max(apart_px, 0.0)
-    reach = 16 * (int(reach_px) // 16 + 1)
-    config = SGBMConfig(num_disparities=reach, with_filled_holes=True)
+    doffs_px = camera.cx_right_minus_left_px if isinstance(camera, StereoRig) else 0.0
+    largest_px = float(truth_px[truth_px.isfinite()].max()) + max(doffs_px, 0.0)
+    num_disparities = 16 * (int(largest_px) // 16 + 1)
+    config = SGBMConfig(num_disparities=num_disparities, with_filled_holes=True)
     return FakestereoNet.load(matcher="sgbm", config=config)
 
 
 def measure(net: FakestereoNet, sample: StereoSample) -> dict[str, float]:
-    """Match a pair: its errors, and the seconds of this processor."""
+    """Match a pair; return its errors, wall time and CPU time."""
     truth_px = sample.truth.disparity_px
     assert truth_px is not None
-    began, spent = time.perf_counter(), time.process_time()
-    found_px = net.estimate_pair(sample.input, with_check=False).disparity_px
-    seconds = {"wall": time.perf_counter() - began, "cpu": time.process_time() - spent}
-    known = truth_px.isfinite() & (truth_px > 0)
-    error_px = (found_px - truth_px).abs()[known].nan_to_num(torch.inf)
-    shares = {f"off by {px:g} px": float((error_px > px).float().mean()) for px in LIMITS_PX}
-    wrong = (error_px > 3) & (error_px > 0.05 * truth_px[known])
+    start_s = time.perf_counter()
+    start_cpu_s = time.process_time()
+    disparity_px = net.estimate_input(sample.input, with_check=False).disparity_px
+    wall_s = time.perf_counter() - start_s
+    cpu_s = time.process_time() - start_cpu_s
+    has_truth = truth_px.isfinite() & (truth_px > 0)
+    error_px = (disparity_px - truth_px).abs()[has_truth].nan_to_num(torch.inf)
+    wrong = is_outlier(error_px, truth_px[has_truth])
     return {
-        "EPE": float(error_px.mean()), "D1": float(wrong.float().mean()), **shares, **seconds
-    }  # fmt: skip
-
-
-def row(name: str, found: list[dict[str, float]], peer: list[dict[str, float]]) -> dict[str, str]:
-    """Average over pairs; times beside the peer's."""
-    mean = {key: sum(one[key] for one in found) / len(found) for key in found[0]}
-    ratio = sum(one["cpu"] for one in found) / sum(one["cpu"] for one in peer)
-    percents: Mapping[str, str] = {
-        key: f"{100 * value:.1f} %" for key, value in mean.items() if key[0] in "Do"
+        "EPE": float(error_px.mean()),
+        "D1": float(wrong.float().mean()),
+        **{off_by(limit_px): float((error_px > limit_px).float().mean()) for limit_px in LIMITS_PX},
+        "wall": wall_s,
+        "cpu": cpu_s,
     }
+
+
+def off_by(limit_px: float) -> str:
+    """Name the share of pixels whose error is larger than a limit."""
+    return f"off by {limit_px:g} px"
+
+
+def table_row(
+    name: str, pairs: list[dict[str, float]], sgbm_pairs: list[dict[str, float]]
+) -> dict[str, str]:
+    """Average over pairs, and compare the CPU time with SGBM's."""
+    ratio = sum(pair["cpu"] for pair in pairs) / sum(pair["cpu"] for pair in sgbm_pairs)
+    shares = ("D1", *map(off_by, LIMITS_PX))
     return {
-        "method": name, "EPE": f"{mean['EPE']:.2f}", **percents,
-        "seconds": f"{mean['wall']:.2f}", "CPU time / SGBM": f"{ratio:.1f}",
-    }  # fmt: skip
+        "method": name,
+        "EPE": f"{mean_of(pairs, 'EPE'):.2f}",
+        **{share: f"{100 * mean_of(pairs, share):.1f} %" for share in shares},
+        "seconds": f"{mean_of(pairs, 'wall'):.2f}",
+        "CPU time / SGBM": f"{ratio:.1f}",
+    }
 
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--data", type=Path)
     parser.add_argument("--weights", nargs="*", default=["default"])
     parser.add_argument("--number", type=int, default=25)
     parser.add_argument("--threads", type=int, default=2)
-    given = parser.parse_args()
-    torch.set_num_threads(given.threads)
-    nets = make_nets(given.weights)
-    found: dict[str, list[dict[str, float]]] = {name: [] for name in nets}
-    for number, sample in enumerate(samples(given.data, given.number)):
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    nets = make_nets(options.weights)
+    results: dict[str, list[dict[str, float]]] = {name: [] for name in nets}
+    for index, sample in enumerate(samples(options.data, options.number)):
         nets[SGBM] = sgbm_for(sample)
-        if number == 0:
+        if index == 0:  # the first match prepares what later ones reuse
             for net in nets.values():
-                net.estimate_pair(
-                    sample.input, with_check=False
-                )  # the first match makes what later ones reuse
+                net.estimate_input(sample.input, with_check=False)
         for name, net in nets.items():
-            found[name].append(measure(net, sample))
-    peer = found[SGBM]
-    print(markdown_table([row(name, each, peer) for name, each in found.items()]))
+            results[name].append(measure(net, sample))
+    table = [table_row(name, pairs, results[SGBM]) for name, pairs in results.items()]
+    print(markdown_table(table))
 
 
 if __name__ == "__main__":

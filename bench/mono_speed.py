@@ -2,9 +2,9 @@
 
     python bench/mono_speed.py [--weights default] [--precision fp32 bf16] [--device cpu]
 
-The shipped weights and those of full width (random weights: time does not depend on them). Stages,
-memory and operations are of the quick speed, ``fine_s`` is the whole at the fine one.
-Each runs in a separate process, so that peak memory is measured separately.
+The shipped weights, and a network of full width with random weights, on which time does not depend.
+Stages, memory and operations are those of the quick speed; ``fine_s`` is the total at the fine one.
+Each set runs in a process of its own, so that its peak memory is its own.
 """
 
 import argparse
@@ -17,7 +17,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from shared import least_seconds, peak_growth_bytes, report, setting
+from shared import (
+    least_seconds,
+    make_parser,
+    peak_growth_bytes,
+    report,
+    setting,
+    with_cpu_seconds,
+)
 from stereo_speed import peak_flops
 from torch.utils.flop_counter import FlopCounterMode
 
@@ -36,7 +43,7 @@ HEIGHT, WIDTH, FOCAL_PX = 375, 1242, 721.5377
 
 
 def make_net(weights: str, config: MatcherConfig) -> FakestereoNet:
-    """Load a set by name, or build the full width."""
+    """Load a set by name, or build the network of full width."""
     if weights != "full":
         return FakestereoNet.load(find_weights(weights), config=config, allow_ood=True)
     torch.manual_seed(0)
@@ -47,27 +54,27 @@ def make_net(weights: str, config: MatcherConfig) -> FakestereoNet:
 
 
 def street() -> StereoInput:
-    """An image of KITTI's size; what it shows does not matter."""
+    """Make an image of KITTI's size, of noise: time does not depend on what it shows."""
     K = torch.tensor([[FOCAL_PX, 0, 609.6], [0, FOCAL_PX, 172.9], [0, 0, 1]], dtype=torch.float64)
     rig = StereoRig(width=WIDTH, height=HEIGHT, K=K, baseline_m=0.5327)
     image = torch.rand(3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0))
     return StereoInput(name="street", left=image, right=None, camera=rig)
 
 
-def seconds(run: Callable[[], object], device: str) -> float:
-    """Least time of three runs after one to warm up."""
+def warm_seconds(run: Callable[[], object], device: str) -> float:
+    """Measure the least time of three runs after one to warm up [s]."""
 
-    def waited() -> None:
+    def run_and_wait() -> None:
         run()
         if device != "cpu":
             torch.cuda.synchronize()
 
-    waited()
-    return least_seconds(waited, 3)
+    run_and_wait()
+    return least_seconds(run_and_wait, 3)
 
 
 def count_flops(run: Callable[[], object]) -> int:
-    """Count operations of the generator, module by module."""
+    """Count the operations of a call of a network."""
     with FlopCounterMode(display=False) as counter:
         run()
     return counter.get_total_flops()
@@ -81,9 +88,9 @@ def matcher_flops(net: FakestereoNet, height: int, width: int) -> int:
     step = config.step_px
     rows, columns = (max(config.min_side_px, -(-side // step) * step) for side in (height, width))
     with torch.device("meta"):
-        shadow = kind.network(config).eval()
-        views = torch.empty(2, 1, 3, rows, columns)
-        return count_flops(lambda: shadow(views[0], views[1]))
+        network = kind.network(config).eval()
+        left, right = torch.empty(2, 1, 3, rows, columns)
+        return count_flops(lambda: network(left, right))
 
 
 def uses_matcher(net: FakestereoNet) -> bool:
@@ -95,47 +102,54 @@ def uses_matcher(net: FakestereoNet) -> bool:
 
 def run_once(weights: str, precision: str, device: str) -> dict[str, object]:
     """Measure one set in this process."""
-    run: Any = {"precision": precision, "device": device}
-    config = MatcherConfig(**run, speed="quick")
-    net, image = make_net(weights, config), street()
-    began = time.perf_counter()
-    memory = peak_growth_bytes(lambda: net.estimate_pair(image))
-    first = time.perf_counter() - began
+    arguments: Any = {"precision": precision, "device": device}
+    image = street()
+    net = make_net(weights, MatcherConfig(**arguments, speed="quick"))
+    start_s = time.perf_counter()
+    memory = peak_growth_bytes(lambda: net.estimate_input(image))
+    first_s = time.perf_counter() - start_s
     if device != "cpu":
         memory = torch.cuda.max_memory_allocated()
+    quick_s = warm_seconds(lambda: net.estimate_input(image), device)
+    fine_net = make_net(weights, MatcherConfig(**arguments))
+    fine_s = warm_seconds(lambda: fine_net.estimate_input(image), device)
+
     assert net.synthesiser is not None
     assert image.camera is not None
     draw = net.synthesiser.draw
     size = size_at_focal_length(image.camera, net.synthesiser.config.virtual_focal_px)
     left = resize_image(image.left, *size)
     right = draw(left[None]).right[0]
-    whole_s = seconds(lambda: net.estimate_pair(image), device)
-    fine = make_net(weights, MatcherConfig(**run))
-    fine_s = seconds(lambda: fine.estimate_pair(image), device)
-    drawing = count_flops(lambda: draw(left[None]))
-    matching = matcher_flops(net, *size) if uses_matcher(net) else 0
-    peak = peak_flops(torch.bfloat16 if precision == "bf16" else torch.float32)
-    matcher = net.matcher
+    draw_s = warm_seconds(lambda: draw(left[None]), device)
+    draw_flops = count_flops(lambda: draw(left[None]))
     match_s = 0.0
+    match_flops = 0
+    matcher = net.matcher
     if matcher is not None and uses_matcher(net):
-        match_s = seconds(lambda: matcher.match(left, right), device)
+        match_s = warm_seconds(lambda: matcher.match(left, right), device)
+        match_flops = matcher_flops(net, *size)
+
+    share_of_peak = None
+    if device == "cpu":
+        peak = peak_flops(torch.bfloat16 if precision == "bf16" else torch.float32)
+        share_of_peak = (draw_flops + match_flops) / quick_s / peak
     return {
         "set": weights,
         "precision": precision,
-        "seconds": whole_s,
+        "seconds": quick_s,
         "fine_s": fine_s,
-        "first_s": first,
-        "draw_s": seconds(lambda: draw(left[None]), device),
+        "first_s": first_s,
+        "draw_s": draw_s,
         "match_s": match_s,
         "memory_mb": memory / 1e6,
-        "draw_gflop": drawing / 1e9,
-        "match_gflop": matching / 1e9,
-        "share_of_peak": (drawing + matching) / whole_s / peak if device == "cpu" else None,
+        "draw_gflop": draw_flops / 1e9,
+        "match_gflop": match_flops / 1e9,
+        "share_of_peak": share_of_peak,
     }
 
 
 def compare(names: list[str], runs: int = 6) -> list[dict[str, object]]:
-    """Alternate in one process, one thread; processor time is valid on a busy machine too."""
+    """Measure the least processor time of sets that alternate in one process, on one thread."""
     torch.set_num_threads(1)
     image = street()
     speeds: tuple[Speed, ...] = ("quick", "fine")
@@ -144,21 +158,20 @@ def compare(names: list[str], runs: int = 6) -> list[dict[str, object]]:
         for name in names
         for speed in speeds
     }
-    times: dict[tuple[str, str], list[float]] = {each: [] for each in nets}
+    times_s: dict[tuple[str, str], list[float]] = {key: [] for key in nets}
     for _ in range(runs):
-        for each, net in nets.items():
-            begin = time.process_time()
-            net.estimate_pair(image)
-            times[each].append(time.process_time() - begin)
+        for key, net in nets.items():
+            _, cpu_s = with_cpu_seconds(lambda net=net: net.estimate_input(image))
+            times_s[key].append(cpu_s)
     return [
-        {"set": Path(name).stem, "speed": speed, "processor_s": min(found)}
-        for (name, speed), found in times.items()
+        {"set": Path(name).stem, "speed": speed, "processor_s": min(times)}
+        for (name, speed), times in times_s.items()
     ]
 
 
 def main() -> None:
     """Run each set of weights in a separate process and print a table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser = make_parser(__doc__)
     parser.add_argument("--weights", nargs="+", default=["default", "full"])
     parser.add_argument("--precision", nargs="+", default=["fp32", "bf16"])
     parser.add_argument("--device", default="cpu")
@@ -179,8 +192,8 @@ def main() -> None:
         for precision in options.precision:
             command = [sys.executable, __file__, "--device", options.device]
             command += ["--child", weights, precision]
-            done = subprocess.run(command, check=True, capture_output=True, text=True)
-            rows.append(json.loads(done.stdout.splitlines()[-1]))
+            process = subprocess.run(command, check=True, capture_output=True, text=True)
+            rows.append(json.loads(process.stdout.splitlines()[-1]))
     print(f"{setting()}, {WIDTH}x{HEIGHT}")
     report("mono_speed", rows)
 

@@ -1,4 +1,4 @@
-"""Random parts, and what is not a known object and may be taken for it: for benches and tests."""
+"""Random parts, and things that may be taken for a known object, for benches and tests."""
 
 import dataclasses
 import math
@@ -29,17 +29,18 @@ from depthpose.pose.types import ObjectModel
 NegativeKind = Literal[
     "another object", "scaled", "mirrored", "blob", "plate", "box or cylinder", "ball", "hand"
 ]
-"""What a negative is."""
-SCALES = (0.8, 0.9, 1.1, 1.25)
-"""Of a scaled copy."""
+"""A kind of thing that is not the object that is searched for."""
+SCALES = (0.8, 0.9, 1.1, 1.25)  # of a scaled copy
 _SIZES = (0.5, 1.1)
-"""Of what has no model, in diameters of the object that is searched for."""
+"""Of a negative that is no changed model, in diameters of the object."""
 
 
 def negative_kinds(model: ObjectModel) -> tuple[NegativeKind, ...]:
     """List what is a negative of an object: its mirror image only where it differs from it."""
     kinds: tuple[NegativeKind, ...] = get_args(NegativeKind)
-    return tuple(k for k in kinds if k != "mirrored" or mirror_deviation(model) > MIRROR_ALIKE)
+    if mirror_deviation(model) > MIRROR_ALIKE:
+        return kinds
+    return tuple(kind for kind in kinds if kind != "mirrored")
 
 
 def negative_of(
@@ -49,37 +50,40 @@ def negative_of(
     generator: torch.Generator,
     scale: float | None = None,
 ) -> ObjectModel:
-    """Make something that is not an object, and bears its name.
+    """Make a negative of an object, with the object's name.
 
     Args:
         model: the object that is searched for.
         kind: of negative.
         others: objects of which another one is taken; where there is none, one of our parts.
-        generator: of the chance.
+        generator: of random choices.
         scale: of a scaled copy; None: one of :data:`SCALES`.
     """
     if kind == "another object":
-        known = [other for other in others if other.name != model.name]
-        if not known:
-            known = [make_part(name) for name in PARTS if name != model.name]
-        return dataclasses.replace(known[random_index(generator, len(known))], name=model.name)
+        candidates = [other for other in others if other.name != model.name]
+        if not candidates:
+            candidates = [make_part(name) for name in PARTS if name != model.name]
+        other = candidates[random_index(generator, len(candidates))]
+        return dataclasses.replace(other, name=model.name)
     if kind == "scaled":
         return scaled(model, scale or SCALES[random_index(generator, len(SCALES))])
-    return mirrored(model) if kind == "mirrored" else _solid(model, kind, generator)
+    if kind == "mirrored":
+        return mirrored(model)
+    return _solid(model, kind, generator)
 
 
-def scaled(model: ObjectModel, times: float) -> ObjectModel:
-    """Make an object so many times as large."""
+def scaled(model: ObjectModel, scale: float) -> ObjectModel:
+    """Scale an object."""
     return dataclasses.replace(
         model,
-        vertices_m=times * model.vertices_m,
-        keypoints_m=times * model.keypoints_m,
-        diameter_m=times * model.diameter_m,
+        vertices_m=scale * model.vertices_m,
+        keypoints_m=scale * model.keypoints_m,
+        diameter_m=scale * model.diameter_m,
     )
 
 
 def mirrored(model: ObjectModel) -> ObjectModel:
-    """Mirror an object across the plane through the origin that x is normal to."""
+    """Mirror an object across the plane x = 0."""
     flip = torch.tensor([-1.0, 1.0, 1.0])
     return dataclasses.replace(
         model,
@@ -95,10 +99,11 @@ def _solid(model: ObjectModel, kind: NegativeKind, generator: torch.Generator) -
 
     mesh: Any
     size_m = model.diameter_m * uniform(generator, *_SIZES)
-    flat, thin = uniform(generator, 0.3, 1.0), uniform(generator, 0.3, 1.0)
+    width_m = uniform(generator, 0.3, 1.0) * size_m
+    height_m = uniform(generator, 0.3, 1.0) * size_m
     match kind:
         case "plate":
-            mesh = trimesh.creation.box((size_m, flat * size_m, 0.01 * size_m))
+            mesh = trimesh.creation.box((size_m, width_m, 0.01 * size_m))
         case "ball":
             mesh = trimesh.creation.icosphere(3, 0.5 * size_m)
         case "blob":
@@ -107,19 +112,20 @@ def _solid(model: ObjectModel, kind: NegativeKind, generator: torch.Generator) -
         case "hand":
             mesh = _hand(size_m, generator)
         case _ if random_index(generator, 2):
-            mesh = trimesh.creation.box((size_m, flat * size_m, thin * size_m))
+            mesh = trimesh.creation.box((size_m, width_m, height_m))
         case _:
-            mesh = trimesh.creation.cylinder(0.5 * flat * size_m, size_m, 32)
-    vertices_m, faces = torch.tensor(mesh.vertices), torch.tensor(mesh.faces)
+            mesh = trimesh.creation.cylinder(0.5 * width_m, size_m, 32)
+    vertices_m = torch.tensor(mesh.vertices)
+    faces = torch.tensor(mesh.faces)
     return make_model(vertices_m, faces, name=model.name, number=model.number)
 
 
 def _bumps(points: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
-    """Give a factor for the radius at each point, by a few waves over the directions."""
-    way = torch.nn.functional.normalize(points.double(), dim=-1)
+    """Compute a factor for the radius at each point: a sum of waves over the directions."""
+    direction = torch.nn.functional.normalize(points.double(), dim=-1)
     waves = 2 * torch.randn(6, 3, generator=generator).double()
     phases = 2 * math.pi * torch.rand(6, generator=generator).double()
-    return 1 + 0.12 * (way @ waves.T + phases).sin().sum(-1, keepdim=True)
+    return 1 + 0.12 * (direction @ waves.T + phases).sin().sum(-1, keepdim=True)
 
 
 def _hand(size_m: float, generator: torch.Generator) -> Any:  # noqa: ANN401  trimesh's types
@@ -131,11 +137,11 @@ def _hand(size_m: float, generator: torch.Generator) -> Any:  # noqa: ANN401  tr
     for k in range(5):
         length = size_m * uniform(generator, 0.25, 0.5)
         finger = trimesh.creation.capsule(length, size_m * uniform(generator, 0.04, 0.07))
-        spread = random_rotation(generator)
-        near = torch.eye(3) + 0.6 * (spread - torch.eye(3))
-        u, _, vh = torch.linalg.svd(near)
-        at = torch.tensor([0.1 * (k - 2), 0.2, 0.0]) * size_m
-        pose = Rigid((u @ vh).double(), at.double())
+        # The rotation that is nearest to a mixture of the identity and a random one.
+        mixture = torch.eye(3) + 0.6 * (random_rotation(generator) - torch.eye(3))
+        u, _, vh = torch.linalg.svd(mixture)
+        position_m = torch.tensor([0.1 * (k - 2), 0.2, 0.0]) * size_m
+        pose = Rigid((u @ vh).double(), position_m.double())
         pieces.append(finger.apply_transform(pose.matrix().numpy()))
     return trimesh.util.concatenate(pieces)
 
@@ -171,8 +177,11 @@ def random_simple_part(generator: torch.Generator, name: str = "part") -> Object
         name: what samples call it.
     """
     width, depth, length = (uniform(generator, 20.0, 90.0) for _ in range(3))
-    wall, bore = uniform(generator, 3.0, 10.0), uniform(generator, 0.3, 0.9)
-    foot, web, edge = box((width, wall, length)), box((wall, depth, length)), (width - wall) / 2
+    wall = uniform(generator, 3.0, 10.0)
+    bore = uniform(generator, 0.3, 0.9)
+    foot = box((width, wall, length))
+    web = box((wall, depth, length))
+    edge = (width - wall) / 2
     left, middle, right = (moved(web, (x, depth / 2, 0.0)) for x in (-edge, 0.0, edge))
     solids = [
         box((width, depth, length)),
@@ -194,10 +203,14 @@ def _cup(radius: float, height: float, wall: float) -> Mesh:
 
 
 def _random_solid(generator: torch.Generator) -> Mesh:
-    kind, height = random_index(generator, 3), uniform(generator, 10.0, 90.0)
+    """Make a box, a tube or a cone."""
+    kind = random_index(generator, 3)
+    height = uniform(generator, 10.0, 90.0)
     if kind == 0:
         return box((uniform(generator, 4.0, 80.0), uniform(generator, 4.0, 60.0), height))
-    low, high = uniform(generator, 3.0, 35.0), uniform(generator, 3.0, 35.0)
+    lower_radius = uniform(generator, 3.0, 35.0)
+    upper_radius = uniform(generator, 3.0, 35.0)
     if kind == 1:
-        return ring(circle(low), circle(uniform(generator, 0.2, 0.8) * low), height)
-    return revolved([(0.0, 0.0), (low, 0.0), (high, height), (0.0, height)])
+        bore = uniform(generator, 0.2, 0.8) * lower_radius
+        return ring(circle(lower_radius), circle(bore), height)
+    return revolved([(0.0, 0.0), (lower_radius, 0.0), (upper_radius, height), (0.0, height)])

@@ -4,14 +4,13 @@
         [--pictures FOLDER ...]
 
 Streets: KITTI's, KITTI-360's and those of six cameras of another car (DGP), with their own focal
-lengths. Unlike: pictures of scikit-image, scikit-learn and matplotlib, and of folders, and their
-quarters and strips, indoor pictures, noise, one colour, gradients, text, shapes; streets turned,
-mirrored vertically, in inverted colours, cut to the part above the horizon, or enlarged four times,
-all with an unchanged focal length. Prints a confusion table by kinds, and writes what was measured
-of each image to images.json.
+lengths. Other images: pictures of scikit-image, scikit-learn and matplotlib, and of folders, and
+their quarters and strips; indoor pictures, noise, one colour, gradients, text, shapes; streets
+rotated, mirrored vertically, in inverted colours, cut to the part above the horizon, or enlarged
+four times, all with an unchanged focal length. Prints how many of each kind are refused, and writes
+the confidence of each image to images.json.
 """
 
-import argparse
 import dataclasses
 import importlib.util
 import json
@@ -24,6 +23,7 @@ import numpy as np
 import skimage.data
 import torch
 from PIL import Image, ImageDraw, ImageFont
+from shared import group_rows, make_parser
 from torch import Tensor
 
 from depthpose.core.camera import Camera
@@ -40,23 +40,25 @@ TRAINED = ("street_pairs/kitti2015_train_drives", "street_pairs/kitti_object_mor
            "street_pairs/kitti_single", "more/kitti_road", "more/kitti_object_csc420",
            "more/kitti_single_more")  # fmt: skip
 """Pairs of KITTI's training drives: the limit of `kitti-nc` was chosen on them."""
-OF_EVALUATION = ("train_000007", "train_000008", "train_000009", "train_000010", "train_000013")
-"""Frames among them that are of evaluation drives."""
-KEPT_BACK = ("street_pairs/kitti2015_eval_drives", "street_pairs/kitti_raw_0056",
+EVALUATION_FRAMES = ("train_000007", "train_000008", "train_000009", "train_000010", "train_000013")
+"""Frames of the folders above that belong to evaluation drives."""
+EVALUATION = ("street_pairs/kitti2015_eval_drives", "street_pairs/kitti_raw_0056",
              "more/kitti_road_unknown_drive")  # fmt: skip
 FOCAL_0052_PX = 721.5377
 PICTURES = ("astronaut", "brick", "camera", "cat", "cell", "checkerboard", "clock", "coffee",
             "coins", "grass", "gravel", "horse", "hubble_deep_field", "immunohistochemistry",
             "logo", "moon", "page", "retina", "rocket", "text")  # fmt: skip
-PHONE = 0.8
-"""Focal length of images without one, in widths."""
+USUAL_FOCAL_LENGTH = 0.8
+"""Of an image of unknown focal length, in its longer side: that of a phone."""
+MAX_SIDE_PX = 1300
+Row = dict[str, Any]
 KITTI360_PX = 552.55
 
 
-def given(name: str, image: Tensor, focal_px: float | None = None) -> StereoInput:
+def with_camera(name: str, image: Tensor, focal_px: float | None = None) -> StereoInput:
     """Make an input whose optical axis goes through its centre."""
     height, width = image.shape[1:]
-    f = PHONE * max(height, width) if focal_px is None else focal_px
+    f = USUAL_FOCAL_LENGTH * max(height, width) if focal_px is None else focal_px
     K = torch.tensor([[f, 0, (width - 1) / 2], [0, f, (height - 1) / 2], [0, 0, 1]]).double()
     return StereoInput(
         name=name, left=image, right=None, camera=Camera(width=width, height=height, K=K)
@@ -67,75 +69,87 @@ def dgp(folder: Path) -> Iterator[StereoInput]:
     """Read the pictures of scenes in DGP's layout, with their intrinsics."""
     for scene in sorted(folder.glob("scene_*")):
         (calibration,) = scene.glob("calibration/*.json")
-        facts = json.loads(calibration.read_text())
-        focal_px = {n: k["fx"] for n, k in zip(facts["names"], facts["intrinsics"], strict=True)}
+        cameras = json.loads(calibration.read_text())
+        intrinsics = dict(zip(cameras["names"], cameras["intrinsics"], strict=True))
         for path in sorted(scene.glob("rgb/*/*.jpg")):
-            yield given(path.stem, read_image(path), focal_px[path.parent.name])
+            focal_px = intrinsics[path.parent.name]["fx"]
+            yield with_camera(path.stem, read_image(path), focal_px)
 
 
 def pairs(samples: Path, folders: tuple[str, ...]) -> Iterator[tuple[str, StereoInput]]:
-    """Give the left images of folders of pairs, with their source."""
+    """Read the left images of folders of pairs, with their source."""
     for folder in folders:
         dataset = open_dataset(samples / "depth" / folder)
         for index in range(len(dataset)):
             image = dataset.read_input(index)
-            is_kept = folder in KEPT_BACK or image.name in OF_EVALUATION
-            yield f"KITTI, {'evaluation' if is_kept else 'training'} drives", image
+            is_evaluation = folder in EVALUATION or image.name in EVALUATION_FRAMES
+            yield f"KITTI, {'evaluation' if is_evaluation else 'training'} drives", image
 
 
 def streets(samples: Path) -> Iterator[tuple[str, StereoInput]]:
-    """Give real streets, with their source."""
-    yield from pairs(samples, TRAINED + KEPT_BACK)
+    """Read real streets, with their source."""
+    yield from pairs(samples, TRAINED + EVALUATION)
     for path in sorted((samples / "depth/kitti_raw").glob("*/*_drive_0052_sync/image_02/data/*")):
-        yield "KITTI, evaluation drives", given(path.stem, read_image(path), FOCAL_0052_PX)
+        yield "KITTI, evaluation drives", with_camera(path.stem, read_image(path), FOCAL_0052_PX)
     for path in sorted((samples / "depth/more/kitti360/left").glob("*")):
-        yield "KITTI-360", given(path.stem, read_image(path), KITTI360_PX)
+        yield "KITTI-360", with_camera(path.stem, read_image(path), KITTI360_PX)
     for image in dgp(samples / "depth/more/tri_dgp"):
         yield "DGP, six cameras", image
 
 
 def picture(name: str) -> Tensor:
-    """Give a picture of scikit-image in RGB."""
-    found = np.asarray(getattr(skimage.data, name)())
-    found = found.astype(np.uint8) * (255 if found.dtype == bool else 1)
-    rgb = np.repeat(found[..., None], 3, 2) if found.ndim == 2 else found[..., :3]
+    """Read a picture of scikit-image in RGB."""
+    pixels = np.asarray(getattr(skimage.data, name)())
+    pixels = pixels.astype(np.uint8) * (255 if pixels.dtype == bool else 1)
+    rgb = np.repeat(pixels[..., None], 3, 2) if pixels.ndim == 2 else pixels[..., :3]
     return torch.from_numpy(rgb.copy()).permute(2, 0, 1).float() / 255
 
 
-def others() -> Iterator[tuple[str, Tensor]]:
-    """Give the pictures that scikit-learn and matplotlib bring along, as far as they are there."""
+def package_pictures() -> Iterator[tuple[str, Tensor]]:
+    """Read the pictures in scikit-learn and matplotlib, where these are installed."""
     for package, pattern in (("sklearn", "datasets/images/*.jpg"),
                              ("matplotlib", "mpl-data/sample_data/*.jpg")):  # fmt: skip
-        found = importlib.util.find_spec(package)
-        if found is not None and found.origin is not None:
-            for path in sorted(Path(found.origin).parent.glob(pattern)):
+        spec = importlib.util.find_spec(package)
+        if spec is not None and spec.origin is not None:
+            for path in sorted(Path(spec.origin).parent.glob(pattern)):
                 yield path.stem, read_image(path)
 
 
 def shapes() -> Iterator[tuple[str, Tensor]]:
-    """Give noise, one colour, gradients, text, checks, stripes and polygons."""
+    """Generate noise, one colour, gradients, text, checks, stripes and polygons."""
     rng = np.random.default_rng(5)
-    for number in range(16):
-        height, width = ((375, 1242), (480, 640), (900, 1600), (640, 480))[number % 4]
-        rough = torch.from_numpy(rng.random((3, height // (1 + number % 4), width // 4))).float()
-        yield "white noise", resize_image(rough, height, width)
-        frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)[None])
-        size = 1 / np.maximum(frequency, 1 / max(height, width)) ** rng.uniform(0.6, 2.2)
-        waves = [size * np.exp(2j * np.pi * rng.random(size.shape)) for _ in range(3)]
-        cloud = np.stack([np.fft.irfft2(wave, (height, width)) for wave in waves])
-        cloud = (cloud - cloud.mean()) / cloud.std() * 0.18 + 0.5
-        yield "fractal noise", torch.from_numpy(cloud.clip(0, 1)).float()
-        one, other = torch.from_numpy(rng.random((2, 3, 1, 1))).float()
-        yield "one colour", one.expand(3, height, width).contiguous()
-        row, column = torch.linspace(0, 1, height)[:, None], torch.linspace(0, 1, width)
-        fade = (row if number % 2 else column).expand(height, width)
-        yield "gradients", torch.lerp(one, other, fade)
+    for index in range(16):
+        height, width = ((375, 1242), (480, 640), (900, 1600), (640, 480))[index % 4]
+        coarse = torch.from_numpy(rng.random((3, height // (1 + index % 4), width // 4))).float()
+        yield "white noise", resize_image(coarse, height, width)
+        yield "fractal noise", fractal_noise(rng, height, width)
+        first, second = torch.from_numpy(rng.random((2, 3, 1, 1))).float()
+        yield "one colour", first.expand(3, height, width).contiguous()
+        downward = torch.linspace(0, 1, height)[:, None]
+        rightward = torch.linspace(0, 1, width)
+        weight = (downward if index % 2 else rightward).expand(height, width)
+        yield "gradients", torch.lerp(first, second, weight)
         side = int(rng.integers(8, 80))
-        v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-        check = (v // side + (u // side if number % 2 else 0)) % 2
-        yield "checks and stripes", torch.lerp(one, other, check.float())
-        for kind, drawn in (("polygons", polygons(rng, height, width)), ("text", text(rng))):
-            yield kind, torch.from_numpy(np.array(drawn)).permute(2, 0, 1).float() / 255
+        row, column = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+        is_second = (row // side + (column // side if index % 2 else 0)) % 2
+        yield "checks and stripes", torch.lerp(first, second, is_second.float())
+        yield "polygons", as_tensor(polygons(rng, height, width))
+        yield "text", as_tensor(text(rng))
+
+
+def fractal_noise(rng: np.random.Generator, height: int, width: int) -> Tensor:
+    """Generate noise whose amplitude falls with a random power of the frequency."""
+    frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)[None])
+    amplitude = 1 / np.maximum(frequency, 1 / max(height, width)) ** rng.uniform(0.6, 2.2)
+    waves = [amplitude * np.exp(2j * np.pi * rng.random(amplitude.shape)) for _ in range(3)]
+    noise = np.stack([np.fft.irfft2(wave, (height, width)) for wave in waves])
+    noise = (noise - noise.mean()) / noise.std() * 0.18 + 0.5
+    return torch.from_numpy(noise.clip(0, 1)).float()
+
+
+def as_tensor(image: Image.Image) -> Tensor:
+    """Turn an RGB image into a tensor (3, height, width) from 0 to 1."""
+    return torch.from_numpy(np.array(image)).permute(2, 0, 1).float() / 255
 
 
 def polygons(rng: np.random.Generator, height: int, width: int) -> Image.Image:
@@ -164,12 +178,12 @@ def text(rng: np.random.Generator) -> Image.Image:
 
 
 def changed(street: StereoInput) -> Iterator[tuple[str, StereoInput]]:
-    """Give a street as no camera of a car sees it."""
+    """Change a street to images that no camera of a car takes."""
     assert street.camera is not None
     image, focal_px = street.left, float(street.camera.K[0, 0])
     height, width = image.shape[1:]
     middle = image[:, height * 3 // 8 : height * 5 // 8, width * 3 // 8 : width * 5 // 8]
-    for kind, made in (
+    for kind, changed_image in (
         ("streets turned by 90 degrees", image.rot90(1, (1, 2))),
         ("streets turned by 180 degrees", image.rot90(2, (1, 2))),
         ("streets mirrored vertically", image.flip(1)),
@@ -178,119 +192,136 @@ def changed(street: StereoInput) -> Iterator[tuple[str, StereoInput]]:
         ("streets above the horizon", image[:, : height * 7 // 20]),
         ("streets enlarged four times", middle),
     ):
-        yield kind, given(street.name, made.contiguous(), focal_px)
+        yield kind, with_camera(street.name, changed_image.contiguous(), focal_px)
 
 
 def whole_pictures(folders: list[Path]) -> Iterator[tuple[str, str, Tensor]]:
-    """Give the pictures of packages and of folders: source, name, RGB."""
+    """Read the pictures of packages and of folders: source, name, RGB."""
     for name in PICTURES:
         yield "scikit-image", name, picture(name)
-    for name, whole in others():
-        yield "other packages", name, whole
+    for name, image in package_pictures():
+        yield "other packages", name, image
     for folder in folders:
         paths = (path for path in folder.rglob("*") if path.suffix in (".jpg", ".jpeg", ".png"))
         for path in sorted(paths):
-            yield folder.name, path.stem, small(read_image(path))
+            yield folder.name, path.stem, shrunk(read_image(path))
 
 
-def parts(whole: Tensor) -> Iterator[tuple[str, Tensor]]:
-    """Give a picture, its quarters, and a strip through its middle, as wide as KITTI's images."""
-    yield "pictures", whole
-    height, width = whole.shape[1:]
+def parts(picture: Tensor) -> Iterator[tuple[str, Tensor]]:
+    """Cut a picture: all of it, a strip of the proportions of KITTI's images, its quarters."""
+    yield "pictures", picture
+    height, width = picture.shape[1:]
     rows = width * 3 // 10
     if rows < height:
-        yield "strips", whole[:, (height - rows) // 2 :][:, :rows].contiguous()
+        top = (height - rows) // 2
+        yield "strips", picture[:, top : top + rows].contiguous()
     for k in range(4):
-        down, right = k // 2 * (height // 2), k % 2 * (width // 2)
-        part = whole[:, down : down + height // 2, right : right + width // 2]
+        top, left = k // 2 * (height // 2), k % 2 * (width // 2)
+        part = picture[:, top : top + height // 2, left : left + width // 2]
         yield "quarters", part.contiguous()
 
 
-def unlike(samples: Path, folders: list[Path]) -> Iterator[tuple[str, StereoInput]]:
-    """Give images that are no street, or a street as no camera of a car sees it."""
-    for source, name, whole in whole_pictures(folders):
-        for kind, part in parts(whole):
-            yield f"{kind}, {source}", given(name, part)
+def other_images(samples: Path, folders: list[Path]) -> Iterator[tuple[str, StereoInput]]:
+    """Read and generate images that are no street, or no street as the camera of a car sees it."""
+    for source, name, image in whole_pictures(folders):
+        for kind, part in parts(image):
+            yield f"{kind}, {source}", with_camera(name, part)
     for path in sorted((samples / "depth/middlebury").glob("*/*/im0.png")):
-        yield "indoors", given(path.parent.name, read_image(path))
+        yield "indoors", with_camera(path.parent.name, read_image(path))
     for path in sorted((samples / "pose").glob("*/test/**/rgb/*")):
-        yield "indoors", given(path.stem, read_image(path), 570.0)
+        yield "indoors", with_camera(path.stem, read_image(path), 570.0)
     for kind, image in shapes():
-        yield kind, given(kind, image)
+        yield kind, with_camera(kind, image)
     for index, (_, street) in enumerate(pairs(samples, TRAINED)):
         if index % 6 == 0:
             yield from changed(street)
 
 
-def small(image: Tensor) -> Tensor:
-    """Bring a picture to 1300 px at most."""
+def shrunk(image: Tensor) -> Tensor:
+    """Resize a picture whose longer side is more than 1300 px."""
     height, width = image.shape[1:]
-    share = min(1300 / max(height, width), 1)
-    return resize_image(image, round(height * share), round(width * share))
+    scale = min(MAX_SIDE_PX / max(height, width), 1)
+    return resize_image(image, round(height * scale), round(width * scale))
 
 
-def look_at(weights: str, samples: Path, folders: list[Path]) -> Iterator[dict[str, Any]]:
-    """Give what decides on each image, and whether it is refused."""
+def judge_images(weights: str, samples: Path, folders: list[Path]) -> Iterator[Row]:
+    """Estimate each image; yield its confidence, and whether it is refused."""
     config = MatcherConfig(speed="quick")
     net = FakestereoNet.load(weights, allow_ood=True, config=config)
-    for is_street, images in ((True, streets(samples)), (False, unlike(samples, folders))):
+    for is_street, images in ((True, streets(samples)), (False, other_images(samples, folders))):
         for kind, image in images:
-            found = net.estimate_pair(dataclasses.replace(image, right=None))
+            estimate = net.estimate_input(dataclasses.replace(image, right=None))
             yield {
-                "weights": weights, "images": kind, "street": is_street, "name": image.name,
-                "confidence": found.image_confidence, "refused": bool(found.warning),
-            }  # fmt: skip
+                "weights": weights,
+                "images": kind,
+                "street": is_street,
+                "name": image.name,
+                "confidence": estimate.image_confidence,
+                "refused": bool(estimate.warning),
+            }
 
 
-def measure(looks: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Give, for each kind of image and of all, how many are refused."""
-    looks = looks + [
-        one | {"images": "all streets" if one["street"] else "all others"} for one in looks
+def summary(images: list[Row]) -> list[Row]:
+    """Count the refused images of each kind, and of all streets and all others."""
+    in_all = [
+        image | {"images": "all streets" if image["street"] else "all others"} for image in images
     ]
-    kinds = dict.fromkeys((one["weights"], one["images"], one["street"]) for one in looks)
     rows = []
-    for weights, kind, is_street in kinds:
-        mine = [one for one in looks if (one["weights"], one["images"]) == (weights, kind)]
-        confidence = [one["confidence"] for one in mine]
-        rows.append({
-            "weights": weights, "images": kind, "street": is_street, "number": len(mine),
-            "refused": sum(one["refused"] for one in mine),
-            "least": min(confidence), "median": float(np.median(confidence)),
-            "most": max(confidence),
-        })  # fmt: skip
+    groups = group_rows(images + in_all, "weights", "images", "street")
+    for (weights, kind, is_street), group in groups.items():
+        confidence = [image["confidence"] for image in group]
+        rows.append(
+            {
+                "weights": weights,
+                "images": kind,
+                "street": is_street,
+                "number": len(group),
+                "refused": sum(image["refused"] for image in group),
+                "least": min(confidence),
+                "median": float(np.median(confidence)),
+                "most": max(confidence),
+            }
+        )
     return rows
 
 
-def indoors(weights: str) -> dict[str, Any]:
-    """Give the error on Middlebury's Motorcycle, an indoor scene, and whether it is refused."""
+def measure_motorcycle(weights: str) -> Row:
+    """Measure the error on Middlebury's Motorcycle, an indoor scene, and the warning about it."""
     sample = read_motorcycle()
     assert sample is not None
     truth_m = sample.truth.depth_m
     net = FakestereoNet.load(weights, allow_ood=True)
-    found = net.estimate_pair(dataclasses.replace(sample.input, right=None))
+    estimate = net.estimate_input(dataclasses.replace(sample.input, right=None))
     assert truth_m is not None
-    assert found.depth_m is not None
-    ratio = (found.depth_m / truth_m)[truth_m.isfinite() & found.depth_m.isfinite()]
-    error = {"AbsRel": float((ratio - 1).abs().mean()), "median ratio": float(ratio.median())}
-    return {"weights": weights, "image": "Motorcycle, 2 to 5 m", **error, "said": found.warning}
+    assert estimate.depth_m is not None
+    is_measured = truth_m.isfinite() & estimate.depth_m.isfinite()
+    ratio = (estimate.depth_m / truth_m)[is_measured]
+    return {
+        "weights": weights,
+        "image": "Motorcycle, 2 to 5 m",
+        "AbsRel": float((ratio - 1).abs().mean()),
+        "median ratio": float(ratio.median()),
+        "said": estimate.warning,
+    }
 
 
 def main() -> None:
     """Measure each set of weights; write the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser = make_parser(__doc__)
     parser.add_argument("--samples", type=Path, required=True)
     parser.add_argument("--pictures", type=Path, nargs="*", default=[])
     parser.add_argument("--weights", nargs="+", default=["default", "kitti-nc"])
     parser.add_argument("--out", type=Path, default=Path("out/bench/out_of_distribution"))
     options = parser.parse_args()
-    looks = [one for weights in options.weights
-             for one in look_at(weights, options.samples, options.pictures)]  # fmt: skip
+    images: list[Row] = []
+    for weights in options.weights:
+        images += judge_images(weights, options.samples, options.pictures)
     options.out.mkdir(parents=True, exist_ok=True)
-    (options.out / "images.json").write_text(json.dumps(looks, indent=0))
-    rows = measure(looks)
+    (options.out / "images.json").write_text(json.dumps(images, indent=0))
+    rows = summary(images)
     write_table(options.out, rows, name="out_of_distribution")
     print(markdown_table(rows))
-    print(markdown_table([indoors(weights) for weights in options.weights]))
+    print(markdown_table([measure_motorcycle(weights) for weights in options.weights]))
 
 
 if __name__ == "__main__":

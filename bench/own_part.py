@@ -4,12 +4,11 @@
     depthpose pose train --cad valve.stl --unit mm --out my_part
     python bench/own_part.py valve.stl --weights my_part/pose.safetensors
 
-Overlapping solids, as in many CAD files; 125 mm across, without symmetry. With ``--weights`` the
-part is posed in the held-out views of the training: by the network, without it (registration), and
-by registration where the network refuses.
+The part consists of overlapping solids, as many CAD files do; it is 125 mm across and has no
+symmetry. With ``--weights`` it is posed in the held-out views of the training: by the network, by
+registration, and by registration only where the network refuses.
 """
 
-import argparse
 import dataclasses
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 import trimesh
+from shared import make_parser
 
 from depthpose.core.config import read_config
 from depthpose.pose.config import EstimateConfig
@@ -32,7 +32,7 @@ CONFIG = Path(__file__).parents[1] / "configs/pose/own-part.yaml"
 
 
 def valve() -> Any:  # noqa: ANN401 - a Trimesh, which trimesh types as Geometry
-    """A foot, a body upright on it, an outlet to one side, a lug and a stem off the middle."""
+    """Make a foot with an upright body, an outlet to one side, a lug and a stem off the middle."""
 
     def box(size_mm: tuple[float, float, float], at_mm: tuple[float, float, float]) -> object:
         solid = trimesh.creation.box(size_mm)
@@ -72,36 +72,43 @@ def measure(weights: PoseWeights, number: int) -> list[dict[str, Any]]:
         views = held_out_objects(weights.models, config.objects, weights.cloud, held_out, share)
         samples = [views.view(index) for index in range(len(views))]
         for name, method in methods.items():
-            found = method.estimate_many([sample.input for sample in samples])
+            estimates = method.estimate_many([sample.input for sample in samples])
             errors = [
-                add_error(one.camera_from_model, sample.truth.camera_from_model, weights.models[0])
-                for one, sample in zip(found, samples, strict=True)
-                if one.is_posed
+                add_error(
+                    estimate.camera_from_model, sample.truth.camera_from_model, weights.models[0]
+                )
+                for estimate, sample in zip(estimates, samples, strict=True)
+                if estimate.is_posed
             ]
-            right = sum(e < SUCCESS_SHARE for e in errors)
-            rows.append({
-                "occluded": share, "method": name, "views": len(views),
-                "right": right / len(views), "wrong": (len(errors) - right) / len(views),
-                "refused": 1 - len(errors) / len(views),
-            })  # fmt: skip
+            right = sum(error < SUCCESS_SHARE for error in errors)
+            rows.append(
+                {
+                    "occluded": share,
+                    "method": name,
+                    "views": len(views),
+                    "right": right / len(views),
+                    "wrong": (len(errors) - right) / len(views),
+                    "refused": 1 - len(errors) / len(views),
+                }
+            )
     return rows
 
 
 def main() -> None:
     """Write the part, or measure weights of it."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser = make_parser(__doc__)
     parser.add_argument("file", type=Path)
     parser.add_argument("--weights", help="of the part, trained by configs/pose/own-part.yaml")
     parser.add_argument("--number", type=int, default=500, help="of views at each occlusion")
-    words = parser.parse_args()
-    if words.weights:
+    options = parser.parse_args()
+    if options.weights:
         torch.set_num_threads(1)
-        print(markdown_table(measure(read_pose_weights(words.weights), words.number)))
+        print(markdown_table(measure(read_pose_weights(options.weights), options.number)))
         return
-    words.file.parent.mkdir(parents=True, exist_ok=True)
+    options.file.parent.mkdir(parents=True, exist_ok=True)
     mesh = valve()
-    mesh.export(words.file)
-    print(f"{words.file}: {len(mesh.faces)} faces, {np.round(mesh.extents, 1)} mm")
+    mesh.export(options.file)
+    print(f"{options.file}: {len(mesh.faces)} faces, {np.round(mesh.extents, 1)} mm")
 
 
 if __name__ == "__main__":

@@ -2,24 +2,26 @@
 
     python bench/pair_pose.py [--scenes 3] [--weights default] [--pictures FOLDER]
 
-Each scene has the five synthetic parts on a table that is seen from above at a slant. It is drawn
-for a rig of 5 cm in infrared (848x480, as of a RealSense D435, without and with its projector) and
-for one of 12 cm in colour (1280x720, as of a ZED), with textured parts and with plain grey ones.
-Pairs are matched, depth that is less sure than 0.5 is left out, and registration poses each part
-with its exact mask; so it does on the depth of a sensor like an active stereo camera, which is
-simulated on the exact depth of the same views. A pose is right where ADD-S is below a tenth of the
-diameter. Wrong and ``ok`` are the answers that a robot would trust.
+Each scene has the five synthetic parts on a table, seen obliquely from above. It is rendered for a
+rig with a baseline of 5 cm in infrared (848x480, like a RealSense D435, without and with its
+projector) and for one of 12 cm in colour (1280x720, like a ZED), with textured parts and with plain
+grey ones.
+
+Pairs are matched, depth with a confidence below 0.5 is left out, and registration poses each part
+with its exact mask. For comparison it does so on the depth of an active stereo camera, which is
+simulated from the exact depth of the same views. A pose is right if its ADD-S is below a tenth of
+the diameter. The answers that are wrong and ``ok`` are those that a robot would trust.
 """
 
-import argparse
 import math
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from shared import group_rows, make_parser, with_cpu_seconds
 from torch import Tensor
 
 from depthpose.core.camera import StereoRig
@@ -43,11 +45,13 @@ from depthpose.pose.synthetic.views import draw_view, make_shape, random_rotatio
 from depthpose.pose.types import ViewInput
 from depthpose.report.page import markdown_table
 
-MIN_CONFIDENCE = 0.5
-"""As ``pose predict --left`` has it by default."""
+MIN_CONFIDENCE = 0.5  # the default of ``pose predict --left``
 DRAWN_BASELINE_M = 0.5
-"""Scenes are drawn so much larger that light and textures have their usual sizes."""
+"""Scenes are enlarged to this baseline, so that light and textures have their usual sizes."""
+MASK_TOLERANCE_M = 1e-3
+SURFACE_POINTS = 2000  # of each part, by which ADD-S is measured
 PAIR, SENSOR = "pair", "depth sensor"
+Row = dict[str, Any]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +78,7 @@ LOOKS = ("textured", "grey", "grey, projector")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TableScene:
-    """A drawn pair, its exact depth, and what lies on the table."""
+    """A rendered pair, its exact depth, and the poses and visible pixels of the parts."""
 
     rig: StereoRig
     left: Tensor
@@ -85,51 +89,41 @@ class TableScene:
 
 
 def place_parts(rng: np.random.Generator, rig: Rig) -> tuple[dict[str, Rigid], np.ndarray]:
-    """Lay the parts on a plane; give their poses, and the plane's axes and origin as (4, 3)."""
+    """Lay the parts on a plane; return their poses, and the plane's axes and origin as (4, 3)."""
     generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
     distance_m = float(rng.uniform(*rig.distance_m))
     tilt = math.radians(rng.uniform(20, 55))
-    # Out of the table, towards the camera, and the two axes in it.
+    # The normal of the table points to the camera; ``right`` and ``ahead`` lie in the table.
     normal = np.array([0.0, -math.sin(tilt), -math.cos(tilt)])
     right = np.array([1.0, 0, 0])
     ahead = np.cross(right, normal)
     origin = np.array([0.0, 0, distance_m])
     poses = {}
-    for name, angle in zip(rng.permutation(PARTS), np.arange(5) * 2 * np.pi / 5, strict=True):
+    angles = np.arange(5) * 2 * np.pi / 5
+    for name, angle in zip(rng.permutation(PARTS), angles, strict=True):
         model = make_part(str(name))
         R = random_rotation(generator).numpy()
         lowest_m = float((model.vertices_m.numpy() @ R.T @ normal).min())
         radius_m = rng.uniform(0.11, 0.14)
-        at = origin + radius_m * (np.cos(angle) * right + np.sin(angle) * ahead)
-        t_m = at - lowest_m * normal
+        position_m = origin + radius_m * (np.cos(angle) * right + np.sin(angle) * ahead)
+        t_m = position_m - lowest_m * normal
         poses[str(name)] = Rigid(torch.from_numpy(R).double(), torch.from_numpy(t_m).double())
     return poses, np.stack([right, ahead, normal, origin])
 
 
 def draw_table(number: int, rig: Rig, look: str) -> TableScene:
-    """Draw scene ``number`` for a rig."""
+    """Render scene ``number`` for a rig."""
     rng = np.random.default_rng([57, number, rig.columns])
     poses, (right, ahead, _, origin) = place_parts(rng, rig)
     scale = DRAWN_BASELINE_M / rig.baseline_m
     builder = MeshBuilder(rng)
-    tops = ("wood", "stone", "concrete", "brick")
-    top = Surface(tops[number % len(tops)], (0.5, 0.45, 0.4), 0.4 * scale, number)
+    materials = ("wood", "stone", "concrete", "brick")
+    material = materials[number % len(materials)]
+    table = Surface(material, (0.5, 0.45, 0.4), 0.4 * scale, number)
     corner = (origin - 3 * (right + ahead)) * scale
-    builder.rectangle(corner, 6 * scale * right, 6 * scale * ahead, top)
+    builder.rectangle(corner, 6 * scale * right, 6 * scale * ahead, table)
     for name, pose in poses.items():
-        builder.thing += 1
-        model = make_part(name)
-        local_m = model.vertices_m.double().numpy()[model.faces.numpy()]
-        corners = (local_m @ pose.R.numpy().T + pose.t_m.numpy()) * scale
-        surface = Surface("paint", (0.35, 0.35, 0.37), 10 * scale, 0)
-        if look == "textured":
-            surface = Surface("stone", (0.6, 0.55, 0.5), 0.06 * scale, builder.thing)
-        # A texture lies on the faces as seen along the axis that they face most.
-        normals = np.cross(local_m[:, 1] - local_m[:, 0], local_m[:, 2] - local_m[:, 0])
-        along = np.abs(normals).argmax(1)
-        across = np.array([[1, 2], [0, 2], [0, 1]])[along]
-        uv = np.take_along_axis(local_m, across[:, None, :].repeat(3, 1), 2) * scale
-        builder.triangles(corners, uv, surface)
+        add_part(builder, name, pose, scale, is_textured=look == "textured")
     scene = StreetScene(
         mesh=builder.finish(),
         markings=Markings(
@@ -150,37 +144,62 @@ def draw_table(number: int, rig: Rig, look: str) -> TableScene:
         )
     config = StreetsConfig(jpeg_share=0.0, rectification_error_px=0.1)
     frame = draw_scene(scene, drawn, config, (57, number), projector)
-    views = [frame.left, frame.right]
+    left, right = frame.left, frame.right
     if rig.is_infrared:
-        views = [view.mean(0, keepdim=True).expand(3, -1, -1) for view in views]
+        left, right = grey(left), grey(right)
     depth_m = frame.depth_m.double() / scale
     return TableScene(
         rig=replace(drawn, baseline_m=rig.baseline_m),
-        left=views[0].contiguous(),
-        right=views[1].contiguous(),
+        left=left.contiguous(),
+        right=right.contiguous(),
         depth_m=depth_m,
         poses=poses,
         masks={name: mask_of(name, pose, K, depth_m) for name, pose in poses.items()},
     )
 
 
+def grey(image: Tensor) -> Tensor:
+    """Average the colours of an image."""
+    return image.mean(0, keepdim=True).expand(3, -1, -1)
+
+
+def add_part(
+    builder: MeshBuilder, name: str, pose: Rigid, scale: float, *, is_textured: bool
+) -> None:
+    """Add a part to a scene that is enlarged by ``scale``."""
+    builder.thing += 1
+    surface = Surface("paint", (0.35, 0.35, 0.37), 10 * scale, 0)
+    if is_textured:
+        surface = Surface("stone", (0.6, 0.55, 0.5), 0.06 * scale, builder.thing)
+    model = make_part(name)
+    triangles_m = model.vertices_m.double().numpy()[model.faces.numpy()]
+    corners = (triangles_m @ pose.R.numpy().T + pose.t_m.numpy()) * scale
+    # A texture is projected along the axis that a face is most perpendicular to.
+    first, second, third = triangles_m.transpose(1, 0, 2)
+    normals = np.cross(second - first, third - first)
+    main_axis = np.abs(normals).argmax(1)
+    other_axes = np.array([[1, 2], [0, 2], [0, 1]])[main_axis]
+    uv = np.take_along_axis(triangles_m, other_axes[:, None, :].repeat(3, 1), 2) * scale
+    builder.triangles(corners, uv, surface)
+
+
 def mask_of(name: str, pose: Rigid, K: Tensor, depth_m: Tensor) -> Tensor:
-    """Give the pixels in which a part is seen."""
-    view = draw_view(make_shape(make_part(name)), pose, K.double())
-    left, top = (K.double()[:2, 2] - view.K[:2, 2]).round().long().tolist()
-    height, width = view.depth_m.shape
+    """Compute the pixels in which a part is visible."""
+    part = draw_view(make_shape(make_part(name)), pose, K.double())
+    left, top = (K.double()[:2, 2] - part.K[:2, 2]).round().long().tolist()
+    height, width = part.depth_m.shape
     rows = slice(max(top, 0), min(top + height, depth_m.shape[0]))
     columns = slice(max(left, 0), min(left + width, depth_m.shape[1]))
-    alone_m = view.depth_m[
+    part_m = part.depth_m[
         rows.start - top : rows.stop - top, columns.start - left : columns.stop - left
     ]
     mask = torch.zeros(depth_m.shape, dtype=torch.bool)
-    mask[rows, columns] = (alone_m - depth_m[rows, columns]).abs() < 1e-3
+    mask[rows, columns] = (part_m - depth_m[rows, columns]).abs() < MASK_TOLERANCE_M
     return mask
 
 
-def scenes(number: int) -> Iterator[tuple[str, str, int, TableScene]]:
-    """Draw every scene for every rig and look."""
+def table_scenes(number: int) -> Iterator[tuple[str, str, int, TableScene]]:
+    """Render every scene for every rig and look."""
     for rig in RIGS:
         for look in LOOKS:
             if look.endswith("projector") and not rig.is_infrared:
@@ -189,90 +208,139 @@ def scenes(number: int) -> Iterator[tuple[str, str, int, TableScene]]:
                 yield rig.name, look, index, draw_table(index, rig, look)
 
 
-def matched_depth(net: FakestereoNet, scene: TableScene) -> tuple[Tensor, Tensor, float]:
-    """Match a scene; give the depth that is sure, its deviation, and the share left out."""
+def match_table(net: FakestereoNet, scene: TableScene) -> tuple[Tensor, Tensor, float]:
+    """Match a scene; return its sure depth, the deviation of depth, and the share left out."""
     pair = StereoInput(name="table", left=scene.left, right=scene.right, camera=scene.rig)
-    found = net.estimate_pair(pair, with_check=False)
-    assert found.depth_m is not None
-    assert found.confidence is not None
-    is_sure = found.is_sure(MIN_CONFIDENCE)
-    deviation_m = depth_deviation(found.depth_m, found.confidence, scene.rig)
-    left_out = 1 - float(is_sure.float().mean())
-    return found.depth_m.where(is_sure, torch.nan), deviation_m, left_out
+    estimate = net.estimate_input(pair, with_check=False)
+    assert estimate.depth_m is not None
+    assert estimate.confidence is not None
+    is_sure = estimate.is_sure(MIN_CONFIDENCE)
+    deviation_m = depth_deviation(estimate.depth_m, estimate.confidence, scene.rig)
+    share_left_out = 1 - float(is_sure.float().mean())
+    return estimate.depth_m.where(is_sure, torch.nan), deviation_m, share_left_out
+
+
+def sense_table(scene: TableScene, seed: int) -> Tensor:
+    """Simulate the depth [m] that an active stereo camera measures of a scene."""
+    generator = torch.Generator().manual_seed(seed)
+    focal_px = float(scene.rig.K[0, 0])
+    sensor = SyntheticSensorConfig(kinds=("active stereo",))
+    return simulate_depth(scene.depth_m.float(), (focal_px, focal_px), sensor, generator)
+
+
+def pose_part(
+    registration: Registration, surface_m: Tensor, scene: TableScene, name: str, depth_m: Tensor
+) -> Row:
+    """Pose a part by measured depth; return the errors of its pose and of the depth in its mask."""
+    mask = scene.masks[name]
+    view = ViewInput(name=name, depth_m=depth_m.float(), mask=mask, K=scene.rig.K, object=name)
+    (estimate,) = registration.estimate_many([view])
+    error = math.inf
+    if estimate.camera_from_model is not None:
+        error_m = adds_m(estimate.camera_from_model.double(), scene.poses[name], surface_m)
+        error = float(error_m) / make_part(name).diameter_m
+    depth_error_m = (depth_m - scene.depth_m)[mask]
+    has_depth = depth_error_m.isfinite()
+    median_error_m = None
+    if bool(has_depth.any()):
+        median_error_m = float(depth_error_m[has_depth].abs().median())
+    return {
+        "part": name,
+        "status": estimate.status,
+        "error": error,
+        "is right": error < SUCCESS_SHARE,
+        "seen": float(has_depth.float().mean()),
+        "off": median_error_m,
+    }
+
+
+def measure_table(
+    net: FakestereoNet, registration: Registration, surfaces_m: dict[str, Tensor],
+    scene: TableScene, seed: int,
+) -> list[Row]:  # fmt: skip
+    """Pose the parts of a scene by the depth of the pair and by that of the sensor."""
+    (pair_m, deviation_m, share_left_out), cpu_s = with_cpu_seconds(lambda: match_table(net, scene))
+    rows: list[Row] = []
+    for kind, depth_m in ((PAIR, pair_m), (SENSOR, sense_table(scene, seed))):
+        for name, mask in scene.masks.items():
+            row = {
+                "depth": kind,
+                **pose_part(registration, surfaces_m[name], scene, name, depth_m),
+                "left out": None,
+                "seconds": cpu_s,
+                "told": None,
+            }
+            if kind == PAIR:
+                has_depth = mask & depth_m.isfinite()
+                row["left out"] = share_left_out
+                if bool(has_depth.any()):
+                    row["told"] = float(deviation_m[has_depth].median())
+            rows.append(row)
+    return rows
+
+
+def print_poses(title: str, rows: list[Row]) -> None:
+    """Print the poses by the depth of a pair."""
+    pair_rows = [row for row in rows if row["depth"] == PAIR]
+    right = sum(row["is right"] for row in pair_rows)
+    parts = [f"{row['part']} {row['status']} {row['error']:.3f}" for row in pair_rows]
+    print(f"{title}: right {right} of 5, {'; '.join(parts)}", flush=True)
+
+
+def summary(rows: list[Row]) -> list[dict[str, str]]:
+    """Average over the scenes of each rig, look and kind of depth."""
+    table = []
+    for (rig, look, kind), group in group_rows(rows, "rig", "look", "depth").items():
+        is_right = [row["is right"] for row in group]
+        is_ok = [row["status"] == "ok" for row in group]
+        right_and_ok = [right and ok for right, ok in zip(is_right, is_ok, strict=True)]
+        errors_m = [row["off"] for row in group if row["off"] is not None]
+        deviations_m = [row["told"] for row in group if row["told"] is not None]
+        deviation_mm = f"{1000 * np.median(deviations_m):.1f}" if deviations_m else ""
+        table.append(
+            {
+                "rig": rig,
+                "parts": look,
+                "depth": kind,
+                "poses": str(len(group)),
+                "right": f"{100 * np.mean(is_right):.0f} %",
+                "right and ok": f"{100 * np.mean(right_and_ok):.0f} %",
+                "wrong and ok": str(sum(is_ok) - sum(right_and_ok)),
+                "refused": str(sum(row["error"] == math.inf for row in group)),
+                "seen of the mask": f"{100 * np.mean([row['seen'] for row in group]):.0f} %",
+                "median error of depth [mm]": f"{1000 * np.median(errors_m):.1f}",
+                "its deviation as told [mm]": deviation_mm,
+            }
+        )
+    return table
 
 
 def main() -> None:
     """Print a table of rigs, looks and kinds of depth."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--scenes", type=int, default=3)
     parser.add_argument("--weights", default="default")
     parser.add_argument("--pictures", type=Path, help="write the left views here")
     parser.add_argument("--out", type=Path)
-    given = parser.parse_args()
+    options = parser.parse_args()
     torch.set_num_threads(1)
-    net = FakestereoNet.load(given.weights, config=MatcherConfig(speed="fine"))
+    net = FakestereoNet.load(options.weights, config=MatcherConfig(speed="fine"))
     models = {name: make_part(name) for name in PARTS}
-    surfaces = {name: sample_surface(model, 2000)[0] for name, model in models.items()}
-    parts = Registration(list(models.values()))
-    results = []
-    for rig, look, index, scene in scenes(given.scenes):
-        if given.pictures is not None:
-            write_image(given.pictures / f"{rig} {look} {index}.png".replace(",", ""), scene.left)
-        began = time.process_time()
-        pair_m, deviation_m, left_out = matched_depth(net, scene)
-        seconds = time.process_time() - began
-        generator = torch.Generator().manual_seed(index)
-        focal_px = float(scene.rig.K[0, 0])
-        sensor = SyntheticSensorConfig(kinds=("active stereo",))
-        sensed_m = simulate_depth(scene.depth_m.float(), (focal_px, focal_px), sensor, generator)
-        for kind, depth_m in ((PAIR, pair_m), (SENSOR, sensed_m)):
-            for name, mask in scene.masks.items():
-                view = ViewInput(
-                    name=name, depth_m=depth_m.float(), mask=mask, K=scene.rig.K, object=name
-                )
-                (found,) = parts.estimate_many([view])
-                error = math.inf
-                if found.camera_from_model is not None:
-                    true = scene.poses[name]
-                    error_m = adds_m(found.camera_from_model.double(), true, surfaces[name])
-                    error = float(error_m) / models[name].diameter_m
-                error_z_m = (depth_m - scene.depth_m)[mask]
-                known = error_z_m.isfinite()
-                results.append({
-                    "rig": rig, "look": look, "depth": kind, "part": name, "status": found.status,
-                    "error": error, "is right": error < SUCCESS_SHARE,
-                    "seen": float(known.float().mean()),
-                    "off": float(error_z_m[known].abs().median()) if bool(known.any()) else None,
-                    "left out": left_out if kind == PAIR else None, "seconds": seconds,
-                    "told": float(deviation_m[mask][known].median())
-                    if kind == PAIR and bool(known.any()) else None,
-                })  # fmt: skip
-        of_pair = [r for r in results[-10:] if r["depth"] == PAIR]
-        print(
-            f"{rig}, {look}, {index}: right {sum(r['is right'] for r in of_pair)} of 5, "
-            + "; ".join(f"{r['part']} {r['status']} {r['error']:.3f}" for r in of_pair),
-            flush=True,
-        )
-    rows = []
-    for key in dict.fromkeys((r["rig"], r["look"], r["depth"]) for r in results):
-        chosen = [r for r in results if (r["rig"], r["look"], r["depth"]) == key]
-        off = [r["off"] for r in chosen if r["off"] is not None]
-        told = [r["told"] for r in chosen if r["told"] is not None]
-        rows.append({
-            "rig": key[0], "parts": key[1], "depth": key[2], "poses": str(len(chosen)),
-            "right": f"{100 * np.mean([r['is right'] for r in chosen]):.0f} %",
-            "right and ok":
-                f"{100 * np.mean([r['is right'] and r['status'] == 'ok' for r in chosen]):.0f} %",
-            "wrong and ok": str(sum(not r["is right"] and r["status"] == "ok" for r in chosen)),
-            "refused": str(sum(r["error"] == math.inf for r in chosen)),
-            "seen of the mask": f"{100 * np.mean([r['seen'] for r in chosen]):.0f} %",
-            "median error of depth [mm]": f"{1000 * np.median(off):.1f}",
-            "its deviation as told [mm]": f"{1000 * np.median(told):.1f}" if told else "",
-        })  # fmt: skip
-    print(markdown_table(rows))
-    if given.out is not None:
-        refusals = {math.inf: None}
-        write_json(given.out, [{k: refusals.get(v, v) for k, v in r.items()} for r in results])
+    surfaces_m = {name: sample_surface(model, SURFACE_POINTS)[0] for name, model in models.items()}
+    registration = Registration(list(models.values()))
+    rows: list[Row] = []
+    for rig, look, index, scene in table_scenes(options.scenes):
+        if options.pictures is not None:
+            file_name = f"{rig} {look} {index}.png".replace(",", "")
+            write_image(options.pictures / file_name, scene.left)
+        scene_rows = measure_table(net, registration, surfaces_m, scene, index)
+        print_poses(f"{rig}, {look}, {index}", scene_rows)
+        rows += [{"rig": rig, "look": look, **row} for row in scene_rows]
+    print(markdown_table(summary(rows)))
+    if options.out is not None:
+        for row in rows:
+            row["error"] = None if row["error"] == math.inf else row["error"]
+        write_json(options.out, rows)
 
 
 if __name__ == "__main__":

@@ -1,29 +1,29 @@
-"""Clouds that do not show the requested object: shares ``ok``, ambiguous, identity confirmed.
+"""Views that do not show the requested object: how often the answer is ok, ambiguous, confirmed.
 
     python bench/pose_negatives.py --weights parts ycb linemod.safetensors --number 40
 
 Eight kinds of negatives, ``--number`` of each: another object of the weights (or one of our parts,
-if they have one only), copies scaled by 0.8, 0.9, 1.1 and 1.25 (``--number`` each), mirrored ones,
-blobs, plates, boxes and cylinders, balls, and hands of capsules. The mirror image of
-an object that it deviates from by 3 % of the diameter at most is no negative: "mirror image alike".
-Views are rendered like held-out ones, half of them with up to a half occluded. Also the objects
-themselves, four times as many: right is an ADD (to the nearest symmetric pose) below 10 % of
-the diameter. ``--seed`` draws other views.
-Each is a depth image with a mask; ``--clouds`` gives the points in the mask alone.
-``--method register`` registers the objects without a network, ``both`` what the network doubts.
-``--save`` writes fit and signals as JSON; then nothing is refused for its fit.
+if they have only one), copies scaled by 0.8, 0.9, 1.1 and 1.25 (``--number`` each), mirror images,
+blobs, plates, boxes and cylinders, balls, and hands of capsules. A mirror image that deviates from
+the object by at most 3 % of the diameter is no negative and counted apart ("mirror image alike").
+For comparison also the objects themselves, four times as many: right is an ADD (to the nearest
+symmetric pose) below 10 % of the diameter.
+
+Views are rendered like held-out ones, half of them with up to a half occluded; ``--seed`` draws
+others. Each is a depth image with a mask; with ``--clouds`` only the points in the mask are given.
+``--method register`` registers the objects without a network, ``both`` only where the network
+refuses. ``--save`` writes status and evidence as JSON; then nothing is refused for its fit.
 """
 
-import argparse
 import dataclasses
 import json
-import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, cast, get_args
 
 import torch
 from negatives import SCALES, NegativeKind, negative_of
+from shared import make_parser, with_cpu_seconds
 
 from depthpose.core.checkpoint import find_weights
 from depthpose.core.loop import sample_generator
@@ -38,13 +38,14 @@ from depthpose.pose.types import CloudSample, ObjectModel, ViewSample
 from depthpose.report.page import markdown_table
 
 SEED = 0x0DD
-TOGETHER = 32
+BATCH_SIZE = 32
+RIGHT = 0.1  # largest error of a right answer, in diameters
 ITSELF = "itself"
 ALIKE = "mirror image alike"
 Row = dict[str, Any]
 
 
-def seen(
+def render_views(
     models: Sequence[ObjectModel], seed: int, with_scene: bool
 ) -> Iterator[CloudSample | ViewSample]:
     """Render each of some models once: a depth image and a mask, or the cloud of the mask alone."""
@@ -56,26 +57,24 @@ def seen(
     return (objects.view(k) if with_scene else objects[k] for k in range(len(models)))
 
 
-def things(
-    known: Sequence[ObjectModel], kind: str, number: int, seed: int
-) -> tuple[list[ObjectModel], list[int]]:
-    """Give the model in view, and the number of the requested object."""
-    generator = sample_generator(sum(map(ord, kind)), seed)
-    asked = [k % len(known) for k in range(number)]
-    models = [known[k] for k in asked]
+def models_in_view(
+    requested: Sequence[ObjectModel], kind: str, objects: Sequence[ObjectModel], seed: int
+) -> list[ObjectModel]:
+    """Make the model that is in view for each requested object: itself or a negative of it."""
     if kind == ITSELF:
-        return models, asked
-    name, _, times = kind.partition(" by ")
-    scale = float(times) if times else None
-    found: Any = name
-    return [negative_of(m, found, known, generator, scale) for m in models], asked
+        return list(requested)
+    generator = sample_generator(sum(map(ord, kind)), seed)
+    name, _, factor = kind.partition(" by ")
+    scale = float(factor) if factor else None
+    negative_kind = cast(NegativeKind, name)
+    return [negative_of(model, negative_kind, objects, generator, scale) for model in requested]
 
 
-def kinds() -> Iterator[str]:
-    """Give the name of the model in view."""
+def negative_kinds() -> Iterator[str]:
+    """List the kinds of negatives, each scale by itself."""
     for kind in get_args(NegativeKind):
         if kind == "scaled":
-            yield from (f"scaled by {times}" for times in SCALES)
+            yield from (f"scaled by {scale}" for scale in SCALES)
         else:
             yield kind
 
@@ -84,50 +83,60 @@ def measure(
     net: PoseEstimator, kind: str, number: int, seed: int, with_scene: bool = True
 ) -> list[Row]:
     """Estimate every negative of a kind, or the objects themselves."""
-    models, asked = things(net.models, kind, number, seed)
-    samples = list(seen(models, seed, with_scene))
-    starts = range(0, len(samples), TOGETHER)
-    parts = ([sample.input for sample in samples[k : k + TOGETHER]] for k in starts)
-    estimates = [estimate for part in parts for estimate in net.estimate_many(part)]
+    requested = [net.models[k % len(net.models)] for k in range(number)]
+    models = models_in_view(requested, kind, net.models, seed)
+    samples = list(render_views(models, seed, with_scene))
+    inputs = [sample.input for sample in samples]
+    estimates = []
+    for start in range(0, len(inputs), BATCH_SIZE):
+        estimates += net.estimate_many(inputs[start : start + BATCH_SIZE])
     rows = []
-    for sample, which, found in zip(samples, asked, estimates, strict=True):
-        error = add_error(
-            found.camera_from_model, sample.truth.camera_from_model, net.models[which]
+    for sample, model, estimate in zip(samples, requested, estimates, strict=True):
+        error = add_error(estimate.camera_from_model, sample.truth.camera_from_model, model)
+        is_alike = kind == "mirrored" and mirror_deviation(model) <= MIRROR_ALIKE
+        rows.append(
+            {
+                "kind": ALIKE if is_alike else kind,
+                "object": sample.input.object,
+                "status": estimate.status,
+                "right": kind == ITSELF and error < RIGHT,
+                "evidence": estimate.evidence and vars(estimate.evidence),
+                "identity": estimate.identity and estimate.identity.status,
+                "hidden": 1 - (sample.truth.visible_fraction or 0.0),
+            }
         )
-        is_right = kind == ITSELF and error < 0.1
-        is_alike = kind == "mirrored" and mirror_deviation(net.models[which]) <= MIRROR_ALIKE
-        rows.append({
-            "kind": ALIKE if is_alike else kind, "object": sample.input.object,
-            "status": found.status,
-            "right": is_right, "evidence": found.evidence and vars(found.evidence),
-            "identity": found.identity and found.identity.status,
-            "hidden": 1 - (sample.truth.visible_fraction or 0.0),
-        })  # fmt: skip
     return rows
 
 
-def groups(rows: Sequence[Row]) -> list[list[Row]]:
-    """Part the rows of one kind: mirror images that are nearly the object are no negatives."""
-    parts = [[row for row in rows if (row["kind"] == ALIKE) == alike] for alike in (True, False)]
-    return [part for part in parts if part]
+def without_alike(rows: Sequence[Row]) -> list[list[Row]]:
+    """Separate mirror images that are nearly the object: they are no negatives."""
+    alike = [row for row in rows if row["kind"] == ALIKE]
+    others = [row for row in rows if row["kind"] != ALIKE]
+    return [group for group in (alike, others) if group]
 
 
 def summary(rows: Sequence[Row]) -> Row:
     """Count answers."""
-    ok = sum(row["status"] == "ok" for row in rows)
-    row: Row = {"kind": rows[0]["kind"], "number": len(rows), "ok": ok / len(rows)}
-    row["ambiguous"] = sum(row["status"] == "ambiguous" for row in rows) / len(rows)
-    posed = [row for row in rows if row["status"] in ("ok", "ambiguous")]
-    row["confirmed"] = sum(row["identity"] == "confirmed" for row in posed) / len(rows)
+    count = len(rows)
+    ok = [row for row in rows if row["status"] == "ok"]
+    ambiguous = [row for row in rows if row["status"] == "ambiguous"]
+    confirmed = sum(row["identity"] == "confirmed" for row in ok + ambiguous)
+    line: Row = {
+        "kind": rows[0]["kind"],
+        "number": count,
+        "ok": len(ok) / count,
+        "ambiguous": len(ambiguous) / count,
+        "confirmed": confirmed / count,
+    }
     if rows[0]["kind"] == ITSELF:
-        row["right"] = sum(row["right"] for row in rows) / len(rows)
-        row["ok and wrong"] = sum(r["status"] == "ok" and not r["right"] for r in rows) / len(rows)
-    return row
+        line["right"] = sum(row["right"] for row in rows) / count
+        line["ok and wrong"] = sum(not row["right"] for row in ok) / count
+    return line
 
 
 def main() -> None:
     """Measure every set of weights."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--weights", nargs="+", default=["parts"])
     parser.add_argument("--number", type=int, default=40)
     parser.add_argument("--seed", type=int, default=SEED)
@@ -135,33 +144,43 @@ def main() -> None:
     parser.add_argument("--method", choices=("network", "register", "both"), default="network")
     parser.add_argument("--kinds", nargs="*", help="some of the kinds alone")
     parser.add_argument("--save", type=Path, help="a folder for the signals of each set")
-    words = parser.parse_args()
-    if words.save and words.method == "both":
+    options = parser.parse_args()
+    if options.save and options.method == "both":
         parser.error("--save opens one refusal, and both methods have their own; save each alone")
     torch.set_num_threads(1)
-    for name in words.weights:
-        config = EstimateConfig(register_refused=words.method == "both")
+    kinds = options.kinds or [ITSELF, *negative_kinds()]
+    for name in options.weights:
+        config = EstimateConfig(register_refused=options.method == "both")
         net = GeoPoseNet.load(find_weights(name), config)
-        opened = dataclasses.replace(net.refusal, min_probability=0.0)
-        if words.method == "register":
-            net = Registration(net.models, refusal=opened if words.save else None)
-        elif words.save:
-            net.weights = dataclasses.replace(net.weights, refusal=opened)
-        began, rows = time.process_time(), []
-        for kind in words.kinds or [ITSELF, *kinds()]:
-            number = 4 * words.number if kind == ITSELF else words.number
-            some = groups(measure(net, kind, number, words.seed, not words.clouds))
-            print(*map(summary, some), sep="\n", flush=True)
-            rows += some
-        every = [row for some in rows for row in some if row["kind"] not in (ITSELF, ALIKE)]
-        table = [summary(some) for some in rows]
-        if every:
-            table.append({**summary(every), "kind": "all negatives"})
-        print(f"{name}, {time.process_time() - began:.0f} s\n{markdown_table(table)}")
-        if words.save:
-            words.save.mkdir(parents=True, exist_ok=True)
-            path = words.save / f"{Path(name).stem}.json"
-            path.write_text(json.dumps([row for some in rows for row in some]))
+        no_refusal = dataclasses.replace(net.refusal, min_probability=0.0)
+        if options.method == "register":
+            net = Registration(net.models, refusal=no_refusal if options.save else None)
+        elif options.save:
+            net.weights = dataclasses.replace(net.weights, refusal=no_refusal)
+
+        groups: list[list[Row]] = []
+        total_s = 0.0
+        for kind in kinds:
+            number = 4 * options.number if kind == ITSELF else options.number
+            rows, cpu_s = with_cpu_seconds(
+                lambda net=net, kind=kind, number=number: measure(
+                    net, kind, number, options.seed, not options.clouds
+                )
+            )
+            kind_groups = without_alike(rows)
+            print(*map(summary, kind_groups), sep="\n", flush=True)
+            groups += kind_groups
+            total_s += cpu_s
+        table = [summary(group) for group in groups]
+        all_rows = [row for group in groups for row in group]
+        negatives = [row for row in all_rows if row["kind"] not in (ITSELF, ALIKE)]
+        if negatives:
+            table.append({**summary(negatives), "kind": "all negatives"})
+        print(f"{name}, {total_s:.0f} s\n{markdown_table(table)}")
+        if options.save:
+            options.save.mkdir(parents=True, exist_ok=True)
+            path = options.save / f"{Path(name).stem}.json"
+            path.write_text(json.dumps(all_rows))
 
 
 if __name__ == "__main__":

@@ -1,16 +1,15 @@
-"""The scoreboard: real data, and rendered parts and sequences, beside those of an earlier run.
+"""The scoreboard: results on real data, rendered parts and sequences, beside an earlier run.
 
     python bench/real.py $DEPTHPOSE_DATA --json out/real.json
     python bench/real.py $DEPTHPOSE_DATA --before out/real.json
     python bench/real.py $DEPTHPOSE_DATA --only masks scans --seeds 20
 
-A number of the earlier run stands in brackets where it differs. ``use`` says of each set whether
-methods and limits are chosen by it (choice), or it is only measured afterwards (held). The module
-of a section (``score_*.py``) says which answers are right. CPU seconds leave out the preparation of
-models. Each process computes with one thread.
+Where a number of the earlier run differs, it stands in brackets. ``use`` is "choice" for sets by
+which methods and limits may be chosen, "held" for sets that are only measured. The docstring of
+each section's module (``score_*.py``) defines which answers are right. CPU seconds leave out the
+preparation of models. Each process computes with one thread.
 """
 
-import argparse
 import json
 import multiprocessing
 import os
@@ -29,6 +28,7 @@ from score_parts import PART_SHAPES
 from score_reports import REPORTS
 from score_scenes import BINS, FRAMES
 from score_tracking import TRACKING
+from shared import make_parser, with_cpu_seconds
 
 from depthpose.core.run import environment
 from depthpose.report.page import markdown_table
@@ -51,9 +51,7 @@ SECTIONS: dict[str, Section] = {
 
 def main() -> None:
     """Run the sections one after the other; print and store each as it is done."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("samples", type=Path, help="folder with pose/ and depth/")
     parser.add_argument("--only", nargs="+", choices=SECTIONS, default=list(SECTIONS))
     parser.add_argument(
@@ -66,27 +64,33 @@ def main() -> None:
     parser.add_argument("--before", type=Path, help="such a file of an earlier run")
     options = parser.parse_args()
 
-    before = {} if options.before is None else json.loads(options.before.read_text())
-    done = {}
+    earlier_results = {} if options.before is None else json.loads(options.before.read_text())
+    results = {}
     if options.json is not None and options.json.exists():
-        done = json.loads(options.json.read_text())
+        results = json.loads(options.json.read_text())
     for name in options.only:
         section = SECTIONS[name]
-        began = time.perf_counter()
+        start_s = time.perf_counter()
         rows, cpu_s = run_jobs(section.jobs(options.samples, options.seeds), options.processes)
+        wall_s = time.perf_counter() - start_s
         table = section.table(rows)
+        results[name] = {
+            "seeds": options.seeds,
+            "environment": environment(),
+            "cpu_s": cpu_s,
+            "table": table,
+            "rows": rows,
+        }
 
-        earlier = before.get(name, {})
-        facts = {"seeds": options.seeds, "environment": environment()}
-        done[name] = {**facts, "cpu_s": cpu_s, "table": table, "rows": rows}
+        earlier = earlier_results.get(name, {})
         print(f"\n## {section.title} ({name})\n")
         print(markdown_table(with_earlier(table, earlier.get("table", []))))
-        print(f"{cpu_s:.0f} CPU s with all preparation, {time.perf_counter() - began:.0f} s")
+        print(f"{cpu_s:.0f} CPU s with all preparation, {wall_s:.0f} s")
         if earlier:
             print(f"in brackets: {describe_run(earlier)}")
         sys.stdout.flush()
         if options.json is not None:
-            options.json.write_text(json.dumps(done, indent=1))
+            options.json.write_text(json.dumps(results, indent=1))
 
 
 def describe_run(section: Row) -> str:
@@ -100,36 +104,31 @@ def run_jobs(jobs: Sequence[Job], processes: int) -> tuple[list[Row], float]:
     with multiprocessing.get_context("spawn").Pool(
         processes, initializer=torch.set_num_threads, initargs=(1,)
     ) as pool:
-        done = list(pool.imap(timed, jobs))
-    return [row for rows, _ in done for row in rows], sum(cpu_s for _, cpu_s in done)
-
-
-def timed(job: Job) -> tuple[list[Row], float]:
-    """Run a job; return its rows and its CPU seconds."""
-    began = time.process_time()
-    rows = job()
-    return rows, time.process_time() - began
+        rows_and_seconds = list(pool.imap(with_cpu_seconds, jobs))
+    all_rows = [row for rows, _ in rows_and_seconds for row in rows]
+    return all_rows, sum(cpu_s for _, cpu_s in rows_and_seconds)
 
 
 def with_earlier(table: Sequence[Row], before: Sequence[Row]) -> list[Row]:
-    """Add the cells of an earlier table that differ in brackets; lines are named by column one."""
-    earlier = {next(iter(line.values())): line for line in before}
+    """Add cells of an earlier table in brackets where they differ; the first column names lines."""
+    earlier_lines = {next(iter(line.values())): line for line in before}
     lines = list[Row]()
     for line in table:
-        name, *columns = line
-        old = earlier.get(line[name], {})
+        first_column, *columns = line
+        earlier_line = earlier_lines.get(line[first_column], {})
         cells = {
-            column: format_cell(line[column], old.get(column, line[column])) for column in columns
+            column: format_cell(line[column], earlier_line.get(column, line[column]))
+            for column in columns
         }
-        lines.append({name: line[name], **cells})
+        lines.append({first_column: line[first_column], **cells})
     return lines
 
 
-def format_cell(value: object, old: object) -> str:
+def format_cell(value: object, earlier_value: object) -> str:
     """Format a cell, with the earlier value in brackets where it differs."""
-    now = format_value(value)
-    before = format_value(old)
-    return now if now == before else f"{now} ({before or 'none'})"
+    text = format_value(value)
+    earlier_text = format_value(earlier_value)
+    return text if text == earlier_text else f"{text} ({earlier_text or 'none'})"
 
 
 def format_value(value: object) -> str:

@@ -1,8 +1,8 @@
-"""Real instances of known pose: LineMOD, scans of the bunny, YCB, a basket, a bottle.
+"""Real instances of known pose, for other scripts: LineMOD, the bunny, YCB, a basket, a bottle.
 
-Two of LineMOD, five scans of the bunny, ten in YCB's two frames, the basket, and two frames of the
-bottle; all but the scans as depth images with masks. From ``$DEPTHPOSE_DATA/pose``; the data have a
-non-commercial licence and are never committed.
+Two instances of LineMOD, five scans of the bunny, ten instances in two frames of YCB, the basket,
+and two frames of the bottle; all but the scans are depth images with masks. They are read from
+``$DEPTHPOSE_DATA/pose``. The data have a non-commercial licence and are never committed.
 """
 
 import json
@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from depthpose.core.camera.pinhole import intrinsics
 from depthpose.core.files import read_cloud, read_depth_png
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid
@@ -29,9 +30,10 @@ from depthpose.pose.types import (
 )
 from depthpose.report.pose import object_points
 
-_MASK_TOLERANCE_M = 0.03  # by which the depth may differ from the annotated pose, inside a mask
-_SCANNER_M = 0.7
-"""The bunny's scanner looks along -z, our camera along +z, from about this distance."""
+MASK_TOLERANCE_M = 0.03
+"""Inside a mask, the depth differs less than this from the rendered annotated pose."""
+SCANNER_DISTANCE_M = 0.7
+"""Of the bunny, about; the scanner looks along -z, our camera along +z."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -41,9 +43,9 @@ class RealCase:
     Attributes:
         sample: the cloud or the view, and the true pose.
         model: of the object.
-        is_symmetric: whether it is measured by ADD-S. All of YCB are: geometry alone does not show
-            the sides of boxes, nor how a can is rotated.
-        frame: the image that shows it; images of tables show several instances.
+        is_symmetric: whether its error is ADD-S. That of all YCB objects is: depth shows neither
+            which side of a box it sees nor how a can is rotated.
+        frame: name of the image; images of tables show several instances.
         color: the colour image registered to the depth, where there is one.
     """
 
@@ -65,85 +67,91 @@ class RealCase:
 
 
 def lm_cases(folder: Path) -> Iterator[RealCase]:
-    """One Kinect frame of LineMOD: cat, annotated, and ape, of a fitted pose."""
+    """Load one Kinect frame of LineMOD: the cat by its annotation, the ape by a fitted pose."""
     data = open_bop(folder / "lm")
     for instance in data.instances:
         model = data.objects[instance.object_id]
         name = f"lm {model.name}"
         is_symmetric = not model.symmetries.is_none
-        yield _case(name, data.view(instance), model, is_symmetric, frame="lm")
+        yield make_case(name, data.view(instance), model, is_symmetric, frame="lm")
 
 
 def bunny_cases(folder: Path, every: int = 5) -> Iterator[RealCase]:
-    """Range scans of the bunny, each ``every``-th point of some 40,000."""
-    model = read_model(folder / "bunny/model/bun_zipper_res2.ply", "m", name="bunny")
-    flip = Rigid(torch.diag(torch.tensor([1.0, -1.0, -1.0])), torch.tensor([0, 0, _SCANNER_M]))
-    for line in (folder / "bunny/bun.conf").read_text().splitlines():
+    """Load the range scans of the bunny, every fifth point of some 40,000."""
+    home = folder / "bunny"
+    model = read_model(home / "model/bun_zipper_res2.ply", "m", name="bunny")
+    camera_from_scanner = Rigid(
+        torch.diag(torch.tensor([1.0, -1.0, -1.0])), torch.tensor([0, 0, SCANNER_DISTANCE_M])
+    )
+    for line in (home / "bun.conf").read_text().splitlines():
         words = line.split()
-        scan = folder / "bunny/scans" / words[1] if words[:1] == ["bmesh"] else None
-        if scan is None or not scan.is_file():
+        if words[:1] != ["bmesh"]:
+            continue
+        scan = home / "scans" / words[1]
+        if not scan.is_file():
             continue
         t_m = np.array(words[2:5], float)
         quaternion = np.array(words[5:9], float)
         R = Rotation.from_quat(quaternion).as_matrix()
-        pose = Rigid(torch.from_numpy(R).float(), torch.from_numpy(-R @ t_m).float())
-        points_m = flip.apply(read_cloud(scan).points[::every].float())
-        truth = PoseTruth(camera_from_model=flip @ pose)
+        scanner_from_model = Rigid(torch.from_numpy(R).float(), torch.from_numpy(-R @ t_m).float())
+        points_m = camera_from_scanner.apply(read_cloud(scan).points[::every].float())
         cloud = CloudInput(name=scan.stem, points_m=points_m, object="bunny")
+        truth = PoseTruth(camera_from_model=camera_from_scanner @ scanner_from_model)
         sample = CloudSample(input=cloud, truth=truth)
-        yield _case(f"bunny {scan.stem}", sample, model, is_symmetric=False)
+        yield make_case(f"bunny {scan.stem}", sample, model, is_symmetric=False)
 
 
 def ycb_cases(folder: Path) -> Iterator[RealCase]:
-    """Ten instances in two frames of a RealSense; poses fitted, models of bare points."""
+    """Load ten instances in two frames of a RealSense; poses are fitted, models have no faces."""
     data = open_bop(folder / "ycb_frames")
     for instance in data.instances:
         model = data.objects[instance.object_id]
         name = f"ycb {instance.image_id} {model.name}"
         frame = f"ycb {instance.image_id}"
-        case = _case(name, data.view(instance), model, is_symmetric=True, frame=frame)
+        case = make_case(name, data.view(instance), model, is_symmetric=True, frame=frame)
         yield replace(case, color=instance.rgb)
 
 
 def basket_cases(folder: Path) -> Iterator[RealCase]:
-    """A basket on a table; its mask is the annotated pose, drawn, where the depth is near it."""
+    """Load a basket on a table, of annotated pose."""
     home = folder / "real_frames/basket"
     model = read_model(home / "obj_000019.ply", "mm", name="basket")
     model = with_found_symmetries(model, None, is_taken=True)
     truth = json.loads((home / "truth.json").read_text())
     R = torch.tensor(truth["cam_R_m2c"]).reshape(3, 3).double()
-    pose = Rigid(R, torch.tensor(truth["cam_t_m2c_mm"]).double() / 1000)
+    t_m = torch.tensor(truth["cam_t_m2c_mm"]).double() / 1000
     K = torch.tensor(json.loads((home / "camera.json").read_text())["K"]).double()
     depth_m = read_depth_png(home / "depth.png", 0.001)
-    yield _case("basket", _view_with_mask(depth_m, K, model, pose), model, is_symmetric=True)
+    view = view_of_pose(depth_m, K, model, Rigid(R, t_m))
+    yield make_case("basket", view, model, is_symmetric=True)
 
 
 def bottle_cases(folder: Path) -> Iterator[RealCase]:
-    """Two frames of a RealSense; the pose is the authors' start, 6 to 7 mm off."""
+    """Load a bottle in two frames of a RealSense; the authors' pose is 6 to 7 mm off."""
     home = folder / "real_frames/bottle"
     model = read_model(home / "bottle.obj", "m", name="bottle")
     model = with_found_symmetries(model, None, is_taken=True)
     annotation = json.loads((home / "poses.json").read_text())
     color_from_model = torch.tensor(annotation["model_to_color_camera_authors_test_pose"]).double()
     color_from_depth = torch.tensor(annotation["depth_camera_to_color_camera"]).double()
-    matrix = torch.linalg.inv(color_from_depth) @ color_from_model
-    pose = Rigid(matrix[:3, :3], matrix[:3, 3])
-    fx, fy, cx, cy = annotation["depth_K"]
-    K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+    depth_from_model = torch.linalg.inv(color_from_depth) @ color_from_model
+    pose = Rigid(depth_from_model[:3, :3], depth_from_model[:3, 3])
+    K = intrinsics(*annotation["depth_K"])
     for frame in annotation["frames"]:
         depth_m = read_depth_png(home / f"depth_{frame}.png", annotation["depth_scale_m"])
-        view = _view_with_mask(depth_m, K, model, pose)
-        yield _case(f"bottle {frame}", view, model, is_symmetric=True)
+        view = view_of_pose(depth_m, K, model, pose)
+        yield make_case(f"bottle {frame}", view, model, is_symmetric=True)
 
 
-def _view_with_mask(
+def view_of_pose(
     depth_m: torch.Tensor, K: torch.Tensor, model: ObjectModel, pose: Rigid
 ) -> ViewSample:
-    """Make the view of an instance whose mask is its rendered pose, where the depth agrees."""
+    """Make a view of an instance; its mask is where depth agrees with the rendered pose."""
     corners = pose.apply(model.vertices_m.double())[model.faces]
     height, width = depth_m.shape
     raster = rasterize(corners, K, width, height, with_barycentric=False)
-    mask = (depth_m.double() - raster.depth_m).abs() < _MASK_TOLERANCE_M
+    difference_m = (depth_m.double() - raster.depth_m).abs()
+    mask = difference_m < MASK_TOLERANCE_M
     view = ViewInput(name="", depth_m=depth_m, mask=mask, K=K, object=model.name)
     return ViewSample(input=view, truth=PoseTruth(camera_from_model=pose))
 
@@ -154,14 +162,14 @@ def real_cases(folder: Path) -> list[RealCase]:
     return [case for load in loaders for case in load(folder)]
 
 
-def _case(
+def make_case(
     name: str,
     sample: CloudSample | ViewSample,
     model: ObjectModel,
     is_symmetric: bool,
     frame: str | None = None,
 ) -> RealCase:
-    """Make an instance and name its sample; without a ``frame`` it is alone in its image."""
+    """Name a sample and join it with its model; without a ``frame`` it is alone in its image."""
     return RealCase(
         sample=replace(sample, input=replace(sample.input, name=name)),
         model=model,

@@ -1,15 +1,16 @@
-"""Run the quick tables of docs/results.md again; list what has changed.
+"""Run the quick tables of docs/results.md again; list the numbers that changed.
 
     DEPTHPOSE_DATA=SAMPLES python bench/recheck.py [--only NAME ...] [--out out/bench/recheck]
 
-A quick table takes minutes on one core and needs only the shipped weights and the published
-PSMNet of the samples. Times, memory and rounding errors depend on the machine
-and are left out; so are rows whose weights are not shipped. A number has changed if it differs from
-the printed one by more than half of the last digit and a five-hundredth of itself, which another
-processor may cause. The exit code is 1 if one has changed.
+A quick table takes minutes on one core and needs only the shipped weights and the published PSMNet
+of the samples. Times, memory and rounding errors depend on the machine and are not compared, nor
+are rows whose weights are not shipped. A number has changed if it differs from the printed one by
+more than half of the last digit plus a five-hundredth of itself, which another processor may cause.
+The exit code is 1 if a number changed.
 """
 
 import argparse
+import itertools
 import json
 import os
 import re
@@ -59,7 +60,7 @@ _STEREO = {
 
 
 def _at_80_m(rows: Mapping[str, Mapping[str, str]]) -> dict[str, dict[str, str]]:
-    """Say which of the caps of an evaluation its rows are of."""
+    """Choose the rows of an evaluation that are capped at 80 m."""
     return {name: {**values, "cap_m": "80"} for name, values in rows.items()}
 
 
@@ -89,7 +90,7 @@ class Table:
     tolerance: float = 0.002
 
     def printed(self) -> list[dict[str, str]]:
-        """Read it from the page: cells by column, without marks."""
+        """Read the printed table from the page: cells by column, without marks."""
         return printed_rows(PAGE.read_text(), self.after)
 
 
@@ -178,13 +179,13 @@ TABLES = (
 
 
 def main() -> int:
-    """Run, compare, and print what has changed."""
+    """Run, compare, and print the numbers that changed."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", nargs="+", choices=[table.name for table in TABLES], default=())
     parser.add_argument("--out", type=Path, default=Path("out/bench/recheck"))
     arguments = parser.parse_args()
     samples = os.environ.get("DEPTHPOSE_DATA", "")
-    moved = 0
+    changed = 0
     for table in TABLES:
         if arguments.only and table.name not in arguments.only:
             continue
@@ -193,15 +194,15 @@ def main() -> int:
             continue
         rows = run(table, arguments.out.resolve(), samples)
         differences, compared, left_out = compare(table, table.printed(), rows)
-        moved += len(differences)
+        changed += len(differences)
         print(f"{table.name}: {compared} numbers, {len(differences)} moved", flush=True)
         print("".join(f"  {line}\n" for line in differences), end="")
         print("".join(f"  not compared: {name}\n" for name in left_out), end="", flush=True)
-    return 1 if moved else 0
+    return 1 if changed else 0
 
 
 def run(table: Table, out: Path, samples: str) -> list[dict[str, Any]]:
-    """Run the commands of a table in OUT, and give the rows that they write."""
+    """Run the commands of a table in OUT, and read the rows that they write."""
     out.mkdir(parents=True, exist_ok=True)
     for command in table.commands:
         _execute(command.replace("SAMPLES", samples).replace("OUT", str(out)), out)
@@ -220,37 +221,44 @@ def printed_rows(text: str, after: str) -> list[dict[str, str]]:
     """Read the first Markdown table below a part of a text: cells by column, without marks."""
     assert text.count(after) == 1, f"{after!r} stands {text.count(after)} times"
     lines = text[text.index(after) :].splitlines()
-    first = next(k for k, line in enumerate(lines) if line.startswith("|"))
-    last = next((k for k in range(first, len(lines)) if not lines[k].startswith("|")), len(lines))
-    cells = [[re.sub(r"[`*]", "", c).strip() for c in line.strip("| ").split("|")]
-             for line in lines[first:last]]  # fmt: skip
-    names, _, *rows = [line + [""] * (len(cells[0]) - len(line)) for line in cells]
-    return [dict(zip(names, row, strict=True)) for row in rows]
+    is_row = [line.startswith("|") for line in lines]
+    first = is_row.index(True)
+    last = is_row.index(False, first) if False in is_row[first:] else len(lines)
+    names, _, *rows = [_cells(line) for line in lines[first:last]]
+    # A row without its last cells ends early.
+    return [dict(itertools.zip_longest(names, row, fillvalue="")) for row in rows]
+
+
+def _cells(line: str) -> list[str]:
+    """Split a row of a Markdown table, without marks."""
+    return [re.sub(r"[`*]", "", cell).strip() for cell in line.strip("| ").split("|")]
 
 
 def compare(
     table: Table, printed: Sequence[Mapping[str, str]], rows: Sequence[Mapping[str, Any]]
 ) -> tuple[list[str], int, list[str]]:
-    """Give a line for each change, the count of compared numbers, and rows not compared."""
-    moved: list[str] = []
+    """List each change, count the compared numbers, and list the rows that are not compared."""
+    changes: list[str] = []
     left_out: list[str] = []
     compared = 0
     for line in printed:
         name = " ".join([next(iter(line.values())), *(line[c] for c in table.key)])
-        wanted = _wanted(table, line)
-        if not wanted:
+        identity = _identity(table, line)
+        if not identity:
             left_out.append(name)
             continue
-        found = [row for row in rows if all(_same(row[k], v) for k, v in wanted.items())]
-        if len(found) != 1:
-            moved.append(f"{name}: {len(found)} rows are {wanted}")
+        matches = [row for row in rows if _has_values(row, identity)]
+        if len(matches) != 1:
+            changes.append(f"{name}: {len(matches)} rows are {identity}")
             continue
-        for column, place in table.numbers.items():
-            if line[column]:
-                compared += 1
-                if has_moved(line[column], found[0][place], table.tolerance):
-                    moved.append(f"{name}: {column} is {found[0][place]}, printed {line[column]}")
-    return moved, compared, left_out
+        row = matches[0]
+        for column, key in table.numbers.items():
+            if not line[column]:
+                continue
+            compared += 1
+            if has_moved(line[column], row[key], table.tolerance):
+                changes.append(f"{name}: {column} is {row[key]}, printed {line[column]}")
+    return changes, compared, left_out
 
 
 def has_moved(printed: str, now: float | None, tolerance: float) -> bool:
@@ -267,18 +275,26 @@ def has_moved(printed: str, now: float | None, tolerance: float) -> bool:
     return abs(scale * now - float(number[0])) > half_digit + tolerance * abs(scale * now)
 
 
-def _wanted(table: Table, line: Mapping[str, str]) -> dict[str, str]:
-    """Give the values that identify the row of a printed line; empty if it is not compared."""
-    by_column = {place: line[column] for column, place in table.key.items()}
+def _identity(table: Table, line: Mapping[str, str]) -> dict[str, str]:
+    """Return the values that identify the row of a printed line; none if it is not compared."""
+    by_column = {key: line[column] for column, key in table.key.items()}
     if table.rows is None:
         return by_column
-    first = table.rows.get(next(iter(line.values())))
-    return {} if first is None else {**first, **by_column}
+    by_name = table.rows.get(next(iter(line.values())))
+    if by_name is None:
+        return {}
+    return {**by_name, **by_column}
 
 
-def _same(value: object, printed: str) -> bool:
-    text = f"{value:g}" if isinstance(value, float | int) else str(value or "")
-    return text == printed
+def _has_values(row: Mapping[str, Any], values: Mapping[str, str]) -> bool:
+    """Whether a row has values, as they are printed."""
+    return all(_format(row[key]) == value for key, value in values.items())
+
+
+def _format(value: object) -> str:
+    if isinstance(value, float | int):
+        return f"{value:g}"
+    return str(value or "")
 
 
 if __name__ == "__main__":

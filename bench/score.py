@@ -1,8 +1,8 @@
-"""What the sections of ``bench/real.py`` share: their type, and the errors of a pose.
+"""The sections of ``bench/real.py``: their type, and the errors of a pose that they measure.
 
 Errors are of points of the model's surface, in diameters: ADD, to the nearest copy of the true pose
 by the symmetries that the data set declares, and ADD-S, from each true point to the nearest posed
-one. Right is below 0.1.
+one. A pose is right if its error is below 0.1.
 """
 
 import inspect
@@ -25,7 +25,7 @@ Job = Callable[[], list[Row]]
 Use = Literal["choice", "held"]
 """Whether a set takes part when a method or a limit is chosen, or is only looked at afterwards."""
 
-RIGHT = 0.1  # largest error of a right answer, in diameters
+RIGHT = 0.1  # largest error of a right pose, in diameters
 POINTS = 1000  # of the surface, by which errors are measured
 
 

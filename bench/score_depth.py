@@ -1,12 +1,11 @@
 """Depth of real pairs and of single real images by the default weights, beside OpenCV's SGBM.
 
-SGBM is told the largest disparity of each pair, and its holes are filled. D1 is the share of the
-pixels off by more than 3 px and 5 %; AbsRel is that of Eigen's protocol (camera z of one LiDAR
-scan, Garg crop, up to 80 m). No weights were trained on these images and nothing was chosen by
-them, so all are held.
+Sections ``indoor``, ``streets`` and ``image`` of ``bench/real.py``. SGBM is given the largest true
+disparity of each pair, and its holes are filled. D1 is the share of pixels off by more than 3 px
+and 5 %; AbsRel is that of Eigen's protocol (camera z of one LiDAR scan, Garg crop, up to 80 m). No
+weights were trained on these images and nothing was chosen by them, so all are held.
 """
 
-import time
 from collections.abc import Sequence
 from functools import cache, partial
 from pathlib import Path
@@ -14,6 +13,7 @@ from pathlib import Path
 import torch
 from indoor import BANDS_PX, SGBM, largest_px, match_sgbm, pair_errors, read_indoor_pair
 from score import Job, Row, Section
+from shared import group_rows, mean_of, with_cpu_seconds
 
 from depthpose import FakestereoNet
 from depthpose.depth.datasets import open_dataset, read_known_depth
@@ -23,65 +23,72 @@ from depthpose.depth.types import DepthEstimate, StereoSample
 OURS = "default"
 CAP_M = 80.0
 STREETS = "street_pairs/kitti2015_eval_drives"  # 25 pairs with LiDAR
-ONE_IMAGE = (STREETS, "kitti_raw/2011_09_26/2011_09_26_drive_0052_sync")
+SINGLE_IMAGES = (STREETS, "kitti_raw/2011_09_26/2011_09_26_drive_0052_sync")
+ALL_BANDS_PX = (0, BANDS_PX[-1][1])
 
 
 @cache
 def network() -> FakestereoNet:
     """Load the weights once in a process."""
-    return FakestereoNet.load("default")
+    return FakestereoNet.load(OURS)
 
 
 def indoor_jobs(samples: Path, seeds: int) -> list[Job]:
     """Match each pair that is no street."""
     del seeds
-    return [partial(match_indoor, path.parent)
-            for path in sorted((samples / "depth/indoor").glob("*/meta.json"))]  # fmt: skip
+    meta_files = sorted((samples / "depth/indoor").glob("*/meta.json"))
+    return [partial(match_indoor, path.parent) for path in meta_files]
 
 
-def match_indoor(home: Path) -> list[Row]:
+def match_indoor(folder: Path) -> list[Row]:
     """Match one pair by both methods."""
-    sample = read_indoor_pair(home)
-    facts = {"pair": home.name, "largest_px": largest_px(sample)}
-    return [{**facts, "method": method, **pair_errors(found, sample.truth), "cpu_s": cpu_s}
-            for method, found, cpu_s in matched(sample)]  # fmt: skip
+    sample = read_indoor_pair(folder)
+    rows = list[Row]()
+    for method, estimate, cpu_s in match_by_both(sample):
+        facts = {"pair": folder.name, "largest_px": largest_px(sample), "method": method}
+        errors = pair_errors(estimate, sample.truth)
+        rows.append({**facts, **errors, "cpu_s": cpu_s})
+    return rows
 
 
-def matched(sample: StereoSample) -> list[tuple[str, DepthEstimate, float]]:
-    """Match a pair by SGBM and by ours; give the CPU seconds of each."""
-    began = time.process_time()
-    peer = match_sgbm(sample)
-    between = time.process_time()
-    ours = network().estimate_pair(sample.input, with_check=False)
-    ended = time.process_time()
-    return [(SGBM, peer, between - began), (OURS, ours, ended - between)]
+def match_by_both(sample: StereoSample) -> list[tuple[str, DepthEstimate, float]]:
+    """Match a pair by SGBM and by ours; return method, estimate and CPU seconds of each."""
+    net = network()
+    sgbm, sgbm_s = with_cpu_seconds(lambda: match_sgbm(sample))
+    ours, ours_s = with_cpu_seconds(lambda: net.estimate_input(sample.input, with_check=False))
+    return [(SGBM, sgbm, sgbm_s), (OURS, ours, ours_s)]
 
 
 def indoor_table(rows: Sequence[Row]) -> list[Row]:
-    """Take means by the largest disparity, and over all."""
+    """Average by the largest disparity, and over all."""
     lines = list[Row]()
-    for low, high in (*BANDS_PX, (0, BANDS_PX[-1][1])):
-        band = [row for row in rows if low <= row["largest_px"] < high]
-        name = "all" if (low, high) == (0, BANDS_PX[-1][1]) else f"from {low} px"
+    for band_px in (*BANDS_PX, ALL_BANDS_PX):
+        low_px, high_px = band_px
+        band_name = "all" if band_px == ALL_BANDS_PX else f"from {low_px} px"
+        band_rows = [row for row in rows if low_px <= row["largest_px"] < high_px]
         for method in (OURS, SGBM):
-            some = [row for row in band if row["method"] == method]
-            if some:
-                lines.append({
-                    "largest disparity, method": f"{name}, {method}", "use": "held",
-                    "pairs": len(some),
-                    "D1 %": 100 * mean(some, "D1"),
-                    "off by twice %": 100 * mean(some, "off by twice"),
-                    "median relative %": 100 * mean(some, "median relative"),
-                    "CPU s": mean(some, "cpu_s"),
-                })  # fmt: skip
+            method_rows = [row for row in band_rows if row["method"] == method]
+            if not method_rows:
+                continue
+            lines.append(
+                {
+                    "largest disparity, method": f"{band_name}, {method}",
+                    "use": "held",
+                    "pairs": len(method_rows),
+                    "D1 %": 100 * mean_of(method_rows, "D1"),
+                    "off by twice %": 100 * mean_of(method_rows, "off by twice"),
+                    "median relative %": 100 * mean_of(method_rows, "median relative"),
+                    "CPU s": mean_of(method_rows, "cpu_s"),
+                }
+            )
     return lines
 
 
 def street_jobs(samples: Path, seeds: int) -> list[Job]:
     """Match each pair of streets."""
     del seeds
-    number = len(open_dataset(samples / "depth" / STREETS))
-    return [partial(match_street, samples / "depth" / STREETS, index) for index in range(number)]
+    folder = samples / "depth" / STREETS
+    return [partial(match_street, folder, index) for index in range(len(open_dataset(folder)))]
 
 
 def match_street(folder: Path, index: int) -> list[Row]:
@@ -92,76 +99,89 @@ def match_street(folder: Path, index: int) -> list[Row]:
     truth_px = sample.truth.disparity_px
     assert truth_m is not None
     assert truth_px is not None
-    known = truth_px.isfinite()
+    has_truth = truth_px.isfinite()
     rows = list[Row]()
-    for method, found, cpu_s in matched(sample):
-        disparity_px = found.disparity_px.nan_to_num(0.0)
-        errors = measure("disparity", disparity_px[known], truth_px[known])
-        rows.append({
-            "pair": sample.input.name, "method": method, "D1": errors["d1_all"],
-            "AbsRel": abs_rel(found, truth_m), "cpu_s": cpu_s,
-        })  # fmt: skip
+    for method, estimate, cpu_s in match_by_both(sample):
+        disparity_px = estimate.disparity_px.nan_to_num(0.0)
+        errors = measure("disparity", disparity_px[has_truth], truth_px[has_truth])
+        rows.append(
+            {
+                "pair": sample.input.name,
+                "method": method,
+                "D1": errors["d1_all"],
+                "AbsRel": abs_rel(estimate, truth_m),
+                "cpu_s": cpu_s,
+            }
+        )
     return rows
 
 
 def street_table(rows: Sequence[Row]) -> list[Row]:
-    """Take means of each method."""
+    """Average over the pairs of each method."""
     lines = list[Row]()
     for method in (OURS, SGBM):
-        some = [row for row in rows if row["method"] == method]
-        lines.append({
-            "method": method, "use": "held", "pairs": len(some), "D1 %": 100 * mean(some, "D1"),
-            "AbsRel": mean(some, "AbsRel"), "CPU s": mean(some, "cpu_s"),
-        })  # fmt: skip
+        method_rows = [row for row in rows if row["method"] == method]
+        lines.append(
+            {
+                "method": method,
+                "use": "held",
+                "pairs": len(method_rows),
+                "D1 %": 100 * mean_of(method_rows, "D1"),
+                "AbsRel": mean_of(method_rows, "AbsRel"),
+                "CPU s": mean_of(method_rows, "cpu_s"),
+            }
+        )
     return lines
 
 
 def image_jobs(samples: Path, seeds: int) -> list[Job]:
     """Estimate each left image of the streets alone."""
     del seeds
-    return [partial(estimate_image, samples / "depth" / folder, index)
-            for folder in ONE_IMAGE
-            for index in range(len(open_dataset(samples / "depth" / folder)))]  # fmt: skip
+    jobs = list[Job]()
+    for name in SINGLE_IMAGES:
+        folder = samples / "depth" / name
+        jobs += [
+            partial(estimate_image, folder, index) for index in range(len(open_dataset(folder)))
+        ]
+    return jobs
 
 
 def estimate_image(folder: Path, index: int) -> list[Row]:
     """Estimate the depth of one image."""
     dataset = open_dataset(folder)
-    given = dataset[index].input
+    image = dataset[index].input
+    camera = image.camera
     truth_m = read_known_depth(dataset, index)
     if truth_m is None:
         return []
-    assert given.camera is not None
-    began = time.process_time()
-    found = network().estimate(given.left, given.camera)
-    cpu_s = time.process_time() - began
-    row = {"set": folder.name, "image": given.name, "AbsRel": abs_rel(found, truth_m)}
-    return [row | {"cpu_s": cpu_s}]
+    assert camera is not None
+    net = network()
+    estimate, cpu_s = with_cpu_seconds(lambda: net.estimate(image.left, camera))
+    facts = {"set": folder.name, "image": image.name}
+    return [{**facts, "AbsRel": abs_rel(estimate, truth_m), "cpu_s": cpu_s}]
 
 
 def image_table(rows: Sequence[Row]) -> list[Row]:
-    """Take means of each set."""
-    lines = list[Row]()
-    for name in dict.fromkeys(row["set"] for row in rows):
-        some = [row for row in rows if row["set"] == name]
-        lines.append({
-            "set": name, "use": "held", "images": len(some), "AbsRel": mean(some, "AbsRel"),
-            "CPU s": mean(some, "cpu_s"),
-        })  # fmt: skip
-    return lines
+    """Average over the images of each set."""
+    return [
+        {
+            "set": name,
+            "use": "held",
+            "images": len(set_rows),
+            "AbsRel": mean_of(set_rows, "AbsRel"),
+            "CPU s": mean_of(set_rows, "cpu_s"),
+        }
+        for (name,), set_rows in group_rows(rows, "set").items()
+    ]
 
 
-def abs_rel(found: DepthEstimate, truth_m: torch.Tensor) -> float:
-    """Measure depth as Eigen's protocol does; where there is none, as in the sky, it is the cap."""
-    assert found.depth_m is not None
-    counts = (truth_m > SMALLEST_DEPTH_M) & (truth_m < CAP_M) & garg_crop(*truth_m.shape)
-    predicted_m = found.depth_m.nan_to_num(CAP_M).clamp(SMALLEST_DEPTH_M, CAP_M)
-    return measure("depth", predicted_m[counts], truth_m[counts])["abs_rel"]
-
-
-def mean(rows: Sequence[Row], column: str) -> float:
-    """Average a column; NaN of no rows."""
-    return sum(row[column] for row in rows) / len(rows) if rows else float("nan")
+def abs_rel(estimate: DepthEstimate, truth_m: torch.Tensor) -> float:
+    """Measure depth by Eigen's protocol; where there is no estimate, as in the sky, it is 80 m."""
+    assert estimate.depth_m is not None
+    has_truth = (truth_m > SMALLEST_DEPTH_M) & (truth_m < CAP_M)
+    is_measured = has_truth & garg_crop(*truth_m.shape)
+    depth_m = estimate.depth_m.nan_to_num(CAP_M).clamp(SMALLEST_DEPTH_M, CAP_M)
+    return measure("depth", depth_m[is_measured], truth_m[is_measured])["abs_rel"]
 
 
 INDOOR = Section("Pairs that are no streets, beside SGBM", indoor_jobs, indoor_table)

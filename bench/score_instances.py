@@ -1,11 +1,11 @@
 """Real instances one by one: exact masks, a detector's boxes, scans in place of models, a network.
 
-Two of LineMOD, five scans of the bunny, ten of YCB, a basket and a bottle twice
-(``bench/real_poses.py``). All of them have been looked at while judging was developed, so none
-is held back.
+Sections ``masks``, ``boxes``, ``scans`` and ``networks`` of ``bench/real.py``: two instances of
+LineMOD, five scans of the bunny, ten instances of YCB, a basket and a bottle twice
+(``bench/real_poses.py``). The limits of registration were developed on all of them, so none is held
+back.
 """
 
-import time
 from collections.abc import Sequence
 from functools import cache, partial
 from pathlib import Path
@@ -14,6 +14,7 @@ from typing import Literal, NamedTuple
 import torch
 from real_poses import RealCase, real_cases
 from score import Job, Row, Section, accepts, errors_of, is_right, median, use_seed
+from shared import group_rows, with_cpu_seconds
 from torch import Tensor
 
 from depthpose import GeoPoseNet, Registration
@@ -23,7 +24,7 @@ WEIGHTS = "ycb"
 
 
 class Region(NamedTuple):
-    """What says where the object is: its exact mask or the box about it, grown on all sides."""
+    """How an image says where the object is: by its mask or its box, grown by a margin."""
 
     kind: Literal["mask", "box"]
     margin_px: int = 0
@@ -43,18 +44,20 @@ def mask_jobs(samples: Path, seeds: int) -> list[Job]:
 
 def network_jobs(samples: Path, seeds: int) -> list[Job]:
     """Pose every instance of YCB by the shipped weights."""
-    return [partial(pose_by_network, samples, name, seeds)
-            for name in cases(samples) if name.startswith("ycb")]  # fmt: skip
+    names = [name for name in cases(samples) if name.startswith("ycb")]
+    return [partial(pose_by_network, samples, name, seeds) for name in names]
 
 
 def box_jobs(samples: Path, seeds: int) -> list[Job]:
     """Pose every instance of an image by boxes and by a grown mask in place of the exact one."""
     if not accepts(Registration.estimate, "box"):
         print("boxes: estimate takes no box=; a mask of the box's pixels is given")
-    views = [name for name, case in cases(samples).items()
-             if isinstance(case.sample.input, ViewInput)]  # fmt: skip
-    return [partial(pose_instance, samples, name, region, seeds)
-            for region in ROUGH for name in views]  # fmt: skip
+    views = [
+        name for name, case in cases(samples).items() if isinstance(case.sample.input, ViewInput)
+    ]
+    return [
+        partial(pose_instance, samples, name, region, seeds) for region in ROUGH for name in views
+    ]
 
 
 def scan_jobs(samples: Path, seeds: int) -> list[Job]:
@@ -102,20 +105,18 @@ def pose_by_seeds(
     estimator.estimate(**arguments)  # the first in a process loads what is compiled
     for seed in range(seeds):
         use_seed(estimator, seed)
-        began = time.process_time()
-        estimate = estimator.estimate(**arguments)
-        cpu_s = time.process_time() - began
+        estimate, cpu_s = with_cpu_seconds(lambda: estimator.estimate(**arguments))
         errors = errors_of(estimate, case.sample.truth.camera_from_model, case.model)
         rows.append({"instance": case.name, "seed": seed, **errors, "cpu_s": cpu_s})
     return rows
 
 
 def arguments_of(case: RealCase, region: Region) -> Row:
-    """Give the arguments of ``estimate``: depth, camera and where the object is, or a cloud."""
-    given = case.sample.input
-    if isinstance(given, ViewInput):
-        return {"depth": given.depth_m, "camera": given.K, **region_of(given.mask, region)}
-    return {"cloud": given.points_m, "unit": "m"}
+    """Give the arguments of ``estimate``: depth, camera and the object's region, or a cloud."""
+    view = case.sample.input
+    if isinstance(view, ViewInput):
+        return {"depth": view.depth_m, "camera": view.K, **region_of(view.mask, region)}
+    return {"cloud": view.points_m, "unit": "m"}
 
 
 def region_of(mask: Tensor, region: Region) -> Row:
@@ -137,9 +138,10 @@ def region_of(mask: Tensor, region: Region) -> Row:
 
 
 def grown(mask: Tensor, pixels: int) -> Tensor:
-    """Grow a mask by so many pixels on all sides."""
+    """Grow a mask by a number of pixels on all sides."""
     size = 2 * pixels + 1
-    return torch.nn.functional.max_pool2d(mask[None].float(), size, 1, pixels)[0] > 0
+    is_near = torch.nn.functional.max_pool2d(mask[None].float(), size, 1, pixels)[0]
+    return is_near > 0
 
 
 @cache
@@ -149,7 +151,7 @@ def cases(samples: Path) -> dict[str, RealCase]:
 
 
 def scan_of(samples: Path, case: RealCase) -> Path:
-    """Name the textured mesh of an instance's object; most have none."""
+    """Give the path of the textured mesh of an instance's object; only some of YCB have one."""
     is_ycb = case.name.startswith("ycb")
     file = f"obj_{case.model.number:06d}.ply" if is_ycb else "none"
     return samples / "pose/ycb_textured" / file
@@ -183,16 +185,17 @@ def table(rows: Sequence[Row]) -> list[Row]:
 
 
 def lines_by(column: str, rows: Sequence[Row]) -> list[Row]:
-    """Count the rows of each value of a column, such as what said where the object is."""
-    values = dict.fromkeys(row[column] for row in rows)
-    return [line(value, [row for row in rows if row[column] == value]) for value in values]
+    """Count the rows of each value of a column, such as the region."""
+    return [line(value, value_rows) for (value,), value_rows in group_rows(rows, column).items()]
 
 
 def line(name: str, rows: Sequence[Row]) -> Row:
-    """Count what is right, what is sure, and what is both sure and wrong."""
+    """Count right answers, sure ones, and those that are sure and wrong."""
     sure = [row for row in rows if row["status"] == "ok"]
     return {
-        "set": name, "use": "choice", "n": len(rows),
+        "set": name,
+        "use": "choice",
+        "n": len(rows),
         "right (ADD-S)": sum(is_right(row["adds"]) for row in rows),
         "right (ADD)": sum(is_right(row["add"]) for row in rows),
         "right or named (ADD)": sum(row["named"] for row in rows),
@@ -200,7 +203,7 @@ def line(name: str, rows: Sequence[Row]) -> Row:
         "ok, wrong (ADD-S)": sum(not is_right(row["adds"]) for row in sure),
         "refused": sum(row["add"] is None for row in rows),
         "median CPU s": median([row["cpu_s"] for row in rows]),
-    }  # fmt: skip
+    }
 
 
 MASKS = Section("Real instances with exact masks", mask_jobs, table)

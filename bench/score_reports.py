@@ -1,14 +1,14 @@
-"""Cases that users' trials found: what the answer says of itself, and whether that is true.
+"""Cases that users reported: whether status, identity and alternatives of the answer are true.
 
-Rendered parts of awkward shape, in ``reports/third/pose``; its README says what was wrong. All
-of them may take part in a choice.
+Section ``reports`` of ``bench/real.py``: rendered parts of awkward shape, in
+``reports/third/pose``, whose README describes each problem. All of them may take part in a choice.
 
-The diameter says little of long parts, whose turns move no point far: right is, beside an ADD below
-a tenth of the diameter, a rotation within 10 degrees, half a tooth of the gear.
+A long part can be far rotated though its ADD is small beside its diameter. So a pose is right if
+its ADD is below a tenth of the diameter and its rotation within 10 degrees, half a tooth of the
+gear.
 """
 
 import math
-import time
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from score import RIGHT, Job, Row, Section, surface_points
+from shared import with_cpu_seconds
 
 from depthpose import Registration
 from depthpose.core.rigid import Rigid, geodesic_rad
@@ -27,11 +28,11 @@ RIGHT_DEG = 10.0
 
 
 class Case(NamedTuple):
-    """An image, the CAD files that are given, and what of the answer is right.
+    """An image and the CAD files by which it is searched.
 
-    ``view``: what the files of depth, mask and pose are called. ``is_doubtful``: something is wrong
-    with the part or the image, so that an identity that is ``confirmed`` misleads. ``with_mask``:
-    else the whole image is searched.
+    ``view``: prefix of the files of depth, mask and pose. ``is_doubtful``: the part or the image
+    is not what the CAD file and the camera say, so that a ``confirmed`` identity misleads. Without
+    a mask the whole image is searched.
     """
 
     name: str
@@ -62,7 +63,7 @@ def jobs(samples: Path, seeds: int) -> list[Job]:
 
 
 def pose_case(home: Path, case: Case) -> list[Row]:
-    """Pose one case, and say how far off the answer and the nearest of what it names are."""
+    """Pose one case, and measure the answer and its alternatives."""
     is_gear = case.view.startswith("gear")
     camera = home / ("gear_camera.json" if is_gear else "camera.json")
     matrix = np.loadtxt(home / f"{case.view}_{'pose' if is_gear else 'truth'}.txt")
@@ -71,63 +72,77 @@ def pose_case(home: Path, case: Case) -> list[Row]:
     registration.prepare()
 
     depth = home / f"{case.view}_depth.png"
-    began = time.process_time()
-    if case.with_mask:
-        found = [registration.estimate(depth=depth, mask=home / f"{case.view}_mask.png",
-                                       camera=camera)]  # fmt: skip
-    else:
-        found = registration.find(depth, camera)
-    cpu_s = time.process_time() - began
-    if not found:
-        nothing = {"is fair": False, "status": "nothing found"}  # the part is there, in full view
-        return [{"case": case.name, **nothing, "CPU s": cpu_s}]
+    mask = home / f"{case.view}_mask.png"
 
-    best = found[0]
-    model = next(one for one in registration.models if one.name == best.object)
+    def search() -> list[PoseEstimate]:
+        if case.with_mask:
+            return [registration.estimate(depth=depth, mask=mask, camera=camera)]
+        return registration.find(depth, camera)
+
+    estimates, cpu_s = with_cpu_seconds(search)
+    if not estimates:  # though the part is in full view
+        return [{"case": case.name, "is fair": False, "status": "nothing found", "CPU s": cpu_s}]
+
+    best = estimates[0]
+    model = next(model for model in registration.models if model.name == best.object)
     errors = case_errors(best, truth, model)
-    return [{
-        "case": case.name, "is fair": is_fair(case, best, errors), "status": best.status,
-        "certainty": best.certainty, **errors,
+    row = {
+        "case": case.name,
+        "is fair": is_fair(case, best, errors),
+        "status": best.status,
+        "certainty": best.certainty,
+        **errors,
         "part": best.object if len(case.cad) > 1 else None,
         "identity": None if best.identity is None else best.identity.status,
         "or": None if best.identity is None else best.identity.other,
         "CPU s": cpu_s,
-    }]  # fmt: skip
+    }
+    return [row]
 
 
 def is_fair(case: Case, best: PoseEstimate, errors: Row) -> bool:
-    """Whether an answer misleads nobody: a refusal does not, nor one that names what is true."""
-    if best.identity is not None and best.identity.status == "confirmed" and case.is_doubtful:
+    """Whether an answer misleads nobody: it is a refusal, or it names the true pose and part."""
+    identity = best.identity
+    if identity is not None and identity.status == "confirmed" and case.is_doubtful:
         return False
-    if case.cad == TWINS and TWINS[1] not in (best.object, best.identity and best.identity.other):
-        return False
+    if case.cad == TWINS:
+        named_parts = (best.object, identity and identity.other)
+        if TWINS[1] not in named_parts:
+            return False
     return not best.is_posed or errors["named"]
 
 
 def case_errors(estimate: PoseEstimate, truth: Rigid, model: ObjectModel) -> Row:
-    """Give the error of the answer, and whether it or an alternative is right."""
-    answer = estimate.camera_from_model
-    if answer is None:
+    """Compute the error of the answer, and whether it or an alternative is right."""
+    best = estimate.camera_from_model
+    if best is None:
         return {"mm": None, "deg": None, "right": False, "named": False, "alternatives": 0}
-    others = [other.camera_from_model for other in estimate.alternatives]
-    errors = [error_of(pose, truth, model) for pose in (answer, *others)]
-    right = [mm < 1000 * RIGHT * model.diameter_m and deg < RIGHT_DEG for mm, deg in errors]
-    mm, deg = errors[0]
-    return {"mm": mm, "deg": deg, "right": right[0], "named": any(right),
-            "alternatives": len(others)}  # fmt: skip
+    alternatives = [alternative.camera_from_model for alternative in estimate.alternatives]
+    errors = [error_of(pose, truth, model) for pose in (best, *alternatives)]
+    max_error_mm = 1000 * RIGHT * model.diameter_m
+    is_right = [mm < max_error_mm and deg < RIGHT_DEG for mm, deg in errors]
+    best_mm, best_deg = errors[0]
+    return {
+        "mm": best_mm,
+        "deg": best_deg,
+        "right": is_right[0],
+        "named": any(is_right),
+        "alternatives": len(alternatives),
+    }
 
 
 def error_of(pose: Rigid, truth: Rigid, model: ObjectModel) -> tuple[float, float]:
-    """ADD [mm] and the angle between the rotations [degrees]."""
+    """Compute ADD [mm] and the angle between the rotations [degrees]."""
     add_mm = 1000 * float(add_m(pose, truth, surface_points(model)))
-    return add_mm, math.degrees(float(geodesic_rad(pose.R.double(), truth.R.double())))
+    angle_rad = float(geodesic_rad(pose.R.double(), truth.R.double()))
+    return add_mm, math.degrees(angle_rad)
 
 
 def table(rows: Sequence[Row]) -> list[Row]:
     """List the cases."""
-    names = ("case", "is fair", "status", "certainty", "mm", "deg", "right", "named",
-             "alternatives", "part", "identity", "or", "CPU s")  # fmt: skip
-    return [{name: row.get(name) for name in names} for row in rows]
+    columns = ("case", "is fair", "status", "certainty", "mm", "deg", "right", "named",
+               "alternatives", "part", "identity", "or", "CPU s")  # fmt: skip
+    return [{column: row.get(column) for column in columns} for row in rows]
 
 
 REPORTS = Section("Cases that users' trials found (all: choice)", jobs, table)

@@ -1,14 +1,14 @@
 """Real images without masks: bins of parts, and whole frames of several objects.
 
-Of the ten bins of elbows, in alphabetical order, the odd ones may take part in a choice; the even
-ones, and the bin of tubes, are held back from it. All whole frames have been looked at.
+Sections ``bins`` and ``frames`` of ``bench/real.py``. Of the ten bins of elbows, in alphabetical
+order, the odd ones may take part in a choice; the even ones, and the bin of tubes, are held back.
+All whole frames take part in choices.
 """
 
-import time
 from collections.abc import Sequence
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from PIL import Image
 from real_poses import RealCase
 from score import POINTS, RIGHT, Job, Row, Section, add_to_copy
 from score_instances import cases
+from shared import with_cpu_seconds
 
 from depthpose import Registration
 from depthpose.core.camera import project
@@ -25,20 +26,20 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.mesh import read_model, sample_surface, symmetries_from_bop
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 
-SURE_VISIBLE = 0.7
-"""An instance of a bin counts where its truth is sure and so much of its silhouette is visible."""
-IGNORED = 0.5
-"""An answer with so many of its points in a region without truth is neither right nor wrong."""
+MIN_VISIBLE = 0.7
+"""An instance of a bin counts if its truth is sure and this share of its silhouette is visible."""
+MAX_IGNORED = 0.5
+"""An answer with a larger share of its points in a region without truth is not counted."""
 BEST = 3
-"""So many answers of a bin would be gripped first."""
+"""Answers of a bin that would be gripped first."""
 
 
 def bin_jobs(samples: Path, seeds: int) -> list[Job]:
     """Search every bin for its part."""
     del seeds
     home = samples / "pose/bins"
-    return [partial(search_bin, home, str(scene.relative_to(home)))
-            for scene in [*bins_of(home, "elbows"), *bins_of(home, "tubes")]]  # fmt: skip
+    scenes = [*bins_of(home, "elbows"), *bins_of(home, "tubes")]
+    return [partial(search_bin, home, str(scene.relative_to(home))) for scene in scenes]
 
 
 def bins_of(home: Path, part: str) -> list[Path]:
@@ -47,32 +48,44 @@ def bins_of(home: Path, part: str) -> list[Path]:
 
 
 def search_bin(home: Path, name: str) -> list[Row]:
-    """Find all parts of one bin, and count what is right."""
+    """Find all parts of one bin, and count right answers."""
     scene = home / name
+    depth = scene / "depth.png"
+    camera = scene / "camera.json"
     registration, model = part_of(scene.parent)
-    depth, camera = scene / "depth.png", scene / "camera.json"
-    began = time.process_time()
-    found = registration.find(depth, camera)
-    cpu_s = time.process_time() - began
+    estimates, cpu_s = with_cpu_seconds(lambda: registration.find(depth, camera))
 
-    facts: Any = read_json(scene / "truth.json")
-    truths = [bop_pose(fact) for fact in facts["0"]]
-    counted = {k for k, fact in enumerate(facts["0"])
-               if fact["my_status"] == "sure" and fact["visib_fract"] >= SURE_VISIBLE}  # fmt: skip
-    lens: Any = read_json(camera)
+    instances = cast(Any, read_json(scene / "truth.json"))["0"]
+    truths = [bop_pose(instance) for instance in instances]
+    counted = {
+        index
+        for index, instance in enumerate(instances)
+        if instance["my_status"] == "sure" and instance["visib_fract"] >= MIN_VISIBLE
+    }
+    K = torch.tensor(cast(Any, read_json(camera))["K"])
     ignored = torch.from_numpy(np.array(Image.open(scene / "ignore.png")) > 0)
-    verdicts = [verdict(one, truths, model, torch.tensor(lens["K"]), ignored) for one in found]
+    verdicts = [verdict(estimate, truths, model, K, ignored) for estimate in estimates]
     right = {verdict for verdict in verdicts if isinstance(verdict, int)}
-    sure = [verdict for one, verdict in zip(found, verdicts, strict=True) if one.is_ok]
-    number = [path.name for path in bins_of(home, scene.parent.name)].index(scene.name)
-    is_choice = scene.parent.name == "elbows" and number % 2 == 0
-    return [{
-        "scene": scene.name, "set": scene.parent.name, "use": "choice" if is_choice else "held",
-        "sure": len(counted), "right": len(counted & right), "answers": len(found),
-        "wrong": verdicts.count("wrong"), "ok": len(sure), "ok, wrong": sure.count("wrong"),
+    ok_verdicts = [
+        verdict for estimate, verdict in zip(estimates, verdicts, strict=True) if estimate.is_ok
+    ]
+    part = scene.parent.name
+    position = [path.name for path in bins_of(home, part)].index(scene.name)
+    is_choice = part == "elbows" and position % 2 == 0
+    row = {
+        "scene": scene.name,
+        "set": part,
+        "use": "choice" if is_choice else "held",
+        "sure": len(counted),
+        "right": len(counted & right),
+        "answers": len(estimates),
+        "wrong": verdicts.count("wrong"),
+        "ok": len(ok_verdicts),
+        "ok, wrong": ok_verdicts.count("wrong"),
         f"best {BEST} right": sum(isinstance(verdict, int) for verdict in verdicts[:BEST]),
         "CPU s": cpu_s,
-    }]  # fmt: skip
+    }
+    return [row]
 
 
 def verdict(
@@ -82,23 +95,26 @@ def verdict(
     K: torch.Tensor,
     ignored: torch.Tensor,
 ) -> int | str:
-    """Give the number of the instance that an answer fits; else whether it is wrong or ignored."""
+    """Return the index of the instance that an answer fits, else "wrong" or "ignored"."""
     pose = estimate.camera_from_model
     assert pose is not None
     errors = [add_to_copy(pose, truth, model) for truth in truths]
     if min(errors) < RIGHT:
         return errors.index(min(errors))
-    pixels = project(pose.apply(sample_surface(model, POINTS)[0].to(pose.R)), K.to(pose.R))
+    points_m = sample_surface(model, POINTS)[0].to(pose.R)
+    pixels = project(pose.apply(points_m), K.to(pose.R))
     column, row = pixels.nan_to_num(-1.0).round().long().unbind(-1)
     height, width = ignored.shape
     is_inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
-    share = ignored[row[is_inside], column[is_inside]].float().mean()
-    return "ignored" if bool(is_inside.any()) and float(share) > IGNORED else "wrong"
+    if not bool(is_inside.any()):
+        return "wrong"
+    ignored_share = ignored[row[is_inside], column[is_inside]].float().mean()
+    return "ignored" if float(ignored_share) > MAX_IGNORED else "wrong"
 
 
 @cache
 def part_of(folder: Path) -> tuple[Registration, ObjectModel]:
-    """Prepare the part of bins as a user would, and give its model as its data set declares it."""
+    """Prepare the part of bins as a user would; return its model with declared symmetries too."""
     path = next((folder / "models").glob("*.ply"))
     info: Any = read_json(folder / "models/models_info.json")
     declared = symmetries_from_bop(next(iter(info.values())), source="models_info.json")
@@ -107,19 +123,24 @@ def part_of(folder: Path) -> tuple[Registration, ObjectModel]:
     return registration, read_model(path, "mm", symmetries=declared)
 
 
-def bop_pose(fact: Any) -> Rigid:  # noqa: ANN401  an entry of a JSON file
+def bop_pose(instance: Any) -> Rigid:  # noqa: ANN401  an entry of a JSON file
     """Read a pose of BOP's ``scene_gt.json``."""
-    R = torch.tensor(fact["cam_R_m2c"]).double().reshape(3, 3)
-    return Rigid(R, torch.tensor(fact["cam_t_m2c"]).double() / 1000)
+    R = torch.tensor(instance["cam_R_m2c"]).double().reshape(3, 3)
+    t_mm = torch.tensor(instance["cam_t_m2c"]).double()
+    return Rigid(R, t_mm / 1000)
 
 
 def bin_table(rows: Sequence[Row]) -> list[Row]:
     """List the bins, and add up the halves of the elbows."""
-    lines = [{name: row[name] for name in row if name != "set"} for row in rows]
-    elbows = [line for row, line in zip(rows, lines, strict=True) if row["set"] == "elbows"]
+    lines = list[Row]()
+    elbows = list[Row]()
+    for row in rows:
+        line = {column: row[column] for column in row if column != "set"}
+        lines.append(line)
+        if row["set"] == "elbows":
+            elbows.append(line)
     for use in ("choice", "held"):
-        some = [line for line in elbows if line["use"] == use]
-        lines.append(total(f"elbows, {use}", use, some))
+        lines.append(total(f"elbows, {use}", use, [line for line in elbows if line["use"] == use]))
     return [*lines, total("elbows, all", "", elbows)]
 
 
@@ -135,47 +156,52 @@ def frame_jobs(samples: Path, seeds: int) -> list[Job]:
     A job is all searches for the same models, which are prepared once for them.
     """
     del seeds
-    asked = dict.fromkeys(names_of(part) for part in frame_searches(samples))
-    return [partial(search_frames, samples, names) for names in asked]
+    objects = dict.fromkeys(names_of(frame) for frame in frame_searches(samples))
+    return [partial(search_frames, samples, names) for names in objects]
 
 
 def search_frames(samples: Path, names: tuple[str, ...]) -> list[Row]:
-    """Search the frames that may show some objects for them."""
-    wanted = [part for part in frame_searches(samples) if names_of(part) == names]
-    registration = Registration(wanted[0].models)
+    """Search for some objects in all frames that are searched for just these."""
+    frames = [frame for frame in frame_searches(samples) if names_of(frame) == names]
+    registration = Registration(frames[0].models)
     registration.prepare()
-    return [search_frame(part, registration) for part in wanted]
+    return [search_frame(frame, registration) for frame in frames]
 
 
 def search_frame(frame: Frame, registration: Registration) -> Row:
-    """Search one frame, and count what is right."""
-    began = time.process_time()
-    found = registration.find(frame.depth_m, frame.K)
-    cpu_s = time.process_time() - began
-    counts = count_answers(frame, found)
-    sure = [one for one in found if one.is_ok]
+    """Search one frame, and count right answers."""
+    estimates, cpu_s = with_cpu_seconds(lambda: registration.find(frame.depth_m, frame.K))
+    counts = count_answers(frame, estimates)
+    ok = [estimate for estimate in estimates if estimate.is_ok]
     return {
-        "search": frame.name, "objects": "one" if len(registration.objects) == 1 else "several",
-        **{key: counts[key] for key in ("instances", "right", "wrong", "which")},
-        "answers": len(found), "ok": len(sure), "ok, wrong": count_answers(frame, sure)["wrong"],
+        "search": frame.name,
+        "objects": "one" if len(registration.objects) == 1 else "several",
+        **{column: counts[column] for column in ("instances", "right", "wrong", "which")},
+        "answers": len(estimates),
+        "ok": len(ok),
+        "ok, wrong": count_answers(frame, ok)["wrong"],
         "cpu_s": cpu_s,
-    }  # fmt: skip
+    }
 
 
 @cache
 def frame_searches(samples: Path) -> list[Frame]:
-    """Give each real frame once for each object that is searched alone, and once for all of them.
+    """List each real frame once for each object that it is searched for, and once for all of them.
 
-    In both frames of YCB the objects of both are searched together.
+    Frames of YCB are searched for the objects of all of these frames together.
     """
-    by_frame = dict[str, list[RealCase]]()
+    cases_of_frame = dict[str, list[RealCase]]()
     for case in cases(samples).values():
         if isinstance(case.sample.input, ViewInput):
-            by_frame.setdefault(case.frame, []).append(case)
-    ycb = [case.model for name, case in cases(samples).items() if name.startswith("ycb")]
-    alone = [frame_of(case.name, [case]) for some in by_frame.values() for case in some]
-    together = [frame_of(name, some, ycb if name.startswith("ycb") else None)
-                for name, some in by_frame.items() if len(some) > 1]  # fmt: skip
+            cases_of_frame.setdefault(case.frame, []).append(case)
+    ycb_models = [case.model for name, case in cases(samples).items() if name.startswith("ycb")]
+    alone = list[Frame]()
+    together = list[Frame]()
+    for name, frame_cases in cases_of_frame.items():
+        alone += [frame_of(case.name, [case]) for case in frame_cases]
+        if len(frame_cases) > 1:
+            searched = ycb_models if name.startswith("ycb") else None
+            together.append(frame_of(name, frame_cases, searched))
     return alone + together
 
 
@@ -203,14 +229,18 @@ def names_of(frame: Frame) -> tuple[str, ...]:
 def frame_table(rows: Sequence[Row]) -> list[Row]:
     """Add up the searches for one object, and those for several."""
     lines = list[Row]()
+    counts = ("instances", "right", "answers", "wrong", "ok", "ok, wrong")
     for objects in ("one", "several"):
-        some = [row for row in rows if row["objects"] == objects]
-        counts = ("instances", "right", "answers", "wrong", "ok", "ok, wrong")
-        lines.append({
-            "objects": objects, "use": "choice", "searches": len(some),
-            **{key: sum(row[key] for row in some) for key in counts},
-            "CPU s a search": sum(row["cpu_s"] for row in some) / max(1, len(some)),
-        })  # fmt: skip
+        searches = [row for row in rows if row["objects"] == objects]
+        lines.append(
+            {
+                "objects": objects,
+                "use": "choice",
+                "searches": len(searches),
+                **{column: sum(row[column] for row in searches) for column in counts},
+                "CPU s a search": sum(row["cpu_s"] for row in searches) / max(1, len(searches)),
+            }
+        )
     return lines
 
 

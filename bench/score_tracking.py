@@ -1,16 +1,17 @@
 """Short rendered sequences of known motion (``bench/tracking.py``), followed by registration.
 
-In each the object is covered in part, covered wholly and removed for a while. Rendered, and looked
-at while tracking was developed: choice. Right is an ADD below a tenth of the diameter; wrong and
-`ok` is what is not right by ADD-S either, for `ok` holds up to near-symmetric copies.
+Section ``tracking`` of ``bench/real.py``. In each sequence the object is partly covered, fully
+covered and removed for a while; all take part in choices. Right is an ADD below a tenth of the
+diameter. "ok, wrong" counts the `ok` answers that are wrong by ADD-S too, for `ok` holds up to
+near-symmetric copies.
 """
 
-import time
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from score import Job, Row, Section, surface_points
+from score import RIGHT, Job, Row, Section, surface_points
+from shared import with_cpu_seconds
 from torch import Tensor
 from tracking import Frame, counts, sequence, verdict
 
@@ -37,20 +38,28 @@ def follow(name: str) -> list[Row]:
     registration = Registration([model])
     registration.prepare()
     frames = list(sequence(model, FRAMES, SPEED, SEED))
-    began = time.process_time()
-    found = list(registration.track((frame.view.depth_m for frame in frames), frames[0].view.K))
-    cpu_s = time.process_time() - began
+    depths_m = [frame.view.depth_m for frame in frames]
+    estimates, cpu_s = with_cpu_seconds(
+        lambda: list(registration.track(iter(depths_m), frames[0].view.K))
+    )
     points_m = surface_points(model)
-    said = [verdict(model, points_m, frame, estimate)[0]
-            for frame, estimate in zip(frames, found, strict=True)]  # fmt: skip
-    is_wrong = [estimate.is_ok and not is_right_by_adds(model, points_m, frame, estimate)
-                for frame, estimate in zip(frames, found, strict=True)]  # fmt: skip
-    kinds = [estimate.tracking for estimate in found]
-    return [{
-        "part": name, "use": "choice", "frames": len(frames), **counts(said),
-        "ok, wrong": sum(is_wrong), "tracked": kinds.count("tracked"),
-        "found": kinds.count("found"), "CPU s": cpu_s,
-    }]  # fmt: skip
+    verdicts = list[str]()
+    ok_and_wrong = 0
+    for frame, estimate in zip(frames, estimates, strict=True):
+        verdicts.append(verdict(model, points_m, frame, estimate)[0])
+        ok_and_wrong += estimate.is_ok and not is_right_by_adds(model, points_m, frame, estimate)
+    states = [estimate.tracking for estimate in estimates]
+    row = {
+        "part": name,
+        "use": "choice",
+        "frames": len(frames),
+        **counts(verdicts),
+        "ok, wrong": ok_and_wrong,
+        "tracked": states.count("tracked"),
+        "found": states.count("found"),
+        "CPU s": cpu_s,
+    }
+    return [row]
 
 
 def is_right_by_adds(
@@ -60,7 +69,7 @@ def is_right_by_adds(
     pose = estimate.camera_from_model
     if pose is None or not frame.is_seen:
         return False
-    return float(adds_m(pose, frame.truth, points_m)) < 0.1 * model.diameter_m
+    return float(adds_m(pose, frame.truth, points_m)) < RIGHT * model.diameter_m
 
 
 def table(rows: Sequence[Row]) -> list[Row]:

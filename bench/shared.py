@@ -1,19 +1,52 @@
-"""Tables, processor time and memory for the scripts of this folder.
+"""Command lines, tables, processor time and memory for the scripts of this folder.
 
 Real instances are loaded by ``real_poses``, synthetic frames by ``find_tables``.
 """
 
+import argparse
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 
 from depthpose.report.page import markdown_table
 
 Row = Mapping[str, Any]
+AnyRow = TypeVar("AnyRow", bound=Row)
+Result = TypeVar("Result")
+
+
+def make_parser(docstring: str | None) -> argparse.ArgumentParser:
+    """Make the parser of a script, whose help shows the script's docstring as it is written."""
+    return argparse.ArgumentParser(
+        description=docstring, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+
+
+def group_rows(rows: Sequence[AnyRow], *columns: str) -> dict[tuple[Any, ...], list[AnyRow]]:
+    """Group rows by their values in some columns, in the order in which these appear."""
+    groups: dict[tuple[Any, ...], list[AnyRow]] = {}
+    for row in rows:
+        values = tuple(row[column] for column in columns)
+        groups.setdefault(values, []).append(row)
+    return groups
+
+
+def mean_of(rows: Sequence[Row], column: str) -> float:
+    """Average a column; NaN of no rows."""
+    if not rows:
+        return float("nan")
+    return sum(row[column] for row in rows) / len(rows)
+
+
+def with_cpu_seconds(run: Callable[[], Result]) -> tuple[Result, float]:
+    """Run something; return its result and its processor time [s], of all threads together."""
+    start_s = time.process_time()
+    result = run()
+    return result, time.process_time() - start_s
 
 
 def report(name: str, rows: Sequence[Row]) -> None:
@@ -40,12 +73,7 @@ def least_seconds(run: Callable[[], object], repeats: int) -> float:
 
     The caller has run it before, so that nothing is loaded or compiled meanwhile.
     """
-    times_s: list[float] = []
-    for _ in range(repeats):
-        began_s = time.process_time()
-        run()
-        times_s.append(time.process_time() - began_s)
-    return min(times_s)
+    return min(with_cpu_seconds(run)[1] for _ in range(repeats))
 
 
 def resident_bytes(field: str) -> int:

@@ -1,12 +1,14 @@
-"""The sky that networks find in synthetic streets, compared with the exact labels.
+"""Depth of the sky in synthetic streets, by the exact labels of their pixels.
 
-python bench/sky.py --weights default kitti-nc --number 24
+    python bench/sky.py --weights default kitti-nc --number 24
+
+The sky should be far (no depth counts as far), and everything else should have depth.
 """
 
-import argparse
 from dataclasses import replace
 
 import torch
+from shared import make_parser
 from torch import Tensor
 from tqdm import tqdm
 
@@ -16,40 +18,44 @@ from depthpose.depth.synthetic import Streets
 from depthpose.depth.types import StereoSample
 from depthpose.report.page import markdown_table
 
-SEED = 90
-"""No weights were trained on streets of this seed."""
-CAP_M = 80.0
+SEED = 90  # no weights were trained on streets of this seed
+FAR_M = 80.0
 
 
 def measure(name: str, input: str, streets: list[StereoSample]) -> dict[str, object]:
-    """One row: a network's depth in the sky and elsewhere; no depth counts as far."""
+    """Measure a network's depth in the sky and elsewhere, from one view or from both."""
     net = FakestereoNet.load(name, allow_ood=True)
-    depths: dict[bool, list[Tensor]] = {True: [], False: []}
-    sure: dict[bool, list[Tensor]] = {True: [], False: []}
+    sky_depths_m: list[Tensor] = []
+    rest_depths_m: list[Tensor] = []
+    sky_confidences: list[Tensor] = []
+    rest_confidences: list[Tensor] = []
     for street in tqdm(streets, f"{name}, {input}"):
-        assert street.truth.is_sky is not None
-        seen = street.input if input == "both" else replace(street.input, right=None)
-        found = net.estimate_pair(seen, with_check=False)
-        assert found.depth_m is not None
-        assert found.confidence is not None
-        for is_sky in (True, False):
-            part = street.truth.is_sky == is_sky
-            depths[is_sky].append(found.depth_m[part].nan_to_num(torch.inf))
-            sure[is_sky].append(found.confidence[part])
-    sky_m, rest_m = torch.cat(depths[True]), torch.cat(depths[False])
+        is_sky = street.truth.is_sky
+        assert is_sky is not None
+        views = street.input if input == "both" else replace(street.input, right=None)
+        estimate = net.estimate_input(views, with_check=False)
+        assert estimate.depth_m is not None
+        assert estimate.confidence is not None
+        depth_m = estimate.depth_m.nan_to_num(torch.inf)
+        sky_depths_m.append(depth_m[is_sky])
+        rest_depths_m.append(depth_m[~is_sky])
+        sky_confidences.append(estimate.confidence[is_sky])
+        rest_confidences.append(estimate.confidence[~is_sky])
+    is_near = torch.cat(sky_depths_m) < FAR_M
+    is_missing = torch.cat(rest_depths_m).isinf()
     return {
         "weights": name,
         "input": input,
-        "sky nearer than 80 m": f"{float((sky_m < CAP_M).float().mean()):.1%}",
-        "rest without depth": f"{float(rest_m.isinf().float().mean()):.2%}",
-        "sky: median confidence": round(float(torch.cat(sure[True]).median()), 2),
-        "rest: mean confidence": round(float(torch.cat(sure[False]).mean()), 2),
+        "sky nearer than 80 m": f"{float(is_near.float().mean()):.1%}",
+        "rest without depth": f"{float(is_missing.float().mean()):.2%}",
+        "sky: median confidence": round(float(torch.cat(sky_confidences).median()), 2),
+        "rest: mean confidence": round(float(torch.cat(rest_confidences).mean()), 2),
     }
 
 
 def main() -> None:
     """Print a row for each network and number of views."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = make_parser(__doc__)
     parser.add_argument("--weights", nargs="+", default=["default", "kitti-nc"])
     parser.add_argument("--number", type=int, default=24, help="streets")
     parser.add_argument("--scale", type=float, default=0.5, help="size as a share of KITTI's")

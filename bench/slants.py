@@ -1,15 +1,14 @@
-"""How much more readings are off on slanted surfaces: real objects at their estimated poses.
+"""How depth errors grow with the slant of a surface: real objects at their estimated poses.
 
     python bench/slants.py SAMPLES
 
 Instances of YCB objects and two bottles by their exact masks, and elbows in three of the bins that
-may take part in a choice, all before RealSenses. Residuals are means over 5x5 readings, away from
-edges, less the posed model, along the optical axis. For each range of slants: their deviation (by
-the median, so that a few dents count little), and the shift across the axis, in pixels of the depth
-image, that explains by how much it is larger than that of the least slanted surface.
+may take part in a choice, all seen by RealSenses. Residuals are means over 5x5 readings, away from
+edges, minus the depth of the posed model. Printed for each range of slants: their deviation
+(computed by the median, which a few dents change little), and the sideways shift in pixels of the
+depth image that explains the growth since the least slanted surface.
 """
 
-import argparse
 import math
 from collections.abc import Iterator
 from itertools import pairwise
@@ -20,6 +19,7 @@ import numpy as np
 from scipy import ndimage
 from score_instances import EXACT, arguments_of, cases, registration_of
 from score_scenes import bins_of, part_of
+from shared import make_parser
 
 from depthpose import Registration
 from depthpose.core.rigid import Rigid
@@ -31,16 +31,17 @@ from depthpose.pose.types import PoseEstimate, ViewInput
 from depthpose.report.page import markdown_table
 
 TANGENTS = (0.0, 0.4, 0.8, 1.2, 1.7, 2.3, 3.2)  # of the angle between ray and normal
-FARTHEST_M = 0.03  # off the model: of something else
-FILLED = 0.5  # of a mean's square
-FEWEST = 300
-MEDIAN_TO_DEVIATION = 1.4826
+MAX_RESIDUAL_M = 0.03  # readings farther off the model show something else
+MIN_FILLED = 0.5  # share of readings in the square of a mean
+MIN_MEANS = 300  # of a range of slants
+MEDIAN_TO_DEVIATION = 1.4826  # of a normal distribution
+MIN_COSINE = 0.15
 SETS = ("ycb", "bottle")
 BINS = 3
 
 
 class Residuals(NamedTuple):
-    """Means of residuals [m], tangents of the slant, and the size of a pixel there [m]."""
+    """Mean residuals [m], tangents of the slant, and widths of a pixel on the surface [m]."""
 
     mean_m: np.ndarray
     tangent: np.ndarray
@@ -52,9 +53,7 @@ Compared = tuple[Observation, Rigid, Surface]
 
 def main() -> None:
     """Print a table of each kind of object."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("samples", type=Path)
     samples: Path = parser.parse_args().samples
 
@@ -83,12 +82,12 @@ def of_masks(samples: Path, kind: str, compared: list[Compared]) -> Iterator[Res
 
 
 def of_bins(home: Path, compared: list[Compared]) -> Iterator[Residuals]:
-    """Measure what is found in some bins of elbows."""
+    """Measure the elbows that are found in some bins."""
     for scene in bins_of(home, "elbows")[::2][:BINS]:
         registration: Registration = part_of(scene.parent)[0]
         compared.clear()
-        found = registration.find(scene / "depth.png", scene / "camera.json")
-        yield from of_estimates(found, compared)
+        estimates = registration.find(scene / "depth.png", scene / "camera.json")
+        yield from of_estimates(estimates, compared)
 
 
 def of_estimates(estimates: list[PoseEstimate], compared: list[Compared]) -> Iterator[Residuals]:
@@ -97,51 +96,56 @@ def of_estimates(estimates: list[PoseEstimate], compared: list[Compared]) -> Ite
         if estimate.camera_from_model is None:
             continue
         pose = estimate.camera_from_model.double()
-        observation, _, surface = min(
-            compared,
-            key=lambda other: float((other[1].matrix().double() - pose.matrix()).norm()),
-        )
+        matrix = pose.matrix()
+        distances = [float((other.matrix().double() - matrix).norm()) for _, other, _ in compared]
+        observation, _, surface = compared[distances.index(min(distances))]
         yield residuals(observation, pose, surface)
 
 
 def residuals(observation: Observation, pose: Rigid, surface: Surface) -> Residuals:
-    """Average the readings less the posed surface over squares, as evidence does."""
+    """Average the readings minus the posed surface over squares, as evidence does."""
     K = observation.K
     drawn_m, cosine, window = render_surface(surface, pose, K, *observation.depth_m.shape)
     step = observation.step
     inner = evidence._without_edges(drawn_m, np.isfinite(drawn_m), surface.diameter_m, step)
     residual_m = observation.depth_m[window] - drawn_m
-    is_used = inner & (np.abs(np.nan_to_num(residual_m, nan=np.inf)) < FARTHEST_M)
+    is_used = inner & (np.abs(np.nan_to_num(residual_m, nan=np.inf)) < MAX_RESIDUAL_M)
     side = evidence._averaged_side(step)
     filled = ndimage.uniform_filter(is_used.astype(np.float32), side)
-    sum_m = ndimage.uniform_filter(np.where(is_used, residual_m, 0).astype(np.float32), side)
-    has_mean = inner & (filled > FILLED)
+    used_m = np.where(is_used, residual_m, 0).astype(np.float32)
+    average_m = ndimage.uniform_filter(used_m, side)
+    has_mean = inner & (filled > MIN_FILLED)
     return Residuals(
-        mean_m=sum_m[has_mean] / filled[has_mean],
-        tangent=np.sqrt(1 / np.clip(cosine[has_mean], 0.15, 1) ** 2 - 1),
+        mean_m=average_m[has_mean] / filled[has_mean],
+        tangent=np.sqrt(1 / np.clip(cosine[has_mean], MIN_COSINE, 1) ** 2 - 1),
         pixel_m=drawn_m[has_mean] / (float(K[0, 0]) * step),
     )
 
 
 def rows_of(measured: list[Residuals]) -> list[dict[str, str]]:
-    """Give the deviation for each range of slants, and the shift that explains its growth."""
+    """Compute the deviation for each range of slants, and the shift that explains its growth."""
     mean_m = np.concatenate([each.mean_m for each in measured])
     tangent = np.concatenate([each.tangent for each in measured])
     pixel_m = np.concatenate([each.pixel_m for each in measured])
     rows: list[dict[str, str]] = []
-    least_m: float | None = None
+    least_slanted_m: float | None = None
     for low, high in pairwise(TANGENTS):
-        is_here = (tangent >= low) & (tangent < high)
-        if is_here.sum() < FEWEST:
+        in_range = (tangent >= low) & (tangent < high)
+        if in_range.sum() < MIN_MEANS:
             continue
-        deviation_m = MEDIAN_TO_DEVIATION * float(np.median(np.abs(mean_m[is_here])))
-        least_m = deviation_m if least_m is None else least_m
-        grown_m = math.sqrt(max(deviation_m**2 - least_m**2, 0))
-        shift_px = grown_m / float(np.median(tangent[is_here]) * np.median(pixel_m[is_here]))
-        rows.append({
-            "tangent": f"{low} to {high}", "means": str(int(is_here.sum())),
-            "deviation [mm]": f"{1000 * deviation_m:.2f}", "shift [px]": f"{shift_px:.2f}",
-        })  # fmt: skip
+        deviation_m = MEDIAN_TO_DEVIATION * float(np.median(np.abs(mean_m[in_range])))
+        if least_slanted_m is None:
+            least_slanted_m = deviation_m
+        growth_m = math.sqrt(max(deviation_m**2 - least_slanted_m**2, 0))
+        growth_of_1_px_m = float(np.median(tangent[in_range]) * np.median(pixel_m[in_range]))
+        rows.append(
+            {
+                "tangent": f"{low} to {high}",
+                "means": str(int(in_range.sum())),
+                "deviation [mm]": f"{1000 * deviation_m:.2f}",
+                "shift [px]": f"{growth_m / growth_of_1_px_m:.2f}",
+            }
+        )
     return rows
 
 

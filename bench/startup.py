@@ -7,31 +7,35 @@ import subprocess
 import sys
 import time
 
-from shared import report
+from shared import make_parser, report
 
 from depthpose.cli import COMMANDS
 
 
-def seconds(*words: str) -> float:
-    """Best of three runs of ``python WORDS``: the machine's noise only ever adds."""
-    runs = []
+def least_wall_seconds(*arguments: str) -> float:
+    """Measure the least wall time [s] of three runs of ``python ARGUMENTS``."""
+    times_s = []
     for _ in range(3):
-        start = time.perf_counter()
-        subprocess.run([sys.executable, *words], check=True, capture_output=True)
-        runs.append(time.perf_counter() - start)
-    return min(runs)
+        start_s = time.perf_counter()
+        subprocess.run([sys.executable, *arguments], check=True, capture_output=True)
+        times_s.append(time.perf_counter() - start_s)
+    return min(times_s)
 
 
 def main() -> None:
     """Print a table and write out/bench/startup.json."""
-    words_of: dict[str, tuple[str, ...]] = {
+    make_parser(__doc__).parse_args()
+    arguments_of: dict[str, tuple[str, ...]] = {
         "python -c pass": ("-c", "pass"),
         "python -c 'import torch'": ("-c", "import torch"),
         "python -c 'import depthpose'": ("-c", "import depthpose"),
     }
     for name in ("", *COMMANDS):
-        words_of[f"depthpose {name} --help"] = ("-m", "depthpose", *name.split(), "--help")
-    rows = [{"command": name, "seconds": seconds(*words)} for name, words in words_of.items()]
+        arguments_of[f"depthpose {name} --help"] = ("-m", "depthpose", *name.split(), "--help")
+    rows = [
+        {"command": name, "seconds": least_wall_seconds(*arguments)}
+        for name, arguments in arguments_of.items()
+    ]
     report("startup", rows)
 
 

@@ -11,15 +11,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from shared import peak_growth_bytes, report, size_of
+from shared import make_parser, peak_growth_bytes, report, size_of
 from stereo_speed import network_for, plain_match, random_pair
 
 from depthpose.depth.config import MatcherConfig
 from depthpose.depth.stereo import PSMNetMatcher
 from depthpose.depth.stereo.psmnet import psmnet_bytes
 
-PLAIN = 0
-"""Marks the plain network, in place of a bound."""
+PLAIN = 0  # in place of a bound: the plain network
 
 
 def run_once(size: tuple[int, int], weights: Path | None, bound: int | None, out: Path) -> None:
@@ -55,45 +54,54 @@ def measure(
 
 
 def least_bytes(size: tuple[int, int], weights: Path | None) -> int:
-    """The least bound that is accepted."""
+    """Compute the least bound that is accepted."""
     config = network_for(weights).config
-    h, w = (max(config.min_side_px, -(-side // 16) * 16) for side in size)
-    return psmnet_bytes(config, h, w, torch.float32)
+    height, width = (max(config.min_side_px, -(-side // 16) * 16) for side in size)
+    return psmnet_bytes(config, height, width, torch.float32)
 
 
 def main() -> None:
     """Print a table and write out/bench/stereo_memory.json."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--size", nargs="+", default=["375x1242"])
     parser.add_argument("--bound-mb", type=float, default=1000)
     parser.add_argument("--weights", type=Path)
     parser.add_argument("--child", type=Path, help=argparse.SUPPRESS)
-    args = parser.parse_args()
-    if args.child:
+    options = parser.parse_args()
+    if options.child:
         has_bound = "--bound-mb" in sys.argv
-        bound = round(args.bound_mb * 1e6) if has_bound else None
-        run_once(size_of(args.size[0]), args.weights, bound, args.child)
+        bound = round(options.bound_mb * 1e6) if has_bound else None
+        run_once(size_of(options.size[0]), options.weights, bound, options.child)
         return
-    rows = [row for size in args.size for row in rows_of(size_of(size), args)]
+    rows = [row for size in options.size for row in rows_of(size_of(size), options)]
     report("stereo_memory", rows)
 
 
-def rows_of(size: tuple[int, int], args: argparse.Namespace) -> list[dict[str, object]]:
-    """Measure the network as it is trained, then the matcher without a bound, with two."""
-    plain, peak = measure(size, args.weights, PLAIN)
-    reference = plain
-    name = f"{size[0]}x{size[1]}"
-    rows: list[dict[str, object]] = [
-        {"size": name, "bound_mb": "plain network", "peak_mb": peak // 10**6, "max_px": 0.0}
-    ]
-    bounds = (None, round(args.bound_mb * 1e6), least_bytes(size, args.weights))
-    for bound in bounds:
-        disparity_px, peak = measure(size, args.weights, bound)
-        # Ours is compared with the plain network, then the bounded runs with the unbounded one.
-        difference = float(np.abs(disparity_px - (plain if bound is None else reference)).max())
-        reference = disparity_px if bound is None else reference
-        shown = "none" if bound is None else -(-bound // 10**6)
-        rows.append({**rows[0], "bound_mb": shown, "peak_mb": peak // 10**6, "max_px": difference})
+def rows_of(size: tuple[int, int], options: argparse.Namespace) -> list[dict[str, object]]:
+    """Measure the network as it is trained, then the matcher without a bound and with two.
+
+    The unbounded matcher is compared with the plain network, the bounded ones with the unbounded.
+    """
+    plain_px, plain_peak = measure(size, options.weights, PLAIN)
+    unbounded_px, unbounded_peak = measure(size, options.weights, None)
+    rows: list[dict[str, object]] = []
+
+    def add_row(bound: str | int, peak: int, difference_px: float) -> None:
+        rows.append(
+            {
+                "size": f"{size[0]}x{size[1]}",
+                "bound_mb": bound,
+                "peak_mb": peak // 10**6,
+                "max_px": difference_px,
+            }
+        )
+
+    add_row("plain network", plain_peak, 0.0)
+    add_row("none", unbounded_peak, float(np.abs(unbounded_px - plain_px).max()))
+    for bound in (round(options.bound_mb * 1e6), least_bytes(size, options.weights)):
+        disparity_px, peak = measure(size, options.weights, bound)
+        difference_px = float(np.abs(disparity_px - unbounded_px).max())
+        add_row(-(-bound // 10**6), peak, difference_px)
     return rows
 
 

@@ -1,18 +1,19 @@
 """Processor time of PSMNetMatcher and of the network as it is trained: same weights and process.
 
-python bench/stereo_speed.py [--size 256x512 375x1242] [--weights published_kitti2015.tar]
+    python bench/stereo_speed.py [--size 256x512 375x1242] [--weights published_kitti2015.tar]
 
-Without weights they are random, and differences mean less. With a left and right image
+Without --weights they are random, and differences mean less. With a left and right image
 (--pair LEFT RIGHT) their lower part is matched instead of noise.
 """
 
 import argparse
-import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import torch
 import torch.nn.functional as F
-from shared import least_seconds, report, setting, size_of
+from shared import least_seconds, make_parser, report, setting, size_of, with_cpu_seconds
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
@@ -45,7 +46,7 @@ def network_for(weights: Path | None) -> PSMNet:
 
 
 def random_pair(size: tuple[int, int], generator: torch.Generator) -> Pair:
-    """Smooth noise, seen from two places 20 px apart."""
+    """Make smooth noise and the same shifted by 20 px."""
     rows, columns = size
     coarse = torch.rand(1, 3, rows // 4 + 1, columns // 4 + 8, generator=generator)
     wide = F.interpolate(coarse, (rows, columns + 20), mode="bicubic")[0].clamp(0, 1)
@@ -57,43 +58,42 @@ def pair_for(size: tuple[int, int], files: list[Path] | None) -> Pair:
     if not files:
         return random_pair(size, torch.Generator().manual_seed(0))
     images = [read_image(file) for file in files]
-    first = max(0, (images[0].shape[-1] - size[1]) // 2)
-    left, right = (i[:, -size[0] :, first : first + size[1]].contiguous() for i in images)
+    height, width = size
+    start = max(0, (images[0].shape[-1] - width) // 2)
+    left, right = (image[:, -height:, start : start + width].contiguous() for image in images)
     return left, right
 
 
 def plain_match(network: PSMNet, pair: Pair) -> Tensor:
     """Run the network module by module on contiguous tensors, padded as the matcher pads."""
-    h, w = pair[0].shape[-2:]
-    rows, columns = (max(256, -(-side // 16) * 16) for side in (h, w))
+    height, width = pair[0].shape[-2:]
+    rows, columns = (max(256, -(-side // 16) * 16) for side in (height, width))
+    padding = (0, columns - width, rows - height, 0)
     dtype = next(network.parameters()).dtype
-    left, right = (
-        F.pad(normalise(i.to(dtype)), (0, columns - w, rows - h, 0))[None].contiguous()
-        for i in pair
-    )
+    left, right = (F.pad(normalise(image.to(dtype)), padding)[None].contiguous() for image in pair)
     with torch.inference_mode():
-        return network(left, right)[-1][0, -h:, :w]
+        return network(left, right)[-1][0, -height:, :width]
 
 
 def peak_flops(dtype: torch.dtype) -> float:
-    """Most operations a second [FLOP/s] that a matrix product reached, by two libraries.
+    """Measure the most operations a second [FLOP/s] of a matrix product, by two libraries.
 
     The second is a 1x1 convolution, which is the same product through oneDNN.
     """
-    a, b = torch.randn(2, 4096, 1024).to(dtype)
-    by_matmul = least_seconds(lambda: a @ b.T, 5)
+    first, second = torch.randn(2, 4096, 1024).to(dtype)
+    product_s = least_seconds(lambda: first @ second.T, 5)
     x = torch.randn(1, 512, 64, 128).to(dtype).contiguous(memory_format=torch.channels_last)
-    w = torch.randn(512, 512, 1, 1).to(dtype).contiguous(memory_format=torch.channels_last)
-    by_convolution = least_seconds(lambda: F.conv2d(x, w), 5)
-    return max(2 * 4096 * 4096 * 1024 / by_matmul, 2 * 512 * 512 * 64 * 128 / by_convolution)
+    kernel = torch.randn(512, 512, 1, 1).to(dtype).contiguous(memory_format=torch.channels_last)
+    convolution_s = least_seconds(lambda: F.conv2d(x, kernel), 5)
+    return max(2 * 4096 * 4096 * 1024 / product_s, 2 * 512 * 512 * 64 * 128 / convolution_s)
 
 
 def plain_flops(network: PSMNet, pair: Pair) -> int:
     """Count the operations of the plain network, without computing anything."""
     with torch.device("meta"):
-        shadow = PSMNet(network.config).eval()
+        network_without_values = PSMNet(network.config).eval()
     with FlopCounterMode(display=False) as counter:
-        plain_match(shadow, (pair[0].to("meta"), pair[1].to("meta")))
+        plain_match(network_without_values, (pair[0].to("meta"), pair[1].to("meta")))
     return counter.get_total_flops()
 
 
@@ -102,19 +102,22 @@ def exact_match(network: PSMNet, pair: Pair) -> Tensor:
     double = PSMNet(network.config).double().eval()
     double.load_state_dict(network.state_dict())
     double.rows = 32
-    h, w = pair[0].shape[-2:]
-    left, right = (pad_top_right(normalise(i.double()), network.config)[None] for i in pair)
+    height, width = pair[0].shape[-2:]
+    left, right = (pad_top_right(normalise(image.double()), network.config)[None] for image in pair)
     size = (network.config.max_disparity_px, left.shape[-2], left.shape[-1])
     align = network.config.align_corners
     with torch.no_grad():
         cost = double.costs(left, right)[-1][0, 0].permute(1, 2, 0)
-        found, _ = expected_disparity(cost, size, align_corners=align, with_confidence=False)
-    return found[-h:, :w]
+        disparity_px, _ = expected_disparity(cost, size, align_corners=align, with_confidence=False)
+    return disparity_px[-height:, :width]
 
 
-def bench(network: PSMNet, size: str, pair: Pair, args: argparse.Namespace) -> list[dict]:
+def measure_pair(network: PSMNet, size: str, pair: Pair, options: argparse.Namespace) -> list[dict]:
     """Time every variant on one pair."""
-    exact = exact_match(network, pair) if args.exact else plain_match(network, pair).double()
+    if options.exact:
+        reference_px = exact_match(network, pair)
+    else:
+        reference_px = plain_match(network, pair).double()
     variants = {
         "plain eager": None,
         "ours fp32": MatcherConfig(with_confidence=False),
@@ -124,51 +127,59 @@ def bench(network: PSMNet, size: str, pair: Pair, args: argparse.Namespace) -> l
     flops = plain_flops(network, pair)
     rows: list[dict] = []
     for name, config in variants.items():
-        row = {"size": size, "what": name, **timed(network, pair, config, args.repeats, exact)}
+        times = measure_variant(network, pair, config, options.repeats, reference_px)
+        row = {"size": size, "what": name, **times}
         rows.append(row)
         peak = peak_flops(torch.bfloat16 if "bf16" in name else torch.float32)
         row["ratio"] = rows[0]["seconds"] / row["seconds"]
-        row["gflop"], row["peak_gflops"] = flops / 1e9, peak / 1e9
+        row["gflop"] = flops / 1e9
+        row["peak_gflops"] = peak / 1e9
         row["share_of_peak"] = flops / row["seconds"] / peak
     return rows
 
 
-def timed(
-    network: PSMNet, pair: Pair, config: MatcherConfig | None, repeats: int, exact: Tensor
+def measure_variant(
+    network: PSMNet, pair: Pair, config: MatcherConfig | None, repeats: int, reference_px: Tensor
 ) -> dict[str, float]:
-    """Time one variant, its first run apart, and compare it with the exact disparity."""
-    begin = time.process_time()
-    if config is None:
-        answer, run = plain_match(network, pair), lambda: plain_match(network, pair)
-    else:
-        matcher = PSMNetMatcher(network, config)
-        answer, run = matcher.match(*pair).disparity_px, lambda: matcher.match(*pair)
-    first = time.process_time() - begin
-    difference = (answer.double() - exact).abs()
-    seconds = least_seconds(run, repeats)
+    """Time one variant, its first run apart, and compare it with the reference disparity."""
+
+    def first_run() -> tuple[Callable[[], Tensor], Tensor]:
+        if config is None:
+            match = partial(plain_match, network, pair)
+        else:
+            matcher = PSMNetMatcher(network, config)
+
+            def match() -> Tensor:
+                return matcher.match(*pair).disparity_px
+
+        return match, match()
+
+    (match, disparity_px), first_s = with_cpu_seconds(first_run)
+    difference_px = (disparity_px.double() - reference_px).abs()
     return {
-        "seconds": seconds,
-        "first_seconds": first,
-        "max_px": float(difference.max()),
-        "mean_px": float(difference.mean()),
+        "seconds": least_seconds(match, repeats),
+        "first_seconds": first_s,
+        "max_px": float(difference_px.max()),
+        "mean_px": float(difference_px.mean()),
     }
 
 
 def main() -> None:
     """Print a table and write out/bench/stereo_speed.json."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--size", nargs="+", default=["256x512", "375x1242"])
     parser.add_argument("--weights", type=Path)
     parser.add_argument("--pair", nargs=2, type=Path)
     parser.add_argument("--repeats", type=int, default=2)
     parser.add_argument("--exact", action="store_true", help="compare with float64: a minute more")
-    args = parser.parse_args()
-    network = network_for(args.weights)
-    print(f"{setting()}; differences from {'float64' if args.exact else 'the plain network'};")
+    options = parser.parse_args()
+    network = network_for(options.weights)
+    print(f"{setting()}; differences from {'float64' if options.exact else 'the plain network'};")
     print("share_of_peak: the plain network's operations a second against the best product's")
-    rows = [
-        row for s in args.size for row in bench(network, s, pair_for(size_of(s), args.pair), args)
-    ]
+    rows = []
+    for size in options.size:
+        pair = pair_for(size_of(size), options.pair)
+        rows += measure_pair(network, size, pair, options)
     report("stereo_speed", rows)
 
 

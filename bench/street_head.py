@@ -1,14 +1,15 @@
-"""Fit the layer by which a generator's weights know a street, on features of its encoder.
+"""Fit the layer by which a generator tells streets from other images, on features of its encoder.
 
     python bench/street_head.py default --out default.safetensors
     python bench/street_head.py kitti-nc --samples $DEPTHPOSE_DATA --out kitti-nc.safetensors
     ... [--pictures FOLDER ...] [--least 0] [--l2 0.01]
 
-Streets: synthetic ones by cameras of many mounts, as drawn and degraded; with --samples those of
-KITTI's training drives too. Others: pictures of packages and of folders, noise, shapes, text, and
-the streets turned, mirrored and in inverted colours (out_of_distribution.py). A logistic
-regression; prints what is refused of each kind by a fit without that kind. The limit, --least, is
-in the logit; what is written has it at a probability of a half.
+A logistic regression on streets and other images. Streets: synthetic ones by cameras of many
+mounts, clean and degraded; with --samples those of KITTI's training drives too. Others: pictures of
+packages and of folders, noise, shapes, text, and the streets rotated, mirrored and in inverted
+colours (out_of_distribution.py). Prints how many images of each kind are refused by a fit without
+that kind. --least is the limit of the logit; in the written weights it is at a probability of a
+half.
 """
 
 import argparse
@@ -23,6 +24,7 @@ import numpy as np
 import out_of_distribution as images
 import torch
 from PIL import Image
+from shared import make_parser
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -49,19 +51,19 @@ def rotation(pitch: float, yaw: float, roll: float) -> np.ndarray:
     return z @ x @ y
 
 
-def view(seed: int, index: int) -> StereoInput | None:
-    """Draw a synthetic street by a random camera: 1 to 3 m high, tilted up to 6 degrees; or None.
+def street_view(seed: int, index: int) -> StereoInput | None:
+    """Render a synthetic street by a random camera, 1 to 3 m high and tilted up to 6 degrees.
 
-    The axis lies up to 0.85 focal lengths off the centre, which is what a part of a wide view sees;
-    half are near the mount of KITTI's cars. None where something stands right before the camera.
+    The axis lies up to 0.85 focal lengths off the centre, as in a part of a wide view; half of the
+    cameras are near the mount of KITTI's cars. None if something stands right before the camera.
     """
     rng = np.random.default_rng([81, seed, index])
     scene = make_scene((seed, index), 1.65)
-    world = scene.mesh.corners.astype(float) @ scene.camera_from_world - [0, 1.65, 0]
+    world_m = scene.mesh.corners.astype(float) @ scene.camera_from_world - [0, 1.65, 0]
     normals = scene.mesh.normals @ scene.camera_from_world.astype(np.float32)
-    road = world[scene.mesh.material == NUMBER["road"]].reshape(-1, 3)
-    along = rng.uniform(0, 60)
-    near = road[np.argsort(np.abs(road[:, 2] - along))[:20]]
+    road_m = world_m[scene.mesh.material == NUMBER["road"]].reshape(-1, 3)
+    z_m = rng.uniform(0, 60)
+    road_here_m = road_m[np.argsort(np.abs(road_m[:, 2] - z_m))[:20]]
     f = float(np.exp(rng.uniform(math.log(360), math.log(600))))
     if rng.random() < 0.5:
         height_m, pitch, roll = rng.normal(1.65, 0.06), rng.normal(0, 0.012), rng.normal(0, 0.009)
@@ -71,8 +73,9 @@ def view(seed: int, index: int) -> StereoInput | None:
         pitch, roll = np.deg2rad(rng.uniform(-6, 6)), np.deg2rad(rng.normal(0, 2))
         cx, cy = COLUMNS / 2 + rng.uniform(-0.85, 0.85) * f, ROWS / 2 + rng.uniform(-70, 70)
     R = rotation(pitch, rng.normal(0, 0.1), roll)
-    eye = np.array([near[:, 0].mean() + rng.normal(0, 0.3), near[:, 1].mean() - height_m, along])
-    corners = ((world - eye) @ R.T).astype(np.float32)
+    x_m = road_here_m[:, 0].mean() + rng.normal(0, 0.3)
+    y_m = road_here_m[:, 1].mean() - height_m
+    corners = ((world_m - np.array([x_m, y_m, z_m])) @ R.T).astype(np.float32)
     mesh = dataclasses.replace(
         scene.mesh, corners=corners, normals=normals @ R.T.astype(np.float32)
     ).part(corners[:, :, 2].max(1) > -12)
@@ -82,7 +85,8 @@ def view(seed: int, index: int) -> StereoInput | None:
     if float((sight.raster.depth_m < 2).float().mean()) > 0.15:
         return None
     light = draw_light(stage, sight)
-    return images.given(f"{index}", expose(light, draw_sensors(rng, light, 0.3)[0]), f)
+    sensor, _ = draw_sensors(rng, light, 0.3)
+    return images.with_camera(f"{index}", expose(light, sensor), f)
 
 
 def degraded(image: Tensor, rng: np.random.Generator) -> Tensor:
@@ -123,10 +127,10 @@ def degraded(image: Tensor, rng: np.random.Generator) -> Tensor:
 
 
 def gather(options: argparse.Namespace) -> Iterator[tuple[str, bool, StereoInput]]:
-    """Give images with their kind (of streets, where they come from), and whether they are one."""
+    """Yield images with their kind (of streets their source), and whether they are streets."""
     rng = np.random.default_rng(1)
     for index in range(options.views):
-        street = view(options.seed, index)
+        street = street_view(options.seed, index)
         if street is None:
             continue
         source = f"synthetic streets, {'odd' if index % 2 else 'even'}"
@@ -143,59 +147,67 @@ def gather(options: argparse.Namespace) -> Iterator[tuple[str, bool, StereoInput
                 if index % 5 == 0:
                     for name, image in images.changed(street):
                         yield name, False, image
-    for source, name, whole in images.whole_pictures(options.pictures):
-        for _, part in images.parts(whole):
-            yield source, False, images.given(name, part)
+    for source, name, picture in images.whole_pictures(options.pictures):
+        for _, part in images.parts(picture):
+            yield source, False, images.with_camera(name, part)
     for kind, image in images.shapes():
-        yield kind, False, images.given(kind, image)
+        yield kind, False, images.with_camera(kind, image)
 
 
 @torch.no_grad()
 def features(generator: SelectionGenerator, street: StereoInput) -> np.ndarray:
-    """Give what the layer reads: three moments over the rows of the deepest features."""
+    """Compute the input of the layer: three moments over the rows of the deepest features."""
     assert street.camera is not None
-    share = generator.config.virtual_focal_px / float(street.camera.K[0, 0])
-    rows, columns = (max(round(side * share), 2) for side in street.left.shape[1:])
-    small = resize_image(street.left, rows, columns)[None]
+    scale = generator.config.virtual_focal_px / float(street.camera.K[0, 0])
+    rows, columns = (max(round(side * scale), 2) for side in street.left.shape[1:])
+    image = resize_image(street.left, rows, columns)[None]
+    # A layer in place of the generator's keeps what it is given.
     layer = torch.nn.Linear(3 * generator.encoder.channels[-1], 1)
-    seen: list[torch.Tensor] = []
-    layer.register_forward_hook(lambda _module, given, _found: seen.append(given[0]))
-    own, generator.street = generator.street, layer
-    generator.street_probability(generator.encoder(pad_to_multiple(small, 32))[-1])
-    generator.street = own
-    return seen[0][0].numpy()
+    inputs: list[torch.Tensor] = []
+    layer.register_forward_hook(lambda _module, arguments, _output: inputs.append(arguments[0]))
+    original_layer = generator.street
+    generator.street = layer
+    generator.street_probability(generator.encoder(pad_to_multiple(image, 32))[-1])
+    generator.street = original_layer
+    return inputs[0][0].numpy()
 
 
 def fit(x: np.ndarray, is_street: np.ndarray, kinds: np.ndarray, l2: float) -> np.ndarray:
-    """Fit a logistic regression; both classes weigh the same, kinds by the root of their number."""
+    """Fit a logistic regression; both classes weigh the same, kinds by the root of their number.
+
+    Returns the slopes of the features and the offset.
+    """
     weight = np.zeros(len(x))
-    for answer in (True, False):
-        for kind in np.unique(kinds[is_street == answer]):
-            mine = (kinds == kind) & (is_street == answer)
-            weight[mine] = mine.sum() ** -0.5
-        weight[is_street == answer] /= 2 * weight[is_street == answer].sum()
+    for in_class in (is_street, ~is_street):
+        for kind in np.unique(kinds[in_class]):
+            of_kind = (kinds == kind) & in_class
+            weight[of_kind] = of_kind.sum() ** -0.5
+        weight[in_class] /= 2 * weight[in_class].sum()
     mean = weight @ x
-    spread = np.sqrt(weight @ (x - mean) ** 2) + 1e-3
-    given = torch.from_numpy(np.c_[(x - mean) / spread, np.ones(len(x))])
-    wanted, counted = torch.from_numpy(is_street.astype(float)), torch.from_numpy(weight)
-    slopes = torch.zeros(given.shape[1], dtype=torch.float64, requires_grad=True)
-    solver = torch.optim.LBFGS([slopes], max_iter=60, line_search_fn="strong_wolfe")
+    deviation = np.sqrt(weight @ (x - mean) ** 2) + 1e-3
+    inputs = torch.from_numpy(np.c_[(x - mean) / deviation, np.ones(len(x))])
+    targets = torch.from_numpy(is_street.astype(float))
+    weights = torch.from_numpy(weight)
+    coefficients = torch.zeros(inputs.shape[1], dtype=torch.float64, requires_grad=True)
+    solver = torch.optim.LBFGS([coefficients], max_iter=60, line_search_fn="strong_wolfe")
 
     def loss() -> Tensor:
         solver.zero_grad()
-        errors = F.binary_cross_entropy_with_logits(given @ slopes, wanted, reduction="none")
-        total = counted @ errors + l2 * slopes[:-1].square().sum()
+        logits = inputs @ coefficients
+        losses = F.binary_cross_entropy_with_logits(logits, targets, reduction="none")
+        total = weights @ losses + l2 * coefficients[:-1].square().sum()
         total.backward()
         return total
 
     solver.step(loss)
-    found = slopes.detach().numpy()
-    return np.r_[found[:-1] / spread, found[-1] - found[:-1] @ (mean / spread)]
+    *slopes, offset = coefficients.detach().numpy()
+    slopes = np.array(slopes)
+    return np.r_[slopes / deviation, offset - slopes @ (mean / deviation)]
 
 
 def main() -> None:
     """Gather, fit, score each kind by a fit without it, write the weights."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser = make_parser(__doc__)
     parser.add_argument("weights")
     parser.add_argument("--views", type=int, default=330)
     parser.add_argument("--seed", type=int, default=43)
@@ -205,31 +217,47 @@ def main() -> None:
     parser.add_argument("--l2", type=float, default=0.01)
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
-    found = read_depth_weights(find_weights(options.weights))
-    generator = found.generator
+    weights = read_depth_weights(find_weights(options.weights))
+    generator = weights.generator
     assert isinstance(generator, SelectionGenerator)
-    looks = [(kind, is_street, features(generator, image))
-             for kind, is_street, image in gather(options)]  # fmt: skip
-    kinds, is_street = np.array([one[0] for one in looks]), np.array([one[1] for one in looks])
-    x = np.stack([one[2] for one in looks]).astype(float)
+    kind_of_image: list[str] = []
+    is_street_of_image: list[bool] = []
+    features_of_image: list[np.ndarray] = []
+    for kind, is_street, image in gather(options):
+        kind_of_image.append(kind)
+        is_street_of_image.append(is_street)
+        features_of_image.append(features(generator, image))
+    kinds = np.array(kind_of_image)
+    is_street = np.array(is_street_of_image)
+    x = np.stack(features_of_image).astype(float)
     rows: list[dict[str, Any]] = []
-    for kind in dict.fromkeys(kinds.tolist()):
-        mine = kinds == kind
-        slopes = fit(x[~mine], is_street[~mine], kinds[~mine], options.l2)
-        logit = x[mine] @ slopes[:-1] + slopes[-1]
-        rows.append({
-            "images": kind, "street": bool(is_street[mine][0]), "number": int(mine.sum()),
-            "refused": int((logit < options.least).sum()), "least": logit.min(),
-            "median": float(np.median(logit)), "most": logit.max(),
-        })  # fmt: skip
+    for kind in dict.fromkeys(kind_of_image):
+        of_kind = kinds == kind
+        *slopes, offset = fit(x[~of_kind], is_street[~of_kind], kinds[~of_kind], options.l2)
+        logit = x[of_kind] @ slopes + offset
+        rows.append(
+            {
+                "images": kind,
+                "street": bool(is_street[of_kind][0]),
+                "number": int(of_kind.sum()),
+                "refused": int((logit < options.least).sum()),
+                "least": logit.min(),
+                "median": float(np.median(logit)),
+                "most": logit.max(),
+            }
+        )
     print(markdown_table(rows))
-    slopes = fit(x, is_street, kinds, options.l2)
+    *slopes, offset = fit(x, is_street, kinds, options.l2)
     generator.config = dataclasses.replace(generator.config, with_street=True, least_confidence=0.5)
     generator.street = torch.nn.Linear(x.shape[1], 1)
-    generator.street.weight.data = torch.from_numpy(slopes[None, :-1]).float()
-    generator.street.bias.data = torch.tensor([slopes[-1] - options.least]).float()
+    generator.street.weight.data = torch.tensor([slopes]).float()
+    generator.street.bias.data = torch.tensor([offset - options.least]).float()
     write_depth_weights(
-        options.out, generator=generator, matcher=found.matcher, facts=found.facts, with_half=True
+        options.out,
+        generator=generator,
+        matcher=weights.matcher,
+        facts=weights.facts,
+        with_half=True,
     )
 
 

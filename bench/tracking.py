@@ -4,29 +4,31 @@
     python bench/tracking.py --weights parts --speed 2 --anew 0
     python bench/tracking.py --weights parts --resting --anew 0
 
-Each object of the weights moves on a smooth path before a wall, over a table, between other
-boxes, and turns as it goes, at 30 frames a second (``--speed 1``: 0.2 m/s and 40 degrees a second
-on average). A plate covers it fully in some frames, it is removed in others, and two
-fifths of it are occluded in others. With ``--resting`` it lies on the table, on the largest face of
-its convex hull, and slides and turns there. Depth has a sensor's errors. Right is an answer with
-ADD (ADD-S where symmetries are declared or were found) below 10 % of the diameter in a frame that
-shows the object; lost is no answer in such a frame. "says so" are frames from the start of a
-drop-out to the first that is refused, "back" those from its end to the next right answer. "off" is
-the error of right answers in percent of the diameter, the median and the 95 % quantile. Seconds are
-of the processor, one thread. ``--anew N``: every N-th frame is searched without earlier frames.
+Each object of the weights moves on a smooth path and rotates, before a wall and a table and
+between boxes, at 30 frames a second (``--speed 1``: 0.2 m/s and 40 degrees a second on average). A
+plate covers it fully in some frames, in others it is removed, in others two fifths of it are
+occluded. With ``--resting`` it lies on the table, on the largest face of its convex hull, and
+slides and rotates there. Depth has a sensor's errors.
+
+An answer is right if its ADD (ADD-S where symmetries are declared or were found) is below 10 % of
+the diameter in a frame that shows the object; no answer in such a frame is lost. "says so" counts
+the frames from the start of a drop-out to the first refusal, "back" those from its end to the next
+right answer. "off" is the error of right answers in percent of the diameter, the median and the
+95 % quantile. Seconds are of the processor, one thread. ``--anew N``: every N-th frame is searched
+without earlier frames.
 """
 
-import argparse
 import math
-import time
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from scipy.spatial import ConvexHull
+from shared import make_parser, with_cpu_seconds
 from torch import Tensor
 
+from depthpose.core.camera.pinhole import intrinsics
 from depthpose.core.checkpoint import find_weights
 from depthpose.core.loop import sample_generator
 from depthpose.core.render import rasterize
@@ -41,16 +43,25 @@ from depthpose.report.page import markdown_table
 
 SEED = 0x7AC4
 WIDTH, HEIGHT, FOCAL_PX = 640, 480, 572.0
-K = torch.tensor([[FOCAL_PX, 0, 319.5], [0, FOCAL_PX, 239.5], [0, 0, 1]], dtype=torch.float64)
-COVERED, REMOVED, PARTLY = (0.25, 0.33), (0.5, 0.58), (0.75, 0.85)
-"""Stretches of a sequence, as shares of its frames."""
-HIDDEN = 0.4
-RATE = 30
-DOWN_RAD = math.radians(50)
-"""How steeply the camera looks down at a table on which things rest."""
-UP = torch.tensor([0.0, -math.cos(DOWN_RAD), -math.sin(DOWN_RAD)], dtype=torch.float64)
-TABLE_M = torch.tensor([0.0, 0.0, 0.75], dtype=torch.float64)
-"""Where the optical axis meets it."""
+CENTRE_X_PX, CENTRE_Y_PX = (WIDTH - 1) / 2, (HEIGHT - 1) / 2
+K = intrinsics(FOCAL_PX, FOCAL_PX, CENTRE_X_PX, CENTRE_Y_PX)
+
+# Parts of a sequence in which the object is covered, removed and partly occluded, as shares of it.
+COVERED = (0.25, 0.33)
+REMOVED = (0.5, 0.58)
+OCCLUDED = (0.75, 0.85)
+OCCLUDED_SHARE = 0.4
+
+FRAMES_PER_S = 30
+TURN_RAD_PER_S = math.radians(40)
+FARTHEST_M = 1.4  # the wall, or the end of the table
+TABLE_PITCH_RAD = math.radians(50)  # by which the camera looks down at the table
+UP = torch.tensor(
+    [0.0, -math.cos(TABLE_PITCH_RAD), -math.sin(TABLE_PITCH_RAD)], dtype=torch.float64
+)
+TABLE_CENTRE_M = torch.tensor([0.0, 0.0, 0.75], dtype=torch.float64)  # on the optical axis
+SURFACE_POINTS = 1000
+RIGHT = 0.1  # largest error of a right answer, in diameters
 Row = dict[str, Any]
 
 
@@ -62,41 +73,49 @@ class Frame(NamedTuple):
     is_seen: bool
 
 
+def random_direction(generator: torch.Generator) -> Tensor:
+    """Draw a unit vector."""
+    return torch.nn.functional.normalize(torch.randn(3, generator=generator).double(), dim=-1)
+
+
 def path(number: int, speed: float, generator: torch.Generator) -> Iterator[Rigid]:
     """Move on a smooth closed curve and turn about a slowly changing axis."""
     R = random_rotation(generator).double()
     phase = 2 * math.pi * torch.rand(3, generator=generator).double()
-    axis = torch.nn.functional.normalize(torch.randn(3, generator=generator).double(), dim=-1)
-    other = torch.nn.functional.normalize(torch.randn(3, generator=generator).double(), dim=-1)
-    size_m = torch.tensor([0.12, 0.08, 0.08], dtype=torch.float64)
+    first_axis = random_direction(generator)
+    second_axis = random_direction(generator)
+    centre_m = torch.tensor([0.0, 0.0, 0.75], dtype=torch.float64)
+    amplitude_m = torch.tensor([0.12, 0.08, 0.08], dtype=torch.float64)
+    angle_rad = TURN_RAD_PER_S * speed / FRAMES_PER_S
     for k in range(number):
-        s = speed * k / RATE
-        angle = phase + 2 * s * torch.tensor([1.0, 1.3, 0.7], dtype=torch.float64)
-        middle_m = torch.tensor([0.0, 0.0, 0.75], dtype=torch.float64) + size_m * angle.sin()
-        turn = math.radians(40) * speed / RATE
-        yield Rigid(R, middle_m)
-        way = torch.nn.functional.normalize(axis * math.cos(s) + other * math.sin(s), dim=-1)
-        R = rotation_by(turn * way) @ R
+        time_s = speed * k / FRAMES_PER_S
+        angles = phase + 2 * time_s * torch.tensor([1.0, 1.3, 0.7], dtype=torch.float64)
+        yield Rigid(R, centre_m + amplitude_m * angles.sin())
+        mixed_axis = first_axis * math.cos(time_s) + second_axis * math.sin(time_s)
+        R = rotation_by(angle_rad * torch.nn.functional.normalize(mixed_axis, dim=-1)) @ R
 
 
 def background(generator: torch.Generator) -> Tensor:
     """Render a wall, a table and boxes that are no known object."""
-    row = torch.arange(HEIGHT)[:, None].expand(HEIGHT, WIDTH).double()
-    table_m = 0.35 / ((row - 239.5) / FOCAL_PX).clamp(min=1e-6)
-    depth_m = table_m.clamp(max=1.4)
+    unit_box = torch.cartesian_prod(*[torch.tensor([-0.5, 0.5])] * 3).double()
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = torch.tensor([face for a, b, c, d in quads for face in ((a, b, c), (a, c, d))])
+    depth_m = (0.35 / ray_slope().clamp(min=1e-6)).clamp(max=FARTHEST_M)
     for _ in range(3):
-        place = (2 * torch.rand(3, generator=generator).double() - 1) * torch.tensor(
-            [0.3, 0.1, 0.1]
-        )
-        corners = torch.cartesian_prod(*[torch.tensor([-0.5, 0.5])] * 3).double()
-        size = 0.05 + 0.15 * torch.rand(3, generator=generator).double()
-        box_m = corners * size @ random_rotation(generator).double().mT
-        box_m = box_m + place + torch.tensor([0.0, 0.2, 1.05])
-        quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-        faces = torch.tensor([f for a, b, c, d in quads for f in ((a, b, c), (a, c, d))])
-        drawn_m = rasterize(box_m[faces], K, WIDTH, HEIGHT).depth_m
-        depth_m = torch.where(drawn_m < depth_m, drawn_m, depth_m)
+        position = 2 * torch.rand(3, generator=generator).double() - 1
+        offset_m = position * torch.tensor([0.3, 0.1, 0.1])
+        size_m = 0.05 + 0.15 * torch.rand(3, generator=generator).double()
+        corners_m = unit_box * size_m @ random_rotation(generator).double().mT + offset_m
+        corners_m = corners_m + torch.tensor([0.0, 0.2, 1.05])
+        box_m = rasterize(corners_m[faces], K, WIDTH, HEIGHT).depth_m
+        depth_m = torch.where(box_m < depth_m, box_m, depth_m)
     return depth_m
+
+
+def ray_slope() -> Tensor:
+    """Compute y / z of the ray of each pixel."""
+    row = torch.arange(HEIGHT)[:, None].expand(HEIGHT, WIDTH).double()
+    return (row - CENTRE_Y_PX) / FOCAL_PX
 
 
 def resting_path(
@@ -104,39 +123,39 @@ def resting_path(
 ) -> Iterator[Rigid]:
     """Slide on a table and turn about its normal, lying on the largest face of the hull."""
     hull = ConvexHull(corners_m.numpy())
-    sides = np.unique(hull.equations.round(3), axis=0, return_inverse=True)
-    a, b, c = hull.points[hull.simplices].transpose(1, 0, 2)
-    areas = np.linalg.norm(np.cross(b - a, c - a), axis=-1)
-    largest = np.bincount(sides[1].reshape(-1), areas).argmax()
-    R = turned_onto(torch.from_numpy(sides[0][largest, :3]), -UP)
+    planes, plane_of_triangle = np.unique(hull.equations.round(3), axis=0, return_inverse=True)
+    first, second, third = hull.points[hull.simplices].transpose(1, 0, 2)
+    areas = np.linalg.norm(np.cross(second - first, third - first), axis=-1)
+    largest = np.bincount(plane_of_triangle.reshape(-1), areas).argmax()
+    R_resting = rotation_onto(torch.from_numpy(planes[largest, :3]), -UP)
     phase = 2 * math.pi * torch.rand(3, generator=generator).double()
     right = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
-    along = torch.linalg.cross(UP, right)
+    ahead = torch.linalg.cross(UP, right)
+    centred_m = corners_m - corners_m.mean(0)
     for k in range(number):
-        s = speed * k / RATE
-        a, b = (phase[:2] + s * torch.tensor([2.0, 2.6])).sin()
-        place_m = TABLE_M + 0.1 * a * right + 0.08 * b * along
-        turned = rotation_by((phase[2] + math.radians(40) * s) * UP) @ R
-        lowest_m = ((corners_m - corners_m.mean(0)) @ turned.mT @ UP).min()
-        yield Rigid(turned, place_m - lowest_m * UP)
+        time_s = speed * k / FRAMES_PER_S
+        x, y = (phase[:2] + time_s * torch.tensor([2.0, 2.6])).sin()
+        position_m = TABLE_CENTRE_M + 0.1 * x * right + 0.08 * y * ahead
+        R = rotation_by((phase[2] + TURN_RAD_PER_S * time_s) * UP) @ R_resting
+        lowest_m = (centred_m @ R.mT @ UP).min()
+        yield Rigid(R, position_m - lowest_m * UP)
 
 
-def turned_onto(direction: Tensor, wanted: Tensor) -> Tensor:
-    """Give a rotation that turns one unit vector onto another."""
+def rotation_onto(direction: Tensor, target: Tensor) -> Tensor:
+    """Compute a rotation that brings one unit vector onto another."""
     direction = torch.nn.functional.normalize(direction, dim=-1)
-    axis = torch.linalg.cross(direction, wanted)
+    axis = torch.linalg.cross(direction, target)
     if float(axis.norm()) < 1e-9:
         axis = torch.linalg.cross(direction, direction.roll(1))
-    angle = (direction @ wanted).clamp(-1, 1).arccos()
+    angle = (direction @ target).clamp(-1, 1).arccos()
     return rotation_by(angle * torch.nn.functional.normalize(axis, dim=-1))
 
 
 def table() -> Tensor:
-    """Render a table seen from above."""
-    y = (torch.arange(HEIGHT)[:, None].expand(HEIGHT, WIDTH).double() - 239.5) / FOCAL_PX
-    slope = UP[1] * y + UP[2]
-    depth_m = (UP @ TABLE_M) / slope.clamp(max=-1e-6)
-    return depth_m.clamp(max=1.4)
+    """Render the depth [m] of a table seen from above."""
+    slope = UP[1] * ray_slope() + UP[2]
+    depth_m = (UP @ TABLE_CENTRE_M) / slope.clamp(max=-1e-6)
+    return depth_m.clamp(max=FARTHEST_M)
 
 
 def sequence(
@@ -144,110 +163,146 @@ def sequence(
 ) -> Iterator[Frame]:
     """Render the frames of one object."""
     generator = sample_generator(seed, SEED)
-    triangles = drawn_triangles(model).double()
-    middle_m = triangles.reshape(-1, 3).mean(0)
+    corners_m = drawn_triangles(model).double().reshape(-1, 3)
+    centre_of_model_m = corners_m.mean(0)
     if is_resting:
-        behind_m = table()
-        poses = resting_path(triangles.reshape(-1, 3), number, speed, generator)
+        background_m = table()
+        poses = resting_path(corners_m, number, speed, generator)
     else:
-        behind_m = background(generator)
+        background_m = background(generator)
         poses = path(number, speed, generator)
     for k, pose in enumerate(poses):
-        truth = Rigid(pose.R, pose.t_m - pose.R @ middle_m)
+        truth = Rigid(pose.R, pose.t_m - pose.R @ centre_of_model_m)
         share = k / number
-        is_removed = REMOVED[0] <= share < REMOVED[1]
-        is_covered = COVERED[0] <= share < COVERED[1]
-        corners_m = truth.apply(triangles.reshape(-1, 3)).reshape(-1, 3, 3)
-        own_m = rasterize(corners_m, K, WIDTH, HEIGHT).depth_m
-        shown = own_m.isfinite() & (own_m < behind_m)
-        depth_m = behind_m if is_removed else torch.where(shown, own_m, behind_m)
-        if is_covered or PARTLY[0] <= share < PARTLY[1]:
-            column = torch.arange(WIDTH).expand(HEIGHT, WIDTH)
-            some = column[shown].double()
-            cut = torch.inf if is_covered else float(some.quantile(HIDDEN))
-            box = (column >= some.min() - 15) & (column <= min(cut, float(some.max()) + 15))
-            depth_m = torch.where(box, float(own_m[shown].min()) - 0.08, depth_m)
-        measured_m = simulate_depth(
-            depth_m, (FOCAL_PX, FOCAL_PX), SyntheticSensorConfig(), generator
-        )
+        is_removed = is_within(share, REMOVED)
+        is_covered = is_within(share, COVERED)
+        object_m = rasterize(truth.apply(corners_m).reshape(-1, 3, 3), K, WIDTH, HEIGHT).depth_m
+        is_object = object_m.isfinite() & (object_m < background_m)
+        depth_m = background_m if is_removed else torch.where(is_object, object_m, background_m)
+        if is_covered or is_within(share, OCCLUDED):
+            is_plate = plate_columns(is_object, is_whole=is_covered)
+            depth_m = torch.where(is_plate, float(object_m[is_object].min()) - 0.08, depth_m)
+        sensor = SyntheticSensorConfig()
+        measured_m = simulate_depth(depth_m, (FOCAL_PX, FOCAL_PX), sensor, generator)
         view = ViewInput(
-            name=f"{model.name}_{k:04d}", depth_m=measured_m.float(), K=K.float(),
-            mask=torch.ones(HEIGHT, WIDTH, dtype=torch.bool), object=model.name,
-        )  # fmt: skip
-        yield Frame(view, truth.float(), not is_removed | is_covered)
+            name=f"{model.name}_{k:04d}",
+            depth_m=measured_m.float(),
+            K=K.float(),
+            mask=torch.ones(HEIGHT, WIDTH, dtype=torch.bool),
+            object=model.name,
+        )
+        yield Frame(view, truth.float(), is_seen=not (is_removed or is_covered))
+
+
+def is_within(share: float, limits: tuple[float, float]) -> bool:
+    """Whether a share of a sequence lies in a part of it."""
+    return limits[0] <= share < limits[1]
+
+
+def plate_columns(is_object: Tensor, *, is_whole: bool) -> Tensor:
+    """Compute the pixels of a plate before an object: before all of it, or its left part."""
+    column = torch.arange(WIDTH).expand(HEIGHT, WIDTH)
+    object_columns = column[is_object].double()
+    last = float(object_columns.max()) + 15
+    if not is_whole:
+        last = min(float(object_columns.quantile(OCCLUDED_SHARE)), last)
+    return (column >= object_columns.min() - 15) & (column <= last)
 
 
 def verdict(
-    model: ObjectModel, points_m: Tensor, frame: Frame, found: PoseEstimate
+    model: ObjectModel, points_m: Tensor, frame: Frame, estimate: PoseEstimate
 ) -> tuple[str, float]:
     """Classify an estimate as right, wrong, lost, or rightly none; and its error in diameters."""
-    if found.camera_from_model is None:
+    pose = estimate.camera_from_model
+    if pose is None:
         return ("lost" if frame.is_seen else "none"), math.nan
-    is_adds = not model.symmetries.is_none
-    measured = adds_m if is_adds else add_m
-    error = float(measured(found.camera_from_model, frame.truth, points_m)) / model.diameter_m
-    return ("right" if frame.is_seen and error < 0.1 else "wrong"), error
+    metric = add_m if model.symmetries.is_none else adds_m
+    error = float(metric(pose, frame.truth, points_m)) / model.diameter_m
+    return ("right" if frame.is_seen and error < RIGHT else "wrong"), error
 
 
-def delays(frames: Sequence[Frame], said: Sequence[str]) -> tuple[list[int], list[int]]:
-    """Count frames from the begin of each drop-out to a refusal, from its end to a right answer."""
-    seen = [frame.is_seen for frame in frames]
-    begins = [k for k in range(1, len(seen)) if seen[k - 1] and not seen[k]]
-    ends = [k for k in range(1, len(seen)) if seen[k] and not seen[k - 1]]
-    far = len(seen)
-    noticed = [next((j for j in range(k, far) if said[j] == "none"), far) - k for k in begins]
-    back = [next((j for j in range(k, far) if said[j] == "right"), far) - k for k in ends]
-    return noticed, back
+def delays(frames: Sequence[Frame], verdicts: Sequence[str]) -> tuple[list[int], list[int]]:
+    """Count frames from the start of each drop-out to a refusal, from its end to a right answer."""
+    until_refusal = list[int]()
+    until_right = list[int]()
+    for k in range(1, len(frames)):
+        if frames[k - 1].is_seen and not frames[k].is_seen:
+            until_refusal.append(frames_until("none", verdicts[k:]))
+        if frames[k].is_seen and not frames[k - 1].is_seen:
+            until_right.append(frames_until("right", verdicts[k:]))
+    return until_refusal, until_right
 
 
-def followed(net: GeoPoseNet, model: ObjectModel, frames: Sequence[Frame]) -> Row:
-    """Follow the object, and count."""
-    points_m = sample_surface(model, 1000)[0]
-    said, kinds, spent = list[str](), list[str | None](), list[float]()
-    off = list[float]()
-    answers = net.track_in([frame.view for frame in frames], model.name)
+def frames_until(wanted: str, verdicts: Sequence[str]) -> int:
+    """Count the frames before the first of a verdict; all if there is none."""
+    return verdicts.index(wanted) if wanted in verdicts else len(verdicts)
+
+
+def track(net: GeoPoseNet, model: ObjectModel, frames: Sequence[Frame]) -> Row:
+    """Track the object through the frames, and count verdicts, delays and times."""
+    points_m = sample_surface(model, SURFACE_POINTS)[0]
+    verdicts = list[str]()
+    states = list[str | None]()
+    seconds = list[float]()
+    errors_percent = list[float]()
+    estimates = net.track_in([frame.view for frame in frames], model.name)
     for frame in frames:
-        began = time.process_time()
-        found = next(answers)
-        spent.append(time.process_time() - began)
-        word, error = verdict(model, points_m, frame, found)
-        said.append(word)
-        off += [100 * error] if word == "right" else []
-        kinds.append(found.tracking)
-    off.sort()
-    icp = sorted(s for s, kind in zip(spent, kinds, strict=True) if kind == "tracked")
-    noticed, back = delays(frames, said)
+        estimate, cpu_s = with_cpu_seconds(lambda: next(estimates))
+        answer, error = verdict(model, points_m, frame, estimate)
+        verdicts.append(answer)
+        states.append(estimate.tracking)
+        seconds.append(cpu_s)
+        if answer == "right":
+            errors_percent.append(100 * error)
+    errors_percent.sort()
+    tracked_s = sorted(
+        cpu_s for cpu_s, state in zip(seconds, states, strict=True) if state == "tracked"
+    )
+    until_refusal, until_right = delays(frames, verdicts)
+    quantiles = None
+    if errors_percent:
+        count = len(errors_percent)
+        quantiles = [round(errors_percent[int(q * count)], 1) for q in (0.5, 0.95)]
     return {
-        "object": model.name, "frames": len(frames), **counts(said),
-        "tracked": kinds.count("tracked"), "found": kinds.count("found"),
-        "says so": noticed, "back": back,
-        "off": [round(off[int(q * len(off))], 1) for q in (0.5, 0.95)] if off else None,
-        "ms tracked": round(1000 * icp[len(icp) // 2], 1) if icp else None,
-        "frames a second": round(len(frames) / sum(spent), 1),
-    }  # fmt: skip
+        "object": model.name,
+        "frames": len(frames),
+        **counts(verdicts),
+        "tracked": states.count("tracked"),
+        "found": states.count("found"),
+        "says so": until_refusal,
+        "back": until_right,
+        "off": quantiles,
+        "ms tracked": round(1000 * tracked_s[len(tracked_s) // 2], 1) if tracked_s else None,
+        "frames a second": round(len(frames) / sum(seconds), 1),
+    }
 
 
-def counts(said: Sequence[str]) -> Row:
+def counts(verdicts: Sequence[str]) -> Row:
     """Count verdicts."""
-    return {word: said.count(word) for word in ("right", "wrong", "lost", "none")}
+    return {name: verdicts.count(name) for name in ("right", "wrong", "lost", "none")}
 
 
-def anew(net: GeoPoseNet, model: ObjectModel, frames: Sequence[Frame]) -> Row:
-    """Search every frame without earlier frames."""
-    points_m = sample_surface(model, 1000)[0]
-    said = []
-    began = time.process_time()
-    for frame in frames:
-        best = net.find_in(frame.view, [model.name])[0]
-        said.append(verdict(model, points_m, frame, best)[0])
-    spent = time.process_time() - began
-    return {"object": model.name, "frames": len(frames), **counts(said),
-            "frames a second": round(len(frames) / spent, 2)}  # fmt: skip
+def search_each(net: GeoPoseNet, model: ObjectModel, frames: Sequence[Frame]) -> Row:
+    """Search every frame without earlier frames, and count verdicts."""
+    points_m = sample_surface(model, SURFACE_POINTS)[0]
+    estimates, cpu_s = with_cpu_seconds(
+        lambda: [net.find_in(frame.view, [model.name])[0] for frame in frames]
+    )
+    verdicts = [
+        verdict(model, points_m, frame, estimate)[0]
+        for frame, estimate in zip(frames, estimates, strict=True)
+    ]
+    return {
+        "object": model.name,
+        "frames": len(frames),
+        **counts(verdicts),
+        "frames a second": round(len(frames) / cpu_s, 2),
+    }
 
 
 def main() -> None:
-    """Follow every object of the weights."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    """Track every object of the weights."""
+    parser = make_parser(__doc__)
     parser.add_argument("--weights", nargs="+", default=["parts"])
     parser.add_argument("--frames", type=int, default=60)
     parser.add_argument("--speed", type=float, default=1.0)
@@ -255,24 +310,28 @@ def main() -> None:
     parser.add_argument("--objects", nargs="*", help="of the weights; all by default")
     parser.add_argument("--anew", type=int, default=6)
     parser.add_argument("--resting", action="store_true", help="on a table")
-    words = parser.parse_args()
+    options = parser.parse_args()
     torch.set_num_threads(1)
-    for name in words.weights:
+    for name in options.weights:
         net = GeoPoseNet.load(find_weights(name))
-        rows, others = [], []
+        tracked: list[Row] = []
+        searched: list[Row] = []
         for model in net.weights.models:
-            if words.objects and model.name not in words.objects:
+            if options.objects and model.name not in options.objects:
                 continue
-            frames = list(sequence(
-                model, words.frames, words.speed, words.seed, is_resting=words.resting
-            ))  # fmt: skip
-            rows.append(followed(net, model, frames))
-            print(rows[-1], flush=True)
-            if words.anew:
-                others.append(anew(net, model, frames[words.anew // 2 :: words.anew]))
-        print(f"{name}, followed\n{markdown_table(rows)}")
-        if others:
-            print(f"{name}, every {words.anew} frames anew\n{markdown_table(others)}")
+            frames = list(
+                sequence(
+                    model, options.frames, options.speed, options.seed, is_resting=options.resting
+                )
+            )
+            tracked.append(track(net, model, frames))
+            print(tracked[-1], flush=True)
+            if options.anew:
+                every_nth = frames[options.anew // 2 :: options.anew]
+                searched.append(search_each(net, model, every_nth))
+        print(f"{name}, followed\n{markdown_table(tracked)}")
+        if searched:
+            print(f"{name}, every {options.anew} frames anew\n{markdown_table(searched)}")
 
 
 if __name__ == "__main__":

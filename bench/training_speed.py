@@ -2,18 +2,17 @@
 
     python bench/training_speed.py --data FOLDER [--workers 0 1 2]
 
-The source is a folder of pairs (read, decoded, augmented), the same held in memory, and streets
-rendered on the fly; then the samples a second that the compact training steps take.
+Sources: a folder of pairs (read, decoded, augmented), the same held in memory, and streets rendered
+on the fly. Then the samples a second that the compact training steps take.
 """
 
-import argparse
 import itertools
 import time
 from dataclasses import replace
 from pathlib import Path
 
 import torch
-from shared import report, setting
+from shared import make_parser, report, setting
 from torch.utils.data import DataLoader
 
 from depthpose.core.config import read_config
@@ -28,7 +27,7 @@ CONFIGS = Path(__file__).parents[1] / "configs" / "depth"
 
 
 def sources(data: str, view: ViewTraining) -> dict[str, PairsConfig]:
-    """Three data sources for the compact generator."""
+    """Configure three data sources for the compact generator."""
     pairs = replace(view.pairs, folders=(data,), with_cache=False)
     synthetic = StreetsConfig(scale=0.52)
     return {
@@ -39,70 +38,72 @@ def sources(data: str, view: ViewTraining) -> dict[str, PairsConfig]:
 
 
 def data_rate(config: PairsConfig, workers: int, samples: int) -> float:
-    """Samples a second, after the workers have started."""
+    """Measure samples a second, after the workers have started."""
     pairs = TrainingPairs(config, 0, needs_truth=False)
     if config.with_cache:
         for index in range(len(pairs)):
             pairs.read(index)
     indices = [[3 * k, 3 * k + 1, 3 * k + 2] for k in range(samples)]
     loader = iter(DataLoader(pairs, batch_sampler=indices, num_workers=workers))  # pyright: ignore[reportArgumentType]
-    warm = 2 + 2 * workers
-    for _ in itertools.islice(loader, warm):
+    warm_up = 2 + 2 * workers
+    for _ in itertools.islice(loader, warm_up):
         pass
-    begin, count = time.perf_counter(), 0
-    for batch in itertools.islice(loader, samples - warm):
-        count += len(batch.left)
-    return count / (time.perf_counter() - begin)
+    start_s = time.perf_counter()
+    count = sum(len(batch.left) for batch in itertools.islice(loader, samples - warm_up))
+    return count / (time.perf_counter() - start_s)
 
 
 def step_rates(pairs: PairsConfig) -> dict[str, float]:
-    """Samples a second that each compact stage takes, in its own precision."""
+    """Measure the samples a second that each compact stage takes, in its own precision."""
     view = read_config(CONFIGS / "compact-view.yaml", ViewTraining)
     stereo = read_config(CONFIGS / "compact-stereo.yaml", StereoTraining)
-    tune = read_config(CONFIGS / "compact-finetune.yaml", FinetuneTraining)
-    generator, matcher = UNetGenerator(view.generator), PSMNet(stereo.matcher)
+    finetune = read_config(CONFIGS / "compact-finetune.yaml", FinetuneTraining)
+    generator = UNetGenerator(view.generator)
+    matcher = PSMNet(stereo.matcher)
     frozen = PSMNet(stereo.matcher)
-    crops = {
+    stages = {
         "view": (ViewTask(generator, view, None), view),
         "stereo": (StereoTask(matcher, stereo, None), stereo),
-        "finetune": (FinetuneTask(generator, frozen, tune, None), tune),
+        "finetune": (FinetuneTask(generator, frozen, finetune, None), finetune),
     }
     rates = {}
-    for name, (task, config) in crops.items():
-        chosen = replace(pairs, augment=config.pairs.augment)
-        found = TrainingPairs(chosen, 0, needs_truth=True)
-        samples = [found[k] for k in range(config.loop.batch_size)]
-        batch = TrainingPair(*(torch.stack(part) for part in zip(*samples, strict=True)))
-        times = []
+    for name, (task, config) in stages.items():
+        augmented = replace(pairs, augment=config.pairs.augment)
+        dataset = TrainingPairs(augmented, 0, needs_truth=True)
+        samples = [dataset[k] for k in range(config.loop.batch_size)]
+        batch = TrainingPair(*(torch.stack(field) for field in zip(*samples, strict=True)))
+        times_s = []
         for _ in range(4):
-            begin = time.perf_counter()
+            start_s = time.perf_counter()
             with torch.autocast("cpu", torch.bfloat16, enabled=config.loop.precision == "bf16"):
                 for turn in task.step(batch):
                     turn.loss.backward()
                     task.optimizers[turn.optimizer][0].step()
-            times.append(time.perf_counter() - begin)
-        rates[name] = config.loop.batch_size / min(times[1:])
+            times_s.append(time.perf_counter() - start_s)
+        rates[name] = config.loop.batch_size / min(times_s[1:])  # the first step compiles
     return rates
 
 
 def main() -> None:
     """Print both tables and write them to out/bench."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser = make_parser(__doc__)
     parser.add_argument("--data", required=True, help="folder of pairs with truth")
     parser.add_argument("--workers", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--batches", type=int, default=20)
     options = parser.parse_args()
     view = read_config(CONFIGS / "compact-view.yaml", ViewTraining)
-    chosen = sources(options.data, view)
-    steps = [{"stage": n, "samples_per_s": r} for n, r in step_rates(chosen["folder"]).items()]
+    configs = sources(options.data, view)
+    rates = step_rates(configs["folder"])
     print(setting())
-    report("training_speed_steps", steps)
-    rows = [
-        {"source": name, "workers": workers,
-         "samples_per_s": data_rate(config, workers, options.batches)}
-        for name, config in chosen.items()
-        for workers in options.workers
-    ]  # fmt: skip
+    report(
+        "training_speed_steps",
+        [{"stage": name, "samples_per_s": rate} for name, rate in rates.items()],
+    )
+    rows = []
+    for name, config in configs.items():
+        for workers in options.workers:
+            rate = data_rate(config, workers, options.batches)
+            rows.append({"source": name, "workers": workers, "samples_per_s": rate})
     report("training_speed", rows)
 
 

@@ -1,7 +1,8 @@
-"""Twenty parts that a pose is easily mistaken on: long, thin, toothed and nearly symmetric ones.
+"""Twenty parts whose poses are easily confused: long, thin, toothed and nearly symmetric ones.
 
-Each part has one small feature that tells its pose from a look-alike, such as the block at one end
-of a profile. Its twin has that feature elsewhere. Sizes are in millimetres.
+Imported by ``score_parts`` and ``fit_probability``. Each part has one small feature that decides
+between two similar poses, such as the block at one end of a profile. Its twin has that feature in
+another place. Sizes of the parts are in millimetres.
 """
 
 import math
@@ -13,6 +14,7 @@ import torch
 import trimesh
 from torch import Tensor
 
+from depthpose.core.camera.pinhole import intrinsics
 from depthpose.core.loop import sample_generator
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid
@@ -24,25 +26,28 @@ from depthpose.pose.types import ObjectModel
 
 FOCAL_PX = 570.0
 WIDTH, HEIGHT = 640, 480
-K = torch.tensor([[FOCAL_PX, 0, 319.5], [0, FOCAL_PX, 239.5], [0, 0, 1]], dtype=torch.float64)
+K = intrinsics(FOCAL_PX, FOCAL_PX, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
 SENSORS: tuple[SensorKind, ...] = ("structured light", "active stereo", "time of flight", "laser")
-"""They take turns from view to view."""
-NEAREST_M = 0.35  # of these sensors
-IMAGED_PX = (120.0, 300.0)  # length of a part in an image
-FEWEST_PX = 300  # of a mask
-APART_PX, APART_M = 200, 0.012
-"""A twin is seen to be one where so many pixels differ by so much: more than three deviations of
-these sensors' noise, that of neighbours included, at the usual distance."""
+"""Simulated in turn, from view to view."""
+MIN_DISTANCE_M = 0.35  # of these sensors
+LENGTH_PX = (120.0, 300.0)  # of a part in an image
+MIN_MASK_PX = 300
+MIN_DIFFERENT_PX = 200
+"""A view shows the difference between a part and its twin if so many pixels of depth differ."""
+MIN_DIFFERENCE_M = 0.012
+"""Of such a pixel: more than three deviations of these sensors' noise at the usual distance."""
+MAX_TRIES = 20  # random poses for each view
 SEED = 0x20A7
 Y = (0.0, 1.0, 0.0)
 
 
 class Part(NamedTuple):
-    """A part, of which the twin differs in one feature.
+    """A part and its twin, which differs in one feature.
 
-    ``mesh``: from the shift of that feature [mm] to the mesh. ``symmetry``: of the true surface, as
-    :func:`~depthpose.pose.mesh.declare_symmetry` takes it. ``right_deg``: a rotation that is off by
-    less is right; at most half a tooth. ``is_held``: left out of every choice.
+    ``mesh``: makes the mesh by the shift of that feature [mm]. ``twin_mm``: its shift in the twin.
+    ``symmetry``: of the true surface, as :func:`~depthpose.pose.mesh.declare_symmetry` takes it.
+    ``right_deg``: rotations with a smaller error are right; at most half a tooth. ``is_held``: left
+    out of every choice.
     """
 
     mesh: Callable[[float], Mesh]
@@ -58,15 +63,15 @@ class Part(NamedTuple):
 
 
 def teeth(number: int, radius: float, depth: float, *, is_leaning: bool = False) -> np.ndarray:
-    """Outline of a toothed wheel about the origin, of as many corners as a circle."""
+    """Outline a toothed wheel about the origin, with as many corners as a circle."""
     unit = circle(1.0)
-    of_tooth = number * np.arange(len(unit)) % len(unit) / len(unit)  # from 0 to 1
-    height = 1 - 2 * of_tooth if is_leaning else np.tanh(3 * np.cos(2 * math.pi * of_tooth))
+    phase = number * np.arange(len(unit)) % len(unit) / len(unit)  # 0 to 1 over each tooth
+    height = 1 - 2 * phase if is_leaning else np.tanh(3 * np.cos(2 * math.pi * phase))
     return (radius + depth / 2 * height)[:, None] * unit
 
 
 def notched(radius: float, depth: float, width_rad: float) -> np.ndarray:
-    """Outline of a circle with a notch along x; of negative depth it points outward."""
+    """Outline a circle with a notch along x; one of negative depth points outward."""
     unit = circle(1.0)
     is_notch = unit[:, 0] > math.cos(width_rad / 2)
     return (radius - depth * is_notch)[:, None] * unit
@@ -74,8 +79,8 @@ def notched(radius: float, depth: float, width_rad: float) -> np.ndarray:
 
 def bar(length: float, radius: float) -> Mesh:
     """A round bar along x."""
-    upright = revolved([(0, -length / 2), (radius, -length / 2), (radius, length / 2),
-                        (0, length / 2)])  # fmt: skip
+    half = length / 2
+    upright = revolved([(0, -half), (radius, -half), (radius, half), (0, half)])
     return turned(upright, Y, 90.0)
 
 
@@ -249,45 +254,47 @@ def views(
 
     Args:
         model: of the part.
-        number: of views; twenty times as many random ones are tried at most.
+        number: of views; up to ``MAX_TRIES`` random poses are tried for each.
         seed: of the random poses.
-        unlike: only views in which this model in its place would look different.
+        unlike: only views in which this model in the same pose looks different.
     """
     triangles_m = drawn_triangles(model).double()
-    middle_m = triangles_m.reshape(-1, 3).mean(0)
-    made = 0
-    for attempt in range(20 * number):
+    centre_of_model_m = triangles_m.reshape(-1, 3).mean(0)
+    view_count = 0
+    for attempt in range(MAX_TRIES * number):
         generator = sample_generator(attempt, SEED + seed)
-        length_px = uniform(generator, *IMAGED_PX)
-        distance_m = max(NEAREST_M, FOCAL_PX * model.diameter_m / length_px)
+        length_px = uniform(generator, *LENGTH_PX)
+        distance_m = max(MIN_DISTANCE_M, FOCAL_PX * model.diameter_m / length_px)
         R = random_rotation(generator).double()
-        shift = (torch.rand(2, generator=generator).double() - 0.5) * 0.2 * distance_m
-        centre_m = torch.cat([shift, torch.tensor([distance_m], dtype=torch.float64)])
-        truth = Rigid(R, centre_m - R @ middle_m)
-        clean_m = _draw(model, truth)
-        mask = clean_m.isfinite()
-        if int(mask.sum()) < FEWEST_PX or not _is_inside(mask):
+        sideways_m = (torch.rand(2, generator=generator).double() - 0.5) * 0.2 * distance_m
+        centre_m = torch.cat([sideways_m, torch.tensor([distance_m], dtype=torch.float64)])
+        truth = Rigid(R, centre_m - R @ centre_of_model_m)
+        part_m = render_depth(model, truth)
+        mask = part_m.isfinite()
+        if int(mask.sum()) < MIN_MASK_PX or touches_border(mask):
             continue
         wall_m = distance_m + 0.6 * model.diameter_m + 0.2
-        scene_m = torch.where(mask, clean_m, wall_m)
+        scene_m = torch.where(mask, part_m, wall_m)
         if unlike is not None:
-            other_m = _draw(unlike, truth).clamp(max=wall_m)
-            if int(((scene_m - other_m).abs() > APART_M).sum()) < APART_PX:
+            other_scene_m = render_depth(unlike, truth).clamp(max=wall_m)
+            is_different = (scene_m - other_scene_m).abs() > MIN_DIFFERENCE_M
+            if int(is_different.sum()) < MIN_DIFFERENT_PX:
                 continue
-        sensor = SyntheticSensorConfig(kinds=(SENSORS[made % len(SENSORS)],))
+        sensor = SyntheticSensorConfig(kinds=(SENSORS[view_count % len(SENSORS)],))
         depth_m = simulate_depth(scene_m.float(), (FOCAL_PX, FOCAL_PX), sensor, generator)
         yield PartView(depth_m, mask, truth)
-        made += 1
-        if made == number:
+        view_count += 1
+        if view_count == number:
             return
 
 
-def _draw(model: ObjectModel, pose: Rigid) -> Tensor:
-    """Draw the depth of a posed model; infinite beside it."""
-    corners_m = pose.apply(drawn_triangles(model).double().reshape(-1, 3)).reshape(-1, 3, 3)
-    return rasterize(corners_m, K, WIDTH, HEIGHT).depth_m
+def render_depth(model: ObjectModel, pose: Rigid) -> Tensor:
+    """Render the depth of a posed model; infinite beside it."""
+    points_m = drawn_triangles(model).double().reshape(-1, 3)
+    triangles_m = pose.apply(points_m).reshape(-1, 3, 3)
+    return rasterize(triangles_m, K, WIDTH, HEIGHT).depth_m
 
 
-def _is_inside(mask: Tensor) -> bool:
-    """Whether no pixel of a mask lies at the edge of the image."""
-    return not bool(mask[0].any() | mask[-1].any() | mask[:, 0].any() | mask[:, -1].any())
+def touches_border(mask: Tensor) -> bool:
+    """Whether a pixel of a mask lies at the border of the image."""
+    return bool(mask[0].any() | mask[-1].any() | mask[:, 0].any() | mask[:, -1].any())

@@ -1,21 +1,22 @@
-"""Time and error of voting, in the manner of table 3.3: RANSAC one by one, ours, least squares.
+"""Time and error of voting, as in table 3.3: RANSAC one by one, ours, least squares.
 
-python bench/voting_speed.py [--points 500 1000 2000 5000] [--hypotheses 50 128 1024] [--noise 0.05]
+    python bench/voting_speed.py [--points 500 1000 2000 5000] [--hypotheses 50 128 1024]
+        [--noise 0.05]
 
-The peer tests one hypothesis at a time in NumPy, vectorised over the points, like published code;
-it draws its pairs, tests and refits as ours does without refinement. Votes err by ``noise``
-[rad, each way] and a fifth of them are random. Each time is the least of many runs, in
-processor time of the one thread used, so that other work on the machine counts little; all rows
-come from one process.
+"One by one" tests one hypothesis at a time in NumPy, vectorised over the points, like published
+code; it draws its pairs, tests and refits as ours does without refinement. Votes have normal errors
+of ``noise`` [rad, each way], and a fifth of them are random. Each time is the least processor time
+of many runs, on one thread; all rows come from one process.
 """
 
-import argparse
 import time
 from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from shared import report
+from shared import make_parser, report
 
 from depthpose.pose.config import VotingConfig
 from depthpose.pose.propose import meet_lines, vote_ransac
@@ -23,90 +24,124 @@ from depthpose.thesis.pose_tables import ransac_one_by_one
 
 KEYPOINTS = 8
 WRONG_SHARE = 0.2
+CLOUDS = 10  # over which errors are averaged
+BUDGET_S = 1.5  # of the runs of one method
+MAX_RUNS = 200
+ONE_BY_ONE = "RANSAC one by one (NumPy)"
 
 
-def exact_votes(points: int, noise: float, seed: int) -> tuple[torch.Tensor, ...]:
-    """The visible half of a ball of 5 cm, eight keypoints in and about it, noisy directions."""
+class Method(NamedTuple):
+    """A method of voting: ``vote`` takes points (n, 3) [m] and directions (n, k, 3)."""
+
+    name: str
+    hypotheses: int | None
+    vote: Callable[[Any, Any], Any]
+
+
+def random_directions(shape: tuple[int, ...], generator: torch.Generator) -> torch.Tensor:
+    """Draw unit vectors."""
+    return torch.nn.functional.normalize(torch.randn(shape, generator=generator), dim=-1)
+
+
+def noisy_votes(
+    points: int, noise: float, seed: int
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Make the visible half of a ball of 5 cm, noisy directions to keypoints, and the keypoints."""
     generator = torch.Generator().manual_seed(seed)
-    x = torch.nn.functional.normalize(torch.randn(points, 3, generator=generator), dim=-1) * 0.05
-    x[:, 2] = -x[:, 2].abs() + 0.8
-    keypoints = torch.nn.functional.normalize(torch.randn(8, 3, generator=generator), dim=-1) * 0.06
-    keypoints[:, 2] += 0.8
-    n = torch.nn.functional.normalize(keypoints - x[:, None], dim=-1)
-    n = torch.nn.functional.normalize(n + noise * torch.randn(n.shape, generator=generator), dim=-1)
-    wrong = torch.nn.functional.normalize(torch.randn(n.shape, generator=generator), dim=-1)
+    points_m = random_directions((points, 3), generator) * 0.05
+    points_m[:, 2] = -points_m[:, 2].abs() + 0.8
+    keypoints_m = random_directions((KEYPOINTS, 3), generator) * 0.06
+    keypoints_m[:, 2] += 0.8
+    exact = torch.nn.functional.normalize(keypoints_m - points_m[:, None], dim=-1)
+    errors = noise * torch.randn(exact.shape, generator=generator)
+    noisy = torch.nn.functional.normalize(exact + errors, dim=-1)
+    wrong = random_directions(tuple(exact.shape), generator)
     is_wrong = torch.rand(points, generator=generator) < WRONG_SHARE
-    return x, torch.where(is_wrong[:, None, None], wrong, n), keypoints
+    return points_m, torch.where(is_wrong[:, None, None], wrong, noisy), keypoints_m
 
 
-def least_seconds(run: Callable[[], object], budget_s: float = 1.5, most: int = 200) -> float:
-    """Least processor time of one call, over as many as fit the budget."""
+def least_seconds(run: Callable[[], object]) -> float:
+    """Measure the least processor time of one call [s], over as many as fit the budget."""
     run()
-    least, start = float("inf"), time.perf_counter()
-    for _ in range(most):
-        began = time.thread_time()
+    times_s = []
+    start_s = time.perf_counter()
+    while len(times_s) < MAX_RUNS and time.perf_counter() - start_s <= BUDGET_S:
+        start_cpu_s = time.thread_time()
         run()
-        least = min(least, time.thread_time() - began)
-        if time.perf_counter() - start > budget_s:
-            break
-    return least
+        times_s.append(time.thread_time() - start_cpu_s)
+    return min(times_s)
+
+
+def methods(hypotheses: list[int]) -> list[Method]:
+    """List the methods, for each number of hypotheses."""
+    result = []
+    for count in hypotheses:
+        config = VotingConfig(hypotheses=count)
+        unrefined = VotingConfig(hypotheses=count, refinements=0)
+        one_by_one = partial(
+            ransac_one_by_one, hypotheses=count, min_cosine=config.min_cosine, seed=0
+        )
+        result += [
+            Method(ONE_BY_ONE, count, one_by_one),
+            Method("RANSAC, published refit", count, partial(vote_ransac, config=unrefined)),
+            Method("RANSAC", count, partial(vote_ransac, config=config)),
+        ]
+    return [
+        *result,
+        Method("least squares, published", None, partial(meet_lines, refinements=0)),
+        Method("least squares", None, meet_lines),
+    ]
 
 
 def measure(points: int, hypotheses: list[int], noise: float) -> list[dict[str, object]]:
-    """Measure all ways for one number of points; errors are means over ten clouds."""
-    clouds = [exact_votes(points, noise, seed) for seed in range(10)]
-    x, n, _ = clouds[0]
-    x_numpy, n_numpy = x.double().numpy(), n.double().numpy()
-    ways: list[tuple[str, int, Callable[..., np.ndarray], Callable[[], object]]] = []
-    for h in hypotheses:
-        plain = VotingConfig(hypotheses=h, refinements=0)
-        config = VotingConfig(hypotheses=h)
-        cosine = config.min_cosine
-        ways += [
-            ("RANSAC one by one (NumPy)", h,
-             lambda a, b, h=h, c=cosine: ransac_one_by_one(a.double().numpy(), b.double().numpy(),
-                                                           h, c, 0),
-             lambda h=h, c=cosine: ransac_one_by_one(x_numpy, n_numpy, h, c, 0)),
-            ("RANSAC, published refit", h,
-             lambda a, b, c=plain: vote_ransac(a, b, None, c).keypoints_m.numpy(),
-             lambda c=plain: vote_ransac(x, n, None, c)),
-            ("RANSAC", h, lambda a, b, c=config: vote_ransac(a, b, None, c).keypoints_m.numpy(),
-             lambda c=config: vote_ransac(x, n, None, c)),
-        ]  # fmt: skip
-    ways += [
-        ("least squares, published", 0, lambda a, b: meet_lines(a, b, None, 0).keypoints_m.numpy(),
-         lambda: meet_lines(x, n, None, 0)),
-        ("least squares", 0, lambda a, b: meet_lines(a, b).keypoints_m.numpy(),
-         lambda: meet_lines(x, n)),
-    ]  # fmt: skip
+    """Measure all methods for one number of points."""
+    clouds = [noisy_votes(points, noise, seed) for seed in range(CLOUDS)]
     rows = []
-    peer_s: dict[int, float] = {}
-    for name, h, answer, run in ways:
-        seconds = least_seconds(run)
-        if "NumPy" in name:
-            peer_s[h] = seconds
-        errors = [np.linalg.norm(answer(a, b) - k.numpy(), axis=-1).mean() for a, b, k in clouds]
-        rows.append({
-            "points": points, "method": name, "hypotheses": h or None,
-            "milliseconds": round(1000 * seconds, 3),
-            "times_faster": round(peer_s[h] / seconds, 1) if h else None,
-            "error_mm": round(1000 * float(np.mean(errors)), 3),
-        })  # fmt: skip
+    one_by_one_s: dict[int | None, float] = {}
+    for method in methods(hypotheses):
+        is_numpy = method.name == ONE_BY_ONE
+        errors_m = []
+        for points_m, directions, keypoints_m in clouds:
+            if is_numpy:
+                voted_m = method.vote(points_m.double().numpy(), directions.double().numpy())
+            else:
+                voted_m = method.vote(points_m, directions).keypoints_m.numpy()
+            errors_m.append(np.linalg.norm(voted_m - keypoints_m.numpy(), axis=-1).mean())
+        points_m, directions, _ = clouds[0]
+        arguments: tuple[Any, Any] = (points_m, directions)
+        if is_numpy:
+            arguments = (points_m.double().numpy(), directions.double().numpy())
+        seconds = least_seconds(partial(method.vote, *arguments))
+        if is_numpy:
+            one_by_one_s[method.hypotheses] = seconds
+        times_faster = None
+        if method.hypotheses is not None:
+            times_faster = round(one_by_one_s[method.hypotheses] / seconds, 1)
+        rows.append(
+            {
+                "points": points,
+                "method": method.name,
+                "hypotheses": method.hypotheses,
+                "milliseconds": round(1000 * seconds, 3),
+                "times_faster": times_faster,
+                "error_mm": round(1000 * float(np.mean(errors_m)), 3),
+            }
+        )
     return rows
 
 
 def main() -> None:
     """Measure and write ``out/bench/voting_speed.json``."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--points", type=int, nargs="+", default=[500, 1000, 2000, 5000])
     parser.add_argument("--hypotheses", type=int, nargs="+", default=[50, 128, 1024])
     parser.add_argument("--noise", type=float, default=0.05)
-    arguments = parser.parse_args()
+    options = parser.parse_args()
     torch.set_num_threads(1)
     rows = [
         row
-        for points in arguments.points
-        for row in measure(points, arguments.hypotheses, arguments.noise)
+        for points in options.points
+        for row in measure(points, options.hypotheses, options.noise)
     ]
     report("voting_speed", rows)
 
