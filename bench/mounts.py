@@ -39,6 +39,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import read_image
 from depthpose.depth.config import MatcherConfig, SelectionConfig
 from depthpose.depth.estimator import FakestereoNet
+from depthpose.depth.estimator.single_image import depth_before_mount
 from depthpose.depth.ground import MountFilter, fit_ground, scale_by_mount
 from depthpose.depth.synthetic.dataset import draw_light, draw_sensors, expose, view_from
 from depthpose.depth.synthetic.scene import make_scene
@@ -345,8 +346,9 @@ def measure_view(view: View, net: FakestereoNet, mount_filter: MountFilter) -> l
     """Estimate a view once, correct it in each way, and measure each."""
     camera = view.image.camera
     assert camera is not None
-    (unscaled,) = net.estimate_without_mount([view.image], net.virtual_sizes(view.image))
     assert net.synthesiser is not None
+    sizes = net.virtual_sizes(view.image)
+    (unscaled,) = depth_before_mount(net.synthesiser, net.matcher, [view.image], sizes)
     config = net.synthesiser.config
     assert isinstance(config, SelectionConfig)
     without_mount = scale_by_mount(unscaled, view.image, None, config)
