@@ -204,14 +204,14 @@ def compare(observation: Observation, pose: Rigid, surface: Surface) -> Evidence
     patch_area_px2 = observation.patch_px**2
     is_bulging = (deviations < -THRESHOLD) & observation.is_object[rendering.window]
     is_beside = _is_beside_silhouette(observation, is_drawn, rendering.window)
-    is_continued = _is_continued(observation, is_drawn, is_supported, rendering.window)
-    if observation.is_masked:  # what lies outside of the mask is of something else
-        is_continued &= observation.is_object
     seen_through = _patch_area(deviations > THRESHOLD, patch_area_px2)
     bulging = _patch_area(is_bulging, patch_area_px2)
     beside = _patch_area(is_beside, patch_area_px2)
-    # A patch in which the surface goes on is as long as others, and half as wide.
-    continued = _patch_area(is_continued, patch_area_px2 / 2)
+    continued = 0.0
+    if not observation.is_masked:  # else the mask says where the object ends
+        is_continued = _is_continued(observation, is_drawn, is_supported, rendering.window)
+        # A patch in which the surface goes on is as long as others, and half as wide.
+        continued = _patch_area(is_continued, patch_area_px2 / 2)
 
     is_explained = _lies_on_rendering(observation, rendering)
     visible = float(inner.sum()) / patch_area_px2

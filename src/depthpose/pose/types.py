@@ -258,7 +258,8 @@ class Evidence:
     seen_through: float  #: patches behind which the camera saw: free-space violations
     bulging: float  #: patches of the object's own readings before the model
     beside: float  #: patches of the object's own readings beside the model's silhouette
-    continued: float  #: patches in which the surface within the silhouette goes on beyond it
+    #: patches in which the surface goes on beyond the silhouette; 0 where a mask says where it ends
+    continued: float
     rms: float  #: root mean square residual of the supported part, in standard deviations
     noise_m: float  #: standard deviation of a reading on the object, estimated from the image
 
