@@ -14,6 +14,7 @@ from tests.synthetic_street import make_street
 
 from depthpose.cli import COMMANDS, main
 from depthpose.cli.arguments import Source, WeightsName, parser_of, refuse_missing
+from depthpose.cli.engine import EngineOptions
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_depth_png, read_map, write_image, write_json
 from depthpose.depth.types import StereoInput
@@ -180,6 +181,15 @@ def test_wrong_words_are_refused(
     assert main(words) == 2
     assert message in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_command_leaves_the_next_one_as_quick(capsys: pytest.CaptureFixture[str]) -> None:
+    """Of many in one process: what is said of an option is not said once more each time."""
+    described: list[str] = []
+    for _ in range(2):
+        assert main(["depth", "match", "--help"]) == 0
+        described.append(str(EngineOptions.__annotations__))
+    assert described[1] == described[0]
 
 
 def test_an_unknown_option_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
