@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from tests.depth.small_training import write_tiny_weights
 from tests.synthetic_street import make_street
 
 from depthpose.cli import COMMANDS, main
@@ -271,7 +272,9 @@ def test_without_bf16_one_line_is_said_and_the_record_says_fp32(
     )
     one = [str(pair_folder / side / "a.png") for side in ("left", "right")]
     words = ["depth", "match", *one, "--camera", str(pair_folder / "cam.json"), "--out"]
-    words += [str(tmp_path / "o"), "--weights", "default", "--precision", "bf16"]
+    write_tiny_weights(tmp_path)
+    weights = str(tmp_path / "m.safetensors")
+    words += [str(tmp_path / "o"), "--weights", weights, "--precision", "bf16"]
     command = [sys.executable, "-c", code, *words]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
