@@ -3,7 +3,10 @@ import contextlib
 import os
 import shutil
 import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import fields, is_dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 import tests.typecheck  # noqa: F401  # loaded, since `make test TYPES=1` names it
@@ -51,6 +54,38 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
     write_pose_weights(path, tiny_weights(*frame_models()))
     return path
+
+
+def _content(value: object) -> object:
+    """What equals that of another value where both hold the same, tensors included."""
+    if isinstance(value, torch.Tensor):
+        return str(value.dtype), tuple(value.shape), value.contiguous().numpy().tobytes()
+    if is_dataclass(value):
+        return tuple(_content(getattr(value, field.name)) for field in fields(value))
+    return tuple(map(_content, value)) if isinstance(value, list | tuple) else value
+
+
+@pytest.fixture(scope="session", autouse=True)
+def prepared_once() -> Iterator[None]:
+    """What an estimator computes of a shape, which takes a second, is computed once a process."""
+    from depthpose.pose import copies, estimator
+
+    made: dict[object, Any] = {}
+
+    def once(compute: Callable[..., Any], key_of: Callable[..., object]) -> Callable[..., Any]:
+        def give(*given: Any) -> Any:  # noqa: ANN401
+            key = key_of(*given), os.environ.get("DEPTHPOSE_COMPILED")
+            if key not in made:
+                made[key] = compute(*given), given  # kept, so that no other has their identity
+            return made[key][0]
+
+        return give
+
+    with pytest.MonkeyPatch.context() as patch:
+        surface = once(estimator.prepare_surface, lambda *given: _content(given))
+        patch.setattr(estimator, "prepare_surface", surface)
+        patch.setattr(copies, "prepare_pairs", once(copies.prepare_pairs, id))
+        yield
 
 
 # How long an example takes is the machine's, not the code's.

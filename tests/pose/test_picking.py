@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from depthpose.pose.datasets import BopFrame
 from depthpose.pose.mesh import drawn_triangles
 from depthpose.pose.picking import with_pick_ranks
 from depthpose.pose.registration import Registration
-from depthpose.pose.surface import prepare_surface
+from depthpose.pose.surface import Surface, prepare_surface
 from depthpose.pose.synthetic import make_frames
 from depthpose.pose.synthetic.parts import make_part
 from depthpose.pose.types import Evidence, PoseEstimate, ViewInput
@@ -25,7 +26,11 @@ EVIDENCE = Evidence(
     unobserved=0.0, seen_through=0.0, bulging=0.0, beside=0.0, continued=0.0,
     rms=0.5, noise_m=0.001,
 )  # fmt: skip
-SURFACES = {"bracket": prepare_surface(bracket())}
+
+
+@cache
+def surface() -> Surface:
+    return prepare_surface(bracket())
 
 
 def posed(x_m: float, z_m: float, certainty: float = 1.0, visible: float = 1.0) -> PoseEstimate:
@@ -40,7 +45,8 @@ def posed(x_m: float, z_m: float, certainty: float = 1.0, visible: float = 1.0) 
 def ranks(*estimates: PoseEstimate) -> list[int | None]:
     depth_m = torch.full((240, 320), 2.0)
     view = ViewInput(name="x", depth_m=depth_m, mask=depth_m > 0, K=K, object="bracket")
-    return [estimate.pick_rank for estimate in with_pick_ranks(estimates, view, SURFACES)]
+    surfaces = {"bracket": surface()}
+    return [estimate.pick_rank for estimate in with_pick_ranks(estimates, view, surfaces)]
 
 
 def test_what_lies_before_another_goes_first_however_unsure_it_is() -> None:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import is_dataclass, replace
 from difflib import get_close_matches
 from enum import Enum
-from functools import partial
+from functools import cache, partial
 from inspect import BoundArguments, cleandoc, signature, unwrap
 from itertools import groupby
 from pathlib import Path
@@ -83,6 +83,7 @@ class Option(NamedTuple):
     names: _Names | None  #: what its value names; None: neither a file nor weights
 
 
+@cache  # a second call would annotate the fields of groups once more, and all later ones be slower
 def parser_of(
     command: Callable[..., int],
 ) -> tuple[Callable[..., BoundArguments], list[Option]]:

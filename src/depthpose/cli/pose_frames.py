@@ -4,7 +4,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -32,8 +32,8 @@ from depthpose.pose.predictions import (
     unreadable_estimate,
     write_predictions,
 )
-from depthpose.pose.surface import prepare_surface
-from depthpose.pose.types import PoseEstimate, ViewInput
+from depthpose.pose.surface import Surface, prepare_surface
+from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 
 
 class SearchResults(Results[ViewInput, list[PoseEstimate]]):
@@ -252,8 +252,14 @@ def _read_masked_by_pose(job: PoseJob[Any], prediction: Prediction, method: Pose
     model = next((model for model in method.models if model.name == estimate.object), None)
     if model is None or estimate.camera_from_model is None or not isinstance(view, ViewInput):
         return view
-    mask = explained_mask(view, estimate.camera_from_model, prepare_surface(model))
+    mask = explained_mask(view, estimate.camera_from_model, _surface_of(model))
     return replace(view, name=estimate.name, mask=mask, object=model.name)
+
+
+@lru_cache(maxsize=32)
+def _surface_of(model: ObjectModel) -> Surface:
+    """Sample the surface of a model once for all frames that show it."""
+    return prepare_surface(model)
 
 
 def track_files(method: PoseMethod, frames: SequenceOptions, out: Path) -> int:
