@@ -79,3 +79,38 @@ def array_of(tensor: Tensor) -> np.ndarray:
     if not np.isfinite(array).all():
         raise ValueError("values must be finite; leave out what is not")
     return array
+
+
+# Vectors of three numbers in compiled loops are tuples: rows of arrays are objects that are counted.
+
+Vector = tuple[float, float, float]
+
+
+@compiled
+def vector(array: np.ndarray, i: int) -> Vector:
+    """Give row ``i`` of an array (n, 3)."""
+    return array[i, 0], array[i, 1], array[i, 2]
+
+
+@compiled
+def minus(a: Vector, b: Vector) -> Vector:
+    """Subtract a vector from another one."""
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+@compiled
+def dot(a: Vector, b: Vector) -> float:
+    """Give the inner product."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@compiled
+def cross(a: Vector, b: Vector) -> Vector:
+    """Give the cross product."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@compiled
+def rotate(R: np.ndarray, a: Vector) -> Vector:
+    """Give ``R a``."""
+    return dot(vector(R, 0), a), dot(vector(R, 1), a), dot(vector(R, 2), a)

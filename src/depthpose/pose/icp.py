@@ -12,7 +12,7 @@ from torch import Tensor
 from depthpose.core.arrays import take_evenly
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, cross_matrix, rotation_by
-from depthpose.pose.compiled import array_of, compiled
+from depthpose.pose.compiled import Vector, array_of, compiled, cross, dot, minus, rotate, vector
 from depthpose.pose.config import IcpConfig
 from depthpose.pose.surface import Surface, Target, look_along_rays, match
 
@@ -366,44 +366,50 @@ def _refine(
     middle = cloud.sum(0) / len(cloud)
     places = np.full(len(cloud), -1)
     last = len(limits) - 1
+    has_converged = False
+    H = np.empty((6, 6))
     for step in range(len(limits)):
-        # Match each point with a sample that faces the camera; all samples do where the camera is
-        # within the ball about the surface.
-        eye = -(t @ R)
-        local = (cloud - t) @ R
+        limit = limits[step]
         is_along_rays = is_exact and 2 * step >= last
-        queries = _meet_planes(local, eye, target, places) if is_along_rays else local
-        distance = np.linalg.norm(eye - target.ball[:3])
-        least = -_SLACK * distance if distance > target.ball[3] else -np.inf
-        match(queries, target, eye, least, limits[step], is_exact, places)
-        if step == last:
+        local = (cloud - t) @ R
+        camera = -(t @ R)
+        eye = (camera[0], camera[1], camera[2])
+
+        # Match each point with a sample that faces the camera; all samples do where the camera is
+        # within the ball about the surface. The matches of a pose that has converged stay.
+        if not has_converged:
+            queries = _meet_planes(local, eye, target, places) if is_along_rays else local
+            way = minus(eye, (target.ball[0], target.ball[1], target.ball[2]))
+            distance = np.sqrt(dot(way, way))
+            least = -_SLACK * distance if distance > target.ball[3] else -np.inf
+            match(queries, target, eye, least, limit, is_exact, places)
+
+        # Linearise about the middle of the cloud: a rotation by w about the camera, D away, with
+        # the shift that cancels it to first order would leave the object w^2 D / 2 off.
+        _linearise(local, eye, places, R, t - middle, limit, target, is_along_rays, residuals)
+        H, b = normal_equations(residuals, 1e-6)
+        if step == last or has_converged:
             break
 
-        # One Gauss-Newton step about the middle of the cloud: a rotation by w about the camera, D
-        # away, with the shift that cancels it to first order would leave the object w^2 D / 2 off.
-        _linearise(local, eye, places, R, t - middle, limits[step], target, is_along_rays, residuals)
-        H, b = normal_equations(residuals, 1e-6)
+        # One Gauss-Newton step.
         motion = np.linalg.solve(H, b)
-        turn = rotation_matrix(motion[:3])
+        turn = rotation_matrix(motion)
         t[:] = turn @ (t - middle) + middle + motion[3:]
         R[:] = turn @ R
 
         # A pose that hardly moved, with the last limit and the last kind of match, has converged.
+        largest = 0.0
+        for k in range(3):
+            largest = max(largest, abs(motion[k]), abs(motion[3 + k]) / diameter)
         has_last_kind = is_along_rays or not is_exact
-        largest = max(np.abs(motion[:3]).max(), np.abs(motion[3:]).max() / diameter)
-        if largest < _CONVERGED and has_last_kind and limits[step] <= limits[last]:
-            break
-
-    eye = -(t @ R)
-    local = (cloud - t) @ R
-    _linearise(local, eye, places, R, t - middle, limits[last], target, is_exact, residuals)
-    return normal_equations(residuals, 1e-6)[0]
+        has_converged = largest < _CONVERGED and has_last_kind and limit <= limits[last]
+    return H
 
 
 @compiled
 def _meet_planes(
     local: Float64[np.ndarray, "n 3"],
-    eye: Float64[np.ndarray, "3"],
+    eye: Vector,
     target: Target,
     places: Int64[np.ndarray, " n"],
 ) -> Float64[np.ndarray, "n 3"]:
@@ -416,22 +422,22 @@ def _meet_planes(
         place = places[i]
         if place < 0:
             continue
-        ray = local[i] - eye
-        normal = target.normals[place]
-        sample = target.tree.points[place]
-        slope = _dot(normal, ray)
-        if slope * slope > _GRAZING * _GRAZING * _dot(ray, ray):
-            share = _dot(normal, sample - local[i]) / slope
-            meet[i] += share * ray
-        else:
-            meet[i] = sample
+        point = vector(local, i)
+        ray = minus(point, eye)
+        normal = vector(target.normals, place)
+        sample = vector(target.tree.points, place)
+        slope = dot(normal, ray)
+        is_grazing = slope * slope <= _GRAZING * _GRAZING * dot(ray, ray)
+        share = 0.0 if is_grazing else dot(normal, minus(sample, point)) / slope
+        for c in range(3):
+            meet[i, c] = sample[c] if is_grazing else point[c] + share * ray[c]
     return meet
 
 
 @compiled
 def _linearise(
     local: Float64[np.ndarray, "n 3"],
-    eye: Float64[np.ndarray, "3"],
+    eye: Vector,
     places: Int64[np.ndarray, " n"],
     R: Float64[np.ndarray, "3 3"],
     arm_of_model: Float64[np.ndarray, "3"],
@@ -462,28 +468,30 @@ def _linearise(
     for i in range(len(local)):
         if places[i] < 0:
             continue
-        sample = target.tree.points[places[i]]
-        gap = local[i] - sample
-        distance = _dot(target.normals[places[i]], gap)
+        point = vector(local, i)
+        sample = vector(target.tree.points, places[i])
+        normal = vector(target.normals, places[i])
+        gap = minus(point, sample)
+        distance = dot(normal, gap)
 
         # Weighted by the whole distance: a point beyond an edge is near the plane, not the surface.
-        square = _dot(gap, gap)
+        square = dot(gap, gap)
         if is_along_rays:
-            ray = local[i] - eye
-            along = _dot(gap, ray)
-            square += distance * distance - along * along / _dot(ray, ray)
+            ray = minus(point, eye)
+            along = dot(gap, ray)
+            square += distance * distance - along * along / dot(ray, ray)
         weight = tukey_weight(square, limit)
         if weight <= 0:
             continue
 
         # Moving the model by (w, v) moves its sample by w x arm + v, and lowers the residual.
-        normal = _rotated(R, target.normals[places[i]])
-        arm = _rotated(R, sample) + arm_of_model
-        J = residuals.jacobian[i]
-        J[0] = arm[1] * normal[2] - arm[2] * normal[1]
-        J[1] = arm[2] * normal[0] - arm[0] * normal[2]
-        J[2] = arm[0] * normal[1] - arm[1] * normal[0]
-        J[3:] = normal
+        x, y, z = rotate(R, sample)
+        arm = (x + arm_of_model[0], y + arm_of_model[1], z + arm_of_model[2])
+        seen_normal = rotate(R, normal)
+        moment = cross(arm, seen_normal)
+        for c in range(3):
+            residuals.jacobian[i, c] = moment[c]
+            residuals.jacobian[i, 3 + c] = seen_normal[c]
         residuals.distance[i] = distance
         residuals.weight[i] = weight
 
@@ -523,22 +531,26 @@ def normal_equations(
     for i in range(len(residuals.weight)):
         if residuals.weight[i] <= 0:
             continue
-        J = residuals.jacobian[i]
         for k in range(unknowns):
-            scaled = residuals.weight[i] * J[k]
+            scaled = residuals.weight[i] * residuals.jacobian[i, k]
             b[k] += scaled * residuals.distance[i]
             for m in range(unknowns):
-                H[k, m] += scaled * J[m]
-    size = max(least_size, np.diag(H).max())
+                H[k, m] += scaled * residuals.jacobian[i, m]
+    size = least_size
+    for k in range(unknowns):
+        size = max(size, H[k, k])
     for k in range(unknowns):
         H[k, k] += 1e-9 * size
     return H, b
 
 
 @compiled
-def rotation_matrix(vector: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
-    """Give the rotation by a rotation vector [rad]: Rodrigues' formula."""
-    x, y, z = vector[0], vector[1], vector[2]
+def rotation_matrix(motion: Float64[np.ndarray, " k"]) -> Float64[np.ndarray, "3 3"]:
+    """Give the rotation by a motion, whose first three numbers are a rotation vector [rad].
+
+    Rodrigues' formula.
+    """
+    x, y, z = motion[0], motion[1], motion[2]
     square = x * x + y * y + z * z
     angle = np.sqrt(square)
     s, c = 1 - square / 6, 0.5 - square / 24  # sin(a) / a and (1 - cos(a)) / a^2 at a small angle
@@ -552,21 +564,6 @@ def rotation_matrix(vector: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 
     R[0, 2], R[2, 0] = c * x * z + s * y, c * x * z - s * y
     R[1, 2], R[2, 1] = c * y * z - s * x, c * y * z + s * x
     return R
-
-
-@compiled
-def _dot(a: Float64[np.ndarray, "3"], b: Float64[np.ndarray, "3"]) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@compiled
-def _rotated(
-    R: Float64[np.ndarray, "3 3"], vector: Float64[np.ndarray, "3"]
-) -> Float64[np.ndarray, "3"]:
-    rotated = np.empty(3)
-    for k in range(3):
-        rotated[k] = _dot(R[k], vector)
-    return rotated
 
 
 def _covariance(

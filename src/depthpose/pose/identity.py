@@ -14,7 +14,7 @@ from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid
-from depthpose.pose.compiled import array_of, compiled
+from depthpose.pose.compiled import array_of, compiled, cross, dot, minus, vector
 from depthpose.pose.config import IcpConfig
 from depthpose.pose.icp import (
     Residuals,
@@ -170,9 +170,10 @@ def _grow(
             growth = min(max(motion[6], -0.1), 0.1)
             times[p] = min(max(times[p] * (1 + growth), 0.5), 2.0)
             # The points move by the inverse of the surface's motion.
-            turn = rotation_matrix(motion[:3])
+            turn = rotation_matrix(motion)
             local[p] = (local[p] - middle - motion[3:6]) @ turn + middle
-            largest = max(largest, np.abs(motion[:3]).max(), abs(motion[6]))
+            for k in (0, 1, 2, 6):
+                largest = max(largest, abs(motion[k]))
         if largest < _CONVERGED:
             break
 
@@ -194,24 +195,25 @@ def _growth_residuals(
     """
     count = len(local)
     unscaled = (local - middle) / scale + middle
-    match(unscaled, target, middle, -np.inf, limit / scale, is_exact, places)
+    centre = (middle[0], middle[1], middle[2])
+    match(unscaled, target, centre, -np.inf, limit / scale, is_exact, places)
     residuals = Residuals(np.zeros((count, 7)), np.zeros(count), np.zeros(count))
     for i in range(count):
         if places[i] < 0:
             continue
-        normal = target.normals[places[i]]
-        arm = scale * (target.tree.points[places[i]] - middle)
-        gap = local[i] - middle - arm
-        weight = tukey_weight((gap * gap).sum(), limit)
+        normal = vector(target.normals, places[i])
+        x, y, z = minus(vector(target.tree.points, places[i]), centre)
+        arm = (scale * x, scale * y, scale * z)
+        gap = minus(minus(vector(local, i), centre), arm)
+        weight = tukey_weight(dot(gap, gap), limit)
         if weight <= 0:
             continue
-        J = residuals.jacobian[i]
-        J[0] = arm[1] * normal[2] - arm[2] * normal[1]
-        J[1] = arm[2] * normal[0] - arm[0] * normal[2]
-        J[2] = arm[0] * normal[1] - arm[1] * normal[0]
-        J[3:6] = normal
-        J[6] = (normal * arm).sum()
-        residuals.distance[i] = (normal * gap).sum()
+        moment = cross(arm, normal)
+        for c in range(3):
+            residuals.jacobian[i, c] = moment[c]
+            residuals.jacobian[i, 3 + c] = normal[c]
+        residuals.jacobian[i, 6] = dot(normal, arm)
+        residuals.distance[i] = dot(normal, gap)
         residuals.weight[i] = weight
     return residuals
 

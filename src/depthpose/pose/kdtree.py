@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from depthpose.pose.compiled import compiled
+from depthpose.pose.compiled import Vector, compiled, dot, minus, vector
 
 _LEAF = 8  # most points of a range that is not split any more
 _MOST_WAITING = 64  # ranges that wait to be searched: fewer than the tree has levels
@@ -108,32 +108,33 @@ def _select(
 
 
 @compiled
-def faces(tree: Tree, place: int, eye: Float64[np.ndarray, "3"], least: float) -> bool:
+def faces(
+    points: Float64[np.ndarray, "m 3"],
+    outward: Float64[np.ndarray, "m 3"],
+    place: int,
+    eye: Vector,
+    least: float,
+) -> bool:
     """Whether a point shows a camera, ``eye``, its outer side.
 
     ``least`` is the least component of the outward normal along the way to the camera, in units of
     length; below 0 it lets points count that nearly face it, and all at minus infinity.
     """
-    x = eye[0] - tree.points[place, 0]
-    y = eye[1] - tree.points[place, 1]
-    z = eye[2] - tree.points[place, 2]
-    return tree.outward[place, 0] * x + tree.outward[place, 1] * y + tree.outward[place, 2] * z >= least
+    return dot(vector(outward, place), minus(eye, vector(points, place))) >= least
 
 
 @compiled
-def square_distance(tree: Tree, place: int, query: Float64[np.ndarray, "3"]) -> float:
+def square_distance(points: Float64[np.ndarray, "m 3"], place: int, query: Vector) -> float:
     """Give the squared distance of a point of the tree from another one."""
-    x = tree.points[place, 0] - query[0]
-    y = tree.points[place, 1] - query[1]
-    z = tree.points[place, 2] - query[2]
-    return x * x + y * y + z * z
+    way = minus(vector(points, place), query)
+    return dot(way, way)
 
 
 @compiled
 def nearest_facing(
-    query: Float64[np.ndarray, "3"],
+    query: Vector,
     tree: Tree,
-    eye: Float64[np.ndarray, "3"],
+    eye: Vector,
     least: float,
     best: int,
     best_square: float,
@@ -143,11 +144,12 @@ def nearest_facing(
     ``best`` is a guess, at a squared distance of ``best_square``; or -1, and only points nearer
     than that are searched. It is returned where no point is nearer.
     """
+    points, outward, _, axes, values = tree
     # The ranges that wait: node, first and last point; squared distance from the query along each
     # axis, and in all.
     ranges = np.empty((_MOST_WAITING, 3), np.int64)
     gaps = np.empty((_MOST_WAITING, 4))
-    ranges[0, 0], ranges[0, 1], ranges[0, 2] = 0, 0, len(tree.points)
+    ranges[0, 0], ranges[0, 1], ranges[0, 2] = 0, 0, len(points)
     gaps[0, :] = 0.0
     waiting = 1
     while waiting > 0:
@@ -158,10 +160,10 @@ def nearest_facing(
             continue
 
         # Down to the few points beside the query; the other half of each node waits.
-        while node < len(tree.axes):
-            axis = tree.axes[node]
+        while node < len(axes):
+            axis = axes[node]
             middle = (low + high) // 2
-            gap = query[axis] - tree.values[node]
+            gap = query[axis] - values[node]
             beyond = square - (x if axis == 0 else y if axis == 1 else z) + gap * gap
             is_low = gap < 0
             if beyond < best_square:
@@ -175,8 +177,8 @@ def nearest_facing(
             node = 2 * node + (1 if is_low else 2)
             low, high = (low, middle) if is_low else (middle, high)
         for place in range(low, high):
-            square = square_distance(tree, place, query)
-            if square < best_square and faces(tree, place, eye, least):
+            square = square_distance(points, place, query)
+            if square < best_square and faces(points, outward, place, eye, least):
                 best, best_square = place, square
     return best
 
@@ -185,10 +187,11 @@ def nearest_facing(
 def nearest_points(queries: Float64[np.ndarray, "n 3"], tree: Tree) -> Int64[np.ndarray, " n"]:
     """Give the index, as it was before sorting, of the point nearest to each query."""
     index = np.empty(len(queries), np.int64)
-    anywhere = np.zeros(3)
-    place = 0
+    anywhere = (0.0, 0.0, 0.0)
+    place = np.int64(0)
     for i in range(len(queries)):
-        square = square_distance(tree, place, queries[i])  # neighbours in an image are near
-        place = nearest_facing(queries[i], tree, anywhere, -np.inf, place, square)
+        query = vector(queries, i)
+        square = square_distance(tree.points, place, query)  # that before is near in an image
+        place = nearest_facing(query, tree, anywhere, -np.inf, place, square)
         index[i] = tree.order[place]
     return index

@@ -13,8 +13,15 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d, normalize, pad
 
 from depthpose.core.rigid import Rigid
-from depthpose.pose.compiled import array_of, compiled
-from depthpose.pose.kdtree import Tree, build_tree, faces, nearest_facing, nearest_points, square_distance
+from depthpose.pose.compiled import Vector, array_of, compiled, dot, vector
+from depthpose.pose.kdtree import (
+    Tree,
+    build_tree,
+    faces,
+    nearest_facing,
+    nearest_points,
+    square_distance,
+)
 from depthpose.pose.mesh import sample_surface, symmetry_transforms
 from depthpose.pose.mesh.models import disc_triangles, drawn_triangles, fibonacci_directions
 from depthpose.pose.types import ObjectModel
@@ -58,7 +65,7 @@ class Boxes:
 
 @compiled
 def _box_of(
-    point: Float64[np.ndarray, "3"],
+    point: Vector,
     low: Float64[np.ndarray, "3"],
     side: float,
     counts: Int64[np.ndarray, "3"],
@@ -82,7 +89,7 @@ def _look_up_all(
     """Give what a table holds for the box of each point."""
     values = np.empty(len(points), np.int64)
     for i in range(len(points)):
-        values[i] = table[_box_of(points[i], low, side, counts)]
+        values[i] = table[_box_of(vector(points, i), low, side, counts)]
     return values
 
 
@@ -103,7 +110,7 @@ class Target(NamedTuple):
 def match(
     points: Float64[np.ndarray, "n 3"],
     target: Target,
-    eye: Float64[np.ndarray, "3"],
+    eye: Vector,
     least: float,
     limit: float,
     is_exact: bool,
@@ -117,42 +124,30 @@ def match(
         eye: the camera in the model frame; samples count that show it their outer side.
         least: how nearly they do (:func:`~depthpose.pose.kdtree.faces`).
         limit: distance of the farthest sample, of exact matches.
-        is_exact: whether the nearest sample is searched, not looked up in the table.
+        is_exact: whether the nearest sample is searched, not looked up in the table, and of two
+            sides of a wall the one that faces the camera.
         places: on entry those of the matches before, or -1, from which exact searches begin.
     """
+    tree, table, across = target.tree, target.table, target.across
+    samples, outward = tree.points, tree.outward
+    low, side, counts = target.low, target.side, target.counts
     for i in range(len(points)):
-        guess = places[i]
-        if not is_exact or guess < 0:
-            guess = _look_up_facing(points[i], target, eye, least)
-        elif not faces(target.tree, guess, eye, least):
-            guess = -1
+        point = vector(points, i)
+        place = places[i]
+        if not is_exact or place < 0:
+            place = np.int64(table[_box_of(point, low, side, counts)])
+            if not faces(samples, outward, place, eye, least):
+                place = np.int64(across[place])
+        if place >= 0 and not faces(samples, outward, place, eye, least):
+            place = -1
         if is_exact:
             square = limit * limit
-            if guess >= 0:
-                guess_square = square_distance(target.tree, guess, points[i])
-                if guess_square < square:
-                    square = guess_square
-                else:
-                    guess = -1
-            guess = nearest_facing(points[i], target.tree, eye, least, guess, square)
-        places[i] = guess
-
-
-@compiled
-def _look_up_facing(
-    point: Float64[np.ndarray, "3"], target: Target, eye: Float64[np.ndarray, "3"], least: float
-) -> int:
-    """Give the place that the table holds for a point, that across the wall, or -1.
-
-    The first of these samples that shows the camera its outer side.
-    """
-    place = int(target.table[_box_of(point, target.low, target.side, target.counts)])
-    if faces(target.tree, place, eye, least):
-        return place
-    place = int(target.across[place])
-    if place >= 0 and faces(target.tree, place, eye, least):
-        return place
-    return -1
+            if place >= 0:
+                square = min(square, square_distance(samples, place, point))
+            if square == limit * limit:  # the guess is too far away
+                place = -1
+            place = nearest_facing(point, tree, eye, least, place, square)
+        places[i] = place
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -535,12 +530,12 @@ def _draw_cells(
     """Write the depth of the nearest posed point in each cell; infinity where there is none."""
     nearest[:] = np.inf
     for i in range(len(points)):
-        point = points[i]
-        z = R[2, 0] * point[0] + R[2, 1] * point[1] + R[2, 2] * point[2] + t[2]
+        point = vector(points, i)
+        z = dot(vector(R, 2), point) + t[2]
         if z <= 0:
             continue
-        x = R[0, 0] * point[0] + R[0, 1] * point[1] + R[0, 2] * point[2] + t[0]
-        y = R[1, 0] * point[0] + R[1, 1] * point[1] + R[1, 2] * point[2] + t[1]
+        x = dot(vector(R, 0), point) + t[0]
+        y = dot(vector(R, 1), point) + t[1]
         cell = _cell_of(x, y, max(z, 1e-6), scale, middle)
         nearest[cell] = min(nearest[cell], z)
 

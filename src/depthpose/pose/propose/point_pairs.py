@@ -272,16 +272,14 @@ def _features_of_all(
     count = len(points)
     keys = np.empty(count * (count - 1), np.int64)
     turns = np.empty(count * (count - 1))
-    feature, bins = np.empty(4), np.empty(4, np.int64)
+    feature = np.empty(4)
     pair = 0
     for i in range(count):
         for j in range(count):
             if j == i:
                 continue
             turns[pair] = _write_feature(points, frames, i, j, step, feature)
-            for k in range(4):
-                bins[k] = _bin(int(feature[k]), k)
-            keys[pair] = _key(bins)
+            keys[pair] = _key(feature)
             pair += 1
     return keys, turns
 
@@ -327,16 +325,19 @@ def _angle_bins(cosine: float) -> float:
 
 
 @compiled
-def _bin(value: int, k: int) -> int:
-    """Give the bin of part ``k`` of a feature; values beyond the bins are in the last one."""
-    last = DISTANCES if k == 0 else ANGLES - 1
-    return min(max(value, 0), last)
+def _key(feature: Float64[np.ndarray, "4"]) -> int:
+    """Give one number for the bins of a feature."""
+    key = 0
+    for k in range(4):
+        key = key * ANGLES + _clamp_bin(int(feature[k]), k)
+    return key
 
 
 @compiled
-def _key(bins: Int64[np.ndarray, "4"]) -> int:
-    """Give one number for the bins of a feature."""
-    return ((bins[0] * ANGLES + bins[1]) * ANGLES + bins[2]) * ANGLES + bins[3]
+def _clamp_bin(number: int, k: int) -> int:
+    """Give the bin of part ``k`` of a feature; values beyond the bins are in the last one."""
+    last = DISTANCES if k == 0 else ANGLES - 1
+    return min(max(number, 0), last)
 
 
 def vote_poses(
@@ -445,21 +446,16 @@ def _vote_of_pair(
     counts: Float32[np.ndarray, "m turns"],
 ) -> None:
     """Add the votes of the model's pairs with the feature of a pair of the scene, or nearly so."""
-    # In each part of the feature the pair's own bin, and the nearer one beside it.
-    own, aside = np.empty(4, np.int64), np.empty(4, np.int64)
-    for k in range(4):
-        below = int(feature[k])
-        beside = below + (-1 if feature[k] - below < 0.5 else 1)
-        own[k], aside[k] = _bin(below, k), _bin(beside, k)
+    key = _key(feature)
+    _add_votes(key, turn, pairs, voted, counts)
 
-    # Pairs of the model in its own bins, then in those with one of the four others.
-    bins = own.copy()
-    _add_votes(_key(bins), turn, pairs, voted, counts)
+    # In each part of the feature the nearer bin beside the own one; beyond the last it is the same.
     for k in range(4):
-        if aside[k] != own[k]:  # they are equal beyond the last bin
-            bins[k] = aside[k]
-            _add_votes(_key(bins), turn, pairs, voted, counts)
-            bins[k] = own[k]
+        own = int(feature[k])
+        beside = own + (-1 if feature[k] - own < 0.5 else 1)
+        change = _clamp_bin(beside, k) - _clamp_bin(own, k)
+        if change != 0:
+            _add_votes(key + change * ANGLES ** (3 - k), turn, pairs, voted, counts)
 
 
 @compiled
