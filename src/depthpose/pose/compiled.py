@@ -52,7 +52,7 @@ class _Compiled:
         digest = sha256()
         for file in sorted(_files(self.loop)):
             digest.update(Path(file).read_bytes())
-        self.loop.__qualname__ += f"_{digest.hexdigest()[:16]}"
+        self.loop.__qualname__ = f"{self.loop.__name__}_{digest.hexdigest()[:16]}"
         try:
             return njit(cache=True, nogil=True, error_model="numpy")(self.loop)
         except RuntimeError:  # no folder that may be written to
@@ -81,7 +81,9 @@ def array_of(tensor: Tensor) -> np.ndarray:
     return array
 
 
-# Vectors of three numbers in compiled loops are tuples: rows of arrays are objects that are counted.
+# Vectors of three numbers, in compiled loops. They are tuples, and innermost functions take arrays
+# one by one: to make an array of a row, or to take one out of a tuple, counts its references, which
+# made ICP take three times the time.
 
 Vector = tuple[float, float, float]
 
