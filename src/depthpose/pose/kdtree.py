@@ -7,6 +7,8 @@ from jaxtyping import Float64, Int64
 
 from depthpose.pose.compiled import Vector, compiled, dot, minus, vector
 
+Place = int | np.int64  #: of a point, in the order of a tree
+
 _LEAF = 8  # most points of a range that is not split any more
 _MOST_WAITING = 64  # ranges that wait to be searched: fewer than the tree has levels
 
@@ -111,7 +113,7 @@ def _select(
 def faces(
     points: Float64[np.ndarray, "m 3"],
     outward: Float64[np.ndarray, "m 3"],
-    place: int,
+    place: Place,
     eye: Vector,
     least: float,
 ) -> bool:
@@ -124,7 +126,7 @@ def faces(
 
 
 @compiled
-def square_distance(points: Float64[np.ndarray, "m 3"], place: int, query: Vector) -> float:
+def square_distance(points: Float64[np.ndarray, "m 3"], place: Place, query: Vector) -> float:
     """Give the squared distance of a point of the tree from another one."""
     way = minus(vector(points, place), query)
     return dot(way, way)
@@ -136,9 +138,9 @@ def nearest_facing(
     tree: Tree,
     eye: Vector,
     least: float,
-    best: int,
+    best: Place,
     best_square: float,
-) -> int:
+) -> Place:
     """Give the place of the nearest point that faces a camera (:func:`faces`).
 
     ``best`` is a guess, at a squared distance of ``best_square``; or -1, and only points nearer
