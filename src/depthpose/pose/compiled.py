@@ -89,7 +89,7 @@ Vector = tuple[float, float, float]
 
 
 @compiled
-def vector(array: np.ndarray, i: int) -> Vector:
+def vector(array: np.ndarray, i: int | np.int64) -> Vector:
     """Give row ``i`` of an array (n, 3)."""
     return array[i, 0], array[i, 1], array[i, 2]
 
