@@ -30,7 +30,7 @@ $(DEMO): pyproject.toml constraints.txt
 	@echo "   build (0.9 GB): PIP_EXTRA_INDEX_URL=URL make ..., URL as PyTorch's 'Start Locally' page says."
 	$(BIN)/python -m pip install -c constraints.txt torch==$$(sed -n 's/^torch==//p' constraints.txt)
 	@echo "depthpose and what its demo needs"
-	$(BIN)/python -m pip install -c constraints.txt -e '.[demo,fast]'
+	$(BIN)/python -m pip install -c constraints.txt -e '.[demo]'
 	touch $@
 	@echo "ready: 'source .venv/bin/activate' puts depthpose on your path"
 

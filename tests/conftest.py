@@ -74,7 +74,7 @@ def prepared_once() -> Iterator[None]:
 
     def once(compute: Callable[..., Any], key_of: Callable[..., object]) -> Callable[..., Any]:
         def give(*given: Any) -> Any:  # noqa: ANN401
-            key = key_of(*given), os.environ.get("DEPTHPOSE_COMPILED")
+            key = key_of(*given)
             if key not in made:
                 made[key] = compute(*given), given  # kept, so that no other has their identity
             return made[key][0]

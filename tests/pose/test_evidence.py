@@ -104,21 +104,6 @@ def test_of_very_many_faces_the_samples_are_rendered(monkeypatch: pytest.MonkeyP
     assert np.median(np.abs(depth_m - exact_m)[both]) < 0.0005
 
 
-@pytest.mark.parametrize("seed", [0, 3])
-def test_torch_renders_what_numba_does(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    surface = prepare_surface(make_part("mug"))
-    pose = pose_at(z_m=0.6, seed=seed)
-    compiled = render_surface(surface, pose, K, 240, 320)
-    monkeypatch.setattr("depthpose.pose.rendering.use_numba", lambda *_: False)
-    by_torch = render_surface(surface, pose, K, 240, 320)
-    assert by_torch.window == compiled.window
-    is_drawn = np.isfinite(by_torch.depth_m)
-    assert (is_drawn != np.isfinite(compiled.depth_m)).sum() < 0.002 * is_drawn.sum()
-    both = is_drawn & np.isfinite(compiled.depth_m)
-    off_m = np.abs(by_torch.depth_m - compiled.depth_m)[both]
-    assert np.quantile(off_m, 0.99) < 1e-6
-
-
 def test_slanted_pixels_are_drawn_as_the_renderer_draws_them() -> None:
     """A skew of 40 px moves a pixel by 8 % of its height."""
     slanted = K.clone()

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from scipy.spatial import KDTree
 from tests.pose.synthetic_objects import (
     CAMERA,
     K,
@@ -110,7 +111,7 @@ def test_readings_on_a_posed_surface_are_all_that_are_near_it() -> None:
     surface, noise = prepare_surface(model), torch.Generator().manual_seed(0)
     depth_m = (table() + 0.01 * torch.randn(240, 320, generator=noise)).double()
     local_m = pose.inverse().apply(back_project(depth_m, K.double()))
-    distance_m = torch.from_numpy(surface.tree.query(local_m.numpy())[0])
+    distance_m = torch.from_numpy(KDTree(surface.points_m.numpy()).query(local_m.numpy())[0])
     view = ViewInput(name="a", depth_m=depth_m, mask=depth_m > 0, K=K, object=model.name)
     found, near = explained_mask(view, pose, surface), distance_m < NEAR * surface.diameter_m
     assert int(near.sum()) > 500

@@ -64,6 +64,5 @@ def test_no_array_stands_on_memory_that_sending_a_surface_frees() -> None:
     tensors = [surface.boxes.low_m, surface.boxes.counts, surface.ball_m, surface.points_m]
     for tensor in tensors:
         assert not any(np.shares_memory(tensor.numpy(), array) for array in arrays)
-    assert not np.shares_memory(surface.points_m.numpy(), surface.tree.data)
     ForkingPickler.dumps(surface)
     assert all(np.array_equal(a, b) for a, b in zip(arrays, values, strict=True))

@@ -202,11 +202,7 @@ def test_half_turns_lay_half_of_a_part_on_itself() -> None:
     assert float(angle.max()) > 170
 
 
-@pytest.mark.parametrize("is_compiled", ["1", "0"])
-def test_a_needle_of_few_points_can_be_looked_for_in_itself(
-    is_compiled: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("DEPTHPOSE_COMPILED", is_compiled)
+def test_a_needle_of_few_points_can_be_looked_for_in_itself() -> None:
     corners, faces = box_faces()
     needle = make_model(corners * torch.tensor([0.002, 0.002, 0.2]), faces, name="needle")
     pairs = prepare_pairs(prepare_surface(needle))

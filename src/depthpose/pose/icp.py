@@ -6,16 +6,18 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float64, Int64
+from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.errors import InputError
-from depthpose.core.rigid import Rigid, cross_matrix, perturb, rotation_by
-from depthpose.pose.compiled import GRAZING, SLACK, use_numba
+from depthpose.core.rigid import Rigid, cross_matrix, rotation_by
+from depthpose.pose.compiled import Vector, array_of, compiled, cross, dot, minus, rotate, vector
 from depthpose.pose.config import IcpConfig
-from depthpose.pose.surface import Surface, finite_array, look_along_rays
+from depthpose.pose.surface import Surface, Target, look_along_rays, match
 
+_SLACK = 0.1  # sine of the angle by which a surface may face away and still count as visible
+_GRAZING = 0.1  # sine of the angle between a ray and a plane below which they do not meet nearby
 _CONVERGED = 3e-4  # stop when a step rotates [rad] and shifts [diameters] by less than this
 _START_ROTATION_RAD = math.radians(15)  # of further starts from the initial pose
 _ROUGH_LIMITS = (3.0, 2.4, 2.0, 1.6, 1.4, 1.2, 1.0, 1.0, 1.0, 1.0)
@@ -59,24 +61,44 @@ class BestStart(NamedTuple):
     others: Rigid  #: the best poses beside it, three at most, roughly refined
 
 
-class _NormalEquations(NamedTuple):
-    """Gauss-Newton step of poses, ``information @ motion = gradient``, and its residuals."""
+class Residuals(NamedTuple):
+    """Distances of points from the planes of their samples, for compiled loops.
 
-    information: Float64[Tensor, "*batch 6 6"]
-    gradient: Float64[Tensor, "*batch 6"]
-    jacobian: Float64[Tensor, "*batch n 6"]  # of the residuals by (rotation, translation)
+    Rows are 0 of a point without a sample, or whose sample is too far away.
+    """
+
+    jacobian: Float64[np.ndarray, "n unknowns"]  #: of the distances
+    distance: Float64[np.ndarray, " n"]
+    weight: Float64[np.ndarray, " n"]
+
+
+class _Linearised(NamedTuple):
+    """Refined poses' residuals, and their information about (rotation, translation)."""
+
+    information: Float64[Tensor, "*batch 6 6"]  # damped
+    jacobian: Float64[Tensor, "*batch n 6"]
     weight: Float64[Tensor, "*batch n"]
     residual_m: Float64[Tensor, "*batch n"]
-    rms_m: Float64[Tensor, "*batch"]  # of the weighted residuals; infinite where no point counts
+
+    @property
+    def rms_m(self) -> Float64[Tensor, "*batch"]:
+        """Root mean square of the weighted residuals; infinite where no point counts."""
+        total = self.weight.sum(-1)
+        mean_square = (self.weight * self.residual_m.square()).sum(-1) / total.clamp(min=1e-12)
+        return torch.where(total > 0, mean_square, torch.inf).sqrt()
 
 
-def tukey_weight(square_m2: Float64[Tensor, "*n"], limit_m: float) -> Float64[Tensor, "*n"]:
+@compiled
+def tukey_weight(
+    square: float | Float64[np.ndarray, "*n"], limit: float
+) -> float | Float64[np.ndarray, "*n"]:
     """Give Tukey's weight of squared distances: 1 at 0, and 0 from the limit on.
 
-    Every ICP weights its residuals so. To use another loss, change this function,
-    ``_influence_slope`` and ``tukey_weight`` in ``compiled/points.py``.
+    Every ICP weights its residuals so. To use another loss, change this function and
+    ``_influence_slope``.
     """
-    return (1 - square_m2 / limit_m**2).clamp(min=0).square()
+    share = np.maximum(0.0, 1 - square / (limit * limit))
+    return share * share
 
 
 def _influence_slope(
@@ -123,13 +145,12 @@ def refine_pose(
     half = max(1, config.iterations // 2)
     limits = [start * (end / start) ** min(1.0, i / half) for i in range(config.iterations)]
     limits_m = [limit * surface.diameter_m for limit in (*limits, end)]
-    pose, index = _iterate(
+    pose, equations = _iterate(
         points_m, config.cloud_points, initial.double(), surface, limits_m, is_exact=True
     )
 
     # Covariance about the middle of the cloud, of the residuals and of an offset along the ray.
     cloud_m = take_evenly(points_m.double(), config.cloud_points)
-    equations = _normal_equations(cloud_m, pose, surface, limits_m[-1], index, is_along_rays=True)
     covariance = _covariance(cloud_m, equations, limits_m[-1], surface.diameter_m)
     middle_m = cloud_m.mean(0)
     ray = torch.nn.functional.normalize(middle_m, dim=0)
@@ -280,12 +301,8 @@ def _iterate(
     limits_m: list[float],
     *,
     is_exact: bool,
-) -> tuple[Rigid, Int64[Tensor, "*batch n"]]:
-    """Take Gauss-Newton steps of ICP until the poses move no more.
-
-    Exact steps match each point with its nearest sample of the surface in the first half of the
-    steps, and with the sample on its ray in the second; other steps look samples up in a table.
-    ``refine`` in ``compiled/poses.py`` takes the same steps where numba is installed.
+) -> tuple[Rigid, _Linearised]:
+    """Take Gauss-Newton steps of ICP until the poses move no more (:func:`_refine`).
 
     Args:
         points_m: of the object, in the camera frame.
@@ -293,91 +310,190 @@ def _iterate(
         pose: one or a batch, ``camera_from_model``.
         surface: of the model.
         limits_m: distance at which a point no longer counts, for each step; the last one is for
-            the samples that are returned.
+            the residuals that are returned, without a step.
         is_exact: whether samples are searched, not looked up.
 
     Returns:
-        The poses, and for each used point the index of its sample of the surface, or -1.
+        The poses, and the residuals there.
     """
     if len(points_m) == 0 or not bool(points_m.isfinite().all()):
         raise InputError(
             f"ICP of {len(points_m)} points, {int((~points_m.isfinite().all(-1)).sum())} of them "
             "not finite: leave those out, and refuse a cloud of none."
         )
-    cloud_m = take_evenly(points_m.double(), max_points)
-    if use_numba(cloud_m, pose.R, pose.t_m):
-        return _iterate_compiled(cloud_m, pose, surface, limits_m, is_exact=is_exact)
-
-    middle_m = cloud_m.mean(0)
-    scale = torch.tensor([1.0] * 3 + [surface.diameter_m] * 3, dtype=torch.float64)
-    is_moving = torch.ones_like(pose.t_m[..., :1])  # 1 or 0 for each pose
-    index = torch.full((*pose.t_m.shape[:-1], len(cloud_m)), -1)
-    last = len(limits_m) - 1
-    for step, limit_m in enumerate(limits_m):
-        # Correspondences; those of a pose that has converged stay.
-        is_along_rays = is_exact and 2 * step >= last
-        if is_along_rays:
-            matches = _match_along_rays(cloud_m, pose, surface, limit_m, index)
-        elif is_exact:
-            matches = _match_nearest(cloud_m, pose, surface, limit_m)
-        else:
-            matches = _match_by_table(cloud_m, pose, surface)
-        index = torch.where(is_moving > 0, matches, index)
-        if step == last:
-            break
-
-        # One Gauss-Newton step. It is taken about the middle of the cloud: a rotation by w about
-        # the camera, D away, with the shift that cancels it to first order would leave the object
-        # w^2 D / 2 off.
-        equations = _normal_equations(
-            cloud_m, pose, surface, limit_m, index, is_along_rays=is_along_rays
+    cloud = array_of(take_evenly(points_m.double(), max_points))
+    R = array_of(pose.R).copy()
+    t_m = array_of(pose.t_m).copy()
+    rotations = R.reshape(-1, 3, 3)
+    translations = t_m.reshape(-1, 3)
+    batch = (len(translations), len(cloud))
+    jacobian, weight, residual_m = np.zeros((*batch, 6)), np.zeros(batch), np.zeros(batch)
+    information = np.empty((batch[0], 6, 6))
+    for k in range(batch[0]):
+        information[k] = _refine(
+            cloud,
+            rotations[k],
+            translations[k],
+            np.array(limits_m),
+            surface.diameter_m,
+            surface.target,
+            is_exact,
+            Residuals(jacobian[k], residual_m[k], weight[k]),
         )
-        motion = torch.linalg.solve(equations.information, equations.gradient) * is_moving
-        moved = perturb(Rigid(pose.R, pose.t_m - middle_m), motion)
-        pose = Rigid(moved.R, moved.t_m + middle_m)
-
-        # A pose that hardly moved, with the last limit and the last kind of match, has converged.
-        has_last_kind = is_along_rays or not is_exact
-        if limit_m <= limits_m[-1] and has_last_kind:
-            is_moving = ((motion / scale).abs() >= _CONVERGED).any(-1, keepdim=True).double()
-            if not bool(is_moving.any()):
-                break
-    return pose, index
-
-
-def _iterate_compiled(
-    cloud_m: Float64[Tensor, "n 3"],
-    pose: Rigid,
-    surface: Surface,
-    limits_m: list[float],
-    *,
-    is_exact: bool,
-) -> tuple[Rigid, Int64[Tensor, "*batch n"]]:
-    """Take the steps of :func:`_iterate` by numba, on copies of the poses."""
-    from depthpose.pose.compiled.poses import refine
-
-    R = torch.from_numpy(finite_array(pose.R.detach().numpy()).copy())
-    t_m = torch.from_numpy(finite_array(pose.t_m.detach().numpy()).copy())
-    points = finite_array(cloud_m.detach().numpy())
-    rotations = R.view(-1, 3, 3).numpy()
-    translations = t_m.view(-1, 3).numpy()
-    target = surface.target
-    places = np.full((len(translations), len(points)), -1)
-    refine(
-        points,
-        rotations,
-        translations,
-        np.array(limits_m),
-        surface.diameter_m,
-        _CONVERGED,
-        target,
-        is_exact,
-        places,
+    linearised = (information, jacobian, weight, residual_m)
+    shape = pose.t_m.shape[:-1]
+    return Rigid(torch.from_numpy(R), torch.from_numpy(t_m)), _Linearised(
+        *(torch.from_numpy(part).reshape(*shape, *part.shape[1:]) for part in linearised)
     )
 
-    # From places in the tree to samples; place -1, of no sample, takes the -1 appended.
-    index = torch.from_numpy(np.append(target.tree.order, -1)[places])
-    return Rigid(R, t_m), index.view(*t_m.shape[:-1], len(points))
+
+@compiled
+def _refine(
+    cloud: Float64[np.ndarray, "n 3"],
+    R: Float64[np.ndarray, "3 3"],
+    t: Float64[np.ndarray, "3"],
+    limits: Float64[np.ndarray, " steps"],
+    diameter: float,
+    target: Target,
+    is_exact: bool,
+    residuals: Residuals,
+) -> Float64[np.ndarray, "6 6"]:
+    """Move a pose in place by point-to-plane ICP; write its residuals, and give its information.
+
+    Exact steps match each point with its nearest sample of the surface in the first half of the
+    steps, and with the sample on its ray in the second; other steps look samples up in a table.
+    """
+    middle = cloud.sum(0) / len(cloud)
+    places = np.full(len(cloud), -1)
+    last = len(limits) - 1
+    has_converged = False
+    H = np.empty((6, 6))
+    for step in range(len(limits)):
+        limit = limits[step]
+        is_along_rays = is_exact and 2 * step >= last
+        local = (cloud - t) @ R
+        camera = -(t @ R)
+        eye = (camera[0], camera[1], camera[2])
+
+        # Match each point with a sample that faces the camera; all samples do where the camera is
+        # within the ball about the surface. The matches of a pose that has converged stay.
+        if not has_converged:
+            queries = _meet_planes(local, eye, target, places) if is_along_rays else local
+            way = minus(eye, (target.ball[0], target.ball[1], target.ball[2]))
+            distance = np.sqrt(dot(way, way))
+            least = -_SLACK * distance if distance > target.ball[3] else -np.inf
+            match(queries, target, eye, least, limit, is_exact, places)
+
+        # Linearise about the middle of the cloud: a rotation by w about the camera, D away, with
+        # the shift that cancels it to first order would leave the object w^2 D / 2 off.
+        _linearise(local, eye, places, R, t - middle, limit, target, is_along_rays, residuals)
+        H, b = normal_equations(residuals, 1e-6)
+        if step == last or has_converged:
+            break
+
+        # One Gauss-Newton step.
+        motion = np.linalg.solve(H, b)
+        turn = rotation_matrix(motion)
+        t[:] = turn @ (t - middle) + middle + motion[3:]
+        R[:] = turn @ R
+
+        # A pose that hardly moved, with the last limit and the last kind of match, has converged.
+        largest = 0.0
+        for k in range(3):
+            largest = max(largest, abs(motion[k]), abs(motion[3 + k]) / diameter)
+        has_last_kind = is_along_rays or not is_exact
+        has_converged = largest < _CONVERGED and has_last_kind and limit <= limits[last]
+    return H
+
+
+@compiled
+def _meet_planes(
+    local: Float64[np.ndarray, "n 3"],
+    eye: Vector,
+    target: Target,
+    places: Int64[np.ndarray, " n"],
+) -> Float64[np.ndarray, "n 3"]:
+    """Give where the ray of each point meets the plane of its sample, in the model frame.
+
+    The sample itself where the ray grazes the plane; the point where it has no sample.
+    """
+    meet = local.copy()
+    for i in range(len(local)):
+        place = places[i]
+        if place < 0:
+            continue
+        point = vector(local, i)
+        ray = minus(point, eye)
+        normal = vector(target.normals, place)
+        sample = vector(target.tree.points, place)
+        slope = dot(normal, ray)
+        is_grazing = slope * slope <= _GRAZING * _GRAZING * dot(ray, ray)
+        share = 0.0 if is_grazing else dot(normal, minus(sample, point)) / slope
+        for c in range(3):
+            meet[i, c] = sample[c] if is_grazing else point[c] + share * ray[c]
+    return meet
+
+
+@compiled
+def _linearise(
+    local: Float64[np.ndarray, "n 3"],
+    eye: Vector,
+    places: Int64[np.ndarray, " n"],
+    R: Float64[np.ndarray, "3 3"],
+    arm_of_model: Float64[np.ndarray, "3"],
+    limit: float,
+    target: Target,
+    is_along_rays: bool,
+    residuals: Residuals,
+) -> None:
+    """Write the residuals of a pose, with their derivatives by a motion of the model.
+
+    The motion is about the middle of the cloud, where its parameters hardly correlate.
+
+    Args:
+        local: the cloud in the model frame.
+        eye: the camera there.
+        places: of the samples of the points, or -1.
+        R: rotation of the pose.
+        arm_of_model: from the middle of the cloud to the model's origin, in the camera frame.
+        limit: distance from which a point has no weight.
+        target: the samples.
+        is_along_rays: whether the samples lie on the rays of their points; then the residual
+            replaces the part of the distance that lies along the ray.
+        residuals: are written.
+    """
+    residuals.jacobian[:] = 0.0
+    residuals.distance[:] = 0.0
+    residuals.weight[:] = 0.0
+    for i in range(len(local)):
+        if places[i] < 0:
+            continue
+        point = vector(local, i)
+        sample = vector(target.tree.points, places[i])
+        normal = vector(target.normals, places[i])
+        gap = minus(point, sample)
+        distance = dot(normal, gap)
+
+        # Weighted by the whole distance: a point beyond an edge is near the plane, not the surface.
+        square = dot(gap, gap)
+        if is_along_rays:
+            ray = minus(point, eye)
+            along = dot(gap, ray)
+            square += distance * distance - along * along / dot(ray, ray)
+        weight = tukey_weight(square, limit)
+        if weight <= 0:
+            continue
+
+        # Moving the model by (w, v) moves its sample by w x arm + v, and lowers the residual.
+        x, y, z = rotate(R, sample)
+        arm = (x + arm_of_model[0], y + arm_of_model[1], z + arm_of_model[2])
+        seen_normal = rotate(R, normal)
+        moment = cross(arm, seen_normal)
+        for c in range(3):
+            residuals.jacobian[i, c] = moment[c]
+            residuals.jacobian[i, 3 + c] = seen_normal[c]
+        residuals.distance[i] = distance
+        residuals.weight[i] = weight
 
 
 def _score_poses(
@@ -391,8 +507,8 @@ def _score_poses(
     cloud_m = take_evenly(points_m.double(), _OCCLUSION_POINTS)
     free_space_violation, unobserved = look_along_rays(cloud_m, poses, surface, every=4)
     few_m = take_evenly(cloud_m, _ROUGH_POINTS)
-    index = _match_by_table(few_m, poses, surface)
-    equations = _normal_equations(few_m, poses, surface, limit_m, index, is_along_rays=False)
+    limits_m = [limit_m]  # no step: matches and residuals alone
+    _, equations = _iterate(few_m, _ROUGH_POINTS, poses, surface, limits_m, is_exact=False)
     inlier_share = (equations.weight > 0).double().mean(-1)
     # Of poses with equal shares the nearer one is better.
     closeness = inlier_share - equations.rms_m / surface.diameter_m
@@ -401,163 +517,58 @@ def _score_poses(
     return score
 
 
-def _in_model_frame(
-    cloud_m: Float64[Tensor, "n 3"], pose: Rigid
-) -> tuple[Float64[Tensor, "b n 3"], Float64[Tensor, "b 1 3"]]:
-    """Give the cloud and the camera in the model frame of each pose; one pose is a batch of one."""
-    poses = Rigid(pose.R.reshape(-1, 3, 3), pose.t_m.reshape(-1, 3))
-    inverse = poses.inverse()
-    return inverse.apply(cloud_m), inverse.t_m[:, None]
+@compiled
+def normal_equations(
+    residuals: Residuals, least_size: float
+) -> tuple[Float64[np.ndarray, "k k"], Float64[np.ndarray, " k"]]:
+    """Give the weighted normal equations of a Gauss-Newton step, ``H @ motion = b``.
 
-
-def _match_by_table(
-    cloud_m: Float64[Tensor, "n 3"], pose: Rigid, surface: Surface
-) -> Int64[Tensor, "*batch n"]:
-    """Look up a visible sample of the surface near each point; -1 where the table has none.
-
-    Where the sample in the table faces away, that on the other side of the wall is taken.
+    H is damped, so that an unknown that no point constrains stays where it was: by a billionth of
+    the largest number of its diagonal, or of ``least_size``.
     """
-    local_m, camera_m = _in_model_frame(cloud_m, pose)
-    index = surface.boxes.look_up(local_m)
-    is_facing = _is_visible(camera_m, index, surface)
-    index = torch.where(is_facing, index, surface.across[index])
-    is_matched = (index >= 0) & _is_visible(camera_m, index, surface)
-    return torch.where(is_matched, index, -1).reshape(*pose.t_m.shape[:-1], -1)
+    unknowns = residuals.jacobian.shape[1]
+    H, b = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
+    for i in range(len(residuals.weight)):
+        if residuals.weight[i] <= 0:
+            continue
+        for k in range(unknowns):
+            scaled = residuals.weight[i] * residuals.jacobian[i, k]
+            b[k] += scaled * residuals.distance[i]
+            for m in range(unknowns):
+                H[k, m] += scaled * residuals.jacobian[i, m]
+    size = least_size
+    for k in range(unknowns):
+        size = max(size, H[k, k])
+    for k in range(unknowns):
+        H[k, k] += 1e-9 * size
+    return H, b
 
 
-def _match_nearest(
-    cloud_m: Float64[Tensor, "n 3"], pose: Rigid, surface: Surface, limit_m: float
-) -> Int64[Tensor, "*batch n"]:
-    """Find the nearest visible sample of the surface within the limit of each point, or -1."""
-    local_m, camera_m = _in_model_frame(cloud_m, pose)
-    return _nearest_visible(local_m, camera_m, surface, limit_m).reshape(*pose.t_m.shape[:-1], -1)
+@compiled
+def rotation_matrix(motion: Float64[np.ndarray, " k"]) -> Float64[np.ndarray, "3 3"]:
+    """Give the rotation by a motion, whose first three numbers are a rotation vector [rad].
 
-
-def _match_along_rays(
-    cloud_m: Float64[Tensor, "n 3"],
-    pose: Rigid,
-    surface: Surface,
-    limit_m: float,
-    previous: Int64[Tensor, "*batch n"],
-) -> Int64[Tensor, "*batch n"]:
-    """Find the visible sample nearest to where the ray of each point meets the surface, or -1.
-
-    The surface there is the plane of the point's ``previous`` sample. Where the ray grazes it, that
-    sample itself is the query, and where there was none the point.
+    Rodrigues' formula.
     """
-    local_m, camera_m = _in_model_frame(cloud_m, pose)
-    sample = previous.reshape(local_m.shape[:2])
-    ray_m = local_m - camera_m
-    normal = surface.normals[sample]
-    sample_m = surface.points_m[sample]
-    slope = (normal * ray_m).sum(-1, keepdim=True)
-    share = (normal * (sample_m - local_m)).sum(-1, keepdim=True) / slope
-    is_meeting = slope.square() > GRAZING**2 * ray_m.square().sum(-1, keepdim=True)
-    meeting_m = torch.where(is_meeting, local_m + share * ray_m, sample_m)
-    query_m = torch.where(sample[..., None] >= 0, meeting_m, local_m)
-    return _nearest_visible(query_m, camera_m, surface, limit_m).reshape(*pose.t_m.shape[:-1], -1)
-
-
-def _nearest_visible(
-    query_m: Float64[Tensor, "b n 3"],
-    camera_m: Float64[Tensor, "b 1 3"],
-    surface: Surface,
-    limit_m: float,
-) -> Int64[Tensor, "b n"]:
-    """Find the visible sample nearest to each point of the model frame, or -1 beyond the limit."""
-    total = len(surface.points_m)
-    index = torch.full(query_m.shape[:2], -1)
-    pose, point = (index < 0).nonzero(as_tuple=True)  # of the queries without an answer yet
-
-    # Ask for ever more of the nearest samples until one is visible.
-    count = 1
-    while len(pose) > 0:
-        _, nearest = surface.tree.query(
-            query_m[pose, point].numpy(), k=range(1, count + 1), distance_upper_bound=limit_m
-        )
-        nearest = torch.from_numpy(nearest)
-        is_within = nearest < total  # beyond the limit the tree gives the number of its points
-        nearest = nearest.clamp(max=total - 1)
-        is_match = is_within & _is_visible(camera_m[pose, 0, None], nearest, surface)
-        first = is_match.int().argmax(1)
-        has_match = is_match.any(1)
-        index[pose[has_match], point[has_match]] = nearest[has_match, first[has_match]]
-        is_open = ~has_match & is_within.all(1) & (count < total)
-        pose = pose[is_open]
-        point = point[is_open]
-        count = min(8 * count, total)
-    return index
-
-
-def _is_visible(
-    camera_m: Float64[Tensor, "b k 3"], index: Int64[Tensor, "b n"], surface: Surface
-) -> Bool[Tensor, "b n"]:
-    """Whether samples show a camera, in the model frame, their outer side, or nearly so.
-
-    A sample whose outer side is not known counts as visible, and all do where the camera is within
-    the ball about the surface.
-    """
-    distance_m = (camera_m - surface.ball_m[:3]).norm(dim=-1)
-    facing_m = ((camera_m - surface.points_m[index]) * surface.outward[index]).sum(-1)
-    return (facing_m >= -SLACK * distance_m) | (distance_m <= surface.ball_m[3])
-
-
-def _normal_equations(
-    cloud_m: Float[Tensor, "n 3"],
-    pose: Rigid,
-    surface: Surface,
-    limit_m: float,
-    index: Int64[Tensor, "*batch n"],
-    *,
-    is_along_rays: bool,
-) -> _NormalEquations:
-    """Linearise the residuals about the middle of the cloud, where the parameters hardly correlate.
-
-    Args:
-        cloud_m: in the camera frame.
-        pose: one or a batch, ``camera_from_model``.
-        surface: of the model.
-        limit_m: distance from which a point has no weight.
-        index: of each point's sample, -1 where it has none.
-        is_along_rays: whether the samples lie on the rays of their points; then the residual
-            replaces the part of the distance that lies along the ray.
-    """
-    # In the camera frame, as the covariance is.
-    normal = surface.normals[index] @ pose.R.mT
-    sample_m = surface.points_m[index] @ pose.R.mT + pose.t_m[..., None, :]
-    gap_m = cloud_m - sample_m
-    residual_m = (normal * gap_m).sum(-1)
-
-    # Weighted by the whole distance: a point beyond an edge is near the plane, not the surface.
-    square_m2 = gap_m.square().sum(-1)
-    if is_along_rays:
-        along_ray_m2 = (gap_m * cloud_m).sum(-1).square() / cloud_m.square().sum(-1)
-        square_m2 = square_m2 - along_ray_m2 + residual_m.square()
-    weight = torch.where(index >= 0, tukey_weight(square_m2, limit_m), 0.0)
-
-    # Moving the model by (w, v) moves its point by w x arm + v, and lowers the residual.
-    arm_m = sample_m - cloud_m.mean(0)
-    J = torch.cat([torch.linalg.cross(arm_m, normal), normal], -1)
-    weighted = J.mT * weight[..., None, :]
-    H = weighted @ J
-    # Damped, so that a direction that no point constrains stays where it was.
-    size = H.diagonal(dim1=-2, dim2=-1).amax(-1)[..., None, None].clamp(min=1e-6)
-    H = H + 1e-9 * size * torch.eye(6, dtype=torch.float64)
-    total = weight.sum(-1)
-    mean_square = (weight * residual_m.square()).sum(-1) / total.clamp(min=1e-12)
-    return _NormalEquations(
-        information=H,
-        gradient=(weighted @ residual_m[..., None]).squeeze(-1),
-        jacobian=J,
-        weight=weight,
-        residual_m=residual_m,
-        rms_m=torch.where(total > 0, mean_square, torch.inf).sqrt(),
-    )
+    x, y, z = motion[0], motion[1], motion[2]
+    square = x * x + y * y + z * z
+    angle = np.sqrt(square)
+    s, c = 1 - square / 6, 0.5 - square / 24  # sin(a) / a and (1 - cos(a)) / a^2 at a small angle
+    if angle >= 1e-4:
+        s, c = np.sin(angle) / angle, (1 - np.cos(angle)) / square
+    R = np.empty((3, 3))
+    R[0, 0] = 1 - c * (y * y + z * z)
+    R[1, 1] = 1 - c * (x * x + z * z)
+    R[2, 2] = 1 - c * (x * x + y * y)
+    R[0, 1], R[1, 0] = c * x * y - s * z, c * x * y + s * z
+    R[0, 2], R[2, 0] = c * x * z + s * y, c * x * z - s * y
+    R[1, 2], R[2, 1] = c * y * z - s * x, c * y * z + s * x
+    return R
 
 
 def _covariance(
     cloud_m: Float64[Tensor, "n 3"],
-    equations: _NormalEquations,
+    equations: _Linearised,
     limit_m: float,
     diameter_m: float,
 ) -> Float64[Tensor, "*batch 6 6"]:
@@ -582,7 +593,7 @@ def _covariance(
 
 
 def _independent_factor(
-    equations: _NormalEquations, slope: Float64[Tensor, "*batch n"]
+    equations: _Linearised, slope: Float64[Tensor, "*batch n"]
 ) -> tuple[
     Float64[Tensor, "*batch 6 6"], Float64[Tensor, "*batch 6 6"], Float64[Tensor, "*batch 1 1"]
 ]:
@@ -612,7 +623,7 @@ def _independent_factor(
 
 def _jackknife_inflation(
     cloud_m: Float64[Tensor, "n 3"],
-    equations: _NormalEquations,
+    equations: _Linearised,
     slope: Float64[Tensor, "*batch n"],
     independent: Float64[Tensor, "*batch 6 6"],
     whitening: Float64[Tensor, "*batch 6 6"],

@@ -9,18 +9,25 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
-from depthpose.core.rigid import Rigid, rotation_by
-from depthpose.pose.compiled import use_numba
+from depthpose.core.rigid import Rigid
+from depthpose.pose.compiled import array_of, compiled, cross, dot, minus, vector
 from depthpose.pose.config import IcpConfig
-from depthpose.pose.icp import refine_pose, refine_roughly, tukey_weight
+from depthpose.pose.icp import (
+    Residuals,
+    normal_equations,
+    refine_pose,
+    refine_roughly,
+    rotation_matrix,
+    tukey_weight,
+)
 from depthpose.pose.mesh import MIRROR_ALIKE
 from depthpose.pose.mesh.models import fibonacci_directions
 from depthpose.pose.sensor import EDGE_PX, INDEPENDENT_SIDES, LARGEST_OFFSET_M
-from depthpose.pose.surface import NEAR, Surface, finite_array
+from depthpose.pose.surface import NEAR, Surface, Target, match
 from depthpose.pose.types import Evidence, Identity
 
 POINTS = 400  #: of the cloud, evenly taken
@@ -39,6 +46,7 @@ _CLEARLY_WORSE = 0.05
 """Where the mirror image, roughly fitted, is so much farther from the points than the model, exact
 steps do not bring it nearer: in 123 views the gain was then -0.035 at most."""
 _FLIP = torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
+_LEAST_INFORMATION = 1e-9  # of an unknown: relative to it a step is damped
 _DEVIATIONS = 2.0  # standard deviations by which a size may err
 _SIZE_GAIN = 0.05
 """Where another size gains less (0.25 % of the diameter), the visible surface fits at many sizes,
@@ -88,61 +96,32 @@ def scale_of(
     times, moved_m = _fit_scale(local_m[None], start, surface, is_exact=True)
     distance = distance_to(moved_m, surface, times, is_exact=True)[0]
     gain = distance_to(local_m, surface, is_exact=True) - distance
-    equations = _growth_equations(moved_m, times, surface, NEAR * surface.diameter_m, is_exact=True)
-    return Scale(float(times), _scale_deviation(equations, object_std_m), float(gain))
-
-
-class _Equations(NamedTuple):
-    """Point-to-plane equations of rotation, translation and growth, one a point."""
-
-    J: Float64[Tensor, "b n 7"]  # derivatives of the residuals
-    residual_m: Float64[Tensor, "b n"]
-    weight: Float64[Tensor, "b n"]
-
-
-def _growth_equations(
-    local_m: Float64[Tensor, "b n 3"],
-    times: Float64[Tensor, " b"],
-    surface: Surface,
-    limit_m: float,
-    *,
-    is_exact: bool,
-) -> _Equations:
-    """Linearise the distances of points to a surface that is ``times`` as large."""
-    middle_m = surface.middle_m
-    scale = times[:, None, None]
-    unscaled_m = (local_m - middle_m) / scale + middle_m
-    index = surface.nearest(unscaled_m) if is_exact else surface.boxes.look_up(unscaled_m)
-    normal = surface.normals[index]
-    arm_m = scale * (surface.points_m[index] - middle_m)
-    offset_m = local_m - middle_m - arm_m
-    growth_m = (normal * arm_m).sum(-1, keepdim=True)
-    return _Equations(
-        J=torch.cat([torch.linalg.cross(arm_m, normal), normal, growth_m], -1),
-        residual_m=(normal * offset_m).sum(-1),
-        weight=tukey_weight(offset_m.square().sum(-1), limit_m),
+    residuals = _growth_residuals(
+        array_of(moved_m[0]),
+        float(times),
+        array_of(surface.middle_m),
+        NEAR * surface.diameter_m,
+        surface.target,
+        True,
+        np.full(moved_m.shape[1], -1),
     )
+    return Scale(float(times), _scale_deviation(residuals, object_std_m), float(gain))
 
 
-def _damped(H: Float64[Tensor, "b 7 7"]) -> Float64[Tensor, "b 7 7"]:
-    """Add a little to the diagonal: what the points leave undetermined stays as it is."""
-    largest = H.diagonal(dim1=1, dim2=2).amax(-1)[:, None, None].clamp(min=1e-9)
-    return H + 1e-9 * largest * torch.eye(7, dtype=torch.float64)
-
-
-def _scale_deviation(equations: _Equations, object_std_m: float) -> float:
+def _scale_deviation(residuals: Residuals, object_std_m: float) -> float:
     """Give the standard deviation of a scale.
 
     It has two causes: noise of the readings, which neighbours share, and sides of the real object
     that deviate from the model by ``object_std_m``.
     """
-    J = equations.J[0]
-    weight = equations.weight[0]
-    inverse = torch.linalg.inv(_damped(((J.mT * weight) @ J)[None]))[0]
-    noise_m2 = (weight * equations.residual_m[0].square()).sum() / (weight.sum() - 7).clamp(min=1)
-    variance = _CORRELATED_READINGS * noise_m2 * inverse[6, 6]
-    variance += object_std_m**2 * weight.sum() * inverse[6, 6] / INDEPENDENT_SIDES
-    return float(variance.clamp(min=0).sqrt())
+    weight = residuals.weight
+    H, _ = normal_equations(residuals, _LEAST_INFORMATION)
+    inverse = float(np.linalg.inv(H)[6, 6])
+    degrees = max(1.0, weight.sum() - 7)
+    noise_m2 = (weight * residuals.distance**2).sum() / degrees
+    variance = _CORRELATED_READINGS * noise_m2 * inverse
+    variance += object_std_m**2 * weight.sum() * inverse / INDEPENDENT_SIDES
+    return math.sqrt(max(0.0, variance))
 
 
 def _fit_scale(
@@ -161,31 +140,82 @@ def _fit_scale(
         is_exact: whether the nearest samples are searched, not looked up in a table.
     """
     # The limit of a distance shrinks over half of the steps, then stays.
-    middle_m = surface.middle_m
     widths = [1 + (_WIDE_STEP - 1) * max(0.0, 1 - 2 * step / _STEPS) for step in range(_STEPS)]
-    limits_m = [NEAR * surface.diameter_m * width for width in widths]
-    if use_numba(local_m, times):
-        from depthpose.pose.compiled.poses import grow
+    limits_m = NEAR * surface.diameter_m * np.array(widths)
+    moved = array_of(local_m).copy()
+    scales = array_of(times).copy()
+    _grow(moved, scales, array_of(surface.middle_m), limits_m, surface.target, is_exact)
+    return torch.from_numpy(scales), torch.from_numpy(moved)
 
-        local_m = torch.from_numpy(finite_array(local_m.numpy()).copy())
-        times = times.clone()
-        arrays = (local_m.numpy(), times.numpy(), middle_m.numpy(), np.array(limits_m))
-        grow(*arrays, surface.target, is_exact, _CONVERGED)
-        return times, local_m
 
-    for limit_m in limits_m:
-        J, residual_m, weight = _growth_equations(
-            local_m, times, surface, limit_m, is_exact=is_exact
-        )
-        weighted = J.mT * weight[:, None]
-        motion = torch.linalg.solve(_damped(weighted @ J), weighted @ residual_m[..., None])[..., 0]
-        times = (times * (1 + motion[:, 6].clamp(-0.1, 0.1))).clamp(0.5, 2.0)
-        # The points move by the inverse of the surface's motion.
-        R = rotation_by(motion[:, :3])
-        local_m = (local_m - middle_m - motion[:, None, 3:6]) @ R + middle_m
-        if float(motion[:, [0, 1, 2, 6]].abs().max()) < _CONVERGED:
+@compiled
+def _grow(
+    local: Float64[np.ndarray, "b n 3"],
+    times: Float64[np.ndarray, " b"],
+    middle: Float64[np.ndarray, "3"],
+    limits: Float64[np.ndarray, " steps"],
+    target: Target,
+    is_exact: bool,
+) -> None:
+    """Take steps of ICP with a scale, until no start moves any more; points and scales change."""
+    places = np.full(local.shape[:2], -1)
+    for limit in limits:
+        largest = 0.0
+        for p in range(len(times)):
+            residuals = _growth_residuals(
+                local[p], times[p], middle, limit, target, is_exact, places[p]
+            )
+            H, b = normal_equations(residuals, _LEAST_INFORMATION)
+            motion = np.linalg.solve(H, b)  # rotation, translation, growth
+            growth = min(max(motion[6], -0.1), 0.1)
+            times[p] = min(max(times[p] * (1 + growth), 0.5), 2.0)
+            # The points move by the inverse of the surface's motion.
+            turn = rotation_matrix(motion)
+            local[p] = (local[p] - middle - motion[3:6]) @ turn + middle
+            for k in (0, 1, 2, 6):
+                largest = max(largest, abs(motion[k]))
+        if largest < _CONVERGED:
             break
-    return times, local_m
+
+
+@compiled
+def _growth_residuals(
+    local: Float64[np.ndarray, "n 3"],
+    scale: float,
+    middle: Float64[np.ndarray, "3"],
+    limit: float,
+    target: Target,
+    is_exact: bool,
+    places: Int64[np.ndarray, " n"],
+) -> Residuals:
+    """Match points with a surface ``scale`` as large, and linearise their distances from it.
+
+    By rotation and translation of the surface, and by its growth about its middle. Where it is not
+    known which side of a surface was seen, all samples count.
+    """
+    count = len(local)
+    unscaled = (local - middle) / scale + middle
+    centre = (middle[0], middle[1], middle[2])
+    match(unscaled, target, centre, -np.inf, limit / scale, is_exact, places)
+    residuals = Residuals(np.zeros((count, 7)), np.zeros(count), np.zeros(count))
+    for i in range(count):
+        if places[i] < 0:
+            continue
+        normal = vector(target.normals, places[i])
+        x, y, z = minus(vector(target.tree.points, places[i]), centre)
+        arm = (scale * x, scale * y, scale * z)
+        gap = minus(minus(vector(local, i), centre), arm)
+        weight = tukey_weight(dot(gap, gap), limit)
+        if weight <= 0:
+            continue
+        moment = cross(arm, normal)
+        for c in range(3):
+            residuals.jacobian[i, c] = moment[c]
+            residuals.jacobian[i, 3 + c] = normal[c]
+        residuals.jacobian[i, 6] = dot(normal, arm)
+        residuals.distance[i] = dot(normal, gap)
+        residuals.weight[i] = weight
+    return residuals
 
 
 def distance_to(

@@ -3,13 +3,12 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64, Int64
 from torch import Tensor
 
 from depthpose.core.camera.pinhole import clip_window, crop_intrinsics, project
-from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid
-from depthpose.pose.compiled import use_numba
+from depthpose.pose.compiled import array_of, compiled
 from depthpose.pose.surface import Surface
 
 _NEAR_M = 0.01
@@ -45,23 +44,14 @@ def render_surface(
     window_K = crop_intrinsics(K, columns.start, rows.start)
     depth_m = np.full(shape, np.inf, dtype=np.float32)
     face = np.full(shape, -1, dtype=np.int64)
-    if use_numba(surface.triangles_m):
-        from depthpose.pose.compiled.triangles import draw_triangles
-
-        draw_triangles(
-            surface.triangles_m.numpy(),
-            pose.R.numpy(),
-            pose.t_m.numpy(),
-            window_K.numpy(),
-            _NEAR_M,
-            depth_m,
-            face,
-        )
-    else:
-        posed_m = pose.apply(surface.triangles_m)
-        raster = rasterize(posed_m, window_K, shape[1], shape[0], _NEAR_M, with_barycentric=False)
-        face = raster.primitive.numpy()
-        depth_m = raster.depth_m.float().numpy()
+    _draw_triangles(
+        array_of(surface.triangles_m),
+        array_of(pose.R),
+        array_of(pose.t_m),
+        array_of(window_K),
+        depth_m,
+        face,
+    )
 
     # A ray meets the plane of its triangle at the depth, so its cosine follows from the distance
     # of the plane from the camera: distance = depth * |ray| * cosine.
@@ -73,6 +63,55 @@ def render_surface(
     ray_length = _ray_lengths(window_K.numpy(), *shape)
     cosine[is_drawn] = distance_m[face[is_drawn]] / (depth_m * ray_length)[is_drawn]
     return Rendering(depth_m, cosine, window)
+
+
+@compiled
+def _draw_triangles(
+    corners_m: Float64[np.ndarray, "f 3 3"],
+    R: Float64[np.ndarray, "3 3"],
+    t_m: Float64[np.ndarray, "3"],
+    K: Float64[np.ndarray, "3 3"],
+    depth_m: Float32[np.ndarray, "h w"],
+    face: Int64[np.ndarray, "h w"],
+) -> None:
+    """Write the depth and the number of the nearest triangle into the pixels that it covers.
+
+    Without clipping: a triangle with a corner nearer than ``_NEAR_M`` is left out.
+    """
+    height, width = depth_m.shape
+    u = np.empty(3)
+    v = np.empty(3)
+    z = np.empty(3)
+    for f in range(len(corners_m)):
+        # The corners in the image, pinhole model.
+        for k in range(3):
+            x_m, y_m, z_m = corners_m[f, k]
+            x = R[0, 0] * x_m + R[0, 1] * y_m + R[0, 2] * z_m + t_m[0]
+            y = R[1, 0] * x_m + R[1, 1] * y_m + R[1, 2] * z_m + t_m[1]
+            z[k] = R[2, 0] * x_m + R[2, 1] * y_m + R[2, 2] * z_m + t_m[2]
+            u[k] = (K[0, 0] * x + K[0, 1] * y) / z[k] + K[0, 2]
+            v[k] = K[1, 1] * y / z[k] + K[1, 2]
+        area = (u[1] - u[0]) * (v[2] - v[0]) - (u[2] - u[0]) * (v[1] - v[0])
+        if min(z[0], z[1], z[2]) < _NEAR_M or area == 0:
+            continue
+
+        # The pixels of its box that lie inside, where it is nearer than what was drawn before.
+        left = max(0, int(np.ceil(min(u[0], u[1], u[2]))))
+        right = min(width - 1, int(np.floor(max(u[0], u[1], u[2]))))
+        top = max(0, int(np.ceil(min(v[0], v[1], v[2]))))
+        bottom = min(height - 1, int(np.floor(max(v[0], v[1], v[2]))))
+        for row in range(top, bottom + 1):
+            for column in range(left, right + 1):
+                # Barycentric coordinates, in which 1 / depth is linear.
+                a = ((u[1] - column) * (v[2] - row) - (u[2] - column) * (v[1] - row)) / area
+                b = ((u[2] - column) * (v[0] - row) - (u[0] - column) * (v[2] - row)) / area
+                c = 1 - a - b
+                if a < 0 or b < 0 or c < 0:
+                    continue
+                pixel_m = 1 / (a / z[0] + b / z[1] + c / z[2])
+                if pixel_m < depth_m[row, column]:
+                    depth_m[row, column] = pixel_m
+                    face[row, column] = f
 
 
 def _ray_lengths(K: np.ndarray, height: int, width: int) -> np.ndarray:

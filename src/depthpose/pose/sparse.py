@@ -1,4 +1,4 @@
-"""Sparse convolution in torch operations, CPU and CUDA alike; small ones compiled by numba.
+"""Sparse convolution in torch operations, CPU and CUDA alike.
 
 Conventions are MinkowskiEngine's (Choy et al., CVPR 2019), so that its published weights fit:
 a coarser level holds ``floor(c / 2) * 2`` of the finer one's coordinates, the offsets of a kernel
@@ -11,7 +11,7 @@ next field. All levels and kernel maps of one set of voxels are made once
 (:class:`CoordinateCache`).
 
 A convolution gathers, multiplies and adds up; its three methods differ in how much is gathered at
-once. Small ones without gradients are computed by a compiled loop, where numba is installed.
+once.
 """
 
 from collections.abc import Iterator
@@ -26,7 +26,6 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from depthpose.core.errors import InputError
-from depthpose.pose.compiled import use_numba
 
 FIELD_BITS = 17
 HALF = 1 << (FIELD_BITS - 1)
@@ -299,10 +298,6 @@ NARROW = 4  #: channels up to which inputs are gathered as a table: products are
 TABLE_ELEMENTS = 1 << 25  #: largest such table
 
 
-COMPILED_ELEMENTS = 1 << 17
-"""Offsets times outputs up to which the compiled loop, which has no gradient, is faster."""
-
-
 def conv(
     features: Float[Tensor, "rows_in c_in"],
     weight: Float[Tensor, "volume c_in c_out"],
@@ -318,21 +313,6 @@ def conv(
         narrower = torch.get_autocast_dtype(device)
         features = features.to(narrower)
         weight = weight.to(narrower)
-    is_plain = features.dtype == weight.dtype == torch.float32
-    near = kernel_map.neighbours
-    if is_plain and use_numba(features, weight) and near.table.numel() <= COMPILED_ELEMENTS:
-        from depthpose.pose.compiled.points import convolve
-
-        read = near.fine_rows
-        written = near.table.shape[1]
-        if kernel_map.is_transposed:
-            read, written = written, read
-        assert features.shape == (read, weight.shape[1]), "a row for each voxel"
-        assert len(weight) == len(near.table), "a weight for each offset"
-        out = features.new_zeros(written, weight.shape[2])
-        arrays = (part.detach().contiguous().numpy() for part in (features, weight, near.table))
-        convolve(*arrays, kernel_map.is_transposed, out.numpy())
-        return out
     return _Convolution.apply(features, weight, kernel_map)
 
 

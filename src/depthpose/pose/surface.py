@@ -3,17 +3,25 @@
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float64, Int32, Int64
 from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn.functional import max_pool2d, normalize, pad
 
 from depthpose.core.rigid import Rigid
-from depthpose.pose.compiled import use_numba
+from depthpose.pose.compiled import Vector, array_of, compiled, dot, vector
+from depthpose.pose.kdtree import (
+    Tree,
+    build_tree,
+    faces,
+    nearest_facing,
+    nearest_points,
+    square_distance,
+)
 from depthpose.pose.mesh import sample_surface, symmetry_transforms
 from depthpose.pose.mesh.models import disc_triangles, drawn_triangles, fibonacci_directions
 from depthpose.pose.types import ObjectModel
@@ -49,9 +57,97 @@ class Boxes:
 
         For a point outside the grid the box at the border is used.
         """
-        box = ((points_m - self.low_m) / self.side_m).long()
-        x, y, z = torch.minimum(box.clamp_(min=0), self.counts - 1).unbind(-1)
-        return self.nearest[(x * self.counts[1] + y) * self.counts[2] + z]
+        points = array_of(points_m).reshape(-1, 3)
+        low, counts = self.low_m.numpy(), self.counts.numpy()
+        index = _look_up_all(points, low, self.side_m, counts, self.nearest.numpy())
+        return torch.from_numpy(index).reshape(points_m.shape[:-1])
+
+
+@compiled
+def _box_of(
+    point: Vector,
+    low: Float64[np.ndarray, "3"],
+    side: float,
+    counts: Int64[np.ndarray, "3"],
+) -> int:
+    """Give the number of the box that holds a point, or of the nearest one at the border."""
+    number = 0
+    for c in range(3):
+        box = min(max(int((point[c] - low[c]) / side), 0), counts[c] - 1)
+        number = number * counts[c] + box
+    return number
+
+
+@compiled
+def _look_up_all(
+    points: Float64[np.ndarray, "n 3"],
+    low: Float64[np.ndarray, "3"],
+    side: float,
+    counts: Int64[np.ndarray, "3"],
+    table: Int64[np.ndarray, " boxes"],
+) -> Int64[np.ndarray, " n"]:
+    """Give what a table holds for the box of each point."""
+    values = np.empty(len(points), np.int64)
+    for i in range(len(points)):
+        values[i] = table[_box_of(vector(points, i), low, side, counts)]
+    return values
+
+
+class Target(NamedTuple):
+    """The samples of a surface for compiled loops, in the order of a k-d tree: their *places*."""
+
+    tree: Tree  #: of the samples, with their outward normals
+    normals: Float64[np.ndarray, "m 3"]  #: of the samples, to either side
+    across: Int32[np.ndarray, " m"]  #: place of the sample on the other side of a wall, or -1
+    low: Float64[np.ndarray, "3"]  #: corner of the grid of boxes
+    side: float  #: of a box
+    counts: Int64[np.ndarray, "3"]  #: boxes along each axis
+    table: Int32[np.ndarray, " boxes"]  #: place of the sample nearest to the middle of each box
+    ball: Float64[np.ndarray, "4"]  #: middle and radius; a camera within it sees no side
+
+
+@compiled
+def match(
+    points: Float64[np.ndarray, "n 3"],
+    target: Target,
+    eye: Vector,
+    least: float,
+    limit: float,
+    is_exact: bool,
+    places: Int64[np.ndarray, " n"],
+) -> None:
+    """Write the place of the sample near each point of the model frame into ``places``, or -1.
+
+    Args:
+        points: in the model frame.
+        target: the samples.
+        eye: the camera in the model frame; samples count that show it their outer side.
+        least: how nearly they do (:func:`~depthpose.pose.kdtree.faces`).
+        limit: distance of the farthest sample, of exact matches.
+        is_exact: whether the nearest sample is searched, not looked up in the table, and of two
+            sides of a wall the one that faces the camera.
+        places: on entry those of the matches before, or -1, from which exact searches begin.
+    """
+    tree, table, across = target.tree, target.table, target.across
+    samples, outward = tree.points, tree.outward
+    low, side, counts = target.low, target.side, target.counts
+    for i in range(len(points)):
+        point = vector(points, i)
+        place = places[i]
+        if not is_exact or place < 0:
+            place = np.int64(table[_box_of(point, low, side, counts)])
+            if not faces(samples, outward, place, eye, least):
+                place = np.int64(across[place])
+        if place >= 0 and not faces(samples, outward, place, eye, least):
+            place = -1
+        if is_exact:
+            square = limit * limit
+            if place >= 0:
+                square = min(square, square_distance(samples, place, point))
+            if square == limit * limit:  # the guess is too far away
+                place = -1
+            place = nearest_facing(point, tree, eye, least, place, square)
+        places[i] = place
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -79,18 +175,12 @@ class Surface:
     middle_m: Float64[Tensor, "3"]  #: of the box about the surface, along the axes of the model
     ball_m: Float64[Tensor, "4"]  #: middle and radius of a ball about the surface
     symmetries: Rigid  #: declared and found, ``model_from_model``, the identity first
-    tree: KDTree  #: of the points
-    boxes: Boxes  #: a table of near points, some thirty times as fast as the tree
+    boxes: Boxes  #: a table of near points, some thirty times as fast as a search
 
     def nearest(self, points_m: Float64[Tensor, "*batch n 3"]) -> Int64[Tensor, "*batch n"]:
         """Give the index of the surface point nearest to each point of the model frame."""
-        if use_numba(points_m):
-            from depthpose.pose.compiled.points import nearest_many
-
-            points = finite_array(points_m.detach().numpy()).reshape(-1, 3)
-            index, _ = nearest_many(points, self.target.tree)
-            return torch.from_numpy(index).reshape(points_m.shape[:-1])
-        return torch.from_numpy(self.tree.query(points_m.numpy(), workers=1)[1])
+        index = nearest_points(array_of(points_m).reshape(-1, 3), self.target.tree)
+        return torch.from_numpy(index).reshape(points_m.shape[:-1])
 
     @cached_property
     def plane_normals(self) -> Float64[Tensor, "f 3"]:
@@ -129,16 +219,13 @@ class Surface:
         )
 
     @cached_property
-    def target(self) -> Any:  # noqa: ANN401  a tuple of numba's
-        """Points, normals and table as compiled functions take them (``compiled.poses.Target``).
+    def target(self) -> Target:
+        """The samples as compiled loops take them.
 
         They are copies: where a surface is sent to another process, torch moves its tensors to
         shared memory and frees the old one, and an array on that memory would point at nothing.
         """
-        from depthpose.pose.compiled.points import Tree, build_tree
-        from depthpose.pose.compiled.poses import Target
-
-        tree = Tree(*build_tree(finite_array(self.points_m.numpy())))
+        tree = build_tree(array_of(self.points_m), array_of(self.outward))
         # The place of each sample in the tree; the last one, -1, is that of no sample.
         place = np.full(len(self.points_m) + 1, -1)
         place[tree.order] = np.arange(len(self.points_m))
@@ -146,26 +233,14 @@ class Surface:
         return Target(
             tree=tree,
             normals=np.ascontiguousarray(self.normals.numpy()[tree.order]),
+            # In 32 bits: half of the memory, which is read at random.
+            across=place[self.across.numpy()[tree.order]].astype(np.int32),
             low=boxes.low_m.numpy().copy(),
             side=boxes.side_m,
             counts=boxes.counts.numpy().copy(),
-            # In 32 bits: half of the memory, which is read at random.
             table=place[boxes.nearest.numpy()].astype(np.int32),
-            outward=np.ascontiguousarray(self.outward.numpy()[tree.order]),
-            across=place[self.across.numpy()[tree.order]].astype(np.int32),
             ball=self.ball_m.numpy().copy(),
         )
-
-
-def finite_array(array: np.ndarray) -> np.ndarray:
-    """Make an array contiguous, as compiled loops read it, and refuse values that are not finite.
-
-    Raises:
-        ValueError: a value is not finite.
-    """
-    if not np.isfinite(array).all():
-        raise ValueError("values must be finite; leave out what is not")
-    return np.ascontiguousarray(array)
 
 
 class _View(NamedTuple):
@@ -233,7 +308,7 @@ def prepare_surface(model: ObjectModel, count: int = 10_000) -> Surface:
     points_m, normals = (part.double() for part in sample_surface(model, count))
     is_large = len(model.faces) > _MOST_FACES
     triangles_m = disc_triangles(points_m, normals) if is_large else drawn_triangles(model).double()
-    tree = KDTree(points_m.numpy(), copy_data=True)  # for other processes, as in Surface.target
+    tree = KDTree(points_m.numpy())
 
     # The outer side of each sample, by cells that hold about four samples.
     some_m = points_m.numpy()[:: max(1, len(points_m) // 500)]
@@ -258,7 +333,6 @@ def prepare_surface(model: ObjectModel, count: int = 10_000) -> Surface:
         middle_m=middle_m,
         ball_m=torch.cat([middle_m, radius_m[None]]),
         symmetries=symmetry_transforms(model.symmetries, _AXIS_STEP).double(),
-        tree=tree,
         boxes=_make_boxes(points_m, tree, _BOX_MARGIN * model.diameter_m),
     )
 
@@ -386,35 +460,89 @@ def look_along_rays(
     observed_rays = cloud_m[:, :2] / cloud_m[:, 2:] * scale
     middle = observed_rays.median(0).values.floor()
     limit_m = 1.5 * NEAR * surface.diameter_m
-    if use_numba(cloud_m, poses.R, poses.t_m):
-        from depthpose.pose.compiled.points import compare_rays
-
-        points_m = surface.points_m[::every]
-        arrays = (finite_array(a.detach().numpy()) for a in (cloud_m, poses.R, poses.t_m, points_m))
-        violation, unobserved = compare_rays(*arrays, scale, *middle.tolist(), _REACH, limit_m)
-        return torch.from_numpy(violation), torch.from_numpy(unobserved)
-
-    # The cells of the rays, in a square about the middle one; rays beyond are at its border.
-    posed_m = poses.apply(surface.points_m[::every])
-    depth_m = posed_m[..., 2]
-    posed_rays = posed_m[..., :2] / depth_m.clamp(min=1e-6)[..., None] * scale
-    width = 2 * _REACH + 1
-    posed_cell, observed_cell = (
-        ((rays - middle).floor().clamp(-_REACH, _REACH) + _REACH).long()
-        for rays in (posed_rays, observed_rays)
+    violation, unobserved = _compare_rays(
+        array_of(cloud_m),
+        array_of(poses.R),
+        array_of(poses.t_m),
+        array_of(surface.points_m[::every]),
+        scale,
+        array_of(middle),
+        limit_m,
     )
-    posed_cell = posed_cell[..., 0] * width + posed_cell[..., 1]
-    observed_cell = observed_cell[..., 0] * width + observed_cell[..., 1]
+    return torch.from_numpy(violation), torch.from_numpy(unobserved)
 
-    # The nearest point of the posed surface in each cell.
-    depth_m = torch.where(depth_m > 0, depth_m, torch.inf)
-    nearest_m = depth_m.new_full((len(depth_m), width**2), torch.inf)
-    nearest_m = nearest_m.scatter_reduce_(1, posed_cell, depth_m, "amin")
-    is_occluded = nearest_m[:, observed_cell] < cloud_m[:, 2] - limit_m
-    is_observed = torch.zeros(width**2, dtype=torch.bool)
-    is_observed[observed_cell] = True
-    is_posed = nearest_m.isfinite()
-    total = is_posed.sum(1)
-    unobserved = (is_posed & ~is_observed).sum(1).double() / total.clamp(min=1)
-    violation = is_occluded.double().mean(1)
-    return torch.where(total > 0, violation, 1.0), torch.where(total > 0, unobserved, 1.0)
+
+@compiled
+def _compare_rays(
+    cloud: Float64[np.ndarray, "n 3"],
+    Rs: Float64[np.ndarray, "b 3 3"],
+    ts: Float64[np.ndarray, "b 3"],
+    points: Float64[np.ndarray, "m 3"],
+    scale: float,
+    middle: Float64[np.ndarray, "2"],
+    limit: float,
+) -> tuple[Float64[np.ndarray, " b"], Float64[np.ndarray, " b"]]:
+    """Compute both shares of :func:`look_along_rays` for each pose.
+
+    Args:
+        cloud: in the camera frame.
+        Rs: rotation of each pose.
+        ts: translation of each pose.
+        points: of the surface, in the model frame.
+        scale: cells per unit of x / z and y / z.
+        middle: column and row of the middle cell.
+        limit: how far before a point the surface must lie to occlude it.
+    """
+    cells = (2 * _REACH + 1) ** 2
+    cell_of_point = np.empty(len(cloud), np.int64)
+    is_observed = np.zeros(cells, np.bool_)
+    for i in range(len(cloud)):
+        cell_of_point[i] = _cell_of(cloud[i, 0], cloud[i, 1], cloud[i, 2], scale, middle)
+        is_observed[cell_of_point[i]] = True
+
+    violation, unobserved = np.ones(len(ts)), np.ones(len(ts))
+    nearest = np.empty(cells)  # depth of the nearest point of the posed surface in each cell
+    for b in range(len(ts)):
+        _draw_cells(points, Rs[b], ts[b], scale, middle, nearest)
+        posed, missed = 0, 0
+        for k in range(cells):
+            if nearest[k] < np.inf:
+                posed += 1
+                missed += not is_observed[k]
+        occluded = 0
+        for i in range(len(cloud)):
+            occluded += nearest[cell_of_point[i]] < cloud[i, 2] - limit
+        if posed > 0:
+            violation[b] = occluded / len(cloud)
+            unobserved[b] = missed / posed
+    return violation, unobserved
+
+
+@compiled
+def _draw_cells(
+    points: Float64[np.ndarray, "m 3"],
+    R: Float64[np.ndarray, "3 3"],
+    t: Float64[np.ndarray, "3"],
+    scale: float,
+    middle: Float64[np.ndarray, "2"],
+    nearest: Float64[np.ndarray, " cells"],
+) -> None:
+    """Write the depth of the nearest posed point in each cell; infinity where there is none."""
+    nearest[:] = np.inf
+    for i in range(len(points)):
+        point = vector(points, i)
+        z = dot(vector(R, 2), point) + t[2]
+        if z <= 0:
+            continue
+        x = dot(vector(R, 0), point) + t[0]
+        y = dot(vector(R, 1), point) + t[1]
+        cell = _cell_of(x, y, max(z, 1e-6), scale, middle)
+        nearest[cell] = min(nearest[cell], z)
+
+
+@compiled
+def _cell_of(x: float, y: float, z: float, scale: float, middle: Float64[np.ndarray, "2"]) -> int:
+    """Give the cell of the ray through a point; rays far off are in a cell at the border."""
+    column = min(max(np.floor(x / z * scale - middle[0]), -_REACH), _REACH) + _REACH
+    row = min(max(np.floor(y / z * scale - middle[1]), -_REACH), _REACH) + _REACH
+    return int(column) * (2 * _REACH + 1) + int(row)

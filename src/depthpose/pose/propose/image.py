@@ -193,7 +193,8 @@ def refine_projectively(frame: Frame, poses: Rigid, surface: Surface, stage: _St
 
         # One step of Gauss-Newton about the middle of the object, weighted by Tukey's function.
         limit_m = share * surface.diameter_m
-        weight = torch.where(is_used, tukey_weight(gap_m.square().sum(-1), limit_m), 0.0)
+        weight = torch.from_numpy(tukey_weight(gap_m.square().sum(-1).numpy(), limit_m))
+        weight = torch.where(is_used, weight, 0.0)
         middle_m = poses.apply(surface.middle_m[None])
         arm_m = visible.points_m - middle_m
         J = torch.cat([torch.linalg.cross(arm_m, normal), normal], -1)

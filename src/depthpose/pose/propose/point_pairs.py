@@ -6,32 +6,36 @@ bins and the check of every candidate follow Vidal et al., Sensors 2018.
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
-from jaxtyping import Float32, Float64, Int32, Int64
+from jaxtyping import Float32, Float64, Int32, Int64, UInt32
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid, geodesic_rad, rotation_by
 from depthpose.pose.cloud import thin
-from depthpose.pose.compiled import ANGLES, DISTANCES, MOST_ALIKE, TURNS, use_numba
+from depthpose.pose.compiled import array_of, compiled
 from depthpose.pose.config import IcpConfig
 from depthpose.pose.icp import refine_roughly
 from depthpose.pose.mesh import true_symmetries
 from depthpose.pose.mesh.models import fibonacci_directions
-from depthpose.pose.surface import (
-    NEAR,
-    Surface,
-    finite_array,
-    look_along_rays,
-    prepare_surface,
-)
+from depthpose.pose.surface import NEAR, Surface, look_along_rays, prepare_surface
 from depthpose.pose.types import ObjectModel
 
 STEP = 0.07
 """Of the diameter: distance of the points of the model, and a bin of the distances of a pair."""
+DISTANCES = 15
+"""Bins of the length of a point pair; what is longer is in one more."""
+ANGLES = 15
+"""Bins of an angle of a point pair, from 0 to 180 degrees."""
+TURNS = 30
+"""Bins of the rotation about the normal of the first point of a pair, 360 degrees."""
+_MOST_ALIKE = 150
+"""Of the model's pairs with the same feature at most so many vote: all pairs of a plane are alike
+and say little."""
 _MODEL_POINTS = 800
 """Of the model at most; where there are more, their distance grows by the factor below."""
 _COARSER = 1.1
@@ -41,7 +45,6 @@ _REFERENCES = 50
 """Points of a cloud that vote with each of the others."""
 _PEAKS = 6
 """Poses that each of them proposes."""
-_REFERENCES_AT_ONCE = 20
 _VIEWS = 30
 """Directions from which the model is viewed, to find the visible sides of its surface."""
 _LEAST_COSINE = 0.2
@@ -179,11 +182,12 @@ def prepare_pairs(surface: Surface) -> PairTable:
     # All pairs of two different points, by feature. Within a feature they are shuffled, so that the
     # first ones are a sample of all.
     count = len(points_m)
-    first, second = (~torch.eye(count, dtype=torch.bool)).nonzero(as_tuple=True)
-    bins, turn_rad = _features(points_m, frames, first, second, surface.diameter_m)
+    first = torch.arange(count).repeat_interleave(count - 1)
+    bin_m = STEP * surface.diameter_m
+    keys, turns = _features_of_all(array_of(points_m), array_of(frames), bin_m)
+    turn_rad = torch.from_numpy(turns)
     shuffle = torch.randperm(len(first), generator=torch.Generator().manual_seed(0))
-    feature = _feature_index(bins.floor().long())[shuffle]
-    feature, order = feature.sort(stable=True)
+    feature, order = torch.from_numpy(keys)[shuffle].sort(stable=True)
     order = shuffle[order]
     sizes = torch.bincount(feature, minlength=(DISTANCES + 1) * ANGLES**3)
     bounds = torch.cat([sizes.new_zeros(1), sizes.cumsum(0)])
@@ -260,36 +264,80 @@ def _frames(normals: Float64[Tensor, "n 3"]) -> Float64[Tensor, "n 3 3"]:
     return torch.stack([normals, first, torch.linalg.cross(normals, first)], -1)
 
 
-def _features(
-    points_m: Float64[Tensor, "n 3"],
-    frames: Float64[Tensor, "n 3 3"],
-    first: Int64[Tensor, " p"],
-    second: Int64[Tensor, " p"],
-    diameter_m: float,
-) -> tuple[Float64[Tensor, "p 4"], Float64[Tensor, " p"]]:
-    """Give the features of pairs of points, and the angle of the second about the first's normal.
+@compiled
+def _features_of_all(
+    points: Float64[np.ndarray, "m 3"], frames: Float64[np.ndarray, "m 3 3"], step: float
+) -> tuple[Int64[np.ndarray, " pairs"], Float64[np.ndarray, " pairs"]]:
+    """Give the key of the feature of every pair of two points, and the turn of its second point."""
+    count = len(points)
+    keys = np.empty(count * (count - 1), np.int64)
+    turns = np.empty(count * (count - 1))
+    feature = np.empty(4)
+    pair = 0
+    for i in range(count):
+        for j in range(count):
+            if j == i:
+                continue
+            turns[pair] = _write_feature(points, frames, i, j, step, feature)
+            keys[pair] = _key(feature)
+            pair += 1
+    return keys, turns
 
-    The features are the distance, the angles of both normals to the line between the points, and
-    the angle between the normals; as fractions of bins.
+
+@compiled
+def _write_feature(
+    points: Float64[np.ndarray, "n 3"],
+    frames: Float64[np.ndarray, "n 3 3"],
+    i: int,
+    j: int,
+    step: float,
+    feature: Float64[np.ndarray, "4"],
+) -> float:
+    """Write the feature of a pair of points; give the angle of the second about the first's normal.
+
+    The feature is the distance, the angles of both normals to the line between the points, and the
+    angle between the normals (Drost et al., equation 1); as fractions of bins.
     """
-    offset_m = points_m[second] - points_m[first]
-    local_m = (offset_m[:, None] @ frames[first]).squeeze(1)
-    distance_m = offset_m.norm(dim=-1)
-    divisor_m = distance_m.clamp(min=1e-12)
-    n, m = frames[first, :, 0], frames[second, :, 0]
-    cosines = torch.stack(
-        [local_m[:, 0] / divisor_m, (m * offset_m).sum(-1) / divisor_m, (n * m).sum(-1)], -1
-    )
-    angles = cosines.clamp(-1, 1).arccos() * (ANGLES / math.pi)
-    bins = torch.cat([(distance_m / (STEP * diameter_m))[:, None], angles], 1)
-    return bins, torch.atan2(local_m[:, 2], local_m[:, 1])
+    # The way from the first point to the second along the first's normal and tangents, and along
+    # the second's normal; and the cosine of the two normals.
+    along, aside, up, along_second, cosine = 0.0, 0.0, 0.0, 0.0, 0.0
+    square = 0.0
+    for c in range(3):
+        way = points[j, c] - points[i, c]
+        square += way * way
+        along += way * frames[i, c, 0]
+        aside += way * frames[i, c, 1]
+        up += way * frames[i, c, 2]
+        along_second += way * frames[j, c, 0]
+        cosine += frames[i, c, 0] * frames[j, c, 0]
+    distance = max(np.sqrt(square), 1e-12)
+    feature[0] = distance / step
+    feature[1] = _angle_bins(along / distance)
+    feature[2] = _angle_bins(along_second / distance)
+    feature[3] = _angle_bins(cosine)
+    return np.arctan2(up, aside)
 
 
-def _feature_index(bins: Int64[Tensor, "*b 4"]) -> Int64[Tensor, "*b"]:
-    """Give the index of four bins together; values beyond the bins are in the last one."""
-    d, a, b, c = bins.clamp(min=0).unbind(-1)
-    a, b, c = (angle.clamp(max=ANGLES - 1) for angle in (a, b, c))
-    return ((d.clamp(max=DISTANCES) * ANGLES + a) * ANGLES + b) * ANGLES + c
+@compiled
+def _angle_bins(cosine: float) -> float:
+    """Give the angle of a cosine in bins."""
+    return np.arccos(min(1.0, max(-1.0, cosine))) * (ANGLES / np.pi)
+
+
+@compiled
+def _key(feature: Float64[np.ndarray, "4"]) -> int:
+    """Give one number for the bins of a feature."""
+    key = 0
+    for k in range(4):
+        key = key * ANGLES + _clamp_bin(int(feature[k]), k)
+    return key
+
+
+@compiled
+def _clamp_bin(number: int, k: int) -> int:
+    """Give the bin of part ``k`` of a feature; values beyond the bins are in the last one."""
+    last = DISTANCES if k == 0 else ANGLES - 1
+    return min(max(number, 0), last)
 
 
 def vote_poses(
@@ -316,104 +364,148 @@ def vote_poses(
         Poses and their votes, reference after reference.
     """
     frames = _frames(normals)
-    peaks = min(peaks, len(table.points_m))
-    if use_numba(points_m):
-        from depthpose.pose.compiled.pairs import vote
-
-        shape = (len(references), peaks)
-        number = torch.zeros(shape, dtype=torch.int64)
-        turn_bin = torch.zeros(shape, dtype=torch.int64)
-        votes = torch.zeros(shape, dtype=torch.float64)
-        vote(
-            finite_array(points_m.numpy()), finite_array(frames.numpy()), references.numpy(),
-            table.bounds.numpy(), table.first.numpy(), table.turn_rad.numpy(), len(table.points_m),
-            STEP * table.surface.diameter_m, number.numpy(), turn_bin.numpy(), votes.numpy(),
-        )  # fmt: skip
-        number = number.flatten()
-        turn_bin = turn_bin.flatten()
-        votes = votes.flatten()
-    else:
-        chunks = [_peaks(points_m, frames, chunk, table, peaks)
-                  for chunk in references.split(_REFERENCES_AT_ONCE)]  # fmt: skip
-        number, turn_bin, votes = (torch.cat(parts) for parts in zip(*chunks, strict=True))
+    peaks_of_each = _vote(
+        array_of(points_m),
+        array_of(frames),
+        references.numpy(),
+        _PairArrays(table.bounds.numpy(), table.first.numpy(), table.turn_rad.numpy()),
+        len(table.points_m),
+        STEP * table.surface.diameter_m,
+        min(peaks, len(table.points_m)),
+    )
+    number, turn_bin, votes = (torch.from_numpy(part).flatten() for part in peaks_of_each)
 
     # The poses that put model points and their normals on reference points, by turns about these.
     angle = ((turn_bin + 0.5) * (2 * math.pi / TURNS)).double()
     turn = rotation_by(angle[:, None] * angle.new_tensor([1.0, 0.0, 0.0]))
-    reference = references.repeat_interleave(peaks)
+    reference = references.repeat_interleave(peaks_of_each[0].shape[1])
     R = frames[reference] @ turn @ table.frames[number].mT
     t_m = points_m[reference] - (R @ table.points_m[number][..., None]).squeeze(-1)
     return Rigid(R, t_m), votes
 
 
-def _peaks(
-    points_m: Float64[Tensor, "n 3"],
-    frames: Float64[Tensor, "n 3 3"],
-    references: Int64[Tensor, " r"],
-    table: PairTable,
+class _PairArrays(NamedTuple):
+    """Parts of :class:`PairTable` for compiled loops."""
+
+    bounds: Int32[np.ndarray, " bounds"]
+    first: Int32[np.ndarray, " pairs"]
+    turn: Float32[np.ndarray, " pairs"]
+
+
+@compiled
+def _vote(
+    points: Float64[np.ndarray, "n 3"],
+    frames: Float64[np.ndarray, "n 3 3"],
+    references: Int64[np.ndarray, " r"],
+    pairs: _PairArrays,
+    models: int,
+    step: float,
     peaks: int,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Vote without numba; give model points, bins of turns, and votes of each reference's peaks."""
-    diameter_m = table.surface.diameter_m
-    model_points = len(table.points_m)
+) -> tuple[
+    Int64[np.ndarray, "r peaks"], Int64[np.ndarray, "r peaks"], Float64[np.ndarray, "r peaks"]
+]:
+    """Let every pair of a reference point vote; give the points, turns and votes of its peaks.
 
-    # Pairs of each reference and the points that are neither too near nor too far.
-    step_m = STEP * diameter_m
-    distance_m = (points_m[references, None] - points_m).norm(dim=-1)
-    is_paired = (distance_m > step_m) & (distance_m < DISTANCES * step_m)
-    row, second = is_paired.nonzero(as_tuple=True)
-    feature, turn_rad = _features(points_m, frames, references[row], second, diameter_m)
-
-    # Each looks up its own bins and, in each of its four features, the nearest other bin.
-    own_bin = feature.floor().long()
-    aside = torch.where(feature - own_bin < 0.5, -1, 1)
-    beside = own_bin[:, None] + aside[:, None] * torch.eye(4, dtype=torch.int64)
-    keys = torch.cat([_feature_index(own_bin)[:, None], _feature_index(beside)], 1)
-    model_pairs = (table.bounds[keys + 1] - table.bounds[keys]).long()
-    is_own_again = keys[:, 1:] == keys[:, :1]  # beyond the last bin
-    model_pairs[:, 1:][is_own_again] = 0
-
-    # A turn votes once for a feature: of look-ups that have both alike the first counts.
-    turn_bin = _turn_bin((turn_rad + math.pi) / (2 * math.pi))
-    vote = (row[:, None] * len(table.bounds) + keys) * TURNS + turn_bin[:, None]
-    vote = torch.where(model_pairs > 0, vote, -1).flatten()
-    lookup = _first_of_each(vote)
-    lookup = lookup[vote[lookup] >= 0].sort().values
-
-    # The model's pairs of each look-up; of a frequent feature the first ones.
-    alike = model_pairs.flatten()[lookup]
-    read = alike.clamp(max=MOST_ALIKE)
-    of_read = torch.repeat_interleave(torch.arange(len(read)), read)
-    offset = torch.arange(len(of_read)) - (read.cumsum(0) - read)[of_read]
-    model_pair = table.bounds[keys.flatten()[lookup][of_read]] + offset
-    scene_pair = lookup[of_read] // keys.shape[1]
-
-    # A vote for a model point and a turn; rare features weigh more, and neighbouring turns share.
-    turn = (turn_rad[scene_pair] - table.turn_rad[model_pair]) / (2 * math.pi) % 1
-    model_point = row[scene_pair] * model_points + table.first[model_pair]
-    weight = 1 / alike[of_read].double().sqrt()
-    bins = len(references) * model_points * TURNS
-    votes = torch.bincount(model_point * TURNS + _turn_bin(turn), weight, minlength=bins)
-    votes = votes.reshape(len(references), model_points, TURNS)
-    votes = 2 * votes + votes.roll(1, -1) + votes.roll(-1, -1)
-
-    # The best turn of each model point, and of these the best model points.
-    most, best_turn = votes.max(-1)
-    best = most.topk(peaks)
-    number = best.indices
-    return number.flatten(), best_turn.gather(1, number).flatten(), best.values.flatten()
+    Args:
+        points: of the scene.
+        frames: normal and two tangents of each, as columns.
+        references: indices of the points that vote with each of the others.
+        pairs: of the model.
+        models: number of its points.
+        step: a bin of the distance of a pair.
+        peaks: of each reference that are given: model points, bins of turns, and votes.
+    """
+    shape = (len(references), peaks)
+    best_point = np.empty(shape, np.int64)
+    best_turn = np.empty(shape, np.int64)
+    best_votes = np.empty(shape)
+    counts = np.zeros((models, TURNS), np.float32)
+    voted = np.zeros(len(pairs.bounds), np.uint32)  # bit b: the feature has had a vote of turn b
+    feature = np.empty(4)
+    for r in range(len(references)):
+        i = references[r]
+        counts[:] = 0
+        voted[:] = 0
+        for j in range(len(points)):
+            square = 0.0
+            for c in range(3):
+                square += (points[j, c] - points[i, c]) ** 2
+            if square > step * step and square < (DISTANCES * step) ** 2:
+                turn = _write_feature(points, frames, i, j, step, feature)
+                _vote_of_pair(feature, turn, pairs, voted, counts)
+        _find_peaks(counts, best_point[r], best_turn[r], best_votes[r])
+    return best_point, best_turn, best_votes
 
 
-def _turn_bin(share: Float64[Tensor, " n"]) -> Int64[Tensor, " n"]:
-    """Give the bin of a turn, which is a share of the full circle."""
-    return (share * TURNS).long().clamp(max=TURNS - 1)
+@compiled
+def _vote_of_pair(
+    feature: Float64[np.ndarray, "4"],
+    turn: float,
+    pairs: _PairArrays,
+    voted: UInt32[np.ndarray, " bounds"],
+    counts: Float32[np.ndarray, "m turns"],
+) -> None:
+    """Add the votes of the model's pairs with the feature of a pair of the scene, or nearly so."""
+    key = _key(feature)
+    _add_votes(key, turn, pairs, voted, counts)
+
+    # In each part of the feature the nearer bin beside the own one; beyond the last it is the same.
+    for k in range(4):
+        own = int(feature[k])
+        beside = own + (-1 if feature[k] - own < 0.5 else 1)
+        change = _clamp_bin(beside, k) - _clamp_bin(own, k)
+        if change != 0:
+            _add_votes(key + change * ANGLES ** (3 - k), turn, pairs, voted, counts)
 
 
-def _first_of_each(numbers: Int64[Tensor, " n"]) -> Int64[Tensor, " m"]:
-    """Give the index of the first occurrence of each distinct number, in the order of numbers."""
-    distinct, index = numbers.unique(return_inverse=True)
-    first = torch.full((len(distinct),), len(numbers))
-    return first.scatter_reduce_(0, index, torch.arange(len(numbers)), "amin")
+@compiled
+def _add_votes(
+    key: int,
+    turn: float,
+    pairs: _PairArrays,
+    voted: UInt32[np.ndarray, " bounds"],
+    counts: Float32[np.ndarray, "m turns"],
+) -> None:
+    """Add the votes of the model's pairs with a feature; a turn votes once for it."""
+    low, high = pairs.bounds[key], pairs.bounds[key + 1]
+    bit = np.uint32(1 << min(int((turn + np.pi) / (2 * np.pi) * TURNS), TURNS - 1))
+    if high == low or voted[key] & bit:
+        return
+    voted[key] |= bit
+    weight = np.float32(1 / np.sqrt(high - low))  # rare features weigh more
+    for p in range(low, min(high, low + _MOST_ALIKE)):
+        counts[pairs.first[p], _turn_bin(turn - pairs.turn[p])] += weight
+
+
+@compiled
+def _turn_bin(turn: float) -> int:
+    """Give the bin of the difference of two angles between -pi and pi."""
+    value = turn * (TURNS / (2 * np.pi))
+    b = int(value + TURNS if value < 0 else value)
+    return b - TURNS if b >= TURNS else b
+
+
+@compiled
+def _find_peaks(
+    counts: Float32[np.ndarray, "m turns"],
+    best_point: Int64[np.ndarray, " peaks"],
+    best_turn: Int64[np.ndarray, " peaks"],
+    best_votes: Float64[np.ndarray, " peaks"],
+) -> None:
+    """Write the model points with the most votes, at the best turn of each."""
+    models = len(counts)
+    most, turn = np.empty(models), np.empty(models, np.int64)
+    for m in range(models):
+        most[m] = -1.0
+        for b in range(TURNS):
+            # Neighbouring turns share their votes.
+            votes = 2 * counts[m, b] + counts[m, b - 1] + counts[m, (b + 1) % TURNS]
+            if votes > most[m]:
+                most[m], turn[m] = votes, b
+    for k in range(len(best_point)):
+        m = np.argmax(most)
+        best_point[k], best_turn[k], best_votes[k] = m, turn[m], most[m]
+        most[m] = -1.0
 
 
 def _score_poses(
