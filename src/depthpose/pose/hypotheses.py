@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -12,7 +13,7 @@ from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid
 from depthpose.pose.color import color_agreement, color_copies, settle_spin
 from depthpose.pose.config import EstimateConfig
-from depthpose.pose.copies import PreparedObject, SymmetricCopies
+from depthpose.pose.copies import PreparedObject
 from depthpose.pose.evidence import Observation, compare
 from depthpose.pose.icp import RefinedPose, refine_pose, refine_roughly
 from depthpose.pose.probability import (
@@ -30,7 +31,7 @@ _SHARE_POINTS = 1000  # of the cloud that say what a pose leaves unexplained
 _UNEXPLAINED_MORE = 0.25
 """A competing pose that leaves by so much more of the readings unexplained is not compared."""
 _MOST_LEADING = 8  # different poses that are compared
-_MOST_COPIES = 36  # and near-symmetric copies of the best of them
+_MOST_COPIES = 45  # and near-symmetric copies of the best of them: about an axis, 15 degrees apart
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -238,35 +239,23 @@ def _refine_distinct_copies(
         cloud_m, winner, starts, prepared.surface, config, _MOST_COPIES
     )
 
+    same = partial(prepared.copies.is_same, motions=prepared.copies.symmetries)
     distinct: list[RefinedPose] = []
     distinct_poses = [winner_pose]
     for competitor in competitors:
-        refined = competitor.refined
+        copy = competitor.refined
         if view is not None:
             # Depth lets a copy drift about an axis of its shape, where its print fixes the angle.
-            settled = settle_spin(refined.camera_from_model, prepared.model, view)
-            refined = replace(refined, camera_from_model=settled)
-        copy = _first_distinct(
-            (refined, competitor.unrefined), Rigid.stack(distinct_poses), prepared.copies
-        )
-        if copy is not None:
+            settled = settle_spin(copy.camera_from_model, prepared.model, view)
+            copy = replace(copy, camera_from_model=settled)
+        # Where little observed fixes a copy, refinement lets it drift toward others: it stays then.
+        start = competitor.unrefined
+        if not bool(same(copy.camera_from_model, start.camera_from_model[None]).any()):
+            copy = start
+        if not bool(same(copy.camera_from_model, Rigid.stack(distinct_poses)).any()):
             distinct.append(copy)
             distinct_poses.append(copy.camera_from_model.double())
     return distinct
-
-
-def _first_distinct(
-    preferred: Sequence[RefinedPose], before: Rigid, copies: SymmetricCopies
-) -> RefinedPose | None:
-    """Give the first of several forms of a copy that is no exact copy of a pose before it.
-
-    Refinement may slide a copy onto another, where nothing observed tells them apart: then it stays
-    where the symmetry has it.
-    """
-    for pose in preferred:
-        if not bool(copies.is_same(pose.camera_from_model, before, copies.symmetries).any()):
-            return pose
-    return None
 
 
 def _with_color_of_best_copy(
