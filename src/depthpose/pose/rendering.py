@@ -1,4 +1,9 @@
-"""A posed model rendered as a depth camera would see it."""
+"""A posed model rendered as a depth camera would see it.
+
+A z-buffer in a compiled loop, fast enough to compare many poses with an image. Synthetic images,
+which need exact pixels and coordinates on the triangles for their textures, are drawn by
+:mod:`depthpose.core.render`.
+"""
 
 from typing import NamedTuple
 
@@ -12,7 +17,7 @@ from depthpose.pose.compiled import array_of, compiled
 from depthpose.pose.surface import Surface
 
 _NEAR_M = 0.01
-"""What is nearer to the camera is not rendered."""
+"""A triangle with a corner nearer to the camera than this is not rendered."""
 
 
 class Rendering(NamedTuple):
