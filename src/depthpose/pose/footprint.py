@@ -24,9 +24,9 @@ _CONTINUED_SHARE = 0.4
 _RIM_DIAMETERS = 0.05
 """Width of the rim beside a footprint that is examined."""
 _REGION_MARGIN = 0.5
-"""Margin about a region in which planes and neighbours are examined, of its larger side."""
+"""Margin about a region in which planes and neighbours are examined, over its larger side."""
 _MOST_SUNK = 0.05
-"""Largest share of a right surface in a bin, table or wall: its pose is off by less."""
+"""Largest share of the surface that may lie in a bin, table or wall: right poses err by less."""
 
 
 def explained_mask(view: ViewInput, pose: Rigid, surface: Surface) -> Bool[Tensor, "h w"]:

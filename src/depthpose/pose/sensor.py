@@ -63,7 +63,7 @@ INDEPENDENT_SIDES = 6.0
 """Independent deviations of a real object from its model, however many readings there are: whole
 sides deviate, of which a body has about six."""
 _TOLERATED = 4.0
-"""Largest distance of a reading from its plane, in deviations of the error that neighbours share."""
+"""Largest distance of a reading from its plane, over the error that neighbours share."""
 _WIDEST_M = 0.004
 _WIDEST_PER_M2 = 0.003
 """That distance is at most 4 mm, and 3 mm for the square of the depth in metres: twice the
