@@ -117,7 +117,7 @@ def cut_depth(
     )
 
 
-_NUMBERS = 9  # outputs of a class: two columns of a rotation, and an offset
+_NUMBERS = 9  # outputs for a class: two columns of a rotation, and an offset in crop widths
 
 
 class DepthImageNet(nn.Module):
@@ -150,7 +150,8 @@ def poses_of(outputs: Float[Tensor, "b 9"], crop: DepthCrop) -> Rigid:
 
     The first six numbers are two columns of a rotation, which Gram and Schmidt's method makes
     orthonormal: a continuous representation, which none of three or four numbers is (Zhou et al.,
-    CVPR 2019). It is undefined where the columns are parallel or zero.
+    CVPR 2019). It is undefined where the columns are parallel or zero. The last three are the
+    offset of the object's origin from the middle of the crop, in widths of the crop (``side_m``).
     """
     first = F.normalize(outputs[:, :3], dim=-1)
     second = outputs[:, 3:6]

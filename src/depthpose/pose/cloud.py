@@ -95,7 +95,7 @@ def prepare_cloud(
 def _why_empty(pose_input: CloudInput | ViewInput) -> str:
     """Say why an input has no reading at all."""
     if isinstance(pose_input, ViewInput):
-        return nothing_seen(pose_input)
+        return why_nothing_seen(pose_input)
     if len(pose_input.points_m) == 0:
         return "the cloud is empty"
     if bool((pose_input.points_m == 0).all(-1).any()):
@@ -103,7 +103,7 @@ def _why_empty(pose_input: CloudInput | ViewInput) -> str:
     return "the cloud has no point with finite coordinates"
 
 
-def nothing_seen(view: ViewInput) -> str:
+def why_nothing_seen(view: ViewInput) -> str:
     """Say why no masked pixel of a view has a depth."""
     masked = int(view.mask.sum())
     if masked == 0 and view.is_region:

@@ -5,9 +5,9 @@ green and blue over green, all as logarithms. Exposure, white balance and a scre
 constants and factors, to which a correlation is blind. Shading, the part of the brightness that is
 linear in the normal (Lambert), is removed from both by regression.
 
-A correlation ``r`` of ``n`` independent places says how much of the image a pose explains: its log
+A correlation ``r`` of ``n`` independent points tells how much of the image a pose explains: its log
 likelihood above that of a pose whose print has nothing to do with the image is
-``-n / 2 log(1 - r^2)``, that of a linear regression. Neighbouring places are not independent: ``n``
+``-n / 2 log(1 - r^2)``, that of a linear regression. Neighbouring points are not independent: ``n``
 is the effective number of a correlation between two fields that each correlate with themselves
 (Clifford, Richardson and Hemon 1989; Dutilleul 1993), so a smooth shade counts for little and fine
 print for much.
@@ -30,18 +30,18 @@ from depthpose.pose.mesh import near_symmetries, turn_about
 from depthpose.pose.types import Axis, ColorImage, ObjectModel, SurfaceColors, ViewInput
 
 _SAMPLES = 4000  # coloured points of a model that are compared, about a third of them visible
-_SWEEP_SAMPLES = 1500  # in a sweep about an axis
-_LEAST_COSINE = 0.3  # between ray and normal: more slanted print is blurred along the slant
-_NEAR = 0.05  # of the diameter: a reading farther from the surface is of another object
-_LEAST_VISIBLE = 40  # points; fewer are not compared
+_SWEEP_SAMPLES = 1500  # coloured points that are compared in a sweep about an axis
+_LEAST_COSINE = 0.3  # least cosine between ray and normal: more slanted print is blurred
+_NEAR = 0.05  # diameters: a reading farther from the surface is of another object
+_LEAST_VISIBLE = 40  # fewer visible points are not compared
 _BLUR = 1.0  # standard deviation of the image's blur, in spacings of the model's coloured points
-_BLACK = 0.05  # of the range: the value that noise and stray light give to black
-_SATURATED = 0.98  # a channel of more is clipped, so the colour is false
-_DARK = 0.06  # where no channel has more, the colour is noise
-_PLAIN = 0.03  # standard deviation of a logarithm below which there is no print
-_MOST_CORRELATION = 0.99  # that an image and a model can have: both are digitised
-_FITTED = 2  # a factor and a constant are fitted to the image
-_POINTS_AT_ONCE = 1_000_000
+_BLACK = 0.05  # value, 0 to 1, that noise and stray light give to black
+_SATURATED = 0.98  # a channel above this value is clipped, so the colour is false
+_DARK = 0.06  # where no channel is above this value, the colour is noise
+_PLAIN = 0.03  # a logarithm with a smaller standard deviation shows no print
+_MOST_CORRELATION = 0.99  # largest correlation of an image and a model: both are digitised
+_FITTED = 2  # unknowns that are fitted to the image: a factor and a constant
+_POINTS_AT_ONCE = 1_000_000  # points of all poses that are compared at a time, for the memory
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -50,7 +50,7 @@ class ColorAgreement:
 
     #: of brightness, red against green, blue against green; 0 where model or image are plain.
     correlation: Float64[Tensor, "b 3"]
-    places: Float64[Tensor, "b 3"]  #: independent ones that each correlation is of
+    independent: Float64[Tensor, "b 3"]  #: effective number of independent points of each
     visible: Int64[Tensor, " b"]  #: coloured points that were compared
 
     @property
@@ -63,10 +63,10 @@ class ColorAgreement:
         """Log likelihood of the image above that of a print that has nothing to do with it.
 
         Differences are log odds between poses, and between objects at one place. It is 0 where
-        colour says nothing: a grey model, too few places, or a print that runs the other way.
+        colour says nothing: a grey model, too few points, or a print that runs the other way.
         """
         explained = self.correlation.clamp(0, _MOST_CORRELATION).square()
-        freedom = (self.places - _FITTED).clamp(min=0)
+        freedom = (self.independent - _FITTED).clamp(min=0)
         return (-freedom / 2 * torch.log1p(-explained)).sum(-1)
 
 
@@ -84,7 +84,9 @@ def color_agreement(
     """
     if model.colors is None or view.color is None:
         nothing = torch.zeros(len(poses.R), 3, dtype=torch.float64)
-        return ColorAgreement(correlation=nothing, places=nothing, visible=nothing[:, 0].long())
+        return ColorAgreement(
+            correlation=nothing, independent=nothing, visible=nothing[:, 0].long()
+        )
     surface = _thin(model.colors, samples)
     image = _blur_image(view.color, poses, surface)
     parts: list[ColorAgreement] = []
@@ -93,12 +95,14 @@ def color_agreement(
         chunk = poses[first : first + at_once].double()
         compared = _compare_features(chunk, surface, view, image, _NEAR * model.diameter_m)
         correlation = _correlation(compared)
-        places = torch.where(correlation != 0, _independent_places(compared, surface), 0.0)
+        independent = torch.where(correlation != 0, _independent_points(compared, surface), 0.0)
         visible = compared.weight[..., 0].sum(-1).long()
-        parts.append(ColorAgreement(correlation=correlation, places=places, visible=visible))
+        parts.append(
+            ColorAgreement(correlation=correlation, independent=independent, visible=visible)
+        )
     return ColorAgreement(
         correlation=torch.cat([part.correlation for part in parts]),
-        places=torch.cat([part.places for part in parts]),
+        independent=torch.cat([part.independent for part in parts]),
         visible=torch.cat([part.visible for part in parts]),
     )
 
@@ -227,7 +231,7 @@ def _compare_features(
     )
 
 
-_RIDGE = 1e-4  # of the normals' second moments: a plane has no second direction
+_RIDGE = 1e-4  # added to the normals' second moments: a plane has no second direction
 
 
 def _without_shading(
@@ -260,22 +264,22 @@ def _correlation(compared: _Compared) -> Float64[Tensor, "b 3"]:
 
 
 _PAIRED = 250  # visible points whose pairs give the autocorrelations
-_BINS = 16  # of distances, the nearer the finer
-_POSES_AT_ONCE = 16
+_BINS = 16  # bins of their distances, the nearer the finer
+_POSES_AT_ONCE = 16  # poses whose pairs are counted at a time, for the memory
 
 
-def _independent_places(compared: _Compared, surface: SurfaceColors) -> Float64[Tensor, "b 3"]:
-    """Give the effective number of independent places of each correlation.
+def _independent_points(compared: _Compared, surface: SurfaceColors) -> Float64[Tensor, "b 3"]:
+    """Give the effective number of independent points of each correlation.
 
     The variance of the correlation of two unrelated fields is the mean product of their
-    autocorrelations over all pairs of places (Dutilleul 1993), and the number its inverse. Products
+    autocorrelations over all pairs of points (Dutilleul 1993), and the number its inverse. Products
     below 0, which come from chance, are left out, so that the number is rather too small.
     """
     generator = torch.Generator().manual_seed(0)
     key = torch.rand(compared.weight.shape[1], generator=generator, dtype=torch.float64)
     count = min(_PAIRED, compared.weight.shape[1])
     reach_m = float((surface.points_m.amax(0) - surface.points_m.amin(0)).norm())
-    places: list[Tensor] = []
+    numbers: list[Tensor] = []
     for first in range(0, len(compared.weight), _POSES_AT_ONCE):
         # Visible points of each pose, chosen at random, and the bin of the distance of each pair.
         chunk = slice(first, first + _POSES_AT_ONCE)
@@ -302,8 +306,8 @@ def _independent_places(compared: _Compared, surface: SurfaceColors) -> Float64[
         visible = weight.square().sum(1).mT
         sums[..., 0] -= visible * product[..., 0]
         variance = (sums.sum(-1) + visible) / visible.square().clamp(min=1)
-        places.append((1 / variance.clamp(min=1 / count)).mT)
-    return torch.cat(places)
+        numbers.append((1 / variance.clamp(min=1 / count)).mT)
+    return torch.cat(numbers)
 
 
 def _sum_by_bin(
@@ -315,9 +319,9 @@ def _sum_by_bin(
     return sums.index_add_(1, bins.flatten(), flat).unflatten(1, (len(bins), _BINS))
 
 
-_STEP_DEG = 5.0
-_FINE_STEPS = 5  # in each step of a sweep
-_MOST_PEAKS = 3  # of a sweep about one axis that are returned
+_STEP_DEG = 5.0  # step of a sweep about an axis
+_FINE_STEPS = 5  # fine steps in each step of a sweep
+_MOST_PEAKS = 3  # largest number of poses that a sweep about one axis returns
 
 
 def copies_about_axis(
@@ -395,12 +399,12 @@ def _sweep_scores(
 
 
 _SAME_RAD = math.radians(3)  # angle up to which two proposed copies are the same
-_MOST_COPIES = 8
+_MOST_COPIES = 8  # largest number of copies that are proposed beside a pose
 _SAME_TURN_RAD = math.radians(10)  # angle up to which two rotations that are tried are the same
-_MANY_TURNS = 6  # about one line: the shape nearly is a body of revolution
-_PARALLEL_COSINE = math.cos(math.radians(8))  # from which two directions are the same
-_SETTLE_STEP_RAD = math.radians(2)  # of the small sweep about a pose
-_SETTLE_STEPS = 10  # to each side
+_MANY_TURNS = 6  # rotations about one line that make a shape nearly a body of revolution
+_PARALLEL_COSINE = math.cos(math.radians(8))  # least cosine of two directions that are the same
+_SETTLE_STEP_RAD = math.radians(2)  # step of the small sweep about a pose
+_SETTLE_STEPS = 10  # steps of it to each side
 
 
 def color_copies(
@@ -431,8 +435,8 @@ def color_copies(
     pose = pose.double()
     if model.colors is None or view.color is None:
         return pose[None]
-    found, axes = _ambiguous_motions(model)
-    motions = found if turns is None else [turns.double()[k] for k in range(len(turns.R))]
+    of_shape, axes = _ambiguous_motions(model)
+    motions = of_shape if turns is None else [turns.double()[k] for k in range(len(turns.R))]
 
     # Of motions that differ by a rotation about an axis one is tried: it is swept about the axis.
     distinct = [Rigid(torch.eye(3).double(), torch.zeros(3).double())]
@@ -522,17 +526,17 @@ def _ambiguous_motions(model: ObjectModel) -> tuple[list[Rigid], list[Axis]]:
     return turns, axes
 
 
-def _axes_of_many_turns(turns: Sequence[Rigid], known: Sequence[Axis]) -> list[Axis]:
-    """Find lines about which many of the turns are, beside the known axes."""
+def _axes_of_many_turns(turns: Sequence[Rigid], others: Sequence[Axis]) -> list[Axis]:
+    """Find lines about which many of the turns are, beside other axes."""
     eye = torch.eye(3).double()
     # The direction of each axis is the one that the rotation leaves as it is.
     directions = [torch.linalg.svd(turn.R - eye).Vh[-1] for turn in turns]
     axes: list[Axis] = []
     for direction in directions:
-        others = [*known, *axes]
-        is_known = any(_are_parallel(direction, axis.direction.double()) for axis in others)
+        before = [*others, *axes]
+        is_before = any(_are_parallel(direction, axis.direction.double()) for axis in before)
         alike = [k for k, other in enumerate(directions) if _are_parallel(other, direction)]
-        if is_known or len(alike) < _MANY_TURNS:
+        if is_before or len(alike) < _MANY_TURNS:
             continue
         # A point that each turn leaves where it is.
         points = [torch.linalg.pinv(eye - turns[k].R, rtol=1e-3) @ turns[k].t_m for k in alike]

@@ -27,14 +27,14 @@ from depthpose.pose.types import Axis, ObjectModel
 SAME_DIAMETERS = 0.1  #: mean distance of the model's points up to which two poses are one
 SAME_RAD = math.radians(8)  #: and angle; both must hold
 _STEP_RAD = math.pi / 32  # half of the step between rotations about an axis: within SAME_RAD
-_FOUND_STEP_RAD = math.pi / 18  # and about one that was found within a tolerance
-_COPY_DIAMETERS = 0.05  # deviation of a near-symmetric copy: of more it is another pose
+_TOLERATED_STEP_RAD = math.pi / 18  # the same about an axis of a symmetry within a tolerance
+_COPY_DIAMETERS = 0.05  # largest deviation of a near-symmetric copy; a look-alike deviates by more
 _CLOSE_RAD = math.radians(45)  # a copy after a smaller rotation is one of a row about its axis
 _COMPARED = 100  # points of the model by which poses are compared
-_ALONG = math.cos(math.radians(15))
-_LEAST_POINTS = 500  # of a model without faces
+_ALONG = math.cos(math.radians(15))  # least cosine between two axes that count as parallel
+_LEAST_POINTS = 500  # a model without faces and with fewer points has no surface
 _LONGER = 1.15
-"""An axis is the longest or shortest where it differs by so much from the next."""
+"""An axis is the longest or the shortest if the lengths along it and the next have this ratio."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,16 +43,17 @@ class SymmetricCopies:
 
     Attributes:
         symmetries: exact ones, whose copies are one pose; the identity first.
-        near_copies: near-symmetries, which map at least 85 % of the surface onto itself: another
-            pose that looks nearly alike, such as a gear turned by a tooth.
-        lookalikes: motions that map a smaller part of the surface onto itself, and half turns.
+        near_copies: near-symmetries, after which 98 % of the surface is within 5 % of the diameter
+            from itself, or 80 % of it on itself: another pose that looks nearly alike, such as a
+            gear turned by a tooth.
+        lookalikes: motions that move a smaller part of the surface onto itself, and half turns.
         trained: symmetries that a network was trained to treat as one pose; the identity first.
-        mirror: how far the mirror image deviates from the model, in diameters.
-        points_m: of the model, by which poses are compared.
-        middle_m: of its box.
-        axes: rows: its principal axes, from the longest.
-        lengths_m: its extent along each.
-        diameter_m: of the model.
+        mirror: deviation of the mirror image from the model, in diameters.
+        points_m: points of the model by which poses are compared.
+        middle_m: middle of the model's box.
+        axes: principal axes of the model, one a row, the longest first.
+        lengths_m: extent of the model along each of these axes.
+        diameter_m: diameter of the model.
     """
 
     symmetries: Rigid
@@ -78,7 +79,7 @@ class SymmetricCopies:
     def near_axis(self) -> Axis | None:
         """Axis about which near-symmetric copies follow each other all round, if there is one.
 
-        A rotation about it changes little that a camera sees: the copies say how far.
+        A rotation about it changes little that a camera sees.
         """
         if len(self.near_copies.R) == 0:
             return None
@@ -154,7 +155,8 @@ def find_copies(model: ObjectModel) -> SymmetricCopies:
     if centre_m is not None:
         return exact
 
-    # Each motion is kept once: as a near-symmetry, or else as a look-alike.
+    # Each motion is kept once: as a near-symmetry, or else as a look-alike. Exact symmetries are
+    # left out: they are the same as the identity, with which the distinct ones begin.
     near_motions, lookalike_motions = _propose_motions(model, middle_m, axes)
     identity = Rigid(torch.eye(3)[None].double(), torch.zeros(1, 3).double())
     near_copies = _distinct(near_motions, identity, exact)
@@ -189,33 +191,38 @@ def _propose_motions(
 ) -> tuple[Rigid, Rigid]:
     """Give motions that may be near-symmetries, and those that may be look-alikes.
 
-    They hold exact symmetries too, and the same motion several times.
+    They hold exact symmetries too, and the same motion several times: :func:`_distinct` leaves
+    these out.
     """
-    # Symmetries that were found within a tolerance, but for the exact ones, are near-symmetries.
-    found = symmetry_transforms(model.symmetries, _FOUND_STEP_RAD).double()
-    near_symmetric: list[Rigid] = []
-    less_alike: list[Rigid] = []
+    # The model's symmetries, which may be exact only within the tolerance of their search.
+    tolerated = symmetry_transforms(model.symmetries, _TOLERATED_STEP_RAD).double()
+
+    # Motions of the whole surface, by the distance of the moved surface from itself: up to 5 % of
+    # the diameter they are near-symmetries, up to 10 % look-alikes.
+    slightly_off: list[Rigid] = []
+    farther_off: list[Rigid] = []
     for near in near_symmetries(model):
-        motions = near_symmetric if near.deviation <= _COPY_DIAMETERS else less_alike
+        motions = slightly_off if near.deviation <= _COPY_DIAMETERS else farther_off
         motions.append(near.model_from_model[None])
 
-    # Rotations that point pairs of the model propose: the first of them are near-symmetries.
+    # Motions of a part of the surface, by the share that they move onto it: from 80 % on they are
+    # near-symmetries, which come first, from 25 % on look-alikes. A mug without its handle.
     by_pairs = cached(model, find_turns, "turns")
     matrices = torch.tensor(by_pairs["turns"], dtype=torch.float64).reshape(-1, 4, 4)
-    rotations = Rigid(matrices[:, :3, :3], matrices[:, :3, 3])
+    partial_motions = Rigid(matrices[:, :3, :3], matrices[:, :3, 3])
     near_count = by_pairs["near"]
 
     # Half turns about the principal axes: the usual mistake about a long or flat part.
     half_R = 2 * axes[:, :, None] * axes[:, None] - torch.eye(3).double()
     half_turns = Rigid(half_R, middle_m - half_R @ middle_m)
 
-    near_motions = Rigid.cat([found, *near_symmetric, rotations[:near_count]])
-    lookalike_motions = Rigid.cat([*less_alike, rotations[near_count:], half_turns])
+    near_motions = Rigid.cat([tolerated, *slightly_off, partial_motions[:near_count]])
+    lookalike_motions = Rigid.cat([*farther_off, partial_motions[near_count:], half_turns])
     return near_motions, lookalike_motions
 
 
 def _distinct(motions: Rigid, others: Rigid, exact: SymmetricCopies) -> Rigid:
-    """Leave out motions that are, up to a symmetry, one before them or one of others."""
+    """Leave out motions that are, up to an exact symmetry, one of ``others`` or one before them."""
     chosen = others
     for k in range(len(motions.R)):
         if not bool(exact.is_same(motions[k], chosen, exact.symmetries).any()):

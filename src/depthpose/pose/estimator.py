@@ -63,7 +63,7 @@ class PoseEstimator:
         self.refusal = refusal
         self.objects = tuple(model.name for model in models)
         """Names of the objects."""
-        self._objects: dict[str, PreparedObject] = {}  # those that were asked for
+        self._prepared_objects: dict[str, PreparedObject] = {}  # by name, those asked for so far
 
     @torch.no_grad()
     @force_float32()
@@ -89,16 +89,17 @@ class PoseEstimator:
         each = self._each(inputs, threads)
         return list(tqdm(each, total=total, unit=" poses", disable=not with_progress))
 
-    def _each(
-        self, inputs: Iterable[AnyInput], threads: int, *, is_expected: bool = True
-    ) -> Iterator[PoseEstimate]:
-        """Give each input's estimate, in order.
-
-        ``is_expected``: whether the inputs are meant to show their objects; else each is one try of
-        several. Ignored here: every try is judged alike.
-        """
-        del is_expected
+    def _each(self, inputs: Iterable[AnyInput], threads: int) -> Iterator[PoseEstimate]:
+        """Give each input's estimate, in order; each is expected to show its object."""
         return each_in_threads(partial(unreadable_on_error, self._estimate), inputs, threads)
+
+    def _each_try(self, inputs: Iterable[AnyInput]) -> Iterator[PoseEstimate]:
+        """Give each input's estimate, in order, where an input may well not show its object.
+
+        The evidence decides which of them does. An estimator that expects less of a try than of
+        another input has its own.
+        """
+        return self._each(inputs, 1)
 
     def _estimate(self, pose_input: AnyInput) -> PoseEstimate:
         """Estimate one input; an estimator of many at once has its own :meth:`_each`."""
@@ -109,9 +110,12 @@ class PoseEstimator:
     def _estimate_or_raise(
         self, inputs: Sequence[AnyInput], *, is_expected: bool
     ) -> list[PoseEstimate]:
-        """Estimate inputs; raise the :class:`InputError` of one that could not be taken."""
+        """Estimate inputs; raise the :class:`InputError` of one that could not be taken.
+
+        ``is_expected``: whether the inputs are meant to show their objects; else they are tries.
+        """
         answers: list[PoseEstimate] = []
-        for estimate in self._each(inputs, 1, is_expected=is_expected):
+        for estimate in self._each(inputs, 1) if is_expected else self._each_try(inputs):
             if estimate.status == "unreadable":
                 raise InputError(estimate.reason)
             answers.append(estimate)
@@ -167,7 +171,8 @@ class PoseEstimator:
             cloud: points of the object alone, in the camera frame (x right, y down, z forward); a
                 file, rows of points, or a cloud of trimesh or Open3D.
             unit: of the cloud, metres by default; of a depth image, where its camera says none.
-            depth: a 16-bit PNG or whole numbers in the camera's ``depth_unit_m``, or metres.
+            depth: a 16-bit PNG or whole numbers in the camera's ``depth_unit_m``; or floats, which
+                are metres unless ``unit`` is given.
             mask: the object's pixels, not 0; a picture, an array, or COCO's run lengths. One that
                 numbers several objects (1, 2, ...) is refused: ``mask == 1`` is one of them.
             camera: of the depth image, its file of any format that is read, a dict of what such a
@@ -409,12 +414,14 @@ class PoseEstimator:
         if name not in names:
             nearest = nearest_name(name, names)
             raise InputError(f"object {name!r}: {self._holder} do not know it; {nearest}")
-        if name not in self._objects:
+        if name not in self._prepared_objects:
             number = names.index(name)
             model = self.models[number]
             surface = prepare_surface(model, self.config.icp.surface_points)
-            self._objects[name] = PreparedObject(number=number, model=model, surface=surface)
-        return self._objects[name]
+            self._prepared_objects[name] = PreparedObject(
+                number=number, model=model, surface=surface
+            )
+        return self._prepared_objects[name]
 
 
 def unreadable_on_error(

@@ -43,8 +43,8 @@ THRESHOLD = 3.0  #: deviations beyond which a residual contradicts a pose
 _CUT_OFF = 2 * THRESHOLD  # deviations at which the residual of one reading is clipped
 AVERAGED_PX = 5  #: residuals are averaged over a square of this side
 _LEAST_FILLED = 0.3  # share of the averaged square that must have residuals
-_CORRELATED_READINGS = 3  # neighbours err alike: of so many averaged readings one is independent
-_LEAST_PATCH = 0.25  # independent patches: smaller ones are accidents of edges and drop-outs
+_CORRELATED_READINGS = 3  # averaged readings that count as one: neighbours share their error
+_LEAST_PATCH = 0.25  # smallest patch that counts, in independent patches: others are accidents
 _ACROSS = (-1.0, -0.5, 0.5, 1.0)
 """Where readings are compared across a silhouette, on the line from it to a pixel beside it: 0 is
 the silhouette, 1 the pixel, and what is negative lies within."""
@@ -61,7 +61,7 @@ _JUMP_DIAMETERS = 0.02
 _JUMP_M = 0.01
 """Drawn neighbours that differ in depth by more than both are the two sides of an edge."""
 _FAR_M = np.float32(1e6)
-_MARGIN_DIAMETERS = 0.6  # of the window about the points of an object
+_MARGIN_DIAMETERS = 0.6  # margin of the window about the points of an object
 
 _Window = tuple[slice, slice]
 """Rows and columns of an image."""

@@ -24,9 +24,9 @@ _CONTINUED_SHARE = 0.4
 _RIM_DIAMETERS = 0.05
 """Width of the rim beside a footprint that is examined."""
 _REGION_MARGIN = 0.5
-"""Margin about a region in which planes and neighbours are examined, of its larger side."""
+"""Margin about a region in which planes and neighbours are examined, over its larger side."""
 _MOST_SUNK = 0.05
-"""Largest share of a right surface in a bin, table or wall: its pose is off by less."""
+"""Largest share of the surface that may lie in a bin, table or wall: right poses err by less."""
 
 
 def explained_mask(view: ViewInput, pose: Rigid, surface: Surface) -> Bool[Tensor, "h w"]:
@@ -110,6 +110,7 @@ def window_of_region(view: ViewInput) -> ViewInput:
 
 def _crop_view(view: ViewInput, window: tuple[slice, slice]) -> ViewInput:
     """Crop a view to rows and columns of its image."""
+    # The colour image stays whole: its pixels are of its own camera, and it has its own K.
     background = view.background
     if background is not None:
         background = KnownBackground(
@@ -130,7 +131,7 @@ def why_background_excludes(frame: Frame, view: ViewInput, pose: Rigid, surface:
 
     Args:
         frame: of the whole image, whose backgrounds count.
-        view: in which the pose was found.
+        view: depth and mask to which the pose was fitted.
         pose: ``camera_from_model``.
         surface: of the model.
     """
@@ -150,10 +151,10 @@ def is_cut_out(view: ViewInput, pose: Rigid, surface: Surface, noise_per_m2: flo
     """Whether what lies on a posed surface is flat, and goes on in its plane beyond the outline.
 
     Args:
-        view: in which the pose was found.
-        pose: of the object.
-        surface: of its model.
-        noise_per_m2: of the view, as of :class:`~depthpose.pose.frame.Frame`.
+        view: depth and mask to which the pose was fitted.
+        pose: ``camera_from_model``.
+        surface: of the model.
+        noise_per_m2: noise of the view, as of :class:`~depthpose.pose.frame.Frame`.
     """
     # Is the footprint flat?
     part = _crop_view(view, _window_of_pose(view.depth_m.shape, view.K, pose, surface))

@@ -19,7 +19,7 @@ from depthpose.pose.sensor import NOISE_PER_M2, measure_noise_per_m2, plane_tole
 from depthpose.pose.types import KnownBackground
 
 _MOST_PIXELS = 110_000
-"""Of a larger image every n-th row and column is used, so that about so many pixels remain."""
+"""A larger image is thinned to about so many pixels: every n-th row and column of it is used."""
 _OBJECT_PX = 60
 """Least width of the smallest object in the thinned image, if the full image has so many pixels."""
 _WINDOW = 3
@@ -30,28 +30,30 @@ _LEAST_SPREAD_PX4 = 0.3
 """Least determinant of the second moments of the pixels that a normal is fitted to."""
 _JUMP_M = 0.004
 _JUMP_PER_M = 0.012
-"""Neighbours are of one surface up to this difference in depth, and this share of it."""
+"""Neighbours lie on one surface if their depths differ by less than the first, in metres, and the
+second times the depth together."""
 
 # Wide planes.
-_MOST_PLANES = 6
-_HYPOTHESES = 400  # of RANSAC
-_REFITS = 3  # of a plane to the readings on it
-_SAMPLE = 4000  # readings by which a plane is found
+_MOST_PLANES = 6  # largest number of wide planes that are looked for in an image
+_HYPOTHESES = 400  # planes through three readings that RANSAC compares
+_REFITS = 3  # times that a plane is fitted again to the readings on it
+_SAMPLE = 4000  # largest number of readings that a plane is fitted to
 _LEAST_SHARE = 0.04
-"""Of the readings: a plane of fewer is no table or wall."""
+"""A plane that holds a smaller share of the image's readings is no table or wall."""
 _LEAST_POINTS = 60
+"""Least number of readings that a plane is fitted to."""
 _BEND_REFITS = 3
-"""Fits of how the sensor bends a plane, each to the readings on the fit before."""
+"""Fits of the bend that the sensor gives a plane, each to the readings on the fit before."""
 _PARALLEL_COSINE = math.cos(math.radians(20))
 """Least cosine between a plane's normal and that of a reading that it may hold."""
 _MOST_BEHIND = 0.08
-"""Largest share of the readings within the outline of a table or wall that lie behind it. Real ones
-have up to 4 %, planes through the tops of several parts from 12 % on."""
+"""Largest share of the readings within the outline of a table or wall that lie behind it. Real
+tables have up to 4 %, planes through the tops of several parts from 12 % on."""
 _WIDTH_RATIO = 1.3
 _LENGTH_RATIO = 3.0
-"""A plane that is wider than an object's diameter by the first ratio is none of its sides, nor is
-one longer by the second. The second is larger for sides of several objects that lie in one plane
-and touch."""
+"""A plane is no side of an object if its width is above the first ratio times the diameter of the
+object, or its length above the second. The second is larger because sides of several objects may
+lie in one plane and touch."""
 
 
 Plane = tuple[Float64[Tensor, "3"], Float64[Tensor, ""]]
@@ -64,17 +66,17 @@ class Frame:
 
     Attributes:
         step: every ``step``-th row and column of the image is used.
-        depth_m: 0 where there is no reading.
-        K: of the thinned image.
-        points_m: in the camera frame.
-        normals: toward the camera.
-        is_smooth: where a normal is known.
+        depth_m: depth along the optical axis; 0 where there is no reading.
+        K: intrinsic matrix of the thinned image.
+        points_m: the readings as points of the camera frame.
+        normals: unit normals of the surface, toward the camera.
+        is_smooth: pixels whose normal could be fitted.
         background_limit_m: largest diameter [m] of an object for which the pixel is background: the
             wide plane there is too large to be a side of it. Infinite on a known background, 0
             where there is none.
         nearest_m: least depth of the pixels up to two away; infinite where none has a reading.
         noise_per_m2: standard deviation of a reading, for the square of the depth in metres.
-        backgrounds: the known one, and the wide planes.
+        backgrounds: the background that was given, if any, and the wide planes.
     """
 
     step: int
@@ -98,8 +100,8 @@ class Background:
     """A surface before which objects lie: a known bin or table, or a wide plane.
 
     Attributes:
-        depth_m: at which the ray of a pixel meets it, also behind objects; infinite where the ray
-            does not meet it, or that is not known.
+        depth_m: depth at which the ray of a pixel meets the surface, also behind objects; infinite
+            where the ray does not meet it, or where that is not known.
         diameter_m: largest diameter of an object that cannot have it as a side.
     """
 
@@ -111,11 +113,11 @@ def prepare_frame(
     depth_m: Float[Tensor, "h w"],
     K: Float[Tensor, "3 3"],
     smallest_m: float | None = None,
-    known: KnownBackground | None = None,
+    background: KnownBackground | None = None,
 ) -> Frame:
     """Thin a depth image, fit a normal at each pixel, and find the background.
 
-    The background is the known one and, elsewhere, the widest planes, which are found one after the
+    The background is the given one and, elsewhere, the widest planes, which are found one after the
     other by RANSAC (Fischler and Bolles 1981).
 
     Args:
@@ -123,7 +125,7 @@ def prepare_frame(
         K: intrinsic matrix.
         smallest_m: diameter of the smallest object that is looked for: the image is not thinned so
             much that it would be few pixels wide.
-        known: background that is known, of the whole image.
+        background: surface before which the objects lie, of the whole image, where it is known.
     """
     depth_m = torch.where(depth_m.isfinite() & (depth_m > 0), depth_m, 0.0).double()
     noise_per_m2 = measure_noise_per_m2(depth_m)
@@ -136,15 +138,15 @@ def prepare_frame(
     # A known background is not searched for planes: one before it is made of objects.
     is_searched = depth_m > 0
     backgrounds: list[Background] = []
-    if known is not None:
-        known_m = known.depth_m[::step, ::step].double().nan_to_num(torch.inf)
-        is_searched &= ~known_m.isfinite()
-        backgrounds.append(Background(depth_m=known_m, diameter_m=math.inf))
+    if background is not None:
+        background_m = background.depth_m[::step, ::step].double().nan_to_num(torch.inf)
+        is_searched &= ~background_m.isfinite()
+        backgrounds.append(Background(depth_m=background_m, diameter_m=math.inf))
     rays = back_project(torch.ones_like(depth_m), K)
     planes, limit_m = _wide_planes(depth_m, points_m, normals, rays, noise_per_m2, is_searched)
     backgrounds += planes
-    if known is not None:
-        limit_m[known.is_seen[::step, ::step] & (limit_m == 0)] = torch.inf
+    if background is not None:
+        limit_m[background.is_seen[::step, ::step] & (limit_m == 0)] = torch.inf
 
     read_m = torch.where(depth_m > 0, depth_m, torch.inf)
     nearest_m = -max_pool2d(-read_m[None], 5, 1, 2)[0]
@@ -158,7 +160,7 @@ def prepare_frame(
 def _thinning_step(
     depth_m: Float64[Tensor, "h w"], focal_px: float, smallest_m: float | None
 ) -> int:
-    """Say of how many rows and columns one is used: few pixels remain, but enough of an object."""
+    """Give the step between rows that are used: few pixels remain, but enough of an object."""
     step = math.ceil(math.sqrt(depth_m.numel() / _MOST_PIXELS))
     is_read = depth_m > 0
     if smallest_m is None or not bool(is_read.any()):
@@ -271,7 +273,7 @@ def _wide_planes(
         if behind_share > _MOST_BEHIND:
             continue
 
-        diameter_m = _largest_diameter_without_side(points_m[piece])
+        diameter_m = _largest_background_diameter(points_m[piece])
         limit_m[surface] = diameter_m
         planes.append(Background(depth_m=plane_depth_m, diameter_m=diameter_m))
     return planes, limit_m
@@ -311,10 +313,11 @@ def _share_of_readings_behind(
     return float(is_behind[is_read_within].double().mean())
 
 
-def _largest_diameter_without_side(points_m: Float64[Tensor, "n 3"]) -> float:
-    """Give the largest diameter of an object that has no side as wide or as long as a plane."""
+def _largest_background_diameter(points_m: Float64[Tensor, "n 3"]) -> float:
+    """Give the diameter of the largest object of which a plane is too wide or long to be a side."""
     some_m = take_evenly(points_m, _SAMPLE)
     offset_m = some_m - some_m.mean(0)
+    # Ascending: the first axis is the plane's normal, the second its width, the third its length.
     _, axes = torch.linalg.eigh(offset_m.T @ offset_m)
     along_m = offset_m @ axes[:, 1:]
     width_m, length_m = (along_m.quantile(0.95, 0) - along_m.quantile(0.05, 0)).tolist()
@@ -347,7 +350,7 @@ def _is_on_bent_plane(
         points_m: in the camera frame.
         plane: the flat one.
         is_near: readings on it.
-        is_parallel: readings whose normals are along that of the plane; no others are marked.
+        is_parallel: readings whose normals are parallel to the plane's; no others are marked.
         noise_per_m2: as in :class:`Frame`.
     """
     off_m = points_m @ plane[0] - plane[1]
@@ -459,9 +462,9 @@ def is_on_background(
     """
     read_m = torch.where(depth_m > 0, depth_m, 0.0).double()
     tolerance_m = math.sqrt(2) * plane_tolerance_m(read_m, measure_noise_per_m2(read_m))
-    known_m = background_m.double().nan_to_num(torch.inf)
-    farthest_m = _largest_about(known_m, 1)
-    nearest_m = -_largest_about(-known_m, 1)
+    behind_m = background_m.double().nan_to_num(torch.inf)
+    farthest_m = _largest_about(behind_m, 1)
+    nearest_m = -_largest_about(-behind_m, 1)
     is_between = (read_m > nearest_m - tolerance_m) & (read_m < farthest_m + tolerance_m)
     return is_between & (read_m > 0) & farthest_m.isfinite()
 

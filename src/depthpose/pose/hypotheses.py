@@ -25,13 +25,15 @@ from depthpose.pose.probability import (
 from depthpose.pose.surface import NEAR, Surface
 from depthpose.pose.types import Evidence, ViewInput
 
-_POINTS = 250  # of the cloud that refine a competing pose
-_STEPS = 6  # of ICP for poses that were refined roughly
-_SHARE_POINTS = 1000  # of the cloud that say what a pose leaves unexplained
+_POINTS = 250  # points of the cloud that refine a competing pose
+_STEPS = 6  # steps of ICP for poses that were refined roughly
+_SHARE_POINTS = 1000  # points of the cloud that measure what a pose leaves unexplained
 _UNEXPLAINED_MORE = 0.25
 """A competing pose that leaves by so much more of the readings unexplained is not compared."""
-_MOST_LEADING = 8  # different poses that are compared
-_MOST_COPIES = 45  # and near-symmetric copies of the best of them: about an axis, 15 degrees apart
+_MOST_LEADING = 8  # largest number of different poses that are compared
+_MOST_COPIES = (
+    45  # and of near-symmetric copies of the best of them: about an axis, 15 degrees apart
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

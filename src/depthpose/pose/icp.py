@@ -16,28 +16,31 @@ from depthpose.pose.compiled import Vector, array_of, compiled, cross, dot, minu
 from depthpose.pose.config import IcpConfig
 from depthpose.pose.surface import Surface, Target, look_along_rays, match
 
-_SLACK = 0.1  # sine of the angle by which a surface may face away and still count as visible
+_SLACK = 0.1  # sine of the angle up to which a surface that faces away counts as visible
 _GRAZING = 0.1  # sine of the angle between a ray and a plane below which they do not meet nearby
-_CONVERGED = 3e-4  # stop when a step rotates [rad] and shifts [diameters] by less than this
-_START_ROTATION_RAD = math.radians(15)  # of further starts from the initial pose
+_CONVERGED = 3e-4  # ICP stops when a step rotates [rad] and shifts [diameters] by less than this
+_START_ROTATION_RAD = math.radians(15)  # angle between the initial pose and further starts
 _ROUGH_LIMITS = (3.0, 2.4, 2.0, 1.6, 1.4, 1.2, 1.0, 1.0, 1.0, 1.0)
-"""Limits of the rough steps, over the last limit of the exact ones: starts begin farther off."""
+"""Distance limits of the rough steps, over the last limit of the exact steps: a start may be far
+from the points."""
 _ROUGH_POINTS = 100  # points of the cloud that refine and compare starts
 _OCCLUSION_POINTS = 1000  # points of the cloud by which free-space violations are counted
-_UNOBSERVED_WEIGHT = 0.3  # in a score: below 1, for something may occlude what is not observed
+_UNOBSERVED_WEIGHT = 0.3
+"""Weight in a score of the share of the surface that should be visible and was not observed. It is
+below 1, for something may occlude it."""
 _DISTINCT_DIAMETERS = 0.1  # mean distance between the surfaces of two poses that are distinct
-_MOST_OTHERS = 3  # local minima beside the best that are returned
+_MOST_OTHERS = 3  # largest number of local minima that are returned beside the best
 _FIRST_POSE_BONUS = 0.02
-"""Added to the score of the first pose, a share of points near the surface: another one must be
-better by more, since a plane fits many places and noise would choose among them."""
+"""Added to the score of the first pose, which is a share of points near the surface. Another pose
+must be better by more: a plane fits at many poses, and noise would choose among them."""
 
-_BLOCK_DIAMETERS = (0.15, 0.2, 0.3, 0.4)  # sides of the blocks of the jackknife
+_BLOCK_DIAMETERS = (0.15, 0.2, 0.3, 0.4)  # sides of the blocks that the jackknife leaves out
 _LEAST_REMAINING = 0.03
-"""Share of the information that counts as remaining where a block is left out: else a block that
-alone constrains a direction would make it infinitely uncertain."""
+"""Least share of the information that counts as remaining where a block is left out: a block that
+alone constrains a direction would else make it infinitely uncertain."""
 _LEAST_SLOPE = 0.25
-"""Least information of the residuals with Tukey's weights as they change with the residual, over
-that with the weights held constant."""
+"""Least ratio of the information with Tukey's weights, which change with the residuals, to the
+information with the weights held constant."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

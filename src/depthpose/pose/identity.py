@@ -30,32 +30,35 @@ from depthpose.pose.sensor import EDGE_PX, INDEPENDENT_SIDES, LARGEST_OFFSET_M
 from depthpose.pose.surface import NEAR, Surface, Target, match
 from depthpose.pose.types import Evidence, Identity
 
-POINTS = 400  #: of the cloud, evenly taken
-_ROUGH_POINTS = 150  # of these, to compare starts
-_ROUGH_MIRROR_POINTS = 100  # of these, to compare starts of the mirror image
-_STEPS = 12  # of ICP with a scale
-_WIDE_STEP = 2.0  # limit of the first step, in the usual limit of a distance
+POINTS = 400  #: points of the cloud that are compared, evenly taken
+_ROUGH_POINTS = 150  # of these points, those that compare starts
+_ROUGH_MIRROR_POINTS = 100  # of these points, those that compare starts of the mirror image
+_STEPS = 12  # steps of ICP with a scale
+_WIDE_STEP = 2.0  # distance limit of the first step, over the usual distance limit
 _CONVERGED = 3e-4  # largest step [rad, m or share] at which ICP with a scale stops
-_CORRELATED_READINGS = 10.0  # neighbours that err alike: the variance is so many times larger
+_CORRELATED_READINGS = 10.0  # factor of the variance, since so many neighbours share their error
 _STARTS = (1.0, 0.87, 1.15)
-"""Scales at which ICP starts: from 1 alone it stays there for smaller copies."""
+"""Scales at which ICP starts: from 1 alone it would stay there for smaller copies."""
 _FIRST_START_BONUS = 0.03
-"""Subtracted from the mean squared distance, in squared limits of nearness, of the start at 1."""
-_MIRROR_PLANES = 24  # across which the posed model is mirrored for a start
+"""Subtracted from the mean squared distance of the start at scale 1, in squared limits of nearness
+(``NEAR`` of the diameter)."""
+_MIRROR_PLANES = 24  # planes across which the posed model is mirrored, each for a start
 _CLEARLY_WORSE = 0.05
 """Where the mirror image, roughly fitted, is so much farther from the points than the model, exact
-steps do not bring it nearer: in 123 views the gain was then -0.035 at most."""
-_FLIP = torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
-_LEAST_INFORMATION = 1e-9  # of an unknown: relative to it a step is damped
-_DEVIATIONS = 2.0  # standard deviations by which a size may err
+steps do not bring it nearer: in 123 views the gain was then -0.035 at most. A distance is in limits
+of nearness."""
+_FLIP = torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)  # the mirror image across x = 0
+_LEAST_INFORMATION = 1e-9  # a step of ICP with a scale is damped by a billionth of it at least
+_DEVIATIONS = 2.0  # standard deviations up to which the estimated size may be wrong
 _SIZE_GAIN = 0.05
-"""Where another size gains less (0.25 % of the diameter), the visible surface fits at many sizes,
-or a sensor errs so: the right pose of a real bowl gains 0.032 at 1.07."""
+"""Least gain (:attr:`Scale.gain`) by which another size counts, 0.25 % of the diameter. With less
+the visible surface fits at many sizes, or the sensor errs: the right pose of a real bowl gains
+0.032 at 1.07."""
 _MIRROR_GAIN = 0.02
-"""Gain from which a cloud is that of a mirrored copy, 0.1 % of the diameter: of right answers for
-synthetic views it was at most 0.004, where the mirror image is not nearly the model."""
-_OTHER_SIZES = 0.1  # difference of sizes that must be excluded for an identity to be confirmed
-_NEAR_SIZE = 0.03  # difference of the size that fits, beside its errors, that is still the model's
+"""Gain from which a cloud is that of a mirrored copy, 0.1 % of the diameter. Right answers for
+synthetic views gained 0.004 at most, where the mirror image is not nearly the model."""
+_OTHER_SIZES = 0.1  # sizes that differ by so much must be excluded to confirm an identity
+_NEAR_SIZE = 0.03  # difference up to which a size is still the model's, beside its own error
 
 
 @dataclass(frozen=True)

@@ -59,10 +59,11 @@ def depth_input(
     """Convert a depth image to metres, NaN where there is no reading; give it, and its camera.
 
     Args:
-        depth: whole numbers in the unit of the camera or ``unit``, or metres as floats.
-        camera: of the image; a file or description of one is read.
-        name: of the image in errors, where it is no file.
-        unit: of whole numbers, where the camera has none.
+        depth: whole numbers in ``unit`` or the unit of the camera; or floats, in ``unit`` if it is
+            given and else in metres.
+        camera: of the image; a file or description of a camera is read.
+        name: what errors call the image, where it is no file.
+        unit: of the depth. Whole numbers need it where the camera has no unit.
     """
     values = read_stored_depth(depth) if isinstance(depth, str | Path) else _tensor(depth)
     if values.ndim != 2:
@@ -71,7 +72,7 @@ def depth_input(
     is_described = isinstance(camera, str | Path | Mapping | float | int)
     lens = camera_of(camera, (width, height)) if is_described else camera
 
-    # Metres: whole numbers have the unit of the option or of the camera; floats are metres.
+    # To metres. Floats are metres unless ``unit`` is given: the camera's unit is not theirs.
     camera_unit_m = lens.depth_unit_m if isinstance(lens, Camera) else None
     unit_m = None if unit is None else metres_of(unit)
     if not values.is_floating_point():
@@ -86,7 +87,8 @@ def depth_input(
             raise InputError(
                 f"{file}: its depth is in whole numbers, and nothing says of what; give a camera "
                 'with "depth_unit_m" (0.001 where they are millimetres, 0.0002 of TUM RGB-D, '
-                "0.00390625 of KITTI), --unit mm (in Python unit='mm'), or metres as floats"
+                "0.00390625 of KITTI), --unit mm (in Python unit='mm'), or floats, which "
+                "are metres unless a unit is given"
             )
         values = values.double()
     depth_m = torch.where(values > 0, values * (unit_m or 1.0), torch.nan).float()
@@ -197,8 +199,8 @@ def _tensor(values: Any) -> Tensor:  # noqa: ANN401  whatever a caller has
     """Convert numbers of any library to a tensor on the CPU, of a type that torch computes with."""
     if isinstance(values, Tensor) and not values.is_complex():
         # Of unsigned numbers torch supports few operations, but for bytes.
-        is_odd = values.dtype in (torch.uint16, torch.uint32, torch.uint64)
-        return (values.long() if is_odd else values).detach().cpu()
+        is_unsigned = values.dtype in (torch.uint16, torch.uint32, torch.uint64)
+        return (values.long() if is_unsigned else values).detach().cpu()
     array = np.asarray(values)
     if array.dtype.kind not in "biuf":
         is_complex = array.dtype.kind == "c"

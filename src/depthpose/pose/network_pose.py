@@ -103,8 +103,8 @@ class GeoPoseNet(PoseEstimator):
     Example::
 
         net = GeoPoseNet.load("parts")
-        found = net.estimate(cloud="mug.ply", unit="mm", object="mug")
-        print(found.camera_from_model if found.is_ok else found.reason)
+        estimate = net.estimate(cloud="mug.ply", unit="mm", object="mug")
+        print(estimate.camera_from_model if estimate.is_ok else estimate.reason)
 
     Args:
         weights: the network and the objects that it knows.
@@ -162,17 +162,21 @@ class GeoPoseNet(PoseEstimator):
         kind = type(self._network).__name__
         return f"GeoPoseNet({kind} of {objects}{named}, {self.config.device})"
 
-    def _each(
-        self, inputs: Iterable[AnyInput], threads: int, *, is_expected: bool = True
+    def _each(self, inputs: Iterable[AnyInput], threads: int) -> Iterator[PoseEstimate]:
+        """Pose inputs by the network; what it doubts is registered where the config wants it."""
+        return self._pose_together(inputs, threads, is_expected=True)
+
+    def _each_try(self, inputs: Iterable[AnyInput]) -> Iterator[PoseEstimate]:
+        """Pose inputs by the network alone, at the lower prior odds of an object at a try."""
+        return self._pose_together(inputs, 1, is_expected=False)
+
+    def _pose_together(
+        self, inputs: Iterable[AnyInput], threads: int, *, is_expected: bool
     ) -> Iterator[PoseEstimate]:
-        """Ask the network for several clouds together, and register what it doubts.
+        """Ask the network for several clouds together, and pose each by its votes.
 
         The answer for an input does not depend on those beside it, but for the rounding of the
-        network's sums.
-
-        ``is_expected``: whether the inputs are meant to show their objects, which makes their prior
-        odds higher; what is then doubted is registered, where the config wants it. Else each input
-        is one try of several, whose best is chosen by its evidence: none is registered.
+        network's sums. ``is_expected``: whether the inputs are meant to show their objects.
         """
         prepared = each_in_threads(partial(unreadable_on_error, self._prepare), inputs, threads)
         pose = partial(self._pose, is_expected=is_expected)
@@ -185,7 +189,7 @@ class GeoPoseNet(PoseEstimator):
     def estimate_with_votes(
         self, pose_input: AnyInput
     ) -> tuple[PoseEstimate, VotingDirections | None]:
-        """Estimate one pose, and give what the network said of each keypoint at each point.
+        """Estimate one pose, and give the network's direction to each keypoint at each point.
 
         What the network doubts is not registered here.
 
@@ -252,7 +256,10 @@ class GeoPoseNet(PoseEstimator):
             job.watch.seconds["network"] = watch.seconds["network"] * count / sum(counts)
 
     def _pose(self, job: CloudToPose | PoseEstimate, *, is_expected: bool) -> PoseEstimate:
-        """Pose a cloud by its votes, or by registration where these are doubted."""
+        """Pose a cloud by its votes, or by registration where these are doubted.
+
+        Registered is only an input that is expected to show its object.
+        """
         if isinstance(job, PoseEstimate):
             return job
         voted = unreadable_on_error(
@@ -269,7 +276,10 @@ class GeoPoseNet(PoseEstimator):
     def _estimate_by_votes(
         self, pose_input: AnyInput, *, job: CloudToPose, is_expected: bool
     ) -> PoseEstimate:
-        """Vote for the keypoints, fit the pose to them, refine it, and decide by the evidence."""
+        """Vote for the keypoints, fit the pose to them, refine it, and decide by the evidence.
+
+        An input that is expected to show its object has higher prior odds.
+        """
         config = self.config
         prepared = job.prepared
         watch = job.watch
@@ -326,8 +336,8 @@ class GeoPoseNet(PoseEstimator):
     def _disagreement(self, job: CloudToPose, pose: Rigid) -> float:
         """Mean angle between the network's directions and those to the keypoints of a pose [rad].
 
-        Of the symmetric copies that the network was trained to treat as one, that counts at which
-        the directions point best.
+        The network was trained to treat symmetric copies of a pose as one: the angle is measured to
+        the copy whose keypoints its directions fit best.
         """
         keypoints_m = job.prepared.model.keypoints_m.double()
         copies_m = (pose @ job.prepared.copies.trained).apply(keypoints_m)

@@ -123,11 +123,11 @@ def earlier_predictions(folder: Path) -> dict[str, Prediction]:
     predictions: dict[str, Prediction] = {}
     for home in (folder, *sorted(folder.glob("part-*"))):
         try:
-            found = read_predictions(home) if (home / POSES).is_file() else []
+            earlier = read_predictions(home) if (home / POSES).is_file() else []
         except InputError as error:
             warnings.warn(f"{error} - it is damaged, and made again", Notice, stacklevel=2)
             continue
-        for prediction in found:
+        for prediction in earlier:
             # An input that one part could read counts as read, though another part could not.
             name = prediction.estimate.name
             if prediction.estimate.status != "unreadable" or name not in predictions:

@@ -33,7 +33,7 @@ class Registration(PoseEstimator):
     Example::
 
         parts = Registration.load("part.stl", unit="mm")
-        found = parts.estimate(cloud="scan.ply", unit="mm")
+        estimate = parts.estimate(cloud="scan.ply", unit="mm")
 
     Args:
         models: the objects.

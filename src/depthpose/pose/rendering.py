@@ -1,4 +1,9 @@
-"""A posed model rendered as a depth camera would see it."""
+"""A posed model rendered as a depth camera would see it.
+
+A z-buffer in a compiled loop, fast enough to compare many poses with an image. Synthetic images,
+which need exact pixels and coordinates on the triangles for their textures, are drawn by
+:mod:`depthpose.core.render`.
+"""
 
 import math
 from typing import NamedTuple, cast
@@ -14,7 +19,7 @@ from depthpose.pose.compiled import array_of, compiled
 from depthpose.pose.surface import Surface
 
 _NEAR_M = 0.01
-"""What is nearer to the camera is not rendered."""
+"""A triangle with a corner nearer to the camera than this is not rendered."""
 _PINHOLE_DEPTH = 3.0
 """Depth of a pinhole between discs, in spacings of their middles, from which it is closed."""
 _FAR_M = np.float32(1e6)

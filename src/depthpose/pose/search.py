@@ -20,7 +20,7 @@ from torch import Tensor
 
 from depthpose.core.devices import each_in_threads
 from depthpose.core.rigid import Rigid
-from depthpose.pose.cloud import cloud_from_depth, nothing_seen
+from depthpose.pose.cloud import cloud_from_depth, why_nothing_seen
 from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.copies import PreparedObject
 from depthpose.pose.decide import (
@@ -448,7 +448,7 @@ def nothing_found(
     read_m = view.depth_m[view.mask & (view.depth_m > 0)]
     facts: dict[str, Any] = {"name": view.name, "object": object, "seconds": {"search": spent_s}}
     if len(read_m) == 0:
-        return PoseEstimate(status="too few points", reason=nothing_seen(view), **facts)
+        return PoseEstimate(status="too few points", reason=why_nothing_seen(view), **facts)
     reason = (
         f"nothing before the background of the image is surely {object}; its depths are "
         f"{float(read_m.min()):.3g} to {float(read_m.max()):.3g} m: if they are right, give a "

@@ -1,4 +1,4 @@
-"""What depth cameras and real objects are off by: noise, offsets, and how far off a plane.
+"""Errors of depth cameras and of real objects: noise, offsets, and the tolerance of a plane.
 
 A depth camera errs in four ways. Each reading has noise of its own. Neighbouring readings also
 share an error, because stereo and structured light match windows of several pixels: a patch of
@@ -22,52 +22,56 @@ from torch import Tensor
 
 NOISE_PER_M2 = 0.0015
 """Standard deviation [m] of a Kinect's readings, for the square of the depth in metres (Nguyen et
-al., 3DIMPVT 2012): where nothing better is known."""
+al., 3DIMPVT 2012): taken where the noise cannot be measured."""
 NOISIEST_PER_M2 = 4 * NOISE_PER_M2
-"""Largest noise that is believed, for the square of the depth in metres."""
+"""Largest noise that is measured on an object, for the square of the depth in metres: what is above
+it is the shape of the object."""
 LARGEST_OFFSET_M = 0.006
-"""Depth cameras are off along the ray by 3 to 6 mm as a whole (``bench/sensors.py``): so much at
-most. The standard deviation of that offset is a setting, ``IcpConfig.sensor_offset_m``."""
+"""Largest offset along the ray that all readings of a depth camera share: 3 to 6 mm were measured
+(``bench/sensors.py``). Its standard deviation is a setting, ``IcpConfig.sensor_offset_m``."""
 FLAT_M = 0.0005
 """Real tables and walls are flat to half a millimetre."""
 EDGE_PX = 3
-"""Readings so near an edge may be of either side: stereo matches windows, and masks end so far from
-the silhouette."""
+"""Readings up to so many pixels from an edge may be of either side: stereo matches windows, and
+masks end so far from the silhouette."""
 LATERAL_PX = 1.0
-"""Standard deviation of where a reading is [px]: on elbows in real bins residuals grow with their
-slant as by 0.5 to 1.2 px, on steep sides of YCB objects as by 0.8 to 1.6 (``bench/slants.py``)."""
+"""Standard deviation of the position of a reading across the optical axis [px]. Residuals grow with
+the slant of a surface as if it were 0.5 to 1.2 px on elbows in real bins, 0.8 to 1.6 px on steep
+sides of YCB objects (``bench/slants.py``)."""
 FINEST_RAD = 2e-4
-"""No sensor has finer pixels: nearer neighbours are of several frames in one cloud."""
+"""Least angle between the rays of two pixels: points of a cloud at a smaller one are of several
+frames."""
 LAG_PX = 3
-"""Noise is measured between readings so far apart: direct neighbours of a real sensor err alike."""
+"""Noise is measured between readings so many pixels apart: direct neighbours of a real sensor share
+their error."""
 SHARED_PER_WHITE = 2.5
-"""Error that neighbours share, in deviations of the noise of one reading. Planes before a Kinect
-and a RealSense show 2 to 4 (``bench/sensors.py``); a laser scanner less."""
+"""Standard deviation of the error that neighbours share, over that of the noise of one reading.
+Planes before a Kinect and a RealSense show 2 to 4 (``bench/sensors.py``); a laser scanner less."""
 AVERAGED_PER_WHITE = 0.55
-"""Deviation of means of five by five readings some ten pixels apart, in deviations of the noise of
-one reading: with half a millimetre beside it some four fifths of the means on planes before a
-Kinect and RealSenses are within two deviations of a straight line (``bench/sensors.py``)."""
+"""Standard deviation of means of five by five readings some ten pixels apart, over that of the
+noise of one reading. With it and half a millimetre, some four fifths of the means on planes before
+a Kinect and RealSenses are within two deviations of a straight line (``bench/sensors.py``)."""
 CORRELATION_PX = 10
-"""Side of a square of readings that is one observation: noise that a Gaussian of 3 px smoothed, as
-a Kinect's, is as many independent readings as squares of 4 pi 3^2 pixels; a RealSense smooths by
-5 px."""
+"""Side of the square of readings that counts as one independent observation. A Kinect smooths its
+noise as a Gaussian of 3 px does, which makes squares of 4 pi 3^2 pixels independent; a RealSense
+smooths by 5 px."""
 CORRELATION_RAD = CORRELATION_PX / 570  #: the same as an angle, for a Kinect of 640 columns
 LEAST_DEVIATION_M = 1e-5
-"""No reading is taken to be surer than a hundredth of a millimetre: depth cameras measure no finer,
-and rounding of some metres to single precision is less than a tenth of it."""
+"""Least standard deviation of a reading: no depth camera measures finer, and the rounding of some
+metres to single precision is less than a tenth of it."""
 INDEPENDENT_SIDES = 6.0
-"""A real object deviates from its model by whole sides, of which a body has about six: they are so
-few independent deviations, however many readings there are."""
+"""Independent deviations of a real object from its model, however many readings there are: whole
+sides deviate, of which a body has about six."""
 _TOLERATED = 4.0
-"""A reading lies on a plane up to so many deviations of the error that its neighbours share."""
+"""Largest distance of a reading from its plane, over the error that neighbours share."""
 _WIDEST_M = 0.004
 _WIDEST_PER_M2 = 0.003
-"""But no farther than 4 mm, and 3 mm for the square of its depth in metres: twice a Kinect's."""
-_MEDIAN_TO_DEVIATION = 1.4826  # of a normal distribution
-_FEWEST_DIFFERENCES = 30  # of readings, whose median says how large the noise is
+"""That distance is at most 4 mm, and 3 mm for the square of the depth in metres: twice the
+noise of a Kinect."""
+_MEDIAN_TO_DEVIATION = 1.4826  # standard deviation over median magnitude, in a normal distribution
+_FEWEST_DIFFERENCES = 30  # least number of second differences whose median measures the noise
 _STEEPEST = 0.3
-"""Least cosine between ray and normal that counts: what is seen at a smaller one is hardly measured
-at all."""
+"""A smaller cosine between ray and normal counts as this one: the sensor hardly measures there."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,8 +80,9 @@ class DepthNoise:
 
     Attributes:
         white_std_m: standard deviation of a reading along the optical axis, independent of others.
-        shared_std_m: standard deviation of the error that neighbouring readings share, along it.
-        lateral_std_m: standard deviation of where a reading is, across it.
+        shared_std_m: standard deviation along the axis of the error that neighbouring readings
+            share.
+        lateral_std_m: standard deviation of the position of a reading across the axis.
         object_std_m: standard deviation of the real surface from the model, along its normal.
     """
 
@@ -93,7 +98,7 @@ class DepthNoise:
 
         Args:
             cosine: between the ray and the surface normal, any shape.
-            readings: how many independent ones are averaged.
+            readings: number of independent readings that are averaged.
         """
         cosine = np.clip(cosine, _STEEPEST, 1.0)
         noise_m2 = self.white_std_m**2 / readings + self.shared_std_m**2
@@ -120,13 +125,13 @@ def measure_noise(
     """
     masked_m = np.where(is_object, depth_m, np.nan)
     distance_m = float(np.nanmedian(masked_m)) if np.isfinite(masked_m).any() else 0.0
-    bend_m = _second_differences(masked_m)
+    bend_m, _ = _second_differences(masked_m)
     if len(bend_m) < _FEWEST_DIFFERENCES:
-        bend_m = _second_differences(depth_m)
+        bend_m, _ = _second_differences(depth_m)
     if len(bend_m) < _FEWEST_DIFFERENCES:
         white_std_m = NOISE_PER_M2 * distance_m**2
     else:
-        # A second difference of independent readings has six times their variance.
+        # A second difference of independent readings has six times their variance: 1 + 1 + 2^2.
         white_std_m = _MEDIAN_TO_DEVIATION * float(np.median(np.abs(bend_m))) / math.sqrt(6)
         # On a small object its own curvature is in the differences: no sensor is so noisy.
         white_std_m = min(white_std_m, NOISIEST_PER_M2 * distance_m**2)
@@ -138,14 +143,21 @@ def measure_noise(
     )
 
 
-def _second_differences(depth_m: np.ndarray) -> np.ndarray:
-    """Second differences of readings ``LAG_PX`` apart, along rows and columns."""
-    differences: list[np.ndarray] = []
+def _second_differences(depth_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Give second differences of readings ``LAG_PX`` apart, and the reading in the middle of each.
+
+    They are taken along rows and columns, where all three readings are finite.
+    """
+    bends_m: list[np.ndarray] = []
+    middles_m: list[np.ndarray] = []
     for along_m in (depth_m, depth_m.T):
         ends_m = along_m[:, : -2 * LAG_PX] + along_m[:, 2 * LAG_PX :]
-        bend_m = ends_m - 2 * along_m[:, LAG_PX:-LAG_PX]
-        differences.append(bend_m[np.isfinite(bend_m)])
-    return np.concatenate(differences)
+        middle_m = along_m[:, LAG_PX:-LAG_PX]
+        bend_m = ends_m - 2 * middle_m
+        is_finite = np.isfinite(bend_m)
+        bends_m.append(bend_m[is_finite])
+        middles_m.append(middle_m[is_finite])
+    return np.concatenate(bends_m), np.concatenate(middles_m)
 
 
 def measure_noise_per_m2(depth_m: Float64[Tensor, "h w"]) -> float:
@@ -158,25 +170,19 @@ def measure_noise_per_m2(depth_m: Float64[Tensor, "h w"]) -> float:
         depth_m: 0 where there is no reading.
     """
     read_m = torch.where(depth_m > 0, depth_m, torch.nan)
-    bends_per_m2: list[Tensor] = []
-    for along_m in (read_m, read_m.T):
-        middle_m = along_m[:, LAG_PX:-LAG_PX]
-        bend_m = along_m[:, : -2 * LAG_PX] + along_m[:, 2 * LAG_PX :] - 2 * middle_m
-        bend_per_m2 = bend_m / middle_m.square()
-        bends_per_m2.append(bend_per_m2[bend_per_m2.isfinite()])
-    bend_per_m2 = torch.cat(bends_per_m2).abs()
-    if len(bend_per_m2) == 0:
+    bend_m, middle_m = _second_differences(read_m.numpy())
+    if len(bend_m) == 0:
         return NOISE_PER_M2
-    # A second difference of independent readings has six times their variance: 1 + 1 + 2^2.
+    bend_per_m2 = torch.from_numpy(np.abs(bend_m) / np.square(middle_m))
     return _MEDIAN_TO_DEVIATION * float(bend_per_m2.median()) / math.sqrt(6)
 
 
 def plane_tolerance_m(depth_m: Float64[Tensor, "*n"], noise_per_m2: float) -> Float64[Tensor, "*n"]:
-    """How far off a plane a reading of it may lie.
+    """Give the largest distance from a plane at which a reading counts as one of it.
 
     Args:
-        depth_m: of the readings.
-        noise_per_m2: of the image, as :func:`measure_noise_per_m2` gives it.
+        depth_m: depths of the readings.
+        noise_per_m2: noise of the image, as :func:`measure_noise_per_m2` gives it.
     """
     square = depth_m.square()
     tolerance_m = FLAT_M + _TOLERATED * SHARED_PER_WHITE * noise_per_m2 * square

@@ -26,21 +26,21 @@ from depthpose.pose.mesh import sample_surface, symmetry_transforms
 from depthpose.pose.mesh.models import disc_triangles, drawn_triangles, fibonacci_directions
 from depthpose.pose.types import ObjectModel
 
-NEAR = 0.05  #: of the diameter: a point of the cloud within this distance lies on the posed surface
+NEAR = 0.05  #: diameters: a point of the cloud within this distance lies on the posed surface
 _AXIS_STEP = 0.1  # half of the step between the rotations about a continuous axis [rad]
 _CELL = 1 / 24  # side of a cell of an image or of rays, in diameters: it holds several samples
 _REACH = 72
 """Cells to each side of the middle of the cloud that are distinguished, three diameters; points
 farther off count as if they lay at this border."""
-_NEAREST_SHARE = 0.1  # of the median depth: nearer points are no part of what a camera observed
+_NEAREST_SHARE = 0.1  # points nearer than this share of the median depth were not observed
 _BOXES = 48  # boxes along the longest side of a model, to look up near samples without a search
-_BOX_MARGIN = 0.15  # by which the boxes reach beyond the model, in diameters
+_BOX_MARGIN = 0.15  # distance by which the boxes reach beyond the model, in diameters
 _VIEWS = 256  # directions from which a model is viewed
-_POINTS = 160  # points of a view, at most
+_POINTS = 160  # largest number of points of a view
 _MOST_FACES = 100_000
-"""Of a model with more faces its samples are rendered, which are fewer."""
+"""Largest number of faces that are rendered; of a larger model its samples are, which are fewer."""
 _EDGE_STEP = 0.08
-"""Of the diameter: neighbouring cells that differ in depth by more are the two sides of an edge."""
+"""Difference in depth, in diameters, from which neighbouring cells are the two sides of an edge."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -355,7 +355,7 @@ def _make_boxes(points_m: Float64[Tensor, "m 3"], tree: KDTree, margin_m: float)
 _SIDE_DIRECTIONS = 32
 _CELL_SPACINGS = 2.0  # side of a cell in mean distances of samples: four in each on average
 _SAME_SHEET = 0.5  # mean distances from a sample's plane up to which others are of its sheet
-_LEAST_COSINE = 0.3  # of the angle to its normal, at which a side of a sample is examined
+_LEAST_COSINE = 0.3  # least cosine to its normal at which a side of a sample is examined
 _LEAST_VISIBLE = 0.1  # least share of directions from which an outer side is visible
 _MOST_INNER = 0.4  # largest share for the inner side, over that of the outer side
 

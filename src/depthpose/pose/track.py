@@ -35,18 +35,18 @@ from depthpose.pose.types import (
 )
 
 MARGIN = 0.15
-"""Of the diameter: points so far from the surface at the last or the predicted pose may be the
-object's; between two frames it moves by less."""
-_MOST_POINTS = 10_000  # of what a camera saw about the object, evenly taken
-_LEAST_POINTS = 60
+"""Largest distance, in diameters, from the surface at the last or the predicted pose of points that
+may be the object's: between two frames it moves by less."""
+_MOST_POINTS = 10_000  # points about the object that are used, evenly taken
+_LEAST_POINTS = 60  # with fewer points about it the object is not followed
 _NEW_EVIDENCE = 0.2
 """Share of a frame's evidence that is new: sensor and object err alike in the next frame."""
-_MOST_LOG_ODDS = 9.0  # of a track: a few contradicting frames must be able to end it
+_MOST_LOG_ODDS = 9.0  # largest log odds of a track: a few contradicting frames must end it
 _LEAST_CERTAINTY = 1e-4
 _SUPPORTS = 2  # planes beside the object that are looked for: a table and a wall
-_SUPPORT_POINTS = 1000  # beside the object, that show them
-_SUPPORT_DEVIATIONS = 3.0  # of the points of such a plane: nearer ones are of it
-_LITTLE = 0.2  # share of the points near an object that its support may leave
+_SUPPORT_POINTS = 1000  # points beside the object in which these planes are looked for
+_SUPPORT_DEVIATIONS = 3.0  # standard deviations up to which a point lies on such a plane
+_LITTLE = 0.2  # least share of the points near an object that its support must leave
 _FLAT = 0.9  # share of a flat object's surface that lies in the plane of its support
 
 

@@ -68,7 +68,10 @@ def detection_scores(
             scale = context.diameter_m if name == "mssd_m" else 1.0
             tables_of_error = [table[name] for table in tables]
             precisions[_COLUMNS[name]] = _mean(
-                [_precision(images_of_object, tables_of_error, scale * limit) for limit in limits]
+                [
+                    _average_precision(images_of_object, tables_of_error, scale * limit)
+                    for limit in limits
+                ]
             )
         scores[number] = {"ap": _mean(list(precisions.values())), **precisions}
     return scores
@@ -142,7 +145,7 @@ def _is_far(name: str, pose: Rigid, instance: Instance, context: ErrorContext) -
     return gap_px * BOP_WIDTH_PX / image_size(instance.depth)[0] > BOP_PIXELS[-1]
 
 
-def _precision(
+def _average_precision(
     images: Sequence[_Image], tables: Sequence[Float[Tensor, "_ _"]], limit: float
 ) -> float | None:
     """Give the average precision of one object at one threshold; None where no instance counts.

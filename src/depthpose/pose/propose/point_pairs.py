@@ -26,58 +26,61 @@ from depthpose.pose.surface import NEAR, Surface, look_along_rays, prepare_surfa
 from depthpose.pose.types import ObjectModel
 
 STEP = 0.07
-"""Of the diameter: distance of the points of the model, and a bin of the distances of a pair."""
+"""Least distance between points of the model, and width of a bin of the length of a pair, both over
+the diameter."""
 DISTANCES = 15
-"""Bins of the length of a point pair; what is longer is in one more."""
+"""Bins of the length of a point pair; one more holds all longer pairs."""
 ANGLES = 15
-"""Bins of an angle of a point pair, from 0 to 180 degrees."""
+"""Bins of each of the three angles of a point pair, from 0 to 180 degrees."""
 TURNS = 30
-"""Bins of the rotation about the normal of the first point of a pair, 360 degrees."""
+"""Bins of the rotation about the normal of the first point of a pair, from 0 to 360 degrees."""
 _MOST_ALIKE = 150
-"""Of the model's pairs with the same feature at most so many vote: all pairs of a plane are alike
-and say little."""
+"""Largest number of pairs of the model with one feature that vote: all pairs of a plane are alike
+and tell little."""
 _MODEL_POINTS = 800
-"""Of the model at most; where there are more, their distance grows by the factor below."""
+"""Largest number of points of a model that form pairs."""
 _COARSER = 1.1
+"""Factor by which the least distance of these points grows until there are few enough."""
 _SCENE_POINTS = 400
-"""Of a cloud at most."""
+"""Largest number of points of a cloud that form pairs."""
 _REFERENCES = 50
 """Points of a cloud that vote with each of the others."""
 _PEAKS = 6
-"""Poses that each of them proposes."""
+"""Poses that each of these points proposes."""
 _VIEWS = 30
 """Directions from which the model is viewed, to find the visible sides of its surface."""
 _LEAST_COSINE = 0.2
-"""Of the angle between its normal and a view, at which a surface is visible."""
+"""Least cosine between the normal of a surface and a direction from which it is visible."""
 _CELLS = 40
-"""Cells along the diameter in which points hide those behind them."""
+"""Cells along the diameter of the model; in each, points hide those behind them."""
 _SCORED_POINTS = 100
-"""Of the cloud, by which proposed poses are compared."""
+"""Points of the cloud by which proposed poses are compared."""
 _NEAR_ROUGHLY = 0.1
-"""Of the diameter: points within this distance of a proposed pose, which is rough, are near it."""
+"""Largest distance, in diameters, of a point that is near the surface at a proposed, rough pose."""
 _RAYS_EVERY = 16
-"""Of so many points of the surface one is used to count free-space violations."""
+"""Every so-many-th point of the surface is used to count free-space violations."""
 _UNOBSERVED_WEIGHT = 0.3
 """Weight in a score of the share of the surface that should be visible and was not observed."""
 
-# A model that is searched in itself.
+# For the search of a model in itself.
 _SELF_REFERENCES = 40
-"""Points that vote."""
+"""Points of the model that vote with each of the others."""
 _SELF_PEAKS = 48
-"""Poses that each proposes."""
+"""Motions that each of these points proposes."""
 _SELF_COMPARED = 250
-"""Points by which poses are compared."""
+"""Points of the surface by which motions are compared."""
 _LEAST_SHARE = 0.25
-"""Least share of the surface that a motion moves onto the surface."""
+"""Least share of the surface that a motion must move onto the surface."""
 _LEAST_OF_BEST = 0.85
-"""Least ratio of that share to the one of the best motion."""
+"""Least ratio of that share to the share of the best motion."""
 _NEAR_SYMMETRY = 0.8
-"""Share from which a motion is a near-symmetry, and may be near another one."""
+"""Share from which a motion is a near-symmetry, and may differ little from another motion."""
 _MIN_COSINE = 0.7
-"""Of the normals of a moved point and of the surface there."""
+"""Least cosine between the normal of a moved point and that of the surface there."""
 _APART_RAD = math.radians(12)
-"""Least angle between two motions."""
+"""Least angle between two near-symmetries; between other motions it is five times as large."""
 _MOST_TURNS = 36
+"""Largest number of motions that are given."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -85,13 +88,13 @@ class PairTable:
     """Pairs of points of a model, sorted by their features.
 
     Attributes:
-        points_m: of the surface that is visible from outside, 0.07 diameters apart or more, in the
-            order of the model's faces.
-        frames: of each point its outward normal and two tangents, as columns.
+        points_m: points of the surface that is visible from outside, 0.07 diameters apart or more,
+            in the order of the model's faces.
+        frames: outward normal and two tangents of each point, as columns.
         bounds: pairs ``bounds[k]`` to ``bounds[k + 1]`` have feature ``k``.
         first: index of the first point of each pair.
         turn_rad: angle of the second point about the normal of the first, from its first tangent.
-        surface: of the model.
+        surface: surface of the model.
     """
 
     points_m: Float64[Tensor, "m 3"]

@@ -308,7 +308,8 @@ def _arrange(
     clutter = low + random_index(generator, high - low + 1)
     chosen += [random_clutter(generator) for _ in range(clutter)]
 
-    # Each is tried at places farther and farther off, until its circle is free.
+    # Each is tried at places farther and farther from the middle until its circle is free; one that
+    # never finds a free place is left out.
     placed: list[tuple[Solid, Rigid]] = []
     circles: list[tuple[float, float, float]] = []
     for solid in chosen:

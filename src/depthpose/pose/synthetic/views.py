@@ -13,7 +13,7 @@ import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -296,10 +296,24 @@ class Shape:
 class CleanView:
     """An object alone, without any error, in a window of the image."""
 
-    depth_m: Float[Tensor, "h w"]  #: minus ``distance_m``; NaN beside the object
+    depth_m: Float[Tensor, "h w"]  #: NaN beside the object
     K: Float[Tensor, "3 3"]  #: intrinsic matrix of the window
     camera_from_model: Rigid  #: the pose
-    distance_m: float = 0.0  #: subtracted in stored views: float16 is then exact to 0.1 mm
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _StoredView:
+    """A view of an object on the optical axis, in half of the memory."""
+
+    offset_m: Float[Tensor, "h w"]  #: depth minus ``distance_m``: float16 is exact to 0.1 mm
+    distance_m: float  #: of the middle of the object
+    K: Float[Tensor, "3 3"]  #: intrinsic matrix of the window
+    camera_from_model: Rigid  #: the pose
+
+    def full_depth(self) -> CleanView:
+        """Give the view with its depth."""
+        depth_m = self.offset_m.float() + self.distance_m
+        return CleanView(depth_m=depth_m, K=self.K, camera_from_model=self.camera_from_model)
 
 
 def make_shape(model: ObjectModel) -> Shape:
@@ -447,7 +461,7 @@ class Objects:
                     f"{1.5 * model.diameter_m:.2g} or farther, or correct the unit of the model."
                 )
         self._shapes = [make_shape(model) for model in self.models]
-        self._views: dict[tuple[int, int], CleanView] = {}
+        self._views: dict[tuple[int, int], _StoredView] = {}
 
     def __len__(self) -> int:
         return self.config.number
@@ -514,6 +528,9 @@ class Objects:
         """Make a view of an object without errors: drawn anew, or a stored one, rotated."""
         shape = self._shapes[number]
         views = self.config.views
+
+        # Drawn anew: the object on the optical axis, turned with the camera to another place in the
+        # image. Its middle (0, 0, distance) is then the third column of the turn, so many times.
         if views is None:
             R = random_rotation(generator)
             distance_m = uniform(generator, *self.config.distance_m)
@@ -522,13 +539,14 @@ class Objects:
             R = turn @ R
             pose = Rigid(R, turn[:, 2] * distance_m - R @ shape.middle_m)
             return draw_view(shape, pose, K)
+
+        # A stored view, in which the object lies on the axis: its pixels are turned likewise.
         stored = self._stored((number, random_index(generator, views)))
         K = self.intrinsics(float(stored.K[0, 0]) / self.config.focal_px[0])
         turn = self._gaze(number, stored.distance_m, K, generator)
-        depth_m = stored.depth_m.float() + stored.distance_m
-        return turn_view(replace(stored, depth_m=depth_m, distance_m=0.0), turn, shape, K)
+        return turn_view(stored.full_depth(), turn, shape, K)
 
-    def _stored(self, key: tuple[int, int]) -> CleanView:
+    def _stored(self, key: tuple[int, int]) -> _StoredView:
         """Give a stored view by the numbers of its object and of the view; drawn when needed."""
         if key not in self._views:
             number, place = key
@@ -539,9 +557,14 @@ class Objects:
             distance_m = uniform(generator, *self.config.distance_m)
             K = self.intrinsics(uniform(generator, *self.config.resolution))
             middle_m = torch.tensor([0.0, 0.0, distance_m], dtype=torch.float64)
-            view = draw_view(shape, Rigid(R, middle_m - R @ shape.middle_m), K)
-            depth_m = (view.depth_m - distance_m).half()
-            self._views[key] = replace(view, depth_m=depth_m, distance_m=distance_m)
+            pose = Rigid(R, middle_m - R @ shape.middle_m)
+            view = draw_view(shape, pose, K)
+            self._views[key] = _StoredView(
+                offset_m=(view.depth_m - distance_m).half(),
+                distance_m=distance_m,
+                K=view.K,
+                camera_from_model=pose,
+            )
         return self._views[key]
 
     def intrinsics(self, scale: float = 1.0) -> Float[Tensor, "3 3"]:

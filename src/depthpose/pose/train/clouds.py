@@ -39,6 +39,7 @@ from depthpose.pose.types import (
 from depthpose.pose.weights import PoseWeights
 
 TRIES = 20  #: samples in a row that may show too few points
+BEYOND_TRAINING = 2**32  #: samples of each object: no training has so many
 
 
 class Cloud(NamedTuple):
@@ -129,11 +130,14 @@ class TrainingClouds(TrainingViews[PoseTraining]):
         """
         generator = sample_generator(index, self.seed)
         cloud = self.config.cloud
+        # Sample i shows object i modulo their number.
+        objects = len(self.models)
         for attempt in range(TRIES):
             # A further attempt takes an index beyond any training, of the same object.
-            place = index + attempt * len(self.models) * 2**32
-            # Sample i shows object i modulo their number: multiples show the first object.
-            place *= len(self.models) if place < self.config.first_alone else 1
+            place = index + attempt * objects * BEYOND_TRAINING
+            # At the start all show the first object, as multiples of the number do.
+            if place < self.config.first_alone:
+                place *= objects
             view, is_frame = self._view(place, generator)
             number = self._class_of[view.input.object]
             sample = lift_sample(view, self.models[number].diameter_m, cloud)

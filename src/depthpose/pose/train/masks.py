@@ -232,9 +232,9 @@ class SegmentationTask:
             predicted = class_probabilities(self.network, image).argmax(0)
             table += count_overlap(predicted, labels, classes)
             if index == 0:
-                found = _tint_objects(image, predicted, classes)
+                segmented = _tint_objects(image, predicted, classes)
                 truth = _tint_objects(image, labels, classes)
-                pictures["found_truth"] = torch.cat([found, truth], -1)
+                pictures["found_truth"] = torch.cat([segmented, truth], -1)
         self.network.train()
         iou = intersection_over_union(table)
         numbers = {

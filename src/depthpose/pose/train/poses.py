@@ -47,6 +47,7 @@ from depthpose.pose.network import ResUNet, fold_norms, unfold_norms
 from depthpose.pose.propose import fit_pose, vote_ransac
 from depthpose.pose.sparse import Voxels
 from depthpose.pose.train.clouds import (
+    BEYOND_TRAINING,
     HELD_OUT_SEED,
     TRIES,
     CloudBatch,
@@ -194,7 +195,7 @@ class TrainingCrops(TrainingViews[DepthImageTraining]):
         """Make the sample of an index; one with too few pixels is replaced by another."""
         for attempt in range(TRIES):
             # A further attempt takes an index beyond any training, of the same object.
-            place = index + attempt * len(self.models) * 2**32
+            place = index + attempt * len(self.models) * BEYOND_TRAINING
             view, _ = self._view(place, sample_generator(place, self.seed))
             number = self._class_of[view.input.object]
             crop = cut_depth(view.input, self.config.network, self.models[number].diameter_m)
