@@ -43,7 +43,6 @@ from depthpose.depth.ground import MountFilter, scale_by_distance
 from depthpose.depth.predictions import (
     CLOUD_M,
     ENDINGS,
-    LAST,
     DepthResults,
     Estimator,
     read_estimate,
@@ -519,9 +518,7 @@ def write_depth_page(
 ) -> None:
     """Write a page of some of the finished depth maps, of every failure and of every warning."""
     # The finished results of each input, and those that are shown.
-    finished = {
-        name for name in run.read_results(out) if run.is_whole(out, name, [f"{name}.{LAST}"])
-    }
+    finished = {name for name in run.read_results(out) if is_finished(out, name)}
     names_of = {files: _result_names(files, finished) for files in sources}
     names = [name for names_of_source in names_of.values() for name in names_of_source]
     chosen = {names[k] for k in spread_evenly(len(names), MOST_VIEWS)}

@@ -32,7 +32,7 @@ from depthpose.pose.datasets.layouts import integer, read_rows
 from depthpose.pose.inputs import AnyInput, rigid_input
 from depthpose.pose.mesh import FIXED_UNITS, symmetries_to_bop, unit_of
 from depthpose.pose.network_pose import DepthImageRegressor, GeoPoseNet
-from depthpose.pose.registration import Registration
+from depthpose.pose.registration import Registration, read_parts
 from depthpose.pose.segmentation import Segmenter
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 from depthpose.pose.weights import read_pose_weights
@@ -493,12 +493,8 @@ def make_method_source(
         return PoseMethodSource(config=config, models=models)
     if not register.cad:
         return PoseMethodSource(config=config, base_from_camera=base_from_camera)
-    registration = Registration.load(
-        *register.cad, unit=cad_unit, symmetry=register.symmetry or None
-    )
-    return PoseMethodSource(
-        config=config, models=registration.models, base_from_camera=base_from_camera
-    )
+    models = read_parts(register.cad, cad_unit, register.symmetry or None)
+    return PoseMethodSource(config=config, models=models, base_from_camera=base_from_camera)
 
 
 def predict_instances(

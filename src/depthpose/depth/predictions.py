@@ -124,9 +124,13 @@ def _rounded(ground: Ground | None) -> dict[str, float] | None:
     return {name: round(value, _DECIMALS) for name, value in asdict(ground).items()}
 
 
-def is_finished(folder: Path, name: str) -> bool:
-    """Whether an earlier run wrote the whole estimate of this frame."""
-    return is_whole(folder, name, [f"{name}.{LAST}"])
+def is_finished(folder: Path, name: str, *, with_cloud: bool = False) -> bool:
+    """Whether an earlier run wrote the whole estimate of this frame.
+
+    ``with_cloud``: only an estimate with a cloud counts.
+    """
+    needed = (LAST, CLOUD) if with_cloud else (LAST,)
+    return is_whole(folder, name, [f"{name}.{ending}" for ending in needed])
 
 
 def has_prediction(folder: Path, name: str, *, of_disparity: bool = False) -> bool:
@@ -266,8 +270,7 @@ class DepthResults(Results[StereoInput, DepthEstimate]):
 
     def is_finished(self, job: Job[StereoInput]) -> bool:
         """Whether an earlier run wrote the whole estimate, with a cloud if there shall be one."""
-        needed = (LAST,) if self.cloud_m is None else (LAST, CLOUD)
-        return is_whole(self.folder, job.name, [f"{job.name}.{ending}" for ending in needed])
+        return is_finished(self.folder, job.name, with_cloud=self.cloud_m is not None)
 
     def store(self, job: Job[StereoInput], data: StereoInput, result: DepthEstimate) -> None:
         """Write the files of an estimate, and record that it is finished."""
