@@ -45,6 +45,7 @@ from depthpose.depth.predictions import (
     ENDINGS,
     DepthResults,
     Estimator,
+    is_finished,
     read_estimate,
     read_ground,
 )
@@ -374,7 +375,7 @@ class DepthWork:
     ) -> list[DepthEstimate | InputError]:
         """Estimate inputs together; ``mount``: of the camera, where all are frames of one."""
         named_inputs = [(depth_input.name, depth_input) for depth_input in inputs]
-        estimates = net.estimate_together(named_inputs, with_check=self.with_check, mount=mount)
+        estimates = net.estimate_batch(named_inputs, with_check=self.with_check, mount=mount)
         if self.scale.known_distance is None:
             return estimates
         return [

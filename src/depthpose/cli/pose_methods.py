@@ -17,7 +17,7 @@ import torch
 from tqdm import tqdm
 
 from depthpose.cli.engine import Weights
-from depthpose.cli.pose_options import DataSetOptions, RegisterOptions, SequenceOptions
+from depthpose.cli.pose_options import DataSetOptions, PoseInputs, RegisterOptions, SequenceOptions
 from depthpose.core.checkpoint import file_sha256, find_weights, read_checkpoint, warn_of_terms
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
@@ -468,8 +468,8 @@ def unit_of_cad(files: Sequence[str], cad_unit: Unit | None, unit: Unit | None) 
 
 
 def make_method_source(
-    weights: str,
-    register: RegisterOptions,
+    weights: str | None,
+    parts: PoseInputs | RegisterOptions,
     unit: Unit | None,
     dataset: DataSetOptions | SequenceOptions,
     config: EstimateConfig,
@@ -477,23 +477,23 @@ def make_method_source(
 ) -> PoseMethodSource:
     """Read what an estimator is built from: weights, or the models of a data set or of CAD files.
 
-    ``base``: the words of ``--base-from-camera``.
+    ``weights``: None: models are registered. ``base``: the words of ``--base-from-camera``.
     """
     base_from_camera = read_base(base)
-    cad_unit = unit_of_cad(register.cad, register.cad_unit, unit)
-    if register.symmetry and (not register.is_register or not register.cad):
+    cad_unit = unit_of_cad(parts.cad, parts.cad_unit, unit)
+    if parts.symmetry and (weights is not None or not parts.cad):
         raise InputError(
-            f"--symmetry {register.symmetry[0]}: is of --method register with --cad; a network and "
+            f"--symmetry {parts.symmetry[0]}: is of --method register with --cad; a network and "
             "a data set have the symmetries that they declare"
         )
-    if not register.is_register:
+    if weights is not None:
         return PoseMethodSource(config=config, weights=weights, base_from_camera=base_from_camera)
     if dataset.bop is not None:
         models = tuple(datasets.open_bop(dataset.bop, dataset.split).objects.values())
         return PoseMethodSource(config=config, models=models)
-    if not register.cad:
+    if not parts.cad:
         return PoseMethodSource(config=config, base_from_camera=base_from_camera)
-    models = read_parts(register.cad, cad_unit, register.symmetry or None)
+    models = read_parts(parts.cad, cad_unit, parts.symmetry or None)
     return PoseMethodSource(config=config, models=models, base_from_camera=base_from_camera)
 
 
