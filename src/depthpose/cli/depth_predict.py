@@ -2,7 +2,6 @@
 
 import re
 import sys
-from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
@@ -34,7 +33,7 @@ from depthpose.core.files import (
     read_video,
     write_video,
 )
-from depthpose.core.files.disk import find_partners, read_text
+from depthpose.core.files.disk import find_partners, read_text, refuse_equal_stems
 from depthpose.core.files.images import LISTED_SUFFIXES, refuse_among_inputs
 from depthpose.core.runner import Job, run_jobs
 from depthpose.depth.config import Answer, MatcherConfig, SGBMConfig
@@ -289,12 +288,10 @@ def list_sources(words: Sequence[str], out: Path) -> list[Path]:
     sources: list[Path] = []
     for word in words:
         sources += [Path(word)] if _is_video(word) else list_images(word)
-    stem_counts = Counter(path.stem for path in sources)
-    repeated = next((stem for stem, count in stem_counts.items() if count > 1), None)
-    if repeated is not None:
-        raise InputError(f"two inputs are called {repeated!r}, and so would their results be.")
+    refuse_equal_stems(sources)
+    stems = [path.stem for path in sources]
     for video in filter(_is_video, sources):
-        frame = next((stem for stem in stem_counts if _is_frame_name(stem, video)), None)
+        frame = next((stem for stem in stems if _is_frame_name(stem, video)), None)
         if frame is not None:
             raise InputError(
                 f"an input is called {frame!r}, as a frame of a video would be, and so would their "
@@ -321,11 +318,9 @@ def list_pairs(left: str, right: str) -> list[tuple[Path, Path]]:
     """
     lefts = list_images(left)
     rights = list_images(right)
+    refuse_equal_stems(lefts)
     left_stems = [path.stem for path in lefts]
     right_stems = [path.stem for path in rights]
-    repeated = next((stem for stem in left_stems if left_stems.count(stem) > 1), None)
-    if repeated is not None:
-        raise InputError(f"{left}: two images are called {repeated!r}, so would their results.")
     are_files = lefts == [Path(left)] and rights == [Path(right)]
     if not are_files:
         partners = find_partners(left_stems, right_stems, f"{left} and {right}")

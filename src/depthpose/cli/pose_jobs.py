@@ -17,7 +17,7 @@ from depthpose.core.camera import AnyLens
 from depthpose.core.checkpoint import file_sha256
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import CLOUD_READERS, MAP_SUFFIXES, list_images, read_stored_depth
-from depthpose.core.files.disk import natural_order
+from depthpose.core.files.disk import natural_order, refuse_equal_stems
 from depthpose.core.files.images import refuse_among_inputs
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
@@ -186,7 +186,7 @@ def cloud_jobs(cloud: Path, unit: Unit, object: str, out: Path) -> list[PoseJob[
     files.sort(key=natural_order)
     if not files:
         raise InputError(f"{cloud}: no {', '.join(suffixes)} file there; give a cloud, or a folder")
-    _refuse_equal_stems(files)
+    refuse_equal_stems(files)
     refuse_among_inputs(out, [cloud], files)
     jobs: list[PoseJob[Any]] = []
     for path in files:
@@ -302,7 +302,7 @@ def box_jobs(
     """Make a job of each box in each depth image: NAME, or of several NAME_1, NAME_2, ..."""
     depths = _list_depths(depth)
     refuse_among_inputs(out, [depth], depths)
-    _refuse_equal_stems(depths)
+    refuse_equal_stems(depths)
     detections = [Detection(object=object, box=parse_box(text)) for text in boxes]
     jobs: list[PoseJob[Any]] = []
     for path in depths:
@@ -324,7 +324,7 @@ def detection_file_jobs(
     ``detections``: a file, or a folder of files with the names of the images.
     """
     depths = _list_depths(depth)
-    _refuse_equal_stems(depths)
+    refuse_equal_stems(depths)
     files = [detections]
     if detections.is_dir():
         files = _list_visible(detections, (".json", ".txt"))
@@ -423,8 +423,8 @@ def _match_to_depths(
     Returns:
         The file of each depth image, by its stem.
     """
-    _refuse_equal_stems(depths)
-    _refuse_equal_stems(files)
+    refuse_equal_stems(depths)
+    refuse_equal_stems(files)
     by_name = {path.stem: path for path in files}
     if len(depths) == len(files) == 1 and not depth.is_dir():
         by_name = {depths[0].stem: files[0]}
@@ -452,7 +452,7 @@ def frame_jobs(
     """Make a job of a whole depth image, or of every one of a folder, without masks."""
     depths = _list_depths(depth)
     refuse_among_inputs(out, [depth], depths)
-    _refuse_equal_stems(depths)
+    refuse_equal_stems(depths)
     jobs: list[PoseJob[Any]] = []
     for path in depths:
         read = partial(view_input, path, None, camera, object, path.stem, unit)
@@ -558,15 +558,3 @@ def _list_depths(depth: Path) -> list[Path]:
         if not maps:
             raise
         return sorted(maps, key=natural_order)
-
-
-def _refuse_equal_stems(files: Sequence[Path]) -> None:
-    """Refuse files of equal stems, which their results would share."""
-    first_of: dict[str, Path] = {}
-    for path in files:
-        other = first_of.setdefault(path.stem, path)
-        if other != path:
-            raise InputError(
-                f"{path.parent}: {other.name} and {path.name} would both be {path.stem!r} in the "
-                "results; rename one, or move it to another folder"
-            )

@@ -20,7 +20,7 @@ from pathlib import Path, PurePosixPath
 
 from depthpose.core.errors import InputError
 from depthpose.core.files import stores
-from depthpose.core.files.disk import file_system, find_partners, refused_write
+from depthpose.core.files.disk import file_system, find_partners, refuse_equal_names, refused_write
 
 PLAN = "plan.jsonl"
 SHARDS = "shards"
@@ -73,14 +73,8 @@ def find_items(words: Sequence[str], files: Files) -> list[Item]:
     else:
         items += _pair_roles(paths, files.suffixes)
 
-    item_of_name: dict[str, Item] = {}
-    for item in items:
-        first = item_of_name.setdefault(item.name, item)
-        if first is not item:
-            raise InputError(
-                f"{first.files[0]} and {item.files[0]} would both be {item.name!r} in the "
-                "results; give a manifest with a column 'name'"
-            )
+    files_by_name = [(item.name, item.files[0]) for item in items]
+    refuse_equal_names(files_by_name, "give a manifest with a column 'name'")
     return items
 
 
