@@ -29,6 +29,7 @@ from depthpose.core.camera.stored_camera import (
     find_matrix,
     find_size,
     is_ros,
+    is_ros_pair,
     normalise_keys,
     order_ros_pair,
     parse_numbers,
@@ -163,7 +164,7 @@ def _read_pair(path: Path, unit_m: float, is_fisheye: bool | None) -> RawPair:
     """
     if path.is_dir():
         first, second = read_pair_files(path)
-        if is_ros(first) and is_ros(second) and "p2" not in first | second:
+        if is_ros_pair(first, second):
             return _from_ros(first, second, unit_m, is_fisheye)
         return _from_opencv(first | second, unit_m, is_fisheye)
     text = read_text(path, MAX_LIST_BYTES)
