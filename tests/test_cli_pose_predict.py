@@ -26,7 +26,7 @@ from tests.pose.synthetic_objects import (
 )
 
 from depthpose.cli import main, pose_methods
-from depthpose.cli.pose_methods import choose_objects, match_names
+from depthpose.cli.pose_dataset import choose_objects, match_names
 from depthpose.core.camera import Camera, write_camera
 from depthpose.core.errors import InputError
 from depthpose.core.files import (

@@ -127,8 +127,9 @@ def evaluate(
         objects: keep these alone, by name or number.
         adds: ADD-S for declared symmetric objects (of LineMOD eggbox and glue), or for all.
     """
-    from depthpose.cli.pose_evaluate import measure, open_instances
-    from depthpose.cli.pose_methods import build_methods, predict_instances, prepare_masks
+    from depthpose.cli.pose_evaluate import measure, open_instances, predict_instances
+    from depthpose.cli.pose_masks import prepare_masks
+    from depthpose.cli.pose_methods import build_methods
     from depthpose.core.config import config_to_dict
     from depthpose.core.run import claim_folder
     from depthpose.pose.config import EvaluationConfig

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from depthpose.cli import pose_methods
+from depthpose.cli import file_names, pose_methods, pose_transforms
 from depthpose.cli.pose_methods import PoseMethod
 from depthpose.cli.pose_options import PoseInputs
 from depthpose.core.camera import AnyLens
@@ -470,14 +470,14 @@ def _with_background(plan: JobPlan, inputs: PoseInputs) -> JobPlan:
                 f"--bin {inputs.bin}: where is it? Give --bin-pose, a text file with its 4x4 "
                 "matrix camera_from_model in metres, or --empty-frame in place of both"
             )
-        pose = pose_methods.read_pose(inputs.bin_pose, "--bin-pose")
+        pose = pose_transforms.read_pose(inputs.bin_pose, "--bin-pose")
         unit = pose_methods.unit_of_cad([inputs.bin], inputs.cad_unit, inputs.unit)
         background = PosedBin.load(inputs.bin, pose, unit)
-        settings["bin"] = pose_methods.name_with_checksum(Path(inputs.bin))
+        settings["bin"] = file_names.name_with_checksum(Path(inputs.bin))
         settings["bin_pose"] = pose.matrix().tolist()
     elif inputs.empty_frame is not None:
         background = Path(inputs.empty_frame)
-        settings["empty_frame"] = pose_methods.name_with_checksum(background)
+        settings["empty_frame"] = file_names.name_with_checksum(background)
     else:
         return plan
     jobs: list[PoseJob[Any]] = []
@@ -521,9 +521,9 @@ def _with_color(
     camera = inputs.color_camera
     color_from_depth = None
     if camera is not None:
-        settings["color_camera"] = pose_methods.name_with_checksum(camera)
+        settings["color_camera"] = file_names.name_with_checksum(camera)
     if inputs.color_from_depth is not None:
-        color_from_depth = pose_methods.read_pose(
+        color_from_depth = pose_transforms.read_pose(
             inputs.color_from_depth, "--color-from-depth", "color_from_depth"
         )
         settings["color_from_depth"] = color_from_depth.matrix().tolist()

@@ -11,7 +11,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from depthpose.cli import pose_methods
+from depthpose.cli import pose_dataset, pose_masks
 from depthpose.cli.engine import EngineOptions, Weights, print_shards
 from depthpose.cli.pose_jobs import object_named, plan_jobs, read_detection
 from depthpose.cli.pose_methods import PoseMethod, PoseMethodSource
@@ -76,9 +76,9 @@ def predict_dataset(
     dataset = open_bop(options.bop, options.split)
     if options.targets is not None:
         dataset = select_targets(dataset, read_targets(options.targets, options.bop))
-    dataset = pose_methods.choose_objects(dataset, method, object)
-    (masks,) = pose_methods.prepare_masks([options.masks], dataset, out, config.device)
-    names = pose_methods.match_names(dataset, method.models)
+    dataset = pose_dataset.choose_objects(dataset, method, object)
+    (masks,) = pose_masks.prepare_masks([options.masks], dataset, out, config.device)
+    names = pose_dataset.match_names(dataset, method.models)
     # A job with an object gives an estimate, and no error, where its input cannot be read.
     jobs: list[PoseJob[Any]] = [
         replace(job, object=names[job.place.object_id])
@@ -88,7 +88,7 @@ def predict_dataset(
     settings = {
         **method.settings,
         "estimate": config_to_dict(config),
-        **pose_methods.dataset_settings(dataset),
+        **pose_dataset.dataset_settings(dataset),
         "masks": masks.name,
         **masks.settings,
     }
