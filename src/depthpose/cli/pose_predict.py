@@ -48,7 +48,7 @@ from depthpose.pose.predictions import (
 from depthpose.pose.types import PoseEstimate
 
 ENDING = "pose.json"
-"""Of the file of one estimate in a shard: an entry of ``poses.json``."""
+"""Ending of the file of one estimate in a shard: an entry of ``poses.json``."""
 
 
 def predict_files(method: PoseMethod, inputs: PoseInputs, out: Path, batch: int) -> int:

@@ -31,7 +31,7 @@ from depthpose.thesis.depth import (
 )
 
 _PANEL_WIDTH_PX = 621
-"""Of panels on a page: half of a frame of KITTI."""
+"""Width of a panel on a page: half of a frame of KITTI."""
 
 
 def reproduce_table(

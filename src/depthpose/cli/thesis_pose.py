@@ -35,7 +35,7 @@ from depthpose.report.pose import close_up, draw_pose, grey_depth, picture_of
 from depthpose.thesis import pose_figures, pose_tables
 
 _SYNTHETIC_SEED = 3303
-"""Of synthetic views for tables and figures; no training uses it."""
+"""Seed of the synthetic views for tables and figures; no training uses it."""
 _MAX_TSNE_POINTS = 4000
 """The time of t-SNE grows with the square of the points."""
 _MAX_VOTES = 1500

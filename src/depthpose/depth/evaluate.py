@@ -38,7 +38,8 @@ _ASPECT_TOLERANCE = 1.01
 """Ratio of two aspects that are still the same: the sides of a scaled image are rounded to whole
 pixels, often to multiples of 32."""
 _CROP_ERROR_SHARE = 0.7
-"""Of the error of a stretched map: a map with less error as a crop is a crop of the image."""
+"""Share of the error of a stretched map: a map with less error than that as a crop is a crop of the
+image."""
 _noticed_sizes: set[str] = set()
 NO_PREDICTION = "no right view to match, and no prediction"
 

@@ -46,6 +46,8 @@ def _side(size: Value, axis: int) -> Value:
 
 def _resize_image(image: Value, size: Value) -> Value:
     """Resize images to rows and columns, with antialiasing where they shrink; clip to [0, 1]."""
+    # As torch does, pixels beyond the border are left out and the other weights add up to 1; by
+    # default ONNX would repeat the pixels of the border.
     resized = image.op(
         "Resize", None, None, size, mode="linear", axes=[2, 3], antialias=1, exclude_outside=1
     )

@@ -52,8 +52,8 @@ ENDINGS = (
 """What follows ``NAME.`` in the names of the files of an estimate."""
 
 _DECIMALS = 6
-"""Of the values of a road in its file: further digits differ from run to run, since threads add in
-another order."""
+"""Decimals of the values of a road in its file: further digits differ from run to run, since
+threads add in another order."""
 CLOUD_M = 80.0
 """Distance up to which a cloud is written, unless another is given."""
 COLOR_RANGE_M = (3.0, 80.0)

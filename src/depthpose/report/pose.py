@@ -38,7 +38,7 @@ VOTED: Color = (1.0, 0.55, 0.1)
 ALTERNATIVE: Color = (0.6, 0.3, 0.85)
 """Colour of an alternative: violet."""
 _SURFACE_POINTS = 5000
-"""Of the posed model in a cloud."""
+"""Number of points of the posed model in a cloud."""
 _SHARP_RAD = math.radians(30)
 """Least angle between the faces at an edge that is drawn."""
 _CROSS_ARM = 0.04
@@ -47,7 +47,7 @@ _DRAWN_VOTES = 40
 """Points whose votes are drawn."""
 _DASH_PX = 6.0
 _GREY = 0.6
-"""Of the points of an observed cloud."""
+"""Grey of the points of an observed cloud."""
 
 
 def picture_of(instance: Instance) -> Float[Tensor, "3 h w"]:
@@ -252,7 +252,7 @@ def grey_depth(depth_m: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
 
 
 _DARKEST_GREY = 0.15
-"""Of the farthest depth; black has no reading."""
+"""Grey of the farthest depth; black has no reading."""
 _OBJECT_COLOR = (0.55, 0.55, 0.55)
 _SURROUNDINGS_COLOR = (0.7, 0.66, 0.6)
 _BACKGROUND_COLOR = (0.45, 0.6, 0.75)
@@ -260,7 +260,7 @@ _REGION_COLOR = (1.0, 0.85, 0.1)
 _MAX_SURROUNDINGS = 20_000
 """Points of all that is not the object, and of the known background."""
 _MARGIN = 0.6
-"""Of a close-up about the object, as a share of the object's extent."""
+"""Margin of a close-up about the object, as a share of the object's extent."""
 _CLOSE_UP_PX = 360
 
 

@@ -43,7 +43,7 @@ class Answer:
 
 
 MOST_PIXELS = 12_500_000
-"""Of a picture that is sent: those of a phone's camera."""
+"""Most pixels of a picture that is sent: those of a phone's camera."""
 KINDS: dict[str, tuple[str, tuple[str, ...]]] = {
     "image": ("a picture", LISTED_SUFFIXES),
     "right": ("a picture", LISTED_SUFFIXES),
@@ -152,7 +152,7 @@ def keep_file(folder: Path, field: str, sent_name: str, data: bytes) -> Path:
 
 
 EXAMPLE_SEED = 9
-"""Of streets and views that no weights were trained on."""
+"""Seed of streets and views that no weights were trained on."""
 
 
 def example_form(folder: Path, fields: dict[str, str]) -> dict[str, Any]:

@@ -256,7 +256,7 @@ def paced(receive: Receive) -> Receive:
 
 
 _MOST_DIGITS = 18
-"""Of a Content-Length: Python reads no number of thousands of digits."""
+"""Most digits of a Content-Length: Python reads no number of thousands of digits."""
 TICKET = "x-ticket"
 """Header of a request: a random name, by which the page asks for its position in the queue."""
 _STORED_ANSWERS = 3

@@ -572,8 +572,8 @@ class FieldOfView:
 
 
 AnyLens = AnyCamera | FieldOfView | float | np.number[Any]
-"""The same, or the focal length [px] or field of view alone: the principal point is then the
-image's centre."""
+"""A camera in any form of ``AnyCamera``, or its focal length [px] or field of view alone: the
+principal point is then the image's centre."""
 
 
 def camera_of(camera: AnyLens | None, size: Size) -> Camera | None:

@@ -40,7 +40,8 @@ Quarter = Float[Tensor, "b h4 w4"]
 STEM = 16
 """Channels at half size."""
 _OFFSETS = (-2, -1, 0, 1, 2)
-"""Where the refinement compares the views: so many pixels at half size from the disparity."""
+"""Differences from the disparity [pixels at half size] at which the refinement compares the
+views."""
 _GROUPS = 4
 _REFINED = 32
 """Groups of features that the refinement compares, and its channels at half size."""
@@ -178,7 +179,7 @@ Scores = Float[Tensor, "b d h4 w4"]
 _CANDIDATES = 2
 """Disparities of the highest scores whose mean is the answer."""
 _WINDOW = 0.15
-"""Of a disparity: what lies so near to it counts for its confidence."""
+"""Share of a disparity: what lies nearer to it than that counts for its confidence."""
 _USUAL_PX = 64
 """A disparity of this size is 1 to the class of the sky."""
 _SKY_WIDTH = 32

@@ -78,7 +78,7 @@ class Surface(NamedTuple):
 
 SIDE_PX = 256
 LEVELS = 9
-"""From 256 pixels down to 1."""
+"""Number of levels of a texture, with sides from 256 pixels down to 1."""
 
 Plane = Float[np.ndarray, "256 256"]
 Picture = Float[np.ndarray, "256 256 3"]

@@ -172,9 +172,11 @@ _OCCLUDER_OFFSETS_PX = ((5, 2), (-2, 5), (-5, -2), (2, -5), (1, 1))
 """Columns and rows from a point on the sky's map to the texels that may hide the sky from it: one
 in each direction, and a neighbour."""
 _OCCLUSION_MARGIN_PX = 10
-"""So near the border of the sky's map nothing is hidden: surfaces beyond it are not known."""
+"""Distance from the border of the sky's map within which nothing is hidden: surfaces beyond it are
+not known."""
 _OCCLUDER_CLEARANCE_M = 0.08
-"""A surface hides the sky if it is so much higher than the point: a slope does not hide its own."""
+"""Least height above a point from which a surface hides the sky from it: a slope does not hide its
+own."""
 _OCCLUSION_DECAY_PER_M = 0.25
 """The higher above the point an occluder is, the less it hides: half as much at 4 m."""
 _OCCLUSION_OF_TEXEL = 0.17
