@@ -332,7 +332,7 @@ def list_pairs(left: str, right: str) -> list[tuple[Path, Path]]:
 class DepthWork:
     """How images or pairs become files of depth, in this process or by workers of an engine.
 
-    ``camera``: of the images (a field of view or a focal length [px] will do), or the rig of pairs.
+    ``camera``: camera of the images (a field of view or focal length [px] will do), or rig of pairs.
     ``with_check``: refuse pairs that are swapped, not rectified or no pair.
     """
 
@@ -597,7 +597,7 @@ class DepthRun:
             jobs: images, pairs or the frames of a video.
             total: how many there are; None: unknown.
             label: what they are called beside the progress.
-            mount: of the camera, where they are frames of one.
+            mount: mount of the camera, where they are frames of one.
         """
         output = self.work.output
         results = DepthResults(

@@ -144,7 +144,7 @@ def _describe_mesh(path: Path) -> FileFacts:
 def _describe_text_file(path: Path, size: Size | None) -> FileFacts:
     """Describe a text file, or a folder of them: a pose, run lengths of a mask, a camera or points.
 
-    ``size``: of an image beside it [px].
+    ``size``: size of an image beside it [px].
     """
     pose_facts = _describe_pose(path)
     if pose_facts is not None:

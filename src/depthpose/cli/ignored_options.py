@@ -420,7 +420,7 @@ def refuse_ignored(command: str, words: Sequence[str]) -> None:
 def refuse_empty(options: Sequence[Option], words: Sequence[str]) -> None:
     """Refuse an empty file or folder name, as a script gives whose variable is unset.
 
-    ``options``: of the command; ``words``: typed after it.
+    ``options``: options of the command; ``words``: words that were typed after it.
     """
     typed, spelling = _parse_words(words)
     for option in options:

@@ -60,7 +60,7 @@ def open_instances(
 
     Args:
         bop: folder of the data set.
-        split: of it.
+        split: name of the split.
         objects: names or numbers of those to keep; empty: all.
         targets: BOP's list of targets; None: all instances.
     """

@@ -53,7 +53,7 @@ class SearchResults(Results[ViewInput, list[PoseEstimate]]):
         """Sort the predictions of earlier runs by images.
 
         Args:
-            folder: of ``poses.json``.
+            folder: folder of ``poses.json``.
             images: names of the images of this run.
             earlier: predictions of earlier runs.
             is_of_image: whether a prediction is of the image of this name.

@@ -130,9 +130,9 @@ def _plan_regions(method: PoseMethod, inputs: PoseInputs, out: Path) -> JobPlan:
 class WantedObjects:
     """Which detections are posed, by their objects.
 
-    ``names``: of all objects of the method. ``labels``: the object of a detector's class, where it
-    is not named so. ``only``: the single object that is wanted; None: all. ``expected``: objects
-    that have a result in every image, detected there or not.
+    ``names``: names of all objects of the method. ``labels``: the object of a detector's class,
+    where it is not named so. ``only``: the single object that is wanted; None: all. ``expected``:
+    objects that have a result in every image, detected there or not.
     """
 
     names: Sequence[str]
@@ -418,7 +418,7 @@ def _match_to_depths(
         files: masks, detections or pictures.
         depth: option that names the depth images: one file, or a folder.
         source: option that names the files, for errors.
-        kind: of the files, for errors.
+        kind: what the files are called in errors.
 
     Returns:
         The file of each depth image, by its stem.
@@ -502,7 +502,7 @@ def _with_color(
 ) -> JobPlan:
     """Return a plan whose depth images have the colour pictures of their names, if any are given.
 
-    ``models``: of the objects that may be visible.
+    ``models``: models of the objects that may be visible.
     """
     if inputs.color is None:
         if inputs.color_camera is not None or inputs.color_from_depth is not None:

@@ -44,9 +44,9 @@ def prepare_masks(
     Args:
         kinds: each ``truth`` (annotated masks), ``predicted`` (those that came with
             Linemod_preprocessed), a JSON file of BOP detections, or weights of a segmentation.
-        dataset: whose instances are masked.
+        dataset: data set whose instances are masked.
         out: folder of the run; segmented masks are written below it.
-        device: that segments.
+        device: device that segments.
     """
     paths = [mask_path(kind) for kind in kinds]
     names = name_files(kinds, paths)

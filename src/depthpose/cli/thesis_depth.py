@@ -50,7 +50,7 @@ def reproduce_table(
         dataset: frames with truth.
         methods: each with the name of the printed row that it reproduces, or "" for none.
         out: folder of the files.
-        protocol: by which the predictions are measured.
+        protocol: protocol by which the predictions are measured.
         caps_m: truth beyond a cap does not count; a row for each.
         pictures: frames of each method that the page shows.
     """

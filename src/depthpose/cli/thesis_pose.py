@@ -73,9 +73,9 @@ def open_views(net: GeoPoseNet, data: PoseDataOptions, number: int | None, synth
     """Read views of a data set, or render synthetic ones of the network's objects.
 
     Args:
-        net: whose names the objects get.
+        net: network whose names the objects get.
         data: the data set; without a folder the views are synthetic.
-        number: of the data set's views, spread evenly; None: all.
+        number: how many of the data set's views, spread evenly; None: all.
         synthetic: number of synthetic views.
     """
     if data.folder is None:
@@ -120,7 +120,7 @@ def reproduce_by_object(
     """Make table 3.1 or 3.2: predict what is missing, measure, join with published rows, write.
 
     Args:
-        number: of the table; 3.2 has published rows.
+        number: number of the table; 3.2 has published rows.
         data: the data set.
         options: how poses are estimated, measured and shown.
         weights: files or names, each a method.
@@ -193,10 +193,10 @@ def _draw_figure_3_5(dataset: BopDataset, predictions: Path, out: Path, number: 
     """Draw true and estimated poses of some instances, and write the pictures.
 
     Args:
-        dataset: with the instances.
+        dataset: data set with the instances.
         predictions: folder of a method's ``poses.json``.
         out: folder of the report.
-        number: of instances, spread evenly; one that the method has no estimate of is left out.
+        number: how many instances, spread evenly; one without an estimate is left out.
     """
     estimates = {p.estimate.name: p.estimate for p in read_predictions(predictions)}
     pictures: list[Picture] = []

@@ -115,9 +115,9 @@ class NearestImageBaseline:
     is twice as far.
     """
 
-    dataset: Dataset  #: of training
-    indices: list[int]  #: of its frames that have truth and a rig
-    thumbnails: Float[Tensor, "n d"]  #: of the left images of these frames
+    dataset: Dataset  #: data set of the training
+    indices: list[int]  #: indices of its frames that have truth and a rig
+    thumbnails: Float[Tensor, "n d"]  #: thumbnails of the left images of these frames
 
     @classmethod
     def fit(cls, dataset: Dataset, progress: Progress = iter) -> "NearestImageBaseline":

@@ -333,7 +333,7 @@ def estimate_from_virtual(
     Args:
         image: the image and its camera.
         rig: config of the generator, which says the virtual rig.
-        match: at the size of the synthesised view.
+        match: the match, at the size of the synthesised view.
         right: the synthesised view.
 
     Returns:

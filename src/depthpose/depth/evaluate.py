@@ -110,12 +110,12 @@ class EvaluationRow:
     The columns of a table are the fields in this order.
     """
 
-    method: str | None = None  #: that predicted; None, as in the next four fields: not known
+    method: str | None = None  #: method that predicted; None, as in the next four fields: not known
     input: str | None = None  #: which images the method had
     speed: str | None = None  #: at which its networks ran
     weights: str | None = None  #: name of their file
     weights_sha256: str | None = None  #: the first 12 digits
-    protocol: str  #: by which the frames were measured
+    protocol: str  #: protocol by which the frames were measured
     dataset: str  #: its name
     frame: str | None = None  #: name of the frame, in a row of one frame
     cap_m: float | None  #: truth beyond it does not count; None for disparity
@@ -162,7 +162,7 @@ class Measured:
 
     frame: str  #: its name
     cap_m: float | None  #: None for disparity
-    pixels: int  #: that were compared
+    pixels: int  #: number of pixels that were compared
     coverage: float  #: share of the pixels with truth that have a prediction
     metrics: Mapping[str, float]  #: by name; empty where no pixel was compared
     #: mean error of each tenth of the pixels, by rising confidence; None without a confidence
@@ -179,7 +179,7 @@ class _Prepared:
     depth_m: Map | None  # where depth was predicted and no disparity
     confidence: Map | None
     rig: StereoRig | None
-    view_metrics: dict[str, float]  # of the synthesised right view
+    view_metrics: dict[str, float]  # metrics of the synthesised right view
 
 
 def evaluate(

@@ -477,7 +477,9 @@ class Target:
     """A kind of graph that weights are exported as."""
 
     fits: Callable[[DepthWeights], bool]  # whether weights may be exported so by default
-    export: Callable[[DepthWeights, dict[str, Any]], Export]  # of weights, and facts for its user
+    export: Callable[
+        [DepthWeights, dict[str, Any]], Export
+    ]  # takes weights, and facts for its user
 
 
 def depth_export(weights: DepthWeights, what: str | None, facts: dict[str, Any]) -> Export:
@@ -486,7 +488,7 @@ def depth_export(weights: DepthWeights, what: str | None, facts: dict[str, Any])
     Args:
         weights: the networks.
         what: a key of ``TARGETS``; None: the first that fits the weights.
-        facts: of the weights, for the user of the file.
+        facts: facts of the weights, for the user of the file.
 
     Raises:
         InputError: there is no such target.

@@ -229,7 +229,7 @@ class MountFilter:
     and is smoothed (a Kalman filter whose state is the last frame's :class:`Ground`).
     """
 
-    last: Ground | None = None  #: of the last frame with a road
+    last: Ground | None = None  #: road of the last frame that shows one
 
 
 def find_mount(
@@ -363,7 +363,7 @@ def scale_by_mount(
     Args:
         estimate: depth by the network.
         image: the image of which it is. Height and tilt that its camera states are used.
-        mount: by the frames before; it is updated by this frame.
+        mount: the mount by the frames before; it is updated by this frame.
         network: config of the network, with the standard deviation of its depth.
 
     Returns:
@@ -472,8 +472,8 @@ def scale_by_distance(
     """Scale an estimate so that the depth around one pixel is the measured one.
 
     Args:
-        estimate: with depth.
-        name: of the image, for errors.
+        estimate: an estimate with depth.
+        name: name of the image, for errors.
         distance: column, row [px] and camera z [m] of the measured point. Its depth in the estimate
             is the median of the 5x5 pixels around it.
 

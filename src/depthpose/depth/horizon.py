@@ -113,8 +113,8 @@ def _connect_edges(
     """Connect neighbouring edge pixels of similar gradients to chains.
 
     Args:
-        rows: of the edge pixels.
-        columns: of the edge pixels.
+        rows: rows of the edge pixels.
+        columns: columns of the edge pixels.
         direction_x: unit vectors of their gradients.
         direction_y: the same along the columns.
         shape: rows and columns of the image.

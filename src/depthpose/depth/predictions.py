@@ -77,12 +77,12 @@ def write_estimate(
     ``NAME.disparity_px.npy``, which is the disparity of the frame's own rig.
 
     Args:
-        folder: where the files go.
+        folder: folder of the files.
         pair: the input; its name is ``NAME``.
         estimate: what was estimated from it.
         range_m: depths of the first and the last colour.
         cloud_m: distance up to which a cloud (``DepthEstimate.cloud``) has points; None: no cloud.
-        min_confidence: of the cloud's points.
+        min_confidence: least confidence of the cloud's points.
     """
     depth_m = estimate.depth_m
     if depth_m is None:
@@ -153,9 +153,9 @@ def read_disparity(
     published script.
 
     Args:
-        folder: of the predictions.
-        name: of the frame.
-        camera: of the frame.
+        folder: folder of the predictions.
+        name: name of the frame.
+        camera: camera of the frame.
         with_disparity_png: ``NAME.png`` is disparity x 256, else metres x 256.
 
     Raises:
@@ -266,7 +266,7 @@ class DepthResults(Results[StereoInput, DepthEstimate]):
     folder: Path  #: claimed before (:func:`depthpose.core.run.claim_folder`)
     range_m: tuple[float, float] = COLOR_RANGE_M
     cloud_m: float | None = None  #: None: no cloud is written
-    min_confidence: float | None = None  #: of clouds
+    min_confidence: float | None = None  #: least confidence of a cloud's points
 
     def is_finished(self, job: Job[StereoInput]) -> bool:
         """Whether an earlier run wrote the whole estimate, with a cloud if there shall be one."""

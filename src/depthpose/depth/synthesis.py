@@ -460,7 +460,7 @@ class SynthesisedViews:
     """Right views of left images; and maps of the left views where the generator estimates them."""
 
     right: Views  #: the right views, RGB in [0, 1]
-    disparity_px: Maps | None = None  #: of the left views, without the sky
+    disparity_px: Maps | None = None  #: disparity of the left views, without the sky
     #: probability of disparities within 15 % of ``disparity_px``; in the sky that of the sky
     confidence: Maps | None = None
     is_sky: Bool[Tensor, "b h w"] | None = None  #: where the sky is more probable than not

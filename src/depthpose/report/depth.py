@@ -53,12 +53,12 @@ def depth_section(
     """Show one estimate: the facts, pictures with the bars of their colours, the cloud in 3D.
 
     Args:
-        title: of the section.
+        title: title of the section.
         pair: the input.
         estimate: its depth.
         text: a paragraph below the title.
         range_m: depth of the brightest and of the darkest colour.
-        error: of each pixel, and the truth, where they are known.
+        error: error of each pixel, and the truth, where they are known.
         with_image: show the left image too.
     """
     _, far_m = range_m

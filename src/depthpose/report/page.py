@@ -142,7 +142,7 @@ def colored_lines(ends_m: Float[Tensor, "n 2 3"], color: tuple[float, float, flo
 def frame_axes(origin_m: Float[Tensor, "3"], R: Float[Tensor, "3 3"], length_m: float) -> Lines:
     """Draw the axes of a frame (columns of R) in the camera frame: x red, y green, z blue.
 
-    ``length_m``: of each axis.
+    ``length_m``: length of each axis.
     """
     tips_m = origin_m + length_m * R.mT
     ends_m = torch.stack([origin_m.expand(3, 3), tips_m], 1)
@@ -307,7 +307,7 @@ class Section:
     facts: Sequence[tuple[str, str]] = ()  #: names and values
     pictures: Sequence[Picture | Drawing] = field(default_factory=tuple)
     films: Sequence[Film] = ()
-    rows: Sequence[Row] = ()  #: of a table that can be sorted
+    rows: Sequence[Row] = ()  #: rows of a table that can be sorted
     tables: Mapping[str, Sequence[Sequence[str]]] = field(default_factory=dict)
     """Small tables by their captions; the rows of each are of equal length."""
     scenes: Sequence[Scene] = field(default_factory=tuple)  #: 3D views

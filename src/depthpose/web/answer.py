@@ -24,7 +24,7 @@ class Shown:
     file: str
     caption: str
     values: str | None = None  #: file with a number for each pixel, shown under the pointer
-    unit: str = ""  #: of these numbers
+    unit: str = ""  #: unit of these numbers
     scale: Scale | None = None  #: what the colours mean; None: they are no numbers
 
 
@@ -36,7 +36,7 @@ class Answer:
     sentence: str
     facts: Sequence[tuple[str, str]]  #: names and values
     scene: Scene
-    terms: str = ""  #: of the weights, where they restrict use
+    terms: str = ""  #: terms of the weights, where they restrict use
     tables: Mapping[str, Sequence[Sequence[str]]] = field(default_factory=dict)  #: by captions
     pictures: Sequence[Shown] = ()
     files: Mapping[str, bytes] = field(default_factory=dict)  #: by names
@@ -93,8 +93,8 @@ class Form:
         """Read the camera file that was sent, or make a camera of fields.
 
         Args:
-            keys: of a camera file, from the fields; None: left empty.
-            size: of the image [px], for a camera file without it.
+            keys: keys of a camera file, from the fields; None: left empty.
+            size: size of the image [px], for a camera file without it.
         """
         if "camera" in self.files:
             return read_camera(self.files["camera"], size)

@@ -93,8 +93,8 @@ _TUM_UNIT_M = 1 / 5000
 _DOFFS = "cx_right_minus_left_px"
 _OPTIONAL_LINES = ("width", "height", "focal_y_px", _DOFFS)
 _MAX_FOCAL_PX = 1e6  # larger numbers are no focal length
-_LARGEST_NUMBER = 1e300  # of JSON: larger whole numbers have no float
-_BARE_NUMBERS = 20  # that are read of a file of bare numbers: more than any format has
+_LARGEST_NUMBER = 1e300  # largest number of JSON: larger whole numbers have no float
+_BARE_NUMBERS = 20  # numbers that are read of a file of bare numbers: more than any format has
 
 
 def _middlebury_facts(path: AnyPath) -> CameraFacts:

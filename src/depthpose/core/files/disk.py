@@ -33,7 +33,7 @@ MAX_TEXT_BYTES = 2**26  # a table of a million points, annotations of ten thousa
 MAX_LIST_BYTES = 2**20  # largest text that lists a few numbers: a calibration, a camera, a config
 _MAX_MEMORY = 700_000_000  # [bytes] of JSON once it is read, estimated from its text
 _MAX_YAML_DEPTH = 50  # lists in lists of YAML
-_MAX_YAML_VALUES = 2_000_000  # of YAML whose references are written out
+_MAX_YAML_VALUES = 2_000_000  # most values of YAML whose references are written out
 _SAFE_LOADER: type[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 """Ten times faster where PyYAML was built with libyaml, as its wheels are."""
 _MERGE = "tag:yaml.org,2002:merge"  # tag of the key ``<<``

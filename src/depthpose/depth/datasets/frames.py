@@ -69,8 +69,8 @@ def read_object_calibration(
 
     Args:
         path: the file.
-        width: of the images.
-        height: of the images.
+        width: width of the images [px].
+        height: height of the images [px].
         is_grey: read the grey pair, P0 and P1, in place of the colour pair.
 
     Raises:
@@ -102,9 +102,9 @@ def read_plain_calibration(path: Path, name: str, width: int, height: int) -> St
 
     Args:
         path: the file.
-        name: of the pair.
-        width: of the images, if the file has one calibration for all pairs.
-        height: of the images, likewise.
+        name: name of the pair.
+        width: width of the images [px], for a file with one calibration for all pairs.
+        height: height of the images [px], likewise.
 
     Raises:
         InputError: there is no calibration of the pair, several, or one that is damaged.
@@ -279,7 +279,7 @@ class Frame:
     depth: Path | None = None
     #: disparity of the left image, 16-bit PNG (x 256), PFM or NPY, of occluded pixels too
     disparity: Path | None = None
-    disparity_noc: Path | None = None  #: the same, of the pixels that both views show only
+    disparity_noc: Path | None = None  #: disparity of those pixels alone that both views show
     sky: Path | None = None  #: 8-bit PNG of the left image, not 0 where it shows the sky
 
     def seen_files(self, *, with_right: bool = True) -> list[Path]:

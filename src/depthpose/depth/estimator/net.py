@@ -339,7 +339,7 @@ class FakestereoNet:
         Args:
             images: inputs; or pictures, or a batch of them as one array or tensor. An iterator is
                 read as its images are needed.
-            camera: of the pictures, as for :meth:`estimate`; inputs have their own.
+            camera: camera of the pictures, as for :meth:`estimate`; inputs have their own.
             focal_px: the focal length alone [px], in place of ``camera``.
             fov_deg: the horizontal field of view alone [degrees], in place of both.
             with_check: of pairs, as for :meth:`estimate`.

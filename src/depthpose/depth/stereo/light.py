@@ -230,7 +230,7 @@ class SkyHead(nn.Module):
         Args:
             levels: features from 1/4 size down.
             quarter_px: disparity at 1/4 size. Detached: no gradient reaches the matcher by it.
-            confidence: of it, likewise: what is surely matched as near is no sky.
+            confidence: its confidence, likewise: what is surely matched as near is no sky.
         """
         quarter, *coarser = levels
         context: list[Tensor] = []  # of the coarser levels; the coarsest one has none
@@ -426,7 +426,7 @@ class LightStereo(StereoNetwork):
 
     @property
     def encoder(self) -> LiteEncoder:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Of ImageNet, in the features."""
+        """The part that may begin with weights of ImageNet: the encoder of the features."""
         return self.features.encoder
 
     @property
@@ -457,7 +457,7 @@ class LightStereo(StereoNetwork):
         Args:
             left: normalised left views.
             right: normalised right views.
-            max_disparity_px: so many disparities are searched.
+            max_disparity_px: number of disparities that are searched.
             first_px: the least of them, a multiple of 4; negative where rigs have principal points
                 apart.
             with_confidence: say how sure each pixel is.
