@@ -332,7 +332,7 @@ def list_pairs(left: str, right: str) -> list[tuple[Path, Path]]:
 class DepthWork:
     """How images or pairs become files of depth, in this process or by workers of an engine.
 
-    ``camera``: camera of the images (a field of view or focal length [px] will do), or rig of pairs.
+    ``camera``: camera of the images (a field of view or focal length [px] does), or rig of a pair.
     ``with_check``: refuse pairs that are swapped, not rectified or no pair.
     """
 
