@@ -26,7 +26,7 @@ from tests.pose.synthetic_objects import (
 )
 
 from depthpose.cli import main, pose_methods
-from depthpose.cli.pose_methods import choose_objects, match_names
+from depthpose.cli.pose_dataset import choose_objects, match_names
 from depthpose.core.camera import Camera, write_camera
 from depthpose.core.errors import InputError
 from depthpose.core.files import (
@@ -590,14 +590,15 @@ def test_two_inputs_of_one_name_are_refused(
     words = ["pose", "predict", "--weights", str(weights), "--out", str(tmp_path / "out")]
     cloud = ["--cloud", str(tmp_path / "clouds"), "--object", "bracket"]
     assert main([*words, *cloud]) == 2
-    said = "a.pcd and a.ply would both be 'a' in the results; rename one, or move it"
-    assert said in capsys.readouterr().err
+    clouds = tmp_path / "clouds"
+    message = f"{clouds / 'a.pcd'} and {clouds / 'a.ply'} would both be 'a' in the results; rename"
+    assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
     views = frames(tmp_path)
     mask = read_image(tmp_path / "mask" / "seen.png")
     write_image(tmp_path / "mask" / "seen.jpg", mask)
     assert main([*words, *views]) == 2
-    assert "seen.jpg and seen.png would both be 'seen'" in capsys.readouterr().err
+    assert "mask/seen.png would both be 'seen'" in capsys.readouterr().err
 
 
 def test_a_cloud_for_weights_that_regress_a_depth_image_is_refused(

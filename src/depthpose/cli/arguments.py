@@ -124,9 +124,9 @@ def _with_help(
     """Annotate the types of options with their placeholders and texts for ``--help``.
 
     Args:
-        types: of the options, by name.
-        parameter: of the command, that they are.
-        texts: of the options, by name.
+        types: types of the options, by name.
+        parameter: parameter of the command that the options belong to.
+        texts: help texts of the options, by name.
 
     Returns:
         The annotated types, and the options.

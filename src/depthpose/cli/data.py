@@ -24,7 +24,8 @@ if TYPE_CHECKING:  # --help must not load torch
 _FRAMES_PER_SCENE = 50
 _SCENES_PER_SEED = 1000
 _MAX_SEED = 10**6 - 1
-"""Of frames of objects: scene numbers have nine digits at most, the last three count its scenes."""
+"""Largest seed of frames of objects: scene numbers have nine digits at most, and the last three
+count the scenes of a seed."""
 
 
 def make_streets(

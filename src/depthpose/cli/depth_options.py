@@ -11,7 +11,7 @@ from depthpose.core.errors import InputError
 from depthpose.depth.config import Answer, BaselineName, MatcherConfig, Speed
 
 _EXPONENTS = {"": 0, "K": 1, "M": 2, "G": 3, "T": 4}
-"""Of 1000, or of 1024, by the prefix of a size in bytes."""
+"""Exponents of 1000, or of 1024, by the prefix of a size in bytes."""
 
 
 def _parse_bytes(text: str) -> int:

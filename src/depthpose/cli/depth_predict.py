@@ -2,7 +2,6 @@
 
 import re
 import sys
-from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
@@ -34,7 +33,7 @@ from depthpose.core.files import (
     read_video,
     write_video,
 )
-from depthpose.core.files.disk import find_partners, read_text
+from depthpose.core.files.disk import find_partners, read_text, refuse_equal_stems
 from depthpose.core.files.images import LISTED_SUFFIXES, refuse_among_inputs
 from depthpose.core.runner import Job, run_jobs
 from depthpose.depth.config import Answer, MatcherConfig, SGBMConfig
@@ -43,9 +42,9 @@ from depthpose.depth.ground import MountFilter, scale_by_distance
 from depthpose.depth.predictions import (
     CLOUD_M,
     ENDINGS,
-    LAST,
     DepthResults,
     Estimator,
+    is_finished,
     read_estimate,
     read_ground,
 )
@@ -289,12 +288,10 @@ def list_sources(words: Sequence[str], out: Path) -> list[Path]:
     sources: list[Path] = []
     for word in words:
         sources += [Path(word)] if _is_video(word) else list_images(word)
-    stem_counts = Counter(path.stem for path in sources)
-    repeated = next((stem for stem, count in stem_counts.items() if count > 1), None)
-    if repeated is not None:
-        raise InputError(f"two inputs are called {repeated!r}, and so would their results be.")
+    refuse_equal_stems(sources)
+    stems = [path.stem for path in sources]
     for video in filter(_is_video, sources):
-        frame = next((stem for stem in stem_counts if _is_frame_name(stem, video)), None)
+        frame = next((stem for stem in stems if _is_frame_name(stem, video)), None)
         if frame is not None:
             raise InputError(
                 f"an input is called {frame!r}, as a frame of a video would be, and so would their "
@@ -321,11 +318,9 @@ def list_pairs(left: str, right: str) -> list[tuple[Path, Path]]:
     """
     lefts = list_images(left)
     rights = list_images(right)
+    refuse_equal_stems(lefts)
     left_stems = [path.stem for path in lefts]
     right_stems = [path.stem for path in rights]
-    repeated = next((stem for stem in left_stems if left_stems.count(stem) > 1), None)
-    if repeated is not None:
-        raise InputError(f"{left}: two images are called {repeated!r}, so would their results.")
     are_files = lefts == [Path(left)] and rights == [Path(right)]
     if not are_files:
         partners = find_partners(left_stems, right_stems, f"{left} and {right}")
@@ -337,7 +332,7 @@ def list_pairs(left: str, right: str) -> list[tuple[Path, Path]]:
 class DepthWork:
     """How images or pairs become files of depth, in this process or by workers of an engine.
 
-    ``camera``: of the images (a field of view or a focal length [px] will do), or the rig of pairs.
+    ``camera``: camera of the images (a field of view or focal length [px] does), or rig of a pair.
     ``with_check``: refuse pairs that are swapped, not rectified or no pair.
     """
 
@@ -375,7 +370,7 @@ class DepthWork:
     ) -> list[DepthEstimate | InputError]:
         """Estimate inputs together; ``mount``: of the camera, where all are frames of one."""
         named_inputs = [(depth_input.name, depth_input) for depth_input in inputs]
-        estimates = net.estimate_together(named_inputs, with_check=self.with_check, mount=mount)
+        estimates = net.estimate_batch(named_inputs, with_check=self.with_check, mount=mount)
         if self.scale.known_distance is None:
             return estimates
         return [
@@ -519,9 +514,7 @@ def write_depth_page(
 ) -> None:
     """Write a page of some of the finished depth maps, of every failure and of every warning."""
     # The finished results of each input, and those that are shown.
-    finished = {
-        name for name in run.read_results(out) if run.is_whole(out, name, [f"{name}.{LAST}"])
-    }
+    finished = {name for name in run.read_results(out) if is_finished(out, name)}
     names_of = {files: _result_names(files, finished) for files in sources}
     names = [name for names_of_source in names_of.values() for name in names_of_source]
     chosen = {names[k] for k in spread_evenly(len(names), MOST_VIEWS)}
@@ -604,7 +597,7 @@ class DepthRun:
             jobs: images, pairs or the frames of a video.
             total: how many there are; None: unknown.
             label: what they are called beside the progress.
-            mount: of the camera, where they are frames of one.
+            mount: mount of the camera, where they are frames of one.
         """
         output = self.work.output
         results = DepthResults(

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from depthpose.cli.pose_methods import read_pose
+from depthpose.cli.pose_transforms import read_pose
 from depthpose.core import camera as cameras
 from depthpose.core import files
 from depthpose.core.errors import InputError
@@ -144,7 +144,7 @@ def _describe_mesh(path: Path) -> FileFacts:
 def _describe_text_file(path: Path, size: Size | None) -> FileFacts:
     """Describe a text file, or a folder of them: a pose, run lengths of a mask, a camera or points.
 
-    ``size``: of an image beside it [px].
+    ``size``: size of an image beside it [px].
     """
     pose_facts = _describe_pose(path)
     if pose_facts is not None:

@@ -57,9 +57,18 @@ def _is_not_on_ray(typed: TypedOptions) -> bool:
     return not _is_on_ray(typed)
 
 
+def is_registration(method: str | None, *, has_cad: bool) -> bool:
+    """Whether models are registered without a network: by ``--method``, or as CAD files are.
+
+    ``method``: the word of ``--method``; None: it was not typed.
+    """
+    return method == "register" or (method is None and has_cad)
+
+
 def _is_registered(typed: TypedOptions) -> bool:
-    """Whether poses come from CAD files without a network."""
-    return "register" in typed["method"] or ("cad" in typed and "method" not in typed)
+    """Whether the typed options ask for a registration."""
+    method = " ".join(typed["method"]) if "method" in typed else None
+    return is_registration(method, has_cad="cad" in typed)
 
 
 def _is_searched(typed: TypedOptions) -> bool:
@@ -411,7 +420,7 @@ def refuse_ignored(command: str, words: Sequence[str]) -> None:
 def refuse_empty(options: Sequence[Option], words: Sequence[str]) -> None:
     """Refuse an empty file or folder name, as a script gives whose variable is unset.
 
-    ``options``: of the command; ``words``: typed after it.
+    ``options``: options of the command; ``words``: words that were typed after it.
     """
     typed, spelling = _parse_words(words)
     for option in options:

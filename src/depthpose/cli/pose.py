@@ -63,15 +63,14 @@ def predict(
         pose_inputs = replace(pose_inputs, depth=str(depth))
 
     # The estimator: a trained network, or registration of CAD files. Workers build their own.
-    register = options.RegisterOptions(
-        method=estimates.method,
-        cad=pose_inputs.cad,
-        cad_unit=pose_inputs.cad_unit,
-        symmetry=pose_inputs.symmetry,
-    )
-    weights = estimates.weights
+    weights = estimates.choose_weights(estimates.weights, pose_inputs.cad)
     source = make_method_source(
-        weights, register, pose_inputs.unit, dataset, estimates.config, pose_inputs.base_from_camera
+        weights,
+        pose_inputs,
+        pose_inputs.unit,
+        dataset,
+        estimates.config,
+        pose_inputs.base_from_camera,
     )
     batch = estimates.batch
     if engine.engine == "ray":
@@ -128,8 +127,9 @@ def evaluate(
         objects: keep these alone, by name or number.
         adds: ADD-S for declared symmetric objects (of LineMOD eggbox and glue), or for all.
     """
-    from depthpose.cli.pose_evaluate import measure, open_instances
-    from depthpose.cli.pose_methods import build_methods, predict_instances, prepare_masks
+    from depthpose.cli.pose_evaluate import measure, open_instances, predict_instances
+    from depthpose.cli.pose_masks import prepare_masks
+    from depthpose.cli.pose_methods import build_methods
     from depthpose.core.config import config_to_dict
     from depthpose.core.run import claim_folder
     from depthpose.pose.config import EvaluationConfig
@@ -187,8 +187,9 @@ def track(
     if find_rank().world > 1:
         raise InputError("a sequence is followed by one process; start one")
     config = EstimateConfig(device=frames.device, min_certainty=frames.min_certainty)
+    chosen_weights = register.choose_weights(weights, register.cad)
     source = make_method_source(
-        weights, register, frames.unit, frames, config, frames.base_from_camera
+        chosen_weights, register, frames.unit, frames, config, frames.base_from_camera
     )
     method = source.build()
     if method.track is None:

@@ -10,7 +10,10 @@ from typing import Any
 
 from tqdm import tqdm
 
-from depthpose.cli.pose_methods import dataset_settings, distinct_names
+from depthpose.cli.file_names import distinct_names
+from depthpose.cli.pose_dataset import dataset_settings, match_names
+from depthpose.cli.pose_masks import Masks
+from depthpose.cli.pose_methods import PoseMethod
 from depthpose.core.checkpoint import file_sha256
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image
@@ -28,6 +31,12 @@ from depthpose.pose.evaluate import (
     select_targets,
 )
 from depthpose.pose.mesh import symmetry_transforms
+from depthpose.pose.predictions import (
+    predict,
+    read_predictions,
+    results_name,
+    write_bop_results,
+)
 from depthpose.report import page
 from depthpose.report.page import Section
 from depthpose.report.pose import pose_section
@@ -51,7 +60,7 @@ def open_instances(
 
     Args:
         bop: folder of the data set.
-        split: of it.
+        split: name of the split.
         objects: names or numbers of those to keep; empty: all.
         targets: BOP's list of targets; None: all instances.
     """
@@ -63,6 +72,26 @@ def open_instances(
     names = ", ".join(model.name for model in dataset.objects.values())
     print(f"{bop} {split}: {len(dataset)} instances, layout {dataset.layout}; objects: {names}")
     return dataset
+
+
+def predict_instances(
+    dataset: BopDataset, method: PoseMethod, masks: Masks, out: Path, batch: int = 1
+) -> Path:
+    """Estimate every instance that is not estimated yet, and write ``poses.json`` and BOP's csv."""
+    jobs = masks.make_jobs(match_names(dataset, method.models))
+    home = out / "predictions" / f"{method.name}_{masks.name}"
+    settings = {
+        **method.settings,
+        "masks": masks.name,
+        **masks.settings,
+        **dataset_settings(dataset),
+    }
+    written = predict(method.estimate_many, jobs, home, settings, batch)
+    label = f"{method.name}, {masks.name} masks"
+    for _ in tqdm(written, label, total=len(jobs), disable=None, unit=" instances"):
+        pass
+    write_bop_results(home / results_name(dataset), read_predictions(home))
+    return home
 
 
 def measure_each(

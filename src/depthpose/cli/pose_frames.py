@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from depthpose.cli import pose_jobs, pose_methods, pose_output
+from depthpose.cli import file_names, pose_dataset, pose_jobs, pose_output, pose_transforms
 from depthpose.cli.pose_methods import PoseMethod
 from depthpose.cli.pose_options import DataSetOptions, PoseInputs, SequenceOptions
 from depthpose.core.errors import InputError
@@ -53,7 +53,7 @@ class SearchResults(Results[ViewInput, list[PoseEstimate]]):
         """Sort the predictions of earlier runs by images.
 
         Args:
-            folder: of ``poses.json``.
+            folder: folder of ``poses.json``.
             images: names of the images of this run.
             earlier: predictions of earlier runs.
             is_of_image: whether a prediction is of the image of this name.
@@ -200,12 +200,12 @@ def search_dataset(
     dataset = open_bop(options.bop, options.split)
     if options.targets is not None:
         dataset = select_targets(dataset, read_targets(options.targets, options.bop))
-    dataset = pose_methods.choose_objects(dataset, method, object)
-    names = pose_methods.match_names(dataset, method.models)
+    dataset = pose_dataset.choose_objects(dataset, method, object)
+    names = pose_dataset.match_names(dataset, method.models)
     numbers = {name: number for number, name in names.items()}
     settings = {
         **method.settings,
-        **pose_methods.dataset_settings(dataset),
+        **pose_dataset.dataset_settings(dataset),
         "masks": "search",
         "find": sorted(numbers),
     }
@@ -268,8 +268,8 @@ def track_files(method: PoseMethod, frames: SequenceOptions, out: Path) -> int:
     settings = {**method.settings, "track": object, **pose_jobs.unit_settings(frames.unit)}
     first_pose = None
     if frames.first is not None:
-        first_pose = pose_methods.read_pose(frames.first)
-        settings["first"] = pose_methods.name_with_checksum(frames.first)
+        first_pose = pose_transforms.read_pose(frames.first)
+        settings["first"] = file_names.name_with_checksum(frames.first)
     if frames.cloud is not None:
         jobs = pose_jobs.cloud_jobs(frames.cloud, frames.unit or "m", object, out)
     else:
@@ -286,11 +286,11 @@ def track_dataset(method: PoseMethod, frames: SequenceOptions, out: Path) -> int
     """Follow each object of the method, or the one named, in each scene; give the exit code."""
     assert frames.bop is not None
     dataset = open_bop(frames.bop, frames.split)
-    dataset = pose_methods.choose_objects(dataset, method, frames.object)
-    names = pose_methods.match_names(dataset, method.models)
+    dataset = pose_dataset.choose_objects(dataset, method, frames.object)
+    names = pose_dataset.match_names(dataset, method.models)
     settings = {
         **method.settings,
-        **pose_methods.dataset_settings(dataset),
+        **pose_dataset.dataset_settings(dataset),
         "track": sorted(names.values()),
     }
     pose_output.claim_for_dataset(out, settings, dataset)

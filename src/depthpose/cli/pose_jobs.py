@@ -10,14 +10,14 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from depthpose.cli import pose_methods
+from depthpose.cli import file_names, pose_methods, pose_transforms
 from depthpose.cli.pose_methods import PoseMethod
 from depthpose.cli.pose_options import PoseInputs
 from depthpose.core.camera import AnyLens
 from depthpose.core.checkpoint import file_sha256
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import CLOUD_READERS, MAP_SUFFIXES, list_images, read_stored_depth
-from depthpose.core.files.disk import natural_order
+from depthpose.core.files.disk import natural_order, refuse_equal_stems
 from depthpose.core.files.images import refuse_among_inputs
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
@@ -130,9 +130,9 @@ def _plan_regions(method: PoseMethod, inputs: PoseInputs, out: Path) -> JobPlan:
 class WantedObjects:
     """Which detections are posed, by their objects.
 
-    ``names``: of all objects of the method. ``labels``: the object of a detector's class, where it
-    is not named so. ``only``: the single object that is wanted; None: all. ``expected``: objects
-    that have a result in every image, detected there or not.
+    ``names``: names of all objects of the method. ``labels``: the object of a detector's class,
+    where it is not named so. ``only``: the single object that is wanted; None: all. ``expected``:
+    objects that have a result in every image, detected there or not.
     """
 
     names: Sequence[str]
@@ -186,7 +186,7 @@ def cloud_jobs(cloud: Path, unit: Unit, object: str, out: Path) -> list[PoseJob[
     files.sort(key=natural_order)
     if not files:
         raise InputError(f"{cloud}: no {', '.join(suffixes)} file there; give a cloud, or a folder")
-    _refuse_equal_stems(files)
+    refuse_equal_stems(files)
     refuse_among_inputs(out, [cloud], files)
     jobs: list[PoseJob[Any]] = []
     for path in files:
@@ -302,7 +302,7 @@ def box_jobs(
     """Make a job of each box in each depth image: NAME, or of several NAME_1, NAME_2, ..."""
     depths = _list_depths(depth)
     refuse_among_inputs(out, [depth], depths)
-    _refuse_equal_stems(depths)
+    refuse_equal_stems(depths)
     detections = [Detection(object=object, box=parse_box(text)) for text in boxes]
     jobs: list[PoseJob[Any]] = []
     for path in depths:
@@ -324,7 +324,7 @@ def detection_file_jobs(
     ``detections``: a file, or a folder of files with the names of the images.
     """
     depths = _list_depths(depth)
-    _refuse_equal_stems(depths)
+    refuse_equal_stems(depths)
     files = [detections]
     if detections.is_dir():
         files = _list_visible(detections, (".json", ".txt"))
@@ -418,13 +418,13 @@ def _match_to_depths(
         files: masks, detections or pictures.
         depth: option that names the depth images: one file, or a folder.
         source: option that names the files, for errors.
-        kind: of the files, for errors.
+        kind: what the files are called in errors.
 
     Returns:
         The file of each depth image, by its stem.
     """
-    _refuse_equal_stems(depths)
-    _refuse_equal_stems(files)
+    refuse_equal_stems(depths)
+    refuse_equal_stems(files)
     by_name = {path.stem: path for path in files}
     if len(depths) == len(files) == 1 and not depth.is_dir():
         by_name = {depths[0].stem: files[0]}
@@ -452,7 +452,7 @@ def frame_jobs(
     """Make a job of a whole depth image, or of every one of a folder, without masks."""
     depths = _list_depths(depth)
     refuse_among_inputs(out, [depth], depths)
-    _refuse_equal_stems(depths)
+    refuse_equal_stems(depths)
     jobs: list[PoseJob[Any]] = []
     for path in depths:
         read = partial(view_input, path, None, camera, object, path.stem, unit)
@@ -470,14 +470,14 @@ def _with_background(plan: JobPlan, inputs: PoseInputs) -> JobPlan:
                 f"--bin {inputs.bin}: where is it? Give --bin-pose, a text file with its 4x4 "
                 "matrix camera_from_model in metres, or --empty-frame in place of both"
             )
-        pose = pose_methods.read_pose(inputs.bin_pose, "--bin-pose")
+        pose = pose_transforms.read_pose(inputs.bin_pose, "--bin-pose")
         unit = pose_methods.unit_of_cad([inputs.bin], inputs.cad_unit, inputs.unit)
         background = PosedBin.load(inputs.bin, pose, unit)
-        settings["bin"] = pose_methods.name_with_checksum(Path(inputs.bin))
+        settings["bin"] = file_names.name_with_checksum(Path(inputs.bin))
         settings["bin_pose"] = pose.matrix().tolist()
     elif inputs.empty_frame is not None:
         background = Path(inputs.empty_frame)
-        settings["empty_frame"] = pose_methods.name_with_checksum(background)
+        settings["empty_frame"] = file_names.name_with_checksum(background)
     else:
         return plan
     jobs: list[PoseJob[Any]] = []
@@ -502,7 +502,7 @@ def _with_color(
 ) -> JobPlan:
     """Return a plan whose depth images have the colour pictures of their names, if any are given.
 
-    ``models``: of the objects that may be visible.
+    ``models``: models of the objects that may be visible.
     """
     if inputs.color is None:
         if inputs.color_camera is not None or inputs.color_from_depth is not None:
@@ -521,9 +521,9 @@ def _with_color(
     camera = inputs.color_camera
     color_from_depth = None
     if camera is not None:
-        settings["color_camera"] = pose_methods.name_with_checksum(camera)
+        settings["color_camera"] = file_names.name_with_checksum(camera)
     if inputs.color_from_depth is not None:
-        color_from_depth = pose_methods.read_pose(
+        color_from_depth = pose_transforms.read_pose(
             inputs.color_from_depth, "--color-from-depth", "color_from_depth"
         )
         settings["color_from_depth"] = color_from_depth.matrix().tolist()
@@ -558,15 +558,3 @@ def _list_depths(depth: Path) -> list[Path]:
         if not maps:
             raise
         return sorted(maps, key=natural_order)
-
-
-def _refuse_equal_stems(files: Sequence[Path]) -> None:
-    """Refuse files of equal stems, which their results would share."""
-    first_of: dict[str, Path] = {}
-    for path in files:
-        other = first_of.setdefault(path.stem, path)
-        if other != path:
-            raise InputError(
-                f"{path.parent}: {other.name} and {path.name} would both be {path.stem!r} in the "
-                "results; rename one, or move it to another folder"
-            )

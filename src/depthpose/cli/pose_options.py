@@ -1,10 +1,12 @@
 """Options that several pose commands take: each is declared, and described, once."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
 from depthpose.cli.arguments import Device, NewPath, Source, WeightsName, shown_as
+from depthpose.cli.ignored_options import is_registration
 from depthpose.core.errors import InputError
 from depthpose.core.units import Unit
 from depthpose.pose.config import DiameterTable, EstimateConfig, VotingConfig, VotingMethod
@@ -187,7 +189,23 @@ class DataSetOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class EstimateOptions:
+class MethodOptions:
+    """What estimates poses."""
+
+    method: Literal["network", "register"] | None = None
+    """network: trained weights. register: the CAD files alone, a second or two for each part, or
+    the models of --bop; it is taken where --cad is given."""
+
+    def choose_weights(self, weights: str, cad: Sequence[str]) -> str | None:
+        """Give the weights of the network, or None where models are registered without one.
+
+        ``weights`` and ``cad``: the words of these options.
+        """
+        return None if is_registration(self.method, has_cad=bool(cad)) else weights
+
+
+@dataclass(frozen=True, kw_only=True)
+class EstimateOptions(MethodOptions):
     """How poses are estimated; options from ``weights`` on have no effect on registration."""
 
     min_certainty: float = 0.9
@@ -195,9 +213,6 @@ class EstimateOptions:
     object_deviation_mm: float = 1.0
     """standard deviation of the real surface from its file [mm]: 0.3 for a machined part, 2 for a
     carton or a scan."""
-    method: Literal["network", "register"] | None = None
-    """network: trained weights. register: the CAD files alone, or the models of --bop; it is taken
-    where --cad is given."""
     weights: WeightsName = "parts"
     """of a pose network, by name or file ('depthpose weights list')."""
     voting: Voting = "ransac"
@@ -232,12 +247,9 @@ class EstimateOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RegisterOptions:
+class RegisterOptions(MethodOptions):
     """Poses by a CAD file alone, without training."""
 
-    method: Literal["network", "register"] | None = None
-    """network: trained weights. register: the CAD files alone, a second or two for each part, or
-    the models of --bop; it is taken where --cad is given."""
     cad: tuple[Source, ...] = ()
     """of register: STL, PLY, OBJ or GLB files; an object has its file's name."""
     cad_unit: Unit | None = None
@@ -247,11 +259,6 @@ class RegisterOptions:
     turns about an axis along z, z,free after any, z,6+x,2 about two axes; or a JSON file with BOP's
     symmetries_discrete and symmetries_continuous. The axis goes where the surface fits best. Of
     several CAD files with the name: NAME:z,18."""
-
-    @property
-    def is_register(self) -> bool:
-        """Whether models are registered without a network: by ``--method``, or as CAD files are."""
-        return self.method == "register" or (self.method is None and bool(self.cad))
 
 
 @dataclass(frozen=True, kw_only=True)

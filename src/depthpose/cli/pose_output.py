@@ -120,8 +120,8 @@ def write_files(
         predictions: all that are shown.
         jobs: one for each prediction, which reads its input.
         out: the folder.
-        method: that made them.
-        dataset: that they are of; None: of clouds or depth images.
+        method: method that made them.
+        dataset: data set that they are of; None: they are of clouds or depth images.
         input_count: number of inputs where it may differ from that of the predictions.
     """
     models = {model.name: model for model in method.models}

@@ -34,7 +34,7 @@ def match_pairs(pair: PairOptions, camera: Path | None, device: str, out: Path) 
     Args:
         pair: left and right images, what matches them, and the least confidence.
         camera: file of the rig, with its baseline.
-        device: that the matcher runs on.
+        device: device that the matcher runs on.
         out: the folder.
 
     Raises:

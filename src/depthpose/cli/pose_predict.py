@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -10,7 +11,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from depthpose.cli import pose_methods
+from depthpose.cli import pose_dataset, pose_masks
 from depthpose.cli.engine import EngineOptions, Weights, print_shards
 from depthpose.cli.pose_jobs import object_named, plan_jobs, read_detection
 from depthpose.cli.pose_methods import PoseMethod, PoseMethodSource
@@ -36,17 +37,18 @@ from depthpose.pose.datasets import Box, Detection, open_bop, parse_box, read_ta
 from depthpose.pose.evaluate import select_targets
 from depthpose.pose.inputs import cloud_input, view_input
 from depthpose.pose.predictions import (
+    POSES,
     PoseJob,
+    PoseResults,
     Prediction,
     earlier_predictions,
-    predict,
     prediction_row,
     write_predictions,
 )
 from depthpose.pose.types import PoseEstimate
 
 ENDING = "pose.json"
-"""Of the file of one estimate in a shard: an entry of ``poses.json``."""
+"""Ending of the file of one estimate in a shard: an entry of ``poses.json``."""
 
 
 def predict_files(method: PoseMethod, inputs: PoseInputs, out: Path, batch: int) -> int:
@@ -74,9 +76,9 @@ def predict_dataset(
     dataset = open_bop(options.bop, options.split)
     if options.targets is not None:
         dataset = select_targets(dataset, read_targets(options.targets, options.bop))
-    dataset = pose_methods.choose_objects(dataset, method, object)
-    (masks,) = pose_methods.prepare_masks([options.masks], dataset, out, config.device)
-    names = pose_methods.match_names(dataset, method.models)
+    dataset = pose_dataset.choose_objects(dataset, method, object)
+    (masks,) = pose_masks.prepare_masks([options.masks], dataset, out, config.device)
+    names = pose_dataset.match_names(dataset, method.models)
     # A job with an object gives an estimate, and no error, where its input cannot be read.
     jobs: list[PoseJob[Any]] = [
         replace(job, object=names[job.place.object_id])
@@ -86,7 +88,7 @@ def predict_dataset(
     settings = {
         **method.settings,
         "estimate": config_to_dict(config),
-        **pose_methods.dataset_settings(dataset),
+        **pose_dataset.dataset_settings(dataset),
         "masks": masks.name,
         **masks.settings,
     }
@@ -109,28 +111,35 @@ def estimate_jobs(
 ) -> list[Prediction] | None:
     """Estimate what is not finished; several processes each write their share to a folder.
 
-    The first process gives the predictions of all jobs, every other one None.
+    ``out`` is claimed before. The first process gives the predictions of all jobs, every other one
+    None.
     """
     process = run.find_rank()
-    home = out if process.world == 1 else out / f"part-{process.rank}"
-    by_name = earlier_predictions(out)
-    finished = {name for name, p in by_name.items() if p.estimate.status != "unreadable"}
+    home = out
+    if process.world > 1:
+        home = out / f"part-{process.rank}"
+        run.claim_folder(home, settings, [POSES])
 
-    def estimate(unfinished: Sequence[PoseJob[Any]]) -> dict[str, Prediction]:
-        """Estimate jobs into the folder of this process; give their predictions by name."""
-        written = predict(method.estimate_many, unfinished, home, settings, batch)
-        shown = tqdm(written, total=len(unfinished), disable=None, unit=" poses")
-        return {prediction.estimate.name: prediction for prediction in shown}
+    def estimate(share: Sequence[PoseJob[Any]]) -> dict[str, Prediction]:
+        """Estimate the unfinished ones of some jobs; give the new predictions by name."""
+        results = PoseResults[Any](home, out)
+        estimated: dict[str, Prediction] = {}
+        with closing(run_jobs(share, method.estimate_many, results, batch)) as outcomes:
+            for outcome in tqdm(outcomes, total=len(share), disable=None, unit=" poses"):
+                name = outcome.job.name
+                if outcome.result is not None or outcome.failure is not None:
+                    estimated[name] = results.predictions[name]
+        return estimated
 
-    unfinished = [job for job in process.share_of(jobs) if job.name not in finished]
-    estimated = estimate(unfinished) if unfinished else {}
+    estimated = estimate(process.share_of(jobs))
     if process.rank > 0:
         return None
 
     # The first process joins the files of all, and keeps what earlier runs posed of other inputs.
     if process.world > 1:
         _wait_for_predictions(out, jobs)
-        by_name = earlier_predictions(out)
+    by_name = earlier_predictions(out) | estimated
+    if process.world > 1:
         # What another process could not read may be a failure of an earlier run, which that
         # process is still to try again: it is tried here too.
         failed = [
@@ -138,8 +147,7 @@ def estimate_jobs(
             for job in jobs
             if job.name not in estimated and by_name[job.name].estimate.status == "unreadable"
         ]
-        estimated |= estimate(failed) if failed else {}
-    by_name |= estimated
+        by_name |= estimate(failed) if failed else {}
     predictions = [by_name.pop(job.name) for job in jobs]
     write_predictions(out, [*by_name.values(), *predictions])
     return predictions

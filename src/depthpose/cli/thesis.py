@@ -94,7 +94,7 @@ def _build_methods(
 ) -> list[tuple[str, "DepthMethod"]]:
     """Build each method, with the row of the thesis that it reproduces, or "" for none.
 
-    ``source``: of a method without weights, with the settings that all share.
+    ``source``: source of a method without weights, with the settings that all share.
     """
     first_row = table.own_rows[0]
     row_names = table.own_rows if len(table.own_rows) > 1 else [first_row] * len(weights)

@@ -31,7 +31,7 @@ from depthpose.thesis.depth import (
 )
 
 _PANEL_WIDTH_PX = 621
-"""Of panels on a page: half of a frame of KITTI."""
+"""Width of a panel on a page: half of a frame of KITTI."""
 
 
 def reproduce_table(
@@ -50,7 +50,7 @@ def reproduce_table(
         dataset: frames with truth.
         methods: each with the name of the printed row that it reproduces, or "" for none.
         out: folder of the files.
-        protocol: by which the predictions are measured.
+        protocol: protocol by which the predictions are measured.
         caps_m: truth beyond a cap does not count; a row for each.
         pictures: frames of each method that the page shows.
     """

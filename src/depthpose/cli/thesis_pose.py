@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 from tqdm import tqdm
 
-from depthpose.cli import pose_evaluate, pose_methods
+from depthpose.cli import file_names, pose_dataset, pose_evaluate, pose_masks, pose_methods
 from depthpose.cli.arguments import refuse_below
 from depthpose.cli.pose_options import PoseDataOptions, PoseTableOptions
 from depthpose.cli.thesis_depth import write_report
@@ -35,7 +35,7 @@ from depthpose.report.pose import close_up, draw_pose, grey_depth, picture_of
 from depthpose.thesis import pose_figures, pose_tables
 
 _SYNTHETIC_SEED = 3303
-"""Of synthetic views for tables and figures; no training uses it."""
+"""Seed of the synthetic views for tables and figures; no training uses it."""
 _MAX_TSNE_POINTS = 4000
 """The time of t-SNE grows with the square of the points."""
 _MAX_VOTES = 1500
@@ -73,9 +73,9 @@ def open_views(net: GeoPoseNet, data: PoseDataOptions, number: int | None, synth
     """Read views of a data set, or render synthetic ones of the network's objects.
 
     Args:
-        net: whose names the objects get.
+        net: network whose names the objects get.
         data: the data set; without a folder the views are synthetic.
-        number: of the data set's views, spread evenly; None: all.
+        number: how many of the data set's views, spread evenly; None: all.
         synthetic: number of synthetic views.
     """
     if data.folder is None:
@@ -95,7 +95,7 @@ def open_views(net: GeoPoseNet, data: PoseDataOptions, number: int | None, synth
     if number is not None and number < len(dataset):
         instances = [dataset.instances[i] for i in page.spread_evenly(len(dataset), number)]
         dataset = replace(dataset, instances=instances)
-    names = pose_methods.match_names(dataset, net.weights.models)
+    names = pose_dataset.match_names(dataset, net.weights.models)
     samples: list[ViewSample] = []
     for instance in dataset.instances:
         view = dataset.view(instance)
@@ -120,7 +120,7 @@ def reproduce_by_object(
     """Make table 3.1 or 3.2: predict what is missing, measure, join with published rows, write.
 
     Args:
-        number: of the table; 3.2 has published rows.
+        number: number of the table; 3.2 has published rows.
         data: the data set.
         options: how poses are estimated, measured and shown.
         weights: files or names, each a method.
@@ -149,17 +149,17 @@ def reproduce_by_object(
         "rule": config_to_dict(rule),
         "methods": {method.name: dict(method.settings) for method in methods},
         "masks": [_mask_setting(kind) for kind in options.masks] if methods else [],
-        "csv": [pose_methods.name_with_checksum(path) for path in csv],
+        "csv": [file_names.name_with_checksum(path) for path in csv],
     }
     results = (*page.table_files("rows", "all", "instances", "risk"), "report.md", "report.html")
     claim_folder(out, settings, (*results, "predictions", "detections", "figures"))
 
     # Predict what is missing, measure, and join with the published rows.
-    all_masks: list[pose_methods.Masks] = []
+    all_masks: list[pose_masks.Masks] = []
     if methods:
-        all_masks = pose_methods.prepare_masks(options.masks, dataset, out, options.device)
+        all_masks = pose_masks.prepare_masks(options.masks, dataset, out, options.device)
     folders = [
-        pose_methods.predict_instances(dataset, method, masks, out)
+        pose_evaluate.predict_instances(dataset, method, masks, out)
         for method in methods
         for masks in all_masks
     ]
@@ -185,18 +185,18 @@ def reproduce_by_object(
 
 def _mask_setting(kind: str) -> str:
     """Give a kind of masks for the record of a run: its word, or its file with a checksum."""
-    path = pose_methods.mask_path(kind)
-    return kind if path is None else pose_methods.name_with_checksum(path)
+    path = pose_masks.mask_path(kind)
+    return kind if path is None else file_names.name_with_checksum(path)
 
 
 def _draw_figure_3_5(dataset: BopDataset, predictions: Path, out: Path, number: int) -> Section:
     """Draw true and estimated poses of some instances, and write the pictures.
 
     Args:
-        dataset: with the instances.
+        dataset: data set with the instances.
         predictions: folder of a method's ``poses.json``.
         out: folder of the report.
-        number: of instances, spread evenly; one that the method has no estimate of is left out.
+        number: how many instances, spread evenly; one without an estimate is left out.
     """
     estimates = {p.estimate.name: p.estimate for p in read_predictions(predictions)}
     pictures: list[Picture] = []

@@ -289,7 +289,7 @@ def calibrate(
 _START = "parts"
 """Weights that a CAD file begins with by default: they ship, under a licence for any use."""
 _NO_START = "nothing"
-"""As ``--start``: begin without weights."""
+"""Word of ``--start`` that begins without weights."""
 
 
 def pose_train(

@@ -65,7 +65,7 @@ class Checkpoint:
     """The contents of a weights file."""
 
     kind: str  #: which network the weights belong to, e.g. ``psmnet``
-    config: Mapping[str, Any]  #: of that network, as ``config_to_dict`` gives it
+    config: Mapping[str, Any]  #: config of that network, as ``config_to_dict`` gives it
     state: Mapping[str, Tensor]  #: tensors by the names of the network's ``state_dict``
     facts: Mapping[str, str] = field(default_factory=dict)  #: the card, such as ``licence``
 

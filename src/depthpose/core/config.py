@@ -196,7 +196,7 @@ def _convert(value: Any, hint: Any, source: str, name: str) -> Any:  # noqa: ANN
         value: what the file holds.
         hint: type of the setting.
         source: what the file is called in errors.
-        name: of the setting, in errors.
+        name: name of the setting, for errors.
 
     Raises:
         InputError: it cannot be converted without loss.

@@ -27,7 +27,7 @@ from depthpose.core.files import atomic_write, write_json
 from depthpose.core.run import environment, refuse_to_replace
 
 OPSET = 18
-_IR_VERSION = 10  # of onnx 1.16: younger ones would shut out older runtimes
+_IR_VERSION = 10  # that of onnx 1.16: a younger one would shut out older runtimes
 Shape = Sequence[int | str]  # text names a side that is known only when the graph runs
 
 
@@ -314,7 +314,7 @@ def network_model(module: nn.Module, images: Sequence[Tensor], multiple: int) ->
     """Convert a network of images to an ONNX model whose batch, rows and columns are variable.
 
     Args:
-        module: in eval mode.
+        module: the network, in eval mode.
         images: examples of its inputs, (b, c, h, w) each, with b, h and w larger than the least
             possible: else the exporter would take them for constants.
         multiple: every height and width is a multiple of it.

@@ -138,8 +138,8 @@ def barycentric_shares(
     """Compute the barycentric coordinates of each pixel centre in its visible triangle.
 
     Args:
-        edges: of all triangles, by :func:`edge_functions`.
-        volume: of all triangles, by the same.
+        edges: edge functions of all triangles, by :func:`edge_functions`.
+        volume: volumes of all triangles, by the same function.
         primitive: number of the visible triangle of each pixel; -1 where there is none.
 
     Returns:

@@ -143,7 +143,7 @@ def wait_for(
     """Wait until other processes have finished the results of all ``names``.
 
     Args:
-        names: of the results.
+        names: names of the results.
         is_there: whether the result of a name is finished.
         timeout_s: how long no further result may appear, as where a process has died.
 
@@ -260,7 +260,7 @@ def claim_names(
     """Reserve names of results for the files that they are made from, in ``sources.json``.
 
     Args:
-        folder: where the results go, claimed before (:func:`claim_folder`).
+        folder: folder of the results, claimed before (:func:`claim_folder`).
         sources: the source file of each name, or several: the first identifies the source, and a
             change of any is noticed.
         endings: what follows a name in the names of its result files.

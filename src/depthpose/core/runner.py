@@ -68,7 +68,7 @@ def run_jobs(
         jobs: all jobs, the finished ones too; taken one by one, so that the frames of a video need
             not fit into memory.
         estimate_many: computes for each input a result, or the reason why there is none.
-        results: where they are stored.
+        results: where the results are stored.
         batch: how many inputs are estimated together.
     """
     read_jobs: list[tuple[Job[Input], Input | InputError]] = []

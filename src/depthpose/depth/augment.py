@@ -26,7 +26,7 @@ def degrade(image: View, config: DegradeConfig, generator: torch.Generator) -> V
     Args:
         image: RGB in [0, 1].
         config: ranges and probabilities of the changes.
-        generator: of the random numbers.
+        generator: generator of the random numbers.
     """
 
     def between(low: float, high: float) -> float:

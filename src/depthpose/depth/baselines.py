@@ -23,7 +23,7 @@ from depthpose.depth.types import DepthEstimate, Map, StereoInput, View
 _CANONICAL_FOCAL_PX = 721.5377
 """Rows are counted in a camera of this focal length (KITTI's), centred at its principal point."""
 _ROWS = 1443
-"""Of that camera."""
+"""Number of rows of that camera."""
 _NEAR_M = 1.0
 _FAR_M = 80.0
 _DEPTH_STEPS = 4096
@@ -115,9 +115,9 @@ class NearestImageBaseline:
     is twice as far.
     """
 
-    dataset: Dataset  #: of training
-    indices: list[int]  #: of its frames that have truth and a rig
-    thumbnails: Float[Tensor, "n d"]  #: of the left images of these frames
+    dataset: Dataset  #: data set of the training
+    indices: list[int]  #: indices of its frames that have truth and a rig
+    thumbnails: Float[Tensor, "n d"]  #: thumbnails of the left images of these frames
 
     @classmethod
     def fit(cls, dataset: Dataset, progress: Progress = iter) -> "NearestImageBaseline":

@@ -388,7 +388,7 @@ class SelectionConfig(Settings):
     """Deviation of the logarithm of depth, by which it is weighed against where the ground is."""
 
     road_tilt_off_deg: Annotated[float, "[-10, 10]"] = -0.4
-    """Of a road in the estimated depth against the true one: negative where its far end is too
+    """Tilt of a road in the estimated depth against the true one: negative where its far end is too
     near. -0.5 degrees by `default` on KITTI, -0.2 on synthetic streets."""
 
     side_multiple_px: ClassVar[int] = 32

@@ -28,12 +28,12 @@ _POSSIBLE_MISTAKES = {
     1 / 16: "is its disparity pixels x 16, as OpenCV's matchers give it?",
     1 / 5.4: "is it of monodepth2, trained with a baseline of 0.1 m (multiply its depth by 5.4)?",
 }
-"""The same for factors that a poor estimate may have too."""
+"""Likely mistakes by factors that a poor estimate may have too."""
 _MISTAKE_TOLERANCE = 1.4
 """Ratio to a factor of ``_UNIT_MISTAKES`` that is still that mistake: a poor estimate is never
 wrong by 250 or 1000 in the median."""
 _POSSIBLE_TOLERANCE = 1.1
-"""The same for ``_POSSIBLE_MISTAKES``."""
+"""Ratio to a factor of ``_POSSIBLE_MISTAKES`` that is still that mistake."""
 _POOR_FACTOR = 3.0
 """Ratio of medians from which a notice is given: an estimate of the right scale has one near 1."""
 _NEARLY_ALL = 0.9
@@ -48,8 +48,8 @@ SKY_M = 10_000.0
 """Depth that the disparity of the sky stands for: protocols take a disparity of zero for no
 prediction, or for a near point."""
 _MIN_SKY_SHARE = 0.002
-"""Of the image; fewer pixels are a lamp or a window, and keep the depth of the match: 43 of them in
-a garage made an RMSE of 0.87 m, in place of 0.25 m."""
+"""Least share of the image that is sky; fewer pixels are a lamp or a window, and keep the depth of
+the match: 43 of them in a garage made an RMSE of 0.87 m, in place of 0.25 m."""
 MOST_ENLARGED_PIXELS = 8_000_000
 """Largest image to which a smaller one is enlarged to reach the focal length of a network."""
 
@@ -333,7 +333,7 @@ def estimate_from_virtual(
     Args:
         image: the image and its camera.
         rig: config of the generator, which says the virtual rig.
-        match: at the size of the synthesised view.
+        match: the match, at the size of the synthesised view.
         right: the synthesised view.
 
     Returns:

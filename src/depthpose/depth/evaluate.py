@@ -38,7 +38,8 @@ _ASPECT_TOLERANCE = 1.01
 """Ratio of two aspects that are still the same: the sides of a scaled image are rounded to whole
 pixels, often to multiples of 32."""
 _CROP_ERROR_SHARE = 0.7
-"""Of the error of a stretched map: a map with less error as a crop is a crop of the image."""
+"""Share of the error of a stretched map: a map with less error than that as a crop is a crop of the
+image."""
 _noticed_sizes: set[str] = set()
 NO_PREDICTION = "no right view to match, and no prediction"
 
@@ -109,12 +110,12 @@ class EvaluationRow:
     The columns of a table are the fields in this order.
     """
 
-    method: str | None = None  #: that predicted; None, as in the next four fields: not known
+    method: str | None = None  #: method that predicted; None, as in the next four fields: not known
     input: str | None = None  #: which images the method had
     speed: str | None = None  #: at which its networks ran
     weights: str | None = None  #: name of their file
     weights_sha256: str | None = None  #: the first 12 digits
-    protocol: str  #: by which the frames were measured
+    protocol: str  #: protocol by which the frames were measured
     dataset: str  #: its name
     frame: str | None = None  #: name of the frame, in a row of one frame
     cap_m: float | None  #: truth beyond it does not count; None for disparity
@@ -161,7 +162,7 @@ class Measured:
 
     frame: str  #: its name
     cap_m: float | None  #: None for disparity
-    pixels: int  #: that were compared
+    pixels: int  #: number of pixels that were compared
     coverage: float  #: share of the pixels with truth that have a prediction
     metrics: Mapping[str, float]  #: by name; empty where no pixel was compared
     #: mean error of each tenth of the pixels, by rising confidence; None without a confidence
@@ -178,7 +179,7 @@ class _Prepared:
     depth_m: Map | None  # where depth was predicted and no disparity
     confidence: Map | None
     rig: StereoRig | None
-    view_metrics: dict[str, float]  # of the synthesised right view
+    view_metrics: dict[str, float]  # metrics of the synthesised right view
 
 
 def evaluate(

@@ -46,6 +46,8 @@ def _side(size: Value, axis: int) -> Value:
 
 def _resize_image(image: Value, size: Value) -> Value:
     """Resize images to rows and columns, with antialiasing where they shrink; clip to [0, 1]."""
+    # As torch does, pixels beyond the border are left out and the other weights add up to 1; by
+    # default ONNX would repeat the pixels of the border.
     resized = image.op(
         "Resize", None, None, size, mode="linear", axes=[2, 3], antialias=1, exclude_outside=1
     )
@@ -475,7 +477,9 @@ class Target:
     """A kind of graph that weights are exported as."""
 
     fits: Callable[[DepthWeights], bool]  # whether weights may be exported so by default
-    export: Callable[[DepthWeights, dict[str, Any]], Export]  # of weights, and facts for its user
+    export: Callable[
+        [DepthWeights, dict[str, Any]], Export
+    ]  # takes weights, and facts for its user
 
 
 def depth_export(weights: DepthWeights, what: str | None, facts: dict[str, Any]) -> Export:
@@ -484,7 +488,7 @@ def depth_export(weights: DepthWeights, what: str | None, facts: dict[str, Any])
     Args:
         weights: the networks.
         what: a key of ``TARGETS``; None: the first that fits the weights.
-        facts: of the weights, for the user of the file.
+        facts: facts of the weights, for the user of the file.
 
     Raises:
         InputError: there is no such target.

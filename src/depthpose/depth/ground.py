@@ -20,7 +20,7 @@ from depthpose.depth.horizon import Angles, find_angles
 from depthpose.depth.types import DepthEstimate, Ground, Map, StereoInput
 
 _MAX_RELATIVE_ERROR = 0.06
-"""Of the inverse depth of an inlier, relative to that of the plane."""
+"""Largest difference of the inverse depth of an inlier from that of the plane, as a share of it."""
 _MAX_POINTS = 2000
 """Number of points that a plane is fitted to, about."""
 _RANSAC_SAMPLES = 200
@@ -28,12 +28,13 @@ _RANSAC_SAMPLES = 200
 _REFITS = 3
 """Least-squares fits after the first, each to the inliers of the one before."""
 _MIN_POINTS = 60
-"""With depth in the lower part of an image, for a fit."""
+"""Least number of points with depth in the lower part of an image, for a fit."""
 _MIN_INLIERS = 30
 _STRIPS = 8
 """Strips of columns; the jackknife leaves one out at a time."""
 _MIN_INLIER_SHARE = 0.25
-"""Of the points in the lower part of the image; with fewer inliers there is no ground."""
+"""Least share of inliers among the points in the lower part of the image; with fewer there is no
+ground."""
 _MAX_ROLL_DEG = 10.0
 _MAX_TAN_TILT = math.tan(math.radians(25))
 _MAX_TAN_ROLL = math.tan(math.radians(_MAX_ROLL_DEG))
@@ -42,13 +43,14 @@ _MAX_HEIGHT_M = 20.0
 _MAX_ROAD_TILT_DEG = 15.0
 """Steeper planes were no road in any of 59 views by cameras tilted up to 7 degrees."""
 _MAX_TILT_DIFFERENCE_DEG = 8.0
-"""Of the user's tilt from that of the road in the map, which was off by at most 5.5 degrees in
-these views."""
+"""Largest difference of the user's tilt from that of the road in the map, which was off by at most
+5.5 degrees in the 59 views."""
 _MAP_TILT_STD_DEG = 0.8
 _MAP_ROLL_STD_DEG = 1.2
 """Standard deviations of tilt and roll of the road in a depth map."""
 _ROAD_STD_DEG = 0.3
-"""Of the near road's tilt against that of the far road, along which the edges run."""
+"""Standard deviation of the near road's tilt against that of the far road, along which the edges
+run."""
 _TILT_CHANGE_DEG = 0.3
 """Standard deviation of a vehicle's tilt and roll from frame to frame."""
 _MEASURED_TILT_STD_DEG = 0.2
@@ -75,7 +77,8 @@ _MAX_GROUND_DEPTH_M = 400.0
 _DEFAULT_NETWORK = SelectionConfig()
 """The config of networks that do not say how far their roads are off."""
 _DECIMALS = 6
-"""Of the values of a mount: as files hold them, so that a rerun continues from the same values."""
+"""Decimals of the values of a mount: as files hold them, so that a rerun continues from the same
+values."""
 _WINDOW_PX = 5
 """Side of the square around a pixel whose distance was measured."""
 
@@ -226,7 +229,7 @@ class MountFilter:
     and is smoothed (a Kalman filter whose state is the last frame's :class:`Ground`).
     """
 
-    last: Ground | None = None  #: of the last frame with a road
+    last: Ground | None = None  #: road of the last frame that shows one
 
 
 def find_mount(
@@ -360,7 +363,7 @@ def scale_by_mount(
     Args:
         estimate: depth by the network.
         image: the image of which it is. Height and tilt that its camera states are used.
-        mount: by the frames before; it is updated by this frame.
+        mount: the mount by the frames before; it is updated by this frame.
         network: config of the network, with the standard deviation of its depth.
 
     Returns:
@@ -469,8 +472,8 @@ def scale_by_distance(
     """Scale an estimate so that the depth around one pixel is the measured one.
 
     Args:
-        estimate: with depth.
-        name: of the image, for errors.
+        estimate: an estimate with depth.
+        name: name of the image, for errors.
         distance: column, row [px] and camera z [m] of the measured point. Its depth in the estimate
             is the median of the 5x5 pixels around it.
 

@@ -23,7 +23,7 @@ from depthpose.depth.types import View
 _MAX_PIXELS = 500_000
 """Larger images are halved until they have fewer: edges in a street are long."""
 _MIN_CONTRAST = 0.012
-"""Of an edge: change of grey from pixel to pixel; white is 1."""
+"""Least contrast of an edge: change of grey from pixel to pixel; white is 1."""
 _MIN_COS_ANGLE = math.cos(math.radians(20))
 """Cosine of the largest angle between the gradients of two neighbours on one segment."""
 _MIN_LENGTH_PX = 20.0
@@ -113,8 +113,8 @@ def _connect_edges(
     """Connect neighbouring edge pixels of similar gradients to chains.
 
     Args:
-        rows: of the edge pixels.
-        columns: of the edge pixels.
+        rows: rows of the edge pixels.
+        columns: columns of the edge pixels.
         direction_x: unit vectors of their gradients.
         direction_y: the same along the columns.
         shape: rows and columns of the image.

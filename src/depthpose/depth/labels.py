@@ -25,11 +25,11 @@ class LabelConfig(Settings):
     """Where a matched disparity becomes truth."""
 
     largest_difference_px: Annotated[float, "[0, inf)"] = 1.0
-    """Of the disparities of both views at one point, at the image's size."""
+    """Largest difference of the disparities of both views at one point, at the image's size."""
     largest_share: Annotated[float, "[0, inf)"] = 0.03
-    """Of the same in shares of the disparity; the larger of both limits holds."""
+    """The same limit as a share of the disparity; the larger of both limits holds."""
     least_confidence: Annotated[float, "[0, 1)"] = 0.5
-    """Of the matcher in the left view, where it has one."""
+    """Least confidence of the matcher in the left view, where it has one."""
 
 
 def label_pairs(

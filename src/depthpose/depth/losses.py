@@ -103,7 +103,7 @@ def plane_loss(
     with truth counts the same, however sparse its truth is.
 
     Args:
-        logits: of the classes.
+        logits: logits of the classes.
         truth_px: 0 in the sky, NaN where it is unknown.
         planes: disparities, evenly spaced in their logarithm.
     """

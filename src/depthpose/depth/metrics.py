@@ -27,7 +27,7 @@ Quantity = Literal["depth", "disparity", "disparity_noc"]
 class Metric:
     """A metric over the pixels of a frame that have truth: a column of every table."""
 
-    name: str  #: of the column
+    name: str  #: name of the column
     of: Quantity  #: the values that are compared
     #: from the predicted and the true values, each ``(n,)`` float64
     function: Callable[[Tensor, Tensor], float]

@@ -52,8 +52,8 @@ ENDINGS = (
 """What follows ``NAME.`` in the names of the files of an estimate."""
 
 _DECIMALS = 6
-"""Of the values of a road in its file: further digits differ from run to run, since threads add in
-another order."""
+"""Decimals of the values of a road in its file: further digits differ from run to run, since
+threads add in another order."""
 CLOUD_M = 80.0
 """Distance up to which a cloud is written, unless another is given."""
 COLOR_RANGE_M = (3.0, 80.0)
@@ -77,12 +77,12 @@ def write_estimate(
     ``NAME.disparity_px.npy``, which is the disparity of the frame's own rig.
 
     Args:
-        folder: where the files go.
+        folder: folder of the files.
         pair: the input; its name is ``NAME``.
         estimate: what was estimated from it.
         range_m: depths of the first and the last colour.
         cloud_m: distance up to which a cloud (``DepthEstimate.cloud``) has points; None: no cloud.
-        min_confidence: of the cloud's points.
+        min_confidence: least confidence of the cloud's points.
     """
     depth_m = estimate.depth_m
     if depth_m is None:
@@ -124,9 +124,13 @@ def _rounded(ground: Ground | None) -> dict[str, float] | None:
     return {name: round(value, _DECIMALS) for name, value in asdict(ground).items()}
 
 
-def is_finished(folder: Path, name: str) -> bool:
-    """Whether an earlier run wrote the whole estimate of this frame."""
-    return is_whole(folder, name, [f"{name}.{LAST}"])
+def is_finished(folder: Path, name: str, *, with_cloud: bool = False) -> bool:
+    """Whether an earlier run wrote the whole estimate of this frame.
+
+    ``with_cloud``: only an estimate with a cloud counts.
+    """
+    needed = (LAST, CLOUD) if with_cloud else (LAST,)
+    return is_whole(folder, name, [f"{name}.{ending}" for ending in needed])
 
 
 def has_prediction(folder: Path, name: str, *, of_disparity: bool = False) -> bool:
@@ -149,9 +153,9 @@ def read_disparity(
     published script.
 
     Args:
-        folder: of the predictions.
-        name: of the frame.
-        camera: of the frame.
+        folder: folder of the predictions.
+        name: name of the frame.
+        camera: camera of the frame.
         with_disparity_png: ``NAME.png`` is disparity x 256, else metres x 256.
 
     Raises:
@@ -262,12 +266,11 @@ class DepthResults(Results[StereoInput, DepthEstimate]):
     folder: Path  #: claimed before (:func:`depthpose.core.run.claim_folder`)
     range_m: tuple[float, float] = COLOR_RANGE_M
     cloud_m: float | None = None  #: None: no cloud is written
-    min_confidence: float | None = None  #: of clouds
+    min_confidence: float | None = None  #: least confidence of a cloud's points
 
     def is_finished(self, job: Job[StereoInput]) -> bool:
         """Whether an earlier run wrote the whole estimate, with a cloud if there shall be one."""
-        needed = (LAST,) if self.cloud_m is None else (LAST, CLOUD)
-        return is_whole(self.folder, job.name, [f"{job.name}.{ending}" for ending in needed])
+        return is_finished(self.folder, job.name, with_cloud=self.cloud_m is not None)
 
     def store(self, job: Job[StereoInput], data: StereoInput, result: DepthEstimate) -> None:
         """Write the files of an estimate, and record that it is finished."""

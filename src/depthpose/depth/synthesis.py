@@ -151,8 +151,9 @@ Logits = Float[Tensor, "b classes rows columns"]
 Planes = Float[Tensor, " planes"]
 
 _MAX_SHARE_OF_RANGE = 0.4
-"""Of the largest disparity that a size can have: above it expectations come out too small, for
-trainings have few objects so near, and the shipped generators hardly give more than half of it."""
+"""Largest usable share of the largest disparity that a size can have: above it expectations come
+out too small, for trainings have few objects so near, and the shipped generators hardly give more
+than half of it."""
 _SURE_RATIO = 1.15
 """Disparities within this ratio of the expectation count as confidence in it."""
 ENCODER_KIND = "efficientnet-lite0"
@@ -167,12 +168,12 @@ _STAGES = (
     (4, 5, 2, 6, 192),
     (1, 3, 1, 6, 320),
 )
-"""Of EfficientNet-Lite0 at width 1."""
+"""Stages of EfficientNet-Lite0 at width 1."""
 _LAST_AT_STRIDE = (0, 1, 2, 4, 6)
 """Stages that are the last at strides 2, 4, 8, 16 and 32."""
 _FROZEN_STAGES = 2
 _CLASSIFIER_PREFIXES = ("_conv_head.", "_bn1.", "_fc.")
-"""Of the published weights that only the classifier has."""
+"""Prefixes of the published weights that only the classifier has."""
 _RENAMES = (
     (r"^_conv_stem\.", "stem.conv."),
     (r"^_bn0\.", "stem.norm."),
@@ -450,7 +451,8 @@ ROWS_SHARE = 0.03
 them."""
 
 COLUMNS_SHARE = 0.01
-"""The same of columns: depth is off by as much."""
+"""Largest share by which columns are stretched to a side that a network takes: depth is off by as
+much."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -458,7 +460,7 @@ class SynthesisedViews:
     """Right views of left images; and maps of the left views where the generator estimates them."""
 
     right: Views  #: the right views, RGB in [0, 1]
-    disparity_px: Maps | None = None  #: of the left views, without the sky
+    disparity_px: Maps | None = None  #: disparity of the left views, without the sky
     #: probability of disparities within 15 % of ``disparity_px``; in the sky that of the sky
     confidence: Maps | None = None
     is_sky: Bool[Tensor, "b h w"] | None = None  #: where the sky is more probable than not

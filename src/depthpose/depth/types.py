@@ -60,12 +60,12 @@ class RawFrame:
     left: View  #: left image (KITTI's camera 2)
     right: View  #: right image (camera 3)
     rig: StereoRig  #: both cameras
-    disparity_px: Map  #: of the left image; NaN where unknown
+    disparity_px: Map  #: disparity of the left image; NaN where unknown
     occluded: Mask  #: left pixels that the right view does not show
     is_sky: Mask  #: left pixels that show the sky
     #: one LiDAR scan, x forward, y left, z up [m] and reflectance; or None
     lidar_points: Float[Tensor, "n 4"] | None
-    camera_from_velodyne: Float64[np.ndarray, "4 4"]  #: from the LiDAR to the left camera
+    camera_from_velodyne: Float64[np.ndarray, "4 4"]  #: transform from the LiDAR to the left camera
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -88,14 +88,14 @@ class Ground:
     The latter is the camera's mount (``find_mount`` of ``depth/ground.py``).
     """
 
-    height_m: float  #: of the camera above the plane
-    tilt_deg: float  #: of the optical axis against the plane; positive looks up
+    height_m: float  #: height of the camera above the plane
+    tilt_deg: float  #: tilt of the optical axis against the plane; positive looks up
     roll_deg: float  #: positive where the horizon falls to the right
-    share: float  #: of the lower part of the image that lies on the plane, 0..1
+    share: float  #: share of the lower part of the image that lies on the plane, 0..1
     #: standard deviation of the height. That of a fit to one map is a jackknife's over its columns,
     #: without the error of the map's scale
     height_std_m: float
-    tilt_std_deg: float  #: the same of the tilt
+    tilt_std_deg: float  #: standard deviation of the tilt
 
     def __str__(self) -> str:
         """Give height, tilt and roll in one line of text."""

@@ -12,19 +12,20 @@ from torch.nn import functional as F
 from depthpose.core.camera.rectified import grey_of
 
 _MAX_VARIATION = 3 / 255
-"""Of the values in a border of one colour: noise of JPEG and videos."""
+"""Largest variation of the values in a border of one colour: noise of JPEG and videos."""
 _MAX_DARK = 24 / 255
 """Largest value of a dark bar: the bars of films are black, which videos store as 16 of 255."""
 _MAX_BLACK = 2 / 255
 """Largest value of the black of a rectified image, as JPEG stores it too."""
 _MIN_BAR_SHARE = 0.01
-"""Of the image's side: a narrower bar is part of the picture."""
+"""Least width of a bar as a share of the image's side: a narrower one is part of the picture."""
 _MIN_REGION_SHARE = 0.0005
-"""Of the image: a smaller black region is part of the picture."""
+"""Least share of the image that is a black region: a smaller one is part of the picture."""
 _MIN_PICTURE_SHARE = 0.1
-"""Of the image: where less would remain, the image is black or plain itself, and has no border."""
+"""Least share of the image that is left as the picture: where less would remain, the image is black
+or plain itself, and has no border."""
 _MIN_FILLED_SHARE = 0.95
-"""Of a black region's pixels: so many have nothing but black between them and a side of the
+"""Least share of a black region's pixels that have nothing but black between them and a side of the
 image."""
 _MIXED_BORDER_PX = 2
 """Width of the edge of a black region where cubic resampling mixes picture and black."""

@@ -267,8 +267,8 @@ def calibrate_weights(
     """Write weights whose ``least_confidence`` refuses a share of images that they should accept.
 
     Args:
-        weights: with a generator that selects; its tensors stay as they are.
-        image_confidence: of images that the weights should accept
+        weights: weights with a generator that selects; its tensors stay as they are.
+        image_confidence: confidences of images that the weights should accept
             (``DepthEstimate.image_confidence``).
         alarm_share: share of these that may be refused all the same, 0..1.
         out: the weights file that is written.

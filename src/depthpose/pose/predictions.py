@@ -340,13 +340,23 @@ class PoseResults(Results[Input, PoseEstimate]):
 
     Inputs that were unreadable are tried again, for they may have been repaired. The file is
     written every 200 results, and when the run ends or is interrupted.
+
+    Args:
+        folder: folder of the file.
+        run_folder: folder of the run where several processes share it, each with a ``folder`` of
+            its own: what any of them finished counts as finished. None: ``folder``.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, run_folder: Path | None = None) -> None:
         self.folder = folder
         self.predictions = earlier_predictions(folder)  #: by the names of the inputs
+        predictions_of_run = self.predictions
+        if run_folder is not None and run_folder != folder:
+            predictions_of_run = earlier_predictions(run_folder)
         self._finished = {
-            name for name, made in self.predictions.items() if made.estimate.status != "unreadable"
+            name
+            for name, prediction in predictions_of_run.items()
+            if prediction.estimate.status != "unreadable"
         }
         self._unsaved = 0
 

@@ -93,12 +93,7 @@ class Registration(PoseEstimator):
             InputError: no file, two of one name, one that is not read, without a surface or unit; a
                 symmetry that is none, or of no object.
         """
-        models = [read_model(path, unit, number=k) for k, path in enumerate(cad, start=1)]
-        declared = symmetry_of_each(symmetry, [model.name for model in models])
-        models = [
-            declare_symmetry(m, declared[m.name]) if m.name in declared else m for m in models
-        ]
-        return cls([with_found_symmetries(m, None, is_taken=True) for m in models], config)
+        return cls(read_parts(cad, unit, symmetry), config)
 
     def __repr__(self) -> str:
         names = self.objects
@@ -112,3 +107,18 @@ class Registration(PoseEstimator):
 
     def _estimate(self, pose_input: AnyInput) -> PoseEstimate:
         return self._register_or_search(pose_input)
+
+
+def read_parts(
+    cad: Sequence[AnyModel],
+    unit: Unit | None,
+    symmetry: AnySymmetry | Mapping[str, AnySymmetry] | Sequence[str] | None = None,
+) -> list[ObjectModel]:
+    """Read the models of CAD files with their declared or found symmetries.
+
+    Arguments and errors are those of :meth:`Registration.load`.
+    """
+    models = [read_model(path, unit, number=k) for k, path in enumerate(cad, start=1)]
+    declared = symmetry_of_each(symmetry, [model.name for model in models])
+    models = [declare_symmetry(m, declared[m.name]) if m.name in declared else m for m in models]
+    return [with_found_symmetries(m, None, is_taken=True) for m in models]

@@ -35,7 +35,7 @@ _SPARSE_SHARE = 0.25
 """Share of pixels with truth below which they are drawn as points: it is LiDAR's."""
 _POINT_RADIUS_PX = 2
 _WIDEST_DISPARITY_PX = 96.0
-"""Of the bar of disparity; a larger one is as bright."""
+"""Largest disparity of the colour bar; a larger one is as bright."""
 _TRUE_COLOR = (0.1, 0.8, 0.2)
 _MAX_TRUE_POINTS = 20_000
 
@@ -53,12 +53,12 @@ def depth_section(
     """Show one estimate: the facts, pictures with the bars of their colours, the cloud in 3D.
 
     Args:
-        title: of the section.
+        title: title of the section.
         pair: the input.
         estimate: its depth.
         text: a paragraph below the title.
         range_m: depth of the brightest and of the darkest colour.
-        error: of each pixel, and the truth, where they are known.
+        error: error of each pixel, and the truth, where they are known.
         with_image: show the left image too.
     """
     _, far_m = range_m

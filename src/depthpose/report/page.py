@@ -31,9 +31,9 @@ MOST_LINES = 20_000
 """Most pieces of line of one layer on a page."""
 
 _GREY = 0.55
-"""Of points without a colour: visible on white and on black."""
+"""Grey of points without a colour: visible on white and on black."""
 _STEPS = 65535
-"""Into which the extent of a layer is divided along each axis, for 16 bits."""
+"""Steps into which the extent of a layer is divided along each axis, for 16 bits."""
 _RED_GREEN_BLUE = ((0.85, 0.2, 0.2), (0.15, 0.65, 0.25), (0.25, 0.45, 0.95))
 
 
@@ -142,7 +142,7 @@ def colored_lines(ends_m: Float[Tensor, "n 2 3"], color: tuple[float, float, flo
 def frame_axes(origin_m: Float[Tensor, "3"], R: Float[Tensor, "3 3"], length_m: float) -> Lines:
     """Draw the axes of a frame (columns of R) in the camera frame: x red, y green, z blue.
 
-    ``length_m``: of each axis.
+    ``length_m``: length of each axis.
     """
     tips_m = origin_m + length_m * R.mT
     ends_m = torch.stack([origin_m.expand(3, 3), tips_m], 1)
@@ -207,9 +207,9 @@ _JPEG_QUALITY = 85
 _ENCODING_ERRORS = "backslashreplace"
 """How names of files are written whose bytes are no UTF-8."""
 _MOST_BYTES = 250_000
-"""Of a picture file that goes onto a page as it is."""
+"""Largest size of a picture file that goes onto a page as it is."""
 _MOST_FILM_BYTES = 8_000_000
-"""Of a video file on a page; a larger one is shown from its own file."""
+"""Largest size of a video file on a page; a larger one is shown from its own file."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -307,7 +307,7 @@ class Section:
     facts: Sequence[tuple[str, str]] = ()  #: names and values
     pictures: Sequence[Picture | Drawing] = field(default_factory=tuple)
     films: Sequence[Film] = ()
-    rows: Sequence[Row] = ()  #: of a table that can be sorted
+    rows: Sequence[Row] = ()  #: rows of a table that can be sorted
     tables: Mapping[str, Sequence[Sequence[str]]] = field(default_factory=dict)
     """Small tables by their captions; the rows of each are of equal length."""
     scenes: Sequence[Scene] = field(default_factory=tuple)  #: 3D views

@@ -38,7 +38,7 @@ VOTED: Color = (1.0, 0.55, 0.1)
 ALTERNATIVE: Color = (0.6, 0.3, 0.85)
 """Colour of an alternative: violet."""
 _SURFACE_POINTS = 5000
-"""Of the posed model in a cloud."""
+"""Number of points of the posed model in a cloud."""
 _SHARP_RAD = math.radians(30)
 """Least angle between the faces at an edge that is drawn."""
 _CROSS_ARM = 0.04
@@ -47,7 +47,7 @@ _DRAWN_VOTES = 40
 """Points whose votes are drawn."""
 _DASH_PX = 6.0
 _GREY = 0.6
-"""Of the points of an observed cloud."""
+"""Grey of the points of an observed cloud."""
 
 
 def picture_of(instance: Instance) -> Float[Tensor, "3 h w"]:
@@ -67,7 +67,7 @@ def draw_pose(
     """Draw the projected box of a posed object and the border of its silhouette, in blue.
 
     Args:
-        image: of the camera; it is not changed.
+        image: image of the camera; it is not changed.
         pose: ``camera_from_model``; None: the truth alone is drawn.
         model: the object; one of points alone is drawn by small discs.
         K: intrinsic matrix of the image.
@@ -95,9 +95,9 @@ def draw_region(
     A mask is drawn only where there is no pose, whose silhouette would cover it.
 
     Args:
-        image: of the camera; it is not changed.
-        view: with its mask or box.
-        pose: that was estimated; None: it was refused.
+        image: image of the camera; it is not changed.
+        view: the view, with its mask or box.
+        pose: the pose that was estimated; None: it was refused.
     """
     if pose is None or view.is_region:
         return draw_outline(image, view.mask, _REGION_COLOR)
@@ -226,7 +226,7 @@ def posed_cloud(cloud_m: Float[Tensor, "n 3"], pose: Rigid | None, model: Object
 def object_points(pose_input: CloudInput | ViewInput, diameter_m: float) -> Float[Tensor, "n 3"]:
     """Give the valid points of a cloud, or of a masked depth image without its flying pixels [m].
 
-    ``diameter_m``: of the object, by which flying pixels are told.
+    ``diameter_m``: diameter of the object, by which flying pixels are told.
     """
     if isinstance(pose_input, ViewInput):
         return cloud_from_depth(
@@ -252,7 +252,7 @@ def grey_depth(depth_m: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
 
 
 _DARKEST_GREY = 0.15
-"""Of the farthest depth; black has no reading."""
+"""Grey of the farthest depth; black has no reading."""
 _OBJECT_COLOR = (0.55, 0.55, 0.55)
 _SURROUNDINGS_COLOR = (0.7, 0.66, 0.6)
 _BACKGROUND_COLOR = (0.45, 0.6, 0.75)
@@ -260,7 +260,7 @@ _REGION_COLOR = (1.0, 0.85, 0.1)
 _MAX_SURROUNDINGS = 20_000
 """Points of all that is not the object, and of the known background."""
 _MARGIN = 0.6
-"""Of a close-up about the object, as a share of the object's extent."""
+"""Margin of a close-up about the object, as a share of the object's extent."""
 _CLOSE_UP_PX = 360
 
 
@@ -281,14 +281,14 @@ def pose_section(
     searched, and the mask where there is no pose.
 
     Args:
-        title: of the section.
+        title: title of the section.
         pose_input: cloud or view that was posed.
         estimate: its pose, or why there is none.
         model: the object.
         text: before the sentence about the pose.
-        image: that the pose is drawn over, of the view's camera; None: the view's depth in grey.
+        image: image of the view's camera, which the pose is drawn over; None: the depth in grey.
         truth: ``camera_from_model``; None: it is unknown.
-        rows: of a table below.
+        rows: rows of a table below.
     """
     drawings: list[Drawing] = []
     if isinstance(pose_input, ViewInput):
@@ -365,7 +365,7 @@ def pose_facts(
 ) -> list[tuple[str, str]]:
     """List the facts of an estimate other than its pose: names and values.
 
-    ``method``: that estimated it, if not empty; ``agreeing``: the name of its ``inlier_share``.
+    ``method``: method that estimated it, if not empty; ``agreeing``: name of its ``inlier_share``.
     """
     facts = [("object", f"{estimate.object}, {model.diameter_m:.4f} m long")]
     if method:

@@ -24,7 +24,7 @@ class Shown:
     file: str
     caption: str
     values: str | None = None  #: file with a number for each pixel, shown under the pointer
-    unit: str = ""  #: of these numbers
+    unit: str = ""  #: unit of these numbers
     scale: Scale | None = None  #: what the colours mean; None: they are no numbers
 
 
@@ -36,14 +36,14 @@ class Answer:
     sentence: str
     facts: Sequence[tuple[str, str]]  #: names and values
     scene: Scene
-    terms: str = ""  #: of the weights, where they restrict use
+    terms: str = ""  #: terms of the weights, where they restrict use
     tables: Mapping[str, Sequence[Sequence[str]]] = field(default_factory=dict)  #: by captions
     pictures: Sequence[Shown] = ()
     files: Mapping[str, bytes] = field(default_factory=dict)  #: by names
 
 
 MOST_PIXELS = 12_500_000
-"""Of a picture that is sent: those of a phone's camera."""
+"""Most pixels of a picture that is sent: those of a phone's camera."""
 KINDS: dict[str, tuple[str, tuple[str, ...]]] = {
     "image": ("a picture", LISTED_SUFFIXES),
     "right": ("a picture", LISTED_SUFFIXES),
@@ -93,8 +93,8 @@ class Form:
         """Read the camera file that was sent, or make a camera of fields.
 
         Args:
-            keys: of a camera file, from the fields; None: left empty.
-            size: of the image [px], for a camera file without it.
+            keys: keys of a camera file, from the fields; None: left empty.
+            size: size of the image [px], for a camera file without it.
         """
         if "camera" in self.files:
             return read_camera(self.files["camera"], size)
@@ -152,7 +152,7 @@ def keep_file(folder: Path, field: str, sent_name: str, data: bytes) -> Path:
 
 
 EXAMPLE_SEED = 9
-"""Of streets and views that no weights were trained on."""
+"""Seed of streets and views that no weights were trained on."""
 
 
 def example_form(folder: Path, fields: dict[str, str]) -> dict[str, Any]:

@@ -172,9 +172,10 @@ class Queue:
     """Computations, one at a time; a limited number of requests may wait for one."""
 
     max_waiting: int
-    most_s: float  #: of one computation, which is stopped then
+    most_s: float  #: longest time of one computation, which is stopped then
     limiter: anyio.CapacityLimiter = field(default_factory=partial(anyio.CapacityLimiter, 1))
-    tickets: list[str] = field(default_factory=list)  #: of the one that computes, and who waits
+    #: tickets of the client that is served and of those that wait
+    tickets: list[str] = field(default_factory=list)
 
     @property
     def is_full(self) -> bool:
@@ -190,7 +191,7 @@ class Queue:
         """Compute in a thread once all earlier computations are done.
 
         Args:
-            ticket: by which the client asks for its position in the queue.
+            ticket: word by which the client asks for its position in the queue.
             work: the computation.
             has_client_gone: whether nobody waits for the result any longer.
 
@@ -256,7 +257,7 @@ def paced(receive: Receive) -> Receive:
 
 
 _MOST_DIGITS = 18
-"""Of a Content-Length: Python reads no number of thousands of digits."""
+"""Most digits of a Content-Length: Python reads no number of thousands of digits."""
 TICKET = "x-ticket"
 """Header of a request: a random name, by which the page asks for its position in the queue."""
 _STORED_ANSWERS = 3

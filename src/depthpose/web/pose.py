@@ -40,7 +40,7 @@ OWN_CAD = "cad"
 _SAME_SHAPE = 0.02
 """Largest difference [diameters] of size and surface of a CAD file and the weights' own object."""
 _SURFACE_POINTS = 500
-"""Of a CAD file, whose distance to that object is measured."""
+"""Number of points of a CAD file whose distance to that object is measured."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -52,7 +52,25 @@ from depthpose.core.files.disk import MAX_LIST_BYTES
 
 Matrix = Float64[np.ndarray, "rows columns"]
 
-_KITTI_NAMES = (("P2", "P3"), ("P_rect_02", "P_rect_03"), ("P0", "P1"), ("P_rect_00", "P_rect_01"))
+
+class KittiPair(NamedTuple):
+    """Keys of two cameras in a calibration of KITTI's."""
+
+    left: str  #: projection of the left camera
+    right: str  #: projection of the right camera
+    size: str  #: width and height of the rectified images; few files have it
+
+
+KITTI_COLOR = (
+    KittiPair("P2", "P3", "S_rect_02"),
+    KittiPair("P_rect_02", "P_rect_03", "S_rect_02"),
+)
+"""The colour pair in the object and the raw layout."""
+KITTI_GREY = (
+    KittiPair("P0", "P1", "S_rect_00"),
+    KittiPair("P_rect_00", "P_rect_01", "S_rect_00"),
+)
+"""The grey pair in the object and the raw layout."""
 _KITTI = re.compile(r"^(?:P|P_rect_0)[0-3]\s*:\s*[-+.\d]", re.MULTILINE)
 _MIDDLEBURY = re.compile(r"^cam0\s*=", re.MULTILINE)
 _FOCAL_LINES = re.compile(r"^[ \t]*focal_px[ \t]*:", re.MULTILINE)
@@ -75,8 +93,8 @@ _TUM_UNIT_M = 1 / 5000
 _DOFFS = "cx_right_minus_left_px"
 _OPTIONAL_LINES = ("width", "height", "focal_y_px", _DOFFS)
 _MAX_FOCAL_PX = 1e6  # larger numbers are no focal length
-_LARGEST_NUMBER = 1e300  # of JSON: larger whole numbers have no float
-_BARE_NUMBERS = 20  # that are read of a file of bare numbers: more than any format has
+_LARGEST_NUMBER = 1e300  # largest number of JSON: larger whole numbers have no float
+_BARE_NUMBERS = 20  # numbers that are read of a file of bare numbers: more than any format has
 
 
 def _middlebury_facts(path: AnyPath) -> CameraFacts:
@@ -154,6 +172,21 @@ def kitti_matrix(
             "Copy the file anew."
         )
     return np.array(keys[name], dtype=np.float64).reshape(shape)
+
+
+def choose_kitti_pair(keys: Mapping[str, list[float]], pairs: Sequence[KittiPair]) -> KittiPair:
+    """Choose the first of some pairs whose left projection a calibration has.
+
+    Where it has none of them, the first pair is given: :func:`kitti_matrix` then raises the error
+    that names its missing projection.
+    """
+    return next((pair for pair in pairs if pair.left in keys), pairs[0])
+
+
+def read_kitti_size(keys: Mapping[str, list[float]], pair: KittiPair) -> Size | None:
+    """Read width and height [px] of the rectified images of a pair; None where they are absent."""
+    sides = keys.get(pair.size, [])
+    return (int(sides[0]), int(sides[1])) if len(sides) == 2 else None
 
 
 def _colmap_facts(text: str) -> CameraFacts:
@@ -492,14 +525,10 @@ def _read_facts(path: AnyPath) -> CameraFacts:
 def _kitti_facts(path: AnyPath) -> CameraFacts:
     """Read KITTI's colour pair (cameras 2 and 3), else its grey pair; or the left camera alone."""
     keys = read_key_values(path)
-    present = [pair for pair in _KITTI_NAMES if pair[0] in keys]
-    left, right = present[0] if present else _KITTI_NAMES[0]
-    left_P = kitti_matrix(path, keys, left, (3, 4))
-    right_P = kitti_matrix(path, keys, right, (3, 4)) if right in keys else None
-    rectified_size = keys.get(f"S_rect_{left[-2:]}", [])
-    size = None
-    if len(rectified_size) == 2:
-        size = (int(rectified_size[0]), int(rectified_size[1]))
+    pair = choose_kitti_pair(keys, (*KITTI_COLOR, *KITTI_GREY))
+    left_P = kitti_matrix(path, keys, pair.left, (3, 4))
+    right_P = kitti_matrix(path, keys, pair.right, (3, 4)) if pair.right in keys else None
+    size = read_kitti_size(keys, pair)
     return facts_from_projections("a KITTI calibration", left_P, right_P, size)
 
 
@@ -543,8 +572,8 @@ class FieldOfView:
 
 
 AnyLens = AnyCamera | FieldOfView | float | np.number[Any]
-"""The same, or the focal length [px] or field of view alone: the principal point is then the
-image's centre."""
+"""A camera in any form of ``AnyCamera``, or its focal length [px] or field of view alone: the
+principal point is then the image's centre."""
 
 
 def camera_of(camera: AnyLens | None, size: Size) -> Camera | None:

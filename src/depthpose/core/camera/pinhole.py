@@ -31,12 +31,12 @@ class Camera:
         InputError: a value is out of its range.
     """
 
-    width: int  #: of the image [px]
-    height: int  #: of the image [px]
+    width: int  #: width of the image [px]
+    height: int  #: height of the image [px]
     K: Float[Tensor, "3 3"]  #: ``[[fx, skew, cx], [0, fy, cy], [0, 0, 1]]`` [px], float64
     depth_unit_m: float | None = None  #: metres a unit of its depth images, where it has any
     mount_height_m: float | None = None  #: height above the road, where known
-    tilt_deg: float | None = None  #: of the optical axis against the road; up is > 0
+    tilt_deg: float | None = None  #: tilt of the optical axis against the road; up is > 0
 
     def __post_init__(self) -> None:
         for name, (smallest, largest, reason) in _RANGES.items():
@@ -78,7 +78,7 @@ class StereoRig(Camera):
     """
 
     baseline_m: float  #: the right camera's x in the left camera's frame [m], positive
-    cx_right_minus_left_px: float = 0.0  #: of the two principal points (Middlebury's ``doffs``)
+    cx_right_minus_left_px: float = 0.0  #: difference of cx (Middlebury's ``doffs``)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -249,16 +249,16 @@ OPTIONAL_KEYS = ("depth_unit_m", "mount_height_m", "tilt_deg")  # beside the mat
 
 _NORMALISED_FX = 2  # a smaller fx is divided by the width
 _MM_FX_SHARE = 0.1  # a focal length below a tenth of the width sees 157 degrees: no pinhole does
-_MAX_FX_SHARE = 200  # of the width: less than 0.3 degrees
-_MIN_UNIT_M = 1e-6  # of depth images: with a smaller unit 16 bits would end before 7 cm
+_MAX_FX_SHARE = 200  # largest fx as a multiple of the width: it spans 0.3 degrees
+_MIN_UNIT_M = 1e-6  # least unit of depth images: with a smaller one 16 bits would end before 7 cm
 _FILE_BASELINE_M = 5.0  # a file's number of 50 to 120 is in mm or cm, though a plane may be as wide
 WIDE_BASELINE_M = 2.0  # wider than cars' rigs: cm, or squares of a board, where no unit is named
 _MIN_FILE_BASELINE_M = 1e-3
 _MAX_CM = 30  # a larger number without a unit is in millimetres
-_SAME_FOCAL_SHARE = 1e-3  # by which the focal lengths of a rectified pair may differ
-_SAME_ROW_PX = 0.5  # by which cy of a rectified pair may differ
-SAME_DIFFERENCE_PX = 1.0  # by which doffs may differ from that of the two matrices
-_MAX_SQUEEZE = 1.8  # of fx to fy, or fy to fx; KITTI's images squeezed to 512x256 have 1.66
+_SAME_FOCAL_SHARE = 1e-3  # share by which the focal lengths of a rectified pair may differ
+_SAME_ROW_PX = 0.5  # difference that cy of a rectified pair may have
+SAME_DIFFERENCE_PX = 1.0  # difference of doffs from that of the two matrices
+_MAX_SQUEEZE = 1.8  # ratio of fx to fy or fy to fx; KITTI's images squeezed to 512x256 have 1.66
 _NO_DISTORTION = 1e-8  # largest coefficient that counts as 0
 _OFF_CENTRE = 0.1  # share of the size that a principal point may be off; KITTI's is below 0.04
 _SAME_SHARE = 0.05  # by which shares along x and y may differ and still mean another resolution
@@ -270,7 +270,7 @@ _CORNER = 0.1  # share of the size at which a principal point is in the corner
 class CameraFacts:
     """Values of a camera file before they are checked; the image's size may be missing."""
 
-    kind: str  # of file, for errors
+    kind: str  # kind of file, for errors
     K: Float[Tensor, "3 3"]
     size: Size | None = None
     baseline_m: float | None = None
@@ -465,7 +465,7 @@ def refuse_other_resolution(K: Float[Tensor, "3 3"], width: int, height: int) ->
     cy = float(K[1, 2])
     x_share = (cx + 0.5) / width - 0.5
     y_share = (cy + 0.5) / height - 0.5
-    scale = 1 + x_share + y_share  # of the resolution of K to that of the image
+    scale = 1 + x_share + y_share  # ratio of the resolution of K to that of the image
     is_same_share = abs(x_share - y_share) <= _SAME_SHARE * max(scale, 1)
     if min(abs(x_share), abs(y_share)) < _OFF_CENTRE or not is_same_share:
         return

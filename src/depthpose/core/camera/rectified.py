@@ -16,18 +16,18 @@ from torch.nn import functional
 from depthpose.core.errors import InputError
 
 # Matching of corners.
-_COARSE_PIXELS = 36_000  # of the copy on which corners are matched
-_FINE_PIXELS = 180_000  # of that on which matches are refined
-_RADIUS = 5  # of a patch of the coarse copy: 11x11 pixels
-_FINE_RADIUS = 7  # of a patch of the fine copy: 15x15 pixels
+_COARSE_PIXELS = 36_000  # pixels of the copy on which corners are matched
+_FINE_PIXELS = 180_000  # pixels of the copy on which matches are refined
+_RADIUS = 5  # half side of a patch of the coarse copy: 11x11 pixels
+_FINE_RADIUS = 7  # half side of a patch of the fine copy: 15x15 pixels
 _FINE_REACH = 4  # pixels of the fine copy that are searched around a coarse match
 _CELL = 8  # pixels; one corner a cell spreads the corners over the image
 _MAX_CORNERS = 200
 _MIN_CORNER = 1e-5  # smaller eigenvalue, for grey in [0, 1]: below is noise
 _MIN_CONTRAST = 0.01  # standard deviation of the grey values of a patch
-_MIN_DEVIATION = 0.004  # of those of an image
+_MIN_DEVIATION = 0.004  # least standard deviation of the grey values of an image
 _MIN_SCORE = 0.8  # correlation of a good match
-_MAX_RIVAL = 0.95  # of the best score: a second match so good means a repeated pattern
+_MAX_RIVAL = 0.95  # share of the best score: a second match so good means a repeated pattern
 _RIVAL_RADIUS = 4  # pixels around the best match whose scores are part of its peak
 _MUTUAL_PX = 1  # a corner that is matched back may miss itself by this much
 
@@ -35,19 +35,19 @@ _MUTUAL_PX = 1  # a corner that is matched back may miss itself by this much
 _MIN_MATCHES = 25
 _MIN_WRONG = 12  # matches that show that rows differ, but not that they agree
 _MIN_TEXTURED = 60  # corners of an image from which the shares below can be judged
-_MIN_MATCHED_SHARE = 0.1  # of the corners, between both images of a pair
+_MIN_MATCHED_SHARE = 0.1  # share of the corners that match between both images of a pair
 _MAX_ALIKE_SHARE = 0.7  # of the corners match something in another scene; more: a repeated pattern
 _MAX_OFFSET_PX = 1.0  # street pairs have up to 0.3
 _MAX_SPREAD_PX = 0.75  # street pairs have 0.1 to 0.4; a rotation by 0.3 degrees makes 1.2 to 2.5
 _LIMITS_WIDTH = 1280  # in wider images the limits grow with the width
-_MAX_SHARE_SWAPPED = 0.2  # of positive disparities
+_MAX_SHARE_SWAPPED = 0.2  # largest share of positive disparities in a swapped pair
 _SAME_PX = 0.5  # a match within this distance of the same pixel has not moved
-_SAME_SHARE = 0.9  # of matches that have not moved: both images show the same view
-_MAD_TO_DEVIATION = 1.4826  # of a normal distribution
+_SAME_SHARE = 0.9  # share of matches that have not moved: both images show the same view
+_MAD_TO_DEVIATION = 1.4826  # MAD to standard deviation of a normal distribution
 
 # Search for the change of a right image that does not match.
-_TRIED_CORNERS = 100  # that are matched to a mirrored, rotated or scaled right image
-_MIN_TRIED_MATCHES = 20  # of them
+_TRIED_CORNERS = 100  # corners that are matched to a mirrored, rotated or scaled right image
+_MIN_TRIED_MATCHES = 20  # least number of these corners that match
 _LUMA = (0.299, 0.587, 0.114)  # shares of red, green and blue in the brightness, ITU-R BT.601
 _TRIED_CHANGES = [
     *((sign * angle, 1.0) for angle in (90.0, 20.0, 40.0, 65.0) for sign in (1, -1)),
@@ -70,7 +70,8 @@ class RectificationReport:
 
     vertical_offset_px: float = math.nan  #: median of the right row less the left row
     vertical_spread_px: float = math.nan  #: its median absolute deviation, as a standard deviation
-    positive_share: float = math.nan  #: of disparities beyond 1 px; NaN: none is
+    #: share of the disparities beyond 1 px that are positive; NaN: none is beyond
+    positive_share: float = math.nan
     corners: int = 0  #: corners of the left image that were sought in the right one
     matches: int = 0  #: matches that all this rests on
     is_pair: bool | None = None  #: whether the images belong together
@@ -102,7 +103,7 @@ def check_rectified(
 
     Args:
         left: RGB in [0, 1].
-        right: of the same size.
+        right: the right image, of the same size.
         cx_difference_px: principal point of the right image less that of the left one, in x.
 
     Raises:
@@ -342,7 +343,7 @@ def _make_report(
         from_centre_px: pixels of the matches in the left image, from its centre (n, 2).
         shift_px: their shifts to the right image (n, 2).
         corners: number of corners that were to be matched.
-        width: of the images [px].
+        width: width of the images [px].
         cx_difference_px: principal point of the right image less that of the left one, in x.
     """
     # How far rows are off, robustly, and how many disparities are positive.

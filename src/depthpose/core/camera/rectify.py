@@ -29,6 +29,7 @@ from depthpose.core.camera.stored_camera import (
     find_matrix,
     find_size,
     is_ros,
+    is_ros_pair,
     normalise_keys,
     order_ros_pair,
     parse_numbers,
@@ -52,13 +53,13 @@ _D = {
 }  # fmt: skip
 _R = ("r", "rotation", "rotationmatrix")
 _T = ("t", "translation", "translationvector")
-_PINHOLE_COUNTS = (4, 5, 8, 12, 14)  # of distortion coefficients, as OpenCV takes them
+_PINHOLE_COUNTS = (4, 5, 8, 12, 14)  # numbers of distortion coefficients that OpenCV takes
 _FISHEYE_COUNTS = (4,)
 _MAX_BASELINE_M = 10.0
 _MIN_ROTATION_DEG = 0.2  # a difference that can be told from an error of the calibration
 _TRANSPOSED_SHARE = 0.5  # R looks transposed if its transpose rotates the cameras by less of that
-_MAX_ENLARGEMENT = 4  # of a raw image by its rectification
-_MAX_FOCAL_RATIO = 1.5  # of the two cameras of a pair; more is of images of two sizes
+_MAX_ENLARGEMENT = 4  # largest enlargement of a raw image by its rectification
+_MAX_FOCAL_RATIO = 1.5  # largest ratio of fx of a pair; a larger one is of images of two sizes
 _KNOWN = (
     "a camchain of Kalibr, OpenCV's K1, D1, K2, D2, R and T (in one file, or intrinsics.yml and "
     "extrinsics.yml in a folder), or a folder with left.yaml and right.yaml of ROS"
@@ -163,7 +164,7 @@ def _read_pair(path: Path, unit_m: float, is_fisheye: bool | None) -> RawPair:
     """
     if path.is_dir():
         first, second = read_pair_files(path)
-        if is_ros(first) and is_ros(second) and "p2" not in first | second:
+        if is_ros_pair(first, second):
             return _from_ros(first, second, unit_m, is_fisheye)
         return _from_opencv(first | second, unit_m, is_fisheye)
     text = read_text(path, MAX_LIST_BYTES)
@@ -336,7 +337,7 @@ class Rectifier:
     rig: StereoRig  #: the camera of the rectified pair
     rectified_from_raw: Rigid  #: carries points from the raw left camera's frame to its
     left_maps: Maps  #: column and row of the raw left image for each pixel of the rectified one
-    right_maps: Maps  #: the same of the right image
+    right_maps: Maps  #: column and row of the raw right image, likewise
 
     def rectify(
         self,

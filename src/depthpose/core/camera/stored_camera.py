@@ -277,6 +277,11 @@ def is_ros(fields: Fields) -> bool:
     return any(key in fields for key in _ROS)
 
 
+def is_ros_pair(first: Fields, second: Fields) -> bool:
+    """Whether two files are the ``camera_info`` of a pair, and not OpenCV's of both cameras."""
+    return is_ros(first) and is_ros(second) and "p2" not in first | second
+
+
 def read_pair_files(folder: Path) -> tuple[Fields, Fields]:
     """Read the two YAML or XML files of a folder, in the order of their names.
 
@@ -299,7 +304,7 @@ def read_pair_files(folder: Path) -> tuple[Fields, Fields]:
 def facts_from_folder(folder: Path) -> CameraFacts:
     """Read the rig of a folder: two cameras of ROS, or OpenCV's intrinsics and extrinsics."""
     first, second = read_pair_files(folder)
-    if is_ros(first) and is_ros(second) and "p2" not in first | second:
+    if is_ros_pair(first, second):
         return facts_from_ros_pair(first, second)
     facts = facts_from_fields(first | second)
     if facts is None:

@@ -9,14 +9,15 @@ from torch.nn import functional
 from depthpose.core.camera.rectified import check_rectified, grey_of
 
 Arrangement = Literal["side by side", "top and bottom"]
-_ROWS = 32  # of the small copies of both halves, which are compared
+_ROWS = 32  # rows of the small copies of both halves, which are compared
 _COLUMNS = 64
 _MAX_SHIFT = 12  # columns by which the copies are shifted
 _MIN_CORRELATION = 0.6
-"""Of the halves without the means of rows and columns: it is 0.77 to 0.95 for the two views of 25
-KITTI pairs put together, and -0.2 to 0.43 for the halves of their left images."""
+"""Least correlation of the two halves, without the means of rows and columns, where they are two
+views: it is 0.77 to 0.95 for the two views of 25 KITTI pairs put together, and -0.2 to 0.43 for the
+halves of their left images."""
 _MIN_DEVIATION = 0.01  # standard deviation of the grey values of a copy in [0, 1]
-_MIN_MATCHES = 25  # of corners of both halves
+_MIN_MATCHES = 25  # least matches of corners between both halves
 
 
 def halves(image: Float[Tensor, "3 h w"], arrangement: Arrangement) -> tuple[Tensor, Tensor]:

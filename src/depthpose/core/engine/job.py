@@ -234,7 +234,7 @@ _CONNECT_TIMEOUT_S = 10
 class RayEngine:
     """Processes blocks with Ray Data, on this machine or a cluster."""
 
-    address: str | None = None  #: of a running cluster, or ``auto``; None starts one for this job
+    address: str | None = None  #: a running cluster, or ``auto``; None starts one for this job
     workers: int | None = None  #: at most; None: as many as fit when the job begins
     worker_cpus: float = 1.0  #: cores that a worker asks for
     worker_gpus: float = 0.0  #: GPUs that it asks for; a fraction lets workers share one

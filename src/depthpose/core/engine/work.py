@@ -20,7 +20,7 @@ from pathlib import Path, PurePosixPath
 
 from depthpose.core.errors import InputError
 from depthpose.core.files import stores
-from depthpose.core.files.disk import file_system, find_partners, refused_write
+from depthpose.core.files.disk import file_system, find_partners, refuse_equal_names, refused_write
 
 PLAN = "plan.jsonl"
 SHARDS = "shards"
@@ -36,14 +36,14 @@ class Files:
     """
 
     roles: tuple[str, ...]  #: a word for each file of an input, such as ``("left", "right")``
-    suffixes: tuple[str, ...]  #: that the files may have, in lower case, with the dot
+    suffixes: tuple[str, ...]  #: suffixes of the files, in lower case, with the dot
 
 
 @dataclass(frozen=True, slots=True)
 class Item:
     """A listed input: its files, and the name of its results."""
 
-    name: str  #: of its results: unique in a job, relative, without a suffix
+    name: str  #: name of its results: unique in a job, relative, without a suffix
     files: tuple[str, ...]  #: paths or URLs, in the order of the roles
 
 
@@ -73,14 +73,8 @@ def find_items(words: Sequence[str], files: Files) -> list[Item]:
     else:
         items += _pair_roles(paths, files.suffixes)
 
-    item_of_name: dict[str, Item] = {}
-    for item in items:
-        first = item_of_name.setdefault(item.name, item)
-        if first is not item:
-            raise InputError(
-                f"{first.files[0]} and {item.files[0]} would both be {item.name!r} in the "
-                "results; give a manifest with a column 'name'"
-            )
+    files_by_name = [(item.name, item.files[0]) for item in items]
+    refuse_equal_names(files_by_name, "give a manifest with a column 'name'")
     return items
 
 
@@ -238,7 +232,7 @@ def read_tar(url: str) -> Iterator[tuple[str, bytes]]:
 class Sample:
     """An input whose files are local."""
 
-    name: str  #: of its results
+    name: str  #: name of its results
     files: tuple[Path, ...] = ()  #: local paths, in the order of the roles
     reason: str = ""  #: why it has no files; such a sample is not passed to a ``Function``
 
@@ -359,7 +353,7 @@ class Work:
 
     start: Callable[[], Function]  #: loads what all samples need, such as a network
     files: Files  #: what files an input consists of
-    endings: Sequence[str]  #: of the files of a result
+    endings: Sequence[str]  #: endings of the files of a result
     batch: int = 1  #: samples that the function gets at once
 
 
@@ -368,8 +362,8 @@ class ShardRecord:
     """The record of a processed block: its shard of results, and why some inputs have none."""
 
     shard: str  #: name of the shard, with its suffix
-    entries: tuple[tuple[str, str], ...]  #: of each input the name, and "" or why it failed
-    endings: tuple[str, ...]  #: that the files of a result may have
+    entries: tuple[tuple[str, str], ...]  #: name of each input, and "" or why it failed
+    endings: tuple[str, ...]  #: endings of the files of a result
     stamp: tuple[int, ...]  #: size [bytes], time of the last change [ns] and CRC-32 of the shard
     block: int  #: CRC-32 of the block, as JSON
 
@@ -392,7 +386,7 @@ class ShardRecord:
         return cls(**row)
 
 
-_CHUNK_BYTES = 2**22  # of a file whose checksum is computed, read at a time
+_CHUNK_BYTES = 2**22  # bytes of a file that are read at a time for its checksum
 
 
 def file_stamp(path: Path) -> tuple[int, int, int]:
@@ -422,7 +416,7 @@ class Runner:
 
     work: Work
     out: str  #: folder of the results, by path or URL
-    function: Function | None = None  #: of the work, once it has started
+    function: Function | None = None  #: function of the work, once it has started
 
     def run(self, block: Block) -> ShardRecord:
         """Process a block to its shard and record, unless both exist and no input failed.

@@ -36,7 +36,7 @@ from depthpose.core.files.points import (
 _ENCODERS = {".ply": encode_ply, ".pcd": encode_pcd}
 _COLOR = ("red", "green", "blue")
 _SEPARATORS = re.compile(r"[\s,;]+")
-_INSPECTED_ROWS = 100  # by which the layout of a table is recognised
+_INSPECTED_ROWS = 100  # rows by which the layout of a table is recognised
 _MANY_ROWS = 5  # a table of fewer rows and more columns than the next looks transposed
 _MAX_COLUMNS = 12
 _MAX_SCAN_BYTES = 2**26  # largest scan of a LiDAR that is read, thirty times KITTI's

@@ -15,7 +15,7 @@ import tarfile
 import unicodedata
 import warnings
 from collections import Counter
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
@@ -33,7 +33,7 @@ MAX_TEXT_BYTES = 2**26  # a table of a million points, annotations of ten thousa
 MAX_LIST_BYTES = 2**20  # largest text that lists a few numbers: a calibration, a camera, a config
 _MAX_MEMORY = 700_000_000  # [bytes] of JSON once it is read, estimated from its text
 _MAX_YAML_DEPTH = 50  # lists in lists of YAML
-_MAX_YAML_VALUES = 2_000_000  # of YAML whose references are written out
+_MAX_YAML_VALUES = 2_000_000  # most values of YAML whose references are written out
 _SAFE_LOADER: type[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 """Ten times faster where PyYAML was built with libyaml, as its wheels are."""
 _MERGE = "tag:yaml.org,2002:merge"  # tag of the key ``<<``
@@ -496,6 +496,35 @@ def natural_order(path: Path) -> tuple[list[list[str | tuple[int, str]]], Path]:
         return key
 
     return [key_of(part) for part in (*path.parent.parts, path.stem)], path
+
+
+def refuse_equal_names(files_by_name: Iterable[tuple[str, str | Path]], remedy: str) -> None:
+    """Refuse two inputs of one name: the results of one would overwrite those of the other.
+
+    Args:
+        files_by_name: the name and the file of each input.
+        remedy: what the user may do, for the error.
+
+    Raises:
+        InputError: names both files.
+    """
+    file_of: dict[str, str | Path] = {}
+    for name, file in files_by_name:
+        if name in file_of:
+            raise InputError(
+                f"{file_of[name]} and {file} would both be {name!r} in the results; {remedy}"
+            )
+        file_of[name] = file
+
+
+def refuse_equal_stems(files: Iterable[Path]) -> None:
+    """Refuse two input files whose names differ in the suffix or the folder alone.
+
+    Raises:
+        InputError: as :func:`refuse_equal_names`.
+    """
+    remedy = "rename one, or give it in a run of its own"
+    refuse_equal_names([(path.stem, path) for path in files], remedy)
 
 
 def stem_of(path: Path) -> str:

@@ -61,7 +61,7 @@ _HUFFMAN_TABLES = 0xC4
 _START_OF_SCAN = 0xDA
 _GREY_16 = ("I;16", "I;16L", "I;16B", "I;16N")
 _EXIF_ORIENTATION = 0x0112
-_PHOTOMETRIC = 0x0106  # of TIFF: 0 where the value 0 is white
+_PHOTOMETRIC = 0x0106  # tag of TIFF: 0 where the value 0 is white
 _UPRIGHT = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
@@ -359,7 +359,7 @@ def encode_image(image: Tensor, name: AnyPath, quality: int = 95) -> bytes:
     Args:
         image: RGB ``(3, h, w)`` in [0, 1].
         name: its suffix decides the format.
-        quality: of a JPEG, 1 to 95.
+        quality: quality of a JPEG, 1 to 95.
 
     Raises:
         InputError: the shape, the values or the suffix are wrong.
@@ -427,7 +427,7 @@ def refuse_among_inputs(out: Path, words: Iterable[str | Path], files: Iterable[
     """Refuse to write results beside the inputs: the next run would read them as inputs.
 
     Args:
-        out: where the results go.
+        out: folder of the results.
         words: files, folders or patterns, as the user named them.
         files: the files that these words stand for.
 
@@ -529,7 +529,7 @@ _RESOLUTION_UNIT = 0xA210
 _PIXELS = 0xA002
 _PIXELS_DOWN = 0xA003
 _SAME_ASPECT = 1.02  # scaled pictures are rounded to whole pixels, and cameras cut some rows
-_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # of a unit of resolution: inch, cm, mm, micrometre
+_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # millimetres of TIFF's units: inch, cm, mm, micrometre
 _DIAGONAL_MM = math.hypot(36, 24)
 
 

@@ -31,7 +31,7 @@ class Field:
     name: str
     code: str  # numpy's type code without byte order, such as "f4"
     count: int = 1  # numbers a record; of several only the first is read
-    size_code: str | None = None  # of a list, the type of its length; None: it is no list
+    size_code: str | None = None  # type of the length of a list; None: it is no list
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +135,7 @@ _MAX_HEADER = 2**16  # bytes in which the end of a header is looked for
 _END = re.compile(rb"(?:^|[\r\n])end_header[ \t]*(?:\r\n|\n|\r)")
 
 
-_MAX_RUNS = 500_000  # of binary lists of equal lengths, each read at once; more take over 10 s
+_MAX_RUNS = 500_000  # most runs of binary lists of one length, read at once; more take over 10 s
 _LEAST_ROWS_AHEAD = 64  # rows of binary lists that are taken to be as long as the first of a run
 _SURPLUS_BYTES = 3  # behind binary data do no harm: a line end
 

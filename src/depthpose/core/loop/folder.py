@@ -167,7 +167,7 @@ def write_card(
     folder = weights.parent
     versions = environment()
     machine = ", ".join(versions[name] for name in ("machine", "gpu") if name in versions)
-    step = 0  # of the last state that is not damaged
+    step = 0  # step of the last state that is not damaged
     for path in reversed(saved_states(folder)):
         with suppress(InputError):
             step = _read_state(path)["step"]

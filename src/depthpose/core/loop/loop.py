@@ -82,7 +82,7 @@ class Run:
         """Claim the folder for a training with this config, and write the config into it.
 
         Args:
-            config: of any training; it has ``loop``.
+            config: config of any training; it has ``loop``.
             weights: names of the weights that such a training writes.
             more: what decides the weights besides the config, such as checksums of files.
             without: settings of the config that change no weight.

@@ -210,7 +210,7 @@ def _check_truth(
     """Report a map of depth or disparity whose size, range or values do not fit its pair.
 
     Args:
-        path: of the map.
+        path: path of the map.
         size: width and height of the left image.
         rig: the cameras, where they are known.
         report: matches between the views; None: values are not compared with them.

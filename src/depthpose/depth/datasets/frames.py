@@ -23,7 +23,17 @@ from depthpose.core.camera import (
     read_camera,
     read_rig,
 )
-from depthpose.core.camera.camera_file import Matrix, kitti_matrix, plain_facts
+from depthpose.core.camera.camera_file import (
+    KITTI_COLOR,
+    KITTI_GREY,
+    KittiPair,
+    Matrix,
+    choose_kitti_pair,
+    errors_naming,
+    kitti_matrix,
+    plain_facts,
+    read_kitti_size,
+)
 from depthpose.core.camera.pinhole import (
     CameraFacts,
     Size,
@@ -59,19 +69,16 @@ def read_object_calibration(
 
     Args:
         path: the file.
-        width: of the images.
-        height: of the images.
+        width: width of the images [px].
+        height: height of the images [px].
         is_grey: read the grey pair, P0 and P1, in place of the colour pair.
 
     Raises:
         InputError: a matrix is missing or damaged, or the file is of images of another size.
     """
     keys = files.read_key_values(path)
-    if is_grey:
-        names = ("P0", "P1")
-    else:
-        names = ("P2", "P3") if "P2" in keys else ("P_rect_02", "P_rect_03")
-    rig, left = _projected_rig(path, keys, names, (width, height))
+    pair = choose_kitti_pair(keys, KITTI_GREY if is_grey else KITTI_COLOR)
+    rig, left = _projected_rig(path, keys, pair, (width, height))
 
     # The LiDAR.
     if "Tr_velo_to_cam" in keys:
@@ -95,9 +102,9 @@ def read_plain_calibration(path: Path, name: str, width: int, height: int) -> St
 
     Args:
         path: the file.
-        name: of the pair.
-        width: of the images, if the file has one calibration for all pairs.
-        height: of the images, likewise.
+        name: name of the pair.
+        width: width of the images [px], for a file with one calibration for all pairs.
+        height: height of the images [px], likewise.
 
     Raises:
         InputError: there is no calibration of the pair, several, or one that is damaged.
@@ -145,34 +152,29 @@ def _leading_numbers(line: str) -> list[float]:
 
 def _rig(path: Path, facts: CameraFacts, size: Size | None) -> StereoRig:
     """Make the rig of a calibration, whose file ``path`` is named in errors."""
-    try:
+    with errors_naming(path):
         rig = camera_from_facts(facts, size)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
     assert isinstance(rig, StereoRig), "datasets name both cameras"
     return rig
 
 
 def _projected_rig(
-    path: Path, keys: Mapping[str, list[float]], names: tuple[str, str], size: Size
+    path: Path, keys: Mapping[str, list[float]], pair: KittiPair, size: Size
 ) -> tuple[StereoRig, Matrix]:
     """Make the rig of a calibration's two projections; give the left projection too.
 
-    ``names``: of both projections; ``size``: width and height of the images.
+    ``pair``: the keys of both cameras; ``size``: width and height of the images.
     """
-    left, right = (kitti_matrix(path, keys, name, (3, 4)) for name in names)
-    sides = keys.get("S_rect_02", [])  # width and height of the rectified images
-    stated_size = (int(sides[0]), int(sides[1])) if len(sides) == 2 else size
+    left, right = (kitti_matrix(path, keys, name, (3, 4)) for name in (pair.left, pair.right))
+    stated_size = read_kitti_size(keys, pair) or size
     if stated_size != size:
         raise InputError(
-            f"{path}: S_rect_02 says {stated_size[0]}x{stated_size[1]}, but the image is "
+            f"{path}: {pair.size} says {stated_size[0]}x{stated_size[1]}, but the image is "
             f"{size[0]}x{size[1]}. It was cropped or scaled: give its own calibration, in a "
             "folder of pairs."
         )
-    try:
+    with errors_naming(path):
         facts = facts_from_projections("a KITTI calibration", left, right)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
     return _rig(path, facts, size), left
 
 
@@ -277,7 +279,7 @@ class Frame:
     depth: Path | None = None
     #: disparity of the left image, 16-bit PNG (x 256), PFM or NPY, of occluded pixels too
     disparity: Path | None = None
-    disparity_noc: Path | None = None  #: the same, of the pixels that both views show only
+    disparity_noc: Path | None = None  #: disparity of those pixels alone that both views show
     sky: Path | None = None  #: 8-bit PNG of the left image, not 0 where it shows the sky
 
     def seen_files(self, *, with_right: bool = True) -> list[Path]:
@@ -334,7 +336,8 @@ def kitti_calibration(frame: Frame) -> KittiCalibration:
     camera_file = frame.calibration / "calib_cam_to_cam.txt"
     lidar_file = frame.calibration / "calib_velo_to_cam.txt"
     camera_keys = files.read_key_values(camera_file)
-    rig, left = _projected_rig(camera_file, camera_keys, ("P_rect_02", "P_rect_03"), size)
+    raw_pair = KITTI_COLOR[1]
+    rig, left = _projected_rig(camera_file, camera_keys, raw_pair, size)
     if not lidar_file.is_file():
         return KittiCalibration(rig=rig, pixels_from_velodyne=None)
     rectify = kitti_matrix(camera_file, camera_keys, "R_rect_00", (3, 3))

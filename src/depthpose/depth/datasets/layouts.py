@@ -297,7 +297,7 @@ def _odometry(folder: Path) -> Iterable[Frame]:
 def _benchmark(folder: Path, left_name: str, right_name: str, ending: str) -> Iterable[Frame]:
     """Find the frames of KITTI object, 2012 or 2015: of the stereo sets those of truth, NNNNNN_10.
 
-    ``ending``: of the names of folders with true disparity.
+    ``ending``: ending of the names of folders with true disparity.
     """
     root = folder / "training" if (folder / "training" / left_name).is_dir() else folder
     lefts = _listed(root / left_name)
@@ -422,7 +422,7 @@ def write_raw_frame(folder: Path, drive: str, number: int, frame: RawFrame) -> N
     Args:
         folder: the root of the dates.
         drive: ``DATE_drive_NNNN_sync``.
-        number: of the frame in its drive.
+        number: number of the frame in its drive.
         frame: the images and their truth.
 
     Raises:

@@ -317,17 +317,7 @@ class FakestereoNet:
         How is said by :func:`~depthpose.depth.estimator.pair.depth_from_pair` and
         :func:`~depthpose.depth.estimator.single_image.depth_from_images`.
         """
-        if depth_input.right is None:
-            sizes = self.virtual_sizes(depth_input)
-            return self._estimate_single_images([depth_input], sizes, mount)[0]
-        if self.matcher is None:
-            raise InputError(
-                f"{depth_input.name}: there is a right image, and these weights answer one image "
-                "alone: a pair needs a matcher. Give matcher='sgbm', or weights of a matcher; "
-                "'depthpose weights pack G --matcher S --trained-on DATA --licence L --out W' "
-                "makes one file of both."
-            )
-        return depth_from_pair(self.matcher, depth_input, with_check=with_check)
+        return self._estimate_in_groups([depth_input], with_check=with_check, mount=mount)[0]
 
     @force_float32()
     def estimate_many(
@@ -349,7 +339,7 @@ class FakestereoNet:
         Args:
             images: inputs; or pictures, or a batch of them as one array or tensor. An iterator is
                 read as its images are needed.
-            camera: of the pictures, as for :meth:`estimate`; inputs have their own.
+            camera: camera of the pictures, as for :meth:`estimate`; inputs have their own.
             focal_px: the focal length alone [px], in place of ``camera``.
             fov_deg: the horizontal field of view alone [degrees], in place of both.
             with_check: of pairs, as for :meth:`estimate`.
@@ -375,16 +365,16 @@ class FakestereoNet:
         total = len(sequence) if isinstance(sequence, Sized) else None
 
         estimates: list[DepthEstimate | InputError] = []
-        estimate_batch = partial(self.estimate_together, lens=lens, with_check=with_check)
+        estimate = partial(self.estimate_batch, lens=lens, with_check=with_check)
         batches = _named_batches(sequence, batch)
         with tqdm(total=total, unit=" images", disable=not with_progress) as bar:
-            for estimates_of_batch in each_in_threads(estimate_batch, batches, threads):
+            for estimates_of_batch in each_in_threads(estimate, batches, threads):
                 estimates += estimates_of_batch
                 bar.update(len(estimates_of_batch))
         return estimates
 
     @force_float32()
-    def estimate_together(
+    def estimate_batch(
         self,
         named: Sequence[tuple[str, object]],
         lens: AnyLens | None = None,
@@ -392,7 +382,7 @@ class FakestereoNet:
         with_check: bool = True,
         mount: MountFilter | None = None,
     ) -> list[DepthEstimate | InputError]:
-        """Estimate one batch; where an image of it is unusable, estimate each image by itself.
+        """Estimate a batch at once; where that fails, each image by itself, so that others succeed.
 
         Args:
             named: names and inputs, or pictures.
@@ -409,7 +399,7 @@ class FakestereoNet:
                 image if isinstance(image, StereoInput) else as_input(image, name, lens)
                 for name, image in named
             ]
-            return self._estimate_inputs(inputs, with_check=with_check, mount=mount)
+            return [*self._estimate_in_groups(inputs, with_check=with_check, mount=mount)]
         except InputError as error:
             if len(named) == 1:
                 return [error]
@@ -419,30 +409,57 @@ class FakestereoNet:
             mount.last = last_mount
         estimates: list[DepthEstimate | InputError] = []
         for named_image in named:
-            estimates += self.estimate_together(
+            estimates += self.estimate_batch(
                 [named_image], lens, with_check=with_check, mount=mount
             )
         return estimates
 
-    def _estimate_inputs(
+    def _estimate_in_groups(
         self, inputs: Sequence[StereoInput], *, with_check: bool, mount: MountFilter | None
-    ) -> list[DepthEstimate | InputError]:
-        """Estimate inputs in order, successive single images of one virtual size together."""
+    ) -> list[DepthEstimate]:
+        """Estimate inputs in order: pairs one by one, single images of one virtual size together.
+
+        Raises:
+            InputError: an input cannot be estimated.
+        """
         sizes_of_inputs = [
             None if depth_input.right is not None else self.virtual_sizes(depth_input)
             for depth_input in inputs
         ]
         sized = zip(sizes_of_inputs, inputs, strict=True)
-        estimates: list[DepthEstimate | InputError] = []
+        estimates: list[DepthEstimate] = []
         for sizes, group in groupby(sized, key=itemgetter(0)):
             group_inputs = [depth_input for _, depth_input in group]
-            if sizes is None:  # pairs
+            if sizes is None:
                 estimates += [
-                    self.estimate_input(pair, with_check=with_check) for pair in group_inputs
+                    self._estimate_pair(pair, with_check=with_check) for pair in group_inputs
                 ]
-            else:
-                estimates += self._estimate_single_images(group_inputs, sizes, mount)
+                continue
+            assert self.synthesiser is not None, "virtual_sizes checked it"
+            estimates += depth_from_images(
+                self.synthesiser,
+                self.matcher,
+                group_inputs,
+                sizes,
+                mount=mount,
+                allow_ood=self.allow_ood,
+            )
         return estimates
+
+    def _estimate_pair(self, pair: StereoInput, *, with_check: bool) -> DepthEstimate:
+        """Estimate a pair by the matcher.
+
+        Raises:
+            InputError: there is no matcher, or what :meth:`estimate` raises of a pair.
+        """
+        if self.matcher is None:
+            raise InputError(
+                f"{pair.name}: there is a right image, and these weights answer one image "
+                "alone: a pair needs a matcher. Give matcher='sgbm', or weights of a matcher; "
+                "'depthpose weights pack G --matcher S --trained-on DATA --licence L --out W' "
+                "makes one file of both."
+            )
+        return depth_from_pair(self.matcher, pair, with_check=with_check)
 
     def virtual_sizes(self, image: StereoInput) -> list[tuple[int, int]]:
         """Give the sizes (rows, columns) at which the generator sees one image.
@@ -457,18 +474,6 @@ class FakestereoNet:
                 "right=, or weights with a generator ('depthpose weights list')."
             )
         return virtual_sizes(self.synthesiser, image, allow_ood=self.allow_ood)
-
-    def _estimate_single_images(
-        self,
-        images: list[StereoInput],
-        sizes: list[tuple[int, int]],
-        mount: MountFilter | None = None,
-    ) -> list[DepthEstimate]:
-        """Estimate single images, all of the same virtual sizes."""
-        assert self.synthesiser is not None, "virtual_sizes checked it"
-        return depth_from_images(
-            self.synthesiser, self.matcher, images, sizes, mount=mount, allow_ood=self.allow_ood
-        )
 
 
 def _named_batches(images: Iterable[object], batch: int) -> Iterator[list[tuple[str, object]]]:

@@ -54,14 +54,14 @@ class DepthPipeline:
         Args:
             inputs: as :meth:`FakestereoNet.estimate` takes them, and as transformers does: the
                 address of a picture (http, https), or its file in base64.
-            camera: of all pictures. Without it, ``focal_px`` and ``fov_deg`` a picture's EXIF is
-                taken, or else 0.75 widths, a phone's, with a notice: the metres are as wrong as
-                that is.
+            camera: camera of all pictures. Without it, ``focal_px`` and ``fov_deg`` a picture's
+                EXIF is taken, or else 0.75 widths, a phone's, with a notice: the metres are as
+                wrong as that is.
             images: another name of ``inputs``.
             focal_px: the focal length alone [px].
             fov_deg: the horizontal field of view alone [degrees].
             batch_size: pictures of one size in one call of the networks; None: the pipeline's.
-            timeout: of a download [s]; None: none.
+            timeout: longest time of a download [s]; None: no limit.
 
         Returns:
             For each picture ``predicted_depth``, metres (H, W), NaN where there are none, and

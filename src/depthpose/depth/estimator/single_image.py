@@ -37,7 +37,7 @@ def depth_from_images(
         matcher: pair to disparity; None where the synthesiser answers disparity itself.
         images: without right views, all of the same virtual sizes.
         sizes: these sizes, by :func:`virtual_sizes`.
-        mount: of one camera, whose successive frames the images then are.
+        mount: mount of one camera, whose successive frames the images then are.
         allow_ood: as for :func:`depth_before_mount`.
 
     Raises:
@@ -175,8 +175,8 @@ def _refuse_ood(
     """Refuse an image that is out of distribution for the weights, or warn of it.
 
     Args:
-        synthesiser: whose config has the limit.
-        name: of the image, for the error.
+        synthesiser: the synthesiser, whose config has the limit.
+        name: name of the image, for the error.
         image_confidence: how sure the generator is of the image as a whole, 0..1.
         allow_ood: warn, and do not refuse.
 

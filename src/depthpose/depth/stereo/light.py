@@ -40,7 +40,8 @@ Quarter = Float[Tensor, "b h4 w4"]
 STEM = 16
 """Channels at half size."""
 _OFFSETS = (-2, -1, 0, 1, 2)
-"""Where the refinement compares the views: so many pixels at half size from the disparity."""
+"""Differences from the disparity [pixels at half size] at which the refinement compares the
+views."""
 _GROUPS = 4
 _REFINED = 32
 """Groups of features that the refinement compares, and its channels at half size."""
@@ -178,7 +179,7 @@ Scores = Float[Tensor, "b d h4 w4"]
 _CANDIDATES = 2
 """Disparities of the highest scores whose mean is the answer."""
 _WINDOW = 0.15
-"""Of a disparity: what lies so near to it counts for its confidence."""
+"""Share of a disparity: what lies nearer to it than that counts for its confidence."""
 _USUAL_PX = 64
 """A disparity of this size is 1 to the class of the sky."""
 _SKY_WIDTH = 32
@@ -229,7 +230,7 @@ class SkyHead(nn.Module):
         Args:
             levels: features from 1/4 size down.
             quarter_px: disparity at 1/4 size. Detached: no gradient reaches the matcher by it.
-            confidence: of it, likewise: what is surely matched as near is no sky.
+            confidence: its confidence, likewise: what is surely matched as near is no sky.
         """
         quarter, *coarser = levels
         context: list[Tensor] = []  # of the coarser levels; the coarsest one has none
@@ -425,7 +426,7 @@ class LightStereo(StereoNetwork):
 
     @property
     def encoder(self) -> LiteEncoder:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Of ImageNet, in the features."""
+        """The part that may begin with weights of ImageNet: the encoder of the features."""
         return self.features.encoder
 
     @property
@@ -456,7 +457,7 @@ class LightStereo(StereoNetwork):
         Args:
             left: normalised left views.
             right: normalised right views.
-            max_disparity_px: so many disparities are searched.
+            max_disparity_px: number of disparities that are searched.
             first_px: the least of them, a multiple of 4; negative where rigs have principal points
                 apart.
             with_confidence: say how sure each pixel is.

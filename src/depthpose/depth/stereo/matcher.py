@@ -77,7 +77,7 @@ class CameraMatcher(Matcher, Protocol):
 
         Args:
             pairs: left and right images, as for ``match``.
-            camera: of the left images; None: it is not known.
+            camera: camera of the left images; None: it is not known.
 
         Raises:
             InputError: as for ``match``.
@@ -197,8 +197,8 @@ class SGBMMatcher:
             blockSize=3,  # side of the matched window [px]
             P1=8 * 3 * 9,  # penalty of a disparity step of 1 between neighbours
             P2=32 * 3 * 9,  # and of a larger step
-            disp12MaxDiff=1,  # of the left-right check [px]
-            preFilterCap=63,  # of the horizontal gradient
+            disp12MaxDiff=1,  # largest difference of the left-right check [px]
+            preFilterCap=63,  # largest horizontal gradient
             uniquenessRatio=10,  # by which the best cost must beat the second [%]
             speckleWindowSize=100,  # islands of at most so many pixels are dropped ...
             speckleRange=2,  # ... where they step by more than this [px]
@@ -328,7 +328,7 @@ class NetworkMatcher(ABC):
         Args:
             left: left views.
             right: right views, the same size.
-            network_config: of the network, perhaps with more disparities than it was trained with.
+            network_config: config of the network, perhaps of more disparities than in training.
             first_px: the least disparity that is searched, a multiple of 4; other
                 than 0 for networks alone that find the range.
         """
@@ -520,7 +520,7 @@ def lower_where_disagreeing(
     sky keeps its confidence.
 
     Args:
-        match: that of the left view.
+        match: match of the left view.
         right_px: disparity of the right view.
         tolerance_px: a difference that says nothing.
         falls_px: what is larger by so much takes the agreement down to 1/e.

@@ -166,7 +166,7 @@ def choose_search_range(
         matcher: a network.
         measured: where the disparities lie.
         size: rows and columns of the images.
-        camera: of the left image, where it is known.
+        camera: camera of the left image, where it is known.
     """
     scale, usual_span_px = _usual_scale_and_span(matcher, size, camera)
     high_px = measured.high_px

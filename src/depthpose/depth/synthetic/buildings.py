@@ -26,7 +26,7 @@ class Style(NamedTuple):
     window_m: tuple[Number, Number]  # width and height
     gap_m: Number  # wall between two windows
     recess_m: float  # depth of the panes behind the wall
-    frame: Color  # of the windows
+    frame: Color  # colour of the frames of windows
     with_details: bool  # sills, frames and gutters; left out where they are finer than a pixel
 
 
@@ -37,8 +37,8 @@ class Plot(NamedTuple):
     start_m: Number  # along the street
     stop_m: Number
     side: int  # 1 on the right of the street, -1 on the left
-    depth_m: Number  # from front to back
-    height_m: float  # of the walls
+    depth_m: Number  # distance from front to back
+    height_m: float  # height of the walls
     ground_m: Number  # y of the ground
 
 

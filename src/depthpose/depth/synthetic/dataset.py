@@ -79,7 +79,7 @@ def nearest_at(
     """Find the nearest triangle on rays between the pixel centres, among candidates of each ray.
 
     Args:
-        visibility: from the camera of the rays.
+        visibility: what the camera of the rays sees.
         candidates: numbers of triangles that are visible near each ray, -1 for none.
         places: lists of pixels (u, v) [px], which share the candidates.
 
@@ -117,7 +117,7 @@ def nearest_at(
 def neighbours(primitive: Int[Tensor, "h w"], index: Indices) -> Int[Tensor, "n 5"]:
     """Give the triangles that are visible at some pixels and at the four neighbours of each.
 
-    ``index``: of the pixels in the flattened image.
+    ``index``: indices of the pixels in the flattened image.
     """
     height, width = primitive.shape
     column = index % width
@@ -191,8 +191,8 @@ def _edge_light(
 
     Args:
         stage: the scene.
-        visibility: from the camera.
-        index: of the edge pixels in the flattened image.
+        visibility: what the camera sees.
+        index: indices of the edge pixels in the flattened image.
         centres: (u, v) of their centres [px].
         at_centre: the triangles at their centres.
     """
@@ -256,7 +256,7 @@ class Sensor:
     noise: tuple[float, float]  # standard deviation of the shot noise of white, and of read noise
     gamma: float  # exponent of the tone curve
     jpeg_quality: int | None  # None: not compressed
-    noise_seed: int  # of this picture
+    noise_seed: int  # seed of the noise of this picture
 
 
 def draw_sensors(
@@ -394,8 +394,8 @@ _OCCLUSION_SHARE = 1e-4
 class StreetFrame(RawFrame):
     """A synthetic pair with its exact truth."""
 
-    right_disparity_px: Map  #: of the right image; NaN in the sky, as that of the left one
-    depth_m: Map  #: of the left image, camera z; NaN in the sky
+    right_disparity_px: Map  #: disparity of the right image; NaN in the sky, likewise
+    depth_m: Map  #: camera z in the left image; NaN in the sky
     is_road: Mask  #: left pixels that show the carriageway
 
 
@@ -485,7 +485,7 @@ def draw_scene(
         scene: the scene.
         rig: the cameras, whose size the views have, whatever the scale of ``config``.
         config: settings of the sensors.
-        seed: of the sensors' noise and misalignment, and of the LiDAR.
+        seed: seed of the noise and misalignment of the cameras, and of the LiDAR.
         projector: adds dots; None: none.
     """
     rng = np.random.default_rng([73, *seed])

@@ -78,7 +78,7 @@ class Surface(NamedTuple):
 
 SIDE_PX = 256
 LEVELS = 9
-"""From 256 pixels down to 1."""
+"""Number of levels of a texture, with sides from 256 pixels down to 1."""
 
 Plane = Float[np.ndarray, "256 256"]
 Picture = Float[np.ndarray, "256 256 3"]
@@ -90,7 +90,7 @@ _y, _x = np.mgrid[:SIDE_PX, :SIDE_PX].astype(np.float32) / SIDE_PX
 class Textures:
     """All textures at all levels of detail."""
 
-    texels: Float16[Tensor, "n 3"]  # of all textures, level by level
+    texels: Float16[Tensor, "n 3"]  # texels of all textures, level by level
     starts: Int[Tensor, " levels"]  # where each level begins
     clouds: Float[Tensor, "256 256"]  # a field of noise for clouds
     stains: Float[Tensor, "256 256"]  # a field of noise for unevenness over metres
@@ -499,10 +499,10 @@ class MeshBuilder:
         """Add a box. Boxes are made all at once, in :meth:`finish`.
 
         Args:
-            centre: of the box [m].
+            centre: centre of the box [m].
             size: along x, y and z, before it is rotated [m].
             surface: what it looks like.
-            rotation: of the box.
+            rotation: rotation of the box.
             taper: scales its upper face, toward -y.
         """
         R = np.eye(3) if rotation is None else rotation

@@ -62,11 +62,11 @@ def add_leaves(
 
     Args:
         b: adds them.
-        centre: of the cloud [m].
-        radii: of the ellipsoid that they fill, or half sides of the block [m].
+        centre: centre of the cloud [m].
+        radii: radii of the ellipsoid that they fill, or half sides of the block [m].
         count: number of leaves.
         length_m: mean length of a leaf.
-        surface: of the leaves.
+        surface: surface of the leaves.
         is_block: fill the surface of a block, as of a clipped hedge, in place of an ellipsoid.
     """
     rng = b.rng
@@ -384,7 +384,7 @@ class Body(NamedTuple):
     stations: tuple[tuple[Number, Number, Number], ...]
     glazed: tuple[int, int]  # first and last cross-section with windows between them
     wheels: tuple[float, ...]  # places of the axles
-    share: Number  # of all vehicles
+    share: Number  # share of all vehicles
 
 
 _HATCH = ((-0.5, 0.4, 0.45), (-0.49, 0.6, 0.62), (-0.45, 0.62, 0.66), (-0.35, 0.62, 0.96),

@@ -51,7 +51,7 @@ class Road:
     curb_m: float  # height of the pavement above the road
     verge_m: Number  # width of the grass between road and pavement
     side_streets: tuple[SideStreet, ...]
-    centre: Float64[np.ndarray, "n 5"]  # of the road: s, x, y, z [m] and heading [rad]
+    centre: Float64[np.ndarray, "n 5"]  # centre line of the road: s, x, y, z [m] and heading [rad]
 
     def is_side_street(self, s_m: Number, side: int, margin_m: Number = 0.0) -> bool:
         """Whether a side street joins at a place, or within a margin of it."""
@@ -251,8 +251,8 @@ def _strip(
 
     Args:
         b: takes the faces.
-        x_m: of the strip's two long edges, to the right.
-        y_m: of the same edges, down.
+        x_m: x of the strip's two long edges, to the right.
+        y_m: y of the same edges, down.
         surface: material and colour.
         stations: ascending positions s ahead, along the road [m].
     """

@@ -78,7 +78,7 @@ class Markings:
     lines: Float64[np.ndarray, "n 4"]
     # Across the road: s, half length, first and last x, and 1 if it is striped, else 0.
     bars: Float64[np.ndarray, "m 5"]
-    brightness: float  # of the paint
+    brightness: float  # brightness of the paint
     wheel_tracks: tuple[float, float]  # x of the left lane's left edge, width of the lanes
 
 

@@ -30,7 +30,7 @@ class LightMap:
     """A shadow map: depth of the first surface along a light; points beyond it are in shadow."""
 
     depth_m: Float[Tensor, "side side"]
-    rotation: Float[Tensor, "3 3"]  # from the camera's frame to that of the light
+    rotation: Float[Tensor, "3 3"]  # rotation from the camera's frame to that of the light
     low: Float[Tensor, "2"]  # the light-frame corner of the map [m]
     pixels_per_m: Float[Tensor, "2"]  # scale of its columns and rows
     texel_m: float  # the larger of its two pixel sizes
@@ -112,12 +112,12 @@ def _light_map(
     """Draw a shadow map: the depth along a light, over a part of the scene before the camera.
 
     Args:
-        corners: of the triangles that cast shadows [m].
+        corners: corners of the triangles that cast shadows [m].
         to_light: direction to the light.
         half_m: extent of that part to the left and to the right.
         reach_m: its nearest and farthest distance ahead.
         full_px: side of the map at full size.
-        share: of the full size.
+        share: share of the full size.
     """
     side_px = round(full_px * share)
     away = F.normalize(-to_light, dim=0)
@@ -172,9 +172,11 @@ _OCCLUDER_OFFSETS_PX = ((5, 2), (-2, 5), (-5, -2), (2, -5), (1, 1))
 """Columns and rows from a point on the sky's map to the texels that may hide the sky from it: one
 in each direction, and a neighbour."""
 _OCCLUSION_MARGIN_PX = 10
-"""So near the border of the sky's map nothing is hidden: surfaces beyond it are not known."""
+"""Distance from the border of the sky's map within which nothing is hidden: surfaces beyond it are
+not known."""
 _OCCLUDER_CLEARANCE_M = 0.08
-"""A surface hides the sky if it is so much higher than the point: a slope does not hide its own."""
+"""Least height above a point from which a surface hides the sky from it: a slope does not hide its
+own."""
 _OCCLUSION_DECAY_PER_M = 0.25
 """The higher above the point an occluder is, the less it hides: half as much at 4 m."""
 _OCCLUSION_OF_TEXEL = 0.17
@@ -379,7 +381,7 @@ def _paint_road(
 
     Args:
         scene: the street.
-        albedo: of the asphalt.
+        albedo: albedo of the asphalt.
         place_m: coordinates (x, s) on the road.
         width_m: width of the pixels' footprints.
         length_m: their length along the road.

@@ -33,7 +33,7 @@ class TrainingPairs:
 
     Args:
         config: which pairs, and how they are changed.
-        seed: of the order and the changes.
+        seed: seed of the order and the changes.
         needs_truth: read truth, and leave out frames without the kind that ``config.truth`` names.
         is_mixed: use frames without truth, and frames without a right view, too. The left image of
             the latter stands for both views.

@@ -56,8 +56,8 @@ def start_from(network: Generator | StereoNetwork, loaded: nn.Module, source: st
     Parts that the network has beyond them (``with_sky``) keep their initial weights.
 
     Args:
-        network: that is trained.
-        loaded: that holds the weights.
+        network: the network that is trained.
+        loaded: the network that holds the weights.
         source: their file, for errors.
 
     Raises:

@@ -328,7 +328,7 @@ class SelectionSamples:
         sources: one or two.
         more_share: share of the samples from the second source.
         config: degradation of the input.
-        seed: of the random numbers.
+        seed: seed of the random numbers.
 
     Attributes:
         truths: which kind of truth each source gives, as :class:`TrainingPairs` has it.

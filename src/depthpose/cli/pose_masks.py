@@ -1,0 +1,199 @@
+"""Masks of a data set by their names: annotated, published, detected or segmented ones."""
+
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+from tqdm import tqdm
+
+from depthpose.cli.file_names import name_files
+from depthpose.cli.pose_dataset import dataset_settings
+from depthpose.core.checkpoint import file_sha256, find_weights
+from depthpose.core.errors import InputError
+from depthpose.core.files import read_image, write_json
+from depthpose.core.run import claim_folder
+from depthpose.pose import datasets, predictions
+from depthpose.pose.datasets.layouts import integer, read_rows
+from depthpose.pose.segmentation import Segmenter
+from depthpose.pose.types import ViewInput
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Masks:
+    """One kind of masks of a data set, its name in tables, and what decides which masks they are.
+
+    ``make_jobs`` makes a job for each mask; it takes the names that the method has for the objects,
+    by their numbers in the data set.
+    """
+
+    name: str
+    make_jobs: Callable[[Mapping[int, str]], list[predictions.PoseJob[ViewInput]]]
+    settings: Mapping[str, Any]
+
+
+def prepare_masks(
+    kinds: Sequence[str], dataset: datasets.BopDataset, out: Path, device: str = "cpu"
+) -> list[Masks]:
+    """Prepare each kind of masks; images are segmented now where a kind is a segmentation.
+
+    Args:
+        kinds: each ``truth`` (annotated masks), ``predicted`` (those that came with
+            Linemod_preprocessed), a JSON file of BOP detections, or weights of a segmentation.
+        dataset: data set whose instances are masked.
+        out: folder of the run; segmented masks are written below it.
+        device: device that segments.
+    """
+    paths = [mask_path(kind) for kind in kinds]
+    names = name_files(kinds, paths)
+    masks: list[Masks] = []
+    for kind, path, name in zip(kinds, paths, names, strict=True):
+        if path is not None:
+            masks.append(_detected_masks(path, name, dataset, out, device))
+        elif kind == "predicted":
+            masks.append(_predicted_masks(dataset))
+        else:
+            make_jobs = partial(predictions.instance_jobs, dataset)
+            masks.append(Masks(name=name, make_jobs=make_jobs, settings={}))
+    return masks
+
+
+def _detected_masks(
+    path: Path, name: str, dataset: datasets.BopDataset, out: Path, device: str
+) -> Masks:
+    """Take masks from a JSON file of BOP detections, or segment the images by weights."""
+    if path.suffix == ".json":
+        detections = datasets.read_detections(path)
+    else:
+        detections = _segment_dataset(path, name, dataset, out, device)
+    make_jobs = partial(predictions.detection_jobs, dataset, detections=detections)
+    return Masks(name=name, make_jobs=make_jobs, settings={"masks_sha256": file_sha256(path)})
+
+
+def _predicted_masks(dataset: datasets.BopDataset) -> Masks:
+    """Take the masks that a segmentation network left in the data set, as it was published."""
+    predicted_mask = datasets.LAYOUTS[dataset.layout].predicted_mask
+    if predicted_mask is None:
+        raise InputError(
+            f"{dataset.folder}: came without predicted masks, as Linemod_preprocessed has "
+            "them; give --masks a file of BOP detections, or weights of a segmentation"
+        )
+    make_jobs = partial(predictions.instance_jobs, dataset, predicted_mask=predicted_mask)
+    return Masks(name="predicted", make_jobs=make_jobs, settings={"masks_of": "segnet_results"})
+
+
+def mask_path(kind: str) -> Path | None:
+    """Give the file of a kind of masks, as :func:`prepare_masks` takes it.
+
+    None for ``truth`` and ``predicted``, which are in the data set.
+    """
+    if kind in ("truth", "predicted"):
+        return None
+    return Path(kind) if kind.endswith(".json") else find_weights(kind)
+
+
+def _segment_dataset(
+    path: Path, name: str, dataset: datasets.BopDataset, out: Path, device: str
+) -> list[datasets.Detection]:
+    """Segment the images of a data set by weights, except those that an earlier run segmented.
+
+    Detections of all objects of the weights are written to ``OUT/detections/NAME.json``, so that a
+    later run may ask for other objects, or for more images.
+    """
+    segmenter = Segmenter.load(path, device)
+    numbers = _numbers_in_dataset(segmenter, dataset, path)
+
+    home = out / "detections" / name
+    claim_folder(home, {"weights_sha256": file_sha256(path), **dataset_settings(dataset)})
+    detections_file = home.parent / f"{name}.json"
+    images_file = home / "images.json"
+    segmented: set[tuple[int, int]] = set()
+    detections: list[datasets.Detection] = []
+    with suppress(InputError):  # damaged or missing: all is segmented again
+        earlier = datasets.read_detections(detections_file)
+        segmented = _read_segmented_images(images_file)
+        detections = [d for d in earlier if (d.scene_id, d.image_id) in segmented]
+
+    images = {(i.scene_id, i.image_id): i for i in dataset.instances}
+    unsegmented = [images[image] for image in sorted(images.keys() - segmented)]
+    if unsegmented:
+        for instance in tqdm(unsegmented, "segmentation", disable=None, unit=" images"):
+            detections += _segment_image(segmenter, instance, numbers)
+        datasets.write_detections(detections_file, detections)
+        rows = [
+            {"scene_id": scene, "im_id": image}
+            for scene, image in sorted(segmented | images.keys())
+        ]
+        write_json(images_file, rows)
+    return detections
+
+
+def _numbers_in_dataset(
+    segmenter: Segmenter, dataset: datasets.BopDataset, path: Path
+) -> dict[str, int]:
+    """Give the data set's number of each object of the weights: by its name, else by its number.
+
+    Objects of the data set that the weights do not segment are printed; it is an error if they
+    segment none.
+    """
+    names = datasets.object_names(dataset.folder)
+    number_by_name = {name: number for number, name in names.items()}
+    weights_numbers = dict(zip(segmenter.weights.objects, segmenter.weights.numbers, strict=True))
+    numbers: dict[str, int] = {}
+    for name, number in weights_numbers.items():
+        if name in number_by_name:
+            numbers[name] = number_by_name[name]
+        elif names.get(number) not in weights_numbers:  # the number is no other object's
+            numbers[name] = number
+
+    wanted = {instance.object_id for instance in dataset.instances}
+    missing = sorted(wanted - set(numbers.values()))
+    if len(missing) == len(wanted):
+        weights_objects = ", ".join(f"{name} ({k})" for name, k in weights_numbers.items())
+        raise InputError(
+            f"{path}: segments {weights_objects}, but {dataset.folder} shows objects {missing}; "
+            "give weights of its objects"
+        )
+    if missing:
+        print(f"{path}: segments no objects {missing}; each is missing", file=sys.stderr)
+    return numbers
+
+
+def _read_segmented_images(path: Path) -> set[tuple[int, int]]:
+    """Read which images an earlier run segmented: scene and image numbers."""
+    source = str(path)
+    return {
+        (integer(row, "scene_id", source), integer(row, "im_id", source)) for row in read_rows(path)
+    }
+
+
+def _segment_image(
+    segmenter: Segmenter, instance: datasets.Instance, numbers: Mapping[str, int]
+) -> list[datasets.Detection]:
+    """Segment the image of an instance; ``numbers``: of the data set's objects, by their names."""
+    if instance.rgb is None:
+        raise InputError(f"{instance.name}: has no picture, and a segmentation needs pictures")
+    start = perf_counter()
+    segmented = segmenter.segment(read_image(instance.rgb))
+    seconds = perf_counter() - start
+
+    detections: list[datasets.Detection] = []
+    for object, masks in segmented.masks.items():
+        if object not in numbers:
+            continue
+        scores = segmented.scores[object].tolist()
+        for mask, score in zip(masks, scores, strict=True):
+            detection = datasets.Detection(
+                scene_id=instance.scene_id,
+                image_id=instance.image_id,
+                object_id=numbers[object],
+                score=score,
+                segmentation=datasets.encode_rle(mask),
+                seconds=seconds,
+            )
+            detections.append(detection)
+    return detections

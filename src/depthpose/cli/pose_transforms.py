@@ -1,0 +1,93 @@
+"""Poses and other rigid transforms that options give, as files or as numbers."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from depthpose.core.errors import InputError
+from depthpose.core.rigid import Rigid
+from depthpose.pose import predictions
+from depthpose.pose.datasets.layouts import read_rows
+from depthpose.pose.inputs import rigid_input
+
+_FARTHEST_BASE_M = 50.0
+"""Largest distance of a camera from the base of its robot; a larger one is in millimetres."""
+
+
+def read_pose(path: Path, option: str = "--first", transform: str = "camera_from_model") -> Rigid:
+    """Read a pose: the only one of a ``poses.json``, or a 4x4 matrix in a text file, in metres.
+
+    Brackets, commas and semicolons between its numbers are skipped. ``option`` and ``transform``
+    name the file and the matrix in errors.
+    """
+    if path.name == predictions.POSES:
+        return _read_only_pose(path, option)
+    try:
+        text = path.read_text()
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{option} {path}: cannot be read ({error}); give a text file with the 4x4 matrix "
+            f"{transform} in metres"
+        ) from error
+    return _parse_rigid(text, f"{option} {path}", transform)
+
+
+def _read_only_pose(path: Path, option: str) -> Rigid:
+    """Read the pose of a ``poses.json`` that holds exactly one."""
+    estimates = [
+        predictions.parse_prediction(row, f"{path}: entry {i}").estimate
+        for i, row in enumerate(read_rows(path))
+    ]
+    poses = [
+        estimate.camera_from_model
+        for estimate in estimates
+        if estimate.camera_from_model is not None
+    ]
+    if len(poses) != 1:
+        raise InputError(
+            f"{option} {path}: holds {len(poses)} poses; give a poses.json of one, or a text file "
+            "with the 4x4 matrix camera_from_model in metres"
+        )
+    return poses[0]
+
+
+def read_base(words: Sequence[str]) -> Rigid | None:
+    """Read ``--base-from-camera``: a text file, or 16 numbers row by row; None: it is unset."""
+    if not words:
+        return None
+    option = "--base-from-camera"
+    transform = "base_from_camera"
+    if len(words) == 1 and Path(words[0]).is_file():
+        base = read_pose(Path(words[0]), option, transform)
+    else:
+        base = _parse_rigid(" ".join(words), option, transform)
+    distance_m = float(base.t_m.norm())
+    if distance_m > _FARTHEST_BASE_M:
+        raise InputError(
+            f"{option}: the camera is {distance_m:.0f} m from the base; is that in "
+            "millimetres? Give metres"
+        )
+    return base
+
+
+def _parse_rigid(text: str, source: str, transform: str) -> Rigid:
+    """Parse a rigid transform: the 16 numbers of its 4x4 matrix, row by row, in metres.
+
+    ``source`` and ``transform`` name it in errors.
+    """
+    try:
+        words = re.sub(r"[\[\],;]", " ", text).split()
+        values = torch.tensor([float(word) for word in words], dtype=torch.float64)
+    except ValueError as error:
+        raise InputError(
+            f"{source}: cannot be read as numbers ({error}); give a text file with the 4x4 matrix "
+            f"{transform} in metres"
+        ) from error
+    if len(values) != 16:
+        raise InputError(f"{source}: {len(values)} numbers; give the 16 of a 4x4 matrix")
+    try:
+        return rigid_input(values.reshape(4, 4), transform, transform)
+    except InputError as error:
+        raise InputError(f"{source}: {error}") from error
