@@ -245,18 +245,17 @@ def _refine_distinct_copies(
     distinct: list[RefinedPose] = []
     distinct_poses = [winner_pose]
     for competitor in competitors:
-        copy = competitor.refined
+        refined, start = competitor
         if view is not None:
             # Depth lets a copy drift about an axis of its shape, where its print fixes the angle.
-            settled = settle_spin(copy.camera_from_model, prepared.model, view)
-            copy = replace(copy, camera_from_model=settled)
-        # Where little observed fixes a copy, refinement lets it drift toward others: it stays then.
-        start = competitor.unrefined
-        if not bool(same(copy.camera_from_model, start.camera_from_model[None]).any()):
-            copy = start
-        if not bool(same(copy.camera_from_model, Rigid.stack(distinct_poses)).any()):
-            distinct.append(copy)
-            distinct_poses.append(copy.camera_from_model.double())
+            settled = settle_spin(refined.camera_from_model, prepared.model, view)
+            refined = replace(refined, camera_from_model=settled)
+        # Where little observed fixes a copy, refinement lets it drift toward others: both compete.
+        has_drifted = not same(refined.camera_from_model, start.camera_from_model[None]).any()
+        for copy in (start, refined) if has_drifted else (refined,):
+            if not bool(same(copy.camera_from_model, Rigid.stack(distinct_poses)).any()):
+                distinct.append(copy)
+                distinct_poses.append(copy.camera_from_model.double())
     return distinct
 
 
