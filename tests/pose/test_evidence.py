@@ -24,7 +24,7 @@ from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid, rotation_by
 from depthpose.pose.cloud import cloud_from_depth, grow_mask
 from depthpose.pose.evidence import Observation, _mean_depth, compare, observe
-from depthpose.pose.mesh import make_model, turn_about
+from depthpose.pose.mesh import turn_about
 from depthpose.pose.rendering import render_surface
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.synthetic.parts import make_part
@@ -102,50 +102,6 @@ def test_of_very_many_faces_the_samples_are_rendered(monkeypatch: pytest.MonkeyP
     both = np.isfinite(depth_m) & np.isfinite(exact_m)
     assert both.sum() > 0.99 * np.isfinite(exact_m).sum()
     assert np.median(np.abs(depth_m - exact_m)[both]) < 0.0005
-
-
-def points_of(model: ObjectModel, number: int) -> ObjectModel:
-    """A model of random points of the surface, as scanned objects often come."""
-    corners_m = model.vertices_m[model.faces].double()
-    edges_m = corners_m[:, 1:] - corners_m[:, :1]
-    normals = torch.linalg.cross(edges_m[:, 0], edges_m[:, 1])
-    area = normals.norm(dim=-1)
-    face = area.multinomial(number, replacement=True, generator=generator(0))
-    share = torch.rand(number, 2, generator=generator(1)).double()
-    share = torch.where(share.sum(1, keepdim=True) > 1, 1 - share, share)
-    points_m = corners_m[face, 0] + (share[..., None] * edges_m[face]).sum(1)
-    none = torch.zeros(0, 3, dtype=torch.int64)
-    return make_model(points_m.float(), none, name="points")
-
-
-def test_nothing_shows_through_the_points_of_a_model() -> None:
-    """Random points leave gaps, in which the back of a bar, 3 cm deeper, would show."""
-    pose = Rigid(torch.eye(3), torch.tensor([0.0, 0.0, 0.35])).double()
-    front_m = 0.35 - 0.015
-    surface = prepare_surface(points_of(BAR, 2500))
-    with_gaps_m = rasterize(pose.apply(surface.triangles_m), K, 320, 240).depth_m.numpy()
-    depth_m, cosine, window = render_surface(surface, pose, K, 240, 320)
-    is_front = ndimage.binary_erosion(np.isfinite(with_gaps_m), iterations=9)[window]
-    assert (with_gaps_m[window][is_front] > front_m + 0.02).sum() > 10, "there are gaps"
-    assert depth_m[is_front].max() < front_m + 0.006
-    assert np.quantile(np.abs(depth_m[is_front] - front_m), 0.95) < 0.002
-    assert np.median(cosine[is_front]) > 0.9
-
-
-def test_a_hole_of_a_model_of_points_stays_open() -> None:
-    ring = make_part("flange")
-    truth = Rigid(torch.eye(3), torch.tensor([0.0, 0.0, 0.4])).double()
-    triangles = truth.apply(ring.vertices_m.double())[ring.faces]
-    exact_m = rasterize(triangles, K, 320, 240).depth_m.numpy()
-    holes, number = ndimage.label(np.logical_not(np.isfinite(exact_m)))
-    assert number > 1, "one of them is the background"
-    depth_m, _, window = render_surface(prepare_surface(points_of(ring, 5000)), truth, K, 240, 320)
-    image_m = np.full((240, 320), np.nan)
-    image_m[window] = depth_m
-    largest = max(range(2, number + 1), key=lambda k: (holes == k).sum())
-    is_hole = ndimage.binary_erosion(holes == largest, iterations=4)
-    assert is_hole.sum() > 20
-    assert not np.isfinite(image_m[is_hole]).any()
 
 
 def test_slanted_pixels_are_drawn_as_the_renderer_draws_them() -> None:

@@ -53,9 +53,6 @@ _NEAREST_WITHIN = 1
 _MEETING = 2.0
 """Deviations of the noise: sides of a silhouette that are farther apart do not meet there, and an
 edge that bends more toward the camera is concave."""
-_WHOLLY_CONTINUED = 0.5
-"""Share of a silhouette across which the surface goes on, from which that contradicts the whole of
-what is visible."""
 _LEAST_INNER = 0.25  # share of the silhouette that must remain without its borders
 _OBJECT_PX = 8000  # pixels of an object that are compared; the window of a larger one is thinned
 _NEIGHBOURS = 4  # the one whose distance is the spacing of a cloud's points
@@ -210,13 +207,14 @@ def compare(observation: Observation, pose: Rigid, surface: Surface) -> Evidence
     seen_through = _patch_area(deviations > THRESHOLD, patch_area_px2)
     bulging = _patch_area(is_bulging, patch_area_px2)
     beside = _patch_area(is_beside, patch_area_px2)
-    visible = float(inner.sum()) / patch_area_px2
     continued = 0.0
     if not observation.is_masked:  # else the mask says where the object ends
-        share = _continued_share(observation, is_drawn, is_supported, rendering.window)
-        continued = visible * min(1.0, share / _WHOLLY_CONTINUED)
+        is_continued = _is_continued(observation, is_drawn, is_supported, rendering.window)
+        # A patch in which the surface goes on is as long as others, and half as wide.
+        continued = _patch_area(is_continued, patch_area_px2 / 2)
 
     is_explained = _lies_on_rendering(observation, rendering)
+    visible = float(inner.sum()) / patch_area_px2
     supported = float(is_supported.sum()) / patch_area_px2
     squares = deviations[is_supported] ** 2
     return Evidence(
@@ -286,13 +284,13 @@ def _is_beside_silhouette(
     return observation.is_object & np.isfinite(observation.depth_m) & np.logical_not(is_near)
 
 
-def _continued_share(
+def _is_continued(
     observation: Observation,
     is_drawn: np.ndarray,
     is_supported: np.ndarray,
     window: _Window,
-) -> float:
-    """Measure the share of a silhouette's length across which the surface within it goes on.
+) -> Bool[np.ndarray, "h w"]:
+    """Mark pixels beside the silhouette in which the surface within it goes on.
 
     At its silhouette an object ends: by a step in depth, or by a concave edge where it touches
     something. It does not end where the readings go on straight, as those of a larger box on whose
@@ -307,7 +305,7 @@ def _continued_share(
         window: rows and columns of the rendering in the observation.
     """
     if not is_drawn.any():  # no silhouette
-        return 0.0
+        return np.zeros(observation.depth_m.shape, bool)
 
     # The silhouette, in a window with a margin.
     border = math.ceil(EDGE_PX / observation.step + observation.patch_px / 2)
@@ -348,17 +346,14 @@ def _continued_share(
             across[-1] = np.where(is_support[row, column], across[-1], np.nan)
 
     noise_m = math.hypot(AVERAGED_PER_WHITE * observation.noise.white_std_m, FLAT_M)
-    is_continued = np.zeros(shape, bool)
-    is_continued[tuple(beside)] = _is_joined_across(
+    is_continued = np.zeros((height, width), bool)
+    is_continued[rows, columns][tuple(beside)] = _is_joined_across(
         np.stack(across),
         spacing_px=0.5 * distance[tuple(beside)],
         edge_px=EDGE_PX / observation.step,
         noise_m=noise_m,
     )
-    # Beside the silhouette a patch is as long as others, and half as wide.
-    patch_area_px2 = observation.patch_px**2 / 2
-    continued = _patch_area(ndimage.binary_closing(is_continued), patch_area_px2)
-    return continued * patch_area_px2 / max(1, beside.shape[1])
+    return ndimage.binary_closing(is_continued)
 
 
 def _is_joined_across(

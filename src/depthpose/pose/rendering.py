@@ -5,12 +5,10 @@ which need exact pixels and coordinates on the triangles for their textures, are
 :mod:`depthpose.core.render`.
 """
 
-import math
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
-from scipy import ndimage
 from torch import Tensor
 
 from depthpose.core.camera.pinhole import clip_window, crop_intrinsics, project
@@ -20,9 +18,6 @@ from depthpose.pose.surface import Surface
 
 _NEAR_M = 0.01
 """A triangle with a corner nearer to the camera than this is not rendered."""
-_PINHOLE_DEPTH = 3.0
-"""Depth of a pinhole between discs, in spacings of their middles, from which it is closed."""
-_FAR_M = np.float32(1e6)
 
 
 class Rendering(NamedTuple):
@@ -72,30 +67,7 @@ def render_surface(
     cosine = np.ones(shape)
     ray_length = _ray_lengths(window_K.numpy(), *shape)
     cosine[is_drawn] = distance_m[face[is_drawn]] / (depth_m * ray_length)[is_drawn]
-    if surface.is_of_discs and is_drawn.any():
-        spacing_px = surface.spacing_m / float(np.nanmedian(depth_m)) * float(K[0, 0])
-        depth_m, cosine = _close_pinholes(depth_m, cosine, spacing_px, surface.spacing_m)
     return Rendering(depth_m, cosine, window)
-
-
-def _close_pinholes(
-    depth_m: np.ndarray, cosine: np.ndarray, spacing_px: float, spacing_m: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Close the gaps between discs, through which what lies behind them shows.
-
-    A pixel is one of a gap if it is deeper than all that a square of twice the spacing of the discs
-    can hold about it. It gets the depth and the cosine of the nearest other pixel.
-    """
-    side = 2 * math.ceil(spacing_px) + 1
-    filled_m = np.where(np.isfinite(depth_m), depth_m, _FAR_M)
-    opened_m = ndimage.grey_opening(filled_m, (side, side))
-    is_pinhole = filled_m - opened_m > _PINHOLE_DEPTH * spacing_m
-    nearest = cast(
-        "np.ndarray",
-        ndimage.distance_transform_edt(is_pinhole, return_distances=False, return_indices=True),
-    )
-    row, column = nearest
-    return depth_m[row, column], cosine[row, column]
 
 
 @compiled

@@ -169,7 +169,6 @@ class Surface:
     normals: Float64[Tensor, "m 3"]  #: of these points, to either side
     outward: Float64[Tensor, "m 3"]  #: normals on the outer side, 0 where none is known
     triangles_m: Float64[Tensor, "f 3 3"]  #: corners of what is rendered, in the model frame
-    is_of_discs: bool  #: the triangles are those of discs at samples, and leave gaps between them
     across: Int64[Tensor, " m"]  #: index of the sample on the other side of a wall, or -1
     diameter_m: float  #: of the object
     spacing_m: float  #: distance from a point to the third nearest, in the median
@@ -308,7 +307,6 @@ def prepare_surface(model: ObjectModel, count: int = 10_000) -> Surface:
     """Sample the surface of a model once for many clouds, by ``count`` points."""
     points_m, normals = (part.double() for part in sample_surface(model, count))
     is_large = len(model.faces) > _MOST_FACES
-    is_of_discs = is_large or len(model.faces) == 0
     triangles_m = disc_triangles(points_m, normals) if is_large else drawn_triangles(model).double()
     tree = KDTree(points_m.numpy())
 
@@ -329,7 +327,6 @@ def prepare_surface(model: ObjectModel, count: int = 10_000) -> Surface:
         normals=normals,
         outward=outward,
         triangles_m=triangles_m,
-        is_of_discs=is_of_discs,
         across=across,
         diameter_m=model.diameter_m,
         spacing_m=float(np.median(near_m[:, -1])),

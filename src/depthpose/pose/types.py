@@ -258,9 +258,7 @@ class Evidence:
     seen_through: float  #: patches behind which the camera saw: free-space violations
     bulging: float  #: patches of the object's own readings before the model
     beside: float  #: patches of the object's own readings beside the model's silhouette
-    #: area that is contradicted because the surface goes on beyond the silhouette: of the visible
-    #: one twice the share of the silhouette across which it does; 0 with a mask, which says itself
-    #: where the object ends
+    #: patches in which the surface goes on beyond the silhouette; 0 where a mask says where it ends
     continued: float
     rms: float  #: root mean square residual of the supported part, in standard deviations
     noise_m: float  #: standard deviation of a reading on the object, estimated from the image
