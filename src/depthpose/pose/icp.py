@@ -274,7 +274,7 @@ def _distinct_poses(
         if len(chosen) == _MOST_OTHERS or score[k] == -torch.inf:
             break
         better = Rigid.stack([best, *(poses[j] for j in chosen)])
-        # In the model's frame: pose k takes the points where each better pose takes these.
+        # Where pose k puts the points, seen from each better pose, which has them at symmetric_m.
         moved_m = (better.inverse() @ poses[k]).apply(points_m)  # (better poses, points, 3)
         distance_m = (moved_m[:, None] - symmetric_m).norm(dim=-1).mean(-1)
         if float(distance_m.min()) > _DISTINCT_DIAMETERS * surface.diameter_m:
