@@ -14,7 +14,7 @@ from depthpose.core.draw import draw_depth
 from depthpose.core.files import Cloud, write_cloud, write_depth_png, write_image
 from depthpose.core.rigid import Rigid
 from depthpose.core.run import claim_folder, environment
-from depthpose.depth.config import SGBMConfig, StreetsConfig
+from depthpose.depth.config import COLOR_RANGE_M, SGBMConfig, StreetsConfig
 from depthpose.depth.disparity import depth_from_disparity
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.evaluate import clamped_depth
@@ -65,7 +65,7 @@ def show_depth(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
     street = replace(street, input=replace(street.input, name="street"))
     scenes = [
         (read_motorcycle(), _MOTORCYCLE_TEXT, (1.5, 8.0)),
-        (street, _STREET_TEXT, (3.0, 80.0)),
+        (street, _STREET_TEXT, COLOR_RANGE_M),
     ]
     network = FakestereoNet.load(weights)
     rows: list[dict[str, Any]] = []

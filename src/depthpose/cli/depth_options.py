@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from depthpose.cli.arguments import Device, Source, WeightsName, shown_as
 from depthpose.core.errors import InputError
-from depthpose.depth.config import Answer, BaselineName, MatcherConfig, Speed
+from depthpose.depth.config import COLOR_RANGE_M, Answer, BaselineName, MatcherConfig, Speed
 
 _EXPONENTS = {"": 0, "K": 1, "M": 2, "G": 3, "T": 4}
 """Exponents of 1000, or of 1024, by the prefix of a size in bytes."""
@@ -142,7 +142,7 @@ class PredictOutput:
     """write a coloured point cloud of what is nearer than 80 m, NAME.cloud.ply."""
     min_confidence: float = 0.0
     """of clouds: depth with a lower confidence, 0 to 1, is left out; the share is printed."""
-    color_range: tuple[float, float] = (3.0, 80.0)
+    color_range: tuple[float, float] = COLOR_RANGE_M
     """metres of the brightest and the darkest colour, the same for all pictures."""
     batch: int = 1
     """images of one size that go through the networks together: for a GPU."""

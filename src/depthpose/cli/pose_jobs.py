@@ -144,11 +144,17 @@ class WantedObjects:
 def _wanted_objects(
     method: PoseMethod, labels: Mapping[str, str] | None, only: str | None
 ) -> WantedObjects:
-    """Say which detections are posed: those of one object, of labelled ones, or of all."""
+    """Say which detections are posed, and which objects have a result in every image.
+
+    Posed are the detections of ``only``, or of every object where it is None. A result, a refusal
+    where it was not detected, have ``only``; else the objects of ``labels``; else, where there are
+    no labels, all objects of a method that expects all, and none of another method.
+    """
     names = [model.name for model in method.models]
     if only is not None:
         expected = [only]
     elif labels is not None:
+        # Two classes may be the same object; and "3=" leaves class 3 out, with an empty name.
         expected = [name for name in dict.fromkeys(labels.values()) if name]
     else:
         expected = names if method.expects_all else []

@@ -183,7 +183,7 @@ class EntryFiles(Results[Any, PoseEstimate]):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class PoseTask:
+class PoseWork:
     """What a worker of an engine estimates, and from which kind of files.
 
     Without a camera the files are clouds; with one they are depth images, each with its mask, or
@@ -261,7 +261,7 @@ def predict_on_ray(
     if options.lens is not None:
         with inputs.first() as first:
             camera = camera_of(options.lens, image_size(first[0]))
-    task = PoseTask(source=source, object=object, unit=options.unit, camera=camera, box=box)
+    poses = PoseWork(source=source, object=object, unit=options.unit, camera=camera, box=box)
 
     # All that decides the poses, for the record of the run.
     settings = {
@@ -275,7 +275,7 @@ def predict_on_ray(
     if camera is not None:
         settings["K"] = camera.K.tolist()
         settings["depth_unit_m"] = camera.depth_unit_m
-    work = Work(start=task.start, files=files, endings=(ENDING,), batch=batch)
+    work = Work(start=poses.start, files=files, endings=(ENDING,), batch=batch)
     return print_shards(engine.run(work, inputs, out, settings), out, "inputs")
 
 

@@ -87,7 +87,7 @@ def show_weights(weights: tyro.conf.Positional[WeightsName]) -> int:
 
 
 def _settings_of(checkpoint: "Checkpoint", source: str) -> dict[str, Any]:
-    """Give all settings of networks, defaults too; of an encoder those that its file holds."""
+    """Give the settings of pose and depth networks, with defaults; of other kinds, as stored."""
     from depthpose.depth import weights as depth_weights
     from depthpose.pose import weights as pose_weights
 

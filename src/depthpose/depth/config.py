@@ -10,6 +10,9 @@ TruthKind = Literal["scan", "annotated", "disparity"]
 """scan: one LiDAR scan, drawn into the left image; annotated: a depth map of the left image
 (KITTI's annotated maps, filled-in LiDAR of object frames); disparity: the left image's own."""
 
+COLOR_RANGE_M = (3.0, 80.0)
+"""Depths of the first and the last colour, the same for all pictures, so that they compare."""
+
 _MAX_FOCAL_PX = 20_000
 """Largest focal length that pairs are brought to: several times that of the largest images. Beyond
 it images would fill the memory."""

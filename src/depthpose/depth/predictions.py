@@ -17,6 +17,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.files.disk import read_text, write_bytes
 from depthpose.core.run import claim_folder, claim_names, is_whole, note_result
 from depthpose.core.runner import Job, Results, run_jobs
+from depthpose.depth.config import COLOR_RANGE_M
 from depthpose.depth.disparity import depth_from_disparity, disparity_from_depth
 from depthpose.depth.metrics import SMALLEST_DEPTH_M
 from depthpose.depth.types import DepthEstimate, Ground, Map, StereoInput
@@ -56,8 +57,6 @@ _DECIMALS = 6
 threads add in another order."""
 CLOUD_M = 80.0
 """Distance up to which a cloud is written, unless another is given."""
-COLOR_RANGE_M = (3.0, 80.0)
-"""Depths of the first and the last colour, the same for all pictures, so that they compare."""
 
 
 def write_estimate(

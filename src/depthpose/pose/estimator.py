@@ -77,7 +77,7 @@ class PoseEstimator:
 
         Args:
             inputs: clouds and views; a generator's are taken as they are needed.
-            threads: so many are worked at at a time.
+            threads: how many inputs are estimated at the same time.
             with_progress: show a bar on the terminal.
 
         Raises:
@@ -304,7 +304,7 @@ class PoseEstimator:
     ) -> list[PoseEstimate]:
         """Do as :meth:`find` does for a view, with a refusal for each object that is not found.
 
-        A refusal says what the nearest miss was. The mask of the view limits where is looked.
+        A refusal says what the nearest miss was. Only the mask of the view is searched.
 
         Args:
             view: depth and camera.
@@ -380,7 +380,7 @@ class PoseEstimator:
     def track_in(
         self, frames: Iterable[AnyInput | PoseEstimate], object: str, first: Rigid | None = None
     ) -> Iterator[PoseEstimate]:
-        """Do as :meth:`track` does for views and clouds; a view's mask limits where is looked.
+        """Do as :meth:`track` does for views and clouds; of a view, only its mask is searched.
 
         In place of a frame that cannot be read there is an estimate that says so.
         """

@@ -38,10 +38,10 @@ class GraphConvolutions:
         self._strides = self._graph.op("Concat", x * y * z, y * z, z, [1], axis=0)
         cell_count = sides.op("ReduceProd", [0], keepdims=1)
 
-        # Of each level the cells of its voxels, the finest in the order of the points; and of each
-        # cell the row of its voxel, or one past all.
+        # Of each level: the cell of each voxel (voxels,), on the finest in the order of the points;
+        # and the row of the voxel in each cell (cells,), one past the last where there is none.
         self._level_cells: list[Value] = []
-        self._rows: list[Value] = []
+        self._row_of_cell: list[Value] = []
         for level in range(LEVELS):
             corner = self._places - self._places % np.array([1, *[1 << level] * 3])
             places = (corner + np.array([0, *[MARGIN] * 3])) * self._strides
@@ -49,32 +49,39 @@ class GraphConvolutions:
             cells = cells.op("Unique", sorted=1) if level else cells
             self._level_cells.append(cells)
             count = cells.op("Shape")
-            numbers = self._graph.op("Range", 0, count.op("Squeeze"), 1)
+            rows = self._graph.op("Range", 0, count.op("Squeeze"), 1)
             empty = count.op("Expand", cell_count)
-            self._rows.append(empty.op("ScatterElements", cells, numbers, axis=0))
-        self._maps: dict[tuple[int, int, int], Value] = {}
+            self._row_of_cell.append(empty.op("ScatterElements", cells, rows, axis=0))
+        # By (kernel, level in, level out): the row that each voxel written reads at each offset
+        # (voxels out, kernel^3), one past the last where there is none.
+        self._read_rows: dict[tuple[int, int, int], Value] = {}
 
     def convolve(
         self, layer: SparseConv | ConvNorm, x: Value, level_in: int, level_out: int
     ) -> Value:
-        """Convolve the features of ``level_in``; the answer is of the voxels of ``level_out``."""
+        """Convolve the features of ``level_in``; the answer is of the voxels of ``level_out``.
+
+        A pair of voxels has ``fine = coarse + offset * step``, with the step of the finer level. So
+        a fine voxel that is written, going up, reads ``coarse = fine - offset * step``.
+        """
         if isinstance(layer, ConvNorm):
             assert layer.norm is None, "norms are folded before a graph is written"
             layer = layer.conv
         volume, inputs, _ = layer.weight.shape
         if layer.kernel > 1:
             key = (layer.kernel, level_in, level_out)
-            if key not in self._maps:  # rows at offsets (voxels, kernel^3); one past the last: none
+            if key not in self._read_rows:
                 step = 1 << min(level_in, level_out)
-                # Going down the kernel is centred on the coarse voxel; going up, on what reads.
                 step = -step if level_out < level_in else step
                 offsets = np.array([(0, *offset) for offset in kernel_offsets(layer.kernel)]) * step
-                moves = self._graph.op("MatMul", offsets, self._strides)
-                cells = self._level_cells[level_out].op("Unsqueeze", [1]) + moves
-                self._maps[key] = self._rows[level_in].op("Gather", cells)
+                cell_offsets = self._graph.op("MatMul", offsets, self._strides)  # (kernel^3,)
+                cells = self._level_cells[level_out].op("Unsqueeze", [1]) + cell_offsets
+                self._read_rows[key] = self._row_of_cell[level_in].op("Gather", cells)
+            # What is read, (voxels out, kernel^3, inputs): zeros where there is no voxel.
             empty = np.zeros((1, inputs), np.float32)
-            met = self._graph.op("Concat", x, empty, axis=0).op("Gather", self._maps[key])
-            x = met.op("Reshape", [-1, volume * inputs])
+            padded = self._graph.op("Concat", x, empty, axis=0)
+            read = padded.op("Gather", self._read_rows[key])
+            x = read.op("Reshape", [-1, volume * inputs])
         out = x.op("MatMul", layer.weight.flatten(0, 1).detach().float().cpu().numpy())
         return out if layer.bias is None else out + layer.bias.detach().float().cpu().numpy()
 

@@ -263,16 +263,19 @@ def _distinct_poses(
 ) -> Rigid:
     """Give up to three poses, the best first, that are distinct from each other and from ``best``.
 
-    Distinct are poses whose surfaces lie apart; poses that differ by a symmetry are the same.
+    The distance of two poses is the mean distance between the places that they give the same point
+    of the model, the least over the symmetries of the model.
     """
     chosen: list[int] = []
     points_m = surface.points_m[:: max(1, len(surface.points_m) // 50)]
-    symmetric_m = surface.symmetries.apply(points_m)
+    symmetric_m = surface.symmetries.apply(points_m)  # (symmetries, points, 3)
     for k in score.argsort(descending=True).tolist():
+        # The score is -inf where no point counts: its residual is infinite. All later ones are too.
         if len(chosen) == _MOST_OTHERS or score[k] == -torch.inf:
             break
         better = Rigid.stack([best, *(poses[j] for j in chosen)])
-        moved_m = (better.inverse() @ poses[k]).apply(points_m)
+        # Where pose k puts the points, seen from each better pose, which has them at symmetric_m.
+        moved_m = (better.inverse() @ poses[k]).apply(points_m)  # (better poses, points, 3)
         distance_m = (moved_m[:, None] - symmetric_m).norm(dim=-1).mean(-1)
         if float(distance_m.min()) > _DISTINCT_DIAMETERS * surface.diameter_m:
             chosen.append(k)

@@ -598,7 +598,9 @@ def _parse_bop_row(
         R = [float(value) for value in row[4].split()]
         t_mm = [float(value) for value in row[5].split()]
     except ValueError as error:
-        raise InputError(f"{source}: {error}; write numbers, R and t parted by blanks") from error
+        raise InputError(
+            f"{source}: {error}; write numbers, and separate those of R and t by spaces"
+        ) from error
     if not all(0 <= value <= MOST for value in place):
         raise InputError(f"{source}: scene, image and object are numbers from 0 to {MOST}")
     if len(R) != 9 or len(t_mm) != 3 or not all(map(math.isfinite, [score, time_s, *R, *t_mm])):

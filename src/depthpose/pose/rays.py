@@ -67,7 +67,7 @@ def ray_bend(depth_m: Float[Tensor, "h w"], K: Float[Tensor, "3 3"]) -> float | 
         K: intrinsic matrix.
 
     Returns:
-        The mean bend of the planes; None where they are too few or too small to tell.
+        The bend that the planes share; None where they are too few or too small to tell.
     """
     v, u = (depth_m > 0).nonzero(as_tuple=True)
     pixels = take_evenly(torch.stack([u, v, torch.ones_like(u)], 1), _SAMPLE)
@@ -90,23 +90,54 @@ def ray_bend(depth_m: Float[Tensor, "h w"], K: Float[Tensor, "3 3"]) -> float | 
         return None
     planes = axis_planes if axis_count > ray_count else ray_planes
 
-    # The bend that all planes share, by least squares.
-    total = 0.0
-    weighted = 0.0
+    return _shared_bend(planes, rays, reading_m, stretch)
+
+
+def _shared_bend(
+    planes: list[Bool[Tensor, " n"]],
+    rays: Float64[Tensor, "n 3"],
+    reading_m: Float64[Tensor, " n"],
+    stretch: Float64[Tensor, " n"],
+) -> float | None:
+    """Fit planes and one bend for all of them, by least squares; give the bend.
+
+    A reading d on a plane (a, b, c) has ``(1 + bend (stretch - 1)) / d = a x + b y + c``, where its
+    ray (x, y, 1) has the length ``stretch``. Times d this is linear in the plane and the bend, with
+    point = d ray::
+
+        1 = (a, b, c) . point + bend (1 - stretch)
+
+    Each plane has unknowns of its own, which are of no interest, so they are projected out: the
+    coefficient of ``1 - stretch`` is that of a regression of residuals on residuals, of both sides
+    after a fit to the points alone (Frisch, Waugh and Lovell).
+
+    Args:
+        planes: which readings lie on each.
+        rays: of the readings, with z = 1.
+        reading_m: values of the depth image.
+        stretch: lengths of the rays.
+
+    Returns:
+        None where the planes are none, or too small to tell.
+    """
+    count = 0
+    numerator = 0.0
+    denominator = 0.0
     for is_on in planes:
-        # (1 + bend (s - 1)) / d = a x + b y + c, times d: linear in the plane and the bend.
         points_m = rays[is_on] * reading_m[is_on, None]
         ones = torch.ones(len(points_m), dtype=torch.float64)
-        bent = 1 - stretch[is_on]
-        # The residuals of both columns after a fit of the plane alone.
-        plane = torch.linalg.lstsq(points_m, torch.stack([ones, bent], 1)).solution
-        off_plane = ones - points_m @ plane[:, 0]
-        bent = bent - points_m @ plane[:, 1]
-        total += float(bent.square().sum())
-        weighted += float((off_plane * bent).sum())
-    if count == 0 or total < count * _LEAST_BEND**2:
+        regressor = 1 - stretch[is_on]
+        fit = torch.linalg.lstsq(points_m, torch.stack([ones, regressor], 1)).solution
+        ones_residual = ones - points_m @ fit[:, 0]
+        regressor_residual = regressor - points_m @ fit[:, 1]
+        count += len(points_m)
+        numerator += float((ones_residual * regressor_residual).sum())
+        denominator += float(regressor_residual.square().sum())
+    # The residual of the regressor is how far the ray's distance bends a reading off its plane, as
+    # a share of its depth.
+    if count == 0 or denominator < count * _LEAST_BEND**2:
         return None
-    return weighted / total
+    return numerator / denominator
 
 
 def _find_planes(

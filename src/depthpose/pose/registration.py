@@ -87,7 +87,8 @@ class Registration(PoseEstimator):
             symmetry: that a part has, in place of those that are found: ``"z,18"`` looks alike
                 after each of 18 equal turns about an axis along z, ``"z,free"`` after any, and
                 ``"z,6+x,2"`` has two axes; BOP's entry of an object, or a JSON file of it. The axis
-                goes where the surface has it. Of several files a dict from names.
+                goes where the surface has it. For several files: a dict from
+                names of objects to their symmetries.
 
         Raises:
             InputError: no file, two of one name, one that is not read, without a surface or unit; a

@@ -134,11 +134,11 @@ def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
 
     Where poses of several objects explain the same readings, they share the probability of one, and
     where none has most of it none is reported. Where an object is there more than once, the rest of
-    the image is searched for more of it. Of an object that is not found a refusal says where it was
-    looked for and what its nearest miss was.
+    the image is searched for more of it. For an object that is not found, the refusal says where it
+    was searched and what the nearest miss was.
 
     Args:
-        view: depth and camera; its mask limits where is looked.
+        view: depth and camera; only its mask is searched.
         targets: what for.
     """
     # The part of the image that is searched, its normals and its background.

@@ -331,78 +331,87 @@ class _Convolution(torch.autograd.Function):
         ctx: Any,  # noqa: ANN401
         gradient: Tensor,
     ) -> tuple[Tensor | None, Tensor | None, None]:
-        """Give the gradients of the features and of the weight, where they are wanted."""
+        """Give the gradients of the features and of the weight, where they are wanted.
+
+        With the pairs (i, o) of offset k, the gradient g and the features x, as rows: ``dx_i = sum
+        over pairs of i of g_o @ W_k^T``, a convolution back, and ``dW_k = sum over pairs of k of
+        x_i^T @ g_o``. The latter by the method of the way forward.
+        """
         x, weight = ctx.saved_tensors
-        m: KernelMap = ctx.kernel_map
+        kernel_map: KernelMap = ctx.kernel_map
         gradient = gradient.contiguous()
         wants_x, wants_weight, _ = ctx.needs_input_grad
-        back = KernelMap(neighbours=m.neighbours, is_transposed=not m.is_transposed)
+        back = KernelMap(
+            neighbours=kernel_map.neighbours, is_transposed=not kernel_map.is_transposed
+        )
         # The first layer's input is no parameter's child: its gradient is seldom wanted.
         for_x = _convolve(gradient, weight.mT, back) if wants_x else None
         if not wants_weight:
             return for_x, None, None
-        method = _choose_method(x, weight, m)
-        if method == "table":
-            return for_x, (_gather_table(x, m) @ gradient).view(weight.shape), None
-        if method == "grid":
-            for_weight = torch.bmm(_gather_slots(x, m).mT, _gather_slots(gradient, back))
-        else:
+        method = _choose_method(x, weight, kernel_map)
+        if method == "table":  # all inputs of each output: one product for all offsets
+            return for_x, (_gather_table(x, kernel_map) @ gradient).view(weight.shape), None
+        if method == "grid":  # x_i and g_o of each pair in the same slot: one batched product
+            for_weight = torch.bmm(_gather_slots(x, kernel_map).mT, _gather_slots(gradient, back))
+        else:  # a product for each offset, of its pairs alone
             for_weight = torch.zeros_like(weight)
-            for offset, read, write in m.by_offset():
-                pulls = gradient.index_select(0, write)
-                torch.mm(x.index_select(0, read).T, pulls, out=for_weight[offset])
-        if (centre := m.neighbours.centre) is not None:
+            for offset, read, write in kernel_map.by_offset():
+                gradient_of_pairs = gradient.index_select(0, write)
+                torch.mm(x.index_select(0, read).T, gradient_of_pairs, out=for_weight[offset])
+        # The pairs leave out the centre, where i = o for each row: nothing need be gathered for it.
+        # The table has it.
+        if (centre := kernel_map.neighbours.centre) is not None:
             torch.mm(x.T, gradient, out=for_weight[centre])
         return for_x, for_weight, None
 
 
-def _convolve(x: Tensor, weight: Tensor, m: KernelMap) -> Tensor:
+def _convolve(x: Tensor, weight: Tensor, kernel_map: KernelMap) -> Tensor:
     """Convolve features by the fastest method for their size; see :func:`_choose_method`."""
-    method = _choose_method(x, weight, m)
-    near = m.neighbours
+    method = _choose_method(x, weight, kernel_map)
+    near = kernel_map.neighbours
     if method == "table":
-        return _gather_table(x, m).T @ weight.flatten(0, 1)
+        return _gather_table(x, kernel_map).T @ weight.flatten(0, 1)
     if method == "grid":  # all offsets at once, padded to the one with the most pairs
-        products = torch.bmm(_gather_slots(x, m), weight).flatten(0, 1)
+        products = torch.bmm(_gather_slots(x, kernel_map), weight).flatten(0, 1)
         # The slots of an output are gathered, not scattered: the same bits on every run, on CUDA
         # too, and several times faster on the CPU than ``index_add_``.
-        slots = near.slots(is_transposed=m.is_transposed)
+        slots = near.slots(is_transposed=kernel_map.is_transposed)
         out = F.embedding_bag(slots.order, products, slots.starts, mode="sum")
     else:  # an offset at a time: its pairs write each row once at most
-        written = near.fine_rows if m.is_transposed else near.table.shape[1]
+        written = near.fine_rows if kernel_map.is_transposed else near.table.shape[1]
         out = x.new_zeros(written, weight.shape[2])
         kernels = weight.unbind()
-        for offset, read, write in m.by_offset():
+        for offset, read, write in kernel_map.by_offset():
             out.index_add_(0, write, x.index_select(0, read) @ kernels[offset])
     return out if near.centre is None else out.addmm_(x, weight[near.centre])
 
 
-def _gather_slots(x: Tensor, m: KernelMap) -> Tensor:
+def _gather_slots(x: Tensor, kernel_map: KernelMap) -> Tensor:
     """Gather the slots of (volume, most); empty ones read a row of zeros."""
-    near = m.neighbours
+    near = kernel_map.neighbours
     padded = F.pad(x, (0, 0, 0, 1))
-    read = padded.index_select(0, near.slots(is_transposed=m.is_transposed).read)
+    read = padded.index_select(0, near.slots(is_transposed=kernel_map.is_transposed).read)
     return read.view(len(near.table), near.pairs.most, x.shape[1])
 
 
-def _gather_table(x: Tensor, m: KernelMap) -> Tensor:
+def _gather_table(x: Tensor, kernel_map: KernelMap) -> Tensor:
     """Gather the inputs of each output voxel (volume * channels, outputs); 0 for no neighbour."""
     padded = F.pad(x, (0, 0, 0, 1))
-    rows = m.neighbours.table
+    rows = kernel_map.neighbours.table
     read = padded.index_select(0, rows.flatten()).view(*rows.shape, x.shape[1])
     return read.transpose(1, 2).reshape(len(rows) * x.shape[1], rows.shape[1])
 
 
 def _choose_method(
-    x: Tensor, weight: Tensor, m: KernelMap
+    x: Tensor, weight: Tensor, kernel_map: KernelMap
 ) -> Literal["table", "grid", "offset by offset"]:
     """Choose how much is gathered at once: all inputs, the padded pairs, or those of one offset."""
-    table = m.neighbours.table
+    table = kernel_map.neighbours.table
     channels = x.shape[1]
     is_small = channels <= NARROW and table.numel() * channels <= TABLE_ELEMENTS
-    if is_small and not m.is_transposed:
+    if is_small and not kernel_map.is_transposed:
         return "table"
-    most = m.neighbours.pairs.most
+    most = kernel_map.neighbours.pairs.most
     is_gridded = most * weight[0].numel() <= GRID_PRODUCTS
     if x.is_cuda:
         # CUDA adds up offset by offset in no fixed order, so only a grid is the same on each run.

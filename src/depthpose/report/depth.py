@@ -15,7 +15,7 @@ from depthpose.core.draw import (
     draw_share,
 )
 from depthpose.core.files import Cloud
-from depthpose.depth.predictions import COLOR_RANGE_M
+from depthpose.depth.config import COLOR_RANGE_M
 from depthpose.depth.types import DepthError, DepthEstimate, Map, StereoInput
 from depthpose.report.page import (
     Drawing,

@@ -10,9 +10,9 @@ from depthpose.core.camera import StereoRig, camera_of, write_camera
 from depthpose.core.draw import draw_share
 from depthpose.core.errors import InputError
 from depthpose.core.files import image_size, read_exif_focal, read_image, write_image
-from depthpose.depth.config import StreetsConfig
+from depthpose.depth.config import COLOR_RANGE_M, StreetsConfig
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.predictions import COLOR_RANGE_M, write_estimate
+from depthpose.depth.predictions import write_estimate
 from depthpose.depth.stereo import CameraMatcher
 from depthpose.depth.synthetic import Streets
 from depthpose.depth.types import DepthEstimate, StereoInput

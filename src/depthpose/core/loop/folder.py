@@ -144,7 +144,7 @@ def _is_metrics_row(row: object) -> TypeGuard[dict[str, Any]]:
 
 
 def card_text(name: str, facts: Mapping[str, str], measured: str = "") -> str:
-    """Word the card of weights in Markdown: their name, a line for each fact, and ``measured``."""
+    """Write the model card of weights in Markdown: name, a line for each fact, and ``measured``."""
     lines = [f"# {name}", ""]
     lines += [f"- **{key.replace('_', ' ').capitalize()}**: {fact}" for key, fact in facts.items()]
     if measured:

@@ -50,19 +50,28 @@ class DisparityRange:
 def move_views(left: Tensor, right: Tensor, first_px: int) -> tuple[Tensor, Tensor]:
     """Move the views of a pair so that a disparity of ``first_px`` becomes 0.
 
-    If ``first_px`` is negative, both views become wider by that many columns, so that no part that
-    both show is cut off. New columns repeat the border.
+    The disparity of a point is its column in the left view less that in the right one. So the right
+    view moves to the right by ``first_px`` columns, or, where that is negative, the left view by
+    ``-first_px`` columns. Columns that become free repeat the border.
 
     Args:
         left: ``(3, H, W)``.
         right: the same size.
-        first_px: in whole pixels.
+        first_px: in whole pixels, of either sign.
+
+    Returns:
+        The left and the right view, both ``(3, H, W)``; where ``first_px`` is negative both are
+        ``-first_px`` columns wider, so that nothing is cut off.
     """
-    width = left.shape[2]
-    added = max(-first_px, 0)
-    moved = F.pad(right[None], (added + first_px, added, 0, 0), mode="replicate")[0]
-    wider = F.pad(left[None], (added, 0, 0, 0), mode="replicate")[0]
-    return wider, moved[..., : width + added]
+    if first_px >= 0:
+        # The columns that are cut off match nothing at a disparity of first_px or more.
+        shifted_right = F.pad(right[None], (first_px, 0, 0, 0), mode="replicate")[0]
+        return left, shifted_right[..., : left.shape[2]]
+    # The right view stays in place, and is padded on the right to the width of the left view.
+    added = -first_px
+    shifted_left = F.pad(left[None], (added, 0, 0, 0), mode="replicate")[0]
+    padded_right = F.pad(right[None], (0, added, 0, 0), mode="replicate")[0]
+    return shifted_left, padded_right
 
 
 def moved_back(match: Match, first_px: int) -> Match:

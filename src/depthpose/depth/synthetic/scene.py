@@ -101,7 +101,6 @@ def make_scene(seed: tuple[int, ...], mount_height_m: float = 1.65) -> StreetSce
     rng = np.random.default_rng([71, *seed])
     road = roads.draw_road(rng)
     builder = MeshBuilder(rng)
-    hills_builder = MeshBuilder(rng)
     roads.add_ground(builder, road)
     roads.add_roadside(builder, road)
     traffic = roads.Traffic(builder, road)
@@ -109,20 +108,18 @@ def make_scene(seed: tuple[int, ...], mount_height_m: float = 1.65) -> StreetSce
     traffic.add_driving()
     traffic.add_people()
     street = roads.bend(builder.finish(), road)
+    # The hills have a builder of their own, since they do not follow the curves of the road.
+    hills_builder = MeshBuilder(rng)
     _add_hills(hills_builder)
     hills = hills_builder.finish()
     hills = replace(hills, thing=hills.thing + street.thing.max() + 1)
 
-    # The camera's pose: nearly level, and sometimes turned away from the road's direction.
-    pitch = rng.normal(0, 0.012)
-    roll = rng.normal(0, 0.009)
-    yaw = rng.normal(0, 0.03) if rng.random() < 0.8 else rng.normal(0, 0.2)
-    camera_from_world = _rotation(pitch, yaw, roll)
-    position = np.array([rng.normal(0, 0.05), -mount_height_m + rng.normal(0, 0.04), 0.0])
-    world_from_camera = camera_from_world.T.astype(np.float32)
+    # Into the camera's frame. Points are rows here, so R p is written p @ R.T.
+    camera_from_world, position_m = _draw_camera(rng, mount_height_m)
+    R = camera_from_world.astype(np.float32)
     mesh = join([street, hills])
-    corners = (mesh.corners - position.astype(np.float32)) @ world_from_camera
-    mesh = replace(mesh, corners=corners, normals=mesh.normals @ world_from_camera)
+    corners = (mesh.corners - position_m.astype(np.float32)) @ R.T
+    mesh = replace(mesh, corners=corners, normals=mesh.normals @ R.T)
     is_near_view = corners[:, :, 2].max(1) > -12  # farther behind nothing casts a visible shadow
     return StreetScene(
         mesh=mesh.part(is_near_view),
@@ -131,6 +128,18 @@ def make_scene(seed: tuple[int, ...], mount_height_m: float = 1.65) -> StreetSce
         camera_from_world=camera_from_world,
         place=road.place,
     )
+
+
+def _draw_camera(rng: np.random.Generator, mount_height_m: float) -> tuple[Rotation, Vector]:
+    """Draw the rotation ``camera_from_world`` and the place of a camera in the world [m].
+
+    It is nearly level, and sometimes turned away from the road's direction.
+    """
+    pitch = rng.normal(0, 0.012)
+    roll = rng.normal(0, 0.009)
+    yaw = rng.normal(0, 0.03) if rng.random() < 0.8 else rng.normal(0, 0.2)
+    position_m = np.array([rng.normal(0, 0.05), -mount_height_m + rng.normal(0, 0.04), 0.0])
+    return _rotation(pitch, yaw, roll), position_m
 
 
 def _add_hills(b: MeshBuilder) -> None:

@@ -113,27 +113,32 @@ def _clean_surface(
     Of faces on the same three points the first stays: a face and its reverse would cancel in the
     normals. Holes are no flaw.
 
+    Returns:
+        Vertices and faces. Where no body is dropped, the vertices are all those given, unused ones
+        too; else they are those of the remaining faces alone, numbered anew.
+
     Raises:
         InputError: the faces have no area, or bodies lie far from each other.
     """
     sides = vertices[faces[:, 1:]] - vertices[faces[:, :1]]
     area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=-1) / 2
-    square = float(np.ptp(vertices, axis=0).max()) ** 2
-    if area.sum() <= _LEAST_AREA * square:
+    extent_squared = float(np.ptp(vertices, axis=0).max()) ** 2
+    if area.sum() <= _LEAST_AREA * extent_squared:
         raise InputError(
             f"{path}: its {len(faces)} faces have no area, so there is no surface to see; all are "
             "lines or points. Export it again as triangles, or as points without faces."
         )
 
     # Points are compared by place, not by index: STL repeats the points of every face.
-    places, place = np.unique(vertices, axis=0, return_inverse=True)
-    merged = place.reshape(-1)[faces]
+    unique_points, index_of_vertex = np.unique(vertices, axis=0, return_inverse=True)
+    merged = index_of_vertex.reshape(-1)[faces]
     _, first = np.unique(np.sort(merged, axis=-1), axis=0, return_index=True)
-    is_kept = np.isin(np.arange(len(faces)), first) & (area > _NO_AREA * square)
+    is_kept = np.isin(np.arange(len(faces)), first) & (area > _NO_AREA * extent_squared)
     faces = faces[is_kept]
-    is_part = faces_of_part(path, places, merged[is_kept], area[is_kept])
+    is_part = faces_of_part(path, unique_points, merged[is_kept], area[is_kept])
     if is_part.all():
-        return vertices, faces
+        return vertices, faces  # vertices of no face stay, and all keep their numbers
+    # The vertices of dropped bodies go, and with them all others of no face.
     used, faces = np.unique(faces[is_part], return_inverse=True)
     return vertices[used], faces.reshape(-1, 3)
 
