@@ -314,8 +314,8 @@ class FakestereoNet:
     ) -> DepthEstimate:
         """Estimate depth of one input whose images are read already, as :meth:`estimate` does.
 
-        How is said by :func:`~depthpose.depth.estimator.pair.depth_from_pair` and
-        :func:`~depthpose.depth.estimator.single_image.depth_from_images`.
+        How is said by ``depth_from_pair`` of ``depth/estimator/pair.py`` and
+        ``depth_from_images`` of ``depth/estimator/single_image.py``.
         """
         return self._estimate_in_groups([depth_input], with_check=with_check, mount=mount)[0]
 
@@ -466,7 +466,7 @@ class FakestereoNet:
 
         Raises:
             InputError: there is no generator, or what
-                :func:`~depthpose.depth.estimator.single_image.virtual_sizes` raises.
+                ``virtual_sizes`` of ``depth/estimator/single_image.py`` raises.
         """
         if self.synthesiser is None:
             raise InputError(
