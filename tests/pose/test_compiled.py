@@ -375,7 +375,8 @@ def test_what_is_compiled_is_kept_until_a_file_changes(tmp_path: Path) -> None:
     head = "from depthpose.pose.compiled import compiled\n\n@compiled\n"
     inner = head + "def step(x):\n    return x + {}\n"
     outer = head + "def twice(x):\n    return step(step(x))\n"
-    for added, answer in ((1, 2), (5, 10), (1, 2)):
+    # Numbers of unlike lengths: within a second Python tells two states of a file by its length.
+    for added, answer in ((1, 2), (50, 100), (1, 2)):
         called = written(tmp_path, "called", inner.format(added))
         caller = written(tmp_path, "caller", outer)
         vars(caller)["step"] = called.step
