@@ -24,12 +24,13 @@ from tests.pose.synthetic_objects import (
 )
 
 from depthpose.core.rigid import Rigid, geodesic_rad, rotation_by
+from depthpose.pose import hypotheses
 from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import EstimateConfig, IcpConfig
 from depthpose.pose.copies import PreparedObject
 from depthpose.pose.evidence import observe
 from depthpose.pose.hypotheses import compete
-from depthpose.pose.icp import refine_pose
+from depthpose.pose.icp import RefinedPose, refine_pose
 from depthpose.pose.mesh import (
     NearSymmetry,
     SymmetryProposal,
@@ -149,6 +150,37 @@ def test_copies_of_a_plate_stay_where_its_symmetry_has_them(seed: int) -> None:
     poses = [competition.best.pose, *(copy.pose for copy, _ in competition.copies)]
     errors = [float(add_m(pose.float(), truth.float(), plate.vertices_m)) for pose in poses]
     assert min(errors) < 0.004
+
+
+def test_a_copy_that_drifts_competes_where_it_began_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One drifts onto the winner and one to another angle: each start stays, and the new angle."""
+    mug = make_part("mug", 1)
+    prepared = PreparedObject(number=0, model=mug, surface=prepare_surface(mug))
+    axis = prepared.copies.near_axis
+    assert axis is not None
+
+    def turned(degrees: float) -> RefinedPose:
+        angle = torch.tensor(math.radians(degrees), dtype=torch.float64)
+        turn = turn_about(axis.direction.double(), axis.point_m.double(), angle)
+        return RefinedPose(
+            camera_from_model=truth @ turn, covariance=torch.eye(6), residual_m=torch.zeros(()),
+            inlier_share=torch.ones(()),
+        )  # fmt: skip
+
+    truth = pose_at(seed=1).double()
+    competitors = [
+        hypotheses._Competitor(refined=turned(0.0), unrefined=turned(60.0)),
+        hypotheses._Competitor(refined=turned(150.0), unrefined=turned(120.0)),
+        hypotheses._Competitor(refined=turned(203.0), unrefined=turned(200.0)),
+    ]
+    monkeypatch.setattr(hypotheses, "_refine_competitors", lambda *_: competitors)
+    copies = hypotheses._refine_distinct_copies(
+        torch.zeros(1, 3).double(), turned(0.0), prepared, EstimateConfig(), None
+    )
+    angles = [
+        math.degrees(float(geodesic_rad(copy.camera_from_model.R, truth.R))) for copy in copies
+    ]
+    assert angles == pytest.approx([60, 120, 150, 360 - 203], abs=0.01)
 
 
 def test_only_what_has_a_copy_is_less_certain_of_it() -> None:

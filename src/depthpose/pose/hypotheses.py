@@ -241,7 +241,7 @@ def _refine_distinct_copies(
         cloud_m, winner, starts, prepared.surface, config, _MOST_COPIES
     )
 
-    same = partial(prepared.copies.is_same, motions=prepared.copies.symmetries)
+    is_same = partial(prepared.copies.is_same, motions=prepared.copies.symmetries)
     distinct: list[RefinedPose] = []
     distinct_poses = [winner_pose]
     for competitor in competitors:
@@ -251,9 +251,10 @@ def _refine_distinct_copies(
             settled = settle_spin(refined.camera_from_model, prepared.model, view)
             refined = replace(refined, camera_from_model=settled)
         # Where little observed fixes a copy, refinement lets it drift toward others: both compete.
-        has_drifted = not same(refined.camera_from_model, start.camera_from_model[None]).any()
-        for copy in (start, refined) if has_drifted else (refined,):
-            if not bool(same(copy.camera_from_model, Rigid.stack(distinct_poses)).any()):
+        has_drifted = not is_same(refined.camera_from_model, start.camera_from_model[None]).any()
+        competing = [start, refined] if has_drifted else [refined]
+        for copy in competing:
+            if not bool(is_same(copy.camera_from_model, Rigid.stack(distinct_poses)).any()):
                 distinct.append(copy)
                 distinct_poses.append(copy.camera_from_model.double())
     return distinct

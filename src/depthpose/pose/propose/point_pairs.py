@@ -452,11 +452,11 @@ def _vote_of_pair(
     key = _key(feature)
     _add_votes(key, turn, pairs, voted, counts)
 
-    # In each part of the feature the nearer bin beside the own one; beyond the last it is the same.
+    # In each part of the feature the bin next to the pair's too; beyond the last it is the same.
     for k in range(4):
-        own = int(feature[k])
-        beside = own + (-1 if feature[k] - own < 0.5 else 1)
-        change = _clamp_bin(beside, k) - _clamp_bin(own, k)
+        pair_bin = int(feature[k])
+        beside = pair_bin + (-1 if feature[k] - pair_bin < 0.5 else 1)
+        change = _clamp_bin(beside, k) - _clamp_bin(pair_bin, k)
         if change != 0:
             _add_votes(key + change * ANGLES ** (3 - k), turn, pairs, voted, counts)
 
