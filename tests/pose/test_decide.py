@@ -30,7 +30,7 @@ from depthpose.pose.types import Alternative, Evidence, PoseEstimate
 
 GOOD = Evidence(
     visible=40.0, supported=38.0, explained=38.0,
-    unobserved=2.0, seen_through=0.0, bulging=0.0, beside=0.0, continued=0.0,
+    unobserved=2.0, seen_through=0.0, bulging=0.0, beside=0.0, silhouette=0.0, continued=0.0,
     rms=0.5, noise_m=0.001,
 )  # fmt: skip
 """What a right pose leaves."""

@@ -171,7 +171,7 @@ def test_which_object_a_cloud_shows_is_answered() -> None:
 def test_another_object_that_fits_too_lowers_the_probability_of_every_pose() -> None:
     evidence = Evidence(
         visible=20.0, supported=18.0, explained=18.0,
-        unobserved=1.0, seen_through=1.0, bulging=0.0, beside=0.0, continued=0.0,
+        unobserved=1.0, seen_through=1.0, bulging=0.0, beside=0.0, silhouette=0.0, continued=0.0,
         rms=0.6, noise_m=0.001,
     )  # fmt: skip
     copy = Alternative(

@@ -52,6 +52,7 @@ def answer(name: str = "a", seed: int = 0) -> PoseEstimate:
             seen_through=1.5,
             bulging=0.0,
             beside=0.25,
+            silhouette=4.0,
             continued=0.5,
             rms=0.75,
             noise_m=0.001,

@@ -319,7 +319,7 @@ def test_a_hundred_models_take_bounded_time(
 
 EVIDENCE = Evidence(
     visible=20.0, supported=20.0, explained=20.0,
-    unobserved=0.0, seen_through=0.0, bulging=0.0, beside=0.0, continued=0.0,
+    unobserved=0.0, seen_through=0.0, bulging=0.0, beside=0.0, silhouette=0.0, continued=0.0,
     rms=0.5, noise_m=0.001,
 )  # fmt: skip
 

@@ -12,7 +12,7 @@ round a corner of one body, does not end there.
 
 import math
 from dataclasses import dataclass
-from typing import cast
+from typing import NamedTuple, cast
 
 import numpy as np
 import torch
@@ -207,11 +207,13 @@ def compare(observation: Observation, pose: Rigid, surface: Surface) -> Evidence
     seen_through = _patch_area(deviations > THRESHOLD, patch_area_px2)
     bulging = _patch_area(is_bulging, patch_area_px2)
     beside = _patch_area(is_beside, patch_area_px2)
+    silhouette = 0.0
     continued = 0.0
     if not observation.is_masked:  # else the mask says where the object ends
-        is_continued = _is_continued(observation, is_drawn, is_supported, rendering.window)
-        # A patch in which the surface goes on is as long as others, and half as wide.
-        continued = _patch_area(is_continued, patch_area_px2 / 2)
+        across = _readings_across(observation, is_drawn, is_supported, rendering.window)
+        # Where the surface goes on, patches are as long as others, and half as wide.
+        silhouette = float(across.is_read.sum()) / (patch_area_px2 / 2)
+        continued = _patch_area(_is_continued(across, observation), patch_area_px2 / 2)
 
     is_explained = _lies_on_rendering(observation, rendering)
     visible = float(inner.sum()) / patch_area_px2
@@ -226,6 +228,7 @@ def compare(observation: Observation, pose: Rigid, surface: Surface) -> Evidence
         seen_through=seen_through,
         bulging=bulging,
         beside=beside,
+        silhouette=silhouette,
         continued=continued,
         rms=float(np.sqrt(squares.mean())) if len(squares) else THRESHOLD,
         noise_m=observation.noise.white_std_m,
@@ -284,19 +287,28 @@ def _is_beside_silhouette(
     return observation.is_object & np.isfinite(observation.depth_m) & np.logical_not(is_near)
 
 
-def _is_continued(
+class _Across(NamedTuple):
+    """Readings on lines across a silhouette, each through a pixel beside it."""
+
+    inverse: np.ndarray  #: (4, n) 1 / depth [1/m] at the places of ``_ACROSS``, NaN without reading
+    spacing_px: np.ndarray  #: (n,) distance of the two places within, and of the two outside
+    pixel: np.ndarray  #: (2, n) row and column beside the silhouette, in the observation
+
+    @property
+    def is_read(self) -> Bool[np.ndarray, " n"]:
+        """Lines whose four places have readings."""
+        return np.isfinite(self.inverse).all(0)
+
+
+def _readings_across(
     observation: Observation,
     is_drawn: np.ndarray,
     is_supported: np.ndarray,
     window: _Window,
-) -> Bool[np.ndarray, "h w"]:
-    """Mark pixels beside the silhouette in which the surface within it goes on.
+) -> _Across:
+    """Average readings at four places on lines across the silhouette, two on each side.
 
-    At its silhouette an object ends: by a step in depth, or by a concave edge where it touches
-    something. It does not end where the readings go on straight, as those of a larger box on whose
-    side a box is posed, or where they bend away, as round a corner of one body. This is decided by
-    four means of readings on a line across the silhouette, two on each side; in 1 / depth those of
-    one plane lie on a straight line. Readings on a known background are of no object.
+    Readings on a known background are of no object, and left out.
 
     Args:
         observation: its readings, (h, w).
@@ -305,7 +317,7 @@ def _is_continued(
         window: rows and columns of the rendering in the observation.
     """
     if not is_drawn.any():  # no silhouette
-        return np.zeros(observation.depth_m.shape, bool)
+        return _Across(np.empty((4, 0)), np.empty(0), np.empty((2, 0), int))
 
     # The silhouette, in a window with a margin.
     border = math.ceil(EDGE_PX / observation.step + observation.patch_px / 2)
@@ -335,23 +347,35 @@ def _is_continued(
     # Means of readings on the line across the silhouette through each pixel.
     is_background = observation.is_background[rows, columns]
     depth_m = np.where(is_background, np.nan, observation.depth_m[rows, columns])
-    side = _averaged_side(observation.step)
-    inverse = 1 / _mean_depth(depth_m, side)
-    across = []
+    mean_inverse = 1 / _mean_depth(depth_m, _averaged_side(observation.step))
+    inverse = []
     for k, times in enumerate(_ACROSS):
         pixel = edge + np.rint(times * outward).astype(int)
         row, column = np.clip(pixel, 0, np.array(shape)[:, None] - 1)
-        across.append(inverse[row, column])
+        inverse.append(mean_inverse[row, column])
         if k == _NEAREST_WITHIN:
-            across[-1] = np.where(is_support[row, column], across[-1], np.nan)
-
-    noise_m = math.hypot(AVERAGED_PER_WHITE * observation.noise.white_std_m, FLAT_M)
-    is_continued = np.zeros((height, width), bool)
-    is_continued[rows, columns][tuple(beside)] = _is_joined_across(
-        np.stack(across),
+            inverse[-1] = np.where(is_support[row, column], inverse[-1], np.nan)
+    return _Across(
+        inverse=np.stack(inverse),
         spacing_px=0.5 * distance[tuple(beside)],
+        pixel=beside + np.array([[rows.start], [columns.start]]),
+    )
+
+
+def _is_continued(across: _Across, observation: Observation) -> Bool[np.ndarray, "h w"]:
+    """Mark pixels beside the silhouette in which the surface within it goes on.
+
+    At its silhouette an object ends: by a step in depth, or by a concave edge where it touches
+    something. It does not end where the readings go on straight, as those of a larger box on whose
+    side a box is posed, or where they bend away, as round a corner of one body. In 1 / depth those
+    of one plane lie on a straight line.
+    """
+    is_continued = np.zeros(observation.depth_m.shape, bool)
+    is_continued[tuple(across.pixel)] = _is_joined_across(
+        across.inverse,
+        spacing_px=across.spacing_px,
         edge_px=EDGE_PX / observation.step,
-        noise_m=noise_m,
+        noise_m=math.hypot(AVERAGED_PER_WHITE * observation.noise.white_std_m, FLAT_M),
     )
     return ndimage.binary_closing(is_continued)
 

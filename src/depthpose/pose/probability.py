@@ -3,7 +3,8 @@
 At a right pose a tenth of the visible area is contradicted on average, by edges, reflections and
 dents that the model does not have; at a wrong pose half of it. Both shares vary from view to view,
 so that a count of contradicting patches has a negative binomial distribution: ten patches more say
-much of a small object and little of a large one.
+much of a small object and little of a large one. Likewise the part of the silhouette across which
+the surface goes on, but of the length of the silhouette.
 
 How patches are counted :mod:`depthpose.pose.evidence` says; what a count then means is said by the
 coefficients of this file alone. ``bench/fit_probability.py`` fits the shares of right and wrong
@@ -50,6 +51,10 @@ COPY_CONTRADICTED = GammaShare(mean=0.1, shape=1.0)
 RIGHT_UNOBSERVED = GammaShare(mean=0.2, shape=1.0)
 WRONG_UNOBSERVED = GammaShare(mean=0.5, shape=3.0)
 """Share of the visible area that has no reading, or is hidden."""
+RIGHT_CONTINUED = GammaShare(mean=0.05, shape=1.0)
+WRONG_CONTINUED = GammaShare(mean=0.3, shape=0.3)
+"""Share of the silhouette across which the surface goes on: of a right pose little, where objects
+touch; of a wrong one much, as on the side of a larger box, or as often nothing."""
 PRIOR_MASKED = 5.0
 """Odds of the best pose being right before its evidence is seen, where a mask shows the object."""
 PRIOR_REGION = 2.0
@@ -84,22 +89,33 @@ def probability_right(evidence: Evidence, prior_odds: float) -> float:
 
 
 def log_likelihood_ratio(evidence: Evidence) -> float:
-    """Log likelihood ratio of a right and a wrong pose: contradicted, unobserved, residuals.
+    """Log likelihood ratio of a right and a wrong pose, by all the evidence.
 
     It grows with the area that was compared: a pose that shows little has little to support it.
     """
     area = max(LEAST_AREA, evidence.visible)
     # Only what was observed can contradict a pose, and what contradicts it was observed.
+    contradicted_area = evidence.seen_through + evidence.bulging + evidence.beside
     observed_area = max(LEAST_AREA, area - evidence.unobserved)
+    contradicted = _log_ratio(
+        RIGHT_CONTRADICTED, WRONG_CONTRADICTED, contradicted_area, observed_area
+    )
     rest = max(LEAST_AREA, area - evidence.seen_through - evidence.bulging)
-    contradicted = RIGHT_CONTRADICTED.log_likelihood(evidence.contradicted, observed_area)
-    contradicted -= WRONG_CONTRADICTED.log_likelihood(evidence.contradicted, observed_area)
-    unobserved = RIGHT_UNOBSERVED.log_likelihood(evidence.unobserved, rest)
-    unobserved -= WRONG_UNOBSERVED.log_likelihood(evidence.unobserved, rest)
+    unobserved = _log_ratio(RIGHT_UNOBSERVED, WRONG_UNOBSERVED, evidence.unobserved, rest)
+    continued = _log_ratio(
+        RIGHT_CONTINUED, WRONG_CONTINUED, evidence.continued, evidence.silhouette
+    )
     # Residuals are of the supported part alone.
     residuals = _log_likelihood_of_residuals(evidence.rms)
     residuals -= _log_likelihood_of_residuals(WRONG_RMS)
-    return contradicted + unobserved + evidence.supported_share * residuals
+    return contradicted + unobserved + continued + evidence.supported_share * residuals
+
+
+def _log_ratio(right: GammaShare, wrong: GammaShare, count: float, area: float) -> float:
+    """Log likelihood ratio of a count of patches in an area, at a right and a wrong pose."""
+    if area < LEAST_AREA:
+        return 0.0
+    return right.log_likelihood(count, area) - wrong.log_likelihood(count, area)
 
 
 def log_likelihood_of_copy(evidence: Evidence, area: float) -> float:

@@ -23,7 +23,7 @@ from depthpose.pose.kdtree import (
     square_distance,
 )
 from depthpose.pose.mesh import sample_surface, symmetry_transforms
-from depthpose.pose.mesh.models import disc_triangles, drawn_triangles, fibonacci_directions
+from depthpose.pose.mesh.models import drawn_triangles, fibonacci_directions, triangulate_points
 from depthpose.pose.types import ObjectModel
 
 NEAR = 0.05  #: diameters: a point of the cloud within this distance lies on the posed surface
@@ -307,7 +307,7 @@ def prepare_surface(model: ObjectModel, count: int = 10_000) -> Surface:
     """Sample the surface of a model once for many clouds, by ``count`` points."""
     points_m, normals = (part.double() for part in sample_surface(model, count))
     is_large = len(model.faces) > _MOST_FACES
-    triangles_m = disc_triangles(points_m, normals) if is_large else drawn_triangles(model).double()
+    triangles_m = triangulate_points(points_m, normals) if is_large else drawn_triangles(model)
     tree = KDTree(points_m.numpy())
 
     # The outer side of each sample, by cells that hold about four samples.
@@ -326,7 +326,7 @@ def prepare_surface(model: ObjectModel, count: int = 10_000) -> Surface:
         points_m=points_m,
         normals=normals,
         outward=outward,
-        triangles_m=triangles_m,
+        triangles_m=triangles_m.double(),
         across=across,
         diameter_m=model.diameter_m,
         spacing_m=float(np.median(near_m[:, -1])),

@@ -258,14 +258,14 @@ class Evidence:
     seen_through: float  #: patches behind which the camera saw: free-space violations
     bulging: float  #: patches of the object's own readings before the model
     beside: float  #: patches of the object's own readings beside the model's silhouette
-    #: patches in which the surface goes on beyond the silhouette; 0 where a mask says where it ends
-    continued: float
+    silhouette: float  #: length with readings on both sides, in patches; 0 with an exact mask
+    continued: float  #: part of it across which the surface goes on: there the object does not end
     rms: float  #: root mean square residual of the supported part, in standard deviations
     noise_m: float  #: standard deviation of a reading on the object, estimated from the image
 
     @property
     def contradicted(self) -> float:
-        """Area that contradicts the pose."""
+        """Patches that contradict the pose."""
         return self.seen_through + self.bulging + self.beside + self.continued
 
     @property

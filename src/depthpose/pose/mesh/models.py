@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float, Int64
-from scipy.spatial import ConvexHull, KDTree, QhullError
+from scipy.spatial import ConvexHull, Delaunay, KDTree, QhullError
 from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
@@ -212,43 +212,55 @@ def sample_surface(
     return points.to(model.vertices_m), normals.to(model.vertices_m)
 
 
-_DISC_CORNERS = 6  # three quarters of a disc's area, in four triangles
-_DISC_RADIUS = 1.6
-"""Radius of a disc, in spacings of its points: neighbours then overlap, and nothing shows through
-where the points are twice as far apart as usual."""
+_MOST_POINTS = 10_000
+"""Of a model of more points so many are joined: a tetrahedralization takes a second."""
+_NEIGHBOURS = 12
+"""A triangle's circumcircle is no larger than the distance of a corner to its twelfth neighbour:
+where points are random a circle without any is seldom so large."""
+_LEAST_ALONG = 0.5
+"""Least cosine between a triangle and the normals of its points, in the mean of the three: one that
+bridges a hole or a thin wall is across its points' normals."""
 
 
 def drawn_triangles(model: ObjectModel) -> Float[Tensor, "n 3 3"]:
-    """Give the faces of a model, or a disc at each point of one that has no faces."""
+    """Give the faces of a model, or the triangles between the points of one that has no faces."""
     if len(model.faces):
         return model.vertices_m[model.faces]
-    return disc_triangles(model.vertices_m, model.normals)
+    return triangulate_points(*sample_surface(model, _MOST_POINTS))
 
 
-def disc_triangles(
+def triangulate_points(
     points_m: Float[Tensor, "p 3"], normals: Float[Tensor, "p 3"]
 ) -> Float[Tensor, "n 3 3"]:
-    """Give the triangles of a disc at each point of a surface.
+    """Join neighbouring points of a surface by triangles.
 
-    A disc is flat and six-cornered, across its normal (Pfister et al. 2000), and as large as its
-    own neighbourhood is sparse: the distance to the third nearest point, but no more than twice the
-    usual one, so that a stray point makes no plate.
+    As an alpha shape (Edelsbrunner and Mücke 1994): triangles of the Delaunay tetrahedra whose
+    circumcircle is small, here beside the distances of neighbouring points, and that lie along the
+    surface by its normals. Triangles within a body remain too: nothing sees them.
     """
-    points = points_m.double()
-    distance, _ = KDTree(points.numpy()).query(points.numpy(), k=min(4, len(points)))
-    spacing = torch.from_numpy(distance[:, -1])
-    radius = _DISC_RADIUS * spacing.clamp(max=2 * float(spacing.median())) / 2**0.5
-    normal = normals.double()
+    points = points_m.double().numpy()
+    tree = KDTree(points)
+    count = min(_NEIGHBOURS + 1, len(points))  # the nearest is the point itself
+    distance_m, _ = tree.query(points, count, workers=1)
+    largest_m = distance_m[:, -1]
 
-    # Corners about each point, from two tangents.
-    helper = torch.eye(3, dtype=torch.float64)[normal.abs().argmin(1)]
-    first = torch.nn.functional.normalize(torch.linalg.cross(normal, helper), dim=-1)
-    second = torch.linalg.cross(normal, first)
-    angle = 2 * math.pi * torch.arange(_DISC_CORNERS, dtype=torch.float64) / _DISC_CORNERS
-    spokes = first[:, None] * angle.cos()[:, None] + second[:, None] * angle.sin()[:, None]
-    corners = points[:, None] + radius[:, None, None] * spokes
-    fan = torch.tensor([[0, i, i + 1] for i in range(1, _DISC_CORNERS - 1)])
-    return corners[:, fan].flatten(0, 1).to(points_m)
+    # Each triangle of each tetrahedron, once. Joggled (QJ), points of one plane have some as well.
+    tetrahedra = Delaunay(points, qhull_options="QJ").simplices
+    triangles = np.concatenate([np.delete(tetrahedra, corner, axis=1) for corner in range(4)])
+    triangles = np.unique(np.sort(triangles, axis=1), axis=0)
+
+    # The radius of a circumcircle is the product of the sides over four times the area.
+    corners = points[triangles]
+    sides = corners - np.roll(corners, 1, axis=1)
+    across = np.cross(sides[:, 0], sides[:, 1])
+    doubled_area = np.maximum(np.linalg.norm(across, axis=1), 1e-300)
+    radius = np.linalg.norm(sides, axis=2).prod(1) / (2 * doubled_area)
+    is_small = radius < largest_m[triangles].max(1)
+
+    direction = across / doubled_area[:, None]
+    cosine = np.abs(np.einsum("tci,ti->tc", normals.double().numpy()[triangles], direction))
+    is_along = cosine.mean(1) > _LEAST_ALONG
+    return torch.from_numpy(corners[is_small & is_along]).to(points_m)
 
 
 def gap_to_surface_m(points_m: Float[Tensor, "n 3"], model: ObjectModel) -> float:
