@@ -30,7 +30,7 @@ from depthpose.pose.types import Alternative, Evidence, PoseEstimate
 
 GOOD = Evidence(
     visible=40.0, supported=38.0, explained=38.0,
-    unobserved=2.0, seen_through=0.0, bulging=0.0, beside=0.0, silhouette=0.0, continued=0.0,
+    unobserved=2.0, seen_through=0.0, bulging=0.0, beside=0.0, silhouette=25.0, continued=0.0,
     rms=0.5, noise_m=0.001,
 )  # fmt: skip
 """What a right pose leaves."""
@@ -83,6 +83,16 @@ def test_each_kind_of_contradiction_lowers_the_probability() -> None:
             before = after
         # Where the rest lies no nearer than it does by accident, it is refused.
         assert probability_right(replace(evidence, rms=1.7), PRIOR_PROPOSED) < 0.1, kind
+
+
+def test_a_surface_that_goes_on_across_half_of_the_silhouette_is_of_something_larger() -> None:
+    touching = replace(GOOD, continued=2.0)
+    larger = replace(GOOD, continued=12.0)
+    assert abs(log_likelihood_ratio(touching) - log_likelihood_ratio(GOOD)) < 1
+    assert log_likelihood_ratio(larger) < log_likelihood_ratio(GOOD) - 4
+    # Of a length that was not examined nothing is said.
+    masked = replace(GOOD, silhouette=0.0)
+    assert abs(log_likelihood_ratio(masked) - log_likelihood_ratio(GOOD)) < 1
 
 
 def test_what_was_not_observed_lowers_it_less_than_what_contradicts() -> None:

@@ -52,9 +52,11 @@ RIGHT_UNOBSERVED = GammaShare(mean=0.2, shape=1.0)
 WRONG_UNOBSERVED = GammaShare(mean=0.5, shape=3.0)
 """Share of the visible area that has no reading, or is hidden."""
 RIGHT_CONTINUED = GammaShare(mean=0.05, shape=1.0)
-WRONG_CONTINUED = GammaShare(mean=0.3, shape=0.3)
-"""Share of the silhouette across which the surface goes on: of a right pose little, where objects
-touch; of a wrong one much, as on the side of a larger box, or as often nothing."""
+LARGER_CONTINUED = GammaShare(mean=0.3, shape=2.0)
+"""Share of the silhouette across which the surface goes on: at a right pose, where objects touch,
+and at a pose on something larger, such as the side of a larger box."""
+WRONG_ON_LARGER = 0.5
+"""Share of the wrong poses that lie on something larger; others end where the surface does."""
 PRIOR_MASKED = 5.0
 """Odds of the best pose being right before its evidence is seen, where a mask shows the object."""
 PRIOR_REGION = 2.0
@@ -102,9 +104,7 @@ def log_likelihood_ratio(evidence: Evidence) -> float:
     )
     rest = max(LEAST_AREA, area - evidence.seen_through - evidence.bulging)
     unobserved = _log_ratio(RIGHT_UNOBSERVED, WRONG_UNOBSERVED, evidence.unobserved, rest)
-    continued = _log_ratio(
-        RIGHT_CONTINUED, WRONG_CONTINUED, evidence.continued, evidence.silhouette
-    )
+    continued = _log_ratio_of_continued(evidence.continued, evidence.silhouette)
     # Residuals are of the supported part alone.
     residuals = _log_likelihood_of_residuals(evidence.rms)
     residuals -= _log_likelihood_of_residuals(WRONG_RMS)
@@ -113,9 +113,15 @@ def log_likelihood_ratio(evidence: Evidence) -> float:
 
 def _log_ratio(right: GammaShare, wrong: GammaShare, count: float, area: float) -> float:
     """Log likelihood ratio of a count of patches in an area, at a right and a wrong pose."""
-    if area < LEAST_AREA:
-        return 0.0
     return right.log_likelihood(count, area) - wrong.log_likelihood(count, area)
+
+
+def _log_ratio_of_continued(continued: float, silhouette: float) -> float:
+    """Log likelihood ratio of the part of a silhouette across which the surface goes on."""
+    if silhouette < LEAST_AREA:
+        return 0.0
+    larger = -_log_ratio(RIGHT_CONTINUED, LARGER_CONTINUED, continued, silhouette)
+    return -math.log(1 - WRONG_ON_LARGER + WRONG_ON_LARGER * math.exp(larger))
 
 
 def log_likelihood_of_copy(evidence: Evidence, area: float) -> float:
