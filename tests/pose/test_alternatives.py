@@ -183,6 +183,40 @@ def test_a_copy_that_drifts_competes_where_it_began_too(monkeypatch: pytest.Monk
     assert angles == pytest.approx([60, 120, 150, 360 - 203], abs=0.01)
 
 
+def test_a_pose_that_is_one_of_the_copies_competes_with_none(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Between two copies about an axis lies no other pose: the group has its probability."""
+    mug = make_part("mug", 1)
+    prepared = PreparedObject(number=0, model=mug, surface=prepare_surface(mug))
+    truth = pose_at(seed=1).double()
+    axis = prepared.copies.near_axis
+    assert axis is not None
+
+    def turned(degrees: float) -> RefinedPose:
+        angle = torch.tensor(math.radians(degrees), dtype=torch.float64)
+        turn = turn_about(axis.direction.double(), axis.point_m.double(), angle)
+        return RefinedPose(
+            camera_from_model=truth @ turn, covariance=torch.eye(6), residual_m=torch.zeros(()),
+            inlier_share=torch.ones(()),
+        )  # fmt: skip
+
+    upside_down = rotation_by(torch.tensor([math.pi, 0.0, 0.0])).double()
+    other = replace(turned(0), camera_from_model=Rigid(truth.R @ upside_down, truth.t_m))
+    different = [turned(0), turned(49.5), other]
+    monkeypatch.setattr(hypotheses, "_refine_different_poses", lambda *_: different)
+    monkeypatch.setattr(hypotheses, "_refine_distinct_copies", lambda *_: [turned(49.5)])
+    cloud_m = cloud_of(mug, truth.float()).double()
+    observation = observe(cloud_m, None, mug.diameter_m, 0.001, is_masked=True)
+    competition = compete(
+        cloud_m, turned(0), Rigid.stack([truth]), prepared, observation, EstimateConfig()
+    )
+    assert len(competition.others) == 1
+    total = competition.group_share + competition.others[0][1]
+    assert total == pytest.approx(1)
+    assert torch.equal(competition.others[0][0].pose.R, other.camera_from_model.R)
+
+
 def test_only_what_has_a_copy_is_less_certain_of_it() -> None:
     """A bottle whose ends are alike declares its axis alone: it may stand on its head."""
     for model in (bracket(), bottle()):

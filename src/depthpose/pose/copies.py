@@ -27,7 +27,7 @@ from depthpose.pose.types import Axis, ObjectModel
 SAME_DIAMETERS = 0.1  #: mean distance of the model's points up to which two poses are one
 SAME_RAD = math.radians(8)  #: and angle; both must hold
 _STEP_RAD = math.pi / 32  # half of the step between rotations about an axis: within SAME_RAD
-_TOLERATED_STEP_RAD = math.pi / 18  # the same about an axis of a symmetry within a tolerance
+_TOLERATED_STEP_RAD = math.pi / 24  # the same about an axis of a symmetry within a tolerance
 _COPY_DIAMETERS = 0.05  # largest deviation of a near-symmetric copy; a look-alike deviates by more
 _CLOSE_RAD = math.radians(45)  # a copy after a smaller rotation is one of a row about its axis
 _COMPARED = 100  # points of the model by which poses are compared

@@ -131,14 +131,20 @@ def compete(
     copies = _refine_distinct_copies(cloud_m, winner.refined, prepared, config, view)
     group = [winner, *map(hypothesize, copies)]
     share_in_group = share_among_copies(group, is_masked=observation.is_masked)
-    copy_shares = float(shares[winner_number]) * share_in_group
-    best = int(copy_shares.argmax())
 
+    # About an axis a pose between two copies is one too: their group has its share.
+    group_poses = Rigid.stack([copy.pose for copy in group])
+    symmetries = _all_symmetries(prepared)
+    is_in_group = torch.tensor(
+        [bool(prepared.copies.is_same(h.pose, group_poses, symmetries).any()) for h in different]
+    )
+    copy_shares = float(shares[is_in_group].sum()) * share_in_group
+    best = int(copy_shares.argmax())
     return Competition(
         best=group[best],
         best_share=float(copy_shares[best]),
         copies=[(h, float(copy_shares[k])) for k, h in enumerate(group) if k != best],
-        others=[(h, float(shares[k])) for k, h in enumerate(different) if k != winner_number],
+        others=[(h, float(shares[k])) for k, h in enumerate(different) if not is_in_group[k]],
     )
 
 
