@@ -65,11 +65,8 @@ def test_a_gear_says_how_much_its_keyway_deviates() -> None:
         assert re.fullmatch(r"rotated by \d+ degrees about .* \(\d+\.\d%\)", line), line
 
 
-@pytest.mark.parametrize("bump_m", [0.002, 0.004])
-def test_the_ends_of_a_bar_that_differ_a_little_are_copies_and_no_symmetries(
-    bump_m: float,
-) -> None:
-    copies = find_copies(with_found_symmetries(bar(bump_m), None, is_taken=True))
+def test_the_ends_of_a_bar_that_differ_a_little_are_copies_and_no_symmetries() -> None:
+    copies = find_copies(with_found_symmetries(bar(0.002), None, is_taken=True))
     for axis in ([0, 1.0, 0], [0, 0, 1.0]):
         assert degrees_to(copies.symmetries, rotation(axis, 180)) > 90
         assert degrees_to(every_copy(copies), rotation(axis, 180)) < 2

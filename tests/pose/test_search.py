@@ -184,10 +184,8 @@ def turns_of(model: ObjectModel) -> Rigid:
 
 @pytest.mark.parametrize("is_handle_first", [False, True])
 def test_a_mug_turned_about_its_axis_looks_alike_but_for_its_handle(is_handle_first: bool) -> None:
-    mug = make_part("mug")
-    off_axis_m = mug.vertices_m[mug.faces].mean(1)[:, :2].norm(dim=-1)
-    order = off_axis_m.argsort(descending=is_handle_first)
-    turns = turns_of(replace(mug, faces=mug.faces[order]))
+    mug = make_part("mug")  # its handle comes last
+    turns = turns_of(replace(mug, faces=mug.faces.flip(0)) if is_handle_first else mug)
     upright = turns.R[turns.R[:, 2, 2] > 0.99]
     angle = torch.atan2(upright[:, 1, 0], upright[:, 0, 0]).rad2deg()
     every = torch.arange(-180.0, 180.0, 5.0)[:, None]

@@ -167,6 +167,12 @@ class SurfaceDeviation:
         return off.quantile(share, dim=-1)
 
 
+@lru_cache(maxsize=4)
+def _surface_of(model: ObjectModel) -> SurfaceDeviation:
+    """Give the surface of a model, made once for its several searches."""
+    return SurfaceDeviation(model)
+
+
 def propose_symmetries(model: ObjectModel, tolerance: float = 0.02) -> list[SymmetryProposal]:
     """Search for rotations that leave the shape as it is, and say how certain each is.
 
@@ -184,7 +190,7 @@ def propose_symmetries(model: ObjectModel, tolerance: float = 0.02) -> list[Symm
     Returns:
         Proposals of a certainty of 1/5 and more, continuous first, then the surest.
     """
-    surface = SurfaceDeviation(model)
+    surface = _surface_of(model)
     limit = 2 * tolerance
     proposals: list[SymmetryProposal] = []
     tried_axes: list[Tensor] = []
@@ -326,7 +332,8 @@ def _rotations(
     return turn_about(direction, torch.zeros_like(direction), angles).R
 
 
-def promising_turns(surface: SurfaceDeviation) -> list[Float[Tensor, "3 3"]]:
+@lru_cache(maxsize=4)
+def promising_turns(surface: SurfaceDeviation) -> tuple[Float[Tensor, "3 3"], ...]:
     """Give the rotations about principal axes and many directions that fit roughly, best first."""
     directions = torch.cat([surface.axes, fibonacci_directions(_DIRECTIONS)])
     angles = torch.tensor([2 * math.pi / order for order in _COARSE_ORDERS], dtype=torch.float64)
@@ -334,7 +341,7 @@ def promising_turns(surface: SurfaceDeviation) -> list[Float[Tensor, "3 3"]]:
     rotations = rotations.flatten(0, 1)
     distance = surface.rough_distance(rotations)
     order = distance.argsort().tolist()
-    return [rotations[i] for i in order if distance[i] <= _MAX_ROUGH_DEVIATION]
+    return tuple(rotations[i] for i in order if distance[i] <= _MAX_ROUGH_DEVIATION)
 
 
 def _is_covered(direction: Tensor, tried_axes: list[Tensor], revolution_axes: list[Tensor]) -> bool:
@@ -459,7 +466,7 @@ def mirror_deviation(model: ObjectModel) -> float:
 
 def _search_mirror(model: ObjectModel) -> float:
     """Give the least deviation of a surface from its mirror images, in diameters."""
-    surface = SurfaceDeviation(model)
+    surface = _surface_of(model)
     # Reflections across planes with normal n, followed by rotations about n by 0, 90, 180 and 270
     # degrees: cos (1 - nn') + sin [n] - nn'. The best that are distinct are the starts.
     normals = torch.cat([surface.axes, fibonacci_directions(_MIRROR_PLANES)])
@@ -581,7 +588,7 @@ def _search_near_symmetries(model: ObjectModel) -> dict[str, Any]:
     Gives JSON values, which are cached: ``near``, transforms with their deviations, the best first;
     and ``alike``, flags of the discrete and the continuous symmetries.
     """
-    surface = SurfaceDeviation(model)
+    surface = _surface_of(model)
     alike = _which_are_alike(model.symmetries, surface)
     measured = _deviations(_near_candidates(model.symmetries, surface), surface)
 
