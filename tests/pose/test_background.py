@@ -5,7 +5,15 @@ from pathlib import Path
 
 import pytest
 import torch
-from tests.pose.synthetic_objects import CAMERA, K, box_faces, bracket, pose_at, view_of
+from tests.pose.synthetic_objects import (
+    CAMERA,
+    K,
+    box_faces,
+    bracket,
+    bracket_surface,
+    pose_at,
+    view_of,
+)
 
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
@@ -112,7 +120,7 @@ def test_readings_on_the_bin_are_background_and_those_of_the_part_are_not() -> N
 
 def test_a_pose_in_a_wave_of_the_floor_is_no_place() -> None:
     """The floor is no plane: it is the known bin that a pose would lie in."""
-    surface = prepare_surface(bracket())
+    surface = bracket_surface()
     sunk = Rigid(TRUTH.R, TRUTH.t_m + torch.tensor([0.12, 0.0, 0.2])).double()
     depth_m = posed_bin().draw(K, 240, 320) + noise(2)
     plain = view_input(depth_m, None, CAMERA, "bracket", "x")
