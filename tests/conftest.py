@@ -5,6 +5,7 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import fields, is_dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +68,8 @@ def _content(value: object) -> object:
 
 @pytest.fixture(scope="session", autouse=True)
 def prepared_once() -> Iterator[None]:
-    """What an estimator computes of a shape, which takes a second, is computed once a process."""
+    """What an estimator computes of a shape, and Git's answer, is computed once a process."""
+    from depthpose.core import run
     from depthpose.pose import copies, estimator
 
     made: dict[object, Any] = {}
@@ -85,6 +87,7 @@ def prepared_once() -> Iterator[None]:
         surface = once(estimator.prepare_surface, lambda *given: _content(given))
         patch.setattr(estimator, "prepare_surface", surface)
         patch.setattr(copies, "prepare_pairs", once(copies.prepare_pairs, id))
+        patch.setattr(run, "_commit_of_package", cache(run._commit_of_package))
         yield
 
 

@@ -27,16 +27,16 @@ from depthpose.pose.synthetic import Objects, make_part
 def cad(drawn: Path, tmp_path: Path) -> Path:
     """The folder of :func:`drawn` for a test of its own; its CAD file."""
     shutil.copytree(drawn, tmp_path, dirs_exist_ok=True)
-    return tmp_path / "connector.stl"
+    return tmp_path / "bracket.stl"
 
 
 @pytest.fixture(scope="module")
 def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A part, a cloud of it in millimetres, and a depth image with its mask and camera."""
     folder = tmp_path_factory.mktemp("part")
-    write_part("connector", folder)
+    write_part("bracket", folder)
     config = ObjectsConfig(views=None, resolution=(1.0, 1.0), occluded_share=0.0, seed=5)
-    views = Objects([make_part("connector")], config)
+    views = Objects([make_part("bracket")], config)
     write_cloud(folder / "scan.ply", Cloud(points=1000 * views[0].input.points_m))
     window = views.view(0).input
     centre_px = torch.tensor(config.centre_px)
@@ -67,7 +67,7 @@ def test_a_cad_file_and_a_cloud_give_a_pose(cad: Path, tmp_path: Path) -> None:
     assert predict(*words, "--out", tmp_path / "out") == 0
     (row,) = rows(tmp_path / "out")
     # A cloud alone shows less than a depth image: nothing is seen through.
-    assert row["object"] == "connector"
+    assert row["object"] == "bracket"
     assert row["status"] in ("ok", "ambiguous")
     assert (tmp_path / "out/scan.pose.ply").is_file()
     assert (tmp_path / "out/report.html").is_file()
@@ -98,8 +98,8 @@ def test_a_notice_on_a_file_that_the_report_reads_again_is_given_once(
 
 def test_a_declared_symmetry_is_taken_and_doubted_aloud(cad: Path, tmp_path: Path) -> None:
     words = ["--cad", cad, "--unit", "mm", "--cloud", tmp_path / "scan.ply"]
-    with pytest.warns(Notice, match="connector: turned by the symmetry z,2 its surface lies"):
-        assert predict(*words, "--symmetry", "connector:z,2", "--out", tmp_path / "out") == 0
+    with pytest.warns(Notice, match="bracket: turned by the symmetry z,2 its surface lies"):
+        assert predict(*words, "--symmetry", "bracket:z,2", "--out", tmp_path / "out") == 0
     assert rows(tmp_path / "out")[0]["status"] in ("ok", "ambiguous")
     # Results of other symmetries are other results.
     assert predict(*words, "--out", tmp_path / "out") == 2
@@ -171,19 +171,19 @@ def test_a_cad_file_is_followed_through_frames(
     ("words", "said"),
     [
         ("--method register --cloud scan.ply", "give --cad part.stl --unit mm, or --bop"),
-        ("--method register --cad connector.stl --cloud scan.ply", "give --unit mm"),
-        ("--cad connector.stl --unit mm --cloud scan.ply --method network",
+        ("--method register --cad bracket.stl --cloud scan.ply", "give --unit mm"),
+        ("--cad bracket.stl --unit mm --cloud scan.ply --method network",
          "weights know their own objects; leave --method network out"),
-        ("--cad connector.stl --unit mm --cloud scan.ply --weights parts", "without a network"),
-        ("--method register --cad connector.stl --bop .", "Leave --cad out"),
+        ("--cad bracket.stl --unit mm --cloud scan.ply --weights parts", "without a network"),
+        ("--method register --cad bracket.stl --bop .", "Leave --cad out"),
         ("--cad-unit mm --cloud scan.ply", "no CAD file is given. Leave --cad-unit out"),
         ("--method register --cad scan.txt --unit mm --cloud scan.ply", "triangles, such as STL"),
         ("--symmetry z,2 --cloud scan.ply", "--symmetry z,2: is of --method register with --cad"),
         ("--method register --symmetry z,2 --bop .", "--symmetry z,2: is of --method register"),
-        ("--method register --cad connector.stl --unit mm --symmetry z,two --cloud scan.ply",
+        ("--method register --cad bracket.stl --unit mm --symmetry z,two --cloud scan.ply",
          "symmetry 'z,two': 'z,two' is no axis with 2 to 360 turns; write AXIS,N"),
-        ("--method register --cad connector.stl --unit mm --symmetry plug:z,2 --cloud scan.ply",
-         "no object is called so; Known: 'connector'"),
+        ("--method register --cad bracket.stl --unit mm --symmetry plug:z,2 --cloud scan.ply",
+         "no object is called so; Known: 'bracket'"),
     ],
 )  # fmt: skip
 def test_what_is_missing_is_said(

@@ -77,7 +77,7 @@ def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[type[Fak
     content = write_weights(tmp_path / "there.safetensors", licence="MIT").read_bytes()
     FakeHub.files |= {"model.safetensors": content, "other/second.safetensors": content}
     with ThreadingHTTPServer(("127.0.0.1", 0), FakeHub) as running:
-        threading.Thread(target=running.serve_forever, daemon=True).start()
+        threading.Thread(target=running.serve_forever, args=(0.02,), daemon=True).start()
         address = f"http://127.0.0.1:{running.server_port}"
         template = address + "/{repo_id}/resolve/{revision}/{filename}"
         monkeypatch.setattr(constants, "ENDPOINT", address)

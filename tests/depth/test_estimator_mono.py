@@ -444,7 +444,7 @@ def test_the_pipeline_takes_what_that_of_transformers_takes(
     plain = base64.b64encode((tmp_path / "street.png").read_bytes()).decode()
     serve = partial(SimpleHTTPRequestHandler, directory=str(tmp_path))
     server = ThreadingHTTPServer(("127.0.0.1", 0), serve)
-    threading.Thread(target=server.serve_forever, daemon=True).start()
+    threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
     address = f"http://127.0.0.1:{server.server_port}/"
     try:
         expected = pipe(RGB, focal_px=100.0)

@@ -1,6 +1,7 @@
 """An object whose sides all differ, its views, and a network that answers what a test says."""
 
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from depthpose.pose.config import CloudConfig, MeshConfig, RefusalConfig
 from depthpose.pose.mesh import make_model
 from depthpose.pose.network import ResUNet, ResUNetConfig
 from depthpose.pose.network_pose import CloudToPose, GeoPoseNet
+from depthpose.pose.surface import Surface, prepare_surface
 from depthpose.pose.synthetic.parts import circle, part_mesh, ring
 from depthpose.pose.types import Axis, ObjectModel, PoseEstimate, Symmetries
 from depthpose.pose.weights import PoseWeights
@@ -49,6 +51,12 @@ def bracket(name: str = "bracket", keypoints: int = 8) -> ObjectModel:
     vertices = torch.cat([corners * torch.tensor(s) + torch.tensor(at) for s, at in parts])
     every = torch.cat([faces + 8 * k for k in range(len(parts))])
     return make_model(vertices, every, name=name, number=7, config=MeshConfig(keypoints=keypoints))
+
+
+@cache
+def bracket_surface() -> Surface:
+    """The prepared surface of :func:`bracket`, made once, which no test changes."""
+    return prepare_surface(bracket())
 
 
 def bottle(name: str = "bottle") -> ObjectModel:

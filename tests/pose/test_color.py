@@ -2,7 +2,9 @@
 
 import math
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 import torch
@@ -51,17 +53,21 @@ def moved(poses: Rigid, seed: int, share: float, diameter_m: float) -> Rigid:
     return Rigid(poses.R @ R, poses.t_m + share * diameter_m * shift / shift.norm())
 
 
-def box(folder: Path, seed: int = 0) -> ObjectModel:
-    return read_model(saved_glb(textured_box(seed), folder / "box.glb"), "m")
+@cache
+def box(seed: int = 0) -> ObjectModel:
+    with TemporaryDirectory() as folder:
+        return read_model(saved_glb(textured_box(seed), Path(folder) / "box.glb"), "m")
 
 
-def can(folder: Path, seed: int = 0) -> ObjectModel:
-    return read_model(saved_glb(textured_can(seed), folder / "can.glb"), "m")
+@cache
+def can(seed: int = 0) -> ObjectModel:
+    with TemporaryDirectory() as folder:
+        return read_model(saved_glb(textured_can(seed), Path(folder) / "can.glb"), "m")
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_the_right_half_turn_of_a_box_is_chosen(tmp_path: Path, seed: int) -> None:
-    model, pose = box(tmp_path, seed), random_pose(seed)
+def test_the_right_half_turn_of_a_box_is_chosen(seed: int) -> None:
+    model, pose = box(seed), random_pose(seed)
     random = torch.Generator().manual_seed(seed)
     light = Light(
         toward=tuple(torch.randn(3, generator=random).tolist()),
@@ -78,12 +84,12 @@ def test_the_right_half_turn_of_a_box_is_chosen(tmp_path: Path, seed: int) -> No
     assert float(agreement.correlation[0].min()) > 0.7
 
 
-def test_wrong_prints_are_as_likely_as_chance_lets_them_be(tmp_path: Path) -> None:
+def test_wrong_prints_are_as_likely_as_chance_lets_them_be() -> None:
     # Of prints that have nothing to do with the image, twice the log likelihood of each of three
     # correlations is chi-squared with one degree of freedom in half of the cases, else 0.
     wrong: list[Tensor] = []
     for seed in range(6):
-        model, pose = box(tmp_path, seed), random_pose(seed)
+        model, pose = box(seed), random_pose(seed)
         view = drawn_view(textured_box(seed), pose)
         wrong.append(color_agreement(half_turns(pose), model, view).log_likelihood[1:])
     every = torch.cat(wrong)
@@ -92,8 +98,8 @@ def test_wrong_prints_are_as_likely_as_chance_lets_them_be(tmp_path: Path) -> No
     assert float(every.max()) > 0.5  # and it is no constant
 
 
-def test_exposure_white_balance_and_gamma_change_little(tmp_path: Path) -> None:
-    model, pose = box(tmp_path), random_pose(3)
+def test_exposure_white_balance_and_gamma_change_little() -> None:
+    model, pose = box(), random_pose(3)
     plain = drawn_view(textured_box(), pose, Light(noise=0.005))
     assert plain.color is not None
     dim = drawn_view(textured_box(), pose, Light(gains=(0.5, 0.35, 0.25), noise=0.005))
@@ -104,9 +110,9 @@ def test_exposure_white_balance_and_gamma_change_little(tmp_path: Path) -> None:
         assert torch.allclose(first, other, atol=0.08)
 
 
-def test_light_from_one_side_is_no_print(tmp_path: Path) -> None:
+def test_light_from_one_side_is_no_print() -> None:
     # A can of one colour but for a thin line, lit from the left: brightness falls off around it.
-    model, mesh = can(tmp_path), textured_can()
+    model, mesh = can(), textured_can()
     mesh.visual.material.image.paste((120, 120, 120), (0, 0, 512, 256))
     pose = Rigid(
         rotation_by(torch.tensor([math.pi / 2, 0, 0]).double()), torch.tensor([0, 0, 0.5]).double()
@@ -119,8 +125,8 @@ def test_light_from_one_side_is_no_print(tmp_path: Path) -> None:
     assert float(color_agreement(spins, model, view).log_likelihood.max()) < math.log(100)
 
 
-def test_colour_is_mute_without_print_or_image(tmp_path: Path) -> None:
-    model, pose = box(tmp_path), random_pose(1)
+def test_colour_is_mute_without_print_or_image() -> None:
+    model, pose = box(), random_pose(1)
     view = drawn_view(textured_box(), pose)
     assert model.colors is not None
     assert view.color is not None
@@ -140,16 +146,16 @@ def test_colour_is_mute_without_print_or_image(tmp_path: Path) -> None:
         assert agreement.score.tolist() == [0.0] * 4
 
 
-def test_colour_of_clipped_pixels_is_not_compared(tmp_path: Path) -> None:
-    model, pose = box(tmp_path), random_pose(2)
+def test_colour_of_clipped_pixels_is_not_compared() -> None:
+    model, pose = box(), random_pose(2)
     bright = drawn_view(textured_box(), pose, Light(gains=(2.5, 2.5, 2.5)))
     agreement = color_agreement(half_turns(pose), model, bright)
     assert int(agreement.log_likelihood.argmax()) == 0
     assert float(agreement.correlation[0, 1:].min()) > 0.6
 
 
-def test_a_colour_camera_beside_the_depth_camera(tmp_path: Path) -> None:
-    model, pose = box(tmp_path), random_pose(4)
+def test_a_colour_camera_beside_the_depth_camera() -> None:
+    model, pose = box(), random_pose(4)
     beside = Rigid(
         rotation_by(torch.tensor([0.01, -0.03, 0.02]).double()),
         torch.tensor([0.05, 0.002, -0.004]).double(),
@@ -168,8 +174,8 @@ def test_a_colour_camera_beside_the_depth_camera(tmp_path: Path) -> None:
     assert float(apart.correlation[0].max()) < 0.7
 
 
-def test_what_is_hidden_is_not_compared(tmp_path: Path) -> None:
-    model, pose = box(tmp_path), random_pose(5)
+def test_what_is_hidden_is_not_compared() -> None:
+    model, pose = box(), random_pose(5)
     view = drawn_view(textured_box(), pose)
     assert view.color is not None
     columns = view.mask.nonzero()[:, 1].sort().values
@@ -185,8 +191,8 @@ def test_what_is_hidden_is_not_compared(tmp_path: Path) -> None:
     assert int(half.log_likelihood.argmax()) == 0
 
 
-def test_colour_tells_twins_apart(tmp_path: Path) -> None:
-    model, twin, pose = box(tmp_path, 0), box(tmp_path, 1), random_pose(6)
+def test_colour_tells_twins_apart() -> None:
+    model, twin, pose = box(0), box(1), random_pose(6)
     view = drawn_view(textured_box(1), pose)
     one, other = (
         float(color_agreement(half_turns(pose), m, view).log_likelihood.max())
@@ -196,8 +202,8 @@ def test_colour_tells_twins_apart(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_spin_of_a_can_is_found(tmp_path: Path, seed: int) -> None:
-    model, pose = can(tmp_path, seed), random_pose(seed, 0.5)
+def test_the_spin_of_a_can_is_found(seed: int) -> None:
+    model, pose = can(seed), random_pose(seed, 0.5)
     view = drawn_view(textured_can(seed), pose, Light(noise=0.03, seed=seed))
     spun = Rigid(pose.R @ rotation_by(torch.tensor([0, 0, 1.0 + seed]).double()), pose.t_m)
     found = copies_about_axis(moved(spun[None], seed, 0.01, model.diameter_m)[0], Z, model, view)
@@ -208,20 +214,18 @@ def test_the_spin_of_a_can_is_found(tmp_path: Path, seed: int) -> None:
     assert int(likelihood.argmax()) == 0
 
 
-def test_a_spin_without_colour_stays(tmp_path: Path) -> None:
-    model, pose = can(tmp_path), random_pose(0, 0.5)
+def test_a_spin_without_colour_stays() -> None:
+    model, pose = can(), random_pose(0, 0.5)
     view = replace(drawn_view(textured_can(), pose), color=None)
     found = copies_about_axis(pose, Z, model, view)
     assert torch.equal(found.R, pose.R[None])
     assert torch.equal(color_copies(pose, model, view).R, pose.R[None])
 
 
-def test_copies_of_a_can_hold_the_right_one(tmp_path: Path) -> None:
+def test_copies_of_a_can_hold_the_right_one() -> None:
     # Upside down and spun: found in the shape as a half turn across the axis, and the axis.
     flip = Rigid(rotation_by(torch.tensor([[math.pi, 0, 0]]).double()), torch.zeros(1, 3).double())
-    model = replace(
-        can(tmp_path), symmetries=Symmetries(discrete=flip, continuous=(Z,), is_found=True)
-    )
+    model = replace(can(), symmetries=Symmetries(discrete=flip, continuous=(Z,), is_found=True))
     pose = random_pose(1, 0.5)
     view = drawn_view(textured_can(), pose)
     wrong = Rigid(pose.R @ rotation_by(torch.tensor([0, 0, 2.0]).double()), pose.t_m) @ flip[0]
@@ -234,7 +238,7 @@ def test_copies_of_a_can_hold_the_right_one(tmp_path: Path) -> None:
     assert len(color_copies(wrong, declared, view).R) < len(copies.R)
 
 
-def test_an_axis_of_many_turns_is_swept(tmp_path: Path) -> None:
+def test_an_axis_of_many_turns_is_swept() -> None:
     # A can whose shape was found to be alike after turns by 30 degrees, upside down too.
     angles = torch.arange(1, 12).double() * (math.pi / 6)
     spins = rotation_by(angles[:, None] * Z.direction.double())
@@ -242,7 +246,7 @@ def test_an_axis_of_many_turns_is_swept(tmp_path: Path) -> None:
     turns = torch.cat([spins, flip, flip @ spins])
     off_m = torch.tensor([0.0001, -0.0002, 0.0]).double()
     found = Rigid(turns, off_m - turns @ off_m)
-    model = replace(can(tmp_path), symmetries=Symmetries(discrete=found, is_found=True))
+    model = replace(can(), symmetries=Symmetries(discrete=found, is_found=True))
     pose = random_pose(2, 0.5)
     view = drawn_view(textured_can(), pose)
     wrong = Rigid(pose.R @ rotation_by(torch.tensor([0, 0, 2.2]).double()), pose.t_m)
@@ -255,8 +259,8 @@ def test_an_axis_of_many_turns_is_swept(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("off_deg", [-13.0, 4.0, 18.0])
-def test_a_spin_that_depth_does_not_fix_is_settled(tmp_path: Path, off_deg: float) -> None:
-    model = replace(can(tmp_path), symmetries=Symmetries(continuous=(Z,), is_found=True))
+def test_a_spin_that_depth_does_not_fix_is_settled(off_deg: float) -> None:
+    model = replace(can(), symmetries=Symmetries(continuous=(Z,), is_found=True))
     pose = random_pose(3, 0.5)
     view = drawn_view(textured_can(), pose)
     turn = rotation_by(math.radians(off_deg) * Z.direction.double())
@@ -269,8 +273,8 @@ def test_a_spin_that_depth_does_not_fix_is_settled(tmp_path: Path, off_deg: floa
     assert torch.equal(settle_spin(drifted, declared, view).R, drifted.R)
 
 
-def test_half_turns_of_a_box_are_proposed(tmp_path: Path) -> None:
-    model, pose = box(tmp_path), random_pose(6)
+def test_half_turns_of_a_box_are_proposed() -> None:
+    model, pose = box(), random_pose(6)
     view = drawn_view(textured_box(), pose)
     for wrong in half_turns(pose)[1:].R:
         copies = color_copies(Rigid(wrong, pose.t_m), model, view)
@@ -279,8 +283,8 @@ def test_half_turns_of_a_box_are_proposed(tmp_path: Path) -> None:
         assert torch.equal(alone.R, wrong[None])
 
 
-def test_a_window_of_the_depth_image_changes_nothing(tmp_path: Path) -> None:
-    model, pose = box(tmp_path), random_pose(7)
+def test_a_window_of_the_depth_image_changes_nothing() -> None:
+    model, pose = box(), random_pose(7)
     view = drawn_view(textured_box(), pose)
     top, left = (int(k) - 2 for k in view.mask.nonzero().amin(0))
     assert top > 0
@@ -305,9 +309,9 @@ def test_a_can_is_as_wide_as_drawn() -> None:
     assert isinstance(view.color, ColorImage)
 
 
-def test_a_printed_box_is_posed_as_its_print_says(tmp_path: Path) -> None:
+def test_a_printed_box_is_posed_as_its_print_says() -> None:
     """By shape alone a box fits at four poses; a colour image says which of them is right."""
-    model = replace(box(tmp_path), name="thing")
+    model = replace(box(), name="thing")
     net = Registration([with_found_symmetries(model, None, is_taken=True)])
     pose = random_pose(1)
     view = drawn_view(textured_box(), pose)

@@ -2,6 +2,7 @@
 
 import math
 import re
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -65,11 +66,8 @@ def test_a_gear_says_how_much_its_keyway_deviates() -> None:
         assert re.fullmatch(r"rotated by \d+ degrees about .* \(\d+\.\d%\)", line), line
 
 
-@pytest.mark.parametrize("bump_m", [0.002, 0.004])
-def test_the_ends_of_a_bar_that_differ_a_little_are_copies_and_no_symmetries(
-    bump_m: float,
-) -> None:
-    copies = find_copies(with_found_symmetries(bar(bump_m), None, is_taken=True))
+def test_the_ends_of_a_bar_that_differ_a_little_are_copies_and_no_symmetries() -> None:
+    copies = find_copies(with_found_symmetries(bar(0.002), None, is_taken=True))
     for axis in ([0, 1.0, 0], [0, 0, 1.0]):
         assert degrees_to(copies.symmetries, rotation(axis, 180)) > 90
         assert degrees_to(every_copy(copies), rotation(axis, 180)) < 2
@@ -160,9 +158,8 @@ def test_words_tell_the_axis_and_the_shift() -> None:
 
 
 def test_an_axis_that_is_hardly_longer_than_the_next_is_named_by_its_direction() -> None:
-    corners, faces = box_faces()
-    plate = make_model(corners * torch.tensor([0.21, 0.2, 0.03]), faces, name="plate", number=1)
-    copies, first = find_copies(plate), pose_at(seed=1).double()
+    of_bar, first = find_copies(bar()), pose_at(seed=1).double()
+    copies = replace(of_bar, lengths_m=torch.tensor([0.21, 0.2, 0.03]).double())
     turned = first @ rotation([1.0, 0, 0], 90)
     words = "rotated by 90 degrees about the model's axis (1.00, 0.00, 0.00)"
     assert difference_of(turned, first, copies) == words

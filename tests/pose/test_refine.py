@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from tests.pose.synthetic_objects import bracket, cloud_of, pose_at
+from tests.pose.synthetic_objects import bracket, bracket_surface, cloud_of, pose_at
 from torch import Tensor
 
 from depthpose.core.config import config_from_dict
@@ -189,7 +189,7 @@ def test_a_thin_plate_is_not_found_on_its_back(kind: str) -> None:
 
 def test_noise_along_the_ray_draws_nothing_nearer() -> None:
     model, offs_m = bracket(), []
-    truth, part = pose_at(seed=3), prepare_surface(model)
+    truth, part = pose_at(seed=3), bracket_surface()
     true = Rigid(truth.R.double(), truth.t_m.double())
     clean_m = cloud_of(model, truth).double()
     for seed in range(8):
@@ -227,7 +227,7 @@ def test_another_pose_of_a_symmetric_part_is_kept() -> None:
 def test_what_a_start_won_is_not_lost_on_the_way() -> None:
     """A given pose may be nearer than steps of a tenth of the diameter reach."""
     model = bracket()
-    truth, part = pose_at(seed=3), prepare_surface(model)
+    truth, part = pose_at(seed=3), bracket_surface()
     start = pose_near(
         Rigid(truth.R.double(), truth.t_m.double()), 46, math.radians(25), 0.15 * model.diameter_m
     )
@@ -282,7 +282,7 @@ def test_its_covariance_is_honest(stone: ObjectModel, surface: Surface) -> None:
 @pytest.mark.parametrize("kind", ["structured light", "active stereo", "time of flight"])
 def test_its_covariance_covers_the_errors_of_sensors(kind: SensorKind) -> None:
     """Neighbours err alike and edges bleed: 85 % of errors and more lie within 95 % intervals."""
-    model, part = bracket(), prepare_surface(bracket())
+    model, part = bracket(), bracket_surface()
     K = torch.tensor([[400.0, 0, 79.5], [0, 400, 59.5], [0, 0, 1]], dtype=torch.float64)
     times, claimed_m, errors_m = [], [], []
     for seed in range(5):
@@ -313,7 +313,7 @@ def test_its_covariance_covers_the_errors_of_sensors(kind: SensorKind) -> None:
 def test_an_offset_of_the_sensor_is_in_the_covariance_along_the_ray() -> None:
     model, pose = bracket(), pose_at(seed=3)
     cloud_m, true = cloud_of(model, pose).double(), Rigid(pose.R.double(), pose.t_m.double())
-    part = prepare_surface(model)
+    part = bracket_surface()
     found = [refine_pose(cloud_m, true, part, IcpConfig(sensor_offset_m=offset_m))
              for offset_m in (0.0, 0.004)]  # fmt: skip
     more = found[1].covariance - found[0].covariance
@@ -364,7 +364,7 @@ def test_the_real_cat_and_ape(real: Path) -> None:
 
 
 def test_nothing_and_no_numbers_are_refused() -> None:
-    surface = prepare_surface(bracket())
+    surface = bracket_surface()
     start = Rigid(torch.eye(3), torch.zeros(3))
     for cloud, said in (
         (torch.zeros(0, 3), "ICP of 0 points, 0 of them not finite"),

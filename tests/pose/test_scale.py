@@ -5,7 +5,15 @@ from typing import get_args
 import pytest
 import torch
 from bench.negatives import NegativeKind, mirrored, negative_of, scaled
-from tests.pose.synthetic_objects import Oracle, bracket, cloud_of, noisy, pose_at, tiny_weights
+from tests.pose.synthetic_objects import (
+    Oracle,
+    bracket,
+    bracket_surface,
+    cloud_of,
+    noisy,
+    pose_at,
+    tiny_weights,
+)
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.loop import sample_generator
@@ -13,7 +21,6 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.icp import refine_pose
 from depthpose.pose.identity import Scale, scale_of
-from depthpose.pose.surface import prepare_surface
 from depthpose.pose.types import PoseEstimate
 
 TRUTH = pose_at(seed=1)
@@ -22,7 +29,7 @@ TRUTH = pose_at(seed=1)
 @pytest.mark.parametrize("times", [0.8, 0.9, 0.97, 1.0, 1.1, 1.2])
 def test_the_scale_of_a_copy_is_measured(times: float) -> None:
     model = bracket()
-    surface, cloud_m = prepare_surface(model), noisy(cloud_of(scaled(model, times), TRUTH))
+    surface, cloud_m = bracket_surface(), noisy(cloud_of(scaled(model, times), TRUTH))
     begun = refine_pose(cloud_m.double(), Rigid(TRUTH.R.double(), TRUTH.t_m.double()), surface)
     scale = scale_of(cloud_m, begun.camera_from_model, surface, 0.0)
     assert scale.times == pytest.approx(times, abs=0.012)
@@ -32,7 +39,7 @@ def test_the_scale_of_a_copy_is_measured(times: float) -> None:
 
 def test_the_deviation_of_a_scale_is_that_of_errors_that_neighbours_share() -> None:
     """As sensors have them: here some eight of the 400 points in a cell of 3 cm err alike."""
-    surface = prepare_surface(bracket())
+    surface = bracket_surface()
     cloud_m = take_evenly(cloud_of(bracket(), TRUTH).double(), 400)
     cells = (cloud_m / 0.03).floor() @ torch.tensor([1.0, 1e3, 1e6], dtype=torch.float64)
     cell = cells.unique(return_inverse=True)[1]

@@ -5,7 +5,16 @@ from typing import Any
 
 import pytest
 import torch
-from tests.pose.synthetic_objects import CAMERA, K, Oracle, bracket, pose_at, tiny_weights, view_of
+from tests.pose.synthetic_objects import (
+    CAMERA,
+    K,
+    Oracle,
+    bracket,
+    bracket_surface,
+    pose_at,
+    tiny_weights,
+    view_of,
+)
 
 from depthpose.core.camera import back_project
 from depthpose.core.errors import InputError
@@ -97,7 +106,7 @@ def test_a_track_that_its_history_ends_does_not_blame_the_frame() -> None:
     pose = pose_at(z_m=0.7, seed=3)
     weights = tiny_weights(bracket())
     target = TrackedObject(
-        prepared=PreparedObject(number=0, model=bracket(), surface=prepare_surface(bracket())),
+        prepared=PreparedObject(number=0, model=bracket(), surface=bracket_surface()),
         refusal=weights.refusal,
         config=EstimateConfig(),
         search=lambda _: pytest.fail("not looked for anew"),

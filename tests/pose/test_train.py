@@ -77,6 +77,12 @@ def _training(**changes: object) -> PoseTraining:
     return dataclasses.replace(config, **changes)
 
 
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Weights of :func:`_training`, in the folder of its run."""
+    return train_pose_network(_training(), Run(folder=tmp_path_factory.mktemp("trained") / "run"))
+
+
 def _clouds(models: Sequence[ObjectModel], **settings: Any) -> TrainingClouds:  # noqa: ANN401
     config = PoseTraining(**{"objects": _VIEWS, "cloud": _CLOUD, **settings})
     return TrainingClouds(models, config, 0)
@@ -260,39 +266,37 @@ def test_a_held_out_view_of_too_few_points_is_a_failure() -> None:
     assert task.validate().numbers["held_out/occluded_0/ransac_median"] == math.inf
 
 
-def test_a_training_leaves_weights_a_card_and_its_config(tmp_path: Path) -> None:
-    path = train_pose_network(_training(), Run(folder=tmp_path / "run"))
-    weights = read_pose_weights(path)
+def test_a_training_leaves_weights_a_card_and_its_config(trained: Path) -> None:
+    weights = read_pose_weights(trained)
     assert isinstance(weights.network, ResUNet)
     assert weights.network.config.norm == "none"
     assert [model.name for model in weights.models] == ["bracket"]
     assert weights.cloud == _CLOUD
     assert "synthetic views of bracket" in weights.facts["trained_on"]
-    card = path.with_suffix(".md").read_text()
+    card = trained.with_suffix(".md").read_text()
     assert "- **Objects**: bracket (160 mm)\n" in card
     assert "`depthpose pose train --what pose --config config.yaml --out run`" in card
     assert "- **Time**: " in card
     assert "| occluded % | right % |" in card
-    rows = json.loads(path.with_suffix(".json").read_text())["held_out"]
+    rows = json.loads(trained.with_suffix(".json").read_text())["held_out"]
     assert set(rows) == {"0"}
     shares = [rows["0"][name] for name in ("right", "wrong", "refused")]
     assert sum(shares) == pytest.approx(1)
-    again = read_config(tmp_path / "run" / "config.yaml", PoseTraining)
+    again = read_config(trained.parent / "config.yaml", PoseTraining)
     assert again.network.classes == 1
     with pytest.raises(InputError, match="holds a training"):
-        train_pose_network(_training(), Run(folder=tmp_path / "run"))
+        train_pose_network(_training(), Run(folder=trained.parent))
 
 
-def test_a_training_begins_with_what_other_objects_taught(tmp_path: Path) -> None:
+def test_a_training_begins_with_what_other_objects_taught(trained: Path, tmp_path: Path) -> None:
     """Whether or not the weights hold their meshes."""
-    first = train_pose_network(_training(), Run(folder=tmp_path / "first"))
     bare = tmp_path / "bare.safetensors"
-    write_pose_weights(bare, read_pose_weights(first), with_meshes=False)
+    write_pose_weights(bare, read_pose_weights(trained), with_meshes=False)
     loop = LoopConfig(steps=1, batch_size=16, device="cpu", log_every_steps=1)
     still = AdamConfig(learning_rate=1e-9)
     parts = ModelsConfig(parts=("bracket", "mug"))
-    paths = [first]
-    for start in (first, bare):
+    paths = [trained]
+    for start in (trained, bare):
         config = _training(models=parts, start=str(start), adam=still, loop=loop)
         paths.append(train_pose_network(config, Run(folder=tmp_path / f"then {start.stem}")))
     networks = [network_of(read_checkpoint(path), str(path)) for path in paths]
@@ -327,13 +331,14 @@ def test_terms_of_the_start_bind_what_comes_of_it(tmp_path: Path) -> None:
         assert expected in then.with_suffix(".md").read_text()
 
 
-def test_a_start_with_other_voxel_features_is_refused(tmp_path: Path) -> None:
-    first = train_pose_network(_training(), Run(folder=tmp_path / "first"))
+def test_a_start_with_other_voxel_features_is_refused(trained: Path, tmp_path: Path) -> None:
     cloud = dataclasses.replace(_CLOUD, with_shape=True)
     with pytest.raises(InputError, match="inputs = 1, but the config says 9"):
-        train_pose_network(_training(cloud=cloud, start=str(first)), Run(folder=tmp_path / "more"))
+        train_pose_network(
+            _training(cloud=cloud, start=str(trained)), Run(folder=tmp_path / "more")
+        )
     with pytest.raises(InputError, match=r"takes 1 features of a voxel, .* clouds give 9\. Set"):
-        dataclasses.replace(read_pose_weights(first), cloud=cloud)
+        dataclasses.replace(read_pose_weights(trained), cloud=cloud)
 
 
 def test_a_training_without_norms_begins_with_weights_that_have_its_biases(tmp_path: Path) -> None:
@@ -357,15 +362,14 @@ def test_a_training_without_norms_begins_with_weights_that_have_its_biases(tmp_p
         assert torch.allclose(then.state_dict()[name], tensor, atol=1e-6), name
 
 
-def test_a_resumed_training_ends_as_one_that_nothing_stopped(tmp_path: Path) -> None:
-    whole = train_pose_network(_training(), Run(folder=tmp_path / "whole"))
+def test_a_resumed_training_ends_as_one_that_nothing_stopped(trained: Path, tmp_path: Path) -> None:
     loop = LoopConfig(steps=3, batch_size=2, device="cpu", log_every_steps=1, save_every_steps=1)
     with pytest.raises(StoppedError):
         train_pose_network(
             _training(loop=loop), Run(folder=tmp_path / "cut", on_step=stop_after(2))
         )
     cut = train_pose_network(_training(loop=loop), Run(folder=tmp_path / "cut", resume=True))
-    one, other = (read_pose_weights(path).network.state_dict() for path in (whole, cut))
+    one, other = (read_pose_weights(path).network.state_dict() for path in (trained, cut))
     assert all(torch.equal(one[name], other[name]) for name in one)
 
 

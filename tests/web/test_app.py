@@ -141,8 +141,9 @@ def test_fields_do_what_a_camera_file_does(page: TestClient, samples: Path) -> N
 
 
 def test_the_field_says_the_baseline_where_the_camera_file_has_none(
-    page: TestClient, samples: Path
+    page: TestClient, tmp_path: Path
 ) -> None:
+    samples = write_street(tmp_path / "street", scale=0.125)
     rig = json.loads((samples / "camera.json").read_text())
     baseline_m = str(rig.pop("baseline_m"))
     (samples / "one.json").write_text(json.dumps(rig))
