@@ -43,7 +43,7 @@ def explained_mask(view: ViewInput, pose: Rigid, surface: Surface) -> Bool[Tenso
 def explained_frame_mask(frame: Frame, pose: Rigid, surface: Surface) -> Bool[Tensor, "h w"]:
     """Mark the pixels of a frame, outside its background, whose readings lie on a posed surface."""
     window = _window_of_pose(frame.depth_m.shape, frame.K, pose, surface)
-    is_candidate = (frame.depth_m[window] > 0) & frame.may_show(surface.diameter_m)[window]
+    is_candidate = (frame.depth_m[window] > 0) & frame.may_show(surface.diameter_m, window)
     explained = torch.zeros(frame.depth_m.shape, dtype=torch.bool)
     explained[window] = _lies_on_surface(frame.points_m[window], is_candidate, pose, surface)
     return explained
@@ -92,18 +92,21 @@ def _window_of_pose(
     return clip_window(left, top, right + 1, bottom + 1, height, width)
 
 
-def window_of_region(view: ViewInput) -> ViewInput:
-    """Crop a view to its mask, with a margin in which planes and neighbours are visible."""
+def window_of_region(view: ViewInput, margin: float = _REGION_MARGIN) -> ViewInput:
+    """Crop a view to its mask, with a margin in which planes and neighbours are visible.
+
+    The margin is a share of the larger side of the mask.
+    """
     rows = view.mask.any(1).nonzero()[:, 0]
     columns = view.mask.any(0).nonzero()[:, 0]
     if len(rows) == 0:
         return view
     top, bottom = int(rows[0]), int(rows[-1])
     left, right = int(columns[0]), int(columns[-1])
-    margin = int(_REGION_MARGIN * max(bottom - top, right - left))
+    margin_px = int(margin * max(bottom - top, right - left))
     window = (
-        slice(max(top - margin, 0), bottom + margin + 1),
-        slice(max(left - margin, 0), right + margin + 1),
+        slice(max(top - margin_px, 0), bottom + margin_px + 1),
+        slice(max(left - margin_px, 0), right + margin_px + 1),
     )
     return _crop_view(view, window)
 

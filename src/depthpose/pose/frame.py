@@ -11,10 +11,11 @@ from jaxtyping import Bool, Float, Float64, Int64
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
-from torch.nn.functional import max_pool2d, normalize, pad
+from torch.nn.functional import max_pool2d
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.camera import back_project, project
+from depthpose.pose.compiled import array_of, compiled
 from depthpose.pose.sensor import NOISE_PER_M2, measure_noise_per_m2, plane_tolerance_m
 from depthpose.pose.types import KnownBackground
 
@@ -56,6 +57,10 @@ object, or its length above the second. The second is larger because sides of se
 lie in one plane and touch."""
 
 
+Window = tuple[slice, slice]
+"""Rows and columns of an image."""
+WHOLE = (slice(None), slice(None))
+"""The window that is the whole image."""
 Plane = tuple[Float64[Tensor, "3"], Float64[Tensor, ""]]
 """Unit normal, and the distance [m] of the origin along it."""
 
@@ -90,9 +95,9 @@ class Frame:
     noise_per_m2: float
     backgrounds: Sequence["Background"]
 
-    def may_show(self, diameter_m: float) -> Bool[Tensor, "h w"]:
-        """Mark the pixels that are no background for an object of this diameter."""
-        return self.background_limit_m < diameter_m
+    def may_show(self, diameter_m: float, window: Window = WHOLE) -> Bool[Tensor, "h w"]:
+        """Mark the pixels of a window that are no background for an object of this diameter."""
+        return self.background_limit_m[window] < diameter_m
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -133,7 +138,10 @@ def prepare_frame(
     depth_m = depth_m[::step, ::step]
     K = K.double() / torch.tensor([[step], [step], [1]])
     points_m = back_project(depth_m, K)
-    normals, is_smooth = _fit_normals(depth_m, points_m, K)
+    rays = back_project(torch.ones_like(depth_m), K)
+    normals = torch.zeros_like(points_m)
+    is_smooth = torch.zeros_like(depth_m, dtype=torch.bool)
+    _fit_normals(array_of(depth_m), array_of(rays), array_of(K), normals.numpy(), is_smooth.numpy())
 
     # A known background is not searched for planes: one before it is made of objects.
     is_searched = depth_m > 0
@@ -142,7 +150,6 @@ def prepare_frame(
         background_m = background.depth_m[::step, ::step].double().nan_to_num(torch.inf)
         is_searched &= ~background_m.isfinite()
         backgrounds.append(Background(depth_m=background_m, diameter_m=math.inf))
-    rays = back_project(torch.ones_like(depth_m), K)
     planes, limit_m = _wide_planes(depth_m, points_m, normals, rays, noise_per_m2, is_searched)
     backgrounds += planes
     if background is not None:
@@ -169,60 +176,77 @@ def _thinning_step(
     return min(step, max(1, math.floor(object_px / _OBJECT_PX)))
 
 
+@compiled
 def _fit_normals(
-    depth_m: Float64[Tensor, "h w"], points_m: Float64[Tensor, "h w 3"], K: Float64[Tensor, "3 3"]
-) -> tuple[Float64[Tensor, "h w 3"], Bool[Tensor, "h w"]]:
-    """Fit a plane to each pixel and its neighbours; give its normal, and where the fit is good.
+    depth_m: Float64[np.ndarray, "h w"],
+    rays: Float64[np.ndarray, "h w 3"],
+    K: Float64[np.ndarray, "3 3"],
+    normals: Float64[np.ndarray, "h w 3"],
+    is_smooth: Bool[np.ndarray, "h w"],
+) -> None:
+    """Fit a plane to each reading and its neighbours; write its normal, and where the fit is good.
 
     In the image of a plane 1 / depth is linear in x and y: its slopes are fitted by least squares
     in a window, to the pixels that are of the same surface as the middle one.
+
+    Args:
+        depth_m: 0 where there is no reading.
+        rays: points of the pixels at a depth of 1 m.
+        K: intrinsic matrix.
+        normals: are written where there is a reading.
+        is_smooth: is set where there are enough neighbours, all round.
     """
     height, width = depth_m.shape
-    depth_m = depth_m.float()  # differences of neighbours are exact enough, and twice as fast
-    inverse = torch.where(depth_m > 0, 1 / depth_m, 0.0)
-    limit = (_JUMP_M + _JUMP_PER_M * depth_m) * inverse.square()
-    padded = pad(inverse, (_WINDOW,) * 4)
-    side = 2 * _WINDOW + 1
+    least_neighbours = _LEAST_FILLED * (2 * _WINDOW + 1) ** 2
+    for row in range(height):
+        for column in range(width):
+            middle_m = depth_m[row, column]
+            if middle_m <= 0:
+                continue
+            inverse = 1 / middle_m
+            limit = (_JUMP_M + _JUMP_PER_M * middle_m) * inverse * inverse
 
-    # Sums over the neighbours of the same surface: their number n, their offsets x and y [px], the
-    # difference q of their 1 / depth to that of the middle, and products of these.
-    n, x, y, q, xx, xy, yy, xq, yq = depth_m.new_zeros(9, height, width)
-    for down in range(-_WINDOW, _WINDOW + 1):
-        for right in range(-_WINDOW, _WINDOW + 1):
-            top, left = _WINDOW + down, _WINDOW + right
-            neighbour = padded[top : top + height, left : left + width]
-            gap = neighbour - inverse
-            is_same = ((neighbour > 0) & (gap.abs() < limit)).to(depth_m)
-            gap = gap * is_same
-            n += is_same
-            x += right * is_same
-            y += down * is_same
-            q += gap
-            xx += right * right * is_same
-            xy += right * down * is_same
-            yy += down * down * is_same
-            xq += right * gap
-            yq += down * gap
+            # Sums over the neighbours of the same surface: their number, their offsets x and y
+            # [px], the difference q of their 1 / depth to that of the middle, and products.
+            n, x, y, q = 0, 0.0, 0.0, 0.0
+            xx, xy, yy, xq, yq = 0.0, 0.0, 0.0, 0.0, 0.0
+            for v in range(max(0, row - _WINDOW), min(height, row + _WINDOW + 1)):
+                for u in range(max(0, column - _WINDOW), min(width, column + _WINDOW + 1)):
+                    if depth_m[v, u] <= 0:
+                        continue
+                    gap = 1 / depth_m[v, u] - inverse
+                    if abs(gap) >= limit:
+                        continue
+                    right, down = u - column, v - row
+                    n += 1
+                    x += right
+                    y += down
+                    q += gap
+                    xx += right * right
+                    xy += right * down
+                    yy += down * down
+                    xq += right * gap
+                    yq += down * gap
 
-    # Means, and second moments about them.
-    count = n.clamp(min=1)
-    x, y, q = x / count, y / count, q / count
-    xx, xy, yy = xx / count - x * x, xy / count - x * y, yy / count - y * y
-    xq, yq = xq / count - x * q, yq / count - y * q
+            # Means, and second moments about them.
+            x, y, q = x / n, y / n, q / n
+            xx, xy, yy = xx / n - x * x, xy / n - x * y, yy / n - y * y
+            xq, yq = xq / n - x * q, yq / n - y * q
 
-    # The slopes a and b of q by x and y, of least squares.
-    spread = xx * yy - xy * xy
-    a = (xq * yy - yq * xy) / spread.clamp(min=1e-9)
-    b = (yq * xx - xq * xy) / spread.clamp(min=1e-9)
+            # The slopes a and b of q by x and y, of least squares.
+            spread = xx * yy - xy * xy
+            a = (xq * yy - yq * xy) / max(spread, 1e-9)
+            b = (yq * xx - xq * xy) / max(spread, 1e-9)
 
-    # The plane n . X = -1 has 1 / depth = -(n_x x' + n_y y' + n_z) on the ray (x', y', 1).
-    along = torch.stack([a * K[0, 0], b * K[1, 1]], -1)
-    ray = torch.where((depth_m > 0)[..., None], points_m[..., :2] * inverse[..., None], 0.0)
-    last = inverse + q - a * x - b * y - (along * ray).sum(-1)
-    normals = -normalize(torch.cat([along, last[..., None]], -1), dim=-1)
-    is_filled = n >= _LEAST_FILLED * side * side
-    is_smooth = is_filled & (spread > _LEAST_SPREAD_PX4) & (depth_m > 0)
-    return normals.double(), is_smooth
+            # The plane n . X = -1 has 1 / depth = -(n_x x' + n_y y' + n_z) on the ray (x', y', 1).
+            normal_x, normal_y = a * K[0, 0], b * K[1, 1]
+            along = normal_x * rays[row, column, 0] + normal_y * rays[row, column, 1]
+            normal_z = inverse + q - a * x - b * y - along
+            length = math.sqrt(normal_x * normal_x + normal_y * normal_y + normal_z * normal_z)
+            normals[row, column, 0] = -normal_x / length
+            normals[row, column, 1] = -normal_y / length
+            normals[row, column, 2] = -normal_z / length
+            is_smooth[row, column] = n >= least_neighbours and spread > _LEAST_SPREAD_PX4
 
 
 def _wide_planes(
@@ -438,10 +462,16 @@ def share_behind(
     # Within the margin of a point the background is no deeper than its deepest pixel there.
     margin_px = margin_m * float(frame.K[0, 0] / points_m[:, 2].median().clamp(min=1e-6))
     reach = min(math.ceil(margin_px), min(frame.depth_m.shape) // 2)
-    limit_m = _largest_about(background.depth_m, reach)
-    limit_m += margin_m + plane_tolerance_m(limit_m, frame.noise_per_m2)
     readings = readings_toward(frame, points_m)
-    limit_m = limit_m.flatten()[readings.pixel]
+    row = readings.pixel // frame.depth_m.shape[1]
+    column = readings.pixel % frame.depth_m.shape[1]
+    top = max(0, int(row.min()) - reach)
+    left = max(0, int(column.min()) - reach)
+    bottom = int(row.max()) + reach + 1
+    right = int(column.max()) + reach + 1
+    deepest_m = _largest_about(background.depth_m[top:bottom, left:right], reach)
+    limit_m = deepest_m[row - top, column - left]
+    limit_m = limit_m + margin_m + plane_tolerance_m(limit_m, frame.noise_per_m2)
     # Where the camera saw farther than the background it has ended; what lies before it hides it.
     is_present = readings.is_read & (readings.depth_m < limit_m)
     is_behind = points_m[:, 2] > limit_m
@@ -472,7 +502,9 @@ def is_on_background(
 def _largest_about(values: Float64[Tensor, "h w"], reach: int) -> Float64[Tensor, "h w"]:
     """Give the largest finite value up to ``reach`` pixels away; infinite where there is none."""
     finite = torch.where(values.isfinite(), values, -torch.inf)
-    largest = max_pool2d(finite[None], 2 * reach + 1, 1, reach)[0]
+    size = 2 * reach + 1
+    wide = max_pool2d(finite[None], (1, size), 1, (0, reach))
+    largest = max_pool2d(wide, (size, 1), 1, (reach, 0))[0]
     return torch.where(largest.isfinite(), largest, torch.inf)
 
 

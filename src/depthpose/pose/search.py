@@ -15,7 +15,7 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from depthpose.core.devices import each_in_threads
@@ -94,14 +94,14 @@ class _Place:
     explained: Bool[Tensor, "h w"]
 
     @cached_property
-    def area_px(self) -> int:
-        """Readings that it explains."""
-        return int(self.explained.count_nonzero())
+    def pixels(self) -> Int64[Tensor, " n"]:
+        """Indices of the readings that it explains, row after row."""
+        return self.explained.flatten().nonzero()[:, 0]
 
     def shared_with(self, other: "_Place") -> float:
         """Share of the smaller one's readings that both explain."""
-        both_px = int((self.explained & other.explained).count_nonzero())
-        return both_px / max(1, min(self.area_px, other.area_px))
+        both_px = int(other.explained.flatten()[self.pixels].count_nonzero())
+        return both_px / max(1, min(len(self.pixels), len(other.pixels)))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -244,7 +244,7 @@ def _propose(
         explained = explained_frame_mask(frame, proposal.pose, surface)
         place = _Place(object=proposal.object, pose=proposal.pose, explained=explained)
         is_claimed = any(place.shared_with(other) > _SHARED for other in claimed)
-        if place.area_px * frame.step**2 >= _LEAST_PIXELS and not is_claimed:
+        if len(place.pixels) * frame.step**2 >= _LEAST_PIXELS and not is_claimed:
             places.append(place)
     return places
 
@@ -286,7 +286,8 @@ def _readings_of(place: _Place, frame: Frame, view: ViewInput) -> Float[Tensor, 
     """Give the readings that a place explains, of all pixels of the view, in the camera frame."""
     height, width = view.depth_m.shape
     mask = place.explained.repeat_interleave(frame.step, 0).repeat_interleave(frame.step, 1)
-    return cloud_from_depth(view.depth_m, mask[:height, :width], view.K)
+    part = window_of_region(replace(view, mask=mask[:height, :width]), margin=0)
+    return cloud_from_depth(part.depth_m, part.mask, part.K)
 
 
 def _group(places: Sequence[_Place]) -> list[list[_Place]]:
