@@ -477,7 +477,7 @@ def predict_files(
     """Estimate what is not finished, and give the exit code.
 
     An input that fails is named and stops no other. Of several processes each takes its share, and
-    the first writes the page.
+    the first waits for the others and writes the page.
     """
     video_stems = [files[0].stem for files in sources if _is_video(files[0])]
     run.claim_folder(out, work.settings(method.settings), [_PAGE])
@@ -491,7 +491,7 @@ def predict_files(
     share = process.share_of(sources)
     stills = [files for files in share if not _is_video(files[0])]
     videos = [files[0] for files in share if _is_video(files[0])]
-    depth_run = DepthRun(work=work, method=method, out=out)
+    depth_run = DepthRun(work=work, method=method, out=out, is_shared=process.world > 1)
     still_jobs = (job for files in stills for job in work.make_jobs(files))
     mount = MountFilter() if work.scale.one_mount else None
     count = len(depth_run.estimate(still_jobs, len(stills), "images", mount))
@@ -505,12 +505,59 @@ def predict_files(
     total = f"{count} of {len(share)} pairs" if work.files == PAIRS else f"{count} depth maps"
     print(f"{total} are in {out}")
     if process.rank == 0:
-        write_depth_page(sources, work, out, failures)
+        reasons = [str(failure) for failure in failures]
+        if process.world > 1:
+            wait_for_results(sources, work, out)
+            reasons = _read_failures(sources, out)
+        write_depth_page(sources, work, out, reasons)
     return 1 if failures else 0
 
 
+def wait_for_results(sources: Sequence[tuple[Path, ...]], work: DepthWork, out: Path) -> None:
+    """Wait until all processes of a launch have a result of each input, or a reason why not.
+
+    A failure of an earlier run counts as one, since the process whose input it is may try again at
+    any time.
+
+    Raises:
+        InputError: the others make no progress for an hour.
+    """
+    videos = {_source_name(files): files[0] for files in sources if _is_video(files[0])}
+
+    def is_there(name: str) -> bool:
+        if name in run.read_failures(out):
+            return True
+        if name in videos:
+            return run.is_whole(out, name, [_video_file(videos[name])])
+        return is_finished(out, name, with_cloud=work.output.cloud)
+
+    names = [_source_name(files) for files in sources]
+    run.wait_for(names, is_there, count_steps=lambda: len(run.read_results(out)))
+
+
+def _read_failures(sources: Sequence[tuple[Path, ...]], out: Path) -> list[str]:
+    """Read why inputs, or frames of them, have no result, as all processes noted it."""
+    failures = run.read_failures(out)
+    reasons: list[str] = []
+    for files in sources:
+        reasons += [failures[name] for name in _result_names(files, failures)]
+        if _is_video(files[0]) and files[0].name in failures:
+            reasons.append(failures[files[0].name])
+    return reasons
+
+
+def _source_name(files: Sequence[Path]) -> str:
+    """Give the name of an image or a pair, that of its result, or of a video, with its suffix."""
+    return files[0].name if _is_video(files[0]) else files[0].stem
+
+
+def _video_file(video: Path) -> str:
+    """Give the name of the file with the depth of a video."""
+    return f"{video.stem}{_VIDEO}"
+
+
 def write_depth_page(
-    sources: Sequence[tuple[Path, ...]], work: DepthWork, out: Path, failures: Sequence[InputError]
+    sources: Sequence[tuple[Path, ...]], work: DepthWork, out: Path, failures: Sequence[str]
 ) -> None:
     """Write a page of some of the finished depth maps, of every failure and of every warning."""
     # The finished results of each input, and those that are shown.
@@ -523,7 +570,7 @@ def write_depth_page(
     selection = "all" if len(shown_inputs) == len(names) else "spread evenly"
     number = f"{len(names)} depth map{'s' * (len(names) != 1)}"
     text = f"Shown: {len(shown_inputs)} of {number} in this folder ({selection})."
-    rows = [{"not estimated, because": str(reason)} for reason in failures]
+    rows = [{"not estimated, because": reason} for reason in failures]
     for name in names:
         warning_file = out / f"{name}.warning.txt"
         if warning_file.is_file():
@@ -545,12 +592,12 @@ def write_depth_page(
     print(f"the page: {out / _PAGE}")
 
 
-def _result_names(files: Sequence[Path], finished: Collection[str]) -> list[str]:
-    """Give the names of the finished results of an image, a pair or a video."""
+def _result_names(files: Sequence[Path], names: Collection[str]) -> list[str]:
+    """Choose, of the names of results, those of an image, a pair or the frames of a video."""
     if _is_video(files[0]):
-        return sorted(name for name in finished if _is_frame_name(name, files[0]))
+        return sorted(name for name in names if _is_frame_name(name, files[0]))
     name = files[0].stem
-    return [name] if name in finished else []
+    return [name] if name in names else []
 
 
 def _read_chosen(
@@ -576,12 +623,13 @@ def _read_chosen(
 class DepthRun:
     """Writes the estimates of one process to ``out``, and collects its failures.
 
-    ``failures``: by the names of images and pairs, or of whole videos.
+    ``failures``: by the names of images, pairs and frames, and of whole videos.
     """
 
     work: DepthWork
     method: DepthMethod
     out: Path
+    is_shared: bool = False  #: other processes of a launch write there too
     failures: dict[str, InputError] = field(default_factory=dict)
 
     def estimate(
@@ -621,8 +669,14 @@ class DepthRun:
                     mount.last = read_ground(self.out, name) or mount.last
                 names.append(name)
             except InputError as error:
-                self.failures[name] = error
+                self._note_failure(name, error)
         return names
+
+    def _note_failure(self, name: str, error: InputError) -> None:
+        """Keep why an input has no result, and tell the other processes of a launch."""
+        self.failures[name] = error
+        if self.is_shared:
+            run.note_failure(self.out, name, str(error))
 
     def estimate_video(self, source: Path) -> int:
         """Estimate the frames of a video and write a video of their depth; give their number."""
@@ -631,9 +685,12 @@ class DepthRun:
             jobs = self.work.make_jobs([source])
             names = self.estimate(jobs, video.frames or None, source.name, MountFilter())
             pictures = self._draw_frames(source, names) if names else ()
-            write_video(self.out / f"{source.stem}{_VIDEO}", pictures, video.fps)
+            file = self.out / _video_file(source)
+            write_video(file, pictures, video.fps)
+            if self.is_shared:
+                run.note_result(self.out, source.name, [file])
         except InputError as error:
-            self.failures[source.name] = error
+            self._note_failure(source.name, error)
             return 0
         return len(names)
 

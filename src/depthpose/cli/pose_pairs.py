@@ -12,7 +12,7 @@ from depthpose.core.camera import StereoRig, read_rig
 from depthpose.core.errors import InputError
 from depthpose.core.files import image_size, read_map, write_map
 from depthpose.core.files.images import refuse_among_inputs
-from depthpose.core.run import claim_folder, is_whole, note_result
+from depthpose.core.run import claim_folder, find_rank, is_whole, note_result
 from depthpose.depth.config import MatcherConfig
 from depthpose.depth.disparity import depth_deviation
 
@@ -61,6 +61,8 @@ def match_pairs(pair: PairOptions, camera: Path | None, device: str, out: Path) 
     networks = PairNetworks(matcher=pair.matcher)
     work = depth_predict.pair_work(camera, networks, source, pairs[0])
     depth_predict.predict_files(pairs, work, source.build(), out / MATCHED)
+    if find_rank().world > 1:  # every process poses its share of all pairs
+        depth_predict.wait_for_results(pairs, work, out / MATCHED)
 
     rig = read_rig(camera, image_size(pairs[0][0]))
     names = [left.stem for left, _ in pairs]
