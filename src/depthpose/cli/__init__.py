@@ -30,16 +30,17 @@ COMMANDS = {
     "doctor": (
         "doctor:doctor", "what is installed, and a test of depth and pose; or what files are"),
     "serve": ("serve:serve", "depth and poses by a page in your browser, on this machine"),
-    "pose predict": ("pose:predict", "a cloud, a masked depth image, or a data set, to poses"),
-    "pose track": ("pose:track", "follow an object through depth images or clouds"),
+    "pose predict": (
+        "pose:predict_poses", "a cloud, a masked depth image, or a data set, to poses"),
+    "pose track": ("pose:track_object", "follow an object through depth images or clouds"),
     "pose train": ("train:pose_train", "your CAD file, or a config, to a network that poses it"),
-    "pose evaluate": ("pose:evaluate", "measure poses on a BOP or LineMOD data set"),
-    "depth match": ("depth:match", "a real stereo pair, or many, to metric depth"),
-    "depth predict": ("depth:predict", "one image, or many, or a video, to metric depth"),
+    "pose evaluate": ("pose:evaluate_poses", "measure poses on a BOP or LineMOD data set"),
+    "depth match": ("depth:match_pairs", "a real stereo pair, or many, to metric depth"),
+    "depth predict": ("depth:predict_depth", "one image, or many, or a video, to metric depth"),
     "depth train": (
         "train:depth_train", "stages view, select, stereo, finetune of generator, matcher"),
     "depth calibrate": ("train:calibrate", "set when an image is refused as out of distribution"),
-    "depth evaluate": ("depth:evaluate", "measure predictions by a named protocol"),
+    "depth evaluate": ("depth:evaluate_depth", "measure predictions by a named protocol"),
     "data make streets": (
         "data:make_streets", "synthetic streets with exact disparity and LiDAR, in KITTI's layout"),
     "data make near": (

@@ -34,7 +34,7 @@ from depthpose.depth.evaluate import (
     summarise,
 )
 from depthpose.depth.metrics import METRICS, RANKING
-from depthpose.depth.predictions import is_finished, predict
+from depthpose.depth.predictions import estimate_missing_depth, is_finished
 from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.report import page
 from depthpose.report.depth import depth_section
@@ -74,7 +74,7 @@ def predict_dataset(dataset: Dataset, method: DepthMethod, rule: Protocol, folde
     jobs = [Job(name=frame.name, read=partial(read, i)) for i, frame in share]
     sources = {f.name: f.seen_files(with_right=method.with_right) for _, f in usable}
     net = _Unchecked(method.net) if isinstance(method.net, FakestereoNet) else method.net
-    written = predict(net, jobs, home, method.settings, sources)
+    written = estimate_missing_depth(net, jobs, home, method.settings, sources)
     for _ in tqdm(written, method.name, total=len(jobs), disable=None, unit=" frames"):
         pass
     if process.rank == 0:

@@ -32,7 +32,7 @@ from depthpose.pose.evaluate import (
 )
 from depthpose.pose.mesh import symmetry_transforms
 from depthpose.pose.predictions import (
-    predict,
+    estimate_missing_poses,
     read_predictions,
     results_name,
     write_bop_results,
@@ -86,7 +86,7 @@ def predict_instances(
         **masks.settings,
         **dataset_settings(dataset),
     }
-    written = predict(method.estimate_many, jobs, home, settings, batch)
+    written = estimate_missing_poses(method.estimate_many, jobs, home, settings, batch)
     label = f"{method.name}, {masks.name} masks"
     for _ in tqdm(written, label, total=len(jobs), disable=None, unit=" instances"):
         pass

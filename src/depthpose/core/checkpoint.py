@@ -11,7 +11,7 @@ import json
 import pickle
 import re
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
@@ -24,6 +24,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
+from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError, Notice, import_extra, nearest_name
 from depthpose.core.files.disk import finite_number, refused_as, write_bytes
 
@@ -278,6 +279,35 @@ def load_weights(network: nn.Module, checkpoint: Checkpoint, source: str) -> Non
             f"{'; '.join(problems[:3])}. File and config belong to different versions."
         )
     network.load_state_dict(dict(checkpoint.state))
+
+
+def refuse_other_network(
+    network: nn.Module, loaded: nn.Module, source: str, independent: Collection[str] = ()
+) -> None:
+    """Refuse to begin a training with weights of another network.
+
+    Args:
+        network: the network that is trained; its ``config`` is a dataclass, as that of ``loaded``.
+        loaded: the network with the weights.
+        source: their file, for errors.
+        independent: settings that may differ, since the weights do not depend on them.
+
+    Raises:
+        InputError: the networks differ in their class, or in another setting.
+    """
+    if type(loaded) is not type(network):
+        raise InputError(
+            f"{source}: holds weights of {type(loaded).__name__}, but the config trains "
+            f"{type(network).__name__}. Give weights of that network."
+        )
+    config = config_to_dict(network.config)
+    loaded_config = config_to_dict(loaded.config)
+    for name, value in config.items():
+        if name not in independent and loaded_config[name] != value:
+            raise InputError(
+                f"{source}: was trained with {name} = {loaded_config[name]!r}, but the config says "
+                f"{value!r}. Give the config the weights' own."
+            )
 
 
 def build_network(make: Callable[[], NetworkT], checkpoint: Checkpoint, source: str) -> NetworkT:

@@ -165,16 +165,16 @@ def fill_by_pyramid(values: Map) -> Map:
 
     All stays NaN where there is no value at all.
     """
-    is_known = torch.isfinite(values)
-    if bool(is_known.all()) or values.shape == (1, 1):
+    has_value = torch.isfinite(values)
+    if bool(has_value.all()) or values.shape == (1, 1):
         return values
     height, width = values.shape
-    parts = torch.stack([values.nan_to_num(0.0), is_known.to(values.dtype)])
+    parts = torch.stack([values.nan_to_num(0.0), has_value.to(values.dtype)])
     padded = F.pad(parts, (0, width % 2, 0, height % 2))
     total, count = F.avg_pool2d(padded, 2)
     coarse = fill_by_pyramid(torch.where(count > 0, total / count, torch.nan))
     fine = coarse.repeat_interleave(2, 0).repeat_interleave(2, 1)
-    return torch.where(is_known, values, fine[:height, :width])
+    return torch.where(has_value, values, fine[:height, :width])
 
 
 def _thumbnail(image: View) -> Float[Tensor, " d"]:

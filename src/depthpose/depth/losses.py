@@ -58,12 +58,12 @@ def heads_loss(
 
 def sky_loss(probability: Maps, truth_px: Maps) -> Float[Tensor, ""]:
     """Mean cross entropy of the probability of the sky, over the pixels with truth (0: sky)."""
-    is_known = truth_px >= 0
+    has_truth = truth_px >= 0
     is_sky = truth_px == 0
     true_probability = torch.where(is_sky, probability, 1 - probability)
     # Gradients stay finite where a probability is 0 in float32.
-    losses = torch.where(is_known, -(true_probability + 1e-4).log(), 0.0)
-    return losses.sum() / is_known.sum().clamp(min=1)
+    losses = torch.where(has_truth, -(true_probability + 1e-4).log(), 0.0)
+    return losses.sum() / has_truth.sum().clamp(min=1)
 
 
 def log_disparity_loss(
@@ -78,10 +78,10 @@ def log_disparity_loss(
     return _mean_of_images((predicted_log_px - truth).abs(), truth_px > 0)
 
 
-def _mean_of_images(error: Tensor, is_known: Tensor) -> Tensor:
+def _mean_of_images(error: Tensor, has_truth: Tensor) -> Tensor:
     """Average over the pixels with truth of each image, then over the images that have any."""
-    counts = is_known.sum((1, 2))
-    means = torch.where(is_known, error, 0.0).sum((1, 2)) / counts.clamp(min=1)
+    counts = has_truth.sum((1, 2))
+    means = torch.where(has_truth, error, 0.0).sum((1, 2)) / counts.clamp(min=1)
     return means.sum() / (counts > 0).sum().clamp(min=1)
 
 

@@ -111,8 +111,8 @@ def _is_other_lens(lens: str, key: str) -> bool:
 
     Under a key that names the lens alone any unknown name is.
     """
-    is_known = lens in _PINHOLE or lens in _RADIAL or lens in _FISHEYE
-    return not is_known and (key in _SURE_KEYS or _OTHER_LENS.search(lens) is not None)
+    is_listed = lens in _PINHOLE or lens in _RADIAL or lens in _FISHEYE
+    return not is_listed and (key in _SURE_KEYS or _OTHER_LENS.search(lens) is not None)
 
 
 def _is_set(value: object) -> bool:

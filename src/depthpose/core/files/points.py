@@ -394,10 +394,10 @@ def read_pcd(path: AnyPath) -> Columns:
     names = header.get("FIELDS", [])
     counts = header.get("COUNT", ["1"] * len(names))
     rows = list(zip(names, header.get("TYPE", []), header.get("SIZE", []), counts, strict=False))
-    is_known = all((kind, size) in _PCD_CODES for _, kind, size, _ in rows)
+    is_readable = all((kind, size) in _PCD_CODES for _, kind, size, _ in rows)
     is_counted = all(re.fullmatch(r"[1-9][0-9]{0,3}", count) for count in counts)
     real = [name for name in names if name != "_"]  # "_" is padding, any number of times
-    if not rows or len(rows) != len(names) or not (is_known and is_counted):
+    if not rows or len(rows) != len(names) or not (is_readable and is_counted):
         raise InputError(
             f"{path}: PCD header of FIELDS {names}, TYPE {header.get('TYPE')}, SIZE "
             f"{header.get('SIZE')}, COUNT {counts} is not understood; save it as version 0.7"

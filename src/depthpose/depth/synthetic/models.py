@@ -116,6 +116,8 @@ def _sphere(level: int) -> Float[np.ndarray, "n 3"]:
 
 
 TREES = 18
+TREE_M = 10
+"""Height of a tree model, about."""
 BUSHES = 8
 HEDGES = 4
 """Number of different models of each."""

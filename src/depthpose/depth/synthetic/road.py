@@ -339,7 +339,7 @@ class _Roadside:
                 height = tall * rng.uniform(0.75, 1.25)
                 self.add_house(s, length, set_back + rng.uniform(0, 0.6), height)
             elif rng.random() < 0.5:
-                self.add_tree(self.x_m(rng.uniform(6, 12)), s, None)
+                self.add_tree(self.x_m(rng.uniform(6, 12)), s, rng.uniform(5, 12))
             s += length + (rng.uniform(2, 9) if rng.random() < 0.3 else 0.0)
 
     def add_gardens(self) -> None:
@@ -518,22 +518,27 @@ class _Roadside:
                 place_m = (x + rng.normal(0, 0.3), s + rng.normal(0, 0.8))
                 self.add_tree(*place_m, height * rng.uniform(0.8, 1.2))
 
-    def add_tree(self, x: Number, s: Number, height: Number | None) -> None:
-        """Add a tree of a random model, coarser where it is far away; height None: random."""
-        tall = self.b.rng.uniform(5, 12) if height is None else height
-        number = int(self.b.rng.integers(models.TREES))
-        wide = tall * self.b.rng.uniform(0.85, 1.15)
-        model = models.tree(number, int(s > 24) + int(s > 48 or abs(x) > 25))
-        scale = np.array([wide, tall, wide]) / 10
-        tints = {"leaf": models.leaf_color(self.b.rng)}
-        self.b.add(place(model, (x, 0, s), self.b.rng.uniform(0, 6.28), scale, tints))
+    def add_tree(self, x_m: Number, s_m: Number, height_m: Number) -> None:
+        """Add a tree of a random model at x and s, with fewer leaves where it is far away."""
+        rng = self.b.rng
+        number = int(rng.integers(models.TREES))
+        width_m = height_m * rng.uniform(0.85, 1.15)
+        coarseness = int(s_m > 24) + int(s_m > 48 or abs(x_m) > 25)
+        model = models.tree(number, coarseness)
+        scale = np.array([width_m, height_m, width_m]) / models.TREE_M
+        tints = {"leaf": models.leaf_color(rng)}
+        yaw = rng.uniform(0, 6.28)
+        self.b.add(place(model, (x_m, 0, s_m), yaw, scale, tints))
 
-    def add_bush(self, x: Number, s: Number, size: Number) -> None:
-        """Add a bush of a random model, coarser where it is far away."""
-        model = models.bush(int(self.b.rng.integers(models.BUSHES)), int(s > 20))
-        scale = size * self.b.rng.uniform(0.7, 1.3, 3)
-        tints = {"leaf": models.leaf_color(self.b.rng)}
-        self.b.add(place(model, (x, 0, s), self.b.rng.uniform(0, 6.28), scale, tints))
+    def add_bush(self, x_m: Number, s_m: Number, height_m: Number) -> None:
+        """Add a bush of a random model at x and s, with fewer leaves where it is far away."""
+        rng = self.b.rng
+        number = int(rng.integers(models.BUSHES))
+        model = models.bush(number, coarseness=int(s_m > 20))
+        scale = height_m * rng.uniform(0.7, 1.3, 3)
+        tints = {"leaf": models.leaf_color(rng)}
+        yaw = rng.uniform(0, 6.28)
+        self.b.add(place(model, (x_m, 0, s_m), yaw, scale, tints))
 
 
 _OWN_CAR = (0.0, 0.5, 1.5, 4.5)
