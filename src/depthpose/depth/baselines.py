@@ -16,7 +16,7 @@ from torch.nn import functional as F
 from depthpose.core.camera import StereoRig
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image
-from depthpose.depth.datasets import Dataset, known_truths, read_known_depth
+from depthpose.depth.datasets import Dataset, read_true_depth, truth_kinds
 from depthpose.depth.disparity import disparity_from_depth
 from depthpose.depth.types import DepthEstimate, Map, StereoInput, View
 
@@ -59,11 +59,11 @@ class RowDepthBaseline:
         # A histogram of the depths of each row, weighted by 1 / t.
         weight = np.zeros((_ROWS, _DEPTH_STEPS))
         for index in progress(range(len(dataset))):
-            known_m = read_known_depth(dataset, index)
+            true_map_m = read_true_depth(dataset, index)
             rig = dataset.read_rig(index)
-            if known_m is None or rig is None:
+            if true_map_m is None or rig is None:
                 continue
-            true_m = known_m.double().numpy()
+            true_m = true_map_m.double().numpy()
             v, u = np.nonzero((true_m > _NEAR_M) & (true_m < _FAR_M))
             true_m = true_m[v, u]
             row = np.rint(_canonical_rows(v, rig)).astype(np.int64).clip(0, _ROWS - 1)
@@ -129,7 +129,7 @@ class NearestImageBaseline:
         indices = [
             i
             for i, frame in enumerate(dataset.frames)
-            if frame.calibration and known_truths(frame) and dataset.read_rig(i) is not None
+            if frame.calibration and truth_kinds(frame) and dataset.read_rig(i) is not None
         ]
         if not indices:
             raise _nothing_to_learn(dataset)
@@ -146,11 +146,11 @@ class NearestImageBaseline:
         rig = _rig_of(pair)
         height, width = pair.left.shape[1:]
         nearest = self.indices[int((self.thumbnails @ _thumbnail(pair.left)).argmax())]
-        known_m = read_known_depth(self.dataset, nearest)
+        nearest_true_m = read_true_depth(self.dataset, nearest)
         nearest_rig = self.dataset.read_rig(nearest)
-        assert known_m is not None  # `fit` chose frames that have both
+        assert nearest_true_m is not None  # `fit` chose frames that have both
         assert nearest_rig is not None
-        inverse = fill_by_pyramid(1 / known_m)
+        inverse = fill_by_pyramid(1 / nearest_true_m)
         inverse = F.interpolate(inverse[None, None], (height, width), mode="bilinear")[0, 0]
 
         # Focal lengths in widths of the images, which now have one size.

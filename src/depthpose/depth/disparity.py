@@ -55,7 +55,7 @@ MOST_ENLARGED_PIXELS = 8_000_000
 
 
 def disparity_advice(predicted_px: Map, true_px: Map) -> str | None:
-    """Say which unit or sign a predicted disparity likely has in place of pixels, else None.
+    """Name the unit or sign that a predicted disparity likely has in place of pixels; None: none.
 
     What a poor estimate could look like too is only a notice, once for each possible mistake.
     """

@@ -351,7 +351,7 @@ class _InvertedResidual(nn.Module):
 
 @dataclass(frozen=True, eq=False)
 class Selected:
-    """What the distributions over disparities of one view give, at the size of the image."""
+    """Disparity, sky and confidence of one view, by its distributions over disparities."""
 
     disparity_px: Maps  #: exponential of the mean logarithm of disparity, without the sky
     sky: Maps  #: probability of the sky

@@ -242,7 +242,7 @@ def _check_truth(
 
 
 def _check_agreement(path: Path, truth_px: Map, report: RectificationReport) -> Iterator[Problem]:
-    """Report a disparity that few matches between the views agree with, and a change that would."""
+    """Report a true map that few matches between the views agree with, and a change that helps."""
     agreement = _agreement(truth_px, report)
     if agreement is None:
         return

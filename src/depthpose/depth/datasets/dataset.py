@@ -236,7 +236,7 @@ def refuse_common(
         )
 
 
-def read_known_depth(dataset: Dataset, index: int) -> Map | None:
+def read_true_depth(dataset: Dataset, index: int) -> Map | None:
     """Read the true depth of a left image [m]: of its LiDAR scan, else its depth map or disparity.
 
     None where the frame has no truth, or disparity without a calibration.

@@ -348,8 +348,8 @@ def kitti_calibration(frame: Frame) -> KittiCalibration:
     return KittiCalibration(rig=rig, pixels_from_velodyne=pixels_from_velodyne)
 
 
-def known_truths(frame: Frame) -> tuple[TruthKind, ...]:
-    """Give the kinds of truth that a frame has files of."""
+def truth_kinds(frame: Frame) -> tuple[TruthKind, ...]:
+    """List the kinds of truth that a frame has files of."""
     kinds: dict[TruthKind, bool] = {
         "scan": has_lidar(frame, "camera_z"),
         "annotated": frame.depth is not None and frame.depth != _scan_map(frame),

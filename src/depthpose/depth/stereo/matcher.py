@@ -85,7 +85,7 @@ class CameraMatcher(Matcher, Protocol):
         ...
 
     def work_size(self, camera: Camera) -> tuple[int, int]:
-        """Rows and columns at which the images of a camera are matched [px]."""
+        """Give the rows and columns at which the images of a camera are matched [px]."""
         ...
 
 
@@ -256,7 +256,7 @@ AGREEMENT_PX = 3.0
 
 
 class StereoNetwork(nn.Module):
-    """A normalised pair to disparity maps for the losses; the last is the output.
+    """A network from a normalised pair to disparity maps, the last of which is its output.
 
     In training it gives at most three maps, the last of which weighs most; else one.
     """
@@ -455,13 +455,13 @@ class NetworkMatcher(ABC):
             )
 
     def work_size(self, camera: Camera) -> tuple[int, int]:
-        """Rows and columns at which images of a camera are matched [px]."""
+        """Give the rows and columns at which images of a camera are matched [px]."""
         if self.network_config.work_focal_px is None:
             return camera.height, camera.width
         return disparity.size_at_focal_length(camera, self.work_focal_px(camera))
 
     def work_disparities(self, camera: Camera) -> int:
-        """Disparities that are searched at :meth:`work_size` [px]."""
+        """Give the number of disparities that are searched at :meth:`work_size` [px]."""
         trained = self.network_config
         if trained.work_focal_px is None:
             return trained.max_disparity_px
@@ -470,12 +470,12 @@ class NetworkMatcher(ABC):
         return self.whole_steps(trained.max_disparity_px * larger)
 
     def whole_steps(self, disparity_px: float) -> int:
-        """Disparities of a volume that reaches up to one [px]: a multiple of the network's step."""
+        """Round a number of disparities [px] up to a multiple of the network's step."""
         step_px = self.network_config.step_px
         return max(1, math.ceil(round(disparity_px, 3) / step_px)) * step_px
 
     def work_focal_px(self, camera: Camera) -> float:
-        """Focal length at which images of a camera are matched [px]."""
+        """Give the focal length at which images of a camera are matched [px]."""
         trained_px = self.network_config.work_focal_px
         if trained_px is None:
             return float(camera.K[0, 0])
@@ -493,7 +493,7 @@ def _scaled_size(left: View, scale: float, camera: Camera | None) -> tuple[int, 
 
 
 def normalise(image: Float[Tensor, "*batch 3 h w"]) -> Float[Tensor, "*batch 3 h w"]:
-    """RGB in [0, 1] to what the network was trained on: ImageNet's mean 0 and deviation 1."""
+    """Normalise RGB in [0, 1] by ImageNet's mean and deviation, as in the training."""
     mean = image.new_tensor(IMAGENET_MEAN)[:, None, None]
     return (image - mean) / image.new_tensor(IMAGENET_STD)[:, None, None]
 

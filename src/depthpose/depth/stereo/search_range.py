@@ -38,7 +38,7 @@ _NAMED = 0.001
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DisparityRange:
-    """Where the disparities of a pair lie, in pixels of its images."""
+    """The range of a pair's disparities, in pixels of its images, and the match that found it."""
 
     low_px: float  #: the least, or infinity's where that may be there
     high_px: float  #: the largest

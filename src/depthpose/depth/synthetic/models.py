@@ -432,25 +432,16 @@ def vehicle(kind: str, number: int) -> Mesh:
     shift = np.zeros((len(body.stations), 3))
     shift[2:-2, 0] = b.rng.normal(0, 0.008, len(shift) - 4)
     stations = np.array(body.stations) + shift
-    rings = [_ring(station, size) for station in stations]
+
+    # The body, in rings of nine faces: flanks (0 to 2 and 6 to 8), and the roof between them.
+    rings = [_make_ring(station, size) for station in stations]
     for i, (rear, front) in enumerate(pairwise(rings)):
         is_glazed = body.glazed[0] <= i < body.glazed[1]
         is_steep = abs(stations[i + 1, 2] - stations[i, 2]) > 0.2
         for j in range(9):
             face = np.stack([rear[j], rear[j + 1], front[j + 1], front[j]])
             if is_glazed and (j in (2, 6) or (is_steep and j in (3, 4, 5))):
-                # A pane in a painted frame, so that pillars part the windows; it looks outwards.
-                uv = [[0, 0], [1, 0], [1, 1], [0, 1]]
-                b.quads([face], [uv], Surface("tyre", (0.015, 0.015, 0.017)))
-                middle = face.mean(0)
-                outward = np.cross(face[1] - face[0], face[3] - face[0])
-                outward *= 0.006 / (np.linalg.norm(outward) + 1e-9)
-                outward *= 1 if outward @ middle > 0 or outward[1] < 0 else -1
-                # Towards the outside: a body's panes look away from its middle.
-                if outward @ (middle - np.array([0, middle[1] * 0.5, 0])) < 0:
-                    outward = -outward
-                pane = middle + (face - middle) * 0.93 + outward
-                b.quads([pane], [uv], Surface("glass", (0.03, 0.035, 0.04)))
+                _add_window(b, face)
             elif j in (3, 4, 5):
                 b.quads([face], [np.stack([face[:, 0], face[:, 2]], -1)], Surface("paint"))
             else:
@@ -460,21 +451,47 @@ def vehicle(kind: str, number: int) -> Mesh:
         hub = np.broadcast_to(ring.mean(0), ring.shape)
         faces = np.stack([hub, ring, np.roll(ring, -1, 0)], 1)
         b.triangles(faces, faces[..., :2], Surface("paint"))
-    radius = 0.31 if size[2] < 2.5 else 0.47
+
     rim = Surface("wheel", (0.4, 0.41, 0.43), 1.0, number)
     for side in (-1, 1):
-        axis = (side, 0, 0)
         for share in body.wheels:
-            hub = np.array([side * (size[1] / 2 + 0.01), -radius, share * size[0]])
-            b.disc(hub - [side * 0.004, 0.02, 0], axis, radius * 1.18, _BLACK, 16)
-            b.tube(hub - [side * 0.22, 0, 0], hub, radius, _BLACK, 16)
-            b.disc(hub + np.array([side * 0.003, 0, 0]), axis, radius, _BLACK, 16)
-            b.disc(hub + np.array([side * 0.012, 0, 0]), axis, radius * 0.66, rim, 12)
+            _add_wheel(b, size, side, share * size[0], rim)
     _add_trim(b, *size)
     return b.finish()
 
 
-def _ring(
+def _add_window(b: MeshBuilder, face: Float[np.ndarray, "4 3"]) -> None:
+    """Add a pane in a dark frame, the four-cornered face of a body; it looks outwards."""
+    uv = [[0, 0], [1, 0], [1, 1], [0, 1]]
+    b.quads([face], [uv], Surface("tyre", (0.015, 0.015, 0.017)))
+    middle = face.mean(0)
+    outward = np.cross(face[1] - face[0], face[3] - face[0])
+    outward *= 0.006 / (np.linalg.norm(outward) + 1e-9)
+    outward *= 1 if outward @ middle > 0 or outward[1] < 0 else -1
+    # Towards the outside: a body's panes look away from its middle.
+    if outward @ (middle - np.array([0, middle[1] * 0.5, 0])) < 0:
+        outward = -outward
+    pane = middle + (face - middle) * 0.93 + outward
+    b.quads([pane], [uv], Surface("glass", (0.03, 0.035, 0.04)))
+
+
+def _add_wheel(
+    b: MeshBuilder, size: Float[np.ndarray, "3"], side: int, axle_m: Number, rim: Surface
+) -> None:
+    """Add a wheel in its arch, on the right (1) or the left (-1) side of a body.
+
+    ``size``: length, width and height of the body [m]; ``axle_m``: place of the axle along it.
+    """
+    radius = 0.31 if size[2] < 2.5 else 0.47
+    axis = (side, 0, 0)
+    hub = np.array([side * (size[1] / 2 + 0.01), -radius, axle_m])
+    b.disc(hub - [side * 0.004, 0.02, 0], axis, radius * 1.18, _BLACK, 16)
+    b.tube(hub - [side * 0.22, 0, 0], hub, radius, _BLACK, 16)
+    b.disc(hub + np.array([side * 0.003, 0, 0]), axis, radius, _BLACK, 16)
+    b.disc(hub + np.array([side * 0.012, 0, 0]), axis, radius * 0.66, rim, 12)
+
+
+def _make_ring(
     station: Float[np.ndarray, "3"], size: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "10 3"]:
     """Make a cross-section of a vehicle: sill, flank, belt, roof edge and roof of both sides."""
@@ -531,8 +548,8 @@ def walker(number: int) -> Mesh:
     b = MeshBuilder(np.random.default_rng((31, number)))
     height = b.rng.uniform(1.55, 1.9)
     step = b.rng.uniform(-0.28, 0.28)
-    coat = _cloth(b, 0.45)
-    trousers = _cloth(b, 0.22)
+    coat = _draw_cloth(b, 0.45)
+    trousers = _draw_cloth(b, 0.22)
     for side in (-1, 1):
         foot = (side * 0.1, -0.04, side * step)
         hip = np.array([side * 0.09, -0.48 * height, 0])
@@ -544,7 +561,7 @@ def walker(number: int) -> Mesh:
     neck = np.array([0, -0.82 * height, 0.02])
     _add_upper_body(b, hip, neck, np.array([0, -0.93 * height, 0.03]), coat)
     if b.rng.random() < 0.4:
-        b.box((0.3, -0.4 * height, 0), (0.12, 0.3, 0.34), _cloth(b, 0.4))
+        b.box((0.3, -0.4 * height, 0), (0.12, 0.3, 0.34), _draw_cloth(b, 0.4))
     return b.finish()
 
 
@@ -570,8 +587,8 @@ def rider(number: int) -> Mesh:
         b.tube(start, stop, 0.022, frame, 5)
     b.tube((-0.28, -1.06, 0.36), (0.28, -1.06, 0.36), 0.016, _RUBBER, 4)
     b.box((0, -0.94, -0.22), (0.16, 0.06, 0.26), _RUBBER)
-    coat = _cloth(b, 0.45)
-    trousers = _cloth(b, 0.22)
+    coat = _draw_cloth(b, 0.45)
+    trousers = _draw_cloth(b, 0.22)
     hip = np.array([0, -0.98, -0.22])
     neck = np.array([0, -1.5, 0.02])
     for side in (-1, 1):
@@ -595,7 +612,7 @@ def _add_upper_body(
     add_ball(b, neck, (0.2, 0.09, 0.13), coat, 1)
     if b.rng.random() < 0.3:
         bag = hip * 0.35 + neck * 0.65 - [0, 0, 0.2]
-        b.box(bag, (0.3, 0.42, 0.18), _cloth(b, 0.4))
+        b.box(bag, (0.3, 0.42, 0.18), _draw_cloth(b, 0.4))
     skin = Surface("skin", _SKINS[b.rng.integers(len(_SKINS))])
     hair = Surface("cloth", tuple(b.rng.uniform(0.01, 0.25) * np.array([1, 0.8, 0.6])))
     b.tube(head + np.array([0, 0.2, 0]), head, 0.06, skin, 6)
@@ -603,7 +620,7 @@ def _add_upper_body(
     add_ball(b, head - [0, 0.03, 0.02], (0.098, 0.11, 0.105), hair, 2)
 
 
-def _cloth(b: MeshBuilder, light: Number) -> Surface:
+def _draw_cloth(b: MeshBuilder, light: Number) -> Surface:
     """Draw a cloth of random colour, no brighter than ``light``."""
     color = b.rng.uniform(0.1, 1, 3) * b.rng.uniform(0.15, 1) * light
     return Surface("cloth", tuple(color), 0.6, int(b.rng.integers(4)))
