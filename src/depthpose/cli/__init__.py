@@ -132,6 +132,8 @@ def main(words: Sequence[str] | None = None) -> int:
             run_module = sys.modules.get("depthpose.core.run")
             if run_module is not None:
                 run_module.release_folders(but=held_before)
+
+    # What could not be printed fails the command too.
     if output.failure is None:
         return code
     if isinstance(output.failure, BrokenPipeError):  # nobody reads it any longer, as in '| head'

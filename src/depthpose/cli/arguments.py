@@ -36,7 +36,7 @@ from depthpose.core.errors import InputError
 
 
 class _Names(Enum):
-    """What the value of an option names."""
+    """The kinds of things that the value of an option may name."""
 
     INPUT = "a file or folder that is read"
     NEW = "a file or folder that need not exist"
@@ -64,12 +64,12 @@ _MAX_WIDTH = 100
 Config = TypeVar("Config", bound=Any)
 
 
-def _default_hint(default: str) -> str:
-    """Say in ``--help`` what the default is, if it is anything."""
+def _describe_default(default: str) -> str:
+    """Make the note on the default for ``--help``; empty where there is none."""
     return "" if default in _EMPTY_DEFAULTS else f"(default: {default})"
 
 
-shown_as = partial(tyro.conf.arg, help_behavior_hint=_default_hint)
+shown_as = partial(tyro.conf.arg, help_behavior_hint=_describe_default)
 """Show an option with this ``metavar`` in the place of its value; None: as tyro does."""
 
 Device = Annotated[str, shown_as(metavar="DEVICE", help="cpu, cuda, cuda:1, ...")]

@@ -112,7 +112,7 @@ def match_pairs(
     from depthpose.cli import depth_predict
     from depthpose.core.files.images import refuse_among_inputs
 
-    weights = None if pairs.matcher == "sgbm" else pairs.matcher or pairs.weights or "default"
+    weights = None if pairs.matcher == "sgbm" else pairs.matcher or pairs.weights
     config = replace(
         matching.config,
         with_left_right_check=matching.left_right_check,

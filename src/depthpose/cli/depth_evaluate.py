@@ -73,7 +73,7 @@ def predict_dataset(dataset: Dataset, method: DepthMethod, rule: Protocol, folde
     share = process.share_of(usable)
     jobs = [Job(name=frame.name, read=partial(read, i)) for i, frame in share]
     sources = {f.name: f.seen_files(with_right=method.with_right) for _, f in usable}
-    net = _Unchecked(method.net) if isinstance(method.net, FakestereoNet) else method.net
+    net = _UncheckedNet(method.net) if isinstance(method.net, FakestereoNet) else method.net
     written = estimate_missing_depth(net, jobs, home, method.settings, sources)
     for _ in tqdm(written, method.name, total=len(jobs), disable=None, unit=" frames"):
         pass
@@ -83,7 +83,7 @@ def predict_dataset(dataset: Dataset, method: DepthMethod, rule: Protocol, folde
 
 
 @dataclass(frozen=True)
-class _Unchecked:
+class _UncheckedNet:
     """A network that refuses no pair, for a measurement counts all of them."""
 
     net: FakestereoNet
@@ -106,6 +106,8 @@ def choose_methods(
         sgbm = DepthMethodSource(weights=None, config=config, with_filled_holes=is_filled)
         chosen.append(sgbm.build())
     chosen += [named_method(name, config) for name in options.weights]
+
+    # Their predictions need folders of different names, and their inputs must be there.
     names = [method.name for method in chosen]
     repeated = next((name for name in names if names.count(name) > 1), None)
     if repeated is not None:
@@ -256,9 +258,12 @@ def _frame_sections(
     rows_at_cap = [row for row in per_frame if row.cap_m == cap_m and row.pixels]
     metric = METRICS[RANKING["disparity" if cap_m is None else "depth"]]
     sign = 1 if metric.better == "lower" else -1
+
+    # Words for the text of each section.
     cap_text = "" if cap_m is None else f", truth up to {cap_m:g} m"
     frame_count = f"{len(rows_at_cap)} frame{'' if len(rows_at_cap) == 1 else 's'}"
     index_of = {frame.name: index for index, frame in enumerate(dataset.frames)}
+
     sections: list[Section] = []
     errors = [sign * row.metrics[metric.name] for row in rows_at_cap]
     for role, k in page.choose_ranked(errors, max_count):

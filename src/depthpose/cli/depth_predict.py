@@ -77,7 +77,7 @@ class DepthMethod(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class DepthMethodSource:
-    """What a method is built from, in this process or by the workers of an engine."""
+    """The description of a method, from which this process or the workers of an engine build it."""
 
     weights: str | Weights | None  #: name or file, or their bytes; None: OpenCV's matcher
     config: MatcherConfig  #: how the networks run
@@ -177,7 +177,7 @@ class DepthMethodSource:
 
 
 def _load_other_matcher(matcher: str) -> tuple[SGBMMatcher | Path, str, dict[str, Any]]:
-    """Give the matcher of the synthesised view, other than the weights' own, and its settings.
+    """Load the matcher of the synthesised view that replaces the weights' own.
 
     Returns:
         OpenCV's matcher or a weights file, its name, and the JSON values that decide its results.
@@ -227,10 +227,12 @@ def _exif_focal_px(sources: Sequence[Path]) -> float:
                 "degrees)"
             )
         focal_of[source.name] = focal
+
     if not focal_of:
         raise InputError(
             "no image can be read; give --camera, --focal-px or --fov, and intact ones"
         )
+
     first = next(iter(focal_of))
     focal_px, tags = focal_of[first]
     for other, (other_px, _) in focal_of.items():
@@ -239,6 +241,7 @@ def _exif_focal_px(sources: Sequence[Path]) -> float:
                 f"the EXIF of {first} says a focal length of {focal_px:.0f} px and that of "
                 f"{other} {other_px:.0f} px; predict them apart"
             )
+
     print(
         f"a focal length of {focal_px:.0f} px, by the EXIF of {first} ({tags}); of a cropped "
         "picture it is another",
@@ -330,7 +333,7 @@ def list_pairs(left: str, right: str) -> list[tuple[Path, Path]]:
 
 @dataclass(frozen=True, kw_only=True)
 class DepthWork:
-    """How images or pairs become files of depth, in this process or by workers of an engine.
+    """The estimation of depth files from images or pairs, here or by workers of an engine.
 
     ``camera``: camera of the images (a field of view or focal length [px] does), or rig of a pair.
     ``with_check``: refuse pairs that are swapped, not rectified or no pair.
@@ -657,6 +660,7 @@ class DepthRun:
         assert isinstance(self.method.net, FakestereoNet), "weights build no other"
         estimate_many = partial(self.work.estimate_many, self.method.net, mount=mount)
         outcomes = run_jobs(jobs, estimate_many, results, output.batch)
+
         names: list[str] = []
         for outcome in tqdm(outcomes, label, total, disable=None, unit=f" {label}"):
             name = outcome.job.name

@@ -46,7 +46,7 @@ _HALF = 0.5
 
 @dataclass(kw_only=True)
 class FileFacts:
-    """What a file holds: one of image, depth, camera, mask, cloud and model; and what is odd."""
+    """The facts of a file: its kind (image, depth, camera, mask, cloud or model) and oddities."""
 
     path: Path
     description: str = ""  #: for the user; empty: it cannot be used
@@ -280,6 +280,7 @@ def _describe_map(path: Path) -> FileFacts:
             return _describe_depth(path, torch.where(units > 0, units, torch.nan))
         if stored.ndim != 2 or stored.shape[1] in (3, 4):
             return _describe_points(path, files.read_cloud(path).points.double())
+
     values = files.read_map(path)
     readings = values[values.isfinite()]
     height, width = values.shape
@@ -287,6 +288,7 @@ def _describe_map(path: Path) -> FileFacts:
     if len(readings) == 0:
         facts.oddities.append("no value is known")
         return facts
+
     median = float(readings.median())
     facts.description += f", {len(readings) / values.numel():.0%} known, median {median:.4g}"
     if float((readings < 0).float().mean()) > _HALF:
@@ -323,7 +325,7 @@ def _describe_points(path: Path, points: Tensor) -> FileFacts:
 
 
 def _contradictions(facts: FileFacts, all_facts: Sequence[FileFacts]) -> Iterator[str]:
-    """Give the contradictions of a file to the others: in size, unit, or scale of a model."""
+    """List where a file contradicts the others: in size, unit, or scale of a model."""
     for other in all_facts:
         camera = other.camera
         if camera is not None and facts.size is not None:

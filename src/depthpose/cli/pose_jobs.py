@@ -128,7 +128,7 @@ def _plan_regions(method: PoseMethod, inputs: PoseInputs, out: Path) -> JobPlan:
 
 @dataclass(frozen=True, kw_only=True)
 class WantedObjects:
-    """Which detections are posed, by their objects.
+    """The objects whose detections are posed.
 
     ``names``: names of all objects of the method. ``labels``: the object of a detector's class,
     where it is not named so. ``only``: the single object that is wanted; None: all. ``expected``:
@@ -144,7 +144,7 @@ class WantedObjects:
 def _wanted_objects(
     method: PoseMethod, labels: Mapping[str, str] | None, only: str | None
 ) -> WantedObjects:
-    """Say which detections are posed, and which objects have a result in every image.
+    """Decide which detections are posed, and which objects have a result in every image.
 
     Posed are the detections of ``only``, or of every object where it is None. A result, a refusal
     where it was not detected, have ``only``; else the objects of ``labels``; else, where there are

@@ -117,12 +117,14 @@ def _network_method(path: Path, name: str, config: EstimateConfig) -> PoseMethod
         name += "-least-squares"
     if not config.with_icp:
         name += "-without-icp"
+
     settings = {
         "kind": read_checkpoint(path).kind,
         "weights": path.stem,
         "weights_sha256": file_sha256(path),
         "estimate": config_to_dict(config),
     }
+
     if isinstance(pose_weights.network, DepthImageNet):
         return PoseMethod(
             name=name,
@@ -175,7 +177,7 @@ def _with_base(method: PoseMethod, base: Rigid) -> PoseMethod:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PoseMethodSource:
-    """What an estimator is built from, in this process or by the workers of an engine.
+    """The description of an estimator, from which this process or an engine's workers build it.
 
     ``weights``: of a network, by name or file, or as bytes to be sent to workers; None: ``models``
     are registered without training. ``base_from_camera``: if given, every estimate has the pose

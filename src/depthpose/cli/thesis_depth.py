@@ -187,6 +187,7 @@ def write_figure(
         "method": method.settings,
     }
     claim_folder(out, settings, (f"figure-{number}.png", "panels", "report.html"))
+
     columns: list[list[Drawing]] = []
     sections: list[Section] = []
     for index, frame in zip(tqdm(indices, unit=" frames", disable=None), frames, strict=True):
@@ -201,6 +202,7 @@ def write_figure(
             panels = draw_figure_2_1(pair, lidar_m, estimate, stereo)
         columns.append(panels)
         sections.append(_panel_section(frame.name, panels, out / "panels" / frame.name))
+
     path = out / f"figure-{number}.png"
     write_image(path, arrange(columns))
     sections.append(_settings_section([method]))

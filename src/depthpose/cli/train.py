@@ -27,7 +27,7 @@ if TYPE_CHECKING:  # --help must not load torch
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingOptions:
-    """How long a training goes, on what, and from which state."""
+    """The length of a training, its machine, and the state that it starts from."""
 
     steps: int | None = None
     """optimiser steps in place of the config's length."""

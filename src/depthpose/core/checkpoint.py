@@ -171,15 +171,15 @@ def fetch_weights(name: str) -> Path:
     try:
         path = hub.hf_hub_download(reference["repository"], file, revision=reference["revision"])
     except Exception as error:
-        refusal = _hub_refusal(error)
+        refusal = _explain_hub_error(error)
         if refusal is None:
             raise
         raise InputError(f"{name}: {refusal}") from error
     return Path(path)
 
 
-def _hub_refusal(error: Exception) -> str | None:
-    """Say why the hub gave no file, and what to do; None where the error has another origin."""
+def _explain_hub_error(error: Exception) -> str | None:
+    """Explain why the hub gave no file, and what to do; None for an error of another origin."""
     errors = import_module("huggingface_hub.errors")
     reason = " ".join(str(error).split())[:_LONGEST_REASON] or type(error).__name__
     # The library's errors derive from those of the HTTP library that it is built on: requests,

@@ -25,7 +25,7 @@ class MissingExtraError(ImportError):
 
 
 def install_command(extra: str) -> str:
-    """Say how an extra is installed: from a clone or a wheel, as no package index has a release."""
+    """Describe how an extra is installed: from a clone or a wheel, for no index has a release."""
     clone = f"pip install -e '.[{extra}]' in the clone of depthpose"
     return f"{clone}, or pip install 'WHEEL[{extra}]' with the file of the wheel"
 

@@ -73,6 +73,7 @@ def lock_folder(folder: Path, *, is_shared: bool, timeout_s: float = 10.0) -> bo
     with refused_write(folder / _LOCK):
         folder.mkdir(parents=True, exist_ok=True)
         file = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT, 0o666)
+
     deadline = time.monotonic() + timeout_s
     while fcntl is not None:
         try:
@@ -89,6 +90,7 @@ def lock_folder(folder: Path, *, is_shared: bool, timeout_s: float = 10.0) -> bo
             time.sleep(_LOCK_POLL_S)
         except OSError:  # no locks on this file system
             break
+
     _locks[folder.resolve()] = file
     return True
 
@@ -447,7 +449,7 @@ def _flatten(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 @dataclass(frozen=True, kw_only=True)
 class _ReadResults:
-    """How far a results file has been read, and the results and failures in it."""
+    """The results and failures in a results file, up to where it has been read."""
 
     inode: int
     end: int = 0  # byte up to which it was read
@@ -476,7 +478,7 @@ def note_failure(folder: Path, name: str, reason: str) -> None:
 
 
 def _append_result(folder: Path, row: Mapping[str, Any]) -> None:
-    """Append a line to ``results.jsonl``."""
+    """Append an entry to ``results.jsonl``, on a line of its own."""
     # The line break in front separates it from what a killed process may have left of a line.
     line = f"\n{json.dumps(row)}\n".encode()
     with refused_write(folder / RESULTS), (folder / RESULTS).open("ab", buffering=0) as file:

@@ -307,6 +307,8 @@ def summarise(
         )
         for result in measured
     ]
+
+    # The means of each cap.
     ranking_metric = RANKING["disparity" if find_protocol(protocol).is_disparity else "depth"]
     rows: list[EvaluationRow] = []
     deciles: list[EvaluationRow] = []

@@ -209,6 +209,7 @@ def write_depth_weights(
             if isinstance(network, classes.network):
                 networks[kind] = network
     assert networks, "a weights file holds at least one network"
+
     configs: dict[str, Any] = {}
     states: dict[str, dict[str, Tensor]] = {}
     for kind, network in networks.items():

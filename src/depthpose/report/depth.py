@@ -162,18 +162,21 @@ def depth_facts(
         facts.append(("focal length", f"{float(camera.K[0, 0]):.1f} px{focal}"))
     if pair.right is not None and isinstance(camera, StereoRig):
         facts.append(("baseline", f"{camera.baseline_m:g} m"))
+
     if depth_m is not None:
         known_m = depth_m[depth_m.isfinite()]
         facts.append(("pixels with depth", f"{len(known_m) / depth_m.numel():.1%}"))
         if len(known_m):
             near, median, far = np.percentile(known_m.numpy(), (1, 50, 99))
             facts.append(("1, 50, 99 % are nearer than", f"{near:.2f}, {median:.2f}, {far:.2f} m"))
+
     if estimate.is_sky is not None:
         facts.append(("sky", f"{float(estimate.is_sky.float().mean()):.1%} of the pixels"))
     if estimate.ground is not None:
         facts.append(("ground", str(estimate.ground)))
     if estimate.warning:
         facts.insert(0, ("warning", estimate.warning))
+
     if estimate.confidence is not None:
         facts.append(("mean confidence", f"{float(estimate.confidence.nanmean()):.2f}"))
         if pair.right is not None:

@@ -105,7 +105,7 @@ def draw_region(
 
 
 def box_edges(model: ObjectModel) -> Float[Tensor, "12 2 3"]:
-    """Give both ends of the edges of the model's box, along its axes [m]."""
+    """Compute both ends of the edges of the model's box, along its axes [m]."""
     low = model.vertices_m.amin(0)
     high = model.vertices_m.amax(0)
     corners = torch.cartesian_prod(*torch.stack([low, high], -1))
@@ -147,7 +147,7 @@ def pose_layers(
 
 
 def _sharp_edges(model: ObjectModel) -> Float64[Tensor, "n 2 3"] | None:
-    """Give both ends of the edges where a mesh ends, or bends by more than ``_SHARP_RAD`` [m].
+    """Find the edges where a mesh ends, or bends by more than ``_SHARP_RAD``: both ends [m].
 
     None of a model without faces.
     """
@@ -224,7 +224,7 @@ def posed_cloud(cloud_m: Float[Tensor, "n 3"], pose: Rigid | None, model: Object
 
 
 def object_points(pose_input: CloudInput | ViewInput, diameter_m: float) -> Float[Tensor, "n 3"]:
-    """Give the valid points of a cloud, or of a masked depth image without its flying pixels [m].
+    """Take the valid points of a cloud, or of a masked depth image without its flying pixels [m].
 
     ``diameter_m``: diameter of the object, by which flying pixels are told.
     """
@@ -340,7 +340,7 @@ def _pose_drawings(
 
 
 def pose_sentence(estimate: PoseEstimate) -> str:
-    """Say in a sentence where the object is, or why it is refused."""
+    """Describe in a sentence where the object is, or why it is refused."""
     if estimate.camera_from_model is None:
         return f"Refused ({estimate.status}): {estimate.reason}."
     x, y, z = estimate.camera_from_model.t_m.tolist()
@@ -377,6 +377,8 @@ def pose_facts(
             ("visible", f"{evidence.supported_share:.0%} of the surface that faces the camera"),
             ("noise of the sensor there", f"{1000 * evidence.noise_m:.1f} mm"),
         ]
+
+    # What it is, and how sure that is.
     if estimate.pick_rank is not None:
         facts.append(("pick rank", f"{estimate.pick_rank} of what was found in this image"))
     if estimate.identity is not None:
@@ -391,7 +393,10 @@ def pose_facts(
         facts.append(("certainty, up to near-symmetry", f"{estimate.certainty:.3f}"))
     if estimate.copy_certainty is not None:
         facts.append(("certainty of this very copy", f"{estimate.copy_certainty:.3f}"))
+
     facts += [("another pose that fits", str(other)) for other in estimate.alternatives]
+
+    # The fit, and how long it took.
     if estimate.inlier_share is not None:
         facts.append((agreeing, f"{estimate.inlier_share:.0%}"))
     if estimate.residual_m is not None and math.isfinite(estimate.residual_m):
@@ -406,7 +411,7 @@ def pose_facts(
 
 
 def pose_tables(estimate: PoseEstimate) -> dict[str, Sequence[Sequence[str]]]:
-    """Give the tables of a pose, by title: its matrix, standard deviations and covariance."""
+    """Make the tables of a pose, by title: its matrix, standard deviations and covariance."""
     tables: dict[str, Sequence[Sequence[str]]] = {}
     pose = estimate.camera_from_model
     if pose is not None:

@@ -156,7 +156,7 @@ def _make_scene(
 
 
 def _box_views(form: Form, pose_input: CloudInput | ViewInput) -> list[ViewInput]:
-    """Give a view for each box in the form: NAME, or of several NAME_1, NAME_2, ..."""
+    """Make a view for each box in the form: NAME, or of several NAME_1, NAME_2, ..."""
     words = form.fields.get("box", "").split()
     if words and ("mask" in form.files or not isinstance(pose_input, ViewInput)):
         raise InputError(
@@ -195,6 +195,7 @@ def _write_results(
         points_m = object_points(shown_pose.input, model.diameter_m)
         cloud = report.posed_cloud(points_m, shown_pose.estimate.camera_from_model, model)
         files.write_cloud(folder / f"{shown_pose.input.name}.{CLOUD}", cloud)
+
     pose_input = shown_poses[0].input
     if not isinstance(pose_input, ViewInput):
         return []
@@ -207,6 +208,7 @@ def _write_results(
             picture = report.draw_region(picture, shown_pose.input, pose)
         picture = report.draw_pose(picture, pose, model, pose_input.K)
         pose_count += pose is not None
+
     if pose_count:
         caption += f", with the posed model{'s' * (pose_count > 1)}"
     if pose_input.is_region:
@@ -271,6 +273,7 @@ def _read_input(form: Form, model: ObjectModel) -> CloudInput | ViewInput:
     mask = form.file("mask") if "mask" in form.files else None
     if mask is not None:
         refuse_large(mask.name, *files.image_size(mask))
+
     if depth.suffix.lower() in files.MAP_SUFFIXES:
         height, width = files.read_stored_depth(depth).shape
         refuse_large(depth.name, width, height)
@@ -278,6 +281,7 @@ def _read_input(form: Form, model: ObjectModel) -> CloudInput | ViewInput:
     else:
         size = files.image_size(depth)
         refuse_large(depth.name, *size)
+
     keys: dict[str, Any] = {}
     if "camera" not in form.files:
         focal_px = form.number("focal_px")

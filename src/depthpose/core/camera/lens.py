@@ -57,7 +57,7 @@ _REALSENSE = ("none", "modifiedbrownconrady", "inversebrownconrady", "ftheta", "
 
 
 def is_fisheye_lens(fields: Mapping[str, Any], owner: str = "its") -> bool | None:
-    """Say whether the lens that a camera file names is an equidistant fisheye, or a pinhole.
+    """Whether the lens that a camera file names is an equidistant fisheye, and no pinhole.
 
     Args:
         fields: values of the file by its keys, in lower case, letters and digits only.

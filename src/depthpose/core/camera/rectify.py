@@ -216,6 +216,7 @@ def _from_opencv(fields: Fields, unit_m: float, is_fisheye: bool | None) -> RawP
         if is_ros(fields) or "cameramatrix" in fields:
             reason = "it describes a single camera"
         raise InputError(f"{reason}; give the calibration of a pair: {_KNOWN}")
+
     have_fisheyes = _choose_lens_model(fields, is_fisheye)
     cameras: list[RawCamera] = []
     for side in ("left", "right"):
@@ -223,6 +224,7 @@ def _from_opencv(fields: Fields, unit_m: float, is_fisheye: bool | None) -> RawP
         D = _find_numbers(fields, _D[side])
         cameras.append(_make_camera(K, D, have_fisheyes, f"the {side} camera"))
     left, right = cameras
+
     R = find_matrix(fields, _R, 9)
     T = _find_numbers(fields, _T)
     if R is None or T is None or len(T) != 3:
@@ -397,6 +399,8 @@ def make_rectifier(pair: RawPair, size: Size, keep: float = 0.0) -> Rectifier:
         )
     else:
         R1, R2, P1, P2, *_ = cv2.stereoRectify(*left, *right, size, R, t, flags=flags, alpha=keep)
+
+    # The rig, unless the picture would be enlarged as no real lens needs.
     rig = camera_from_facts(facts_from_projections("the rectified pair", P1, P2, size), size)
     assert isinstance(rig, StereoRig), "two projections have a baseline"
     raw_px = float(pair.left.K[0, 0])

@@ -51,7 +51,7 @@ Engine = Callable[[Sequence[Block], Work, str], Iterable[ShardRecord]]
 
 @dataclass(frozen=True, kw_only=True)
 class ShardedJob:
-    """What is computed, for which inputs, and where the results go."""
+    """A job: the work, its inputs, and the folder of its results."""
 
     work: Work  #: what is computed
     items: Sequence[Item] = ()  #: listed inputs

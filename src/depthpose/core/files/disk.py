@@ -405,6 +405,8 @@ def refuse_yaml_bomb(path: AnyPath, text: str) -> None:
                     anchor = None
                 case yaml.ScalarEvent():
                     size = 1
+
+            # The value counts in its anchor, and in the collection about it.
             if anchor is not None:
                 sizes[anchor] = size
             if open_collections:

@@ -708,11 +708,13 @@ def read_numbers(path: AnyPath) -> np.ndarray:
         if version not in _HEADER_READERS:
             raise InputError(f"{path}: NPY version {version}; save plain floats with numpy.save")
         shape, is_fortran, dtype = _HEADER_READERS[version](stream)
+
         if dtype.kind not in "fiu" or dtype.itemsize > 8:
             raise InputError(
                 f"{path}: holds {dtype}, not float16, 32 or 64; save .astype('float32')"
             )
         body = stream.getbuffer()[stream.tell() :]
+
         if len(shape) > _MAX_DIMENSIONS or any(type(side) is not int for side in shape):
             raise InputError(
                 f"{path}: declares an array of shape {str(shape)[:60]}; give whole numbers, "

@@ -7,7 +7,7 @@ import math
 import re
 import warnings
 from array import array
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from io import BytesIO, TextIOWrapper
 from itertools import accumulate, islice
@@ -168,6 +168,8 @@ def read_ply_elements(path: AnyPath, last: str | None = None) -> tuple[Columns, 
         raise InputError(f"{path}: no PLY header ('ply' ... 'end_header'); is it a PLY file?")
     order, elements = _parse_header(path, data[: end.start()].decode("latin-1").splitlines())
     body = memoryview(data)[end.end() :]
+
+    # Elements one after the other: of records in bytes, or of rows of text.
     rows = None if order else text_rows(path, body)
     columns: Columns = {}
     lists: dict[str, Ragged] = {}
@@ -223,6 +225,7 @@ def _read_text_lists(path: AnyPath, rows: Iterator[str], element: _Element) -> d
                 f"{path}: row {row_count} of {element.name}, {row.strip()[:60]!r}, is not what the "
                 "header declares (the number of values, then as many); save it again"
             )
+
     if row_count < element.count:
         declared = f"{element.count} {element.name}"
         raise InputError(f"{path}: {_TOO_FEW_ROWS.format(declared, row_count)}")
@@ -350,6 +353,12 @@ def _parse_header(path: AnyPath, lines: list[str]) -> tuple[str, list[_Element]]
                 )
     if order is None:
         raise InputError(f"{path}: the PLY header names no format; use {', '.join(_ORDERS)} 1.0")
+    _refuse_unusable_elements(path, elements)
+    return order, elements
+
+
+def _refuse_unusable_elements(path: AnyPath, elements: Sequence[_Element]) -> None:
+    """Refuse a header without one element of vertices, or with unusable properties."""
     names = [e.name for e in elements]
     if names.count("vertex") != 1:
         raise InputError(f"{path}: elements {names}, where exactly one 'vertex' is needed")
@@ -361,7 +370,6 @@ def _parse_header(path: AnyPath, lines: list[str]) -> tuple[str, list[_Element]]
                 f"{path}: {element.name} properties {properties} are none, a list or repeat a "
                 "name; give each vertex x, y and z"
             )
-    return order, elements
 
 
 _PCD_CODES = {
@@ -391,6 +399,25 @@ def read_pcd(path: AnyPath) -> Columns:
     lines = data[: end.start()].decode("latin-1").splitlines()
     rows = (line.split() for line in lines if not line.startswith("#"))
     header = {words[0]: words[1:] for words in rows if words}
+    fields = _read_pcd_fields(path, header)
+    _warn_of_viewpoint(path, " ".join(header.get("VIEWPOINT", [])))
+
+    # The number of points, and their values.
+    sides = [header.get(name, []) for name in ("WIDTH", "HEIGHT")]
+    sides = [header["POINTS"]] if "POINTS" in header else sides
+    if not all(re.fullmatch(r"[0-9]{1,10}", " ".join(side)) for side in sides):
+        raise InputError(f"{path}: the PCD header says no number of POINTS; add that line")
+    count = math.prod(int(side[0]) for side in sides)
+    body = memoryview(data)[end.end() :]
+    if end[1] == b"binary":
+        return split_records(path, body, fields, count)
+    if end[1] == b"binary_compressed":
+        return _split_compressed(path, body, fields, count)
+    return split_rows(path, text_rows(path, body), fields, count)
+
+
+def _read_pcd_fields(path: AnyPath, header: Mapping[str, list[str]]) -> list[Field]:
+    """Read the fields of a PCD header, whose words are listed by the first word of their line."""
     names = header.get("FIELDS", [])
     counts = header.get("COUNT", ["1"] * len(names))
     rows = list(zip(names, header.get("TYPE", []), header.get("SIZE", []), counts, strict=False))
@@ -404,27 +431,19 @@ def read_pcd(path: AnyPath) -> Columns:
         )
     if len(set(real)) != len(real):
         raise InputError(f"{path}: PCD fields {names} repeat a name; keep one of them")
-    viewpoint = " ".join(header.get("VIEWPOINT", []))
+    return [Field(name=n, code=_PCD_CODES[k, s], count=int(c)) for n, k, s, c in rows]
+
+
+def _warn_of_viewpoint(path: AnyPath, viewpoint: str) -> None:
+    """Warn that the pose of the sensor in a PCD header, if it is any, is not applied."""
     if viewpoint and not _is_identity(viewpoint):
         warnings.warn(
             f"{path}: its VIEWPOINT {viewpoint[:100]} (x y z, qw qx qy qz of the sensor) is not "
             "applied: the points are taken as they are. If they are in that other frame, turn them "
             "into the sensor's (x right, y down, z forward) and write VIEWPOINT 0 0 0 1 0 0 0",
             Notice,
-            stacklevel=4,
+            stacklevel=5,
         )
-    fields = [Field(name=n, code=_PCD_CODES[k, s], count=int(c)) for n, k, s, c in rows]
-    sides = [header.get(name, []) for name in ("WIDTH", "HEIGHT")]
-    sides = [header["POINTS"]] if "POINTS" in header else sides
-    if not all(re.fullmatch(r"[0-9]{1,10}", " ".join(side)) for side in sides):
-        raise InputError(f"{path}: the PCD header says no number of POINTS; add that line")
-    count = math.prod(int(side[0]) for side in sides)
-    body = memoryview(data)[end.end() :]
-    if end[1] == b"binary":
-        return split_records(path, body, fields, count)
-    if end[1] == b"binary_compressed":
-        return _split_compressed(path, body, fields, count)
-    return split_rows(path, text_rows(path, body), fields, count)
 
 
 def _split_compressed(path: AnyPath, body: memoryview, fields: list[Field], count: int) -> Columns:

@@ -230,31 +230,9 @@ class Parts:
         Raises:
             InputError: it does not fit; the message names the first tensors that differ.
         """
-        present = self.state()
-        problems: list[str] = []
-        for prefix, part in (("", "modules"), ("average of ", "average")):
-            for name, tensors in present[part].items():
-                problems += [
-                    f"{prefix}{name}: {fault}" for fault in misfits(tensors, state[part][name])
-                ]
+        problems = self._list_misfits(state)
         for name, optimizer in self.optimizers.items():
-            saved = state["optimizers"][name]
-            counts = [len(group["params"]) for group in optimizer.param_groups]
-            saved_counts = [len(group["params"]) for group in saved["param_groups"]]
-            if counts != saved_counts:
-                problems.append(
-                    f"optimiser of {name}: it moved groups of {saved_counts} parameters, not of "
-                    f"{counts}"
-                )
-                continue
-            optimizer.load_state_dict(saved)
-            problems += [
-                f"optimiser of {name}: {key} of parameter {k} is {tuple(value.shape)}, not "
-                f"{tuple(parameter.shape)}"
-                for k, (parameter, values) in enumerate(optimizer.state.items())
-                for key, value in values.items()
-                if value.ndim and value.shape != parameter.shape
-            ]
+            problems += _restore_optimizer(name, optimizer, state["optimizers"][name])
         if problems:
             raise InputError(
                 f"{len(problems)} tensors do not fit this network: {', '.join(problems[:3])}; it "
@@ -267,6 +245,40 @@ class Parts:
                 tensor.copy_(state["average"][name][key])
         if self.scaler.is_enabled() and state["scaler"]:
             self.scaler.load_state_dict(state["scaler"])
+
+    def _list_misfits(self, state: Mapping[str, Any]) -> list[str]:
+        """List the tensors of networks and averages that do not fit a saved state."""
+        present = self.state()
+        problems: list[str] = []
+        for prefix, part in (("", "modules"), ("average of ", "average")):
+            for name, tensors in present[part].items():
+                problems += [
+                    f"{prefix}{name}: {fault}" for fault in misfits(tensors, state[part][name])
+                ]
+        return problems
+
+
+def _restore_optimizer(
+    name: str, optimizer: torch.optim.Optimizer, saved: dict[str, Any]
+) -> list[str]:
+    """Load the saved state of an optimiser, and list what of it does not fit its parameters."""
+    counts = [len(group["params"]) for group in optimizer.param_groups]
+    saved_counts = [len(group["params"]) for group in saved["param_groups"]]
+    if counts != saved_counts:
+        return [
+            f"optimiser of {name}: it moved groups of {saved_counts} parameters, not of {counts}"
+        ]
+    # Only a loaded state has its tensors by parameter.
+    optimizer.load_state_dict(saved)
+    problems: list[str] = []
+    for number, (parameter, values) in enumerate(optimizer.state.items()):
+        for key, value in values.items():
+            if value.ndim and value.shape != parameter.shape:
+                problems.append(
+                    f"optimiser of {name}: {key} of parameter {number} is {tuple(value.shape)}, "
+                    f"not {tuple(parameter.shape)}"
+                )
+    return problems
 
 
 def saved_states(folder: Path) -> list[Path]:

@@ -191,6 +191,7 @@ def _check_measurements(frame: Frame) -> Iterator[Problem]:
                 yield Problem(path=frame.calibration, kind="missing", message=message)
         except InputError as error:
             yield unreadable(frame.calibration, error)
+
     if frame.velodyne is not None:
         try:
             if not len(read_points_bin(frame.velodyne)):

@@ -475,6 +475,7 @@ def write_scene(folder: Path, name: str, frame: RawFrame) -> None:
     scene = folder / name
     rig = frame.rig
     written = [scene / part for part in ("im0.png", "im1.png", "disp0.pfm", "calib.txt")]
+
     files.write_image(written[0], frame.left)
     files.write_image(written[1], frame.right)
     files.write_map(written[2], frame.disparity_px)

@@ -156,6 +156,8 @@ def pipeline(
     precision = torch_dtype if dtype is None else dtype
     if precision not in (None, "auto", "float32", torch.float32):
         raise InputError(f"pipeline: torch_dtype is {precision}; networks run in float32, omit it")
+
+    # The device, in all ways in which transformers lets it be named.
     if device is not None and device_map is not None:
         raise InputError("pipeline: device and device_map are both given; omit one of the two")
     chosen_device = device_map if device is None else device
@@ -167,6 +169,7 @@ def pipeline(
         raise InputError(
             "pipeline: device_map is a mapping; the networks go to one device, as 'auto'"
         )
+
     config = MatcherConfig(device=str(chosen_device or "cpu"))
     net = FakestereoNet.load(model or DEFAULT, config=config)
     return DepthPipeline(net, batch_size)

@@ -122,6 +122,8 @@ class CallableMatcher:
         if self.with_numpy_images:
             views = tuple(view.permute(1, 2, 0).cpu().numpy() for view in views)
         answer = self.function(*views)
+
+        # Refuse what is no map of numbers of the images' size.
         if isinstance(answer, np.ndarray) and answer.dtype.kind in "fiu":
             answer = torch.from_numpy(np.ascontiguousarray(answer, dtype=np.float32))
         if not isinstance(answer, Tensor) or answer.is_complex():
@@ -136,6 +138,8 @@ class CallableMatcher:
                 f"the wrapped matcher answered shape {tuple(disparity_px.shape)} for images of "
                 f"{size}; let it answer one disparity a pixel"
             )
+
+        # Refuse disparities that no rectified pair has.
         least_px = float(disparity_px.nan_to_num(0).min())
         faults = {
             "infinite disparity; use NaN for no answer": disparity_px.isinf().any(),

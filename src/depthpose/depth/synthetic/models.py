@@ -226,10 +226,14 @@ def add_wood_edge(
     share = np.linspace(0, 1, count)
     x = x0 + (x1 - x0) * share + rng.normal(0, 0.6, count)
     s = s0 + (s1 - s0) * share + rng.normal(0, 0.3, count)
+
+    # Points of four rows, one above the other, that lean in and out.
     rows = np.array([0.3, -0.35, -0.75, -1.0]) * height_m
     out = rng.normal(0, 0.5, (len(rows), count))
     up = rows[:, None] * np.clip(1 + 0.13 * rng.normal(size=count), 0.6, 1.4)
     points = np.stack([x + out, up, s + 0.5 * out[::-1]], -1)
+
+    # Dark leaves between each two rows.
     along = np.arange(count) * 1.5
     color = np.array(leaf_color(rng))
     b.thing += 1
@@ -239,6 +243,8 @@ def add_wood_edge(
         shade = rng.uniform(0.4, 1.3, (count - 1, 1))
         tint = shade * np.asarray(surface.tint)
         b.quads(between(points[low], points[high]), between(below, above), surface, tint=tint)
+
+    # Single leaves that break its outline.
     leaf = surface._replace(tint=tuple(0.6 * color))
     for first in range(0, count - 4, 4):
         if s[first] < 80:  # farther away they would be less than a pixel
@@ -565,19 +571,26 @@ def walker(number: int) -> Mesh:
     return b.finish()
 
 
+def _add_bicycle_wheel(b: MeshBuilder, z: float, metal: Surface) -> None:
+    """Add a wheel of a bicycle that rides along z: its tyre, its axle and its spokes."""
+    angle = np.linspace(0, 2 * np.pi, 19)
+    rim = np.stack([0 * angle, -0.34 + 0.33 * np.cos(angle), z + 0.33 * np.sin(angle)], 1)
+    for start, stop in pairwise(rim):
+        b.tube(start, stop, 0.02, _RUBBER, 4)
+    b.tube((-0.05, -0.34, z), (0.05, -0.34, z), 0.03, metal, 5)
+    for spoke in rim[:-1:3]:
+        b.tube((0, -0.34, z), spoke, 0.005, metal, 3)
+
+
 @cache
 def rider(number: int) -> Mesh:
     """Give a person on a bicycle, riding along z."""
     b = MeshBuilder(np.random.default_rng((32, number)))
     frame = Surface("metal", tuple(b.rng.uniform(0.03, 0.4, 3)))
     for z in (-0.52, 0.52):
-        angle = np.linspace(0, 2 * np.pi, 19)
-        rim = np.stack([0 * angle, -0.34 + 0.33 * np.cos(angle), z + 0.33 * np.sin(angle)], 1)
-        for start, stop in pairwise(rim):
-            b.tube(start, stop, 0.02, _RUBBER, 4)
-        b.tube((-0.05, -0.34, z), (0.05, -0.34, z), 0.03, frame, 5)
-        for spoke in rim[:-1:3]:
-            b.tube((0, -0.34, z), spoke, 0.005, frame, 3)
+        _add_bicycle_wheel(b, z, frame)
+
+    # The frame, its handlebar and its saddle.
     joints = {"rear": (-0.34, -0.52), "front": (-0.34, 0.52), "saddle": (-0.9, -0.2),
               "pedals": (-0.3, -0.02), "head": (-0.86, 0.36), "bar": (-1.05, 0.36)}  # fmt: skip
     links = ("rear saddle", "rear pedals", "pedals saddle", "pedals head", "saddle head",
@@ -587,6 +600,8 @@ def rider(number: int) -> Mesh:
         b.tube(start, stop, 0.022, frame, 5)
     b.tube((-0.28, -1.06, 0.36), (0.28, -1.06, 0.36), 0.016, _RUBBER, 4)
     b.box((0, -0.94, -0.22), (0.16, 0.06, 0.26), _RUBBER)
+
+    # The person: legs on the pedals, hands on the handlebar.
     coat = _draw_cloth(b, 0.45)
     trousers = _draw_cloth(b, 0.22)
     hip = np.array([0, -0.98, -0.22])
