@@ -115,18 +115,18 @@ def main(words: Sequence[str] | None = None) -> int:
     held_before = () if run_module is None else run_module.held_folders()
     usual_format = warnings.formatwarning
     with lasting_streams() as output:
-        warnings.formatwarning = _notice_format(usual_format)
+        warnings.formatwarning = _make_notice_format(usual_format)
         try:
             code = _run(list(sys.argv[1:] if words is None else words))
         except (InputError, MissingExtraError) as error:
-            code = _fail(f"error: {error}")
+            code = _print_failure(f"error: {error}")
         except KeyboardInterrupt as stop:
-            code = _fail(f"{str(stop) or 'interrupted'}; what was finished is kept", 130)
+            code = _print_failure(f"{str(stop) or 'interrupted'}; what was finished is kept", 130)
         except Exception as error:
             reason = _explain_system_error(error)
             if reason is None:
                 raise
-            code = _fail(f"error: {reason}")
+            code = _print_failure(f"error: {reason}")
         finally:
             warnings.formatwarning = usual_format
             run_module = sys.modules.get("depthpose.core.run")
@@ -139,10 +139,10 @@ def main(words: Sequence[str] | None = None) -> int:
     if isinstance(output.failure, BrokenPipeError):  # nobody reads it any longer, as in '| head'
         return 141
     reason = f"cannot be written: {output.failure.strerror}; all files are written as without it"
-    return _fail(f"error: standard output: {reason}", code or 1)
+    return _print_failure(f"error: standard output: {reason}", code or 1)
 
 
-def _notice_format(usual_format: Callable[..., str]) -> Callable[..., str]:
+def _make_notice_format(usual_format: Callable[..., str]) -> Callable[..., str]:
     """Make a format of warnings that shows each :class:`Notice` once, in a line without its place.
 
     Other warnings look as usual.
@@ -166,7 +166,7 @@ def _notice_format(usual_format: Callable[..., str]) -> Callable[..., str]:
     return format_warning
 
 
-def _fail(reason: str, code: int = 2) -> int:
+def _print_failure(reason: str, code: int = 2) -> int:
     """Print why the command failed, and give the exit code."""
     print(f"depthpose: {reason}", file=sys.stderr)
     return code
@@ -321,7 +321,7 @@ def _list_commands(words: Sequence[str]) -> int:
     group = words[0] if words and not words[0].startswith("-") else ""
     groups = {name.partition(" ")[0] for name in COMMANDS}
     if group and group not in groups:
-        return _fail(f"error: no command {group!r}; {nearest_name(group, groups)}")
+        return _print_failure(f"error: no command {group!r}; {nearest_name(group, groups)}")
     summaries = {name: summary for name, (_, summary) in COMMANDS.items() if name.startswith(group)}
     verb = next((word for word in words[1:] if not word.startswith("-")), "")
     if group and verb:

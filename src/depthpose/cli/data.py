@@ -514,7 +514,7 @@ def _read_two_view_pictures(source: Path) -> "Iterator[tuple[str, Sequence[Tenso
 
 def _split_picture(picture: "Tensor", source: Path, name: str) -> "tuple[Tensor, Tensor]":
     """Split a picture into its two views, side by side or one above the other."""
-    from depthpose.core.camera import find_two_views, halves
+    from depthpose.core.camera import find_two_views, split_halves
 
     layout = find_two_views(picture)
     if layout is None:
@@ -522,7 +522,7 @@ def _split_picture(picture: "Tensor", source: Path, name: str) -> "tuple[Tensor,
             f"{source}: {name} does not look like two views of one scene, side by side or one "
             "above the other; leave it out"
         )
-    return halves(picture, layout)
+    return split_halves(picture, layout)
 
 
 def _check_rows(

@@ -224,7 +224,7 @@ def measure(
     view_counts = page.share_views(len(folders))
     frame_sections: list[Section] = []
     for folder, evaluation, count in zip(folders, evaluations, view_counts, strict=True):
-        frame_sections += _frame_sections(dataset, folder, evaluation.per_frame, protocol, count)
+        frame_sections += _show_frames(dataset, folder, evaluation.per_frame, protocol, count)
     sections = [
         Section(title="Mean over frames", text=text, rows=rows),
         *frame_sections,
@@ -243,7 +243,7 @@ def measure(
     return 0
 
 
-def _frame_sections(
+def _show_frames(
     dataset: Dataset,
     folder: Path,
     per_frame: Sequence[EvaluationRow],

@@ -77,9 +77,8 @@ class ScaleOptions:
     """X,Y,METRES: column and row of a pixel and its measured depth along the optical axis, which
     sets the scale of each image."""
 
-    @property
-    def measured_point(self) -> tuple[float, float, float]:
-        """``--known-distance`` parsed: column and row [px] of a pixel, and its depth [m]."""
+    def parse_known_distance(self) -> tuple[float, float, float]:
+        """Parse ``--known-distance``: column and row [px] of a pixel, and its depth [m]."""
         assert self.known_distance is not None
         try:
             column, row, metres = (float(word) for word in self.known_distance.split(","))

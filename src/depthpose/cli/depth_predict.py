@@ -201,9 +201,9 @@ def read_lens(options: LensOptions, sources: Sequence[Path]) -> Camera | FieldOf
     if fov is not None:
         return FieldOfView(fov)
     if options.camera is None:
-        return _exif_focal_px(sources) if focal_px is None else focal_px
+        return _read_exif_focal_px(sources) if focal_px is None else focal_px
 
-    camera = read_camera(options.camera, _size_of_first(sources))
+    camera = read_camera(options.camera, _read_first_size(sources))
     if not isinstance(camera, StereoRig):
         return camera
     print("the camera's baseline is ignored: one image has none", file=sys.stderr)
@@ -211,7 +211,7 @@ def read_lens(options: LensOptions, sources: Sequence[Path]) -> Camera | FieldOf
     return Camera(width=camera.width, height=camera.height, K=camera.K, **keys)
 
 
-def _exif_focal_px(sources: Sequence[Path]) -> float:
+def _read_exif_focal_px(sources: Sequence[Path]) -> float:
     """Read the focal length [px] on which the EXIF of all images agrees, and print it."""
     focal_of: dict[str, tuple[float, str]] = {}  # by file name: focal length [px], EXIF's tags
     for source in sources:
@@ -250,8 +250,8 @@ def _exif_focal_px(sources: Sequence[Path]) -> float:
     return focal_px
 
 
-def _size_of_first(sources: Sequence[Path]) -> tuple[int, int] | None:
-    """Give width and height [px] of the first image or video that can be read, None if none can."""
+def _read_first_size(sources: Sequence[Path]) -> tuple[int, int] | None:
+    """Read width and height [px] of the first image or video that can be read, None if none can."""
     for source in sources:
         with suppress(InputError):  # the image fails by itself, later
             if not _is_video(source):
@@ -388,7 +388,7 @@ class DepthWork:
         if isinstance(estimate, InputError):
             return estimate
         try:
-            return scale_by_distance(estimate, name, self.scale.measured_point)
+            return scale_by_distance(estimate, name, self.scale.parse_known_distance())
         except InputError as error:
             return error
 
@@ -525,16 +525,16 @@ def wait_for_results(sources: Sequence[tuple[Path, ...]], work: DepthWork, out: 
     Raises:
         InputError: the others make no progress for an hour.
     """
-    videos = {_source_name(files): files[0] for files in sources if _is_video(files[0])}
+    videos = {_name_source(files): files[0] for files in sources if _is_video(files[0])}
 
     def is_there(name: str) -> bool:
         if name in run.read_failures(out):
             return True
         if name in videos:
-            return run.is_whole(out, name, [_video_file(videos[name])])
+            return run.is_whole(out, name, [_name_video_file(videos[name])])
         return is_finished(out, name, with_cloud=work.output.cloud)
 
-    names = [_source_name(files) for files in sources]
+    names = [_name_source(files) for files in sources]
     run.wait_for(names, is_there, count_steps=lambda: len(run.read_results(out)))
 
 
@@ -543,19 +543,19 @@ def _read_failures(sources: Sequence[tuple[Path, ...]], out: Path) -> list[str]:
     failures = run.read_failures(out)
     reasons: list[str] = []
     for files in sources:
-        reasons += [failures[name] for name in _result_names(files, failures)]
+        reasons += [failures[name] for name in _choose_result_names(files, failures)]
         if _is_video(files[0]) and files[0].name in failures:
             reasons.append(failures[files[0].name])
     return reasons
 
 
-def _source_name(files: Sequence[Path]) -> str:
-    """Give the name of an image or a pair, that of its result, or of a video, with its suffix."""
+def _name_source(files: Sequence[Path]) -> str:
+    """Name an image or a pair as its result is named, and a video with its suffix."""
     return files[0].name if _is_video(files[0]) else files[0].stem
 
 
-def _video_file(video: Path) -> str:
-    """Give the name of the file with the depth of a video."""
+def _name_video_file(video: Path) -> str:
+    """Name the file with the depth of a video."""
     return f"{video.stem}{_VIDEO}"
 
 
@@ -565,7 +565,7 @@ def write_depth_page(
     """Write a page of some of the finished depth maps, of every failure and of every warning."""
     # The finished results of each input, and those that are shown.
     finished = {name for name in run.read_results(out) if is_finished(out, name)}
-    names_of = {files: _result_names(files, finished) for files in sources}
+    names_of = {files: _choose_result_names(files, finished) for files in sources}
     names = [name for names_of_source in names_of.values() for name in names_of_source]
     chosen = {names[k] for k in spread_evenly(len(names), MOST_VIEWS)}
     shown_inputs = list(_read_chosen(names_of, work, chosen))
@@ -595,7 +595,7 @@ def write_depth_page(
     print(f"the page: {out / _PAGE}")
 
 
-def _result_names(files: Sequence[Path], names: Collection[str]) -> list[str]:
+def _choose_result_names(files: Sequence[Path], names: Collection[str]) -> list[str]:
     """Choose, of the names of results, those of an image, a pair or the frames of a video."""
     if _is_video(files[0]):
         return sorted(name for name in names if _is_frame_name(name, files[0]))
@@ -689,7 +689,7 @@ class DepthRun:
             jobs = self.work.make_jobs([source])
             names = self.estimate(jobs, video.frames or None, source.name, MountFilter())
             pictures = self._draw_frames(source, names) if names else ()
-            file = self.out / _video_file(source)
+            file = self.out / _name_video_file(source)
             write_video(file, pictures, video.fps)
             if self.is_shared:
                 run.note_result(self.out, source.name, [file])

@@ -13,7 +13,7 @@ from depthpose.cli.pose_transforms import read_pose
 from depthpose.core import camera as cameras
 from depthpose.core import files
 from depthpose.core.errors import InputError
-from depthpose.core.files.images import opened_image, read_numbers, value_range
+from depthpose.core.files.images import open_image, read_numbers, value_range
 from depthpose.core.rigid import geodesic_rad
 from depthpose.pose.cloud import frame_advice, unit_advice
 from depthpose.pose.datasets import decode_rle
@@ -75,7 +75,7 @@ def describe_files(paths: Sequence[Path]) -> int:
 
     # What each is, and where it contradicts another.
     for facts in all_facts:
-        facts.oddities += _contradictions(facts, all_facts)
+        facts.oddities += _list_contradictions(facts, all_facts)
     for path in paths:
         facts = next(facts for facts in all_facts if facts.path == path)
         print(f"{path}: {facts.description or 'cannot be used'}")
@@ -207,7 +207,7 @@ def _describe_pose(path: Path) -> FileFacts | None:
 
 def _describe_picture(path: Path) -> FileFacts:
     """Describe a picture: a depth image, a mask or a photograph."""
-    with opened_image(path) as image:
+    with open_image(path) as image:
         units = None
         if image.mode == "I;16":
             units = torch.from_numpy(np.asarray(image).astype(np.float32))
@@ -324,7 +324,7 @@ def _describe_points(path: Path, points: Tensor) -> FileFacts:
     return FileFacts(path=path, description=description, oddities=oddities, cloud=points)
 
 
-def _contradictions(facts: FileFacts, all_facts: Sequence[FileFacts]) -> Iterator[str]:
+def _list_contradictions(facts: FileFacts, all_facts: Sequence[FileFacts]) -> Iterator[str]:
     """List where a file contradicts the others: in size, unit, or scale of a model."""
     for other in all_facts:
         camera = other.camera

@@ -199,7 +199,7 @@ def measure(
     instance_sections: list[Section] = []
     for path, evaluation, count in zip(predictions, evaluations, view_counts, strict=True):
         if count:
-            instance_sections += _instance_sections(dataset, path, evaluation.per_instance, count)
+            instance_sections += _show_instances(dataset, path, evaluation.per_instance, count)
     sections = [
         Section(title="Success by masks", text=text, rows=list(by_masks.values())),
         Section(title="All numbers", rows=rows),
@@ -213,7 +213,7 @@ def measure(
     return 0
 
 
-def _instance_sections(
+def _show_instances(
     dataset: BopDataset, predictions: Path, rows: Sequence[InstanceRow], max_count: int
 ) -> list[Section]:
     """Show some instances of a folder or file of predictions, ``max_count`` at most, with truth."""

@@ -152,7 +152,7 @@ def reproduce_by_object(
         "frames_sha256": frames_hash(dataset.instances),
         "rule": config_to_dict(rule),
         "methods": {method.name: dict(method.settings) for method in methods},
-        "masks": [_mask_setting(kind) for kind in options.masks] if methods else [],
+        "masks": [_describe_masks(kind) for kind in options.masks] if methods else [],
         "csv": [file_names.name_with_checksum(path) for path in csv],
     }
     results = (*page.table_files("rows", "all", "instances", "risk"), "report.md", "report.html")
@@ -187,7 +187,7 @@ def reproduce_by_object(
     return 0
 
 
-def _mask_setting(kind: str) -> str:
+def _describe_masks(kind: str) -> str:
     """Describe a kind of masks for the record of a run: its word, or its file with a checksum."""
     path = pose_masks.mask_path(kind)
     return kind if path is None else file_names.name_with_checksum(path)

@@ -272,7 +272,7 @@ def load_weights(network: nn.Module, checkpoint: Checkpoint, source: str) -> Non
         InputError: they do not; it names ``source`` and the first tensors that are missing,
             unexpected or of another shape.
     """
-    problems = misfits(network.state_dict(), checkpoint.state)
+    problems = list_misfits(network.state_dict(), checkpoint.state)
     if problems:
         raise InputError(
             f"{source}: {len(problems)} tensors do not fit the network of its config: "
@@ -353,7 +353,7 @@ class _SkipRandomInit(TorchFunctionMode):
         return func(*args, **options)
 
 
-def misfits(wanted: Mapping[str, Tensor], tensors: Mapping[str, Tensor]) -> list[str]:
+def list_misfits(wanted: Mapping[str, Tensor], tensors: Mapping[str, Tensor]) -> list[str]:
     """Compare named tensors with the wanted ones: those missing, unexpected or of another shape.
 
     Returns:

@@ -221,7 +221,7 @@ def _draw(
         v = row.double()
         u_slope, v_slope, constant = edges.index_select(0, triangle).unbind(-1)
         offset = torch.addcmul(constant, v_slope, v[:, None])
-        start, stop = _columns_inside(
+        start, stop = _find_columns_inside(
             u_slope, offset, first_column[triangle], last_column[triangle]
         )
         not_empty = (start <= stop).nonzero()[:, 0]
@@ -263,7 +263,7 @@ def _draw(
     return Raster(depth_m=depth_m, primitive=primitive, barycentric=shares)
 
 
-def _columns_inside(
+def _find_columns_inside(
     slope: Float64[Tensor, "n 3"],
     offset: Float64[Tensor, "n 3"],
     first: Int64[Tensor, " n"],

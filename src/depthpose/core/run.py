@@ -113,7 +113,7 @@ def release_folders(but: Collection[Path] = ()) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class ProcessRank:
-    """Rank of this process among those of a launch, which exchange results through files."""
+    """The rank of this process among those of a launch, which exchange results through files."""
 
     rank: int = 0  #: 0 .. world - 1
     world: int = 1  #: how many processes there are
@@ -187,13 +187,13 @@ def environment() -> dict[str, str]:
     )
     if torch.cuda.is_available():
         facts["gpu"] = torch.cuda.get_device_name()
-    commit = _commit_of_package()
+    commit = _read_commit()
     if commit:
         facts["commit"] = commit
     return facts
 
 
-def _commit_of_package() -> str:
+def _read_commit() -> str:
     """Ask Git for the commit of the running code; "" where it is not in a repository."""
     package_folder = str(Path(__file__).resolve().parent)
     command = ["git", "-C", package_folder, "describe", "--always", "--dirty", "--exclude", "*"]
@@ -284,10 +284,10 @@ def claim_names(
     """
     record = folder / _SOURCES
     # Listed before the record is read, which other processes write before their results.
-    results = _files_by_stem(folder, endings)
+    results = _list_files_by_stem(folder, endings)
     recorded = read_sources(folder)
     finished = {*results, *(_FRAME.sub("", stem) for stem in results)}
-    wanted = {name: _source_entry(files) for name, files in sources.items()}
+    wanted = {name: _make_source_entry(files) for name, files in sources.items()}
 
     # Refuse a name that an earlier run gave to another file, and a file that has changed since.
     for name, (path, stamp) in wanted.items():
@@ -328,7 +328,7 @@ def claim_names(
         write_json(record, recorded | wanted)
 
 
-def _files_by_stem(folder: Path, endings: Sequence[str]) -> dict[str, Path]:
+def _list_files_by_stem(folder: Path, endings: Sequence[str]) -> dict[str, Path]:
     """List the files of a folder that have one of the endings, by their names without it."""
     files: dict[str, Path] = {}
     for file in sorted(folder.iterdir()) if folder.is_dir() else ():
@@ -338,7 +338,7 @@ def _files_by_stem(folder: Path, endings: Sequence[str]) -> dict[str, Path]:
     return files
 
 
-def _source_entry(files: Path | Sequence[Path]) -> list[str]:
+def _make_source_entry(files: Path | Sequence[Path]) -> list[str]:
     """Make the entry of a source in the record: its path, and size and time of all its files."""
     paths = [files] if isinstance(files, Path) else list(files)
     stamps: list[str] = []
@@ -465,7 +465,7 @@ def note_result(folder: Path, name: str, files: Iterable[Path]) -> None:
 
     Without files it is noted that the result is to be made again.
     """
-    stamps = {file.relative_to(folder).as_posix(): _stamp(file) for file in files}
+    stamps = {file.relative_to(folder).as_posix(): _read_stamp(file) for file in files}
     _append_result(folder, {"name": name, "files": stamps})
 
 
@@ -487,7 +487,7 @@ def _append_result(folder: Path, row: Mapping[str, Any]) -> None:
             line = line[written:]
 
 
-def _stamp(file: Path) -> list[int]:
+def _read_stamp(file: Path) -> list[int]:
     """Return size [bytes] and time of the last change [ns] of a file."""
     status = file.stat()
     return [status.st_size, status.st_mtime_ns]
@@ -505,7 +505,7 @@ def is_whole(folder: Path, name: str, needed: Collection[str]) -> bool:
     if not noted:
         return False
     try:
-        stamps = {file: _stamp(folder / file) for file in {*noted, *needed}}
+        stamps = {file: _read_stamp(folder / file) for file in {*noted, *needed}}
     except OSError:
         return False
     return stamps == noted

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 
 
 class Stopwatch:
-    """Wall seconds of named stages.
+    """A stopwatch for named stages, in wall seconds.
 
     Example::
 

@@ -322,7 +322,7 @@ def summarise(
                 frames=len(at_cap),
                 pixels=sum(result.pixels for result in at_cap),
                 coverage=sum(result.coverage for result in at_cap) / len(at_cap),
-                metrics=_mean_metrics(at_cap),
+                metrics=_average_metrics(at_cap),
             )
         )
 
@@ -342,7 +342,7 @@ def summarise(
     return Evaluation(rows=rows, per_frame=per_frame, deciles=deciles, skipped=skipped)
 
 
-def _mean_metrics(results: Sequence[Measured]) -> dict[str, float]:
+def _average_metrics(results: Sequence[Measured]) -> dict[str, float]:
     """Average over frames with a compared pixel the metrics that all of them have."""
     compared = [result.metrics for result in results if result.pixels]
     common = [name for name in compared[0] if all(name in metrics for metrics in compared)]

@@ -423,12 +423,12 @@ def _depth_factor(
     map_plane = _plane_of(fit)
     mount_plane = _plane_of(ground)
     scale = float(mount_plane[1] / map_plane[1])
-    inverse_change = _plane_at_pixels(mount_plane - scale * map_plane, camera, depth_m)
+    inverse_change = _spread_plane(mount_plane - scale * map_plane, camera, depth_m)
     inverse = scale / depth_m + inverse_change
     ground_depth_m = 1 / inverse.clamp(min=1 / _MAX_GROUND_DEPTH_M)
 
     # How surely a pixel is no ground but stands on it: 0..1.
-    plane_ratio = _plane_at_pixels(map_plane, camera, depth_m) * depth_m
+    plane_ratio = _spread_plane(map_plane, camera, depth_m) * depth_m
     off_plane = plane_ratio.clamp(min=1e-3).log().abs()
     stands = (off_plane / _OFF_PLANE_LOG - 1).clamp(0, 1)
 
@@ -444,8 +444,8 @@ def _depth_factor(
     return (ground_depth_m / depth_m) ** weight
 
 
-def _plane_at_pixels(plane: Float[Tensor, "3"], camera: Camera, like: Map) -> Map:
-    """Give the inverse depth of a plane, ``plane @ ray`` (z = 1), at every pixel [1/m].
+def _spread_plane(plane: Float[Tensor, "3"], camera: Camera, like: Map) -> Map:
+    """Compute the inverse depth of a plane, ``plane @ ray`` (z = 1), at every pixel [1/m].
 
     ``like``: a map of the size, type and device of the result.
     """

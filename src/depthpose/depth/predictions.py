@@ -73,31 +73,31 @@ class _EstimateFile(NamedTuple):
     content: Callable[[DepthEstimate, _FileOptions], Any]
 
 
-def _cloud_of(estimate: DepthEstimate, options: _FileOptions) -> files.Cloud | None:
+def _make_cloud(estimate: DepthEstimate, options: _FileOptions) -> files.Cloud | None:
     """Make the cloud of an estimate, if one is asked for."""
     if options.cloud_m is None:
         return None
     return estimate.cloud(options.cloud_m, options.min_confidence)
 
 
-def _warning_of(estimate: DepthEstimate, _: _FileOptions) -> bytes | None:
+def _encode_warning(estimate: DepthEstimate, _: _FileOptions) -> bytes | None:
     """Encode the warning of an estimate as a line of text."""
     return f"{estimate.warning}\n".encode() if estimate.warning else None
 
 
-def _ground_of(estimate: DepthEstimate, _: _FileOptions) -> dict[str, float] | None:
-    """Give the values of a road, rounded to the digits that are the same in every run."""
+def _round_ground(estimate: DepthEstimate, _: _FileOptions) -> dict[str, float] | None:
+    """Round the values of a road to the digits that are the same in every run."""
     if estimate.ground is None:
         return None
     return {name: round(value, _DECIMALS) for name, value in asdict(estimate.ground).items()}
 
 
-def _sky_of(estimate: DepthEstimate, _: _FileOptions) -> View | None:
+def _draw_sky(estimate: DepthEstimate, _: _FileOptions) -> View | None:
     """Draw the sky white, and all else black."""
     return None if estimate.is_sky is None else estimate.is_sky.float().expand(3, -1, -1)
 
 
-def _colors_of(estimate: DepthEstimate, options: _FileOptions) -> View:
+def _draw_colors(estimate: DepthEstimate, options: _FileOptions) -> View:
     """Draw the depth of an estimate, or its disparity where it has no depth."""
     if estimate.depth_m is None:
         return draw_disparity(estimate.disparity_px, is_sky=estimate.is_sky)
@@ -105,17 +105,17 @@ def _colors_of(estimate: DepthEstimate, options: _FileOptions) -> View:
 
 
 _FILES = (
-    _EstimateFile(CLOUD, files.write_cloud, _cloud_of),
-    _EstimateFile("warning.txt", write_bytes, _warning_of),
-    _EstimateFile("ground.json", files.write_json, _ground_of),
+    _EstimateFile(CLOUD, files.write_cloud, _make_cloud),
+    _EstimateFile("warning.txt", write_bytes, _encode_warning),
+    _EstimateFile("ground.json", files.write_json, _round_ground),
     _EstimateFile("depth_m.npy", files.write_map, lambda estimate, _: estimate.depth_m),
     # 16 bits, metres x 256.
     _EstimateFile("depth.png", files.write_depth_png, lambda estimate, _: estimate.depth_m),
     _EstimateFile("confidence.npy", files.write_map, lambda estimate, _: estimate.confidence),
     # The synthesised right view.
     _EstimateFile("right.png", files.write_image, lambda estimate, _: estimate.right),
-    _EstimateFile("sky.png", files.write_image, _sky_of),
-    _EstimateFile("color.png", files.write_image, _colors_of),
+    _EstimateFile("sky.png", files.write_image, _draw_sky),
+    _EstimateFile("color.png", files.write_image, _draw_colors),
     # In pixels of the frame's own rig.
     _EstimateFile(LAST, files.write_map, lambda estimate, _: estimate.disparity_px),
 )

@@ -62,8 +62,8 @@ GENERATORS = {
 """Kinds of generators with weights."""
 
 
-def _kinds() -> dict[str, GeneratorKind]:
-    """Give all kinds of networks, the generators first; users may have added to ``MATCHERS``."""
+def _list_kinds() -> dict[str, GeneratorKind]:
+    """List all kinds of networks, the generators first; users may have added to ``MATCHERS``."""
     return {**GENERATORS, **MATCHERS}
 
 
@@ -91,10 +91,10 @@ def read_depth_weights(
         InputError: not such weights, or weights that do not fit their own config.
     """
     checkpoint = checkpoints.read_checkpoint(path)
-    if checkpoint.kind not in (*_kinds(), BOTH):
+    if checkpoint.kind not in (*_list_kinds(), BOTH):
         raise InputError(
             f"{path}: holds weights of kind {checkpoint.kind!r}; depth takes "
-            f"{', '.join(map(repr, _kinds()))} or {BOTH!r}."
+            f"{', '.join(map(repr, _list_kinds()))} or {BOTH!r}."
         )
     is_both = checkpoint.kind == BOTH
     parts = _split(checkpoint, path) if is_both else {checkpoint.kind: checkpoint}
@@ -105,8 +105,8 @@ def read_depth_weights(
         is_generator = kind in GENERATORS
         if use == "pairs" and is_both and is_generator:
             continue
-        config = _network_config(kind, part.config, str(path))
-        make = partial(_kinds()[kind].network, config)
+        config = _read_network_config(kind, part.config, str(path))
+        make = partial(_list_kinds()[kind].network, config)
         networks[kind] = checkpoints.build_network(make, part, str(path)).eval()
         if use == "images" and is_generator and (answer or config.answer) == "own":
             break
@@ -120,7 +120,7 @@ def read_depth_weights(
 def _split(checkpoint: checkpoints.Checkpoint, path: Path) -> dict[str, checkpoints.Checkpoint]:
     """Split the checkpoint of two networks into one for each, by kind, the generator first."""
     parts: dict[str, checkpoints.Checkpoint] = {}
-    for kind in _kinds():
+    for kind in _list_kinds():
         if kind not in checkpoint.config:
             continue
         config = checkpoint.config[kind]
@@ -141,9 +141,9 @@ def _split(checkpoint: checkpoints.Checkpoint, path: Path) -> dict[str, checkpoi
     return parts
 
 
-def _network_config(kind: str, settings: Mapping[str, Any], source: str) -> Any:  # noqa: ANN401
+def _read_network_config(kind: str, settings: Mapping[str, Any], source: str) -> Any:  # noqa: ANN401
     """Make the config of a network from the metadata of its file; ``source`` is for errors."""
-    return config_from_dict(settings, _kinds()[kind].config, source=source)
+    return config_from_dict(settings, _list_kinds()[kind].config, source=source)
 
 
 def settings_of(checkpoint: checkpoints.Checkpoint, source: str) -> dict[str, Any]:
@@ -155,9 +155,9 @@ def settings_of(checkpoint: checkpoints.Checkpoint, source: str) -> dict[str, An
         InputError: a setting is unknown, or its value is not allowed.
     """
     if checkpoint.kind != BOTH:
-        return config_to_dict(_network_config(checkpoint.kind, checkpoint.config, source))
+        return config_to_dict(_read_network_config(checkpoint.kind, checkpoint.config, source))
     return {
-        kind: config_to_dict(_network_config(kind, settings, source))
+        kind: config_to_dict(_read_network_config(kind, settings, source))
         for kind, settings in checkpoint.config.items()
     }
 
@@ -204,7 +204,7 @@ def write_depth_weights(
         with_half: store 16-bit floats: half the size.
     """
     networks: dict[str, Any] = {}
-    for kind, classes in _kinds().items():
+    for kind, classes in _list_kinds().items():
         for network in (generator, matcher):
             if isinstance(network, classes.network):
                 networks[kind] = network

@@ -79,7 +79,7 @@ def depth_section(
         )
         pictures.append(depth)
     if error is not None:
-        pictures += _error_drawings(pair, error, range_m)
+        pictures += _draw_errors(pair, error, range_m)
     if estimate.confidence is not None:
         confidence = Drawing(
             image=draw_share(1 - estimate.confidence),
@@ -100,7 +100,7 @@ def depth_section(
     return Section(title=title, text=text, facts=facts, pictures=pictures, scenes=scenes)
 
 
-def _error_drawings(
+def _draw_errors(
     pair: StereoInput, error: DepthError, range_m: tuple[float, float]
 ) -> list[Drawing]:
     """Draw the true depth, where it is known, and the error of each pixel.

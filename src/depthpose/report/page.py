@@ -265,7 +265,9 @@ class Drawing:
     scale: Scale | None = None
 
 
-def embedded(picture: Picture | Drawing, most_pixels: int = _MOST_PIXELS) -> tuple[int, int, str]:
+def embed_picture(
+    picture: Picture | Drawing, most_pixels: int = _MOST_PIXELS
+) -> tuple[int, int, str]:
     """Embed a picture: its width and height [px], and its data as a ``data:`` address.
 
     With these the page needs no other file, and does not move while a picture loads. A small file
@@ -446,7 +448,7 @@ def write_page(
         show_value=show_value,
         column_names=column_names,
         page_file=page_file,
-        embedded=embedded,
+        embed_picture=embed_picture,
         about=_COLUMN_MEANINGS,
     )
     html = pages.get_template("report.html").render(

@@ -113,7 +113,7 @@ class Form:
         return {"width": size[0], "height": size[1], "K": K}
 
 
-def without_paths(text: str, folder: Path) -> str:
+def remove_paths(text: str, folder: Path) -> str:
     """Remove the folder of a request from a message, so that files have their own names in it."""
     fields = "|".join(KINDS)
     return re.sub(f"{re.escape(str(folder))}/(({fields})/)?", "", text)

@@ -42,7 +42,7 @@ from depthpose.core.errors import InputError, MissingExtraError
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.report.page import page_file
-from depthpose.web.answer import KINDS, Answer, Form, keep_file, without_paths
+from depthpose.web.answer import KINDS, Answer, Form, keep_file, remove_paths
 from depthpose.web.depth import answer_depth, depth_example
 from depthpose.web.pose import answer_pose, pose_example
 
@@ -59,7 +59,7 @@ _SAFE_HEADERS = {
 _MOST_FILES = 6
 _MOST_FIELDS = 30
 _LONGEST_FIELD = 4096
-"""Limits of a form; a field's in bytes."""
+"""Longest value of a field [bytes]."""
 
 
 @dataclass(frozen=True)
@@ -230,7 +230,7 @@ async def has_gone(receive: Receive) -> bool:
     return False
 
 
-def paced(receive: Receive) -> Receive:
+def limit_pace(receive: Receive) -> Receive:
     """Make a function that receives a request's body, and refuses one that comes too slowly."""
     start = time.monotonic()
     size = 0
@@ -362,7 +362,7 @@ class Handlers:
                 work = partial(self._estimators[kind], form)
                 answer = await self._queue.compute(ticket, work, partial(has_gone, request.receive))
             except (InputError, MissingExtraError) as error:
-                raise HTTPException(400, without_paths(str(error), Path(folder))) from error
+                raise HTTPException(400, remove_paths(str(error), Path(folder))) from error
             except ClientDisconnect:
                 answer = None
         if answer is None:
@@ -401,7 +401,7 @@ class Handlers:
         try:
             fields: dict[str, str] = {}
             files: dict[str, Path] = {}
-            async with Request(request.scope, paced(request.receive)).form(
+            async with Request(request.scope, limit_pace(request.receive)).form(
                 max_files=_MOST_FILES, max_fields=_MOST_FIELDS, max_part_size=_LONGEST_FIELD
             ) as form:
                 for name, value in form.multi_items():

@@ -83,7 +83,7 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
     tables = report.pose_tables(best.estimate)
     if len(shown_poses) > 1:
         head = ["", "status", "x [m]", "y [m]", "z [m]", "certainty", "visible", "pick rank"]
-        rows = [[shown.input.name, *_table_row(shown.estimate)] for shown in shown_poses]
+        rows = [[shown.input.name, *_format_row(shown.estimate)] for shown in shown_poses]
         tables = {"found in this image": [head, *rows]} | tables
     return Answer(
         is_ok=best.estimate.is_posed,
@@ -104,7 +104,7 @@ def _estimate(
 
     Boxes are searched, one pose in each; a depth image without a mask is searched as a whole.
     """
-    views = _box_views(form, pose_input)
+    views = _make_box_views(form, pose_input)
     if views:
         estimates = target.net.estimate_many(views)
         shown_poses = [
@@ -155,7 +155,7 @@ def _make_scene(
     return replace(scene, layers=layers)
 
 
-def _box_views(form: Form, pose_input: CloudInput | ViewInput) -> list[ViewInput]:
+def _make_box_views(form: Form, pose_input: CloudInput | ViewInput) -> list[ViewInput]:
     """Make a view for each box in the form: NAME, or of several NAME_1, NAME_2, ..."""
     words = form.fields.get("box", "").split()
     if words and ("mask" in form.files or not isinstance(pose_input, ViewInput)):
@@ -172,7 +172,7 @@ def _box_views(form: Form, pose_input: CloudInput | ViewInput) -> list[ViewInput
     return views
 
 
-def _table_row(estimate: PoseEstimate) -> list[str]:
+def _format_row(estimate: PoseEstimate) -> list[str]:
     """Format the row of an estimate in the table of an image; empty where it has no value."""
     pose = estimate.camera_from_model
     position = [""] * 3 if pose is None else [f"{v:.4f}" for v in pose.t_m.tolist()]

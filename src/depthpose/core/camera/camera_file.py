@@ -301,7 +301,7 @@ def facts_from_json(content: object) -> CameraFacts:
 
     optional_keys = ("baseline_m", _DOFFS, *OPTIONAL_KEYS)
     values: dict[str, Any] = {
-        key: _json_number(content, key) for key in optional_keys if key in content
+        key: _read_json_number(content, key) for key in optional_keys if key in content
     }
     size = _read_size(content)
     return CameraFacts(
@@ -339,13 +339,13 @@ def _read_foreign_json(content: object) -> CameraFacts | None:
     elif isinstance(open3d_intrinsic, dict) and "intrinsic_matrix" in open3d_intrinsic:
         facts = _from_open3d(open3d_intrinsic)
     elif content.keys() >= set(_BOP):
-        fx, fy, cx, cy = (_json_number(content, key) for key in _BOP)
+        fx, fy, cx, cy = (_read_json_number(content, key) for key in _BOP)
         facts = CameraFacts(
             kind="a camera of BOP",
             K=intrinsics(fx, fy, cx, cy),
             size=_read_size(content) if {"width", "height"} <= content.keys() else None,
             baseline_m=read_baseline_m(fields),
-            depth_unit_m=_bop_unit_m(content),
+            depth_unit_m=_read_bop_unit_m(content),
             distortion=find_distortion(fields),
         )
     elif content and all(
@@ -372,7 +372,7 @@ def _from_scene_camera(images: dict[str, dict[str, Any]]) -> CameraFacts:
     first = entries[0]
     for entry in entries:
         has_same_K = entry["cam_K"] == first["cam_K"]
-        if not has_same_K or _bop_unit_m(entry) != _bop_unit_m(first):
+        if not has_same_K or _read_bop_unit_m(entry) != _read_bop_unit_m(first):
             raise InputError(
                 f"a scene_camera.json of BOP whose {len(entries)} images have several cameras; "
                 "write that of one image into a file, or open the data set by --bop"
@@ -383,28 +383,28 @@ def _from_scene_camera(images: dict[str, dict[str, Any]]) -> CameraFacts:
     return CameraFacts(
         kind="a scene_camera.json of BOP",
         K=_read_matrix(flat),
-        depth_unit_m=_bop_unit_m(first),
+        depth_unit_m=_read_bop_unit_m(first),
     )
 
 
-def _bop_unit_m(keys: dict[str, Any]) -> float | None:
+def _read_bop_unit_m(keys: dict[str, Any]) -> float | None:
     """Read the unit of depth images [m] of a camera of BOP; None where it has none."""
     if "depth_scale" in keys:
-        return 0.001 * _json_number(keys, "depth_scale")  # millimetres a unit
-    return _json_number(keys, "depth_unit_m") if "depth_unit_m" in keys else None
+        return 0.001 * _read_json_number(keys, "depth_scale")  # millimetres a unit
+    return _read_json_number(keys, "depth_unit_m") if "depth_unit_m" in keys else None
 
 
 def _read_size(keys: dict[str, Any]) -> Size:
     """Read width and height [px], which must be whole numbers."""
     what = "a whole number of pixels"
     for key in ("width", "height"):
-        value = _json_number(keys, key, what)
+        value = _read_json_number(keys, key, what)
         if value != int(value) or abs(value) > MAX_SIDE_PX:
             raise InputError(f"{key!r} is {repr(keys[key])[:80]}; give {what}")
     return int(keys["width"]), int(keys["height"])
 
 
-def _json_number(keys: dict[str, Any], key: str, what: str = "a number") -> float:
+def _read_json_number(keys: dict[str, Any], key: str, what: str = "a number") -> float:
     """Read a number of a JSON file; ``what`` says in the error what belongs there."""
     value = keys[key]
     is_number = type(value) in (int, float)  # a bool is none
@@ -609,7 +609,7 @@ def camera_of(camera: AnyLens | None, size: Size) -> Camera | None:
     if isinstance(camera, np.generic | np.ndarray | Tensor) and camera.ndim == 0:
         camera = float(camera)
     if isinstance(camera, int | float):
-        return _camera_of_focal_length(camera, size)
+        return _make_focal_camera(camera, size)
     if isinstance(camera, Mapping):
         keys = {key: np.asarray(value).tolist() for key, value in camera.items()}
         if {"width", "height"} & keys.keys():
@@ -620,7 +620,7 @@ def camera_of(camera: AnyLens | None, size: Size) -> Camera | None:
     return camera_from_facts(CameraFacts(kind="a matrix K", K=intrinsics_of(camera)), size)
 
 
-def _camera_of_focal_length(focal_px: float, size: Size) -> Camera:
+def _make_focal_camera(focal_px: float, size: Size) -> Camera:
     """Make the camera of a focal length, whose principal point is the centre of the image."""
     if not 1 < focal_px < _MAX_FOCAL_PX:
         raise InputError(f"focal_px is {focal_px}: not a focal length in pixels; KITTI's is 721.5")

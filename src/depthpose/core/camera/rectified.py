@@ -337,7 +337,7 @@ def _warp(image: Grey, rotation_deg: float, scale: float) -> Grey:
 def _make_report(
     from_centre_px: Tensor, shift_px: Tensor, corners: int, width: int, cx_difference_px: float
 ) -> RectificationReport:
-    """Judge a pair by its matches.
+    """Judge a pair by its matches: whether it is one, rectified, and not swapped.
 
     Args:
         from_centre_px: pixels of the matches in the left image, from its centre (n, 2).

@@ -222,7 +222,7 @@ def _read_text(path: AnyPath) -> Cloud:
             names = words
             break
 
-    table = parse_rows(path, map(_separator_blanker(path, head, names), chain(head, rows)))
+    table = parse_rows(path, map(_make_blanker(path, head, names), chain(head, rows)))
     if count not in (None, len(table)):
         raise InputError(f"{path}: declares {count} points but {len(table)} rows follow")
     if names:
@@ -268,7 +268,7 @@ def _rows_without_comments(text: Iterable[str], comments: list[str]) -> Iterator
             comments.append(comment)
 
 
-def _separator_blanker(path: AnyPath, head: list[str], names: list[str]) -> Callable[[str], str]:
+def _make_blanker(path: AnyPath, head: list[str], names: list[str]) -> Callable[[str], str]:
     """Make the function that replaces the separators of a row by blanks.
 
     From the first rows it is decided whether commas separate numbers or are decimal signs, which

@@ -252,7 +252,7 @@ def _read_binary_lists(
     while rows_left:
         lengths = _read_list_lengths(path, body, position, element, order)
         if lengths not in record_types:
-            record_types[lengths] = _record_type(element.fields, lengths, order)
+            record_types[lengths] = _make_record_type(element.fields, lengths, order)
         record_type = record_types[lengths]
 
         # Rows up to the first whose lists have other lengths.
@@ -303,7 +303,7 @@ def _read_list_lengths(
     return tuple(lengths)
 
 
-def _record_type(fields: list[Field], lengths: tuple[int, ...], order: str) -> np.dtype:
+def _make_record_type(fields: list[Field], lengths: tuple[int, ...], order: str) -> np.dtype:
     """Make numpy's type of a binary row whose fields have these numbers of values."""
     parts: list[Any] = []
     for f, length in zip(fields, lengths, strict=True):

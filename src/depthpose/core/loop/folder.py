@@ -15,7 +15,7 @@ from zipfile import ZipFile
 import torch
 from torch import Tensor, nn
 
-from depthpose.core.checkpoint import misfits, read_torch_file
+from depthpose.core.checkpoint import list_misfits, read_torch_file
 from depthpose.core.errors import InputError, Notice, import_extra
 from depthpose.core.files import atomic_write, read_text, remove_parts, write_image
 from depthpose.core.files.disk import refuse_heavy, refused_as, refused_write
@@ -171,7 +171,7 @@ def write_card(
     for path in reversed(saved_states(folder)):
         with suppress(InputError):
             step = _read_state(path)["step"]
-    duration = _duration_text(seconds)
+    duration = _describe_duration(seconds)
     record = {
         "command": f"`depthpose {words} --config config.yaml --out {shlex.quote(folder.name)}`",
         "time": f"{step} steps in {duration} on {machine}; {versions['date']}",
@@ -180,7 +180,7 @@ def write_card(
         part.write_text(card_text(weights.stem, {**facts, **record}, measured))
 
 
-def _duration_text(seconds: float) -> str:
+def _describe_duration(seconds: float) -> str:
     """Word a duration in seconds, minutes or hours."""
     if seconds < 120:
         return f"{seconds:.0f} s"
@@ -253,7 +253,7 @@ class Parts:
         for prefix, part in (("", "modules"), ("average of ", "average")):
             for name, tensors in present[part].items():
                 problems += [
-                    f"{prefix}{name}: {fault}" for fault in misfits(tensors, state[part][name])
+                    f"{prefix}{name}: {fault}" for fault in list_misfits(tensors, state[part][name])
                 ]
         return problems
 

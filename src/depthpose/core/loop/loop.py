@@ -221,15 +221,15 @@ class _Training:
         Raises:
             Interrupted: it was asked to stop, and its state is saved.
         """
-        batches = self._batches()
+        batches = self._load_batches()
         while self.step < self.steps:
             self._take_step([next(batches) for _ in range(self.config.accumulate)])
             self.step += 1
 
             # Whether it was asked to stop: once to save and stop, twice to finish here.
-            is_stopped = self._any_process(bool(requests))
+            is_stopped = self._is_true_in_any_process(bool(requests))
             is_finish_requested = _wait_for_second_press(requests)
-            if is_stopped and self._any_process(is_finish_requested):
+            if is_stopped and self._is_true_in_any_process(is_finish_requested):
                 self.steps = self.step
 
             metrics: dict[str, float] = {}
@@ -270,7 +270,7 @@ class _Training:
         self.logger.show(self.step, self.task.validate())
         self._load_weights(trained)
 
-    def _batches(self) -> Iterator[Any]:
+    def _load_batches(self) -> Iterator[Any]:
         """Load this process's micro-batches of the remaining steps to the device."""
         from accelerate.utils import send_to_device
 
@@ -376,7 +376,7 @@ class _Training:
         for name, state in states.items():
             self.task.modules[name].load_state_dict(state)
 
-    def _any_process(self, is_true: bool) -> bool:
+    def _is_true_in_any_process(self, is_true: bool) -> bool:
         """Whether something is true in any process; all of them must ask at the same point."""
         if self.world == 1:
             return is_true

@@ -230,15 +230,15 @@ def _find_raw(folder: Path) -> Iterable[Frame]:
             calibration={stem_of(left): date for left in lefts if is_calibrated},
             right=_list_by_stem(drive / "image_03/data"),
             velodyne=_list_by_stem(drive / "velodyne_points/data", (".bin",)),
-            scan=_list_by_stem(_depth_maps_of_drive(drive, "velodyne_raw", "velodyne")),
-            depth=_list_by_stem(_depth_maps_of_drive(drive, "groundtruth", "annotated")),
+            scan=_list_by_stem(_find_depth_maps(drive, "velodyne_raw", "velodyne")),
+            depth=_list_by_stem(_find_depth_maps(drive, "groundtruth", "annotated")),
             disparity=_list_by_stem(drive / "disp_occ"),
             disparity_noc=_list_by_stem(drive / "disp_noc"),
             sky=_list_by_stem(drive / "sky"),
         )
 
 
-def _depth_maps_of_drive(drive: Path, kind: str, archive: str) -> Path:
+def _find_depth_maps(drive: Path, kind: str, archive: str) -> Path:
     """Find the folder of a drive's left maps of KITTI's depth-prediction set.
 
     Its archives are unpacked into the drive, into the folder of the date or of all dates, or beside

@@ -90,7 +90,7 @@ class DepthPipeline:
         while chunk := list(islice(remaining, batch)):
             inputs: list[StereoInput] = []
             for picture in chunk:
-                depth_input = as_input(_opened(picture, timeout), "the picture", lens)
+                depth_input = as_input(_open_picture(picture, timeout), "the picture", lens)
                 if depth_input.camera is None:
                     height, width = depth_input.left.shape[1:]
                     phone_focal_px = _PHONE_FOCAL_WIDTHS * width
@@ -175,7 +175,7 @@ def pipeline(
     return DepthPipeline(net, batch_size)
 
 
-def _opened(picture: Picture, timeout: float | None) -> Picture:
+def _open_picture(picture: Picture, timeout: float | None) -> Picture:
     """Open an address or base64 text as transformers does; return anything else unchanged."""
     if not isinstance(picture, str) or os.path.isfile(picture):  # noqa: PTH113  long text is no path
         return picture

@@ -119,7 +119,7 @@ class ConvNorm(nn.Sequential):
         super().__init__(OrderedDict(conv=conv, norm=norm(outputs)))
 
 
-def _folded(conv: Conv, norm: Norm) -> tuple[Tensor, Tensor]:
+def _merge_norm(conv: Conv, norm: Norm) -> tuple[Tensor, Tensor]:
     """Merge a convolution and the norm after it to one; give its weight and bias, in float64.
 
     norm(conv(x)) = gain * (conv(x) - mean) + bias, with gain = weight / sqrt(var + eps).
@@ -149,7 +149,7 @@ def fold(network: ModuleT, example: Tensor) -> ModuleT:
             if not isinstance(norm, Norm):
                 continue
             conv = cast("Conv", layer.conv)
-            weight, bias = _folded(conv, norm)
+            weight, bias = _merge_norm(conv, norm)
             if isinstance(norm, nn.BatchNorm3d):
                 setattr(parent, name, VolumeConv(conv, weight, bias, example))
                 continue

@@ -85,7 +85,7 @@ class ConvexUpsampling(nn.Module):
             F.normalize(self.compared(half).float(), dim=1, eps=1e-3)
             for half in (left_half, right_half)
         )
-        shifts = (_neighbours(quarters[:, 0].detach()) / 2).unbind(1)
+        shifts = (_gather_neighbours(quarters[:, 0].detach()) / 2).unbind(1)
         cosines = torch.stack([(near * _shift_columns(far, shift)).sum(1) for shift in shifts], 1)
         x = F.relu(x + self.agreement(cosines.to(x)))
 
@@ -93,7 +93,7 @@ class ConvexUpsampling(nn.Module):
         b, _, h, w = x.shape
         weights = self.weights(x).float().reshape(b, 9, 4, h, w).softmax(1)
         enlarged = [
-            F.pixel_shuffle((weights * _neighbours(quarter)[:, :, None]).sum(1), 2)
+            F.pixel_shuffle((weights * _gather_neighbours(quarter)[:, :, None]).sum(1), 2)
             for quarter in quarters.unbind(1)
         ]
         return torch.cat(enlarged, 1)
@@ -161,8 +161,8 @@ class Refinement(nn.Module):
         return corrected if self.training else corrected.clamp_min(least_px)
 
 
-def _neighbours(quarter: Quarter) -> Float[Tensor, "b 9 h2 w2"]:
-    """Give for each pixel at half size the nine neighbours at a quarter of the size."""
+def _gather_neighbours(quarter: Quarter) -> Float[Tensor, "b 9 h2 w2"]:
+    """Gather for each pixel at half size the nine neighbours at a quarter of the size."""
     h, w = quarter.shape[1:]
     padded = F.pad(quarter[:, None], (1, 1, 1, 1), mode="replicate")
     near = [padded[:, :, y : y + h, x : x + w] for y, x in product(range(3), repeat=2)]

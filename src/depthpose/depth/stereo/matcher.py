@@ -363,7 +363,7 @@ class NetworkMatcher(ABC):
         """
         for left, right in pairs:
             check_pair(left, right)
-        views, network_config = self._working_views(pairs, camera, search)
+        views, network_config = self._resize_views(pairs, camera, search)
         first_px = 0 if search is None else search.first_px
         is_one_size = len({left.shape for left, _ in views}) == 1
         is_together = is_one_size and self.config.max_memory_bytes is None
@@ -382,7 +382,7 @@ class NetworkMatcher(ABC):
             for match, (left, _) in zip(matches, pairs, strict=True)
         ]
 
-    def _working_views(
+    def _resize_views(
         self,
         pairs: Sequence[tuple[Tensor, Tensor]],
         camera: Camera | None,

@@ -480,10 +480,12 @@ class MeshBuilder:
         faces = np.asarray(corners, np.float32)
         n = len(faces)
         if normals is not None:
-            normals = _halves(_broadcast(normals, (n, 4, 3)))
+            normals = _split_quads(_broadcast(normals, (n, 4, 3)))
         if tint is not None:
             tint = np.tile(_broadcast(tint, (n, 3)), (2, 1))
-        self.triangles(_halves(faces), _halves(_broadcast(uv_m, (n, 4, 2))), surface, normals, tint)
+        self.triangles(
+            _split_quads(faces), _split_quads(_broadcast(uv_m, (n, 4, 2))), surface, normals, tint
+        )
 
     def rectangle(self, corner: Values, along: Values, up: Values, surface: Surface) -> None:
         """Add one rectangle: a corner and its two sides [m]."""
@@ -570,8 +572,8 @@ class MeshBuilder:
         uv[:, :, 2:, 1] = (size[:, _FACE_HEIGHT] / tile)[:, :, None]
         row = np.tile(np.repeat(np.arange(len(surfaces)), 6), 2)  # six faces, in both halves
         boxes = _make_mesh(
-            _halves(vertices[:, _FACES].reshape(-1, 4, 3)),
-            _halves(uv.reshape(-1, 4, 2)),
+            _split_quads(vertices[:, _FACES].reshape(-1, 4, 3)),
+            _split_quads(uv.reshape(-1, 4, 2)),
             None,
             np.array([surface.tint for surface in surfaces])[row],
             np.array([NUMBER[surface.material] for surface in surfaces])[row],
@@ -627,7 +629,7 @@ def between(low: np.ndarray, high: np.ndarray) -> np.ndarray:
     return np.stack([low[:-1], low[1:], high[1:], high[:-1]], 1)
 
 
-def _halves(faces: np.ndarray) -> np.ndarray:
+def _split_quads(faces: np.ndarray) -> np.ndarray:
     """Split four-cornered faces into triangles: all first halves, then all second ones."""
     return np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])
 

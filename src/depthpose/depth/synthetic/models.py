@@ -34,7 +34,7 @@ def add_ball(
 
     ``dents``: amplitude of random dents, as a share of the radius.
     """
-    directions = _sphere(level)
+    directions = _make_sphere(level)
     radii = np.broadcast_to(np.asarray(radii_m, np.float64), 3)
     swell = np.ones(len(directions))
     for _ in range(6 if dents else 0):
@@ -75,41 +75,41 @@ def add_leaves(
         axis = rng.integers(0, 3, count)
         rows = range(count)
         places[rows, axis] = np.sign(places[rows, axis]) * rng.uniform(0.8, 1.05, count)
-        outward = _unit(places)
+        outward = _scale_to_unit(places)
     else:
-        outward = _unit(rng.normal(size=(count, 3)))
+        outward = _scale_to_unit(rng.normal(size=(count, 3)))
         places = outward * np.sqrt(rng.uniform(0.45, 1, (count, 1)))
     points = places * np.asarray(radii) + np.asarray(centre)
-    along = _unit(rng.normal(size=(count, 3)) + 0.7 * np.cross(outward, [0.3, 1, 0.2]))
-    across = _unit(np.cross(along, outward + 0.6 * rng.normal(size=(count, 3))))
+    along = _scale_to_unit(rng.normal(size=(count, 3)) + 0.7 * np.cross(outward, [0.3, 1, 0.2]))
+    across = _scale_to_unit(np.cross(along, outward + 0.6 * rng.normal(size=(count, 3))))
     size = length_m * rng.uniform(0.6, 1.4, (count, 1))
     low = points - across * size * 0.3
     side = along * size * 0.5
     corners = np.stack([low - side, low + side, points + across * size * 0.6], 1)
     shade = rng.uniform(0.55, 1.25, (count, 1)) * (1 + 0.1 * rng.normal(size=(count, 3)))
     uv = rng.uniform(0, 1, (count, 1, 2)) + np.array([[0, 0], [0.3, 0], [0.15, 0.3]])
-    normals = _unit(outward * 0.8 + 0.6 * rng.normal(size=(count, 3)))[:, None]
+    normals = _scale_to_unit(outward * 0.8 + 0.6 * rng.normal(size=(count, 3)))[:, None]
     b.triangles(corners, uv, surface, normals, np.asarray(surface.tint) * shade)
 
 
-def _unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+def _scale_to_unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """Scale vectors to length 1."""
     return vectors / (np.linalg.norm(vectors, axis=1, keepdims=True) + 1e-9)
 
 
 @cache
-def _sphere(level: int) -> Float[np.ndarray, "n 3"]:
-    """Give corners of triangles on the unit sphere: an icosahedron, divided ``level`` times."""
+def _make_sphere(level: int) -> Float[np.ndarray, "n 3"]:
+    """Make the corners of a unit sphere's triangles: an icosahedron, divided ``level`` times."""
     t = (1 + 5**0.5) / 2
     corners = [(-1, t, 0), (1, t, 0), (-1, -t, 0), (1, -t, 0), (0, -1, t), (0, 1, t),
                (0, -1, -t), (0, 1, -t), (t, 0, -1), (t, 0, 1), (-t, 0, -1), (-t, 0, 1)]  # fmt: skip
     faces = [(0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11), (1, 5, 9), (5, 11, 4),
              (11, 10, 2), (10, 7, 6), (7, 1, 8), (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8),
              (3, 8, 9), (4, 9, 5), (2, 4, 11), (6, 2, 10), (8, 6, 7), (9, 8, 1)]  # fmt: skip
-    points = _unit(np.array(corners, float))[np.array(faces)]
+    points = _scale_to_unit(np.array(corners, float))[np.array(faces)]
     for _ in range(level):
         a, b, c = points.transpose(1, 0, 2)
-        ab, bc, ca = (_unit(p + q) for p, q in ((a, b), (b, c), (c, a)))
+        ab, bc, ca = (_scale_to_unit(p + q) for p, q in ((a, b), (b, c), (c, a)))
         quarters = [(a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca)]
         points = np.concatenate([np.stack(quarter, 1) for quarter in quarters])
     return points.reshape(-1, 3)

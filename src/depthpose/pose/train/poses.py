@@ -364,7 +364,7 @@ def _copy_start(network: AnyNetwork, start: str, samples: TrainingViews[Any]) ->
     refuse_other_network(network, loaded, start, independent)
 
     # Written weights are folded: they have no norms, but biases; batch norm takes both up.
-    if has_norms and isinstance(loaded, ResUNet):
+    if has_norms and isinstance(network, ResUNet) and isinstance(loaded, ResUNet):
         assert isinstance(samples, TrainingClouds)
         batch = samples.collate([samples[index] for index in range(_STATISTICS_CLOUDS)])
         unfold_norms(loaded, network, Voxels.from_points(batch.coordinates, batch.features))
