@@ -20,7 +20,7 @@ from depthpose.core.errors import (
     InputError,
     MissingExtraError,
     Notice,
-    full_memory,
+    describe_full_memory,
     nearest_name,
 )
 
@@ -174,7 +174,7 @@ def _print_failure(reason: str, code: int = 2) -> int:
 
 def _explain_system_error(error: Exception) -> str | None:
     """Explain a full memory, a full disk or an unusable path in a line; None: another error."""
-    reason = full_memory(error)
+    reason = describe_full_memory(error)
     if reason is not None:
         return f"{reason}; what was finished is kept"
     if not isinstance(error, OSError) or error.errno not in (*_DISK_ERRORS, *_PATH_ERRORS):

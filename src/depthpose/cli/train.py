@@ -268,7 +268,7 @@ def calibrate(
     from depthpose.depth.datasets import join_datasets, open_dataset
     from depthpose.depth.estimator import FakestereoNet
     from depthpose.depth.evaluate import measure_image_confidence
-    from depthpose.depth.weights import calibrate_weights, refuse_share
+    from depthpose.depth.weights import calibrate_weights, refuse_alarm_share
 
     refuse_to_replace(out)
     if out.suffix != ".safetensors":
@@ -276,7 +276,7 @@ def calibrate(
     path = find_weights(weights)
     parts = [open_dataset(folder, split if k == 0 else None) for k, folder in enumerate(data)]
     dataset = join_datasets(parts)
-    refuse_share(len(dataset), alarm_share)
+    refuse_alarm_share(len(dataset), alarm_share)
     net = FakestereoNet.load(path, config=MatcherConfig(device=device), allow_ood=True)
     shown = tqdm(range(len(dataset)), unit=" images", disable=None)
     confidences = measure_image_confidence(net, map(dataset.read_input, shown))

@@ -434,7 +434,7 @@ def save_imported(
     save_checkpoint(out, Checkpoint(kind=kind, config={}, state=state, facts={**origin, **facts}))
 
 
-def half_state(network: nn.Module) -> dict[str, Tensor]:
+def halve_state(network: nn.Module) -> dict[str, Tensor]:
     """Return the state of a network with its floating-point tensors converted to float16."""
     state = network.state_dict()
     return {

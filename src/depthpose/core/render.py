@@ -274,9 +274,12 @@ def _find_columns_inside(
     Inside, ``slope * u + offset`` of no edge is negative; ``first`` and ``last`` bound the columns.
     The last column is before the first where there is none.
     """
+    # An edge that rises with u bounds the row on the left, one that falls on the right.
     crossing = -offset / slope
     left = _reduce_columns(torch.maximum, torch.where(slope > 0, crossing, -torch.inf))
     right = _reduce_columns(torch.minimum, torch.where(slope < 0, crossing, torch.inf))
+
+    # An edge along the row has no crossing: the whole row is inside of it, or outside.
     is_level = slope == 0
     is_outside = _reduce_columns(torch.logical_or, is_level & (offset < 0))
     # The edge functions of a triangle without area are 0: it would cover everything.

@@ -252,6 +252,7 @@ def find_mount(
         network: config of the network that estimated the map, which says by how much its roads are
             tilted too far.
     """
+    # The tilt that is expected, which the edges of the image then improve.
     camera = image.camera
     assert camera is not None
     map_tilt_deg = fit.tilt_deg - network.road_tilt_off_deg
@@ -273,6 +274,7 @@ def find_mount(
         height_std = _MEASURED_HEIGHT_STD
     else:
         height_m, height_std = _estimate_height(fit.height_m, map_tilt_deg - tilt_deg, before)
+
     values = {
         "height_m": height_m,
         "tilt_deg": tilt_deg,

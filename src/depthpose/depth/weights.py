@@ -214,7 +214,7 @@ def write_depth_weights(
     states: dict[str, dict[str, Tensor]] = {}
     for kind, network in networks.items():
         configs[kind] = config_to_dict(network.config)
-        states[kind] = checkpoints.half_state(network) if with_half else network.state_dict()
+        states[kind] = checkpoints.halve_state(network) if with_half else network.state_dict()
 
     if len(networks) == 1:
         kind = next(iter(networks))
@@ -247,7 +247,7 @@ def make_matcher(network: stereo.StereoNetwork, config: MatcherConfig) -> stereo
     )
 
 
-def refuse_share(images: int, alarm_share: float) -> None:
+def refuse_alarm_share(images: int, alarm_share: float) -> None:
     """Refuse a share of false alarms that is not between 0 and 1, or is less than one image.
 
     Raises:
@@ -280,7 +280,7 @@ def calibrate_weights(
     Raises:
         InputError: too few images for that share, or weights of another kind.
     """
-    refuse_share(len(image_confidence), alarm_share)
+    refuse_alarm_share(len(image_confidence), alarm_share)
     quantile = float(np.quantile(image_confidence, alarm_share))
     least_confidence = min(round(quantile, 4), 0.9999)
     checkpoint = checkpoints.read_checkpoint(weights)

@@ -183,6 +183,8 @@ def _cloud_from_table(path: AnyPath, table: np.ndarray) -> Cloud:
             "look like a pixel's place; leave them out, or name the columns in a first line "
             "(u v x y z)"
         )
+
+    # Numbers of points ascend; by one, or beside coordinates that are no whole numbers.
     is_ascending = (steps > 0).all()
     is_count = is_ascending and ((steps == 1).all() or not is_whole[1:4].any())
     first = 1 if has_whole_first and is_count else 0

@@ -119,6 +119,7 @@ def _decode(name: AnyPath, image: Image.Image) -> np.ndarray:
     tiles = (getattr(image, "tile", None) or []) if is_of_file else []
     raw_modes = [tile.args if isinstance(tile.args, str) else tile.args[0] for tile in tiles]
 
+    # Colours of 16 bits: Pillow reads the upper bytes, and the lower ones where they are exchanged.
     if raw_modes and all(re.fullmatch("RGBA?;16[BLN]", str(mode)) for mode in raw_modes):
         lower = _open_with_bytes_exchanged(opened, raw_modes)
         upper_bytes, lower_bytes = (
@@ -500,6 +501,7 @@ def _refuse_two_views(path: AnyPath, image: Image.Image) -> None:
         frames.seek(0)
         if first_size in other_sizes:
             layout = "MPO, one after the other"
+
     if layout:
         raise InputError(
             f"{path}: holds both views of a stereo camera ({layout}); "

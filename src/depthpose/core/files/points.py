@@ -52,7 +52,7 @@ def split_records(
     # Named by place, since a file may use one name for several fields of padding.
     with refused_as(path, "list of fields", "save it again"):
         dtype = np.dtype([(f"{i}", order + f.code, (f.count,)) for i, f in enumerate(fields)])
-    need_bytes(path, len(body), count * dtype.itemsize, f"{count} points")
+    require_bytes(path, len(body), count * dtype.itemsize, f"{count} points")
     records = np.frombuffer(body, dtype, count)
     return {f.name: records[f"{i}"][:, 0] for i, f in enumerate(fields)}
 
@@ -113,7 +113,7 @@ def parse_rows(path: AnyPath, rows: Iterable[str]) -> np.ndarray:
     return table if table.size else np.empty((0, 0))
 
 
-def need_bytes(path: AnyPath, have: int, need: int, what: str) -> None:
+def require_bytes(path: AnyPath, have: int, need: int, what: str) -> None:
     """Refuse a body that is shorter than its header declares, before memory is allocated for it.
 
     ``what`` is what the header declares, such as ``100 points``.
@@ -292,14 +292,14 @@ def _read_list_lengths(
         length = 1
         if f.size_code:
             size_type = np.dtype(order + f.size_code)
-            need_bytes(path, len(body), end + size_type.itemsize, declared)
+            require_bytes(path, len(body), end + size_type.itemsize, declared)
             length = int(np.frombuffer(body, size_type, 1, end)[0])
             if length < 0:
                 raise InputError(f"{path}: a list of {declared} has {length} values; save it anew")
             end += size_type.itemsize
         lengths.append(length)
         end += length * np.dtype(f.code).itemsize
-    need_bytes(path, len(body), end, declared)
+    require_bytes(path, len(body), end, declared)
     return tuple(lengths)
 
 
@@ -452,9 +452,9 @@ def _split_compressed(path: AnyPath, body: memoryview, fields: list[Field], coun
     It is the compressed and the uncompressed size (4 bytes each), then the columns of all points,
     one after the other, compressed by LZF.
     """
-    need_bytes(path, len(body), 8, "the two compressed sizes")
+    require_bytes(path, len(body), 8, "the two compressed sizes")
     packed_size, size = (int(n) for n in np.frombuffer(body, "<u4", 2))
-    need_bytes(path, len(body) - 8, packed_size, "compressed points")
+    require_bytes(path, len(body) - 8, packed_size, "compressed points")
     declared = count * sum(f.count * np.dtype(f.code).itemsize for f in fields)
     if size != declared or size > _MAX_UNPACKED or packed_size > _MAX_PACKED:
         raise InputError(

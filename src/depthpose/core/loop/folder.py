@@ -311,6 +311,7 @@ def restore_last(folder: Path, parts: Parts) -> tuple[Path, int, float]:
             message = str(error)
             damages.append(message if message.startswith(str(path)) else f"{path}: {message}")
             continue
+
         if path.name != STATE:
             reason = "; ".join(damages) or f"{folder}: there is no {STATE}"
             notice = f"{reason}; the training goes on from {path.name}, step {step}"

@@ -18,8 +18,8 @@ from depthpose.depth.stereo import (
     doubt_hidden,
     doubt_outside,
     measure_disparity_range,
+    move_match_back,
     move_views,
-    moved_back,
 )
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
 
@@ -168,4 +168,4 @@ def _match_moved_views(matcher: Matcher, pair: StereoInput, cx_difference_px: fl
         (match,) = matcher.match_many([(left, right)], rig)
     else:
         match = matcher.match(left, right)
-    return moved_back(match, shift_px)
+    return move_match_back(match, shift_px)

@@ -376,8 +376,8 @@ class NetworkMatcher(ABC):
         # Back to the size and the device of the images.
         home = pairs[0][0].device
         return [
-            disparity.resized_match(
-                disparity.changed_match(match, lambda values: values.to(home)), *left.shape[1:]
+            disparity.resize_match(
+                disparity.map_match(match, lambda values: values.to(home)), *left.shape[1:]
             )
             for match, (left, _) in zip(matches, pairs, strict=True)
         ]
@@ -441,7 +441,7 @@ class NetworkMatcher(ABC):
         self._refuse_memory(network_config, *padded_left.shape[-2:])
         matches = self.run(padded_left, padded_right, network_config, first_px)
         crop = itemgetter((slice(-height, None), slice(width)))  # values[-height:, :width]
-        return [disparity.changed_match(match, crop) for match in matches]
+        return [disparity.map_match(match, crop) for match in matches]
 
     def _refuse_memory(self, network_config: Any, height: int, width: int) -> None:  # noqa: ANN401
         """Refuse images whose matching takes more memory than the config allows."""

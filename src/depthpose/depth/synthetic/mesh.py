@@ -599,19 +599,20 @@ def _make_mesh(
     Without ``normals`` they are those of the planes.
     """
     n = len(corners)
-    flat = normals
-    if flat is None:
+    if normals is None:
         (ax, ay, az), (bx, by, bz) = ((corners[:, k] - corners[:, 0]).T for k in (1, 2))
         across = np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], 1)
-        flat = (across / (np.sqrt((across**2).sum(1, keepdims=True)) + 1e-12))[:, None]
+        length = np.sqrt((across**2).sum(1, keepdims=True))
+        normals = (across / (length + 1e-12))[:, None]
 
     def for_each(number: Values) -> Int[np.ndarray, " n"]:
+        """Repeat a number for each triangle, or take one for each."""
         return np.array(np.broadcast_to(number, n), np.int32)
 
     return Mesh(
         corners=corners,
         uv=_broadcast(uv, (n, 3, 2)),
-        normals=_broadcast(flat, (n, 3, 3)),
+        normals=_broadcast(normals, (n, 3, 3)),
         tint=_broadcast(np.clip(tint, 0.005, 0.97), (n, 3)),
         material=for_each(material),
         layer=for_each(layer),

@@ -473,8 +473,10 @@ def _add_window(b: MeshBuilder, face: Float[np.ndarray, "4 3"]) -> None:
     middle = face.mean(0)
     outward = np.cross(face[1] - face[0], face[3] - face[0])
     outward *= 0.006 / (np.linalg.norm(outward) + 1e-9)
+
+    # Towards the outside, by two rules of which the second has the last word: a pane looks up or
+    # away from the origin, and away from the middle of its body.
     outward *= 1 if outward @ middle > 0 or outward[1] < 0 else -1
-    # Towards the outside: a body's panes look away from its middle.
     if outward @ (middle - np.array([0, middle[1] * 0.5, 0])) < 0:
         outward = -outward
     pane = middle + (face - middle) * 0.93 + outward
