@@ -175,18 +175,20 @@ def find_frames(folder: Path) -> tuple[str, list[Frame]]:
         frames = sorted(layout.find(folder), key=lambda frame: frame.name)
         if frames:
             return name, frames
-    raise _unknown_layout(folder)
+    raise _make_layout_error(folder)
 
 
-def _unknown_layout(folder: Path) -> InputError:
+def _has_layout(folder: Path) -> bool:
+    """Whether a folder has a frame of any layout."""
+    first_frames = (next(iter(layout.find(folder)), None) for layout in LAYOUTS.values())
+    return any(first_frames)
+
+
+def _make_layout_error(folder: Path) -> InputError:
     """Make the error of a folder whose layout is not recognised, with what to do."""
     children = sorted(folder.iterdir())
     names = ", ".join(path.name for path in children[:8]) or "nothing"
-    datasets = [
-        path.name
-        for path in children[:50]
-        if path.is_dir() and any(next(iter(layout.find(path)), None) for layout in LAYOUTS.values())
-    ]
+    datasets = [path.name for path in children[:50] if path.is_dir() and _has_layout(path)]
     hint = f" Open one of its folders instead: {', '.join(datasets)}." if datasets else ""
     possible_drives = (folder, *children, *folder.glob("*/*_extract"))
     if any(path.name.endswith("_extract") for path in possible_drives):
