@@ -599,11 +599,12 @@ def _make_mesh(
     Without ``normals`` they are those of the planes.
     """
     n = len(corners)
-    if normals is None:
+    corner_normals = normals
+    if corner_normals is None:
         (ax, ay, az), (bx, by, bz) = ((corners[:, k] - corners[:, 0]).T for k in (1, 2))
         across = np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], 1)
         length = np.sqrt((across**2).sum(1, keepdims=True))
-        normals = (across / (length + 1e-12))[:, None]
+        corner_normals = (across / (length + 1e-12))[:, None]
 
     def for_each(number: Values) -> Int[np.ndarray, " n"]:
         """Repeat a number for each triangle, or take one for each."""
@@ -612,7 +613,7 @@ def _make_mesh(
     return Mesh(
         corners=corners,
         uv=_broadcast(uv, (n, 3, 2)),
-        normals=_broadcast(normals, (n, 3, 3)),
+        normals=_broadcast(corner_normals, (n, 3, 3)),
         tint=_broadcast(np.clip(tint, 0.005, 0.97), (n, 3)),
         material=for_each(material),
         layer=for_each(layer),
