@@ -16,7 +16,7 @@ from score import Job, Row, Section
 from shared import group_rows, mean_of, with_cpu_seconds
 
 from depthpose import FakestereoNet
-from depthpose.depth.datasets import open_dataset, read_known_depth
+from depthpose.depth.datasets import open_dataset, read_true_depth
 from depthpose.depth.metrics import SMALLEST_DEPTH_M, garg_crop, measure
 from depthpose.depth.types import DepthEstimate, StereoSample
 
@@ -95,7 +95,7 @@ def match_street(folder: Path, index: int) -> list[Row]:
     """Match one pair of streets by both methods."""
     dataset = open_dataset(folder)
     sample = dataset[index]
-    truth_m = read_known_depth(dataset, index)
+    truth_m = read_true_depth(dataset, index)
     truth_px = sample.truth.disparity_px
     assert truth_m is not None
     assert truth_px is not None
@@ -151,7 +151,7 @@ def estimate_image(folder: Path, index: int) -> list[Row]:
     dataset = open_dataset(folder)
     image = dataset[index].input
     camera = image.camera
-    truth_m = read_known_depth(dataset, index)
+    truth_m = read_true_depth(dataset, index)
     if truth_m is None:
         return []
     assert camera is not None

@@ -373,14 +373,18 @@ def test_a_path_that_leads_nowhere_is_refused_before_torch_is_loaded(
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there is no limit of address space")
 @pytest.mark.parametrize("kib", [100_000, 450_000, 740_000])
+@pytest.mark.parametrize("images", [("match", "l.png", "r.png"), ("predict", "l.png")])
 def test_a_limit_below_what_the_libraries_take_is_refused_before_they_end_the_process(
-    kib: int, tmp_path: Path
+    images: tuple[str, ...], kib: int, tmp_path: Path
 ) -> None:
-    """At 450,000 glibc aborts, at 500,000 OpenBLAS ends the process: neither names a remedy."""
+    """At 450,000 glibc aborts, at 500,000 OpenBLAS ends the process: neither names a remedy.
+
+    The look at weights that a command names by default loaded the libraries before the check.
+    """
     limit = f"resource.setrlimit(resource.RLIMIT_AS, ({kib * 1024},) * 2)"
     code = f"import resource, sys; from depthpose.cli import main; {limit}; sys.exit(main())"
-    words = ["depth", "match", "l.png", "r.png", "--camera", "c.json", "--out", "out"]
-    for name in words[2:4]:
+    words = ["depth", *images, "--camera", "c.json", "--out", "out"]
+    for name in images[1:]:
         write_image(tmp_path / name, torch.zeros(3, 8, 8))
     (tmp_path / "c.json").write_text("{}")
     command = [sys.executable, "-c", code, *words]

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import os
 import random
 import shutil
 import subprocess
@@ -235,6 +236,33 @@ def test_processes_share_a_folder_of_images(
         done.append({path.name for path in (tmp_path / "shared").glob("*.depth_m.npy")})
     assert len(done[0]) in (1, 2)
     assert done[0] < done[1] == {f"{k}.depth_m.npy" for k in range(3)}
+
+
+def test_the_first_process_waits_for_the_others(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The page shows their depth maps and their failures, those of frames of a video too."""
+    for name in ("0", "1", "2"):
+        write_image(tmp_path / "in" / f"{name}.png", read_image(home / "images" / f"{name}.png"))
+    (tmp_path / "in" / "3.png").write_bytes(b"no picture")
+    write_video(tmp_path / "in" / "drive.avi", [torch.full((3, 48, 64), 0.3)] * 2, 5.0)
+    (tmp_path / "in" / "empty.avi").write_bytes(b"no video")
+    # The first process takes 0, 2 and the empty video, the second one 1, 3 and the drive.
+    names = ("0.png", "1.png", "2.png", "3.png", "empty.avi", "drive.avi")
+    words = [str(tmp_path / "in" / name) for name in names]
+    words += ["--camera", str(home / "cam.json"), "--allow-ood"]
+    program = "import sys; from depthpose.cli import main; sys.exit(main(sys.argv[1:]))"
+    command = [sys.executable, "-c", program, "depth", "predict", *words]
+    command += ["--weights", str(home / "w.safetensors"), "--out", str(tmp_path / "out")]
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    with subprocess.Popen(command, env=os.environ | {"RANK": "1"}) as second:
+        monkeypatch.setenv("RANK", "0")
+        assert predict(home, tmp_path / "out", *words) == 1, "of the empty video"
+        page = (tmp_path / "out" / "report.html").read_text()
+    assert second.returncode == 1, "of the picture that is none"
+    assert "5 depth maps in this folder" in page
+    assert "3.png: not a readable picture" in page
+    assert "empty.avi: not a video" in page
 
 
 def test_a_focal_length_stands_for_a_centred_camera(home: Path, tmp_path: Path) -> None:

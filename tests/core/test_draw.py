@@ -16,7 +16,7 @@ from depthpose.core.draw import (
     draw_points,
     draw_share,
 )
-from depthpose.report.page import Drawing, depth_scale, embedded, rising_scale
+from depthpose.report.page import Drawing, depth_scale, embed_picture, rising_scale
 
 
 def test_near_is_brighter_than_far_all_along() -> None:
@@ -113,7 +113,7 @@ def test_a_large_picture_shrinks_and_a_small_one_stays() -> None:
         (600, image, (30, 20)),
         (10, wide, (223, 1)),
     ):
-        width, height, address = embedded(Drawing(image=picture, caption=""), most)
+        width, height, address = embed_picture(Drawing(image=picture, caption=""), most)
         assert (width, height) == (picture.shape[2], picture.shape[1])
         shown = Image.open(io.BytesIO(b64decode(address.removeprefix("data:image/jpeg;base64,"))))
         assert shown.size == size

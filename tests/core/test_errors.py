@@ -7,7 +7,7 @@ from depthpose.core.devices import refused_memory
 from depthpose.core.errors import (
     InputError,
     MissingExtraError,
-    full_memory,
+    describe_full_memory,
     import_extra,
     nearest_name,
 )
@@ -69,10 +69,10 @@ def test_a_package_that_is_not_there_is_not_a_package_that_does_not_load(
     ids=str,
 )
 def test_a_full_memory_is_said_whoever_meets_it(error: Exception) -> None:
-    said = full_memory(error)
+    said = describe_full_memory(error)
     assert said is not None
     assert said.startswith("the memory is full (")
-    assert full_memory(OSError(13, "Permission denied")) is None
+    assert describe_full_memory(OSError(13, "Permission denied")) is None
 
 
 def test_an_input_that_is_too_large_for_the_memory_is_named() -> None:

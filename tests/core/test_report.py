@@ -15,7 +15,7 @@ from depthpose.report.page import (
     Picture,
     Scene,
     Section,
-    embedded,
+    embed_picture,
     frame_axes,
     markdown_table,
     plain_table,
@@ -146,7 +146,7 @@ def test_a_large_picture_is_made_small_enough_for_a_page(tmp_path: Path) -> None
     noise = torch.rand(3, 800, 1000, generator=torch.Generator().manual_seed(0))
     write_image(tmp_path / "p.png", noise)
     picture = Picture(path=tmp_path / "p.png", caption="noise")
-    width, height, address = embedded(picture)
+    width, height, address = embed_picture(picture)
     assert (width, height) == (1000, 800)
     assert address.startswith("data:image/jpeg;base64,")
     assert len(address) < (tmp_path / "p.png").stat().st_size / 2

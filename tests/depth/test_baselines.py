@@ -8,7 +8,7 @@ from depthpose.core.camera import StereoRig, resize_camera, write_camera
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_depth_png, write_image
 from depthpose.depth.baselines import NearestImageBaseline, RowDepthBaseline, fill_by_pyramid
-from depthpose.depth.datasets import Dataset, join_datasets, open_dataset, read_known_depth
+from depthpose.depth.datasets import Dataset, join_datasets, open_dataset, read_true_depth
 from depthpose.depth.disparity import depth_from_disparity
 from depthpose.depth.types import StereoInput
 
@@ -129,7 +129,7 @@ def test_disparity_serves_where_no_depth_is_known(tmp_path: Path) -> None:
     write_image(tmp_path / "left/a.png", torch.rand(3, H, W))
     write_depth_png(tmp_path / "disp_occ/a.png", torch.full((H, W), 4.0))
     write_camera(tmp_path / "camera.json", rig())
-    known_m = read_known_depth(open_dataset(tmp_path), 0)
+    known_m = read_true_depth(open_dataset(tmp_path), 0)
     assert known_m is not None
     assert torch.allclose(known_m, torch.full((H, W), 5.0))
 

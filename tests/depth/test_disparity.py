@@ -8,7 +8,7 @@ from depthpose.depth.disparity import (
     depth_deviation,
     depth_from_disparity,
     disparity_from_depth,
-    resized_match,
+    resize_match,
     right_disparity_from_left,
     size_at_focal_length,
     warp_right_to_left,
@@ -72,21 +72,21 @@ def test_no_depth_without_positive_disparity(value: float) -> None:
 
 def test_resizing_keeps_the_depth_of_a_slanted_plane() -> None:
     plane = torch.linspace(10, 20, 32).expand(16, 32).contiguous()
-    half = resized_match(Match(disparity_px=plane), 8, 16).disparity_px
+    half = resize_match(Match(disparity_px=plane), 8, 16).disparity_px
     inner = (plane[::2, 0::2] + plane[::2, 1::2]) / 2
     torch.testing.assert_close(half, inner / 2)
 
 
 def test_resizing_in_one_direction_scales_disparity_by_the_columns() -> None:
     px = torch.full((6, 8), 12.0)
-    assert torch.equal(resized_match(Match(disparity_px=px), 3, 8).disparity_px, px[:3])
-    narrow = resized_match(Match(disparity_px=px), 6, 4).disparity_px
+    assert torch.equal(resize_match(Match(disparity_px=px), 3, 8).disparity_px, px[:3])
+    narrow = resize_match(Match(disparity_px=px), 6, 4).disparity_px
     assert torch.equal(narrow, torch.full((6, 4), 6.0))
 
 
 def test_resizing_to_its_own_size_changes_nothing() -> None:
     disparity_px = torch.rand(5, 9)
-    same = resized_match(Match(disparity_px=disparity_px), 5, 9)
+    same = resize_match(Match(disparity_px=disparity_px), 5, 9)
     assert torch.equal(same.disparity_px, disparity_px)
 
 

@@ -41,7 +41,7 @@ from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.depth.weights import (
     calibrate_weights,
     read_generator,
-    refuse_share,
+    refuse_alarm_share,
     write_depth_weights,
 )
 
@@ -684,7 +684,7 @@ def test_a_threshold_is_chosen_by_known_images(tmp_path: Path) -> None:
     assert read_checkpoint(out).facts == read_checkpoint(given).facts
     for share in (0.0, 1.0, math.nan):
         with pytest.raises(InputError, match="must be above 0 and below 1"):
-            refuse_share(100, share)
+            refuse_alarm_share(100, share)
     with pytest.raises(InputError, match=r"7 images cannot say what refuses 0\.01 of them"):
         calibrate_weights(given, [*known, 0.1, 0.9], 0.01, out)
 

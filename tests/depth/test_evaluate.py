@@ -25,8 +25,8 @@ from depthpose.depth.evaluate import (
     measure_frame,
 )
 from depthpose.depth.predictions import (
+    estimate_missing_depth,
     is_finished,
-    predict,
     read_disparity,
     read_estimate,
     write_estimate,
@@ -400,14 +400,14 @@ def test_a_prediction_of_which_a_file_is_damaged_is_made_again(
     net = FakestereoNet(CallableMatcher(answer))
     sources = {frame.name: frame.left for frame in pairs.frames}
     jobs = [Job(name=f.name, read=partial(pairs.read_input, i)) for i, f in enumerate(pairs.frames)]
-    list(predict(net, jobs, tmp_path, {}, sources))
+    list(estimate_missing_depth(net, jobs, tmp_path, {}, sources))
     files = {path: path.read_bytes() for path in sorted(tmp_path.glob("a.*"))}
     assert len(files) == 5, list(files)
     for path, good in files.items():
         for damaged in (None, good[: len(good) // 2], b"", good[:-1] + b"?"):
             path.unlink() if damaged is None else path.write_bytes(damaged)
             calls.clear()
-            list(predict(net, jobs, tmp_path, {}, sources))
+            list(estimate_missing_depth(net, jobs, tmp_path, {}, sources))
             assert len(calls) == 1, "this frame, and no other"
             assert path.read_bytes() == good
 
@@ -423,15 +423,15 @@ def test_predicting_goes_on_where_it_stopped(pairs: Dataset, tmp_path: Path) -> 
     sources = {frame.name: frame.left for frame in pairs.frames}
     jobs = [Job(name=f.name, read=partial(pairs.read_input, i)) for i, f in enumerate(pairs.frames)]
     constant = {"method": "constant"}
-    first = iter(predict(net, jobs, tmp_path / "p", constant, sources))
+    first = iter(estimate_missing_depth(net, jobs, tmp_path / "p", constant, sources))
     assert next(first) == "a"
-    assert len(list(predict(net, jobs, tmp_path / "p", constant, sources))) == 3
+    assert len(list(estimate_missing_depth(net, jobs, tmp_path / "p", constant, sources))) == 3
     assert len(calls) == 3
     with pytest.raises(InputError, match="Two settings never share a folder"):
-        list(predict(net, jobs, tmp_path / "p", {"method": "another"}, sources))
+        list(estimate_missing_depth(net, jobs, tmp_path / "p", {"method": "another"}, sources))
     others = {name: tmp_path / f"other/{name}.png" for name in sources}
     with pytest.raises(InputError, match="'a' is the result of"):
-        list(predict(net, jobs, tmp_path / "p", constant, others))
+        list(estimate_missing_depth(net, jobs, tmp_path / "p", constant, others))
 
 
 def test_disparity_alone_is_written_without_metres(tmp_path: Path) -> None:

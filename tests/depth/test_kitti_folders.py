@@ -15,11 +15,11 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import write_depth_png, write_image, write_map
 from depthpose.depth.datasets import (
     check_dataset,
-    known_truths,
     lidar_truth,
     open_dataset,
-    read_known_depth,
     read_split,
+    read_true_depth,
+    truth_kinds,
 )
 from depthpose.depth.datasets.frames import read_object_calibration, read_plain_calibration
 
@@ -210,7 +210,7 @@ def test_what_is_known_of_a_depth_is_the_scan_where_there_is_one(tmp_path: Path)
     inside = f"{drive}/proj_depth/groundtruth/image_02/0000000007.png"
     write_depth_png(tmp_path / "val" / inside, torch.full((H, W), 5.0))
     for index in range(2):  # with an annotated map, and with a scan alone
-        known_m = read_known_depth(open_dataset(tmp_path), index)
+        known_m = read_true_depth(open_dataset(tmp_path), index)
         assert known_m is not None
         assert known_m[known_m.isfinite()].tolist() == pytest.approx([20.003, 10.003], abs=0.01)
 
@@ -229,8 +229,8 @@ def test_a_scan_of_the_depth_prediction_set_stands_in_for_one_of_points(
     drawn[3, 4] = 7.5
     write_depth_png(tmp_path / inside, drawn)
     frame, other = open_dataset(tmp_path).frames
-    assert known_truths(other) == ()
-    assert known_truths(frame) == ("scan",)
+    assert truth_kinds(other) == ()
+    assert truth_kinds(frame) == ("scan",)
     assert lidar_truth(frame, "camera_z").nan_to_num(0.0).sum().item() == 7.5
     assert lidar_truth(frame, "camera_z")[3, 4].item() == 7.5
     with pytest.raises(InputError, match="no LiDAR scan of the kind velodyne_x"):
@@ -592,7 +592,7 @@ def test_the_selection_of_frames_has_one_camera_and_both_truths(tmp_path: Path) 
         assert check_dataset(folder).is_ok
         assert dataset.read_rig(0) is None
         assert dataset.read_input(0).camera is not None
-        assert known_truths(dataset.frames[0]) == ("scan", "annotated")
+        assert truth_kinds(dataset.frames[0]) == ("scan", "annotated")
         assert float(lidar_truth(dataset.frames[0], "camera_z").mean()) == 10
 
 

@@ -20,8 +20,8 @@ from depthpose.depth.stereo import (
     doubt_hidden,
     doubt_outside,
     measure_disparity_range,
+    move_match_back,
     move_views,
-    moved_back,
 )
 from depthpose.depth.stereo.light import correlation_volume, unit_groups
 from depthpose.depth.types import Match, StereoInput
@@ -230,7 +230,7 @@ def test_views_are_moved_and_their_match_moved_back(first_px: int) -> None:
         torch.testing.assert_close(one[..., x + added], left[..., x])
         torch.testing.assert_close(other[..., x + added - (d - first_px)], right[..., x - d])
     flat = torch.full(one.shape[1:], 8.0 - first_px)
-    back = moved_back(Match(disparity_px=flat, confidence=torch.ones_like(flat)), first_px)
+    back = move_match_back(Match(disparity_px=flat, confidence=torch.ones_like(flat)), first_px)
     assert torch.equal(back.disparity_px, torch.full((4, 30), 8.0))
     assert back.confidence is not None
     assert int((back.confidence == 0).sum()) == 4 * max(first_px, 0)

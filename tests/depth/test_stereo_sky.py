@@ -15,7 +15,7 @@ from depthpose.core.draw import draw_disparity
 from depthpose.core.errors import InputError
 from depthpose.depth.augment import TrainingPair
 from depthpose.depth.config import LightConfig, MatcherConfig
-from depthpose.depth.disparity import estimate_from_pair, resized_match
+from depthpose.depth.disparity import estimate_from_pair, resize_match
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.export import depth_export
 from depthpose.depth.labels import LabelConfig, label_pair
@@ -165,7 +165,7 @@ def test_what_is_surely_matched_is_not_the_sky(
 
 def test_another_size_has_the_same_sky() -> None:
     left = torch.rand(3, 20, 30)
-    found = resized_match(UpperHalf().match(left, left), 40, 90)
+    found = resize_match(UpperHalf().match(left, left), 40, 90)
     assert found.is_sky is not None
     assert torch.equal(found.is_sky, torch.arange(40)[:, None].expand(40, 90) < 20)
     assert torch.equal(found.disparity_px, torch.full((40, 90), 12.0)), "beside the sky too"

@@ -17,7 +17,7 @@ from depthpose.pose.predictions import (
     PoseJob,
     Prediction,
     earlier_predictions,
-    predict,
+    estimate_missing_poses,
     read_bop_results,
     read_predictions,
     write_bop_results,
@@ -159,15 +159,19 @@ def test_finished_work_is_not_done_again(tmp_path: Path) -> None:
     def jobs(*names: str) -> list[PoseJob[str]]:
         return [PoseJob(name=name, read=lambda name=name: name) for name in names]
 
-    run = predict(estimate, jobs("a", "b", "c"), tmp_path, {"voxel_m": 0.008})
+    run = estimate_missing_poses(estimate, jobs("a", "b", "c"), tmp_path, {"voxel_m": 0.008})
     assert [next(run).estimate.name for _ in range(2)] == ["a", "b"]
     run.close()  # as an interrupt does
     assert [p.estimate.name for p in read_predictions(tmp_path)] == ["a", "b"]
-    done = list(predict(estimate, jobs("a", "b", "c", "d"), tmp_path, {"voxel_m": 0.008}, batch=2))
+    done = list(
+        estimate_missing_poses(
+            estimate, jobs("a", "b", "c", "d"), tmp_path, {"voxel_m": 0.008}, batch=2
+        )
+    )
     assert [one.estimate.name for one in done] == ["a", "b", "c", "d"]
     assert asked == ["a", "b", "c", "d"]
     with pytest.raises(InputError, match=r"holds results made with voxel_m = 0.008, but now it is"):
-        next(predict(estimate, jobs("a"), tmp_path, {"voxel_m": 0.005}))
+        next(estimate_missing_poses(estimate, jobs("a"), tmp_path, {"voxel_m": 0.005}))
 
 
 def test_damaged_files_are_refused(tmp_path: Path) -> None:

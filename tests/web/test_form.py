@@ -6,7 +6,7 @@ import torch
 
 from depthpose.core.camera import Camera, StereoRig, write_camera
 from depthpose.core.errors import InputError
-from depthpose.web.answer import Form, keep_file, without_paths
+from depthpose.web.answer import Form, keep_file, remove_paths
 
 
 def form(folder: Path, **fields: str) -> Form:
@@ -76,4 +76,4 @@ def test_fields_and_a_file_make_the_same_camera(tmp_path: Path) -> None:
 
 def test_messages_name_files_as_the_user_knows_them(tmp_path: Path) -> None:
     said = f"{tmp_path}/image/a.png is 2x2, {tmp_path}/the camera fields: no, /image/b.png"
-    assert without_paths(said, tmp_path) == "a.png is 2x2, the camera fields: no, /image/b.png"
+    assert remove_paths(said, tmp_path) == "a.png is 2x2, the camera fields: no, /image/b.png"

@@ -20,7 +20,7 @@ from depthpose.core.errors import (
     InputError,
     MissingExtraError,
     Notice,
-    full_memory,
+    describe_full_memory,
     nearest_name,
 )
 
@@ -30,16 +30,17 @@ COMMANDS = {
     "doctor": (
         "doctor:doctor", "what is installed, and a test of depth and pose; or what files are"),
     "serve": ("serve:serve", "depth and poses by a page in your browser, on this machine"),
-    "pose predict": ("pose:predict", "a cloud, a masked depth image, or a data set, to poses"),
-    "pose track": ("pose:track", "follow an object through depth images or clouds"),
+    "pose predict": (
+        "pose:predict_poses", "a cloud, a masked depth image, or a data set, to poses"),
+    "pose track": ("pose:track_object", "follow an object through depth images or clouds"),
     "pose train": ("train:pose_train", "your CAD file, or a config, to a network that poses it"),
-    "pose evaluate": ("pose:evaluate", "measure poses on a BOP or LineMOD data set"),
-    "depth match": ("depth:match", "a real stereo pair, or many, to metric depth"),
-    "depth predict": ("depth:predict", "one image, or many, or a video, to metric depth"),
+    "pose evaluate": ("pose:evaluate_poses", "measure poses on a BOP or LineMOD data set"),
+    "depth match": ("depth:match_pairs", "a real stereo pair, or many, to metric depth"),
+    "depth predict": ("depth:predict_depth", "one image, or many, or a video, to metric depth"),
     "depth train": (
         "train:depth_train", "stages view, select, stereo, finetune of generator, matcher"),
     "depth calibrate": ("train:calibrate", "set when an image is refused as out of distribution"),
-    "depth evaluate": ("depth:evaluate", "measure predictions by a named protocol"),
+    "depth evaluate": ("depth:evaluate_depth", "measure predictions by a named protocol"),
     "data make streets": (
         "data:make_streets", "synthetic streets with exact disparity and LiDAR, in KITTI's layout"),
     "data make near": (
@@ -114,32 +115,34 @@ def main(words: Sequence[str] | None = None) -> int:
     held_before = () if run_module is None else run_module.held_folders()
     usual_format = warnings.formatwarning
     with lasting_streams() as output:
-        warnings.formatwarning = _notice_format(usual_format)
+        warnings.formatwarning = _make_notice_format(usual_format)
         try:
             code = _run(list(sys.argv[1:] if words is None else words))
         except (InputError, MissingExtraError) as error:
-            code = _fail(f"error: {error}")
+            code = _print_failure(f"error: {error}")
         except KeyboardInterrupt as stop:
-            code = _fail(f"{str(stop) or 'interrupted'}; what was finished is kept", 130)
+            code = _print_failure(f"{str(stop) or 'interrupted'}; what was finished is kept", 130)
         except Exception as error:
             reason = _explain_system_error(error)
             if reason is None:
                 raise
-            code = _fail(f"error: {reason}")
+            code = _print_failure(f"error: {reason}")
         finally:
             warnings.formatwarning = usual_format
             run_module = sys.modules.get("depthpose.core.run")
             if run_module is not None:
                 run_module.release_folders(but=held_before)
+
+    # What could not be printed fails the command too.
     if output.failure is None:
         return code
     if isinstance(output.failure, BrokenPipeError):  # nobody reads it any longer, as in '| head'
         return 141
     reason = f"cannot be written: {output.failure.strerror}; all files are written as without it"
-    return _fail(f"error: standard output: {reason}", code or 1)
+    return _print_failure(f"error: standard output: {reason}", code or 1)
 
 
-def _notice_format(usual_format: Callable[..., str]) -> Callable[..., str]:
+def _make_notice_format(usual_format: Callable[..., str]) -> Callable[..., str]:
     """Make a format of warnings that shows each :class:`Notice` once, in a line without its place.
 
     Other warnings look as usual.
@@ -163,7 +166,7 @@ def _notice_format(usual_format: Callable[..., str]) -> Callable[..., str]:
     return format_warning
 
 
-def _fail(reason: str, code: int = 2) -> int:
+def _print_failure(reason: str, code: int = 2) -> int:
     """Print why the command failed, and give the exit code."""
     print(f"depthpose: {reason}", file=sys.stderr)
     return code
@@ -171,7 +174,7 @@ def _fail(reason: str, code: int = 2) -> int:
 
 def _explain_system_error(error: Exception) -> str | None:
     """Explain a full memory, a full disk or an unusable path in a line; None: another error."""
-    reason = full_memory(error)
+    reason = describe_full_memory(error)
     if reason is not None:
         return f"{reason}; what was finished is kept"
     if not isinstance(error, OSError) or error.errno not in (*_DISK_ERRORS, *_PATH_ERRORS):
@@ -293,8 +296,8 @@ def _run(words: list[str]) -> int:
         return int(stop.code or 0)
     ignored_options.refuse_empty(options, option_words)
     ignored_options.refuse_ignored(name, option_words)
+    _refuse_small_address_space()  # before weights are looked up, which loads torch
     arguments.refuse_missing(options, parsed.arguments)
-    _refuse_small_address_space()
     return command(*parsed.args, **parsed.kwargs)
 
 
@@ -318,7 +321,7 @@ def _list_commands(words: Sequence[str]) -> int:
     group = words[0] if words and not words[0].startswith("-") else ""
     groups = {name.partition(" ")[0] for name in COMMANDS}
     if group and group not in groups:
-        return _fail(f"error: no command {group!r}; {nearest_name(group, groups)}")
+        return _print_failure(f"error: no command {group!r}; {nearest_name(group, groups)}")
     summaries = {name: summary for name, (_, summary) in COMMANDS.items() if name.startswith(group)}
     verb = next((word for word in words[1:] if not word.startswith("-")), "")
     if group and verb:

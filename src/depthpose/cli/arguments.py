@@ -36,7 +36,7 @@ from depthpose.core.errors import InputError
 
 
 class _Names(Enum):
-    """What the value of an option names."""
+    """The kinds of things that the value of an option may name."""
 
     INPUT = "a file or folder that is read"
     NEW = "a file or folder that need not exist"
@@ -64,12 +64,12 @@ _MAX_WIDTH = 100
 Config = TypeVar("Config", bound=Any)
 
 
-def _default_hint(default: str) -> str:
-    """Say in ``--help`` what the default is, if it is anything."""
+def _describe_default(default: str) -> str:
+    """Make the note on the default for ``--help``; empty where there is none."""
     return "" if default in _EMPTY_DEFAULTS else f"(default: {default})"
 
 
-shown_as = partial(tyro.conf.arg, help_behavior_hint=_default_hint)
+shown_as = partial(tyro.conf.arg, help_behavior_hint=_describe_default)
 """Show an option with this ``metavar`` in the place of its value; None: as tyro does."""
 
 Device = Annotated[str, shown_as(metavar="DEVICE", help="cpu, cuda, cuda:1, ...")]
@@ -99,10 +99,10 @@ def parser_of(
         if is_dataclass(parameter.default):
             group = type(parameter.default)
             types = get_type_hints(group, include_extras=True)
-            group.__annotations__, more = _with_help(types, parameter.name, _help_texts(group))
+            group.__annotations__, more = _with_help(types, parameter.name, _read_help_texts(group))
         else:
             types = {parameter.name: hints[parameter.name]}
-            shown, more = _with_help(types, parameter.name, _help_texts(command))
+            shown, more = _with_help(types, parameter.name, _read_help_texts(command))
             hints |= shown
         options += more
     parameters = [p.replace(annotation=hints[name]) for name, p in shape.parameters.items()]
@@ -134,7 +134,7 @@ def _with_help(
     annotated: dict[str, Any] = {}
     options: list[Option] = []
     for name, hint in types.items():
-        placeholder, names = _placeholder_of(hint)
+        placeholder, names = _choose_placeholder(hint)
         marks = getattr(hint, "__metadata__", ())
         if any(hasattr(mark, "metavar") for mark in marks):  # the declaration has its own
             placeholder = None
@@ -143,7 +143,7 @@ def _with_help(
     return annotated, options
 
 
-def _help_texts(described: type | Callable[..., int]) -> dict[str, str]:
+def _read_help_texts(described: type | Callable[..., int]) -> dict[str, str]:
     """Read the text of each option from the docstrings of a command, or of a group's fields.
 
     Each text becomes a single line, for tyro would keep the line breaks of the source code.
@@ -173,8 +173,8 @@ def description_of(command: Callable[..., int]) -> str:
     return textwrap.indent("\n".join(wrapped), "  ")
 
 
-def _placeholder_of(hint: Any) -> tuple[str | None, _Names | None]:  # noqa: ANN401  any type
-    """Give the placeholder of a value in ``--help``, and what the value names.
+def _choose_placeholder(hint: Any) -> tuple[str | None, _Names | None]:  # noqa: ANN401  any type
+    """Choose the placeholder of a value in ``--help``, and tell what the value names.
 
     The placeholder is None where tyro's own will do, the second None where it names nothing.
     """
@@ -183,15 +183,15 @@ def _placeholder_of(hint: Any) -> tuple[str | None, _Names | None]:  # noqa: ANN
     if origin is Annotated:
         names = next((mark for mark in parts if isinstance(mark, _Names)), None)
         if names is None:
-            return None, _placeholder_of(parts[0])[1]
+            return None, _choose_placeholder(parts[0])[1]
         placeholder = "NAME|FILE" if names is _Names.WEIGHTS else "PATH"
         return None if _POSITIONAL in parts else placeholder, names
     if origin in (Union, UnionType):
-        return _placeholder_of(next(part for part in parts if part is not NoneType))
+        return _choose_placeholder(next(part for part in parts if part is not NoneType))
     if origin is Literal:
         return f"{{{','.join(map(str, parts))}}}", None
     if origin in (tuple, list):
-        placeholder, names = _placeholder_of(parts[0])
+        placeholder, names = _choose_placeholder(parts[0])
         has_any_length = parts[1:] in ((), (...,))
         if placeholder is not None and has_any_length:
             placeholder = f"{placeholder} ..."
@@ -209,17 +209,17 @@ def refuse_missing(options: Sequence[Option], values: Mapping[str, Any]) -> None
     """
     with_paths = [option for option in options if option.names in (_Names.INPUT, _Names.NEW)]
     for option in with_paths:
-        for word in _words_of(option, values):
+        for word in _list_words(option, values):
             if not any(mark in word for mark in ("://", *"*?[{")):
                 _refuse_missing_path(word, must_exist=option.names is _Names.INPUT)
     for option in options:
         if option.names is _Names.WEIGHTS:
-            for word in _words_of(option, values):
+            for word in _list_words(option, values):
                 _refuse_missing_weights(word)
 
 
-def _words_of(option: Option, values: Mapping[str, Any]) -> list[str]:
-    """Give the words of an option: of several values, of one, or of none."""
+def _list_words(option: Option, values: Mapping[str, Any]) -> list[str]:
+    """List the words of an option: of several values, of one, or of none."""
     if option.parameter not in values:
         return []
     value = values[option.parameter]
@@ -262,6 +262,6 @@ def refuse_below(least: int, option: str, value: int, usual: str) -> None:
         raise InputError(f"{option} {value}: give {least} or more, such as {usual}")
 
 
-def changed(config: Config, **values: object) -> Config:
+def replace_given(config: Config, **values: object) -> Config:
     """Return a copy of a config with other values; a value of None leaves its setting as it is."""
     return replace(config, **{name: value for name, value in values.items() if value is not None})

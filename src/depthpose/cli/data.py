@@ -368,12 +368,12 @@ def label(
 
     for failure in failures:
         print(f"depthpose: failed: {failure}", file=sys.stderr)
-    print(f"{out}: {_label_summary(shares, len(failures))}")
+    print(f"{out}: {_summarise_labels(shares, len(failures))}")
     return 1 if failures else 0
 
 
-def _label_summary(shares: list[float], failures: int) -> str:
-    """Say how many pairs were labelled, which share of their pixels, and how many failed."""
+def _summarise_labels(shares: list[float], failures: int) -> str:
+    """Summarise a labelling: how many pairs, which share of their pixels, how many failed."""
     share = f", {sum(shares) / len(shares):.0%} of their pixels labelled" if shares else ""
     failed = f"{failures} failed, " if failures else ""
     return f"{len(shares)} pairs labelled{share}; {failed}the others were labelled before"
@@ -428,6 +428,7 @@ def rectify(
     from depthpose.core.files import image_size, read_image, write_image
     from depthpose.core.run import claim_folder, claim_names
 
+    # Refuse what cannot be rectified, before anything is written.
     unit_m = metres_of(unit) if unit else None
     calibration = read_raw_pair(camera, unit_m=unit_m, is_fisheye=fisheye or None)
     pairs = list_pairs(left, right)
@@ -439,6 +440,8 @@ def rectify(
         )
     rectifier = make_rectifier(calibration, image_size(pairs[0][0]), keep)
     _check_rows(rectifier, pairs, is_refused=check)
+
+    # All that decides the results, for the record of the folder.
     settings: dict[str, Any] = {
         "command": "data rectify",
         "keep": keep,
@@ -452,6 +455,7 @@ def rectify(
         }
     claim_folder(out, settings, [*_SIDES, "camera.json"])
     claim_names(out, {pair[0].stem: pair for pair in pairs})
+
     for first, second in tqdm(pairs, unit=" pairs", leave=False, disable=None):
         names = [str(first), str(second)]
         rectified = rectifier.rectify(read_image(first), read_image(second), names)
@@ -510,7 +514,7 @@ def _read_two_view_pictures(source: Path) -> "Iterator[tuple[str, Sequence[Tenso
 
 def _split_picture(picture: "Tensor", source: Path, name: str) -> "tuple[Tensor, Tensor]":
     """Split a picture into its two views, side by side or one above the other."""
-    from depthpose.core.camera import find_two_views, halves
+    from depthpose.core.camera import find_two_views, split_halves
 
     layout = find_two_views(picture)
     if layout is None:
@@ -518,7 +522,7 @@ def _split_picture(picture: "Tensor", source: Path, name: str) -> "tuple[Tensor,
             f"{source}: {name} does not look like two views of one scene, side by side or one "
             "above the other; leave it out"
         )
-    return halves(picture, layout)
+    return split_halves(picture, layout)
 
 
 def _check_rows(

@@ -13,7 +13,7 @@ from depthpose.cli.engine import EngineOptions
 from depthpose.core.errors import InputError
 
 
-def predict(
+def predict_depth(
     images: tyro.conf.Positional[tuple[Source, ...]],
     out: NewPlace,
     lens: options.LensOptions = options.LensOptions(),
@@ -23,7 +23,7 @@ def predict(
     scale: options.ScaleOptions = options.ScaleOptions(),
     engine: EngineOptions = EngineOptions(),
 ) -> int:
-    """Depth in metres from single images, by a synthesised right view.
+    """Estimate depth in metres from single images, by a synthesised right view.
 
     For each NAME.png: NAME.depth_m.npy (metres, NaN where invalid and in the sky), NAME.depth.png
     (16 bit, metres x 256), NAME.disparity_px.npy, NAME.confidence.npy (0..1), NAME.right.png (the
@@ -82,7 +82,7 @@ def predict(
     return depth_predict.predict_files([(path,) for path in paths], work, method, Path(out))
 
 
-def match(
+def match_pairs(
     left: tyro.conf.Positional[Source],
     right: tyro.conf.Positional[Source | None] = None,
     *,
@@ -112,7 +112,7 @@ def match(
     from depthpose.cli import depth_predict
     from depthpose.core.files.images import refuse_among_inputs
 
-    weights = None if pairs.matcher == "sgbm" else pairs.matcher or pairs.weights or "default"
+    weights = None if pairs.matcher == "sgbm" else pairs.matcher or pairs.weights
     config = replace(
         matching.config,
         with_left_right_check=matching.left_right_check,
@@ -138,7 +138,7 @@ def match(
     return depth_predict.predict_files(files, work, source.build(), Path(out))
 
 
-def evaluate(
+def evaluate_depth(
     data: Path,
     out: NewPath,
     split: str | None = None,

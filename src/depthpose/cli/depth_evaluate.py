@@ -34,7 +34,7 @@ from depthpose.depth.evaluate import (
     summarise,
 )
 from depthpose.depth.metrics import METRICS, RANKING
-from depthpose.depth.predictions import is_finished, predict
+from depthpose.depth.predictions import estimate_missing_depth, is_finished
 from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.report import page
 from depthpose.report.depth import depth_section
@@ -73,8 +73,8 @@ def predict_dataset(dataset: Dataset, method: DepthMethod, rule: Protocol, folde
     share = process.share_of(usable)
     jobs = [Job(name=frame.name, read=partial(read, i)) for i, frame in share]
     sources = {f.name: f.seen_files(with_right=method.with_right) for _, f in usable}
-    net = _Unchecked(method.net) if isinstance(method.net, FakestereoNet) else method.net
-    written = predict(net, jobs, home, method.settings, sources)
+    net = _UncheckedNet(method.net) if isinstance(method.net, FakestereoNet) else method.net
+    written = estimate_missing_depth(net, jobs, home, method.settings, sources)
     for _ in tqdm(written, method.name, total=len(jobs), disable=None, unit=" frames"):
         pass
     if process.rank == 0:
@@ -83,7 +83,7 @@ def predict_dataset(dataset: Dataset, method: DepthMethod, rule: Protocol, folde
 
 
 @dataclass(frozen=True)
-class _Unchecked:
+class _UncheckedNet:
     """A network that refuses no pair, for a measurement counts all of them."""
 
     net: FakestereoNet
@@ -106,6 +106,8 @@ def choose_methods(
         sgbm = DepthMethodSource(weights=None, config=config, with_filled_holes=is_filled)
         chosen.append(sgbm.build())
     chosen += [named_method(name, config) for name in options.weights]
+
+    # Their predictions need folders of different names, and their inputs must be there.
     names = [method.name for method in chosen]
     repeated = next((name for name in names if names.count(name) > 1), None)
     if repeated is not None:
@@ -222,7 +224,7 @@ def measure(
     view_counts = page.share_views(len(folders))
     frame_sections: list[Section] = []
     for folder, evaluation, count in zip(folders, evaluations, view_counts, strict=True):
-        frame_sections += _frame_sections(dataset, folder, evaluation.per_frame, protocol, count)
+        frame_sections += _show_frames(dataset, folder, evaluation.per_frame, protocol, count)
     sections = [
         Section(title="Mean over frames", text=text, rows=rows),
         *frame_sections,
@@ -241,7 +243,7 @@ def measure(
     return 0
 
 
-def _frame_sections(
+def _show_frames(
     dataset: Dataset,
     folder: Path,
     per_frame: Sequence[EvaluationRow],
@@ -256,9 +258,12 @@ def _frame_sections(
     rows_at_cap = [row for row in per_frame if row.cap_m == cap_m and row.pixels]
     metric = METRICS[RANKING["disparity" if cap_m is None else "depth"]]
     sign = 1 if metric.better == "lower" else -1
+
+    # Words for the text of each section.
     cap_text = "" if cap_m is None else f", truth up to {cap_m:g} m"
     frame_count = f"{len(rows_at_cap)} frame{'' if len(rows_at_cap) == 1 else 's'}"
     index_of = {frame.name: index for index, frame in enumerate(dataset.frames)}
+
     sections: list[Section] = []
     errors = [sign * row.metrics[metric.name] for row in rows_at_cap]
     for role, k in page.choose_ranked(errors, max_count):

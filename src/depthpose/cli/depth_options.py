@@ -25,7 +25,7 @@ def _parse_bytes(text: str) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class MatcherOptions:
-    """How the weights run."""
+    """The settings by which the networks of the weights run."""
 
     speed: Speed = "fine"
     """quick: at the size that the weights were trained at; fine: one image in a larger size too, a
@@ -49,7 +49,7 @@ class MatcherOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class LensOptions:
-    """What is known of the camera of single images; without any of it their EXIF is read."""
+    """The known facts of the camera of single images; without any of them their EXIF is read."""
 
     camera: Path | None = None
     """JSON file: {"width", "height", "K": 3x3}, or a file of ROS, OpenCV, KITTI and others, which
@@ -62,7 +62,7 @@ class LensOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class ScaleOptions:
-    """What sets the metres of single images."""
+    """The known lengths that set the metres of single images."""
 
     camera_height: float | None = None
     """height of the camera above the road in metres, which else is estimated ("mount_height_m" of a
@@ -77,9 +77,8 @@ class ScaleOptions:
     """X,Y,METRES: column and row of a pixel and its measured depth along the optical axis, which
     sets the scale of each image."""
 
-    @property
-    def measured_point(self) -> tuple[float, float, float]:
-        """``--known-distance`` parsed: column and row [px] of a pixel, and its depth [m]."""
+    def parse_known_distance(self) -> tuple[float, float, float]:
+        """Parse ``--known-distance``: column and row [px] of a pixel, and its depth [m]."""
         assert self.known_distance is not None
         try:
             column, row, metres = (float(word) for word in self.known_distance.split(","))
@@ -92,7 +91,7 @@ class ScaleOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class MatchOptions(MatcherOptions):
-    """How the matcher of the weights runs; sgbm takes none of these."""
+    """The settings by which the matcher of the weights runs; sgbm takes none of these."""
 
     left_right_check: bool = False
     """match the mirrored pair too, which makes the confidence better."""
@@ -103,14 +102,14 @@ class MatchOptions(MatcherOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class PairNetworks:
-    """What matches real pairs, whether they are checked, and what is written."""
+    """The matcher of real pairs, their check, and the clouds that are written."""
 
     cloud: bool = False
     """write a coloured point cloud of what is nearer than 80 m, NAME.cloud.ply."""
     min_confidence: float = 0.5
     """of clouds: depth with a lower confidence, 0 to 1, is left out; the share is printed."""
-    weights: WeightsName | None = None
-    """weights with a matcher, by name or file; 'default' unless sgbm matches."""
+    weights: WeightsName = "default"
+    """weights with a matcher, by name or file."""
     matcher: WeightsName | None = None
     """what matches the two views: sgbm (OpenCV's, which needs no weights), or weights with a
     matcher, by name or file. Left out: that of the weights."""
@@ -120,7 +119,7 @@ class PairNetworks:
 
 @dataclass(frozen=True, kw_only=True)
 class ImageNetworks:
-    """Which networks answer depth of one image."""
+    """The networks that answer depth of one image."""
 
     weights: WeightsName = "default"
     """weights with a generator, by name or file ('depthpose weights list')."""
@@ -136,7 +135,7 @@ class ImageNetworks:
 
 @dataclass(frozen=True, kw_only=True)
 class PredictOutput:
-    """What is written, and how many images go together."""
+    """The files that are written, and the number of images that go together."""
 
     cloud: bool = False
     """write a coloured point cloud of what is nearer than 80 m, NAME.cloud.ply."""
@@ -184,7 +183,7 @@ class MethodOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class ProtocolOptions:
-    """How prediction and truth are compared."""
+    """The protocol by which prediction and truth are compared."""
 
     protocol: str = "eigen-raw"
     """name of the protocol; eigen-raw is the thesis's."""

@@ -77,7 +77,7 @@ class DepthMethod(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class DepthMethodSource:
-    """What a method is built from, in this process or by the workers of an engine."""
+    """The description of a method, from which this process or the workers of an engine build it."""
 
     weights: str | Weights | None  #: name or file, or their bytes; None: OpenCV's matcher
     config: MatcherConfig  #: how the networks run
@@ -177,7 +177,7 @@ class DepthMethodSource:
 
 
 def _load_other_matcher(matcher: str) -> tuple[SGBMMatcher | Path, str, dict[str, Any]]:
-    """Give the matcher of the synthesised view, other than the weights' own, and its settings.
+    """Load the matcher of the synthesised view that replaces the weights' own.
 
     Returns:
         OpenCV's matcher or a weights file, its name, and the JSON values that decide its results.
@@ -201,9 +201,9 @@ def read_lens(options: LensOptions, sources: Sequence[Path]) -> Camera | FieldOf
     if fov is not None:
         return FieldOfView(fov)
     if options.camera is None:
-        return _exif_focal_px(sources) if focal_px is None else focal_px
+        return _read_exif_focal_px(sources) if focal_px is None else focal_px
 
-    camera = read_camera(options.camera, _size_of_first(sources))
+    camera = read_camera(options.camera, _read_first_size(sources))
     if not isinstance(camera, StereoRig):
         return camera
     print("the camera's baseline is ignored: one image has none", file=sys.stderr)
@@ -211,7 +211,7 @@ def read_lens(options: LensOptions, sources: Sequence[Path]) -> Camera | FieldOf
     return Camera(width=camera.width, height=camera.height, K=camera.K, **keys)
 
 
-def _exif_focal_px(sources: Sequence[Path]) -> float:
+def _read_exif_focal_px(sources: Sequence[Path]) -> float:
     """Read the focal length [px] on which the EXIF of all images agrees, and print it."""
     focal_of: dict[str, tuple[float, str]] = {}  # by file name: focal length [px], EXIF's tags
     for source in sources:
@@ -227,10 +227,12 @@ def _exif_focal_px(sources: Sequence[Path]) -> float:
                 "degrees)"
             )
         focal_of[source.name] = focal
+
     if not focal_of:
         raise InputError(
             "no image can be read; give --camera, --focal-px or --fov, and intact ones"
         )
+
     first = next(iter(focal_of))
     focal_px, tags = focal_of[first]
     for other, (other_px, _) in focal_of.items():
@@ -239,6 +241,7 @@ def _exif_focal_px(sources: Sequence[Path]) -> float:
                 f"the EXIF of {first} says a focal length of {focal_px:.0f} px and that of "
                 f"{other} {other_px:.0f} px; predict them apart"
             )
+
     print(
         f"a focal length of {focal_px:.0f} px, by the EXIF of {first} ({tags}); of a cropped "
         "picture it is another",
@@ -247,8 +250,8 @@ def _exif_focal_px(sources: Sequence[Path]) -> float:
     return focal_px
 
 
-def _size_of_first(sources: Sequence[Path]) -> tuple[int, int] | None:
-    """Give width and height [px] of the first image or video that can be read, None if none can."""
+def _read_first_size(sources: Sequence[Path]) -> tuple[int, int] | None:
+    """Read width and height [px] of the first image or video that can be read, None if none can."""
     for source in sources:
         with suppress(InputError):  # the image fails by itself, later
             if not _is_video(source):
@@ -330,7 +333,7 @@ def list_pairs(left: str, right: str) -> list[tuple[Path, Path]]:
 
 @dataclass(frozen=True, kw_only=True)
 class DepthWork:
-    """How images or pairs become files of depth, in this process or by workers of an engine.
+    """The estimation of depth files from images or pairs, here or by workers of an engine.
 
     ``camera``: camera of the images (a field of view or focal length [px] does), or rig of a pair.
     ``with_check``: refuse pairs that are swapped, not rectified or no pair.
@@ -385,7 +388,7 @@ class DepthWork:
         if isinstance(estimate, InputError):
             return estimate
         try:
-            return scale_by_distance(estimate, name, self.scale.measured_point)
+            return scale_by_distance(estimate, name, self.scale.parse_known_distance())
         except InputError as error:
             return error
 
@@ -477,7 +480,7 @@ def predict_files(
     """Estimate what is not finished, and give the exit code.
 
     An input that fails is named and stops no other. Of several processes each takes its share, and
-    the first writes the page.
+    the first waits for the others and writes the page.
     """
     video_stems = [files[0].stem for files in sources if _is_video(files[0])]
     run.claim_folder(out, work.settings(method.settings), [_PAGE])
@@ -491,7 +494,7 @@ def predict_files(
     share = process.share_of(sources)
     stills = [files for files in share if not _is_video(files[0])]
     videos = [files[0] for files in share if _is_video(files[0])]
-    depth_run = DepthRun(work=work, method=method, out=out)
+    depth_run = DepthRun(work=work, method=method, out=out, is_shared=process.world > 1)
     still_jobs = (job for files in stills for job in work.make_jobs(files))
     mount = MountFilter() if work.scale.one_mount else None
     count = len(depth_run.estimate(still_jobs, len(stills), "images", mount))
@@ -505,17 +508,64 @@ def predict_files(
     total = f"{count} of {len(share)} pairs" if work.files == PAIRS else f"{count} depth maps"
     print(f"{total} are in {out}")
     if process.rank == 0:
-        write_depth_page(sources, work, out, failures)
+        reasons = [str(failure) for failure in failures]
+        if process.world > 1:
+            wait_for_results(sources, work, out)
+            reasons = _read_failures(sources, out)
+        write_depth_page(sources, work, out, reasons)
     return 1 if failures else 0
 
 
+def wait_for_results(sources: Sequence[tuple[Path, ...]], work: DepthWork, out: Path) -> None:
+    """Wait until all processes of a launch have a result of each input, or a reason why not.
+
+    A failure of an earlier run counts as one, since the process whose input it is may try again at
+    any time.
+
+    Raises:
+        InputError: the others make no progress for an hour.
+    """
+    videos = {_name_source(files): files[0] for files in sources if _is_video(files[0])}
+
+    def is_there(name: str) -> bool:
+        if name in run.read_failures(out):
+            return True
+        if name in videos:
+            return run.is_whole(out, name, [_name_video_file(videos[name])])
+        return is_finished(out, name, with_cloud=work.output.cloud)
+
+    names = [_name_source(files) for files in sources]
+    run.wait_for(names, is_there, count_steps=lambda: len(run.read_results(out)))
+
+
+def _read_failures(sources: Sequence[tuple[Path, ...]], out: Path) -> list[str]:
+    """Read why inputs, or frames of them, have no result, as all processes noted it."""
+    failures = run.read_failures(out)
+    reasons: list[str] = []
+    for files in sources:
+        reasons += [failures[name] for name in _choose_result_names(files, failures)]
+        if _is_video(files[0]) and files[0].name in failures:
+            reasons.append(failures[files[0].name])
+    return reasons
+
+
+def _name_source(files: Sequence[Path]) -> str:
+    """Name an image or a pair as its result is named, and a video with its suffix."""
+    return files[0].name if _is_video(files[0]) else files[0].stem
+
+
+def _name_video_file(video: Path) -> str:
+    """Name the file with the depth of a video."""
+    return f"{video.stem}{_VIDEO}"
+
+
 def write_depth_page(
-    sources: Sequence[tuple[Path, ...]], work: DepthWork, out: Path, failures: Sequence[InputError]
+    sources: Sequence[tuple[Path, ...]], work: DepthWork, out: Path, failures: Sequence[str]
 ) -> None:
     """Write a page of some of the finished depth maps, of every failure and of every warning."""
     # The finished results of each input, and those that are shown.
     finished = {name for name in run.read_results(out) if is_finished(out, name)}
-    names_of = {files: _result_names(files, finished) for files in sources}
+    names_of = {files: _choose_result_names(files, finished) for files in sources}
     names = [name for names_of_source in names_of.values() for name in names_of_source]
     chosen = {names[k] for k in spread_evenly(len(names), MOST_VIEWS)}
     shown_inputs = list(_read_chosen(names_of, work, chosen))
@@ -523,7 +573,7 @@ def write_depth_page(
     selection = "all" if len(shown_inputs) == len(names) else "spread evenly"
     number = f"{len(names)} depth map{'s' * (len(names) != 1)}"
     text = f"Shown: {len(shown_inputs)} of {number} in this folder ({selection})."
-    rows = [{"not estimated, because": str(reason)} for reason in failures]
+    rows = [{"not estimated, because": reason} for reason in failures]
     for name in names:
         warning_file = out / f"{name}.warning.txt"
         if warning_file.is_file():
@@ -545,12 +595,12 @@ def write_depth_page(
     print(f"the page: {out / _PAGE}")
 
 
-def _result_names(files: Sequence[Path], finished: Collection[str]) -> list[str]:
-    """Give the names of the finished results of an image, a pair or a video."""
+def _choose_result_names(files: Sequence[Path], names: Collection[str]) -> list[str]:
+    """Choose, of the names of results, those of an image, a pair or the frames of a video."""
     if _is_video(files[0]):
-        return sorted(name for name in finished if _is_frame_name(name, files[0]))
+        return sorted(name for name in names if _is_frame_name(name, files[0]))
     name = files[0].stem
-    return [name] if name in finished else []
+    return [name] if name in names else []
 
 
 def _read_chosen(
@@ -576,12 +626,13 @@ def _read_chosen(
 class DepthRun:
     """Writes the estimates of one process to ``out``, and collects its failures.
 
-    ``failures``: by the names of images and pairs, or of whole videos.
+    ``failures``: by the names of images, pairs and frames, and of whole videos.
     """
 
     work: DepthWork
     method: DepthMethod
     out: Path
+    is_shared: bool = False  #: other processes of a launch write there too
     failures: dict[str, InputError] = field(default_factory=dict)
 
     def estimate(
@@ -609,6 +660,7 @@ class DepthRun:
         assert isinstance(self.method.net, FakestereoNet), "weights build no other"
         estimate_many = partial(self.work.estimate_many, self.method.net, mount=mount)
         outcomes = run_jobs(jobs, estimate_many, results, output.batch)
+
         names: list[str] = []
         for outcome in tqdm(outcomes, label, total, disable=None, unit=f" {label}"):
             name = outcome.job.name
@@ -621,8 +673,14 @@ class DepthRun:
                     mount.last = read_ground(self.out, name) or mount.last
                 names.append(name)
             except InputError as error:
-                self.failures[name] = error
+                self._note_failure(name, error)
         return names
+
+    def _note_failure(self, name: str, error: InputError) -> None:
+        """Keep why an input has no result, and tell the other processes of a launch."""
+        self.failures[name] = error
+        if self.is_shared:
+            run.note_failure(self.out, name, str(error))
 
     def estimate_video(self, source: Path) -> int:
         """Estimate the frames of a video and write a video of their depth; give their number."""
@@ -631,9 +689,12 @@ class DepthRun:
             jobs = self.work.make_jobs([source])
             names = self.estimate(jobs, video.frames or None, source.name, MountFilter())
             pictures = self._draw_frames(source, names) if names else ()
-            write_video(self.out / f"{source.stem}{_VIDEO}", pictures, video.fps)
+            file = self.out / _name_video_file(source)
+            write_video(file, pictures, video.fps)
+            if self.is_shared:
+                run.note_result(self.out, source.name, [file])
         except InputError as error:
-            self.failures[source.name] = error
+            self._note_failure(source.name, error)
             return 0
         return len(names)
 

@@ -95,7 +95,7 @@ def _run_trial(name: str, trial: Callable[[], str]) -> bool:
 
 
 def device_names() -> str:
-    """Name the GPUs that torch has, or say that there is the processor alone."""
+    """List the GPUs that torch has, or the processor where there are none."""
     import torch
 
     gpus = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]

@@ -13,7 +13,7 @@ from depthpose.cli.pose_transforms import read_pose
 from depthpose.core import camera as cameras
 from depthpose.core import files
 from depthpose.core.errors import InputError
-from depthpose.core.files.images import opened_image, read_numbers, value_range
+from depthpose.core.files.images import open_image, read_numbers, value_range
 from depthpose.core.rigid import geodesic_rad
 from depthpose.pose.cloud import frame_advice, unit_advice
 from depthpose.pose.datasets import decode_rle
@@ -46,7 +46,7 @@ _HALF = 0.5
 
 @dataclass(kw_only=True)
 class FileFacts:
-    """What a file holds: one of image, depth, camera, mask, cloud and model; and what is odd."""
+    """The facts of a file: its kind (image, depth, camera, mask, cloud or model) and oddities."""
 
     path: Path
     description: str = ""  #: for the user; empty: it cannot be used
@@ -75,7 +75,7 @@ def describe_files(paths: Sequence[Path]) -> int:
 
     # What each is, and where it contradicts another.
     for facts in all_facts:
-        facts.oddities += _contradictions(facts, all_facts)
+        facts.oddities += _list_contradictions(facts, all_facts)
     for path in paths:
         facts = next(facts for facts in all_facts if facts.path == path)
         print(f"{path}: {facts.description or 'cannot be used'}")
@@ -207,7 +207,7 @@ def _describe_pose(path: Path) -> FileFacts | None:
 
 def _describe_picture(path: Path) -> FileFacts:
     """Describe a picture: a depth image, a mask or a photograph."""
-    with opened_image(path) as image:
+    with open_image(path) as image:
         units = None
         if image.mode == "I;16":
             units = torch.from_numpy(np.asarray(image).astype(np.float32))
@@ -280,6 +280,7 @@ def _describe_map(path: Path) -> FileFacts:
             return _describe_depth(path, torch.where(units > 0, units, torch.nan))
         if stored.ndim != 2 or stored.shape[1] in (3, 4):
             return _describe_points(path, files.read_cloud(path).points.double())
+
     values = files.read_map(path)
     readings = values[values.isfinite()]
     height, width = values.shape
@@ -287,6 +288,7 @@ def _describe_map(path: Path) -> FileFacts:
     if len(readings) == 0:
         facts.oddities.append("no value is known")
         return facts
+
     median = float(readings.median())
     facts.description += f", {len(readings) / values.numel():.0%} known, median {median:.4g}"
     if float((readings < 0).float().mean()) > _HALF:
@@ -322,8 +324,8 @@ def _describe_points(path: Path, points: Tensor) -> FileFacts:
     return FileFacts(path=path, description=description, oddities=oddities, cloud=points)
 
 
-def _contradictions(facts: FileFacts, all_facts: Sequence[FileFacts]) -> Iterator[str]:
-    """Give the contradictions of a file to the others: in size, unit, or scale of a model."""
+def _list_contradictions(facts: FileFacts, all_facts: Sequence[FileFacts]) -> Iterator[str]:
+    """List where a file contradicts the others: in size, unit, or scale of a model."""
     for other in all_facts:
         camera = other.camera
         if camera is not None and facts.size is not None:

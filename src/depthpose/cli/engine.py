@@ -17,7 +17,7 @@ if TYPE_CHECKING:  # --help imports this module and must answer at once
 
 @dataclass(frozen=True, kw_only=True)
 class EngineOptions:
-    """Where the work is done: in this process, or by Ray."""
+    """The choice of where the work is done: in this process, or by Ray."""
 
     engine: Literal["here", "ray"] = "here"
     """here: in this process, a file for each result. ray: by workers of a Ray cluster (an extra),

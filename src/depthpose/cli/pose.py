@@ -10,7 +10,7 @@ from depthpose.core.errors import InputError
 from depthpose.pose.config import EstimateConfig, SymmetryRule
 
 
-def predict(
+def predict_poses(
     out: NewPlace,
     inputs: options.InputOptions = options.InputOptions(),
     details: options.InputDetailOptions = options.InputDetailOptions(),
@@ -19,7 +19,7 @@ def predict(
     estimates: options.EstimateOptions = options.EstimateOptions(),
     engine: EngineOptions = EngineOptions(),
 ) -> int:
-    """The pose of known objects from clouds, depth images, pairs or a data set; or why none.
+    """Pose known objects from clouds, depth images, pairs or a data set, or say why not.
 
     poses.json holds for each input camera_from_model (metres), its covariance (about this answer
     alone), its certainty, the alternatives that fit as well with their probabilities, status and
@@ -96,7 +96,7 @@ def predict(
     return predict_files(method, pose_inputs, home, batch)
 
 
-def evaluate(
+def evaluate_poses(
     bop: Path,
     out: NewPath,
     split: str = "test",
@@ -153,7 +153,7 @@ def evaluate(
     return measure(dataset, [*folders, *csv, *predictions], rule, out)
 
 
-def track(
+def track_object(
     out: NewPath,
     weights: WeightsName = "parts",
     frames: options.SequenceOptions = options.SequenceOptions(),

@@ -23,7 +23,7 @@ def dataset_settings(dataset: datasets.BopDataset) -> dict[str, Any]:
 
 
 def match_names(dataset: datasets.BopDataset, models: Sequence[ObjectModel]) -> dict[int, str]:
-    """Give the name that a method has for each object of a data set, by the object's number.
+    """Match the objects of a data set to a method's: its name for each, by the object's number.
 
     Objects are matched by name, else by number.
 
@@ -53,7 +53,7 @@ def match_names(dataset: datasets.BopDataset, models: Sequence[ObjectModel]) -> 
 def _match_models(
     dataset: datasets.BopDataset, models: Sequence[ObjectModel]
 ) -> dict[int, ObjectModel]:
-    """Give the method's model of each object of a data set that has one, by the object's number.
+    """Match the objects of a data set to a method's models, by the object's number.
 
     It is that of the object's name, else that of its number, unless the data set has another object
     of that model's name.

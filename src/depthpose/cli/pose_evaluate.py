@@ -32,7 +32,7 @@ from depthpose.pose.evaluate import (
 )
 from depthpose.pose.mesh import symmetry_transforms
 from depthpose.pose.predictions import (
-    predict,
+    estimate_missing_poses,
     read_predictions,
     results_name,
     write_bop_results,
@@ -86,7 +86,7 @@ def predict_instances(
         **masks.settings,
         **dataset_settings(dataset),
     }
-    written = predict(method.estimate_many, jobs, home, settings, batch)
+    written = estimate_missing_poses(method.estimate_many, jobs, home, settings, batch)
     label = f"{method.name}, {masks.name} masks"
     for _ in tqdm(written, label, total=len(jobs), disable=None, unit=" instances"):
         pass
@@ -199,7 +199,7 @@ def measure(
     instance_sections: list[Section] = []
     for path, evaluation, count in zip(predictions, evaluations, view_counts, strict=True):
         if count:
-            instance_sections += _instance_sections(dataset, path, evaluation.per_instance, count)
+            instance_sections += _show_instances(dataset, path, evaluation.per_instance, count)
     sections = [
         Section(title="Success by masks", text=text, rows=list(by_masks.values())),
         Section(title="All numbers", rows=rows),
@@ -213,7 +213,7 @@ def measure(
     return 0
 
 
-def _instance_sections(
+def _show_instances(
     dataset: BopDataset, predictions: Path, rows: Sequence[InstanceRow], max_count: int
 ) -> list[Section]:
     """Show some instances of a folder or file of predictions, ``max_count`` at most, with truth."""

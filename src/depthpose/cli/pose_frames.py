@@ -216,12 +216,12 @@ def search_dataset(
     any_object = next(iter(numbers))
     jobs: list[PoseJob[Any]] = []
     for image, instance in sorted(images.items()):
-        name = _image_name(image)
+        name = _name_image(image)
         read = partial(_read_whole_view, instance, any_object, name)
         jobs.append(PoseJob(name=name, read=read, place=place_of(instance)))
 
     def is_of_image(prediction: Prediction, image: str) -> bool:
-        return prediction.place is not None and _image_name(prediction.place[:2]) == image
+        return prediction.place is not None and _name_image(prediction.place[:2]) == image
 
     earlier = list(earlier_predictions(out).values())
     results = SearchResults(out, [job.name for job in jobs], earlier, is_of_image, numbers)
@@ -230,7 +230,7 @@ def search_dataset(
     return pose_output.print_result(predictions, out, len(images))
 
 
-def _image_name(image: tuple[int, int]) -> str:
+def _name_image(image: tuple[int, int]) -> str:
     """Name an image of a data set by its scene and its number."""
     scene_id, image_id = image
     return f"{scene_id:06d}_{image_id:06d}"
@@ -252,12 +252,12 @@ def _read_masked_by_pose(job: PoseJob[Any], prediction: Prediction, method: Pose
     model = next((model for model in method.models if model.name == estimate.object), None)
     if model is None or estimate.camera_from_model is None or not isinstance(view, ViewInput):
         return view
-    mask = explained_mask(view, estimate.camera_from_model, _surface_of(model))
+    mask = explained_mask(view, estimate.camera_from_model, _sample_surface_once(model))
     return replace(view, name=estimate.name, mask=mask, object=model.name)
 
 
 @lru_cache(maxsize=32)
-def _surface_of(model: ObjectModel) -> Surface:
+def _sample_surface_once(model: ObjectModel) -> Surface:
     """Sample the surface of a model once for all frames that show it."""
     return prepare_surface(model)
 

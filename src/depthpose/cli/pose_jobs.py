@@ -107,7 +107,7 @@ def _plan_regions(method: PoseMethod, inputs: PoseInputs, out: Path) -> JobPlan:
     if inputs.detections is not None:
         detections = Path(inputs.detections)
         settings["detections"] = str(detections.resolve())
-        wanted = _wanted_objects(method, labels, object)
+        wanted = _choose_wanted(method, labels, object)
         jobs = detection_file_jobs(depth, detections, inputs.lens, wanted, inputs.unit, out)
     elif inputs.box:
         settings["box"] = list(inputs.box)
@@ -128,7 +128,7 @@ def _plan_regions(method: PoseMethod, inputs: PoseInputs, out: Path) -> JobPlan:
 
 @dataclass(frozen=True, kw_only=True)
 class WantedObjects:
-    """Which detections are posed, by their objects.
+    """The objects whose detections are posed.
 
     ``names``: names of all objects of the method. ``labels``: the object of a detector's class,
     where it is not named so. ``only``: the single object that is wanted; None: all. ``expected``:
@@ -141,10 +141,10 @@ class WantedObjects:
     expected: Sequence[str]
 
 
-def _wanted_objects(
+def _choose_wanted(
     method: PoseMethod, labels: Mapping[str, str] | None, only: str | None
 ) -> WantedObjects:
-    """Say which detections are posed, and which objects have a result in every image.
+    """Decide which detections are posed, and which objects have a result in every image.
 
     Posed are the detections of ``only``, or of every object where it is None. A result, a refusal
     where it was not detected, have ``only``; else the objects of ``labels``; else, where there are
@@ -235,10 +235,10 @@ def mask_jobs(
     for path in depths:
         mask_file = masks[path.stem]
         if labels is not None:
-            parts = _labelled_parts(mask_file, labels, object)
+            parts = _split_by_label(mask_file, labels, object)
         else:
             assert object is not None
-            parts = _numbered_parts(mask_file, object)
+            parts = _split_by_number(mask_file, object)
         for part in parts:
             name = path.stem + part.ending
             read = partial(view_input, path, part.mask, camera, part.object, name, unit)
@@ -256,8 +256,8 @@ class _MaskPart(NamedTuple):
     mask: AnyMask
 
 
-def _numbered_parts(mask: Path, object: str) -> list[_MaskPart]:
-    """Give a part for each number of a mask that has several, all of one object; else the mask."""
+def _split_by_number(mask: Path, object: str) -> list[_MaskPart]:
+    """Split a mask by its numbers, all of one object; a mask with one number stays whole."""
     whole_mask = [_MaskPart("", object, mask)]
     try:
         label_map = read_labels(mask)
@@ -269,8 +269,8 @@ def _numbered_parts(mask: Path, object: str) -> list[_MaskPart]:
     return [_MaskPart(f"_{k}", object, _run_lengths(label_map == k)) for k in numbers]
 
 
-def _labelled_parts(mask: Path, labels: Mapping[str, str], wanted: str | None) -> list[_MaskPart]:
-    """Give a part for each number that ``--labels`` names; only of ``wanted``, if given.
+def _split_by_label(mask: Path, labels: Mapping[str, str], wanted: str | None) -> list[_MaskPart]:
+    """Split a mask by the numbers that ``--labels`` names; only of ``wanted``, if given.
 
     A number that the mask lacks has an empty part, whose pose is then refused.
     """
@@ -312,7 +312,7 @@ def box_jobs(
     detections = [Detection(object=object, box=parse_box(text)) for text in boxes]
     jobs: list[PoseJob[Any]] = []
     for path in depths:
-        jobs += _detection_jobs(path, detections, (path,), camera, unit)
+        jobs += _make_detection_jobs(path, detections, (path,), camera, unit)
     _refuse_equal_names(jobs, depth)
     return jobs
 
@@ -359,7 +359,7 @@ def detection_file_jobs(
         has_detection |= bool(in_image)
         detected = {detection.object for detection in in_image}
         undetected = [name for name in wanted.expected if name not in detected]
-        jobs += _detection_jobs(path, in_image, (path, file), camera, unit, undetected)
+        jobs += _make_detection_jobs(path, in_image, (path, file), camera, unit, undetected)
     if not has_detection:
         raise InputError(f"{detections}: holds no detection of what is asked for in {depth}")
     _refuse_equal_names(jobs, depth)
@@ -375,7 +375,7 @@ def _read_detections_of(depth: Path, file: Path) -> list[Detection]:
     return read_detections(file, size)
 
 
-def _detection_jobs(
+def _make_detection_jobs(
     path: Path,
     detections: Sequence[Detection],
     files: tuple[Path, ...],

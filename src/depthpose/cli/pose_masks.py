@@ -53,16 +53,16 @@ def prepare_masks(
     masks: list[Masks] = []
     for kind, path, name in zip(kinds, paths, names, strict=True):
         if path is not None:
-            masks.append(_detected_masks(path, name, dataset, out, device))
+            masks.append(_take_detected_masks(path, name, dataset, out, device))
         elif kind == "predicted":
-            masks.append(_predicted_masks(dataset))
+            masks.append(_take_predicted_masks(dataset))
         else:
             make_jobs = partial(predictions.instance_jobs, dataset)
             masks.append(Masks(name=name, make_jobs=make_jobs, settings={}))
     return masks
 
 
-def _detected_masks(
+def _take_detected_masks(
     path: Path, name: str, dataset: datasets.BopDataset, out: Path, device: str
 ) -> Masks:
     """Take masks from a JSON file of BOP detections, or segment the images by weights."""
@@ -74,7 +74,7 @@ def _detected_masks(
     return Masks(name=name, make_jobs=make_jobs, settings={"masks_sha256": file_sha256(path)})
 
 
-def _predicted_masks(dataset: datasets.BopDataset) -> Masks:
+def _take_predicted_masks(dataset: datasets.BopDataset) -> Masks:
     """Take the masks that a segmentation network left in the data set, as it was published."""
     predicted_mask = datasets.LAYOUTS[dataset.layout].predicted_mask
     if predicted_mask is None:
@@ -105,7 +105,7 @@ def _segment_dataset(
     later run may ask for other objects, or for more images.
     """
     segmenter = Segmenter.load(path, device)
-    numbers = _numbers_in_dataset(segmenter, dataset, path)
+    numbers = _match_numbers(segmenter, dataset, path)
 
     home = out / "detections" / name
     claim_folder(home, {"weights_sha256": file_sha256(path), **dataset_settings(dataset)})
@@ -132,10 +132,10 @@ def _segment_dataset(
     return detections
 
 
-def _numbers_in_dataset(
+def _match_numbers(
     segmenter: Segmenter, dataset: datasets.BopDataset, path: Path
 ) -> dict[str, int]:
-    """Give the data set's number of each object of the weights: by its name, else by its number.
+    """Match the objects of the weights to the data set's numbers: by name, else by number.
 
     Objects of the data set that the weights do not segment are printed; it is an error if they
     segment none.

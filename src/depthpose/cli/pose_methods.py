@@ -67,13 +67,13 @@ def build_methods(
     methods: list[PoseMethod] = []
     for path, label in zip(paths, labels, strict=True):
         if path is None:
-            methods.append(_registration_method(label, models, config))
+            methods.append(_make_registration_method(label, models, config))
         else:
-            methods.append(_network_method(path, label, config))
+            methods.append(_make_network_method(path, label, config))
     return methods
 
 
-def _registration_method(
+def _make_registration_method(
     name: str, models: Sequence[ObjectModel], config: EstimateConfig
 ) -> PoseMethod:
     """Make the method that registers models without training."""
@@ -83,7 +83,7 @@ def _registration_method(
             "models it takes"
         )
     net = Registration(models, config)
-    fingerprints = {model.name: _model_fingerprint(model) for model in models}
+    fingerprints = {model.name: _fingerprint_model(model) for model in models}
     return PoseMethod(
         name=name,
         estimate_many=net.estimate_many,
@@ -97,8 +97,8 @@ def _registration_method(
     )
 
 
-def _model_fingerprint(model: ObjectModel) -> str:
-    """Give the start of the SHA-256 of a model's mesh and of its declared symmetries."""
+def _fingerprint_model(model: ObjectModel) -> str:
+    """Compute the start of the SHA-256 of a model's mesh and of its declared symmetries."""
     digest = sha256(model.vertices_m.contiguous().numpy().tobytes())
     digest.update(model.faces.contiguous().numpy().tobytes())
     if not model.symmetries.is_found and not model.symmetries.is_none:
@@ -106,7 +106,7 @@ def _model_fingerprint(model: ObjectModel) -> str:
     return digest.hexdigest()[:16]
 
 
-def _network_method(path: Path, name: str, config: EstimateConfig) -> PoseMethod:
+def _make_network_method(path: Path, name: str, config: EstimateConfig) -> PoseMethod:
     """Make the method of a weights file: a network that votes, or the regressor.
 
     Its name in tables also says which settings differ from the defaults.
@@ -117,12 +117,14 @@ def _network_method(path: Path, name: str, config: EstimateConfig) -> PoseMethod
         name += "-least-squares"
     if not config.with_icp:
         name += "-without-icp"
+
     settings = {
         "kind": read_checkpoint(path).kind,
         "weights": path.stem,
         "weights_sha256": file_sha256(path),
         "estimate": config_to_dict(config),
     }
+
     if isinstance(pose_weights.network, DepthImageNet):
         return PoseMethod(
             name=name,
@@ -175,7 +177,7 @@ def _with_base(method: PoseMethod, base: Rigid) -> PoseMethod:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PoseMethodSource:
-    """What an estimator is built from, in this process or by the workers of an engine.
+    """The description of an estimator, from which this process or an engine's workers build it.
 
     ``weights``: of a network, by name or file, or as bytes to be sent to workers; None: ``models``
     are registered without training. ``base_from_camera``: if given, every estimate has the pose
@@ -197,12 +199,12 @@ class PoseMethodSource:
         """Build the estimator of poses from the camera alone."""
         config = self.config if device is None else replace(self.config, device=device)
         if self.weights is None or self.weights == REGISTER:
-            return _registration_method(REGISTER, self.models, config)
+            return _make_registration_method(REGISTER, self.models, config)
         if isinstance(self.weights, str):
             path = find_weights(self.weights)
-            return _network_method(path, path.stem, config)
+            return _make_network_method(path, path.stem, config)
         with self.weights.unpacked() as name:
-            return _network_method(Path(name), Path(name).stem, config)
+            return _make_network_method(Path(name), Path(name).stem, config)
 
 
 def unit_of_cad(files: Sequence[str], cad_unit: Unit | None, unit: Unit | None) -> Unit | None:

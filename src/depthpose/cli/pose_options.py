@@ -37,7 +37,7 @@ class PoseDataOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class PoseMeasureOptions:
-    """How poses of a data set are estimated and measured."""
+    """The settings by which poses of a data set are estimated and measured."""
 
     masks: tuple[str, ...] = ("truth",)
     """truth; predicted (those that came with Linemod_preprocessed); a JSON file of BOP detections;
@@ -64,7 +64,7 @@ class PoseMeasureOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class PoseTableOptions(PoseMeasureOptions):
-    """How the poses of a table are estimated, measured and shown."""
+    """The settings by which the poses of a table are estimated, measured and shown."""
 
     pictures: int = 4
     """instances that the page shows."""
@@ -72,7 +72,7 @@ class PoseTableOptions(PoseMeasureOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class InputOptions:
-    """What is looked for, and in what."""
+    """The objects that are looked for, and the clouds or depth images that show them."""
 
     cad: tuple[Source, ...] = ()
     """STL, PLY, OBJ or GLB files of the parts: they are posed without training, a second or two for
@@ -98,7 +98,7 @@ class InputOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class InputDetailOptions:
-    """More about the objects and the images."""
+    """Further facts of the objects and the images."""
 
     detections: Source | None = None
     """boxes or masks of a detector: .json of COCO or BOP, .txt of YOLO, or a folder of such files
@@ -190,7 +190,7 @@ class DataSetOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class MethodOptions:
-    """What estimates poses."""
+    """The estimator of the poses."""
 
     method: Literal["network", "register"] | None = None
     """network: trained weights. register: the CAD files alone, a second or two for each part, or
@@ -206,7 +206,7 @@ class MethodOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class EstimateOptions(MethodOptions):
-    """How poses are estimated; options from ``weights`` on have no effect on registration."""
+    """The settings of the estimator; those from ``weights`` on have no effect on registration."""
 
     min_certainty: float = 0.9
     """below it the status is ambiguous, not ok: the likeliest pose with its alternatives."""

@@ -220,7 +220,7 @@ def print_result(predictions: list[Prediction], out: Path, input_count: int | No
 
     counts = Counter(estimate.status for estimate in readable)
     statuses = ", ".join(f"{count} {status}" for status, count in sorted(counts.items()))
-    total = _count_inputs(predictions, input_count)
+    total = _describe_counts(predictions, input_count)
     print(f"{total}: {statuses or 'none readable'}; {out / 'poses.json'}")
     return 1 if unreadable else 0
 
@@ -229,7 +229,7 @@ def _print_table(estimates: Sequence[PoseEstimate]) -> None:
     """Print a table of the first estimates, and what its columns mean."""
     rows: list[dict[str, Any]] = []
     for estimate in estimates[:_MAX_PRINTED_POSES]:
-        row = _row(estimate)
+        row = _make_row(estimate)
         row |= _pose_cells(estimate.camera_from_model)
         row |= _pose_cells(estimate.base_from_model, prefix="base ")
         row |= {name: f"{row[name]:.3f}" for name in _SHARES if row[name] is not None}
@@ -251,8 +251,8 @@ def _pose_cells(pose: Rigid | None, prefix: str = "") -> dict[str, str]:
     }
 
 
-def _count_inputs(predictions: Sequence[Prediction], input_count: int | None) -> str:
-    """Say how many inputs there were, and how many estimates where that number differs."""
+def _describe_counts(predictions: Sequence[Prediction], input_count: int | None) -> str:
+    """Describe the number of inputs, and of estimates where that differs."""
     answers = len(predictions)
     count = answers if input_count is None else input_count
     text = f"{count} input{'s' * (count != 1)}"
@@ -261,7 +261,7 @@ def _count_inputs(predictions: Sequence[Prediction], input_count: int | None) ->
     return text
 
 
-def _row(estimate: PoseEstimate) -> dict[str, Any]:
+def _make_row(estimate: PoseEstimate) -> dict[str, Any]:
     """Give the row of an estimate for the page and the terminal."""
     row: dict[str, Any] = {
         "input": estimate.name,
@@ -305,12 +305,12 @@ def _write_page(
     # The table: refusals first, for they are what is looked for.
     estimates = [prediction.estimate for prediction in predictions]
     refusals_first = sorted(estimates, key=lambda estimate: estimate.is_posed)
-    rows = [_row(estimate) for estimate in refusals_first[:_MAX_PAGE_ROWS]]
+    rows = [_make_row(estimate) for estimate in refusals_first[:_MAX_PAGE_ROWS]]
     sections = _pose_sections(predictions, jobs, models, dataset)
 
     status_counts = Counter(estimate.status for estimate in estimates)
     counts = ", ".join(f"{count} {status}" for status, count in sorted(status_counts.items()))
-    total = _count_inputs(predictions, input_count)
+    total = _describe_counts(predictions, input_count)
     text = f"{total}: {counts}. Shown below: {len(sections)}"
     text += "." if len(sections) == len(predictions) else ", answers and refusals spread evenly."
     if len(predictions) > _MAX_PAGE_ROWS:
@@ -335,6 +335,7 @@ def _pose_sections(
         for prediction, job in zip(predictions, jobs, strict=True)
         if prediction.estimate.status != "unreadable"
     ]
+
     sections: list[Section] = []
     for k in choose_answers([prediction.estimate.is_posed for prediction, _ in readable]):
         prediction, job = readable[k]
@@ -343,9 +344,11 @@ def _pose_sections(
             pose_input = job.read()
         except InputError:  # unreadable by now
             continue
+
         is_whole_image = isinstance(pose_input, ViewInput) and bool(pose_input.mask.all())
         if is_whole_image and not estimate.is_posed:
             continue  # there is no part of the image to show; the row says why
+
         rgb = None if prediction.place is None else rgb_of[prediction.place[:2]]
         image = None if rgb is None else read_image(rgb)
         section = drawn.pose_section(

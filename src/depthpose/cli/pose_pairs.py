@@ -12,7 +12,7 @@ from depthpose.core.camera import StereoRig, read_rig
 from depthpose.core.errors import InputError
 from depthpose.core.files import image_size, read_map, write_map
 from depthpose.core.files.images import refuse_among_inputs
-from depthpose.core.run import claim_folder, is_whole, note_result
+from depthpose.core.run import claim_folder, find_rank, is_whole, note_result
 from depthpose.depth.config import MatcherConfig
 from depthpose.depth.disparity import depth_deviation
 
@@ -49,6 +49,7 @@ def match_pairs(pair: PairOptions, camera: Path | None, device: str, out: Path) 
         raise InputError(
             f"--min-confidence {pair.min_confidence:g}: a confidence lies in 0 to 1; 0 keeps all"
         )
+
     pairs = depth_predict.list_pairs(pair.left, pair.right)
     images = [path for both in pairs for path in both]
     refuse_among_inputs(out, (pair.left, pair.right), images)
@@ -61,6 +62,8 @@ def match_pairs(pair: PairOptions, camera: Path | None, device: str, out: Path) 
     networks = PairNetworks(matcher=pair.matcher)
     work = depth_predict.pair_work(camera, networks, source, pairs[0])
     depth_predict.predict_files(pairs, work, source.build(), out / MATCHED)
+    if find_rank().world > 1:  # every process poses its share of all pairs
+        depth_predict.wait_for_results(pairs, work, out / MATCHED)
 
     rig = read_rig(camera, image_size(pairs[0][0]))
     names = [left.stem for left, _ in pairs]
@@ -85,6 +88,7 @@ def _write_sure_depth(name: str, rig: StereoRig, min_confidence: float, out: Pat
         claim_folder(folder, settings)
     if all(is_whole(folder, name, [f"{name}.npy"]) for folder in folders):
         return
+
     depth_m = read_map(home / f"{name}.depth_m.npy")
     confidence = torch.ones_like(depth_m)
     if (home / f"{name}.confidence.npy").is_file():
@@ -96,11 +100,13 @@ def _write_sure_depth(name: str, rig: StereoRig, min_confidence: float, out: Pat
             f"{name}: no depth is as sure as {min_confidence:g}, so there is nothing to pose; "
             "give a lower --min-confidence"
         )
+
     left_out = 1 - float(sure_m.isfinite().sum() / depth_m.isfinite().sum())
     print(
         f"{name}: {left_out:.1%} of the depth is less sure than {min_confidence:g} and left out",
         file=sys.stderr,
     )
+
     deviation_m = depth_deviation(depth_m, confidence, rig)
     sure_deviation_m = torch.where(is_sure, deviation_m, torch.nan)
     for folder, values_m in zip(folders, (sure_m, sure_deviation_m), strict=True):

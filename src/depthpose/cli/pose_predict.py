@@ -184,7 +184,7 @@ class EntryFiles(Results[Any, PoseEstimate]):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PoseWork:
-    """What a worker of an engine estimates, and from which kind of files.
+    """The estimation of poses by a worker of an engine, from one kind of files.
 
     Without a camera the files are clouds; with one they are depth images, each with its mask, or
     all with one box.

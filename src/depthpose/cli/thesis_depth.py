@@ -87,12 +87,12 @@ def reproduce_table(
     figures: list[Section] = []
     if pictures > 0:
         for _, method in methods:
-            figures += _figure_sections(method, dataset, out, pictures)
+            figures += _make_figure_sections(method, dataset, out, pictures)
     sections = [
         Section(title="Published rows, ours, and difference", text=method_note, rows=rows),
         *figures,
         *evaluation.write_details(measured, out),
-        _settings_section([method for _, method in methods]),
+        _make_settings_section([method for _, method in methods]),
     ]
     write_report(f"{table.title}, on {dataset.name}", sections, out)
     for name, reason in measured.skipped.items():
@@ -107,7 +107,7 @@ def _frames_sha256(frames: Sequence[Frame]) -> str:
     return hashlib.sha256(paths.encode()).hexdigest()
 
 
-def _settings_section(methods: Sequence[DepthMethod]) -> Section:
+def _make_settings_section(methods: Sequence[DepthMethod]) -> Section:
     """Show what decides the results of each method, a row for each setting."""
     rows = [
         {"method": method.name, "setting": name, "value": str(value)}
@@ -117,7 +117,7 @@ def _settings_section(methods: Sequence[DepthMethod]) -> Section:
     return Section(title="Settings", rows=rows)
 
 
-def _figure_sections(
+def _make_figure_sections(
     method: DepthMethod, dataset: Dataset, out: Path, number: int
 ) -> list[Section]:
     """Draw figure 2-5 of some frames that a method predicted, and figure 2-1 of the first.
@@ -139,7 +139,7 @@ def _figure_sections(
             figures["2-1"] = draw_figure_2_1(pair, lidar_m, estimate, stereo)
         for figure, panels in figures.items():
             title = f"Figure {figure}: {method.name}, {pair.name}"
-            sections.append(_panel_section(title, panels, home / f"{figure}_{pair.name}"))
+            sections.append(_make_panel_section(title, panels, home / f"{figure}_{pair.name}"))
     return sections
 
 
@@ -187,6 +187,7 @@ def write_figure(
         "method": method.settings,
     }
     claim_folder(out, settings, (f"figure-{number}.png", "panels", "report.html"))
+
     columns: list[list[Drawing]] = []
     sections: list[Section] = []
     for index, frame in zip(tqdm(indices, unit=" frames", disable=None), frames, strict=True):
@@ -200,17 +201,18 @@ def write_figure(
             stereo = method.net.estimate_input(pair)
             panels = draw_figure_2_1(pair, lidar_m, estimate, stereo)
         columns.append(panels)
-        sections.append(_panel_section(frame.name, panels, out / "panels" / frame.name))
+        sections.append(_make_panel_section(frame.name, panels, out / "panels" / frame.name))
+
     path = out / f"figure-{number}.png"
     write_image(path, arrange(columns))
-    sections.append(_settings_section([method]))
+    sections.append(_make_settings_section([method]))
     page.write_page(out / "report.html", f"Figure {number}", sections, environment())
     captions = "; ".join(panel.caption for panel in columns[0])
     print(f"{path}: each column from top to bottom: {captions}. {DEPTH_SCALE}; see the bar below.")
     return 0
 
 
-def _panel_section(title: str, panels: Sequence[Drawing], stem: Path) -> Section:
+def _make_panel_section(title: str, panels: Sequence[Drawing], stem: Path) -> Section:
     """Write each panel as a file, STEM.1.jpg, ..., small enough for a page of many; show them."""
     pictures: list[Picture] = []
     for k, panel in enumerate(panels, 1):

@@ -87,6 +87,7 @@ def open_views(net: GeoPoseNet, data: PoseDataOptions, number: int | None, synth
             facts={"frames": f"synthetic, seed {_SYNTHETIC_SEED}"},
             settings={"synthetic": synthetic, "seed": _SYNTHETIC_SEED},
         )
+
     dataset = pose_evaluate.open_instances(data.folder, data.split, data.objects, None)
     facts = {
         "frames": f"{data.folder.resolve().name} {data.split}",
@@ -95,12 +96,15 @@ def open_views(net: GeoPoseNet, data: PoseDataOptions, number: int | None, synth
     if number is not None and number < len(dataset):
         instances = [dataset.instances[i] for i in page.spread_evenly(len(dataset), number)]
         dataset = replace(dataset, instances=instances)
+
+    # Views of instances call the object as the weights do.
     names = pose_dataset.match_names(dataset, net.weights.models)
     samples: list[ViewSample] = []
     for instance in dataset.instances:
         view = dataset.view(instance)
         named_input = replace(view.input, object=names[instance.object_id])
         samples.append(replace(view, input=named_input))
+
     settings = {
         "data": str(dataset.folder.resolve()),
         "split": dataset.split,
@@ -148,7 +152,7 @@ def reproduce_by_object(
         "frames_sha256": frames_hash(dataset.instances),
         "rule": config_to_dict(rule),
         "methods": {method.name: dict(method.settings) for method in methods},
-        "masks": [_mask_setting(kind) for kind in options.masks] if methods else [],
+        "masks": [_describe_masks(kind) for kind in options.masks] if methods else [],
         "csv": [file_names.name_with_checksum(path) for path in csv],
     }
     results = (*page.table_files("rows", "all", "instances", "risk"), "report.md", "report.html")
@@ -183,8 +187,8 @@ def reproduce_by_object(
     return 0
 
 
-def _mask_setting(kind: str) -> str:
-    """Give a kind of masks for the record of a run: its word, or its file with a checksum."""
+def _describe_masks(kind: str) -> str:
+    """Describe a kind of masks for the record of a run: its word, or its file with a checksum."""
     path = pose_masks.mask_path(kind)
     return kind if path is None else file_names.name_with_checksum(path)
 
@@ -249,12 +253,14 @@ def reproduce_voting(
         **views.settings,
     }
     claim_folder(out, settings, [*page.table_files("rows"), "report.md", "report.html"])
+
     rows: list[dict[str, Any]] = []
     for count in points:
         samples = tqdm(views.samples, f"{count} points", disable=None)
         cases = list(pose_tables.voting_cases(net, samples, count))
         rows += [row | facts for row in pose_tables.compare_voting(cases, count)]
     page.write_table(out, rows)
+
     text = (
         "Success: percent of instances whose ADD(-S) is below 10 % of the diameter, without ICP; "
         "milliseconds: processor time of one thread for all keypoints of a cloud, the median. "

@@ -15,7 +15,7 @@ from depthpose.cli.arguments import (
     NewPath,
     Source,
     WeightsName,
-    changed,
+    replace_given,
 )
 from depthpose.core.errors import InputError
 from depthpose.core.units import Unit
@@ -27,7 +27,7 @@ if TYPE_CHECKING:  # --help must not load torch
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingOptions:
-    """How long a training goes, on what, and from which state."""
+    """The length of a training, its machine, and the state that it starts from."""
 
     steps: int | None = None
     """optimiser steps in place of the config's length."""
@@ -58,7 +58,7 @@ class TrainingOptions:
 
         config: Any = (default or kind()) if path is None else read_config(path, kind)
         self._refuse_long_warmup(config)
-        loop = changed(
+        loop = replace_given(
             config.loop,
             workers=workers,
             seed=self.seed,
@@ -220,7 +220,7 @@ def depth_train(
 
     kind, run_stage = STAGES[stage]
     settings = training.read(config, kind)
-    settings = replace(settings, pairs=changed(settings.pairs, folders=data or None))
+    settings = replace(settings, pairs=replace_given(settings.pairs, folders=data or None))
     if held_out:
         # A generator is measured at the focal length of its own rig, whatever it is trained on.
         focal_px = settings.pairs.focal_px if stage == "stereo" else None
@@ -235,7 +235,7 @@ def depth_train(
     for name, value in weights.items():
         if value is not None and name not in usable_names:
             raise InputError(f"--{name} has no meaning for '{stage}'; see --help.")
-    return training.run(run_stage, changed(settings, **weights), out)
+    return training.run(run_stage, replace_given(settings, **weights), out)
 
 
 def calibrate(
@@ -268,7 +268,7 @@ def calibrate(
     from depthpose.depth.datasets import join_datasets, open_dataset
     from depthpose.depth.estimator import FakestereoNet
     from depthpose.depth.evaluate import measure_image_confidence
-    from depthpose.depth.weights import calibrate_weights, refuse_share
+    from depthpose.depth.weights import calibrate_weights, refuse_alarm_share
 
     refuse_to_replace(out)
     if out.suffix != ".safetensors":
@@ -276,7 +276,7 @@ def calibrate(
     path = find_weights(weights)
     parts = [open_dataset(folder, split if k == 0 else None) for k, folder in enumerate(data)]
     dataset = join_datasets(parts)
-    refuse_share(len(dataset), alarm_share)
+    refuse_alarm_share(len(dataset), alarm_share)
     net = FakestereoNet.load(path, config=MatcherConfig(device=device), allow_ood=True)
     shown = tqdm(range(len(dataset)), unit=" images", disable=None)
     confidences = measure_image_confidence(net, map(dataset.read_input, shown))
@@ -364,7 +364,7 @@ def _with_models(
             f"--{option} has no meaning for 'segmentation', which learns from pictures: make them "
             "by 'depthpose data make objects --cad ...' and name the folder in the config"
         )
-    models = changed(config.models, cad=cad or None, unit=unit)
+    models = replace_given(config.models, cad=cad or None, unit=unit)
     if symmetries is not None:
         models = replace(models, with_found_symmetries=symmetries == "found")
     if cad:  # they take the place of a data set's models

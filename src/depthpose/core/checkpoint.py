@@ -11,7 +11,7 @@ import json
 import pickle
 import re
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
@@ -24,6 +24,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
+from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError, Notice, import_extra, nearest_name
 from depthpose.core.files.disk import finite_number, refused_as, write_bytes
 
@@ -170,15 +171,15 @@ def fetch_weights(name: str) -> Path:
     try:
         path = hub.hf_hub_download(reference["repository"], file, revision=reference["revision"])
     except Exception as error:
-        refusal = _hub_refusal(error)
+        refusal = _explain_hub_error(error)
         if refusal is None:
             raise
         raise InputError(f"{name}: {refusal}") from error
     return Path(path)
 
 
-def _hub_refusal(error: Exception) -> str | None:
-    """Say why the hub gave no file, and what to do; None where the error has another origin."""
+def _explain_hub_error(error: Exception) -> str | None:
+    """Explain why the hub gave no file, and what to do; None for an error of another origin."""
     errors = import_module("huggingface_hub.errors")
     reason = " ".join(str(error).split())[:_LONGEST_REASON] or type(error).__name__
     # The library's errors derive from those of the HTTP library that it is built on: requests,
@@ -271,13 +272,42 @@ def load_weights(network: nn.Module, checkpoint: Checkpoint, source: str) -> Non
         InputError: they do not; it names ``source`` and the first tensors that are missing,
             unexpected or of another shape.
     """
-    problems = misfits(network.state_dict(), checkpoint.state)
+    problems = list_misfits(network.state_dict(), checkpoint.state)
     if problems:
         raise InputError(
             f"{source}: {len(problems)} tensors do not fit the network of its config: "
             f"{'; '.join(problems[:3])}. File and config belong to different versions."
         )
     network.load_state_dict(dict(checkpoint.state))
+
+
+def refuse_other_network(
+    network: nn.Module, loaded: nn.Module, source: str, independent: Collection[str] = ()
+) -> None:
+    """Refuse to begin a training with weights of another network.
+
+    Args:
+        network: the network that is trained; its ``config`` is a dataclass, as that of ``loaded``.
+        loaded: the network with the weights.
+        source: their file, for errors.
+        independent: settings that may differ, since the weights do not depend on them.
+
+    Raises:
+        InputError: the networks differ in their class, or in another setting.
+    """
+    if type(loaded) is not type(network):
+        raise InputError(
+            f"{source}: holds weights of {type(loaded).__name__}, but the config trains "
+            f"{type(network).__name__}. Give weights of that network."
+        )
+    config = config_to_dict(network.config)
+    loaded_config = config_to_dict(loaded.config)
+    for name, value in config.items():
+        if name not in independent and loaded_config[name] != value:
+            raise InputError(
+                f"{source}: was trained with {name} = {loaded_config[name]!r}, but the config says "
+                f"{value!r}. Give the config the weights' own."
+            )
 
 
 def build_network(make: Callable[[], NetworkT], checkpoint: Checkpoint, source: str) -> NetworkT:
@@ -323,7 +353,7 @@ class _SkipRandomInit(TorchFunctionMode):
         return func(*args, **options)
 
 
-def misfits(wanted: Mapping[str, Tensor], tensors: Mapping[str, Tensor]) -> list[str]:
+def list_misfits(wanted: Mapping[str, Tensor], tensors: Mapping[str, Tensor]) -> list[str]:
     """Compare named tensors with the wanted ones: those missing, unexpected or of another shape.
 
     Returns:
@@ -404,7 +434,7 @@ def save_imported(
     save_checkpoint(out, Checkpoint(kind=kind, config={}, state=state, facts={**origin, **facts}))
 
 
-def half_state(network: nn.Module) -> dict[str, Tensor]:
+def halve_state(network: nn.Module) -> dict[str, Tensor]:
     """Return the state of a network with its floating-point tensors converted to float16."""
     state = network.state_dict()
     return {

@@ -27,7 +27,7 @@ ASCENDING = "ascending"
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Rule:
-    """What the values of a setting must fulfil."""
+    """The rule that the values of a setting must fulfil."""
 
     words: tuple[str, ...]  # the allowed words; none: any value
     interval: str  # such as "[16, inf)", for each number of the setting; "": any number
@@ -149,8 +149,8 @@ def _merge_nested_defaults(content: Mapping[Any, Any], kind: type) -> dict[Any, 
         removes = getattr(default, "INSTEAD", {})
         removed = {removes[key] for key in differences if key in removes}
         defaults = config_to_dict(default)
-        kept = {key: value for key, value in defaults.items() if key not in removed}
-        merged[field.name] = kept | _merge_nested_defaults(differences, type(default))
+        remaining = {key: value for key, value in defaults.items() if key not in removed}
+        merged[field.name] = remaining | _merge_nested_defaults(differences, type(default))
     return merged
 
 

@@ -10,7 +10,7 @@ from typing import TypeVar, cast
 
 import torch
 
-from depthpose.core.errors import InputError, Notice, full_memory
+from depthpose.core.errors import InputError, Notice, describe_full_memory
 
 _IMPORTING_PROCESS = os.getpid()  # a process that is forked later has another number
 Item = TypeVar("Item")
@@ -108,7 +108,7 @@ def refused_memory(name: str) -> Iterator[None]:
     try:
         yield
     except (MemoryError, RuntimeError) as error:
-        reason = full_memory(error)
+        reason = describe_full_memory(error)
         if reason is None:
             raise
         raise InputError(f"{name}: {reason}") from error

@@ -25,7 +25,7 @@ class MissingExtraError(ImportError):
 
 
 def install_command(extra: str) -> str:
-    """Say how an extra is installed: from a clone or a wheel, as no package index has a release."""
+    """Describe how an extra is installed: from a clone or a wheel, for no index has a release."""
     clone = f"pip install -e '.[{extra}]' in the clone of depthpose"
     return f"{clone}, or pip install 'WHEEL[{extra}]' with the file of the wheel"
 
@@ -42,7 +42,7 @@ _OUT_OF_MEMORY = re.compile(
 _LONGEST_CAUSE = 200  # letters that are shown of another library's message
 
 
-def full_memory(error: BaseException) -> str | None:
+def describe_full_memory(error: BaseException) -> str | None:
     """Describe an out-of-memory error of any library, with remedies; None for any other error.
 
     Libraries raise errors of many types, which are recognised by their message.
@@ -76,7 +76,7 @@ def import_extra(module: str, package: str, extra: str, purpose: str) -> Any:  #
         # A module of another name that is missing is one which this dependency needs itself.
         if isinstance(error, ModuleNotFoundError) and error.name in (module, top_module):
             raise MissingExtraError(package, extra, purpose) from error
-        reason = full_memory(error)
+        reason = describe_full_memory(error)
         if reason is not None:
             raise InputError(f"{purpose} needs {package}: {reason}") from error
         raise InputError(

@@ -155,7 +155,7 @@ class Case:
 
 @dataclass(frozen=True, kw_only=True)
 class Limit:
-    """How far an output may differ from PyTorch's.
+    """The limit within which an output may differ from PyTorch's.
 
     Where a discrete decision depends on a rounding, numbers flip: they differ by more, or are NaN
     in one output alone. A share of ``flips`` may do so, and is left out of the differences.
@@ -230,7 +230,7 @@ def _compare_output(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Export:
-    """What is written, and the cases by which it is compared with PyTorch."""
+    """An export: the graph to write, and the cases by which it is compared with PyTorch."""
 
     graph: Callable[[], Graph]
     cases: Callable[[], Iterable[Case]]
@@ -292,6 +292,7 @@ def _compare_with_torch(onnx_file: Path, export: Export) -> list[Row]:
                 torch_output = torch_output[mask]
             limit = export.limits[name]
             rows.append(_compare_output(case.name, name, onnx_output, torch_output, limit))
+
     if not rows:
         raise InputError("no output is compared with PyTorch's; nothing is written. Name a case.")
     for row in rows:

@@ -34,7 +34,7 @@ class CheckReport:
 
     @property
     def summary(self) -> str:
-        """One line for people."""
+        """Summarise the result in a line for people."""
         parts = ", ".join(f"{count} {part}" for part, count in self.counts.items())
         verdict = "nothing is wrong" if self.is_ok else f"{len(self.problems)} problems"
         return f"{self.layout}: {parts}; {verdict}, {len(self.notices)} notices"

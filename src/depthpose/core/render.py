@@ -221,7 +221,7 @@ def _draw(
         v = row.double()
         u_slope, v_slope, constant = edges.index_select(0, triangle).unbind(-1)
         offset = torch.addcmul(constant, v_slope, v[:, None])
-        start, stop = _columns_inside(
+        start, stop = _find_columns_inside(
             u_slope, offset, first_column[triangle], last_column[triangle]
         )
         not_empty = (start <= stop).nonzero()[:, 0]
@@ -263,7 +263,7 @@ def _draw(
     return Raster(depth_m=depth_m, primitive=primitive, barycentric=shares)
 
 
-def _columns_inside(
+def _find_columns_inside(
     slope: Float64[Tensor, "n 3"],
     offset: Float64[Tensor, "n 3"],
     first: Int64[Tensor, " n"],
@@ -274,9 +274,12 @@ def _columns_inside(
     Inside, ``slope * u + offset`` of no edge is negative; ``first`` and ``last`` bound the columns.
     The last column is before the first where there is none.
     """
+    # An edge that rises with u bounds the row on the left, one that falls on the right.
     crossing = -offset / slope
     left = _reduce_columns(torch.maximum, torch.where(slope > 0, crossing, -torch.inf))
     right = _reduce_columns(torch.minimum, torch.where(slope < 0, crossing, torch.inf))
+
+    # An edge along the row has no crossing: the whole row is inside of it, or outside.
     is_level = slope == 0
     is_outside = _reduce_columns(torch.logical_or, is_level & (offset < 0))
     # The edge functions of a triangle without area are 0: it would cover everything.

@@ -12,7 +12,7 @@ import subprocess
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -73,6 +73,7 @@ def lock_folder(folder: Path, *, is_shared: bool, timeout_s: float = 10.0) -> bo
     with refused_write(folder / _LOCK):
         folder.mkdir(parents=True, exist_ok=True)
         file = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT, 0o666)
+
     deadline = time.monotonic() + timeout_s
     while fcntl is not None:
         try:
@@ -89,6 +90,7 @@ def lock_folder(folder: Path, *, is_shared: bool, timeout_s: float = 10.0) -> bo
             time.sleep(_LOCK_POLL_S)
         except OSError:  # no locks on this file system
             break
+
     _locks[folder.resolve()] = file
     return True
 
@@ -111,7 +113,7 @@ def release_folders(but: Collection[Path] = ()) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class ProcessRank:
-    """Rank of this process among those of a launch, which exchange results through files."""
+    """The rank of this process among those of a launch, which exchange results through files."""
 
     rank: int = 0  #: 0 .. world - 1
     world: int = 1  #: how many processes there are
@@ -138,19 +140,25 @@ def find_rank() -> ProcessRank:
 
 
 def wait_for(
-    names: Sequence[str], is_there: Callable[[str], bool], timeout_s: float = 3600.0
+    names: Sequence[str],
+    is_there: Callable[[str], bool],
+    timeout_s: float = 3600.0,
+    count_steps: Callable[[], int] | None = None,
 ) -> None:
     """Wait until other processes have finished the results of all ``names``.
 
     Args:
         names: names of the results.
         is_there: whether the result of a name is finished.
-        timeout_s: how long no further result may appear, as where a process has died.
+        timeout_s: how long there may be no progress, as where a process has died.
+        count_steps: counts what else shows progress, such as frames of a long video; None: only
+            finished names do.
 
     Raises:
         InputError: the time is up; the message names the first result that is missing.
     """
     missing = [name for name in names if not is_there(name)]
+    step_count = 0
     last_progress = time.monotonic()
     while missing:
         if time.monotonic() - last_progress > timeout_s:
@@ -161,9 +169,11 @@ def wait_for(
             )
         time.sleep(min(_RESULTS_POLL_S, timeout_s))
         still_missing = [name for name in missing if not is_there(name)]
-        if len(still_missing) < len(missing):
+        new_step_count = 0 if count_steps is None else count_steps()
+        if len(still_missing) < len(missing) or new_step_count > step_count:
             last_progress = time.monotonic()
         missing = still_missing
+        step_count = new_step_count
 
 
 def environment() -> dict[str, str]:
@@ -177,13 +187,13 @@ def environment() -> dict[str, str]:
     )
     if torch.cuda.is_available():
         facts["gpu"] = torch.cuda.get_device_name()
-    commit = _commit_of_package()
+    commit = _read_commit()
     if commit:
         facts["commit"] = commit
     return facts
 
 
-def _commit_of_package() -> str:
+def _read_commit() -> str:
     """Ask Git for the commit of the running code; "" where it is not in a repository."""
     package_folder = str(Path(__file__).resolve().parent)
     command = ["git", "-C", package_folder, "describe", "--always", "--dirty", "--exclude", "*"]
@@ -274,10 +284,10 @@ def claim_names(
     """
     record = folder / _SOURCES
     # Listed before the record is read, which other processes write before their results.
-    results = _files_by_stem(folder, endings)
+    results = _list_files_by_stem(folder, endings)
     recorded = read_sources(folder)
     finished = {*results, *(_FRAME.sub("", stem) for stem in results)}
-    wanted = {name: _source_entry(files) for name, files in sources.items()}
+    wanted = {name: _make_source_entry(files) for name, files in sources.items()}
 
     # Refuse a name that an earlier run gave to another file, and a file that has changed since.
     for name, (path, stamp) in wanted.items():
@@ -318,7 +328,7 @@ def claim_names(
         write_json(record, recorded | wanted)
 
 
-def _files_by_stem(folder: Path, endings: Sequence[str]) -> dict[str, Path]:
+def _list_files_by_stem(folder: Path, endings: Sequence[str]) -> dict[str, Path]:
     """List the files of a folder that have one of the endings, by their names without it."""
     files: dict[str, Path] = {}
     for file in sorted(folder.iterdir()) if folder.is_dir() else ():
@@ -328,7 +338,7 @@ def _files_by_stem(folder: Path, endings: Sequence[str]) -> dict[str, Path]:
     return files
 
 
-def _source_entry(files: Path | Sequence[Path]) -> list[str]:
+def _make_source_entry(files: Path | Sequence[Path]) -> list[str]:
     """Make the entry of a source in the record: its path, and size and time of all its files."""
     paths = [files] if isinstance(files, Path) else list(files)
     stamps: list[str] = []
@@ -439,11 +449,12 @@ def _flatten(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 @dataclass(frozen=True, kw_only=True)
 class _ReadResults:
-    """How far a results file has been read, and the results in it."""
+    """The results and failures in a results file, up to where it has been read."""
 
     inode: int
-    end: int  # byte up to which it was read
-    results: dict[str, dict[str, list[int]]]
+    end: int = 0  # byte up to which it was read
+    results: dict[str, dict[str, list[int]]] = field(default_factory=dict)
+    failures: dict[str, str] = field(default_factory=dict)
 
 
 _read_results: dict[Path, _ReadResults] = {}  # by results file, so that only new lines are read
@@ -454,16 +465,29 @@ def note_result(folder: Path, name: str, files: Iterable[Path]) -> None:
 
     Without files it is noted that the result is to be made again.
     """
-    stamps = {file.relative_to(folder).as_posix(): _stamp(file) for file in files}
+    stamps = {file.relative_to(folder).as_posix(): _read_stamp(file) for file in files}
+    _append_result(folder, {"name": name, "files": stamps})
+
+
+def note_failure(folder: Path, name: str, reason: str) -> None:
+    """Append to ``results.jsonl`` why there is no result, for the other processes of a launch.
+
+    The next run makes it again.
+    """
+    _append_result(folder, {"name": name, "files": {}, "failure": reason})
+
+
+def _append_result(folder: Path, row: Mapping[str, Any]) -> None:
+    """Append an entry to ``results.jsonl``, on a line of its own."""
     # The line break in front separates it from what a killed process may have left of a line.
-    line = f"\n{json.dumps({'name': name, 'files': stamps})}\n".encode()
+    line = f"\n{json.dumps(row)}\n".encode()
     with refused_write(folder / RESULTS), (folder / RESULTS).open("ab", buffering=0) as file:
         while line:  # a full disk writes a part of it, and fails at the next try
             written = file.write(line)
             line = line[written:]
 
 
-def _stamp(file: Path) -> list[int]:
+def _read_stamp(file: Path) -> list[int]:
     """Return size [bytes] and time of the last change [ns] of a file."""
     status = file.stat()
     return [status.st_size, status.st_mtime_ns]
@@ -481,7 +505,7 @@ def is_whole(folder: Path, name: str, needed: Collection[str]) -> bool:
     if not noted:
         return False
     try:
-        stamps = {file: _stamp(folder / file) for file in {*noted, *needed}}
+        stamps = {file: _read_stamp(folder / file) for file in {*noted, *needed}}
     except OSError:
         return False
     return stamps == noted
@@ -490,30 +514,44 @@ def is_whole(folder: Path, name: str, needed: Collection[str]) -> bool:
 def read_results(folder: Path) -> dict[str, dict[str, list[int]]]:
     """Read the finished results of a folder, by name: their files, relative to the folder.
 
-    Each file has its stamp: size [bytes] and time of the last change [ns]. A repeated call reads
-    only the lines that were added since. Empty where nothing is noted or it cannot be read.
+    Each file has its stamp: size [bytes] and time of the last change [ns]. A result that is to be
+    made again has no files. Empty where nothing is noted or it cannot be read.
     """
+    return _read_new_lines(folder).results
+
+
+def read_failures(folder: Path) -> dict[str, str]:
+    """Read why results of a folder could not be made, by name (:func:`note_failure`).
+
+    A result that was made later is left out.
+    """
+    return _read_new_lines(folder).failures
+
+
+def _read_new_lines(folder: Path) -> _ReadResults:
+    """Read ``results.jsonl``; of a file that was read before, only the lines added since."""
     path = (folder / RESULTS).absolute()
     try:
         status = path.stat()
         earlier = _read_results.get(path)
-        end = 0
-        results: dict[str, dict[str, list[int]]] = {}
-        # Unless the file was replaced or cut since, it is read on from where it was read to.
-        if earlier and earlier.inode == status.st_ino and earlier.end <= status.st_size:
-            end = earlier.end
-            results = earlier.results
-        if status.st_size > end:
+        if earlier is None or earlier.inode != status.st_ino or earlier.end > status.st_size:
+            earlier = _ReadResults(inode=status.st_ino)  # the file was replaced or cut since
+        text = b""
+        if status.st_size > earlier.end:
             with path.open("rb") as file:
-                file.seek(end)
+                file.seek(earlier.end)
                 text = file.read()
-            whole_lines = text.rfind(b"\n") + 1  # another process may be writing the last line
-            for line in filter(None, text[:whole_lines].split(b"\n")):
-                with suppress(ValueError, KeyError, TypeError, AttributeError):  # a damaged line
-                    row = json.loads(line)
-                    results[str(row["name"])] = dict(row["files"].items())
-            end += whole_lines
-        _read_results[path] = _ReadResults(inode=status.st_ino, end=end, results=results)
     except OSError:
-        return {}
-    return results
+        return _ReadResults(inode=0)
+
+    whole_lines = text.rfind(b"\n") + 1  # another process may be writing the last line
+    for line in filter(None, text[:whole_lines].split(b"\n")):
+        with suppress(ValueError, KeyError, TypeError, AttributeError):  # a damaged line
+            row = json.loads(line)
+            name = str(row["name"])
+            earlier.results[name] = dict(row["files"].items())
+            earlier.failures.pop(name, None)
+            if "failure" in row:
+                earlier.failures[name] = str(row["failure"])
+    _read_results[path] = replace(earlier, end=earlier.end + whole_lines)
+    return _read_results[path]

@@ -26,7 +26,7 @@ class Job(Generic[Input]):
 
 
 class Results(ABC, Generic[Input, Result]):
-    """Where the results of a run are stored, and which of them an earlier run has finished."""
+    """The store of a run's results, which knows those that an earlier run has finished."""
 
     def is_finished(self, job: Job[Input]) -> bool:  # noqa: ARG002  for subclasses
         """Whether the result of a job is there from an earlier run; by default it never is."""

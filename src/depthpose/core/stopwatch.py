@@ -6,7 +6,7 @@ from contextlib import contextmanager
 
 
 class Stopwatch:
-    """Wall seconds of named stages.
+    """A stopwatch for named stages, in wall seconds.
 
     Example::
 
@@ -21,7 +21,7 @@ class Stopwatch:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Add the time of a ``with`` block to that of a stage."""
+        """Measure a ``with`` block, and add its time to that of a stage."""
         began = time.perf_counter()
         try:
             yield

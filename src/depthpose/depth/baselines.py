@@ -16,7 +16,7 @@ from torch.nn import functional as F
 from depthpose.core.camera import StereoRig
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image
-from depthpose.depth.datasets import Dataset, known_truths, read_known_depth
+from depthpose.depth.datasets import Dataset, read_true_depth, truth_kinds
 from depthpose.depth.disparity import disparity_from_depth
 from depthpose.depth.types import DepthEstimate, Map, StereoInput, View
 
@@ -59,14 +59,14 @@ class RowDepthBaseline:
         # A histogram of the depths of each row, weighted by 1 / t.
         weight = np.zeros((_ROWS, _DEPTH_STEPS))
         for index in progress(range(len(dataset))):
-            known_m = read_known_depth(dataset, index)
+            true_map_m = read_true_depth(dataset, index)
             rig = dataset.read_rig(index)
-            if known_m is None or rig is None:
+            if true_map_m is None or rig is None:
                 continue
-            true_m = known_m.double().numpy()
+            true_m = true_map_m.double().numpy()
             v, u = np.nonzero((true_m > _NEAR_M) & (true_m < _FAR_M))
             true_m = true_m[v, u]
-            row = np.rint(_canonical_rows(v, rig)).astype(np.int64).clip(0, _ROWS - 1)
+            row = np.rint(_convert_to_canonical_rows(v, rig)).astype(np.int64).clip(0, _ROWS - 1)
             step = np.log(true_m / _NEAR_M) / np.log(_FAR_M / _NEAR_M) * _DEPTH_STEPS
             cell = row * _DEPTH_STEPS + step.astype(np.int64)
             cell_weight = 1 / true_m / max(len(true_m), 1)
@@ -89,16 +89,16 @@ class RowDepthBaseline:
         Raises:
             InputError: the input has no rig.
         """
-        rig = _rig_of(pair)
+        rig = _require_rig(pair)
         height, width = pair.left.shape[1:]
-        rows = _canonical_rows(np.arange(height), rig)
+        rows = _convert_to_canonical_rows(np.arange(height), rig)
         inverse = np.interp(rows, np.arange(_ROWS), 1 / self.depth_m)
         row_depth_m = torch.from_numpy(1 / inverse).float()
         depth_m = row_depth_m[:, None].expand(height, width).contiguous()
         return DepthEstimate(depth_m=depth_m, disparity_px=disparity_from_depth(depth_m, rig))
 
 
-def _canonical_rows(rows: np.ndarray, rig: StereoRig) -> np.ndarray:
+def _convert_to_canonical_rows(rows: np.ndarray, rig: StereoRig) -> np.ndarray:
     """Convert rows of a camera's image to fractional rows of the canonical camera."""
     slope = (rows - float(rig.K[1, 2])) / float(rig.K[1, 1])
     return slope * _CANONICAL_FOCAL_PX + _ROWS // 2
@@ -129,12 +129,12 @@ class NearestImageBaseline:
         indices = [
             i
             for i, frame in enumerate(dataset.frames)
-            if frame.calibration and known_truths(frame) and dataset.read_rig(i) is not None
+            if frame.calibration and truth_kinds(frame) and dataset.read_rig(i) is not None
         ]
         if not indices:
             raise _nothing_to_learn(dataset)
         lefts = [dataset.frames[i].left for i in indices]
-        thumbnails = [_thumbnail(read_image(lefts[k])) for k in progress(range(len(lefts)))]
+        thumbnails = [_make_thumbnail(read_image(lefts[k])) for k in progress(range(len(lefts)))]
         return cls(dataset, indices, torch.stack(thumbnails))
 
     def estimate_input(self, pair: StereoInput) -> DepthEstimate:
@@ -143,14 +143,14 @@ class NearestImageBaseline:
         Raises:
             InputError: the input has no rig.
         """
-        rig = _rig_of(pair)
+        rig = _require_rig(pair)
         height, width = pair.left.shape[1:]
-        nearest = self.indices[int((self.thumbnails @ _thumbnail(pair.left)).argmax())]
-        known_m = read_known_depth(self.dataset, nearest)
+        nearest = self.indices[int((self.thumbnails @ _make_thumbnail(pair.left)).argmax())]
+        nearest_true_m = read_true_depth(self.dataset, nearest)
         nearest_rig = self.dataset.read_rig(nearest)
-        assert known_m is not None  # `fit` chose frames that have both
+        assert nearest_true_m is not None  # `fit` chose frames that have both
         assert nearest_rig is not None
-        inverse = fill_by_pyramid(1 / known_m)
+        inverse = fill_by_pyramid(1 / nearest_true_m)
         inverse = F.interpolate(inverse[None, None], (height, width), mode="bilinear")[0, 0]
 
         # Focal lengths in widths of the images, which now have one size.
@@ -165,27 +165,27 @@ def fill_by_pyramid(values: Map) -> Map:
 
     All stays NaN where there is no value at all.
     """
-    is_known = torch.isfinite(values)
-    if bool(is_known.all()) or values.shape == (1, 1):
+    has_value = torch.isfinite(values)
+    if bool(has_value.all()) or values.shape == (1, 1):
         return values
     height, width = values.shape
-    parts = torch.stack([values.nan_to_num(0.0), is_known.to(values.dtype)])
+    parts = torch.stack([values.nan_to_num(0.0), has_value.to(values.dtype)])
     padded = F.pad(parts, (0, width % 2, 0, height % 2))
     total, count = F.avg_pool2d(padded, 2)
     coarse = fill_by_pyramid(torch.where(count > 0, total / count, torch.nan))
     fine = coarse.repeat_interleave(2, 0).repeat_interleave(2, 1)
-    return torch.where(is_known, values, fine[:height, :width])
+    return torch.where(has_value, values, fine[:height, :width])
 
 
-def _thumbnail(image: View) -> Float[Tensor, " d"]:
+def _make_thumbnail(image: View) -> Float[Tensor, " d"]:
     """Shrink an image to 24 x 8 cells, with mean 0 and norm 1: dot products are correlations."""
     cells = F.interpolate(image[None], (8, 24), mode="area").flatten()
     centred = cells - cells.mean()
     return centred / centred.norm().clamp(min=1e-9)
 
 
-def _rig_of(pair: StereoInput) -> StereoRig:
-    """Give the rig of a pair, which a baseline needs."""
+def _require_rig(pair: StereoInput) -> StereoRig:
+    """Return the rig of a pair, which must have one."""
     if not isinstance(pair.camera, StereoRig):
         raise InputError(
             f"{pair.name}: has no rig, and a baseline is measured as disparity; give a camera with "

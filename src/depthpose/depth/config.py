@@ -85,7 +85,7 @@ class AugmentConfig(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class StreetsConfig(Settings):
-    """What synthetic street scenes are like, seen by the five rigs of KITTI's recording days."""
+    """Settings of synthetic street scenes, seen by the five rigs of KITTI's recording days."""
 
     seed: Annotated[int, "[0, inf)"] = 0
     """Another seed, other streets."""
@@ -112,7 +112,7 @@ class StreetsConfig(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class NearConfig(Settings):
-    """What synthetic near scenes are like: rooms, tables, bins, shelves, walls with things."""
+    """Settings of synthetic near scenes: rooms, tables, bins, shelves, walls with things."""
 
     seed: Annotated[int, "[0, inf)"] = 0
     """Another seed, other scenes."""
@@ -147,7 +147,7 @@ class NearConfig(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class PairsConfig(Settings):
-    """Which pairs a training sees, and how."""
+    """Settings of the pairs that a training sees: which ones, and how they are changed."""
 
     folders: tuple[str, ...] = ()
     """Datasets on disk: KITTI raw, object, 2015, Middlebury, plain folders (see ``--data``)."""
@@ -191,7 +191,7 @@ Speed = Literal["quick", "fine"]
 
 @dataclass(frozen=True, kw_only=True)
 class NetworkConfig(Settings):
-    """What every stereo network declares."""
+    """Settings that every stereo network has."""
 
     max_disparity_px: int = 192
     """Disparities below this are considered; a multiple of ``step_px``."""
@@ -266,7 +266,7 @@ class LightConfig(NetworkConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class MatcherConfig(Settings):
-    """How a stereo network is run on a pair of images."""
+    """Settings by which networks are run on pairs and images."""
 
     device: str = "cpu"
     """Where to compute: cpu, cuda, cuda:1, ..."""

@@ -55,7 +55,7 @@ MOST_ENLARGED_PIXELS = 8_000_000
 
 
 def disparity_advice(predicted_px: Map, true_px: Map) -> str | None:
-    """Say which unit or sign a predicted disparity likely has in place of pixels, else None.
+    """Name the unit or sign that a predicted disparity likely has in place of pixels; None: none.
 
     What a poor estimate could look like too is only a notice, once for each possible mistake.
     """
@@ -238,13 +238,13 @@ def resize_image(
     return resized.clamp(0, 1).reshape(*image.shape[:-2], height, width)
 
 
-def changed_match(match: Match, change: Callable[[Tensor], Tensor]) -> Match:
+def map_match(match: Match, change: Callable[[Tensor], Tensor]) -> Match:
     """Apply a function to each map that a match has, and give the new match."""
     maps = {field.name: getattr(match, field.name) for field in fields(match)}
     return Match(**{name: change(values) for name, values in maps.items() if values is not None})
 
 
-def resized_match(match: Match, height: int, width: int) -> Match:
+def resize_match(match: Match, height: int, width: int) -> Match:
     """Resize a match to another size of its image; disparities scale by the ratio of the widths."""
     confidence = match.confidence
     if confidence is not None:
@@ -342,7 +342,7 @@ def estimate_from_virtual(
     camera = image.camera
     assert camera is not None
     height, width = image.left.shape[1:]
-    match = resized_match(match, height, width)
+    match = resize_match(match, height, width)
     disparity_px = match.disparity_px
     confidence = match.confidence
     # Depth x disparity, at the image's own focal length.

@@ -46,7 +46,7 @@ NO_PREDICTION = "no right view to match, and no prediction"
 
 @dataclass(frozen=True)
 class Protocol:
-    """How a prediction is compared with the truth.
+    """A rule by which predictions are compared with the truth.
 
     In all protocols of depth, truth counts between 0.001 m and the cap, and predictions are clamped
     to that range.
@@ -170,7 +170,7 @@ class Measured:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Prepared:
+class _PreparedFrame:
     """A frame's truth and prediction, at the size of the image."""
 
     frame: Frame
@@ -217,7 +217,7 @@ def measure_frame(
         InputError: an unknown protocol, or a missing or damaged prediction.
     """
     rule = find_protocol(protocol)
-    prepared = _prepare(dataset, index, predictions, rule)
+    prepared = _prepare_frame(dataset, index, predictions, rule)
     if isinstance(prepared, str):
         return prepared
     caps: Sequence[float | None] = [None] if rule.is_disparity else caps_m
@@ -226,7 +226,9 @@ def measure_frame(
     return measured or "no truth within the caps and the crop"
 
 
-def _measure_at_cap(prepared: _Prepared, rule: Protocol, cap_m: float | None) -> Measured | None:
+def _measure_at_cap(
+    prepared: _PreparedFrame, rule: Protocol, cap_m: float | None
+) -> Measured | None:
     """Measure a frame at one cap (None for disparity); None where it has no truth within it."""
     predicted, truth = _apply_protocol(prepared, rule, cap_m)
     has_truth = torch.isfinite(truth)
@@ -261,7 +263,7 @@ def _measure_at_cap(prepared: _Prepared, rule: Protocol, cap_m: float | None) ->
     )
 
 
-def _measure_non_occluded(prepared: _Prepared) -> dict[str, float]:
+def _measure_non_occluded(prepared: _PreparedFrame) -> dict[str, float]:
     """Measure the disparity of the pixels that both views show; {} where they have no truth."""
     if prepared.frame.disparity_noc is None:
         return {}
@@ -305,6 +307,8 @@ def summarise(
         )
         for result in measured
     ]
+
+    # The means of each cap.
     ranking_metric = RANKING["disparity" if find_protocol(protocol).is_disparity else "depth"]
     rows: list[EvaluationRow] = []
     deciles: list[EvaluationRow] = []
@@ -318,7 +322,7 @@ def summarise(
                 frames=len(at_cap),
                 pixels=sum(result.pixels for result in at_cap),
                 coverage=sum(result.coverage for result in at_cap) / len(at_cap),
-                metrics=_mean_metrics(at_cap),
+                metrics=_average_metrics(at_cap),
             )
         )
 
@@ -338,7 +342,7 @@ def summarise(
     return Evaluation(rows=rows, per_frame=per_frame, deciles=deciles, skipped=skipped)
 
 
-def _mean_metrics(results: Sequence[Measured]) -> dict[str, float]:
+def _average_metrics(results: Sequence[Measured]) -> dict[str, float]:
     """Average over frames with a compared pixel the metrics that all of them have."""
     compared = [result.metrics for result in results if result.pixels]
     common = [name for name in compared[0] if all(name in metrics for metrics in compared)]
@@ -379,7 +383,7 @@ def frame_result(
     """
     rule = find_protocol(protocol)
     name = dataset.frames[index].name
-    prepared = _prepare(dataset, index, predictions, rule)
+    prepared = _prepare_frame(dataset, index, predictions, rule)
     if isinstance(prepared, str):
         raise InputError(f"{name}: {prepared}; choose a frame that counts")
     rig = prepared.rig
@@ -424,7 +428,9 @@ def clamped_depth(disparity_px: Map, rig: StereoRig, cap_m: float) -> Map:
     return torch.where(torch.isnan(disparity_px), torch.nan, clamped_m)
 
 
-def _prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) -> _Prepared | str:
+def _prepare_frame(
+    dataset: Dataset, index: int, predictions: Path, rule: Protocol
+) -> _PreparedFrame | str:
     """Read truth and prediction of a frame, or give the reason why it is not measured.
 
     Raises:
@@ -477,7 +483,7 @@ def _prepare(dataset: Dataset, index: int, predictions: Path, rule: Protocol) ->
     confidence = files.read_part(predictions, frame.name, "confidence.npy")
     if confidence is not None and confidence.shape != truth.shape:
         confidence = disparity.resized_map(confidence, height, width)
-    return _Prepared(
+    return _PreparedFrame(
         frame=frame,
         truth=truth,
         disparity_px=predicted_px,
@@ -562,7 +568,9 @@ def _refuse_crop(
         )
 
 
-def _apply_protocol(prepared: _Prepared, rule: Protocol, cap_m: float | None) -> tuple[Map, Map]:
+def _apply_protocol(
+    prepared: _PreparedFrame, rule: Protocol, cap_m: float | None
+) -> tuple[Map, Map]:
     """Clamp the prediction and mask the truth as the protocol says.
 
     Both are disparity [px] or depth [m], as the protocol compares; NaN where there is no

@@ -499,7 +499,7 @@ def depth_export(weights: DepthWeights, what: str | None, facts: dict[str, Any])
     return TARGETS[what].export(weights, facts)
 
 
-def _pair_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
+def _describe_pair_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
     """Describe the export of a matcher: its graph, and cases by which the graph is proven."""
 
     def cases() -> Iterator[Case]:
@@ -538,7 +538,7 @@ def _pair_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
     )
 
 
-def _image_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
+def _describe_image_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
     """Describe the export of a generator: its graph, and cases by which the graph is proven."""
 
     def cases() -> Iterator[Case]:
@@ -588,8 +588,10 @@ def _image_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
 
 
 TARGETS = {
-    "image": Target(fits=lambda weights: weights.generator is not None, export=_image_export),
-    "pair": Target(fits=lambda weights: weights.matcher is not None, export=_pair_export),
+    "image": Target(
+        fits=lambda weights: weights.generator is not None, export=_describe_image_export
+    ),
+    "pair": Target(fits=lambda weights: weights.matcher is not None, export=_describe_pair_export),
 }
 """One image to depth, a rectified pair to disparity: a new target is a function and one entry."""
 

@@ -252,6 +252,7 @@ def find_mount(
         network: config of the network that estimated the map, which says by how much its roads are
             tilted too far.
     """
+    # The tilt that is expected, which the edges of the image then improve.
     camera = image.camera
     assert camera is not None
     map_tilt_deg = fit.tilt_deg - network.road_tilt_off_deg
@@ -273,6 +274,7 @@ def find_mount(
         height_std = _MEASURED_HEIGHT_STD
     else:
         height_m, height_std = _estimate_height(fit.height_m, map_tilt_deg - tilt_deg, before)
+
     values = {
         "height_m": height_m,
         "tilt_deg": tilt_deg,
@@ -374,9 +376,24 @@ def scale_by_mount(
             another tilt.
     """
     camera = image.camera
-    name = image.name
     assert camera is not None and estimate.depth_m is not None  # noqa: PT018
     fit = fit_ground(estimate.depth_m, camera)
+    _refuse_contradiction(camera, fit, image.name)
+    if fit is None:
+        return estimate
+    before = None if mount is None else mount.last
+    ground = find_mount(fit, image, before, network)
+    if mount is not None:
+        mount.last = ground
+    factor = _depth_factor(estimate.depth_m, camera, fit, ground, network)
+    return replace(rescale(estimate, factor), ground=ground)
+
+
+def _refuse_contradiction(camera: Camera, fit: Ground | None, name: str) -> None:
+    """Refuse a height or tilt that the camera states, where the map contradicts it.
+
+    ``fit``: the road in the map, None where there is none; ``name``: of the image, for the error.
+    """
     if fit is None:
         mount_values = {
             "height": (camera.mount_height_m, "m"),
@@ -388,31 +405,32 @@ def scale_by_mount(
                     f"{name}: no road is seen in its lower part, so a camera {quantity} of "
                     f"{value:g} {unit} cannot set the scale; omit it, or give --known-distance"
                 )
-        return estimate
-    if (
-        camera.tilt_deg is not None
-        and abs(camera.tilt_deg - fit.tilt_deg) > _MAX_TILT_DIFFERENCE_DEG
-    ):
+        return
+    tilt_deg = camera.tilt_deg
+    if tilt_deg is not None and abs(tilt_deg - fit.tilt_deg) > _MAX_TILT_DIFFERENCE_DEG:
         raise InputError(
-            f"{name}: a tilt of {camera.tilt_deg:g} degrees is given, and the road that is seen "
+            f"{name}: a tilt of {tilt_deg:g} degrees is given, and the road that is seen "
             f"says {fit.tilt_deg:.1f}. Negative is down; correct it, or omit it"
         )
-    before = None if mount is None else mount.last
-    ground = find_mount(fit, image, before, network)
-    if mount is not None:
-        mount.last = ground
 
+
+def _depth_factor(
+    depth_m: Map, camera: Camera, fit: Ground, ground: Ground, network: SelectionConfig
+) -> Map:
+    """Give the factor by which the mount corrects the depth of each pixel.
+
+    ``fit``: the road in the map; ``ground``: the road that the mount says.
+    """
     # The depth by the ground: the road moves from its plane in the map to that of the mount.
-    depth_m = estimate.depth_m
     map_plane = _plane_of(fit)
     mount_plane = _plane_of(ground)
-    factor = float(mount_plane[1] / map_plane[1])
-    inverse_change = _plane_at_pixels(mount_plane - factor * map_plane, camera, depth_m)
-    inverse = factor / depth_m + inverse_change
+    scale = float(mount_plane[1] / map_plane[1])
+    inverse_change = _spread_plane(mount_plane - scale * map_plane, camera, depth_m)
+    inverse = scale / depth_m + inverse_change
     ground_depth_m = 1 / inverse.clamp(min=1 / _MAX_GROUND_DEPTH_M)
 
     # How surely a pixel is no ground but stands on it: 0..1.
-    plane_ratio = _plane_at_pixels(map_plane, camera, depth_m) * depth_m
+    plane_ratio = _spread_plane(map_plane, camera, depth_m) * depth_m
     off_plane = plane_ratio.clamp(min=1e-3).log().abs()
     stands = (off_plane / _OFF_PLANE_LOG - 1).clamp(0, 1)
 
@@ -425,11 +443,11 @@ def scale_by_mount(
         + _MEASURED_HEIGHT_STD**2
     )
     weight = network.depth_std**2 / (network.depth_std**2 + ground_variance)
-    return replace(rescale(estimate, (ground_depth_m / depth_m) ** weight), ground=ground)
+    return (ground_depth_m / depth_m) ** weight
 
 
-def _plane_at_pixels(plane: Float[Tensor, "3"], camera: Camera, like: Map) -> Map:
-    """Give the inverse depth of a plane, ``plane @ ray`` (z = 1), at every pixel [1/m].
+def _spread_plane(plane: Float[Tensor, "3"], camera: Camera, like: Map) -> Map:
+    """Compute the inverse depth of a plane, ``plane @ ray`` (z = 1), at every pixel [1/m].
 
     ``like``: a map of the size, type and device of the result.
     """

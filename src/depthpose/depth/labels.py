@@ -22,7 +22,7 @@ from depthpose.depth.types import Map, StereoInput
 
 @dataclass(frozen=True, kw_only=True)
 class LabelConfig(Settings):
-    """Where a matched disparity becomes truth."""
+    """Limits within which a matched disparity becomes truth."""
 
     largest_difference_px: Annotated[float, "[0, inf)"] = 1.0
     """Largest difference of the disparities of both views at one point, at the image's size."""

@@ -16,7 +16,7 @@ HEAD_WEIGHTS = (0.5, 0.7, 1.0)
 def adversarial_loss(
     logits: Float[Tensor, "b 1 rows columns"], mode: str, *, is_real: bool
 ) -> Float[Tensor, ""]:
-    """Loss of a discriminator's logits against the label ``is_real`` (eq. 2.4 of the thesis).
+    """Compute the loss of a discriminator's logits for a label ``is_real`` (eq. 2.4 of the thesis).
 
     ``mode`` is a key of ``ADVERSARIAL_LOSSES``. The generator trains with ``is_real=True``.
     """
@@ -33,7 +33,7 @@ ADVERSARIAL_LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 def disparity_loss(
     predicted_px: Maps, truth_px: Maps, max_px: int, *, sky_weight: float = 0.0
 ) -> Float[Tensor, ""]:
-    """Smooth L1 over the pixels with truth below ``max_px`` (eq. 2.6 of the thesis).
+    """Compute smooth L1 over the pixels with truth below ``max_px`` (eq. 2.6 of the thesis).
 
     The truth of the sky is 0 and such a pixel has the weight ``sky_weight``; NaN has no truth. The
     loss is 0 where no pixel has truth.
@@ -57,19 +57,19 @@ def heads_loss(
 
 
 def sky_loss(probability: Maps, truth_px: Maps) -> Float[Tensor, ""]:
-    """Mean cross entropy of the probability of the sky, over the pixels with truth (0: sky)."""
-    is_known = truth_px >= 0
+    """Average the cross entropy of the sky's probability over the pixels with truth (0: sky)."""
+    has_truth = truth_px >= 0
     is_sky = truth_px == 0
     true_probability = torch.where(is_sky, probability, 1 - probability)
     # Gradients stay finite where a probability is 0 in float32.
-    losses = torch.where(is_known, -(true_probability + 1e-4).log(), 0.0)
-    return losses.sum() / is_known.sum().clamp(min=1)
+    losses = torch.where(has_truth, -(true_probability + 1e-4).log(), 0.0)
+    return losses.sum() / has_truth.sum().clamp(min=1)
 
 
 def log_disparity_loss(
     predicted_log_px: Maps, truth_px: Maps, range_px: tuple[float, float]
 ) -> Float[Tensor, ""]:
-    """Mean absolute error of the logarithm of disparity, which is a relative error of depth.
+    """Average the absolute error of the log of disparity, which is a relative error of depth.
 
     Each image with truth counts the same, however sparse its truth is. Truth is clamped to
     ``range_px``; NaN and the sky (0) do not count.
@@ -78,10 +78,10 @@ def log_disparity_loss(
     return _mean_of_images((predicted_log_px - truth).abs(), truth_px > 0)
 
 
-def _mean_of_images(error: Tensor, is_known: Tensor) -> Tensor:
+def _mean_of_images(error: Tensor, has_truth: Tensor) -> Tensor:
     """Average over the pixels with truth of each image, then over the images that have any."""
-    counts = is_known.sum((1, 2))
-    means = torch.where(is_known, error, 0.0).sum((1, 2)) / counts.clamp(min=1)
+    counts = has_truth.sum((1, 2))
+    means = torch.where(has_truth, error, 0.0).sum((1, 2)) / counts.clamp(min=1)
     return means.sum() / (counts > 0).sum().clamp(min=1)
 
 
@@ -97,7 +97,7 @@ def plane_loss(
     truth_px: Float[Tensor, "b rows columns"],
     planes: Float[Tensor, " planes"],
 ) -> Float[Tensor, ""]:
-    """Cross entropy of the classes sky (0) and planes (1, 2, ...).
+    """Average the cross entropy of the classes sky (0) and planes (1, 2, ...).
 
     A disparity between two planes has its probability divided between both, linearly. Each image
     with truth counts the same, however sparse its truth is.
@@ -125,7 +125,7 @@ def plane_loss(
 
 
 def view_loss(drawn: Views, real: Views) -> Float[Tensor, " b"]:
-    """L1 of a synthesised view plus L1 of its horizontal gradient, for each image."""
+    """Add L1 of a synthesised view and L1 of its horizontal gradient, for each image."""
     colour = (drawn - real).abs().mean((1, 2, 3))
     drawn_gradient = drawn[..., 1:] - drawn[..., :-1]
     real_gradient = real[..., 1:] - real[..., :-1]

@@ -1,4 +1,4 @@
-"""How far a depth or disparity map is from the truth.
+"""Metrics of a depth or disparity map against the truth.
 
 All arithmetic is float64, so that a mean does not depend on the order of its terms.
 """
@@ -62,18 +62,18 @@ def measure(of: Quantity, predicted: Numbers, true: Numbers) -> dict[str, float]
 
 
 def _end_point_error(p: Tensor, t: Tensor) -> float:
-    """Mean absolute error of disparity [px]."""
+    """Compute the mean absolute error of disparity [px]."""
     return float((p - t).abs().mean())
 
 
 def _bad_share(p: Tensor, t: Tensor) -> float:
-    """Share of disparities that are wrong by more than 3 px and by more than 5 % (KITTI's D1)."""
+    """Give the share of disparities wrong by more than 3 px and by more than 5 % (KITTI's D1)."""
     error = (p - t).abs()
     return float(((error > 3) & (error > 0.05 * t)).double().mean())
 
 
 def _share_within(p: Tensor, t: Tensor, factor: float) -> float:
-    """Share of depths whose ratio to the truth is below a factor."""
+    """Give the share of depths whose ratio to the truth is below a factor."""
     return float((torch.maximum(p / t, t / p) < factor).double().mean())
 
 

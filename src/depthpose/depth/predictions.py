@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
@@ -20,7 +20,7 @@ from depthpose.core.runner import Job, Results, run_jobs
 from depthpose.depth.config import COLOR_RANGE_M
 from depthpose.depth.disparity import depth_from_disparity, disparity_from_depth
 from depthpose.depth.metrics import SMALLEST_DEPTH_M
-from depthpose.depth.types import DepthEstimate, Ground, Map, StereoInput
+from depthpose.depth.types import DepthEstimate, Ground, Map, StereoInput, View
 
 
 @runtime_checkable
@@ -46,17 +46,82 @@ _NEARLY_ALL = 0.9
 CLOUD = "cloud.ply"
 LAST = "disparity_px.npy"
 """Ending of the file that every estimate has, and that is written last."""
-ENDINGS = (
-    "depth_m.npy", "depth.png", "confidence.npy", "right.png", "sky.png", "color.png",
-    LAST, "warning.txt", "ground.json", CLOUD,
-)  # fmt: skip
-"""What follows ``NAME.`` in the names of the files of an estimate."""
-
 _DECIMALS = 6
 """Decimals of the values of a road in its file: further digits differ from run to run, since
 threads add in another order."""
 CLOUD_M = 80.0
 """Distance up to which a cloud is written, unless another is given."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _FileOptions:
+    """Options of the files of an estimate, as :func:`write_estimate` takes them."""
+
+    range_m: tuple[float, float]
+    cloud_m: float | None
+    min_confidence: float | None
+
+
+class _EstimateFile(NamedTuple):
+    """A kind of file ``NAME.ENDING`` of an estimate: how it is written, and what it holds.
+
+    ``content`` gives None where an estimate has nothing of the kind.
+    """
+
+    ending: str
+    write: Callable[[Path, Any], None]
+    content: Callable[[DepthEstimate, _FileOptions], Any]
+
+
+def _make_cloud(estimate: DepthEstimate, options: _FileOptions) -> files.Cloud | None:
+    """Make the cloud of an estimate, if one is asked for."""
+    if options.cloud_m is None:
+        return None
+    return estimate.cloud(options.cloud_m, options.min_confidence)
+
+
+def _encode_warning(estimate: DepthEstimate, _: _FileOptions) -> bytes | None:
+    """Encode the warning of an estimate as a line of text."""
+    return f"{estimate.warning}\n".encode() if estimate.warning else None
+
+
+def _round_ground(estimate: DepthEstimate, _: _FileOptions) -> dict[str, float] | None:
+    """Round the values of a road to the digits that are the same in every run."""
+    if estimate.ground is None:
+        return None
+    return {name: round(value, _DECIMALS) for name, value in asdict(estimate.ground).items()}
+
+
+def _draw_sky(estimate: DepthEstimate, _: _FileOptions) -> View | None:
+    """Draw the sky white, and all else black."""
+    return None if estimate.is_sky is None else estimate.is_sky.float().expand(3, -1, -1)
+
+
+def _draw_colors(estimate: DepthEstimate, options: _FileOptions) -> View:
+    """Draw the depth of an estimate, or its disparity where it has no depth."""
+    if estimate.depth_m is None:
+        return draw_disparity(estimate.disparity_px, is_sky=estimate.is_sky)
+    return draw_depth(estimate.depth_m, *options.range_m)
+
+
+_FILES = (
+    _EstimateFile(CLOUD, files.write_cloud, _make_cloud),
+    _EstimateFile("warning.txt", write_bytes, _encode_warning),
+    _EstimateFile("ground.json", files.write_json, _round_ground),
+    _EstimateFile("depth_m.npy", files.write_map, lambda estimate, _: estimate.depth_m),
+    # 16 bits, metres x 256.
+    _EstimateFile("depth.png", files.write_depth_png, lambda estimate, _: estimate.depth_m),
+    _EstimateFile("confidence.npy", files.write_map, lambda estimate, _: estimate.confidence),
+    # The synthesised right view.
+    _EstimateFile("right.png", files.write_image, lambda estimate, _: estimate.right),
+    _EstimateFile("sky.png", files.write_image, _draw_sky),
+    _EstimateFile("color.png", files.write_image, _draw_colors),
+    # In pixels of the frame's own rig.
+    _EstimateFile(LAST, files.write_map, lambda estimate, _: estimate.disparity_px),
+)
+"""The files of an estimate, in the order in which they are written."""
+ENDINGS = tuple(file.ending for file in _FILES)
+"""What follows ``NAME.`` in the names of the files of an estimate."""
 
 
 def write_estimate(
@@ -69,11 +134,7 @@ def write_estimate(
 ) -> list[Path]:
     """Write the files of one estimate, and give their paths; the disparity comes last.
 
-    Each part is written where the estimate has it: ``NAME.depth_m.npy``, ``NAME.depth.png``
-    (uint16, metres x 256), ``NAME.confidence.npy``, ``NAME.color.png``, ``NAME.right.png``
-    (synthesised), ``NAME.sky.png`` (8 bit, 255 in the sky), ``NAME.ground.json``
-    (:class:`~depthpose.depth.types.Ground`), ``NAME.warning.txt``, ``NAME.cloud.ply`` and
-    ``NAME.disparity_px.npy``, which is the disparity of the frame's own rig.
+    They are called ``NAME.ENDING``, with the ``ENDINGS`` of what the estimate has.
 
     Args:
         folder: folder of the files.
@@ -83,44 +144,16 @@ def write_estimate(
         cloud_m: distance up to which a cloud (``DepthEstimate.cloud``) has points; None: no cloud.
         min_confidence: least confidence of the cloud's points.
     """
-    depth_m = estimate.depth_m
-    if depth_m is None:
-        color = draw_disparity(estimate.disparity_px, is_sky=estimate.is_sky)
-    else:
-        color = draw_depth(depth_m, *range_m)
-    cloud = None
-    if cloud_m is not None:
-        cloud = replace(estimate, input=pair).cloud(cloud_m, min_confidence)
-    warning = f"{estimate.warning}\n".encode() if estimate.warning else None
-    sky = None if estimate.is_sky is None else estimate.is_sky.float().expand(3, -1, -1)
-
-    # How each part is written; None is not.
-    parts: dict[str, tuple[Callable[..., None], Any]] = {
-        CLOUD: (files.write_cloud, cloud),
-        "warning.txt": (write_bytes, warning),
-        "ground.json": (files.write_json, _rounded(estimate.ground)),
-        "depth_m.npy": (files.write_map, depth_m),
-        "depth.png": (files.write_depth_png, depth_m),
-        "confidence.npy": (files.write_map, estimate.confidence),
-        "right.png": (files.write_image, estimate.right),
-        "sky.png": (files.write_image, sky),
-        "color.png": (files.write_image, color),
-        LAST: (files.write_map, estimate.disparity_px),
-    }
+    options = _FileOptions(range_m=range_m, cloud_m=cloud_m, min_confidence=min_confidence)
+    estimate = replace(estimate, input=pair)  # which colours the cloud
     written: list[Path] = []
-    for ending, (write, content) in parts.items():
+    for file in _FILES:
+        content = file.content(estimate, options)
         if content is not None:
-            path = folder / f"{pair.name}.{ending}"
-            write(path, content)
+            path = folder / f"{pair.name}.{file.ending}"
+            file.write(path, content)
             written.append(path)
     return written
-
-
-def _rounded(ground: Ground | None) -> dict[str, float] | None:
-    """Give the values of a road, rounded to the digits that are the same in every run."""
-    if ground is None:
-        return None
-    return {name: round(value, _DECIMALS) for name, value in asdict(ground).items()}
 
 
 def is_finished(folder: Path, name: str, *, with_cloud: bool = False) -> bool:
@@ -279,7 +312,7 @@ class DepthResults(Results[StereoInput, DepthEstimate]):
         note_result(self.folder, job.name, written)
 
 
-def predict(
+def estimate_missing_depth(
     net: Estimator,
     jobs: Sequence[Job[StereoInput]],
     folder: Path,

@@ -351,7 +351,7 @@ class _InvertedResidual(nn.Module):
 
 @dataclass(frozen=True, eq=False)
 class Selected:
-    """What the distributions over disparities of one view give, at the size of the image."""
+    """Disparity, sky and confidence of one view, by its distributions over disparities."""
 
     disparity_px: Maps  #: exponential of the mean logarithm of disparity, without the sky
     sky: Maps  #: probability of the sky
@@ -582,8 +582,8 @@ def select_views(
     height, width = left.shape[-2:]
     size = (height, width) if size is None else size
     multiple = generator.config.side_multiple_px
-    rows = _even(_near_multiple(height, multiple, ROWS_SHARE))
-    columns = _even(_near_multiple(width, multiple, COLUMNS_SHARE))
+    rows = _round_to_even(_round_to_multiple(height, multiple, ROWS_SHARE))
+    columns = _round_to_even(_round_to_multiple(width, multiple, COLUMNS_SHARE))
     padded = pad_to_multiple(resize_image(left, rows, columns), multiple)
 
     features = generator.encoder(padded)
@@ -623,20 +623,20 @@ def draw_right(generator: Generator, left: Views) -> Views:
         return _warp_by_estimate(left, select_views(generator, left)[1])
     height, width = left.shape[-2:]
     multiple = generator.config.side_multiple_px
-    rows = _near_multiple(height, multiple, ROWS_SHARE)
-    columns = _near_multiple(width, multiple, COLUMNS_SHARE)
+    rows = _round_to_multiple(height, multiple, ROWS_SHARE)
+    columns = _round_to_multiple(width, multiple, COLUMNS_SHARE)
     padded = pad_to_multiple(2 * resize_image(left, rows, columns) - 1, multiple)
     right = (generator(padded)[..., :rows, :columns] + 1) / 2
     return resize_image(right, height, width)
 
 
-def _near_multiple(side_px: int, multiple: int, share: float) -> int:
-    """Give the nearest multiple if it is within a share of the side, else the side itself."""
+def _round_to_multiple(side_px: int, multiple: int, share: float) -> int:
+    """Round to the nearest multiple if it is within a share of the side, else keep the side."""
     nearest = max(round(side_px / multiple), 1) * multiple
     return nearest if abs(nearest - side_px) <= share * side_px else side_px
 
 
-def _even(side_px: int) -> int:
+def _round_to_even(side_px: int) -> int:
     """Round a side down to an even number, for logits stand for two rows and two columns."""
     return max(side_px // 2 * 2, 2)
 

@@ -51,13 +51,13 @@ def without_picture(image: Float[Tensor, "3 h w"]) -> Bool[Tensor, "h w"]:
     is_blank[:, :left] = True
     is_blank[:, width - right :] = True
 
-    border = _black_border((image.amax(0) <= _MAX_BLACK).cpu().numpy())
+    border = _find_black_border((image.amax(0) <= _MAX_BLACK).cpu().numpy())
     is_blank |= torch.from_numpy(border).to(is_blank.device)
     picture_share = float((~is_blank).float().mean())
     return is_blank if picture_share >= _MIN_PICTURE_SHARE else torch.zeros_like(is_blank)
 
 
-def _black_border(is_black: np.ndarray) -> np.ndarray:
+def _find_black_border(is_black: np.ndarray) -> np.ndarray:
     """Find the black regions that rectification leaves, but not dark objects at the border.
 
     The picture of a rectified image is bulged or cut straight: a black region beside it reaches a

@@ -62,8 +62,8 @@ GENERATORS = {
 """Kinds of generators with weights."""
 
 
-def _kinds() -> dict[str, GeneratorKind]:
-    """Give all kinds of networks, the generators first; users may have added to ``MATCHERS``."""
+def _list_kinds() -> dict[str, GeneratorKind]:
+    """List all kinds of networks, the generators first; users may have added to ``MATCHERS``."""
     return {**GENERATORS, **MATCHERS}
 
 
@@ -91,10 +91,10 @@ def read_depth_weights(
         InputError: not such weights, or weights that do not fit their own config.
     """
     checkpoint = checkpoints.read_checkpoint(path)
-    if checkpoint.kind not in (*_kinds(), BOTH):
+    if checkpoint.kind not in (*_list_kinds(), BOTH):
         raise InputError(
             f"{path}: holds weights of kind {checkpoint.kind!r}; depth takes "
-            f"{', '.join(map(repr, _kinds()))} or {BOTH!r}."
+            f"{', '.join(map(repr, _list_kinds()))} or {BOTH!r}."
         )
     is_both = checkpoint.kind == BOTH
     parts = _split(checkpoint, path) if is_both else {checkpoint.kind: checkpoint}
@@ -105,8 +105,8 @@ def read_depth_weights(
         is_generator = kind in GENERATORS
         if use == "pairs" and is_both and is_generator:
             continue
-        config = _network_config(kind, part.config, str(path))
-        make = partial(_kinds()[kind].network, config)
+        config = _read_network_config(kind, part.config, str(path))
+        make = partial(_list_kinds()[kind].network, config)
         networks[kind] = checkpoints.build_network(make, part, str(path)).eval()
         if use == "images" and is_generator and (answer or config.answer) == "own":
             break
@@ -120,7 +120,7 @@ def read_depth_weights(
 def _split(checkpoint: checkpoints.Checkpoint, path: Path) -> dict[str, checkpoints.Checkpoint]:
     """Split the checkpoint of two networks into one for each, by kind, the generator first."""
     parts: dict[str, checkpoints.Checkpoint] = {}
-    for kind in _kinds():
+    for kind in _list_kinds():
         if kind not in checkpoint.config:
             continue
         config = checkpoint.config[kind]
@@ -141,9 +141,9 @@ def _split(checkpoint: checkpoints.Checkpoint, path: Path) -> dict[str, checkpoi
     return parts
 
 
-def _network_config(kind: str, settings: Mapping[str, Any], source: str) -> Any:  # noqa: ANN401
+def _read_network_config(kind: str, settings: Mapping[str, Any], source: str) -> Any:  # noqa: ANN401
     """Make the config of a network from the metadata of its file; ``source`` is for errors."""
-    return config_from_dict(settings, _kinds()[kind].config, source=source)
+    return config_from_dict(settings, _list_kinds()[kind].config, source=source)
 
 
 def settings_of(checkpoint: checkpoints.Checkpoint, source: str) -> dict[str, Any]:
@@ -155,9 +155,9 @@ def settings_of(checkpoint: checkpoints.Checkpoint, source: str) -> dict[str, An
         InputError: a setting is unknown, or its value is not allowed.
     """
     if checkpoint.kind != BOTH:
-        return config_to_dict(_network_config(checkpoint.kind, checkpoint.config, source))
+        return config_to_dict(_read_network_config(checkpoint.kind, checkpoint.config, source))
     return {
-        kind: config_to_dict(_network_config(kind, settings, source))
+        kind: config_to_dict(_read_network_config(kind, settings, source))
         for kind, settings in checkpoint.config.items()
     }
 
@@ -204,16 +204,17 @@ def write_depth_weights(
         with_half: store 16-bit floats: half the size.
     """
     networks: dict[str, Any] = {}
-    for kind, classes in _kinds().items():
+    for kind, classes in _list_kinds().items():
         for network in (generator, matcher):
             if isinstance(network, classes.network):
                 networks[kind] = network
     assert networks, "a weights file holds at least one network"
+
     configs: dict[str, Any] = {}
     states: dict[str, dict[str, Tensor]] = {}
     for kind, network in networks.items():
         configs[kind] = config_to_dict(network.config)
-        states[kind] = checkpoints.half_state(network) if with_half else network.state_dict()
+        states[kind] = checkpoints.halve_state(network) if with_half else network.state_dict()
 
     if len(networks) == 1:
         kind = next(iter(networks))
@@ -246,7 +247,7 @@ def make_matcher(network: stereo.StereoNetwork, config: MatcherConfig) -> stereo
     )
 
 
-def refuse_share(images: int, alarm_share: float) -> None:
+def refuse_alarm_share(images: int, alarm_share: float) -> None:
     """Refuse a share of false alarms that is not between 0 and 1, or is less than one image.
 
     Raises:
@@ -279,7 +280,7 @@ def calibrate_weights(
     Raises:
         InputError: too few images for that share, or weights of another kind.
     """
-    refuse_share(len(image_confidence), alarm_share)
+    refuse_alarm_share(len(image_confidence), alarm_share)
     quantile = float(np.quantile(image_confidence, alarm_share))
     least_confidence = min(round(quantile, 4), 0.9999)
     checkpoint = checkpoints.read_checkpoint(weights)

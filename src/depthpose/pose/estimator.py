@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from depthpose.core.camera import AnyCamera, choose_lens
 from depthpose.core.devices import each_in_float32, each_in_threads, force_float32
-from depthpose.core.errors import InputError, full_memory, nearest_name
+from depthpose.core.errors import InputError, describe_full_memory, nearest_name
 from depthpose.core.files import Picture
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
@@ -438,7 +438,7 @@ def unreadable_on_error(
     except InputError as error:
         reason = str(error)
     except (MemoryError, RuntimeError) as error:
-        if (message := full_memory(error)) is None:
+        if (message := describe_full_memory(error)) is None:
             raise
         reason = f"{pose_input.name}: {message}"
     return refused(pose_input, Refusal(status="unreadable", reason=reason), {})

@@ -392,7 +392,7 @@ class PoseResults(Results[Input, PoseEstimate]):
             self._unsaved = 0
 
 
-def predict(
+def estimate_missing_poses(
     estimate_many: Callable[[Sequence[Input]], Sequence[PoseEstimate]],
     jobs: Iterable[PoseJob[Input]],
     folder: Path,

@@ -18,7 +18,7 @@ from depthpose.core.checkpoint import (
     Checkpoint,
     build_network,
     find_weights,
-    half_state,
+    halve_state,
     load_weights,
     read_checkpoint,
     read_published,
@@ -230,7 +230,7 @@ def write_segmentation(
         "objects": list(weights.objects),
         "numbers": list(weights.numbers),
     }
-    state = half_state(network) if with_half else network.state_dict()
+    state = halve_state(network) if with_half else network.state_dict()
     save_checkpoint(path, Checkpoint(kind=KIND, config=config, state=state, facts=weights.facts))
 
 

@@ -15,7 +15,7 @@ from depthpose.core.checkpoint import (
     Checkpoint,
     build_network,
     find_weights,
-    half_state,
+    halve_state,
     read_checkpoint,
     save_checkpoint,
 )
@@ -94,7 +94,7 @@ def write_pose_weights(
             used until :func:`complete_weights` has added them again.
     """
     network = weights.network
-    learnt = half_state(network) if with_half else network.state_dict()
+    learnt = halve_state(network) if with_half else network.state_dict()
     state = {f"network.{name}": tensor for name, tensor in learnt.items()}
     for k, model in enumerate(weights.models):
         tensor_names = _TENSORS if with_meshes else ("keypoints_m",)

@@ -79,7 +79,7 @@ def depth_section(
         )
         pictures.append(depth)
     if error is not None:
-        pictures += _error_drawings(pair, error, range_m)
+        pictures += _draw_errors(pair, error, range_m)
     if estimate.confidence is not None:
         confidence = Drawing(
             image=draw_share(1 - estimate.confidence),
@@ -100,7 +100,7 @@ def depth_section(
     return Section(title=title, text=text, facts=facts, pictures=pictures, scenes=scenes)
 
 
-def _error_drawings(
+def _draw_errors(
     pair: StereoInput, error: DepthError, range_m: tuple[float, float]
 ) -> list[Drawing]:
     """Draw the true depth, where it is known, and the error of each pixel.
@@ -162,18 +162,21 @@ def depth_facts(
         facts.append(("focal length", f"{float(camera.K[0, 0]):.1f} px{focal}"))
     if pair.right is not None and isinstance(camera, StereoRig):
         facts.append(("baseline", f"{camera.baseline_m:g} m"))
+
     if depth_m is not None:
         known_m = depth_m[depth_m.isfinite()]
         facts.append(("pixels with depth", f"{len(known_m) / depth_m.numel():.1%}"))
         if len(known_m):
             near, median, far = np.percentile(known_m.numpy(), (1, 50, 99))
             facts.append(("1, 50, 99 % are nearer than", f"{near:.2f}, {median:.2f}, {far:.2f} m"))
+
     if estimate.is_sky is not None:
         facts.append(("sky", f"{float(estimate.is_sky.float().mean()):.1%} of the pixels"))
     if estimate.ground is not None:
         facts.append(("ground", str(estimate.ground)))
     if estimate.warning:
         facts.insert(0, ("warning", estimate.warning))
+
     if estimate.confidence is not None:
         facts.append(("mean confidence", f"{float(estimate.confidence.nanmean()):.2f}"))
         if pair.right is not None:

@@ -56,13 +56,13 @@ class Layer:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Scene:
-    """What one 3D view shows."""
+    """The content of one 3D view."""
 
     caption: str  #: stands below it
     layers: Sequence[Layer]  #: drawn together
 
     def encoded(self) -> dict[str, Any]:
-        """Give the JSON that ``viewer.js`` reads: base64 of 16-bit places and 8-bit colours.
+        """Encode as the JSON that ``viewer.js`` reads: base64 of 16-bit places and 8-bit colours.
 
         Places are steps of 1/65535 of their extent: of a street of 80 m, 1.2 mm. ``note`` says
         which layers are thinned.
@@ -82,6 +82,7 @@ class Scene:
                 max_count = MOST_LINES
                 places = shape.ends_m
                 color = shape.color
+
             if len(places) > max_count:
                 notes.append(f"{layer.name}: {max_count} of {len(places)}, thinned evenly")
                 sampled = _sample_runs(len(places), max_count)
@@ -214,7 +215,7 @@ _MOST_FILM_BYTES = 8_000_000
 
 @dataclass(frozen=True, kw_only=True)
 class Scale:
-    """What the colours of a picture mean, for a colour bar."""
+    """The colour bar of a picture: its colours and their meaning."""
 
     title: str  #: the quantity, with its unit
     colors: Sequence[tuple[float, float, float]]  #: RGB in [0, 1] at even steps from left to right
@@ -225,7 +226,8 @@ def depth_scale(near_m: float = 3.0, far_m: float = 80.0) -> Scale:
     """Make the colour bar of ``core.draw.draw_depth``: logarithmic, with marks at round metres."""
     marks = [(0.0, f"{near_m:g}"), (1.0, f"{far_m:g}")]
     exponents = range(math.floor(math.log10(near_m)), math.ceil(math.log10(far_m)) + 1)
-    for round_m in (digit * 10.0**exponent for exponent in exponents for digit in (1, 2, 5)):
+    round_metres = [digit * 10.0**exponent for exponent in exponents for digit in (1, 2, 5)]
+    for round_m in round_metres:
         position = math.log(round_m / near_m) / math.log(far_m / near_m)
         has_room = all(abs(position - other) >= _LEAST_GAP for other, _ in marks)
         if has_room and 0 < position < 1:
@@ -263,8 +265,10 @@ class Drawing:
     scale: Scale | None = None
 
 
-def embedded(picture: Picture | Drawing, most_pixels: int = _MOST_PIXELS) -> tuple[int, int, str]:
-    """Give a picture's width and height [px], and its data as a ``data:`` address.
+def embed_picture(
+    picture: Picture | Drawing, most_pixels: int = _MOST_PIXELS
+) -> tuple[int, int, str]:
+    """Embed a picture: its width and height [px], and its data as a ``data:`` address.
 
     With these the page needs no other file, and does not move while a picture loads. A small file
     is taken as it is; another picture is shrunk to about ``most_pixels``, its proportions kept.
@@ -292,7 +296,7 @@ class Film:
 
     @property
     def address(self) -> str:
-        """Address of the video on the page: its bytes (``data:``), or its name if it is large."""
+        """Make the address of the video: its bytes (``data:``), or its name if it is large."""
         if self.path.stat().st_size > _MOST_FILM_BYTES:
             return quote(self.path.name)
         return "data:video/mp4;base64," + base64.b64encode(self.path.read_bytes()).decode()
@@ -352,13 +356,15 @@ def plain_table(rows: Sequence[Row], names: Sequence[str] = ()) -> str:
 
     Columns without a value are left out.
     """
-    shown_names = [
-        name
-        for name in names or column_names(rows)
-        if any(row.get(name) not in (None, "") for row in rows)
-    ]
+
+    def has_value(name: str) -> bool:
+        """Whether any row has a value in a column."""
+        return any(row.get(name) not in (None, "") for row in rows)
+
+    shown_names = list(filter(has_value, names or column_names(rows)))
     lines = [shown_names]
     lines += [[show_value(row.get(name)) for name in shown_names] for row in rows]
+
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     text = ""
     for line in lines:
@@ -442,7 +448,7 @@ def write_page(
         show_value=show_value,
         column_names=column_names,
         page_file=page_file,
-        embedded=embedded,
+        embed_picture=embed_picture,
         about=_COLUMN_MEANINGS,
     )
     html = pages.get_template("report.html").render(

@@ -105,7 +105,7 @@ def draw_region(
 
 
 def box_edges(model: ObjectModel) -> Float[Tensor, "12 2 3"]:
-    """Give both ends of the edges of the model's box, along its axes [m]."""
+    """Compute both ends of the edges of the model's box, along its axes [m]."""
     low = model.vertices_m.amin(0)
     high = model.vertices_m.amax(0)
     corners = torch.cartesian_prod(*torch.stack([low, high], -1))
@@ -130,7 +130,7 @@ def pose_layers(
     """
     pose = pose.double()
     box_m = pose.apply(box_edges(model).double()).float()
-    edges_m = _sharp_edges(model)
+    edges_m = _find_sharp_edges(model)
     if edges_m is not None:
         edges_m = pose.apply(edges_m).float()
     if is_true:
@@ -146,8 +146,8 @@ def pose_layers(
     return [*layers, box, Layer(name="its axes (x red, y green, z blue)", shape=axes)]
 
 
-def _sharp_edges(model: ObjectModel) -> Float64[Tensor, "n 2 3"] | None:
-    """Give both ends of the edges where a mesh ends, or bends by more than ``_SHARP_RAD`` [m].
+def _find_sharp_edges(model: ObjectModel) -> Float64[Tensor, "n 2 3"] | None:
+    """Find the edges where a mesh ends, or bends by more than ``_SHARP_RAD``: both ends [m].
 
     None of a model without faces.
     """
@@ -224,7 +224,7 @@ def posed_cloud(cloud_m: Float[Tensor, "n 3"], pose: Rigid | None, model: Object
 
 
 def object_points(pose_input: CloudInput | ViewInput, diameter_m: float) -> Float[Tensor, "n 3"]:
-    """Give the valid points of a cloud, or of a masked depth image without its flying pixels [m].
+    """Take the valid points of a cloud, or of a masked depth image without its flying pixels [m].
 
     ``diameter_m``: diameter of the object, by which flying pixels are told.
     """
@@ -340,7 +340,7 @@ def _pose_drawings(
 
 
 def pose_sentence(estimate: PoseEstimate) -> str:
-    """Say in a sentence where the object is, or why it is refused."""
+    """Describe in a sentence where the object is, or why it is refused."""
     if estimate.camera_from_model is None:
         return f"Refused ({estimate.status}): {estimate.reason}."
     x, y, z = estimate.camera_from_model.t_m.tolist()
@@ -377,6 +377,8 @@ def pose_facts(
             ("visible", f"{evidence.supported_share:.0%} of the surface that faces the camera"),
             ("noise of the sensor there", f"{1000 * evidence.noise_m:.1f} mm"),
         ]
+
+    # What it is, and how sure that is.
     if estimate.pick_rank is not None:
         facts.append(("pick rank", f"{estimate.pick_rank} of what was found in this image"))
     if estimate.identity is not None:
@@ -391,7 +393,10 @@ def pose_facts(
         facts.append(("certainty, up to near-symmetry", f"{estimate.certainty:.3f}"))
     if estimate.copy_certainty is not None:
         facts.append(("certainty of this very copy", f"{estimate.copy_certainty:.3f}"))
+
     facts += [("another pose that fits", str(other)) for other in estimate.alternatives]
+
+    # The fit, and how long it took.
     if estimate.inlier_share is not None:
         facts.append((agreeing, f"{estimate.inlier_share:.0%}"))
     if estimate.residual_m is not None and math.isfinite(estimate.residual_m):
@@ -406,13 +411,13 @@ def pose_facts(
 
 
 def pose_tables(estimate: PoseEstimate) -> dict[str, Sequence[Sequence[str]]]:
-    """Give the tables of a pose, by title: its matrix, standard deviations and covariance."""
+    """Make the tables of a pose, by title: its matrix, standard deviations and covariance."""
     tables: dict[str, Sequence[Sequence[str]]] = {}
     pose = estimate.camera_from_model
     if pose is not None:
-        tables["camera_from_model: R | t [m]"] = _matrix_rows(pose)
+        tables["camera_from_model: R | t [m]"] = _format_matrix(pose)
     if estimate.base_from_model is not None:
-        tables["base_from_model: R | t [m]"] = _matrix_rows(estimate.base_from_model)
+        tables["base_from_model: R | t [m]"] = _format_matrix(estimate.base_from_model)
     if pose is not None and estimate.covariance is not None:
         assert estimate.origin_std_mm is not None
         assert estimate.rotation_std_deg is not None
@@ -435,7 +440,7 @@ def _format_std(value: float) -> str:
     return f"{value:.3f}" if math.isfinite(value) else "free"
 
 
-def _matrix_rows(pose: Rigid) -> list[list[str]]:
+def _format_matrix(pose: Rigid) -> list[list[str]]:
     """Format the rows of a transform's 3x4 matrix."""
     rows = torch.cat([pose.R, pose.t_m[:, None]], 1).tolist()
     return [[f"{value:.5f}" for value in row] for row in rows]
@@ -458,7 +463,7 @@ def pose_scene(
         truth: ``camera_from_model``, shown in green; None: it is unknown.
     """
     pose = estimate.camera_from_model
-    layers = [_point_layer("the object, as seen", points_m, _OBJECT_COLOR)]
+    layers = [_make_point_layer("the object, as seen", points_m, _OBJECT_COLOR)]
     if pose is not None:
         layers += pose_layers(pose, model, with_box=truth is not None)
     for alternative in estimate.alternatives:
@@ -473,28 +478,28 @@ def pose_scene(
     if estimate.keypoints_m is not None:
         layers += keypoint_layers(estimate.keypoints_m, pose, model)
     if isinstance(pose_input, ViewInput):
-        layers += _surroundings_layers(pose_input)
+        layers += _make_surroundings(pose_input)
     caption = "The cloud and the posed model" if pose is not None else "The cloud; there is no pose"
     return Scene(caption=caption, layers=layers)
 
 
-def _surroundings_layers(view: ViewInput) -> list[Layer]:
+def _make_surroundings(view: ViewInput) -> list[Layer]:
     """Make the layers of all that is not the object, and of the known background; both hidden."""
     around_m = cloud_from_depth(view.depth_m, ~view.mask, view.K).float()
     around_m = take_evenly(around_m, _MAX_SURROUNDINGS)
-    layers = [_point_layer("all else", around_m, _SURROUNDINGS_COLOR, is_shown=False)]
+    layers = [_make_point_layer("all else", around_m, _SURROUNDINGS_COLOR, is_shown=False)]
     if view.background is not None:
         depth_m = view.background.depth_m
         background_m = cloud_from_depth(depth_m, depth_m > 0, view.K).float()
         background_m = take_evenly(background_m, _MAX_SURROUNDINGS)
-        layer = _point_layer(
+        layer = _make_point_layer(
             "the known background", background_m, _BACKGROUND_COLOR, is_shown=False
         )
         layers.append(layer)
     return layers
 
 
-def _point_layer(
+def _make_point_layer(
     name: str, points_m: Float[Tensor, "n 3"], color: Color, *, is_shown: bool = True
 ) -> Layer:
     """Make a layer of points of one colour."""

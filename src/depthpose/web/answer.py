@@ -70,14 +70,14 @@ class Form:
     files: Mapping[str, Path]
 
     def file(self, field: str) -> Path:
-        """Give the file of a field."""
+        """Return the file of a field, which must be there."""
         if field not in self.files:
             noun, suffixes = KINDS[field]
             raise InputError(f"{field}: no file; choose {noun} ({', '.join(suffixes)})")
         return self.files[field]
 
     def number(self, field: str) -> float | None:
-        """Give the number of a field; None where it was left empty."""
+        """Read the number of a field; None where it was left empty."""
         text = self.fields.get(field, "").strip()
         if not text:
             return None
@@ -104,7 +104,7 @@ class Form:
         return read_camera(path)
 
     def pinhole_keys(self, size: tuple[int, int], focal_px: float | None) -> dict[str, Any]:
-        """Give size and K as keys of a camera file; an empty principal point is the centre."""
+        """Make size and K as keys of a camera file; an empty principal point is the centre."""
         cx = self.number("cx_px")
         cy = self.number("cy_px")
         cx = (size[0] - 1) / 2 if cx is None else cx
@@ -113,7 +113,7 @@ class Form:
         return {"width": size[0], "height": size[1], "K": K}
 
 
-def without_paths(text: str, folder: Path) -> str:
+def remove_paths(text: str, folder: Path) -> str:
     """Remove the folder of a request from a message, so that files have their own names in it."""
     fields = "|".join(KINDS)
     return re.sub(f"{re.escape(str(folder))}/(({fields})/)?", "", text)
@@ -156,7 +156,7 @@ EXAMPLE_SEED = 9
 
 
 def example_form(folder: Path, fields: dict[str, str]) -> dict[str, Any]:
-    """Give the content of a form as JSON for the page; files in ``folder`` have fields' names."""
+    """Encode the content of a form as JSON for the page; files in ``folder`` have fields' names."""
     files: list[dict[str, str]] = []
     for path in sorted(folder.iterdir()):
         data = b64encode(path.read_bytes()).decode()

@@ -42,7 +42,7 @@ from depthpose.core.errors import InputError, MissingExtraError
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.report.page import page_file
-from depthpose.web.answer import KINDS, Answer, Form, keep_file, without_paths
+from depthpose.web.answer import KINDS, Answer, Form, keep_file, remove_paths
 from depthpose.web.depth import answer_depth, depth_example
 from depthpose.web.pose import answer_pose, pose_example
 
@@ -59,7 +59,7 @@ _SAFE_HEADERS = {
 _MOST_FILES = 6
 _MOST_FIELDS = 30
 _LONGEST_FIELD = 4096
-"""Limits of a form; a field's in bytes."""
+"""Longest value of a field [bytes]."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class HostCheck:
     hosts: tuple[str, ...] | None
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request."""
+        """Answer a request by the application, or by a refusal; safe headers are added."""
 
         async def send_safely(message: Message) -> None:
             if message["type"] == "http.response.start":
@@ -86,7 +86,7 @@ class HostCheck:
 
 
 def refuse_other_host(request: Request, hosts: tuple[str, ...] | None) -> Response | None:
-    """Give the refusal of a request under another host name, or sent by another page; else None."""
+    """Refuse a request under another host name, or sent by another page; else give None."""
     host = request.headers.get("host", "")
     try:
         name = urlsplit(f"//{host}").hostname
@@ -131,7 +131,7 @@ class _Stopped(BaseException):
 
 
 class TookTooLong(Exception):  # noqa: N818  what happened
-    """A computation was stopped after its time."""
+    """A computation was stopped, for it took longer than allowed."""
 
 
 def run_in_time(work: Callable[[], Result], most_s: float) -> Result:
@@ -230,7 +230,7 @@ async def has_gone(receive: Receive) -> bool:
     return False
 
 
-def paced(receive: Receive) -> Receive:
+def limit_pace(receive: Receive) -> Receive:
     """Make a function that receives a request's body, and refuses one that comes too slowly."""
     start = time.monotonic()
     size = 0
@@ -268,7 +268,7 @@ _MEDIA_TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".json": "application
 
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """What the page refuses to take."""
+    """The limits beyond which the page refuses a request."""
 
     upload_bytes: int = 64 * 10**6
     """All files of one request together."""
@@ -284,7 +284,7 @@ class Limits:
 
 
 class Handlers:
-    """Handlers of the routes, with the networks and the files of the latest answers."""
+    """The handlers of the routes, with the networks and the files of the latest answers."""
 
     def __init__(self, depth: FakestereoNet, pose: GeoPoseNet, limits: Limits) -> None:
         self._limits = limits
@@ -299,6 +299,8 @@ class Handlers:
         self._queue = Queue(limits.waiting, limits.compute_s)
         self._upload_count = 0
         self._stored_files: OrderedDict[str, Mapping[str, bytes]] = OrderedDict()
+
+        # The page and its parts, as they are sent.
         loader = PackageLoader("depthpose.web", ".")
         template = Environment(loader=loader, autoescape=True, undefined=StrictUndefined)
         page = template.get_template("page.html").render(
@@ -318,7 +320,7 @@ class Handlers:
         }
 
     async def asset(self, request: Request) -> Response:
-        """Give the page, a script or the style."""
+        """Answer with the page, a script or the style."""
         name = request.path_params.get("name", "")
         if name not in self._assets:
             raise HTTPException(404, f"there is no {name!r}; the page is at /")
@@ -326,7 +328,7 @@ class Handlers:
         return Response(text, media_type=media_type)
 
     async def example(self, request: Request) -> Response:
-        """Give files and fields to fill a form with; they are made at the first request."""
+        """Answer with an example: files and fields of a form, made at the first request."""
         kind = request.path_params["kind"]
         if kind not in self._examples:
             raise HTTPException(404, f"only {' and '.join(self._examples)} are estimated here")
@@ -340,13 +342,13 @@ class Handlers:
         return JSONResponse(content)
 
     async def position(self, request: Request) -> Response:
-        """Give the number of computations before that of a ticket; null: it does not wait here."""
+        """Answer with the number of computations before that of a ticket, or null if none waits."""
         ticket = request.path_params["ticket"]
         waiting = self._queue.tickets
         return JSONResponse({"before": waiting.index(ticket) if ticket in waiting else None})
 
     async def estimate(self, request: Request) -> Response:
-        """Estimate for a form, and give the answer as JSON; 400 if the client has gone."""
+        """Estimate for a form, and answer with the result as JSON; 400 if the client has gone."""
         self._refuse_large_body(request)
         kind = request.path_params["kind"]
         if kind not in self._estimators:
@@ -360,7 +362,7 @@ class Handlers:
                 work = partial(self._estimators[kind], form)
                 answer = await self._queue.compute(ticket, work, partial(has_gone, request.receive))
             except (InputError, MissingExtraError) as error:
-                raise HTTPException(400, without_paths(str(error), Path(folder))) from error
+                raise HTTPException(400, remove_paths(str(error), Path(folder))) from error
             except ClientDisconnect:
                 answer = None
         if answer is None:
@@ -399,7 +401,7 @@ class Handlers:
         try:
             fields: dict[str, str] = {}
             files: dict[str, Path] = {}
-            async with Request(request.scope, paced(request.receive)).form(
+            async with Request(request.scope, limit_pace(request.receive)).form(
                 max_files=_MOST_FILES, max_fields=_MOST_FIELDS, max_part_size=_LONGEST_FIELD
             ) as form:
                 for name, value in form.multi_items():
@@ -414,7 +416,7 @@ class Handlers:
             self._upload_count -= 1
 
     async def download(self, request: Request) -> Response:
-        """Give a file of one of the latest answers, or all of them as a ZIP."""
+        """Answer with a file of one of the latest answers, or with all of them as a ZIP."""
         key = request.path_params["key"]
         name = request.path_params["name"]
         files = self._stored_files.get(key)

@@ -59,7 +59,7 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
     folder.mkdir()
     write_estimate(folder, pair, estimate, (near_m, far_m), far_m)
     write_image(folder / f"{pair.name}.input.jpg", pair.left)
-    pictures = _pictures(pair, estimate, (near_m, far_m))
+    pictures = _list_pictures(pair, estimate, (near_m, far_m))
     if estimate.confidence is not None:
         write_image(folder / f"{pair.name}.confidence.png", draw_share(1 - estimate.confidence))
     # The warning is in the sentence already.
@@ -67,7 +67,7 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
     facts = [(name, value) for name, value in facts if name != "warning"]
     return Answer(
         is_ok=not estimate.warning,
-        sentence=_sentence(pair, estimate),
+        sentence=_describe_depth(pair, estimate),
         facts=[*facts, ("computed in", f"{seconds:.2f} s")],
         pictures=pictures,
         scene=depth_scene(pair, estimate, far_m),
@@ -114,6 +114,7 @@ def _refuse_large_work(pair: StereoInput, net: FakestereoNet) -> None:
         sizes.append(net.matcher.work_size(camera))
     elif is_matched:
         sizes.append((camera.height, camera.width))
+
     rows, columns = max(sizes, key=math.prod)
     if (rows, columns) == (height, width) and rows * columns > _MOST_WORK_PIXELS:
         raise InputError(
@@ -146,11 +147,15 @@ def _read_input(form: Form) -> tuple[StereoInput, str]:
             "baseline in metres (of KITTI's 2011_09_26: 0.5327), or choose a camera file that has "
             "it"
         )
+
+    # A focal length that is not given is the one of the EXIF, or guessed; a pair is not guessed.
     origin = ""
     if focal_px is None and "camera" not in form.files:
         exif = None if has_right else read_exif_focal(path)
         focal_px, tags = (_PHONE_FOCAL_WIDTHS * width, "") if exif is None else exif
         origin = f" (EXIF: {tags})" if tags else _GUESSED
+
+    # The camera, by its file or by the fields.
     doffs_px = form.number("cx_right_minus_left_px")
     keys = form.pinhole_keys((width, height), focal_px) | {
         "baseline_m": baseline_m,
@@ -167,6 +172,7 @@ def _read_input(form: Form) -> tuple[StereoInput, str]:
             baseline_m=baseline_m,
             cx_right_minus_left_px=doffs_px or 0.0,
         )
+
     right = None
     if has_right:
         right_path = form.file("right")
@@ -176,7 +182,7 @@ def _read_input(form: Form) -> tuple[StereoInput, str]:
     return pair, origin
 
 
-def _pictures(
+def _list_pictures(
     pair: StereoInput, estimate: DepthEstimate, range_m: tuple[float, float]
 ) -> list[Shown]:
     """List the pictures that the page shows of an estimate."""
@@ -205,8 +211,8 @@ def _pictures(
     return pictures
 
 
-def _sentence(pair: StereoInput, estimate: DepthEstimate) -> str:
-    """Say in a sentence how much of the image has a depth, and how far half of it is."""
+def _describe_depth(pair: StereoInput, estimate: DepthEstimate) -> str:
+    """Describe in a sentence how much of the image has a depth, and how far half of it is."""
     assert estimate.depth_m is not None
     known_m = estimate.depth_m[estimate.depth_m.isfinite()]
     images = "one image" if pair.right is None else "both images"

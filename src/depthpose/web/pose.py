@@ -83,7 +83,7 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
     tables = report.pose_tables(best.estimate)
     if len(shown_poses) > 1:
         head = ["", "status", "x [m]", "y [m]", "z [m]", "certainty", "visible", "pick rank"]
-        rows = [[shown.input.name, *_table_row(shown.estimate)] for shown in shown_poses]
+        rows = [[shown.input.name, *_format_row(shown.estimate)] for shown in shown_poses]
         tables = {"found in this image": [head, *rows]} | tables
     return Answer(
         is_ok=best.estimate.is_posed,
@@ -104,7 +104,7 @@ def _estimate(
 
     Boxes are searched, one pose in each; a depth image without a mask is searched as a whole.
     """
-    views = _box_views(form, pose_input)
+    views = _make_box_views(form, pose_input)
     if views:
         estimates = target.net.estimate_many(views)
         shown_poses = [
@@ -155,8 +155,8 @@ def _make_scene(
     return replace(scene, layers=layers)
 
 
-def _box_views(form: Form, pose_input: CloudInput | ViewInput) -> list[ViewInput]:
-    """Give a view for each box in the form: NAME, or of several NAME_1, NAME_2, ..."""
+def _make_box_views(form: Form, pose_input: CloudInput | ViewInput) -> list[ViewInput]:
+    """Make a view for each box in the form: NAME, or of several NAME_1, NAME_2, ..."""
     words = form.fields.get("box", "").split()
     if words and ("mask" in form.files or not isinstance(pose_input, ViewInput)):
         raise InputError(
@@ -172,7 +172,7 @@ def _box_views(form: Form, pose_input: CloudInput | ViewInput) -> list[ViewInput
     return views
 
 
-def _table_row(estimate: PoseEstimate) -> list[str]:
+def _format_row(estimate: PoseEstimate) -> list[str]:
     """Format the row of an estimate in the table of an image; empty where it has no value."""
     pose = estimate.camera_from_model
     position = [""] * 3 if pose is None else [f"{v:.4f}" for v in pose.t_m.tolist()]
@@ -195,6 +195,7 @@ def _write_results(
         points_m = object_points(shown_pose.input, model.diameter_m)
         cloud = report.posed_cloud(points_m, shown_pose.estimate.camera_from_model, model)
         files.write_cloud(folder / f"{shown_pose.input.name}.{CLOUD}", cloud)
+
     pose_input = shown_poses[0].input
     if not isinstance(pose_input, ViewInput):
         return []
@@ -207,6 +208,7 @@ def _write_results(
             picture = report.draw_region(picture, shown_pose.input, pose)
         picture = report.draw_pose(picture, pose, model, pose_input.K)
         pose_count += pose is not None
+
     if pose_count:
         caption += f", with the posed model{'s' * (pose_count > 1)}"
     if pose_input.is_region:
@@ -271,6 +273,7 @@ def _read_input(form: Form, model: ObjectModel) -> CloudInput | ViewInput:
     mask = form.file("mask") if "mask" in form.files else None
     if mask is not None:
         refuse_large(mask.name, *files.image_size(mask))
+
     if depth.suffix.lower() in files.MAP_SUFFIXES:
         height, width = files.read_stored_depth(depth).shape
         refuse_large(depth.name, width, height)
@@ -278,6 +281,7 @@ def _read_input(form: Form, model: ObjectModel) -> CloudInput | ViewInput:
     else:
         size = files.image_size(depth)
         refuse_large(depth.name, *size)
+
     keys: dict[str, Any] = {}
     if "camera" not in form.files:
         focal_px = form.number("focal_px")

@@ -30,5 +30,5 @@ from depthpose.core.camera.rectify import make_rectifier as make_rectifier
 from depthpose.core.camera.rectify import read_raw_pair as read_raw_pair
 from depthpose.core.camera.stored_camera import CAMERA_SUFFIXES as CAMERA_SUFFIXES
 from depthpose.core.camera.two_views import find_two_views as find_two_views
-from depthpose.core.camera.two_views import halves as halves
 from depthpose.core.camera.two_views import order_views as order_views
+from depthpose.core.camera.two_views import split_halves as split_halves

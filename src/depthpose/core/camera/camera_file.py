@@ -97,12 +97,13 @@ _LARGEST_NUMBER = 1e300  # largest number of JSON: larger whole numbers have no 
 _BARE_NUMBERS = 20  # numbers that are read of a file of bare numbers: more than any format has
 
 
-def _middlebury_facts(path: AnyPath) -> CameraFacts:
+def _read_middlebury(path: AnyPath) -> CameraFacts:
     """Read Middlebury's ``calib.txt``: cam0, doffs, baseline [mm], size; cam1 is only checked."""
     keys = read_key_values(path)
     K = kitti_matrix(path, keys, "cam0", (3, 3))
     right = kitti_matrix(path, keys, "cam1", (3, 3)) if "cam1" in keys else K
-    baseline_mm, doffs_px = (_number(path, keys, name) for name in ("baseline", "doffs"))
+    baseline_mm, doffs_px = (_read_number(path, keys, name) for name in ("baseline", "doffs"))
+
     refuse_apart(K, right)
     cx_difference_px = right[0, 2] - K[0, 2]
     if "cam1" in keys and abs(cx_difference_px - doffs_px) > SAME_DIFFERENCE_PX:
@@ -115,10 +116,11 @@ def _middlebury_facts(path: AnyPath) -> CameraFacts:
             f"{path}: baseline is {baseline_mm:g}, and Middlebury's is in millimetres; where it is "
             f"in metres, write {1000 * baseline_mm:g}"
         )
+
     return CameraFacts(
         kind="a Middlebury calibration",
         K=torch.from_numpy(K),
-        size=_size({name: _number(path, keys, name) for name in ("width", "height")}),
+        size=_read_size({name: _read_number(path, keys, name) for name in ("width", "height")}),
         baseline_m=baseline_mm / 1000,
         cx_right_minus_left_px=doffs_px,
         is_metric=True,
@@ -137,7 +139,7 @@ def plain_facts(path: AnyPath, keys: Mapping[str, list[float]]) -> CameraFacts:
     """
     optional = [key for key in _OPTIONAL_LINES if key in keys]
     wanted = ("focal_px", "cx", "cy", "baseline_m", *optional)
-    values = {key: _number(path, keys, key) for key in wanted}
+    values = {key: _read_number(path, keys, key) for key in wanted}
     focal_px = values["focal_px"]
     has_size = {"width", "height"} <= values.keys()
     return CameraFacts(
@@ -189,13 +191,14 @@ def read_kitti_size(keys: Mapping[str, list[float]], pair: KittiPair) -> Size | 
     return (int(sides[0]), int(sides[1])) if len(sides) == 2 else None
 
 
-def _colmap_facts(text: str) -> CameraFacts:
+def _read_colmap(text: str) -> CameraFacts:
     """Read COLMAP's ``cameras.txt``, a line a camera: number, model, size, parameters."""
     cameras = {match.groups() for match in _COLMAP.finditer(text)}
     if len(cameras) > 1:
         raise InputError(
             f"a cameras.txt of COLMAP with {len(cameras)} different cameras; keep the line of one"
         )
+
     model, width, height, parameters = cameras.pop()
     is_fisheye = bool(is_fisheye_lens({"cameramodel": model}))
     try:
@@ -207,6 +210,7 @@ def _colmap_facts(text: str) -> CameraFacts:
         values.insert(0, values[0])
     if len(values) < 4:
         raise InputError(f"a camera of COLMAP with {len(values)} parameters; copy it anew")
+
     fx, fy, cx, cy = values[:4]
     return CameraFacts(
         kind=f"a {model} camera of COLMAP",
@@ -218,7 +222,7 @@ def _colmap_facts(text: str) -> CameraFacts:
     )
 
 
-def _bare_facts(text: str) -> CameraFacts | None:
+def _read_bare_numbers(text: str) -> CameraFacts | None:
     """Read bare numbers: ``fx fy cx cy`` and distortion; K, perhaps with a baseline; or P.
 
     None where they are none of these.
@@ -258,7 +262,7 @@ def _bare_facts(text: str) -> CameraFacts | None:
     )
 
 
-def _number(path: AnyPath, keys: Mapping[str, list[float]], name: str) -> float:
+def _read_number(path: AnyPath, keys: Mapping[str, list[float]], name: str) -> float:
     """Return the number of a key of a calibration, which must be there and be only one."""
     if len(keys.get(name, [])) != 1:
         raise InputError(f"{path}: {name!r} is missing, or is not one number; copy the file anew")
@@ -277,9 +281,11 @@ def facts_from_json(content: object) -> CameraFacts:
         InputError: it is none, or a key is unknown, missing or of another type.
     """
     if not isinstance(content, dict) or not content.keys() <= set(_KEYS):
-        facts = _foreign_facts(content)
+        facts = _read_foreign_json(content)
         if facts is not None:
             return facts
+
+    # A mistake of depthpose's own keys is named.
     assert isinstance(content, dict)
     if not content.keys() & set(_KEYS):
         keys = ", ".join(map(repr, content))
@@ -292,28 +298,30 @@ def facts_from_json(content: object) -> CameraFacts:
         raise InputError(f"missing {', '.join(map(repr, missing))}; add it to the camera")
     if "cx_right_minus_left_px" in content and "baseline_m" not in content:
         raise InputError("'cx_right_minus_left_px' needs 'baseline_m' beside it; add it")
+
     optional_keys = ("baseline_m", _DOFFS, *OPTIONAL_KEYS)
     values: dict[str, Any] = {
-        key: _json_number(content, key) for key in optional_keys if key in content
+        key: _read_json_number(content, key) for key in optional_keys if key in content
     }
-    size = _size(content)
+    size = _read_size(content)
     return CameraFacts(
-        kind="a camera", K=_matrix(content["K"]), size=size, is_metric=True, **values
+        kind="a camera", K=_read_matrix(content["K"]), size=size, is_metric=True, **values
     )
 
 
-def _foreign_facts(content: object) -> CameraFacts | None:
+def _read_foreign_json(content: object) -> CameraFacts | None:
     """Read the JSON of other systems: a bare matrix, ROS, OpenCV, RealSense, Open3D or BOP.
 
     None where it is of none of them.
     """
     if isinstance(content, list) and len(content) in (3, 9):
-        return CameraFacts(kind="a matrix", K=_matrix(content))
+        return CameraFacts(kind="a matrix", K=_read_matrix(content))
     if not isinstance(content, dict):
         raise InputError(
             f"a camera is a JSON object with the keys {', '.join(_KEYS)}, "
             f"not a {type(content).__name__}"
         )
+
     fields = normalise_keys(content)
     facts = None
     is_fisheye = bool(is_fisheye_lens(fields))
@@ -321,6 +329,8 @@ def _foreign_facts(content: object) -> CameraFacts | None:
     is_opencv = any(isinstance(value, dict) and "data" in value for value in content.values())
     if is_opencv or is_ros(fields) or {"ppx", "cameramatrix"} & fields.keys():
         facts = _with_json_keys(facts_from_fields(fields), fields)
+
+    # Keys of depthpose in a camera of no other system: its own reader names what is wrong.
     if facts is not None or "K" in content:
         return facts
     open3d_intrinsic = content.get("intrinsic", content)
@@ -329,29 +339,30 @@ def _foreign_facts(content: object) -> CameraFacts | None:
     elif isinstance(open3d_intrinsic, dict) and "intrinsic_matrix" in open3d_intrinsic:
         facts = _from_open3d(open3d_intrinsic)
     elif content.keys() >= set(_BOP):
-        fx, fy, cx, cy = (_json_number(content, key) for key in _BOP)
+        fx, fy, cx, cy = (_read_json_number(content, key) for key in _BOP)
         facts = CameraFacts(
             kind="a camera of BOP",
             K=intrinsics(fx, fy, cx, cy),
-            size=_size(content) if {"width", "height"} <= content.keys() else None,
+            size=_read_size(content) if {"width", "height"} <= content.keys() else None,
             baseline_m=read_baseline_m(fields),
-            depth_unit_m=_bop_unit_m(content),
+            depth_unit_m=_read_bop_unit_m(content),
             distortion=find_distortion(fields),
         )
     elif content and all(
         isinstance(image, dict) and "cam_K" in image for image in content.values()
     ):
         facts = _from_scene_camera(content)
+
     return None if facts is None else with_fisheye(facts, is_fisheye=is_fisheye)
 
 
 def _from_open3d(keys: dict[str, Any]) -> CameraFacts:
     """Read Open3D's ``PinholeCameraIntrinsic``, whose flat matrix is stored column by column."""
-    K = _matrix(keys["intrinsic_matrix"])
+    K = _read_matrix(keys["intrinsic_matrix"])
     is_by_columns = isinstance(keys["intrinsic_matrix"][0], int | float)
     if is_by_columns:
         K = K.T.contiguous()
-    size = _size(keys) if {"width", "height"} <= keys.keys() else None
+    size = _read_size(keys) if {"width", "height"} <= keys.keys() else None
     return CameraFacts(kind="a camera of Open3D", K=K, size=size)
 
 
@@ -361,7 +372,7 @@ def _from_scene_camera(images: dict[str, dict[str, Any]]) -> CameraFacts:
     first = entries[0]
     for entry in entries:
         has_same_K = entry["cam_K"] == first["cam_K"]
-        if not has_same_K or _bop_unit_m(entry) != _bop_unit_m(first):
+        if not has_same_K or _read_bop_unit_m(entry) != _read_bop_unit_m(first):
             raise InputError(
                 f"a scene_camera.json of BOP whose {len(entries)} images have several cameras; "
                 "write that of one image into a file, or open the data set by --bop"
@@ -371,29 +382,29 @@ def _from_scene_camera(images: dict[str, dict[str, Any]]) -> CameraFacts:
         raise InputError(f"'cam_K' is {flat!r:.80}, where 9 numbers belong")
     return CameraFacts(
         kind="a scene_camera.json of BOP",
-        K=_matrix(flat),
-        depth_unit_m=_bop_unit_m(first),
+        K=_read_matrix(flat),
+        depth_unit_m=_read_bop_unit_m(first),
     )
 
 
-def _bop_unit_m(keys: dict[str, Any]) -> float | None:
+def _read_bop_unit_m(keys: dict[str, Any]) -> float | None:
     """Read the unit of depth images [m] of a camera of BOP; None where it has none."""
     if "depth_scale" in keys:
-        return 0.001 * _json_number(keys, "depth_scale")  # millimetres a unit
-    return _json_number(keys, "depth_unit_m") if "depth_unit_m" in keys else None
+        return 0.001 * _read_json_number(keys, "depth_scale")  # millimetres a unit
+    return _read_json_number(keys, "depth_unit_m") if "depth_unit_m" in keys else None
 
 
-def _size(keys: dict[str, Any]) -> Size:
+def _read_size(keys: dict[str, Any]) -> Size:
     """Read width and height [px], which must be whole numbers."""
     what = "a whole number of pixels"
     for key in ("width", "height"):
-        value = _json_number(keys, key, what)
+        value = _read_json_number(keys, key, what)
         if value != int(value) or abs(value) > MAX_SIDE_PX:
             raise InputError(f"{key!r} is {repr(keys[key])[:80]}; give {what}")
     return int(keys["width"]), int(keys["height"])
 
 
-def _json_number(keys: dict[str, Any], key: str, what: str = "a number") -> float:
+def _read_json_number(keys: dict[str, Any], key: str, what: str = "a number") -> float:
     """Read a number of a JSON file; ``what`` says in the error what belongs there."""
     value = keys[key]
     is_number = type(value) in (int, float)  # a bool is none
@@ -402,7 +413,7 @@ def _json_number(keys: dict[str, Any], key: str, what: str = "a number") -> floa
     return float(value)
 
 
-def _matrix(value: object) -> Float[Tensor, "3 3"]:
+def _read_matrix(value: object) -> Float[Tensor, "3 3"]:
     """Read the 9 numbers of K, nested or flat."""
     try:
         return torch.from_numpy(np.array(value, dtype=np.float64).reshape(3, 3))
@@ -498,20 +509,22 @@ def _read_facts(path: AnyPath) -> CameraFacts:
     text = read_text(path, MAX_LIST_BYTES)
     if re.match(r"\s*(\{|\[\s*[-+\[\d])", text):
         return facts_from_json(read_json(path))
+
+    # Other text: formats that a word of theirs tells, else bare numbers, or keys and values.
     facts: CameraFacts | None
     if _MIDDLEBURY.search(text):
-        facts = _middlebury_facts(path)
+        facts = _read_middlebury(path)
     elif _KITTI.search(text):
-        facts = _kitti_facts(path)
+        facts = _read_kitti(path)
     elif _FOCAL_LINES.search(text):
         facts = plain_facts(path, read_key_values(path))
     elif _COLMAP.search(text):
-        facts = _colmap_facts(text)
+        facts = _read_colmap(text)
     else:
         for sign, description in _FOREIGN.items():
             if re.search(sign, text, re.MULTILINE):
                 raise InputError(f"{description}. {_OWN_FORMAT}")
-        facts = _bare_facts(text)
+        facts = _read_bare_numbers(text)
         if facts is None:
             fields = parse_storage(path, text)
             if fields is not None:
@@ -522,7 +535,7 @@ def _read_facts(path: AnyPath) -> CameraFacts:
     return facts
 
 
-def _kitti_facts(path: AnyPath) -> CameraFacts:
+def _read_kitti(path: AnyPath) -> CameraFacts:
     """Read KITTI's colour pair (cameras 2 and 3), else its grey pair; or the left camera alone."""
     keys = read_key_values(path)
     pair = choose_kitti_pair(keys, (*KITTI_COLOR, *KITTI_GREY))
@@ -596,7 +609,7 @@ def camera_of(camera: AnyLens | None, size: Size) -> Camera | None:
     if isinstance(camera, np.generic | np.ndarray | Tensor) and camera.ndim == 0:
         camera = float(camera)
     if isinstance(camera, int | float):
-        return _camera_of_focal_length(camera, size)
+        return _make_focal_camera(camera, size)
     if isinstance(camera, Mapping):
         keys = {key: np.asarray(value).tolist() for key, value in camera.items()}
         if {"width", "height"} & keys.keys():
@@ -607,7 +620,7 @@ def camera_of(camera: AnyLens | None, size: Size) -> Camera | None:
     return camera_from_facts(CameraFacts(kind="a matrix K", K=intrinsics_of(camera)), size)
 
 
-def _camera_of_focal_length(focal_px: float, size: Size) -> Camera:
+def _make_focal_camera(focal_px: float, size: Size) -> Camera:
     """Make the camera of a focal length, whose principal point is the centre of the image."""
     if not 1 < focal_px < _MAX_FOCAL_PX:
         raise InputError(f"focal_px is {focal_px}: not a focal length in pixels; KITTI's is 721.5")

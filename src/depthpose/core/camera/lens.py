@@ -57,7 +57,7 @@ _REALSENSE = ("none", "modifiedbrownconrady", "inversebrownconrady", "ftheta", "
 
 
 def is_fisheye_lens(fields: Mapping[str, Any], owner: str = "its") -> bool | None:
-    """Say whether the lens that a camera file names is an equidistant fisheye, or a pinhole.
+    """Whether the lens that a camera file names is an equidistant fisheye, and no pinhole.
 
     Args:
         fields: values of the file by its keys, in lower case, letters and digits only.
@@ -80,7 +80,7 @@ def is_fisheye_lens(fields: Mapping[str, Any], owner: str = "its") -> bool | Non
         lens = re.sub(r"^(rs2?)?distortion|(camera|lens|model)+$", "", lens)
         if lens in _REFUSED or lens.startswith("mei") or _is_other_lens(lens, key):
             remedy = _REFUSED.get(lens, _BY_ITS_TOOL)
-            raise _refused_lens(f"{owner} {_spell_key(key)} is {value!r}", remedy)
+            raise _make_lens_error(f"{owner} {_spell_key(key)} is {value!r}", remedy)
         if lens in _RADIAL or lens in _FISHEYE:
             named_lenses[key] = (value, lens in _FISHEYE)
     for key in _FLAGS:
@@ -93,7 +93,7 @@ def is_fisheye_lens(fields: Mapping[str, Any], owner: str = "its") -> bool | Non
         if isinstance(value, Mapping):
             xi = value.get("xi")
         if _is_set(xi):
-            raise _refused_lens(
+            raise _make_lens_error(
                 f"{owner} xi is {xi}, of MEI's omnidirectional model", _OMNIDIRECTIONAL
             )
 
@@ -111,8 +111,8 @@ def _is_other_lens(lens: str, key: str) -> bool:
 
     Under a key that names the lens alone any unknown name is.
     """
-    is_known = lens in _PINHOLE or lens in _RADIAL or lens in _FISHEYE
-    return not is_known and (key in _SURE_KEYS or _OTHER_LENS.search(lens) is not None)
+    is_listed = lens in _PINHOLE or lens in _RADIAL or lens in _FISHEYE
+    return not is_listed and (key in _SURE_KEYS or _OTHER_LENS.search(lens) is not None)
 
 
 def _is_set(value: object) -> bool:
@@ -133,7 +133,7 @@ def _spell_key(key: str) -> str:
     return re.sub("^is", "is_", words)
 
 
-def _refused_lens(described: str, remedy: str) -> InputError:
+def _make_lens_error(described: str, remedy: str) -> InputError:
     """Make the error of a lens that is no pinhole and no equidistant fisheye."""
     return InputError(
         f"{described}, and only pinholes and the equidistant fisheye (Kannala and Brandt, "

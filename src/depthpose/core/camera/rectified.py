@@ -62,7 +62,7 @@ Flags = Bool[Tensor, "_"]
 
 @dataclass(frozen=True, kw_only=True)
 class RectificationReport:
-    """What the matches between two images tell about the pair.
+    """The findings about a pair from the matches between its images.
 
     A number is NaN without matches, a judgement None with too few of them. The images are no pair
     where one shows nothing, both show the same view, or they are of different scenes.
@@ -120,7 +120,7 @@ def check_rectified(
         return RectificationReport(is_pair=False, message=finding)
     with torch.no_grad():
         # Images without texture match nothing.
-        left_grey, right_grey = (_grey(image, _COARSE_PIXELS) for image in (left, right))
+        left_grey, right_grey = (_reduce_to_grey(image, _COARSE_PIXELS) for image in (left, right))
         for side, grey in (("left", left_grey), ("right", right_grey)):
             deviation = float(grey.std(correction=0))
             if deviation < _MIN_DEVIATION:
@@ -251,8 +251,8 @@ def _refine_matches(
         Pixels of the matches in the left image, from its centre, and their shifts to the right
         image [px].
     """
-    left_grey, right_grey = (_grey(image, _FINE_PIXELS) for image in (left, right))
-    enlargement = left_grey.shape[1] / _grey(left, _COARSE_PIXELS).shape[1]
+    left_grey, right_grey = (_reduce_to_grey(image, _FINE_PIXELS) for image in (left, right))
+    enlargement = left_grey.shape[1] / _reduce_to_grey(left, _COARSE_PIXELS).shape[1]
     left_px, right_px = (
         ((pixels + 0.5) * enlargement - 0.5).round().long() for pixels in (left_px, right_px)
     )
@@ -337,7 +337,7 @@ def _warp(image: Grey, rotation_deg: float, scale: float) -> Grey:
 def _make_report(
     from_centre_px: Tensor, shift_px: Tensor, corners: int, width: int, cx_difference_px: float
 ) -> RectificationReport:
-    """Judge a pair by its matches.
+    """Judge a pair by its matches: whether it is one, rectified, and not swapped.
 
     Args:
         from_centre_px: pixels of the matches in the left image, from its centre (n, 2).
@@ -366,6 +366,7 @@ def _make_report(
     is_level = abs(offset_px) <= max_offset_px and spread_px <= max_spread_px
     is_decided = matches >= _MIN_MATCHES or (matches >= _MIN_WRONG and not is_level)
     is_order_decided = len(clear_px) >= _MIN_MATCHES
+
     report = RectificationReport(
         vertical_offset_px=offset_px,
         vertical_spread_px=spread_px,
@@ -385,6 +386,7 @@ def _make_report(
             "rectified"
         )
         return replace(report, message=message)
+
     findings: list[str] = []
     if report.is_pair is False:
         findings.append(
@@ -408,6 +410,7 @@ def _make_report(
             "allowed); rectify the pair ('depthpose data rectify', with the calibration of both "
             "cameras)"
         )
+
     agreement = f"rows agree to {abs(offset_px):.1f} px, with a spread of {spread_px:.1f} px"
     return replace(report, message=f"{'. '.join(findings) or agreement} ({matches} matches)")
 
@@ -442,7 +445,7 @@ def grey_of(image: Float[Tensor, "3 h w"]) -> Float[Tensor, "h w"]:
     return (image * image.new_tensor(_LUMA)[:, None, None]).sum(0)
 
 
-def _grey(image: Float[Tensor, "3 h w"], pixels: int) -> Float[Tensor, "h2 w2"]:
+def _reduce_to_grey(image: Float[Tensor, "3 h w"], pixels: int) -> Float[Tensor, "h2 w2"]:
     """Convert an image to grey with a mean of 0, reduced to at most this number of pixels."""
     grey = grey_of(image).float()
     scale = math.sqrt(pixels / grey.numel())

@@ -108,6 +108,8 @@ def read_raw_pair(
     with errors_naming(path):
         pair = _read_pair(Path(path), unit_m or 1.0, is_fisheye)
         R = pair.right_from_left.R
+
+        # The distance of the cameras, and the rotation between them.
         length = float(pair.right_from_left.t_m.norm())
         if not length:
             raise InputError("T is 0: both cameras stand in one place; calibrate as a pair")
@@ -116,6 +118,8 @@ def read_raw_pair(
         if not torch.allclose(R @ R.mT, torch.eye(3).double(), atol=1e-3) or torch.det(R) < 0:
             raise InputError(f"R is {R.tolist()}, which is no rotation; copy it anew")
         _warn_if_transposed(path, pair.right_from_left)
+
+        # The place of the second camera in the frame of the first.
         x, y, z = pair.right_from_left.inverse().t_m.tolist()
         if abs(x) < max(abs(y), abs(z)):
             raise InputError(
@@ -165,8 +169,8 @@ def _read_pair(path: Path, unit_m: float, is_fisheye: bool | None) -> RawPair:
     if path.is_dir():
         first, second = read_pair_files(path)
         if is_ros_pair(first, second):
-            return _from_ros(first, second, unit_m, is_fisheye)
-        return _from_opencv(first | second, unit_m, is_fisheye)
+            return _read_ros_pair(first, second, unit_m, is_fisheye)
+        return _read_opencv_pair(first | second, unit_m, is_fisheye)
     text = read_text(path, MAX_LIST_BYTES)
     is_json = text.lstrip()[:1] == "{"
     content = read_json(path) if is_json else None
@@ -174,11 +178,13 @@ def _read_pair(path: Path, unit_m: float, is_fisheye: bool | None) -> RawPair:
     if fields is None:
         raise InputError(f"no calibration of two cameras; known are {_KNOWN}")
     if "cam0" in fields:
-        return _from_kalibr(fields, unit_m, is_fisheye)
-    return _from_opencv(fields, unit_m, is_fisheye)
+        return _read_kalibr_pair(fields, unit_m, is_fisheye)
+    return _read_opencv_pair(fields, unit_m, is_fisheye)
 
 
-def _from_ros(first: Fields, second: Fields, unit_m: float, is_fisheye: bool | None) -> RawPair:
+def _read_ros_pair(
+    first: Fields, second: Fields, unit_m: float, is_fisheye: bool | None
+) -> RawPair:
     """Read ROS's two ``camera_info``, whose R and P describe the rectified pair.
 
     Each R rotates a raw camera to its rectified one, and the rectified cameras differ by x alone:
@@ -209,13 +215,14 @@ def _from_ros(first: Fields, second: Fields, unit_m: float, is_fisheye: bool | N
     return _make_pair(cameras[0], cameras[1], motion, find_size(first))
 
 
-def _from_opencv(fields: Fields, unit_m: float, is_fisheye: bool | None) -> RawPair:
+def _read_opencv_pair(fields: Fields, unit_m: float, is_fisheye: bool | None) -> RawPair:
     """Read OpenCV's ``stereoCalibrate``, whose R and T carry points of camera 1 to camera 2."""
     if not any(key in fields for side_keys in _K.values() for key in side_keys):
         reason = "it has no camera matrices K1 and K2"
         if is_ros(fields) or "cameramatrix" in fields:
             reason = "it describes a single camera"
         raise InputError(f"{reason}; give the calibration of a pair: {_KNOWN}")
+
     have_fisheyes = _choose_lens_model(fields, is_fisheye)
     cameras: list[RawCamera] = []
     for side in ("left", "right"):
@@ -223,6 +230,7 @@ def _from_opencv(fields: Fields, unit_m: float, is_fisheye: bool | None) -> RawP
         D = _find_numbers(fields, _D[side])
         cameras.append(_make_camera(K, D, have_fisheyes, f"the {side} camera"))
     left, right = cameras
+
     R = find_matrix(fields, _R, 9)
     T = _find_numbers(fields, _T)
     if R is None or T is None or len(T) != 3:
@@ -230,7 +238,7 @@ def _from_opencv(fields: Fields, unit_m: float, is_fisheye: bool | None) -> RawP
     return _make_pair(left, right, (R, unit_m * np.array(T)), find_size(fields))
 
 
-def _from_kalibr(fields: Fields, unit_m: float, is_fisheye: bool | None) -> RawPair:
+def _read_kalibr_pair(fields: Fields, unit_m: float, is_fisheye: bool | None) -> RawPair:
     """Read Kalibr's camchain, whose ``T_cn_cnm1`` carries points of cam0 to cam1."""
     if not all(isinstance(fields.get(owner), Mapping) for owner in ("cam0", "cam1")):
         raise InputError("a camchain without cam0 and cam1; calibrate both cameras together")
@@ -397,6 +405,8 @@ def make_rectifier(pair: RawPair, size: Size, keep: float = 0.0) -> Rectifier:
         )
     else:
         R1, R2, P1, P2, *_ = cv2.stereoRectify(*left, *right, size, R, t, flags=flags, alpha=keep)
+
+    # The rig, unless the picture would be enlarged as no real lens needs.
     rig = camera_from_facts(facts_from_projections("the rectified pair", P1, P2, size), size)
     assert isinstance(rig, StereoRig), "two projections have a baseline"
     raw_px = float(pair.left.K[0, 0])

@@ -370,6 +370,8 @@ def _from_intrinsics(
             depth_unit_m=find_number(fields, "depthscale") if is_realsense else None,
             distortion=distortion,
         )
+
+    # OpenCV's calibration of a pair has R and T from the left camera to the right one.
     facts = CameraFacts(kind=kind, K=torch.from_numpy(K), size=size)
     T = parse_numbers(fields.get("t"))
     R = parse_numbers(fields.get("r"))

@@ -20,7 +20,7 @@ _MIN_DEVIATION = 0.01  # standard deviation of the grey values of a copy in [0, 
 _MIN_MATCHES = 25  # least matches of corners between both halves
 
 
-def halves(image: Float[Tensor, "3 h w"], arrangement: Arrangement) -> tuple[Tensor, Tensor]:
+def split_halves(image: Float[Tensor, "3 h w"], arrangement: Arrangement) -> tuple[Tensor, Tensor]:
     """Split a picture into its left and right half, or its upper and lower one."""
     if arrangement == "side by side":
         width = image.shape[2] // 2
@@ -34,16 +34,16 @@ def find_two_views(image: Float[Tensor, "3 h w"]) -> Arrangement | None:
     if min(image.shape[1:]) < 2 * _ROWS:
         return None
     for arrangement in ("side by side", "top and bottom"):
-        first_half, second_half = halves(image, arrangement)
+        first_half, second_half = split_halves(image, arrangement)
         if (
-            _best_correlation(first_half, second_half) > _MIN_CORRELATION
+            _find_best_correlation(first_half, second_half) > _MIN_CORRELATION
             and check_rectified(first_half, second_half).matches >= _MIN_MATCHES
         ):
             return arrangement
     return None
 
 
-def _best_correlation(first_half: Tensor, second_half: Tensor) -> float:
+def _find_best_correlation(first_half: Tensor, second_half: Tensor) -> float:
     """Correlate small copies of both halves, at the shift along rows where it is largest."""
     small_copies: list[Tensor] = []
     for half in (first_half, second_half):
@@ -53,15 +53,15 @@ def _best_correlation(first_half: Tensor, second_half: Tensor) -> float:
     first, second = small_copies
     best = 0.0
     for shift in range(-_MAX_SHIFT, _MAX_SHIFT + 1):
-        a = _without_means(first[:, max(shift, 0) : _COLUMNS + min(shift, 0)])
-        b = _without_means(second[:, max(-shift, 0) : _COLUMNS + min(-shift, 0)])
+        a = _subtract_means(first[:, max(shift, 0) : _COLUMNS + min(shift, 0)])
+        b = _subtract_means(second[:, max(-shift, 0) : _COLUMNS + min(-shift, 0)])
         if min(float(a.std()), float(b.std())) > _MIN_DEVIATION:
             correlation = float((a * b).sum() / (a.norm() * b.norm()))
             best = max(best, correlation)
     return best
 
 
-def _without_means(grey: Tensor) -> Tensor:
+def _subtract_means(grey: Tensor) -> Tensor:
     """Subtract the means of rows and columns: any two halves share a bright sky above a road."""
     return grey - grey.mean(0) - grey.mean(1, keepdim=True) + grey.mean()
 

@@ -51,7 +51,7 @@ Engine = Callable[[Sequence[Block], Work, str], Iterable[ShardRecord]]
 
 @dataclass(frozen=True, kw_only=True)
 class ShardedJob:
-    """What is computed, for which inputs, and where the results go."""
+    """A job: the work, its inputs, and the folder of its results."""
 
     work: Work  #: what is computed
     items: Sequence[Item] = ()  #: listed inputs
@@ -264,7 +264,7 @@ class RayEngine:
                     fn_constructor_args=(work_reference, out),
                     compute=ray.data.ActorPoolStrategy(
                         min_size=1,
-                        max_size=min(self.workers or self._capacity(ray), len(lines)),
+                        max_size=min(self.workers or self._count_fitting_workers(ray), len(lines)),
                         max_tasks_in_flight_per_actor=2,
                     ),
                     num_cpus=self.worker_cpus,
@@ -302,7 +302,7 @@ class RayEngine:
                 "'ray start --head', or omit the address"
             ) from error
 
-    def _capacity(self, ray: Any) -> int:  # noqa: ANN401
+    def _count_fitting_workers(self, ray: Any) -> int:  # noqa: ANN401
         """Compute how many workers fit into the cluster.
 
         Raises:

@@ -29,7 +29,7 @@ _TARS = (".tar", ".tar.gz", ".tgz")
 
 @dataclass(frozen=True, slots=True)
 class Files:
-    """What files an input consists of.
+    """The files that an input consists of, by their roles.
 
     A manifest has a column for each role. In a tar shard the file of a role is
     ``KEY.ROLE.SUFFIX``, or ``KEY.SUFFIX`` where there is only one role.
@@ -177,6 +177,7 @@ def make_plan(out: str, items: Sequence[Item], tars: Sequence[str], size: int) -
     with suppress(ValueError, KeyError, TypeError, AttributeError):
         for line in lines:
             blocks.append(Block.from_json(line.decode()))  # noqa: PERF401
+
     planned_count = len(blocks)
     planned_tars = {block.tar for block in blocks}
     planned_files = {item.name: item.files for block in blocks for item in block.items}
@@ -349,7 +350,7 @@ failed."""
 
 @dataclass(frozen=True, kw_only=True)
 class Work:
-    """What a job computes; it is sent to every worker, which starts it once."""
+    """The work of a job; it is sent to every worker, which starts it once."""
 
     start: Callable[[], Function]  #: loads what all samples need, such as a network
     files: Files  #: what files an input consists of
@@ -369,7 +370,7 @@ class ShardRecord:
 
     @property
     def failures(self) -> list[tuple[str, str]]:
-        """Entries of the inputs without a result."""
+        """List the entries of the inputs without a result."""
         return [(name, reason) for name, reason in self.entries if reason]
 
     def to_json(self) -> str:

@@ -183,6 +183,8 @@ def _cloud_from_table(path: AnyPath, table: np.ndarray) -> Cloud:
             "look like a pixel's place; leave them out, or name the columns in a first line "
             "(u v x y z)"
         )
+
+    # Numbers of points ascend; by one, or beside coordinates that are no whole numbers.
     is_ascending = (steps > 0).all()
     is_count = is_ascending and ((steps == 1).all() or not is_whole[1:4].any())
     first = 1 if has_whole_first and is_count else 0
@@ -222,7 +224,7 @@ def _read_text(path: AnyPath) -> Cloud:
             names = words
             break
 
-    table = parse_rows(path, map(_separator_blanker(path, head, names), chain(head, rows)))
+    table = parse_rows(path, map(_make_blanker(path, head, names), chain(head, rows)))
     if count not in (None, len(table)):
         raise InputError(f"{path}: declares {count} points but {len(table)} rows follow")
     if names:
@@ -268,7 +270,7 @@ def _rows_without_comments(text: Iterable[str], comments: list[str]) -> Iterator
             comments.append(comment)
 
 
-def _separator_blanker(path: AnyPath, head: list[str], names: list[str]) -> Callable[[str], str]:
+def _make_blanker(path: AnyPath, head: list[str], names: list[str]) -> Callable[[str], str]:
     """Make the function that replaces the separators of a row by blanks.
 
     From the first rows it is decided whether commas separate numbers or are decimal signs, which

@@ -405,6 +405,8 @@ def refuse_yaml_bomb(path: AnyPath, text: str) -> None:
                     anchor = None
                 case yaml.ScalarEvent():
                     size = 1
+
+            # The value counts in its anchor, and in the collection about it.
             if anchor is not None:
                 sizes[anchor] = size
             if open_collections:
@@ -555,7 +557,7 @@ def find_partners(first: Sequence[str], second: Sequence[str], sides: str) -> li
     first_keys: Sequence[Hashable] = first
     second_keys: Sequence[Hashable] = second
     if not set(first) & set(second):
-        first_keys, second_keys = _pairing_keys(first, second)
+        first_keys, second_keys = _make_pairing_keys(first, second)
 
     first_counts = Counter(first_keys)
     second_counts = Counter(second_keys)
@@ -578,7 +580,7 @@ def find_partners(first: Sequence[str], second: Sequence[str], sides: str) -> li
     return [index_of_key[key] for key in first_keys]
 
 
-def _pairing_keys(
+def _make_pairing_keys(
     first: Sequence[str], second: Sequence[str]
 ) -> tuple[list[Hashable], list[Hashable]]:
     """Remove from each name what all names of its side share, and read numbers by value.

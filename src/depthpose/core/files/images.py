@@ -84,7 +84,7 @@ def read_image(path: AnyPath) -> Float32[Tensor, "3 h w"]:
         InputError: the file is missing, damaged, too large, not a picture, or holds both views of a
             stereo camera.
     """
-    with opened_image(path) as image:
+    with open_image(path) as image:
         pixels = _decode(path, image)
         count = getattr(image, "n_frames", 1) if image.format != "MPO" else 1
     if count > 1 and _is_first_notice(path, "several"):
@@ -93,7 +93,7 @@ def read_image(path: AnyPath) -> Float32[Tensor, "3 h w"]:
             "there); save each in a file of its own to have them all"
         )
         warnings.warn(message, Notice, stacklevel=2)
-    return _rgb_tensor(pixels, path)
+    return _make_rgb_tensor(pixels, path)
 
 
 def picture_tensor(image: Image.Image, name: AnyPath) -> Float32[Tensor, "3 h w"]:
@@ -104,7 +104,7 @@ def picture_tensor(image: Image.Image, name: AnyPath) -> Float32[Tensor, "3 h w"
     """
     with refused_as(name, "picture", "give an intact one"):
         pixels = _decode(name, image)
-    return _rgb_tensor(pixels, name)
+    return _make_rgb_tensor(pixels, name)
 
 
 def _decode(name: AnyPath, image: Image.Image) -> np.ndarray:
@@ -113,16 +113,17 @@ def _decode(name: AnyPath, image: Image.Image) -> np.ndarray:
     Pillow keeps 8 bits of colours of 16, and decodes damaged JPEGs without a word: those formats
     are decoded in other ways.
     """
-    rotation = _UPRIGHT.get(_orientation(image))
+    rotation = _UPRIGHT.get(_read_orientation(image))
     opened: Any = image  # a picture that is not of a file has neither ``fp`` nor ``tile``
     is_of_file = getattr(image, "fp", None) is not None
     tiles = (getattr(image, "tile", None) or []) if is_of_file else []
     raw_modes = [tile.args if isinstance(tile.args, str) else tile.args[0] for tile in tiles]
 
+    # Colours of 16 bits: Pillow reads the upper bytes, and the lower ones where they are exchanged.
     if raw_modes and all(re.fullmatch("RGBA?;16[BLN]", str(mode)) for mode in raw_modes):
         lower = _open_with_bytes_exchanged(opened, raw_modes)
         upper_bytes, lower_bytes = (
-            _upright_pixels(name, part, rotation).astype(np.uint16) for part in (image, lower)
+            _turn_upright(name, part, rotation).astype(np.uint16) for part in (image, lower)
         )
         return upper_bytes * 256 + lower_bytes
 
@@ -135,8 +136,8 @@ def _decode(name: AnyPath, image: Image.Image) -> np.ndarray:
     if tiles and image.format == "JPEG" and image.mode in _JPEG_COLOURS:
         opened.fp.seek(0)
         image = _decode_jpeg(name, opened.fp.read(), _JPEG_COLOURS[image.mode])
-        return _upright_pixels(name, image, rotation)
-    return _upright_pixels(name, image, rotation)
+        return _turn_upright(name, image, rotation)
+    return _turn_upright(name, image, rotation)
 
 
 def _open_with_bytes_exchanged(image: Any, raw_modes: list[str]) -> Image.Image:  # noqa: ANN401
@@ -167,7 +168,7 @@ def _decode_ppm_16(image: Any, offset: int, largest: int) -> np.ndarray:  # noqa
     return (pixels * (65535 / largest)).round().clip(0, 65535).astype(np.uint16)
 
 
-def _upright_pixels(
+def _turn_upright(
     name: AnyPath, image: Image.Image, rotation: Image.Transpose | None
 ) -> np.ndarray:
     """Turn a picture of Pillow's by ``rotation``; return its pixels as RGB, or grey of 16 bits."""
@@ -244,7 +245,7 @@ def _has_hole(data: bytes) -> bool:
     return False
 
 
-def _rgb_tensor(pixels: np.ndarray, name: AnyPath) -> Float32[Tensor, "3 h w"]:
+def _make_rgb_tensor(pixels: np.ndarray, name: AnyPath) -> Float32[Tensor, "3 h w"]:
     """Convert decoded pixels to RGB in [0, 1].
 
     Not done while decoding, where warnings are silenced: this may warn of the range of 16 bits.
@@ -337,9 +338,9 @@ def image_size(path: AnyPath) -> tuple[int, int]:
     Raises:
         InputError: the file is missing, too large or not a picture.
     """
-    with opened_image(path) as image:
+    with open_image(path) as image:
         width, height = image.size
-        return (height, width) if _orientation(image) in (5, 6, 7, 8) else (width, height)
+        return (height, width) if _read_orientation(image) in (5, 6, 7, 8) else (width, height)
 
 
 def write_image(path: AnyPath, image: Tensor) -> None:
@@ -448,16 +449,16 @@ def read_views(path: AnyPath) -> list[Float32[Tensor, "3 _ _"]]:
     Raises:
         InputError: as there, but not for files of a stereo camera.
     """
-    with opened_image(path, with_views=True) as image:
+    with open_image(path, with_views=True) as image:
         pixels = [_decode(path, image)]
         if image.format == "MPO":
             image.seek(1)
             pixels.append(_decode(path, image))
-    return [_rgb_tensor(view, path) for view in pixels]
+    return [_make_rgb_tensor(view, path) for view in pixels]
 
 
 @contextmanager
-def opened_image(path: AnyPath, *, with_views: bool = False) -> Iterator[Image.Image]:
+def open_image(path: AnyPath, *, with_views: bool = False) -> Iterator[Image.Image]:
     """Open a picture, decoding only its header; errors inside the block become :class:`InputError`.
 
     Files that hold both views of a stereo camera are refused, unless ``with_views``.
@@ -500,6 +501,7 @@ def _refuse_two_views(path: AnyPath, image: Image.Image) -> None:
         frames.seek(0)
         if first_size in other_sizes:
             layout = "MPO, one after the other"
+
     if layout:
         raise InputError(
             f"{path}: holds both views of a stereo camera ({layout}); "
@@ -508,7 +510,7 @@ def _refuse_two_views(path: AnyPath, image: Image.Image) -> None:
         )
 
 
-def _orientation(image: Image.Image) -> int:
+def _read_orientation(image: Image.Image) -> int:
     """Read the EXIF orientation that is still to be applied, 1 (upright) to 8."""
     is_turned_by_pillow = image.format == "TIFF"
     if is_turned_by_pillow or _has_hidden_exif(image):
@@ -550,7 +552,7 @@ def read_exif_focal(picture: AnyPath | Image.Image) -> tuple[float, str] | None:
     if isinstance(picture, Image.Image):
         focal, doubt = _exif_focal(picture)
     else:
-        with opened_image(picture) as opened:
+        with open_image(picture) as opened:
             focal, doubt = _exif_focal(opened)
     if doubt:
         warnings.warn(doubt, Notice, stacklevel=2)
@@ -562,12 +564,12 @@ def _exif_focal(picture: Image.Image) -> tuple[tuple[float, str] | None, str]:
     if _has_hidden_exif(picture):
         return None, ""
     tags = picture.getexif().get_ifd(_EXIF_IFD)
-    film_mm = _positive_number(tags.get(_FOCAL_35MM))
-    focal_mm = _positive_number(tags.get(_FOCAL_MM))
+    film_mm = _read_positive_number(tags.get(_FOCAL_35MM))
+    focal_mm = _read_positive_number(tags.get(_FOCAL_MM))
 
     # A crop has another aspect than the picture that was taken.
-    taken_width = _positive_number(tags.get(_PIXELS))
-    taken_height = _positive_number(tags.get(_PIXELS_DOWN))
+    taken_width = _read_positive_number(tags.get(_PIXELS))
+    taken_height = _read_positive_number(tags.get(_PIXELS_DOWN))
     if (film_mm or focal_mm) and taken_width and taken_height:
         taken_aspect = max(taken_width, taken_height) / min(taken_width, taken_height)
         aspect = max(picture.size) / min(picture.size)
@@ -583,7 +585,7 @@ def _exif_focal(picture: Image.Image) -> tuple[tuple[float, str] | None, str]:
     if film_mm is not None:
         focal_px = film_mm / _DIAGONAL_MM * math.hypot(*picture.size)
         return (focal_px, f"FocalLengthIn35mmFilm {film_mm:g} mm"), ""
-    pixels_per_unit = _positive_number(tags.get(_RESOLUTION))
+    pixels_per_unit = _read_positive_number(tags.get(_RESOLUTION))
     unit_mm = _MM.get(tags.get(_RESOLUTION_UNIT, 2))
     if focal_mm is None or pixels_per_unit is None or unit_mm is None:
         return None, ""
@@ -594,7 +596,7 @@ def _exif_focal(picture: Image.Image) -> tuple[tuple[float, str] | None, str]:
     return (focal_px, f"FocalLength {focal_mm:g} mm, {sensor_mm:.1f} mm of sensor"), ""
 
 
-def _positive_number(value: Any) -> float | None:  # noqa: ANN401  whatever a file holds
+def _read_positive_number(value: Any) -> float | None:  # noqa: ANN401  whatever a file holds
     """Convert a value of a file to a positive finite number; None where it is none."""
     try:
         number = float(value)
@@ -708,11 +710,13 @@ def read_numbers(path: AnyPath) -> np.ndarray:
         if version not in _HEADER_READERS:
             raise InputError(f"{path}: NPY version {version}; save plain floats with numpy.save")
         shape, is_fortran, dtype = _HEADER_READERS[version](stream)
+
         if dtype.kind not in "fiu" or dtype.itemsize > 8:
             raise InputError(
                 f"{path}: holds {dtype}, not float16, 32 or 64; save .astype('float32')"
             )
         body = stream.getbuffer()[stream.tell() :]
+
         if len(shape) > _MAX_DIMENSIONS or any(type(side) is not int for side in shape):
             raise InputError(
                 f"{path}: declares an array of shape {str(shape)[:60]}; give whole numbers, "
@@ -752,7 +756,7 @@ def read_depth_png(path: AnyPath, unit_m: float = KITTI_UNIT) -> Float32[Tensor,
     """
     if not 0 < unit_m < math.inf:
         raise InputError(f"{path}: {_NO_UNIT.format(unit_m)}")
-    with opened_image(path) as image:
+    with open_image(path) as image:
         if image.format not in ("PNG", "TIFF") or image.mode not in ("I;16", "I;16B"):
             raise InputError(
                 f"{path}: a {image.format} of mode {image.mode}, where depth or disparity needs a "
@@ -784,7 +788,7 @@ def read_stored_depth(path: AnyPath) -> Shaped[Tensor, "h w"]:
     if suffix in MAP_SUFFIXES:
         return read_map(path)
     if suffix != ".png":
-        with opened_image(path) as image:
+        with open_image(path) as image:
             if image.mode in ("F", "I"):
                 return torch.from_numpy(np.array(image))
     return read_depth_png(path, 1.0).nan_to_num(0.0).int()

@@ -7,7 +7,7 @@ import math
 import re
 import warnings
 from array import array
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from io import BytesIO, TextIOWrapper
 from itertools import accumulate, islice
@@ -52,7 +52,7 @@ def split_records(
     # Named by place, since a file may use one name for several fields of padding.
     with refused_as(path, "list of fields", "save it again"):
         dtype = np.dtype([(f"{i}", order + f.code, (f.count,)) for i, f in enumerate(fields)])
-    need_bytes(path, len(body), count * dtype.itemsize, f"{count} points")
+    require_bytes(path, len(body), count * dtype.itemsize, f"{count} points")
     records = np.frombuffer(body, dtype, count)
     return {f.name: records[f"{i}"][:, 0] for i, f in enumerate(fields)}
 
@@ -113,7 +113,7 @@ def parse_rows(path: AnyPath, rows: Iterable[str]) -> np.ndarray:
     return table if table.size else np.empty((0, 0))
 
 
-def need_bytes(path: AnyPath, have: int, need: int, what: str) -> None:
+def require_bytes(path: AnyPath, have: int, need: int, what: str) -> None:
     """Refuse a body that is shorter than its header declares, before memory is allocated for it.
 
     ``what`` is what the header declares, such as ``100 points``.
@@ -168,6 +168,8 @@ def read_ply_elements(path: AnyPath, last: str | None = None) -> tuple[Columns, 
         raise InputError(f"{path}: no PLY header ('ply' ... 'end_header'); is it a PLY file?")
     order, elements = _parse_header(path, data[: end.start()].decode("latin-1").splitlines())
     body = memoryview(data)[end.end() :]
+
+    # Elements one after the other: of records in bytes, or of rows of text.
     rows = None if order else text_rows(path, body)
     columns: Columns = {}
     lists: dict[str, Ragged] = {}
@@ -223,6 +225,7 @@ def _read_text_lists(path: AnyPath, rows: Iterator[str], element: _Element) -> d
                 f"{path}: row {row_count} of {element.name}, {row.strip()[:60]!r}, is not what the "
                 "header declares (the number of values, then as many); save it again"
             )
+
     if row_count < element.count:
         declared = f"{element.count} {element.name}"
         raise InputError(f"{path}: {_TOO_FEW_ROWS.format(declared, row_count)}")
@@ -249,7 +252,7 @@ def _read_binary_lists(
     while rows_left:
         lengths = _read_list_lengths(path, body, position, element, order)
         if lengths not in record_types:
-            record_types[lengths] = _record_type(element.fields, lengths, order)
+            record_types[lengths] = _make_record_type(element.fields, lengths, order)
         record_type = record_types[lengths]
 
         # Rows up to the first whose lists have other lengths.
@@ -289,18 +292,18 @@ def _read_list_lengths(
         length = 1
         if f.size_code:
             size_type = np.dtype(order + f.size_code)
-            need_bytes(path, len(body), end + size_type.itemsize, declared)
+            require_bytes(path, len(body), end + size_type.itemsize, declared)
             length = int(np.frombuffer(body, size_type, 1, end)[0])
             if length < 0:
                 raise InputError(f"{path}: a list of {declared} has {length} values; save it anew")
             end += size_type.itemsize
         lengths.append(length)
         end += length * np.dtype(f.code).itemsize
-    need_bytes(path, len(body), end, declared)
+    require_bytes(path, len(body), end, declared)
     return tuple(lengths)
 
 
-def _record_type(fields: list[Field], lengths: tuple[int, ...], order: str) -> np.dtype:
+def _make_record_type(fields: list[Field], lengths: tuple[int, ...], order: str) -> np.dtype:
     """Make numpy's type of a binary row whose fields have these numbers of values."""
     parts: list[Any] = []
     for f, length in zip(fields, lengths, strict=True):
@@ -350,6 +353,12 @@ def _parse_header(path: AnyPath, lines: list[str]) -> tuple[str, list[_Element]]
                 )
     if order is None:
         raise InputError(f"{path}: the PLY header names no format; use {', '.join(_ORDERS)} 1.0")
+    _refuse_unusable_elements(path, elements)
+    return order, elements
+
+
+def _refuse_unusable_elements(path: AnyPath, elements: Sequence[_Element]) -> None:
+    """Refuse a header without one element of vertices, or with unusable properties."""
     names = [e.name for e in elements]
     if names.count("vertex") != 1:
         raise InputError(f"{path}: elements {names}, where exactly one 'vertex' is needed")
@@ -361,7 +370,6 @@ def _parse_header(path: AnyPath, lines: list[str]) -> tuple[str, list[_Element]]
                 f"{path}: {element.name} properties {properties} are none, a list or repeat a "
                 "name; give each vertex x, y and z"
             )
-    return order, elements
 
 
 _PCD_CODES = {
@@ -391,29 +399,10 @@ def read_pcd(path: AnyPath) -> Columns:
     lines = data[: end.start()].decode("latin-1").splitlines()
     rows = (line.split() for line in lines if not line.startswith("#"))
     header = {words[0]: words[1:] for words in rows if words}
-    names = header.get("FIELDS", [])
-    counts = header.get("COUNT", ["1"] * len(names))
-    rows = list(zip(names, header.get("TYPE", []), header.get("SIZE", []), counts, strict=False))
-    is_known = all((kind, size) in _PCD_CODES for _, kind, size, _ in rows)
-    is_counted = all(re.fullmatch(r"[1-9][0-9]{0,3}", count) for count in counts)
-    real = [name for name in names if name != "_"]  # "_" is padding, any number of times
-    if not rows or len(rows) != len(names) or not (is_known and is_counted):
-        raise InputError(
-            f"{path}: PCD header of FIELDS {names}, TYPE {header.get('TYPE')}, SIZE "
-            f"{header.get('SIZE')}, COUNT {counts} is not understood; save it as version 0.7"
-        )
-    if len(set(real)) != len(real):
-        raise InputError(f"{path}: PCD fields {names} repeat a name; keep one of them")
-    viewpoint = " ".join(header.get("VIEWPOINT", []))
-    if viewpoint and not _is_identity(viewpoint):
-        warnings.warn(
-            f"{path}: its VIEWPOINT {viewpoint[:100]} (x y z, qw qx qy qz of the sensor) is not "
-            "applied: the points are taken as they are. If they are in that other frame, turn them "
-            "into the sensor's (x right, y down, z forward) and write VIEWPOINT 0 0 0 1 0 0 0",
-            Notice,
-            stacklevel=4,
-        )
-    fields = [Field(name=n, code=_PCD_CODES[k, s], count=int(c)) for n, k, s, c in rows]
+    fields = _read_pcd_fields(path, header)
+    _warn_of_viewpoint(path, " ".join(header.get("VIEWPOINT", [])))
+
+    # The number of points, and their values.
     sides = [header.get(name, []) for name in ("WIDTH", "HEIGHT")]
     sides = [header["POINTS"]] if "POINTS" in header else sides
     if not all(re.fullmatch(r"[0-9]{1,10}", " ".join(side)) for side in sides):
@@ -427,15 +416,45 @@ def read_pcd(path: AnyPath) -> Columns:
     return split_rows(path, text_rows(path, body), fields, count)
 
 
+def _read_pcd_fields(path: AnyPath, header: Mapping[str, list[str]]) -> list[Field]:
+    """Read the fields of a PCD header, whose words are listed by the first word of their line."""
+    names = header.get("FIELDS", [])
+    counts = header.get("COUNT", ["1"] * len(names))
+    rows = list(zip(names, header.get("TYPE", []), header.get("SIZE", []), counts, strict=False))
+    is_readable = all((kind, size) in _PCD_CODES for _, kind, size, _ in rows)
+    is_counted = all(re.fullmatch(r"[1-9][0-9]{0,3}", count) for count in counts)
+    real = [name for name in names if name != "_"]  # "_" is padding, any number of times
+    if not rows or len(rows) != len(names) or not (is_readable and is_counted):
+        raise InputError(
+            f"{path}: PCD header of FIELDS {names}, TYPE {header.get('TYPE')}, SIZE "
+            f"{header.get('SIZE')}, COUNT {counts} is not understood; save it as version 0.7"
+        )
+    if len(set(real)) != len(real):
+        raise InputError(f"{path}: PCD fields {names} repeat a name; keep one of them")
+    return [Field(name=n, code=_PCD_CODES[k, s], count=int(c)) for n, k, s, c in rows]
+
+
+def _warn_of_viewpoint(path: AnyPath, viewpoint: str) -> None:
+    """Warn that the pose of the sensor in a PCD header, if it is any, is not applied."""
+    if viewpoint and not _is_identity(viewpoint):
+        warnings.warn(
+            f"{path}: its VIEWPOINT {viewpoint[:100]} (x y z, qw qx qy qz of the sensor) is not "
+            "applied: the points are taken as they are. If they are in that other frame, turn them "
+            "into the sensor's (x right, y down, z forward) and write VIEWPOINT 0 0 0 1 0 0 0",
+            Notice,
+            stacklevel=5,
+        )
+
+
 def _split_compressed(path: AnyPath, body: memoryview, fields: list[Field], count: int) -> Columns:
     """Split the body of a ``binary_compressed`` PCD file into columns.
 
     It is the compressed and the uncompressed size (4 bytes each), then the columns of all points,
     one after the other, compressed by LZF.
     """
-    need_bytes(path, len(body), 8, "the two compressed sizes")
+    require_bytes(path, len(body), 8, "the two compressed sizes")
     packed_size, size = (int(n) for n in np.frombuffer(body, "<u4", 2))
-    need_bytes(path, len(body) - 8, packed_size, "compressed points")
+    require_bytes(path, len(body) - 8, packed_size, "compressed points")
     declared = count * sum(f.count * np.dtype(f.code).itemsize for f in fields)
     if size != declared or size > _MAX_UNPACKED or packed_size > _MAX_PACKED:
         raise InputError(

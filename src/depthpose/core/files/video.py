@@ -79,6 +79,7 @@ def read_video(path: AnyPath) -> Video:
     capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
         raise InputError(f"{path}: {_NO_VIDEO}")
+
     fps = capture.get(cv2.CAP_PROP_FPS)
     frames = capture.get(cv2.CAP_PROP_FRAME_COUNT)
     pixel_width = capture.get(cv2.CAP_PROP_SAR_NUM)
@@ -87,6 +88,8 @@ def read_video(path: AnyPath) -> Video:
     capture.release()
     if not is_read or not 0 < fps < math.inf:
         raise InputError(f"{path}: {_NO_VIDEO}")
+
+    # Pixels that are not square: frames become so large that they are.
     height, width = first_frame.shape[:2]
     size = (width, height)
     if pixel_width > 0 and pixel_height > 0 and pixel_width != pixel_height:
@@ -125,6 +128,7 @@ def write_video(path: AnyPath, images: Iterable[Float[Tensor, "3 _ _"]], fps: fl
     if not 0 < fps < math.inf:
         raise InputError(f"{path}: fps is {fps:g}, but a video has a positive rate; give, say, 10")
     cv2 = import_opencv("writing a video")
+
     writer = None
     first_size = (0, 0)
     count = 0

@@ -15,7 +15,7 @@ from zipfile import ZipFile
 import torch
 from torch import Tensor, nn
 
-from depthpose.core.checkpoint import misfits, read_torch_file
+from depthpose.core.checkpoint import list_misfits, read_torch_file
 from depthpose.core.errors import InputError, Notice, import_extra
 from depthpose.core.files import atomic_write, read_text, remove_parts, write_image
 from depthpose.core.files.disk import refuse_heavy, refused_as, refused_write
@@ -171,7 +171,7 @@ def write_card(
     for path in reversed(saved_states(folder)):
         with suppress(InputError):
             step = _read_state(path)["step"]
-    duration = _duration_text(seconds)
+    duration = _describe_duration(seconds)
     record = {
         "command": f"`depthpose {words} --config config.yaml --out {shlex.quote(folder.name)}`",
         "time": f"{step} steps in {duration} on {machine}; {versions['date']}",
@@ -180,7 +180,7 @@ def write_card(
         part.write_text(card_text(weights.stem, {**facts, **record}, measured))
 
 
-def _duration_text(seconds: float) -> str:
+def _describe_duration(seconds: float) -> str:
     """Word a duration in seconds, minutes or hours."""
     if seconds < 120:
         return f"{seconds:.0f} s"
@@ -230,31 +230,9 @@ class Parts:
         Raises:
             InputError: it does not fit; the message names the first tensors that differ.
         """
-        present = self.state()
-        problems: list[str] = []
-        for prefix, part in (("", "modules"), ("average of ", "average")):
-            for name, tensors in present[part].items():
-                problems += [
-                    f"{prefix}{name}: {fault}" for fault in misfits(tensors, state[part][name])
-                ]
+        problems = self._list_misfits(state)
         for name, optimizer in self.optimizers.items():
-            saved = state["optimizers"][name]
-            counts = [len(group["params"]) for group in optimizer.param_groups]
-            saved_counts = [len(group["params"]) for group in saved["param_groups"]]
-            if counts != saved_counts:
-                problems.append(
-                    f"optimiser of {name}: it moved groups of {saved_counts} parameters, not of "
-                    f"{counts}"
-                )
-                continue
-            optimizer.load_state_dict(saved)
-            problems += [
-                f"optimiser of {name}: {key} of parameter {k} is {tuple(value.shape)}, not "
-                f"{tuple(parameter.shape)}"
-                for k, (parameter, values) in enumerate(optimizer.state.items())
-                for key, value in values.items()
-                if value.ndim and value.shape != parameter.shape
-            ]
+            problems += _restore_optimizer(name, optimizer, state["optimizers"][name])
         if problems:
             raise InputError(
                 f"{len(problems)} tensors do not fit this network: {', '.join(problems[:3])}; it "
@@ -267,6 +245,40 @@ class Parts:
                 tensor.copy_(state["average"][name][key])
         if self.scaler.is_enabled() and state["scaler"]:
             self.scaler.load_state_dict(state["scaler"])
+
+    def _list_misfits(self, state: Mapping[str, Any]) -> list[str]:
+        """List the tensors of networks and averages that do not fit a saved state."""
+        present = self.state()
+        problems: list[str] = []
+        for prefix, part in (("", "modules"), ("average of ", "average")):
+            for name, tensors in present[part].items():
+                problems += [
+                    f"{prefix}{name}: {fault}" for fault in list_misfits(tensors, state[part][name])
+                ]
+        return problems
+
+
+def _restore_optimizer(
+    name: str, optimizer: torch.optim.Optimizer, saved: dict[str, Any]
+) -> list[str]:
+    """Load the saved state of an optimiser, and list what of it does not fit its parameters."""
+    counts = [len(group["params"]) for group in optimizer.param_groups]
+    saved_counts = [len(group["params"]) for group in saved["param_groups"]]
+    if counts != saved_counts:
+        return [
+            f"optimiser of {name}: it moved groups of {saved_counts} parameters, not of {counts}"
+        ]
+    # Only a loaded state has its tensors by parameter.
+    optimizer.load_state_dict(saved)
+    problems: list[str] = []
+    for number, (parameter, values) in enumerate(optimizer.state.items()):
+        for key, value in values.items():
+            if value.ndim and value.shape != parameter.shape:
+                problems.append(
+                    f"optimiser of {name}: {key} of parameter {number} is {tuple(value.shape)}, "
+                    f"not {tuple(parameter.shape)}"
+                )
+    return problems
 
 
 def saved_states(folder: Path) -> list[Path]:
@@ -299,6 +311,7 @@ def restore_last(folder: Path, parts: Parts) -> tuple[Path, int, float]:
             message = str(error)
             damages.append(message if message.startswith(str(path)) else f"{path}: {message}")
             continue
+
         if path.name != STATE:
             reason = "; ".join(damages) or f"{folder}: there is no {STATE}"
             notice = f"{reason}; the training goes on from {path.name}, step {step}"

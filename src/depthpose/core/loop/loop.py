@@ -55,7 +55,7 @@ class Interrupted(KeyboardInterrupt):
 
 @dataclass(frozen=True, kw_only=True)
 class Progress:
-    """How far a training is."""
+    """The progress of a training."""
 
     step: int  #: steps done
     steps: int  #: steps in all
@@ -175,15 +175,20 @@ class _Training:
                 "too."
             )
         self.autocast_type = _AUTOCAST_TYPES[usable_precision(config.precision, device)]
+
+        # How long it goes, and where it stands.
         self.world = self.accelerator.num_processes
         self.steps = config.total_steps(len(samples), self.world)
         self.logger = RunLogger(folder, is_writer=self.accelerator.is_main_process)
         self.step = 0
         self.began = time.monotonic()
         self.sums: dict[str, tuple[float, int]] = {}  # sum and number of terms of each metric
+
         saved = saved_states(folder)
         if saved and not resume:
             raise InputError(f"{folder}: holds a training. Add --resume, or take another folder.")
+
+        # The networks on the device, with equal weights in all processes.
         for module in task.modules.values():
             module.to(device)
         if not saved and self.world > 1:
@@ -194,6 +199,7 @@ class _Training:
             scaler=torch.amp.GradScaler(device.type, enabled=self.autocast_type is torch.float16),
             average={} if config.ema_decay is None else _copy_weights(task),
         )
+
         if saved:
             path, self.step, seconds = restore_last(folder, self.parts)
             self.began -= seconds
@@ -215,13 +221,15 @@ class _Training:
         Raises:
             Interrupted: it was asked to stop, and its state is saved.
         """
-        batches = self._batches()
+        batches = self._load_batches()
         while self.step < self.steps:
             self._take_step([next(batches) for _ in range(self.config.accumulate)])
             self.step += 1
-            is_stopped = self._any_process(bool(requests))
+
+            # Whether it was asked to stop: once to save and stop, twice to finish here.
+            is_stopped = self._is_true_in_any_process(bool(requests))
             is_finish_requested = _wait_for_second_press(requests)
-            if is_stopped and self._any_process(is_finish_requested):
+            if is_stopped and self._is_true_in_any_process(is_finish_requested):
                 self.steps = self.step
 
             metrics: dict[str, float] = {}
@@ -230,15 +238,18 @@ class _Training:
                 metrics = {name: total / terms for name, (total, terms) in self.sums.items()}
                 self.sums = {}
                 self.logger.log(self.step, metrics)
+
             if is_last or self.step % self.config.validate_every_steps == 0:
                 if self.accelerator.is_main_process:
                     self._validate()
                 self.accelerator.wait_for_everyone()
+
             if is_stopped or is_last or self.step % self.config.save_every_steps == 0:
                 seconds = time.monotonic() - self.began
                 self.logger.save({"step": self.step, "seconds": seconds, **self.parts.state()})
             if on_step is not None and self.accelerator.is_main_process:
                 on_step(Progress(step=self.step, steps=self.steps, numbers=metrics))
+
             if is_stopped and self.step < self.steps:
                 self.logger.close()
                 self.accelerator.wait_for_everyone()  # rank 0 may still be writing
@@ -246,6 +257,7 @@ class _Training:
                     f"stopped after step {self.step} of {self.steps}, --resume goes on from there, "
                     "--finish makes weights of it"
                 )
+
         self.accelerator.wait_for_everyone()  # no process ends while another still needs it
         self._load_weights(self.parts.average)  # where there is an average, it is exported
         self.logger.close()
@@ -258,7 +270,7 @@ class _Training:
         self.logger.show(self.step, self.task.validate())
         self._load_weights(trained)
 
-    def _batches(self) -> Iterator[Any]:
+    def _load_batches(self) -> Iterator[Any]:
         """Load this process's micro-batches of the remaining steps to the device."""
         from accelerate.utils import send_to_device
 
@@ -364,7 +376,7 @@ class _Training:
         for name, state in states.items():
             self.task.modules[name].load_state_dict(state)
 
-    def _any_process(self, is_true: bool) -> bool:
+    def _is_true_in_any_process(self, is_true: bool) -> bool:
         """Whether something is true in any process; all of them must ask at the same point."""
         if self.world == 1:
             return is_true

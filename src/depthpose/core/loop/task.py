@@ -53,7 +53,7 @@ class AdamConfig(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class LoopConfig(Settings):
-    """How a task is trained, and for how long."""
+    """The settings of the training loop: how a task is trained, and for how long."""
 
     INSTEAD: ClassVar[dict[str, str]] = {"steps": "epochs", "epochs": "steps"}
     """A config file that gives one of these removes the other's default."""
@@ -147,16 +147,16 @@ class ValidationResult:
 
 @runtime_checkable
 class Task(Protocol):
-    """What is trained."""
+    """The networks that are trained, and the computation of their losses."""
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
-        """Networks by name; all of them are saved and resumed."""
+        """List the networks by name; all of them are saved and resumed."""
         ...
 
     @property
     def optimizers(self) -> Mapping[str, tuple[torch.optim.Optimizer, AdamConfig]]:
-        """Optimisers with their settings; each parameter is in at most one of them."""
+        """List the optimisers with their settings; each parameter is in at most one of them."""
         ...
 
     def step(self, batch: Any) -> Iterator[Update]:  # noqa: ANN401 - the task's own batch
@@ -183,7 +183,7 @@ class Samples(Protocol):
     """
 
     def __len__(self) -> int:
-        """Samples of one epoch."""
+        """Give the number of samples of an epoch."""
         ...
 
     def __getitem__(self, sample_index: int, /) -> Any:  # noqa: ANN401 - a tuple of tensors

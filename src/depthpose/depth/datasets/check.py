@@ -191,6 +191,7 @@ def _check_measurements(frame: Frame) -> Iterator[Problem]:
                 yield Problem(path=frame.calibration, kind="missing", message=message)
         except InputError as error:
             yield unreadable(frame.calibration, error)
+
     if frame.velodyne is not None:
         try:
             if not len(read_points_bin(frame.velodyne)):
@@ -242,8 +243,8 @@ def _check_truth(
 
 
 def _check_agreement(path: Path, truth_px: Map, report: RectificationReport) -> Iterator[Problem]:
-    """Report a disparity that few matches between the views agree with, and a change that would."""
-    agreement = _agreement(truth_px, report)
+    """Report a true map that few matches between the views agree with, and a change that helps."""
+    agreement = _measure_agreement(truth_px, report)
     if agreement is None:
         return
     share, count = agreement
@@ -257,7 +258,7 @@ def _check_agreement(path: Path, truth_px: Map, report: RectificationReport) -> 
     best_share = max(_MIN_AGREEMENT, share)
     hint = ""
     for change, changed_px in changes.items():
-        changed_agreement = _agreement(changed_px, report)
+        changed_agreement = _measure_agreement(changed_px, report)
         if changed_agreement is not None and changed_agreement[0] >= best_share:
             best_share = changed_agreement[0]
             hint = f"; {change} it agrees with {best_share:.0%}"
@@ -265,8 +266,8 @@ def _check_agreement(path: Path, truth_px: Map, report: RectificationReport) -> 
     yield Problem(path=path, kind="mismatch", message=message)
 
 
-def _agreement(disparity_px: Map, report: RectificationReport) -> tuple[float, int] | None:
-    """Give the share of matches that agree with a map, of those with truth near them.
+def _measure_agreement(disparity_px: Map, report: RectificationReport) -> tuple[float, int] | None:
+    """Measure the share of matches that agree with a map, of those with truth near them.
 
     Gives the number of the latter too; None where they are too few.
     """

@@ -67,6 +67,7 @@ def read_split(name: str | Path) -> Split:
     if not is_file:
         hint = nearest_name(str(name), SPLIT_NAMES)
         raise InputError(f"split {str(name)!r}: no such file; {hint}")
+
     text = read_text(path, _MAX_BYTES)
     frames: set[tuple[str, int]] = set()
     for number, line in enumerate(map(str.strip, text.splitlines()), 1):
@@ -78,6 +79,8 @@ def read_split(name: str | Path) -> Split:
         raise InputError(
             f"{path}: names no frame. Each line is 'DATE/DRIVE FRAME l' or two images."
         )
+
+    # A file with the frames of a known split is called by its name.
     listed = tuple(sorted(frames))
     equal_splits = [key for key in SPLIT_NAMES if _shipped_split(key).frames == listed]
     return Split(name=equal_splits[0] if equal_splits else path.name, frames=listed)
@@ -236,7 +239,7 @@ def refuse_common(
         )
 
 
-def read_known_depth(dataset: Dataset, index: int) -> Map | None:
+def read_true_depth(dataset: Dataset, index: int) -> Map | None:
     """Read the true depth of a left image [m]: of its LiDAR scan, else its depth map or disparity.
 
     None where the frame has no truth, or disparity without a calibration.

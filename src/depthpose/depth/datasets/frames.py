@@ -112,7 +112,7 @@ def read_plain_calibration(path: Path, name: str, width: int, height: int) -> St
     text = files.read_text(path, _MAX_PAIRS_BYTES)
     if re.search(r"^[ \t]*focal_px[ \t]*:", text, re.MULTILINE):
         keys = files.read_key_values(path)
-        return _rig(path, plain_facts(path, keys), (width, height))
+        return _make_rig(path, plain_facts(path, keys), (width, height))
 
     # The line of the pair; other pairs' names may begin with this one's, and a space.
     lines = re.findall(rf"^[ \t]*{re.escape(name)}[ \t]+(.+)$", text, re.MULTILINE)
@@ -134,7 +134,7 @@ def read_plain_calibration(path: Path, name: str, width: int, height: int) -> St
     values = {column: [number] for column, number in zip(columns, numbers[2:], strict=False)}
     try:
         size = int(numbers[0]), int(numbers[1])
-        return _rig(path, replace(plain_facts(path, values), size=size), size)
+        return _make_rig(path, replace(plain_facts(path, values), size=size), size)
     except (ValueError, OverflowError) as error:
         raise InputError(f"{path}: the line of {name!r} is no calibration ({error}).") from error
 
@@ -150,7 +150,7 @@ def _leading_numbers(line: str) -> list[float]:
     return numbers
 
 
-def _rig(path: Path, facts: CameraFacts, size: Size | None) -> StereoRig:
+def _make_rig(path: Path, facts: CameraFacts, size: Size | None) -> StereoRig:
     """Make the rig of a calibration, whose file ``path`` is named in errors."""
     with errors_naming(path):
         rig = camera_from_facts(facts, size)
@@ -175,7 +175,7 @@ def _projected_rig(
         )
     with errors_naming(path):
         facts = facts_from_projections("a KITTI calibration", left, right)
-    return _rig(path, facts, size), left
+    return _make_rig(path, facts, size), left
 
 
 def _compose_projection(
@@ -348,11 +348,11 @@ def kitti_calibration(frame: Frame) -> KittiCalibration:
     return KittiCalibration(rig=rig, pixels_from_velodyne=pixels_from_velodyne)
 
 
-def known_truths(frame: Frame) -> tuple[TruthKind, ...]:
-    """Give the kinds of truth that a frame has files of."""
+def truth_kinds(frame: Frame) -> tuple[TruthKind, ...]:
+    """List the kinds of truth that a frame has files of."""
     kinds: dict[TruthKind, bool] = {
         "scan": has_lidar(frame, "camera_z"),
-        "annotated": frame.depth is not None and frame.depth != _scan_map(frame),
+        "annotated": frame.depth is not None and frame.depth != _find_scan_map(frame),
         "disparity": frame.disparity is not None,
     }
     return tuple(kind for kind, has_kind in kinds.items() if has_kind)
@@ -360,7 +360,7 @@ def known_truths(frame: Frame) -> tuple[TruthKind, ...]:
 
 def has_lidar(frame: Frame, depth: LidarDepth) -> bool:
     """Whether a frame has a LiDAR scan, or a map of one, for :func:`lidar_truth`."""
-    return frame.velodyne is not None or (depth == "camera_z" and _scan_map(frame) is not None)
+    return frame.velodyne is not None or (depth == "camera_z" and _find_scan_map(frame) is not None)
 
 
 def lidar_truth(frame: Frame, depth: LidarDepth) -> Map:
@@ -372,7 +372,7 @@ def lidar_truth(frame: Frame, depth: LidarDepth) -> Map:
     Raises:
         InputError: no scan (see :func:`has_lidar`), or one without calibration.
     """
-    scan_map = _scan_map(frame)
+    scan_map = _find_scan_map(frame)
     if frame.velodyne is None and scan_map is not None and depth == "camera_z":
         depth_m = read_depth(scan_map)
         check_map_size(scan_map, depth_m, files.image_size(frame.left))
@@ -390,8 +390,8 @@ def lidar_truth(frame: Frame, depth: LidarDepth) -> Map:
     return project_lidar(points, pixels_from_velodyne, (height, width), depth)
 
 
-def _scan_map(frame: Frame) -> Path | None:
-    """Give the depth map of a LiDAR scan, if there is one; the depth of a plain folder is such."""
+def _find_scan_map(frame: Frame) -> Path | None:
+    """Find the depth map of a LiDAR scan, if there is one; the depth of a plain folder is such."""
     is_plain = frame.style in ("plain", "camera") and frame.scan is None
     return frame.depth if is_plain else frame.scan
 

@@ -60,17 +60,13 @@ def pack_frames(
         with files.atomic_write(out / shard) as part, tarfile.open(part, "w") as tar:
             while remaining:
                 frame = remaining.popleft()
-                row = {"name": frame.name, "style": frame.style}
+                row: dict[str, Any] = {"name": frame.name, "style": frame.style}
                 for field in _PACKED_FIELDS:
                     path = getattr(frame, field)
-                    if path is None:
-                        continue
-                    data = files.read_bytes(path)
-                    member = tarfile.TarInfo(f"{len(rows):08d}.{field}{path.suffix.lower()}")
-                    member.size = len(data)
-                    tar.addfile(member, io.BytesIO(data))
-                    row[field] = f"{shard}/{member.name}"
-                    size += len(data)
+                    if path is not None:
+                        member = f"{len(rows):08d}.{field}{path.suffix.lower()}"
+                        size += _add_member(tar, member, files.read_bytes(path))
+                        row[field] = f"{shard}/{member}"
                 if frame.calibration is not None:
                     row["calibration"] = packed_calibrations[frame.calibration]
                 rows.append(row)
@@ -80,6 +76,14 @@ def pack_frames(
         shard_count += 1
     files.write_json(out / INDEX, {"frames": rows})
     return shard_count
+
+
+def _add_member(tar: tarfile.TarFile, name: str, data: bytes) -> int:
+    """Add a file to a shard, and give its size [bytes]."""
+    member = tarfile.TarInfo(name)
+    member.size = len(data)
+    tar.addfile(member, io.BytesIO(data))
+    return len(data)
 
 
 def _pack_calibrations(frames: list[Frame], out: Path) -> dict[Path, str]:
@@ -171,18 +175,20 @@ def find_frames(folder: Path) -> tuple[str, list[Frame]]:
         frames = sorted(layout.find(folder), key=lambda frame: frame.name)
         if frames:
             return name, frames
-    raise _no_layout(folder)
+    raise _make_layout_error(folder)
 
 
-def _no_layout(folder: Path) -> InputError:
+def _has_layout(folder: Path) -> bool:
+    """Whether a folder has a frame of any layout."""
+    first_frames = (next(iter(layout.find(folder)), None) for layout in LAYOUTS.values())
+    return any(first_frames)
+
+
+def _make_layout_error(folder: Path) -> InputError:
     """Make the error of a folder whose layout is not recognised, with what to do."""
     children = sorted(folder.iterdir())
     names = ", ".join(path.name for path in children[:8]) or "nothing"
-    datasets = [
-        path.name
-        for path in children[:50]
-        if path.is_dir() and any(next(iter(layout.find(path)), None) for layout in LAYOUTS.values())
-    ]
+    datasets = [path.name for path in children[:50] if path.is_dir() and _has_layout(path)]
     hint = f" Open one of its folders instead: {', '.join(datasets)}." if datasets else ""
     possible_drives = (folder, *children, *folder.glob("*/*_extract"))
     if any(path.name.endswith("_extract") for path in possible_drives):
@@ -196,7 +202,7 @@ def _no_layout(folder: Path) -> InputError:
     )
 
 
-def _frames(
+def _make_frames(
     lefts: list[Path], style: CalibrationStyle, prefix: str = "", **parts: Mapping[str, Path]
 ) -> Iterator[Frame]:
     """Make the frames of left images.
@@ -209,7 +215,7 @@ def _frames(
         yield Frame(name=prefix + stem, left=left, style=style, **others)
 
 
-def _raw(folder: Path) -> Iterable[Frame]:
+def _find_raw(folder: Path) -> Iterable[Frame]:
     """Find the frames of KITTI raw, and of its depth-prediction set inside or beside it.
 
     ``folder`` is a root of dates, a date or a drive.
@@ -217,24 +223,24 @@ def _raw(folder: Path) -> Iterable[Frame]:
     own_drive = [folder] if folder.name.endswith("_sync") else []
     for drive in sorted([*own_drive, *folder.glob("*_sync"), *folder.glob("*/*_sync")]):
         date = drive.parent
-        lefts = _listed(drive / "image_02/data")
+        lefts = _list_files(drive / "image_02/data")
         is_calibrated = (date / "calib_cam_to_cam.txt").exists()
-        yield from _frames(
+        yield from _make_frames(
             lefts,
             "raw",
             f"{drive.name}_",
             calibration={stem_of(left): date for left in lefts if is_calibrated},
-            right=_by_stem(drive / "image_03/data"),
-            velodyne=_by_stem(drive / "velodyne_points/data", (".bin",)),
-            scan=_by_stem(_depth_maps_of_drive(drive, "velodyne_raw", "velodyne")),
-            depth=_by_stem(_depth_maps_of_drive(drive, "groundtruth", "annotated")),
-            disparity=_by_stem(drive / "disp_occ"),
-            disparity_noc=_by_stem(drive / "disp_noc"),
-            sky=_by_stem(drive / "sky"),
+            right=_list_by_stem(drive / "image_03/data"),
+            velodyne=_list_by_stem(drive / "velodyne_points/data", (".bin",)),
+            scan=_list_by_stem(_find_depth_maps(drive, "velodyne_raw", "velodyne")),
+            depth=_list_by_stem(_find_depth_maps(drive, "groundtruth", "annotated")),
+            disparity=_list_by_stem(drive / "disp_occ"),
+            disparity_noc=_list_by_stem(drive / "disp_noc"),
+            sky=_list_by_stem(drive / "sky"),
         )
 
 
-def _depth_maps_of_drive(drive: Path, kind: str, archive: str) -> Path:
+def _find_depth_maps(drive: Path, kind: str, archive: str) -> Path:
     """Find the folder of a drive's left maps of KITTI's depth-prediction set.
 
     Its archives are unpacked into the drive, into the folder of the date or of all dates, or beside
@@ -250,16 +256,16 @@ def _depth_maps_of_drive(drive: Path, kind: str, archive: str) -> Path:
     return next((candidate for candidate in candidates if candidate.is_dir()), drive / maps)
 
 
-def _depth_selection(folder: Path) -> Iterable[Frame]:
+def _find_depth_selection(folder: Path) -> Iterable[Frame]:
     """Find KITTI's frames for completion and prediction of depth: cropped, each with its camera."""
     inner = folder / "val_selection_cropped"
     root = inner if inner.is_dir() else folder
     if not (root / "intrinsics").is_dir():
         return
-    intrinsics = _by_stem(root / "intrinsics", (".txt",))
-    scans = _by_stem(root / "velodyne_raw")
-    depth = _by_stem(root / "groundtruth_depth")
-    for left in _listed(root / "image"):
+    intrinsics = _list_by_stem(root / "intrinsics", (".txt",))
+    scans = _list_by_stem(root / "velodyne_raw")
+    depth = _list_by_stem(root / "groundtruth_depth")
+    for left in _list_files(root / "image"):
         stem = stem_of(left)
         yield Frame(
             name=stem,
@@ -271,7 +277,7 @@ def _depth_selection(folder: Path) -> Iterable[Frame]:
         )
 
 
-def _odometry(folder: Path) -> Iterable[Frame]:
+def _find_odometry(folder: Path) -> Iterable[Frame]:
     """Find the frames of KITTI odometry: the colour pairs, else the grey ones.
 
     ``folder`` is a sequence, or holds all sequences.
@@ -283,47 +289,49 @@ def _odometry(folder: Path) -> Iterable[Frame]:
         if not (sequence / "calib.txt").is_file():
             continue
         is_grey = not (sequence / "image_2").is_dir()
-        lefts = _listed(sequence / ("image_0" if is_grey else "image_2"))
-        yield from _frames(
+        lefts = _list_files(sequence / ("image_0" if is_grey else "image_2"))
+        yield from _make_frames(
             lefts,
             "grey" if is_grey else "object",
             "" if sequence == folder else f"{sequence.name}_",
             calibration={stem_of(left): sequence / "calib.txt" for left in lefts},
-            right=_by_stem(sequence / ("image_1" if is_grey else "image_3")),
-            velodyne=_by_stem(sequence / "velodyne", (".bin",)),
+            right=_list_by_stem(sequence / ("image_1" if is_grey else "image_3")),
+            velodyne=_list_by_stem(sequence / "velodyne", (".bin",)),
         )
 
 
-def _benchmark(folder: Path, left_name: str, right_name: str, ending: str) -> Iterable[Frame]:
+def _find_benchmark(folder: Path, left_name: str, right_name: str, ending: str) -> Iterable[Frame]:
     """Find the frames of KITTI object, 2012 or 2015: of the stereo sets those of truth, NNNNNN_10.
 
     ``ending``: ending of the names of folders with true disparity.
     """
     root = folder / "training" if (folder / "training" / left_name).is_dir() else folder
-    lefts = _listed(root / left_name)
+    lefts = _list_files(root / left_name)
     # Frames of the stereo sets are NNNNNN_10 and, without truth, NNNNNN_11; object has neither.
     lefts = [left for left in lefts if stem_of(left).endswith("_10")] or lefts
-    texts = _by_stem(root / "calib_cam_to_cam", (".txt",)) | _by_stem(root / "calib", (".txt",))
+    texts = _list_by_stem(root / "calib_cam_to_cam", (".txt",)) | _list_by_stem(
+        root / "calib", (".txt",)
+    )
     texts = {f"{stem}_10": path for stem, path in texts.items()} | texts
-    return _frames(
+    return _make_frames(
         lefts,
         "object",
         calibration=texts,
-        right=_by_stem(root / right_name),
-        velodyne=_by_stem(root / "velodyne", (".bin",)),
-        depth=_by_stem(root / "gt_depth_map"),
-        disparity=_by_stem(root / f"disp_occ{ending}"),
-        disparity_noc=_by_stem(root / f"disp_noc{ending}"),
+        right=_list_by_stem(root / right_name),
+        velodyne=_list_by_stem(root / "velodyne", (".bin",)),
+        depth=_list_by_stem(root / "gt_depth_map"),
+        disparity=_list_by_stem(root / f"disp_occ{ending}"),
+        disparity_noc=_list_by_stem(root / f"disp_noc{ending}"),
     )
 
 
-def _middlebury(folder: Path) -> Iterable[Frame]:
+def _find_middlebury(folder: Path) -> Iterable[Frame]:
     """Find the scenes of a folder in Middlebury's layout, up to two folders deep."""
     for scene in [folder, *folder.glob("*"), *folder.glob("*/*")]:
         if not (scene / "calib.txt").is_file():
             continue
-        views = _by_stem(scene, LISTED_SUFFIXES)
-        truth = _by_stem(scene, (".pfm",))
+        views = _list_by_stem(scene, LISTED_SUFFIXES)
+        truth = _list_by_stem(scene, (".pfm",))
         if "im0" in views:
             yield Frame(
                 name="_".join(scene.relative_to(folder).parts) or scene.name,
@@ -335,61 +343,64 @@ def _middlebury(folder: Path) -> Iterable[Frame]:
             )
 
 
-def _pairs(folder: Path) -> Iterable[Frame]:
+def _find_pairs(folder: Path) -> Iterable[Frame]:
     """Find the frames of a plain folder: left, right, lidar_depth, disp_occ and a calibration."""
-    cameras = _by_stem(folder, (".json", ".yaml", ".yml"))
+    cameras = _list_by_stem(folder, (".json", ".yaml", ".yml"))
     camera = cameras.get("camera")
     text = folder / "calib.txt"
     calibration = camera or (text if text.is_file() else None)
 
     # Right views by the stems of the left ones, which may differ: left_0004 and right_0004.
-    lefts = _listed(folder / "left")
-    right = _by_stem(folder / "right")
+    lefts = _list_files(folder / "left")
+    right = _list_by_stem(folder / "right")
     if right and not any(stem_of(left) in right for left in lefts):
         with suppress(InputError):  # no pairs of names: the left images are single
             partners = find_partners([stem_of(left) for left in lefts], list(right), str(folder))
             views = list(right.values())
             right = {stem_of(left): views[k] for left, k in zip(lefts, partners, strict=True)}
-    return _frames(
+    return _make_frames(
         lefts,
         "camera" if camera else "plain",
         calibration={stem_of(left): calibration for left in lefts if calibration},
         right=right,
-        depth=_by_stem(folder / "lidar_depth"),
-        disparity=_by_stem(folder / "disp_occ"),
+        depth=_list_by_stem(folder / "lidar_depth"),
+        disparity=_list_by_stem(folder / "disp_occ"),
     )
 
 
 LAYOUTS = {
     "packed shards": Layout(find=packed_frames, parts="index.json of 'depthpose data pack'"),
-    "KITTI raw": Layout(find=_raw, parts="DATE/DATE_drive_NNNN_sync/image_02/data"),
+    "KITTI raw": Layout(find=_find_raw, parts="DATE/DATE_drive_NNNN_sync/image_02/data"),
     "KITTI depth selection": Layout(
-        find=_depth_selection, parts="val_selection_cropped: image, groundtruth_depth, intrinsics"
+        find=_find_depth_selection,
+        parts="val_selection_cropped: image, groundtruth_depth, intrinsics",
     ),
-    "KITTI odometry": Layout(find=_odometry, parts="sequences/NN/image_2, image_3, calib.txt"),
+    "KITTI odometry": Layout(find=_find_odometry, parts="sequences/NN/image_2, image_3, calib.txt"),
     "KITTI object or 2015": Layout(
-        find=partial(_benchmark, left_name="image_2", right_name="image_3", ending="_0"),
+        find=partial(_find_benchmark, left_name="image_2", right_name="image_3", ending="_0"),
         parts="image_2, image_3, calib or disp_occ_0",
     ),
     "KITTI 2012": Layout(
-        find=partial(_benchmark, left_name="colored_0", right_name="colored_1", ending=""),
+        find=partial(_find_benchmark, left_name="colored_0", right_name="colored_1", ending=""),
         parts="colored_0, colored_1",
     ),
-    "Middlebury": Layout(find=_middlebury, parts="SCENE/im0.png, calib.txt"),
-    "pairs": Layout(find=_pairs, parts="left, right, calib.txt or camera.json, .yaml"),
+    "Middlebury": Layout(find=_find_middlebury, parts="SCENE/im0.png, calib.txt"),
+    "pairs": Layout(find=_find_pairs, parts="left, right, calib.txt or camera.json, .yaml"),
 }
 """Layouts of folders, tried in this order: a new one is a function and one entry here."""
 
 
-def _by_stem(
+def _list_by_stem(
     folder: Path, suffixes: tuple[str, ...] = (*LISTED_SUFFIXES, *files.MAP_SUFFIXES)
 ) -> dict[str, Path]:
     """List files by their stems; of files of one stem, that of the first suffix counts."""
-    paths = sorted(_listed(folder, suffixes), key=lambda path: suffixes.index(path.suffix.lower()))
+    paths = sorted(
+        _list_files(folder, suffixes), key=lambda path: suffixes.index(path.suffix.lower())
+    )
     return {stem_of(path): path for path in reversed(paths)}
 
 
-def _listed(folder: Path, suffixes: tuple[str, ...] = LISTED_SUFFIXES) -> list[Path]:
+def _list_files(folder: Path, suffixes: tuple[str, ...] = LISTED_SUFFIXES) -> list[Path]:
     """List the files of a folder with one of the suffixes, in any case; [] without a folder."""
     if not folder.is_dir():
         return []
@@ -466,6 +477,7 @@ def write_scene(folder: Path, name: str, frame: RawFrame) -> None:
     scene = folder / name
     rig = frame.rig
     written = [scene / part for part in ("im0.png", "im1.png", "disp0.pfm", "calib.txt")]
+
     files.write_image(written[0], frame.left)
     files.write_image(written[1], frame.right)
     files.write_map(written[2], frame.disparity_px)

@@ -18,8 +18,8 @@ from depthpose.depth.stereo import (
     doubt_hidden,
     doubt_outside,
     measure_disparity_range,
+    move_match_back,
     move_views,
-    moved_back,
 )
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
 
@@ -82,6 +82,7 @@ def refuse_unrectified(pair: StereoInput, *, with_check: bool = True) -> str:
             f"{pair.name}: the left image is {left[1]}x{left[0]} and the right one "
             f"{right[1]}x{right[0]}; a rectified pair has one size. Rectify the pair again."
         )
+
     if pair.camera is not None:
         height, width = pair.left.shape[1:]
         check_image_matches_camera(pair.camera, width, height, pair.name)
@@ -90,6 +91,7 @@ def refuse_unrectified(pair: StereoInput, *, with_check: bool = True) -> str:
                 f"{pair.name}: the camera has no baseline, so disparity cannot become metres. Add "
                 '"baseline_m" (the distance between the two cameras in metres) to its file.'
             )
+
     if not with_check:
         return ""
     cx_difference_px = 0.0 if pair.camera is None else pair.camera.cx_right_minus_left_px
@@ -166,4 +168,4 @@ def _match_moved_views(matcher: Matcher, pair: StereoInput, cx_difference_px: fl
         (match,) = matcher.match_many([(left, right)], rig)
     else:
         match = matcher.match(left, right)
-    return moved_back(match, shift_px)
+    return move_match_back(match, shift_px)

@@ -90,7 +90,7 @@ class DepthPipeline:
         while chunk := list(islice(remaining, batch)):
             inputs: list[StereoInput] = []
             for picture in chunk:
-                depth_input = as_input(_opened(picture, timeout), "the picture", lens)
+                depth_input = as_input(_open_picture(picture, timeout), "the picture", lens)
                 if depth_input.camera is None:
                     height, width = depth_input.left.shape[1:]
                     phone_focal_px = _PHONE_FOCAL_WIDTHS * width
@@ -156,6 +156,8 @@ def pipeline(
     precision = torch_dtype if dtype is None else dtype
     if precision not in (None, "auto", "float32", torch.float32):
         raise InputError(f"pipeline: torch_dtype is {precision}; networks run in float32, omit it")
+
+    # The device, in all ways in which transformers lets it be named.
     if device is not None and device_map is not None:
         raise InputError("pipeline: device and device_map are both given; omit one of the two")
     chosen_device = device_map if device is None else device
@@ -167,12 +169,13 @@ def pipeline(
         raise InputError(
             "pipeline: device_map is a mapping; the networks go to one device, as 'auto'"
         )
+
     config = MatcherConfig(device=str(chosen_device or "cpu"))
     net = FakestereoNet.load(model or DEFAULT, config=config)
     return DepthPipeline(net, batch_size)
 
 
-def _opened(picture: Picture, timeout: float | None) -> Picture:
+def _open_picture(picture: Picture, timeout: float | None) -> Picture:
     """Open an address or base64 text as transformers does; return anything else unchanged."""
     if not isinstance(picture, str) or os.path.isfile(picture):  # noqa: PTH113  long text is no path
         return picture

@@ -161,7 +161,7 @@ def _match_views(
 
 
 def _image_confidence(views: SynthesisedViews, index: int) -> float | None:
-    """Say how sure the generator is of an image as a whole, 0..1; None where it does not say."""
+    """Give the generator's confidence in an image as a whole, 0..1; None where it has none."""
     if views.street_probability is not None:
         return float(views.street_probability[index])
     if views.confidence is not None:

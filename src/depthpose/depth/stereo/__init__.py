@@ -21,5 +21,5 @@ from depthpose.depth.stereo.search_range import choose_search_range as choose_se
 from depthpose.depth.stereo.search_range import doubt_hidden as doubt_hidden
 from depthpose.depth.stereo.search_range import doubt_outside as doubt_outside
 from depthpose.depth.stereo.search_range import measure_disparity_range as measure_disparity_range
+from depthpose.depth.stereo.search_range import move_match_back as move_match_back
 from depthpose.depth.stereo.search_range import move_views as move_views
-from depthpose.depth.stereo.search_range import moved_back as moved_back

@@ -31,10 +31,10 @@ def by_rows(
 ) -> Tensor:
     """Compute some rows of an answer at a time: the same numbers, with less held in between.
 
-    Rows stand last but one. Inputs and answer may have whole multiples of the rows of the smallest
-    input, in which everything here is counted: the ``halo`` to each side that an answer depends on,
-    and the ``rows`` at a time (None: all). The answer is written ``into`` a tensor, perhaps an
-    input of which no answer needs another row than its own.
+    Rows are the last axis but one. Inputs and answer may have whole multiples of the rows of the
+    smallest input, in which everything here is counted: the ``halo`` of rows on each side that an
+    answer depends on, and the ``rows`` at a time (None: all). The answer is written ``into`` a
+    tensor, perhaps an input of which no answer needs another row than its own.
     """
     if rows is None:
         return function(*inputs)
@@ -119,8 +119,8 @@ class ConvNorm(nn.Sequential):
         super().__init__(OrderedDict(conv=conv, norm=norm(outputs)))
 
 
-def _folded(conv: Conv, norm: Norm) -> tuple[Tensor, Tensor]:
-    """Give weight and bias, in float64, of the one convolution that a convolution and norm are.
+def _merge_norm(conv: Conv, norm: Norm) -> tuple[Tensor, Tensor]:
+    """Merge a convolution and the norm after it to one; give its weight and bias, in float64.
 
     norm(conv(x)) = gain * (conv(x) - mean) + bias, with gain = weight / sqrt(var + eps).
     """
@@ -149,7 +149,7 @@ def fold(network: ModuleT, example: Tensor) -> ModuleT:
             if not isinstance(norm, Norm):
                 continue
             conv = cast("Conv", layer.conv)
-            weight, bias = _folded(conv, norm)
+            weight, bias = _merge_norm(conv, norm)
             if isinstance(norm, nn.BatchNorm3d):
                 setattr(parent, name, VolumeConv(conv, weight, bias, example))
                 continue
@@ -218,8 +218,8 @@ def has_onednn_operators() -> bool:
             transposed = torch.ops.mkldnn._convolution_transpose_pointwise(*tensors, *more)
     except (AttributeError, RuntimeError, TypeError):
         return False
-    both = (
+    answers = (
         (convolved, F.conv3d(*tensors, 1, 1)),
         (transposed, F.conv_transpose3d(*tensors, 2, 1, 1)),
     )
-    return all(a.shape == b.shape and torch.allclose(a, b) for a, b in both)
+    return all(a.shape == b.shape and torch.allclose(a, b) for a, b in answers)

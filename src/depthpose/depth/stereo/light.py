@@ -79,19 +79,21 @@ class ConvexUpsampling(nn.Module):
         """Bring maps, the first the disparity [px], to full size by features of both views."""
         wide = F.interpolate(left_quarter, scale_factor=2.0, mode="nearest")
         x = self.hidden(torch.cat([left_half, wide], 1))
+
         # The cosine of features at half size under the disparity of each of nine neighbours.
         near, far = (
             F.normalize(self.compared(half).float(), dim=1, eps=1e-3)
             for half in (left_half, right_half)
         )
-        shifts = (_neighbours(quarters[:, 0].detach()) / 2).unbind(1)
-        alike = torch.stack([(near * _shift_columns(far, shift)).sum(1) for shift in shifts], 1)
-        x = F.relu(x + self.agreement(alike.to(x)))
+        shifts = (_gather_neighbours(quarters[:, 0].detach()) / 2).unbind(1)
+        cosines = torch.stack([(near * _shift_columns(far, shift)).sum(1) for shift in shifts], 1)
+        x = F.relu(x + self.agreement(cosines.to(x)))
+
+        # Nine weights that sum to one, for each of the four pixels that a pixel at half size is.
         b, _, h, w = x.shape
-        # They sum to one, for the four pixels of each one at half size.
         weights = self.weights(x).float().reshape(b, 9, 4, h, w).softmax(1)
         enlarged = [
-            F.pixel_shuffle((weights * _neighbours(quarter)[:, :, None]).sum(1), 2)
+            F.pixel_shuffle((weights * _gather_neighbours(quarter)[:, :, None]).sum(1), 2)
             for quarter in quarters.unbind(1)
         ]
         return torch.cat(enlarged, 1)
@@ -137,20 +139,20 @@ class Refinement(nn.Module):
         least_px: float = LEAST_PX,
     ) -> Maps:
         """Correct a disparity of the left view [px] by features of both views at half size."""
-        four = F.pixel_unshuffle(enlarged_px.detach()[:, None], 2) / 2
-        middle = four.mean(1)
+        # The disparities of the four pixels that a pixel at half size is, and their mean.
+        four_px = F.pixel_unshuffle(enlarged_px.detach()[:, None], 2) / 2
+        mean_px = four_px.mean(1)
+
+        # The cosine of each group of features at five disparities about the mean.
         left = self.compared(left_half)
         right = self.compared(right_half)
-        # The cosine of each group of features at five disparities about that one.
         near, far = (unit_groups(half.float(), _GROUPS) for half in (left, right))
-        cosines = [
-            (
-                near
-                * _shift_columns(far.flatten(1, 2), middle + offset).unflatten(1, near.shape[1:3])
-            ).sum(2)
-            for offset in _OFFSETS
-        ]
-        x = torch.cat([*cosines, left_half.float(), four - middle[:, None]], 1).to(left)
+        cosines: list[Tensor] = []
+        for offset in _OFFSETS:
+            shifted = _shift_columns(far.flatten(1, 2), mean_px + offset)
+            cosines.append((near * shifted.unflatten(1, near.shape[1:3])).sum(2))
+
+        x = torch.cat([*cosines, left_half.float(), four_px - mean_px[:, None]], 1).to(left)
         for layer in self.layers:
             x = F.relu(layer(x))
         correction_px = F.pixel_shuffle(self.correction(x).to(enlarged_px), 2)[:, 0]
@@ -159,8 +161,8 @@ class Refinement(nn.Module):
         return corrected if self.training else corrected.clamp_min(least_px)
 
 
-def _neighbours(quarter: Quarter) -> Float[Tensor, "b 9 h2 w2"]:
-    """Give for each pixel at half size the nine neighbours at a quarter of the size."""
+def _gather_neighbours(quarter: Quarter) -> Float[Tensor, "b 9 h2 w2"]:
+    """Gather for each pixel at half size the nine neighbours at a quarter of the size."""
     h, w = quarter.shape[1:]
     padded = F.pad(quarter[:, None], (1, 1, 1, 1), mode="replicate")
     near = [padded[:, :, y : y + h, x : x + w] for y, x in product(range(3), repeat=2)]
@@ -243,7 +245,7 @@ class SkyHead(nn.Module):
 
 
 class Reading(NamedTuple):
-    """What the scores say about the left view.
+    """Disparity, confidence and sky of the left view, as read off the scores.
 
     While training there is a head of all scores, enlarged without the image, one before the
     refinement, and one after it; in eval mode the last alone. What a head says in the sky means
@@ -361,8 +363,10 @@ class Aggregation(nn.Module):
 
         With ``rows``, and no gradient, one volume of the largest size is held, instead of four.
         """
-        both = zip(self.guides, levels, strict=True)
-        guides = [torch.sigmoid(guide(level))[:, :, None] for guide, level in both]
+        guides = [
+            torch.sigmoid(guide(level))[:, :, None]
+            for guide, level in zip(self.guides, levels, strict=True)
+        ]
         # In place where no gradient needs the old values.
         product = torch.Tensor.mul if torch.is_grad_enabled() else torch.Tensor.mul_
 
@@ -534,7 +538,7 @@ ROWS = 16
 def light_bytes(
     config: LightConfig, height: int, width: int, dtype: torch.dtype, rows: int = ROWS
 ) -> int:
-    """Peak memory of activations of one padded pair [bytes], with margin for the allocator.
+    """Estimate the peak memory of a padded pair [bytes], with margin for the allocator.
 
     One volume of the largest size is held whole; ``rows`` at quarter size are computed at a time.
     """

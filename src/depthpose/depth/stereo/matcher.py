@@ -85,7 +85,7 @@ class CameraMatcher(Matcher, Protocol):
         ...
 
     def work_size(self, camera: Camera) -> tuple[int, int]:
-        """Rows and columns at which the images of a camera are matched [px]."""
+        """Give the rows and columns at which the images of a camera are matched [px]."""
         ...
 
 
@@ -122,6 +122,8 @@ class CallableMatcher:
         if self.with_numpy_images:
             views = tuple(view.permute(1, 2, 0).cpu().numpy() for view in views)
         answer = self.function(*views)
+
+        # Refuse what is no map of numbers of the images' size.
         if isinstance(answer, np.ndarray) and answer.dtype.kind in "fiu":
             answer = torch.from_numpy(np.ascontiguousarray(answer, dtype=np.float32))
         if not isinstance(answer, Tensor) or answer.is_complex():
@@ -136,6 +138,8 @@ class CallableMatcher:
                 f"the wrapped matcher answered shape {tuple(disparity_px.shape)} for images of "
                 f"{size}; let it answer one disparity a pixel"
             )
+
+        # Refuse disparities that no rectified pair has.
         least_px = float(disparity_px.nan_to_num(0).min())
         faults = {
             "infinite disparity; use NaN for no answer": disparity_px.isinf().any(),
@@ -256,7 +260,7 @@ AGREEMENT_PX = 3.0
 
 
 class StereoNetwork(nn.Module):
-    """A normalised pair to disparity maps for the losses; the last is the output.
+    """A network from a normalised pair to disparity maps, the last of which is its output.
 
     In training it gives at most three maps, the last of which weighs most; else one.
     """
@@ -359,7 +363,7 @@ class NetworkMatcher(ABC):
         """
         for left, right in pairs:
             check_pair(left, right)
-        views, network_config = self._working_views(pairs, camera, search)
+        views, network_config = self._resize_views(pairs, camera, search)
         first_px = 0 if search is None else search.first_px
         is_one_size = len({left.shape for left, _ in views}) == 1
         is_together = is_one_size and self.config.max_memory_bytes is None
@@ -372,13 +376,13 @@ class NetworkMatcher(ABC):
         # Back to the size and the device of the images.
         home = pairs[0][0].device
         return [
-            disparity.resized_match(
-                disparity.changed_match(match, lambda values: values.to(home)), *left.shape[1:]
+            disparity.resize_match(
+                disparity.map_match(match, lambda values: values.to(home)), *left.shape[1:]
             )
             for match, (left, _) in zip(matches, pairs, strict=True)
         ]
 
-    def _working_views(
+    def _resize_views(
         self,
         pairs: Sequence[tuple[Tensor, Tensor]],
         camera: Camera | None,
@@ -437,7 +441,7 @@ class NetworkMatcher(ABC):
         self._refuse_memory(network_config, *padded_left.shape[-2:])
         matches = self.run(padded_left, padded_right, network_config, first_px)
         crop = itemgetter((slice(-height, None), slice(width)))  # values[-height:, :width]
-        return [disparity.changed_match(match, crop) for match in matches]
+        return [disparity.map_match(match, crop) for match in matches]
 
     def _refuse_memory(self, network_config: Any, height: int, width: int) -> None:  # noqa: ANN401
         """Refuse images whose matching takes more memory than the config allows."""
@@ -455,13 +459,13 @@ class NetworkMatcher(ABC):
             )
 
     def work_size(self, camera: Camera) -> tuple[int, int]:
-        """Rows and columns at which images of a camera are matched [px]."""
+        """Give the rows and columns at which images of a camera are matched [px]."""
         if self.network_config.work_focal_px is None:
             return camera.height, camera.width
         return disparity.size_at_focal_length(camera, self.work_focal_px(camera))
 
     def work_disparities(self, camera: Camera) -> int:
-        """Disparities that are searched at :meth:`work_size` [px]."""
+        """Give the number of disparities that are searched at :meth:`work_size` [px]."""
         trained = self.network_config
         if trained.work_focal_px is None:
             return trained.max_disparity_px
@@ -470,12 +474,12 @@ class NetworkMatcher(ABC):
         return self.whole_steps(trained.max_disparity_px * larger)
 
     def whole_steps(self, disparity_px: float) -> int:
-        """Disparities of a volume that reaches up to one [px]: a multiple of the network's step."""
+        """Round a number of disparities [px] up to a multiple of the network's step."""
         step_px = self.network_config.step_px
         return max(1, math.ceil(round(disparity_px, 3) / step_px)) * step_px
 
     def work_focal_px(self, camera: Camera) -> float:
-        """Focal length at which images of a camera are matched [px]."""
+        """Give the focal length at which images of a camera are matched [px]."""
         trained_px = self.network_config.work_focal_px
         if trained_px is None:
             return float(camera.K[0, 0])
@@ -493,7 +497,7 @@ def _scaled_size(left: View, scale: float, camera: Camera | None) -> tuple[int, 
 
 
 def normalise(image: Float[Tensor, "*batch 3 h w"]) -> Float[Tensor, "*batch 3 h w"]:
-    """RGB in [0, 1] to what the network was trained on: ImageNet's mean 0 and deviation 1."""
+    """Normalise RGB in [0, 1] by ImageNet's mean and deviation, as in the training."""
     mean = image.new_tensor(IMAGENET_MEAN)[:, None, None]
     return (image - mean) / image.new_tensor(IMAGENET_STD)[:, None, None]
 

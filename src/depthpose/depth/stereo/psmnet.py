@@ -145,7 +145,7 @@ class Hourglass(nn.Module):
     def forward(
         self, x: Volume, first: Volume | None, before: Volume | None
     ) -> tuple[Volume, Volume]:
-        """Answer the half-size volumes going down and coming up, between ``down1`` and ``up1``.
+        """Give the half-size volumes going down and coming up, between ``down1`` and ``up1``.
 
         Args:
             x: what ``down1`` made of the volume that the hourglass refines; it is overwritten.
@@ -250,7 +250,7 @@ class PSMNet(StereoNetwork):
     def costs(
         self, left: Views, right: Views, max_disparity_px: int | None = None
     ) -> tuple[Volume, Volume, Volume]:
-        """Answer the quarter-size cost after each hourglass; each adds to the one before.
+        """Give the quarter-size cost after each hourglass; each adds to the one before.
 
         ``max_disparity_px`` takes the place of the network's own: the same filters look over all
         disparities, so they can look farther than they did in training.
@@ -298,7 +298,7 @@ ROWS = 32
 def psmnet_bytes(
     config: PSMNetConfig, height: int, width: int, dtype: torch.dtype, rows: int = ROWS
 ) -> int:
-    """Peak memory of activations of one padded pair [bytes], with margin for the allocator.
+    """Estimate the peak memory of a padded pair [bytes], with margin for the allocator.
 
     Two volumes of the largest size are held whole; ``rows`` at quarter size are computed at a time.
     """

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from depthpose.core.camera import Camera
-from depthpose.depth.disparity import changed_match, warp_right_to_left
+from depthpose.depth.disparity import map_match, warp_right_to_left
 from depthpose.depth.stereo.matcher import (
     STEP_PX,
     NetworkMatcher,
@@ -38,7 +38,7 @@ _NAMED = 0.001
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DisparityRange:
-    """Where the disparities of a pair lie, in pixels of its images."""
+    """The range of a pair's disparities, in pixels of its images, and the match that found it."""
 
     low_px: float  #: the least, or infinity's where that may be there
     high_px: float  #: the largest
@@ -74,12 +74,12 @@ def move_views(left: Tensor, right: Tensor, first_px: int) -> tuple[Tensor, Tens
     return shifted_left, padded_right
 
 
-def moved_back(match: Match, first_px: int) -> Match:
-    """Give the match of moved views in the pixels of the views before :func:`move_views`."""
+def move_match_back(match: Match, first_px: int) -> Match:
+    """Convert a match of moved views to the pixels of the views before :func:`move_views`."""
     if first_px == 0:
         return match
     added = max(-first_px, 0)
-    moved = changed_match(match, lambda values: values[:, added:])
+    moved = map_match(match, lambda values: values[:, added:])
     moved = replace(moved, disparity_px=moved.disparity_px + first_px)
     if moved.confidence is None:
         return moved

@@ -114,6 +114,8 @@ def _add_windows(b: MeshBuilder, wall: _Wall, style: Style, length: Number, heig
     The wall is divided into a grid; cells of an odd row and an odd column are windows.
     """
     rng = b.rng
+
+    # The lines of the grid, and its cells.
     width, tall = style.window_m
     count = max(1, int(length // (width + style.gap_m)))
     storeys = max(1, int((height - 0.5) // style.storey_m))
@@ -129,21 +131,27 @@ def _add_windows(b: MeshBuilder, wall: _Wall, style: Style, length: Number, heig
     is_window[1::2, 1::2] = True
     panels = cells[~is_window]
     windows = cells[is_window]
+
+    # The wall, and panes behind it, some of them covered by blinds or curtains.
     b.quads(wall.at(panels), panels + rng.uniform(0, 5, 2), style.wall)
     outer = wall.at(windows)
     inner = wall.at(windows, -style.recess_m)
     count = len(windows)
     uv = _SQUARE + rng.integers(0, 8, (count, 1, 2))
-    is_covered = rng.random((count, 1)) < 0.3  # by blinds or curtains
+    is_covered = rng.random((count, 1)) < 0.3
     dark = np.array([0.05, 0.06, 0.07]) * rng.uniform(0.3, 2.0, (count, 1))
     covered = np.array([0.35, 0.33, 0.28]) * rng.uniform(0.5, 1.2, (count, 1))
     pane = Surface("pane", (1, 1, 1), 1.0, int(rng.integers(3)))
     b.quads(inner, uv, pane, tint=np.where(is_covered, covered, dark))
+
+    # The sides of the recesses.
     after = [1, 2, 3, 0]
     reveal = np.stack([outer, outer[:, after], inner[:, after], inner], 2).reshape(-1, 4, 3)
     b.quads(reveal, _SQUARE * [0.5, 0.1], Surface("plaster", style.wall.tint))
     if not style.with_details:
         return
+
+    # Frames: at four sides of each window, and a bar in the middle.
     left, low = windows[:, 0].T
     right, high = windows[:, 2].T
     middle = (left + right) / 2
@@ -158,6 +166,8 @@ def _add_windows(b: MeshBuilder, wall: _Wall, style: Style, length: Number, heig
         ]
     )
     b.quads(wall.at(frames, 0.03 - style.recess_m), frames, Surface("wood", style.frame))
+
+    # Sills: their fronts and tops.
     sill = _rectangles(left - 0.1, right + 0.1, low - 0.09, low)
     front = wall.at(sill, 0.12)
     stone = Surface("concrete", (0.4, 0.39, 0.36))
@@ -184,7 +194,9 @@ def _add_gable_roof(b: MeshBuilder, plot: Plot, style: Style) -> None:
     ridge_x = plot.x_m + side * half
     slate = Surface("roof", _ROOFS[rng.integers(len(_ROOFS))], 2.4, int(rng.integers(3)))
     slope = np.hypot(half + over, rise)
-    eave_y = top + rise * over / half  # the slopes go on, below the walls' top, over the eaves
+
+    # Both slopes, which go on below the walls' top over the eaves, and the gables.
+    eave_y = top + rise * over / half
     first = start - over
     last = stop + over
     for sign in (-1, 1):
@@ -197,11 +209,13 @@ def _add_gable_roof(b: MeshBuilder, plot: Plot, style: Style) -> None:
     for z in (start, stop):
         gable = [(ridge_x - half, top, z), (ridge_x + half, top, z), (ridge_x, top - rise, z)]
         b.triangles([gable], [[[0, 0], [plot.depth_m, 0], [half, rise]]], style.wall)
+
+    # A chimney, and at times dormers.
     x = ridge_x + rng.uniform(-1, 1) * half * 0.5
     z = rng.uniform(start + 1, stop - 1)
     chimney = Surface("brick", (0.28, 0.13, 0.09), 1.8)
     b.box((x, top - rise * 0.8, z), (0.6, 1.8, 0.6), chimney)
-    if rng.random() < 0.5:  # dormers
+    if rng.random() < 0.5:
         glass = Surface("pane", (0.05, 0.055, 0.06))
         x = plot.x_m + side * half * 0.45
         front = x - side * (half * 0.25 + 0.01)
@@ -221,6 +235,8 @@ def _add_trim(b: MeshBuilder, plot: Plot, style: Style) -> None:
     stop = plot.stop_m
     middle = (start + stop) / 2
     length = stop - start
+
+    # Plinth, rain pipe and door.
     plinth = Surface("stone", (0.2, 0.19, 0.18), 2.0)
     b.box((x, y - 0.25, middle), (0.12, 0.6, length), plinth)
     foot, head = ((x - side * 0.07, at, start + 0.3) for at in (y, y - plot.height_m))
@@ -228,7 +244,8 @@ def _add_trim(b: MeshBuilder, plot: Plot, style: Style) -> None:
     door_z = rng.uniform(start + 1, stop - 1.5)
     door = Surface("wood", tuple(rng.uniform(0.03, 0.35, 3)), 1.0, int(rng.integers(2)))
     b.box((x, y - 1.05, door_z), (0.1, 2.1, 1.1), door)
-    if rng.random() < 0.25:
+
+    if rng.random() < 0.25:  # a balcony on each storey above the first, one above the other
         slab = Surface("concrete", (0.42, 0.42, 0.4), 2.0)
         rail = Surface("metal", (0.05, 0.05, 0.05))
         z = rng.uniform(start + 1.5, stop - 1.5)
@@ -239,6 +256,7 @@ def _add_trim(b: MeshBuilder, plot: Plot, style: Style) -> None:
             for shift in np.linspace(-1.2, 1.2, 9):
                 b.box((outer, up - 0.5, z + shift), (0.03, 0.9, 0.03), rail)
             b.box((outer, up - 0.97, z), (0.05, 0.05, 2.45), rail)
+
     if rng.random() < 0.25:  # a shop window, a board above it, perhaps an awning
         width = min(5.0, length - 1)
         glass = Surface("pane", (0.12, 0.12, 0.12), 2.5)

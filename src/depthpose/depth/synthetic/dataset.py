@@ -144,7 +144,7 @@ def draw_light(stage: Stage, visibility: Visibility) -> Float[Tensor, "h w 3"]:
     height, width = visibility.raster.primitive.shape
     index = torch.arange(height * width)
     centres = torch.stack([index % width, index // width], 1).double()
-    is_edge = _edge_pixels(stage, visibility.raster).flatten()
+    is_edge = _find_edge_pixels(stage, visibility.raster).flatten()
     inner = (~is_edge).nonzero()[:, 0]
     edge = is_edge.nonzero()[:, 0]
 
@@ -154,13 +154,15 @@ def draw_light(stage: Stage, visibility: Visibility) -> Float[Tensor, "h w 3"]:
         visibility.raster.depth_m.flatten(),
     )
     light = torch.zeros(height * width, 3)
-    light[inner] = _light(stage, visibility, centres[inner], at_centre.select(inner))
+    light[inner] = _light_of_rays(stage, visibility, centres[inner], at_centre.select(inner))
     if len(edge):
-        light[edge] = _edge_light(stage, visibility, edge, centres[edge], at_centre.select(edge))
+        light[edge] = _light_of_edges(
+            stage, visibility, edge, centres[edge], at_centre.select(edge)
+        )
     return light.reshape(height, width, 3)
 
 
-def _edge_pixels(stage: Stage, raster: Raster) -> Bool[Tensor, "h w"]:
+def _find_edge_pixels(stage: Stage, raster: Raster) -> Bool[Tensor, "h w"]:
     """Find pixels with a neighbour of another surface, or of the same one at a sharp angle."""
     visible = raster.primitive.clamp(min=0)
     kind = torch.where(raster.primitive >= 0, stage.kind[visible], -1)
@@ -180,7 +182,7 @@ def _edge_pixels(stage: Stage, raster: Raster) -> Bool[Tensor, "h w"]:
     return is_edge
 
 
-def _edge_light(
+def _light_of_edges(
     stage: Stage,
     visibility: Visibility,
     index: Indices,
@@ -210,12 +212,12 @@ def _edge_light(
             )
         )
     nearest = Nearest(*(torch.cat(parts) for parts in zip(*hits, strict=True)))
-    light = _light(stage, visibility, torch.cat(places), nearest)
+    light = _light_of_rays(stage, visibility, torch.cat(places), nearest)
     # A glint in a quarter of a pixel would outshine the rest, as it does not in a sensor.
     return light.clamp(max=4).reshape(len(_OFFSETS), -1, 3).mean(0)
 
 
-def _light(
+def _light_of_rays(
     stage: Stage, visibility: Visibility, pixels: Float64[Tensor, "n 2"], nearest: Nearest
 ) -> Vectors:
     """Give the linear RGB that comes along rays, from the nearest triangle or the sky.
@@ -425,7 +427,7 @@ class Projector:
 
 
 @cache
-def _dots() -> Float[Tensor, "1024 1024"]:
+def _make_dots() -> Float[Tensor, "1024 1024"]:
     """Make a pattern of 341 x 341 dots that can be tiled; each dot has a cell of 3 x 3 pixels."""
     rng = np.random.default_rng(79)
     cells = 341
@@ -455,7 +457,7 @@ def _project_dots(
     points_m = points_m - torch.tensor(projector.place_m)
 
     # Their places in the pattern, which is tiled and sampled bilinearly.
-    pattern = _dots()
+    pattern = _make_dots()
     side = len(pattern)
     pixels_per_radian = 3 * projector.dots_per_radian
     x = (pixels_per_radian * points_m[..., 0] / points_m[..., 2]).nan_to_num(0.0)
@@ -514,7 +516,7 @@ def draw_scene(
         disparity_px=disparity_from_depth(depth_m, rig),
         right_disparity_px=disparity_from_depth(right.raster.depth_m, rig),
         depth_m=depth_m,
-        occluded=_occluded(left, right, rig),
+        occluded=_find_occluded(left, right, rig),
         is_sky=primitive < 0,
         is_road=(primitive >= 0) & (stage.material[primitive.clamp(min=0)] == NUMBER["road"]),
         lidar_points=points,
@@ -523,7 +525,7 @@ def draw_scene(
     )
 
 
-def _occluded(left: Visibility, right: Visibility, rig: StereoRig) -> Mask:
+def _find_occluded(left: Visibility, right: Visibility, rig: StereoRig) -> Mask:
     """Find left pixels whose point is occluded in the right image, or lies outside of it."""
     height, width = left.raster.primitive.shape
     primitive = left.raster.primitive.flatten()
@@ -557,7 +559,7 @@ class Streets:
     config: StreetsConfig  #: settings of the frames
 
     def __len__(self) -> int:
-        """Number of frames."""
+        """Give the number of frames."""
         return self.config.frames
 
     def __getitem__(self, index: int) -> StereoSample:

@@ -71,7 +71,7 @@ class Surface(NamedTuple):
 
     @property
     def layer(self) -> int:
-        """Number of the texture in the stack of all textures."""
+        """The number of the texture in the stack of all textures."""
         variants = MATERIALS[self.material].variants
         return FIRST_LAYER[self.material] + int(self.variant) % variants
 
@@ -105,9 +105,10 @@ def textures() -> Textures:
         for variant in range(material.variants):
             paint = _paint_thing if name in _THINGS else _paint_surface
             painted = paint(name, _Noise(rng), variant)
-            stack[FIRST_LAYER[name] + variant] = (
-                painted if painted.ndim == 3 else painted[..., None]
-            )
+            is_grey = painted.ndim == 2
+            stack[FIRST_LAYER[name] + variant] = painted[..., None] if is_grey else painted
+
+    # Each level has half the side of the one before.
     level = np.clip(stack, 0.02, 3)
     levels = []
     for _ in range(LEVELS):
@@ -116,6 +117,7 @@ def textures() -> Textures:
         if half:
             level = level.reshape(LAYERS, half, 2, half, 2, 3).mean((2, 4))
     starts = np.cumsum([0, *(len(texels) for texels in levels[:-1])])
+
     return Textures(
         texels=torch.from_numpy(np.concatenate(levels).astype(np.float16)),
         starts=torch.from_numpy(starts),
@@ -130,23 +132,26 @@ def sample_texture(
     """Sample textures bilinearly, in the nearest level of detail.
 
     Args:
-        textures: all of them.
+        textures: all textures.
         layer: number of the texture of each sample.
         uv: coordinates in tiles.
         level: fractional level: 0 is the full size, 1 half of it.
     """
+    # The four texels about each place; sides are powers of two, so a mask repeats the texture.
     whole = level.round().clamp(0, LEVELS - 1).long()
     side = SIDE_PX >> whole
     place = uv * side[:, None] - 0.5
     low = place.floor()
     share = place - low
     column, row = low.long().unbind(1)
-    mask = side - 1  # sides are powers of two
+    mask = side - 1
     start = textures.starts.to(layer.device)[whole] + layer * side * side
     left = column & mask
     right = (column + 1) & mask
     above = start + (row & mask) * side
     below = start + ((row + 1) & mask) * side
+
+    # Their mean, weighted by nearness.
     texels = textures.texels
     a, b, c, d = (
         texels.index_select(0, index).float()
@@ -460,7 +465,7 @@ class MeshBuilder:
         material = NUMBER[surface.material]
         color = surface.tint if tint is None else tint
         self._parts.append(
-            _mesh(positions, uv, normals, color, material, surface.layer, self.thing)
+            _make_mesh(positions, uv, normals, color, material, surface.layer, self.thing)
         )
 
     def quads(
@@ -475,10 +480,12 @@ class MeshBuilder:
         faces = np.asarray(corners, np.float32)
         n = len(faces)
         if normals is not None:
-            normals = _halves(_full(normals, (n, 4, 3)))
+            normals = _split_quads(_broadcast(normals, (n, 4, 3)))
         if tint is not None:
-            tint = np.tile(_full(tint, (n, 3)), (2, 1))
-        self.triangles(_halves(faces), _halves(_full(uv_m, (n, 4, 2))), surface, normals, tint)
+            tint = np.tile(_broadcast(tint, (n, 3)), (2, 1))
+        self.triangles(
+            _split_quads(faces), _split_quads(_broadcast(uv_m, (n, 4, 2))), surface, normals, tint
+        )
 
     def rectangle(self, corner: Values, along: Values, up: Values, surface: Surface) -> None:
         """Add one rectangle: a corner and its two sides [m]."""
@@ -550,19 +557,23 @@ class MeshBuilder:
         """Give the mesh of all triangles; boxes are made together, which is much faster."""
         if not self._boxes:
             return join(self._parts)
+
+        # The eight corners of each box.
         centres, sizes, turns, tapers, surfaces, things = zip(*self._boxes, strict=True)
         centre, size, R, taper = (np.array(v, np.float32) for v in (centres, sizes, turns, tapers))
         vertices = _CUBE * (size / 2)[:, None]
         vertices[:, _CUBE[:, 1] < 0] *= np.stack([taper, 0 * taper + 1, taper], 1)[:, None]
         vertices = np.einsum("kij,kvj->kvi", R, vertices) + centre[:, None]
+
+        # Its six faces, each of two triangles.
         uv = np.zeros((len(surfaces), 6, 4, 2), np.float32)
         tile = np.array([surface.tile_m for surface in surfaces], np.float32)[:, None]
         uv[:, :, 1:3, 0] = (size[:, _FACE_WIDTH] / tile)[:, :, None]
         uv[:, :, 2:, 1] = (size[:, _FACE_HEIGHT] / tile)[:, :, None]
         row = np.tile(np.repeat(np.arange(len(surfaces)), 6), 2)  # six faces, in both halves
-        boxes = _mesh(
-            _halves(vertices[:, _FACES].reshape(-1, 4, 3)),
-            _halves(uv.reshape(-1, 4, 2)),
+        boxes = _make_mesh(
+            _split_quads(vertices[:, _FACES].reshape(-1, 4, 3)),
+            _split_quads(uv.reshape(-1, 4, 2)),
             None,
             np.array([surface.tint for surface in surfaces])[row],
             np.array([NUMBER[surface.material] for surface in surfaces])[row],
@@ -574,7 +585,7 @@ class MeshBuilder:
         return join(self._parts)
 
 
-def _mesh(
+def _make_mesh(
     corners: Float32[np.ndarray, "n 3 3"],
     uv: Values,
     normals: Values | None,
@@ -588,24 +599,29 @@ def _mesh(
     Without ``normals`` they are those of the planes.
     """
     n = len(corners)
-    flat = normals
-    if flat is None:
+    corner_normals = normals
+    if corner_normals is None:
         (ax, ay, az), (bx, by, bz) = ((corners[:, k] - corners[:, 0]).T for k in (1, 2))
         across = np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], 1)
-        flat = (across / (np.sqrt((across**2).sum(1, keepdims=True)) + 1e-12))[:, None]
-    each = lambda number: np.array(np.broadcast_to(number, n), np.int32)  # noqa: E731
+        length = np.sqrt((across**2).sum(1, keepdims=True))
+        corner_normals = (across / (length + 1e-12))[:, None]
+
+    def for_each(number: Values) -> Int[np.ndarray, " n"]:
+        """Repeat a number for each triangle, or take one for each."""
+        return np.array(np.broadcast_to(number, n), np.int32)
+
     return Mesh(
         corners=corners,
-        uv=_full(uv, (n, 3, 2)),
-        normals=_full(flat, (n, 3, 3)),
-        tint=_full(np.clip(tint, 0.005, 0.97), (n, 3)),
-        material=each(material),
-        layer=each(layer),
-        thing=each(thing),
+        uv=_broadcast(uv, (n, 3, 2)),
+        normals=_broadcast(corner_normals, (n, 3, 3)),
+        tint=_broadcast(np.clip(tint, 0.005, 0.97), (n, 3)),
+        material=for_each(material),
+        layer=for_each(layer),
+        thing=for_each(thing),
     )
 
 
-def _full(values: Values, shape: tuple[int, ...]) -> Float32[np.ndarray, "..."]:
+def _broadcast(values: Values, shape: tuple[int, ...]) -> Float32[np.ndarray, "..."]:
     """Broadcast values to a shape, as a new array of float32."""
     return np.ascontiguousarray(np.broadcast_to(np.asarray(values, np.float32), shape))
 
@@ -615,7 +631,7 @@ def between(low: np.ndarray, high: np.ndarray) -> np.ndarray:
     return np.stack([low[:-1], low[1:], high[1:], high[:-1]], 1)
 
 
-def _halves(faces: np.ndarray) -> np.ndarray:
+def _split_quads(faces: np.ndarray) -> np.ndarray:
     """Split four-cornered faces into triangles: all first halves, then all second ones."""
     return np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])
 

@@ -34,7 +34,7 @@ def add_ball(
 
     ``dents``: amplitude of random dents, as a share of the radius.
     """
-    directions = _sphere(level)
+    directions = _make_sphere(level)
     radii = np.broadcast_to(np.asarray(radii_m, np.float64), 3)
     swell = np.ones(len(directions))
     for _ in range(6 if dents else 0):
@@ -75,47 +75,49 @@ def add_leaves(
         axis = rng.integers(0, 3, count)
         rows = range(count)
         places[rows, axis] = np.sign(places[rows, axis]) * rng.uniform(0.8, 1.05, count)
-        outward = _unit(places)
+        outward = _scale_to_unit(places)
     else:
-        outward = _unit(rng.normal(size=(count, 3)))
+        outward = _scale_to_unit(rng.normal(size=(count, 3)))
         places = outward * np.sqrt(rng.uniform(0.45, 1, (count, 1)))
     points = places * np.asarray(radii) + np.asarray(centre)
-    along = _unit(rng.normal(size=(count, 3)) + 0.7 * np.cross(outward, [0.3, 1, 0.2]))
-    across = _unit(np.cross(along, outward + 0.6 * rng.normal(size=(count, 3))))
+    along = _scale_to_unit(rng.normal(size=(count, 3)) + 0.7 * np.cross(outward, [0.3, 1, 0.2]))
+    across = _scale_to_unit(np.cross(along, outward + 0.6 * rng.normal(size=(count, 3))))
     size = length_m * rng.uniform(0.6, 1.4, (count, 1))
     low = points - across * size * 0.3
     side = along * size * 0.5
     corners = np.stack([low - side, low + side, points + across * size * 0.6], 1)
     shade = rng.uniform(0.55, 1.25, (count, 1)) * (1 + 0.1 * rng.normal(size=(count, 3)))
     uv = rng.uniform(0, 1, (count, 1, 2)) + np.array([[0, 0], [0.3, 0], [0.15, 0.3]])
-    normals = _unit(outward * 0.8 + 0.6 * rng.normal(size=(count, 3)))[:, None]
+    normals = _scale_to_unit(outward * 0.8 + 0.6 * rng.normal(size=(count, 3)))[:, None]
     b.triangles(corners, uv, surface, normals, np.asarray(surface.tint) * shade)
 
 
-def _unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+def _scale_to_unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """Scale vectors to length 1."""
     return vectors / (np.linalg.norm(vectors, axis=1, keepdims=True) + 1e-9)
 
 
 @cache
-def _sphere(level: int) -> Float[np.ndarray, "n 3"]:
-    """Give corners of triangles on the unit sphere: an icosahedron, divided ``level`` times."""
+def _make_sphere(level: int) -> Float[np.ndarray, "n 3"]:
+    """Make the corners of a unit sphere's triangles: an icosahedron, divided ``level`` times."""
     t = (1 + 5**0.5) / 2
     corners = [(-1, t, 0), (1, t, 0), (-1, -t, 0), (1, -t, 0), (0, -1, t), (0, 1, t),
                (0, -1, -t), (0, 1, -t), (t, 0, -1), (t, 0, 1), (-t, 0, -1), (-t, 0, 1)]  # fmt: skip
     faces = [(0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11), (1, 5, 9), (5, 11, 4),
              (11, 10, 2), (10, 7, 6), (7, 1, 8), (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8),
              (3, 8, 9), (4, 9, 5), (2, 4, 11), (6, 2, 10), (8, 6, 7), (9, 8, 1)]  # fmt: skip
-    points = _unit(np.array(corners, float))[np.array(faces)]
+    points = _scale_to_unit(np.array(corners, float))[np.array(faces)]
     for _ in range(level):
         a, b, c = points.transpose(1, 0, 2)
-        ab, bc, ca = (_unit(p + q) for p, q in ((a, b), (b, c), (c, a)))
+        ab, bc, ca = (_scale_to_unit(p + q) for p, q in ((a, b), (b, c), (c, a)))
         quarters = [(a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca)]
         points = np.concatenate([np.stack(quarter, 1) for quarter in quarters])
     return points.reshape(-1, 3)
 
 
 TREES = 18
+TREE_M = 10
+"""Height of a tree model, about."""
 BUSHES = 8
 HEDGES = 4
 """Number of different models of each."""
@@ -224,10 +226,14 @@ def add_wood_edge(
     share = np.linspace(0, 1, count)
     x = x0 + (x1 - x0) * share + rng.normal(0, 0.6, count)
     s = s0 + (s1 - s0) * share + rng.normal(0, 0.3, count)
+
+    # Points of four rows, one above the other, that lean in and out.
     rows = np.array([0.3, -0.35, -0.75, -1.0]) * height_m
     out = rng.normal(0, 0.5, (len(rows), count))
     up = rows[:, None] * np.clip(1 + 0.13 * rng.normal(size=count), 0.6, 1.4)
     points = np.stack([x + out, up, s + 0.5 * out[::-1]], -1)
+
+    # Dark leaves between each two rows.
     along = np.arange(count) * 1.5
     color = np.array(leaf_color(rng))
     b.thing += 1
@@ -237,6 +243,8 @@ def add_wood_edge(
         shade = rng.uniform(0.4, 1.3, (count - 1, 1))
         tint = shade * np.asarray(surface.tint)
         b.quads(between(points[low], points[high]), between(below, above), surface, tint=tint)
+
+    # Single leaves that break its outline.
     leaf = surface._replace(tint=tuple(0.6 * color))
     for first in range(0, count - 4, 4):
         if s[first] < 80:  # farther away they would be less than a pixel
@@ -430,25 +438,16 @@ def vehicle(kind: str, number: int) -> Mesh:
     shift = np.zeros((len(body.stations), 3))
     shift[2:-2, 0] = b.rng.normal(0, 0.008, len(shift) - 4)
     stations = np.array(body.stations) + shift
-    rings = [_ring(station, size) for station in stations]
+
+    # The body, in rings of nine faces: flanks (0 to 2 and 6 to 8), and the roof between them.
+    rings = [_make_ring(station, size) for station in stations]
     for i, (rear, front) in enumerate(pairwise(rings)):
         is_glazed = body.glazed[0] <= i < body.glazed[1]
         is_steep = abs(stations[i + 1, 2] - stations[i, 2]) > 0.2
         for j in range(9):
             face = np.stack([rear[j], rear[j + 1], front[j + 1], front[j]])
             if is_glazed and (j in (2, 6) or (is_steep and j in (3, 4, 5))):
-                # A pane in a painted frame, so that pillars part the windows; it looks outwards.
-                uv = [[0, 0], [1, 0], [1, 1], [0, 1]]
-                b.quads([face], [uv], Surface("tyre", (0.015, 0.015, 0.017)))
-                middle = face.mean(0)
-                outward = np.cross(face[1] - face[0], face[3] - face[0])
-                outward *= 0.006 / (np.linalg.norm(outward) + 1e-9)
-                outward *= 1 if outward @ middle > 0 or outward[1] < 0 else -1
-                # Towards the outside: a body's panes look away from its middle.
-                if outward @ (middle - np.array([0, middle[1] * 0.5, 0])) < 0:
-                    outward = -outward
-                pane = middle + (face - middle) * 0.93 + outward
-                b.quads([pane], [uv], Surface("glass", (0.03, 0.035, 0.04)))
+                _add_window(b, face)
             elif j in (3, 4, 5):
                 b.quads([face], [np.stack([face[:, 0], face[:, 2]], -1)], Surface("paint"))
             else:
@@ -458,21 +457,49 @@ def vehicle(kind: str, number: int) -> Mesh:
         hub = np.broadcast_to(ring.mean(0), ring.shape)
         faces = np.stack([hub, ring, np.roll(ring, -1, 0)], 1)
         b.triangles(faces, faces[..., :2], Surface("paint"))
-    radius = 0.31 if size[2] < 2.5 else 0.47
+
     rim = Surface("wheel", (0.4, 0.41, 0.43), 1.0, number)
     for side in (-1, 1):
-        axis = (side, 0, 0)
         for share in body.wheels:
-            hub = np.array([side * (size[1] / 2 + 0.01), -radius, share * size[0]])
-            b.disc(hub - [side * 0.004, 0.02, 0], axis, radius * 1.18, _BLACK, 16)
-            b.tube(hub - [side * 0.22, 0, 0], hub, radius, _BLACK, 16)
-            b.disc(hub + np.array([side * 0.003, 0, 0]), axis, radius, _BLACK, 16)
-            b.disc(hub + np.array([side * 0.012, 0, 0]), axis, radius * 0.66, rim, 12)
+            _add_wheel(b, size, side, share * size[0], rim)
     _add_trim(b, *size)
     return b.finish()
 
 
-def _ring(
+def _add_window(b: MeshBuilder, face: Float[np.ndarray, "4 3"]) -> None:
+    """Add a pane in a dark frame, the four-cornered face of a body; it looks outwards."""
+    uv = [[0, 0], [1, 0], [1, 1], [0, 1]]
+    b.quads([face], [uv], Surface("tyre", (0.015, 0.015, 0.017)))
+    middle = face.mean(0)
+    outward = np.cross(face[1] - face[0], face[3] - face[0])
+    outward *= 0.006 / (np.linalg.norm(outward) + 1e-9)
+
+    # Towards the outside, by two rules of which the second has the last word: a pane looks up or
+    # away from the origin, and away from the middle of its body.
+    outward *= 1 if outward @ middle > 0 or outward[1] < 0 else -1
+    if outward @ (middle - np.array([0, middle[1] * 0.5, 0])) < 0:
+        outward = -outward
+    pane = middle + (face - middle) * 0.93 + outward
+    b.quads([pane], [uv], Surface("glass", (0.03, 0.035, 0.04)))
+
+
+def _add_wheel(
+    b: MeshBuilder, size: Float[np.ndarray, "3"], side: int, axle_m: Number, rim: Surface
+) -> None:
+    """Add a wheel in its arch, on the right (1) or the left (-1) side of a body.
+
+    ``size``: length, width and height of the body [m]; ``axle_m``: place of the axle along it.
+    """
+    radius = 0.31 if size[2] < 2.5 else 0.47
+    axis = (side, 0, 0)
+    hub = np.array([side * (size[1] / 2 + 0.01), -radius, axle_m])
+    b.disc(hub - [side * 0.004, 0.02, 0], axis, radius * 1.18, _BLACK, 16)
+    b.tube(hub - [side * 0.22, 0, 0], hub, radius, _BLACK, 16)
+    b.disc(hub + np.array([side * 0.003, 0, 0]), axis, radius, _BLACK, 16)
+    b.disc(hub + np.array([side * 0.012, 0, 0]), axis, radius * 0.66, rim, 12)
+
+
+def _make_ring(
     station: Float[np.ndarray, "3"], size: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "10 3"]:
     """Make a cross-section of a vehicle: sill, flank, belt, roof edge and roof of both sides."""
@@ -529,8 +556,8 @@ def walker(number: int) -> Mesh:
     b = MeshBuilder(np.random.default_rng((31, number)))
     height = b.rng.uniform(1.55, 1.9)
     step = b.rng.uniform(-0.28, 0.28)
-    coat = _cloth(b, 0.45)
-    trousers = _cloth(b, 0.22)
+    coat = _draw_cloth(b, 0.45)
+    trousers = _draw_cloth(b, 0.22)
     for side in (-1, 1):
         foot = (side * 0.1, -0.04, side * step)
         hip = np.array([side * 0.09, -0.48 * height, 0])
@@ -542,8 +569,19 @@ def walker(number: int) -> Mesh:
     neck = np.array([0, -0.82 * height, 0.02])
     _add_upper_body(b, hip, neck, np.array([0, -0.93 * height, 0.03]), coat)
     if b.rng.random() < 0.4:
-        b.box((0.3, -0.4 * height, 0), (0.12, 0.3, 0.34), _cloth(b, 0.4))
+        b.box((0.3, -0.4 * height, 0), (0.12, 0.3, 0.34), _draw_cloth(b, 0.4))
     return b.finish()
+
+
+def _add_bicycle_wheel(b: MeshBuilder, z: float, metal: Surface) -> None:
+    """Add a wheel of a bicycle that rides along z: its tyre, its axle and its spokes."""
+    angle = np.linspace(0, 2 * np.pi, 19)
+    rim = np.stack([0 * angle, -0.34 + 0.33 * np.cos(angle), z + 0.33 * np.sin(angle)], 1)
+    for start, stop in pairwise(rim):
+        b.tube(start, stop, 0.02, _RUBBER, 4)
+    b.tube((-0.05, -0.34, z), (0.05, -0.34, z), 0.03, metal, 5)
+    for spoke in rim[:-1:3]:
+        b.tube((0, -0.34, z), spoke, 0.005, metal, 3)
 
 
 @cache
@@ -552,13 +590,9 @@ def rider(number: int) -> Mesh:
     b = MeshBuilder(np.random.default_rng((32, number)))
     frame = Surface("metal", tuple(b.rng.uniform(0.03, 0.4, 3)))
     for z in (-0.52, 0.52):
-        angle = np.linspace(0, 2 * np.pi, 19)
-        rim = np.stack([0 * angle, -0.34 + 0.33 * np.cos(angle), z + 0.33 * np.sin(angle)], 1)
-        for start, stop in pairwise(rim):
-            b.tube(start, stop, 0.02, _RUBBER, 4)
-        b.tube((-0.05, -0.34, z), (0.05, -0.34, z), 0.03, frame, 5)
-        for spoke in rim[:-1:3]:
-            b.tube((0, -0.34, z), spoke, 0.005, frame, 3)
+        _add_bicycle_wheel(b, z, frame)
+
+    # The frame, its handlebar and its saddle.
     joints = {"rear": (-0.34, -0.52), "front": (-0.34, 0.52), "saddle": (-0.9, -0.2),
               "pedals": (-0.3, -0.02), "head": (-0.86, 0.36), "bar": (-1.05, 0.36)}  # fmt: skip
     links = ("rear saddle", "rear pedals", "pedals saddle", "pedals head", "saddle head",
@@ -568,8 +602,10 @@ def rider(number: int) -> Mesh:
         b.tube(start, stop, 0.022, frame, 5)
     b.tube((-0.28, -1.06, 0.36), (0.28, -1.06, 0.36), 0.016, _RUBBER, 4)
     b.box((0, -0.94, -0.22), (0.16, 0.06, 0.26), _RUBBER)
-    coat = _cloth(b, 0.45)
-    trousers = _cloth(b, 0.22)
+
+    # The person: legs on the pedals, hands on the handlebar.
+    coat = _draw_cloth(b, 0.45)
+    trousers = _draw_cloth(b, 0.22)
     hip = np.array([0, -0.98, -0.22])
     neck = np.array([0, -1.5, 0.02])
     for side in (-1, 1):
@@ -593,7 +629,7 @@ def _add_upper_body(
     add_ball(b, neck, (0.2, 0.09, 0.13), coat, 1)
     if b.rng.random() < 0.3:
         bag = hip * 0.35 + neck * 0.65 - [0, 0, 0.2]
-        b.box(bag, (0.3, 0.42, 0.18), _cloth(b, 0.4))
+        b.box(bag, (0.3, 0.42, 0.18), _draw_cloth(b, 0.4))
     skin = Surface("skin", _SKINS[b.rng.integers(len(_SKINS))])
     hair = Surface("cloth", tuple(b.rng.uniform(0.01, 0.25) * np.array([1, 0.8, 0.6])))
     b.tube(head + np.array([0, 0.2, 0]), head, 0.06, skin, 6)
@@ -601,7 +637,7 @@ def _add_upper_body(
     add_ball(b, head - [0, 0.03, 0.02], (0.098, 0.11, 0.105), hair, 2)
 
 
-def _cloth(b: MeshBuilder, light: Number) -> Surface:
+def _draw_cloth(b: MeshBuilder, light: Number) -> Surface:
     """Draw a cloth of random colour, no brighter than ``light``."""
     color = b.rng.uniform(0.1, 1, 3) * b.rng.uniform(0.15, 1) * light
     return Surface("cloth", tuple(color), 0.6, int(b.rng.integers(4)))

@@ -262,12 +262,14 @@ class _NearSceneBuilder:
         near_m = self.near_m
         tilt = np.deg2rad(rng.uniform(0, 75 if not is_bin else 35))
         roll = rng.normal(0, 0.15)
-        # Up from the plane, towards the camera: straight at it, or aslant.
+
+        # Its axes. Up from the plane, towards the camera: straight at it, or aslant.
         normal = np.array([np.sin(roll), -np.sin(tilt), -np.cos(tilt) * np.cos(roll)])
         normal /= np.linalg.norm(normal)
         right = np.cross(normal, [0.0, 1, 0]) if tilt < 0.1 else np.cross([0.0, 0, -1], normal)
         right /= np.linalg.norm(right)
         ahead = np.cross(right, normal)
+
         # The plane passes through the axis so far away that its nearest visible corner is far
         # enough; a ray (u, v, 1) meets it at z = distance * normal_z / (normal . ray).
         rays = np.array([[u, v, 1.0] for u in (-1, 0, 1) for v in (-1, 0, 1)])
@@ -275,6 +277,8 @@ class _NearSceneBuilder:
         aligned = rays @ normal
         nearest = (normal[2] / aligned[aligned < -0.03]).min()
         distance_m = near_m * rng.uniform(1.05, 1.6) / nearest
+
+        # The wall behind, the plane, and the sides of a bin.
         middle = np.array([0, 0, distance_m])
         extent_m = distance_m * log_uniform(rng, 0.5, 4)
         if is_bin:
@@ -290,6 +294,7 @@ class _NearSceneBuilder:
                 corner = middle + extent_m * (outwards - along)
                 surface = random_near_surface(rng, extent_m)
                 self.builder.rectangle(corner, 2 * extent_m * along, height_m * normal, surface)
+
         # Objects on it, where random rays meet the plane.
         common = random_kind(rng) if is_bin else None
         common_m = distance_m * self.half[0] * log_uniform(rng, 0.1, 0.5)
@@ -312,6 +317,8 @@ class _NearSceneBuilder:
         front_m = near_m * rng.uniform(1.02, 1.5)
         back_m = front_m + depth_m
         self.add_wall(back_m * rng.uniform(1.0, 1.6))
+
+        # Size, surface and rotation of the shelf.
         half_x, half_y = (back_m * side * rng.uniform(0.6, 1.5) for side in self.half)
         thick_m = depth_m * rng.uniform(0.02, 0.12)
         surface = random_near_surface(rng, half_x)
@@ -319,6 +326,8 @@ class _NearSceneBuilder:
         rotation = np.array(
             [[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]]
         )
+
+        # Boards and uprights.
         middle = np.array([0, 0, front_m + depth_m / 2])
         levels = np.linspace(-half_y, half_y, int(rng.integers(2, 6)))
         columns = np.linspace(-half_x, half_x, int(rng.integers(2, 6)))
@@ -329,6 +338,8 @@ class _NearSceneBuilder:
         for x in columns:
             size = (thick_m, 2 * half_y, depth_m)
             self.builder.box(middle + rotation @ [x, 0, 0], size, surface, rotation)
+
+        # Objects on all boards but the uppermost.
         cell_m = float(levels[1] - levels[0])
         for _ in range(int(rng.integers(5, 40))):
             size_m = cell_m * rng.uniform(0.2, 0.8)

@@ -65,6 +65,8 @@ def draw_road(rng: np.random.Generator) -> Road:
     """Draw the plan of a road, with the camera's car somewhere in one of its right lanes."""
     names = list(PLACES)
     place = names[rng.choice(len(names), p=list(PLACES.values()))]
+
+    # Lanes and strips for parked cars, and where the car is among them.
     lanes = {"avenue": int(rng.integers(3, 6)), "city": int(rng.integers(2, 4))}.get(place, 2)
     lane_m = rng.uniform(2.7, 3.7) + 0.2 * (place == "avenue")
     parking = rng.uniform(1.9, 2.3, 2) * (
@@ -75,20 +77,53 @@ def draw_road(rng: np.random.Generator) -> Road:
     right_m = (lanes - lane - 0.5) * lane_m + parking[1] + rng.normal(0, 0.3)
     if lanes == 2 and rng.random() < 0.12:  # a narrow street without lanes, driven in the middle
         right_m = width_m / 2 + rng.normal(0, 0.4)
+
+    # Pavement and verge.
     has_walk = place in ("city", "suburb") or (place == "avenue" and rng.random() < 0.7)
     walk_m, curb_m = (rng.uniform(1.4, 4.0), rng.uniform(0.06, 0.15)) if has_walk else (0.0, 0.0)
     verge_m = rng.uniform(1, 5) if place == "avenue" else 0.0
-    often = {"city": 0.7, "suburb": 0.65, "avenue": 0.6}.get(place, 0.2)
-    streets = []
+
+    side_streets = _draw_side_streets(rng, place)
+    centre = _draw_centre(rng, place)
+    left_m = float(right_m - width_m)
+    right_m = float(right_m)
+    parking_m = (float(parking[0]), float(parking[1]))
+    return Road(
+        place=place,
+        edge_m={-1: left_m, 1: right_m},
+        lanes=lanes,
+        lane_m=(right_m - left_m - sum(parking_m)) / lanes,
+        parking_m=parking_m,
+        walk_m=walk_m,
+        curb_m=curb_m,
+        verge_m=verge_m,
+        side_streets=side_streets,
+        centre=centre,
+    )
+
+
+def _draw_side_streets(rng: np.random.Generator, place: Place) -> tuple[SideStreet, ...]:
+    """Draw the side streets that join a road in a kind of place."""
+    probability = {"city": 0.7, "suburb": 0.65, "avenue": 0.6}.get(place, 0.2)
+    streets: list[SideStreet] = []
     s = rng.uniform(4, 40)
-    while rng.random() < often and s < 110:
+    while rng.random() < probability and s < 110:
         sides = ((1,), (-1,), (-1, 1))[rng.choice(3, p=[0.3, 0.3, 0.4])]
         streets.append(SideStreet(s_m=s, half_m=rng.uniform(2.8, 6), sides=sides))
         s += rng.uniform(25, 60)
-    # The centre by its curvature and slope; at the car the road is level and leads ahead.
+    return tuple(streets)
+
+
+def _draw_centre(rng: np.random.Generator, place: Place) -> Float64[np.ndarray, "n 5"]:
+    """Draw the centre line of a road by its curvature and slope: s, x, y, z [m] and heading [rad].
+
+    At the car the road is level and leads ahead.
+    """
     along = np.arange(-BEHIND_M - 2, AHEAD_M + 2, 1.0)
     curvature = np.zeros_like(along)
     slope = np.zeros_like(along)
+
+    # Up to three curves, and up to three changes of the slope.
     if rng.random() < {"city": 0.35, "avenue": 0.45}.get(place, 0.65):
         start = rng.uniform(-5, 45)
         for _ in range(3):
@@ -105,41 +140,33 @@ def draw_road(rng: np.random.Generator) -> Road:
             width = rng.uniform(15, 50)
             slope += rng.normal(0, 0.022) * (1 + np.tanh((along - where) / width)) / 2
         slope -= np.interp(0.0, along, slope)
+
     heading = np.cumsum(curvature)
     heading -= np.interp(0.0, along, heading)
     line = np.cumsum(np.sin(heading)), -np.cumsum(slope), np.cumsum(np.cos(heading))
     x, y, z = (values - np.interp(0.0, along, values) for values in line)
-    left_m = float(right_m - width_m)
-    right_m = float(right_m)
-    parking_m = (float(parking[0]), float(parking[1]))
-    return Road(
-        place=place,
-        edge_m={-1: left_m, 1: right_m},
-        lanes=lanes,
-        lane_m=(right_m - left_m - sum(parking_m)) / lanes,
-        parking_m=parking_m,
-        walk_m=walk_m,
-        curb_m=curb_m,
-        verge_m=verge_m,
-        side_streets=tuple(streets),
-        centre=np.stack([along, x, y, z, heading], 1),
-    )
+    return np.stack([along, x, y, z, heading], 1)
 
 
 def bend(mesh: Mesh, road: Road) -> Mesh:
     """Bend a mesh from the straight street to the curves and slopes of the road."""
-    points = mesh.corners.reshape(-1, 3)
+    # The centre line and its curvature, a row for each metre of the road.
     curvature = np.gradient(road.centre[:, 4], road.centre[:, 0])
     table = np.column_stack([road.centre, curvature]).astype(np.float32)
-    # The table has a row for each metre of the road.
+
+    # Its values where each point is along the road, interpolated.
+    points = mesh.corners.reshape(-1, 3)
     place = np.clip(points[:, 2] - table[0, 0], 0, len(table) - 1.001)
     row = place.astype(np.int64)
     share = (place - row)[:, None]
     here = table[row] * (1 - share) + table[row + 1] * share
     x, y, z, heading, curvature = here[:, 1:].T
+
     # On the inside of a curve no point may lie beyond its centre, or the ground would fold.
     inward = np.clip(points[:, 0] * curvature, 0, None)
     across = points[:, 0] / (1 + inward**4) ** 0.25
+
+    # Points and normals turn by the heading.
     cos = np.cos(heading)
     sin = np.sin(heading)
     bent = np.stack([x + across * cos, y + points[:, 1], z - across * sin], 1)
@@ -169,7 +196,7 @@ def add_ground(b: MeshBuilder, road: Road) -> None:
     even = np.concatenate(
         [np.arange(-BEHIND_M, 60, 4), np.arange(60, 150, 10), np.arange(150, AHEAD_M + 1, 30)]
     )
-    _strip(b, (road.edge_m[-1], road.edge_m[1]), (0.0, 0.0), asphalt, even)
+    _add_strip(b, (road.edge_m[-1], road.edge_m[1]), (0.0, 0.0), asphalt, even)
 
     # Side streets on each side, and the ground between them.
     land = walk if road.place == "city" and rng.random() < 0.7 else grass
@@ -185,7 +212,7 @@ def add_ground(b: MeshBuilder, road: Road) -> None:
             piece = stations[first : last + 1]
             edge = road.edge_m[side]
             if is_street[first]:
-                _strip(b, (edge, edge + side * _WIDE_M), (0.0, 0.0), asphalt, piece)
+                _add_strip(b, (edge, edge + side * _WIDE_M), (0.0, 0.0), asphalt, piece)
             else:
                 _add_side(b, road, side, walk, grass, land, piece)
 
@@ -209,7 +236,7 @@ def _add_side(
     x = edge = road.edge_m[side]
 
     def strip(width: Number, heights: tuple[Number, Number], surface: Surface) -> None:
-        _strip(b, (x, x + side * width), heights, surface, stations)
+        _add_strip(b, (x, x + side * width), heights, surface, stations)
 
     if road.curb_m:
         strip(0.0, (0.0, high), curb)
@@ -238,7 +265,7 @@ def _add_side(
         b.quads(corners, corners[..., :2], curb if road.curb_m else land)
 
 
-def _strip(
+def _add_strip(
     b: MeshBuilder,
     x_m: tuple[Number, Number],
     y_m: tuple[Number, Number],
@@ -284,22 +311,20 @@ def add_roadside(b: MeshBuilder, road: Road) -> None:
     rng = b.rng
     sides = {side: _Roadside(b, road, side) for side in (-1, 1)}
     for beside in sides.values():
-        plots = {
-            "city": beside.add_houses, "suburb": beside.add_gardens, "avenue": beside.add_avenue
-        }  # fmt: skip
-        plots.get(road.place, beside.add_country)()
+        match road.place:
+            case "city":
+                beside.add_houses()
+            case "suburb":
+                beside.add_gardens()
+            case "avenue":
+                beside.add_avenue()
+            case _:
+                beside.add_country()
         beside.add_kerb()
-        # The front of a wood: right behind a forest's first trees, far behind elsewhere.
-        is_forest = road.place == "forest"
-        often = {"forest": 0.9, "city": 0.1, "suburb": 0.35}
-        if rng.random() <= often.get(road.place, 0.55):
-            near, height = (rng.uniform(8, 13), 13.0) if is_forest else (rng.uniform(14, 55), 9.0)
-            s = rng.uniform(-10, 0 if is_forest else 60)
-            x = beside.x_m(near)
-            stop = s + rng.uniform(60, 200)
-            other = x + beside.side * rng.uniform(-2, 15)
-            models.add_wood_edge(b, (x, s), (other, stop), height * rng.uniform(0.7, 1.3))
-    if rng.random() < 0.85:  # trees across the end of the road's straight part
+        beside.add_wood()
+
+    # Trees across the end of the road's straight part, and a wood behind them.
+    if rng.random() < 0.85:
         for _ in range(int(rng.integers(30, 90))):
             beside = sides[int(rng.choice([-1, 1]))]
             x = beside.x_m(rng.uniform(2, 90))
@@ -339,7 +364,7 @@ class _Roadside:
                 height = tall * rng.uniform(0.75, 1.25)
                 self.add_house(s, length, set_back + rng.uniform(0, 0.6), height)
             elif rng.random() < 0.5:
-                self.add_tree(self.x_m(rng.uniform(6, 12)), s, None)
+                self.add_tree(self.x_m(rng.uniform(6, 12)), s, rng.uniform(5, 12))
             s += length + (rng.uniform(2, 9) if rng.random() < 0.3 else 0.0)
 
     def add_gardens(self) -> None:
@@ -411,6 +436,20 @@ class _Roadside:
         if not is_forest and rng.random() < 0.45:
             self.add_border(-8, 90, int(rng.integers(4)))
 
+    def add_wood(self) -> None:
+        """Add at times the edge of a wood: right behind a forest's first trees, else far behind."""
+        rng = self.b.rng
+        is_forest = self.road.place == "forest"
+        probability = {"forest": 0.9, "city": 0.1, "suburb": 0.35}.get(self.road.place, 0.55)
+        if rng.random() > probability:
+            return
+        near, height = (rng.uniform(8, 13), 13.0) if is_forest else (rng.uniform(14, 55), 9.0)
+        s = rng.uniform(-10, 0 if is_forest else 60)
+        x = self.x_m(near)
+        stop = s + rng.uniform(60, 200)
+        other = x + self.side * rng.uniform(-2, 15)
+        models.add_wood_edge(self.b, (x, s), (other, stop), height * rng.uniform(0.7, 1.3))
+
     def add_copse(self, s: Number, length: Number, depth: Number) -> None:
         """Add some trees and bushes on a plot of a length and depth, unless a street is there."""
         rng = self.b.rng
@@ -431,12 +470,16 @@ class _Roadside:
         side = self.side
         x = self.road.edge_m[self.side] + side * (0.5 if road.walk_m else 1.3)
         y = -road.curb_m
+
+        # Lamps, at even distances.
         if rng.random() <= {"forest": 0.1, "rural": 0.3}.get(road.place, 0.7):
             number = int(rng.integers(6))
             step = rng.uniform(16, 34)
             for s in np.arange(rng.uniform(2, 25), 110, step):
                 if not road.is_side_street(s, side):
                     self.b.add(place(models.lamp(number), (x, y, s), 0.0 if side < 0 else np.pi))
+
+        # Signs, small things and trees; in the country guide posts in place of small things.
         s = rng.uniform(3, 12)
         is_town = road.place not in ("rural", "forest")
         while s < 70:
@@ -453,29 +496,37 @@ class _Roadside:
                 else:
                     self.add_tree(where[0] + side * 0.4, s, rng.uniform(3.5, 7))
             s += rng.uniform(3, 14) * (1 if is_town else 1.8)
+
+        # Traffic lights, before side streets.
         for street in road.side_streets:
             if side in street.sides and rng.random() < 0.4:
                 light = models.traffic_light(int(rng.integers(4)))
                 where = (x, y, street.s_m - street.half_m - 1)
                 self.b.add(place(light, where, 0, (-side, 1, 1)))
-        if rng.random() < 0.25:  # wooden poles with cables between them, which hang
-            at = x + side * rng.uniform(0.5, 3)
-            height = rng.uniform(6, 8)
-            gap = rng.uniform(22, 38)
-            places = np.arange(rng.uniform(-15, 10), 120, gap)
-            self.b.thing += 1
-            for s in places:
-                self.b.tube((at, 0.2, s), (at, -height, s), (0.12, 0.09), _WOOD, 8)
-                self.b.box((at, -height + 0.3, s), (1.4, 0.1, 0.1), _WOOD)
-            share = np.linspace(0, 1, 7)[:, None]
-            for ends in pairwise(places):
-                for shift in (-0.6, 0.6):
-                    start, stop = (np.array([at + shift, -height + 0.22, s]) for s in ends)
-                    points = start * (1 - share) + stop * share
-                    sag = (4 * share * (1 - share))[:, 0] * 0.02
-                    points[:, 1] += sag * np.linalg.norm(stop - start)
-                    for here, there in pairwise(points):
-                        self.b.tube(here, there, 0.018, _DARK, 3)
+        if rng.random() < 0.25:
+            self.add_cables(x + side * rng.uniform(0.5, 3))
+
+    def add_cables(self, x_m: Number) -> None:
+        """Add a row of wooden poles along the road, and two cables that hang between them."""
+        rng = self.b.rng
+        height = rng.uniform(6, 8)
+        gap = rng.uniform(22, 38)
+        places = np.arange(rng.uniform(-15, 10), 120, gap)
+        self.b.thing += 1
+        for s in places:
+            self.b.tube((x_m, 0.2, s), (x_m, -height, s), (0.12, 0.09), _WOOD, 8)
+            self.b.box((x_m, -height + 0.3, s), (1.4, 0.1, 0.1), _WOOD)
+
+        # A cable sags in a parabola, by a fiftieth of its length.
+        share = np.linspace(0, 1, 7)[:, None]
+        for ends in pairwise(places):
+            for shift in (-0.6, 0.6):
+                start, stop = (np.array([x_m + shift, -height + 0.22, s]) for s in ends)
+                points = start * (1 - share) + stop * share
+                sag = (4 * share * (1 - share))[:, 0] * 0.02
+                points[:, 1] += sag * np.linalg.norm(stop - start)
+                for here, there in pairwise(points):
+                    self.b.tube(here, there, 0.018, _DARK, 3)
 
     def add_house(self, s: Number, length: Number, back: Number, height: float) -> None:
         """Add a house at a distance ``back`` behind the pavement."""
@@ -518,22 +569,27 @@ class _Roadside:
                 place_m = (x + rng.normal(0, 0.3), s + rng.normal(0, 0.8))
                 self.add_tree(*place_m, height * rng.uniform(0.8, 1.2))
 
-    def add_tree(self, x: Number, s: Number, height: Number | None) -> None:
-        """Add a tree of a random model, coarser where it is far away; height None: random."""
-        tall = self.b.rng.uniform(5, 12) if height is None else height
-        number = int(self.b.rng.integers(models.TREES))
-        wide = tall * self.b.rng.uniform(0.85, 1.15)
-        model = models.tree(number, int(s > 24) + int(s > 48 or abs(x) > 25))
-        scale = np.array([wide, tall, wide]) / 10
-        tints = {"leaf": models.leaf_color(self.b.rng)}
-        self.b.add(place(model, (x, 0, s), self.b.rng.uniform(0, 6.28), scale, tints))
+    def add_tree(self, x_m: Number, s_m: Number, height_m: Number) -> None:
+        """Add a tree of a random model at x and s, with fewer leaves where it is far away."""
+        rng = self.b.rng
+        number = int(rng.integers(models.TREES))
+        width_m = height_m * rng.uniform(0.85, 1.15)
+        coarseness = int(s_m > 24) + int(s_m > 48 or abs(x_m) > 25)
+        model = models.tree(number, coarseness)
+        scale = np.array([width_m, height_m, width_m]) / models.TREE_M
+        tints = {"leaf": models.leaf_color(rng)}
+        yaw = rng.uniform(0, 6.28)
+        self.b.add(place(model, (x_m, 0, s_m), yaw, scale, tints))
 
-    def add_bush(self, x: Number, s: Number, size: Number) -> None:
-        """Add a bush of a random model, coarser where it is far away."""
-        model = models.bush(int(self.b.rng.integers(models.BUSHES)), int(s > 20))
-        scale = size * self.b.rng.uniform(0.7, 1.3, 3)
-        tints = {"leaf": models.leaf_color(self.b.rng)}
-        self.b.add(place(model, (x, 0, s), self.b.rng.uniform(0, 6.28), scale, tints))
+    def add_bush(self, x_m: Number, s_m: Number, height_m: Number) -> None:
+        """Add a bush of a random model at x and s, with fewer leaves where it is far away."""
+        rng = self.b.rng
+        number = int(rng.integers(models.BUSHES))
+        model = models.bush(number, coarseness=int(s_m > 20))
+        scale = height_m * rng.uniform(0.7, 1.3, 3)
+        tints = {"leaf": models.leaf_color(rng)}
+        yaw = rng.uniform(0, 6.28)
+        self.b.add(place(model, (x_m, 0, s_m), yaw, scale, tints))
 
 
 _OWN_CAR = (0.0, 0.5, 1.5, 4.5)
@@ -549,7 +605,7 @@ class Traffic:
     _taken: list[tuple[Number, float, Number, float]] = field(default_factory=lambda: [_OWN_CAR])
 
     def claim(self, x: Number, s: float, half_x: Number, half_s: float) -> bool:
-        """Reserve a rectangle [m] if it is free; whether it was."""
+        """Reserve a rectangle [m] if it is free, and give whether it was."""
         for other in self._taken:
             if abs(x - other[0]) < half_x + other[2] and abs(s - other[1]) < half_s + other[3]:
                 return False
@@ -601,13 +657,16 @@ class Traffic:
         rng = self.b.rng
         shares = np.array([body.share for body in models.BODIES.values()])
         kind = list(models.BODIES)[rng.choice(len(shares), p=shares / shares.sum())]
+
+        # The rectangle along x and s that it covers.
         length, width, _ = models.BODIES[kind].size_m
-        c = abs(np.cos(yaw))
-        t = abs(np.sin(yaw))
-        half_x = (width * c + length * t) / 2 + 0.1
-        half_s = (length * c + width * t) / 2 + 0.3
+        cos = abs(np.cos(yaw))
+        sin = abs(np.sin(yaw))
+        half_x = (width * cos + length * sin) / 2 + 0.1
+        half_s = (length * cos + width * sin) / 2 + 0.3
         if not self.claim(x, s, half_x, half_s):
             return
+
         shares = np.array([share for _, share in models.PAINTS])
         color, _ = models.PAINTS[rng.choice(len(models.PAINTS), p=shares / shares.sum())]
         color = tuple(np.array(color) * rng.uniform(0.8, 1.15))

@@ -139,7 +139,7 @@ def _draw_camera(rng: np.random.Generator, mount_height_m: float) -> tuple[Rotat
     roll = rng.normal(0, 0.009)
     yaw = rng.normal(0, 0.03) if rng.random() < 0.8 else rng.normal(0, 0.2)
     position_m = np.array([rng.normal(0, 0.05), -mount_height_m + rng.normal(0, 0.04), 0.0])
-    return _rotation(pitch, yaw, roll), position_m
+    return _make_rotation(pitch, yaw, roll), position_m
 
 
 def _add_hills(b: MeshBuilder) -> None:
@@ -157,7 +157,7 @@ def _add_hills(b: MeshBuilder) -> None:
     b.quads(faces, uv, Surface("hills", (0.045, 0.065, 0.03), 150.0, int(b.rng.integers(2))))
 
 
-def _rotation(pitch: float, yaw: float, roll: float) -> Float64[np.ndarray, "3 3"]:
+def _make_rotation(pitch: float, yaw: float, roll: float) -> Float64[np.ndarray, "3 3"]:
     """Make a camera's rotation of angles [rad] about x, y and z; yaw first, roll last."""
     c = np.cos([pitch, yaw, roll])
     s = np.sin([pitch, yaw, roll])

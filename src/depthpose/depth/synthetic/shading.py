@@ -96,12 +96,12 @@ def prepare(scene: StreetScene, pixels: int = 1242 * 375) -> Stage:
         kind=torch.from_numpy(mesh.thing.astype(np.int64)) * len(MATERIALS) + material,
         to_sun=to_sun,
         up=up,
-        sun_maps=[_light_map(casters, to_sun, *sun_map, size_share) for sun_map in sun_maps],
-        sky_map=_light_map(casters, up, *_SKY_MAP, size_share),
+        sun_maps=[_draw_light_map(casters, to_sun, *sun_map, size_share) for sun_map in sun_maps],
+        sky_map=_draw_light_map(casters, up, *_SKY_MAP, size_share),
     )
 
 
-def _light_map(
+def _draw_light_map(
     corners: Float[Tensor, "n 3 3"],
     to_light: Float[Tensor, "3"],
     half_m: float,
@@ -261,7 +261,7 @@ def _shade(stage: Stage, hits: Hits, focal_px: float) -> Vectors:
     weather = stage.scene.weather
     points = hits.points
     u = points[:, 0] * 0.021 + points[:, 1] * 0.013 + weather.shift[0]
-    stains = _looked_up(surfaces.textures().stains, u, points[:, 2] * 0.021 + weather.shift[1])
+    stains = _look_up(surfaces.textures().stains, u, points[:, 2] * 0.021 + weather.shift[1])
     albedo *= (1 + 0.07 * stains)[:, None]
 
     is_road = (material == NUMBER["road"]).nonzero()[:, 0]
@@ -353,7 +353,7 @@ def sky_light(stage: Stage, towards: Vectors, *, with_sun: bool = True) -> Vecto
     far = towards / height.clamp(min=0.03)[:, None]
     u = far[:, 0] * 0.05 + weather.shift[0]
     v = far[:, 2] * 0.05 + weather.shift[1]
-    density = _looked_up(surfaces.textures().clouds, u, v)
+    density = _look_up(surfaces.textures().clouds, u, v)
     cover = torch.sigmoid(3 * (density - 1.4 + 2.2 * weather.cloud)) * (height * 6).clamp(0, 1)
     lit = (horizon * 0.9 + sun_color * 0.12).expand_as(color)
     color = torch.lerp(color, lit, (0.8 * cover)[:, None])
@@ -392,17 +392,17 @@ def _paint_road(
     # are narrower than a pixel.
     cover = torch.zeros_like(x)
     for at, half, period, dash in scene.markings.lines.tolist():
-        line = _inside(x - at, half, width_m)
+        line = _covered_share(x - at, half, width_m)
         if dash < period:
-            line = line * _inside(s % period - period / 2, dash / 2, length_m)
+            line = line * _covered_share(s % period - period / 2, dash / 2, length_m)
         cover = torch.maximum(cover, line)
     for at, half, first, last, is_striped in scene.markings.bars.tolist():
-        bar = _inside(s - at, half, length_m)
-        bar = bar * _inside(x - (first + last) / 2, (last - first) / 2, width_m)
+        bar = _covered_share(s - at, half, length_m)
+        bar = bar * _covered_share(x - (first + last) / 2, (last - first) / 2, width_m)
         if is_striped:
-            bar = bar * _inside(x % 1.0 - 0.5, 0.25, width_m)
+            bar = bar * _covered_share(x % 1.0 - 0.5, 0.25, width_m)
         cover = torch.maximum(cover, bar)
-    wear = torch.sigmoid(3 * (_looked_up(surfaces.textures().stains, x * 0.13, s * 0.13) + 1.4))
+    wear = torch.sigmoid(3 * (_look_up(surfaces.textures().stains, x * 0.13, s * 0.13) + 1.4))
     paint = (cover * scene.markings.brightness * (0.3 + 0.7 * wear))[:, None]
 
     # Wheels darken two tracks in each lane.
@@ -428,7 +428,7 @@ def _paint_road(
     return torch.lerp(worn, worn.new_tensor([0.8, 0.8, 0.77]).expand_as(worn), paint)
 
 
-def _inside(off: Tensor, half: float, foot: Tensor) -> Tensor:
+def _covered_share(off: Tensor, half: float, foot: Tensor) -> Tensor:
     """Give the share of a footprint of size ``foot`` that lies within ``half`` of a line.
 
     ``off``: distance of the footprint's centre from the line.
@@ -437,7 +437,7 @@ def _inside(off: Tensor, half: float, foot: Tensor) -> Tensor:
     return ((half - off.abs()) / foot + 0.5).clamp(0, 1) * (2 * half / foot).clamp(max=1)
 
 
-def _looked_up(field: Tensor, u: Tensor, v: Tensor) -> Tensor:
+def _look_up(field: Tensor, u: Tensor, v: Tensor) -> Tensor:
     """Look up a repeating field of noise at places that are counted in tiles."""
     column = (u * SIDE_PX).long() % SIDE_PX
     row = (v * SIDE_PX).long() % SIDE_PX

@@ -200,12 +200,14 @@ class StereoTraining(Settings):
         for kind in self.other:
             refuse_unknown("other", kind, MATCHERS)
         super().__post_init__()
+
         is_psmnet = self.light is None and not self.other
         if is_psmnet and (self.encoder_rate != 0.3 or not self.with_frozen_stem):
             raise InputError(
                 "encoder_rate and with_frozen_stem are for the encoder of the light network, which "
                 "PSMNet does not have; leave them out, or give light"
             )
+
         if self.light is not None and self.light.with_sky and self.sky_weight == 0:
             raise InputError(
                 "light.with_sky is true and sky_weight 0, so the sky would not be learnt; set "

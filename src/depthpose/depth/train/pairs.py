@@ -11,7 +11,7 @@ from depthpose.core.errors import InputError, Notice
 from depthpose.core.loop import sample_generator, shuffled_index
 from depthpose.depth.augment import TrainingPair, augment, scale_pair
 from depthpose.depth.config import PairsConfig, TruthKind
-from depthpose.depth.datasets import Dataset, Frame, known_truths, lidar_truth, open_dataset
+from depthpose.depth.datasets import Dataset, Frame, lidar_truth, open_dataset, truth_kinds
 from depthpose.depth.disparity import disparity_from_depth, right_disparity_from_left
 from depthpose.depth.synthetic import Streets, kitti_rig
 from depthpose.depth.types import Map
@@ -233,7 +233,7 @@ def _usable_pairs(
 
     # The kinds of truth of each frame that has the views.
     kinds_by_index = {
-        index: known_truths(frame)
+        index: truth_kinds(frame)
         for index, frame in enumerate(dataset.frames)
         if (frame.right is not None or is_mixed) and frame.name not in config.exclude
     }

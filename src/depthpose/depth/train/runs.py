@@ -4,13 +4,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import torch
 from torch import nn
 
-from depthpose.core.checkpoint import bound_facts, file_sha256, find_weights, warn_of_terms
-from depthpose.core.config import config_to_dict
+from depthpose.core.checkpoint import (
+    bound_facts,
+    file_sha256,
+    find_weights,
+    refuse_other_network,
+    warn_of_terms,
+)
 from depthpose.core.errors import InputError
 from depthpose.core.loop import Run, Task, held_out_text, releases_folder, write_card
 from depthpose.core.run import find_rank
@@ -50,8 +55,8 @@ def refuse_frozen_random(config: SelectTraining | StereoTraining) -> None:
         )
 
 
-def start_from(network: Generator | StereoNetwork, loaded: nn.Module, source: str) -> None:
-    """Copy the weights of a loaded network to the network that a config trains.
+def copy_start(network: Generator | StereoNetwork, loaded: nn.Module, source: str) -> None:
+    """Copy the weights that a training begins with into the network that it trains.
 
     Parts that the network has beyond them (``with_sky``) keep their initial weights.
 
@@ -63,22 +68,9 @@ def start_from(network: Generator | StereoNetwork, loaded: nn.Module, source: st
     Raises:
         InputError: the networks differ in their kind, or in a setting on which weights depend.
     """
-    if type(loaded) is not type(network):
-        raise InputError(
-            f"{source}: holds weights of {type(loaded).__name__}, but the config trains "
-            f"{type(network).__name__}. Give weights of that network."
-        )
-    config = config_to_dict(network.config)
-    loaded_config = config_to_dict(cast("Any", loaded).config)
-    for setting, value in config.items():
-        loaded_value = loaded_config[setting]
-        is_added = setting in _ADDABLE and value and not loaded_value
-        if loaded_value != value and setting not in _INDEPENDENT_OF_WEIGHTS and not is_added:
-            raise InputError(
-                f"{source}: was trained with {setting} = {loaded_value!r}, but the "
-                f"config says {value!r}. Give the config the weights' own."
-            )
-
+    # A part may be added, but none that the weights have may be left out.
+    added = [name for name in _ADDABLE if getattr(network.config, name, False)]
+    refuse_other_network(network, loaded, source, [*_INDEPENDENT_OF_WEIGHTS, *added])
     state = network.state_dict()
     common = {name: tensor for name, tensor in loaded.state_dict().items() if name in state}
     network.load_state_dict(state | common)
@@ -98,7 +90,7 @@ def make_matcher_network(config: StereoTraining) -> StereoNetwork:
     if matcher.encoder is not None:
         refuse_frozen_random(config)
     if config.start is not None:
-        start_from(matcher, read_matcher(find_weights(config.start)), config.start)
+        copy_start(matcher, read_matcher(find_weights(config.start)), config.start)
     return matcher
 
 
@@ -129,7 +121,7 @@ def train_view(config: ViewTraining, run: Run) -> Path:
     held_out = config.held_out and TrainingPairs(config.held_out, 0, needs_truth=False)
     generator = UNetGenerator(config.generator)
     if config.start is not None:
-        start_from(generator, read_generator(find_weights(config.start)), config.start)
+        copy_start(generator, read_generator(find_weights(config.start)), config.start)
     facts, seconds = _run_stage(stages.ViewTask(generator, config, held_out), pairs, config, run)
     return _write_weights(run, "view", facts, seconds, generator=generator)
 
@@ -154,7 +146,7 @@ def train_select(config: SelectTraining, run: Run) -> Path:
     if config.encoder is not None:
         load_encoder(generator.encoder, find_weights(config.encoder))
     if config.start is not None:
-        start_from(generator, read_generator(find_weights(config.start)), config.start)
+        copy_start(generator, read_generator(find_weights(config.start)), config.start)
     held_out = config.held_out and TrainingPairs(config.held_out, 0, needs_truth=True)
     task = stages.SelectTask(generator, config, held_out)
     facts, seconds = _run_stage(task, samples, config, run)

@@ -119,7 +119,7 @@ class StereoTask:
 def _end_point_error(
     predicted_px: Maps, truth_px: Maps, max_disparity_px: int
 ) -> Float[Tensor, ""]:
-    """Mean absolute error of the pixels with truth, without a gradient; 0 where there are none."""
+    """Average the absolute error over pixels with truth, without a gradient; 0 if there is none."""
     is_valid = (truth_px > 0) & (truth_px < max_disparity_px)
     error_px = (predicted_px.detach() - truth_px.nan_to_num(0.0)).abs()
     return error_px.where(is_valid, 0.0).sum() / is_valid.sum().clamp(min=1)

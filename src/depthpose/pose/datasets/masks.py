@@ -11,7 +11,7 @@ from torch import Tensor
 
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_json
-from depthpose.core.files.images import MAX_PIXELS, opened_image
+from depthpose.core.files.images import MAX_PIXELS, open_image
 
 Runs = tuple[tuple[int, ...], int, int]  #: run lengths, height and width
 _MOST_LABELS = 64  # different values of an image of labels; one of more is a picture
@@ -87,7 +87,7 @@ def _mask_pixels(path: Path, *, with_palette: bool) -> np.ndarray:
 
     ``with_palette`` gives the colours of a palette, else its indices.
     """
-    with opened_image(path) as image:
+    with open_image(path) as image:
         if image.mode in ("LA", "PA", "RGBA", "RGBa", "La") or "transparency" in image.info:
             pixels = np.asarray(image.convert("RGBA"))
         elif not with_palette and image.mode == "P":

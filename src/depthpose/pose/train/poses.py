@@ -16,9 +16,9 @@ from depthpose.core.checkpoint import (
     file_sha256,
     find_weights,
     read_checkpoint,
+    refuse_other_network,
     warn_of_terms,
 )
-from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_json
 from depthpose.core.loop import (
@@ -270,7 +270,7 @@ def train_pose_network(config: PoseTraining | DepthImageTraining, run: Run) -> P
     config = _with_sizes(config, models)
     kind, task, samples = _build_training(config, models)
     if config.start is not None:
-        _start_from(task.network, config.start, samples)
+        _copy_start(task.network, config.start, samples)
     # The folder is claimed only now: until here a setting may be refused.
     claim_run(config, run, config.models.cad)
 
@@ -346,35 +346,31 @@ def _write_pose_card(
     write_card(path, command, seconds, facts | dict(weights.facts), held_out)
 
 
-def _start_from(network: AnyNetwork, start: str, samples: TrainingViews[Any]) -> None:
-    """Copy the weights of a file into a network that has the same settings.
+def _copy_start(network: AnyNetwork, start: str, samples: TrainingViews[Any]) -> None:
+    """Copy the weights that a training begins with into the network that it trains.
 
     Where the numbers of objects differ the last layer, which is theirs, stays as it is; a network
     on depth images takes weights of the same number alone.
 
     Raises:
-        InputError: the file is of other settings.
+        InputError: the file is of another network, or of other settings.
     """
     path = find_weights(start)
-    started = network_of(read_checkpoint(path), str(path))
-    wanted = config_to_dict(network.config)
-    settings = config_to_dict(started.config)
+    loaded = network_of(read_checkpoint(path), str(path))
     has_norms = isinstance(network, ResUNet) and network.config.norm == "batch"
-    free = ("classes", "norm", "with_bias") if has_norms else ("classes",)
-    free = () if isinstance(network, DepthImageNet) else free
-    for name, value in wanted.items():
-        if name not in free and settings.get(name) != value:
-            raise InputError(
-                f"{start}: was trained with {name} = {settings.get(name)!r}, but the config says "
-                f"{value!r}. Give the config the weights' own."
-            )
+    independent = () if isinstance(network, DepthImageNet) else ("classes",)
+    if has_norms:
+        independent = ("classes", "norm", "with_bias")
+    refuse_other_network(network, loaded, start, independent)
+
     # Written weights are folded: they have no norms, but biases; batch norm takes both up.
-    if has_norms and isinstance(network, ResUNet) and isinstance(started, ResUNet):
+    if has_norms and isinstance(network, ResUNet) and isinstance(loaded, ResUNet):
         assert isinstance(samples, TrainingClouds)
         batch = samples.collate([samples[index] for index in range(_STATISTICS_CLOUDS)])
-        unfold_norms(started, network, Voxels.from_points(batch.coordinates, batch.features))
+        unfold_norms(loaded, network, Voxels.from_points(batch.coordinates, batch.features))
         return
-    state = started.state_dict()
-    if started.config.classes != network.config.classes:
-        state |= {k: v for k, v in network.state_dict().items() if k.startswith("final.")}
+    state = loaded.state_dict()
+    if loaded.config.classes != network.config.classes:
+        initial = network.state_dict()
+        state |= {name: initial[name] for name in initial if name.startswith("final.")}
     network.load_state_dict(state)
