@@ -198,7 +198,7 @@ def test_triangles_between_points_stand_for_their_surface(
     solid: trimesh.Trimesh, distance_m: float
 ) -> None:
     mesh = make_model(torch.tensor(solid.vertices), torch.tensor(solid.faces), name="mesh")
-    random_m, _ = trimesh.sample.sample_surface(solid, 2600, seed=1)
+    random_m = trimesh.sample.sample_surface(solid, 2600, seed=1)[0]
     points = make_model(torch.tensor(random_m), torch.empty(0, 3), name="points")
     R = random_rotation(torch.Generator().manual_seed(1)).double()
     pose = Rigid(R, torch.tensor([0, 0, distance_m]).double() - R @ make_shape(mesh).middle_m)

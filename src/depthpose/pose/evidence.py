@@ -297,7 +297,7 @@ class _Across(NamedTuple):
     @property
     def is_read(self) -> Bool[np.ndarray, " n"]:
         """Lines whose four places have readings."""
-        return np.isfinite(self.inverse).all(0)
+        return np.asarray(np.isfinite(self.inverse).all(0))
 
 
 def _readings_across(
