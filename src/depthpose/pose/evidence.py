@@ -22,7 +22,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
-from depthpose.core.camera.pinhole import crop_intrinsics
+from depthpose.core.camera.pinhole import Window, crop_intrinsics
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import grow_mask
 from depthpose.pose.rendering import Rendering, render_surface
@@ -62,9 +62,6 @@ _JUMP_M = 0.01
 """Drawn neighbours that differ in depth by more than both are the two sides of an edge."""
 _FAR_M = np.float32(1e6)
 _MARGIN_DIAMETERS = 0.6  # margin of the window about the points of an object
-
-_Window = tuple[slice, slice]
-"""Rows and columns of an image."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -277,7 +274,7 @@ def _lies_on_rendering(observation: Observation, rendering: Rendering) -> Bool[n
 
 
 def _is_beside_silhouette(
-    observation: Observation, is_drawn: np.ndarray, window: _Window
+    observation: Observation, is_drawn: np.ndarray, window: Window
 ) -> Bool[np.ndarray, "h w"]:
     """Mark the object's readings that lie beside the silhouette, farther than an edge may move."""
     border = max(1, round((EDGE_PX + 1) / observation.step))
@@ -304,7 +301,7 @@ def _readings_across(
     observation: Observation,
     is_drawn: np.ndarray,
     is_supported: np.ndarray,
-    window: _Window,
+    window: Window,
 ) -> _Across:
     """Average readings at four places on lines across the silhouette, two on each side.
 

@@ -1,4 +1,4 @@
-"""The footprint of a posed surface in an image: the readings that it explains, and its rim."""
+"""Which readings of an image a posed surface explains, and whether a background excludes it."""
 
 import math
 from dataclasses import replace
@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from depthpose.core.camera import back_project, project
-from depthpose.core.camera.pinhole import clip_window, crop_intrinsics
+from depthpose.core.camera.pinhole import Window, clip_window, crop_intrinsics
 from depthpose.core.rigid import Rigid
 from depthpose.pose.frame import Frame, share_behind
 from depthpose.pose.sensor import EDGE_PX
@@ -66,7 +66,7 @@ def _lies_on_surface(
 
 def _window_of_pose(
     shape: tuple[int, ...], K: Float[Tensor, "3 3"], pose: Rigid, surface: Surface
-) -> tuple[slice, slice]:
+) -> Window:
     """Give the rows and columns in which a posed surface lies, with a margin; clipped to the image.
 
     ``shape`` is (height, width) of the image. Nothing of a surface behind the camera lies in it.
@@ -103,7 +103,7 @@ def window_of_region(view: ViewInput, margin: float = _REGION_MARGIN) -> ViewInp
     return _crop_view(view, window)
 
 
-def _crop_view(view: ViewInput, window: tuple[slice, slice]) -> ViewInput:
+def _crop_view(view: ViewInput, window: Window) -> ViewInput:
     """Crop a view to rows and columns of its image."""
     # The colour image stays whole: its pixels are of its own camera, and it has its own K.
     background = view.background

@@ -15,6 +15,7 @@ from torch.nn.functional import max_pool2d
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.camera import back_project, project
+from depthpose.core.camera.pinhole import Window
 from depthpose.pose.compiled import array_of, compiled
 from depthpose.pose.sensor import NOISE_PER_M2, measure_noise_per_m2, plane_tolerance_m
 from depthpose.pose.types import KnownBackground
@@ -57,8 +58,6 @@ object, or its length above the second. The second is larger because sides of se
 lie in one plane and touch."""
 
 
-Window = tuple[slice, slice]
-"""Rows and columns of an image."""
 WHOLE = (slice(None), slice(None))
 """The window that is the whole image."""
 Plane = tuple[Float64[Tensor, "3"], Float64[Tensor, ""]]

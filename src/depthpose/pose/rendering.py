@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 from torch import Tensor
 
-from depthpose.core.camera.pinhole import clip_window, crop_intrinsics, project
+from depthpose.core.camera.pinhole import Window, clip_window, crop_intrinsics, project
 from depthpose.core.rigid import Rigid
 from depthpose.pose.compiled import array_of, compiled
 from depthpose.pose.surface import Surface
@@ -25,7 +25,7 @@ class Rendering(NamedTuple):
 
     depth_m: np.ndarray  #: (h, w), along the optical axis; NaN where nothing is rendered
     cosine: np.ndarray  #: (h, w), between ray and normal; 1 where nothing is rendered
-    window: tuple[slice, slice]  #: rows and columns of the part
+    window: Window  #: rows and columns of the part
 
 
 def render_surface(
@@ -128,7 +128,7 @@ def _ray_lengths(K: np.ndarray, height: int, width: int) -> np.ndarray:
 
 def _window_about(
     surface: Surface, pose: Rigid, K: Float64[Tensor, "3 3"], height: int, width: int
-) -> tuple[slice, slice]:
+) -> Window:
     """Rows and columns of an image that a posed surface may cover."""
     corners_m = pose.apply(surface.box_corners_m)
     if float(corners_m[:, 2].amax()) < _NEAR_M:

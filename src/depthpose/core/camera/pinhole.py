@@ -22,6 +22,9 @@ MAX_SIDE_PX = 2**20  # largest image side: a larger number in a file is a mistak
 MAX_BASELINE_M = 100  # no rig on the ground is this wide: such a number was in millimetres
 MIN_BASELINE_M = 1e-4  # no two lenses stand so near: such a number was divided once too often
 
+Window = tuple[slice, slice]
+"""Rows and columns of an image."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Camera:
@@ -179,9 +182,7 @@ def back_project(
     return torch.stack([x, y, torch.ones_like(x)], -1) * depth_m[..., None]
 
 
-def clip_window(
-    left: int, top: int, right: int, bottom: int, height: int, width: int
-) -> tuple[slice, slice]:
+def clip_window(left: int, top: int, right: int, bottom: int, height: int, width: int) -> Window:
     """Give the rows and columns of a window [px], as far as they lie in an image.
 
     ``right`` and ``bottom`` are the first column and row beyond the window.
