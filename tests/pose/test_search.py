@@ -446,6 +446,31 @@ def test_what_would_lie_in_the_wall_is_not_possible(net: Registration) -> None:
     assert why_background_excludes(gap, pose.double(), surface) == ""
 
 
+def test_proposals_at_one_place_leave_room_for_others(
+    net: Registration, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Sixty lie on a first part, and only then some on a second: these are looked at too."""
+    prepared = net._object("bracket").prepare()
+    truths = [pose_at(x_m).double() for x_m in (-0.15, 0.15)]
+    depth_m, _ = view_of(prepared.model, *(truth.float() for truth in truths))
+    view = view_input(depth_m.float(), None, CAMERA, "bracket", "x", None)
+    frame = prepare_frame(view.depth_m, view.K, prepared.surface.diameter_m)
+    first, second = truths
+    names = ["a", "b"]
+
+    def propose(*_: object) -> tuple[Rigid, torch.Tensor]:
+        return Rigid.stack([first] * 30 + [second] * 3), torch.linspace(1.0, 0.5, 33)
+
+    monkeypatch.setattr(search, "propose_in_frame", propose)
+    targets = replace(TARGETS, objects=dict.fromkeys(names, prepared))
+    everywhere = torch.ones_like(frame.depth_m, dtype=torch.bool)
+    places = search._propose(frame, everywhere, names, [], targets)
+    for name in names:
+        at_second = [p for p in places if p.object == name and torch.equal(p.pose.t_m, second.t_m)]
+        assert len(at_second) == 1, "one more place, not one more pose at a place"
+    assert sum(torch.equal(place.pose.t_m, first.t_m) for place in places) == search._MOST_PLACES
+
+
 def test_the_best_evidence_leads_a_place_not_the_first_proposal(net: Registration) -> None:
     """Each proposal is refined on what it explains: a coarse right one passes a wrong one."""
     prepared = net._object("bracket").prepare()

@@ -234,6 +234,8 @@ def _propose(
         for proposal in group
     ]
     proposals.sort(key=lambda proposal: -proposal.score)
+
+    # The best of them, and for each object the best at some places, which others' may outnumber.
     places: list[_Place] = []
     count_of_object = Counter[str]()
     for number, proposal in enumerate(proposals):
