@@ -248,10 +248,10 @@ def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
     folder = out / "geo-posenet"
     write_predictions(folder, predictions)
     nearest = [
-        replace(prediction, estimate=_at_nearest_copy(prediction.estimate, instance, models))
+        replace(prediction, estimate=_choose_nearest_copy(prediction.estimate, instance, models))
         for prediction, instance in zip(predictions, dataset.instances, strict=True)
     ]
-    copies = {estimate.object: len(_named_copies(estimate)) for estimate in estimates}
+    copies = {estimate.object: len(_list_named_copies(estimate)) for estimate in estimates}
     measured = [row.columns() for row in evaluate(dataset, nearest).per_instance]
     rows = [_select_columns({**row, "copies": copies[row["object"]]}) for row in measured]
 
@@ -293,19 +293,19 @@ def _write_sample(view: ViewInput, folder: Path) -> None:
     write_mask(folder / "mask.png", view.mask)
 
 
-def _named_copies(estimate: PoseEstimate) -> list[Rigid]:
+def _list_named_copies(estimate: PoseEstimate) -> list[Rigid]:
     """Give the near-symmetric copies that an estimate names beside its pose."""
     return [other.camera_from_model for other in estimate.alternatives if other.is_copy]
 
 
-def _at_nearest_copy(
+def _choose_nearest_copy(
     estimate: PoseEstimate, instance: Instance, models: Mapping[int, ObjectModel]
 ) -> PoseEstimate:
     """Return an estimate with the nearest to the truth of its pose and that pose's copies."""
     if estimate.camera_from_model is None:
         return estimate
     points_m = models[instance.object_id].vertices_m
-    poses = [estimate.camera_from_model, *_named_copies(estimate)]
+    poses = [estimate.camera_from_model, *_list_named_copies(estimate)]
     nearest = min(poses, key=lambda pose: float(add_m(pose, instance.camera_from_model, points_m)))
     return replace(estimate, camera_from_model=nearest)
 

@@ -50,7 +50,7 @@ from depthpose.pose.train.masks import (
     TrainingImages,
     cut_window,
 )
-from depthpose.pose.train.poses import DepthImageTask, TrainingCrops, symmetric_copies
+from depthpose.pose.train.poses import DepthImageTask, TrainingCrops, stack_symmetries
 from depthpose.pose.types import CloudInput
 from depthpose.pose.weights import read_pose_weights
 
@@ -177,7 +177,7 @@ def test_points_and_copies_have_one_shape_for_all_objects() -> None:
     task = DepthImageTask(DepthImageNet(network), (models[0], sparse), config)
     assert len(sparse.vertices_m) < 2000
     assert task._points_m.shape == (2, 2000, 3)
-    copies = symmetric_copies(models, 0.2).float()
+    copies = stack_symmetries(models, 0.2).float()
     assert copies.R.shape[:2] == (2, 16)
     assert bool((copies.R[0] == torch.eye(3)).all())
     around = copies.apply(models[1].vertices_m.expand(2, 16, -1, -1))[1]

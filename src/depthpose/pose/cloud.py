@@ -85,7 +85,7 @@ def prepare_cloud(
     if len(readings_m) == 0:
         return Refusal(status="too few points", reason=_why_empty(pose_input))
 
-    cloud_m = _without_flying_pixels(readings_m, model.diameter_m, cloud_config)
+    cloud_m = _drop_flying_pixels(readings_m, model.diameter_m, cloud_config)
     refusal = _why_refused(pose_input, readings_m, cloud_m, model, cloud_config)
     if refusal is not None:
         return refusal
@@ -168,7 +168,7 @@ def _why_other_frame_or_unit(
     """
     # The size is measured without flying pixels, if those are few.
     are_few_flying = len(cloud_m) > _MAJORITY * len(readings_m)
-    size_advice = unit_advice(model.diameter_m, cloud_m if are_few_flying else readings_m)
+    size_advice = advise_unit(model.diameter_m, cloud_m if are_few_flying else readings_m)
 
     # A camera sees only points before it: a cloud about the origin is in another frame.
     is_about_origin = float(readings_m.median(0).values.norm()) < model.diameter_m / 2
@@ -179,7 +179,7 @@ def _why_other_frame_or_unit(
             "the cloud lies about the origin, where the camera is: it was centred, or is in "
             "the frame of the model; give it in the camera's frame, as it was seen"
         )
-    axes_advice = frame_advice(readings_m)
+    axes_advice = advise_frame(readings_m)
     if axes_advice is not None:
         return axes_advice
     if size_advice is None:
@@ -187,11 +187,11 @@ def _why_other_frame_or_unit(
     # Some background in the mask makes a cloud larger, and does not mean another unit.
     if are_few_flying and size_advice.is_cloud_larger:
         return None
-    hint = _size_hint(pose_input.mask) if isinstance(pose_input, ViewInput) else ""
+    hint = _hint_at_size_mistakes(pose_input.mask) if isinstance(pose_input, ViewInput) else ""
     return f"{size_advice.message} (the object is {model.diameter_m:.3g} m long{hint})"
 
 
-def _size_hint(mask: Bool[Tensor, "h w"]) -> str:
+def _hint_at_size_mistakes(mask: Bool[Tensor, "h w"]) -> str:
     """Say which mistakes with a mask or camera, other than a unit, change the size of its cloud."""
     share = float(mask.float().mean())
     border = torch.cat([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
@@ -224,7 +224,7 @@ def cloud_from_depth(
         InputError: mask and depth differ in size.
     """
     if depth_m.shape != mask.shape:
-        raise other_size(mask, depth_m)
+        raise make_size_error(mask, depth_m)
     is_read = mask & torch.isfinite(depth_m) & (depth_m > 0)
     # As ``back_project`` does, for these pixels alone.
     v, u = is_read.nonzero(as_tuple=True)
@@ -234,10 +234,10 @@ def cloud_from_depth(
     points_m = torch.stack([x, y, torch.ones_like(x)], -1) * depth_m[is_read][:, None]
     if diameter_m is None or len(points_m) == 0:
         return points_m
-    return _without_flying_pixels(points_m, diameter_m, config or CloudConfig())
+    return _drop_flying_pixels(points_m, diameter_m, config or CloudConfig())
 
 
-def _without_flying_pixels(
+def _drop_flying_pixels(
     points_m: Float[Tensor, "n 3"], diameter_m: float, config: CloudConfig
 ) -> Float[Tensor, "m 3"]:
     """Drop points far from the median of one point or more: background at the mask's border."""
@@ -255,7 +255,9 @@ def lift_sample(view: ViewSample, diameter_m: float, config: CloudConfig) -> Clo
     return CloudSample(input=cloud, truth=view.truth)
 
 
-def other_size(mask: Bool[Tensor, "mask_h mask_w"], depth_m: Float[Tensor, "h w"]) -> InputError:
+def make_size_error(
+    mask: Bool[Tensor, "mask_h mask_w"], depth_m: Float[Tensor, "h w"]
+) -> InputError:
     """Make the error of a mask that is not of this depth image."""
     return InputError(
         f"the mask is {mask.shape[1]}x{mask.shape[0]}, but the depth image is "
@@ -312,7 +314,7 @@ class UnitAdvice(NamedTuple):
     message: str  #: how much larger or smaller it is, and the likely units
 
 
-def unit_advice(model_diameter_m: float, points_m: Float[Tensor, "n 3"]) -> UnitAdvice | None:
+def advise_unit(model_diameter_m: float, points_m: Float[Tensor, "n 3"]) -> UnitAdvice | None:
     """Say that the model and the cloud seem to be of different units; None where they agree.
 
     The size of a cloud is twice the distance from its median that 95 % of the points stay within:
@@ -339,7 +341,7 @@ def unit_advice(model_diameter_m: float, points_m: Float[Tensor, "n 3"]) -> Unit
     smaller = "model" if is_cloud_larger else "cloud"
     # Five times too large is a mask of more than the object sooner than a sliver in inches.
     least = _LIKELY_RATIO if is_cloud_larger else _SMALLEST_RATIO
-    units = _likely_units(ratio, least)
+    units = _name_likely_units(ratio, least)
     if units:
         times = max(ratio, 1 / ratio)
         message = f"your {larger} is {times:.0f} times larger than the {smaller}: is it in {units}?"
@@ -360,7 +362,7 @@ def unit_advice(model_diameter_m: float, points_m: Float[Tensor, "n 3"]) -> Unit
     return UnitAdvice(is_cloud_larger, message)
 
 
-def _likely_units(ratio: float, least: float) -> str:
+def _name_likely_units(ratio: float, least: float) -> str:
     """Name the units of the larger of cloud and model that would explain the ratio of their sizes.
 
     ``ratio`` is that of cloud to model; it must lie above ``least`` in the right unit.
@@ -378,7 +380,7 @@ def _likely_units(ratio: float, least: float) -> str:
     )
 
 
-def frame_advice(points_m: Float[Tensor, "n 3"]) -> str | None:
+def advise_frame(points_m: Float[Tensor, "n 3"]) -> str | None:
     """Say that a cloud lies in another frame than x right, y down, z forward; None where not.
 
     The points that a camera sees lie before it, less than 60 degrees off its axis.

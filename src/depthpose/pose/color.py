@@ -87,15 +87,17 @@ def color_agreement(
         return ColorAgreement(
             correlation=nothing, independent=nothing, visible=nothing[:, 0].long()
         )
-    surface = _thin(model.colors, samples)
+    surface = _take_samples(model.colors, samples)
     image = _blur_image(view.color, poses, surface)
     parts: list[ColorAgreement] = []
     at_once = max(1, _POINTS_AT_ONCE // len(surface.points_m))
     for first in range(0, len(poses.R), at_once):
         chunk = poses[first : first + at_once].double()
         compared = _compare_features(chunk, surface, view, image, _NEAR * model.diameter_m)
-        correlation = _correlation(compared)
-        independent = torch.where(correlation != 0, _independent_points(compared, surface), 0.0)
+        correlation = _correlate(compared)
+        independent = torch.where(
+            correlation != 0, _count_independent_points(compared, surface), 0.0
+        )
         visible = compared.weight[..., 0].sum(-1).long()
         parts.append(
             ColorAgreement(correlation=correlation, independent=independent, visible=visible)
@@ -107,7 +109,7 @@ def color_agreement(
     )
 
 
-def _thin(colors: SurfaceColors, samples: int) -> SurfaceColors:
+def _take_samples(colors: SurfaceColors, samples: int) -> SurfaceColors:
     """Take at most ``samples`` of the coloured points, evenly."""
     return SurfaceColors(
         points_m=take_evenly(colors.points_m, samples),
@@ -174,7 +176,7 @@ class _Compared(NamedTuple):
     of_image: Float64[Tensor, "b n 3"]
 
 
-def _features(rgb: Float64[Tensor, "*b 3"]) -> Float64[Tensor, "*b 3"]:
+def _take_logarithms(rgb: Float64[Tensor, "*b 3"]) -> Float64[Tensor, "*b 3"]:
     """Give the logarithms of brightness, of red over green, and of blue over green."""
     red, green, blue = (rgb + _BLACK).log().unbind(-1)
     return torch.stack([(rgb.mean(-1) + _BLACK).log(), red - green, blue - green], -1)
@@ -223,18 +225,18 @@ def _compare_features(
     has_color = (rgb.amax(-1) < _SATURATED) & (rgb.amax(-1) > _DARK)
     with_color = is_visible & has_color
     weight = torch.stack([is_visible, with_color, with_color], -1).double()
-    of_model = _features(surface.rgb.double()).expand(len(points_m), -1, -1)
+    of_model = _take_logarithms(surface.rgb.double()).expand(len(points_m), -1, -1)
     return _Compared(
         weight=weight,
-        of_model=_without_shading(of_model, normals, weight),
-        of_image=_without_shading(_features(rgb), normals, weight),
+        of_model=_remove_shading(of_model, normals, weight),
+        of_image=_remove_shading(_take_logarithms(rgb), normals, weight),
     )
 
 
 _RIDGE = 1e-4  # added to the normals' second moments: a plane has no second direction
 
 
-def _without_shading(
+def _remove_shading(
     features: Float64[Tensor, "b n 3"],
     normals: Float64[Tensor, "b n 3"],
     weight: Float64[Tensor, "b n 3"],
@@ -252,7 +254,7 @@ def _without_shading(
     return torch.cat([brightness - shading, features[..., 1:]], -1)
 
 
-def _correlation(compared: _Compared) -> Float64[Tensor, "b 3"]:
+def _correlate(compared: _Compared) -> Float64[Tensor, "b 3"]:
     """Correlate model and image; 0 where few points are visible, or either has no print."""
     total = compared.weight.sum(1)
     of_model = compared.of_model.square().sum(1)
@@ -268,7 +270,9 @@ _BINS = 16  # bins of their distances, the nearer the finer
 _POSES_AT_ONCE = 16  # poses whose pairs are counted at a time, for the memory
 
 
-def _independent_points(compared: _Compared, surface: SurfaceColors) -> Float64[Tensor, "b 3"]:
+def _count_independent_points(
+    compared: _Compared, surface: SurfaceColors
+) -> Float64[Tensor, "b 3"]:
     """Give the effective number of independent points of each correlation.
 
     The variance of the correlation of two unrelated fields is the mean product of their
@@ -349,7 +353,7 @@ def copies_about_axis(
     steps = max(3, math.ceil(360 / step_deg))
     step_rad = 2 * math.pi / steps
     sweep_rad = torch.arange(steps, dtype=torch.float64) * step_rad
-    rough = _sweep_scores(_rotated(pose, axis, sweep_rad), model, view, _SWEEP_SAMPLES)
+    rough = _score_sweep(_rotate_about(pose, axis, sweep_rad), model, view, _SWEEP_SAMPLES)
     is_peak = (rough >= rough.roll(1)) & (rough > rough.roll(-1)) & (rough > 0)
     peaks = is_peak.nonzero()[:, 0]
     peaks = peaks[rough[peaks].argsort(descending=True)][:_MOST_PEAKS]
@@ -360,24 +364,24 @@ def copies_about_axis(
     fine_rad = step_rad / _FINE_STEPS
     offsets_rad = torch.arange(-_FINE_STEPS, _FINE_STEPS + 1, dtype=torch.float64) * fine_rad
     angles_rad = sweep_rad[peaks, None] + offsets_rad
-    fine = _sweep_scores(_rotated(pose, axis, angles_rad.flatten()), model, view, _SAMPLES)
+    fine = _score_sweep(_rotate_about(pose, axis, angles_rad.flatten()), model, view, _SAMPLES)
     fine = fine.reshape(angles_rad.shape)
     best = fine.argmax(1).clamp(1, 2 * _FINE_STEPS - 1)
     three = fine.gather(1, best[:, None] + torch.tensor([-1, 0, 1]))
     best_rad = angles_rad.gather(1, best[:, None])[:, 0]
-    best_rad = best_rad + _parabola_peak(three) * step_rad / _FINE_STEPS
+    best_rad = best_rad + _find_parabola_peak(three) * step_rad / _FINE_STEPS
     order = three[:, 1].argsort(descending=True)
-    return _rotated(pose, axis, best_rad[order])
+    return _rotate_about(pose, axis, best_rad[order])
 
 
-def _rotated(pose: Rigid, axis: Axis, angles_rad: Float64[Tensor, " a"]) -> Rigid:
+def _rotate_about(pose: Rigid, axis: Axis, angles_rad: Float64[Tensor, " a"]) -> Rigid:
     """Rotate the model at a pose about one of its axes by each angle."""
     return pose.double()[None] @ turn_about(
         axis.direction.double(), axis.point_m.double(), angles_rad
     )
 
 
-def _sweep_scores(
+def _score_sweep(
     poses: Rigid, model: ObjectModel, view: ViewInput, samples: int
 ) -> Float64[Tensor, " b"]:
     """Score poses by how much of the colours they explain, fast enough for sweeps of many poses.
@@ -386,14 +390,14 @@ def _sweep_scores(
     """
     assert model.colors is not None
     assert view.color is not None
-    surface = _thin(model.colors, samples)
+    surface = _take_samples(model.colors, samples)
     image = _blur_image(view.color, poses, surface)
     scores: list[Tensor] = []
     at_once = max(1, _POINTS_AT_ONCE // len(surface.points_m))
     for first in range(0, len(poses.R), at_once):
         chunk = poses[first : first + at_once]
         compared = _compare_features(chunk, surface, view, image, _NEAR * model.diameter_m)
-        explained = _correlation(compared).clamp(0, _MOST_CORRELATION).square()
+        explained = _correlate(compared).clamp(0, _MOST_CORRELATION).square()
         scores.append((-compared.weight.sum(1) * torch.log1p(-explained)).sum(-1))
     return torch.cat(scores)
 
@@ -435,7 +439,7 @@ def color_copies(
     pose = pose.double()
     if model.colors is None or view.color is None:
         return pose[None]
-    of_shape, axes = _ambiguous_motions(model)
+    of_shape, axes = _find_ambiguous_motions(model)
     motions = of_shape if turns is None else [turns.double()[k] for k in range(len(turns.R))]
 
     # Of motions that differ by a rotation about an axis one is tried: it is swept about the axis.
@@ -455,7 +459,7 @@ def color_copies(
 
     # The best that are distinct.
     copies = Rigid.cat(proposed)
-    order = _sweep_scores(copies, model, view, _SAMPLES).argsort(descending=True, stable=True)
+    order = _score_sweep(copies, model, view, _SAMPLES).argsort(descending=True, stable=True)
     best = [pose[None]]
     for k in order.tolist():
         better = Rigid.cat(best)
@@ -483,17 +487,17 @@ def settle_spin(pose: Rigid, model: ObjectModel, view: ViewInput) -> Rigid:
         return pose
     steps = torch.arange(-_SETTLE_STEPS, _SETTLE_STEPS + 1).double()
     offsets_rad = steps * _SETTLE_STEP_RAD
-    _, axes = _ambiguous_motions(model)
+    _, axes = _find_ambiguous_motions(model)
     for axis in axes:
-        scores = _sweep_scores(_rotated(pose, axis, offsets_rad), model, view, _SWEEP_SAMPLES)
+        scores = _score_sweep(_rotate_about(pose, axis, offsets_rad), model, view, _SWEEP_SAMPLES)
         best = int(scores.argmax().clamp(1, len(offsets_rad) - 2))
         if float(scores[best]) > 0:
-            peak = _parabola_peak(scores[best - 1 : best + 2])
-            pose = _rotated(pose, axis, offsets_rad[best, None] + peak * _SETTLE_STEP_RAD)[0]
+            peak = _find_parabola_peak(scores[best - 1 : best + 2])
+            pose = _rotate_about(pose, axis, offsets_rad[best, None] + peak * _SETTLE_STEP_RAD)[0]
     return pose
 
 
-def _parabola_peak(values: Float64[Tensor, "*b 3"]) -> Float64[Tensor, "*b"]:
+def _find_parabola_peak(values: Float64[Tensor, "*b 3"]) -> Float64[Tensor, "*b"]:
     """Give where the parabola through three values is largest, -1 to 1 from the middle one."""
     before, middle, after = values.unbind(-1)
     bend = (before - 2 * middle + after).clamp(max=-1e-9)
@@ -501,7 +505,7 @@ def _parabola_peak(values: Float64[Tensor, "*b 3"]) -> Float64[Tensor, "*b"]:
 
 
 @lru_cache(maxsize=64)
-def _ambiguous_motions(model: ObjectModel) -> tuple[list[Rigid], list[Axis]]:
+def _find_ambiguous_motions(model: ObjectModel) -> tuple[list[Rigid], list[Axis]]:
     """Give the motions of a model after which depth looks alike or nearly, and its free axes.
 
     Declared symmetries are not among them.
@@ -514,7 +518,7 @@ def _ambiguous_motions(model: ObjectModel) -> tuple[list[Rigid], list[Axis]]:
         if discrete is not None:
             turns += [discrete.double()[k] for k in range(len(discrete.R))]
         axes += model.symmetries.continuous
-    axes += _axes_of_many_turns(turns, axes)
+    axes += _find_axes_of_many_turns(turns, axes)
 
     # A box whose halves differ a little looks alike after half turns about its middle.
     points_m = model.colors.points_m.double()
@@ -526,7 +530,7 @@ def _ambiguous_motions(model: ObjectModel) -> tuple[list[Rigid], list[Axis]]:
     return turns, axes
 
 
-def _axes_of_many_turns(turns: Sequence[Rigid], others: Sequence[Axis]) -> list[Axis]:
+def _find_axes_of_many_turns(turns: Sequence[Rigid], others: Sequence[Axis]) -> list[Axis]:
     """Find lines about which many of the turns are, beside other axes."""
     eye = torch.eye(3).double()
     # The direction of each axis is the one that the rotation leaves as it is.

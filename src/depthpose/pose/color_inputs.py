@@ -73,7 +73,7 @@ def color_input(
     rgb = as_tensor(color, f"{view.name}: the colour image")
     height, width = rgb.shape[1:]
     if camera is not None:
-        K = _color_intrinsics(camera, width, height, view)
+        K = _read_color_intrinsics(camera, width, height, view)
         transform = None
         if color_from_depth is not None:
             transform = rigid_input(color_from_depth, "color_from_depth", "color_from_depth")
@@ -94,7 +94,7 @@ def color_input(
     return ColorImage(rgb=rgb, K=view.K)
 
 
-def _color_intrinsics(
+def _read_color_intrinsics(
     camera: AnyLens, width: int, height: int, view: ViewInput
 ) -> Float[Tensor, "3 3"]:
     """Give the intrinsic matrix of a colour camera; raise if its images are of another size."""

@@ -50,7 +50,7 @@ class _Compiled:
         # numba keeps compiled code by a function's name and until its file changes; the functions
         # that it calls are in the code too, so the name says of which files they are.
         digest = sha256()
-        for file in sorted(_files(self.loop)):
+        for file in sorted(_find_source_files(self.loop)):
             digest.update(Path(file).read_bytes())
         self.loop.__qualname__ = f"{self.loop.__name__}_{digest.hexdigest()[:16]}"
         try:
@@ -59,13 +59,13 @@ class _Compiled:
             return njit(nogil=True, error_model="numpy")(self.loop)
 
 
-def _files(loop: Callable[..., Any]) -> set[str]:
+def _find_source_files(loop: Callable[..., Any]) -> set[str]:
     """Give the files of a function and of all compiled ones that it calls."""
     files = {loop.__code__.co_filename}
     for name in loop.__code__.co_names:
         called = loop.__globals__.get(name)
         if isinstance(called, _Compiled):
-            files |= _files(called.loop)
+            files |= _find_source_files(called.loop)
     return files
 
 

@@ -86,23 +86,23 @@ class PoseEstimator:
         if isinstance(inputs, AnyInput):
             raise InputError("estimate_many takes several inputs; give one as [input]")
         total = len(inputs) if isinstance(inputs, Sized) else None
-        each = self._each(inputs, threads)
+        each = self._estimate_each(inputs, threads)
         return list(tqdm(each, total=total, unit=" poses", disable=not with_progress))
 
-    def _each(self, inputs: Iterable[AnyInput], threads: int) -> Iterator[PoseEstimate]:
+    def _estimate_each(self, inputs: Iterable[AnyInput], threads: int) -> Iterator[PoseEstimate]:
         """Give each input's estimate, in order; each is expected to show its object."""
         return each_in_threads(partial(unreadable_on_error, self._estimate), inputs, threads)
 
-    def _each_try(self, inputs: Iterable[AnyInput]) -> Iterator[PoseEstimate]:
+    def _estimate_each_try(self, inputs: Iterable[AnyInput]) -> Iterator[PoseEstimate]:
         """Give each input's estimate, in order, where an input may well not show its object.
 
         The evidence decides which of them does. An estimator that expects less of a try than of
         another input has its own.
         """
-        return self._each(inputs, 1)
+        return self._estimate_each(inputs, 1)
 
     def _estimate(self, pose_input: AnyInput) -> PoseEstimate:
-        """Estimate one input; an estimator of many at once has its own :meth:`_each`."""
+        """Estimate one input; an estimator of many at once has its own :meth:`_estimate_each`."""
         raise NotImplementedError
 
     @torch.no_grad()
@@ -115,7 +115,9 @@ class PoseEstimator:
         ``is_expected``: whether the inputs are meant to show their objects; else they are tries.
         """
         answers: list[PoseEstimate] = []
-        for estimate in self._each(inputs, 1) if is_expected else self._each_try(inputs):
+        for estimate in (
+            self._estimate_each(inputs, 1) if is_expected else self._estimate_each_try(inputs)
+        ):
             if estimate.status == "unreadable":
                 raise InputError(estimate.reason)
             answers.append(estimate)
@@ -128,7 +130,7 @@ class PoseEstimator:
         """
         if isinstance(pose_input, ViewInput) and pose_input.is_region:
             return self._search_region(pose_input)
-        prepared = self._object(pose_input.object).prepare()
+        prepared = self._find_object(pose_input.object).prepare()
         estimate = register(pose_input, prepared, self.config, self.refusal)
         if estimate.status != "doubtful" or not isinstance(pose_input, ViewInput):
             return estimate
@@ -139,7 +141,7 @@ class PoseEstimator:
     def _search_region(self, view: ViewInput) -> PoseEstimate:
         """Search the one object that is somewhere in the mask of a view, as in a box."""
         targets = SearchTargets(
-            objects={view.object: self._object(view.object).prepare()},
+            objects={view.object: self._find_object(view.object).prepare()},
             config=self.config,
             refusal=self.refusal,
             prior_odds=PRIOR_REGION,
@@ -192,7 +194,7 @@ class PoseEstimator:
             InputError: an unknown object, a file that cannot be read, shapes that do not fit. What
                 the data themselves lack is no error but a refusal.
         """
-        which = self.objects[0] if object is None else self._object(object).model.name
+        which = self.objects[0] if object is None else self._find_object(object).model.name
         of_view = {
             "depth": depth, "mask": mask, "box": box, "camera": camera, "focal_px": focal_px,
             "color": color, "color_camera": color_camera, "color_from_depth": color_from_depth,
@@ -217,7 +219,7 @@ class PoseEstimator:
                 pixels = box_mask(box, *pose_input.depth_m.shape)
                 pose_input = replace(pose_input, mask=pixels, is_region=True)
             pose_input = with_background(pose_input, background, lens, unit)
-            models = self.models if object is None else [self._object(object).model]
+            models = self.models if object is None else [self._find_object(object).model]
             pose_input = with_color(pose_input, models, color, color_camera, color_from_depth)
         if object is not None or len(self.models) == 1:
             return self._estimate_or_raise([pose_input], is_expected=True)[0]
@@ -256,7 +258,7 @@ class PoseEstimator:
         if lens is None:
             raise InputError("estimate_instances: give camera= or focal_px=")
         labels = labels_input(mask, _NAME)
-        which = self._object(object).model.name
+        which = self._find_object(object).model.name
         view = view_input(depth, labels != 0, lens, which, _NAME, unit)
         pieces = split_instances(labels) or [view.mask]
         views = [replace(view, mask=m, name=f"{_NAME}_{k}") for k, m in enumerate(pieces)]
@@ -290,7 +292,11 @@ class PoseEstimator:
             InputError: as for :meth:`estimate`.
         """
         asked = [objects] if isinstance(objects, str) else objects
-        names = self.objects if asked is None else [self._object(name).model.name for name in asked]
+        names = (
+            self.objects
+            if asked is None
+            else [self._find_object(name).model.name for name in asked]
+        )
         if not names:
             raise InputError("find: objects names none; give those that may be there, or omit it")
         view = view_input(depth, None, camera, names[0], _NAME, unit)
@@ -312,7 +318,7 @@ class PoseEstimator:
             is_single: search once, without further rounds for more of the same object.
         """
         targets = SearchTargets(
-            objects={name: self._object(name).prepare() for name in objects},
+            objects={name: self._find_object(name).prepare() for name in objects},
             config=self.config,
             refusal=self.refusal,
             is_single=is_single,
@@ -353,7 +359,7 @@ class PoseEstimator:
         Raises:
             InputError: an unknown object, or a ``first`` that is no pose.
         """
-        which = self._object(object).model.name
+        which = self._find_object(object).model.name
         if isinstance(frames, str | Path):
             raise InputError(
                 f"track: frames is {str(frames)!r}, one path; give a list of files or arrays in "
@@ -390,7 +396,7 @@ class PoseEstimator:
                 return self._estimate_or_raise([pose_input], is_expected=False)[0]
             return self.find_in(pose_input, [object], is_single=True)[0]
 
-        prepared = self._object(object)
+        prepared = self._find_object(object)
         target = TrackedObject(
             prepared=prepared,
             refusal=self.refusal,
@@ -399,7 +405,7 @@ class PoseEstimator:
         )
         return each_in_float32(track(frames, target, first))
 
-    def _object(self, name: str | None) -> PreparedObject:
+    def _find_object(self, name: str | None) -> PreparedObject:
         """Give an object by its name, with its surface; None where one alone is known."""
         names = self.objects
         if name is None:

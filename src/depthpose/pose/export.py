@@ -138,7 +138,7 @@ def pose_export(weights: PoseWeights, facts: dict[str, Any]) -> Export:
     }
     return Export(
         graph=partial(direction_graph, network),
-        cases=partial(_cases, weights, network),
+        cases=partial(_make_cases, weights, network),
         limits={"directions": Limit(value=1e-4)},
         facts={
             **facts, **model_facts,
@@ -147,7 +147,7 @@ def pose_export(weights: PoseWeights, facts: dict[str, Any]) -> Export:
     )  # fmt: skip
 
 
-def _cases(weights: PoseWeights, network: ResUNet) -> Iterator[Case]:
+def _make_cases(weights: PoseWeights, network: ResUNet) -> Iterator[Case]:
     """Run the network on voxels of surfaces, of one cloud and of several, as the graph must."""
     for counts in _POINTS:
         clouds: list[Tensor] = []

@@ -98,13 +98,13 @@ def tukey_weight(
     """Give Tukey's weight of squared distances: 1 at 0, and 0 from the limit on.
 
     Every ICP weights its residuals so. To use another loss, change this function and
-    ``_influence_slope``.
+    ``_differentiate_influence``.
     """
     share = np.maximum(0.0, 1 - square / (limit * limit))
     return share * share
 
 
-def _influence_slope(
+def _differentiate_influence(
     weight: Float64[Tensor, "*batch n"], residual_m: Float64[Tensor, "*batch n"], limit_m: float
 ) -> Float64[Tensor, "*batch n"]:
     """Give the derivative of weight times residual by the residual, for :func:`tukey_weight`."""
@@ -154,7 +154,7 @@ def refine_pose(
 
     # Covariance about the middle of the cloud, of the residuals and of an offset along the ray.
     cloud_m = take_evenly(points_m.double(), config.cloud_points)
-    covariance = _covariance(cloud_m, equations, limits_m[-1], surface.diameter_m)
+    covariance = _estimate_covariance(cloud_m, equations, limits_m[-1], surface.diameter_m)
     middle_m = cloud_m.mean(0)
     ray = torch.nn.functional.normalize(middle_m, dim=0)
     offset_m = config.sensor_offset_m * torch.cat([torch.zeros(3), ray])
@@ -198,7 +198,7 @@ def refine_best(
     """
     config = IcpConfig() if config is None else config
     initial = Rigid(initial.R.reshape(-1, 3, 3), initial.t_m.reshape(-1, 3))
-    starts = _rotated_starts(initial.double(), surface, config.starts)
+    starts = _add_rotated_starts(initial.double(), surface, config.starts)
     rough = refine_roughly(points_m, starts, surface, config)
     end_m = config.end_distance_diameters * surface.diameter_m
     score = _score_poses(points_m, rough, surface, end_m)
@@ -208,7 +208,7 @@ def refine_best(
     is_initial = best < len(initial.R)
     start = initial[best] if is_initial else None
     refined = _refine_exactly(points_m, start, rough[best], surface, config)
-    others = _distinct_poses(rough, score, refined.camera_from_model.double(), surface)
+    others = _choose_distinct_poses(rough, score, refined.camera_from_model.double(), surface)
     return BestStart(refined=refined, others=others)
 
 
@@ -244,7 +244,7 @@ def _refine_exactly(
     return refine_pose(points_m, rough, surface, near)
 
 
-def _rotated_starts(poses: Rigid, surface: Surface, number: int) -> Rigid:
+def _add_rotated_starts(poses: Rigid, surface: Surface, number: int) -> Rigid:
     """Give poses, then all of them rotated about the object's middle by each of the camera's axes.
 
     ``number`` is the starts from each pose, 1 to 7: itself, then rotated by 15 degrees about x, y
@@ -258,7 +258,7 @@ def _rotated_starts(poses: Rigid, surface: Surface, number: int) -> Rigid:
     return Rigid((rotations @ poses.R).flatten(0, 1), t_m.flatten(0, 1))
 
 
-def _distinct_poses(
+def _choose_distinct_poses(
     poses: Rigid, score: Float64[Tensor, " b"], best: Rigid, surface: Surface
 ) -> Rigid:
     """Give up to three poses, the best first, that are distinct from each other and from ``best``.
@@ -393,13 +393,13 @@ def _refine(
         # Linearise about the middle of the cloud: a rotation by w about the camera, D away, with
         # the shift that cancels it to first order would leave the object w^2 D / 2 off.
         _linearise(local, eye, places, R, t - middle, limit, target, is_along_rays, residuals)
-        H, b = normal_equations(residuals, 1e-6)
+        H, b = build_normal_equations(residuals, 1e-6)
         if step == last or has_converged:
             break
 
         # One Gauss-Newton step.
         motion = np.linalg.solve(H, b)
-        turn = rotation_matrix(motion)
+        turn = make_rotation(motion)
         t[:] = turn @ (t - middle) + middle + motion[3:]
         R[:] = turn @ R
 
@@ -524,7 +524,7 @@ def _score_poses(
 
 
 @compiled
-def normal_equations(
+def build_normal_equations(
     residuals: Residuals, least_size: float
 ) -> tuple[Float64[np.ndarray, "k k"], Float64[np.ndarray, " k"]]:
     """Give the weighted normal equations of a Gauss-Newton step, ``H @ motion = b``.
@@ -551,7 +551,7 @@ def normal_equations(
 
 
 @compiled
-def rotation_matrix(motion: Float64[np.ndarray, " k"]) -> Float64[np.ndarray, "3 3"]:
+def make_rotation(motion: Float64[np.ndarray, " k"]) -> Float64[np.ndarray, "3 3"]:
     """Give the rotation by a motion, whose first three numbers are a rotation vector [rad].
 
     Rodrigues' formula.
@@ -572,7 +572,7 @@ def rotation_matrix(motion: Float64[np.ndarray, " k"]) -> Float64[np.ndarray, "3
     return R
 
 
-def _covariance(
+def _estimate_covariance(
     cloud_m: Float64[Tensor, "n 3"],
     equations: _Linearised,
     limit_m: float,
@@ -587,9 +587,9 @@ def _covariance(
     because the correlation length is not known. With few blocks a direction can look certain by
     chance, so no direction is inflated by less than the mean over all, or by less than 1.
     """
-    slope = _influence_slope(equations.weight, equations.residual_m, limit_m)
-    independent, whitening, spread_m = _independent_factor(equations, slope)
-    inflation, directions = _jackknife_inflation(
+    slope = _differentiate_influence(equations.weight, equations.residual_m, limit_m)
+    independent, whitening, spread_m = _factor_independent_covariance(equations, slope)
+    inflation, directions = _measure_inflation(
         cloud_m, equations, slope, independent, whitening, spread_m, diameter_m
     )
     least = inflation.mean(-1, keepdim=True).clamp(min=1)
@@ -598,7 +598,7 @@ def _covariance(
     return (factor * inflation[..., None, :]) @ factor.mT
 
 
-def _independent_factor(
+def _factor_independent_covariance(
     equations: _Linearised, slope: Float64[Tensor, "*batch n"]
 ) -> tuple[
     Float64[Tensor, "*batch 6 6"], Float64[Tensor, "*batch 6 6"], Float64[Tensor, "*batch 1 1"]
@@ -627,7 +627,7 @@ def _independent_factor(
     return factor, inverse_factor, spread_m
 
 
-def _jackknife_inflation(
+def _measure_inflation(
     cloud_m: Float64[Tensor, "n 3"],
     equations: _Linearised,
     slope: Float64[Tensor, "*batch n"],

@@ -18,10 +18,10 @@ from depthpose.pose.compiled import array_of, compiled, cross, dot, minus, vecto
 from depthpose.pose.config import IcpConfig
 from depthpose.pose.icp import (
     Residuals,
-    normal_equations,
+    build_normal_equations,
+    make_rotation,
     refine_pose,
     refine_roughly,
-    rotation_matrix,
     tukey_weight,
 )
 from depthpose.pose.mesh import MIRROR_ALIKE
@@ -72,7 +72,7 @@ class Scale:
     gain: float
 
 
-def scale_of(
+def measure_scale(
     cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface, object_std_m: float
 ) -> Scale:
     """Measure the scale of the model that fits a cloud best, the pose moving with it.
@@ -91,15 +91,15 @@ def scale_of(
     starts = torch.tensor(_STARTS, dtype=torch.float64)
     few_m = take_evenly(local_m, _ROUGH_POINTS).expand(len(starts), -1, -1)
     times, moved_m = _fit_scale(few_m, starts, surface, is_exact=False)
-    costs = distance_to(moved_m, surface, times, is_exact=False).square()
+    costs = measure_distance(moved_m, surface, times, is_exact=False).square()
     costs[0] -= _FIRST_START_BONUS
     start = starts[costs.argmin()][None]
 
     # From it exactly.
     times, moved_m = _fit_scale(local_m[None], start, surface, is_exact=True)
-    distance = distance_to(moved_m, surface, times, is_exact=True)[0]
-    gain = distance_to(local_m, surface, is_exact=True) - distance
-    residuals = _growth_residuals(
+    distance = measure_distance(moved_m, surface, times, is_exact=True)[0]
+    gain = measure_distance(local_m, surface, is_exact=True) - distance
+    residuals = _linearise_growth(
         array_of(moved_m[0]),
         float(times),
         array_of(surface.middle_m),
@@ -108,17 +108,17 @@ def scale_of(
         True,
         np.full(moved_m.shape[1], -1),
     )
-    return Scale(float(times), _scale_deviation(residuals, object_std_m), float(gain))
+    return Scale(float(times), _estimate_scale_deviation(residuals, object_std_m), float(gain))
 
 
-def _scale_deviation(residuals: Residuals, object_std_m: float) -> float:
+def _estimate_scale_deviation(residuals: Residuals, object_std_m: float) -> float:
     """Give the standard deviation of a scale.
 
     It has two causes: noise of the readings, which neighbours share, and sides of the real object
     that deviate from the model by ``object_std_m``.
     """
     weight = residuals.weight
-    H, _ = normal_equations(residuals, _LEAST_INFORMATION)
+    H, _ = build_normal_equations(residuals, _LEAST_INFORMATION)
     inverse = float(np.linalg.inv(H)[6, 6])
     degrees = max(1.0, weight.sum() - 7)
     noise_m2 = (weight * residuals.distance**2).sum() / degrees
@@ -165,15 +165,15 @@ def _grow(
     for limit in limits:
         largest = 0.0
         for p in range(len(times)):
-            residuals = _growth_residuals(
+            residuals = _linearise_growth(
                 local[p], times[p], middle, limit, target, is_exact, places[p]
             )
-            H, b = normal_equations(residuals, _LEAST_INFORMATION)
+            H, b = build_normal_equations(residuals, _LEAST_INFORMATION)
             motion = np.linalg.solve(H, b)  # rotation, translation, growth
             growth = min(max(motion[6], -0.1), 0.1)
             times[p] = min(max(times[p] * (1 + growth), 0.5), 2.0)
             # The points move by the inverse of the surface's motion.
-            turn = rotation_matrix(motion)
+            turn = make_rotation(motion)
             local[p] = (local[p] - middle - motion[3:6]) @ turn + middle
             for k in (0, 1, 2, 6):
                 largest = max(largest, abs(motion[k]))
@@ -182,7 +182,7 @@ def _grow(
 
 
 @compiled
-def _growth_residuals(
+def _linearise_growth(
     local: Float64[np.ndarray, "n 3"],
     scale: float,
     middle: Float64[np.ndarray, "3"],
@@ -221,7 +221,7 @@ def _growth_residuals(
     return residuals
 
 
-def distance_to(
+def measure_distance(
     local_m: Float64[Tensor, "*batch n 3"],
     surface: Surface,
     times: Float64[Tensor, "*batch"] | None = None,
@@ -265,10 +265,10 @@ def mirror_gain(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) ->
 
     # Is the mirror image clearly worse?
     few_m = take_evenly(mirrored_m, _ROUGH_MIRROR_POINTS).expand(len(rough.R), -1, -1)
-    distance = distance_to(rough.inverse().apply(few_m), surface, is_exact=False)
+    distance = measure_distance(rough.inverse().apply(few_m), surface, is_exact=False)
     local_m = pose.double().inverse().apply(cloud_m)
     few_m = take_evenly(local_m, _ROUGH_MIRROR_POINTS)
-    unmirrored = distance_to(few_m, surface, is_exact=False)
+    unmirrored = measure_distance(few_m, surface, is_exact=False)
     if float(distance.min() - unmirrored) > _CLEARLY_WORSE:
         return float(unmirrored - distance.min())
 
@@ -277,18 +277,18 @@ def mirror_gain(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) ->
     config = replace(config, start_distance_diameters=config.end_distance_diameters)
     refined = refine_pose(mirrored_m, rough[best], surface, config)
     exact_m = refined.camera_from_model.inverse().apply(mirrored_m[None])
-    distance = distance_to(exact_m, surface, is_exact=True)
-    unmirrored = distance_to(local_m, surface, is_exact=True)
+    distance = measure_distance(exact_m, surface, is_exact=True)
+    unmirrored = measure_distance(local_m, surface, is_exact=True)
     return float(unmirrored - distance.min())
 
 
-def sensor_size_error(distance_m: float, focal_px: float, diameter_m: float) -> float:
+def _bound_size_error(distance_m: float, focal_px: float, diameter_m: float) -> float:
     """Give the share by which an offset and displaced edges of a sensor may change a size."""
     edges_m = 2 * EDGE_PX * distance_m / focal_px
-    return _offset_size_error(distance_m) + edges_m / diameter_m
+    return _bound_offset_error(distance_m) + edges_m / diameter_m
 
 
-def _offset_size_error(distance_m: float) -> float:
+def _bound_offset_error(distance_m: float) -> float:
     """Give the share by which a sensor's offset may change a size: the same as of the distance."""
     return LARGEST_OFFSET_M / distance_m
 
@@ -328,13 +328,13 @@ def identify(
         max_size_error: by so much a real object may differ in size from its model.
         object_std_m: standard deviation of its surface from the model's.
     """
-    scale = scale_of(cloud_m, pose, surface, object_std_m)
+    scale = measure_scale(cloud_m, pose, surface, object_std_m)
     has_mirror_image = mirror_deviation > MIRROR_ALIKE
     gain = mirror_gain(cloud_m, pose, surface) if has_mirror_image else None
 
     # Errors that explain a difference: of the sensor, and of sides that deviate from the model.
     distance_m = float(cloud_m[:, 2].double().median())
-    sensor_error = sensor_size_error(distance_m, focal_px, surface.diameter_m)
+    sensor_error = _bound_size_error(distance_m, focal_px, surface.diameter_m)
     sides_m = object_std_m / math.sqrt(INDEPENDENT_SIDES)
     fits = _Fits(
         name=name,
@@ -342,7 +342,7 @@ def identify(
         mirror_gain=gain,
         size_tolerance=max_size_error + sensor_error,
         mirror_tolerance=sides_m / (NEAR * surface.diameter_m),
-        offset_error=_offset_size_error(distance_m),
+        offset_error=_bound_offset_error(distance_m),
     )
 
     reason = _why_contradicted(fits)

@@ -38,10 +38,10 @@ def build_tree(points: Float64[np.ndarray, "m 3"], outward: Float64[np.ndarray, 
     values = np.zeros((1 << depth) - 1)
     for level in range(depth):
         for k in range(1 << level):
-            low, high = _range_of(k, level, count)
-            axis = _widest_axis(points, order, low, high)
+            low, high = _find_range(k, level, count)
+            axis = _find_widest_axis(points, order, low, high)
             middle = (low + high) // 2
-            _select(points, order, low, high - 1, middle, axis)
+            _select_rank(points, order, low, high - 1, middle, axis)
             node = (1 << level) - 1 + k
             axes[node] = axis
             values[node] = points[order[middle], axis]
@@ -49,7 +49,7 @@ def build_tree(points: Float64[np.ndarray, "m 3"], outward: Float64[np.ndarray, 
 
 
 @compiled
-def _range_of(k: int, level: int, count: int) -> tuple[int, int]:
+def _find_range(k: int, level: int, count: int) -> tuple[int, int]:
     """Give the range of points of node ``k`` of a level: each bit of ``k`` chooses a half."""
     low, high = 0, count
     for bit in range(level - 1, -1, -1):
@@ -61,7 +61,7 @@ def _range_of(k: int, level: int, count: int) -> tuple[int, int]:
 
 
 @compiled
-def _widest_axis(
+def _find_widest_axis(
     points: Float64[np.ndarray, "m 3"], order: Int64[np.ndarray, " m"], low: int, high: int
 ) -> int:
     """Give the axis along which the points ``order[low:high]`` extend farthest."""
@@ -77,7 +77,7 @@ def _widest_axis(
 
 
 @compiled
-def _select(
+def _select_rank(
     points: Float64[np.ndarray, "m 3"],
     order: Int64[np.ndarray, " m"],
     low: int,
@@ -133,7 +133,7 @@ def square_distance(points: Float64[np.ndarray, "m 3"], place: Place, query: Vec
 
 
 @compiled
-def nearest_facing(
+def find_nearest_facing(
     query: Vector,
     tree: Tree,
     eye: Vector,
@@ -186,7 +186,7 @@ def nearest_facing(
 
 
 @compiled
-def nearest_points(queries: Float64[np.ndarray, "n 3"], tree: Tree) -> Int64[np.ndarray, " n"]:
+def find_nearest_points(queries: Float64[np.ndarray, "n 3"], tree: Tree) -> Int64[np.ndarray, " n"]:
     """Give the index, as it was before sorting, of the point nearest to each query."""
     index = np.empty(len(queries), np.int64)
     anywhere = (0.0, 0.0, 0.0)
@@ -194,6 +194,6 @@ def nearest_points(queries: Float64[np.ndarray, "n 3"], tree: Tree) -> Int64[np.
     for i in range(len(queries)):
         query = vector(queries, i)
         square = square_distance(tree.points, place, query)  # that before is near in an image
-        place = nearest_facing(query, tree, anywhere, -np.inf, place, square)
+        place = find_nearest_facing(query, tree, anywhere, -np.inf, place, square)
         index[i] = tree.order[place]
     return index

@@ -52,7 +52,9 @@ def direction_loss(
         return predicted.sum()
     points = torch.bincount(instance, minlength=len(copies_m))
 
-    def means_of(truth_m: Float[Tensor, "instances keypoints 3"]) -> Float[Tensor, " instances"]:
+    def average_losses(
+        truth_m: Float[Tensor, "instances keypoints 3"],
+    ) -> Float[Tensor, " instances"]:
         # 0 where a point lies on its keypoint.
         truth = F.normalize(truth_m[instance] - points_m[:, None], dim=-1, eps=1e-9)
         losses = POINT_LOSSES[mode](predicted, truth)
@@ -60,8 +62,8 @@ def direction_loss(
         return sums / points.clamp(min=1).to(losses.dtype)
 
     with torch.no_grad():
-        copy = torch.stack([means_of(truth_m) for truth_m in copies_m.unbind(1)]).argmin(0)
-    means = means_of(copies_m[torch.arange(len(copies_m), device=copy.device), copy])
+        copy = torch.stack([average_losses(truth_m) for truth_m in copies_m.unbind(1)]).argmin(0)
+    means = average_losses(copies_m[torch.arange(len(copies_m), device=copy.device), copy])
     return means.sum() / (points > 0).sum()
 
 

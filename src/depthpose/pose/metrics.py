@@ -29,7 +29,7 @@ RenderDepth = Callable[[Rigid], Float[Tensor, "h w"]]
 
 def add_m(estimated: Rigid, true: Rigid, points_m: Float[Tensor, "n 3"]) -> Float[Tensor, "*batch"]:
     """ADD [m]: mean distance of each model point at one pose to itself at the other."""
-    gap_m = _posed(estimated, points_m) - _posed(true, points_m)
+    gap_m = _pose_points(estimated, points_m) - _pose_points(true, points_m)
     return gap_m.norm(dim=-1).mean(-1)
 
 
@@ -41,8 +41,8 @@ def adds_m(
     This is the definition of BOP and Hinterstoisser. DenseFusion and the method's published code
     measure from each estimated point to the nearest true one.
     """
-    true_m = _posed(true, points_m)
-    estimated_m = _posed(estimated, points_m)
+    true_m = _pose_points(true, points_m)
+    estimated_m = _pose_points(estimated, points_m)
     means_m: list[float] = []
     rows = -1, *true_m.shape[-2:]
     for of_truth, of_estimate in zip(true_m.reshape(rows), estimated_m.reshape(rows), strict=True):
@@ -66,10 +66,10 @@ def add_of_nearest_m(
         symmetries: ``model_from_model``, a batch with the identity, of
             ``mesh.symmetry_transforms``.
     """
-    estimated_m = _posed(estimated, points_m)
+    estimated_m = _pose_points(estimated, points_m)
     errors_m = [
-        (_posed(copies, points_m) - estimated_m).norm(dim=-1).mean(-1)
-        for copies in _symmetric_copies(true, symmetries, len(points_m))
+        (_pose_points(copies, points_m) - estimated_m).norm(dim=-1).mean(-1)
+        for copies in _split_symmetric_copies(true, symmetries, len(points_m))
     ]
     return torch.cat(errors_m).min()
 
@@ -81,10 +81,10 @@ def mssd_m(
 
     The arguments are those of :func:`add_of_nearest_m`.
     """
-    estimated_m = _posed(estimated, points_m)
+    estimated_m = _pose_points(estimated, points_m)
     errors_m = [
-        (_posed(copies, points_m) - estimated_m).norm(dim=-1).amax(-1)
-        for copies in _symmetric_copies(true, symmetries, len(points_m))
+        (_pose_points(copies, points_m) - estimated_m).norm(dim=-1).amax(-1)
+        for copies in _split_symmetric_copies(true, symmetries, len(points_m))
     ]
     return torch.cat(errors_m).min()
 
@@ -101,10 +101,10 @@ def mspd_px(
     Infinite where a point lies behind the camera. BOP scales it by 640 / image width before its
     thresholds; see :func:`average_recall`.
     """
-    pixels = project(_posed(estimated, points_m), K)
+    pixels = project(_pose_points(estimated, points_m), K)
     errors_px: list[Tensor] = []
-    for copies in _symmetric_copies(true, symmetries, len(points_m)):
-        distance_px = (project(_posed(copies, points_m), K) - pixels).norm(dim=-1)
+    for copies in _split_symmetric_copies(true, symmetries, len(points_m)):
+        distance_px = (project(_pose_points(copies, points_m), K) - pixels).norm(dim=-1)
         errors_px.append(distance_px.nan_to_num(torch.inf).amax(-1))
     return torch.cat(errors_px).min()
 
@@ -213,12 +213,12 @@ def average_precision(is_right: Sequence[bool], targets: int) -> float:
     return float(best[place].mean())
 
 
-def _posed(pose: Rigid, points_m: Float[Tensor, "n 3"]) -> Float[Tensor, "*batch n 3"]:
+def _pose_points(pose: Rigid, points_m: Float[Tensor, "n 3"]) -> Float[Tensor, "*batch n 3"]:
     points = points_m.double()
     return points @ pose.R.double().mT + pose.t_m.double()[..., None, :]
 
 
-def _symmetric_copies(true: Rigid, symmetries: Rigid, points: int) -> list[Rigid]:
+def _split_symmetric_copies(true: Rigid, symmetries: Rigid, points: int) -> list[Rigid]:
     """Give the poses that look like the true one, in batches that fit into memory."""
     pose = true.double()
     R = symmetries.R.double()

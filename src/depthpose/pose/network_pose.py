@@ -40,7 +40,7 @@ from depthpose.pose.decide import refused
 from depthpose.pose.estimator import PoseEstimator, unreadable_on_error
 from depthpose.pose.icp import BestStart, RefinedPose, refine_best
 from depthpose.pose.probability import PRIOR_MASKED, PRIOR_PROPOSED
-from depthpose.pose.propose import fits_of, meet_lines, vote_ransac
+from depthpose.pose.propose import fit_poses, meet_lines, vote_ransac
 from depthpose.pose.register import judge
 from depthpose.pose.types import (
     AnyInput,
@@ -79,7 +79,7 @@ class CloudToPose:
     directions: Float[Tensor, "n k 3"] = field(default_factory=lambda: torch.empty(0, 0, 3))
 
 
-def _batches(
+def _group_by_voxels(
     clouds: Iterable[CloudToPose | PoseEstimate], most: int
 ) -> Iterator[list[CloudToPose | PoseEstimate]]:
     """Group clouds so that each group has ``most`` voxels at most, or is one cloud."""
@@ -162,11 +162,11 @@ class GeoPoseNet(PoseEstimator):
         kind = type(self._network).__name__
         return f"GeoPoseNet({kind} of {objects}{named}, {self.config.device})"
 
-    def _each(self, inputs: Iterable[AnyInput], threads: int) -> Iterator[PoseEstimate]:
+    def _estimate_each(self, inputs: Iterable[AnyInput], threads: int) -> Iterator[PoseEstimate]:
         """Pose inputs by the network; what it doubts is registered where the config wants it."""
         return self._pose_together(inputs, threads, is_expected=True)
 
-    def _each_try(self, inputs: Iterable[AnyInput]) -> Iterator[PoseEstimate]:
+    def _estimate_each_try(self, inputs: Iterable[AnyInput]) -> Iterator[PoseEstimate]:
         """Pose inputs by the network alone, at the lower prior odds of an object at a try."""
         return self._pose_together(inputs, 1, is_expected=False)
 
@@ -179,8 +179,8 @@ class GeoPoseNet(PoseEstimator):
         network's sums. ``is_expected``: whether the inputs are meant to show their objects.
         """
         prepared = each_in_threads(partial(unreadable_on_error, self._prepare), inputs, threads)
-        pose = partial(self._pose, is_expected=is_expected)
-        for group in _batches(prepared, self.config.batch_voxels):
+        pose = partial(self._pose_or_register, is_expected=is_expected)
+        for group in _group_by_voxels(prepared, self.config.batch_voxels):
             self._ask_network(group)
             yield from each_in_threads(pose, group, threads)
 
@@ -215,7 +215,7 @@ class GeoPoseNet(PoseEstimator):
         """
         if isinstance(pose_input, ViewInput) and pose_input.is_region:
             return self._search_region(pose_input)
-        prepared = self._object(pose_input.object)
+        prepared = self._find_object(pose_input.object)
         _ = prepared.copies  # cached now, so that the seconds of no stage hold it
         watch = Stopwatch()
         with watch.stage("cloud"):
@@ -255,7 +255,9 @@ class GeoPoseNet(PoseEstimator):
             # Each has a share of the time.
             job.watch.seconds["network"] = watch.seconds["network"] * count / sum(counts)
 
-    def _pose(self, job: CloudToPose | PoseEstimate, *, is_expected: bool) -> PoseEstimate:
+    def _pose_or_register(
+        self, job: CloudToPose | PoseEstimate, *, is_expected: bool
+    ) -> PoseEstimate:
         """Pose a cloud by its votes, or by registration where these are doubted.
 
         Registered is only an input that is expected to show its object.
@@ -287,7 +289,7 @@ class GeoPoseNet(PoseEstimator):
         # Propose: where the directions meet are the keypoints, to which the model's are fitted.
         with watch.stage("proposal"):
             vote = self._vote(job)
-            fits = fits_of(vote, prepared.model, config)
+            fits = fit_poses(vote, prepared.model, config)
         if isinstance(fits, Refusal):
             return refused(pose_input, fits, watch.seconds)
 
@@ -316,7 +318,7 @@ class GeoPoseNet(PoseEstimator):
             self.weights.refusal,
             watch,
             prior_odds=PRIOR_MASKED if is_expected else PRIOR_PROPOSED,
-            votes_rad=partial(self._disagreement, job),
+            votes_rad=partial(self._measure_disagreement, job),
         )
         return replace(
             estimate,
@@ -333,7 +335,7 @@ class GeoPoseNet(PoseEstimator):
             return vote_ransac(points_m, directions, config=voting)
         return meet_lines(points_m, directions, refinements=voting.refinements)
 
-    def _disagreement(self, job: CloudToPose, pose: Rigid) -> float:
+    def _measure_disagreement(self, job: CloudToPose, pose: Rigid) -> float:
         """Mean angle between the network's directions and those to the keypoints of a pose [rad].
 
         The network was trained to treat symmetric copies of a pose as one: the angle is measured to
@@ -392,7 +394,7 @@ class DepthImageRegressor(PoseEstimator):
 
     def _estimate(self, pose_input: AnyInput) -> PoseEstimate:
         """Regress the pose from a crop of the depth image, and refine it by ICP."""
-        prepared = self._object(pose_input.object)
+        prepared = self._find_object(pose_input.object)
         if not isinstance(pose_input, ViewInput):
             raise InputError(_NEEDS_MASK)
         # An empty region says that nothing was detected: of that too few pixels are refused below.

@@ -39,13 +39,13 @@ def with_pick_ranks(
         on_top = [k for k in remaining if not occluders[k] & remaining]
         # Where objects lie in a ring, each before the next, the best of all goes first.
         candidates = on_top or sorted(remaining)
-        best = max(candidates, key=lambda k: (_visible_certainty(estimates[k]), -k))
+        best = max(candidates, key=lambda k: (_weigh_certainty(estimates[k]), -k))
         ranks[best] = len(ranks) + 1
         remaining.remove(best)
     return [replace(estimate, pick_rank=ranks.get(k)) for k, estimate in enumerate(estimates)]
 
 
-def _visible_certainty(estimate: PoseEstimate) -> float:
+def _weigh_certainty(estimate: PoseEstimate) -> float:
     """Give certainty times visible share; 0 where one of them is not known."""
     return (estimate.certainty or 0.0) * (estimate.visible_share or 0.0)
 

@@ -24,7 +24,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.core.run import claim_folder
 from depthpose.core.runner import Job, Results, run_jobs
 from depthpose.pose.datasets import BopDataset, Detection, Instance, read_mask
-from depthpose.pose.datasets.layouts import MOST, integer, make_pose, number, read_rows
+from depthpose.pose.datasets.layouts import MOST, make_pose, read_integer, read_number, read_rows
 from depthpose.pose.types import (
     POSED,
     Alternative,
@@ -115,7 +115,7 @@ def read_predictions(folder: Path) -> Predictions:
     return predictions
 
 
-def earlier_predictions(folder: Path) -> dict[str, Prediction]:
+def read_earlier_predictions(folder: Path) -> dict[str, Prediction]:
     """Read the predictions of earlier runs by name, of a folder and its parts of several processes.
 
     A damaged file counts as missing, and gives a notice.
@@ -232,11 +232,11 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
         "free_motions": _parse_table(row, "free_motions", 6, source),
     }
     for key in ("inlier_share", "residual_m", "certainty", "copy_certainty"):
-        values[key] = None if row.get(key) is None else number(row, key, None, source)
+        values[key] = None if row.get(key) is None else read_number(row, key, None, source)
     seconds = row.get("seconds", {})
     if not isinstance(seconds, dict):
         raise InputError(f"{source}: seconds is {seconds!r}, where names to numbers belong")
-    values["seconds"] = {str(stage): number(seconds, stage, None, source) for stage in seconds}
+    values["seconds"] = {str(stage): read_number(seconds, stage, None, source) for stage in seconds}
     for key, kind in (("evidence", Evidence), ("identity", Identity)):
         value = row.get(key)
         where = f"{source}: {key}"
@@ -252,11 +252,11 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
         base_from_model=_parse_pose(row, source, "base_from_model"),
         alternatives=_parse_alternatives(row, source),
         tracking=cast("Tracking | None", tracking),
-        pick_rank=None if row.get("pick_rank") is None else integer(row, "pick_rank", source),
+        pick_rank=None if row.get("pick_rank") is None else read_integer(row, "pick_rank", source),
         **values,
     )
     has_place = any(row.get(key) is not None for key in _PLACE)
-    place = Place(*(integer(row, key, source) for key in _PLACE)) if has_place else None
+    place = Place(*(read_integer(row, key, source) for key in _PLACE)) if has_place else None
     return Prediction(estimate=estimate, place=place)
 
 
@@ -274,7 +274,7 @@ def _parse_alternatives(row: dict[str, Any], source: str) -> tuple[Alternative, 
         alternatives.append(
             Alternative(
                 camera_from_model=pose,
-                probability=number(entry, "probability", None, where),
+                probability=read_number(entry, "probability", None, where),
                 difference=str(entry.get("difference", "")),
                 is_copy=bool(entry.get("is_copy", False)),
             )
@@ -329,7 +329,7 @@ class PoseJob(Job[Input]):
     seconds: Mapping[str, float] = field(default_factory=dict)  #: spent before, on a mask
 
 
-def unreadable_estimate(name: str, object: str, error: InputError) -> PoseEstimate:
+def refuse_unreadable(name: str, object: str, error: InputError) -> PoseEstimate:
     """Make the estimate that says why an input cannot be read."""
     reason = f"cannot be read: {error}"
     return PoseEstimate(name=name, object=object, status="unreadable", reason=reason)
@@ -349,10 +349,10 @@ class PoseResults(Results[Input, PoseEstimate]):
 
     def __init__(self, folder: Path, run_folder: Path | None = None) -> None:
         self.folder = folder
-        self.predictions = earlier_predictions(folder)  #: by the names of the inputs
+        self.predictions = read_earlier_predictions(folder)  #: by the names of the inputs
         predictions_of_run = self.predictions
         if run_folder is not None and run_folder != folder:
-            predictions_of_run = earlier_predictions(run_folder)
+            predictions_of_run = read_earlier_predictions(run_folder)
         self._finished = {
             name
             for name, prediction in predictions_of_run.items()
@@ -375,7 +375,7 @@ class PoseResults(Results[Input, PoseEstimate]):
         assert isinstance(job, PoseJob)
         if job.object is None:
             raise error
-        self._keep(job, unreadable_estimate(job.name, job.object, error))
+        self._keep(job, refuse_unreadable(job.name, job.object, error))
 
     def _keep(self, job: PoseJob[Input], estimate: PoseEstimate) -> None:
         """Add an estimate to those that the file gets, and write it now and then."""
@@ -418,7 +418,7 @@ def estimate_missing_poses(
             yield results.predictions[outcome.job.name]
 
 
-def instance_jobs(
+def make_instance_jobs(
     dataset: BopDataset, names: Mapping[int, str], predicted_mask: str | None = None
 ) -> list[PoseJob[ViewInput]]:
     """Make a job for each annotated instance, by its own mask or a predicted one.
@@ -455,7 +455,7 @@ def _read_view(
     return replace(view, name=name, object=object, is_region=is_region)
 
 
-def detection_jobs(
+def make_detection_jobs(
     dataset: BopDataset, names: Mapping[int, str], detections: Sequence[Detection]
 ) -> list[PoseJob[ViewInput]]:
     """Make jobs of the detections with the highest scores, as many as an image shows of an object.

@@ -43,7 +43,7 @@ def warn_of_rays(depth_m: Float[Tensor, "h w"], K: Float[Tensor, "3 3"]) -> None
     camera = tuple(K.flatten().tolist())
     if camera in _told:
         return
-    bend = ray_bend(depth_m, K)
+    bend = measure_ray_bend(depth_m, K)
     if bend is None or not _RAY_BEND[0] < bend < _RAY_BEND[1]:
         return
     _told.add(camera)
@@ -56,7 +56,7 @@ def warn_of_rays(depth_m: Float[Tensor, "h w"], K: Float[Tensor, "3 3"]) -> None
     )
 
 
-def ray_bend(depth_m: Float[Tensor, "h w"], K: Float[Tensor, "3 3"]) -> float | None:
+def measure_ray_bend(depth_m: Float[Tensor, "h w"], K: Float[Tensor, "3 3"]) -> float | None:
     """Measure how planes are bent: 0 where values are depth along the axis, 1 along the ray.
 
     Planes are searched by RANSAC under both assumptions. Those of the assumption under which more
@@ -90,10 +90,10 @@ def ray_bend(depth_m: Float[Tensor, "h w"], K: Float[Tensor, "3 3"]) -> float | 
         return None
     planes = axis_planes if axis_count > ray_count else ray_planes
 
-    return _shared_bend(planes, rays, reading_m, stretch)
+    return _fit_shared_bend(planes, rays, reading_m, stretch)
 
 
-def _shared_bend(
+def _fit_shared_bend(
     planes: list[Bool[Tensor, " n"]],
     rays: Float64[Tensor, "n 3"],
     reading_m: Float64[Tensor, " n"],

@@ -104,7 +104,7 @@ class Registration(PoseEstimator):
     def prepare(self) -> None:
         """Prepare every model now, about a second each; else it is done when first asked for."""
         for name in self.objects:
-            self._object(name).prepare()
+            self._find_object(name).prepare()
 
     def _estimate(self, pose_input: AnyInput) -> PoseEstimate:
         return self._register_or_search(pose_input)

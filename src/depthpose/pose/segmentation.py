@@ -287,13 +287,13 @@ class Segmenter:
             InputError: the tensor is no such image.
         """
         check_image(image, "the image")
-        probability = class_probabilities(self._network, image)
+        probability = predict_probabilities(self._network, image)
         label = probability.argmax(0)
         config = self._network.config
         masks: dict[str, Tensor] = {}
         scores: dict[str, Tensor] = {}
         for number, name in enumerate(self.weights.objects, 1):
-            parts = connected_parts(label == number, config)
+            parts = find_connected_parts(label == number, config)
             if len(parts):
                 score = torch.stack([probability[number][part].mean() for part in parts])
                 order = score.argsort(descending=True)
@@ -303,7 +303,7 @@ class Segmenter:
 
 
 @torch.no_grad()
-def class_probabilities(network: FCN, image: Image) -> Float[Tensor, "classes h w"]:
+def predict_probabilities(network: FCN, image: Image) -> Float[Tensor, "classes h w"]:
     """Give the probability of background and objects at each pixel of an image of any size.
 
     The image is resized to the network's long side, and padded at the bottom and right to multiples
@@ -323,7 +323,9 @@ def class_probabilities(network: FCN, image: Image) -> Float[Tensor, "classes h 
     return logits[0].float().softmax(0).cpu()
 
 
-def connected_parts(mask: Bool[Tensor, "h w"], config: SegmentationConfig) -> Bool[Tensor, "n h w"]:
+def find_connected_parts(
+    mask: Bool[Tensor, "h w"], config: SegmentationConfig
+) -> Bool[Tensor, "n h w"]:
     """Give the connected parts of a mask that are large enough; the largest alone if so configured.
 
     ``config`` has the least share of the image, and whether it shows each object once.

@@ -18,8 +18,8 @@ from depthpose.pose.kdtree import (
     Tree,
     build_tree,
     faces,
-    nearest_facing,
-    nearest_points,
+    find_nearest_facing,
+    find_nearest_points,
     square_distance,
 )
 from depthpose.pose.mesh import sample_surface, symmetry_transforms
@@ -64,7 +64,7 @@ class Boxes:
 
 
 @compiled
-def _box_of(
+def _find_box(
     point: Vector,
     low: Float64[np.ndarray, "3"],
     side: float,
@@ -89,7 +89,7 @@ def _look_up_all(
     """Give what a table holds for the box of each point."""
     values = np.empty(len(points), np.int64)
     for i in range(len(points)):
-        values[i] = table[_box_of(vector(points, i), low, side, counts)]
+        values[i] = table[_find_box(vector(points, i), low, side, counts)]
     return values
 
 
@@ -135,7 +135,7 @@ def match(
         point = vector(points, i)
         place = places[i]
         if not is_exact or place < 0:
-            place = np.int64(table[_box_of(point, low, side, counts)])
+            place = np.int64(table[_find_box(point, low, side, counts)])
             if not faces(samples, outward, place, eye, least):
                 place = np.int64(across[place])
         if place >= 0 and not faces(samples, outward, place, eye, least):
@@ -146,7 +146,7 @@ def match(
                 square = min(square, square_distance(samples, place, point))
             if square == limit * limit:  # the guess is too far away
                 place = -1
-            place = nearest_facing(point, tree, eye, least, place, square)
+            place = find_nearest_facing(point, tree, eye, least, place, square)
         places[i] = place
 
 
@@ -179,7 +179,7 @@ class Surface:
 
     def nearest(self, points_m: Float64[Tensor, "*batch n 3"]) -> Int64[Tensor, "*batch n"]:
         """Give the index of the surface point nearest to each point of the model frame."""
-        index = nearest_points(array_of(points_m).reshape(-1, 3), self.target.tree)
+        index = find_nearest_points(array_of(points_m).reshape(-1, 3), self.target.tree)
         return torch.from_numpy(index).reshape(points_m.shape[:-1])
 
     @cached_property
@@ -208,7 +208,7 @@ class Surface:
         # The last two rows of each frame are two axes across the direction.
         _, _, frames = torch.linalg.svd(toward[:, None])
         views = [
-            _visible_from(self, direction, frame[1:])
+            _view_from(self, direction, frame[1:])
             for direction, frame in zip(toward, frames, strict=True)
         ]
         return Views(
@@ -251,7 +251,7 @@ class _View(NamedTuple):
     is_inner: Bool[Tensor, " n"]
 
 
-def _visible_from(surface: Surface, toward: Tensor, across: Tensor) -> _View:
+def _view_from(surface: Surface, toward: Tensor, across: Tensor) -> _View:
     """Choose the points of a surface that a far camera sees, 160 at most.
 
     Args:
@@ -315,7 +315,7 @@ def prepare_surface(model: ObjectModel, count: int = 10_000) -> Surface:
     near_m, _ = tree.query(some_m, k=min(5, len(points_m)))
     cell_m = _CELL_SPACINGS * float(np.median(near_m[:, -1])) * np.sqrt(np.pi) / 2
     limit_m = 3 * NEAR * model.diameter_m
-    sides = outer_sides(points_m.numpy(), normals.numpy(), cell_m, limit_m)
+    sides = _find_outer_sides(points_m.numpy(), normals.numpy(), cell_m, limit_m)
     outward, across = (torch.from_numpy(part) for part in sides)
 
     some_m = points_m.numpy()[:: max(1, len(points_m) // 1000)]
@@ -357,7 +357,7 @@ _LEAST_VISIBLE = 0.1  # least share of directions from which an outer side is vi
 _MOST_INNER = 0.4  # largest share for the inner side, over that of the outer side
 
 
-def outer_sides(
+def _find_outer_sides(
     points: np.ndarray, normals: np.ndarray, cell: float, limit: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Flip normals to the side from which the surface is visible from afar.
@@ -375,17 +375,17 @@ def outer_sides(
         The normals (n, 3); and for each sample the index of the nearest one of an opposite side, or
         -1.
     """
-    share = _visible_shares(points, normals, cell)
+    share = _measure_visible_shares(points, normals, cell)
     # The outer side is visible from clearly more directions than the inner one.
     outer = share.argmax(0)
     is_clear = share.max(0) > _LEAST_VISIBLE
     is_clear &= share.min(0) < _MOST_INNER * share.max(0)
     outward = normals * ((1 - 2 * outer) * is_clear)[:, None]
-    across = _nearest_opposite(points, outward, limit)
+    across = _find_nearest_opposite(points, outward, limit)
     return outward, across
 
 
-def _visible_shares(points: np.ndarray, normals: np.ndarray, cell: float) -> np.ndarray:
+def _measure_visible_shares(points: np.ndarray, normals: np.ndarray, cell: float) -> np.ndarray:
     """Give for both sides of each sample (2, n) from how many directions they are visible.
 
     As a share of the directions that a side faces. The first side is that of the normal.
@@ -412,7 +412,7 @@ def _visible_shares(points: np.ndarray, normals: np.ndarray, cell: float) -> np.
     return visible_count / facing_count
 
 
-def _nearest_opposite(points: np.ndarray, outward: np.ndarray, limit: float) -> np.ndarray:
+def _find_nearest_opposite(points: np.ndarray, outward: np.ndarray, limit: float) -> np.ndarray:
     """Find for each sample the nearest one that faces the other way, as through a wall, or -1.
 
     Samples are searched by six groups of normals, each about a direction of an axis: every normal
@@ -497,7 +497,7 @@ def _compare_rays(
     cell_of_point = np.empty(len(cloud), np.int64)
     is_observed = np.zeros(cells, np.bool_)
     for i in range(len(cloud)):
-        cell_of_point[i] = _cell_of(cloud[i, 0], cloud[i, 1], cloud[i, 2], scale, middle)
+        cell_of_point[i] = _find_cell(cloud[i, 0], cloud[i, 1], cloud[i, 2], scale, middle)
         is_observed[cell_of_point[i]] = True
 
     violation, unobserved = np.ones(len(ts)), np.ones(len(ts))
@@ -536,12 +536,12 @@ def _draw_cells(
             continue
         x = dot(vector(R, 0), point) + t[0]
         y = dot(vector(R, 1), point) + t[1]
-        cell = _cell_of(x, y, max(z, 1e-6), scale, middle)
+        cell = _find_cell(x, y, max(z, 1e-6), scale, middle)
         nearest[cell] = min(nearest[cell], z)
 
 
 @compiled
-def _cell_of(x: float, y: float, z: float, scale: float, middle: Float64[np.ndarray, "2"]) -> int:
+def _find_cell(x: float, y: float, z: float, scale: float, middle: Float64[np.ndarray, "2"]) -> int:
     """Give the cell of the ray through a point; rays far off are in a cell at the border."""
     column = min(max(np.floor(x / z * scale - middle[0]), -_REACH), _REACH) + _REACH
     row = min(max(np.floor(y / z * scale - middle[1]), -_REACH), _REACH) + _REACH

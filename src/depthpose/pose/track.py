@@ -50,7 +50,7 @@ _LITTLE = 0.2  # least share of the points near an object that its support must 
 _FLAT = 0.9  # share of a flat object's surface that lies in the plane of its support
 
 
-def scene_about(pose_input: AnyInput, poses: Rigid, surface: Surface) -> Float64[Tensor, "n 3"]:
+def _gather_scene(pose_input: AnyInput, poses: Rigid, surface: Surface) -> Float64[Tensor, "n 3"]:
     """Give all points in the direction of the object at one of several poses, and about it."""
     middles_m = (poses.R @ surface.points_m.mean(0)) + poses.t_m
     middle_m = middles_m.mean(0)
@@ -195,9 +195,9 @@ def _follow(
     poses = Rigid.stack(starts)
 
     # The points near these poses, without the plane that the object lies on.
-    scene_m = scene_about(pose_input, poses, surface)
-    near = _is_near(scene_m, poses, surface, MARGIN)
-    is_support = _is_support(scene_m, near, current.pose.apply(surface.points_m))
+    scene_m = _gather_scene(pose_input, poses, surface)
+    near = _mark_near(scene_m, poses, surface, MARGIN)
+    is_support = _mark_support(scene_m, near, current.pose.apply(surface.points_m))
     cloud_m = scene_m[near & ~is_support]
     if len(cloud_m) < _LEAST_POINTS:
         return Refusal(
@@ -209,7 +209,7 @@ def _follow(
     icp = replace(target.config.icp, starts=1)
     refined = refine_best(cloud_m, poses, surface, icp).refined
     pose = refined.camera_from_model.double()
-    object_points_m = scene_m[_is_near(scene_m, pose[None], surface, NEAR) & ~is_support]
+    object_points_m = scene_m[_mark_near(scene_m, pose[None], surface, NEAR) & ~is_support]
     if len(object_points_m) < _LEAST_POINTS:
         return Refusal(
             status="too few points",
@@ -262,14 +262,14 @@ def _follow(
         copy_certainty=certainty,
         tracking="tracked",
     )
-    estimate = _with_copies(estimate, pose, current.origin)
+    estimate = _carry_copies(estimate, pose, current.origin)
     estimate = with_status(estimate, target.config.min_certainty)
     motion = _FrameMotion.between(current.pose, pose)
     following = replace(current, pose=pose, motion=motion, log_odds=log_odds)
     return estimate, following
 
 
-def _with_copies(estimate: PoseEstimate, pose: Rigid, origin: PoseEstimate | None) -> PoseEstimate:
+def _carry_copies(estimate: PoseEstimate, pose: Rigid, origin: PoseEstimate | None) -> PoseEstimate:
     """Carry the near-symmetric copies that the track began with along with its pose."""
     if origin is None or not origin.certainty or origin.copy_certainty is None:
         return estimate
@@ -291,7 +291,7 @@ def _with_copies(estimate: PoseEstimate, pose: Rigid, origin: PoseEstimate | Non
     )
 
 
-def _is_support(
+def _mark_support(
     scene_m: Float64[Tensor, "n 3"], near: Bool[Tensor, " n"], posed_m: Float64[Tensor, "m 3"]
 ) -> Bool[Tensor, " n"]:
     """Whether points are of a table or wall beside the object, onto which ICP would pull it."""
@@ -318,7 +318,7 @@ def _is_support(
     return torch.zeros_like(near) if is_little_left and is_object_flat else is_support
 
 
-def _is_near(
+def _mark_near(
     points_m: Float64[Tensor, "n 3"], poses: Rigid, surface: Surface, limit: float
 ) -> Bool[Tensor, " n"]:
     """Whether points are within a limit, in diameters, of the surface at one of several poses."""

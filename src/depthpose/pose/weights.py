@@ -103,7 +103,7 @@ def write_pose_weights(
             # A copy: two models may be made of one tensor, which safetensors refuses to write.
             stored = tensor.dtype if tensor.is_floating_point() else torch.int32
             state[f"models.{k}.{name}"] = tensor.to(stored, copy=True)
-        state |= _color_tensors(k, model) if with_meshes else {}
+        state |= _store_colors(k, model) if with_meshes else {}
     config = {
         "network": config_to_dict(network.config),
         "cloud": config_to_dict(weights.cloud),
@@ -162,14 +162,14 @@ def complete_weights(path: Path, meshes: Mapping[int, ObjectModel], out: Path) -
             tensor = getattr(model, name)
             stored = tensor.dtype if tensor.is_floating_point() else torch.int32
             state[f"models.{k}.{name}"] = tensor.to(stored, copy=True)
-        state |= _color_tensors(k, model)
+        state |= _store_colors(k, model)
     save_checkpoint(out, dataclasses.replace(checkpoint, state=state))
 
 
 _COLORS = "colors."  # prefix of the names of a model's coloured points
 
 
-def _color_tensors(k: int, model: ObjectModel) -> dict[str, Tensor]:
+def _store_colors(k: int, model: ObjectModel) -> dict[str, Tensor]:
     """Give the tensors of the colours of model k by their names in a file; a byte a channel."""
     colors = model.colors
     if colors is None:
@@ -184,7 +184,7 @@ def _color_tensors(k: int, model: ObjectModel) -> dict[str, Tensor]:
     return {f"models.{k}.{_COLORS}{name}": tensor for name, tensor in tensors.items()}
 
 
-def _colors_of(state: Mapping[str, Tensor]) -> SurfaceColors | None:
+def _restore_colors(state: Mapping[str, Tensor]) -> SurfaceColors | None:
     """Give the colours among the tensors of a model, if it has any."""
     tensors = {n.removeprefix(_COLORS): t for n, t in state.items() if n.startswith(_COLORS)}
     if not tensors:
@@ -196,7 +196,7 @@ def _colors_of(state: Mapping[str, Tensor]) -> SurfaceColors | None:
     return SurfaceColors(points_m=points_m, normals=normals, rgb=rgb / 255, spacing_m=spacing_m)
 
 
-def known_numbers(path: Path) -> tuple[int, ...]:
+def read_object_numbers(path: Path) -> tuple[int, ...]:
     """Give the numbers of the objects that weights know, with or without their surfaces.
 
     Raises:
@@ -222,7 +222,7 @@ def read_pose_weights(path: Path) -> PoseWeights:
     """
     checkpoint = read_checkpoint(path)
     source = str(path)
-    network = network_of(checkpoint, source)
+    network = build_pose_network(checkpoint, source)
     if not any(f"models.0.{name}" in checkpoint.state for name in _SURFACE):
         word = quote(str(path))
         with suppress(InputError):  # a name where it leads there
@@ -244,7 +244,7 @@ def read_pose_weights(path: Path) -> PoseWeights:
             prefix = f"models.{k}."
             stored = checkpoint.state.items()
             state = {n.removeprefix(prefix): t for n, t in stored if n.startswith(prefix)}
-            models.append(_model_of(record, state, f"{source}: model {k}"))
+            models.append(_restore_model(record, state, f"{source}: model {k}"))
 
     # No tensor but theirs and the network's.
     prefixes = ("network.", *(f"models.{k}." for k in range(len(models))))
@@ -260,7 +260,7 @@ def read_pose_weights(path: Path) -> PoseWeights:
     )
 
 
-def _model_of(record: Any, state: Mapping[str, Tensor], source: str) -> ObjectModel:  # noqa: ANN401
+def _restore_model(record: Any, state: Mapping[str, Tensor], source: str) -> ObjectModel:  # noqa: ANN401
     """Make an object of its entry in the config and its tensors; ``source`` is for errors."""
     missing = [name for name in _TENSORS if name not in state]
     missing += [name for name in ("name", "number", "diameter_m") if name not in record]
@@ -285,7 +285,7 @@ def _model_of(record: Any, state: Mapping[str, Tensor], source: str) -> ObjectMo
         diameter_m=float(record["diameter_m"]),
         keypoints_m=state["keypoints_m"],
         symmetries=symmetries_from_bop(record, source=source),
-        colors=_colors_of(state),
+        colors=_restore_colors(state),
     )
 
 
@@ -303,7 +303,7 @@ def settings_of(checkpoint: Checkpoint, source: str) -> dict[str, Any]:
     }
 
 
-def network_of(checkpoint: Checkpoint, source: str) -> AnyNetwork:
+def build_pose_network(checkpoint: Checkpoint, source: str) -> AnyNetwork:
     """Build the network alone, in eval mode, of weights with or without their objects' surfaces.
 
     Raises:

@@ -80,14 +80,14 @@ def join_published(
         ours = {**dict.fromkeys(_FIRST_COLUMNS, ""), **row.columns(), "source": "ours"}
         rows.append(ours)
         rows += [
-            _difference(ours, theirs)
+            _subtract_row(ours, theirs)
             for theirs in published
             if theirs["method"] == counterpart and theirs["cap_m"] == row.cap_m
         ]
     return sorted(rows, key=lambda row: -row["cap_m"])
 
 
-def _difference(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> dict[str, Any]:
+def _subtract_row(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> dict[str, Any]:
     """Subtract the thesis's row from one of ours."""
     row = {name: ours[name] for name in _FIRST_COLUMNS}
     row["source"] = "difference"
@@ -188,10 +188,10 @@ def draw_figure_2_5(
     panels = [Drawing(caption="left image", image=pair.left)]
     if pair.right is not None:
         panels.append(Drawing(caption="real right image", image=pair.right))
-    panels.append(_depth_panel("predicted depth", pair, estimate))
+    panels.append(_draw_depth_panel("predicted depth", pair, estimate))
     if estimate.right is not None:
         panels.append(Drawing(caption="predicted right image", image=estimate.right))
-    return panels + _lidar_panels(pair, lidar_m)
+    return panels + _draw_lidar_panels(pair, lidar_m)
 
 
 def draw_figure_2_1(
@@ -218,9 +218,9 @@ def draw_figure_2_1(
         Drawing(caption="(a) left image", image=pair.left),
         Drawing(caption="(b) real right image", image=pair.right),
         Drawing(caption="(c) synthesised right image", image=mono.right),
-        _depth_panel("(d) depth from left and synthesised right", pair, mono),
-        _depth_panel("(e) depth from left and real right", pair, stereo),
-        *_lidar_panels(pair, lidar_m, "(f) LiDAR"),
+        _draw_depth_panel("(d) depth from left and synthesised right", pair, mono),
+        _draw_depth_panel("(e) depth from left and real right", pair, stereo),
+        *_draw_lidar_panels(pair, lidar_m, "(f) LiDAR"),
     ]
 
 
@@ -255,7 +255,7 @@ def arrange(columns: Sequence[Sequence[Drawing]], width_px: int = 621) -> Float[
     return torch.cat([grid, bar], 1)
 
 
-def _depth_panel(caption: str, pair: StereoInput, estimate: DepthEstimate) -> Drawing:
+def _draw_depth_panel(caption: str, pair: StereoInput, estimate: DepthEstimate) -> Drawing:
     """Draw estimated depth, in the colours of every panel."""
     if estimate.depth_m is None:
         raise InputError(f"{pair.name}: a figure shows metres; give a camera with a baseline.")
@@ -263,7 +263,7 @@ def _depth_panel(caption: str, pair: StereoInput, estimate: DepthEstimate) -> Dr
     return Drawing(caption=caption, image=image, scale=depth_scale(_NEAR_M, _FAR_M))
 
 
-def _lidar_panels(
+def _draw_lidar_panels(
     pair: StereoInput, lidar_m: Float[Tensor, "h w"] | None, caption: str = "LiDAR"
 ) -> list[Drawing]:
     """Draw the LiDAR points over the left image; no panel without a scan."""

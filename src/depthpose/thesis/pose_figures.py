@@ -84,7 +84,7 @@ _TILT_OFFSET_RAD = math.radians(20)
 
 
 @torch.inference_mode()
-def featured_points(
+def compute_features(
     net: GeoPoseNet, pose_input: AnyInput
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n c"]] | None:
     """Give the points that the network takes, in the camera frame, and its features of them.

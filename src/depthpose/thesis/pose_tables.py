@@ -110,7 +110,7 @@ ROWS = (
 """Every figure as printed. Not like for like: see the notes, and the diameters."""
 
 
-def linemod_number(model: ObjectModel) -> int:
+def find_linemod_number(model: ObjectModel) -> int:
     """Give BOP's number of the object of LineMOD that a model is, by its name and diameter.
 
     A model without a name is known by its number and diameter.
@@ -139,7 +139,7 @@ def join_by_object(
     Args:
         rows: of ``pose.evaluate``, with their origin and conditions.
         numbers: BOP's number of each object, by the name in the rows; with printed rows that of
-            LineMOD's object (:func:`linemod_number`).
+            LineMOD's object (:func:`find_linemod_number`).
         with_published: set the printed rows of LineMOD before ours, and the differences to
             ``PEERS`` after; else (table 3.1) the differences of the first method to the others.
 
@@ -153,10 +153,10 @@ def join_by_object(
     for row in rows:
         assert row.origin is not None, "rows of an evaluation say whose they are"
         groups.setdefault((row.origin.method, row.origin.masks), []).append(row)
-    our_rows = [_our_row(group, columns) for group in groups.values()]
+    our_rows = [_make_our_row(group, columns) for group in groups.values()]
     names = list(columns.values())
     if not with_published:
-        return [*our_rows, *(_difference(our_rows[0], other, names) for other in our_rows[1:])]
+        return [*our_rows, *(_subtract_row(our_rows[0], other, names) for other in our_rows[1:])]
     printed = [
         {
             "source": "published",
@@ -175,11 +175,11 @@ def join_by_object(
     return [
         *printed,
         *our_rows,
-        *(_difference(row, peer, names) for row in our_rows for peer in peers),
+        *(_subtract_row(row, peer, names) for row in our_rows for peer in peers),
     ]
 
 
-def _our_row(rows: Sequence[ObjectRow], columns: Mapping[str, str]) -> dict[str, Any]:
+def _make_our_row(rows: Sequence[ObjectRow], columns: Mapping[str, str]) -> dict[str, Any]:
     """Give the row of one method of ours: percentages of each object, by the table's columns."""
     by_name = {row.object: row for row in rows}
     # Of one object there is no row of means: it is its own.
@@ -208,7 +208,7 @@ def _our_row(rows: Sequence[ObjectRow], columns: Mapping[str, str]) -> dict[str,
     }
 
 
-def _difference(
+def _subtract_row(
     our_row: Mapping[str, Any], other: Mapping[str, Any], names: Sequence[str]
 ) -> dict[str, Any]:
     """Subtract a row from one of ours, by the names of our objects."""
@@ -246,7 +246,7 @@ class VotingCase:
     is_adds: bool
 
 
-def voting_cases(
+def collect_votes(
     net: GeoPoseNet, views: Iterable[ViewSample], points: int
 ) -> Iterator[VotingCase | None]:
     """Give the votes of some points of each view; None where it has too few to be posed.
@@ -305,7 +305,7 @@ def compare_voting(cases: Sequence[VotingCase | None], points: int) -> list[dict
     methods give. The time is the median of the vote alone, on one thread.
 
     Args:
-        cases: of :func:`voting_cases`; None counts as a failure of every method.
+        cases: of :func:`collect_votes`; None counts as a failure of every method.
         points: most points of a view, for its column.
 
     Raises:
@@ -315,7 +315,7 @@ def compare_voting(cases: Sequence[VotingCase | None], points: int) -> list[dict
     if not usable:
         raise InputError(f"none of the {len(cases)} views has enough points to be posed")
     rows: list[dict[str, Any]] = []
-    for voting in _voting_methods():
+    for voting in _list_voting_methods():
         successes, seconds = _time_votes(usable, voting.vote)
         row = {
             "points": points,
@@ -341,7 +341,7 @@ class _Voting(NamedTuple):
     vote: Callable[[VotingCase], Tensor]
 
 
-def _voting_methods() -> list[_Voting]:
+def _list_voting_methods() -> list[_Voting]:
     """List the methods of table 3.3; the loop, which the others are compared with, is the first."""
     methods = [_Voting("RANSAC, one by one (NumPy)", LOOP_HYPOTHESES, "angle", _vote_by_loop)]
     for hypotheses in OUR_HYPOTHESES:
@@ -427,7 +427,7 @@ def ransac_one_by_one(
         for _ in range(hypotheses):
             pair = random.choice(len(points_m), 2, replace=False)
             try:
-                hypothesis = np.linalg.solve(*_normal_equations(points_m[pair], n[pair]))
+                hypothesis = np.linalg.solve(*_build_normal_equations(points_m[pair], n[pair]))
             except np.linalg.LinAlgError:
                 continue
             offsets = hypothesis - points_m
@@ -438,14 +438,16 @@ def ransac_one_by_one(
                 most_inliers = count
                 best_inliers = inliers
         try:
-            refitted = np.linalg.solve(*_normal_equations(points_m[best_inliers], n[best_inliers]))
+            refitted = np.linalg.solve(
+                *_build_normal_equations(points_m[best_inliers], n[best_inliers])
+            )
         except np.linalg.LinAlgError:  # no inlier but parallel ones, or none: all votes count
-            refitted = np.linalg.lstsq(*_normal_equations(points_m, n), rcond=None)[0]
+            refitted = np.linalg.lstsq(*_build_normal_equations(points_m, n), rcond=None)[0]
         keypoints.append(refitted)
     return np.stack(keypoints)
 
 
-def _normal_equations(points_m: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _build_normal_equations(points_m: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Give A and b of the normal equations ``A x = b`` of the point nearest to lines.
 
     The lines go through ``points_m`` along the unit directions ``n``; A is singular if they are

@@ -28,19 +28,19 @@ from depthpose.core.files.disk import write_bytes
 from depthpose.core.findings import CheckReport, Problem, make_report, unreadable
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import (
+    advise_unit,
     cloud_from_depth,
     grow_mask,
-    other_size,
-    unit_advice,
+    make_size_error,
     why_too_few,
 )
 from depthpose.pose.datasets.layouts import (
     Instance,
-    bop_splits,
-    layout_of,
-    object_names,
+    find_layout,
+    list_bop_splits,
     read_bop_models,
     read_models_info,
+    read_object_names,
 )
 from depthpose.pose.datasets.masks import mask_box, read_mask
 from depthpose.pose.mesh import (
@@ -69,7 +69,7 @@ class BopDataset:
     @property
     def folder_of_split(self) -> str:
         """The folder of the split: its name without that of the sensor."""
-        splits = bop_splits(self.folder) if self.layout == "BOP" else {}
+        splits = list_bop_splits(self.folder) if self.layout == "BOP" else {}
         return splits[self.split][0] if self.split in splits else self.split
 
     def __getitem__(self, index: int) -> ViewSample:
@@ -97,7 +97,7 @@ class BopDataset:
         mask = read_instance_mask(instance) if mask is None else mask
         depth_m = read_depth_png(instance.depth, instance.depth_unit_m)
         if mask.shape != depth_m.shape:
-            raise other_size(mask, depth_m)
+            raise make_size_error(mask, depth_m)
         return ViewSample(
             input=ViewInput(
                 name=instance.name,
@@ -120,7 +120,7 @@ class BopDataset:
             InputError: none is left.
         """
         there = sorted({instance.object_id for instance in self.instances})
-        names = object_names(self.folder, there)
+        names = read_object_names(self.folder, there)
         digits = (o for o in objects if isinstance(o, str) and o.isdecimal())
         wanted = {*objects, *(int(o) for o in digits if o not in names.values())}
         kept = [i for i in self.instances if {i.object_id, names[i.object_id]} & wanted]
@@ -145,7 +145,7 @@ def open_bop(folder: str | Path, split: str = "test") -> BopDataset:
         InputError: no such folder or split, or an annotation is damaged.
     """
     folder = Path(folder)
-    name, layout = layout_of(folder)
+    name, layout = find_layout(folder)
     instances = list(layout.instances(folder, split))
     digest = hashlib.sha256()
     for instance in instances:
@@ -194,7 +194,7 @@ def check_bop(
         InputError: there is no such split.
     """
     folder = Path(folder)
-    name, layout = layout_of(folder)
+    name, layout = find_layout(folder)
     splits = layout.splits(folder)
     if split is not None and split not in splits:
         raise InputError(f"{folder}: no split {split!r}. Here: {', '.join(splits) or 'none'}.")
@@ -261,7 +261,7 @@ def _check_models(
             problems.append(Problem(path=path, kind="mismatch", message=message))
 
     # Estimators know objects by name, and refuse two of one.
-    names = object_names(folder, numbers)
+    names = read_object_names(folder, numbers)
     for name, count in sorted(Counter(names.values()).items()):
         if count > 1:
             of_name = " and ".join(str(n) for n in sorted(names) if names[n] == name)
@@ -298,7 +298,7 @@ def _check_instance(instance: Instance, model: ObjectModel | None) -> Iterator[P
     centre_m = instance.camera_from_model.apply(model.vertices_m.double()).mean(0)
     away_m = float((cloud.double().median(0).values - centre_m).norm())
     if away_m > _FAR_DIAMETERS * model.diameter_m:
-        advice = unit_advice(model.diameter_m, cloud[cloud[:, 2] < 3 * cloud[:, 2].median()])
+        advice = advise_unit(model.diameter_m, cloud[cloud[:, 2] < 3 * cloud[:, 2].median()])
         message = (
             f"the cloud lies {away_m:.2f} m from the annotated pose; are depth_scale and "
             "cam_t_m2c both for millimetres?"

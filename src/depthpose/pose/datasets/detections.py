@@ -13,7 +13,7 @@ from torch import Tensor
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import read_json, read_text, write_json
 from depthpose.core.files.disk import refused_suffix
-from depthpose.pose.datasets.layouts import MOST, integer, number, numbers
+from depthpose.pose.datasets.layouts import MOST, read_integer, read_number, read_numbers
 from depthpose.pose.datasets.masks import Runs, decode_rle, mask_box, read_runs
 
 Box = tuple[float, float, float, float]
@@ -100,7 +100,7 @@ def check_box(box: Box) -> None:
     x0, y0, x1, y1 = box
     if not all(math.isfinite(edge) for edge in box) or not x0 < x1 or not y0 < y1:
         raise InputError(
-            f"box {_edges(box)}: the right edge is to lie right of the left edge, and the "
+            f"box {_format_edges(box)}: the right edge is to lie right of the left edge, and the "
             "bottom below the top; give left,top,right,bottom (of left,top,width,height add width "
             "and height)"
         )
@@ -116,9 +116,9 @@ def box_mask(box: Box, height: int, width: int) -> Bool[Tensor, "height width"]:
     x0, y0, x1, y1 = box
     if not (0 <= (x0 + x1) / 2 <= width and 0 <= (y0 + y1) / 2 <= height):
         raise InputError(
-            f"box {_edges(box)}: its centre lies outside of the image of {width}x{height} pixels; "
-            "give pixels of the depth image: a box of an image that is s times as large is to be "
-            "divided by s"
+            f"box {_format_edges(box)}: its centre lies outside of the image of {width}x{height} "
+            "pixels; give pixels of the depth image: a box of an image that is s times as large is "
+            "to be divided by s"
         )
     mask = torch.zeros(height, width, dtype=torch.bool)
     rows = slice(max(0, math.floor(y0)), math.ceil(y1))
@@ -158,14 +158,16 @@ def _read_coco(path: Path) -> list[Detection]:
     class_names: dict[int, str] = {}
     image_files: dict[int, str] = {}
     if isinstance(content, dict) and "annotations" in content:
-        for category in _entries(content.get("categories", []), f"{path}: categories"):
-            class_names[integer(category, "id", f"{path}: categories")] = str(category.get("name"))
-        for image in _entries(content.get("images", []), f"{path}: images"):
-            image_files[integer(image, "id", f"{path}: images")] = str(image.get("file_name"))
+        for category in _check_entries(content.get("categories", []), f"{path}: categories"):
+            class_names[read_integer(category, "id", f"{path}: categories")] = str(
+                category.get("name")
+            )
+        for image in _check_entries(content.get("images", []), f"{path}: images"):
+            image_files[read_integer(image, "id", f"{path}: images")] = str(image.get("file_name"))
         content = content["annotations"]
     return [
         _parse_coco_entry(row, class_names, image_files, f"{path}: entry {place}")
-        for place, row in enumerate(_entries(content, str(path)))
+        for place, row in enumerate(_check_entries(content, str(path)))
     ]
 
 
@@ -184,32 +186,32 @@ def _parse_coco_entry(
     name = row.get("name", row.get("category_name"))
     object_id = None
     if "category_id" in row or name is None:
-        object_id = integer(row, "category_id", source)
+        object_id = read_integer(row, "category_id", source)
     if name is None and object_id is not None:
         name = class_names.get(object_id)
 
     # The image, by number or by the name of its file.
-    image_id = integer(row, "image_id", source) if _is_number(row, "image_id") else None
+    image_id = read_integer(row, "image_id", source) if _is_number(row, "image_id") else None
     file = row.get("file_name", row.get("image_id") if image_id is None else None)
     if file is None and image_id is not None:
         file = image_files.get(image_id)
 
     # The mask, or the box.
-    seconds = number(row, "time", -1.0, source)
+    seconds = read_number(row, "time", -1.0, source)
     segmentation = row.get("segmentation")
     box = None
     if row.get("bbox") is not None and not segmentation:
-        left, top, width, height = numbers(row, "bbox", 4, source)
+        left, top, width, height = read_numbers(row, "bbox", 4, source)
         if [left, top, width, height] != _NO_BOX:
             box = (left, top, left + width, top + height)
     try:
         return Detection(
             object=None if name is None else str(name),
             object_id=object_id,
-            score=number(row, "score", 1.0, source),
+            score=read_number(row, "score", 1.0, source),
             box=box,
             segmentation=read_runs(segmentation, source) if segmentation else None,
-            scene_id=integer(row, "scene_id", source) if "scene_id" in row else None,
+            scene_id=read_integer(row, "scene_id", source) if "scene_id" in row else None,
             image_id=image_id,
             image=None if file is None else PurePosixPath(str(file)).stem,
             seconds=seconds if seconds >= 0 else None,
@@ -405,7 +407,7 @@ def group_by_image(
     return groups
 
 
-def _entries(content: object, source: str) -> list[dict[str, Any]]:
+def _check_entries(content: object, source: str) -> list[dict[str, Any]]:
     if not isinstance(content, list) or not all(isinstance(row, dict) for row in content):
         raise InputError(f"{source}: is no list of objects, one an entry")
     return content
@@ -415,5 +417,5 @@ def _is_number(row: Mapping[str, Any], key: str) -> bool:
     return isinstance(row.get(key), int) and not isinstance(row[key], bool)
 
 
-def _edges(box: Box) -> str:
+def _format_edges(box: Box) -> str:
     return ",".join(f"{edge:g}" for edge in box)

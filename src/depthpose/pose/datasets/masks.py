@@ -62,7 +62,7 @@ def read_labels(
                 "name a list of BOP detections by --masks, beside --bop"
             )
         return decode_rle(*read_runs(entries[0], str(path))).long()
-    pixels = _mask_pixels(path, with_palette=labels is None)
+    pixels = _read_pixels(path, with_palette=labels is None)
 
     # Each colour becomes a number.
     values = pixels[..., 0]
@@ -82,7 +82,7 @@ def read_labels(
     return number_objects(values) if labels is None else _keep_labels(values, labels, path)
 
 
-def _mask_pixels(path: Path, *, with_palette: bool) -> np.ndarray:
+def _read_pixels(path: Path, *, with_palette: bool) -> np.ndarray:
     """Read the pixels of a mask image (h, w, channels): 1 of numbers, 3 of colours, 4 with alpha.
 
     ``with_palette`` gives the colours of a palette, else its indices.
@@ -116,7 +116,7 @@ def _keep_labels(
     Raises:
         InputError: another number fills a square of three by three pixels somewhere.
     """
-    for other in sorted(_solid_numbers(values) - set(labels)):
+    for other in sorted(_find_solid_numbers(values) - set(labels)):
         raise InputError(
             f"{path}: {int((values == other).sum())} pixels have the number {other}, which the "
             f"labels do not name; add {other}=OBJECT, or {other}= to leave it out"
@@ -124,7 +124,7 @@ def _keep_labels(
     return torch.from_numpy(np.where(np.isin(values, list(labels)), values, 0)).long()
 
 
-def _solid_numbers(values: np.ndarray) -> set[int]:
+def _find_solid_numbers(values: np.ndarray) -> set[int]:
     """Give the numbers other than 0 that fill a square of three by three pixels somewhere."""
     middle = values[1:-1, 1:-1]
     is_solid = middle != 0
@@ -143,7 +143,7 @@ def number_objects(values: np.ndarray) -> Int64[Tensor, "h w"]:
     shown = values[values != 0]
     if len(shown) == 0 or (shown == shown[0]).all():
         return torch.from_numpy(values != 0).long()
-    numbers = _solid_numbers(values)
+    numbers = _find_solid_numbers(values)
     if not 2 <= len(numbers) <= _MOST_LABELS:
         return torch.from_numpy(values != 0).long()
     return torch.from_numpy(np.where(np.isin(values, list(numbers)), values, 0)).long()

@@ -67,7 +67,7 @@ class Metric:
     has_median: bool = False  #: whether rows hold the median over estimates, ``NAME_median``
 
 
-def nearest_copy(
+def find_nearest_copy(
     estimated: Rigid, true: Rigid, symmetries: Rigid, declared: Symmetries | None = None
 ) -> Rigid:
     """Give the symmetric copy of the true pose whose rotation is nearest to an estimate's.
@@ -107,7 +107,9 @@ def nearest_copy(
     return min(rotated, key=lambda pose: float(geodesic_rad(estimated_R, pose.R)))
 
 
-def _vsd(estimated: Rigid, instance: Instance, context: ErrorContext) -> Float[Tensor, "10"]:
+def _measure_vsd(
+    estimated: Rigid, instance: Instance, context: ErrorContext
+) -> Float[Tensor, "10"]:
     """Measure the visible surface discrepancy at each of BOP's ten tolerances, 0..1."""
     assert context.vsd_delta_m is not None
     depth_m = _read_depth(instance.depth, instance.depth_unit_m)
@@ -141,24 +143,24 @@ def _vsd(estimated: Rigid, instance: Instance, context: ErrorContext) -> Float[T
 _read_depth = lru_cache(maxsize=4)(read_depth_png)  # instances of one image follow each other
 
 
-def _add(estimated: Rigid, instance: Instance, context: ErrorContext) -> Tensor:
+def _measure_add(estimated: Rigid, instance: Instance, context: ErrorContext) -> Tensor:
     """Measure ADD [m], or ADD-S where that decides a success."""
     measure = adds_m if context.is_adds else add_m
     return measure(estimated, instance.camera_from_model, context.model.vertices_m)
 
 
-def _adds(estimated: Rigid, instance: Instance, context: ErrorContext) -> Tensor:
+def _measure_adds(estimated: Rigid, instance: Instance, context: ErrorContext) -> Tensor:
     """Measure ADD-S [m]."""
     return adds_m(estimated, instance.camera_from_model, context.model.vertices_m)
 
 
-def _mssd(estimated: Rigid, instance: Instance, context: ErrorContext) -> Tensor:
+def _measure_mssd(estimated: Rigid, instance: Instance, context: ErrorContext) -> Tensor:
     """Measure MSSD [m]."""
     points_m = context.model.vertices_m
     return mssd_m(estimated, instance.camera_from_model, points_m, context.symmetries)
 
 
-def _mspd(estimated: Rigid, instance: Instance, context: ErrorContext) -> Tensor:
+def _measure_mspd(estimated: Rigid, instance: Instance, context: ErrorContext) -> Tensor:
     """Measure MSPD [px], scaled to an image 640 wide."""
     points_m = context.model.vertices_m
     true = instance.camera_from_model
@@ -166,29 +168,31 @@ def _mspd(estimated: Rigid, instance: Instance, context: ErrorContext) -> Tensor
     return (BOP_WIDTH_PX / image_size(instance.depth)[0]) * error_px
 
 
-def _true_copy(estimated: Rigid, instance: Instance, context: ErrorContext) -> Rigid:
+def _find_true_copy(estimated: Rigid, instance: Instance, context: ErrorContext) -> Rigid:
     """Give the symmetric copy of the annotated pose that is nearest to an estimate."""
     true = instance.camera_from_model
-    return nearest_copy(estimated, true, context.symmetries, context.model.symmetries)
+    return find_nearest_copy(estimated, true, context.symmetries, context.model.symmetries)
 
 
-def _rotation_deg(estimated: Rigid, instance: Instance, context: ErrorContext) -> Tensor:
+def _measure_rotation_deg(estimated: Rigid, instance: Instance, context: ErrorContext) -> Tensor:
     """Measure the angle to the nearest symmetric copy of the true pose [deg]."""
-    true = _true_copy(estimated, instance, context)
+    true = _find_true_copy(estimated, instance, context)
     return geodesic_rad(estimated.R.double(), true.R.double()).rad2deg()
 
 
-def _translation_m(estimated: Rigid, instance: Instance, context: ErrorContext) -> Tensor:
+def _measure_translation_m(estimated: Rigid, instance: Instance, context: ErrorContext) -> Tensor:
     """Measure the distance to the nearest symmetric copy of the true pose [m]."""
-    true = _true_copy(estimated, instance, context)
+    true = _find_true_copy(estimated, instance, context)
     return (true.t_m.double() - estimated.t_m.double()).norm(dim=-1)
 
 
 METRICS = {
-    "error_m": Metric(measure=_add, summaries={"auc": lambda errors, _: auc(errors[:, 0])}),
-    "adds_m": Metric(measure=_adds, summaries={"auc_adds": lambda errors, _: auc(errors[:, 0])}),
+    "error_m": Metric(measure=_measure_add, summaries={"auc": lambda errors, _: auc(errors[:, 0])}),
+    "adds_m": Metric(
+        measure=_measure_adds, summaries={"auc_adds": lambda errors, _: auc(errors[:, 0])}
+    ),
     "mssd_m": Metric(
-        measure=_mssd,
+        measure=_measure_mssd,
         summaries={
             "ar_mssd": lambda errors, diameters_m: average_recall(
                 errors / diameters_m[:, None], BOP_SHARES
@@ -196,13 +200,13 @@ METRICS = {
         },
     ),
     "mspd_px": Metric(
-        measure=_mspd,
+        measure=_measure_mspd,
         summaries={"ar_mspd": lambda errors, _: average_recall(errors, BOP_PIXELS)},
     ),
-    "rotation_deg": Metric(measure=_rotation_deg, has_median=True),
-    "translation_m": Metric(measure=_translation_m, has_median=True),
+    "rotation_deg": Metric(measure=_measure_rotation_deg, has_median=True),
+    "translation_m": Metric(measure=_measure_translation_m, has_median=True),
     "vsd": Metric(
-        measure=_vsd,
+        measure=_measure_vsd,
         missing=(1.0,) * len(BOP_SHARES),
         is_wanted=lambda context: context.vsd_delta_m is not None,
         summaries={"ar_vsd": lambda errors, _: average_recall(errors, BOP_SHARES)},
@@ -324,7 +328,7 @@ class _Change:
         return replace(prediction, estimate=replace(prediction.estimate, camera_from_model=pose))
 
 
-def _changes() -> list[_Change]:
+def _list_changes() -> list[_Change]:
     """Give the changes that are tried: numbers by one, and conventions with units."""
     changes = [
         change
@@ -341,7 +345,7 @@ def _changes() -> list[_Change]:
     return changes
 
 
-def convention_advice(
+def advise_convention(
     dataset: BopDataset,
     predictions: Sequence[Prediction],
     contexts: Mapping[int, ErrorContext],
@@ -352,7 +356,7 @@ def convention_advice(
     if right > (1 - _GAIN) * tried > 0:
         return None
 
-    changes = _changes()
+    changes = _list_changes()
     counts = [_count_right(dataset, posed, contexts, change) for change in changes]
     best = max(range(len(changes)), key=lambda k: counts[k][0])
     best_right, best_tried = counts[best]

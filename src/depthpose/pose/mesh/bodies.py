@@ -15,7 +15,7 @@ _SMALL = 0.05  # of the part's area: a smaller body far away is left out
 _MOST_NAMED = 3  # bodies in a message
 
 
-def faces_of_part(
+def mark_part(
     path: AnyPath, vertices: np.ndarray, faces: np.ndarray, area: np.ndarray
 ) -> np.ndarray:
     """Mark the faces of a file's part: all but those of small bodies that lie far from the rest.

@@ -52,7 +52,7 @@ def read_colors(path: AnyPath, scale: float, model: ObjectModel) -> SurfaceColor
         return None
     try:
         with refused_as(path, "model with colours", "export it again"):
-            samples, lost = _colored_samples(path, suffix)
+            samples, lost = _sample_colors(path, suffix)
     except InputError as error:
         message = f"{path}: {str(error).removeprefix(f'{path}: ')}"
         warnings.warn(f"{message} (its shape is read, its colours are not)", Notice, stacklevel=3)
@@ -154,15 +154,15 @@ class _Samples(NamedTuple):
     rgb: Float[Tensor, "n 3"]
 
 
-def _colored_samples(path: AnyPath, suffix: str) -> tuple[_Samples | None, list[str]]:
+def _sample_colors(path: AnyPath, suffix: str) -> tuple[_Samples | None, list[str]]:
     """Sample the coloured surface of a file; give the samples, and names of files not beside it.
 
     The samples are None where no part of the surface has a colour.
     """
     import trimesh
 
-    files = _files_beside(path)
-    with _quiet():
+    files = _make_resolver(path)
+    with _silence_trimesh():
         scene: Any = trimesh.load_scene(
             BytesIO(read_bytes(path)),
             file_type=suffix[1:],
@@ -201,7 +201,7 @@ def _colored_samples(path: AnyPath, suffix: str) -> tuple[_Samples | None, list[
         face_of_mesh = (face[is_of_mesh] - first).numpy()
         first += len(mesh.faces)
         barycentric = share[is_of_mesh].numpy()
-        colors = _colors_of(mesh, face_of_mesh, barycentric, is_file_missing=bool(files.lost))
+        colors = _color_points(mesh, face_of_mesh, barycentric, is_file_missing=bool(files.lost))
         if colors is not None:
             rgb[is_of_mesh] = torch.from_numpy(colors)
     has_color = rgb.isfinite().all(-1)
@@ -210,7 +210,7 @@ def _colored_samples(path: AnyPath, suffix: str) -> tuple[_Samples | None, list[
     return _Samples(points[has_color], normals[has_color], rgb[has_color]), files.lost
 
 
-def _colors_of(
+def _color_points(
     mesh: Any,  # noqa: ANN401  trimesh's classes carry no types
     face: np.ndarray,
     barycentric: np.ndarray,
@@ -234,10 +234,10 @@ def _colors_of(
         return _interpolate_corners(visual.vertex_colors, corners, barycentric) / 255
     if visual.kind != "texture":
         return None
-    return _material_colors(visual, corners, barycentric, is_file_missing=is_file_missing)
+    return _color_by_material(visual, corners, barycentric, is_file_missing=is_file_missing)
 
 
-def _material_colors(
+def _color_by_material(
     visual: Any,  # noqa: ANN401  trimesh's classes carry no types
     corners: np.ndarray,
     barycentric: np.ndarray,
@@ -275,7 +275,7 @@ def _interpolate_corners(values: Any, corners: np.ndarray, barycentric: np.ndarr
     return (at_corners * barycentric[..., None]).sum(1)
 
 
-def _files_beside(path: AnyPath) -> Any:  # noqa: ANN401  trimesh's classes carry no types
+def _make_resolver(path: AnyPath) -> Any:  # noqa: ANN401  trimesh's classes carry no types
     """Make the resolver by which trimesh reads files beside a model; it notes missing ones."""
     from trimesh.resolvers import FilePathResolver
 
@@ -298,7 +298,7 @@ def _files_beside(path: AnyPath) -> Any:  # noqa: ANN401  trimesh's classes carr
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def _silence_trimesh() -> Iterator[None]:
     """Keep trimesh from logging a traceback of a missing texture, of which a notice tells."""
     log = logging.getLogger("trimesh")
     level = log.level

@@ -95,7 +95,7 @@ def declare_symmetry(model: ObjectModel, symmetry: AnySymmetry) -> ObjectModel:
     """
     surface = SurfaceDeviation(model)
     if isinstance(symmetry, str) and not symmetry.lower().endswith(".json"):
-        declared = _from_words(read_symmetry(symmetry), surface, model)
+        declared = _place_axes(read_symmetry(symmetry), surface, model)
     elif isinstance(symmetry, Symmetries):
         declared = replace(symmetry, is_found=False)
     elif isinstance(symmetry, str | Path):
@@ -106,7 +106,7 @@ def declare_symmetry(model: ObjectModel, symmetry: AnySymmetry) -> ObjectModel:
         raise InputError(f"symmetry is a {type(symmetry).__name__}; {_FORM}")
     if declared.is_none:
         raise InputError(f"symmetry of {model.name}: there is none in it; {_FORM}")
-    deviation = _deviation(declared, surface, model)
+    deviation = _measure_deviation(declared, surface, model)
     if deviation > _CONTRADICTED:
         source = symmetry if isinstance(symmetry, str | Path) else "that was given"
         warnings.warn(
@@ -183,12 +183,12 @@ def _read_entry(path: Path, model: ObjectModel) -> Mapping[str, Any]:
     return entry
 
 
-def _from_words(
+def _place_axes(
     terms: Sequence[DeclaredTurns], surface: SurfaceDeviation, model: ObjectModel
 ) -> Symmetries:
     """Place the axes by the surface, and complete their rotations to a group."""
     axes = [
-        Axis(direction=term.direction, point_m=_point_on_axis(term, surface, model))
+        Axis(direction=term.direction, point_m=_find_point_on_axis(term, surface, model))
         for term in terms
     ]
     pairs = list(zip(terms, axes, strict=True))
@@ -220,7 +220,7 @@ _FOLLOW_STEPS = 20  # by which an axis is placed
 _NEAREST = 0.9  # share of the points that place an axis: a keyway, without a counterpart, does not
 
 
-def _point_on_axis(
+def _find_point_on_axis(
     term: DeclaredTurns, surface: SurfaceDeviation, model: ObjectModel
 ) -> Float64[Tensor, "3"]:
     """Find a point on an axis of given direction, such that the surface rotated about it fits best.
@@ -254,7 +254,9 @@ def _point_on_axis(
     return best * model.diameter_m + surface.centre_m
 
 
-def _deviation(declared: Symmetries, surface: SurfaceDeviation, model: ObjectModel) -> float:
+def _measure_deviation(
+    declared: Symmetries, surface: SurfaceDeviation, model: ObjectModel
+) -> float:
     """Measure how far the surface lies off itself after any of the rotations, in diameters."""
     turns = symmetry_transforms(declared, 2 * math.pi / _CHECKED / 2).double()[1:]
     some = turns[:: max(1, len(turns.R) // (2 * _CHECKED))]

@@ -22,7 +22,7 @@ from depthpose.core.files import CLOUD_READERS, AnyPath, read_bytes, read_cloud
 from depthpose.core.files.disk import refused_as, refused_suffix
 from depthpose.core.files.points import Ragged, read_ply_elements
 from depthpose.core.units import Unit
-from depthpose.pose.mesh.bodies import faces_of_part
+from depthpose.pose.mesh.bodies import mark_part
 from depthpose.pose.mesh.shapes import shape_geometry, shape_unit
 
 _MOST_VALUES = 2 * 10**7  # that the accessors of a GLB may declare: six million points
@@ -135,7 +135,7 @@ def _clean_surface(
     _, first = np.unique(np.sort(merged, axis=-1), axis=0, return_index=True)
     is_kept = np.isin(np.arange(len(faces)), first) & (area > _NO_AREA * extent_squared)
     faces = faces[is_kept]
-    is_part = faces_of_part(path, unique_points, merged[is_kept], area[is_kept])
+    is_part = mark_part(path, unique_points, merged[is_kept], area[is_kept])
     if is_part.all():
         return vertices, faces  # vertices of no face stay, and all keep their numbers
     # The vertices of dropped bodies go, and with them all others of no face.
@@ -164,7 +164,7 @@ def _read_ply(path: AnyPath) -> tuple[np.ndarray, Ragged]:
     return vertices, lists[named[0]] if named else _NO_FACES
 
 
-def _rows_of(path: AnyPath, data: bytes) -> Iterator[tuple[int, list[bytes]]]:
+def _split_lines(path: AnyPath, data: bytes) -> Iterator[tuple[int, list[bytes]]]:
     """Give the number and the words of each line of text, without comments.
 
     The first word is in lower case. A backslash at the end of a line joins it with the next.
@@ -224,7 +224,7 @@ def _read_stl_text(path: AnyPath, data: bytes) -> tuple[np.ndarray, Ragged]:
     points = array("d")
     ends = array("q", [0])  # of loops, in points
     keyword = b""
-    for line, words in _rows_of(path, data):
+    for line, words in _split_lines(path, data):
         keyword = words[0]
         if keyword == b"vertex":
             points.extend(_read_point(path, line, words))
@@ -246,7 +246,7 @@ def _read_obj(path: AnyPath) -> tuple[np.ndarray, Ragged]:
     has_curves = False
     highest = 0
     highest_line = 0
-    for line, words in _rows_of(path, read_bytes(path)):
+    for line, words in _split_lines(path, read_bytes(path)):
         if words[0] == b"v":
             points.extend(_read_point(path, line, words))
         elif words[0] in (b"f", b"fo"):  # fo of old writers is the same
@@ -317,7 +317,7 @@ def _refuse_scene(path: AnyPath, data: bytes) -> None:
         nodes = scene.get("nodes", [])
         values = _count_values(scene)
         work = _refuse_nodes(path, nodes)
-        unread = _unread_features(scene)
+        unread = _list_unread_features(scene)
         links = [str(buffer.get("uri") or "data:") for buffer in scene.get("buffers", [])]
         outside = [link for link in links if not link.startswith("data:")]
     if outside:
@@ -356,7 +356,7 @@ def _count_values(scene: Any) -> int:  # noqa: ANN401  JSON
     return max(sum(values), placed)
 
 
-def _unread_features(scene: Any) -> list[str]:  # noqa: ANN401  JSON
+def _list_unread_features(scene: Any) -> list[str]:  # noqa: ANN401  JSON
     """Name the features of a glTF scene that change its surface, and are not read."""
     unread = [n for n in scene.get("extensionsRequired", []) if not n.startswith(_KNOWN)]
     accessors = scene.get("accessors", [])
@@ -471,7 +471,7 @@ def cut_polygons(
     overlap = np.zeros(len(sizes))  # area of each polygon that its triangles cover twice
     area = 0.0
     steps = 0.0
-    for group in _groups_by_size(sizes):
+    for group in _group_by_size(sizes):
         size = int(sizes[group[0]])
         polygons = corners[starts[group, None] + np.arange(size)]
         normals, is_reflex = _find_reflex(vertices[polygons])
@@ -482,7 +482,7 @@ def cut_polygons(
                 f"{path}: its polygons that are not convex have too many corners to be cut in some "
                 f"seconds (one of {size} among them); export it as triangles"
             )
-        local = _cut(vertices[polygons], normals, is_reflex)
+        local = _cut_equal_polygons(vertices[polygons], normals, is_reflex)
         triangles = np.take_along_axis(polygons[:, None], local, 2)
         pieces.append(triangles.reshape(-1, 3))
         owners.append(group.repeat(size - 2))
@@ -503,7 +503,7 @@ def cut_polygons(
     return np.concatenate(pieces)[np.argsort(np.concatenate(owners), kind="stable")]
 
 
-def _groups_by_size(sizes: np.ndarray) -> Iterator[np.ndarray]:
+def _group_by_size(sizes: np.ndarray) -> Iterator[np.ndarray]:
     """Give the indices of polygons of equally many corners, in groups that fit in memory."""
     order = np.argsort(sizes, kind="stable")
     for same_size in np.split(order, np.flatnonzero(np.diff(sizes[order])) + 1):
@@ -525,7 +525,9 @@ def _find_reflex(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return normals, turns < -_FLAT * (normals**2).sum(-1, keepdims=True)
 
 
-def _cut(points: np.ndarray, normals: np.ndarray, is_reflex: np.ndarray) -> np.ndarray:
+def _cut_equal_polygons(
+    points: np.ndarray, normals: np.ndarray, is_reflex: np.ndarray
+) -> np.ndarray:
     """Cut polygons (m, n, 3) into triangles; give the corners of each, as indices (m, n - 2, 3).
 
     Convex polygons are cut as fans, others by ear clipping.

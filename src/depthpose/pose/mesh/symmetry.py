@@ -168,7 +168,7 @@ class SurfaceDeviation:
 
 
 @lru_cache(maxsize=4)
-def _surface_of(model: ObjectModel) -> SurfaceDeviation:
+def _prepare_surface(model: ObjectModel) -> SurfaceDeviation:
     """Give the surface of a model, made once for its several searches."""
     return SurfaceDeviation(model)
 
@@ -190,17 +190,17 @@ def propose_symmetries(model: ObjectModel, tolerance: float = 0.02) -> list[Symm
     Returns:
         Proposals of a certainty of 1/5 and more, continuous first, then the surest.
     """
-    surface = _surface_of(model)
+    surface = _prepare_surface(model)
     limit = 2 * tolerance
     proposals: list[SymmetryProposal] = []
     tried_axes: list[Tensor] = []
     revolution_axes: list[Tensor] = []
-    for coarse in promising_turns(surface):
+    for coarse in _find_promising_turns(surface):
         if len(revolution_axes) >= 2 or len(tried_axes) >= _MOST_AXES:
             break
-        if _is_covered(_axis_of(coarse), tried_axes, revolution_axes):
+        if _is_covered(_find_axis(coarse), tried_axes, revolution_axes):
             continue
-        axis = _axis_of(_follow_surface(surface, coarse))
+        axis = _find_axis(_follow_surface(surface, coarse))
         if not _is_covered(axis, tried_axes, revolution_axes):
             tried_axes.append(axis)
             measured = _measure_axis(surface, axis, limit, tolerance)
@@ -209,7 +209,7 @@ def propose_symmetries(model: ObjectModel, tolerance: float = 0.02) -> list[Symm
     return sorted(proposals, key=lambda p: (p.kind != "continuous", -p.certainty))
 
 
-def _axis_of(R: Tensor) -> Tensor:
+def _find_axis(R: Tensor) -> Tensor:
     """Give the direction that a rotation leaves alone; well defined for half turns too."""
     return torch.linalg.svd(R - _EYE).Vh[-1]
 
@@ -325,7 +325,7 @@ def with_found_symmetries(
     return replace(model, symmetries=symmetries) if is_taken else model
 
 
-def _rotations(
+def _rotate_about(
     direction: Float[Tensor, "3"], angles: Float[Tensor, " a"]
 ) -> Float[Tensor, "a 3 3"]:
     """Give the rotation matrices about a direction by each angle."""
@@ -333,11 +333,11 @@ def _rotations(
 
 
 @lru_cache(maxsize=4)
-def promising_turns(surface: SurfaceDeviation) -> tuple[Float[Tensor, "3 3"], ...]:
+def _find_promising_turns(surface: SurfaceDeviation) -> tuple[Float[Tensor, "3 3"], ...]:
     """Give the rotations about principal axes and many directions that fit roughly, best first."""
     directions = torch.cat([surface.axes, fibonacci_directions(_DIRECTIONS)])
     angles = torch.tensor([2 * math.pi / order for order in _COARSE_ORDERS], dtype=torch.float64)
-    rotations = torch.stack([_rotations(direction, angles) for direction in directions])
+    rotations = torch.stack([_rotate_about(direction, angles) for direction in directions])
     rotations = rotations.flatten(0, 1)
     distance = surface.rough_distance(rotations)
     order = distance.argsort().tolist()
@@ -372,7 +372,7 @@ def _measure_axis(
     """
     # Angle and deviation of each symmetry; an angle of None is that of the full circle.
     step = 2 * math.pi / _CIRCLE_TURNS
-    circle = _rotations(direction, torch.arange(1, _CIRCLE_TURNS) * step)
+    circle = _rotate_about(direction, torch.arange(1, _CIRCLE_TURNS) * step)
     full: list[tuple[None, float]] = []
     worst = math.inf
     if bool((surface.rough_distance(circle) <= _MAX_ROUGH_DEVIATION).all()):
@@ -399,11 +399,11 @@ def _measure_orders(
     """Measure rotations of order 2 to 12; give angle and deviation of the best within ``limit``."""
     shares = sorted({k / order for order in _ORDERS for k in range(1, order)})
     angles = torch.tensor(shares, dtype=torch.float64) * (2 * math.pi)
-    rough = surface.rough_distance(_rotations(direction, angles))
+    rough = surface.rough_distance(_rotate_about(direction, angles))
     angles = angles[rough <= _MAX_ROUGH_DEVIATION]
     if len(angles) == 0:
         return []
-    deviation = surface.deviation(_rotations(direction, angles))
+    deviation = surface.deviation(_rotate_about(direction, angles))
     chosen: list[tuple[float, float]] = []
     for i in deviation.argsort().tolist():
         angle = float(angles[i])
@@ -425,7 +425,7 @@ def _measure_teeth(
     for order in _TEETH:
         step = 2 * math.pi / order
         angles = torch.tensor([step, 0.5 * step, 1.5 * step], dtype=torch.float64)
-        tooth_R, *between_R = _rotations(direction, angles)
+        tooth_R, *between_R = _rotate_about(direction, angles)
         if float(surface.rough_distance(tooth_R)) > _MAX_ROUGH_DEVIATION:
             continue
         turn = Rigid(tooth_R, torch.zeros(3, dtype=torch.float64))
@@ -466,7 +466,7 @@ def mirror_deviation(model: ObjectModel) -> float:
 
 def _search_mirror(model: ObjectModel) -> float:
     """Give the least deviation of a surface from its mirror images, in diameters."""
-    surface = _surface_of(model)
+    surface = _prepare_surface(model)
     # Reflections across planes with normal n, followed by rotations about n by 0, 90, 180 and 270
     # degrees: cos (1 - nn') + sin [n] - nn'. The best that are distinct are the starts.
     normals = torch.cat([surface.axes, fibonacci_directions(_MIRROR_PLANES)])
@@ -588,15 +588,15 @@ def _search_near_symmetries(model: ObjectModel) -> dict[str, Any]:
     Gives JSON values, which are cached: ``near``, transforms with their deviations, the best first;
     and ``alike``, flags of the discrete and the continuous symmetries.
     """
-    surface = _surface_of(model)
-    alike = _which_are_alike(model.symmetries, surface)
-    measured = _deviations(_near_candidates(model.symmetries, surface), surface)
+    surface = _prepare_surface(model)
+    alike = _find_alike(model.symmetries, surface)
+    measured = _measure_deviations(_propose_near_symmetries(model.symmetries, surface), surface)
 
     # Products of the best candidates are candidates too: a can upside down, then about its axis.
     by_deviation = sorted(measured, key=lambda pair: pair[0])
     good = [motion for deviation, motion in by_deviation if deviation <= _NEAR_TOLERANCE]
     products = [first @ second for first in good[:_NEAR_STARTS] for second in good[:3]]
-    measured += _deviations(products, surface)
+    measured += _measure_deviations(products, surface)
 
     # The best, each far from better ones and from all copies of these that look alike.
     same = symmetry_transforms(true_symmetries(model, alike), _FINE_AXIS_STEP_RAD).R.double()
@@ -614,9 +614,7 @@ def _search_near_symmetries(model: ObjectModel) -> dict[str, Any]:
     return {"near": rows, "alike": alike}
 
 
-def _which_are_alike(
-    symmetries: Symmetries, surface: SurfaceDeviation
-) -> tuple[list[bool], list[bool]]:
+def _find_alike(symmetries: Symmetries, surface: SurfaceDeviation) -> tuple[list[bool], list[bool]]:
     """Say which discrete symmetries, and which axes, have copies that lie on the surface."""
     discrete = list[bool]()
     if symmetries.discrete is not None:
@@ -625,12 +623,12 @@ def _which_are_alike(
     circle = torch.arange(1, 8, dtype=torch.float64) * (math.pi / 4)
     continuous = list[bool]()
     for axis in symmetries.continuous:
-        R = _rotations(axis.direction.double(), circle)
+        R = _rotate_about(axis.direction.double(), circle)
         continuous.append(float(surface.deviation(R, share=ALMOST_ALL).max()) <= ALIKE)
     return discrete, continuous
 
 
-def _near_candidates(symmetries: Symmetries, surface: SurfaceDeviation) -> list[Rigid]:
+def _propose_near_symmetries(symmetries: Symmetries, surface: SurfaceDeviation) -> list[Rigid]:
     """Give motions that may be near-symmetries: symmetries that were found, and refined rotations.
 
     Refinement may shift the surface too: a scan whose points are denser on one side has its centre
@@ -643,8 +641,8 @@ def _near_candidates(symmetries: Symmetries, surface: SurfaceDeviation) -> list[
 
     # Refined from quarter turns about the principal axes, and the best of many other rotations.
     quarters = torch.arange(1, 4).double() * (math.pi / 2)
-    starts = [R for axis in surface.axes for R in _rotations(axis, quarters)]
-    for R in promising_turns(surface):
+    starts = [R for axis in surface.axes for R in _rotate_about(axis, quarters)]
+    for R in _find_promising_turns(surface):
         if len(starts) >= _NEAR_STARTS:
             break
         distances = [float(geodesic_rad(R, start)) for start in (_EYE, *starts)]
@@ -653,7 +651,9 @@ def _near_candidates(symmetries: Symmetries, surface: SurfaceDeviation) -> list[
     return candidates + [refine_turn(surface, R) for R in starts]
 
 
-def _deviations(motions: list[Rigid], surface: SurfaceDeviation) -> list[tuple[float, Rigid]]:
+def _measure_deviations(
+    motions: list[Rigid], surface: SurfaceDeviation
+) -> list[tuple[float, Rigid]]:
     """Pair each motion with how far it moves the surface off itself, in diameters."""
     if not motions:
         return []

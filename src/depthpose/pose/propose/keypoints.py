@@ -98,7 +98,7 @@ def _meet(lines: Lines, centre_m: Float[Tensor, "*batch 1 3"], refinements: int)
     wn = n * w[..., None, :]
     A = (total * eye - (wn @ n.mT).double()) / total
     b = (local @ w[..., None] - wn @ along.mT).double() / total
-    p = torch.linalg.solve(_damped(A), b).squeeze(-1)
+    p = torch.linalg.solve(_damp(A), b).squeeze(-1)
     values = torch.linalg.eigvalsh(A)
     least = values[..., 0].clamp(min=_EIGENVALUE_ROUNDING)
     is_crossing = values[..., 0] > _EIGENVALUE_ROUNDING
@@ -121,7 +121,7 @@ def _meet(lines: Lines, centre_m: Float[Tensor, "*batch 1 3"], refinements: int)
         amount = pull / distance * cosine.clamp(min=0.5)
         outer = ((q * amount[..., None, :]) @ q.mT).double()
         A = amount.sum(-1).double()[..., None, None] * eye - outer
-        step = torch.linalg.solve(_damped(A), gradient.sum(-1).double()[..., None]).squeeze(-1)
+        step = torch.linalg.solve(_damp(A), gradient.sum(-1).double()[..., None]).squeeze(-1)
         # No step is longer than the root mean square distance of the keypoint to the points.
         spread = local.square().sum(-2).mean(-1).double()
         limit = (p.square().sum(-1) + spread).sqrt()
@@ -129,7 +129,7 @@ def _meet(lines: Lines, centre_m: Float[Tensor, "*batch 1 3"], refinements: int)
         p = p + step * shortening[..., None]
 
     # Each line gives 2 equations for 3 unknowns: the correction for the degrees of freedom.
-    inverse = torch.linalg.inv(_damped(A))
+    inverse = torch.linalg.inv(_damp(A))
     votes = (w > 0).sum(-1)
     correction = (2 * votes.double() / (2 * votes - 3).clamp(min=1))[..., None, None]
     covariance = correction * (inverse @ (gradient @ gradient.mT).double() @ inverse)
@@ -141,7 +141,7 @@ def _meet(lines: Lines, centre_m: Float[Tensor, "*batch 1 3"], refinements: int)
     )
 
 
-def _damped(A: Float64[Tensor, "*b k 3 3"]) -> Float64[Tensor, "*b k 3 3"]:
+def _damp(A: Float64[Tensor, "*b k 3 3"]) -> Float64[Tensor, "*b k 3 3"]:
     """Add a little to the diagonal: parallel lines then meet near the mean of the points."""
     size = A.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None].clamp(min=1e-300)
     return A + 1e-12 * size * torch.eye(3, dtype=A.dtype, device=A.device)
@@ -307,7 +307,7 @@ _LEAST_KEYPOINTS = 4  # that must agree: three fix a pose with nothing left to c
 _STEPS = 4  # Gauss-Newton from Kabsch: the fourth step is below float64's noise
 
 
-def fits_of(vote: Vote, model: ObjectModel, config: EstimateConfig) -> PoseFit | Refusal:
+def fit_poses(vote: Vote, model: ObjectModel, config: EstimateConfig) -> PoseFit | Refusal:
     """Fit a pose to the keypoints that are consistent; where ICP follows, also to all of them.
 
     Returns:
@@ -329,7 +329,7 @@ def fits_of(vote: Vote, model: ObjectModel, config: EstimateConfig) -> PoseFit |
         config.rough_rigidity_diameters if config.with_icp else config.voting.rigidity_diameters
     )
     limit_m = model.diameter_m * limit_diameters
-    is_consistent = consistent_keypoints(vote.keypoints_m, model.keypoints_m, limit_m, is_met)
+    is_consistent = find_consistent_keypoints(vote.keypoints_m, model.keypoints_m, limit_m, is_met)
     consistent = int(is_consistent.sum())
     choices = [is_consistent] if consistent >= _LEAST_KEYPOINTS else []
     if config.with_icp and not torch.equal(is_consistent, is_met):
@@ -388,13 +388,13 @@ def fit_pose(
 
     for _ in range(_STEPS):  # of Gauss-Newton
         moved_m = pose.apply(model_m)
-        weighted, H = _pose_information(moved_m, information)
+        weighted, H = _weigh_motion(moved_m, information)
         gradient = (weighted @ (observed_m - moved_m)[..., None]).sum(-3).squeeze(-1)
         motion = torch.linalg.solve(H, gradient)
         pose = Rigid(rotation_by(motion[..., :3]), motion[..., 3:]) @ pose
 
     moved_m = pose.apply(model_m)
-    _, H = _pose_information(moved_m, information)
+    _, H = _weigh_motion(moved_m, information)
     error_m = moved_m - observed_m
     mean_square_m2 = (error_m.square().sum(-1) * used).sum(-1) / used.sum(-1)
     return PoseFit(
@@ -404,7 +404,7 @@ def fit_pose(
     )
 
 
-def _pose_information(
+def _weigh_motion(
     moved_m: Float64[Tensor, "*batch k 3"], information: Float64[Tensor, "*batch k 3 3"]
 ) -> tuple[Float64[Tensor, "*batch k 6 3"], Float64[Tensor, "*batch 6 6"]]:
     """Give ``J^T C^-1`` of each keypoint and ``sum J^T C^-1 J``, by left perturbations of a pose.
@@ -419,7 +419,7 @@ def _pose_information(
     return weighted, (weighted @ J).sum(-3)
 
 
-def consistent_keypoints(
+def find_consistent_keypoints(
     keypoints_m: Float[Tensor, "*batch k 3"],
     model_keypoints_m: Float[Tensor, "k 3"],
     tolerance_m: float,
@@ -440,8 +440,8 @@ def consistent_keypoints(
     Returns:
         Those that remain; three or more of them fix a pose.
     """
-    distance_m = _pairwise_distance(keypoints_m)
-    model_distance_m = _pairwise_distance(model_keypoints_m.to(keypoints_m))
+    distance_m = _measure_pairs(keypoints_m)
+    model_distance_m = _measure_pairs(model_keypoints_m.to(keypoints_m))
     errors_m = (distance_m - model_distance_m).abs()
     count = keypoints_m.shape[-2]
     remains = torch.ones(keypoints_m.shape[:-1], dtype=torch.bool, device=keypoints_m.device)
@@ -457,5 +457,5 @@ def consistent_keypoints(
     return remains
 
 
-def _pairwise_distance(points_m: Float[Tensor, "*batch k 3"]) -> Float[Tensor, "*batch k k"]:
+def _measure_pairs(points_m: Float[Tensor, "*batch k 3"]) -> Float[Tensor, "*batch k k"]:
     return (points_m[..., :, None, :] - points_m[..., None, :, :]).norm(dim=-1)

@@ -120,24 +120,24 @@ def find_turns(model: ObjectModel) -> dict[str, Any]:
     # References from all sides, not from the first faces alone.
     references = take_evenly(torch.arange(len(table.points_m)), _SELF_REFERENCES)
     candidates, _ = vote_poses(table.points_m, table.frames[..., 0], references, table, _SELF_PEAKS)
-    candidates = candidates[_distinct_turns(candidates, surface)[0]]
+    candidates = candidates[_choose_distinct_turns(candidates, surface)[0]]
 
     # Refined as poses before a camera in the middle of the model, from where all is visible.
     points_m = surface.points_m - surface.middle_m
     starts = Rigid(candidates.R, candidates.t_m - surface.middle_m)
     candidates = refine_roughly(points_m, starts, surface, IcpConfig())
     candidates = Rigid(candidates.R, candidates.t_m + surface.middle_m)
-    candidates = candidates[_distinct_turns(candidates, surface)[0]]
+    candidates = candidates[_choose_distinct_turns(candidates, surface)[0]]
 
     # Products of two are candidates too, which fill gaps between those that were found.
     products = candidates[:, None] @ candidates
     products = Rigid(products.R.flatten(0, 1), products.t_m.flatten(0, 1))
     candidates = Rigid.cat([candidates, products])
-    chosen, near = _distinct_turns(candidates, surface)
+    chosen, near = _choose_distinct_turns(candidates, surface)
     return {"turns": candidates[chosen].matrix().tolist(), "near": near}
 
 
-def _distinct_turns(turns: Rigid, surface: Surface) -> tuple[list[int], int]:
+def _choose_distinct_turns(turns: Rigid, surface: Surface) -> tuple[list[int], int]:
     """Choose the motions after which most of a surface lies on itself, the best first.
 
     None is within 12 degrees of a better one, of a symmetry, or of a product of these; one that is
@@ -175,19 +175,19 @@ def prepare_pairs(surface: Surface) -> PairTable:
         surface: of the model; normals may point to either side.
     """
     # Points of the visible surface, few enough.
-    points_m, normals = _visible_from_outside(surface)
+    points_m, normals = _find_visible_points(surface)
     step_m = STEP * surface.diameter_m
     while len(kept := thin(points_m, normals, step_m)) > _MODEL_POINTS:
         step_m *= _COARSER
     points_m = points_m[kept]
-    frames = _frames(normals[kept])
+    frames = _make_frames(normals[kept])
 
     # All pairs of two different points, by feature. Within a feature they are shuffled, so that the
     # first ones are a sample of all.
     count = len(points_m)
     first = torch.arange(count).repeat_interleave(count - 1)
     bin_m = STEP * surface.diameter_m
-    keys, turns = _features_of_all(array_of(points_m), array_of(frames), bin_m)
+    keys, turns = _describe_all_pairs(array_of(points_m), array_of(frames), bin_m)
     turn_rad = torch.from_numpy(turns)
     shuffle = torch.randperm(len(first), generator=torch.Generator().manual_seed(0))
     feature, order = torch.from_numpy(keys)[shuffle].sort(stable=True)
@@ -231,7 +231,7 @@ def propose_poses(
     return poses[best]
 
 
-def _visible_from_outside(
+def _find_visible_points(
     surface: Surface,
 ) -> tuple[Float64[Tensor, "n 3"], Float64[Tensor, "n 3"]]:
     """Give the points that a far camera sees from anywhere, with normals toward it.
@@ -260,7 +260,7 @@ def _visible_from_outside(
     return points_m, torch.cat([surface.normals[front], -surface.normals[back]])
 
 
-def _frames(normals: Float64[Tensor, "n 3"]) -> Float64[Tensor, "n 3 3"]:
+def _make_frames(normals: Float64[Tensor, "n 3"]) -> Float64[Tensor, "n 3 3"]:
     """Give each normal and two tangents, as columns."""
     least = torch.eye(3, dtype=torch.float64)[normals.abs().argmin(-1)]
     first = normalize(torch.linalg.cross(normals, least), dim=-1)
@@ -268,7 +268,7 @@ def _frames(normals: Float64[Tensor, "n 3"]) -> Float64[Tensor, "n 3 3"]:
 
 
 @compiled
-def _features_of_all(
+def _describe_all_pairs(
     points: Float64[np.ndarray, "m 3"], frames: Float64[np.ndarray, "m 3 3"], step: float
 ) -> tuple[Int64[np.ndarray, " pairs"], Float64[np.ndarray, " pairs"]]:
     """Give the key of the feature of every pair of two points, and the turn of its second point."""
@@ -282,7 +282,7 @@ def _features_of_all(
             if j == i:
                 continue
             turns[pair] = _write_feature(points, frames, i, j, step, feature)
-            keys[pair] = _key(feature)
+            keys[pair] = _make_key(feature)
             pair += 1
     return keys, turns
 
@@ -315,20 +315,20 @@ def _write_feature(
         cosine += frames[i, c, 0] * frames[j, c, 0]
     distance = max(np.sqrt(square), 1e-12)
     feature[0] = distance / step
-    feature[1] = _angle_bins(along / distance)
-    feature[2] = _angle_bins(along_second / distance)
-    feature[3] = _angle_bins(cosine)
+    feature[1] = _measure_angle(along / distance)
+    feature[2] = _measure_angle(along_second / distance)
+    feature[3] = _measure_angle(cosine)
     return np.arctan2(up, aside)
 
 
 @compiled
-def _angle_bins(cosine: float) -> float:
+def _measure_angle(cosine: float) -> float:
     """Give the angle of a cosine in bins."""
     return np.arccos(min(1.0, max(-1.0, cosine))) * (ANGLES / np.pi)
 
 
 @compiled
-def _key(feature: Float64[np.ndarray, "4"]) -> int:
+def _make_key(feature: Float64[np.ndarray, "4"]) -> int:
     """Give one number for the bins of a feature."""
     key = 0
     for k in range(4):
@@ -366,7 +366,7 @@ def vote_poses(
     Returns:
         Poses and their votes, reference after reference.
     """
-    frames = _frames(normals)
+    frames = _make_frames(normals)
     peaks_of_each = _vote(
         array_of(points_m),
         array_of(frames),
@@ -435,13 +435,13 @@ def _vote(
                 square += (points[j, c] - points[i, c]) ** 2
             if square > step * step and square < (DISTANCES * step) ** 2:
                 turn = _write_feature(points, frames, i, j, step, feature)
-                _vote_of_pair(feature, turn, pairs, voted, counts)
+                _vote_by_pair(feature, turn, pairs, voted, counts)
         _find_peaks(counts, best_point[r], best_turn[r], best_votes[r])
     return best_point, best_turn, best_votes
 
 
 @compiled
-def _vote_of_pair(
+def _vote_by_pair(
     feature: Float64[np.ndarray, "4"],
     turn: float,
     pairs: _PairArrays,
@@ -449,7 +449,7 @@ def _vote_of_pair(
     counts: Float32[np.ndarray, "m turns"],
 ) -> None:
     """Add the votes of the model's pairs with the feature of a pair of the scene, or nearly so."""
-    key = _key(feature)
+    key = _make_key(feature)
     _add_votes(key, turn, pairs, voted, counts)
 
     # In each part of the feature the bin next to the pair's too; beyond the last it is the same.
@@ -477,11 +477,11 @@ def _add_votes(
     voted[key] |= bit
     weight = np.float32(1 / np.sqrt(high - low))  # rare features weigh more
     for p in range(low, min(high, low + _MOST_ALIKE)):
-        counts[pairs.first[p], _turn_bin(turn - pairs.turn[p])] += weight
+        counts[pairs.first[p], _find_turn_bin(turn - pairs.turn[p])] += weight
 
 
 @compiled
-def _turn_bin(turn: float) -> int:
+def _find_turn_bin(turn: float) -> int:
     """Give the bin of the difference of two angles between -pi and pi."""
     value = turn * (TURNS / (2 * np.pi))
     b = int(value + TURNS if value < 0 else value)

@@ -45,7 +45,7 @@ class Solid:
     number: int | None  # ``obj_id``; None for clutter
 
 
-def random_pattern(
+def draw_pattern(
     generator: torch.Generator, size_m: float, colourful: tuple[float, float] = (0.0, 0.8)
 ) -> Pattern:
     """Draw a pattern whose features are about a third of a size.
@@ -68,7 +68,7 @@ def random_pattern(
     )
 
 
-def random_clutter(generator: torch.Generator) -> Solid:
+def draw_clutter(generator: torch.Generator) -> Solid:
     """Draw clutter: a box, a ball or a can."""
     import trimesh
 
@@ -85,7 +85,7 @@ def random_clutter(generator: torch.Generator) -> Solid:
     corners = torch.tensor(mesh.triangles, dtype=torch.float32)
     normals = torch.tensor(mesh.face_normals, dtype=torch.float32)[:, None].expand(-1, 3, 3)
     return Solid(
-        triangles_m=corners, normals=normals, pattern=random_pattern(generator, size_m), number=None
+        triangles_m=corners, normals=normals, pattern=draw_pattern(generator, size_m), number=None
     )
 
 
@@ -180,7 +180,7 @@ def make_frames(
     solids = list[Solid]()
     for model in models:  # an object looks alike in every frame of every data set
         chance = sample_generator(model.number, _COLOUR_SEED)
-        pattern = random_pattern(chance, model.diameter_m, (0.7, 1.0))
+        pattern = draw_pattern(chance, model.diameter_m, (0.7, 1.0))
         corners = drawn_triangles(model)
         normals = model.normals[model.faces]
         if not len(model.faces):  # each point is a disc of several triangles
@@ -200,11 +200,11 @@ def _make_frame(
     # The scene in the table's frame (z up), and the camera.
     generator = sample_generator(index, config.seed + _FRAMES_SEED)
     if config.frame_pile:
-        scene = _pile(models, solids, config, generator)
+        scene = _drop_pile(models, solids, config, generator)
     else:
         scene = _arrange(solids, config, generator)
-    scene.append((_random_table(generator), Rigid(torch.eye(3), torch.zeros(3))))
-    camera_from_table = _random_viewpoint(config, generator)
+    scene.append((_draw_table(generator), Rigid(torch.eye(3), torch.zeros(3))))
+    camera_from_table = _draw_viewpoint(config, generator)
     placed = [(solid, camera_from_table @ pose) for solid, pose in scene]
     assert config.centre_px is not None, "the config computes a centre left out"
     fx, fy = config.focal_px
@@ -219,9 +219,9 @@ def _make_frame(
     visible = torch.where(raster.primitive >= 0, owner[raster.primitive.clamp(min=0)], -1)
 
     # The picture: a background, lit bodies before it, and a camera's errors.
-    image = _blurred_background(height, width, generator)
+    image = _draw_background(height, width, generator)
     up = camera_from_table.R[:, 2]
-    towards, lamp, ambient = _random_light(up, generator)
+    towards, lamp, ambient = _draw_light(up, generator)
     image[:, raster.primitive >= 0] = shade(placed, raster, K, towards, lamp, ambient).mT
     rgb = _photograph(image, generator)
 
@@ -246,19 +246,19 @@ def _make_frame(
     return BopFrame(number=index, K=K, depth_m=depth_m, objects=shown, rgb=rgb)
 
 
-def _random_table(generator: torch.Generator) -> Solid:
+def _draw_table(generator: torch.Generator) -> Solid:
     """Draw the top of a table, at height 0."""
     h = 0.5 * uniform(generator, 0.8, 3.0)
     return Solid(
         triangles_m=torch.tensor([[[-h, -h, 0.0], [h, -h, 0.0], [h, h, 0.0]],
                                   [[-h, -h, 0.0], [h, h, 0.0], [-h, h, 0.0]]]),
         normals=torch.tensor([0.0, 0.0, 1.0]).expand(2, 3, 3),
-        pattern=random_pattern(generator, uniform(generator, 0.05, 0.5)),
+        pattern=draw_pattern(generator, uniform(generator, 0.05, 0.5)),
         number=None,
     )  # fmt: skip
 
 
-def _blurred_background(
+def _draw_background(
     height: int, width: int, generator: torch.Generator
 ) -> Float[Tensor, "3 {height} {width}"]:
     """Draw a background out of focus: blots of several sizes over a colour."""
@@ -270,7 +270,7 @@ def _blurred_background(
     return image.clamp(0, 1)
 
 
-def _random_light(
+def _draw_light(
     up: Float[Tensor, "3"], generator: torch.Generator
 ) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"], Float[Tensor, "3"]]:
     """Draw a lamp above a table: the direction to it, its colour, and that of ambient light."""
@@ -306,7 +306,7 @@ def _arrange(
     chosen = [solids[i] for i in order[:objects].tolist()]
     low, high = config.frame_clutter
     clutter = low + random_index(generator, high - low + 1)
-    chosen += [random_clutter(generator) for _ in range(clutter)]
+    chosen += [draw_clutter(generator) for _ in range(clutter)]
 
     # Each is tried at places farther and farther from the middle until its circle is free; one that
     # never finds a free place is left out.
@@ -333,7 +333,7 @@ _CELL_M = 0.004  # side of a cell of the height map of a pile
 _DROPS = 10  # places that are tried for each body of a pile
 
 
-def _pile(
+def _drop_pile(
     models: Sequence[ObjectModel],
     solids: Sequence[Solid],
     config: ObjectsConfig,
@@ -371,7 +371,7 @@ def _pile(
     return placed
 
 
-def _random_viewpoint(config: ObjectsConfig, generator: torch.Generator) -> Rigid:
+def _draw_viewpoint(config: ObjectsConfig, generator: torch.Generator) -> Rigid:
     """Draw a camera that looks down at about the middle of the table; ``camera_from_table``.
 
     It is 25 to 85 degrees above the table.

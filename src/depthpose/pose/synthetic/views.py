@@ -69,7 +69,7 @@ def random_rotation(generator: torch.Generator) -> Float[Tensor, "3 3"]:
     return torch.tensor(rows, dtype=torch.float64)
 
 
-def random_levels(height: int, width: int, generator: torch.Generator) -> Depth:
+def draw_levels(height: int, width: int, generator: torch.Generator) -> Depth:
     """Draw an image whose sublevel sets are half-planes, ellipses, boxes or convex polygons.
 
     Where it lies below a quantile of its values on an object, exactly that share of the object is
@@ -112,7 +112,7 @@ def occlude(
         The depth with the occluder, and the part of the silhouette that stays visible.
     """
     count = round(share * int(silhouette.sum()))
-    levels = random_levels(depth_m.shape[0], depth_m.shape[1], generator)
+    levels = draw_levels(depth_m.shape[0], depth_m.shape[1], generator)
     gap_m = uniform(generator, 0.005, 0.15)
     if count == 0:
         return depth_m, silhouette
@@ -143,8 +143,8 @@ def simulate_depth(
     missing = uniform(generator, *config.missing)
     if kind == "none":
         return depth_m
-    is_lost = _is_too_steep(depth_m, focal_px[0], is_laser=kind == "laser")
-    is_lost |= _random_gaps(depth_m.shape, missing, generator)
+    is_lost = _mark_steep(depth_m, focal_px[0], is_laser=kind == "laser")
+    is_lost |= _mark_gaps(depth_m.shape, missing, generator)
 
     # Noise that neighbours share, by a width in pixels of the full image.
     correlation_px = config.noise_correlation_px
@@ -152,17 +152,19 @@ def simulate_depth(
         correlation_px = correlation_px or _STEREO_CORRELATION_PX
     scale = focal_px[0] / focal_px[1]
     width_px = scale * uniform(generator, *correlation_px) if correlation_px else 0.0
-    unit_noise = noise * smooth_noise((depth_m.shape[0], depth_m.shape[1]), width_px, generator)
+    unit_noise = noise * draw_smooth_noise(
+        (depth_m.shape[0], depth_m.shape[1]), width_px, generator
+    )
 
     if kind == "structured light":
-        is_lost |= _is_shadowed(depth_m, focal_px[0])
+        is_lost |= _mark_shadow(depth_m, focal_px[0])
         read_m = _swap_neighbours(depth_m, generator)
         # Nguyen, Izadi and Lovell 2012: sigma_z = 0.0012 + 0.0019 (z - 0.4)^2 [m].
         read_m = read_m + unit_noise * (0.0012 + 0.0019 * (read_m - 0.4).square())
         scale_px_m = _KINECT_STEPS_PER_PX * focal_px[1] * _KINECT_BASELINE_M
         read_m = _round_disparity(read_m, scale_px_m)
     elif kind == "active stereo":
-        is_lost |= _is_shadowed(depth_m.flip(1), focal_px[0], _STEREO_BASELINE_M).flip(1)
+        is_lost |= _mark_shadow(depth_m.flip(1), focal_px[0], _STEREO_BASELINE_M).flip(1)
         first, second = (_displace(depth_m, scale, generator) for _ in range(2))
         read_m = torch.lerp(first, second, torch.rand(depth_m.shape, generator=generator))
         read_m = read_m + unit_noise * 0.003 * read_m.square()
@@ -177,7 +179,7 @@ def simulate_depth(
     return torch.where(is_lost, torch.nan, read_m)
 
 
-def _is_too_steep(depth_m: Depth, focal_px: float, *, is_laser: bool) -> Mask:
+def _mark_steep(depth_m: Depth, focal_px: float, *, is_laser: bool) -> Mask:
     """Mark pixels of a surface seen at a grazing angle, which a sensor does not read."""
     steepest = 2 * _STEEPEST if is_laser else _STEEPEST
     limit_m = depth_m * (steepest / focal_px)  # largest change of depth to the next pixel
@@ -190,7 +192,7 @@ def _is_too_steep(depth_m: Depth, focal_px: float, *, is_laser: bool) -> Mask:
     return is_steep
 
 
-def _random_gaps(size: torch.Size, share: float, generator: torch.Generator) -> Mask:
+def _mark_gaps(size: torch.Size, share: float, generator: torch.Generator) -> Mask:
     """Mark a share of the pixels as missing, half of them singly, half in patches."""
     height, width = size
     is_missing = torch.rand(height, width, generator=generator) < 0.5 * share
@@ -239,7 +241,7 @@ def _mix_at_jumps(depth_m: Depth, generator: torch.Generator) -> Depth:
     return mixed_m
 
 
-def smooth_noise(size: tuple[int, int], width_px: float, generator: torch.Generator) -> Depth:
+def draw_smooth_noise(size: tuple[int, int], width_px: float, generator: torch.Generator) -> Depth:
     """Draw normal noise of deviation 1, correlated between neighbours.
 
     It is white noise convolved with a Gaussian of deviation ``width_px``, 0 for white noise;
@@ -255,7 +257,7 @@ def smooth_noise(size: tuple[int, int], width_px: float, generator: torch.Genera
     return F.conv2d(along, weights.view(1, 1, -1, 1))[0, 0]
 
 
-def _is_shadowed(depth_m: Depth, focal_px: float, baseline_m: float = _KINECT_BASELINE_M) -> Mask:
+def _mark_shadow(depth_m: Depth, focal_px: float, baseline_m: float = _KINECT_BASELINE_M) -> Mask:
     """Mark pixels in shadow: a nearer surface hides them from the projector beside the camera."""
     column = torch.arange(depth_m.shape[1])
     projector_column = column + (focal_px * baseline_m / depth_m).nan_to_num(-torch.inf)
@@ -269,7 +271,7 @@ def _displace(depth_m: Depth, scale: float, generator: torch.Generator) -> Depth
     ``scale`` is that of the window to the full image, in whose pixels the displacement is drawn.
     """
     height, width = depth_m.shape
-    shifts = [1.2 * smooth_noise((height, width), 3.0 * scale, generator) for _ in range(2)]
+    shifts = [1.2 * draw_smooth_noise((height, width), 3.0 * scale, generator) for _ in range(2)]
     farthest = _STEREO_WINDOW_PX * scale
     dy, dx = ((scale * shift).clamp(-farthest, farthest).round().long() for shift in shifts)
     rows = (torch.arange(height)[:, None] + dy).clamp(0, height - 1)
@@ -310,7 +312,7 @@ class _StoredView:
     K: Float[Tensor, "3 3"]  #: intrinsic matrix of the window
     camera_from_model: Rigid  #: the pose
 
-    def full_depth(self) -> CleanView:
+    def restore_depth(self) -> CleanView:
         """Give the view with its depth."""
         depth_m = self.offset_m.float() + self.distance_m
         return CleanView(depth_m=depth_m, K=self.K, camera_from_model=self.camera_from_model)
@@ -327,7 +329,7 @@ def make_shape(model: ObjectModel) -> Shape:
     return Shape(triangles_m=triangles, hull_m=hull_m - middle, middle_m=middle)
 
 
-def gaze(direction: Float[Tensor, "3"], roll_rad: float) -> Float[Tensor, "3 3"]:
+def aim_camera(direction: Float[Tensor, "3"], roll_rad: float) -> Float[Tensor, "3 3"]:
     """Give the rotation that rolls a camera and then points its optical axis at a direction."""
     cosine = math.cos(roll_rad)
     sine = math.sin(roll_rad)
@@ -335,14 +337,14 @@ def gaze(direction: Float[Tensor, "3"], roll_rad: float) -> Float[Tensor, "3 3"]
     return turn_axis_to(direction) @ torch.tensor(roll, dtype=torch.float64)
 
 
-def pixel_to_ray(K: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
+def invert_intrinsics(K: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
     """Invert an intrinsic matrix without skew, in a tenth of the time of a general inverse."""
     (fx, _, cx), (_, fy, cy), _ = K.tolist()
     rows = [[1 / fx, 0, -cx / fx], [0, 1 / fy, -cy / fy], [0, 0, 1]]
     return torch.tensor(rows, dtype=torch.float64)
 
 
-def window_of(
+def find_window(
     shape: Shape, pose: Rigid, K: Float[Tensor, "3 3"]
 ) -> tuple[Float[Tensor, "3 3"], int, int]:
     """Give the window in which an object lies, with a margin: its intrinsics, width and height."""
@@ -356,7 +358,7 @@ def window_of(
 
 def draw_view(shape: Shape, pose: Rigid, K: Float[Tensor, "3 3"]) -> CleanView:
     """Draw an object in the window around it."""
-    window_K, width, height = window_of(shape, pose, K)
+    window_K, width, height = find_window(shape, pose, K)
     # float64 poses: the corners are rounded once.
     triangles = (shape.triangles_m.double() @ pose.R.mT + pose.t_m).float()
     raster = rasterize(triangles, window_K, width, height, with_barycentric=False)
@@ -376,10 +378,10 @@ def turn_view(
     """
     old = view.camera_from_model
     pose = Rigid(turn @ old.R, turn @ old.t_m)
-    window_K, width, height = window_of(shape, pose, K)
+    window_K, width, height = find_window(shape, pose, K)
 
     # The old pixel of each new one, and w, the old depth over the new one.
-    ray_from_pixel = turn.mT @ pixel_to_ray(window_K)
+    ray_from_pixel = turn.mT @ invert_intrinsics(window_K)
     (a, b, c), (d, e, f), (g, h, i) = (view.K @ ray_from_pixel).tolist()
     u = torch.arange(width)[None]
     v = torch.arange(height)[:, None]
@@ -409,7 +411,7 @@ def turn_view(
     return CleanView(depth_m=1 / (resampled * w), K=window_K, camera_from_model=pose)
 
 
-def _random_offset(generator: torch.Generator, most: int) -> int:
+def _draw_offset(generator: torch.Generator, most: int) -> int:
     """Draw a whole number, -most to most, all equally likely."""
     return random_index(generator, 2 * most + 1) - most
 
@@ -481,33 +483,33 @@ class Objects:
         """Draw all stored views now, in ``workers`` threads: processes forked later share them."""
         keys = [(n, k) for k in range(self.config.views or 0) for n in range(len(self.models))]
         with ThreadPoolExecutor(workers) as pool:
-            for _ in pool.map(self._stored, keys):
+            for _ in pool.map(self._find_stored, keys):
                 pass
 
     def view(self, index: int) -> ViewSample:
         """Make the window of depth and the mask that a sample is lifted from."""
         number = index % len(self.models)
         generator = sample_generator(index, self.config.seed)
-        clean = self._clean_view(number, generator)
+        clean = self._make_clean_view(number, generator)
         silhouette = clean.depth_m.isfinite()
         depth_m = clean.depth_m
         visible = silhouette
 
         # A background behind the object, and something that occludes a part of it.
         if self.config.with_background:
-            depth_m = self._before_background(clean, self._shapes[number], generator)
+            depth_m = self._add_background(clean, self._shapes[number], generator)
         if uniform(generator, 0.0, 1.0) < self.config.occluded_share:
             share = uniform(generator, *self.config.occlusion)
             depth_m, visible = occlude(depth_m, silhouette, share, generator)
 
         # The errors of a mask, and those of a sensor.
         scale = float(clean.K[0, 0]) / self.config.focal_px[0]  # to pixels of the full image
-        grow_px = _random_offset(generator, self.config.mask_error_px)
+        grow_px = _draw_offset(generator, self.config.mask_error_px)
         mask = grow_mask(visible, round(grow_px * scale))
         focal_px = (float(clean.K[0, 0]), self.config.focal_px[0])
         measured_m = simulate_depth(depth_m, focal_px, self.config.sensor, generator)
-        down = round(_random_offset(generator, self.config.mask_shift_px) * scale)
-        right = round(_random_offset(generator, self.config.mask_shift_px) * scale)
+        down = round(_draw_offset(generator, self.config.mask_shift_px) * scale)
+        right = round(_draw_offset(generator, self.config.mask_shift_px) * scale)
         mask = _shift_mask(mask, down, right)
 
         model = self.models[number]
@@ -524,7 +526,7 @@ class Objects:
         )
         return ViewSample(input=view, truth=truth)
 
-    def _clean_view(self, number: int, generator: torch.Generator) -> CleanView:
+    def _make_clean_view(self, number: int, generator: torch.Generator) -> CleanView:
         """Make a view of an object without errors: drawn anew, or a stored one, rotated."""
         shape = self._shapes[number]
         views = self.config.views
@@ -535,18 +537,18 @@ class Objects:
             R = random_rotation(generator)
             distance_m = uniform(generator, *self.config.distance_m)
             K = self.intrinsics(uniform(generator, *self.config.resolution))
-            turn = self._gaze(number, distance_m, K, generator)
+            turn = self._draw_gaze(number, distance_m, K, generator)
             R = turn @ R
             pose = Rigid(R, turn[:, 2] * distance_m - R @ shape.middle_m)
             return draw_view(shape, pose, K)
 
         # A stored view, in which the object lies on the axis: its pixels are turned likewise.
-        stored = self._stored((number, random_index(generator, views)))
+        stored = self._find_stored((number, random_index(generator, views)))
         K = self.intrinsics(float(stored.K[0, 0]) / self.config.focal_px[0])
-        turn = self._gaze(number, stored.distance_m, K, generator)
-        return turn_view(stored.full_depth(), turn, shape, K)
+        turn = self._draw_gaze(number, stored.distance_m, K, generator)
+        return turn_view(stored.restore_depth(), turn, shape, K)
 
-    def _stored(self, key: tuple[int, int]) -> _StoredView:
+    def _find_stored(self, key: tuple[int, int]) -> _StoredView:
         """Give a stored view by the numbers of its object and of the view; drawn when needed."""
         if key not in self._views:
             number, place = key
@@ -578,7 +580,7 @@ class Objects:
         ]
         return torch.tensor([*rows, [0, 0, 1]], dtype=torch.float64)
 
-    def _gaze(
+    def _draw_gaze(
         self, number: int, distance_m: float, K: Tensor, generator: torch.Generator
     ) -> Float[Tensor, "3 3"]:
         """Draw a rotation of the camera by which an object lies wholly in the image, anywhere."""
@@ -592,9 +594,9 @@ class Objects:
             place.append(uniform(generator, low, high) if low < high else middle)
         roll_rad = uniform(generator, 0.0, 2 * math.pi)
         pixel = torch.tensor([*place, 1.0], dtype=torch.float64)
-        return gaze(pixel_to_ray(K) @ pixel, roll_rad)
+        return aim_camera(invert_intrinsics(K) @ pixel, roll_rad)
 
-    def _before_background(
+    def _add_background(
         self, clean: CleanView, shape: Shape, generator: torch.Generator
     ) -> Float[Tensor, "h w"]:
         """Put a table or wall behind an object, and clutter beside it; give the depth."""
@@ -603,12 +605,12 @@ class Objects:
         hull_m = shape.hull_m @ pose.R.mT + (pose.t_m + pose.R @ shape.middle_m)
         tilt = uniform(generator, 0.0, _MOST_TILT_RAD)
         side = uniform(generator, 0.0, 2 * math.pi)
-        normal = gaze(hull_m.mean(0), side) @ torch.tensor(
+        normal = aim_camera(hull_m.mean(0), side) @ torch.tensor(
             [math.sin(tilt), 0.0, -math.cos(tilt)], dtype=torch.float64
         )
         gap_m = max(0.0, uniform(generator, -0.2, 0.3))
         offset = float((hull_m @ normal).min()) - gap_m
-        a, b, c = (normal @ pixel_to_ray(clean.K)).tolist()
+        a, b, c = (normal @ invert_intrinsics(clean.K)).tolist()
         height, width = clean.depth_m.shape
         slope = a * torch.arange(width)[None] + b * torch.arange(height)[:, None] + c
         behind_m = torch.where(slope * offset > 0, offset / slope, torch.nan)
@@ -616,7 +618,7 @@ class Objects:
         # Clutter: a shape parallel to the image, at about the depth of the object.
         nearest_m = float(hull_m[:, 2].min())
         farthest_m = float(hull_m[:, 2].max())
-        levels = random_levels(height, width, generator)
+        levels = draw_levels(height, width, generator)
         lowest = float(levels.amin())
         level = lowest + uniform(generator, 0.0, 0.6) * float(levels.amax() - levels.amin())
         clutter_m = uniform(generator, nearest_m, farthest_m + 0.2)

@@ -108,7 +108,7 @@ class TrainingViews(Generic[Config]):
             return len(self.synthetic)
         return max(1, round(len(self._real) / self._frames.share))
 
-    def _view(self, place: int, generator: torch.Generator) -> tuple[ViewSample, bool]:
+    def _choose_view(self, place: int, generator: torch.Generator) -> tuple[ViewSample, bool]:
         """Give a frame, with the probability of their share, or a synthetic view; and which it is.
 
         The second value is whether it is a frame.
@@ -138,7 +138,7 @@ class TrainingClouds(TrainingViews[PoseTraining]):
             # At the start all show the first object, as multiples of the number do.
             if place < self.config.first_alone:
                 place *= objects
-            view, is_frame = self._view(place, generator)
+            view, is_frame = self._choose_view(place, generator)
             number = self._class_of[view.input.object]
             sample = lift_sample(view, self.models[number].diameter_m, cloud)
             if self._frames is not None and is_frame:
@@ -146,7 +146,7 @@ class TrainingClouds(TrainingViews[PoseTraining]):
                 if self._frames.with_roll:
                     sample = _roll_camera(sample, angle_rad)
             if why_too_few(sample.input.points_m, cloud) is None:
-                return voxelised_cloud(sample, number, cloud, generator)
+                return voxelise_sample(sample, number, cloud, generator)
         raise InputError(
             f"sample {index}: {TRIES} samples in a row have fewer than "
             f"{cloud.min_points} points; bring the camera nearer (distance_m), or lower "
@@ -183,7 +183,7 @@ def _roll_camera(sample: CloudSample, angle_rad: float) -> CloudSample:
     )
 
 
-def voxelised_cloud(
+def voxelise_sample(
     sample: CloudSample, class_number: int, config: CloudConfig, generator: torch.Generator
 ) -> Cloud:
     """Choose points of a sample and voxelise them, as an estimate does.
@@ -272,8 +272,8 @@ class ViewsTask:
         self.optimizers = {"network": (make_adam(network.parameters(), config.adam), config.adam)}
         self._held_out: dict[float, list[ViewSample]] = {}
 
-    def held_out_error(self, view: ViewSample, index: int) -> float:
-        """ADD of a held-out view, posed without ICP and refusal: see ``add_error``."""
+    def measure_held_out(self, view: ViewSample, index: int) -> float:
+        """ADD of a held-out view, posed without ICP and refusal: see ``measure_add``."""
         raise NotImplementedError
 
     @torch.no_grad()
@@ -284,12 +284,12 @@ class ViewsTask:
         config = self.training
         for occlusion in config.held_out.occlusions:
             if occlusion not in self._held_out:
-                drawn = held_out_objects(
+                drawn = make_held_out_objects(
                     self.models, config.objects, config.cloud, config.held_out, occlusion
                 )
                 self._held_out[occlusion] = [drawn.view(index) for index in range(len(drawn))]
             views = self._held_out[occlusion]
-            errors = torch.tensor([self.held_out_error(view, k) for k, view in enumerate(views)])
+            errors = torch.tensor([self.measure_held_out(view, k) for k, view in enumerate(views)])
             place = f"held_out/occluded_{round(100 * occlusion)}/{self.method}"
             numbers[f"{place}_add_10"] = float((errors < SUCCESS_SHARE).float().mean())
             numbers[f"{place}_median"] = float(errors.median())
@@ -297,7 +297,7 @@ class ViewsTask:
         return ValidationResult(numbers=numbers)
 
 
-def held_out_objects(
+def make_held_out_objects(
     models: Sequence[ObjectModel],
     synthetic: ObjectsConfig,
     cloud: CloudConfig,
@@ -317,7 +317,7 @@ def held_out_objects(
     return Objects(models, held_out_config, cloud)
 
 
-def add_error(estimated: Rigid | None, truth: Rigid, model: ObjectModel) -> float:
+def measure_add(estimated: Rigid | None, truth: Rigid, model: ObjectModel) -> float:
     """ADD to the nearest symmetric pose, in diameters; infinite where there is no estimate."""
     if estimated is None:
         return math.inf
@@ -340,8 +340,8 @@ def score_held_out(weights: PoseWeights, synthetic: ObjectsConfig, config: HeldO
     """
     table: dict[str, dict[str, float | None]] = {}
     for occlusion in config.occlusions:
-        objects = held_out_objects(weights.models, synthetic, weights.cloud, config, occlusion)
-        estimates, errors = _posed(weights, objects)
+        objects = make_held_out_objects(weights.models, synthetic, weights.cloud, config, occlusion)
+        estimates, errors = _estimate_views(weights, objects)
         answered = [e for e, estimate in zip(errors, estimates, strict=True) if estimate.is_ok]
         posed = sorted(e for e in errors if e < math.inf)
         right = sum(e < SUCCESS_SHARE for e in answered)
@@ -355,7 +355,7 @@ def score_held_out(weights: PoseWeights, synthetic: ObjectsConfig, config: HeldO
     return table
 
 
-def table_text(table: Table) -> str:
+def format_table(table: Table) -> str:
     """Format a table as Markdown."""
     lines = [
         "Synthetic views that no training saw, posed with ICP and refusal; right is an "
@@ -373,7 +373,9 @@ def table_text(table: Table) -> str:
     return "\n".join(lines)
 
 
-def _posed(weights: PoseWeights, objects: Objects) -> tuple[list[PoseEstimate], list[float]]:
+def _estimate_views(
+    weights: PoseWeights, objects: Objects
+) -> tuple[list[PoseEstimate], list[float]]:
     """Estimate views of objects; give the estimates and their errors (ADD or ADD-S) [diameters]."""
     is_regressed = isinstance(weights.network, DepthImageNet)
     net = DepthImageRegressor(weights) if is_regressed else GeoPoseNet(weights)
@@ -387,5 +389,5 @@ def _posed(weights: PoseWeights, objects: Objects) -> tuple[list[PoseEstimate], 
         for place, estimate, sample in zip(places, posed, samples, strict=True):
             model = weights.models[place % len(weights.models)]
             pose = estimate.camera_from_model
-            errors.append(add_error(pose, sample.truth.camera_from_model, model))
+            errors.append(measure_add(pose, sample.truth.camera_from_model, model))
     return estimates, errors

@@ -26,22 +26,22 @@ from depthpose.core.loop import (
     write_card,
 )
 from depthpose.core.run import find_rank
-from depthpose.pose.datasets import Instance, object_names, open_bop
+from depthpose.pose.datasets import Instance, open_bop, read_object_names
 from depthpose.pose.datasets.dataset import read_instance_mask
 from depthpose.pose.segmentation import (
     ENCODER_KIND,
     FCN,
     KIND,
     SegmentationWeights,
-    class_probabilities,
     count_overlap,
     intersection_over_union,
     normalise_colors,
+    predict_probabilities,
     write_segmentation,
 )
 from depthpose.pose.synthetic.views import random_index, uniform
 from depthpose.pose.train.config import ImageAugmentConfig, ImagesConfig, SegmentationTraining
-from depthpose.pose.train.poses import claim_run, with_origin
+from depthpose.pose.train.poses import add_origin, claim_run
 
 
 class LabelledImage(NamedTuple):
@@ -72,7 +72,7 @@ class AnnotatedImages:
                     f"{config.folder}: shows none of the objects {list(config.objects)}; it has "
                     f"{shown_numbers}"
                 )
-            objects = object_names(Path(config.folder), wanted)
+            objects = read_object_names(Path(config.folder), wanted)
         self.objects = objects  # names by number, in the order of the classes
         self._class_of = {number: k for k, number in enumerate(objects, 1)}
         self._images = list(images.values())
@@ -229,7 +229,7 @@ class SegmentationTask:
         table = torch.zeros(classes, classes, dtype=torch.int64)
         for index in range(len(self._held_out)):
             image, labels = self._held_out[index]
-            predicted = class_probabilities(self.network, image).argmax(0)
+            predicted = predict_probabilities(self.network, image).argmax(0)
             table += count_overlap(predicted, labels, classes)
             if index == 0:
                 segmented = _tint_objects(image, predicted, classes)
@@ -279,7 +279,7 @@ def train_segmentation(config: SegmentationTraining, run: Run) -> Path:
         network=network.cpu().eval(),
         objects=tuple(images.objects.values()),
         numbers=tuple(images.objects),
-        facts=with_origin(facts, config),
+        facts=add_origin(facts, config),
     )
     write_segmentation(path, weights, with_half=config.with_half)
     measured = held_out_text(run.folder, "Images that were held out: intersection over union.")
