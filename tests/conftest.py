@@ -87,7 +87,7 @@ def prepared_once() -> Iterator[None]:
         surface = once(estimator.prepare_surface, lambda *given: _content(given))
         patch.setattr(estimator, "prepare_surface", surface)
         patch.setattr(copies, "prepare_pairs", once(copies.prepare_pairs, id))
-        patch.setattr(run, "_commit_of_package", cache(run._commit_of_package))
+        patch.setattr(run, "_read_commit", cache(run._read_commit))
         yield
 
 

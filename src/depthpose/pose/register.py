@@ -15,11 +15,11 @@ from depthpose.core.stopwatch import Stopwatch
 from depthpose.pose.cloud import ObjectCloud, local_planes, prepare_cloud, thin
 from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig
 from depthpose.pose.copies import PreparedObject
-from depthpose.pose.decide import contradiction, decide, refused
-from depthpose.pose.evidence import compare, observe
+from depthpose.pose.decide import decide, refused
+from depthpose.pose.evidence import observe
 from depthpose.pose.hypotheses import compete
 from depthpose.pose.icp import BestStart, refine_best
-from depthpose.pose.probability import LEAST_POSSIBLE, PRIOR_MASKED, probability_right
+from depthpose.pose.probability import PRIOR_MASKED
 from depthpose.pose.propose.point_pairs import propose_poses
 from depthpose.pose.types import AnyInput, PoseEstimate, Refusal
 
@@ -113,22 +113,6 @@ def judge(
             config.object_deviation_m,
             is_masked=cloud.is_masked,
         )
-
-    # A search proposes much: what the depth image plainly contradicts goes no further.
-    if not cloud.is_masked:
-        with watch.stage("evidence"):
-            pose = refinement.refined.camera_from_model
-            evidence = compare(observation, pose, prepared.surface)
-        probability = probability_right(evidence, prior_odds)
-        if probability < LEAST_POSSIBLE:
-            return PoseEstimate(
-                name=cloud.name,
-                object=prepared.model.name,
-                status="doubtful",
-                reason=contradiction(evidence, probability, is_masked=False),
-                evidence=evidence,
-                seconds=watch.seconds,
-            )
 
     # The best pose against its near-symmetric copies, look-alikes and other local minima.
     has_color = cloud.view is not None and cloud.view.color is not None

@@ -12,7 +12,6 @@ from depthpose.core.rigid import Rigid, perturb
 from depthpose.pose.frame import Frame, readings_toward
 from depthpose.pose.icp import tukey_weight
 from depthpose.pose.propose.point_pairs import STEP, PairTable, vote_poses
-from depthpose.pose.sensor import NOISE_PER_M2
 from depthpose.pose.surface import NEAR, Surface
 
 # Votes.
@@ -128,7 +127,7 @@ def _scene_points(
     """
     is_used = frame.is_smooth & is_unclaimed & frame.may_show(surface.diameter_m)
     # Where the noise is as large as the limit of nearness, no shape is visible.
-    is_used &= NOISE_PER_M2 * frame.depth_m.square() < NEAR * surface.diameter_m
+    is_used &= frame.noise_per_m2 * frame.depth_m.square() < NEAR * surface.diameter_m
     points_m = frame.points_m[is_used]
     normals = frame.normals[is_used]
     if len(points_m) == 0:
@@ -224,7 +223,7 @@ def score_by_image(
     depth_m = visible.points_m[..., 2]
     readings = readings_toward(frame, visible.points_m)
     gap_m = readings.depth_m - depth_m
-    limit_m = stage.near * surface.diameter_m + _DEVIATIONS * NOISE_PER_M2 * depth_m.square()
+    limit_m = stage.near * surface.diameter_m + _DEVIATIONS * frame.noise_per_m2 * depth_m.square()
     is_background = ~frame.may_show(surface.diameter_m).flatten()[readings.pixel]
 
     # At the depth of the surface, with its normal or another one.
