@@ -39,18 +39,24 @@ _SMALLEST_INSTANCE = 0.2
 
 
 def cloud_input(cloud: AnyCloud, unit: Unit, object: str, name: str) -> CloudInput:
-    """Convert points of any unit to a cloud in metres."""
+    """Convert points of any unit to a cloud in metres.
+
+    Args:
+        cloud: points, a file, or a cloud of trimesh or Open3D.
+        unit: of the points.
+        object: name of the object that they are of.
+        name: what results and errors call the cloud.
+    """
     if is_shape(cloud):
-        cloud = shape_geometry(cloud)[0]
+        cloud, _ = shape_geometry(cloud)
     points = read_cloud(cloud).points if isinstance(cloud, str | Path) else _to_tensor(cloud)
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(
             f"{name}: the cloud is of shape {tuple(points.shape)}; give points as rows of x, y and "
             "z: (n, 3)"
         )
-    return CloudInput(
-        name=name, points_m=(points.double() * metres_of(unit)).float(), object=object
-    )
+    points_m = (points.double() * metres_of(unit)).float()
+    return CloudInput(name=name, points_m=points_m, object=object)
 
 
 def depth_input(
@@ -103,7 +109,16 @@ def view_input(
     name: str,
     unit: Unit | None = None,
 ) -> ViewInput:
-    """Convert a depth image, a mask and a camera to a view in metres."""
+    """Convert a depth image, a mask and a camera to a view in metres.
+
+    Args:
+        depth: as for :func:`depth_input`.
+        mask: the object's pixels; None: all pixels.
+        camera: of the depth image.
+        object: name of the object.
+        name: what results and errors call the view.
+        unit: of the depth, where its camera says none.
+    """
     depth_m, lens = depth_input(depth, camera, name, unit)
     height, width = depth_m.shape
 
@@ -148,9 +163,9 @@ def rigid_input(
             f"the 4x4 matrix {what} in metres"
         )
     R = matrix[:3, :3]
-    last = matrix.new_tensor([0, 0, 0, 1])
-    is_rotation = torch.allclose(R @ R.T, torch.eye(3).to(R), atol=1e-4) and torch.det(R) > 0
-    if not is_rotation or not torch.equal(matrix[3], last):
+    is_orthonormal = torch.allclose(R @ R.T, torch.eye(3).to(R), atol=1e-4)
+    is_rotation = is_orthonormal and torch.det(R) > 0
+    if not is_rotation or not torch.equal(matrix[3], matrix.new_tensor([0, 0, 0, 1])):
         raise InputError(
             f"{name} is no rigid transform; give [R t; 0 0 0 1], R a rotation, t in metres (a "
             "transposed matrix has t in its last row)"
@@ -164,10 +179,13 @@ def split_instances(labels: Int64[Tensor, "h w"]) -> list[Bool[Tensor, "h w"]]:
     Objects are the labels where there are several. Else they are the connected pieces, by corners
     too; those below a fifth of the largest are fragments, and left out.
     """
+    # One mask a number, where there are several.
     numbers, pixels = labels[labels != 0].unique(return_counts=True)
     if len(numbers) > 1:
         order = pixels.argsort(descending=True, stable=True)
         return [labels == number for number in numbers[order]]
+
+    # Else one a connected piece.
     label, pixels = label_parts(labels != 0)
     order = pixels.argsort(descending=True, stable=True)
     least = max(1, math.ceil(_SMALLEST_INSTANCE * int(pixels.max())))
@@ -202,13 +220,16 @@ def _to_tensor(values: Any) -> Tensor:  # noqa: ANN401  whatever a caller has
         is_unsigned = values.dtype in (torch.uint16, torch.uint32, torch.uint64)
         return (values.long() if is_unsigned else values).detach().cpu()
     array = np.asarray(values)
-    if array.dtype.kind not in "biuf":
+    is_numeric = array.dtype.kind in "biuf"
+    if not is_numeric:
         is_complex = array.dtype.kind == "c"
         what = "complex numbers where real" if is_complex else f"a {type(values).__name__} where"
         raise InputError(
             f"{what} numbers belong; give a tensor or array of numbers, "
             "or a file's path (of a camera: a Camera, its file or its matrix K)"
         )
+
+    # Types that torch lacks or hardly supports, and the other byte order.
     if array.dtype.kind == "u" and array.dtype.itemsize > 1:
         array = array.astype(np.int64)
     if array.dtype.kind == "f" and array.dtype.itemsize > 8:

@@ -29,6 +29,7 @@ class Tree(NamedTuple):
 @compiled
 def build_tree(points: Float64[np.ndarray, "m 3"], outward: Float64[np.ndarray, "m 3"]) -> Tree:
     """Sort points, one at least, and their normals into a tree."""
+    # As many levels as leave a few points to each range of the last one.
     count = len(points)
     order = np.arange(count)
     depth = 0
@@ -36,6 +37,8 @@ def build_tree(points: Float64[np.ndarray, "m 3"], outward: Float64[np.ndarray, 
         depth += 1
     axes = np.zeros((1 << depth) - 1, np.int64)
     values = np.zeros((1 << depth) - 1)
+
+    # Each range is split at the middle of its points, across its longest side.
     for level in range(depth):
         for k in range(1 << level):
             low, high = _find_range(k, level, count)
@@ -50,7 +53,7 @@ def build_tree(points: Float64[np.ndarray, "m 3"], outward: Float64[np.ndarray, 
 
 @compiled
 def _find_range(k: int, level: int, count: int) -> tuple[int, int]:
-    """Give the range of points of node ``k`` of a level: each bit of ``k`` chooses a half."""
+    """Find the range of points of node ``k`` of a level: each bit of ``k`` chooses a half."""
     low, high = 0, count
     for bit in range(level - 1, -1, -1):
         if (k >> bit) & 1:
@@ -64,15 +67,17 @@ def _find_range(k: int, level: int, count: int) -> tuple[int, int]:
 def _find_widest_axis(
     points: Float64[np.ndarray, "m 3"], order: Int64[np.ndarray, " m"], low: int, high: int
 ) -> int:
-    """Give the axis along which the points ``order[low:high]`` extend farthest."""
-    widest, axis = -1.0, 0
+    """Find the axis along which the points ``order[low:high]`` extend farthest."""
+    widest = -1.0
+    axis = 0
     for c in range(3):
         least, most = np.inf, -np.inf
         for i in range(low, high):
             least = min(least, points[order[i], c])
             most = max(most, points[order[i], c])
         if most - least > widest:
-            widest, axis = most - least, c
+            widest = most - least
+            axis = c
     return axis
 
 
@@ -141,14 +146,20 @@ def find_nearest_facing(
     best: Place,
     best_square: float,
 ) -> Place:
-    """Give the place of the nearest point that faces a camera (:func:`faces`).
+    """Find the place of the nearest point that faces a camera (:func:`faces`).
 
-    ``best`` is a guess, at a squared distance of ``best_square``; or -1, and only points nearer
-    than that are searched. It is returned where no point is nearer.
+    Args:
+        query: the point whose neighbour is searched.
+        tree: of the points.
+        eye: the camera.
+        least: how nearly a point must face it (:func:`faces`).
+        best: place of a guess, or -1; it is returned where no point is nearer than
+            ``best_square``.
+        best_square: squared distance of the guess; only points nearer than it are searched.
     """
     points, outward, _, axes, values = tree
-    # The ranges that wait: node, first and last point; squared distance from the query along each
-    # axis, and in all.
+    # The ranges that wait: node, first point and one past the last; and how far they are from the
+    # query, squared, along each axis and in all.
     ranges = np.empty((_MOST_WAITING, 3), np.int64)
     gaps = np.empty((_MOST_WAITING, 4))
     ranges[0, 0], ranges[0, 1], ranges[0, 2] = 0, 0, len(points)
@@ -178,6 +189,8 @@ def find_nearest_facing(
                 waiting += 1
             node = 2 * node + (1 if is_low else 2)
             low, high = (low, middle) if is_low else (middle, high)
+
+        # The points of that last range, one by one.
         for place in range(low, high):
             square = square_distance(points, place, query)
             if square < best_square and faces(points, outward, place, eye, least):
@@ -187,13 +200,14 @@ def find_nearest_facing(
 
 @compiled
 def find_nearest_points(queries: Float64[np.ndarray, "n 3"], tree: Tree) -> Int64[np.ndarray, " n"]:
-    """Give the index, as it was before sorting, of the point nearest to each query."""
+    """Find the index, as it was before sorting, of the point nearest to each query."""
     index = np.empty(len(queries), np.int64)
     anywhere = (0.0, 0.0, 0.0)
     place = np.int64(0)
     for i in range(len(queries)):
         query = vector(queries, i)
-        square = square_distance(tree.points, place, query)  # that before is near in an image
+        # The answer of the query before is the guess: neighbours in an image lie near each other.
+        square = square_distance(tree.points, place, query)
         place = find_nearest_facing(query, tree, anywhere, -np.inf, place, square)
         index[i] = tree.order[place]
     return index
