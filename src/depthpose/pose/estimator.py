@@ -39,7 +39,7 @@ from depthpose.pose.surface import prepare_surface
 from depthpose.pose.track import TrackedObject, track
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, Refusal, ViewInput
 
-Made = TypeVar("Made")
+Result = TypeVar("Result")
 _NAME = "input"  # what an input is called that came without a name
 
 
@@ -134,6 +134,8 @@ class PoseEstimator:
         estimate = register(pose_input, prepared, self.config, self.refusal)
         if estimate.status != "doubtful" or not isinstance(pose_input, ViewInput):
             return estimate
+
+        # A mask whose pose is doubtful may not fit its object.
         in_region = self._search_region(replace(pose_input, is_region=True))
         seconds = seconds_of_all([estimate, in_region])
         return replace(in_region if in_region.is_posed else estimate, seconds=seconds)
@@ -194,6 +196,7 @@ class PoseEstimator:
             InputError: an unknown object, a file that cannot be read, shapes that do not fit. What
                 the data themselves lack is no error but a refusal.
         """
+        # A cloud, or a depth image with what belongs to it.
         which = self.objects[0] if object is None else self._find_object(object).model.name
         of_view = {
             "depth": depth, "mask": mask, "box": box, "camera": camera, "focal_px": focal_px,
@@ -221,6 +224,8 @@ class PoseEstimator:
             pose_input = with_background(pose_input, background, lens, unit)
             models = self.models if object is None else [self._find_object(object).model]
             pose_input = with_color(pose_input, models, color, color_camera, color_from_depth)
+
+        # Of one object, or of whichever fits best.
         if object is not None or len(self.models) == 1:
             return self._estimate_or_raise([pose_input], is_expected=True)[0]
         tried = [replace(pose_input, object=name) for name in self.objects]
@@ -366,9 +371,9 @@ class PoseEstimator:
                 "their order, such as list_images of depthpose.core.files gives of a folder"
             )
         start = None if first is None else rigid_input(first)
-        made = partial(cloud_input, unit=unit or "m", object=which)
+        convert = partial(cloud_input, unit=unit or "m", object=which)
         if camera is not None:
-            made = partial(view_input, mask=None, camera=camera, object=which, unit=unit)
+            convert = partial(view_input, mask=None, camera=camera, object=which, unit=unit)
 
         def read(number: int, frame: AnyArray | None) -> AnyInput | PoseEstimate:
             """Read a frame; one that cannot be read is an estimate that says so."""
@@ -376,12 +381,13 @@ class PoseEstimator:
             reason = f"{name}: there is no frame, a None in its place"
             if frame is not None:
                 try:
-                    return made(frame, name=name)
+                    return convert(frame, name=name)
                 except InputError as error:
                     reason = str(error)
             return PoseEstimate(name=name, object=which, status="unreadable", reason=reason)
 
-        return self.track_in((read(*numbered) for numbered in enumerate(frames)), which, start)
+        inputs = (read(number, frame) for number, frame in enumerate(frames))
+        return self.track_in(inputs, which, start)
 
     def track_in(
         self, frames: Iterable[AnyInput | PoseEstimate], object: str, first: Rigid | None = None
@@ -392,6 +398,7 @@ class PoseEstimator:
         """
 
         def search(pose_input: AnyInput) -> PoseEstimate:
+            """Pose the object in a frame without a pose of the frame before."""
             if isinstance(pose_input, CloudInput):
                 return self._estimate_or_raise([pose_input], is_expected=False)[0]
             return self.find_in(pose_input, [object], is_single=True)[0]
@@ -406,7 +413,11 @@ class PoseEstimator:
         return each_in_float32(track(frames, target, first))
 
     def _find_object(self, name: str | None) -> PreparedObject:
-        """Give an object by its name, with its surface; None where one alone is known."""
+        """Find an object by its name, with its surface; None where one alone is known.
+
+        Raises:
+            InputError: no object has this name, or several are known and none is named.
+        """
         names = self.objects
         if name is None:
             if len(names) > 1:
@@ -420,6 +431,8 @@ class PoseEstimator:
         if name not in names:
             nearest = nearest_name(name, names)
             raise InputError(f"object {name!r}: {self._holder} do not know it; {nearest}")
+
+        # Its surface is sampled when it is first asked for.
         if name not in self._prepared_objects:
             number = names.index(name)
             model = self.models[number]
@@ -431,9 +444,9 @@ class PoseEstimator:
 
 
 def unreadable_on_error(
-    work: Callable[[AnyInput], Made], pose_input: AnyInput
-) -> Made | PoseEstimate:
-    """Give what work makes of an input; a refusal where it raises an error of the input."""
+    work: Callable[[AnyInput], Result], pose_input: AnyInput
+) -> Result | PoseEstimate:
+    """Do work on an input; give a refusal in place of an error that the input causes."""
     if not isinstance(pose_input, AnyInput):
         raise InputError(
             "estimate_many takes CloudInput and ViewInput of depthpose.pose.types, not a "

@@ -112,7 +112,7 @@ def measure_scale(
 
 
 def _estimate_scale_deviation(residuals: Residuals, object_std_m: float) -> float:
-    """Give the standard deviation of a scale.
+    """Estimate the standard deviation of a scale.
 
     It has two causes: noise of the readings, which neighbours share, and sides of the real object
     that deviate from the model by ``object_std_m``.
@@ -164,17 +164,18 @@ def _grow(
     places = np.full(local.shape[:2], -1)
     for limit in limits:
         largest = 0.0
-        for p in range(len(times)):
+        for start in range(len(times)):
             residuals = _linearise_growth(
-                local[p], times[p], middle, limit, target, is_exact, places[p]
+                local[start], times[start], middle, limit, target, is_exact, places[start]
             )
             H, b = build_normal_equations(residuals, _LEAST_INFORMATION)
             motion = np.linalg.solve(H, b)  # rotation, translation, growth
             growth = min(max(motion[6], -0.1), 0.1)
-            times[p] = min(max(times[p] * (1 + growth), 0.5), 2.0)
+            times[start] = min(max(times[start] * (1 + growth), 0.5), 2.0)
+
             # The points move by the inverse of the surface's motion.
             turn = make_rotation(motion)
-            local[p] = (local[p] - middle - motion[3:6]) @ turn + middle
+            local[start] = (local[start] - middle - motion[3:6]) @ turn + middle
             for k in (0, 1, 2, 6):
                 largest = max(largest, abs(motion[k]))
         if largest < _CONVERGED:
@@ -196,6 +197,7 @@ def _linearise_growth(
     By rotation and translation of the surface, and by its growth about its middle. Where it is not
     known which side of a surface was seen, all samples count.
     """
+    # Matched with the surface at its own size.
     count = len(local)
     unscaled = (local - middle) / scale + middle
     centre = (middle[0], middle[1], middle[2])
@@ -204,6 +206,8 @@ def _linearise_growth(
     for i in range(count):
         if places[i] < 0:
             continue
+
+        # The distance, and how the surface's motion and growth change it.
         normal = vector(target.normals, places[i])
         x, y, z = minus(vector(target.tree.points, places[i]), centre)
         arm = (scale * x, scale * y, scale * z)
@@ -228,9 +232,15 @@ def measure_distance(
     *,
     is_exact: bool,
 ) -> Float64[Tensor, "*batch"]:
-    """Give the root mean square distance of points to a surface, in limits of nearness.
+    """Measure the root mean square distance of points to a surface, in limits of nearness.
 
-    Distances are cut off at 1, the limit. With ``times`` the surface is scaled about its middle.
+    Distances are cut off at 1, the limit.
+
+    Args:
+        local_m: points in the model frame.
+        surface: of the model.
+        times: scale of the surface about its middle, of each batch; None: its own size.
+        is_exact: whether the nearest samples are searched, not looked up in a table.
     """
     if times is not None:
         local_m = (local_m - surface.middle_m) / times[:, None, None] + surface.middle_m
@@ -241,7 +251,7 @@ def measure_distance(
     return (gap_m / (NEAR * surface.diameter_m)).clamp(max=1).square().mean(-1).sqrt()
 
 
-def mirror_gain(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) -> float:
+def measure_mirror_gain(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) -> float:
     """Measure how much nearer a cloud lies to the mirror image of the model, in its best pose.
 
     The cloud is mirrored in place of the model, so that ICP finds a pose.
@@ -283,13 +293,13 @@ def mirror_gain(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) ->
 
 
 def _bound_size_error(distance_m: float, focal_px: float, diameter_m: float) -> float:
-    """Give the share by which an offset and displaced edges of a sensor may change a size."""
+    """Bound the share by which an offset and displaced edges of a sensor may change a size."""
     edges_m = 2 * EDGE_PX * distance_m / focal_px
     return _bound_offset_error(distance_m) + edges_m / diameter_m
 
 
 def _bound_offset_error(distance_m: float) -> float:
-    """Give the share by which a sensor's offset may change a size: the same as of the distance."""
+    """Bound the share by which a sensor's offset may change a size: that of the distance."""
     return LARGEST_OFFSET_M / distance_m
 
 
@@ -328,9 +338,10 @@ def identify(
         max_size_error: by so much a real object may differ in size from its model.
         object_std_m: standard deviation of its surface from the model's.
     """
+    # The best fits of another size and of the mirror image.
     scale = measure_scale(cloud_m, pose, surface, object_std_m)
     has_mirror_image = mirror_deviation > MIRROR_ALIKE
-    gain = mirror_gain(cloud_m, pose, surface) if has_mirror_image else None
+    gain = measure_mirror_gain(cloud_m, pose, surface) if has_mirror_image else None
 
     # Errors that explain a difference: of the sensor, and of sides that deviate from the model.
     distance_m = float(cloud_m[:, 2].double().median())
@@ -345,11 +356,12 @@ def identify(
         offset_error=_bound_offset_error(distance_m),
     )
 
-    reason = _why_contradicted(fits)
+    # What they say of the object.
+    reason = _explain_contradiction(fits)
     if reason:
         status = "contradicted"
     else:
-        reason = _why_not_confirmed(fits, evidence)
+        reason = _explain_doubt(fits, evidence)
         status = "not excluded" if reason else "confirmed"
     return Identity(
         status=status,
@@ -360,8 +372,8 @@ def identify(
     )
 
 
-def _why_contradicted(fits: _Fits) -> str:
-    """Say which other fit is clearly better than that of the model; an empty text where none is."""
+def _explain_contradiction(fits: _Fits) -> str:
+    """Explain which other fit is clearly better than that of the model; empty where none is."""
     scale = fits.scale
     largest_error = fits.size_tolerance + _DEVIATIONS * scale.sigma
     is_other_size = abs(scale.times - 1) > largest_error and scale.gain > _SIZE_GAIN
@@ -383,15 +395,19 @@ def _why_contradicted(fits: _Fits) -> str:
     return ""
 
 
-def _why_not_confirmed(fits: _Fits, evidence: Evidence) -> str:
-    """Say what keeps a model that nothing contradicts from being confirmed; empty where nothing."""
+def _explain_doubt(fits: _Fits, evidence: Evidence) -> str:
+    """Explain what keeps a model that is not contradicted from being confirmed; empty if nothing."""
     scale = fits.scale
     size_error = abs(scale.times - 1)
     deviation = _DEVIATIONS * scale.sigma
+
+    # Is another size or the mirror image excluded?
     if size_error + deviation + fits.offset_error > _OTHER_SIZES:
         return f"what was seen does not fix the size: {_describe_size(scale)}"
     if fits.mirror_gain is not None and fits.mirror_gain > -_MIRROR_GAIN:
         return f"the mirror image of {fits.name} fits what was seen as well"
+
+    # And is it the model's own size, with nothing that contradicts it?
     if scale.gain > _SIZE_GAIN:
         return f"{_describe_size(scale)}, which a sensor's errors may explain"
     if size_error > max(_NEAR_SIZE, deviation) + fits.offset_error:
@@ -406,6 +422,7 @@ def _why_not_confirmed(fits: _Fits, evidence: Evidence) -> str:
 
 
 def _describe_size(scale: Scale) -> str:
+    """Describe the size that fits best, and how certain it is."""
     return (
         f"{scale.times:.2f} times the model's size fits best (standard deviation {scale.sigma:.2f})"
     )

@@ -84,15 +84,15 @@ def _group_by_voxels(
 ) -> Iterator[list[CloudToPose | PoseEstimate]]:
     """Group clouds so that each group has ``most`` voxels at most, or is one cloud."""
     group: list[CloudToPose | PoseEstimate] = []
-    total = 0
+    voxels = 0
     for job in clouds:
         count = len(job.voxels.points_m) if isinstance(job, CloudToPose) else 0
-        if group and total + count > most:
+        if group and voxels + count > most:
             yield group
             group = []
-            total = 0
+            voxels = 0
         group.append(job)
-        total += count
+        voxels += count
     if group:
         yield group
 
@@ -236,6 +236,7 @@ class GeoPoseNet(PoseEstimator):
             return
         watch = Stopwatch()
         with watch.stage("network"):
+            # The voxels of all clouds, one after the other.
             grids = [job.voxels for job in ready]
             counts = [len(grid.points_m) for grid in grids]
             cloud_of_point = torch.repeat_interleave(torch.arange(len(ready)), torch.tensor(counts))
@@ -250,6 +251,8 @@ class GeoPoseNet(PoseEstimator):
                 class_of_point=numbers[cloud_of_point].to(device),
             )
             outputs = self._network.directions(network_input).float().cpu().split(counts)
+
+        # Back to each cloud, in its camera's frame.
         for job, of_cloud, count in zip(ready, outputs, counts, strict=True):
             job.directions = of_cloud @ job.voxels.grid_from_camera
             # Each has a share of the time.
@@ -260,7 +263,7 @@ class GeoPoseNet(PoseEstimator):
     ) -> PoseEstimate:
         """Pose a cloud by its votes, or by registration where these are doubted.
 
-        Registered is only an input that is expected to show its object.
+        Only an input that is expected to show its object is registered.
         """
         if isinstance(job, PoseEstimate):
             return job
@@ -336,11 +339,14 @@ class GeoPoseNet(PoseEstimator):
         return meet_lines(points_m, directions, refinements=voting.refinements)
 
     def _measure_disagreement(self, job: CloudToPose, pose: Rigid) -> float:
-        """Mean angle between the network's directions and those to the keypoints of a pose [rad].
+        """Measure the mean angle between the network's directions and those to a pose [rad].
+
+        The latter point to the keypoints of the model at the pose.
 
         The network was trained to treat symmetric copies of a pose as one: the angle is measured to
         the copy whose keypoints its directions fit best.
         """
+        # The copy that fits some of the directions best.
         keypoints_m = job.prepared.model.keypoints_m.double()
         copies_m = (pose @ job.prepared.copies.trained).apply(keypoints_m)
         points_m = job.voxels.points_m.double()
@@ -348,6 +354,8 @@ class GeoPoseNet(PoseEstimator):
         step = max(1, len(points_m) // _COMPARED)
         toward = normalize(copies_m[:, None] - points_m[::step, None], dim=-1)
         best = int((directions[::step] * toward).sum(-1).mean((-2, -1)).argmax())
+
+        # The angle to it, over all of them.
         toward = normalize(copies_m[best] - points_m[:, None], dim=-1)
         return float((directions * toward).sum(-1).clamp(-1, 1).arccos().mean())
 
@@ -380,6 +388,7 @@ class DepthImageRegressor(PoseEstimator):
     def _estimate_or_raise(
         self, inputs: Sequence[AnyInput], *, is_expected: bool
     ) -> list[PoseEstimate]:
+        """Estimate one input; refuse to choose among several objects."""
         if len(inputs) > 1:
             names = ", ".join(item.object for item in inputs)
             raise InputError(f"object: say which of {names}; a regressor refuses none")
@@ -403,6 +412,8 @@ class DepthImageRegressor(PoseEstimator):
         config = self._network.config
         model = prepared.model
         watch = Stopwatch()
+
+        # The crop that the network sees, and the pose that it regresses.
         with watch.stage("network"):
             crop = cut_depth(pose_input, config, model.diameter_m)
         if crop is None:
@@ -425,6 +436,7 @@ class DepthImageRegressor(PoseEstimator):
         if not self.config.with_icp:
             return estimate
 
+        # Refined on the points of the mask.
         with watch.stage("icp"):
             points_m = cloud_from_depth(
                 pose_input.depth_m, pose_input.mask, pose_input.K, model.diameter_m, self._cloud

@@ -1,6 +1,6 @@
 """Registration: poses of objects from their models alone, without training.
 
-How an object is posed :mod:`depthpose.pose.register` says, step by step.
+The steps by which an object is posed are those of :mod:`depthpose.pose.register`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -107,6 +107,7 @@ class Registration(PoseEstimator):
             self._find_object(name).prepare()
 
     def _estimate(self, pose_input: AnyInput) -> PoseEstimate:
+        """Register one input, or search its region."""
         return self._register_or_search(pose_input)
 
 
@@ -121,5 +122,7 @@ def read_parts(
     """
     models = [read_model(path, unit, number=k) for k, path in enumerate(cad, start=1)]
     declared = symmetry_of_each(symmetry, [model.name for model in models])
-    models = [declare_symmetry(m, declared[m.name]) if m.name in declared else m for m in models]
-    return [with_found_symmetries(m, None, is_taken=True) for m in models]
+    for k, model in enumerate(models):
+        if model.name in declared:
+            models[k] = declare_symmetry(model, declared[model.name])
+    return [with_found_symmetries(model, None, is_taken=True) for model in models]

@@ -40,6 +40,7 @@ def render_surface(
         height: rows of the image.
         width: its columns.
     """
+    # The triangles, drawn into the part of the image about them.
     pose = pose.double()
     window = _window_about(surface, pose, K, height, width)
     rows, columns = window
@@ -120,7 +121,7 @@ def _draw_triangles(
 
 
 def _ray_lengths(K: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Length of the ray of each pixel up to a depth of 1, (h, w)."""
+    """Measure the length of each pixel's ray up to a depth of 1, (h, w)."""
     y = (np.arange(height)[:, None] - K[1, 2]) / K[1, 1]
     x = (np.arange(width) - K[0, 2] - K[0, 1] * y) / K[0, 0]
     return np.sqrt(x**2 + y**2 + 1)
@@ -129,12 +130,15 @@ def _ray_lengths(K: np.ndarray, height: int, width: int) -> np.ndarray:
 def _window_about(
     surface: Surface, pose: Rigid, K: Float64[Tensor, "3 3"], height: int, width: int
 ) -> tuple[slice, slice]:
-    """Rows and columns of an image that a posed surface may cover."""
+    """Find the rows and columns of an image that a posed surface may cover."""
+    # None of a surface behind the camera; all where a part of it is.
     corners_m = pose.apply(surface.box_corners_m)
     if float(corners_m[:, 2].amax()) < _NEAR_M:
         return slice(0, 0), slice(0, 0)
     if float(corners_m[:, 2].amin()) < _NEAR_M:
         return slice(0, height), slice(0, width)
+
+    # Else the box about the projected corners.
     pixels = project(corners_m, K)
     left, top = (int(value) for value in pixels.amin(0).floor().tolist())
     right, bottom = (int(value) for value in pixels.amax(0).ceil().tolist())

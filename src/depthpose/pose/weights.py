@@ -93,6 +93,7 @@ def write_pose_weights(
         with_meshes: write the models' surfaces. A licence may forbid it; then the file cannot be
             used until :func:`complete_weights` has added them again.
     """
+    # The tensors: those of the network, and those of each model.
     network = weights.network
     learnt = halve_state(network) if with_half else network.state_dict()
     state = {f"network.{name}": tensor for name, tensor in learnt.items()}
@@ -104,6 +105,8 @@ def write_pose_weights(
             stored = tensor.dtype if tensor.is_floating_point() else torch.int32
             state[f"models.{k}.{name}"] = tensor.to(stored, copy=True)
         state |= _store_colors(k, model) if with_meshes else {}
+
+    # The settings, and what a model is beside its tensors.
     config = {
         "network": config_to_dict(network.config),
         "cloud": config_to_dict(weights.cloud),
@@ -140,6 +143,7 @@ def complete_weights(path: Path, meshes: Mapping[int, ObjectModel], out: Path) -
     """
     checkpoint = read_checkpoint(path)
     state = dict(checkpoint.state)
+    # Each object is compared with its mesh: is it the one that was trained on?
     for k, record in enumerate(checkpoint.config.get("models", ())):
         number = record["number"]
         keypoints_m = state[f"models.{k}.keypoints_m"]
@@ -170,7 +174,7 @@ _COLORS = "colors."  # prefix of the names of a model's coloured points
 
 
 def _store_colors(k: int, model: ObjectModel) -> dict[str, Tensor]:
-    """Give the tensors of the colours of model k by their names in a file; a byte a channel."""
+    """Convert the colours of model k to tensors by their names in a file; a byte a channel."""
     colors = model.colors
     if colors is None:
         return {}
@@ -185,11 +189,13 @@ def _store_colors(k: int, model: ObjectModel) -> dict[str, Tensor]:
 
 
 def _restore_colors(state: Mapping[str, Tensor]) -> SurfaceColors | None:
-    """Give the colours among the tensors of a model, if it has any."""
+    """Restore the colours among the tensors of a model; None where it has none."""
     tensors = {n.removeprefix(_COLORS): t for n, t in state.items() if n.startswith(_COLORS)}
     if not tensors:
         return None
-    points_m, normals, rgb = (tensors[name].float() for name in ("points_m", "normals", "rgb"))
+    points_m = tensors["points_m"].float()
+    normals = tensors["normals"].float()
+    rgb = tensors["rgb"].float()
     if not len(points_m) == len(normals) == len(rgb) > 0:
         raise ValueError(f"{len(points_m)} coloured points have {len(rgb)} colours")
     spacing_m = float(tensors["spacing_m"][0, 0])
@@ -197,7 +203,7 @@ def _restore_colors(state: Mapping[str, Tensor]) -> SurfaceColors | None:
 
 
 def read_object_numbers(path: Path) -> tuple[int, ...]:
-    """Give the numbers of the objects that weights know, with or without their surfaces.
+    """Read the numbers of the objects that weights know, with or without their surfaces.
 
     Raises:
         InputError: they are of another kind, or damaged.
@@ -262,6 +268,7 @@ def read_pose_weights(path: Path) -> PoseWeights:
 
 def _restore_model(record: Any, state: Mapping[str, Tensor], source: str) -> ObjectModel:  # noqa: ANN401
     """Make an object of its entry in the config and its tensors; ``source`` is for errors."""
+    # Does the entry have all that an object needs, and do its tensors fit each other?
     missing = [name for name in _TENSORS if name not in state]
     missing += [name for name in ("name", "number", "diameter_m") if name not in record]
     if missing:
@@ -295,12 +302,13 @@ def settings_of(checkpoint: Checkpoint, source: str) -> dict[str, Any]:
     Raises:
         InputError: a setting is unknown, or has a value that is refused.
     """
-    _, kind = POSE_NETWORKS[checkpoint.kind]
-    kinds = {"network": kind, "cloud": CloudConfig, "refusal": RefusalConfig}
-    return {
-        name: config_to_dict(config_from_dict(checkpoint.config[name], of, source=source))
-        for name, of in kinds.items()
-    }
+    _, network_config = POSE_NETWORKS[checkpoint.kind]
+    kinds = {"network": network_config, "cloud": CloudConfig, "refusal": RefusalConfig}
+    settings: dict[str, Any] = {}
+    for name, config_kind in kinds.items():
+        config = config_from_dict(checkpoint.config[name], config_kind, source=source)
+        settings[name] = config_to_dict(config)
+    return settings
 
 
 def build_pose_network(checkpoint: Checkpoint, source: str) -> AnyNetwork:
@@ -314,14 +322,16 @@ def build_pose_network(checkpoint: Checkpoint, source: str) -> AnyNetwork:
             f"{source}: holds weights of kind {checkpoint.kind!r}, but a pose takes one of "
             f"{', '.join(map(repr, POSE_NETWORKS))}."
         )
-    made, kind = POSE_NETWORKS[checkpoint.kind]
+    network_class, config_kind = POSE_NETWORKS[checkpoint.kind]
     for name in ("network", "cloud", "refusal"):
         if not isinstance(checkpoint.config.get(name), Mapping):
             raise InputError(
                 f"{source}: its config has no {name!r}; the file is of another version."
             )
-    config = config_from_dict(checkpoint.config["network"], kind, source=source)
+    config = config_from_dict(checkpoint.config["network"], config_kind, source=source)
+
+    # The tensors of the network alone.
     learnt = {name: t for name, t in checkpoint.state.items() if name.startswith("network.")}
     state = {name.removeprefix("network."): tensor for name, tensor in learnt.items()}
-    held = dataclasses.replace(checkpoint, state=state)
-    return build_network(lambda: made(config), held, source).eval()
+    of_network = dataclasses.replace(checkpoint, state=state)
+    return build_network(lambda: network_class(config), of_network, source).eval()
