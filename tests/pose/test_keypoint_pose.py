@@ -92,6 +92,21 @@ def test_a_sure_keypoint_outweighs_unsure_ones() -> None:
     assert float(without.residual_m) < 1e-9
 
 
+@pytest.mark.parametrize("seed", [0, 2, 7])
+def test_unused_keypoints_change_no_weight_of_the_others(seed: int) -> None:
+    random = generator(seed)
+    model = torch.randn(8, 3, generator=random).double() * 0.05
+    true = random_pose(seed)
+    std_m = torch.tensor([1e-4, 1e-4, 1e-4, 0.25, 0.05, 0.05, 0.05, 0.05]).double()
+    found = true.apply(model) + std_m[:, None] * torch.randn(8, 3, generator=random).double()
+    covariance = std_m.square()[:, None, None] * torch.eye(3).double()
+    used = torch.arange(8) < 4
+    fit = fit_pose(found, covariance, model, used).camera_from_model
+    alone = fit_pose(found[used], covariance[used], model[used]).camera_from_model
+    assert torch.allclose(fit.R, alone.R, atol=1e-9)
+    assert torch.allclose(fit.t_m, alone.t_m, atol=1e-9)
+
+
 def test_two_keypoints_fix_no_pose() -> None:
     with pytest.raises(InputError, match="fixed by 3"):
         fit_pose(torch.rand(8, 3).double(), torch.eye(3).double().expand(8, 3, 3),

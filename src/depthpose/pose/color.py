@@ -55,7 +55,7 @@ class ColorAgreement:
 
     @property
     def score(self) -> Float64[Tensor, " b"]:
-        """Mean of the three correlations, -1 to 1."""
+        """The mean of the three correlations, -1 to 1."""
         return self.correlation.mean(-1)
 
     @property
@@ -87,6 +87,8 @@ def color_agreement(
         return ColorAgreement(
             correlation=nothing, independent=nothing, visible=nothing[:, 0].long()
         )
+
+    # So many poses at a time as fit in memory.
     surface = _take_samples(model.colors, samples)
     image = _blur_image(view.color, poses, surface)
     parts: list[ColorAgreement] = []
@@ -140,8 +142,9 @@ def _project_to_color(
 
 def _blur_image(color: ColorImage, poses: Rigid, surface: SurfaceColors) -> _BlurredImage:
     """Blur an image, where the posed models lie, by the spacing of the model's colours."""
-    some_m = take_evenly(surface.points_m, 300).double()
-    pixels, depth_m = _project_to_color(poses.double().apply(some_m), color)
+    # The blur in pixels, where the models lie.
+    few_m = take_evenly(surface.points_m, 300).double()
+    pixels, depth_m = _project_to_color(poses.double().apply(few_m), color)
     is_front = depth_m > 0
     height, width = color.rgb.shape[1:]
     if not bool(is_front.any()):
@@ -177,15 +180,16 @@ class _Compared(NamedTuple):
 
 
 def _take_logarithms(rgb: Float64[Tensor, "*b 3"]) -> Float64[Tensor, "*b 3"]:
-    """Give the logarithms of brightness, of red over green, and of blue over green."""
+    """Take the logarithms of brightness, of red over green, and of blue over green."""
     red, green, blue = (rgb + _BLACK).log().unbind(-1)
-    return torch.stack([(rgb.mean(-1) + _BLACK).log(), red - green, blue - green], -1)
+    brightness = (rgb.mean(-1) + _BLACK).log()
+    return torch.stack([brightness, red - green, blue - green], -1)
 
 
 def _compare_features(
     poses: Rigid, surface: SurfaceColors, view: ViewInput, image: _BlurredImage, near_m: float
 ) -> _Compared:
-    """Give the colour features of posed surfaces and of the image, where both cameras see them.
+    """Compare the colours of posed surfaces and of the image, where both cameras see them.
 
     Args:
         poses: a batch, ``camera_from_model`` of the depth camera.
@@ -273,7 +277,7 @@ _POSES_AT_ONCE = 16  # poses whose pairs are counted at a time, for the memory
 def _count_independent_points(
     compared: _Compared, surface: SurfaceColors
 ) -> Float64[Tensor, "b 3"]:
-    """Give the effective number of independent points of each correlation.
+    """Count the independent points of each correlation: their effective number.
 
     The variance of the correlation of two unrelated fields is the mean product of their
     autocorrelations over all pairs of points (Dutilleul 1993), and the number its inverse. Products
@@ -349,6 +353,7 @@ def copies_about_axis(
     """
     if model.colors is None or view.color is None:
         return pose.double()[None]
+
     # The largest agreements of a sweep.
     steps = max(3, math.ceil(360 / step_deg))
     step_rad = 2 * math.pi / steps
@@ -368,17 +373,16 @@ def copies_about_axis(
     fine = fine.reshape(angles_rad.shape)
     best = fine.argmax(1).clamp(1, 2 * _FINE_STEPS - 1)
     three = fine.gather(1, best[:, None] + torch.tensor([-1, 0, 1]))
-    best_rad = angles_rad.gather(1, best[:, None])[:, 0]
-    best_rad = best_rad + _find_parabola_peak(three) * step_rad / _FINE_STEPS
+    middle_rad = angles_rad.gather(1, best[:, None])[:, 0]
+    best_rad = middle_rad + _find_parabola_peak(three) * step_rad / _FINE_STEPS
     order = three[:, 1].argsort(descending=True)
     return _rotate_about(pose, axis, best_rad[order])
 
 
 def _rotate_about(pose: Rigid, axis: Axis, angles_rad: Float64[Tensor, " a"]) -> Rigid:
     """Rotate the model at a pose about one of its axes by each angle."""
-    return pose.double()[None] @ turn_about(
-        axis.direction.double(), axis.point_m.double(), angles_rad
-    )
+    turns = turn_about(axis.direction.double(), axis.point_m.double(), angles_rad)
+    return pose.double()[None] @ turns
 
 
 def _score_sweep(
@@ -439,6 +443,8 @@ def color_copies(
     pose = pose.double()
     if model.colors is None or view.color is None:
         return pose[None]
+
+    # The motions that may be, and axes to sweep about.
     of_shape, axes = _find_ambiguous_motions(model)
     motions = of_shape if turns is None else [turns.double()[k] for k in range(len(turns.R))]
 
@@ -451,6 +457,8 @@ def color_copies(
         apart_rad = [float(geodesic_rad(motion.R, other.R)) for other in distinct]
         if not is_swept and min(apart_rad) > _SAME_TURN_RAD:
             distinct.append(motion)
+
+    # Each of them, rotated about the axes to where its print agrees.
     proposed: list[Rigid] = []
     for motion in distinct:
         copy = pose @ motion
@@ -498,7 +506,7 @@ def settle_spin(pose: Rigid, model: ObjectModel, view: ViewInput) -> Rigid:
 
 
 def _find_parabola_peak(values: Float64[Tensor, "*b 3"]) -> Float64[Tensor, "*b"]:
-    """Give where the parabola through three values is largest, -1 to 1 from the middle one."""
+    """Find the peak of the parabola through three values, -1 to 1 from the middle one."""
     before, middle, after = values.unbind(-1)
     bend = (before - 2 * middle + after).clamp(max=-1e-9)
     return ((before - after) / (2 * bend)).clamp(-1, 1)
@@ -506,11 +514,12 @@ def _find_parabola_peak(values: Float64[Tensor, "*b 3"]) -> Float64[Tensor, "*b"
 
 @lru_cache(maxsize=64)
 def _find_ambiguous_motions(model: ObjectModel) -> tuple[list[Rigid], list[Axis]]:
-    """Give the motions of a model after which depth looks alike or nearly, and its free axes.
+    """Find the motions of a model after which depth looks alike or nearly, and its free axes.
 
     Declared symmetries are not among them.
     """
     assert model.colors is not None
+    # Those of the shape: near-symmetries, and symmetries that were found.
     turns = [near.model_from_model.double() for near in near_symmetries(model)]
     axes: list[Axis] = []
     if model.symmetries.is_found:
@@ -522,7 +531,8 @@ def _find_ambiguous_motions(model: ObjectModel) -> tuple[list[Rigid], list[Axis]
 
     # A box whose halves differ a little looks alike after half turns about its middle.
     points_m = model.colors.points_m.double()
-    principal = torch.linalg.eigh((points_m - points_m.mean(0)).T.cov()).eigenvectors.T
+    centred_m = points_m - points_m.mean(0)
+    principal = torch.linalg.eigh(centred_m.T.cov()).eigenvectors.T
     along_m = points_m @ principal.T
     middle_m = (along_m.amin(0) + along_m.amax(0)) / 2 @ principal
     half = torch.tensor(math.pi, dtype=torch.float64)
@@ -531,17 +541,18 @@ def _find_ambiguous_motions(model: ObjectModel) -> tuple[list[Rigid], list[Axis]
 
 
 def _find_axes_of_many_turns(turns: Sequence[Rigid], others: Sequence[Axis]) -> list[Axis]:
-    """Find lines about which many of the turns are, beside other axes."""
-    eye = torch.eye(3).double()
+    """Find the lines about which many of the turns are, without those parallel to other axes."""
     # The direction of each axis is the one that the rotation leaves as it is.
+    eye = torch.eye(3).double()
     directions = [torch.linalg.svd(turn.R - eye).Vh[-1] for turn in turns]
     axes: list[Axis] = []
     for direction in directions:
-        before = [*others, *axes]
-        is_before = any(_are_parallel(direction, axis.direction.double()) for axis in before)
+        earlier = [*others, *axes]
+        has_axis = any(_are_parallel(direction, axis.direction.double()) for axis in earlier)
         alike = [k for k, other in enumerate(directions) if _are_parallel(other, direction)]
-        if is_before or len(alike) < _MANY_TURNS:
+        if has_axis or len(alike) < _MANY_TURNS:
             continue
+
         # A point that each turn leaves where it is.
         points = [torch.linalg.pinv(eye - turns[k].R, rtol=1e-3) @ turns[k].t_m for k in alike]
         point_m = torch.stack(points).median(0).values

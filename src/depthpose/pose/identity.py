@@ -396,7 +396,7 @@ def _explain_contradiction(fits: _Fits) -> str:
 
 
 def _explain_doubt(fits: _Fits, evidence: Evidence) -> str:
-    """Explain what keeps a model that is not contradicted from being confirmed; empty if nothing."""
+    """Explain what keeps a model without contradiction from being confirmed; empty if nothing."""
     scale = fits.scale
     size_error = abs(scale.times - 1)
     deviation = _DEVIATIONS * scale.sigma

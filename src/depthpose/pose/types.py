@@ -160,16 +160,19 @@ class Symmetries:
 
     @property
     def ball_centre_m(self) -> Float[Tensor, "3"] | None:
-        """Where two axes of revolution meet: every turn about it changes nothing; else None."""
+        """The point where two axes of revolution meet, about which any turn is one; else None."""
         for other in self.continuous[1:]:
             first = self.continuous[0]
             across = torch.linalg.cross(first.direction, other.direction)
-            if float(across.norm()) > _OTHER_AXIS:
-                eye = torch.eye(3).to(across)
-                planes = [eye - torch.outer(a.direction, a.direction) for a in (first, other)]
-                points_m = torch.stack([first.point_m, other.point_m])
-                pulls = (torch.stack(planes) @ points_m[..., None]).sum(0)
-                return torch.linalg.solve(planes[0] + planes[1], pulls).squeeze(-1)
+            if float(across.norm()) <= _OTHER_AXIS:
+                continue
+
+            # The point nearest to both lines.
+            eye = torch.eye(3).to(across)
+            planes = [eye - torch.outer(a.direction, a.direction) for a in (first, other)]
+            points_m = torch.stack([first.point_m, other.point_m])
+            pulls = (torch.stack(planes) @ points_m[..., None]).sum(0)
+            return torch.linalg.solve(planes[0] + planes[1], pulls).squeeze(-1)
         return None
 
 
@@ -240,7 +243,7 @@ class Alternative:
     is_copy: bool = False  #: a near-symmetric copy of the estimate's pose, which looks nearly alike
 
     def __str__(self) -> str:
-        """Say how it differs from the pose, and how likely it is."""
+        """Describe how it differs from the pose, and how likely it is."""
         return f"{self.difference}, {self.probability:.0%}"
 
 
@@ -395,7 +398,13 @@ class PoseEstimate:
         return None if std is None else std.rad2deg()
 
     def _std_along(self, rows: Float64[Tensor, "3 6"], least: float) -> Tensor | None:
-        """Standard deviations of linear functions of the motion; free is what moves as much."""
+        """Give standard deviations of linear functions of the motion, or None.
+
+        Args:
+            rows: the functions' derivatives by (rotation, translation).
+            least: a function is free, and its deviation infinite, where a free motion moves it by
+                more than this.
+        """
         if self.covariance is None:
             return None
         std = (rows @ self.covariance.double() @ rows.mT).diagonal().clamp(min=0).sqrt()

@@ -383,7 +383,8 @@ def fit_pose(
 
     # Kabsch. One keypoint that looks exact must not decide alone; a rotation takes three.
     trace = information.diagonal(dim1=-2, dim2=-1).sum(-1)
-    most = 100 * trace.median(-1, keepdim=True).values.clamp(min=1e-300)
+    usual = trace.masked_fill(~used, torch.nan).nanmedian(-1, keepdim=True).values
+    most = 100 * usual.clamp(min=1e-300)
     pose = fit_rigid(model_m, observed_m, trace.clamp(max=most))
 
     for _ in range(_STEPS):  # of Gauss-Newton
