@@ -145,7 +145,7 @@ def test_weights_of_the_other_kind_are_refused_with_the_class_to_take(
     with pytest.raises(InputError, match="load them as GeoPoseNet"):
         DepthImageRegressor(read_pose_weights(votes))
     other = dataclasses.replace(depth_image_config(models_folder), start=str(votes))
-    with pytest.raises(InputError, match="Give the config the weights' own"):
+    with pytest.raises(InputError, match="Give weights of that network"):
         STAGES["depth-image"][1](other, Run(folder=tmp_path / "o"))
 
 

@@ -58,7 +58,8 @@ def mark_part(
         part_low = low[is_part].min(0)
         part_high = high[is_part].max(0)
         diagonal = float(np.linalg.norm(part_high - part_low))
-        gap = np.linalg.norm(np.maximum(0, np.maximum(low - part_high, part_low - high)), axis=1)
+        gap_along_axes = np.maximum(low - part_high, part_low - high)
+        gap = np.linalg.norm(np.maximum(0, gap_along_axes), axis=1)
         is_small = size < _SMALL * size[is_part].sum()
         is_near = gap <= diagonal * np.where(is_small, _SMALL_BODY_GAP, _BODY_GAP)
         if not (is_near & ~is_part).any():
@@ -67,6 +68,7 @@ def mark_part(
     if is_part.all():
         return all_faces
 
+    # The others are named: left out where they are small, else refused.
     left_out = np.flatnonzero(~is_part)
     extent = np.linalg.norm(high - low, axis=1)
     listing = ", ".join(

@@ -66,8 +66,9 @@ def read_colors(path: AnyPath, scale: float, model: ObjectModel) -> SurfaceColor
         )
     if samples is None:
         return None
+
+    # Those of the shape alone. The shape is read by another reader, which leaves stray bodies out.
     points_m = scale * samples.points
-    # The shape is read by another reader, which leaves stray bodies out.
     low_m = model.vertices_m.amin(0).double()
     high_m = model.vertices_m.amax(0).double()
     slack_m = _SAME_BOX * float((high_m - low_m).max())
@@ -92,26 +93,29 @@ def average_colors(
     """
     if float(rgb.double().std(0).max()) < _LEAST_CONTRAST:
         return None
-    kept_m = points_m[::_DENSE].double()
-    kept_normals = normals[::_DENSE].double()
-    tree = KDTree(kept_m.numpy())
-    distance_m, _ = tree.query(kept_m.numpy()[:: max(1, len(kept_m) // 1000)], k=2)
+
+    # The fourth part of the samples, and how far they lie apart.
+    chosen_m = points_m[::_DENSE].double()
+    chosen_normals = normals[::_DENSE].double()
+    tree = KDTree(chosen_m.numpy())
+    few_m = chosen_m.numpy()[:: max(1, len(chosen_m) // 1000)]
+    distance_m, _ = tree.query(few_m, k=2)
     spacing_m = float(np.median(distance_m[:, 1]))
 
-    # The mean of the samples nearest to each one kept. On a thin sheet a sample of the other side,
+    # The mean of the samples nearest to each of them. On a thin sheet a sample of the other side,
     # which may have another colour, is left out.
     _, nearest = tree.query(points_m.double().numpy())
     owner = torch.from_numpy(np.asarray(nearest))
-    is_same_side = (normals.double() * kept_normals[owner]).sum(-1) > 0
+    is_same_side = (normals.double() * chosen_normals[owner]).sum(-1) > 0
     owner = owner[is_same_side]
     values = rgb.double()[is_same_side]
-    count = torch.zeros(len(kept_m), dtype=torch.float64)
+    count = torch.zeros(len(chosen_m), dtype=torch.float64)
     count.index_add_(0, owner, torch.ones_like(owner, dtype=torch.float64))
-    total = torch.zeros_like(kept_m).index_add_(0, owner, values)
+    total = torch.zeros_like(chosen_m).index_add_(0, owner, values)
     mean = torch.where(count[:, None] > 0, total / count[:, None], rgb[::_DENSE].double())
     return SurfaceColors(
-        points_m=kept_m.float(),
-        normals=kept_normals.float(),
+        points_m=chosen_m.float(),
+        normals=chosen_normals.float(),
         rgb=mean.float(),
         spacing_m=spacing_m,
     )
@@ -161,6 +165,7 @@ def _sample_colors(path: AnyPath, suffix: str) -> tuple[_Samples | None, list[st
     """
     import trimesh
 
+    # The file, as a scene of meshes.
     files = _make_resolver(path)
     with _silence_trimesh():
         scene: Any = trimesh.load_scene(
@@ -170,6 +175,7 @@ def _sample_colors(path: AnyPath, suffix: str) -> tuple[_Samples | None, list[st
             process=False,
             allow_remote=False,
         )
+
     # The meshes of the scene, and their vertices where the scene places them.
     parts: list[tuple[Any, np.ndarray]] = []
     for node in scene.graph.nodes_geometry:
@@ -187,6 +193,7 @@ def _sample_colors(path: AnyPath, suffix: str) -> tuple[_Samples | None, list[st
     points = (corners[face] * share[..., None]).sum(-2)
     sides = corners[:, 1:] - corners[:, :1]
     doubled = torch.linalg.cross(sides[:, 0], sides[:, 1])
+
     # Faces of a negative volume look inward: their normals are flipped.
     middle = corners.flatten(0, 1).mean(0)
     volume = float(((corners.mean(1) - middle) * doubled).sum())
@@ -217,7 +224,7 @@ def _color_points(
     *,
     is_file_missing: bool,
 ) -> np.ndarray | None:
-    """Give the colours of points of a mesh (n, 3), 0..1; None where it has none.
+    """Color points of a mesh (n, 3), 0..1, by whatever colours it has; None where it has none.
 
     Args:
         mesh: of trimesh.
@@ -244,7 +251,14 @@ def _color_by_material(
     *,
     is_file_missing: bool,
 ) -> np.ndarray | None:
-    """Give the colours of points by a texture, else by vertices, else by the material's colour."""
+    """Color points by a texture, else by vertices, else by the material's colour.
+
+    Args:
+        visual: of trimesh.
+        corners: indices of the three corners of each point's face (n, 3).
+        barycentric: coordinates of each point in its face (n, 3).
+        is_file_missing: as of :func:`_color_points`.
+    """
     from trimesh.visual.color import uv_to_interpolated_color
 
     material = visual.material
@@ -258,6 +272,8 @@ def _color_by_material(
             f"its texture is {image.width}x{image.height}, more than {_MOST_TEXELS} pixels; save "
             "it smaller"
         )
+
+    # The first of the three that there is.
     if image is not None and visual.uv is not None:
         uv = _interpolate_corners(visual.uv, corners, barycentric)
         return uv_to_interpolated_color(uv, image)[:, :3] / 255 * tint

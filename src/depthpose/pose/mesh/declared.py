@@ -93,6 +93,7 @@ def declare_symmetry(model: ObjectModel, symmetry: AnySymmetry) -> ObjectModel:
     Raises:
         InputError: it is no symmetry, or a file of none.
     """
+    # In whatever form it is given.
     surface = SurfaceDeviation(model)
     if isinstance(symmetry, str) and not symmetry.lower().endswith(".json"):
         declared = _place_axes(read_symmetry(symmetry), surface, model)
@@ -106,6 +107,8 @@ def declare_symmetry(model: ObjectModel, symmetry: AnySymmetry) -> ObjectModel:
         raise InputError(f"symmetry is a {type(symmetry).__name__}; {_FORM}")
     if declared.is_none:
         raise InputError(f"symmetry of {model.name}: there is none in it; {_FORM}")
+
+    # Does the surface have it?
     deviation = _measure_deviation(declared, surface, model)
     if deviation > _CONTRADICTED:
         source = symmetry if isinstance(symmetry, str | Path) else "that was given"
@@ -122,7 +125,7 @@ def declare_symmetry(model: ObjectModel, symmetry: AnySymmetry) -> ObjectModel:
 def symmetry_of_each(
     given: AnySymmetry | Mapping[str, AnySymmetry] | Sequence[str] | None, names: Sequence[str]
 ) -> dict[str, AnySymmetry]:
-    """Give the declared symmetry of each object that has one.
+    """Assign declared symmetries to the objects that have one.
 
     Args:
         given: one, where one object is known; a mapping from names; or words that begin by a name
@@ -134,18 +137,22 @@ def symmetry_of_each(
     """
     if given is None:
         return {}
+
+    # A mapping from names.
     is_bop = isinstance(given, Mapping) and any(key.startswith("symmetries_") for key in given)
     if isinstance(given, Mapping) and not is_bop:
         for name in given:
             _refuse_other(name, names, f"symmetry of {name!r}")
         return dict(given)
-    is_one = isinstance(given, str | Path | Mapping | Symmetries)
-    every: Sequence[AnySymmetry] = [given] if is_one else list(given)
+
+    # One symmetry or several, which may begin by the name of their object.
+    is_single = isinstance(given, str | Path | Mapping | Symmetries)
+    declarations: Sequence[AnySymmetry] = [given] if is_single else list(given)
     declared: dict[str, AnySymmetry] = {}
-    for declaration in every:
-        name, colon, rest = (
-            declaration.partition(":") if isinstance(declaration, str) else ("", "", "")
-        )
+    for declaration in declarations:
+        name = colon = rest = ""
+        if isinstance(declaration, str):
+            name, colon, rest = declaration.partition(":")
         if colon and (name in names or "," in rest):
             _refuse_other(name, names, f"symmetry {declaration!r}")
             symmetry: AnySymmetry = rest
@@ -164,12 +171,13 @@ def symmetry_of_each(
 
 
 def _refuse_other(name: str, names: Sequence[str], message: str) -> None:
+    """Refuse the name of no object; ``message`` says what it was given for."""
     if name not in names:
         raise InputError(f"{message}: no object is called so; {nearest_name(name, names)}")
 
 
 def _read_entry(path: Path, model: ObjectModel) -> Mapping[str, Any]:
-    """Give BOP's entry of an object: the file itself, its only entry, or that of its number."""
+    """Read BOP's entry of an object: the file itself, its only entry, or that of its number."""
     content = read_json(path)
     if isinstance(content, Mapping) and any(str(k).startswith("symmetries_") for k in content):
         return content
@@ -186,7 +194,16 @@ def _read_entry(path: Path, model: ObjectModel) -> Mapping[str, Any]:
 def _place_axes(
     terms: Sequence[DeclaredTurns], surface: SurfaceDeviation, model: ObjectModel
 ) -> Symmetries:
-    """Place the axes by the surface, and complete their rotations to a group."""
+    """Place the axes by the surface, and complete their rotations to a group.
+
+    Args:
+        terms: of the symmetry in words.
+        surface: of the model.
+        model: the object.
+
+    Raises:
+        InputError: the rotations make more copies than a symmetry has.
+    """
     axes = [
         Axis(direction=term.direction, point_m=_find_point_on_axis(term, surface, model))
         for term in terms
@@ -229,6 +246,7 @@ def _find_point_on_axis(
     is rotated by about a half turn, and the axis moves to where the rotated points would lie on
     the surface.
     """
+    # The rotation that is tried, and where the axis may be to begin with.
     axis = term.direction
     across = torch.linalg.svd(axis[None]).Vh[1:]  # two axes across it
     half = (term.turns or 2) // 2
@@ -238,6 +256,7 @@ def _find_point_on_axis(
     origin = -surface.centre_m / model.diameter_m
     candidates: list[tuple[float, Tensor]] = []
     for start in (torch.zeros(3).double(), (low + high) / 2, origin):
+        # Moved until the rotated surface lies on itself.
         point = start
         for _ in range(_FOLLOW_STEPS):
             turn = turn_about(axis, point, angle_rad)
@@ -248,6 +267,8 @@ def _find_point_on_axis(
             # Moving the axis by p shifts the rotated points by (1 - R) p, solved across the axis.
             lever = across @ (torch.eye(3).double() - turn.R) @ across.T
             point = point + across.T @ torch.linalg.solve(lever, across @ gap)
+
+        # How well that fits, by some of the rotations.
         turns = turn_about(axis, point, term.angles_rad[:: max(1, len(term.angles_rad) // 6)])
         candidates.append((float(surface.deviation(turns.R, turns.t_m).max()), point))
     _, best = min(candidates, key=lambda pair: pair[0])
@@ -258,8 +279,10 @@ def _measure_deviation(
     declared: Symmetries, surface: SurfaceDeviation, model: ObjectModel
 ) -> float:
     """Measure how far the surface lies off itself after any of the rotations, in diameters."""
+    # Not all of many rotations are measured.
     turns = symmetry_transforms(declared, 2 * math.pi / _CHECKED / 2).double()[1:]
-    some = turns[:: max(1, len(turns.R) // (2 * _CHECKED))]
+    turns = turns[:: max(1, len(turns.R) // (2 * _CHECKED))]
+
     # From the model's frame and metres to the surface's centre and unit.
-    moved_m = some.R @ surface.centre_m + some.t_m - surface.centre_m
-    return float(surface.deviation(some.R, moved_m / model.diameter_m).max())
+    moved_m = turns.R @ surface.centre_m + turns.t_m - surface.centre_m
+    return float(surface.deviation(turns.R, moved_m / model.diameter_m).max())

@@ -30,23 +30,31 @@ from depthpose.pose.types import Axis, ObjectModel, Symmetries
 
 @lru_cache(maxsize=64)
 def cached(model: ObjectModel, compute: Callable[..., Any], name: str, *settings: float) -> Any:  # noqa: ANN401
-    """Give ``compute(model, *settings)``, JSON values that take long, from the cache if possible.
+    """Compute ``compute(model, *settings)``, JSON values that take long, or read them from a cache.
 
     The cache is ``$DEPTHPOSE_CACHE``, where that can be written to. Its key is made of the bytes of
     the shape and its symmetries, and of the code that computes.
+
+    Args:
+        model: the object.
+        compute: the function.
+        name: of the folder of its values in the cache.
+        settings: further arguments.
     """
+    # What the values depend on.
     symmetries = model.symmetries
     tensors = [model.vertices_m, model.faces]
     if symmetries.discrete is not None:
         tensors.append(symmetries.discrete.R)
     tensors += [axis.direction for axis in symmetries.continuous]
-
     digest = sha256(f"{symmetries.is_found}".encode())
     code = {*Path(__file__).parent.glob("*.py"), Path(compute.__code__.co_filename)}
     for path in sorted(code):
         digest.update(path.read_bytes())
     for tensor in tensors:
         digest.update(tensor.contiguous().numpy().tobytes())
+
+    # Read, or computed and written.
     folder = "_".join(map(str, (name, *settings)))
     path = cache_folder() / folder / f"{digest.hexdigest()}.json"
     try:
@@ -90,31 +98,25 @@ class SymmetryProposal(NamedTuple):
 
 
 class SurfaceDeviation:
-    """Measures how far a moved surface lies from itself, in diameters.
-
-    Attributes:
-        centre_m: of the surface, about which it is rotated.
-        points: samples of the surface about the centre, in diameters.
-        few: a hundred of them, for a rough measure of thousands of rotations.
-        many: a thousand of them.
-        dense: five thousand of them.
-        axes: principal axes, one a row.
-    """
+    """Measures how far a moved surface lies from itself, in diameters."""
 
     def __init__(self, model: ObjectModel) -> None:
         samples_m, normals = sample_surface(model, 20000)
-        self.centre_m = samples_m.double().mean(0)
+        self.centre_m = samples_m.double().mean(0)  #: of the surface, about which it is rotated
+        #: samples of the surface about the centre, in diameters.
         self.points = (samples_m.double() - self.centre_m) / model.diameter_m
+        self.few = take_evenly(self.points, 100)  #: of them, to measure thousands of rotations
+        self.many = take_evenly(self.points, 1000)  #: of them, for usual measures
+        self.dense = take_evenly(self.points, 5000)  #: of them, for exact measures
+        self.axes = torch.linalg.eigh(
+            self.points.T @ self.points
+        ).eigenvectors.T  #: principal, rows
         self._normals = normals.double().numpy()
         self._tree = KDTree(self.points.numpy())
-        self.few = take_evenly(self.points, 100)
-        self.many = take_evenly(self.points, 1000)
-        self.dense = take_evenly(self.points, 5000)
         self._rough_tree = KDTree(take_evenly(self.points, 2500).numpy())
-        self.axes = torch.linalg.eigh(self.points.T @ self.points).eigenvectors.T
 
     def nearest(self, moved: Float[Tensor, "*batch m 3"]) -> tuple[np.ndarray, np.ndarray]:
-        """Give the distance [diameters] and index of the sample nearest to each point."""
+        """Find the sample nearest to each point: its distance [diameters] and index."""
         distance, index = self._tree.query(moved.numpy(), workers=torch.get_num_threads())
         return np.asarray(distance), np.asarray(index)
 
@@ -149,6 +151,7 @@ class SurfaceDeviation:
 
         It is a lower bound of that, in half of the time.
         """
+        # The nearest samples of each moved point; in an exact measure several.
         is_exact = share >= ALMOST_ALL
         points = self.dense if is_exact else self.many
         count = _NEAREST_SAMPLES if is_exact else 1
@@ -169,12 +172,12 @@ class SurfaceDeviation:
 
 @lru_cache(maxsize=4)
 def _prepare_surface(model: ObjectModel) -> SurfaceDeviation:
-    """Give the surface of a model, made once for its several searches."""
+    """Prepare the surface of a model, once for its several searches."""
     return SurfaceDeviation(model)
 
 
 def propose_symmetries(model: ObjectModel, tolerance: float = 0.02) -> list[SymmetryProposal]:
-    """Search for rotations that leave the shape as it is, and say how certain each is.
+    """Search for rotations that leave the shape as it is, each with a certainty.
 
     Every symmetry leaves the centre of the surface where it is. Rotations by 1/2 to 1/6 of the
     circle about the principal axes and about 400 directions are measured coarsely; the promising
@@ -200,6 +203,8 @@ def propose_symmetries(model: ObjectModel, tolerance: float = 0.02) -> list[Symm
             break
         if _is_covered(_find_axis(coarse), tried_axes, revolution_axes):
             continue
+
+        # Refined to an exact axis, about which all rotations are measured.
         axis = _find_axis(_follow_surface(surface, coarse))
         if not _is_covered(axis, tried_axes, revolution_axes):
             tried_axes.append(axis)
@@ -210,7 +215,7 @@ def propose_symmetries(model: ObjectModel, tolerance: float = 0.02) -> list[Symm
 
 
 def _find_axis(R: Tensor) -> Tensor:
-    """Give the direction that a rotation leaves alone; well defined for half turns too."""
+    """Find the direction that a rotation leaves alone; well defined for half turns too."""
     return torch.linalg.svd(R - _EYE).Vh[-1]
 
 
@@ -237,6 +242,7 @@ def symmetries_from_proposals(proposals: list[SymmetryProposal]) -> Symmetries:
     They are axes of revolution, and rotations that do not follow from an axis. Without an axis the
     rotations are completed to a group, for the product of two symmetries is one.
     """
+    # The axes of the certain ones.
     sure = [p for p in proposals if p.certainty >= SURE]
     lines = [
         Axis(
@@ -246,28 +252,30 @@ def symmetries_from_proposals(proposals: list[SymmetryProposal]) -> Symmetries:
         for p in sure
     ]
     axes = tuple(line for line, p in zip(lines, sure, strict=True) if p.kind == "continuous")
+
+    # Rotations that follow neither from an axis nor from an earlier rotation.
     turns: list[Rigid] = []
     for line, proposal in zip(lines, sure, strict=True):
         if proposal.angle_rad is None:
             continue
         angle_rad = torch.tensor(proposal.angle_rad, dtype=torch.float64)
         turn = turn_about(line.direction, line.point_m, angle_rad)
-        # Two that move an axis of revolution alike differ by a rotation about that axis.
-        is_same = any(
-            float(geodesic_rad(turn.R, earlier.R)) < _SAME_RAD
-            or any(
-                float((turn.R @ axis.direction - earlier.R @ axis.direction).norm()) < _SAME_RAD
-                for axis in axes
-            )
-            for earlier in turns
-        )
-        if not is_same:
+        if not any(_are_equivalent(turn, earlier, axes) for earlier in turns):
             turns.append(turn)
     if not turns:
         return Symmetries(continuous=axes)
 
     group = turns if axes else _complete_group(turns)
     return Symmetries(discrete=Rigid.stack(group), continuous=axes)
+
+
+def _are_equivalent(turn: Rigid, other: Rigid, axes: Sequence[Axis]) -> bool:
+    """Whether two rotations are the same, or differ by a rotation about an axis of revolution."""
+    if float(geodesic_rad(turn.R, other.R)) < _SAME_RAD:
+        return True
+    # Two that move an axis alike differ by a rotation about it.
+    apart = [float((turn.R @ a.direction - other.R @ a.direction).norm()) for a in axes]
+    return any(distance < _SAME_RAD for distance in apart)
 
 
 def _complete_group(turns: list[Rigid]) -> list[Rigid]:
@@ -305,11 +313,15 @@ def with_found_symmetries(
     declared = model.symmetries
     if not (is_taken or on_message) or declared.discrete is not None or declared.continuous:
         return model
+
+    # What the shape has.
     rows = cached(model, propose_symmetries, "symmetries", tolerance)
     proposals = [SymmetryProposal(*row) for row in rows]
     symmetries = replace(symmetries_from_proposals(proposals), is_found=True)
     if symmetries.discrete is None and not symmetries.continuous:
         return model
+
+    # Said, and taken if wanted.
     turns = 0 if symmetries.discrete is None else len(symmetries.discrete.R)
     certainty = min(p.certainty for p in proposals if p.certainty >= SURE)
     if on_message is not None:
@@ -328,13 +340,13 @@ def with_found_symmetries(
 def _rotate_about(
     direction: Float[Tensor, "3"], angles: Float[Tensor, " a"]
 ) -> Float[Tensor, "a 3 3"]:
-    """Give the rotation matrices about a direction by each angle."""
+    """Make the rotation matrices about a direction by each angle."""
     return turn_about(direction, torch.zeros_like(direction), angles).R
 
 
 @lru_cache(maxsize=4)
 def _find_promising_turns(surface: SurfaceDeviation) -> tuple[Float[Tensor, "3 3"], ...]:
-    """Give the rotations about principal axes and many directions that fit roughly, best first."""
+    """Find the rotations about principal axes and many directions that fit roughly, best first."""
     directions = torch.cat([surface.axes, fibonacci_directions(_DIRECTIONS)])
     angles = torch.tensor([2 * math.pi / order for order in _COARSE_ORDERS], dtype=torch.float64)
     rotations = torch.stack([_rotate_about(direction, angles) for direction in directions])
@@ -350,15 +362,14 @@ def _is_covered(direction: Tensor, tried_axes: list[Tensor], revolution_axes: li
     All lines at right angles to an axis of revolution are equivalent.
     """
     is_tried = any(abs(float(direction @ tried)) > math.cos(_SAME_RAD) for tried in tried_axes)
-    right_angle_cosine = math.sin(_SAME_RAD)  # up to which two lines are at right angles
-    perpendicular = [
-        axis for axis in revolution_axes if abs(float(axis @ direction)) < right_angle_cosine
-    ]
-    is_equivalent = any(
-        abs(float(axis @ tried)) < right_angle_cosine
-        for axis in perpendicular
-        for tried in tried_axes
-    )
+
+    def are_perpendicular(first: Tensor, second: Tensor) -> bool:
+        """Whether two lines are at right angles."""
+        return abs(float(first @ second)) < math.sin(_SAME_RAD)
+
+    # Is there an axis of revolution across both this line and one that was tried?
+    across = [axis for axis in revolution_axes if are_perpendicular(axis, direction)]
+    is_equivalent = any(are_perpendicular(axis, tried) for axis in across for tried in tried_axes)
     return is_tried or is_equivalent
 
 
@@ -370,7 +381,7 @@ def _measure_axis(
     They are the full circle and, unless that is within the tolerance, rotations of order 2 to 12;
     and a rotation by one of many teeth.
     """
-    # Angle and deviation of each symmetry; an angle of None is that of the full circle.
+    # The full circle, as an angle of None with its deviation.
     step = 2 * math.pi / _CIRCLE_TURNS
     circle = _rotate_about(direction, torch.arange(1, _CIRCLE_TURNS) * step)
     full: list[tuple[None, float]] = []
@@ -378,6 +389,8 @@ def _measure_axis(
     if bool((surface.rough_distance(circle) <= _MAX_ROUGH_DEVIATION).all()):
         worst = float(surface.deviation(circle).max())
         full = [(None, worst)] if worst <= limit else []
+
+    # Else single rotations, as angles with their deviations.
     turns = _measure_orders(surface, direction, limit) if worst > tolerance else []
     teeth = [] if full else _measure_teeth(surface, direction, tolerance)
     return [
@@ -397,12 +410,15 @@ def _measure_orders(
     surface: SurfaceDeviation, direction: Tensor, limit: float
 ) -> list[tuple[float, float]]:
     """Measure rotations of order 2 to 12; give angle and deviation of the best within ``limit``."""
+    # Those that fit roughly.
     shares = sorted({k / order for order in _ORDERS for k in range(1, order)})
     angles = torch.tensor(shares, dtype=torch.float64) * (2 * math.pi)
     rough = surface.rough_distance(_rotate_about(direction, angles))
     angles = angles[rough <= _MAX_ROUGH_DEVIATION]
     if len(angles) == 0:
         return []
+
+    # The best of each symmetry.
     deviation = surface.deviation(_rotate_about(direction, angles))
     chosen: list[tuple[float, float]] = []
     for i in deviation.argsort().tolist():
@@ -428,15 +444,16 @@ def _measure_teeth(
         tooth_R, *between_R = _rotate_about(direction, angles)
         if float(surface.rough_distance(tooth_R)) > _MAX_ROUGH_DEVIATION:
             continue
+        # The fast lower bound first.
         turn = Rigid(tooth_R, torch.zeros(3, dtype=torch.float64))
         if float(surface.deviation_one_way(turn)) > tolerance:
             continue
-        tooth = float(surface.deviation(tooth_R))
-        if tooth > tolerance:
+        tooth_deviation = float(surface.deviation(tooth_R))
+        if tooth_deviation > tolerance:
             continue
-        between = float(surface.deviation(torch.stack(between_R)).min())
-        if between > 2 * tooth + ALIKE:
-            measured.append((step, tooth))
+        between_deviation = float(surface.deviation(torch.stack(between_R)).min())
+        if between_deviation > 2 * tooth_deviation + ALIKE:
+            measured.append((step, tooth_deviation))
     return sorted(measured, key=lambda pair: pair[1])[:1]
 
 
@@ -465,7 +482,7 @@ def mirror_deviation(model: ObjectModel) -> float:
 
 
 def _search_mirror(model: ObjectModel) -> float:
-    """Give the least deviation of a surface from its mirror images, in diameters."""
+    """Search the least deviation of a surface from its mirror images, in diameters."""
     surface = _prepare_surface(model)
     # Reflections across planes with normal n, followed by rotations about n by 0, 90, 180 and 270
     # degrees: cos (1 - nn') + sin [n] - nn'. The best that are distinct are the starts.
@@ -479,11 +496,11 @@ def _search_mirror(model: ObjectModel) -> float:
     for k in surface.rough_distance(reflections).argsort().tolist():
         if len(starts) == _MIRROR_STARTS:
             break
-        if all(
-            float(geodesic_rad(reflections[k], start)) > _MIN_START_DISTANCE_RAD for start in starts
-        ):
+        apart_rad = [float(geodesic_rad(reflections[k], start)) for start in starts]
+        if all(angle_rad > _MIN_START_DISTANCE_RAD for angle_rad in apart_rad):
             starts.append(reflections[k])
 
+    # Each is refined.
     refined = [refine_turn(surface, R @ _FLIP, _FLIP) for R in starts]
     R = torch.stack([motion.R for motion in refined]) @ _FLIP
     shift = torch.stack([motion.t_m for motion in refined])
@@ -518,9 +535,8 @@ ALIKE = 0.004
 """Deviation in diameters up to which a symmetry that was found in a shape is exact: as much as a
 cylinder of 25 facets deviates. A copy that deviates by more, as a scan's dents or a keyway do, is
 another pose, though a view may not tell which."""
-ALMOST_ALL = (
-    0.998  #: share of the surface within ``ALIKE``; a key or a notch is a few percent of it
-)
+ALMOST_ALL = 0.998
+"""Share of the surface within ``ALIKE``; a key or a notch is a few percent of it."""
 _NEAR_TOLERANCE = 0.05
 """Deviation in diameters at which a sensor's noise begins to mask the difference of two poses: real
 points of LineMOD and YCB lie 1.4 to 2.6 % of the diameter off the posed surface. Twice as much is
@@ -559,12 +575,14 @@ def near_symmetries(model: ObjectModel) -> tuple[NearSymmetry, ...]:
 def true_symmetries(
     model: ObjectModel, alike: tuple[list[bool], list[bool]] | None = None
 ) -> Symmetries:
-    """Give the symmetries whose copies count as one pose.
+    """Select the symmetries whose copies count as one pose.
 
     These are all that were declared. Of those that were found in the geometry, near-symmetries,
     whose copies deviate by more than ``ALIKE``, are left out.
 
-    ``alike`` says which discrete symmetries and which axes deviate by less; None: it is searched.
+    Args:
+        model: the object.
+        alike: which discrete symmetries and which axes deviate by less; None: it is searched.
     """
     symmetries = model.symmetries
     if not symmetries.is_found:
@@ -588,6 +606,7 @@ def _search_near_symmetries(model: ObjectModel) -> dict[str, Any]:
     Gives JSON values, which are cached: ``near``, transforms with their deviations, the best first;
     and ``alike``, flags of the discrete and the continuous symmetries.
     """
+    # Symmetries that were found, and rotations that nearly are some.
     surface = _prepare_surface(model)
     alike = _find_alike(model.symmetries, surface)
     measured = _measure_deviations(_propose_near_symmetries(model.symmetries, surface), surface)
@@ -615,13 +634,13 @@ def _search_near_symmetries(model: ObjectModel) -> dict[str, Any]:
 
 
 def _find_alike(symmetries: Symmetries, surface: SurfaceDeviation) -> tuple[list[bool], list[bool]]:
-    """Say which discrete symmetries, and which axes, have copies that lie on the surface."""
-    discrete = list[bool]()
+    """Find which discrete symmetries, and which axes, have copies that lie on the surface."""
+    discrete: list[bool] = []
     if symmetries.discrete is not None:
         R = symmetries.discrete.R.double()
         discrete = (surface.deviation(R, share=ALMOST_ALL) <= ALIKE).tolist()
     circle = torch.arange(1, 8, dtype=torch.float64) * (math.pi / 4)
-    continuous = list[bool]()
+    continuous: list[bool] = []
     for axis in symmetries.continuous:
         R = _rotate_about(axis.direction.double(), circle)
         continuous.append(float(surface.deviation(R, share=ALMOST_ALL).max()) <= ALIKE)
@@ -629,11 +648,12 @@ def _find_alike(symmetries: Symmetries, surface: SurfaceDeviation) -> tuple[list
 
 
 def _propose_near_symmetries(symmetries: Symmetries, surface: SurfaceDeviation) -> list[Rigid]:
-    """Give motions that may be near-symmetries: symmetries that were found, and refined rotations.
+    """Propose motions as near-symmetries: symmetries that were found, and refined rotations.
 
     Refinement may shift the surface too: a scan whose points are denser on one side has its centre
     where no symmetry has it.
     """
+    # Symmetries that were found.
     candidates: list[Rigid] = []
     if symmetries.is_found:
         copies = symmetry_transforms(symmetries, _AXIS_STEP_RAD).R.double()[1:]
@@ -645,8 +665,8 @@ def _propose_near_symmetries(symmetries: Symmetries, surface: SurfaceDeviation) 
     for R in _find_promising_turns(surface):
         if len(starts) >= _NEAR_STARTS:
             break
-        distances = [float(geodesic_rad(R, start)) for start in (_EYE, *starts)]
-        if min(distances) > _NEAR_SUPPRESSION_RAD:
+        apart_rad = [float(geodesic_rad(R, start)) for start in (_EYE, *starts)]
+        if min(apart_rad) > _NEAR_SUPPRESSION_RAD:
             starts.append(R)
     return candidates + [refine_turn(surface, R) for R in starts]
 

@@ -85,24 +85,17 @@ _MOST_TURNS = 36
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PairTable:
-    """Pairs of points of a model, sorted by their features.
+    """Pairs of points of a model, sorted by their features."""
 
-    Attributes:
-        points_m: points of the surface that is visible from outside, 0.07 diameters apart or more,
-            in the order of the model's faces.
-        frames: outward normal and two tangents of each point, as columns.
-        bounds: pairs ``bounds[k]`` to ``bounds[k + 1]`` have feature ``k``.
-        first: index of the first point of each pair.
-        turn_rad: angle of the second point about the normal of the first, from its first tangent.
-        surface: surface of the model.
-    """
-
+    #: of the surface that is visible from outside, 0.07 diameters apart or more, in the order of
+    #: the model's faces.
     points_m: Float64[Tensor, "m 3"]
-    frames: Float64[Tensor, "m 3 3"]
-    bounds: Int32[Tensor, " bounds"]
-    first: Int32[Tensor, " pairs"]
+    frames: Float64[Tensor, "m 3 3"]  #: outward normal and two tangents of each point, as columns
+    bounds: Int32[Tensor, " bounds"]  #: pairs ``bounds[k]`` to ``bounds[k + 1]`` have feature ``k``
+    first: Int32[Tensor, " pairs"]  #: index of the first point of each pair
+    #: angle of the second point about the normal of the first, from its first tangent.
     turn_rad: Float32[Tensor, " pairs"]
-    surface: Surface
+    surface: Surface  #: of the model
 
 
 def find_turns(model: ObjectModel) -> dict[str, Any]:
@@ -115,6 +108,7 @@ def find_turns(model: ObjectModel) -> dict[str, Any]:
         JSON values: ``turns``, 4x4 matrices ``model_from_model`` in metres, the best first, and
         ``near``, how many of the first ones are near-symmetries, with 80 % of the surface or more.
     """
+    # Motions that pairs of points vote for.
     surface = prepare_surface(replace(model, symmetries=true_symmetries(model)))
     table = prepare_pairs(surface)
     # References from all sides, not from the first faces alone.
@@ -177,10 +171,12 @@ def prepare_pairs(surface: Surface) -> PairTable:
     # Points of the visible surface, few enough.
     points_m, normals = _find_visible_points(surface)
     step_m = STEP * surface.diameter_m
-    while len(kept := thin(points_m, normals, step_m)) > _MODEL_POINTS:
+    chosen = thin(points_m, normals, step_m)
+    while len(chosen) > _MODEL_POINTS:
         step_m *= _COARSER
-    points_m = points_m[kept]
-    frames = _make_frames(normals[kept])
+        chosen = thin(points_m, normals, step_m)
+    points_m = points_m[chosen]
+    frames = _make_frames(normals[chosen])
 
     # All pairs of two different points, by feature. Within a feature they are shuffled, so that the
     # first ones are a sample of all.
@@ -192,6 +188,8 @@ def prepare_pairs(surface: Surface) -> PairTable:
     shuffle = torch.randperm(len(first), generator=torch.Generator().manual_seed(0))
     feature, order = torch.from_numpy(keys)[shuffle].sort(stable=True)
     order = shuffle[order]
+
+    # Where the pairs of each feature begin.
     sizes = torch.bincount(feature, minlength=(DISTANCES + 1) * ANGLES**3)
     bounds = torch.cat([sizes.new_zeros(1), sizes.cumsum(0)])
     return PairTable(
@@ -234,7 +232,7 @@ def propose_poses(
 def _find_visible_points(
     surface: Surface,
 ) -> tuple[Float64[Tensor, "n 3"], Float64[Tensor, "n 3"]]:
-    """Give the points that a far camera sees from anywhere, with normals toward it.
+    """Find the points that a far camera sees from anywhere, with normals toward it.
 
     A point of a thin sheet, both of whose sides are visible, is given twice.
     """
@@ -252,6 +250,8 @@ def _find_visible_points(
         nearest_m = torch.full(((int(column.max()) + 1) * width,), -torch.inf, dtype=torch.float64)
         nearest_m.scatter_reduce_(0, cell, toward_m, "amax")
         visible_from.append(toward_m > nearest_m[cell] - surface.diameter_m / _CELLS)
+
+    # The sides that face one of these cameras.
     is_visible = torch.stack(visible_from)
     cosine = directions @ surface.normals.T
     front = (is_visible & (cosine > _LEAST_COSINE)).any(0)
@@ -261,7 +261,8 @@ def _find_visible_points(
 
 
 def _make_frames(normals: Float64[Tensor, "n 3"]) -> Float64[Tensor, "n 3 3"]:
-    """Give each normal and two tangents, as columns."""
+    """Make a frame of each normal: it and two tangents, as columns."""
+    # The first tangent is across the axis along which the normal points least.
     least = torch.eye(3, dtype=torch.float64)[normals.abs().argmin(-1)]
     first = normalize(torch.linalg.cross(normals, least), dim=-1)
     return torch.stack([normals, first, torch.linalg.cross(normals, first)], -1)
@@ -271,7 +272,7 @@ def _make_frames(normals: Float64[Tensor, "n 3"]) -> Float64[Tensor, "n 3 3"]:
 def _describe_all_pairs(
     points: Float64[np.ndarray, "m 3"], frames: Float64[np.ndarray, "m 3 3"], step: float
 ) -> tuple[Int64[np.ndarray, " pairs"], Float64[np.ndarray, " pairs"]]:
-    """Give the key of the feature of every pair of two points, and the turn of its second point."""
+    """Compute the key of the feature of every pair of points, and the turn of its second point."""
     count = len(points)
     keys = np.empty(count * (count - 1), np.int64)
     turns = np.empty(count * (count - 1))
@@ -323,13 +324,13 @@ def _write_feature(
 
 @compiled
 def _measure_angle(cosine: float) -> float:
-    """Give the angle of a cosine in bins."""
+    """Convert a cosine to its angle in bins."""
     return np.arccos(min(1.0, max(-1.0, cosine))) * (ANGLES / np.pi)
 
 
 @compiled
 def _make_key(feature: Float64[np.ndarray, "4"]) -> int:
-    """Give one number for the bins of a feature."""
+    """Make one number of the bins of a feature."""
     key = 0
     for k in range(4):
         key = key * ANGLES + _clamp_bin(int(feature[k]), k)
@@ -338,7 +339,7 @@ def _make_key(feature: Float64[np.ndarray, "4"]) -> int:
 
 @compiled
 def _clamp_bin(number: int, k: int) -> int:
-    """Give the bin of part ``k`` of a feature; values beyond the bins are in the last one."""
+    """Find the bin of part ``k`` of a feature; values beyond the bins are in the last one."""
     last = DISTANCES if k == 0 else ANGLES - 1
     return min(max(number, 0), last)
 
@@ -407,7 +408,7 @@ def _vote(
 ) -> tuple[
     Int64[np.ndarray, "r peaks"], Int64[np.ndarray, "r peaks"], Float64[np.ndarray, "r peaks"]
 ]:
-    """Let every pair of a reference point vote; give the points, turns and votes of its peaks.
+    """Let every pair of a reference point vote; give points, turns and votes of its peaks.
 
     Args:
         points: of the scene.
@@ -429,6 +430,7 @@ def _vote(
         i = references[r]
         counts[:] = 0
         voted[:] = 0
+        # With every other point that is neither too near nor too far.
         for j in range(len(points)):
             square = 0.0
             for c in range(3):
@@ -470,7 +472,8 @@ def _add_votes(
     counts: Float32[np.ndarray, "m turns"],
 ) -> None:
     """Add the votes of the model's pairs with a feature; a turn votes once for it."""
-    low, high = pairs.bounds[key], pairs.bounds[key + 1]
+    low = pairs.bounds[key]
+    high = pairs.bounds[key + 1]
     bit = np.uint32(1 << min(int((turn + np.pi) / (2 * np.pi) * TURNS), TURNS - 1))
     if high == low or voted[key] & bit:
         return
@@ -482,7 +485,7 @@ def _add_votes(
 
 @compiled
 def _find_turn_bin(turn: float) -> int:
-    """Give the bin of the difference of two angles between -pi and pi."""
+    """Find the bin of the difference of two angles between -pi and pi."""
     value = turn * (TURNS / (2 * np.pi))
     b = int(value + TURNS if value < 0 else value)
     return b - TURNS if b >= TURNS else b
@@ -496,18 +499,25 @@ def _find_peaks(
     best_votes: Float64[np.ndarray, " peaks"],
 ) -> None:
     """Write the model points with the most votes, at the best turn of each."""
+    # The best turn of each model point.
     models = len(counts)
-    most, turn = np.empty(models), np.empty(models, np.int64)
+    most = np.empty(models)
+    turn = np.empty(models, np.int64)
     for m in range(models):
         most[m] = -1.0
         for b in range(TURNS):
             # Neighbouring turns share their votes.
             votes = 2 * counts[m, b] + counts[m, b - 1] + counts[m, (b + 1) % TURNS]
             if votes > most[m]:
-                most[m], turn[m] = votes, b
+                most[m] = votes
+                turn[m] = b
+
+    # The points of the most votes, one after the other.
     for k in range(len(best_point)):
         m = np.argmax(most)
-        best_point[k], best_turn[k], best_votes[k] = m, turn[m], most[m]
+        best_point[k] = m
+        best_turn[k] = turn[m]
+        best_votes[k] = most[m]
         most[m] = -1.0
 
 
@@ -521,6 +531,7 @@ def _score_poses(
 
     These are free-space violations and part of the unobserved surface.
     """
+    # Points near the surface, by how their normals fit.
     inverse = poses.inverse()
     local_m = points_m[:_SCORED_POINTS] @ inverse.R.mT + inverse.t_m[:, None]
     local_normals = normals[:_SCORED_POINTS] @ inverse.R.mT
@@ -528,6 +539,8 @@ def _score_poses(
     limit_m = _NEAR_ROUGHLY * surface.diameter_m
     is_near = (local_m - surface.points_m[index]).norm(dim=-1) < limit_m
     cosine = (local_normals * surface.normals[index]).sum(-1).abs()
-    free_space_violation, unobserved = look_along_rays(points_m, poses, surface, every=_RAYS_EVERY)
     support = (is_near * cosine).mean(-1)
+
+    # And what contradicts the pose.
+    free_space_violation, unobserved = look_along_rays(points_m, poses, surface, every=_RAYS_EVERY)
     return support - free_space_violation - _UNOBSERVED_WEIGHT * unobserved
