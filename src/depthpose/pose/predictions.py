@@ -138,7 +138,7 @@ def read_earlier_predictions(folder: Path) -> dict[str, Prediction]:
 def score_of(estimate: PoseEstimate) -> float:
     """Give the score of an estimate, 0..1: its certainty where known, else its share of inliers.
 
-    1 where neither is known.
+    It is 1 where neither is known.
     """
     if estimate.certainty is not None:
         return estimate.certainty
@@ -146,21 +146,25 @@ def score_of(estimate: PoseEstimate) -> float:
 
 
 def prediction_row(prediction: Prediction) -> dict[str, Any]:
-    """Give the JSON values of an entry of ``poses.json``."""
+    """Convert a prediction to the JSON values of an entry of ``poses.json``."""
+    # What it is of, and how it ended.
     estimate = prediction.estimate
     place = prediction.place
     pose = estimate.camera_from_model
     row: dict[str, Any] = {"version": VERSION, "name": estimate.name, "object": estimate.object}
     row |= dict(zip(_PLACE, place, strict=True)) if place is not None else {}
     row |= {"status": estimate.status, "reason": estimate.reason}
+
+    # Poses and tables.
     row["camera_from_model"] = None if pose is None else pose.matrix().tolist()
     base = estimate.base_from_model
     row["base_from_model"] = None if base is None else base.matrix().tolist()
     for name in ("covariance", "free_motions", "keypoints_m"):
         values: Tensor | None = getattr(estimate, name)
         row[name] = None if values is None else values.double().tolist()
-    # JSON has no infinity: the deviation along a free axis becomes null, and so does the distance
-    # where no point lies near the surface.
+
+    # Numbers. JSON has no infinity: the deviation along a free axis becomes null, and so does the
+    # distance where no point lies near the surface.
     for name in ("origin_std_mm", "rotation_std_deg"):
         values = None if pose is None else getattr(estimate, name)
         deviations = [] if values is None else values.tolist()
@@ -170,6 +174,8 @@ def prediction_row(prediction: Prediction) -> dict[str, Any]:
         row[name] = value if value is not None and math.isfinite(value) else None
     row["visible_share"] = estimate.visible_share
     row["pick_rank"] = estimate.pick_rank
+
+    # Parts with values of their own.
     for name in ("evidence", "identity"):
         record = getattr(estimate, name)
         row[name] = None if record is None else asdict(record)
@@ -485,20 +491,21 @@ def make_detection_jobs(
         place = Place(detection.scene_id, detection.image_id, detection.object_id)
         if len(of_place[place]) < len(shown.get(place, ())):
             of_place[place].append(detection)
-    kept = [
+    chosen = [
         (place, k, detection)
         for place, best in of_place.items()
         for k, detection in enumerate(best)
     ]
-    if not kept:
+    if not chosen:
         raise InputError(
             f"{dataset.folder}: none of the {len(detections)} detections is of an image and object "
             f"of split {dataset.split!r}; give those of this very split"
         )
 
-    jobs_of_image = Counter(place[:2] for place, _, _ in kept)
+    # A job for each, in the order of places.
+    jobs_of_image = Counter(place[:2] for place, _, _ in chosen)
     jobs: list[PoseJob[ViewInput]] = []
-    for place, k, detection in sorted(kept, key=lambda item: item[:2]):
+    for place, k, detection in sorted(chosen, key=lambda item: item[:2]):
         name = f"{place.scene_id:06d}_{place.image_id:06d}_object{place.object_id}_{k}"
         seconds: dict[str, float] = {}
         if detection.seconds is not None:
@@ -511,20 +518,20 @@ def make_detection_jobs(
 
 
 def additive_seconds(predictions: Sequence[Prediction]) -> list[dict[str, float]]:
-    """Give seconds of each prediction whose sum is the time that all predictions took together.
+    """Divide times among predictions: seconds whose sum is what all of them took together.
 
     The estimates of one search all hold the time of the whole search, which is divided among them
     here. The stages that ran within a search are left out beside it.
     """
     # Estimates of one image that hold the very same time come from one search: regions of an image
     # are searched one by one, and take different times.
-    searches = [
-        (prediction.place[:2] if prediction.place else prediction.estimate.name,
-         prediction.estimate.seconds.get("search"))
-        for prediction in predictions
-    ]  # fmt: skip
+    searches: list[tuple[object, float | None]] = []
+    for prediction in predictions:
+        image = prediction.place[:2] if prediction.place else prediction.estimate.name
+        searches.append((image, prediction.estimate.seconds.get("search")))
     estimate_count = Counter(searches)
 
+    # The share of each in its search, without the stages within it.
     rows: list[dict[str, float]] = []
     for prediction, search in zip(predictions, searches, strict=True):
         seconds = dict(prediction.estimate.seconds)
@@ -554,12 +561,15 @@ def read_bop_results(path: str | Path) -> list[Prediction]:
     Raises:
         InputError: it is missing or damaged, or rows of an image have different times.
     """
+    # The lines of the file.
     data = read_bytes(path)
     refuse_heavy(path, data, {b"\n": 300, b",": 60})
     with refused_as(path, "results file", "write it anew"):
         rows = list(csv.reader(data.decode("utf-8-sig").splitlines()))
     if not rows or [name.strip() for name in rows[0]] != _HEADER:
         raise InputError(f"{path}: the first line is not {','.join(_HEADER)}; put it there")
+
+    # An estimate a line, and the time of each image.
     estimates: list[tuple[Place, PoseEstimate]] = []
     image_s: dict[tuple[int, int], float] = {}
     for line, row in enumerate(rows[1:], 2):
@@ -577,8 +587,13 @@ def read_bop_results(path: str | Path) -> list[Prediction]:
                 f"one row and {time_s} s in another; time is that of the whole image, "
                 "the same in all"
             )
-    rows_of = Counter(place[:2] for place, _ in estimates)
-    shares = {image: {"image": s / rows_of[image]} for image, s in image_s.items() if s >= 0}
+
+    # The time of an image, divided among its estimates.
+    estimate_count = Counter(place[:2] for place, _ in estimates)
+    shares: dict[tuple[int, int], dict[str, float]] = {}
+    for image, time_s in image_s.items():
+        if time_s >= 0:
+            shares[image] = {"image": time_s / estimate_count[image]}
     return [
         Prediction(estimate=replace(estimate, seconds=shares.get(place[:2], {})), place=place)
         for place, estimate in estimates
@@ -632,11 +647,14 @@ def write_bop_results(
     Raises:
         InputError: a pose belongs to no scene, or the disk refuses.
     """
+    # The time of each image.
     entries = list(predictions)
     image_s: dict[tuple[int, int], float] = defaultdict(float)
     for prediction, seconds in zip(entries, additive_seconds(entries), strict=True):
         if prediction.place is not None:
             image_s[prediction.place[:2]] += sum(seconds.values())
+
+    # A row for each pose.
     text = StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(_HEADER)

@@ -24,8 +24,8 @@ _FIRST_COLUMNS = ("source", "method", "weights", "cap_m", *_METRICS, "protocol")
 class PublishedRow:
     """One printed row: the seven numbers of a method for truth up to ``cap_m``."""
 
-    method: str
-    cap_m: float
+    method: str  #: its name, as printed
+    cap_m: float  #: largest depth of the truth [m]
     printed: str  #: the numbers, in the order of our metrics of depth
     protocol: str = "eigen-raw"  #: by which they were measured
     note: str = ""  #: the row's footnote
@@ -38,17 +38,13 @@ class PublishedRow:
 
 @dataclass(frozen=True, kw_only=True)
 class PublishedTable:
-    """One printed table: every author's row, in the order of print.
+    """One printed table: every author's row, in the order of print."""
 
-    ``own_rows``: names of the thesis's own methods, in the order in which weights are given;
-    ``with_right``: whether the methods see the real right view.
-    """
-
-    number: str
-    title: str
-    rows: tuple[PublishedRow, ...]
-    own_rows: tuple[str, ...]
-    with_right: bool
+    number: str  #: the thesis's
+    title: str  #: what our page calls it
+    rows: tuple[PublishedRow, ...]  #: every row
+    own_rows: tuple[str, ...]  #: methods of the thesis, in the order in which weights are given
+    with_right: bool  #: whether the methods see the real right view
 
 
 def join_published(
@@ -66,6 +62,7 @@ def join_published(
     Returns:
         The columns of each row; ``source`` is ``published``, ``ours`` or ``difference``.
     """
+    # The printed rows.
     published: list[dict[str, Any]] = []
     for row in table.rows:
         columns: dict[str, Any] = dict.fromkeys(_FIRST_COLUMNS, "")
@@ -74,6 +71,7 @@ def join_published(
         columns |= {"protocol": row.protocol, "note": row.note}
         published.append(columns)
 
+    # Ours, each with its difference to the thesis's own.
     rows = list(published)
     for counterpart, row in our_rows:
         assert row.cap_m is not None, "the tables are of depth, and reproduce takes no disparity"
@@ -239,6 +237,7 @@ def arrange(columns: Sequence[Sequence[Drawing]], width_px: int = 621) -> Float[
     for k in range(max(map(len, shrunk))):
         heights = [column[k].shape[1] for column in shrunk if k < len(column)]
         row_heights.append(max(heights) + _GAP_PX)
+
     filled_columns: list[Tensor] = []
     for column in shrunk:
         cells = [
@@ -250,6 +249,7 @@ def arrange(columns: Sequence[Sequence[Drawing]], width_px: int = 621) -> Float[
         filled_columns.append(F.pad(stacked, (0, 0, 0, missing_px), value=1.0))
     grid = torch.cat(filled_columns, 2)[..., :-_GAP_PX]
 
+    # The bar of colours below them.
     ramp_m = torch.logspace(0, 1, grid.shape[2], base=_FAR_M / _NEAR_M) * _NEAR_M
     bar = draw_depth(ramp_m[None], _NEAR_M, _FAR_M).expand(-1, _BAR_PX, -1)
     return torch.cat([grid, bar], 1)

@@ -61,18 +61,14 @@ PEERS = ("PointFusion", "DenseFusion, per pixel", "DenseFusion, iterative")
 
 @dataclass(frozen=True)
 class PublishedRow:
-    """One printed row: percent of the objects of :data:`LINEMOD`, in its order, and their mean.
+    """One printed row: percent of the objects of :data:`LINEMOD`, in its order, and their mean."""
 
-    ``printed`` is empty where only the mean is; ``note`` says what else it takes to compare it,
-    ``source`` where it is printed.
-    """
-
-    method: str
-    input: str
-    printed: str
-    mean: float
-    note: str
-    source: str
+    method: str  #: its name
+    input: str  # of the method; after "#:" the docs would take the builtin for it
+    printed: str  #: percent of each object; empty where only the mean is printed
+    mean: float  #: percent
+    note: str  #: what else it takes to compare it
+    source: str  #: where it is printed
 
 
 _TABLES = "tables in the READMEs of ethnhe/PVN3D and j96w/DenseFusion"
@@ -111,7 +107,7 @@ ROWS = (
 
 
 def find_linemod_number(model: ObjectModel) -> int:
-    """Give BOP's number of the object of LineMOD that a model is, by its name and diameter.
+    """Find BOP's number of the object of LineMOD that a model is, by its name and diameter.
 
     A model without a name is known by its number and diameter.
 
@@ -120,10 +116,11 @@ def find_linemod_number(model: ObjectModel) -> int:
     """
     is_named = model.name != f"obj_{model.number:06d}"
     number = _NUMBERS.get(model.name.lower(), 0) if is_named else model.number
-    theirs_m = LINEMOD_DIAMETERS_M.get(number, 0.0)
-    if abs(theirs_m / model.diameter_m - 1) <= (_SAME_NAMED if is_named else _SAME_DIAMETER):
+    diameter_m = LINEMOD_DIAMETERS_M.get(number, 0.0)
+    largest_difference = _SAME_NAMED if is_named else _SAME_DIAMETER
+    if abs(diameter_m / model.diameter_m - 1) <= largest_difference:
         return number
-    remark = f"; LineMOD's object {number} is {theirs_m:.4f} m" if theirs_m else ""
+    remark = f"; LineMOD's object {number} is {diameter_m:.4f} m" if diameter_m else ""
     raise InputError(
         f"object {model.number} ({model.name}, {model.diameter_m:.4f} m across) is none of "
         f"LineMOD{remark}. Table 3.2 compares with numbers of LineMOD's objects; for other data "
@@ -148,7 +145,10 @@ def join_by_object(
         the other). The mean of ours is over the objects that were measured; a difference of means
         is given only where both are over the same objects.
     """
-    columns = {n: LINEMOD.get(k, n) if with_published else n for n, k in numbers.items()}
+    # Ours: a row for each method and kind of masks, a column for each object.
+    columns: dict[str, str] = {}
+    for name, number in numbers.items():
+        columns[name] = LINEMOD.get(number, name) if with_published else name
     groups: dict[tuple[str, str], list[ObjectRow]] = {}
     for row in rows:
         assert row.origin is not None, "rows of an evaluation say whose they are"
@@ -156,7 +156,10 @@ def join_by_object(
     our_rows = [_make_our_row(group, columns) for group in groups.values()]
     names = list(columns.values())
     if not with_published:
-        return [*our_rows, *(_subtract_row(our_rows[0], other, names) for other in our_rows[1:])]
+        differences = [_subtract_row(our_rows[0], other, names) for other in our_rows[1:]]
+        return [*our_rows, *differences]
+
+    # The printed ones before them, and the differences to our peers after.
     printed = [
         {
             "source": "published",
@@ -172,15 +175,12 @@ def join_by_object(
         for row in ROWS
     ]
     peers = [row for row in printed if row["method"] in PEERS]
-    return [
-        *printed,
-        *our_rows,
-        *(_subtract_row(row, peer, names) for row in our_rows for peer in peers),
-    ]
+    differences = [_subtract_row(row, peer, names) for row in our_rows for peer in peers]
+    return [*printed, *our_rows, *differences]
 
 
 def _make_our_row(rows: Sequence[ObjectRow], columns: Mapping[str, str]) -> dict[str, Any]:
-    """Give the row of one method of ours: percentages of each object, by the table's columns."""
+    """Make the row of one method of ours: percentages of each object, by the table's columns."""
     by_name = {row.object: row for row in rows}
     # Of one object there is no row of means: it is its own.
     mean = by_name.get("mean", rows[0])
@@ -212,6 +212,7 @@ def _subtract_row(
     our_row: Mapping[str, Any], other: Mapping[str, Any], names: Sequence[str]
 ) -> dict[str, Any]:
     """Subtract a row from one of ours, by the names of our objects."""
+    # Means are compared only where both are over the same objects.
     compared = names if other["source"] == "ours" else [n for n in LINEMOD.values() if n in other]
     difference = {
         "source": "difference",
@@ -234,22 +235,19 @@ OUR_HYPOTHESES = (50, 128, 1024)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class VotingCase:
-    """One cloud in the camera frame, the network's unit directions from its points, and the truth.
+    """The votes of one cloud, and the truth."""
 
-    ``is_adds``: ADD-S decides, not ADD.
-    """
-
-    points_m: Float[Tensor, "n 3"]
-    directions: Float[Tensor, "n k 3"]
-    model: ObjectModel
-    truth: Rigid
-    is_adds: bool
+    points_m: Float[Tensor, "n 3"]  #: in the camera frame
+    directions: Float[Tensor, "n k 3"]  #: the network's at these points, of length 1
+    model: ObjectModel  #: the object
+    truth: Rigid  #: ``camera_from_model``
+    is_adds: bool  #: whether ADD-S decides, not ADD
 
 
 def collect_votes(
     net: GeoPoseNet, views: Iterable[ViewSample], points: int
 ) -> Iterator[VotingCase | None]:
-    """Give the votes of some points of each view; None where it has too few to be posed.
+    """Collect the votes of some points of each view; None where it has too few to be posed.
 
     The points are chosen at random, the same each time. Each votes from its own position; points of
     one voxel share the network's direction.
@@ -267,6 +265,7 @@ def collect_votes(
         raise InputError("table 3.3 compares ways of voting: give weights of the sparse network")
     numbers = {model.name: k for k, model in enumerate(net.weights.models)}
     for view in views:
+        # Some points of the object.
         number = numbers[view.input.object]
         model = net.weights.models[number]
         view_input = view.input
@@ -278,6 +277,8 @@ def collect_votes(
         if why_too_few(points_m, net.weights.cloud) is not None:
             yield None
             continue
+
+        # The network's directions at their voxels.
         grid = voxelise(points_m, net.weights.cloud)
         coordinates = torch.nn.functional.pad(grid.coordinates, (1, 0))  # all of cloud 0
         voxels = VotingPoints(
@@ -419,8 +420,9 @@ def ransac_one_by_one(
     with the most is refitted to its inliers. Published practice is 50 hypotheses for each keypoint.
     """
     random = np.random.default_rng(seed)
-    keypoints = []
+    keypoints: list[np.ndarray] = []
     for k in range(directions.shape[1]):
+        # The hypothesis of most inliers.
         n = directions[:, k]
         most_inliers = -1
         best_inliers = np.ones(len(n), bool)
@@ -437,6 +439,8 @@ def ransac_one_by_one(
             if count > most_inliers:
                 most_inliers = count
                 best_inliers = inliers
+
+        # Refitted to them.
         try:
             refitted = np.linalg.solve(
                 *_build_normal_equations(points_m[best_inliers], n[best_inliers])
@@ -448,7 +452,7 @@ def ransac_one_by_one(
 
 
 def _build_normal_equations(points_m: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Give A and b of the normal equations ``A x = b`` of the point nearest to lines.
+    """Build A and b of the normal equations ``A x = b`` of the point nearest to lines.
 
     The lines go through ``points_m`` along the unit directions ``n``; A is singular if they are
     parallel.

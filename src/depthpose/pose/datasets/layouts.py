@@ -57,7 +57,7 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
 
 
 def read_numbers(entry: object, key: str, count: int, source: str) -> list[float]:
-    """Get a list of ``count`` finite numbers from an entry."""
+    """Read a list of ``count`` finite numbers from an entry; ``source`` names it in errors."""
     values = entry.get(key) if isinstance(entry, Mapping) else None
     # A whole number beyond 1e300 has no float.
     if (
@@ -70,7 +70,7 @@ def read_numbers(entry: object, key: str, count: int, source: str) -> list[float
 
 
 def read_integer(entry: object, key: str, source: str) -> int:
-    """Get a whole number of 0 or more from an entry."""
+    """Read a whole number of 0 or more from an entry; ``source`` names it in errors."""
     value = entry.get(key) if isinstance(entry, Mapping) else None
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= MOST:
         raise InputError(
@@ -80,7 +80,7 @@ def read_integer(entry: object, key: str, source: str) -> int:
 
 
 def read_number(entry: object, key: str, default: float | None, source: str) -> float:
-    """Get a finite number from an entry; ``default``, if any, where it is missing."""
+    """Read a finite number from an entry; ``default``, if any, where it is missing."""
     value = entry.get(key, default) if isinstance(entry, Mapping) else None
     if not isinstance(value, int | float) or isinstance(value, bool) or not abs(value) < 1e300:
         raise InputError(f"{source}: {key} is {_shorten(value)}, where a number belongs")
@@ -94,10 +94,11 @@ def make_pose(R: list[float], t_mm: list[float], source: str) -> Rigid:
     """
     rough = torch.tensor(R, dtype=torch.float64).reshape(3, 3)
     u, sizes, vh = torch.linalg.svd(rough)
-    if float((sizes - 1).abs().max()) > _ROTATION_SLACK or float(torch.linalg.det(rough)) < 0:
+    determinant = float(torch.linalg.det(rough))
+    if float((sizes - 1).abs().max()) > _ROTATION_SLACK or determinant < 0:
         raise InputError(
             f"{source}: the rotation {_shorten(R)} is none: its determinant is "
-            f"{float(torch.linalg.det(rough)):.3f}, its stretches {_shorten(sizes.tolist())}. "
+            f"{determinant:.3f}, its stretches {_shorten(sizes.tolist())}. "
             "Write a rotation, row by row"
         )
     return Rigid(u @ vh, torch.tensor(t_mm, dtype=torch.float64) * 0.001)
@@ -117,6 +118,7 @@ def read_bop_camera(entry: object, source: str) -> tuple[Float64[Tensor, "3 3"],
 
 
 def _shorten(value: object) -> str:
+    """Shorten what a file holds to 80 characters, for a message."""
     text = repr(value)
     return text if len(text) <= 80 else f"{text[:77]}..."
 
@@ -148,7 +150,7 @@ class Instance:
 
 
 def list_bop_splits(folder: Path) -> dict[str, tuple[str, str]]:
-    """Give the splits of a data set by name, with the folder and the suffix of file names of each.
+    """List the splits of a data set by name, with the folder and the suffix of file names of each.
 
     Where the scenes are of several sensors, as in BOP-Industrial, each sensor has its own files,
     such as ``scene_camera_photoneo.json`` beside ``depth_photoneo``. The split ``test`` of that
@@ -190,6 +192,7 @@ def list_bop_scenes(folder: Path, split: str) -> tuple[list[Path], str]:
 
 def read_bop_instances(scene: Path, end: str = "") -> Iterator[Instance]:
     """Read the annotations of one scene; ``end`` is the suffix of its files' names (_photoneo)."""
+    # The files of the scene.
     camera_path = scene / f"scene_camera{end}.json"
     truth_path = scene / f"scene_gt{end}.json"
     info_path = scene / f"scene_gt_info{end}.json"
@@ -206,26 +209,34 @@ def read_bop_instances(scene: Path, end: str = "") -> Iterator[Instance]:
         raise InputError(
             f"{truth_path.name}: {wrong[0][:80]!r} is no number of an image; name images 0, 1, ..."
         )
+
+    # Image by image.
     for key in sorted(truths, key=int):
         source = f"{truth_path}: image {key}"
         if key not in cameras:
             raise InputError(f"{source} has no entry in {camera_path.name}; add its camera")
         entries = truths[key]
-        more = infos.get(key, [])
-        if not isinstance(entries, list) or not isinstance(more, list):
+        visibilities = infos.get(key, [])
+        if not isinstance(entries, list) or not isinstance(visibilities, list):
             raise InputError(f"{source}: is no list of annotations")
-        at_camera = f"{camera_path}: image {int(key)}"
+        camera_source = f"{camera_path}: image {int(key)}"
         image = f"{int(key):06d}"
         tiff = scene / f"depth{end}" / f"{image}.tif"  # of ITODD
-        pictures = (scene / f"{folder}{end}" / f"{image}{suffix}"
-                    for folder in _IMAGE_FOLDERS for suffix in LISTED_SUFFIXES)  # fmt: skip
+        pictures = (
+            scene / f"{folder}{end}" / f"{image}{suffix}"
+            for folder in _IMAGE_FOLDERS
+            for suffix in LISTED_SUFFIXES
+        )
         rgb = next((path for path in pictures if path.is_file()), None)
+
+        # Annotation by annotation.
         for index, entry in enumerate(entries):
-            K, unit_m = read_bop_camera(cameras[key], at_camera)
-            extra = more[index] if index < len(more) and isinstance(more[index], dict) else {}
+            K, unit_m = read_bop_camera(cameras[key], camera_source)
+            info = visibilities[index] if index < len(visibilities) else {}
+            info = info if isinstance(info, dict) else {}
             mask = scene / f"mask_visib{end}" / f"{image}_{index:06d}.png"
             here = f"{source}, annotation {index}"
-            visible = read_number(extra, "visib_fract", -1.0, here)
+            visible = read_number(info, "visib_fract", -1.0, here)
             yield Instance(
                 scene_id=int(scene.name),
                 image_id=int(key),
@@ -242,7 +253,7 @@ def read_bop_instances(scene: Path, end: str = "") -> Iterator[Instance]:
                     here,
                 ),
                 visible_fraction=visible if visible >= 0 else None,
-                is_measured=not str(extra.get("pose_source", "")).startswith("pseudo"),
+                is_measured=not str(info.get("pose_source", "")).startswith("pseudo"),
             )
 
 
@@ -273,17 +284,17 @@ def read_targets(path: str | Path, folder: str | Path = ".") -> list[BopTarget]:
         InputError: the file is missing or damaged.
     """
     path = Path(path) if Path(path).is_file() else Path(folder, path)
-    targets = []
+    targets: list[BopTarget] = []
     for row_number, row in enumerate(read_rows(path)):
         source = f"{path}: entry {row_number}"
-        keys = ("obj_id", "inst_count")
-        wanted, count = (read_integer(row, key, source) if key in row else None for key in keys)
+        has_object = "obj_id" in row
+        has_count = "inst_count" in row
         targets.append(
             BopTarget(
                 scene_id=read_integer(row, "scene_id", source),
                 image_id=read_integer(row, "im_id", source),
-                object_id=wanted,
-                count=count,
+                object_id=read_integer(row, "obj_id", source) if has_object else None,
+                count=read_integer(row, "inst_count", source) if has_count else None,
             )
         )
     return targets
@@ -309,6 +320,8 @@ def read_linemod_instances(folder: Path, split: str) -> Iterator[Instance]:
         for line in read_text(listed, _MAX_BYTES).split():
             if parse_entry_number(line) is None:
                 raise InputError(f"{listed}: {line[:40]!r} is no number of an image")
+
+            # The one annotation of the folder's own object.
             image = int(line)
             number = int(scene.name)
             source = f"{scene / 'gt.yml'}: image {image}"
@@ -320,11 +333,13 @@ def read_linemod_instances(folder: Path, split: str) -> Iterator[Instance]:
                 raise InputError(
                     f"{source} annotates object {number} {len(of_object)} times, where once belongs"
                 )
-            at_camera = f"{scene / 'info.yml'}: image {image}"
-            K, unit_m = read_bop_camera(infos.get(image), at_camera)
-            depth, mask, rgb = (
-                scene / name / f"{image:04d}.png" for name in ("depth", "mask", "rgb")
-            )
+
+            # Its camera and its images.
+            camera_source = f"{scene / 'info.yml'}: image {image}"
+            K, unit_m = read_bop_camera(infos.get(image), camera_source)
+            depth = scene / "depth" / f"{image:04d}.png"
+            mask = scene / "mask" / f"{image:04d}.png"
+            rgb = scene / "rgb" / f"{image:04d}.png"
             yield Instance(
                 scene_id=number,
                 image_id=image,
@@ -375,7 +390,7 @@ split in it."""
 
 
 def find_layout(folder: Path) -> tuple[str, Layout]:
-    """Give the name and the layout of a folder; BOP's where none fits."""
+    """Find the name and the layout of a folder; BOP's where none fits."""
     name = next((name for name, layout in LAYOUTS.items() if layout.splits(folder)), "BOP")
     return name, LAYOUTS[name]
 
@@ -418,10 +433,12 @@ def read_bop_models(
     _, layout = find_layout(folder)
     models: dict[int, ObjectModel] = {}
     for wanted in sorted(set(numbers)):
-        named = (home / f"obj_{wanted:06d}.ply", home / f"obj_{wanted:02d}.ply")
-        path = next((path for path in named if path.is_file()), None)
+        candidates = (home / f"obj_{wanted:06d}.ply", home / f"obj_{wanted:02d}.ply")
+        path = next((path for path in candidates if path.is_file()), None)
         if path is None:
             raise InputError(f"{home}: no obj_{wanted:06d}.ply for object {wanted}; put it there")
+
+        # Its declared symmetries, and the half turn of an object that declares none.
         info = infos.get(wanted, {})
         source = f"{home / 'models_info.json'}: object {wanted}"
         symmetries = symmetries_from_bop(info, source=source)
@@ -430,6 +447,8 @@ def read_bop_models(
             origin = torch.zeros(3).double()
             turn = turn_about(up, origin, torch.tensor([math.pi]).double())
             symmetries = Symmetries(discrete=turn)
+
+        # The mesh, with the declared name and diameter.
         model = read_model(
             path,
             "mm",
@@ -444,7 +463,7 @@ def read_bop_models(
 
 
 def read_object_names(folder: Path, numbers: Iterable[int] | None = None) -> dict[int, str]:
-    """Give the names of objects by number; of all in ``models_info`` where none are given.
+    """Read the names of objects by number; of all in ``models_info`` where none are given.
 
     Raises:
         InputError: there is no folder of models, or the file is damaged.

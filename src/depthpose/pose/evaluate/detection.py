@@ -43,7 +43,7 @@ def score_detections(
     contexts: Mapping[int, ErrorContext],
     measured: Pairs,
 ) -> dict[int, dict[str, float | None]]:
-    """Give ``ap_mssd``, ``ap_mspd`` and their mean ``ap`` of each object, by its number.
+    """Compute ``ap_mssd``, ``ap_mspd`` and their mean ``ap`` of each object, by its number.
 
     For each error and threshold the estimates of an image, those of the highest scores first, are
     matched with the instance of the least error below the threshold that is not matched yet. An
@@ -67,12 +67,11 @@ def score_detections(
         for name, limits in _LIMITS.items():
             scale = context.diameter_m if name == "mssd_m" else 1.0
             tables_of_error = [table[name] for table in tables]
-            precisions[_COLUMNS[name]] = _average(
-                [
-                    _measure_precision(images_of_object, tables_of_error, scale * limit)
-                    for limit in limits
-                ]
-            )
+            at_limits = [
+                _measure_precision(images_of_object, tables_of_error, scale * limit)
+                for limit in limits
+            ]
+            precisions[_COLUMNS[name]] = _average(at_limits)
         scores[number] = {"ap": _average(list(precisions.values())), **precisions}
     return scores
 
@@ -85,6 +84,7 @@ def _average(values: Sequence[float | None]) -> float | None:
 
 def _group_by_image(dataset: BopDataset, predictions: Sequence[Prediction]) -> dict[Place, _Image]:
     """Group instances and estimates by image and object, estimates of the highest scores first."""
+    # The instances of each object in each image.
     images: dict[Place, _Image] = defaultdict(_Image)
     places = {instance.name: place_of(instance) for instance in dataset.instances}
     for instance in dataset.instances:
@@ -148,10 +148,15 @@ def _is_certainly_far(name: str, pose: Rigid, instance: Instance, context: Error
 def _measure_precision(
     images: Sequence[_Image], tables: Sequence[Float[Tensor, "_ _"]], limit: float
 ) -> float | None:
-    """Give the average precision of one object at one threshold; None where no instance counts.
+    """Measure the average precision of one object at one threshold; None if no instance counts.
 
     In each image, the highest score first, an estimate is matched with the nearest instance that is
     left. One that is matched with a mostly hidden instance is neither right nor wrong, as in BOP.
+
+    Args:
+        images: of the object.
+        tables: errors of each image's estimates against its instances.
+        limit: error below which an estimate is right.
     """
     counted: list[tuple[float, bool]] = []  # score, and whether it is right
     targets = 0

@@ -70,7 +70,7 @@ class Metric:
 def find_nearest_copy(
     estimated: Rigid, true: Rigid, symmetries: Rigid, declared: Symmetries | None = None
 ) -> Rigid:
-    """Give the symmetric copy of the true pose whose rotation is nearest to an estimate's.
+    """Find the symmetric copy of the true pose whose rotation is nearest to an estimate's.
 
     Args:
         estimated: ``camera_from_model``.
@@ -79,9 +79,11 @@ def find_nearest_copy(
         declared: the symmetries that these are steps of; then rotations about their axes are exact,
             not rounded to a step.
     """
+    # The nearest of the given copies.
     R = symmetries.R.double()
     t_m = symmetries.t_m.double()
-    copies = Rigid(true.R.double() @ R, (true.R.double() @ t_m[..., None])[..., 0] + true.t_m)
+    true_R = true.R.double()
+    copies = Rigid(true_R @ R, (true_R @ t_m[..., None])[..., 0] + true.t_m)
     nearest = int(geodesic_rad(estimated.R.double().expand_as(R), copies.R).argmin())
     copy = copies[nearest]
     if declared is None or not declared.continuous:
@@ -97,7 +99,7 @@ def find_nearest_copy(
 
     # Else the copy is rotated about each axis to the angle of the largest trace of
     # relative^T rotation(angle), which is that of the least difference.
-    rotated = []
+    rotated: list[Rigid] = []
     for axis in declared.continuous:
         a = axis.direction.to(estimated_R) / axis.direction.norm()
         skew = relative - relative.mT
@@ -133,6 +135,7 @@ def _measure_vsd(
     height, width = window.shape
 
     def render(pose: Rigid) -> Float[Tensor, "h w"]:
+        """Draw the depth [m] of the object in the window."""
         triangles_m = pose.double().apply(context.triangles_m)
         return rasterize(triangles_m, K, width, height, with_barycentric=False).depth_m
 
@@ -169,7 +172,7 @@ def _measure_mspd(estimated: Rigid, instance: Instance, context: ErrorContext) -
 
 
 def _find_true_copy(estimated: Rigid, instance: Instance, context: ErrorContext) -> Rigid:
-    """Give the symmetric copy of the annotated pose that is nearest to an estimate."""
+    """Find the symmetric copy of the annotated pose that is nearest to an estimate."""
     true = instance.camera_from_model
     return find_nearest_copy(estimated, true, context.symmetries, context.model.symmetries)
 
@@ -233,6 +236,7 @@ def match_instances(
     the sum of ADD-S, at most a diameter each, is least. BOP does so anew for each error and
     threshold. Refusals are matched with instances that are left over.
     """
+    # Estimates that have the name of their instance.
     places = {instance.name: place_of(instance) for instance in instances}
     matched: dict[str, PoseEstimate] = {}
     unnamed: list[Prediction] = []
@@ -252,6 +256,8 @@ def match_instances(
     for prediction in unnamed:
         if prediction.place is not None and prediction.place in unmatched:
             offered[prediction.place].append(prediction.estimate)
+
+    # Of each place the poses of the highest scores, then refusals.
     for place, estimates in offered.items():
         instances_there = unmatched[place]
         model = models[place.object_id]
@@ -329,15 +335,11 @@ class _Change:
 
 
 def _list_changes() -> list[_Change]:
-    """Give the changes that are tried: numbers by one, and conventions with units."""
-    changes = [
-        change
-        for words, step in _COUNTED_FROM.items()
-        for change in (
-            _Change(words=f"image numbers were one {words}", image_step=step),
-            _Change(words=f"object numbers were one {words}", object_step=step),
-        )
-    ]
+    """List the changes that are tried: numbers by one, and conventions with units."""
+    changes: list[_Change] = []
+    for words, step in _COUNTED_FROM.items():
+        changes.append(_Change(words=f"image numbers were one {words}", image_step=step))
+        changes.append(_Change(words=f"object numbers were one {words}", object_step=step))
     for convention in _CONVENTIONS:
         for scale, words in _SCALES.items():
             both = " and ".join(filter(None, (words, convention)))
@@ -350,12 +352,20 @@ def advise_convention(
     predictions: Sequence[Prediction],
     contexts: Mapping[int, ErrorContext],
 ) -> str | None:
-    """Say by which change of all predictions many more would be right; None where by none."""
+    """Advise a change of all predictions by which many more would be right; None if there is none.
+
+    Args:
+        dataset: instances with truth.
+        predictions: of any method.
+        contexts: of the errors, by the number of the object.
+    """
+    # Are few right as they are?
     posed = [p for p in predictions if p.estimate.is_posed]
     right, tried = _count_right(dataset, posed, contexts, _Change())
     if right > (1 - _GAIN) * tried > 0:
         return None
 
+    # Of all changes the one by which most are.
     changes = _list_changes()
     counts = [_count_right(dataset, posed, contexts, change) for change in changes]
     best = max(range(len(changes)), key=lambda k: counts[k][0])
@@ -375,6 +385,7 @@ def _count_right(
     change: _Change,
 ) -> tuple[int, int]:
     """Count the predictions that are right by a change, of some instances, and these instances."""
+    # Some instances that have an estimate, once numbers are changed.
     renumbered = [change.renumber(prediction) for prediction in posed]
     matched = match_instances(dataset.instances, renumbered, dataset.objects)
     with_estimate = [instance for instance in dataset.instances if instance.name in matched]

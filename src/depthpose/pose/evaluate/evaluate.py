@@ -197,6 +197,7 @@ def measure_risk(rows: Sequence[InstanceRow]) -> list[RiskRow]:
 
     A ``coverage`` of 0.1 is a tenth of all instances. The rows end where there are no more poses.
     """
+    # The answers, the surest first, and how many of them make each coverage.
     answered = [row for row in rows if row.status in POSED and row.score is not None]
     answered.sort(key=lambda row: -(row.score or 0.0))
     tenths = (round(k * len(rows) / _DECILES) for k in range(1, _DECILES + 1))
@@ -219,6 +220,7 @@ def _summarise_errors(rows: Sequence[InstanceRow]) -> dict[str, Number]:
     Recalls and areas are over all instances, of which one without an estimate is missed; medians
     are over the instances with an estimate.
     """
+    # The summaries of each error.
     diameters_m = torch.tensor([row.diameter_m for row in rows], dtype=torch.float64)
     scores: dict[str, Number] = {}
     for name, metric in METRICS.items():
@@ -233,6 +235,7 @@ def _summarise_errors(rows: Sequence[InstanceRow]) -> dict[str, Number]:
     is_complete = len(measured_recalls) == len(recalls)
     scores["ar"] = sum(measured_recalls) / len(recalls) if is_complete else None
 
+    # Medians, of poses alone.
     posed = [row for row in rows if row.status in POSED]
     for name, metric in METRICS.items():
         if metric.has_median:
@@ -242,12 +245,13 @@ def _summarise_errors(rows: Sequence[InstanceRow]) -> dict[str, Number]:
 
 
 def _average(values: Sequence[Number]) -> Number:
+    """Average the values that are not None; None where there are none."""
     numbers = [value for value in values if value is not None]
     return sum(numbers) / len(numbers) if numbers else None
 
 
 def hash_frames(instances: Sequence[Instance]) -> str:
-    """Give the SHA-256 of a list of instances: scene, image, object and place, each in a line."""
+    """Compute the SHA-256 of a list of instances, a line each: scene, image, object and place."""
     lines = (f"{i.scene_id} {i.image_id} {i.object_id} {i.index}\n" for i in instances)
     return hashlib.sha256("".join(sorted(lines)).encode()).hexdigest()
 
@@ -258,11 +262,14 @@ def select_targets(dataset: BopDataset, targets: Sequence[BopTarget]) -> BopData
     Raises:
         InputError: a target has fewer annotations than its count, or none of them has any.
     """
+    # What is annotated, by place and by image.
     of_place: dict[Place, list[Instance]] = defaultdict(list)
     of_image: dict[tuple[int, int], list[Instance]] = defaultdict(list)
     for instance in dataset.instances:
         of_place[place_of(instance)].append(instance)
         of_image[instance.scene_id, instance.image_id].append(instance)
+
+    # Of each target as many as it asks for.
     chosen: list[Instance] = []
     for target in targets:
         instances = of_image[target.scene_id, target.image_id]
@@ -377,6 +384,7 @@ def evaluate(
         InputError: there is no instance, no prediction is of this data set, or a file of it is
             damaged.
     """
+    # Which estimate is of which instance?
     config = EvaluationConfig() if config is None else config
     matched = match_instances(dataset.instances, predictions, dataset.objects)
     if len(dataset) == 0:
@@ -390,14 +398,15 @@ def evaluate(
             f"{prediction.place or prediction.estimate.name!r}. Give the predictions of "
             "this very split"
         )
-    contexts = {number: prepare_errors(model, config) for number, model in dataset.objects.items()}
-    # Stages in the order of work; those of other methods come last.
+
+    # Rows of instances. Stages in the order of work; those of other methods come last.
     timed = dict.fromkeys(stage for p in predictions for stage in p.estimate.seconds)
     stages = [s for s in STAGES if s in timed] + [s for s in timed if s not in STAGES]
     seconds_of = {
         prediction.estimate: seconds
         for prediction, seconds in zip(predictions, additive_seconds(predictions), strict=True)
     }
+    contexts = {number: prepare_errors(model, config) for number, model in dataset.objects.items()}
     rows: list[InstanceRow] = []
     for instance in progress(dataset.instances):
         estimate = matched.get(instance.name)
@@ -470,7 +479,7 @@ def _measure_instance(
 
 
 def _list_stage_ms(estimate: PoseEstimate, additive: Mapping[str, float]) -> dict[str, float]:
-    """Give the milliseconds of each stage of an estimate, and in ``total``, if it has any.
+    """List the milliseconds of each stage of an estimate, and in ``total``, if it has any.
 
     ``additive``: its seconds of :func:`additive_seconds`, whose sum is the total.
     """

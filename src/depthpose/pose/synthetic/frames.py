@@ -73,15 +73,15 @@ def draw_clutter(generator: torch.Generator) -> Solid:
     import trimesh
 
     size_m = uniform(generator, 0.04, 0.15)
-    flat = uniform(generator, 0.3, 1.0)
-    thin = uniform(generator, 0.3, 1.0)
+    depth_share = uniform(generator, 0.3, 1.0)
+    height_share = uniform(generator, 0.3, 1.0)
     match random_index(generator, 3):
-        case 0:
-            mesh = trimesh.creation.box((size_m, flat * size_m, thin * size_m))
-        case 1:
+        case 0:  # a box
+            mesh = trimesh.creation.box((size_m, depth_share * size_m, height_share * size_m))
+        case 1:  # a ball
             mesh = trimesh.creation.icosphere(3, 0.5 * size_m)
-        case _:
-            mesh = trimesh.creation.cylinder(0.5 * flat * size_m, size_m, 32)
+        case _:  # a can
+            mesh = trimesh.creation.cylinder(0.5 * depth_share * size_m, size_m, 32)
     corners = torch.tensor(mesh.triangles, dtype=torch.float32)
     normals = torch.tensor(mesh.face_normals, dtype=torch.float32)[:, None].expand(-1, 3, 3)
     return Solid(
@@ -177,20 +177,21 @@ def make_frames(
             f"distance_m begins at {config.distance_m[0]:g} m, but the largest object is "
             f"{widest_m:.3g} m wide and would fill the image; begin at {3 * widest_m:.2g}"
         )
-    solids = list[Solid]()
-    for model in models:  # an object looks alike in every frame of every data set
-        chance = sample_generator(model.number, _COLOUR_SEED)
-        pattern = draw_pattern(chance, model.diameter_m, (0.7, 1.0))
-        corners = drawn_triangles(model)
-        normals = model.normals[model.faces]
-        if not len(model.faces):  # each point is a disc of several triangles
-            each = len(corners) // len(model.vertices_m)
-            normals = model.normals.repeat_interleave(each, 0)[:, None].expand(-1, 3, 3)
-        solids.append(
-            Solid(triangles_m=corners, normals=normals, pattern=pattern, number=model.number)
-        )
+    solids = [_make_solid(model) for model in models]
     for index in range(first, first + number):
         yield _make_frame(models, solids, config, index)
+
+
+def _make_solid(model: ObjectModel) -> Solid:
+    """Make the body of an object, which looks alike in every frame of every data set."""
+    random = sample_generator(model.number, _COLOUR_SEED)
+    pattern = draw_pattern(random, model.diameter_m, (0.7, 1.0))
+    corners = drawn_triangles(model)
+    normals = model.normals[model.faces]
+    if not len(model.faces):  # each point is a disc of several triangles
+        triangles_of_disc = len(corners) // len(model.vertices_m)
+        normals = model.normals.repeat_interleave(triangles_of_disc, 0)[:, None].expand(-1, 3, 3)
+    return Solid(triangles_m=corners, normals=normals, pattern=pattern, number=model.number)
 
 
 def _make_frame(
@@ -206,6 +207,8 @@ def _make_frame(
     scene.append((_draw_table(generator), Rigid(torch.eye(3), torch.zeros(3))))
     camera_from_table = _draw_viewpoint(config, generator)
     placed = [(solid, camera_from_table @ pose) for solid, pose in scene]
+
+    # The intrinsic matrix.
     assert config.centre_px is not None, "the config computes a centre left out"
     fx, fy = config.focal_px
     cx, cy = config.centre_px
@@ -249,13 +252,14 @@ def _make_frame(
 def _draw_table(generator: torch.Generator) -> Solid:
     """Draw the top of a table, at height 0."""
     h = 0.5 * uniform(generator, 0.8, 3.0)
+    first = [[-h, -h, 0.0], [h, -h, 0.0], [h, h, 0.0]]
+    second = [[-h, -h, 0.0], [h, h, 0.0], [-h, h, 0.0]]
     return Solid(
-        triangles_m=torch.tensor([[[-h, -h, 0.0], [h, -h, 0.0], [h, h, 0.0]],
-                                  [[-h, -h, 0.0], [h, h, 0.0], [-h, h, 0.0]]]),
+        triangles_m=torch.tensor([first, second]),
         normals=torch.tensor([0.0, 0.0, 1.0]).expand(2, 3, 3),
         pattern=draw_pattern(generator, uniform(generator, 0.05, 0.5)),
         number=None,
-    )  # fmt: skip
+    )
 
 
 def _draw_background(
@@ -285,10 +289,13 @@ def _draw_light(
 def _photograph(
     image: Float[Tensor, "3 h w"], generator: torch.Generator
 ) -> Float[Tensor, "3 h w"]:
-    """Blur, tint and expose linear light, add noise, and encode it as sRGB."""
+    """Imitate a camera: blur, tint and expose linear light, add noise, and encode it as sRGB."""
+    # Blurred.
     blur = uniform(generator, 0.0, 0.3)
     near = F.avg_pool2d(image[None], 3, 1, 1, count_include_pad=False)[0]
     image = torch.lerp(image, near, blur)
+
+    # Tinted, exposed, with noise.
     tint = 1 + 0.15 * (2 * torch.rand(3, 1, 1, generator=generator) - 1)
     gain = math.exp(uniform(generator, -0.8, 0.2))
     noise = uniform(generator, 0.0, 0.02) * torch.randn(image.shape, generator=generator)
@@ -321,9 +328,9 @@ def _arrange(
             reach_m = 0.08 + 0.015 * attempt + 0.03 * len(circles)
             x, y = (uniform(generator, -reach_m, reach_m) for _ in range(2))
             if all(math.hypot(x - a, y - b) > radius_m + r for a, b, r in circles):
-                shift = torch.tensor([x - float(middle[0]), y - float(middle[1]),
-                                      -float(corners[:, 2].min())])  # fmt: skip
-                placed.append((solid, Rigid(R, shift)))
+                height_m = -float(corners[:, 2].min())  # at which the body stands on the table
+                shift_m = [x - float(middle[0]), y - float(middle[1]), height_m]
+                placed.append((solid, Rigid(R, torch.tensor(shift_m))))
                 circles.append((x, y, radius_m))
                 break
     return placed
@@ -343,16 +350,19 @@ def _drop_pile(
 
     Of several drops of each copy the one is taken by which its middle comes to lie lowest.
     """
+    # One of the objects, and a map of the pile's height.
     chosen = random_index(generator, len(solids))
-    points = sample_surface(models[chosen], 20000)[0]
+    points, _ = sample_surface(models[chosen], 20000)
     middle = (points.amin(0) + points.amax(0)) / 2
     points = points - middle
     radius_m = float(points.norm(dim=1).max())
     reach_m = 0.6 * radius_m * math.sqrt(config.frame_pile)
     cells = math.ceil((reach_m + radius_m) / _CELL_M)
     height_m = torch.zeros((2 * cells + 1) ** 2)
+
     placed: list[tuple[Solid, Rigid]] = []
     for _ in range(config.frame_pile):
+        # Several drops: turned and shifted at random, and as low as the pile lets them.
         drops: list[tuple[float, Rigid, Tensor, Tensor]] = []
         for _ in range(_DROPS):
             R = random_rotation(generator).float()
@@ -365,6 +375,8 @@ def _drop_pile(
             z = float((height_m - bottom)[bottom.isfinite()].max())
             t = torch.tensor([x, y, z]) - R @ middle
             drops.append((z, Rigid(R, t), cell, moved[:, 2] + z))
+
+        # The lowest is taken, and the pile grows by it.
         _, pose, cell, top = min(drops, key=lambda drop: drop[0])
         height_m = height_m.scatter_reduce(0, cell, top, "amax")
         placed.append((solids[chosen], pose))
@@ -376,6 +388,7 @@ def _draw_viewpoint(config: ObjectsConfig, generator: torch.Generator) -> Rigid:
 
     It is 25 to 85 degrees above the table.
     """
+    # Where it stands, looking at the middle.
     elevation = math.radians(uniform(generator, 25.0, 85.0))
     azimuth = uniform(generator, 0.0, 2 * math.pi)
     distance_m = uniform(generator, *config.distance_m)

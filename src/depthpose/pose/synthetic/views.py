@@ -75,6 +75,7 @@ def draw_levels(height: int, width: int, generator: torch.Generator) -> Depth:
     Where it lies below a quantile of its values on an object, exactly that share of the object is
     occluded.
     """
+    # Coordinates about a random place, along a random direction and across it.
     size = max(height, width)
     angle = uniform(generator, 0.0, 2 * math.pi)
     stretch = uniform(generator, 0.3, 1.0)
@@ -85,22 +86,30 @@ def draw_levels(height: int, width: int, generator: torch.Generator) -> Depth:
     along = math.cos(angle) * u + math.sin(angle) * v
     across = (math.cos(angle) * v - math.sin(angle) * u) * stretch
     match random_index(generator, 4):
-        case 0:
+        case 0:  # half-planes
             return along
-        case 1:
+        case 1:  # ellipses
             return along.square() + across.square()
-        case 2:
+        case 2:  # boxes
             return torch.maximum(along.abs(), across.abs())
-        case _:  # a convex polygon
-            sides = 3 + random_index(generator, 4)
-            gaps = torch.rand(sides, generator=generator).cumsum(0)
-            angles = 2 * math.pi * gaps / (gaps[-1] + uniform(generator, 0.2, 0.8))
-            extents = 0.5 + torch.rand(sides, generator=generator)
-            level = torch.full_like(along, -torch.inf)
-            for side_angle, extent in zip(angles.tolist(), extents.tolist(), strict=True):
-                side = math.cos(side_angle) * along + math.sin(side_angle) * across
-                level = torch.maximum(level, side / extent)
-            return level
+        case _:
+            return _draw_polygon_levels(along, across, generator)
+
+
+def _draw_polygon_levels(along: Depth, across: Depth, generator: torch.Generator) -> Depth:
+    """Draw an image whose sublevel sets are convex polygons of three to six sides.
+
+    ``along`` and ``across`` are the coordinates of each pixel.
+    """
+    sides = 3 + random_index(generator, 4)
+    gaps = torch.rand(sides, generator=generator).cumsum(0)
+    angles = 2 * math.pi * gaps / (gaps[-1] + uniform(generator, 0.2, 0.8))
+    extents = 0.5 + torch.rand(sides, generator=generator)
+    level = torch.full_like(along, -torch.inf)
+    for angle, extent in zip(angles.tolist(), extents.tolist(), strict=True):
+        side = math.cos(angle) * along + math.sin(angle) * across
+        level = torch.maximum(level, side / extent)
+    return level
 
 
 def occlude(
@@ -138,6 +147,7 @@ def simulate_depth(
         config: kinds of sensor, and their errors.
         generator: of random numbers.
     """
+    # The sensor of this view, and the pixels that it does not read.
     kind: SensorKind = config.kinds[random_index(generator, len(config.kinds))]
     noise = uniform(generator, *config.noise)
     missing = uniform(generator, *config.missing)
@@ -156,6 +166,7 @@ def simulate_depth(
         (depth_m.shape[0], depth_m.shape[1]), width_px, generator
     )
 
+    # What each kind of sensor reads.
     if kind == "structured light":
         is_lost |= _mark_shadow(depth_m, focal_px[0])
         read_m = _swap_neighbours(depth_m, generator)
@@ -173,8 +184,10 @@ def simulate_depth(
     elif kind == "time of flight":
         read_m = _mix_at_jumps(depth_m, generator)
         read_m = read_m + unit_noise * (0.001 + 0.002 * read_m.square())
-    else:
+    else:  # a laser
         read_m = depth_m + 0.0005 * unit_noise
+
+    # All readings are off alike.
     read_m = read_m + uniform(generator, *config.offset_m)
     return torch.where(is_lost, torch.nan, read_m)
 
@@ -194,14 +207,17 @@ def _mark_steep(depth_m: Depth, focal_px: float, *, is_laser: bool) -> Mask:
 
 def _mark_gaps(size: torch.Size, share: float, generator: torch.Generator) -> Mask:
     """Mark a share of the pixels as missing, half of them singly, half in patches."""
+    # Single ones.
     height, width = size
     is_missing = torch.rand(height, width, generator=generator) < 0.5 * share
+
+    # Patches, where a smooth image is low.
     coarse = torch.rand(1, 1, 2 + height // 12, 2 + width // 12, generator=generator)
     patches = F.interpolate(coarse, (height, width), mode="bilinear", align_corners=False)[0, 0]
     # The level of the patches is a quantile of every fourth row and column, which is near enough.
-    some = patches[::4, ::4].flatten()
-    if count := round(0.5 * share * len(some)):
-        is_missing |= patches <= some.kthvalue(count).values
+    sampled = patches[::4, ::4].flatten()
+    if count := round(0.5 * share * len(sampled)):
+        is_missing |= patches <= sampled.kthvalue(count).values
     return is_missing
 
 
@@ -247,10 +263,13 @@ def draw_smooth_noise(size: tuple[int, int], width_px: float, generator: torch.G
     It is white noise convolved with a Gaussian of deviation ``width_px``, 0 for white noise;
     ``size`` is rows and columns.
     """
+    # White noise, with a margin for the Gaussian.
     radius = math.ceil(3 * width_px)
     white = torch.randn(size[0] + 2 * radius, size[1] + 2 * radius, generator=generator)
     if radius == 0:
         return white
+
+    # The Gaussian, one axis after the other.
     weights = (-0.5 * (torch.arange(-radius, radius + 1) / width_px).square()).exp()
     weights = weights / weights.norm()
     along = F.conv2d(white[None, None], weights.view(1, 1, 1, -1))
@@ -313,7 +332,7 @@ class _StoredView:
     camera_from_model: Rigid  #: the pose
 
     def restore_depth(self) -> CleanView:
-        """Give the view with its depth."""
+        """Restore the depth of the view."""
         depth_m = self.offset_m.float() + self.distance_m
         return CleanView(depth_m=depth_m, K=self.K, camera_from_model=self.camera_from_model)
 
@@ -330,7 +349,7 @@ def make_shape(model: ObjectModel) -> Shape:
 
 
 def aim_camera(direction: Float[Tensor, "3"], roll_rad: float) -> Float[Tensor, "3 3"]:
-    """Give the rotation that rolls a camera and then points its optical axis at a direction."""
+    """Make the rotation that rolls a camera and then points its optical axis at a direction."""
     cosine = math.cos(roll_rad)
     sine = math.sin(roll_rad)
     roll = [[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]]
@@ -347,7 +366,7 @@ def invert_intrinsics(K: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
 def find_window(
     shape: Shape, pose: Rigid, K: Float[Tensor, "3 3"]
 ) -> tuple[Float[Tensor, "3 3"], int, int]:
-    """Give the window in which an object lies, with a margin: its intrinsics, width and height."""
+    """Find the window in which an object lies, with a margin: its intrinsics, width and height."""
     corners = shape.hull_m @ pose.R.mT + (pose.t_m + pose.R @ shape.middle_m)
     pixels = (corners @ K.mT)[:, :2] / corners[:, 2:]
     left, top = (pixels.amin(0).floor() - MARGIN_PX).tolist()
@@ -400,12 +419,18 @@ def turn_view(
     index = (top * columns + left).long()
     flat = inverse.reshape(-1)
     nw, ne, sw, se = (flat[index + beyond] for beyond in (0, 1, columns, columns + 1))
-    smooth = torch.lerp(torch.lerp(nw, ne, x), torch.lerp(sw, se, x), y)
-    nearest = torch.where(y < 0.5, torch.where(x < 0.5, nw, ne), torch.where(x < 0.5, sw, se))
+    upper = torch.lerp(nw, ne, x)
+    lower = torch.lerp(sw, se, x)
+    smooth = torch.lerp(upper, lower, y)
+    nearest_upper = torch.where(x < 0.5, nw, ne)
+    nearest_lower = torch.where(x < 0.5, sw, se)
+    nearest = torch.where(y < 0.5, nearest_upper, nearest_lower)
     # A comparison with NaN is false: where one of the four pixels is empty the nearest is taken.
     highest = torch.maximum(torch.maximum(nw, ne), torch.maximum(sw, se))
     lowest = torch.minimum(torch.minimum(nw, ne), torch.minimum(sw, se))
     resampled = torch.where(highest - lowest < _JUMP * smooth, smooth, nearest)
+
+    # Pixels beyond the old window see nothing.
     is_inside = (x - 0.5).abs().maximum((y - 0.5).abs()) <= 1
     resampled = torch.where(is_inside, resampled, torch.nan)
     return CleanView(depth_m=1 / (resampled * w), K=window_K, camera_from_model=pose)
@@ -549,7 +574,7 @@ class Objects:
         return turn_view(stored.restore_depth(), turn, shape, K)
 
     def _find_stored(self, key: tuple[int, int]) -> _StoredView:
-        """Give a stored view by the numbers of its object and of the view; drawn when needed."""
+        """Find a stored view by the numbers of its object and of the view; drawn when needed."""
         if key not in self._views:
             number, place = key
             index = place * len(self.models) + number
@@ -583,15 +608,25 @@ class Objects:
     def _draw_gaze(
         self, number: int, distance_m: float, K: Tensor, generator: torch.Generator
     ) -> Float[Tensor, "3 3"]:
-        """Draw a rotation of the camera by which an object lies wholly in the image, anywhere."""
+        """Draw a rotation of the camera by which an object lies wholly in the image, anywhere.
+
+        Args:
+            number: of the object.
+            distance_m: of its middle.
+            K: intrinsic matrix of the image.
+            generator: of random numbers.
+        """
+        # A place at which the whole object is in the image; the middle, where it is too large.
         diameter = self.models[number].diameter_m
         scale = float(K[0, 0]) / self.config.focal_px[0]
         radius_px = float(K[0, 0]) * 0.5 * diameter / max(distance_m - 0.5 * diameter, 1e-3)
-        place = []
+        place: list[float] = []
         for size, middle in zip(self.config.image_px, K[:2, 2].tolist(), strict=True):
             low = radius_px
             high = scale * size - 1 - radius_px
             place.append(uniform(generator, low, high) if low < high else middle)
+
+        # A camera that looks there, rolled.
         roll_rad = uniform(generator, 0.0, 2 * math.pi)
         pixel = torch.tensor([*place, 1.0], dtype=torch.float64)
         return aim_camera(invert_intrinsics(K) @ pixel, roll_rad)
@@ -605,9 +640,10 @@ class Objects:
         hull_m = shape.hull_m @ pose.R.mT + (pose.t_m + pose.R @ shape.middle_m)
         tilt = uniform(generator, 0.0, _MOST_TILT_RAD)
         side = uniform(generator, 0.0, 2 * math.pi)
-        normal = aim_camera(hull_m.mean(0), side) @ torch.tensor(
-            [math.sin(tilt), 0.0, -math.cos(tilt)], dtype=torch.float64
-        )
+        tilted = torch.tensor([math.sin(tilt), 0.0, -math.cos(tilt)], dtype=torch.float64)
+        normal = aim_camera(hull_m.mean(0), side) @ tilted
+
+        # Its depth in each pixel; none where the ray does not meet it.
         gap_m = max(0.0, uniform(generator, -0.2, 0.3))
         offset = float((hull_m @ normal).min()) - gap_m
         a, b, c = (normal @ invert_intrinsics(clean.K)).tolist()

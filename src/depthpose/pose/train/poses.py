@@ -94,7 +94,7 @@ class PoseTask(ViewsTask):
         self._copies_m = (keypoints_m[:, None] @ copies.R.mT + copies.t_m[:, :, None]).float()
 
     def step(self, batch: CloudBatch) -> Iterator[Update]:
-        """One update: all clouds at once."""
+        """Make one update: the loss of all clouds at once."""
         directions = self.network.directions(batch.network_input).float()
         copies = self._copies_m.to(batch.R)[batch.class_of]
         copies_m = copies @ batch.R.mT[:, None] + batch.t_m[:, None, None]
@@ -104,6 +104,7 @@ class PoseTask(ViewsTask):
 
     def measure_held_out(self, view: ViewSample, index: int) -> float:
         """Pose the cloud of a view by voting and measure ADD; infinite for too few points."""
+        # The cloud of the view, in the axes of its grid.
         number = index % len(self.models)
         generator = sample_generator(index, HELD_OUT_SEED)
         model = self.models[number]
@@ -112,6 +113,8 @@ class PoseTask(ViewsTask):
         if why_too_few(sample.input.points_m, config) is not None:
             return math.inf
         cloud = voxelise_sample(sample, number, config, generator)
+
+        # Its votes, and the pose that they fit best.
         device = next(self.network.parameters()).device
         batch = TrainingClouds.collate([cloud])
         points = CloudBatch(*(part.to(device) for part in batch)).network_input
@@ -121,7 +124,7 @@ class PoseTask(ViewsTask):
 
 
 def stack_symmetries(models: Sequence[ObjectModel], step_rad: float) -> Rigid:
-    """Give the symmetries of each object, ``model_from_model`` (classes, copies).
+    """Stack the symmetries of all objects, ``model_from_model`` (classes, copies).
 
     Objects with fewer are filled up with the identity.
     """
@@ -167,7 +170,7 @@ def pack_weights(
 
 
 def add_origin(facts: Mapping[str, str], config: Any) -> dict[str, str]:  # noqa: ANN401
-    """Give facts with the stage and the start weights added, whose terms bind the new ones too."""
+    """Add to facts the stage and the start weights, whose terms bind the new ones too."""
     origin = {**facts, "stage": type(config).__name__}
     if config.start is None:
         return origin
@@ -229,7 +232,7 @@ class DepthImageTask(ViewsTask):
         self._diameter_m = torch.tensor([model.diameter_m for model in models])
 
     def step(self, batch: CropSample) -> Iterator[Update]:
-        """One update: regress poses and compare the points of the models; in diameters."""
+        """Make one update: regress poses and compare the points of the models, in diameters."""
         class_of = batch.class_of
         device = batch.R.device
         outputs = self.network(batch.crop.image, class_of).float()
@@ -271,21 +274,24 @@ def train_pose_network(config: PoseTraining | DepthImageTraining, run: Run) -> P
     kind, task, samples = _build_training(config, models)
     if config.start is not None:
         _copy_start(task.network, config.start, samples)
+
     # The folder is claimed only now: until here a setting may be refused.
     claim_run(config, run, config.models.cad)
-
     seconds = run.train(task, samples, config.loop)
     path = run.folder / f"{kind}.safetensors"
     if run.on_message is not None:
         run.on_message("trained; now it is measured on synthetic views: a minute or more")
     if find_rank().rank:
         return path  # statistics of batch norm are rank 0's, and so is the file
+
+    # Weights, with norms folded into their convolutions.
     network = task.network
     inference_network = fold_norms(network) if isinstance(network, ResUNet) else network
     packed_weights = pack_weights(inference_network, models, config)
     write_pose_weights(path, packed_weights, with_half=config.with_half)
 
-    weights = read_pose_weights(path)  # as the file holds them: 16 bits round them
+    # Their card, measured with the weights as the file holds them: 16 bits round them.
+    weights = read_pose_weights(path)
     held_out_rows = score_held_out(weights, config.objects, config.held_out)
     write_json(path.with_suffix(".json"), {"held_out": held_out_rows})
     _write_pose_card(path, weights, config, seconds, format_table(held_out_rows))
@@ -295,7 +301,7 @@ def train_pose_network(config: PoseTraining | DepthImageTraining, run: Run) -> P
 def _set_network_sizes(
     config: PoseTraining | DepthImageTraining, models: Sequence[ObjectModel]
 ) -> PoseTraining | DepthImageTraining:
-    """Give the network the classes and keypoints of the objects, and the inputs of the cloud."""
+    """Set the network's classes and keypoints by the objects, and its inputs by the cloud."""
     sizes = {
         "classes": len(models),
         "keypoints": len(models[0].keypoints_m),
@@ -309,7 +315,7 @@ def _set_network_sizes(
 def _build_training(
     config: PoseTraining | DepthImageTraining, models: tuple[ObjectModel, ...]
 ) -> tuple[str, PoseTask | DepthImageTask, TrainingClouds | TrainingCrops]:
-    """Give the kind of weights that a config trains, its task with a new network, and samples."""
+    """Build what a config trains: the kind of its weights, its task with a new network, samples."""
     if isinstance(config, DepthImageTraining):
         crops = TrainingCrops(models, config, config.loop.seed)
         return "depth-image", DepthImageTask(DepthImageNet(config.network), models, config), crops
@@ -329,10 +335,13 @@ def _write_pose_card(
     held_out: str,
 ) -> None:
     """Write the card beside weights: the command, the objects, and what was measured of them."""
+    # The command, as far as options say it.
     cad_options = [word for file in config.models.cad for word in ("--cad", file)]
     if cad_options and config.models.unit:
         cad_options += ["--unit", config.models.unit]
     command = shlex.join(["pose", "train", "--what", path.stem, *cad_options])
+
+    # The objects, and the rotations that no view of them may tell apart.
     objects = ", ".join(f"{m.name} ({1000 * m.diameter_m:.0f} mm)" for m in weights.models)
     facts = {"objects": objects}
     rotations = {
@@ -355,6 +364,7 @@ def _copy_start(network: AnyNetwork, start: str, samples: TrainingViews[Any]) ->
     Raises:
         InputError: the file is of another network, or of other settings.
     """
+    # What may differ between the two networks.
     path = find_weights(start)
     loaded = build_pose_network(read_checkpoint(path), str(path))
     has_norms = isinstance(network, ResUNet) and network.config.norm == "batch"
