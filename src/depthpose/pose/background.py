@@ -119,6 +119,8 @@ def with_background(
         )
     is_seen = is_on_background(view.depth_m, background_m)
     is_behind = is_compared & ~is_seen & (view.depth_m > background_m)
+
+    # What lies behind it, and what on it.
     behind_share = float(is_behind[is_compared].double().mean())
     if behind_share > _MOST_BEHIND:
         off_mm = 1000 * float((view.depth_m - background_m)[is_behind].median())

@@ -97,6 +97,7 @@ def color_agreement(
         chunk = poses[first : first + at_once].double()
         compared = _compare_features(chunk, surface, view, image, _NEAR * model.diameter_m)
         correlation = _correlate(compared)
+        # Colour that explains nothing has no independent points.
         independent = torch.where(
             correlation != 0, _count_independent_points(compared, surface), 0.0
         )
@@ -124,9 +125,9 @@ def _take_samples(colors: SurfaceColors, samples: int) -> SurfaceColors:
 class _BlurredImage(NamedTuple):
     """The part of a colour image about an object, as blurred as the model's colours are."""
 
-    rgb: Float[Tensor, "3 h w"]
-    left: int  # first column of the part
-    top: int  # and its first row
+    rgb: Float[Tensor, "3 h w"]  #: 0..1
+    left: int  #: first column of the part
+    top: int  #: and its first row
 
 
 def _project_to_color(
@@ -174,9 +175,9 @@ def _blur_image(color: ColorImage, poses: Rigid, surface: SurfaceColors) -> _Blu
 class _Compared(NamedTuple):
     """Colour features of a model and of an image at the same points, less mean and shading."""
 
-    weight: Float64[Tensor, "b n 3"]  # 1 where a feature is compared, else 0
-    of_model: Float64[Tensor, "b n 3"]
-    of_image: Float64[Tensor, "b n 3"]
+    weight: Float64[Tensor, "b n 3"]  #: 1 where a feature is compared, else 0
+    of_model: Float64[Tensor, "b n 3"]  #: features of the model
+    of_image: Float64[Tensor, "b n 3"]  #: features of the image
 
 
 def _take_logarithms(rgb: Float64[Tensor, "*b 3"]) -> Float64[Tensor, "*b 3"]:

@@ -86,8 +86,8 @@ class PoseEstimator:
         if isinstance(inputs, AnyInput):
             raise InputError("estimate_many takes several inputs; give one as [input]")
         total = len(inputs) if isinstance(inputs, Sized) else None
-        each = self._estimate_each(inputs, threads)
-        return list(tqdm(each, total=total, unit=" poses", disable=not with_progress))
+        estimates = self._estimate_each(inputs, threads)
+        return list(tqdm(estimates, total=total, unit=" poses", disable=not with_progress))
 
     def _estimate_each(self, inputs: Iterable[AnyInput], threads: int) -> Iterator[PoseEstimate]:
         """Give each input's estimate, in order; each is expected to show its object."""
@@ -212,6 +212,7 @@ class PoseEstimator:
         if cloud is not None:
             pose_input = cloud_input(cloud, unit or "m", which, _NAME)
         else:
+            # A view by its mask or its box, with background and colours.
             lens = choose_lens(camera, focal_px)
             if depth is None or lens is None or (mask is None) == (box is None):
                 raise InputError(

@@ -71,17 +71,17 @@ class Residuals(NamedTuple):
     """
 
     jacobian: Float64[np.ndarray, "n unknowns"]  #: of the distances
-    distance: Float64[np.ndarray, " n"]
-    weight: Float64[np.ndarray, " n"]
+    distance: Float64[np.ndarray, " n"]  #: along the normal of the sample
+    weight: Float64[np.ndarray, " n"]  #: of :func:`tukey_weight`
 
 
 class _Linearised(NamedTuple):
     """Refined poses' residuals, and their information about (rotation, translation)."""
 
-    information: Float64[Tensor, "*batch 6 6"]  # damped
-    jacobian: Float64[Tensor, "*batch n 6"]
-    weight: Float64[Tensor, "*batch n"]
-    residual_m: Float64[Tensor, "*batch n"]
+    information: Float64[Tensor, "*batch 6 6"]  #: damped
+    jacobian: Float64[Tensor, "*batch n 6"]  #: of the residuals
+    weight: Float64[Tensor, "*batch n"]  #: of each point
+    residual_m: Float64[Tensor, "*batch n"]  #: of each point
 
     @property
     def rms_m(self) -> Float64[Tensor, "*batch"]:

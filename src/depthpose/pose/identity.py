@@ -306,12 +306,12 @@ def _bound_offset_error(distance_m: float) -> float:
 class _Fits(NamedTuple):
     """What other fits of a model to a cloud found, and how far their results may be off."""
 
-    name: str  # of the model
-    scale: Scale
-    mirror_gain: float | None  # None where the mirror image is the model itself
-    size_tolerance: float  # share by which a right object may seem to differ in size
-    mirror_tolerance: float  # gain of the mirror image that deviating sides explain
-    offset_error: float  # share by which a sensor's offset may change the size
+    name: str  #: of the model
+    scale: Scale  #: that fits best
+    mirror_gain: float | None  #: None where the mirror image is the model itself
+    size_tolerance: float  #: share by which a right object may seem to differ in size
+    mirror_tolerance: float  #: gain of the mirror image that deviating sides explain
+    offset_error: float  #: share by which a sensor's offset may change the size
 
 
 def identify(

@@ -19,7 +19,7 @@ class Tree(NamedTuple):
     Node ``k`` is split into ``2 k + 1``, of the smaller coordinates, and ``2 k + 2``.
     """
 
-    points: Float64[np.ndarray, "m 3"]
+    points: Float64[np.ndarray, "m 3"]  #: of the surface
     outward: Float64[np.ndarray, "m 3"]  #: normals on their outer side, 0 where none is known
     order: Int64[np.ndarray, " m"]  #: index that each point had before
     axes: Int64[np.ndarray, " nodes"]  #: axis across which each node is split
@@ -167,8 +167,10 @@ def find_nearest_facing(
     waiting = 1
     while waiting > 0:
         waiting -= 1
-        node, low, high = ranges[waiting, 0], ranges[waiting, 1], ranges[waiting, 2]
-        x, y, z, square = gaps[waiting, 0], gaps[waiting, 1], gaps[waiting, 2], gaps[waiting, 3]
+        node = ranges[waiting, 0]
+        low, high = ranges[waiting, 1], ranges[waiting, 2]
+        x, y, z = gaps[waiting, 0], gaps[waiting, 1], gaps[waiting, 2]
+        square = gaps[waiting, 3]
         if square >= best_square:
             continue
 

@@ -62,15 +62,15 @@ _NEEDS_MASK = "a regressed depth image takes a depth image with a mask; give bot
 class VotingDirections(NamedTuple):
     """The points that vote, in the camera frame, and the network's directions at them."""
 
-    points_m: Float[Tensor, "n 3"]
-    directions: Float[Tensor, "n k 3"]
+    points_m: Float[Tensor, "n 3"]  #: where the votes start
+    directions: Float[Tensor, "n k 3"]  #: of any length
 
 
 @dataclass(kw_only=True, eq=False)
 class CloudToPose:
     """An input on its way through the network."""
 
-    pose_input: AnyInput
+    pose_input: AnyInput  #: as it was given
     prepared: PreparedObject  #: its object
     cloud: ObjectCloud  #: all points of the object
     voxels: VoxelGrid  #: those that the network sees and that vote, one a voxel
@@ -157,10 +157,10 @@ class GeoPoseNet(PoseEstimator):
 
     def __repr__(self) -> str:
         names = self.objects
-        named = f", weights {self.name!r}" if self.name else ""
+        weights = f", weights {self.name!r}" if self.name else ""
         objects = ", ".join(names) if len(names) <= 5 else f"{len(names)} objects"
         kind = type(self._network).__name__
-        return f"GeoPoseNet({kind} of {objects}{named}, {self.config.device})"
+        return f"GeoPoseNet({kind} of {objects}{weights}, {self.config.device})"
 
     def _estimate_each(self, inputs: Iterable[AnyInput], threads: int) -> Iterator[PoseEstimate]:
         """Pose inputs by the network; what it doubts is registered where the config wants it."""

@@ -55,9 +55,9 @@ _PLACE = ("scene_id", "im_id", "obj_id")  # keys of a :class:`Place`
 class Place(NamedTuple):
     """The scene, image and object of a BOP data set that an estimate is of."""
 
-    scene_id: int
-    image_id: int
-    object_id: int
+    scene_id: int  #: number of the scene
+    image_id: int  #: number of the image in it
+    object_id: int  #: BOP's ``obj_id``
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -217,6 +217,8 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
     if status not in get_args(Status):
         statuses = get_args(Status)
         raise InputError(f"{source}: status {status!r}: {nearest_name(str(status), statuses)}")
+
+    # How it came about, and its pose, which only an answer has.
     tracking = row.get("tracking")
     if tracking is not None and tracking not in get_args(Tracking):
         raise InputError(f"{source}: tracking is {tracking!r}; write one of {get_args(Tracking)}")
@@ -231,24 +233,8 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
             f"{source}: every estimate but one that is ok has a reason; its status is {status!r}"
         )
 
-    # The numbers.
-    values: dict[str, Any] = {
-        "keypoints_m": _parse_table(row, "keypoints_m", 3, source),
-        "covariance": _parse_table(row, "covariance", 6, source, rows=6),
-        "free_motions": _parse_table(row, "free_motions", 6, source),
-    }
-    for key in ("inlier_share", "residual_m", "certainty", "copy_certainty"):
-        values[key] = None if row.get(key) is None else read_number(row, key, None, source)
-    seconds = row.get("seconds", {})
-    if not isinstance(seconds, dict):
-        raise InputError(f"{source}: seconds is {seconds!r}, where names to numbers belong")
-    values["seconds"] = {str(stage): read_number(seconds, stage, None, source) for stage in seconds}
-    for key, kind in (("evidence", Evidence), ("identity", Identity)):
-        value = row.get(key)
-        where = f"{source}: {key}"
-        if value is not None and not isinstance(value, dict):
-            raise InputError(f"{where} is {value!r}, where names to values belong")
-        values[key] = None if value is None else config_from_dict(value, kind, source=where)
+    # All that is known of it, and its place.
+    values = _parse_values(row, source)
     estimate = PoseEstimate(
         name=name,
         object=object_name,
@@ -264,6 +250,32 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
     has_place = any(row.get(key) is not None for key in _PLACE)
     place = Place(*(read_integer(row, key, source) for key in _PLACE)) if has_place else None
     return Prediction(estimate=estimate, place=place)
+
+
+def _parse_values(row: dict[str, Any], source: str) -> dict[str, Any]:
+    """Read the tables, numbers and parts of an entry, by the names of an estimate's fields."""
+    values: dict[str, Any] = {
+        "keypoints_m": _parse_table(row, "keypoints_m", 3, source),
+        "covariance": _parse_table(row, "covariance", 6, source, rows=6),
+        "free_motions": _parse_table(row, "free_motions", 6, source),
+    }
+    for key in ("inlier_share", "residual_m", "certainty", "copy_certainty"):
+        values[key] = None if row.get(key) is None else read_number(row, key, None, source)
+
+    # Times of stages.
+    seconds = row.get("seconds", {})
+    if not isinstance(seconds, dict):
+        raise InputError(f"{source}: seconds is {seconds!r}, where names to numbers belong")
+    values["seconds"] = {str(stage): read_number(seconds, stage, None, source) for stage in seconds}
+
+    # Parts with values of their own.
+    for key, kind in (("evidence", Evidence), ("identity", Identity)):
+        value = row.get(key)
+        where = f"{source}: {key}"
+        if value is not None and not isinstance(value, dict):
+            raise InputError(f"{where} is {value!r}, where names to values belong")
+        values[key] = None if value is None else config_from_dict(value, kind, source=where)
+    return values
 
 
 def _parse_alternatives(row: dict[str, Any], source: str) -> tuple[Alternative, ...]:
@@ -481,7 +493,7 @@ def make_detection_jobs(
     shown: dict[Place, list[Instance]] = defaultdict(list)
     for instance in dataset.instances:
         shown[place_of(instance)].append(instance)
-    of_place: dict[Place, list[Detection]] = defaultdict(list)
+    best_of_place: dict[Place, list[Detection]] = defaultdict(list)
     for detection in sorted(detections, key=lambda d: -d.score):
         if detection.scene_id is None or detection.image_id is None or detection.object_id is None:
             raise InputError(
@@ -489,11 +501,11 @@ def make_detection_jobs(
                 "category_id; detections of a data set have all three"
             )
         place = Place(detection.scene_id, detection.image_id, detection.object_id)
-        if len(of_place[place]) < len(shown.get(place, ())):
-            of_place[place].append(detection)
+        if len(best_of_place[place]) < len(shown.get(place, ())):
+            best_of_place[place].append(detection)
     chosen = [
         (place, k, detection)
-        for place, best in of_place.items()
+        for place, best in best_of_place.items()
         for k, detection in enumerate(best)
     ]
     if not chosen:
@@ -604,6 +616,7 @@ def _parse_bop_row(
     row: Sequence[str], number: int, source: str
 ) -> tuple[Place, PoseEstimate, float]:
     """Read a row of BOP's csv: its place, an estimate named by ``number``, and the image's time."""
+    # The numbers of the row.
     if len(row) != len(_HEADER):
         raise InputError(f"{source}: {len(row)} values, where {len(_HEADER)} belong")
     try:
@@ -616,6 +629,8 @@ def _parse_bop_row(
         raise InputError(
             f"{source}: {error}; write numbers, and separate those of R and t by spaces"
         ) from error
+
+    # Are they possible?
     if not all(0 <= value <= MOST for value in place):
         raise InputError(f"{source}: scene, image and object are numbers from 0 to {MOST}")
     if len(R) != 9 or len(t_mm) != 3 or not all(map(math.isfinite, [score, time_s, *R, *t_mm])):

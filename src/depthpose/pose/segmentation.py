@@ -219,9 +219,9 @@ class SegmentationWeights:
 class _FileConfig:
     """The config in a file of these weights."""
 
-    network: SegmentationConfig = field(default_factory=SegmentationConfig)
-    objects: tuple[str, ...] = ()
-    numbers: tuple[int, ...] = ()
+    network: SegmentationConfig = field(default_factory=SegmentationConfig)  #: its settings
+    objects: tuple[str, ...] = ()  #: names, in the order of the classes
+    numbers: tuple[int, ...] = ()  #: BOP's ``obj_id`` of each
 
 
 def write_segmentation(

@@ -42,6 +42,7 @@ Keys = Int64[Tensor, " _"]
 
 def pack(coordinates: Int[Tensor, "n 4"]) -> Keys:
     """Pack rows of (cloud, x, y, z) into keys."""
+    # Do they fit their fields?
     if len(coordinates):
         lowest = coordinates.amin(0).tolist()
         highest = coordinates.amax(0).tolist()
@@ -170,7 +171,7 @@ class NeighbourTable:
     table: Int32[Tensor, "volume coarse_rows"]
     fine_rows: int  #: number of voxels of the finer level
     centre: int | None  #: offset at which each voxel is its own neighbour; None across levels
-    _slots: dict[bool, Slots] = field(default_factory=dict)
+    _slots: dict[bool, Slots] = field(default_factory=dict)  #: by direction, made when asked for
 
     @cached_property
     def pairs(self) -> PairList:
@@ -250,8 +251,11 @@ class CoordinateCache:
     """
 
     finest: Keys  #: sorted, distinct keys of level 0
-    _coarser: dict[int, Keys] = field(default_factory=dict)
-    _indices: dict[int, VoxelIndex] = field(default_factory=dict)
+    _coarser: dict[int, Keys] = field(default_factory=dict)  #: keys of levels above 0
+    _indices: dict[int, VoxelIndex] = field(
+        default_factory=dict
+    )  #: of the levels that were searched
+    #: by (finer level, kernel, levels between).
     _neighbours: dict[tuple[int, int, int], NeighbourTable] = field(default_factory=dict)
 
     def keys(self, level: int) -> Keys:
@@ -469,8 +473,10 @@ class Voxels:
         """
         if features is None:
             features = torch.ones(len(coordinates), 1, device=coordinates.device)
-        given = pack(coordinates)
-        keys, row_of_point, counts = torch.unique(given, return_inverse=True, return_counts=True)
+        keys_of_points = pack(coordinates)
+        keys, row_of_point, counts = torch.unique(
+            keys_of_points, return_inverse=True, return_counts=True
+        )
         repeated = counts > 1
         if bool(repeated.any()):
             cloud, *xyz = unpack(keys[repeated][:1])[0].tolist()
@@ -478,7 +484,7 @@ class Voxels:
                 f"{int((counts - 1).sum())} points share a voxel with another, the first at {xyz} "
                 f"of cloud {cloud}; keep one point a voxel."
             )
-        features = features[torch.argsort(given)]
+        features = features[torch.argsort(keys_of_points)]
         return cls(features=features, cache=CoordinateCache(keys), row_of_point=row_of_point)
 
     def with_features(self, features: Float[Tensor, "m c2"], level: int | None = None) -> "Voxels":

@@ -129,9 +129,15 @@ def match(
             sides of a wall the one that faces the camera.
         places: on entry those of the matches before, or -1, from which exact searches begin.
     """
-    tree, table, across = target.tree, target.table, target.across
-    samples, outward = tree.points, tree.outward
-    low, side, counts = target.low, target.side, target.counts
+    # Taken out of the tuple once, not for each point.
+    tree = target.tree
+    samples = tree.points
+    outward = tree.outward
+    across = target.across
+    table = target.table
+    low = target.low
+    side = target.side
+    counts = target.counts
     for i in range(len(points)):
         point = vector(points, i)
         place = places[i]
@@ -251,9 +257,9 @@ class Surface:
 class _View(NamedTuple):
     """The visible points from one direction: a row of each part of :class:`Views`."""
 
-    points_m: Float64[Tensor, "n 3"]
-    normals: Float64[Tensor, "n 3"]
-    is_inner: Bool[Tensor, " n"]
+    points_m: Float64[Tensor, "n 3"]  #: NaN where there are fewer
+    normals: Float64[Tensor, "n 3"]  #: of these points
+    is_inner: Bool[Tensor, " n"]  #: whether it is on no rim or edge
 
 
 def _view_from(surface: Surface, toward: Tensor, across: Tensor) -> _View:
@@ -524,7 +530,8 @@ def _compare_rays(
     nearest = np.empty(cells)  # depth of the nearest point of the posed surface in each cell
     for b in range(len(ts)):
         _draw_cells(points, Rs[b], ts[b], scale, middle, nearest)
-        posed, missed = 0, 0
+        posed = 0
+        missed = 0
         for k in range(cells):
             if nearest[k] < np.inf:
                 posed += 1

@@ -82,8 +82,8 @@ class PoseTruth:
 class CloudSample:
     """One sample of a dataset."""
 
-    input: CloudInput
-    truth: PoseTruth
+    input: CloudInput  #: the cloud
+    truth: PoseTruth  #: its pose
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -129,8 +129,8 @@ AnyInput = CloudInput | ViewInput
 class ViewSample:
     """A view and its truth."""
 
-    input: ViewInput
-    truth: PoseTruth
+    input: ViewInput  #: the view
+    truth: PoseTruth  #: its pose
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

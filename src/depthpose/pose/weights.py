@@ -59,18 +59,23 @@ class PoseWeights:
     facts: Mapping[str, str]  #: the card in short: ``trained_on``, ``licence``, ``terms`` and more
 
     def __post_init__(self) -> None:
+        # A class for each model.
         config = self.network.config
         if len(self.models) != config.classes:
             raise InputError(
                 f"the network knows {config.classes} classes, but {len(self.models)} models are "
                 "given; class k is models[k]. Give one model for each."
             )
+
+        # The features that its clouds give.
         inputs = SHAPE_FEATURES if self.cloud.with_shape else 1
         if isinstance(config, ResUNetConfig) and config.inputs != inputs:
             raise InputError(
                 f"the network takes {config.inputs} features of a voxel, but its clouds give "
                 f"{inputs}. Set with_shape of the cloud as it was in training."
             )
+
+        # The keypoints of each model.
         keypoints = None if isinstance(config, DepthImageConfig) else config.keypoints
         for model in self.models:
             if keypoints not in (None, len(model.keypoints_m)):
@@ -162,6 +167,8 @@ def complete_weights(path: Path, meshes: Mapping[int, ObjectModel], out: Path) -
                 f"long) lies {gap_m:.3g} m off the model {model.name} ({model.diameter_m:.3g} m "
                 "long): another object, frame or unit. Give the models that it was trained on."
             )
+
+        # Its surface is added.
         for name in _SURFACE:
             tensor = getattr(model, name)
             stored = tensor.dtype if tensor.is_floating_point() else torch.int32
@@ -268,11 +275,13 @@ def read_pose_weights(path: Path) -> PoseWeights:
 
 def _restore_model(record: Any, state: Mapping[str, Tensor], source: str) -> ObjectModel:  # noqa: ANN401
     """Make an object of its entry in the config and its tensors; ``source`` is for errors."""
-    # Does the entry have all that an object needs, and do its tensors fit each other?
+    # Is all there that an object needs?
     missing = [name for name in _TENSORS if name not in state]
     missing += [name for name in ("name", "number", "diameter_m") if name not in record]
     if missing:
         raise InputError(f"{source} has no {missing[0]!r}; the file is of another version.")
+
+    # Do its tensors fit each other?
     vertices = state["vertices_m"]
     faces = state["faces"].long()
     shapes = {name: tuple(tensor.shape[1:]) for name, tensor in state.items()}

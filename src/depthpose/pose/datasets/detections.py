@@ -199,7 +199,7 @@ def _parse_coco_entry(
     if file is None and image_id is not None:
         file = image_files.get(image_id)
 
-    # The mask, or the box.
+    # The mask, or the box; and the time, which is negative where it is not known.
     seconds = read_number(row, "time", -1.0, source)
     segmentation = row.get("segmentation")
     box = None

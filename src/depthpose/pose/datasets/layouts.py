@@ -235,22 +235,22 @@ def read_bop_instances(scene: Path, end: str = "") -> Iterator[Instance]:
             info = visibilities[index] if index < len(visibilities) else {}
             info = info if isinstance(info, dict) else {}
             mask = scene / f"mask_visib{end}" / f"{image}_{index:06d}.png"
-            here = f"{source}, annotation {index}"
-            visible = read_number(info, "visib_fract", -1.0, here)
+            annotation_source = f"{source}, annotation {index}"
+            visible = read_number(info, "visib_fract", -1.0, annotation_source)
             yield Instance(
                 scene_id=int(scene.name),
                 image_id=int(key),
                 index=index,
-                object_id=read_integer(entry, "obj_id", here),
+                object_id=read_integer(entry, "obj_id", annotation_source),
                 K=K,
                 depth=tiff if tiff.is_file() else tiff.with_suffix(".png"),
                 depth_unit_m=unit_m,
                 mask=mask if mask.is_file() else None,
                 rgb=rgb,
                 camera_from_model=make_pose(
-                    read_numbers(entry, "cam_R_m2c", 9, here),
-                    read_numbers(entry, "cam_t_m2c", 3, here),
-                    here,
+                    read_numbers(entry, "cam_R_m2c", 9, annotation_source),
+                    read_numbers(entry, "cam_t_m2c", 3, annotation_source),
+                    annotation_source,
                 ),
                 visible_fraction=visible if visible >= 0 else None,
                 is_measured=not str(info.get("pose_source", "")).startswith("pseudo"),
@@ -268,8 +268,8 @@ def _read_bop_split(folder: Path, split: str) -> Iterator[Instance]:
 class BopTarget:
     """An entry of a list of targets: instances that are to be posed in an image."""
 
-    scene_id: int
-    image_id: int
+    scene_id: int  #: number of the scene
+    image_id: int  #: number of the image
     object_id: int | None = None  #: None: all objects in the image
     count: int | None = None  #: number of instances of the object; None: all
 

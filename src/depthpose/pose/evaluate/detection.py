@@ -33,8 +33,8 @@ Pairs = Mapping[tuple[str, str], Mapping[str, Errors]]
 class _Image:
     """The instances and estimates of one object in one image."""
 
-    instances: list[Instance] = field(default_factory=list)
-    predictions: list[Prediction] = field(default_factory=list)
+    instances: list[Instance] = field(default_factory=list)  #: what is annotated
+    predictions: list[Prediction] = field(default_factory=list)  #: the highest scores first
 
 
 def score_detections(

@@ -310,11 +310,11 @@ _COUNTED_FROM = {"smaller (are yours counted from 1?)": -1, "larger (from 0?)": 
 class _Change:
     """A change of all predictions: of their image and object numbers, and of their poses."""
 
-    words: str = ""  # that describe it
-    image_step: int = 0  # that is added to the numbers of images
-    object_step: int = 0  # and of objects
-    convention: str = ""  # a key of ``_CONVENTIONS``
-    scale: float = 1.0  # of translations
+    words: str = ""  #: that describe it
+    image_step: int = 0  #: that is added to the numbers of images
+    object_step: int = 0  #: and of objects
+    convention: str = ""  #: a key of ``_CONVENTIONS``
+    scale: float = 1.0  #: of translations
 
     def renumber(self, prediction: Prediction) -> Prediction:
         """Give a prediction with its numbers of image and object changed."""

@@ -75,16 +75,16 @@ def mark_part(
         f"one of {extent[k]:.3g} at ({', '.join(f'{value:.4g}' for value in low[k])})"
         for k in left_out[:_MOST_NAMED]
     )
-    more = f" and {len(left_out) - _MOST_NAMED} more" if len(left_out) > _MOST_NAMED else ""
+    others = f" and {len(left_out) - _MOST_NAMED} more" if len(left_out) > _MOST_NAMED else ""
     if size[left_out].sum() >= _SMALL * size[is_part].sum():
         raise InputError(
             f"{path}: holds bodies that lie farther from each other than they are long (a part of "
-            f"{diagonal:.4g}; {listing}{more}), and it cannot be known which of them is the "
+            f"{diagonal:.4g}; {listing}{others}), and it cannot be known which of them is the "
             "object; export that one alone"
         )
     bodies = f"{len(left_out)} small {'body' if len(left_out) == 1 else 'bodies'}"
     warnings.warn(
-        f"{path}: left out {bodies} far from the part of {diagonal:.4g} ({listing}{more}, in the "
+        f"{path}: left out {bodies} far from the part of {diagonal:.4g} ({listing}{others}, in the "
         "file's unit); export the part alone",
         Notice,
         stacklevel=3,

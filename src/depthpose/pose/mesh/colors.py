@@ -153,9 +153,9 @@ def _read_point_colors(path: AnyPath, model: ObjectModel) -> SurfaceColors | Non
 class _Samples(NamedTuple):
     """Coloured points of a surface."""
 
-    points: Float[Tensor, "n 3"]  # in the file's own unit
-    normals: Float[Tensor, "n 3"]
-    rgb: Float[Tensor, "n 3"]
+    points: Float[Tensor, "n 3"]  #: in the file's own unit
+    normals: Float[Tensor, "n 3"]  #: outward
+    rgb: Float[Tensor, "n 3"]  #: 0..1
 
 
 def _sample_colors(path: AnyPath, suffix: str) -> tuple[_Samples | None, list[str]]:

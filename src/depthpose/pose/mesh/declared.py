@@ -60,10 +60,11 @@ def read_symmetry(text: str) -> tuple[DeclaredTurns, ...]:
     """
     declared: list[DeclaredTurns] = []
     for part in text.split("+"):
+        # An axis and how many turns about it; a length of 0 where it is none.
         axis, _, count = (word.strip().lower() for word in part.rpartition(","))
         try:
-            named = {"x": (1.0, 0, 0), "y": (0, 1.0, 0), "z": (0, 0, 1.0)}
-            numbers = named.get(axis) or [float(word) for word in axis.split()]
+            directions = {"x": (1.0, 0, 0), "y": (0, 1.0, 0), "z": (0, 0, 1.0)}
+            numbers = directions.get(axis) or [float(word) for word in axis.split()]
             direction = torch.tensor(numbers, dtype=torch.float64).reshape(3)
             length = float(direction.norm())
             turns = None if count == "free" else int(count)

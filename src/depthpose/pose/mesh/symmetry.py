@@ -143,8 +143,9 @@ class SurfaceDeviation:
             share: of the points; from ``ALMOST_ALL`` on more points and samples are compared.
         """
         forward = Rigid(R, torch.zeros_like(R[..., 0]) if shift is None else shift)
-        there = self.deviation_one_way(forward, share)
-        return torch.maximum(there, self.deviation_one_way(forward.inverse(), share))
+        forward_deviation = self.deviation_one_way(forward, share)
+        backward_deviation = self.deviation_one_way(forward.inverse(), share)
+        return torch.maximum(forward_deviation, backward_deviation)
 
     def deviation_one_way(self, motion: Rigid, share: float = 0.98) -> Float[Tensor, "*batch"]:
         """Measure how far the moved surface lies off the surface, as :meth:`deviation` does.

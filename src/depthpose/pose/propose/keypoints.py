@@ -24,9 +24,9 @@ _EIGENVALUE_ROUNDING = 1e-7
 class Lines(NamedTuple):
     """Lines through points; coordinates are about the mean of the points, and come before them."""
 
-    points: Float[Tensor, "*batch 1 3 n"]
-    directions: Float[Tensor, "*batch k 3 n"]  # unit vectors
-    weights: Float[Tensor, "*batch k n"]  # 0 leaves a line out
+    points: Float[Tensor, "*batch 1 3 n"]  #: one on each line
+    directions: Float[Tensor, "*batch k 3 n"]  #: unit vectors
+    weights: Float[Tensor, "*batch k n"]  #: 0 leaves a line out
 
 
 def meet_lines(

@@ -142,11 +142,11 @@ def _choose_distinct_turns(turns: Rigid, surface: Surface) -> tuple[list[int], i
         Indices of the chosen motions, and how many of them are near-symmetries.
     """
     # The share of the surface that each motion moves onto the surface.
-    every = max(1, len(surface.points_m) // _SELF_COMPARED)
-    local_m = turns.inverse().apply(surface.points_m[::every])
+    step = max(1, len(surface.points_m) // _SELF_COMPARED)
+    local_m = turns.inverse().apply(surface.points_m[::step])
     index = surface.boxes.look_up(local_m)
     is_alike = (local_m - surface.points_m[index]).norm(dim=-1) < NEAR * surface.diameter_m
-    cosine = ((surface.normals[index] @ turns.R.mT) * surface.normals[::every]).sum(-1)
+    cosine = ((surface.normals[index] @ turns.R.mT) * surface.normals[::step]).sum(-1)
     share = (is_alike & (cosine.abs() > _MIN_COSINE)).double().mean(-1)
 
     chosen: list[int] = []
@@ -304,7 +304,9 @@ def _write_feature(
     """
     # The way from the first point to the second along the first's normal and tangents, and along
     # the second's normal; and the cosine of the two normals.
-    along, aside, up, along_second, cosine = 0.0, 0.0, 0.0, 0.0, 0.0
+    along, aside, up = 0.0, 0.0, 0.0
+    along_second = 0.0
+    cosine = 0.0
     square = 0.0
     for c in range(3):
         way = points[j, c] - points[i, c]
@@ -391,9 +393,9 @@ def vote_poses(
 class _PairArrays(NamedTuple):
     """Parts of :class:`PairTable` for compiled loops."""
 
-    bounds: Int32[np.ndarray, " bounds"]
-    first: Int32[np.ndarray, " pairs"]
-    turn: Float32[np.ndarray, " pairs"]
+    bounds: Int32[np.ndarray, " bounds"]  #: of the features
+    first: Int32[np.ndarray, " pairs"]  #: point of each pair
+    turn: Float32[np.ndarray, " pairs"]  #: of each pair [rad]
 
 
 @compiled

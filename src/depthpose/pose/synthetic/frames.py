@@ -28,21 +28,21 @@ _COLOUR_SEED = 0xC0102
 class Pattern:
     """The colour of a surface by place: a base colour that waves in space change."""
 
-    base: Float[Tensor, "3"]  # linear RGB
-    waves: Float[Tensor, "w 3"]  # amplitude of each wave in RGB, a share of the base
-    frequencies: Float[Tensor, "w 3"]  # [rad/m] along x, y and z
-    phases: Float[Tensor, " w"]  # [rad]
-    gloss: float  # share of the lamp's light that is mirrored
+    base: Float[Tensor, "3"]  #: linear RGB
+    waves: Float[Tensor, "w 3"]  #: amplitude of each wave in RGB, a share of the base
+    frequencies: Float[Tensor, "w 3"]  #: [rad/m] along x, y and z
+    phases: Float[Tensor, " w"]  #: [rad]
+    gloss: float  #: share of the lamp's light that is mirrored
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Solid:
     """A body of a scene, in its own frame."""
 
-    triangles_m: Float[Tensor, "n 3 3"]
-    normals: Float[Tensor, "n 3 3"]  # at each corner
-    pattern: Pattern
-    number: int | None  # ``obj_id``; None for clutter
+    triangles_m: Float[Tensor, "n 3 3"]  #: corners
+    normals: Float[Tensor, "n 3 3"]  #: at each corner
+    pattern: Pattern  #: its colour
+    number: int | None  #: ``obj_id``; None for clutter
 
 
 def draw_pattern(

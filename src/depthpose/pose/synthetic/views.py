@@ -576,6 +576,7 @@ class Objects:
     def _find_stored(self, key: tuple[int, int]) -> _StoredView:
         """Find a stored view by the numbers of its object and of the view; drawn when needed."""
         if key not in self._views:
+            # Drawn on the optical axis, by a seed of its own.
             number, place = key
             index = place * len(self.models) + number
             generator = sample_generator(index, self.config.seed + _BANK_SEED)

@@ -45,12 +45,12 @@ BEYOND_TRAINING = 2**32  #: samples of each object: no training has so many
 class Cloud(NamedTuple):
     """One training sample: the point of each voxel, and the true pose, in the axes of the grid."""
 
-    points_m: Float[Tensor, "n 3"]
-    coordinates: Int[Tensor, "n 3"]
-    features: Float[Tensor, "n c"]
-    class_number: int
-    R: Float[Tensor, "3 3"]
-    t_m: Float[Tensor, "3"]
+    points_m: Float[Tensor, "n 3"]  #: in the axes of the grid about its camera
+    coordinates: Int[Tensor, "n 3"]  #: (x, y, z) of their voxels
+    features: Float[Tensor, "n c"]  #: of their voxels
+    class_number: int  #: of the object
+    R: Float[Tensor, "3 3"]  #: rotation of the pose
+    t_m: Float[Tensor, "3"]  #: its translation
 
 
 class CloudBatch(NamedTuple):

@@ -185,10 +185,10 @@ that remains after training."""
 class CropSample(NamedTuple):
     """A crop, or a batch of them, with truth."""
 
-    crop: DepthCrop
-    class_of: Int[Tensor, "*b"]
-    R: Float[Tensor, "*b 3 3"]
-    t_m: Float[Tensor, "*b 3"]
+    crop: DepthCrop  #: that the network sees
+    class_of: Int[Tensor, "*b"]  #: class of its object
+    R: Float[Tensor, "*b 3 3"]  #: rotation of the pose
+    t_m: Float[Tensor, "*b 3"]  #: its translation
 
 
 class TrainingCrops(TrainingViews[DepthImageTraining]):
