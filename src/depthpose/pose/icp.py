@@ -72,7 +72,7 @@ class Residuals(NamedTuple):
 
     jacobian: Float64[np.ndarray, "n unknowns"]  #: of the distances
     distance: Float64[np.ndarray, " n"]  #: along the normal of the sample
-    weight: Float64[np.ndarray, " n"]  #: of :func:`tukey_weight`
+    weight: Float64[np.ndarray, " n"]  #: by ``tukey_weight``
 
 
 class _Linearised(NamedTuple):
