@@ -20,13 +20,13 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.background import PosedBin, with_background
 from depthpose.pose.cloud import cloud_from_depth, grow_mask
 from depthpose.pose.evidence import compare, observe
-from depthpose.pose.footprint import is_cut_out, why_background_excludes
+from depthpose.pose.footprint import why_background_excludes
 from depthpose.pose.frame import prepare_frame
 from depthpose.pose.inputs import view_input
 from depthpose.pose.mesh import make_model
 from depthpose.pose.metrics import add_m
+from depthpose.pose.probability import MOST_CONTINUED
 from depthpose.pose.registration import Registration
-from depthpose.pose.sensor import NOISE_PER_M2
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 
@@ -124,13 +124,13 @@ def test_a_pose_in_a_wave_of_the_floor_is_no_place() -> None:
     depth_m = posed_bin().draw(K, 240, 320) + noise(2)
     plain = view_input(depth_m, None, CAMERA, "bracket", "x")
     assert why_background_excludes(
-        prepare_frame(plain.depth_m, plain.K), plain, sunk, surface
+        prepare_frame(plain.depth_m, plain.K), sunk, surface
     ) == ""  # fmt: skip
     view = with_background(plain, posed_bin())
     frame = prepare_frame(view.depth_m, view.K, None, view.background)
-    assert "would lie in" in why_background_excludes(frame, view, sunk, surface)
+    assert "would lie in" in why_background_excludes(frame, sunk, surface)
     before = Rigid(TRUTH.R, TRUTH.t_m).double()
-    assert why_background_excludes(frame, view, before, surface) == ""
+    assert why_background_excludes(frame, before, surface) == ""
 
 
 def test_a_plane_through_the_tops_of_parts_is_no_background_before_a_known_bin() -> None:
@@ -179,17 +179,16 @@ def test_a_plate_that_lies_flush_in_its_tray_is_not_cut_out_of_it() -> None:
     plain = view_input(depth_m, mask, CAMERA, "plate", "x")
     known = with_background(plain, empty_m + noise(1))
     surface = prepare_surface(plate)
-    assert is_cut_out(plain, pose, surface, NOISE_PER_M2)
-    assert not is_cut_out(known, pose, surface, NOISE_PER_M2)
     cloud_m = cloud_from_depth(depth_m, mask, K)
 
-    def continued_area(view: ViewInput, *, is_masked: bool) -> float:
+    def continued_share(view: ViewInput, *, is_masked: bool) -> float:
         observation = observe(cloud_m, view, surface.diameter_m, 0.001, is_masked=is_masked)
-        return compare(observation, pose, surface).continued
+        evidence = compare(observation, pose, surface)
+        return evidence.continued / max(1.0, evidence.silhouette)
 
-    assert continued_area(plain, is_masked=False) > 10
-    assert continued_area(known, is_masked=False) < 1
-    assert continued_area(plain, is_masked=True) < 1, "the mask says where it ends"
+    assert continued_share(plain, is_masked=False) > MOST_CONTINUED
+    assert continued_share(known, is_masked=False) < 0.1
+    assert continued_share(plain, is_masked=True) == 0, "the mask says where it ends"
 
 
 def test_backgrounds_that_cannot_be_are_refused() -> None:

@@ -20,13 +20,15 @@ from tests.pose.synthetic_objects import (
 from depthpose.core.camera import back_project
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
+from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import RefusalConfig
 from depthpose.pose.decide import choose_object
-from depthpose.pose.footprint import explained_mask, is_cut_out
+from depthpose.pose.evidence import compare, observe
+from depthpose.pose.footprint import explained_mask
 from depthpose.pose.mesh import make_model
 from depthpose.pose.metrics import add_m
+from depthpose.pose.probability import PRIOR_PROPOSED, probability_right
 from depthpose.pose.search import nothing_found
-from depthpose.pose.sensor import NOISE_PER_M2
 from depthpose.pose.surface import NEAR, prepare_surface
 from depthpose.pose.types import (
     Alternative,
@@ -102,7 +104,11 @@ def test_a_piece_of_a_larger_plane_is_no_flat_part(
     depth_m = torch.where(mask, seen.float(), depth_m)
     depth_m += 0.001 * torch.randn(240, 320, generator=torch.Generator().manual_seed(0))
     view = ViewInput(name="a", depth_m=depth_m, mask=mask, K=K, object=model.name)
-    assert is_cut_out(view, pose, prepare_surface(model), NOISE_PER_M2) == is_cut
+    surface = prepare_surface(model)
+    cloud_m = cloud_from_depth(depth_m, mask, K)
+    observation = observe(cloud_m, view, surface.diameter_m, 0.001, is_masked=False)
+    evidence = compare(observation, pose, surface)
+    assert (probability_right(evidence, PRIOR_PROPOSED) == 0) == is_cut
 
 
 def test_readings_on_a_posed_surface_are_all_that_are_near_it() -> None:

@@ -439,12 +439,11 @@ def test_what_would_lie_in_the_wall_is_not_possible(net: Registration) -> None:
     wall[:, 100:220] = 1.25 - 0.0005 * torch.arange(240)[:, None]  # neither bracket
     depth_m = torch.where(mask, torch.minimum(seen.float(), wall), wall)
     frame = prepare_frame(depth_m, K.float())
-    view = view_input(depth_m, None, CAMERA, "bracket", "x", None)
-    assert "would lie in" in why_background_excludes(frame, view, pose.double(), surface)
+    assert "would lie in" in why_background_excludes(frame, pose.double(), surface)
     before = Rigid(pose.R, pose.t_m - torch.tensor([0.0, 0.0, 0.15]))
-    assert why_background_excludes(frame, view, before.double(), surface) == ""
+    assert why_background_excludes(frame, before.double(), surface) == ""
     gap = replace(frame, depth_m=torch.where(grow_mask(mask, 12), 3.0, frame.depth_m))
-    assert why_background_excludes(gap, view, pose.double(), surface) == ""
+    assert why_background_excludes(gap, pose.double(), surface) == ""
 
 
 def test_the_best_evidence_leads_a_place_not_the_first_proposal(net: Registration) -> None:

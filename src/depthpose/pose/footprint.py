@@ -10,19 +10,11 @@ from torch import Tensor
 from depthpose.core.camera import back_project, project
 from depthpose.core.camera.pinhole import clip_window, crop_intrinsics
 from depthpose.core.rigid import Rigid
-from depthpose.pose.cloud import grow_mask
-from depthpose.pose.frame import Frame, is_on_plane, largest_plane, share_behind
+from depthpose.pose.frame import Frame, share_behind
 from depthpose.pose.sensor import EDGE_PX
 from depthpose.pose.surface import NEAR, Surface
 from depthpose.pose.types import KnownBackground, ViewInput
 
-_FLAT_SHARE = 0.9
-"""A footprint is flat where at least so much of it lies on one plane: anything with its outline
-looks the same."""
-_CONTINUED_SHARE = 0.4
-"""Where so much of the rim lies on that plane, the outline is cut out of something larger."""
-_RIM_DIAMETERS = 0.05
-"""Width of the rim beside a footprint that is examined."""
 _REGION_MARGIN = 0.5
 """Margin about a region in which planes and neighbours are examined, over its larger side."""
 _MOST_SUNK = 0.05
@@ -129,17 +121,14 @@ def _crop_view(view: ViewInput, window: tuple[slice, slice]) -> ViewInput:
     )
 
 
-def why_background_excludes(frame: Frame, view: ViewInput, pose: Rigid, surface: Surface) -> str:
+def why_background_excludes(frame: Frame, pose: Rigid, surface: Surface) -> str:
     """Say why the background of an image excludes a pose; an empty text where it does not.
 
     Args:
         frame: of the whole image, whose backgrounds count.
-        view: depth and mask to which the pose was fitted.
         pose: ``camera_from_model``.
         surface: of the model.
     """
-    if is_cut_out(view, pose, surface, frame.noise_per_m2):
-        return "it would be cut out of a plane that goes on beside it"
     points_m = pose.apply(surface.points_m)
     for background in frame.backgrounds:
         if background.diameter_m < surface.diameter_m:  # the plane may be a side of the object
@@ -148,34 +137,3 @@ def why_background_excludes(frame: Frame, view: ViewInput, pose: Rigid, surface:
         if share > _MOST_SUNK:
             return f"{share:.0%} of it would lie in the bin, table or wall before which it is seen"
     return ""
-
-
-def is_cut_out(view: ViewInput, pose: Rigid, surface: Surface, noise_per_m2: float) -> bool:
-    """Whether what lies on a posed surface is flat, and goes on in its plane beyond the outline.
-
-    Args:
-        view: depth and mask to which the pose was fitted.
-        pose: ``camera_from_model``.
-        surface: of the model.
-        noise_per_m2: noise of the view, as of :class:`~depthpose.pose.frame.Frame`.
-    """
-    # Is the footprint flat?
-    part = _crop_view(view, _window_of_pose(view.depth_m.shape, view.K, pose, surface))
-    explained = explained_mask(part, pose, surface)
-    points_m = back_project(part.depth_m.double(), part.K.double())
-    footprint_m = points_m[explained]
-    plane = largest_plane(footprint_m, torch.Generator().manual_seed(0), noise_per_m2)
-    if plane is None:
-        return False
-    flat_share = float(is_on_plane(footprint_m, plane, noise_per_m2).double().mean())
-    if flat_share < _FLAT_SHARE:
-        return False
-
-    # Does its plane go on in the rim? Readings at the edge itself may be of either side.
-    pixel_m = float(footprint_m[:, 2].median() / part.K[0, 0])
-    reach_px = EDGE_PX + math.ceil(_RIM_DIAMETERS * surface.diameter_m / pixel_m)
-    is_rim = grow_mask(explained, reach_px) & ~grow_mask(explained, EDGE_PX)
-    if part.background is not None:
-        is_rim &= ~part.background.is_seen
-    rim_share = float(is_on_plane(points_m[is_rim], plane, noise_per_m2).double().mean())
-    return rim_share > _CONTINUED_SHARE

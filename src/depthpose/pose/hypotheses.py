@@ -125,27 +125,31 @@ def compete(
     winner_number = int(shares.argmax())
     winner = different[winner_number]
 
-    # And which of its copies?
-    if view is not None:  # its own colours again, in place of those of its best copy
-        winner = replace(winner, log_color=_log_color(winner.pose, prepared, view))
-    copies = _refine_distinct_copies(cloud_m, winner.refined, prepared, config, view)
-    group = [winner, *map(hypothesize, copies)]
+    # And which of its copies? Others of the poses may be copies too, as about an axis.
+    copies = [winner.refined]
+    copies += _refine_distinct_copies(cloud_m, winner.refined, prepared, config, view)
+    is_copy = [_add_if_copy(hypothesis.refined, copies, prepared) for hypothesis in different]
+    group = [hypothesize(pose) for pose in copies]  # with its own colours, in place of the best's
     share_in_group = share_among_copies(group, is_masked=observation.is_masked)
-
-    # About an axis a pose between two copies is one too: their group has its share.
-    group_poses = Rigid.stack([copy.pose for copy in group])
-    symmetries = _all_symmetries(prepared)
-    is_in_group = torch.tensor(
-        [bool(prepared.copies.is_same(h.pose, group_poses, symmetries).any()) for h in different]
-    )
-    copy_shares = float(shares[is_in_group].sum()) * share_in_group
+    copy_shares = float(shares[torch.tensor(is_copy)].sum()) * share_in_group
     best = int(copy_shares.argmax())
     return Competition(
         best=group[best],
         best_share=float(copy_shares[best]),
         copies=[(h, float(copy_shares[k])) for k, h in enumerate(group) if k != best],
-        others=[(h, float(shares[k])) for k, h in enumerate(different) if not is_in_group[k]],
+        others=[(h, float(shares[k])) for k, h in enumerate(different) if not is_copy[k]],
     )
+
+
+def _add_if_copy(pose: RefinedPose, copies: list[RefinedPose], prepared: PreparedObject) -> bool:
+    """Whether a pose is a near-symmetric copy of one of some; a new one is added to them."""
+    is_same = partial(prepared.copies.is_same, pose.camera_from_model)
+    copy_poses = Rigid.stack([copy.camera_from_model.double() for copy in copies])
+    if not bool(is_same(copy_poses, _all_symmetries(prepared)).any()):
+        return False
+    if not bool(is_same(copy_poses, prepared.copies.symmetries).any()):
+        copies.append(pose)
+    return True
 
 
 def _refine_different_poses(

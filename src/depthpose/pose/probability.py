@@ -73,6 +73,8 @@ VOTES_RAD = 0.15
 """Mean angle between a network's directions and those to the keypoints at a right pose."""
 LEAST_AGREEMENT = 2 / 3
 """Share of what was compared that must support a pose."""
+MOST_CONTINUED = 0.4
+"""Where the surface goes on across so much of the silhouette, the pose lies on something larger."""
 LEAST_POSSIBLE = 0.02
 """A proposal of a search that is less likely goes no further."""
 LEAST_AREA = 1.0
@@ -82,9 +84,12 @@ LEAST_AREA = 1.0
 def probability_right(evidence: Evidence, prior_odds: float) -> float:
     """Probability that a pose is right, up to near-symmetry, and not the best of wrong ones.
 
-    It is 0 where less than two thirds of what was observed supports the pose.
+    It is 0 where less than two thirds of what was observed supports the pose, and where the surface
+    goes on across two fifths of its silhouette.
     """
     if evidence.agreement < LEAST_AGREEMENT:
+        return 0.0
+    if evidence.continued > MOST_CONTINUED * max(LEAST_AREA, evidence.silhouette):
         return 0.0
     log_odds = math.log(prior_odds) + log_likelihood_ratio(evidence)
     return 1 / (1 + math.exp(-min(log_odds, 50.0)))

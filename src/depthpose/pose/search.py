@@ -48,8 +48,8 @@ from depthpose.pose.types import CloudInput, Evidence, PoseEstimate, ViewInput
 
 _MOST_PLACES = 40
 """Largest number of proposals that are looked at in an image."""
-_LEAST_PROPOSALS = 4
-"""Number of proposals of each object that are looked at in any case."""
+_LEAST_PLACES = 4
+"""Number of places of each object that are looked at in any case."""
 _ROUNDS = 4
 """An image is searched at most so many times for an object that is there more than once."""
 _MOST_TOGETHER = 8
@@ -202,13 +202,11 @@ class _Proposal(NamedTuple):
 
     Attributes:
         score: by which the image agrees with it.
-        rank: among those of its object.
         object: its name.
         pose: of the object.
     """
 
     score: float
-    rank: int
     object: str
     pose: Rigid
 
@@ -220,14 +218,14 @@ def _propose(
     claimed: Sequence[_Place],
     targets: SearchTargets,
 ) -> list[_Place]:
-    """Propose poses of every object: the best of all, and some of each; none at a claimed place."""
+    """Propose poses: the best of all objects, and some places of each; none at a claimed place."""
 
     def propose(name: str) -> list[_Proposal]:
         pairs = targets.objects[name].pairs
         poses, score = propose_in_frame(frame, is_unclaimed, pairs, len(names))
         return [
-            _Proposal(score=float(score[rank]), rank=rank, object=name, pose=poses[rank])
-            for rank in range(min(len(score), _MOST_PLACES))
+            _Proposal(score=float(score[k]), object=name, pose=poses[k])
+            for k in range(min(len(score), _MOST_PLACES))
         ]
 
     proposals = [
@@ -237,14 +235,21 @@ def _propose(
     ]
     proposals.sort(key=lambda proposal: -proposal.score)
     places: list[_Place] = []
+    count_of_object = Counter[str]()
     for number, proposal in enumerate(proposals):
-        if number >= _MOST_PLACES and proposal.rank >= _LEAST_PROPOSALS:
+        if number >= _MOST_PLACES and count_of_object[proposal.object] >= _LEAST_PLACES:
             continue
         surface = targets.objects[proposal.object].surface
         explained = explained_frame_mask(frame, proposal.pose, surface)
         place = _Place(object=proposal.object, pose=proposal.pose, explained=explained)
         is_claimed = any(place.shared_with(other) > _SHARED for other in claimed)
-        if len(place.pixels) * frame.step**2 >= _LEAST_PIXELS and not is_claimed:
+        if is_claimed or len(place.pixels) * frame.step**2 < _LEAST_PIXELS:
+            continue
+        same_object = [other for other in places if other.object == place.object]
+        is_new = all(place.shared_with(other) <= _RIVAL for other in same_object)
+        if is_new:
+            count_of_object[proposal.object] += 1
+        if is_new or number < _MOST_PLACES:
             places.append(place)
     return places
 
@@ -335,9 +340,7 @@ def _judge(
         evidence = estimate.evidence
         reason = estimate.reason
         if estimate.camera_from_model is not None:
-            reason = why_background_excludes(
-                frame, view, estimate.camera_from_model.double(), surface
-            )
+            reason = why_background_excludes(frame, estimate.camera_from_model.double(), surface)
         if estimate.camera_from_model is None or evidence is None or reason:
             misses.append(_miss_at(group[0], evidence, reason, targets))
             continue

@@ -12,6 +12,7 @@ from depthpose.core.rigid import Rigid, perturb
 from depthpose.pose.frame import Frame, readings_toward
 from depthpose.pose.icp import tukey_weight
 from depthpose.pose.propose.point_pairs import STEP, PairTable, vote_poses
+from depthpose.pose.sensor import SHARED_PER_WHITE
 from depthpose.pose.surface import NEAR, Surface
 
 # Votes.
@@ -46,7 +47,8 @@ _DAMPING = 0.02
 
 # The score of a pose.
 _DEVIATIONS = 2.0
-"""Of the noise, by which a reading may lie farther off the surface than the stage's limit."""
+"""Of the error that neighbouring readings share, by which a reading may lie farther off the surface
+than the stage's limit."""
 _LEAST_READ = 0.5
 """Least share of the visible surface by which a score is divided, though less of it is read."""
 
@@ -223,7 +225,8 @@ def score_by_image(
     depth_m = visible.points_m[..., 2]
     readings = readings_toward(frame, visible.points_m)
     gap_m = readings.depth_m - depth_m
-    limit_m = stage.near * surface.diameter_m + _DEVIATIONS * frame.noise_per_m2 * depth_m.square()
+    noise_m = SHARED_PER_WHITE * frame.noise_per_m2 * depth_m.square()
+    limit_m = stage.near * surface.diameter_m + _DEVIATIONS * noise_m
     is_background = ~frame.may_show(surface.diameter_m).flatten()[readings.pixel]
 
     # At the depth of the surface, with its normal or another one.
