@@ -151,7 +151,7 @@ class DepthImageNet(nn.Module):
         return outputs[torch.arange(len(image), device=image.device), number]
 
 
-def poses_of(outputs: Float[Tensor, "b 9"], crop: DepthCrop) -> Rigid:
+def make_poses(outputs: Float[Tensor, "b 9"], crop: DepthCrop) -> Rigid:
     """Convert outputs of the network to poses ``camera_from_model``.
 
     The first six numbers are two columns of a rotation, which Gram and Schmidt's method makes

@@ -25,7 +25,7 @@ from depthpose.core.devices import (
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.core.stopwatch import Stopwatch
-from depthpose.pose.baselines import DepthCrop, DepthImageNet, cut_depth, poses_of
+from depthpose.pose.baselines import DepthCrop, DepthImageNet, cut_depth, make_poses
 from depthpose.pose.cloud import (
     ObjectCloud,
     VoxelGrid,
@@ -424,7 +424,7 @@ class DepthImageRegressor(PoseEstimator):
         with watch.stage("network"):
             batch = DepthCrop(*(part[None].to(self.config.device) for part in crop))
             numbers = torch.tensor([prepared.number], device=self.config.device)
-            poses = poses_of(self._network(batch.image, numbers), batch)
+            poses = make_poses(self._network(batch.image, numbers), batch)
             pose = Rigid(poses.R[0].cpu().float(), poses.t_m[0].cpu().float())
         estimate = PoseEstimate(
             name=pose_input.name,

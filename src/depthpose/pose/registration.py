@@ -15,10 +15,10 @@ from depthpose.pose.inputs import AnyInput
 from depthpose.pose.mesh import (
     AnyModel,
     AnySymmetry,
+    assign_symmetries,
     declare_symmetry,
     read_model,
     refuse_one_name,
-    symmetry_of_each,
     with_found_symmetries,
 )
 from depthpose.pose.types import ObjectModel, PoseEstimate
@@ -121,7 +121,7 @@ def read_parts(
     Arguments and errors are those of :meth:`Registration.load`.
     """
     models = [read_model(path, unit, number=k) for k, path in enumerate(cad, start=1)]
-    declared = symmetry_of_each(symmetry, [model.name for model in models])
+    declared = assign_symmetries(symmetry, [model.name for model in models])
     for k, model in enumerate(models):
         if model.name in declared:
             models[k] = declare_symmetry(model, declared[model.name])

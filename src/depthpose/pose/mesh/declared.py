@@ -123,7 +123,7 @@ def declare_symmetry(model: ObjectModel, symmetry: AnySymmetry) -> ObjectModel:
     return replace(model, symmetries=declared)
 
 
-def symmetry_of_each(
+def assign_symmetries(
     given: AnySymmetry | Mapping[str, AnySymmetry] | Sequence[str] | None, names: Sequence[str]
 ) -> dict[str, AnySymmetry]:
     """Assign declared symmetries to the objects that have one.
@@ -143,7 +143,7 @@ def symmetry_of_each(
     is_bop = isinstance(given, Mapping) and any(key.startswith("symmetries_") for key in given)
     if isinstance(given, Mapping) and not is_bop:
         for name in given:
-            _refuse_other(name, names, f"symmetry of {name!r}")
+            _refuse_unknown_name(name, names, f"symmetry of {name!r}")
         return dict(given)
 
     # One symmetry or several, which may begin by the name of their object.
@@ -155,7 +155,7 @@ def symmetry_of_each(
         if isinstance(declaration, str):
             name, colon, rest = declaration.partition(":")
         if colon and (name in names or "," in rest):
-            _refuse_other(name, names, f"symmetry {declaration!r}")
+            _refuse_unknown_name(name, names, f"symmetry {declaration!r}")
             symmetry: AnySymmetry = rest
         elif len(names) == 1:
             name = names[0]
@@ -171,7 +171,7 @@ def symmetry_of_each(
     return declared
 
 
-def _refuse_other(name: str, names: Sequence[str], message: str) -> None:
+def _refuse_unknown_name(name: str, names: Sequence[str], message: str) -> None:
     """Refuse the name of no object; ``message`` says what it was given for."""
     if name not in names:
         raise InputError(f"{message}: no object is called so; {nearest_name(name, names)}")

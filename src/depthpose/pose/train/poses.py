@@ -36,7 +36,7 @@ from depthpose.pose.baselines import (
     PointNet,
     PointNetConfig,
     cut_depth,
-    poses_of,
+    make_poses,
 )
 from depthpose.pose.cloud import lift_sample, why_too_few
 from depthpose.pose.config import SHAPE_FEATURES, RefusalConfig
@@ -239,7 +239,7 @@ class DepthImageTask(ViewsTask):
         copies = Rigid(self._copies.R.to(device)[class_of], self._copies.t_m.to(device)[class_of])
         points_m = self._points_m.to(device)[class_of]
         truth = Rigid(batch.R, batch.t_m)
-        error_m = model_point_loss(poses_of(outputs, batch.crop), truth, points_m, copies)
+        error_m = model_point_loss(make_poses(outputs, batch.crop), truth, points_m, copies)
         diameter_m = self._diameter_m.to(device)[class_of]
         yield Update("network", (error_m / diameter_m).mean(), {})
 
@@ -252,7 +252,7 @@ class DepthImageTask(ViewsTask):
         if crop is None:
             return math.inf
         batch = DepthCrop(*(part[None].to(device) for part in crop))
-        poses = poses_of(self.network(batch.image, torch.tensor([number], device=device)), batch)
+        poses = make_poses(self.network(batch.image, torch.tensor([number], device=device)), batch)
         return measure_add(
             Rigid(poses.R[0].cpu(), poses.t_m[0].cpu()), view.truth.camera_from_model, model
         )
