@@ -49,7 +49,9 @@ def cloud_input(cloud: AnyCloud, unit: Unit, object: str, name: str) -> CloudInp
     """
     if is_shape(cloud):
         cloud, _ = shape_geometry(cloud)
-    points = read_cloud(cloud).points if isinstance(cloud, str | Path) else _to_tensor(cloud)
+    points = (
+        read_cloud(cloud).points if isinstance(cloud, str | Path) else _convert_to_tensor(cloud)
+    )
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(
             f"{name}: the cloud is of shape {tuple(points.shape)}; give points as rows of x, y and "
@@ -71,7 +73,9 @@ def depth_input(
         name: what errors call the image, where it is no file.
         unit: of the depth. Whole numbers need it where the camera has no unit.
     """
-    values = read_stored_depth(depth) if isinstance(depth, str | Path) else _to_tensor(depth)
+    values = (
+        read_stored_depth(depth) if isinstance(depth, str | Path) else _convert_to_tensor(depth)
+    )
     if values.ndim != 2:
         raise InputError(f"{name}: the depth is of shape {tuple(values.shape)}, not (h, w)")
     height, width = values.shape
@@ -156,7 +160,7 @@ def rigid_input(
     """Convert a transform, or its 4x4 matrix in metres; ``name`` and ``what`` name it in errors."""
     if isinstance(pose, Rigid):
         return pose
-    matrix = torch.zeros(0) if isinstance(pose, str | Path) else _to_tensor(pose).double()
+    matrix = torch.zeros(0) if isinstance(pose, str | Path) else _convert_to_tensor(pose).double()
     if tuple(matrix.shape) != (4, 4):
         raise InputError(
             f"{name} is a {type(pose).__name__} of shape {tuple(matrix.shape)}; give a Rigid, or "
@@ -201,7 +205,7 @@ def labels_input(mask: AnyMask, name: str) -> Int64[Tensor, "_ _"]:
         return read_labels(Path(mask))
     if isinstance(mask, Mapping):
         return decode_rle(*read_runs(mask, name)).long()
-    values = _to_tensor(mask)
+    values = _convert_to_tensor(mask)
     if values.is_floating_point() and not bool((values % 1 == 0).all()):
         if not bool(((values >= 0) & (values <= 1)).all()):
             raise InputError(
@@ -213,7 +217,7 @@ def labels_input(mask: AnyMask, name: str) -> Int64[Tensor, "_ _"]:
     return number_objects(whole.numpy()) if whole.ndim == 2 else whole
 
 
-def _to_tensor(values: Any) -> Tensor:  # noqa: ANN401  whatever a caller has
+def _convert_to_tensor(values: Any) -> Tensor:  # noqa: ANN401  whatever a caller has
     """Convert numbers of any library to a tensor on the CPU, of a type that torch computes with."""
     if isinstance(values, Tensor) and not values.is_complex():
         # Of unsigned numbers torch supports few operations, but for bytes.

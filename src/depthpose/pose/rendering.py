@@ -42,7 +42,7 @@ def render_surface(
     """
     # The triangles, drawn into the part of the image about them.
     pose = pose.double()
-    window = _window_about(surface, pose, K, height, width)
+    window = _find_window_about(surface, pose, K, height, width)
     rows, columns = window
     shape = rows.stop - rows.start, columns.stop - columns.start
     if 0 in shape:
@@ -66,7 +66,7 @@ def render_surface(
     camera_m = -(pose.R.mT @ pose.t_m)  # in the model frame
     distance_m = (surface.plane_offsets_m - surface.plane_normals @ camera_m).abs().numpy()
     cosine = np.ones(shape)
-    ray_length = _ray_lengths(window_K.numpy(), *shape)
+    ray_length = _measure_ray_lengths(window_K.numpy(), *shape)
     cosine[is_drawn] = distance_m[face[is_drawn]] / (depth_m * ray_length)[is_drawn]
     return Rendering(depth_m, cosine, window)
 
@@ -120,14 +120,14 @@ def _draw_triangles(
                     face[row, column] = f
 
 
-def _ray_lengths(K: np.ndarray, height: int, width: int) -> np.ndarray:
+def _measure_ray_lengths(K: np.ndarray, height: int, width: int) -> np.ndarray:
     """Measure the length of each pixel's ray up to a depth of 1, (h, w)."""
     y = (np.arange(height)[:, None] - K[1, 2]) / K[1, 1]
     x = (np.arange(width) - K[0, 2] - K[0, 1] * y) / K[0, 0]
     return np.sqrt(x**2 + y**2 + 1)
 
 
-def _window_about(
+def _find_window_about(
     surface: Surface, pose: Rigid, K: Float64[Tensor, "3 3"], height: int, width: int
 ) -> tuple[slice, slice]:
     """Find the rows and columns of an image that a posed surface may cover."""

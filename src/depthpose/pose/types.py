@@ -382,7 +382,7 @@ class PoseEstimate:
         eye = torch.eye(3, dtype=torch.float64)
         t_m = self.camera_from_model.t_m.double()
         turned = torch.linalg.cross(eye, t_m.expand(3, 3)).mT
-        std_m = self._std_along(torch.cat([turned, eye], 1), 1e-3)
+        std_m = self._measure_std_along(torch.cat([turned, eye], 1), 1e-3)
         return None if std_m is None else 1000 * std_m
 
     @property
@@ -394,10 +394,10 @@ class PoseEstimate:
         if self.camera_from_model is None:
             return None
         R = self.camera_from_model.R.double()
-        std = self._std_along(torch.cat([R.mT, torch.zeros_like(R)], 1), 1e-2)
+        std = self._measure_std_along(torch.cat([R.mT, torch.zeros_like(R)], 1), 1e-2)
         return None if std is None else std.rad2deg()
 
-    def _std_along(self, rows: Float64[Tensor, "3 6"], least: float) -> Tensor | None:
+    def _measure_std_along(self, rows: Float64[Tensor, "3 6"], least: float) -> Tensor | None:
         """Give standard deviations of linear functions of the motion, or None.
 
         Args:

@@ -91,13 +91,15 @@ def read_geometry(path: AnyModel) -> tuple[np.ndarray, np.ndarray]:
         )
 
     # Polygons become triangles, of which those of the part stay.
-    triangles = _to_triangles(str(path), vertices, faces)
+    triangles = _convert_to_triangles(str(path), vertices, faces)
     if len(triangles) == 0:
         return vertices, triangles
     return _clean_surface(str(path), vertices, triangles)
 
 
-def _to_triangles(path: AnyPath, vertices: np.ndarray, faces: np.ndarray | Ragged) -> np.ndarray:
+def _convert_to_triangles(
+    path: AnyPath, vertices: np.ndarray, faces: np.ndarray | Ragged
+) -> np.ndarray:
     """Convert faces to triangles (m, 3): as they are, or polygons cut."""
     if isinstance(faces, np.ndarray):
         faces = Ragged(np.full(len(faces), faces.shape[1]), faces.reshape(-1))
