@@ -620,6 +620,12 @@ def _estimate_covariance(
     far the pose moves. This is repeated for several block sizes, and the largest result counts,
     because the correlation length is not known. With few blocks a direction can look certain by
     chance, so no direction is inflated by less than the mean over all, or by less than 1.
+
+    Args:
+        cloud_m: the points of the residuals, in the camera frame.
+        equations: residuals, weights and information of each pose.
+        limit_m: distance from which a point has no weight.
+        diameter_m: of the object.
     """
     slope = _differentiate_influence(equations.weight, equations.residual_m, limit_m)
     independent, whitening, spread_m = _factor_independent_covariance(equations, slope)
@@ -673,8 +679,16 @@ def _measure_inflation(
     """Measure the ratios of a block jackknife's variances to independent ones; and directions.
 
     Of several block sizes the one with the largest sum is taken; the ratios are 1 where no size has
-    a larger sum. Directions are columns, in the coordinates of ``whitening``, the inverse of the
-    factor ``independent``.
+    a larger sum. Directions are columns, in the coordinates of ``whitening``.
+
+    Args:
+        cloud_m: the points of the residuals, in the camera frame.
+        equations: residuals, weights and information of each pose.
+        slope: of the influence of each residual.
+        independent: factor of the covariance under independent residuals.
+        whitening: its inverse.
+        spread_m: standard deviation of the residuals.
+        diameter_m: of the object.
     """
     # What each point adds to the gradient and to the information.
     inverse_information = independent @ independent.mT / spread_m.square()

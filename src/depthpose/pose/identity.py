@@ -160,7 +160,16 @@ def _grow(
     target: Target,
     is_exact: bool,
 ) -> None:
-    """Take steps of ICP with a scale, until no start moves any more; points and scales change."""
+    """Take steps of ICP with a scale, until no start moves any more.
+
+    Args:
+        local: points in the model frame, for each start; changed.
+        times: scale of each start; changed.
+        middle: about which the surface grows.
+        limits: of the distance, for each step.
+        target: samples of the surface.
+        is_exact: whether samples are searched, not looked up in a table.
+    """
     places = np.full(local.shape[:2], -1)
     for limit in limits:
         largest = 0.0
@@ -196,6 +205,15 @@ def _linearise_growth(
 
     By rotation and translation of the surface, and by its growth about its middle. Where it is not
     known which side of a surface was seen, all samples count.
+
+    Args:
+        local: points in the model frame.
+        scale: of the surface.
+        middle: about which it grows.
+        limit: distance from which a point has no weight.
+        target: samples of the surface at its own size.
+        is_exact: whether samples are searched, not looked up in a table.
+        places: of the samples of the points, or -1; written.
     """
     # Matched with the surface at its own size.
     count = len(local)

@@ -93,6 +93,14 @@ def _select_rank(
     """Partially sort ``order[low:high + 1]`` by a coordinate: rank ``wanted`` gets to its place.
 
     Quickselect (Hoare 1961): smaller ones come before it, larger ones after it.
+
+    Args:
+        points: in any order.
+        order: indices of points; changed.
+        low: first place of the range that is sorted.
+        high: its last place.
+        wanted: the rank, as a place in the range.
+        axis: of the coordinate.
     """
     while low < high:
         pivot = points[order[(low + high) // 2], axis]
@@ -124,8 +132,13 @@ def faces(
 ) -> bool:
     """Whether a point shows a camera, ``eye``, its outer side.
 
-    ``least`` is the least component of the outward normal along the way to the camera, in units of
-    length; below 0 it lets points count that nearly face it, and all at minus infinity.
+    Args:
+        points: of a tree.
+        outward: their normals.
+        place: of the point.
+        eye: the camera.
+        least: the least component of the outward normal along the way to the camera, in units of
+            length; below 0 it lets points count that nearly face it, and all at minus infinity.
     """
     return dot(vector(outward, place), minus(eye, vector(points, place))) >= least
 

@@ -83,6 +83,14 @@ def _draw_triangles(
     """Write the depth and the number of the nearest triangle into the pixels that it covers.
 
     Without clipping: a triangle with a corner nearer than ``_NEAR_M`` is left out.
+
+    Args:
+        corners_m: of the triangles, in the model frame.
+        R: rotation of the pose.
+        t_m: its translation.
+        K: intrinsic matrix of the window.
+        depth_m: infinite at first; changed.
+        face: -1 at first; changed.
     """
     height, width = depth_m.shape
     u = np.empty(3)

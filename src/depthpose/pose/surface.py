@@ -554,7 +554,16 @@ def _draw_cells(
     middle: Float64[np.ndarray, "2"],
     nearest: Float64[np.ndarray, " cells"],
 ) -> None:
-    """Write the depth of the nearest posed point in each cell; infinity where there is none."""
+    """Write the depth of the nearest posed point in each cell; infinity where there is none.
+
+    Args:
+        points: of the surface, in the model frame.
+        R: rotation of the pose.
+        t: its translation.
+        scale: cells per unit of x / z and y / z.
+        middle: column and row of the middle cell.
+        nearest: is written.
+    """
     nearest[:] = np.inf
     for i in range(len(points)):
         point = vector(points, i)

@@ -189,6 +189,13 @@ def draw_field(
 
     All are in the camera frame, directions of unit length, and drawn in the plane of x and y: an
     arrow that points away from the viewer is short. The picture holds the cloud and both keypoints.
+
+    Args:
+        points_m: where the directions begin.
+        directions: to the keypoint.
+        true_m: the true keypoint.
+        voted_m: the voted one; None: none is drawn.
+        size_px: width and height of the picture.
     """
     # The scale by which everything fits into the picture.
     keypoints_xy = torch.stack([true_m, true_m if voted_m is None else voted_m]).double()[:, :2]

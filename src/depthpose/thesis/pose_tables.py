@@ -418,6 +418,13 @@ def ransac_one_by_one(
     A hypothesis is the point nearest to the lines of two random points; its inliers are the points
     from which the cosine between unit direction and hypothesis is more than ``min_cosine``. The one
     with the most is refitted to its inliers. Published practice is 50 hypotheses for each keypoint.
+
+    Args:
+        points_m: where the votes start.
+        directions: unit vectors.
+        hypotheses: for each keypoint.
+        min_cosine: of inliers.
+        seed: of the pairs of points.
     """
     random = np.random.default_rng(seed)
     keypoints: list[np.ndarray] = []

@@ -383,6 +383,12 @@ def write_bop_scene(
 ) -> Path:  # fmt: skip
     """Write a scene whole: images and masks first, so that its JSON never names what is missing.
 
+    Args:
+        folder: of the data set.
+        split: name of the split.
+        scene_id: number of the scene.
+        frames: its images.
+
     Returns:
         The folder of the scene.
 

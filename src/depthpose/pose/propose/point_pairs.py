@@ -301,6 +301,14 @@ def _write_feature(
 
     The feature is the distance, the angles of both normals to the line between the points, and the
     angle between the normals (Drost et al., equation 1); as fractions of bins.
+
+    Args:
+        points: of the model or the scene.
+        frames: normal and two tangents of each, as columns.
+        i: index of the first point of the pair.
+        j: index of the second.
+        step: a bin of the distance.
+        feature: is written.
     """
     # The way from the first point to the second along the first's normal and tangents, and along
     # the second's normal; and the cosine of the two normals.
@@ -452,7 +460,15 @@ def _vote_by_pair(
     voted: UInt32[np.ndarray, " bounds"],
     counts: Float32[np.ndarray, "m turns"],
 ) -> None:
-    """Add the votes of the model's pairs with the feature of a pair of the scene, or nearly so."""
+    """Add the votes of the model's pairs with the feature of a pair of the scene, or nearly so.
+
+    Args:
+        feature: of the pair of the scene, as fractions of bins.
+        turn: of its second point about the normal of the first.
+        pairs: of the model.
+        voted: for each feature, which turns have voted; changed.
+        counts: votes of each model point and turn; changed.
+    """
     key = _make_key(feature)
     _add_votes(key, turn, pairs, voted, counts)
 
@@ -500,7 +516,14 @@ def _find_peaks(
     best_turn: Int64[np.ndarray, " peaks"],
     best_votes: Float64[np.ndarray, " peaks"],
 ) -> None:
-    """Write the model points with the most votes, at the best turn of each."""
+    """Write the model points with the most votes, at the best turn of each.
+
+    Args:
+        counts: votes of each model point and turn.
+        best_point: is written: model points, those of the most votes first.
+        best_turn: is written: bins of turns.
+        best_votes: is written.
+    """
     # The best turn of each model point.
     models = len(counts)
     most = np.empty(models)

@@ -117,6 +117,12 @@ def occlude(
 ) -> tuple[Depth, Mask]:
     """Occlude exactly a share of a silhouette by something before it.
 
+    Args:
+        depth_m: of the object and what is behind it.
+        silhouette: pixels of the object.
+        share: of them, that is occluded.
+        generator: of random numbers.
+
     Returns:
         The depth with the occluder, and the part of the silhouette that stays visible.
     """

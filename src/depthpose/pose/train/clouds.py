@@ -192,6 +192,12 @@ def voxelise_sample(
     """Choose points of a sample and voxelise them, as an estimate does.
 
     Cloud and true pose are rotated to the axes of the grid.
+
+    Args:
+        sample: cloud and pose.
+        class_number: of its object in the network.
+        config: how many points, and the grid.
+        generator: chooses the points.
     """
     points = sample_points(sample.input.points_m, config.max_points, generator)
     voxels = voxelise(points, config)
