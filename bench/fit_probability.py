@@ -165,7 +165,7 @@ def view_of(group: str, registration: Registration, arguments: Any, truth: Rigid
 
     with patch.object(hypotheses, "share_among_poses", remember):
         registration.estimate(**arguments)
-    copies = registration._object(registration.objects[0]).prepare().copies
+    copies = registration._find_object(registration.objects[0]).prepare().copies
     symmetries = Rigid.cat([copies.symmetries, copies.near_copies])
     true_pose = truth.double()[None]
     is_right = [

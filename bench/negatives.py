@@ -14,14 +14,14 @@ from depthpose.pose.mesh import MIRROR_ALIKE, make_model, mirror_deviation
 from depthpose.pose.synthetic.parts import (
     PARTS,
     Mesh,
-    box,
-    circle,
-    joined,
+    join,
+    make_box,
+    make_circle,
     make_part,
-    moved,
-    revolved,
-    ring,
-    turned,
+    make_ring,
+    move,
+    revolve,
+    rotate,
 )
 from depthpose.pose.synthetic.views import random_index, random_rotation, uniform
 from depthpose.pose.types import ObjectModel
@@ -157,11 +157,11 @@ def random_part(generator: torch.Generator, name: str = "part") -> ObjectModel:
     for _ in range(3 + random_index(generator, 4)):
         piece = _random_solid(generator)
         for axis in np.eye(3).tolist():
-            piece = turned(piece, (axis[0], axis[1], axis[2]), 90.0 * random_index(generator, 4))
+            piece = rotate(piece, (axis[0], axis[1], axis[2]), 90.0 * random_index(generator, 4))
         if random_index(generator, 4) == 0:
-            piece = turned(piece, (0.0, 0.0, 1.0), uniform(generator, 0.0, 90.0))
-        pieces.append(moved(piece, tuple(uniform(generator, -35.0, 35.0) for _ in range(3))))
-    vertices, faces = joined(*pieces)
+            piece = rotate(piece, (0.0, 0.0, 1.0), uniform(generator, 0.0, 90.0))
+        pieces.append(move(piece, tuple(uniform(generator, -35.0, 35.0) for _ in range(3))))
+    vertices, faces = join(*pieces)
     return make_model(torch.from_numpy(vertices) * metres_of("mm"), torch.from_numpy(faces),
                       name=name)  # fmt: skip
 
@@ -179,17 +179,17 @@ def random_simple_part(generator: torch.Generator, name: str = "part") -> Object
     width, depth, length = (uniform(generator, 20.0, 90.0) for _ in range(3))
     wall = uniform(generator, 3.0, 10.0)
     bore = uniform(generator, 0.3, 0.9)
-    foot = box((width, wall, length))
-    web = box((wall, depth, length))
+    foot = make_box((width, wall, length))
+    web = make_box((wall, depth, length))
     edge = (width - wall) / 2
-    left, middle, right = (moved(web, (x, depth / 2, 0.0)) for x in (-edge, 0.0, edge))
+    left, middle, right = (move(web, (x, depth / 2, 0.0)) for x in (-edge, 0.0, edge))
     solids = [
-        box((width, depth, length)),
-        ring(circle(width / 2), circle(bore * width / 2), length),
+        make_box((width, depth, length)),
+        make_ring(make_circle(width / 2), make_circle(bore * width / 2), length),
         _cup(width / 2, length, wall),
-        joined(foot, left),
-        joined(foot, middle),
-        joined(foot, left, right),
+        join(foot, left),
+        join(foot, middle),
+        join(foot, left, right),
     ]
     vertices, faces = solids[random_index(generator, len(solids))]
     return make_model(torch.from_numpy(vertices) * metres_of("mm"), torch.from_numpy(faces),
@@ -198,7 +198,7 @@ def random_simple_part(generator: torch.Generator, name: str = "part") -> Object
 
 def _cup(radius: float, height: float, wall: float) -> Mesh:
     inner = radius - min(wall, radius / 2)
-    return revolved([(0.0, 0.0), (radius, 0.0), (radius, height), (inner, height),
+    return revolve([(0.0, 0.0), (radius, 0.0), (radius, height), (inner, height),
                       (inner, radius - inner), (0.0, radius - inner)])  # fmt: skip
 
 
@@ -207,10 +207,10 @@ def _random_solid(generator: torch.Generator) -> Mesh:
     kind = random_index(generator, 3)
     height = uniform(generator, 10.0, 90.0)
     if kind == 0:
-        return box((uniform(generator, 4.0, 80.0), uniform(generator, 4.0, 60.0), height))
+        return make_box((uniform(generator, 4.0, 80.0), uniform(generator, 4.0, 60.0), height))
     lower_radius = uniform(generator, 3.0, 35.0)
     upper_radius = uniform(generator, 3.0, 35.0)
     if kind == 1:
         bore = uniform(generator, 0.2, 0.8) * lower_radius
-        return ring(circle(lower_radius), circle(bore), height)
-    return revolved([(0.0, 0.0), (lower_radius, 0.0), (upper_radius, height), (0.0, height)])
+        return make_ring(make_circle(lower_radius), make_circle(bore), height)
+    return revolve([(0.0, 0.0), (lower_radius, 0.0), (upper_radius, height), (0.0, height)])

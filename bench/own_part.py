@@ -23,7 +23,7 @@ from depthpose.pose.config import EstimateConfig
 from depthpose.pose.metrics import SUCCESS_SHARE
 from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.pose.registration import Registration
-from depthpose.pose.train.clouds import add_error, held_out_objects
+from depthpose.pose.train.clouds import make_held_out_objects, measure_add
 from depthpose.pose.train.config import PoseTraining
 from depthpose.pose.weights import PoseWeights, read_pose_weights
 from depthpose.report.page import markdown_table
@@ -69,12 +69,14 @@ def measure(weights: PoseWeights, number: int) -> list[dict[str, Any]]:
     rows = []
     for share in (0.0, 0.3):
         held_out = dataclasses.replace(config.held_out, number=number)
-        views = held_out_objects(weights.models, config.objects, weights.cloud, held_out, share)
+        views = make_held_out_objects(
+            weights.models, config.objects, weights.cloud, held_out, share
+        )
         samples = [views.view(index) for index in range(len(views))]
         for name, method in methods.items():
             estimates = method.estimate_many([sample.input for sample in samples])
             errors = [
-                add_error(
+                measure_add(
                     estimate.camera_from_model, sample.truth.camera_from_model, weights.models[0]
                 )
                 for estimate, sample in zip(estimates, samples, strict=True)

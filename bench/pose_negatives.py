@@ -33,7 +33,7 @@ from depthpose.pose.mesh import MIRROR_ALIKE, mirror_deviation
 from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.pose.registration import Registration
 from depthpose.pose.synthetic import Objects
-from depthpose.pose.train.clouds import add_error
+from depthpose.pose.train.clouds import measure_add
 from depthpose.pose.types import CloudSample, ObjectModel, ViewSample
 from depthpose.report.page import markdown_table
 
@@ -92,7 +92,7 @@ def measure(
         estimates += net.estimate_many(inputs[start : start + BATCH_SIZE])
     rows = []
     for sample, model, estimate in zip(samples, requested, estimates, strict=True):
-        error = add_error(estimate.camera_from_model, sample.truth.camera_from_model, model)
+        error = measure_add(estimate.camera_from_model, sample.truth.camera_from_model, model)
         is_alike = kind == "mirrored" and mirror_deviation(model) <= MIRROR_ALIKE
         rows.append(
             {

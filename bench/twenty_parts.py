@@ -20,7 +20,16 @@ from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import SensorKind, SyntheticSensorConfig
 from depthpose.pose.mesh import drawn_triangles
-from depthpose.pose.synthetic.parts import Mesh, box, circle, joined, moved, revolved, ring, turned
+from depthpose.pose.synthetic.parts import (
+    Mesh,
+    join,
+    make_box,
+    make_circle,
+    make_ring,
+    move,
+    revolve,
+    rotate,
+)
 from depthpose.pose.synthetic.views import random_rotation, simulate_depth, uniform
 from depthpose.pose.types import ObjectModel
 
@@ -64,7 +73,7 @@ class Part(NamedTuple):
 
 def teeth(number: int, radius: float, depth: float, *, is_leaning: bool = False) -> np.ndarray:
     """Outline a toothed wheel about the origin, with as many corners as a circle."""
-    unit = circle(1.0)
+    unit = make_circle(1.0)
     phase = number * np.arange(len(unit)) % len(unit) / len(unit)  # 0 to 1 over each tooth
     height = 1 - 2 * phase if is_leaning else np.tanh(3 * np.cos(2 * math.pi * phase))
     return (radius + depth / 2 * height)[:, None] * unit
@@ -72,7 +81,7 @@ def teeth(number: int, radius: float, depth: float, *, is_leaning: bool = False)
 
 def notched(radius: float, depth: float, width_rad: float) -> np.ndarray:
     """Outline a circle with a notch along x; one of negative depth points outward."""
-    unit = circle(1.0)
+    unit = make_circle(1.0)
     is_notch = unit[:, 0] > math.cos(width_rad / 2)
     return (radius - depth * is_notch)[:, None] * unit
 
@@ -80,139 +89,146 @@ def notched(radius: float, depth: float, width_rad: float) -> np.ndarray:
 def bar(length: float, radius: float) -> Mesh:
     """A round bar along x."""
     half = length / 2
-    upright = revolved([(0, -half), (radius, -half), (radius, half), (0, half)])
-    return turned(upright, Y, 90.0)
+    upright = revolve([(0, -half), (radius, -half), (radius, half), (0, half)])
+    return rotate(upright, Y, 90.0)
 
 
 def profile(shift: float) -> Mesh:
     """An L profile of 600 mm with a block at one end."""
-    flange = moved(box((600, 40, 3)), (0, 0, -11))
-    web = moved(box((600, 3, 25)), (0, -18.5, 0))
-    return joined(flange, web, moved(box((20, 30, 12)), (285 - shift, 2, -4)))
+    flange = move(make_box((600, 40, 3)), (0, 0, -11))
+    web = move(make_box((600, 3, 25)), (0, -18.5, 0))
+    return join(flange, web, move(make_box((20, 30, 12)), (285 - shift, 2, -4)))
 
 
 def channel(shift: float) -> Mesh:
     """A U channel of 500 mm with a wall near one end."""
-    base = moved(box((500, 30, 2)), (0, 0, -14))
-    sides = [moved(box((500, 2, 30)), (0, y, 0)) for y in (-14.0, 14.0)]
-    return joined(base, *sides, moved(box((3, 28, 26)), (240 - shift, 0, 0)))
+    base = move(make_box((500, 30, 2)), (0, 0, -14))
+    sides = [move(make_box((500, 2, 30)), (0, y, 0)) for y in (-14.0, 14.0)]
+    return join(base, *sides, move(make_box((3, 28, 26)), (240 - shift, 0, 0)))
 
 
 def keyed_shaft(shift: float) -> Mesh:
     """A shaft of 300 mm with a key near one end."""
-    return joined(bar(300, 12), moved(box((40, 6, 10)), (115 - shift, 0, 11)))
+    return join(bar(300, 12), move(make_box((40, 6, 10)), (115 - shift, 0, 11)))
 
 
 def flat_shaft(shift: float) -> Mesh:
     """A shaft of 250 mm with a flat of 60 mm at one end."""
-    outline = circle(14.0).copy()
+    outline = make_circle(14.0).copy()
     outline[:, 0] = np.minimum(outline[:, 0], 8.0)
-    flat = turned(ring(outline, circle(0.01), 60.0 + shift), Y, 90.0)
+    flat = rotate(make_ring(outline, make_circle(0.01), 60.0 + shift), Y, 90.0)
     round_part = bar(190.0 - shift, 14.0)
-    return joined(moved(round_part, (-30.0 - shift / 2, 0, 0)), moved(flat, (95 - shift / 2, 0, 0)))
+    return join(move(round_part, (-30.0 - shift / 2, 0, 0)), move(flat, (95 - shift / 2, 0, 0)))
 
 
 def flanged_tube(shift: float) -> Mesh:
     """A tube of 350 mm with a flange near one end."""
-    tube = turned(ring(circle(20), circle(16), 350), Y, 90.0)
-    flange = turned(ring(circle(32), circle(18), 8), Y, 90.0)
-    return joined(tube, moved(flange, (160 - shift, 0, 0)))
+    tube = rotate(make_ring(make_circle(20), make_circle(16), 350), Y, 90.0)
+    flange = rotate(make_ring(make_circle(32), make_circle(18), 8), Y, 90.0)
+    return join(tube, move(flange, (160 - shift, 0, 0)))
 
 
 def rail(shift: float) -> Mesh:
     """A rail of 400 mm with two carriages, not at equal distances from the ends."""
-    carriages = [moved(box((50, 36, 16)), (x, 0, 12)) for x in (-130.0, 90.0 + shift)]
-    return joined(box((400, 24, 14)), *carriages)
+    carriages = [move(make_box((50, 36, 16)), (x, 0, 12)) for x in (-130.0, 90.0 + shift)]
+    return join(make_box((400, 24, 14)), *carriages)
 
 
 def plate(shift: float) -> Mesh:
     """A plate of 3 mm with a boss off its middle."""
-    return joined(box((150, 100, 3)), moved(ring(circle(14), circle(7), 8), (35 - shift, 18, 4)))
+    return join(
+        make_box((150, 100, 3)),
+        move(make_ring(make_circle(14), make_circle(7), 8), (35 - shift, 18, 4)),
+    )
 
 
 def washer(shift: float) -> Mesh:
     """A washer of 3 mm with a notch."""
-    return ring(notched(40, 9 - shift, 0.5), circle(20), 3)
+    return make_ring(notched(40, 9 - shift, 0.5), make_circle(20), 3)
 
 
 def sheet_bracket(shift: float) -> Mesh:
     """A bracket of sheet metal of 2 mm, with a tab on one side."""
-    base = box((80, 60, 2))
-    wall = moved(box((2, 60, 50)), (-39, 0, 25))
-    return joined(base, wall, moved(box((20, 2, 14)), (15 - shift, 29, 7)))
+    base = make_box((80, 60, 2))
+    wall = move(make_box((2, 60, 50)), (-39, 0, 25))
+    return join(base, wall, move(make_box((20, 2, 14)), (15 - shift, 29, 7)))
 
 
 def clip(shift: float) -> Mesh:
     """A clip of sheet metal with legs of unlike length."""
-    back = moved(box((2, 24, 40)), (-30, 0, 0))
-    long_leg = moved(box((70, 24, 2)), (5, 0, 19))
-    short_leg = moved(box((50 + shift, 24, 2)), (-5 + shift / 2, 0, -19))
-    return joined(back, long_leg, short_leg)
+    back = move(make_box((2, 24, 40)), (-30, 0, 0))
+    long_leg = move(make_box((70, 24, 2)), (5, 0, 19))
+    short_leg = move(make_box((50 + shift, 24, 2)), (-5 + shift / 2, 0, -19))
+    return join(back, long_leg, short_leg)
 
 
 def comb(shift: float) -> Mesh:
     """A comb of five prongs, of which the outer one is shorter."""
-    prongs = [moved(box((8, 60, 4)), (x, 38, 0)) for x in (-40.0, -20.0, 0.0, 20.0)]
-    return joined(
-        box((100, 18, 4)), *prongs, moved(box((8, 40 + shift, 4)), (40, 28 + shift / 2, 0))
+    prongs = [move(make_box((8, 60, 4)), (x, 38, 0)) for x in (-40.0, -20.0, 0.0, 20.0)]
+    return join(
+        make_box((100, 18, 4)), *prongs, move(make_box((8, 40 + shift, 4)), (40, 28 + shift / 2, 0))
     )
 
 
 def gear(shift: float) -> Mesh:
     """A gear of 24 teeth with a hub and a keyway."""
-    wheel = ring(teeth(24, 50, 7), notched(12, -5, 0.6), 14)
-    return joined(wheel, moved(ring(circle(20), notched(12, -5, 0.6), 10 + shift), (0, 0, 12)))
+    wheel = make_ring(teeth(24, 50, 7), notched(12, -5, 0.6), 14)
+    return join(
+        wheel, move(make_ring(make_circle(20), notched(12, -5, 0.6), 10 + shift), (0, 0, 12))
+    )
 
 
 def sprocket(shift: float) -> Mesh:
     """A sprocket of 12 teeth with a pin off its middle."""
-    pin = revolved([(0, 0), (5, 0), (5, 12), (0, 12)])
-    return joined(ring(teeth(12, 45, 10), circle(8), 6), moved(pin, (24 - shift, 0, 3)))
+    pin = revolve([(0, 0), (5, 0), (5, 12), (0, 12)])
+    return join(make_ring(teeth(12, 45, 10), make_circle(8), 6), move(pin, (24 - shift, 0, 3)))
 
 
 def rack(shift: float) -> Mesh:
     """A rack of 200 mm with a block on one end."""
-    ridges = [moved(box((5, 20, 6)), (x, 0, 11)) for x in np.arange(-95.0, 96.0, 10.0)]
-    return joined(box((200, 20, 16)), *ridges, moved(box((16, 20, 12)), (92 - shift, 0, -14)))
+    ridges = [move(make_box((5, 20, 6)), (x, 0, 11)) for x in np.arange(-95.0, 96.0, 10.0)]
+    return join(
+        make_box((200, 20, 16)), *ridges, move(make_box((16, 20, 12)), (92 - shift, 0, -14))
+    )
 
 
 def ratchet(shift: float) -> Mesh:
     """A ratchet of 16 leaning teeth with a hub on one side."""
-    wheel = ring(teeth(16, 40, 9, is_leaning=True), circle(10), 8)
-    return joined(wheel, moved(ring(circle(18), circle(10), 12 + shift), (0, 0, 10)))
+    wheel = make_ring(teeth(16, 40, 9, is_leaning=True), make_circle(10), 8)
+    return join(wheel, move(make_ring(make_circle(18), make_circle(10), 12 + shift), (0, 0, 10)))
 
 
 def nut(shift: float) -> Mesh:
     """A nut of 60 mm with a collar on one side."""
-    unit = circle(1.0)
+    unit = make_circle(1.0)
     angle = np.arange(len(unit)) * (2 * math.pi / len(unit))
     to_side = (angle + math.pi / 6) % (math.pi / 3) - math.pi / 6
     hexagon = (30 / np.cos(to_side))[:, None] * unit
-    collar = moved(ring(circle(38 - shift), circle(16), 4), (0, 0, -12))
-    return joined(ring(hexagon, circle(16), 24), collar)
+    collar = move(make_ring(make_circle(38 - shift), make_circle(16), 4), (0, 0, -12))
+    return join(make_ring(hexagon, make_circle(16), 24), collar)
 
 
 def dice(shift: float) -> Mesh:
     """A cube of 50 mm with a boss off the middle of one face."""
-    boss = revolved([(0, 0), (9, 0), (9, 8), (0, 8)])
-    return joined(box((50, 50, 50)), moved(boss, (10 - shift, 6, 25)))
+    boss = revolve([(0, 0), (9, 0), (9, 8), (0, 8)])
+    return join(make_box((50, 50, 50)), move(boss, (10 - shift, 6, 25)))
 
 
 def cup(shift: float) -> Mesh:
     """A cup with a small handle."""
-    wall = revolved([(0, 0), (30, 0), (36, 70), (32, 70), (27, 5), (0, 5)])
-    return joined(wall, moved(box((18, 8, 26)), (40, 0, 40 - shift)))
+    wall = revolve([(0, 0), (30, 0), (36, 70), (32, 70), (27, 5), (0, 5)])
+    return join(wall, move(make_box((18, 8, 26)), (40, 0, 40 - shift)))
 
 
 def knob(shift: float) -> Mesh:
     """A knob with a pointer."""
-    body = revolved([(0, 0), (28, 0), (24, 24), (0, 24)])
-    return joined(body, moved(box((22, 6, 6)), (12 - shift, 0, 26)))
+    body = revolve([(0, 0), (28, 0), (24, 24), (0, 24)])
+    return join(body, move(make_box((22, 6, 6)), (12 - shift, 0, 26)))
 
 
 def lid(shift: float) -> Mesh:
     """A box of 90x50x30 mm with a lip along one long edge."""
-    return joined(box((90, 50, 30)), moved(box((60, 8, 4)), (shift, 28, 11)))
+    return join(make_box((90, 50, 30)), move(make_box((60, 8, 4)), (shift, 28, 11)))
 
 
 PARTS: dict[str, Part] = {

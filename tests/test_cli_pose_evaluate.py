@@ -12,7 +12,7 @@ from tests.pose.synthetic_objects import tiny_weights
 from depthpose.cli import main
 from depthpose.core.checkpoint import file_sha256
 from depthpose.pose.datasets import BopDataset, Detection, encode_rle, read_mask, write_detections
-from depthpose.pose.evaluate import frames_hash
+from depthpose.pose.evaluate import hash_frames
 from depthpose.pose.predictions import read_predictions, write_bop_results, write_predictions
 from depthpose.pose.weights import write_pose_weights
 
@@ -41,7 +41,7 @@ def test_a_csv_is_measured(
     assert mean["success"] == pooled["success"] == 0.5
     assert mean["method"] == "theirs_made-test"
     assert mean["weights_sha256"] == file_sha256(file)[:12]
-    assert mean["frames_sha256"] == frames_hash(synthetic.instances)[:12]
+    assert mean["frames_sha256"] == hash_frames(synthetic.instances)[:12]
     assert mean["diameters"] == "bop"
     assert "| theirs_made-test |" in (out / "table.md").read_text()
     with (out / "instances.csv").open() as lines:

@@ -20,7 +20,7 @@ from depthpose.depth.disparity import depth_deviation
 from depthpose.depth.synthetic import draw_scene
 from depthpose.depth.synthetic.mesh import MeshBuilder, Surface
 from depthpose.depth.synthetic.scene import Markings, StreetScene, draw_weather
-from depthpose.pose.synthetic.parts import part_mesh
+from depthpose.pose.synthetic.parts import make_part_mesh
 
 pytestmark = pytest.mark.skipif(
     not (SHIPPED / "default.safetensors").is_file(), reason="no weights ship yet"
@@ -33,7 +33,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A part before a wall, seen by a rig of 8 cm; its mask, and its CAD file in millimetres."""
     home = tmp_path_factory.mktemp("pair")
     write_part("bracket", home)
-    vertices_mm, faces = part_mesh("bracket")
+    vertices_mm, faces = make_part_mesh("bracket")
     turn = Rotation.from_euler("xyz", [200, 25, 40], degrees=True).as_matrix()
     corners = np.asarray(vertices_mm)[np.asarray(faces)] / 1000 @ turn.T + PLACE_M
     rng = np.random.default_rng(2)

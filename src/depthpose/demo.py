@@ -120,6 +120,7 @@ def _show_scene(
     Returns:
         A row for each method, and the sections of the page.
     """
+    # The pair, as files.
     pair = sample.input
     truth = sample.truth
     folder = out / pair.name
@@ -131,6 +132,8 @@ def _show_scene(
     write_image(folder / "right.png", pair.right)
     write_camera(folder / "camera.json", pair.camera)
     write_image(folder / "depth.color.png", draw_depth(truth.depth_m, *range_m))
+
+    # The depth of each method.
     rows: list[dict[str, Any]] = []
     sections: list[Section] = []
     homes = {method: out / method.lower().replace(",", "").replace(" ", "-") for method in nets}
@@ -149,6 +152,7 @@ def _show_scene(
         row |= measure("depth", predicted_m[mask], truth.depth_m[mask])
         rows.append(row)
 
+        # Its part of the page.
         error_px = (estimate.disparity_px - truth.disparity_px).abs()
         error = DepthError(error=error_px, is_disparity=True)
         title = f"{pair.name}: {method}, {views}"
@@ -157,6 +161,7 @@ def _show_scene(
         )
         sections.append(section)
 
+    # Above them the pair, the first method's depth and the truth.
     first_method = next(iter(nets))
     estimated_picture = homes[first_method] / f"{pair.name}.color.png"
     true_picture = folder / "depth.color.png"
@@ -178,6 +183,8 @@ def read_motorcycle() -> StereoSample | None:
         from skimage.data import stereo_motorcycle
     except ImportError:
         return None
+
+    # The camera.
     left, right, disparity = stereo_motorcycle()
     K = torch.tensor([[994.978, 0, 311.193], [0, 994.978, 254.877], [0, 0, 1]], dtype=torch.float64)
     rig = StereoRig(
@@ -187,13 +194,14 @@ def read_motorcycle() -> StereoSample | None:
         baseline_m=0.193001,
         cx_right_minus_left_px=31.086,
     )
+
+    # Truth and views.
     disparity_px = torch.from_numpy(np.array(disparity, np.float32))
     disparity_px[~torch.isfinite(disparity_px)] = torch.nan
     truth = StereoTruth(disparity_px=disparity_px, depth_m=depth_from_disparity(disparity_px, rig))
-    views = [
-        torch.from_numpy(np.array(view)).permute(2, 0, 1).float() / 255 for view in (left, right)
-    ]
-    pair = StereoInput(name="motorcycle", left=views[0], right=views[1], camera=rig)
+    left_view = torch.from_numpy(np.array(left)).permute(2, 0, 1).float() / 255
+    right_view = torch.from_numpy(np.array(right)).permute(2, 0, 1).float() / 255
+    pair = StereoInput(name="motorcycle", left=left_view, right=right_view, camera=rig)
     return StereoSample(input=pair, truth=truth)
 
 
@@ -222,6 +230,7 @@ def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
 
     The frame is written as a data set, one of its parts as files of a first command.
     """
+    # A frame that shows each part once.
     net = GeoPoseNet.load(weights)
     models = {model.number: model for model in net.weights.models}
     count = len(models)
@@ -231,6 +240,7 @@ def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
     frame = next(make_frames(tuple(models.values()), config, 1, first=_FRAME))
     assert frame.rgb is not None
 
+    # As a data set, and one part as files.
     write_bop_models(out / "parts", net.weights.models)
     write_bop_scene(out / "parts", "test", 0, [frame])
     dataset = open_bop(out / "parts")
@@ -247,19 +257,23 @@ def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
     ]
     folder = out / "geo-posenet"
     write_predictions(folder, predictions)
+
+    # What the page says of each part; the error is that of the nearest copy.
     nearest = [
-        replace(prediction, estimate=_at_nearest_copy(prediction.estimate, instance, models))
+        replace(prediction, estimate=_choose_nearest_copy(prediction.estimate, instance, models))
         for prediction, instance in zip(predictions, dataset.instances, strict=True)
     ]
-    copies = {estimate.object: len(_named_copies(estimate)) for estimate in estimates}
+    copies = {estimate.object: len(_list_named_copies(estimate)) for estimate in estimates}
     measured = [row.columns() for row in evaluate(dataset, nearest).per_instance]
     rows = [_select_columns({**row, "copies": copies[row["object"]]}) for row in measured]
 
-    # Pictures, clouds and a scene of them.
+    # The sensor's cloud.
     points_m = back_project(frame.depth_m, frame.K).reshape(-1, 3)
     has_reading = points_m.isfinite().all(-1) & (points_m[:, 2] > 0)
     color = frame.rgb.permute(1, 2, 0).reshape(-1, 3)[has_reading]
     table = Cloud(points=points_m[has_reading].float(), color=color)
+
+    # The poses over it, and over the picture.
     picture = frame.rgb
     layers = [Layer(name="table, as the sensor sees it", shape=table)]
     for view, estimate, instance in zip(views, estimates, dataset.instances, strict=True):
@@ -273,6 +287,8 @@ def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
             layers += pose_layers(pose, model)
         picture = draw_pose(picture, None, model, K, truth=instance.camera_from_model)
         layers += pose_layers(instance.camera_from_model, model, is_true=True)
+
+    # The section of the page.
     write_image(folder / "poses.png", picture)
     write_image(folder / "depth.grey.png", grey_depth(frame.depth_m))
     pictures = [
@@ -293,19 +309,19 @@ def _write_sample(view: ViewInput, folder: Path) -> None:
     write_mask(folder / "mask.png", view.mask)
 
 
-def _named_copies(estimate: PoseEstimate) -> list[Rigid]:
-    """Give the near-symmetric copies that an estimate names beside its pose."""
+def _list_named_copies(estimate: PoseEstimate) -> list[Rigid]:
+    """List the near-symmetric copies that an estimate names beside its pose."""
     return [other.camera_from_model for other in estimate.alternatives if other.is_copy]
 
 
-def _at_nearest_copy(
+def _choose_nearest_copy(
     estimate: PoseEstimate, instance: Instance, models: Mapping[int, ObjectModel]
 ) -> PoseEstimate:
-    """Return an estimate with the nearest to the truth of its pose and that pose's copies."""
+    """Choose the nearest to the truth of an estimate's pose and that pose's copies."""
     if estimate.camera_from_model is None:
         return estimate
     points_m = models[instance.object_id].vertices_m
-    poses = [estimate.camera_from_model, *_named_copies(estimate)]
+    poses = [estimate.camera_from_model, *_list_named_copies(estimate)]
     nearest = min(poses, key=lambda pose: float(add_m(pose, instance.camera_from_model, points_m)))
     return replace(estimate, camera_from_model=nearest)
 
@@ -333,11 +349,11 @@ _RESULT_FOLDERS = (
 
 @dataclass(frozen=True)
 class DemoResult:
-    """Where the page is, and the rows on it: a depth for each method, a pose for each part."""
+    """The page of a demo, and the rows on it."""
 
-    page: Path
-    depths: list[dict[str, Any]]
-    poses: list[dict[str, Any]]
+    page: Path  #: its file
+    depths: list[dict[str, Any]]  #: one for each scene and method
+    poses: list[dict[str, Any]]  #: one for each part
 
 
 def make_demo(
@@ -354,6 +370,7 @@ def make_demo(
         parts: weights of a pose network for the parts.
         on_message: called with what is done next.
     """
+    # Both parts of the demo.
     files = [*_RESULT_FOLDERS, *pages.table_files("depths", "poses"), _PAGE]
     claim_folder(out, {"command": "demo"}, files)
     on_message = on_message or (lambda _: None)
@@ -361,6 +378,8 @@ def make_demo(
     poses, pose_sections = show_poses(out, parts)
     on_message("depth of a real pair and of a synthetic street ...")
     depths, depth_sections = show_depth(out, weights)
+
+    # Their tables and the page.
     pages.write_table(out, depths, name="depths")
     pages.write_table(out, poses, name="poses")
     page = out / _PAGE

@@ -51,7 +51,7 @@ from depthpose.pose.datasets.layouts import read_mapping
 from depthpose.pose.mesh import read_model
 from depthpose.pose.predictions import read_bop_results, read_predictions
 from depthpose.pose.train import STAGES as POSE_STAGES
-from depthpose.pose.weights import known_numbers, read_pose_weights, write_pose_weights
+from depthpose.pose.weights import read_object_numbers, read_pose_weights, write_pose_weights
 
 Reader = Callable[[Path], object]
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -299,7 +299,7 @@ def _weights() -> dict[str, Kind]:
         ),
         "pose weights": Kind(
             file=name, good=written(write_pose, name), damage=damage.hurt_safetensors,
-            readers=(read_pose_weights, known_numbers),
+            readers=(read_pose_weights, read_object_numbers),
         ),
         "torch file": Kind(file="w.pt", good=stream.getvalue(), damage=damage.hurt_bytes,
                            readers=(read_torch_file,)),

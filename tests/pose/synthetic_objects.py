@@ -16,7 +16,7 @@ from depthpose.pose.mesh import make_model
 from depthpose.pose.network import ResUNet, ResUNetConfig
 from depthpose.pose.network_pose import CloudToPose, GeoPoseNet
 from depthpose.pose.surface import Surface, prepare_surface
-from depthpose.pose.synthetic.parts import circle, part_mesh, ring
+from depthpose.pose.synthetic.parts import make_circle, make_part_mesh, make_ring
 from depthpose.pose.types import Axis, ObjectModel, PoseEstimate, Symmetries
 from depthpose.pose.weights import PoseWeights
 
@@ -95,9 +95,9 @@ def gear(teeth: int = 12, keyway_mm: float = 0.0) -> ObjectModel:
     is_tooth = number % (96 // teeth) < 48 // teeth
     radius_mm = torch.where(is_tooth, 30.0, 25.0)
     outline = torch.stack([radius_mm * angle.cos(), radius_mm * angle.sin()], 1)
-    bore = torch.from_numpy(circle(8.0)).clone()
+    bore = torch.from_numpy(make_circle(8.0)).clone()
     bore[torch.minimum(number, 96 - number) <= 5] *= 1 + keyway_mm / 8
-    vertices_mm, faces = ring(outline.double().numpy(), bore.numpy(), 12.0)
+    vertices_mm, faces = make_ring(outline.double().numpy(), bore.numpy(), 12.0)
     return make_model(
         torch.from_numpy(vertices_mm) * 0.001, torch.from_numpy(faces), name="gear", number=3
     )
@@ -204,7 +204,7 @@ def write_part(name: str, folder: Path) -> Path:
     """Write a part as an STL file in millimetres, as a CAD program would; give the file."""
     import trimesh
 
-    data = trimesh.Trimesh(*part_mesh(name), process=False).export(file_type="stl")
+    data = trimesh.Trimesh(*make_part_mesh(name), process=False).export(file_type="stl")
     assert isinstance(data, bytes)
     path = folder / f"{name}.stl"
     path.parent.mkdir(parents=True, exist_ok=True)

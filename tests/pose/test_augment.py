@@ -11,10 +11,10 @@ from depthpose.core.config import config_to_dict, read_config, write_config
 from depthpose.core.errors import InputError
 from depthpose.pose.config import ObjectsConfig, SyntheticSensorConfig
 from depthpose.pose.synthetic.views import (
+    draw_levels,
     grow_mask,
     occlude,
     random_index,
-    random_levels,
     random_rotation,
     simulate_depth,
 )
@@ -36,7 +36,7 @@ def test_rotations_are_rotations_and_cover_the_sphere_evenly() -> None:
 
 
 def test_an_occluder_hides_exactly_its_share_and_stands_nearer() -> None:
-    silhouette = random_levels(60, 80, _generator(9)) < 0.3
+    silhouette = draw_levels(60, 80, _generator(9)) < 0.3
     depth_m = torch.where(silhouette, 0.8 + 0.1 * torch.rand(60, 80), 1.5)
     for seed in range(40):
         hidden_m, visible = occlude(depth_m, silhouette, 0.3, _generator(seed))

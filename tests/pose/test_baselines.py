@@ -19,7 +19,7 @@ from depthpose.pose.baselines import (
     PointNet,
     PointNetConfig,
     cut_depth,
-    poses_of,
+    make_poses,
 )
 from depthpose.pose.cloud import turn_axis_to
 from depthpose.pose.losses import model_point_loss
@@ -36,7 +36,7 @@ def regressed(numbers: Tensor) -> Rigid:
     eye, count = torch.eye(3).to(numbers), len(numbers)
     crop = DepthCrop(torch.zeros(count, 1, 4, 4), eye.expand(count, 3, 3),
                      numbers.new_zeros(count, 3), numbers.new_ones(count))  # fmt: skip
-    return poses_of(numbers, crop)
+    return make_poses(numbers, crop)
 
 
 def turned(seed: int) -> Tensor:
@@ -147,7 +147,7 @@ def test_the_network_begins_at_the_crops_middle_and_each_class_has_its_head() ->
     assert outputs.shape == (3, 9)
     assert not torch.allclose(outputs[0], outputs[1])
     middle = torch.tensor([[1.0, 0, 0, 0, 1, 0, 0, 0, 0]])
-    pose = poses_of(middle, batched(crop))
+    pose = make_poses(middle, batched(crop))
     torch.testing.assert_close(pose.t_m[0], crop.middle_m)
     torch.testing.assert_close(pose.R[0], crop.R)
 
@@ -157,7 +157,7 @@ def test_offsets_are_in_widths_of_the_crop() -> None:
         image=torch.zeros(1, 1, 4, 4), R=turned(3)[None], middle_m=torch.ones(1, 3),
         side_m=torch.tensor([0.5]),
     )  # fmt: skip
-    pose = poses_of(torch.tensor([[1.0, 0, 0, 0, 1, 0, 0, 0, 2.0]]), crop)
+    pose = make_poses(torch.tensor([[1.0, 0, 0, 0, 1, 0, 0, 0, 2.0]]), crop)
     torch.testing.assert_close(pose.t_m[0], torch.ones(3) + turned(3)[:, 2])
 
 

@@ -26,7 +26,7 @@ from depthpose.pose.datasets import (
 )
 from depthpose.pose.datasets.layouts import read_bop_models
 from depthpose.pose.mesh import make_model, turn_about
-from depthpose.pose.train.poses import symmetric_copies
+from depthpose.pose.train.poses import stack_symmetries
 from depthpose.pose.types import ObjectModel, Symmetries
 from depthpose.report.pose import object_points
 
@@ -291,7 +291,7 @@ def test_eggbox_and_glue_of_linemod_get_the_half_turn_that_is_not_declared(tmp_p
         turned = Rigid(turn.R[0], turn.t_m[0]).apply(point)
         assert torch.allclose(turned, torch.tensor([[-0.01, -0.02, 0.03]]).double())
     # Training gets the copy, as evaluation does.
-    assert symmetric_copies([models[10]], 0.05).R.shape[1] == 2
+    assert stack_symmetries([models[10]], 0.05).R.shape[1] == 2
 
 
 def test_the_real_frames(real: Path) -> None:

@@ -120,7 +120,7 @@ def test_errors_are_skipped_only_where_they_are_beyond_the_limits(
         for p in predictions_of(synthetic, lambda i, s=s: moved(i, [0, s, 0, s, 0.3 * s, 2 * s]))
     ]
     found = scores(synthetic, predictions)
-    monkeypatch.setattr(detection, "_is_far", lambda *_: False)
+    monkeypatch.setattr(detection, "_is_certainly_far", lambda *_: False)
     assert scores(synthetic, predictions) == found
 
 

@@ -18,13 +18,13 @@ from depthpose.pose.config import IcpConfig
 from depthpose.pose.icp import (
     Residuals,
     _iterate,
-    normal_equations,
+    build_normal_equations,
+    make_rotation,
     refine_roughly,
-    rotation_matrix,
     tukey_weight,
 )
-from depthpose.pose.identity import _growth_residuals
-from depthpose.pose.kdtree import build_tree, nearest_points
+from depthpose.pose.identity import _linearise_growth
+from depthpose.pose.kdtree import build_tree, find_nearest_points
 from depthpose.pose.propose.point_pairs import (
     ANGLES,
     DISTANCES,
@@ -84,7 +84,7 @@ def test_trees_of_few_points(count: int) -> None:
     points[count // 2] = points[0]  # two alike
     asked = torch.randn(50, 3, generator=generator, dtype=torch.float64)
     tree = build_tree(points.numpy(), np.zeros((count, 3)))
-    index = nearest_points(asked.numpy(), tree)
+    index = find_nearest_points(asked.numpy(), tree)
     distances = torch.cdist(asked, points, compute_mode="donot_use_mm_for_euclid_dist")
     found = distances[torch.arange(50), torch.from_numpy(index)]
     assert torch.allclose(found, distances.amin(1), rtol=0, atol=1e-12)
@@ -133,7 +133,7 @@ def test_tukey_weights() -> None:
 def test_rotation_matrices(angle: float) -> None:
     vector = angle * np.array([2.0, -1.0, 2.0]) / 3
     expected = Rotation.from_rotvec(vector).as_matrix()
-    assert np.allclose(rotation_matrix(vector), expected, rtol=0, atol=1e-14)
+    assert np.allclose(make_rotation(vector), expected, rtol=0, atol=1e-14)
 
 
 def test_normal_equations() -> None:
@@ -141,12 +141,12 @@ def test_normal_equations() -> None:
     J, distance, weight = generator.normal(size=(40, 6)), generator.normal(size=40), np.ones(40)
     weight[::3] = 0.0
     J[weight == 0] = np.inf  # what has no weight is not read
-    H, b = normal_equations(Residuals(J, distance, weight), 1e-6)
+    H, b = build_normal_equations(Residuals(J, distance, weight), 1e-6)
     J = J[weight > 0]
     assert np.allclose(H, J.T @ J, rtol=1e-8)
     assert np.allclose(b, J.T @ distance[weight > 0])
     none = Residuals(np.zeros((4, 6)), np.zeros(4), np.zeros(4))
-    assert np.allclose(normal_equations(none, 1e-6)[0], 1e-15 * np.eye(6), rtol=1e-12, atol=0)
+    assert np.allclose(build_normal_equations(none, 1e-6)[0], 1e-15 * np.eye(6), rtol=1e-12, atol=0)
 
 
 def test_residuals_change_with_a_scale_as_their_derivatives_say(surface: Surface) -> None:
@@ -155,7 +155,7 @@ def test_residuals_change_with_a_scale_as_their_derivatives_say(surface: Surface
     limit = 0.1 * surface.diameter_m
     places = np.full((2, len(local_m)), -1)
     here, there = (
-        _growth_residuals(local_m, scale, middle, limit, surface.target, True, places[k])
+        _linearise_growth(local_m, scale, middle, limit, surface.target, True, places[k])
         for k, scale in enumerate((1.0, 1.0 + 1e-7))
     )
     both = (here.weight > 0) & (there.weight > 0) & (places[0] == places[1])

@@ -11,7 +11,7 @@ from tests.pose.synthetic_objects import K, bottle, pose_at, view_of
 
 from depthpose.core.errors import InputError, Notice
 from depthpose.core.rigid import Rigid, geodesic_rad, rotation_by
-from depthpose.pose.mesh import declare_symmetry, make_model, read_symmetry, symmetry_of_each
+from depthpose.pose.mesh import assign_symmetries, declare_symmetry, make_model, read_symmetry
 from depthpose.pose.registration import Registration
 from depthpose.pose.synthetic.parts import make_part
 from depthpose.pose.types import ObjectModel, Symmetries, ViewInput
@@ -153,15 +153,15 @@ def test_bop_forms(tmp_path: Path) -> None:
 
 def test_whose_symmetry_it_is() -> None:
     both = ["gear", "nut"]
-    assert symmetry_of_each(None, both) == {}
-    assert symmetry_of_each("z,18", ["gear"]) == {"gear": "z,18"}
-    assert symmetry_of_each(["gear:z,18", "nut:z,6+x,2"], both) == {
+    assert assign_symmetries(None, both) == {}
+    assert assign_symmetries("z,18", ["gear"]) == {"gear": "z,18"}
+    assert assign_symmetries(["gear:z,18", "nut:z,6+x,2"], both) == {
         "gear": "z,18",
         "nut": "z,6+x,2",
     }
-    assert symmetry_of_each({"nut": "z,6"}, both) == {"nut": "z,6"}
+    assert assign_symmetries({"nut": "z,6"}, both) == {"nut": "z,6"}
     bop = {"symmetries_continuous": [{"axis": [0, 0, 1]}]}
-    assert symmetry_of_each(bop, ["gear"]) == {"gear": bop}
+    assert assign_symmetries(bop, ["gear"]) == {"gear": bop}
     cases = [
         ("z,18", r"2 objects are known \(gear, nut\); say whose it is: gear:z,18"),
         (["gaer:z,18"], "symmetry 'gaer:z,18': no object is called so; did you mean 'gear'"),
@@ -170,7 +170,7 @@ def test_whose_symmetry_it_is() -> None:
     ]
     for given, said in cases:
         with pytest.raises(InputError, match=said):
-            symmetry_of_each(given, both)
+            assign_symmetries(given, both)
 
 
 def test_declared_copies_are_one_answer(tmp_path: Path) -> None:

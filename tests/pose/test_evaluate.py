@@ -24,11 +24,11 @@ from depthpose.pose.evaluate import (
     ObjectRow,
     Origin,
     RiskRow,
-    error_context,
     errors,
     evaluate,
-    frames_hash,
-    nearest_copy,
+    find_nearest_copy,
+    hash_frames,
+    prepare_errors,
     read_any,
     select_targets,
 )
@@ -58,7 +58,7 @@ def test_the_truth_itself_is_perfect(synthetic: BopDataset) -> None:
         assert row["ms_network"] == pytest.approx(20.0)
         assert row["ms_total"] == pytest.approx(25.0)
         assert "ms_icp" not in row
-        assert row["frames_sha256"] == frames_hash(synthetic.instances)[:12]
+        assert row["frames_sha256"] == hash_frames(synthetic.instances)[:12]
     assert [row.metric for row in result.rows[:2]] == ["ADD", "ADD-S"]
     assert columns(result.rows)[2]["instances"] == columns(result.rows)[3]["instances"] == 6
 
@@ -192,8 +192,8 @@ def test_several_of_an_object_are_set_against_their_nearest(synthetic: BopDatase
 def test_the_diameter_table_is_named_and_decides(synthetic: BopDataset) -> None:
     cat = replace(synthetic.objects[7], number=6, diameter_m=0.154546)
     pvnet = EvaluationConfig(diameters="pvnet")
-    assert error_context(cat, EvaluationConfig()).diameter_m == 0.154546
-    assert error_context(cat, pvnet).diameter_m == 0.152633
+    assert prepare_errors(cat, EvaluationConfig()).diameter_m == 0.154546
+    assert prepare_errors(cat, pvnet).diameter_m == 0.152633
     with pytest.raises(InputError, match=r"object 7 \(bracket\) .* no object of PVNet's table"):
         evaluate(synthetic, predictions_of(synthetic, lambda i: i.camera_from_model), pvnet)
 
@@ -203,9 +203,9 @@ def test_symmetry_or_the_rule_decides_which_of_the_two_adds(synthetic: BopDatase
     turned = Symmetries(discrete=turn_about(up, origin, torch.tensor([math.pi])))
     glue = replace(synthetic.objects[7], symmetries=turned)
     cat = replace(glue, symmetries=Symmetries())
-    assert error_context(glue, EvaluationConfig()).is_adds
-    assert not error_context(cat, EvaluationConfig()).is_adds
-    assert error_context(cat, EvaluationConfig(adds="all")).is_adds
+    assert prepare_errors(glue, EvaluationConfig()).is_adds
+    assert not prepare_errors(cat, EvaluationConfig()).is_adds
+    assert prepare_errors(cat, EvaluationConfig(adds="all")).is_adds
 
 
 def test_targets_keep_the_most_visible(synthetic: BopDataset) -> None:
@@ -215,7 +215,7 @@ def test_targets_keep_the_most_visible(synthetic: BopDataset) -> None:
     assert [i.name for i in select_targets(some, [target]).instances] == [
         synthetic.instances[0].name
     ]
-    assert frames_hash(some.instances) != frames_hash(synthetic.instances)
+    assert hash_frames(some.instances) != hash_frames(synthetic.instances)
     with pytest.raises(InputError, match="ask for 3 of object 7 in scene 1, image 0, but 2"):
         select_targets(some, [replace(target, count=3)])
 
@@ -252,8 +252,8 @@ def test_the_nearest_copy_of_what_turns_freely_is_the_estimate_itself() -> None:
         torch.cat([0.5 * math.pi * axis.direction.double(), torch.zeros(3).double()]),
     )
     found = Rigid(true.R @ turn.R, true.t_m)
-    free = nearest_copy(found, true, symmetry_transforms(bottle.symmetries))
-    fixed = nearest_copy(found, true, symmetry_transforms(bracket.symmetries))
+    free = find_nearest_copy(found, true, symmetry_transforms(bottle.symmetries))
+    fixed = find_nearest_copy(found, true, symmetry_transforms(bracket.symmetries))
     assert math.degrees(float(geodesic_rad(found.R.double(), free.R.double()))) < 3
     assert torch.allclose(fixed.R, true.R)
     assert torch.allclose(fixed.t_m, true.t_m)
@@ -299,10 +299,10 @@ def test_turns_about_an_axis_of_revolution_are_no_error() -> None:
     )
     for declared, motion in ((bottle, turn), (ball, tilt)):
         found = true @ motion
-        copy = nearest_copy(found, true, symmetry_transforms(declared), declared)
+        copy = find_nearest_copy(found, true, symmetry_transforms(declared), declared)
         assert float(geodesic_rad(found.R.double(), copy.R.double())) < 1e-6
         assert torch.allclose(found.t_m, copy.t_m, atol=1e-9)
-    tilted = nearest_copy(true @ tilt, true, symmetry_transforms(bottle), bottle)
+    tilted = find_nearest_copy(true @ tilt, true, symmetry_transforms(bottle), bottle)
     assert float(geodesic_rad((true @ tilt).R.double(), tilted.R.double())) > 0.5, (
         "a bottle may not be tilted"
     )

@@ -19,7 +19,7 @@ from depthpose.core.files import CLOUD_READERS, Cloud, read_cloud
 from depthpose.core.files.disk import AnyPath
 from depthpose.core.rigid import Rigid
 from depthpose.pose.datasets import LAYOUTS, Instance, Layout, open_bop
-from depthpose.pose.datasets.layouts import bop_instances
+from depthpose.pose.datasets.layouts import read_bop_instances
 from depthpose.pose.evaluate import METRICS, Metric
 from depthpose.pose.evaluate.errors import ErrorContext
 from depthpose.pose.losses import POINT_LOSSES, direction_loss
@@ -79,7 +79,7 @@ def test_extending_layouts(
 
     def instances(folder: Path, split: str) -> Iterator[Instance]:
         for scene in sorted((folder / split / "scenes").iterdir()):
-            yield from bop_instances(scene)
+            yield from read_bop_instances(scene)
 
     known = make_dataset(tmp_path / "own", frames=1)
     (tmp_path / "own/test").rename(tmp_path / "scenes")

@@ -15,7 +15,7 @@ from depthpose.pose.icp import refine_pose
 from depthpose.pose.metrics import add_m
 from depthpose.pose.observability import free_motions
 from depthpose.pose.propose import (
-    consistent_keypoints,
+    find_consistent_keypoints,
     fit_pose,
     vote_ransac,
 )
@@ -92,6 +92,21 @@ def test_a_sure_keypoint_outweighs_unsure_ones() -> None:
     assert float(without.residual_m) < 1e-9
 
 
+@pytest.mark.parametrize("seed", [0, 2, 7])
+def test_unused_keypoints_change_no_weight_of_the_others(seed: int) -> None:
+    random = generator(seed)
+    model = torch.randn(8, 3, generator=random).double() * 0.05
+    true = random_pose(seed)
+    std_m = torch.tensor([1e-4, 1e-4, 1e-4, 0.25, 0.05, 0.05, 0.05, 0.05]).double()
+    found = true.apply(model) + std_m[:, None] * torch.randn(8, 3, generator=random).double()
+    covariance = std_m.square()[:, None, None] * torch.eye(3).double()
+    used = torch.arange(8) < 4
+    fit = fit_pose(found, covariance, model, used).camera_from_model
+    alone = fit_pose(found[used], covariance[used], model[used]).camera_from_model
+    assert torch.allclose(fit.R, alone.R, atol=1e-9)
+    assert torch.allclose(fit.t_m, alone.t_m, atol=1e-9)
+
+
 def test_two_keypoints_fix_no_pose() -> None:
     with pytest.raises(InputError, match="fixed by 3"):
         fit_pose(torch.rand(8, 3).double(), torch.eye(3).double().expand(8, 3, 3),
@@ -101,14 +116,14 @@ def test_two_keypoints_fix_no_pose() -> None:
 def test_keypoints_that_break_rigidity_are_dropped() -> None:
     model = torch.randn(8, 3, generator=generator(4)).double() * 0.1
     found = random_pose(7, (3,)).apply(model.expand(3, 8, 3))
-    assert consistent_keypoints(found, model, 1e-12).all()
+    assert find_consistent_keypoints(found, model, 1e-12).all()
     found[1, 2] += 0.1
     found[2, [0, 5]] -= torch.tensor([0.1, 0.05, -0.2]).double()
-    stays = consistent_keypoints(found, model, 0.01)
+    stays = find_consistent_keypoints(found, model, 0.01)
     assert stays[0].all()
     assert (~stays[1]).nonzero().flatten().tolist() == [2]
     assert (~stays[2]).nonzero().flatten().tolist() == [0, 5]
-    some = consistent_keypoints(found, model, 0.01, torch.arange(8).expand(3, 8) > 3)
+    some = find_consistent_keypoints(found, model, 0.01, torch.arange(8).expand(3, 8) > 3)
     assert some[1].tolist() == [False] * 4 + [True] * 4
 
 
@@ -161,7 +176,7 @@ def test_the_whole_way_on_the_real_cat(real: Path) -> None:
     noise = torch.randn(directions.shape, generator=generator(0), dtype=torch.float64)
     noise[::10] *= 20
     vote = vote_ransac(points, directions + 0.05 * noise)
-    used = consistent_keypoints(vote.keypoints_m, model.keypoints_m, 0.1 * model.diameter_m)
+    used = find_consistent_keypoints(vote.keypoints_m, model.keypoints_m, 0.1 * model.diameter_m)
     assert used.all()
     fit = fit_pose(vote.keypoints_m, vote.covariance_m2, model.keypoints_m.double(), used)
     keypoints_m = model.keypoints_m.double()

@@ -11,7 +11,7 @@ import trimesh
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_json
 from depthpose.core.rigid import Rigid, geodesic_rad, rotation_by
-from depthpose.pose.cloud import unit_advice
+from depthpose.pose.cloud import advise_unit
 from depthpose.pose.config import MeshConfig
 from depthpose.pose.mesh import (
     SymmetryProposal,
@@ -179,13 +179,13 @@ def test_the_wrong_unit_is_reported(tmp_path: Path) -> None:
 
 def test_the_unit_doctor(box: ObjectModel) -> None:
     def message(diameter_m: float, points_m: torch.Tensor) -> str:
-        advice = unit_advice(diameter_m, points_m)
+        advice = advise_unit(diameter_m, points_m)
         assert advice is not None
         assert advice.is_cloud_larger == (float(points_m.abs().max()) > diameter_m)
         return advice.message
 
     cloud, _ = sample_surface(box, 500)
-    assert unit_advice(box.diameter_m, cloud[:250]) is None
+    assert advise_unit(box.diameter_m, cloud[:250]) is None
     assert message(1000 * box.diameter_m, cloud) == (
         f"your model is {1000 / size_share(box, cloud):.0f} times larger than the cloud: "
         "is it in mm?"
@@ -193,7 +193,7 @@ def test_the_unit_doctor(box: ObjectModel) -> None:
     assert "is it in inches?" in message(39.37 * box.diameter_m, cloud)
     assert "your cloud is" in message(box.diameter_m, 1000 * cloud)
     assert "is this the right object" in message(4 * box.diameter_m / 0.3, cloud)
-    assert unit_advice(box.diameter_m, cloud[:1]) is None
+    assert advise_unit(box.diameter_m, cloud[:1]) is None
 
 
 def size_share(model: ObjectModel, cloud: torch.Tensor) -> float:

@@ -16,7 +16,7 @@ from tests.fuzz.damage import pack_glb
 
 from depthpose.core.errors import InputError, Notice
 from depthpose.core.rigid import rotation_by
-from depthpose.pose.cloud import unit_advice
+from depthpose.pose.cloud import advise_unit
 from depthpose.pose.mesh import read_geometry, read_model
 from depthpose.pose.mesh.files import cut_polygons
 from depthpose.pose.registration import Registration
@@ -264,8 +264,8 @@ def test_a_bent_polygon_is_cut_as_it_is_seen_from_above() -> None:
 @pytest.mark.parametrize(("factor", "said"), [(0.01, "is it in cm?"), (0.001, "is it in mm?")])
 def test_a_model_in_centimetres_is_not_called_inches(factor: float, said: str) -> None:
     diameter, seen = float(np.linalg.norm(POINTS.max(0))), torch.from_numpy(0.6 * POINTS)
-    smaller = unit_advice(diameter, factor * seen)
-    larger = unit_advice(diameter / 10, seen)
+    smaller = advise_unit(diameter, factor * seen)
+    larger = advise_unit(diameter / 10, seen)
     assert smaller is not None
     assert larger is not None
     assert said in smaller.message

@@ -10,7 +10,7 @@ from torch import Tensor
 from depthpose.core.rigid import Rigid, geodesic_rad
 from depthpose.pose.config import EvaluationConfig
 from depthpose.pose.datasets import open_bop
-from depthpose.pose.evaluate import error_context
+from depthpose.pose.evaluate import prepare_errors
 from depthpose.pose.evaluate.errors import METRICS
 from depthpose.pose.mesh import read_model, symmetries_from_bop, symmetry_transforms
 from depthpose.pose.metrics import (
@@ -74,7 +74,7 @@ def test_vsd_is_that_of_the_bop_toolkit(real: Path) -> None:
     data = open_bop(real / "pose/lm").of_objects("cat")
     assert len(data) == 1
     cat = data.objects[6]
-    context = error_context(cat, EvaluationConfig(vsd_delta_m=VSD_DELTA_M))
+    context = prepare_errors(cat, EvaluationConfig(vsd_delta_m=VSD_DELTA_M))
     first = reference["rows"][0]
     true = replace(data.instances[0], camera_from_model=pose_of(first["R_est"], first["t_est"]))
     assert tuple(reference["taus"]) == BOP_SHARES

@@ -19,7 +19,7 @@ from tests.pose.synthetic_objects import (
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import RefusalConfig
 from depthpose.pose.icp import refine_pose
-from depthpose.pose.identity import mirror_gain
+from depthpose.pose.identity import measure_mirror_gain
 from depthpose.pose.mesh import MIRROR_ALIKE, mirror_deviation
 from depthpose.pose.surface import Surface, prepare_surface
 from depthpose.pose.synthetic.parts import make_part
@@ -54,7 +54,9 @@ def gain(seen: ObjectModel, seed: int, origin_m: float = 0.0) -> float:
     shift_m = torch.full((3,), origin_m)
     surface = surface_off_origin(origin_m)
     begun = Rigid(truth.R.double(), (truth.t_m - truth.R @ shift_m).double())
-    return mirror_gain(cloud_m, refine_pose(cloud_m, begun, surface).camera_from_model, surface)
+    return measure_mirror_gain(
+        cloud_m, refine_pose(cloud_m, begun, surface).camera_from_model, surface
+    )
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])

@@ -15,8 +15,8 @@ from depthpose.pose.datasets import check_bop, open_bop, write_bop_models, write
 from depthpose.pose.mesh import drawn_triangles, make_model
 from depthpose.pose.synthetic import Objects, make_frames, views
 from depthpose.pose.synthetic.views import (
+    aim_camera,
     draw_view,
-    gaze,
     make_shape,
     random_rotation,
     turn_view,
@@ -72,10 +72,10 @@ def test_a_turned_view_of_a_plane_is_exact_to_rounding() -> None:
     corners = torch.tensor([[-0.1, -0.1, 0], [0.1, -0.1, 0], [0.1, 0.1, 0], [-0.1, 0.1, 0.0]])
     faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
     shape = make_shape(make_model(corners, faces, name="plate"))
-    tilt = gaze(torch.tensor([0.5, 0.3, 1.0], dtype=torch.float64), 0.4)
+    tilt = aim_camera(torch.tensor([0.5, 0.3, 1.0], dtype=torch.float64), 0.4)
     middle_m = torch.tensor([0.0, 0.0, 0.8], dtype=torch.float64)
     pose = Rigid(tilt, middle_m - tilt @ shape.middle_m)
-    turn = gaze(torch.tensor([-0.2, 0.3, 1.0], dtype=torch.float64), 2.0)
+    turn = aim_camera(torch.tensor([-0.2, 0.3, 1.0], dtype=torch.float64), 2.0)
     turned = turn_view(draw_view(shape, pose, _K), turn, shape, _K)
     error_m = (turned.depth_m - draw_view(shape, turned.camera_from_model, _K).depth_m).abs()
     inside = error_m[error_m.isfinite()]
@@ -87,7 +87,7 @@ def test_a_turned_view_of_a_plane_is_exact_to_rounding() -> None:
 def test_gaze_turns_the_axis_to_the_direction() -> None:
     for direction in ([0.0, 0.0, 1.0], [0.4, -0.2, 1.0], [-3.0, 1.0, 0.5]):
         towards = torch.tensor(direction, dtype=torch.float64)
-        R = gaze(towards, 0.7)
+        R = aim_camera(towards, 0.7)
         assert torch.allclose(R[:, 2], towards / towards.norm(), atol=1e-12)
         assert torch.allclose(R @ R.mT, torch.eye(3).double(), atol=1e-12)
         assert float(torch.linalg.det(R)) > 0
@@ -326,7 +326,7 @@ def test_the_projector_throws_the_shadow_of_a_thing_onto_what_lies_behind_it() -
     """To one side alone, as wide as its disparities differ."""
     depth_m = torch.full((3, 60), 2.0)
     depth_m[:, 20:30] = 1.0
-    is_shadowed = views._is_shadowed(depth_m, focal_px=100.0, baseline_m=0.2)
+    is_shadowed = views._mark_shadow(depth_m, focal_px=100.0, baseline_m=0.2)
     columns = is_shadowed[0].nonzero().flatten().tolist()
     wide_px = 100 * 0.2 * (1 / 1.0 - 1 / 2.0)
     # Half a pixel more than one is tolerated at its end.

@@ -16,12 +16,12 @@ from depthpose.pose.mesh import (
     with_found_symmetries,
 )
 from depthpose.pose.synthetic import PARTS, make_part
-from depthpose.pose.synthetic.parts import part_mesh
+from depthpose.pose.synthetic.parts import make_part_mesh
 
 
 @pytest.mark.parametrize("name", sorted(PARTS))
 def test_a_part_is_closed_surfaces_that_face_outward(name: str) -> None:
-    pieces = trimesh.Trimesh(*part_mesh(name)).split(only_watertight=False)
+    pieces = trimesh.Trimesh(*make_part_mesh(name)).split(only_watertight=False)
     assert all(piece.is_watertight and piece.volume > 0 for piece in pieces)
     assert 0.08 < make_part(name).diameter_m < 0.2
 

@@ -16,9 +16,9 @@ from depthpose.pose.predictions import (
     Place,
     PoseJob,
     Prediction,
-    earlier_predictions,
     estimate_missing_poses,
     read_bop_results,
+    read_earlier_predictions,
     read_predictions,
     write_bop_results,
     write_predictions,
@@ -201,12 +201,12 @@ def test_damaged_files_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("content", ["", "[{", "{}", '[{"name": 1}]'])
 def test_damaged_results_are_made_again_with_a_notice(tmp_path: Path, content: str) -> None:
-    assert earlier_predictions(tmp_path) == {}
+    assert read_earlier_predictions(tmp_path) == {}
     write_predictions(tmp_path, [Prediction(estimate=answer())])
-    assert len(earlier_predictions(tmp_path)) == 1
+    assert len(read_earlier_predictions(tmp_path)) == 1
     (tmp_path / "poses.json").write_text(content)
     with pytest.warns(Notice, match=r"poses\.json.* it is damaged, and made again"):
-        assert earlier_predictions(tmp_path) == {}
+        assert read_earlier_predictions(tmp_path) == {}
 
 
 def schema() -> dict[str, Any]:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from depthpose.core.errors import Notice
 from depthpose.pose.inputs import view_input
-from depthpose.pose.rays import ray_bend
+from depthpose.pose.rays import measure_ray_bend
 
 K = torch.tensor([[300.0, 0, 159.5], [0, 300, 119.5], [0, 0, 1]], dtype=torch.float64)
 NORMALS = {"wall": (0.0, 0.0, -1.0), "table": (0.0, -0.7, -0.7), "side": (0.6, 0.1, -0.8)}
@@ -47,20 +47,20 @@ def with_ball(depth_m: Tensor) -> Tensor:
 def test_a_plane_is_straight_in_depth_and_bent_in_distance(name: str) -> None:
     depth_m = with_ball(plane(NORMALS[name]))
     distance_m = depth_m * rays().norm(dim=-1)
-    assert ray_bend(depth_m, K) == pytest.approx(0, abs=0.05)
-    assert ray_bend(distance_m, K) == pytest.approx(1, abs=0.05)
+    assert measure_ray_bend(depth_m, K) == pytest.approx(0, abs=0.05)
+    assert measure_ray_bend(distance_m, K) == pytest.approx(1, abs=0.05)
 
 
 def test_what_is_no_plane_or_too_small_a_one_is_no_answer() -> None:
     ball_m = with_ball(torch.full((240, 320), torch.nan, dtype=torch.float64))
     ball_m = torch.where(ball_m.isnan(), 0.0, ball_m)
-    assert ray_bend(ball_m, K) is None
-    assert ray_bend(torch.zeros(240, 320), K) is None
+    assert measure_ray_bend(ball_m, K) is None
+    assert measure_ray_bend(torch.zeros(240, 320), K) is None
     # As a lens of twelve times the focal length sees it.
     far = torch.diag(torch.tensor([12.0, 12.0, 1.0]).double()) @ K
     far[:2, 2] = K[:2, 2]
     distance_m = rays(far).norm(dim=-1)
-    assert ray_bend(distance_m, far) is None
+    assert measure_ray_bend(distance_m, far) is None
 
 
 def test_a_view_of_distances_is_told_of_once_with_the_remedy(
@@ -90,12 +90,12 @@ def test_real_depth_is_along_the_axis_and_real_distance_is_told_of(real: Path) -
         lens = torch.tensor(camera["K"], dtype=torch.float64)
         stored = np.array(Image.open(file)).astype(np.float64)
         depth_m = camera["depth_unit_m"] * torch.from_numpy(stored)
-        bend = ray_bend(depth_m, lens)
+        bend = measure_ray_bend(depth_m, lens)
         assert bend is None or abs(bend) < 0.1
         v, u = torch.meshgrid(*map(torch.arange, depth_m.shape), indexing="ij")
         pixels = torch.stack([u, v, torch.ones_like(u)], -1).double()
         stretch = (pixels @ torch.linalg.inv(lens).mT).norm(dim=-1)
-        bend = ray_bend(stretch * depth_m, lens)
+        bend = measure_ray_bend(stretch * depth_m, lens)
         assert bend is None or abs(bend - 1) < 0.1
         told.append(bend is not None)
     assert len(told) == 11

@@ -16,7 +16,7 @@ from depthpose.core.rigid import Rigid, cross_matrix, geodesic_rad, perturb
 from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import IcpConfig, SensorKind, SyntheticSensorConfig
 from depthpose.pose.datasets import open_bop
-from depthpose.pose.icp import _covariance, _Linearised, refine_best, refine_pose
+from depthpose.pose.icp import _estimate_covariance, _Linearised, refine_best, refine_pose
 from depthpose.pose.mesh import drawn_triangles, make_model, sample_surface
 from depthpose.pose.mesh.models import turn_about
 from depthpose.pose.metrics import add_m
@@ -378,7 +378,7 @@ def test_nothing_and_no_numbers_are_refused() -> None:
 def covariance_of(
     cloud_m: Tensor, H: Tensor, J: Tensor, weight: Tensor, residual_m: Tensor, limit_m: float
 ) -> Tensor:
-    return _covariance(cloud_m, _Linearised(H, J, weight, residual_m), limit_m, 0.2)
+    return _estimate_covariance(cloud_m, _Linearised(H, J, weight, residual_m), limit_m, 0.2)
 
 
 def test_a_covariance_of_few_points_is_finite_and_symmetric() -> None:

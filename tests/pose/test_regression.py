@@ -39,7 +39,7 @@ def test_the_refinement_is_ours_from_several_starts(
     # So far turned that ICP from this start alone ends elsewhere.
     start = perturb(pose_at(), torch.tensor([math.radians(60), 0.0, 0.0, 0.0, 0.0, 0.0]))
     wrong = Rigid(start.R[None], pose_at().t_m[None])
-    monkeypatch.setattr("depthpose.pose.network_pose.poses_of", lambda *_: wrong)
+    monkeypatch.setattr("depthpose.pose.network_pose.make_poses", lambda *_: wrong)
     errors_m: list[float] = []
     for starts in (7, 1):
         config = EstimateConfig(icp=IcpConfig(starts=starts))

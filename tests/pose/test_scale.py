@@ -20,7 +20,7 @@ from depthpose.core.loop import sample_generator
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.icp import refine_pose
-from depthpose.pose.identity import Scale, scale_of
+from depthpose.pose.identity import Scale, measure_scale
 from depthpose.pose.types import PoseEstimate
 
 TRUTH = pose_at(seed=1)
@@ -31,7 +31,7 @@ def test_the_scale_of_a_copy_is_measured(times: float) -> None:
     model = bracket()
     surface, cloud_m = bracket_surface(), noisy(cloud_of(scaled(model, times), TRUTH))
     begun = refine_pose(cloud_m.double(), Rigid(TRUTH.R.double(), TRUTH.t_m.double()), surface)
-    scale = scale_of(cloud_m, begun.camera_from_model, surface, 0.0)
+    scale = measure_scale(cloud_m, begun.camera_from_model, surface, 0.0)
     assert scale.times == pytest.approx(times, abs=0.012)
     assert scale.sigma < 0.02
     assert (scale.gain > 0.05) == (abs(times - 1) > 0.09)
@@ -49,7 +49,7 @@ def test_the_deviation_of_a_scale_is_that_of_errors_that_neighbours_share() -> N
         generator = torch.Generator().manual_seed(seed)
         noise_m = 0.0015 * torch.randn(int(cell.max()) + 1, generator=generator).double()[cell]
         seen_m = cloud_m * (1 + noise_m[:, None] / cloud_m.norm(dim=1, keepdim=True))
-        scale = scale_of(seen_m, pose, surface, 0.0)
+        scale = measure_scale(seen_m, pose, surface, 0.0)
         errors.append((scale.times - 1) / scale.sigma)
     assert 0.4 < float(torch.tensor(errors).square().mean().sqrt()) < 1.6
 
@@ -85,7 +85,7 @@ def test_an_identity_is_confirmed_where_the_size_that_fits_is_near(
     times: float, status: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scale = Scale(times, sigma=0.01, gain=0.03)
-    monkeypatch.setattr("depthpose.pose.identity.scale_of", lambda *_: scale)
+    monkeypatch.setattr("depthpose.pose.identity.measure_scale", lambda *_: scale)
     identity = estimated(1.0).identity
     assert identity is not None
     assert identity.status == status
@@ -97,7 +97,7 @@ def test_another_size_refuses_where_it_fits_clearly_better(
     gain: float, status: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What is seen of a bowl from above fits at many sizes: one that gains little says nothing."""
-    monkeypatch.setattr("depthpose.pose.identity.scale_of", lambda *_: Scale(1.2, 0.02, gain))
+    monkeypatch.setattr("depthpose.pose.identity.measure_scale", lambda *_: Scale(1.2, 0.02, gain))
     found = estimated(1.0)
     assert found.status == status
     assert found.identity is not None

@@ -251,7 +251,7 @@ def test_turns_that_fit_as_well_are_named() -> None:
     net = Registration([mug])
     found = register(
         cloud,
-        net._object("mug").prepare(),
+        net._find_object("mug").prepare(),
         net.config,
         RefusalConfig(min_observability=0.0, min_probability=0.0),
         proposals=truth[None],
@@ -309,7 +309,7 @@ def test_a_hundred_models_take_bounded_time(
         )
 
     monkeypatch.setattr(search, "register", count)
-    prepared = net._object("bracket").prepare()
+    prepared = net._find_object("bracket").prepare()
     objects: dict[str, PreparedObject] = {}
     for k in range(100):
         model = replace(prepared.model, name=f"part {k}")
@@ -432,7 +432,7 @@ def test_in_a_bin_of_many_each_is_as_likely_as_alone() -> None:
 
 def test_what_would_lie_in_the_wall_is_not_possible(net: Registration) -> None:
     """The wall hides no half of an object that is seen before it; a gap in the wall may."""
-    surface = net._object("bracket").prepare().surface
+    surface = net._find_object("bracket").prepare().surface
     pose = pose_at(0.0, 1.19, seed=1)  # the wall is 1.2 m away there
     seen, mask = view_of(bracket(), pose)
     wall = table()
@@ -473,7 +473,7 @@ def test_proposals_at_one_place_leave_room_for_others(
 
 def test_the_best_evidence_leads_a_place_not_the_first_proposal(net: Registration) -> None:
     """Each proposal is refined on what it explains: a coarse right one passes a wrong one."""
-    prepared = net._object("bracket").prepare()
+    prepared = net._find_object("bracket").prepare()
     truth = pose_at()
     depth_m, _ = view_of(prepared.model, truth)
     view = view_input(depth_m.float(), None, CAMERA, "bracket", "x", None)

@@ -16,11 +16,11 @@ from depthpose.pose.segmentation import (
     SegmentationConfig,
     SegmentationWeights,
     Segmenter,
-    class_probabilities,
-    connected_parts,
     count_overlap,
+    find_connected_parts,
     intersection_over_union,
     label_parts,
+    predict_probabilities,
     write_segmentation,
 )
 from depthpose.pose.train.config import SegmentationTraining
@@ -118,17 +118,19 @@ def painted(shape: tuple[int, int], *boxes: tuple[int, int, int, int]) -> Tensor
 
 def test_the_largest_part_is_kept_or_every_large_one() -> None:
     mask = painted((40, 60), (2, 2, 10, 10), (20, 20, 35, 50), (38, 58, 39, 59))
-    one = connected_parts(mask, TINY)
+    one = find_connected_parts(mask, TINY)
     assert torch.equal(one, painted((40, 60), (20, 20, 35, 50))[None])
     several = replace(TINY, with_one_instance=False, min_share=0.001)
-    parts = connected_parts(mask, several)
+    parts = find_connected_parts(mask, several)
     assert parts.sum((1, 2)).tolist() == [64, 450]  # 1 pixel of 2,400 is below the share
-    assert connected_parts(mask & False, TINY).shape == (0, 40, 60)
+    assert find_connected_parts(mask & False, TINY).shape == (0, 40, 60)
 
 
 def test_pixels_that_touch_at_a_corner_are_one_part() -> None:
     mask = painted((8, 8), (0, 0, 2, 2), (2, 2, 4, 4))
-    assert len(connected_parts(mask, replace(TINY, with_one_instance=False, min_share=0.0))) == 1
+    assert (
+        len(find_connected_parts(mask, replace(TINY, with_one_instance=False, min_share=0.0))) == 1
+    )
 
 
 def test_parts_have_numbers_and_sizes() -> None:
@@ -182,7 +184,7 @@ def test_probabilities_add_up_to_one_and_the_network_runs_from_a_file(tmp_path: 
     with pytest.warns(LicenceNotice, match="For research alone"):
         segmenter = Segmenter.load(tmp_path / "w.safetensors")
     assert segmenter.weights.objects == ("cat", "can")
-    probability = class_probabilities(segmenter.weights.network, torch.rand(3, 50, 70))
+    probability = predict_probabilities(segmenter.weights.network, torch.rand(3, 50, 70))
     torch.testing.assert_close(probability.sum(0), torch.ones(50, 70))
 
 

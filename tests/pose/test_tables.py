@@ -17,11 +17,11 @@ from depthpose.thesis.pose_tables import (
     LINEMOD_DIAMETERS_M,
     ROWS,
     VotingCase,
+    collect_votes,
     compare_voting,
+    find_linemod_number,
     join_by_object,
-    linemod_number,
     ransac_one_by_one,
-    voting_cases,
 )
 
 
@@ -73,7 +73,7 @@ def test_ours_stand_beside_the_print_and_below_the_difference() -> None:
 def test_an_object_of_linemod_is_known_by_name_or_diameter() -> None:
     def found(name: str, number: int, diameter_m: float) -> int:
         model = replace(bracket(name), number=number, diameter_m=diameter_m)
-        return linemod_number(model)
+        return find_linemod_number(model)
 
     assert set(LINEMOD) < set(LINEMOD_DIAMETERS_M)
     assert found("obj_000006", 6, 0.1545) == 6
@@ -168,9 +168,9 @@ def test_votes_stand_at_the_points_of_the_view() -> None:
     net = GeoPoseNet(tiny_weights(model))
     views = [Objects([model]).view(i) for i in range(2)]
     empty = replace(views[0].input, mask=torch.zeros_like(views[0].input.mask))
-    cases = list(voting_cases(net, [*views, replace(views[0], input=empty)], 50))
+    cases = list(collect_votes(net, [*views, replace(views[0], input=empty)], 50))
     assert cases[2] is None
-    first, again = cases[0], next(voting_cases(net, views, 50))
+    first, again = cases[0], next(collect_votes(net, views, 50))
     assert first is not None
     assert again is not None
     assert len(first.points_m) == 50
@@ -186,7 +186,7 @@ def test_votes_are_those_of_the_estimator() -> None:
     view = Objects([model]).view(1)
     _, voted = net.estimate_with_votes(view.input)
     assert voted is not None
-    case = next(voting_cases(net, [view], 100_000))
+    case = next(collect_votes(net, [view], 100_000))
     assert case is not None
     expected = torch.nn.functional.normalize(voted.directions, dim=-1)
     # A kept point of each voxel; the estimator drops flying pixels by the same rule.

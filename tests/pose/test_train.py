@@ -38,15 +38,15 @@ from depthpose.pose.train import (
 from depthpose.pose.train.clouds import (
     HELD_OUT_SEED,
     TrainingViews,
-    held_out_objects,
+    format_table,
+    make_held_out_objects,
     score_held_out,
-    table_text,
 )
-from depthpose.pose.train.poses import packed
+from depthpose.pose.train.poses import pack_weights
 from depthpose.pose.types import ObjectModel, PoseEstimate, Symmetries, VotingPoints
 from depthpose.pose.weights import (
     PoseWeights,
-    network_of,
+    build_pose_network,
     read_pose_weights,
     write_pose_weights,
 )
@@ -256,12 +256,12 @@ def test_held_out_views_are_not_those_that_are_trained_on() -> None:
 def test_a_held_out_view_of_too_few_points_is_a_failure() -> None:
     held_out = HeldOutConfig(number=3, occlusions=(0.0,))
     network = ResUNet(_SMALL).eval()
-    made = held_out_objects(_models(), _VIEWS, _CLOUD, held_out, 0.0)
+    made = make_held_out_objects(_models(), _VIEWS, _CLOUD, held_out, 0.0)
     seen = [len(made[i].input.points_m) for i in range(6)]
     cloud = dataclasses.replace(_CLOUD, max_points=None, min_points=sorted(seen)[4])
     task = PoseTask(network, _models(), _training(held_out=held_out, cloud=cloud))
     with torch.no_grad():
-        errors = [task.held_out_error(made.view(i), i) for i in range(6)]
+        errors = [task.measure_held_out(made.view(i), i) for i in range(6)]
     assert [math.isfinite(error) for error in errors] == [n >= cloud.min_points for n in seen]
     assert task.validate().numbers["held_out/occluded_0/ransac_median"] == math.inf
 
@@ -299,7 +299,7 @@ def test_a_training_begins_with_what_other_objects_taught(trained: Path, tmp_pat
     for start in (trained, bare):
         config = _training(models=parts, start=str(start), adam=still, loop=loop)
         paths.append(train_pose_network(config, Run(folder=tmp_path / f"then {start.stem}")))
-    networks = [network_of(read_checkpoint(path), str(path)) for path in paths]
+    networks = [build_pose_network(read_checkpoint(path), str(path)) for path in paths]
     cloud = TrainingClouds(_models(), PoseTraining(objects=_VIEWS, cloud=_CLOUD), seed=1)[0]
     voxels = Voxels.from_points(F.pad(cloud.coordinates, (1, 0)))
     seen = [n.features(voxels).at_points().detach() for n in networks if isinstance(n, ResUNet)]
@@ -345,7 +345,7 @@ def test_a_training_without_norms_begins_with_weights_that_have_its_biases(tmp_p
     path = tmp_path / "folded.safetensors"
     config = _training()
     network = fold_norms(ResUNet(dataclasses.replace(_SMALL, classes=1)))
-    write_pose_weights(path, packed(network, read_models(config.models), config))
+    write_pose_weights(path, pack_weights(network, read_models(config.models), config))
     plain = dataclasses.replace(_SMALL, norm="none")
     with pytest.raises(InputError) as error:
         train_pose_network(
@@ -400,13 +400,15 @@ def test_held_out_views_are_right_ambiguous_wrong_or_refused(
     none = PoseEstimate(name="", object="", status="doubtful", reason="so")
     rows = [(sure, 0.02)] * 5 + [(sure, 0.4), (unsure, 0.01), (unsure, 0.5), (none, math.inf)] * 1
     answers = ([one for one, _ in rows], [error for _, error in rows])
-    monkeypatch.setattr("depthpose.pose.train.clouds._posed", lambda *_: answers)
+    monkeypatch.setattr("depthpose.pose.train.clouds._estimate_views", lambda *_: answers)
     held_out = HeldOutConfig(number=4, occlusions=(0.0,))
     table = score_held_out(tiny_weights(*_models()), _VIEWS, held_out)
     shares = {"right": 5 / 9, "ambiguous": 2 / 9, "wrong": 1 / 9, "refused": 1 / 9, "median": 0.02}
     assert table["0"] == pytest.approx(shares)
-    assert "| occluded % | right % | ambiguous % | wrong % | refused %" in table_text(table)
-    assert table_text(table).splitlines()[-1].startswith("| 0 | 55.6 | 22.2 | 11.1 | 11.1 | 2.0 |")
+    assert "| occluded % | right % | ambiguous % | wrong % | refused %" in format_table(table)
+    assert (
+        format_table(table).splitlines()[-1].startswith("| 0 | 55.6 | 22.2 | 11.1 | 11.1 | 2.0 |")
+    )
 
 
 def test_models_come_from_one_source(tmp_path: Path) -> None:

@@ -50,7 +50,7 @@ from depthpose.pose.train.masks import (
     TrainingImages,
     cut_window,
 )
-from depthpose.pose.train.poses import DepthImageTask, TrainingCrops, symmetric_copies
+from depthpose.pose.train.poses import DepthImageTask, TrainingCrops, stack_symmetries
 from depthpose.pose.types import CloudInput
 from depthpose.pose.weights import read_pose_weights
 
@@ -145,7 +145,7 @@ def test_weights_of_the_other_kind_are_refused_with_the_class_to_take(
     with pytest.raises(InputError, match="load them as GeoPoseNet"):
         DepthImageRegressor(read_pose_weights(votes))
     other = dataclasses.replace(depth_image_config(models_folder), start=str(votes))
-    with pytest.raises(InputError, match="Give the config the weights' own"):
+    with pytest.raises(InputError, match="Give weights of that network"):
         STAGES["depth-image"][1](other, Run(folder=tmp_path / "o"))
 
 
@@ -177,7 +177,7 @@ def test_points_and_copies_have_one_shape_for_all_objects() -> None:
     task = DepthImageTask(DepthImageNet(network), (models[0], sparse), config)
     assert len(sparse.vertices_m) < 2000
     assert task._points_m.shape == (2, 2000, 3)
-    copies = symmetric_copies(models, 0.2).float()
+    copies = stack_symmetries(models, 0.2).float()
     assert copies.R.shape[:2] == (2, 16)
     assert bool((copies.R[0] == torch.eye(3)).all())
     around = copies.apply(models[1].vertices_m.expand(2, 16, -1, -1))[1]

@@ -15,7 +15,7 @@ from depthpose.core import files
 from depthpose.core.errors import InputError
 from depthpose.core.files.images import open_image, read_numbers, value_range
 from depthpose.core.rigid import geodesic_rad
-from depthpose.pose.cloud import frame_advice, unit_advice
+from depthpose.pose.cloud import advise_frame, advise_unit
 from depthpose.pose.datasets import decode_rle
 from depthpose.pose.datasets.masks import read_runs
 from depthpose.pose.mesh import MESH_READERS, exact_diameter, read_geometry
@@ -315,7 +315,7 @@ def _describe_points(path: Path, points: Tensor) -> FileFacts:
     description = f"{len(points)} points, {distance:.4g} from the origin: {unit}"
 
     oddities: list[str] = []
-    advice = frame_advice(points)
+    advice = advise_frame(points)
     if advice is not None:
         oddities = [advice]
     radius = float((points - centre).norm(dim=-1).median())
@@ -344,6 +344,6 @@ def _list_contradictions(facts: FileFacts, all_facts: Sequence[FileFacts]) -> It
         if facts.mask is not None and is_depth and other.size != facts.size:
             yield f"it is not of the size of {other.path.name}; give the mask of this very image"
         if facts.model is not None and other.cloud is not None:
-            advice = unit_advice(exact_diameter(facts.model), other.cloud)
+            advice = advise_unit(exact_diameter(facts.model), other.cloud)
             if advice is not None:
                 yield f"beside {other.path.name}: {advice.message}"

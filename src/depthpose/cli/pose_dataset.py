@@ -58,7 +58,7 @@ def _match_models(
     It is that of the object's name, else that of its number, unless the data set has another object
     of that model's name.
     """
-    names_in_dataset = set(datasets.object_names(dataset.folder).values())
+    names_in_dataset = set(datasets.read_object_names(dataset.folder).values())
     by_name = {model.name: model for model in models}
     by_number = {model.number: model for model in models if model.name not in names_in_dataset}
     matched_models: dict[int, ObjectModel] = {}
@@ -78,7 +78,7 @@ def choose_objects(
     """
     numbers = {model.name: model.number for model in method.models}
     if object is not None:
-        names_in_dataset = datasets.object_names(dataset.folder).values()
+        names_in_dataset = datasets.read_object_names(dataset.folder).values()
         if object not in names_in_dataset and object in numbers:
             return dataset.of_objects(numbers[object])  # the method's own name of the object
         return dataset.of_objects(object)  # the data set's name or number of it

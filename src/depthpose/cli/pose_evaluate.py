@@ -25,8 +25,8 @@ from depthpose.pose.evaluate import (
     InstanceRow,
     Origin,
     evaluate,
+    find_nearest_copy,
     match_instances,
-    nearest_copy,
     read_any,
     select_targets,
 )
@@ -228,7 +228,7 @@ def _show_instances(
         truth = instance.camera_from_model
         if (pose := estimate.camera_from_model) is not None:
             symmetries = symmetry_transforms(model.symmetries)
-            truth = nearest_copy(pose, truth, symmetries, model.symmetries)
+            truth = find_nearest_copy(pose, truth, symmetries, model.symmetries)
         columns = row.columns()
         section = pose_section(
             f"{predictions.stem}: {row.object} in {row.instance}, {role}",

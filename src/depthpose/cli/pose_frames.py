@@ -27,9 +27,9 @@ from depthpose.pose.predictions import (
     Place,
     PoseJob,
     Prediction,
-    earlier_predictions,
     place_of,
-    unreadable_estimate,
+    read_earlier_predictions,
+    refuse_unreadable,
     write_predictions,
 )
 from depthpose.pose.surface import Surface, prepare_surface
@@ -92,7 +92,7 @@ class SearchResults(Results[ViewInput, list[PoseEstimate]]):
         if job.object is None:
             raise error
         self.by_image[job.name] = [
-            Prediction(estimate=unreadable_estimate(job.name, job.object, error))
+            Prediction(estimate=refuse_unreadable(job.name, job.object, error))
         ]
         self.flush()
 
@@ -159,7 +159,9 @@ def search_files(method: PoseMethod, inputs: PoseInputs, out: Path) -> int:
     _refuse_numbered_names({job.name for job in jobs})
     settings = {**method.settings, **plan.settings}
     pose_output.claim_for_jobs(out, settings, jobs, pose_output.is_result_of)
-    earlier = [p for p in earlier_predictions(out).values() if p.estimate.status != "unreadable"]
+    earlier = [
+        p for p in read_earlier_predictions(out).values() if p.estimate.status != "unreadable"
+    ]
 
     def is_of_image(prediction: Prediction, image: str) -> bool:
         return pose_output.is_result_of(prediction.estimate.name, image)
@@ -223,7 +225,7 @@ def search_dataset(
     def is_of_image(prediction: Prediction, image: str) -> bool:
         return prediction.place is not None and _name_image(prediction.place[:2]) == image
 
-    earlier = list(earlier_predictions(out).values())
+    earlier = list(read_earlier_predictions(out).values())
     results = SearchResults(out, [job.name for job in jobs], earlier, is_of_image, numbers)
     predictions, object_jobs = _search(method, list(numbers), jobs, results)
     pose_output.write_files(predictions, object_jobs, out, method, dataset, input_count=len(images))
@@ -338,7 +340,7 @@ def _write_sequences(
     ``poses.json`` is written after an interruption too; it then keeps what an earlier run had of
     the frames that this one did not reach. Gives the exit code.
     """
-    earlier = list(earlier_predictions(out).values())
+    earlier = list(read_earlier_predictions(out).values())
     predictions: list[Prediction] = []
     try:
         for prediction in followed:
@@ -371,7 +373,7 @@ def _follow(
             try:
                 frame = job.read()
             except InputError as error:
-                frame = unreadable_estimate(job.name, object, error)
+                frame = refuse_unreadable(job.name, object, error)
             yield frame
 
     assert method.track is not None

@@ -18,7 +18,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import read_image, write_json
 from depthpose.core.run import claim_folder
 from depthpose.pose import datasets, predictions
-from depthpose.pose.datasets.layouts import integer, read_rows
+from depthpose.pose.datasets.layouts import read_integer, read_rows
 from depthpose.pose.segmentation import Segmenter
 from depthpose.pose.types import ViewInput
 
@@ -57,7 +57,7 @@ def prepare_masks(
         elif kind == "predicted":
             masks.append(_take_predicted_masks(dataset))
         else:
-            make_jobs = partial(predictions.instance_jobs, dataset)
+            make_jobs = partial(predictions.make_instance_jobs, dataset)
             masks.append(Masks(name=name, make_jobs=make_jobs, settings={}))
     return masks
 
@@ -70,7 +70,7 @@ def _take_detected_masks(
         detections = datasets.read_detections(path)
     else:
         detections = _segment_dataset(path, name, dataset, out, device)
-    make_jobs = partial(predictions.detection_jobs, dataset, detections=detections)
+    make_jobs = partial(predictions.make_detection_jobs, dataset, detections=detections)
     return Masks(name=name, make_jobs=make_jobs, settings={"masks_sha256": file_sha256(path)})
 
 
@@ -82,7 +82,7 @@ def _take_predicted_masks(dataset: datasets.BopDataset) -> Masks:
             f"{dataset.folder}: came without predicted masks, as Linemod_preprocessed has "
             "them; give --masks a file of BOP detections, or weights of a segmentation"
         )
-    make_jobs = partial(predictions.instance_jobs, dataset, predicted_mask=predicted_mask)
+    make_jobs = partial(predictions.make_instance_jobs, dataset, predicted_mask=predicted_mask)
     return Masks(name="predicted", make_jobs=make_jobs, settings={"masks_of": "segnet_results"})
 
 
@@ -140,7 +140,7 @@ def _match_numbers(
     Objects of the data set that the weights do not segment are printed; it is an error if they
     segment none.
     """
-    names = datasets.object_names(dataset.folder)
+    names = datasets.read_object_names(dataset.folder)
     number_by_name = {name: number for number, name in names.items()}
     weights_numbers = dict(zip(segmenter.weights.objects, segmenter.weights.numbers, strict=True))
     numbers: dict[str, int] = {}
@@ -167,7 +167,8 @@ def _read_segmented_images(path: Path) -> set[tuple[int, int]]:
     """Read which images an earlier run segmented: scene and image numbers."""
     source = str(path)
     return {
-        (integer(row, "scene_id", source), integer(row, "im_id", source)) for row in read_rows(path)
+        (read_integer(row, "scene_id", source), read_integer(row, "im_id", source))
+        for row in read_rows(path)
     }
 
 

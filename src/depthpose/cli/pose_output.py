@@ -23,7 +23,7 @@ from depthpose.pose.predictions import (
     POSES,
     PoseJob,
     Prediction,
-    earlier_predictions,
+    read_earlier_predictions,
     results_name,
     write_bop_results,
 )
@@ -78,7 +78,7 @@ def claim_for_jobs(
 
     def is_finished(name: str) -> bool:
         """Whether an earlier run has a result of an input, which could be read."""
-        estimates = [prediction.estimate for prediction in earlier_predictions(out).values()]
+        estimates = [prediction.estimate for prediction in read_earlier_predictions(out).values()]
         return any(
             is_result(estimate.name, name)
             for estimate in estimates

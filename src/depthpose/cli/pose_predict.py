@@ -41,8 +41,8 @@ from depthpose.pose.predictions import (
     PoseJob,
     PoseResults,
     Prediction,
-    earlier_predictions,
     prediction_row,
+    read_earlier_predictions,
     write_predictions,
 )
 from depthpose.pose.types import PoseEstimate
@@ -138,7 +138,7 @@ def estimate_jobs(
     # The first process joins the files of all, and keeps what earlier runs posed of other inputs.
     if process.world > 1:
         _wait_for_predictions(out, jobs)
-    by_name = earlier_predictions(out) | estimated
+    by_name = read_earlier_predictions(out) | estimated
     if process.world > 1:
         # What another process could not read may be a failure of an earlier run, which that
         # process is still to try again: it is tried here too.
@@ -163,7 +163,7 @@ def _wait_for_predictions(out: Path, jobs: Sequence[PoseJob[Any]]) -> None:
         nonlocal written_names, last_read_s
         # The files are read for all names at once, every second.
         if name not in written_names and time.monotonic() - last_read_s > 1:
-            written_names = set(earlier_predictions(out))
+            written_names = set(read_earlier_predictions(out))
             last_read_s = time.monotonic()
         return name in written_names
 

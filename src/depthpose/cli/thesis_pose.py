@@ -23,7 +23,7 @@ from depthpose.core.run import claim_folder, environment
 from depthpose.pose.config import EvaluationConfig, ObjectsConfig
 from depthpose.pose.datasets import BopDataset, Instance
 from depthpose.pose.datasets.dataset import read_instance_mask
-from depthpose.pose.evaluate import frames_hash
+from depthpose.pose.evaluate import hash_frames
 from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.pose.predictions import read_predictions
 from depthpose.pose.propose import vote_ransac
@@ -91,7 +91,7 @@ def open_views(net: GeoPoseNet, data: PoseDataOptions, number: int | None, synth
     dataset = pose_evaluate.open_instances(data.folder, data.split, data.objects, None)
     facts = {
         "frames": f"{data.folder.resolve().name} {data.split}",
-        "frames_sha256": frames_hash(dataset.instances)[:12],
+        "frames_sha256": hash_frames(dataset.instances)[:12],
     }
     if number is not None and number < len(dataset):
         instances = [dataset.instances[i] for i in page.spread_evenly(len(dataset), number)]
@@ -108,7 +108,7 @@ def open_views(net: GeoPoseNet, data: PoseDataOptions, number: int | None, synth
     settings = {
         "data": str(dataset.folder.resolve()),
         "split": dataset.split,
-        "frames_sha256": frames_hash(dataset.instances),
+        "frames_sha256": hash_frames(dataset.instances),
     }
     return Views(samples=samples, instances=dataset.instances, facts=facts, settings=settings)
 
@@ -140,7 +140,7 @@ def reproduce_by_object(
     models = tuple(dataset.objects.values())
     with_published = number == "3.2"
     if with_published:
-        numbers = {model.name: pose_tables.linemod_number(model) for model in models}
+        numbers = {model.name: pose_tables.find_linemod_number(model) for model in models}
     else:
         numbers = {model.name: model.number for model in models}
     methods = pose_methods.build_methods(weights, options.config, models)
@@ -149,7 +149,7 @@ def reproduce_by_object(
         "table": number,
         "data": str(dataset.folder.resolve()),
         "split": dataset.split,
-        "frames_sha256": frames_hash(dataset.instances),
+        "frames_sha256": hash_frames(dataset.instances),
         "rule": config_to_dict(rule),
         "methods": {method.name: dict(method.settings) for method in methods},
         "masks": [_describe_masks(kind) for kind in options.masks] if methods else [],
@@ -257,7 +257,7 @@ def reproduce_voting(
     rows: list[dict[str, Any]] = []
     for count in points:
         samples = tqdm(views.samples, f"{count} points", disable=None)
-        cases = list(pose_tables.voting_cases(net, samples, count))
+        cases = list(pose_tables.collect_votes(net, samples, count))
         rows += [row | facts for row in pose_tables.compare_voting(cases, count)]
     page.write_table(out, rows)
 
@@ -318,7 +318,7 @@ def feature_panels(net: GeoPoseNet, views: Views, perplexity: float) -> list[Dra
     points_m: list[Tensor] = []
     features: list[Tensor] = []
     for view in views.samples:
-        featured = pose_figures.featured_points(net, view.input)
+        featured = pose_figures.compute_features(net, view.input)
         if featured is not None:
             usable.append(view)
             points_m.append(featured[0])
@@ -347,7 +347,7 @@ def field_panels(net: GeoPoseNet, views: Views, keypoint: int | None) -> list[Dr
     ``keypoint``: only this one of each view, from 0 on; None: all.
     """
     votes: list[_KeypointVote] = []
-    for index, case in enumerate(pose_tables.voting_cases(net, views.samples, _MAX_VOTES)):
+    for index, case in enumerate(pose_tables.collect_votes(net, views.samples, _MAX_VOTES)):
         if case is None:
             continue
         voted_m = vote_ransac(case.points_m, case.directions, None, net.config.voting).keypoints_m

@@ -217,11 +217,11 @@ def complete_weights(
     from depthpose.pose.datasets.layouts import read_bop_models
     from depthpose.pose.mesh import read_model
     from depthpose.pose.weights import complete_weights as complete
-    from depthpose.pose.weights import known_numbers
+    from depthpose.pose.weights import read_object_numbers
 
     refuse_to_replace(out)
     path = find_weights(weights)
-    numbers = known_numbers(path)
+    numbers = read_object_numbers(path)
     if not models.is_file():
         meshes = read_bop_models(models, numbers)
     elif len(numbers) == 1:

@@ -23,15 +23,10 @@ _MOST_BEHIND = 0.5
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PosedBin:
-    """A bin or table whose CAD file and pose are known.
+    """A bin or table whose CAD file and pose are known."""
 
-    Attributes:
-        model: of the bin.
-        camera_from_model: its pose.
-    """
-
-    model: ObjectModel
-    camera_from_model: Rigid
+    model: ObjectModel  #: of the bin
+    camera_from_model: Rigid  #: its pose
 
     @classmethod
     def load(
@@ -99,6 +94,8 @@ def with_background(
     """
     if background is None:
         return view
+
+    # The depth of the background in the pixels of the view.
     height, width = view.depth_m.shape
     if isinstance(background, PosedBin):
         label = "the bin"
@@ -113,15 +110,17 @@ def with_background(
             f"{view.name}: {label} has {background_m.shape[1]}x{background_m.shape[0]} pixels, the "
             f"depth image {width}x{height}; take both by one camera and in one size"
         )
+
+    # Does the background fit the view? Some readings lie on it, and no camera sees through it.
     is_compared = (view.depth_m > 0) & background_m.isfinite()
     if not bool(is_compared.any()):
         raise InputError(
             f"{view.name}: no pixel has a reading both in the depth image and in {label}; {remedy}"
         )
-
-    # Does the background fit the view?
     is_seen = is_on_background(view.depth_m, background_m)
     is_behind = is_compared & ~is_seen & (view.depth_m > background_m)
+
+    # What lies behind it, and what on it.
     behind_share = float(is_behind[is_compared].double().mean())
     if behind_share > _MOST_BEHIND:
         off_mm = 1000 * float((view.depth_m - background_m)[is_behind].median())

@@ -86,12 +86,15 @@ def cut_depth(
 
     Pixels farther than the diameter from the median depth are left out; with None all are kept.
     """
+    # The pixels of the object.
     depth_m = torch.where(view.mask, view.depth_m, torch.nan)
     is_seen = depth_m.isfinite() & (depth_m > 0)
     if diameter_m is not None and bool(is_seen.any()):
         is_seen &= (depth_m - depth_m[is_seen].median()).abs() <= diameter_m
     if int(is_seen.sum()) < config.min_points:
         return None
+
+    # A square about them, and their depth about its mean.
     rows, columns = is_seen.nonzero(as_tuple=True)
     low = torch.stack([columns.min(), rows.min()]).float() - 0.5
     high = torch.stack([columns.max(), rows.max()]).float() + 0.5
@@ -103,10 +106,13 @@ def cut_depth(
 
     # Resized by nearest neighbour, so that depth is not mixed across edges.
     steps = (torch.arange(config.crop_px) + 0.5) / config.crop_px - 0.5
-    column, row = ((middle_px[axis] + side_px * steps).round().long() for axis in (0, 1))
+    column = (middle_px[0] + side_px * steps).round().long()
+    row = (middle_px[1] + side_px * steps).round().long()
     height, width = relief.shape
     is_inside = ((row >= 0) & (row < height))[:, None] & ((column >= 0) & (column < width))
     image = relief[row.clamp(0, height - 1)[:, None], column.clamp(0, width - 1)]
+
+    # The ray through the middle, toward which the crop's axes are turned.
     K = view.K.to(depth_m)
     ray = torch.linalg.solve(K, torch.cat([middle_px, torch.ones(1)]))
     return DepthCrop(
@@ -145,7 +151,7 @@ class DepthImageNet(nn.Module):
         return outputs[torch.arange(len(image), device=image.device), number]
 
 
-def poses_of(outputs: Float[Tensor, "b 9"], crop: DepthCrop) -> Rigid:
+def make_poses(outputs: Float[Tensor, "b 9"], crop: DepthCrop) -> Rigid:
     """Convert outputs of the network to poses ``camera_from_model``.
 
     The first six numbers are two columns of a rotation, which Gram and Schmidt's method makes
@@ -178,10 +184,10 @@ class PointNet(nn.Module):
         self.config = config = config or PointNetConfig()
         c = config
         self.turn_points = _Transform(3)
-        self.local = _layers((3, *c.local))
+        self.local = _make_layers((3, *c.local))
         self.turn_features = _Transform(c.local[1])
-        self.pooled = _layers((c.local[1], *c.pooled))
-        self.head = _layers((c.local[1] + c.pooled[2], *c.head))
+        self.pooled = _make_layers((c.local[1], *c.pooled))
+        self.head = _make_layers((c.local[1] + c.pooled[2], *c.head))
         self.final = nn.Linear(c.head[2], c.classes * c.keypoints * 3)
 
     def forward(
@@ -193,6 +199,7 @@ class PointNet(nn.Module):
             points_m: about the mean of their cloud.
             cloud: which cloud each belongs to, 0, 1, ..., ascending.
         """
+        # Each point by itself, with coordinates and then features turned as its cloud demands.
         x = points_m / self.config.unit_m
         sizes = torch.bincount(cloud).tolist()
         turns = self.turn_points(x, sizes)
@@ -200,6 +207,8 @@ class PointNet(nn.Module):
         x = self.local(x)
         turns = self.turn_features(x, sizes)
         x = torch.cat([part @ T for part, T in zip(x.split(sizes), turns, strict=True)])
+
+        # Each point beside the maximum over its cloud.
         whole = torch.stack([part.amax(0) for part in self.pooled(x).split(sizes)])
         outputs = self.final(self.head(torch.cat([x, whole[cloud]], 1)))
         return outputs.view(len(outputs), self.config.classes, self.config.keypoints, 3)
@@ -221,8 +230,8 @@ class _Transform(nn.Module):
     def __init__(self, width: int) -> None:
         super().__init__()
         self.width = width
-        self.pooled = _layers((width, *_TRANSFORM_POOLED))
-        self.head = _layers((_TRANSFORM_POOLED[-1], *_TRANSFORM_HEAD))
+        self.pooled = _make_layers((width, *_TRANSFORM_POOLED))
+        self.head = _make_layers((_TRANSFORM_POOLED[-1], *_TRANSFORM_HEAD))
         self.final = nn.Linear(_TRANSFORM_HEAD[-1], width * width)
         nn.init.zeros_(self.final.weight)
         nn.init.zeros_(self.final.bias)
@@ -230,13 +239,14 @@ class _Transform(nn.Module):
     def forward(
         self, x: Float[Tensor, "points c"], sizes: Sequence[int]
     ) -> Float[Tensor, "clouds c c"]:
-        """``sizes``: points of each cloud, one after the other."""
+        """Give the matrix of each cloud; ``sizes`` are the points of each, one after the other."""
         whole = torch.stack([part.amax(0) for part in self.pooled(x).split(list(sizes))])
         eye = torch.eye(self.width, device=x.device, dtype=x.dtype)
         return self.final(self.head(whole)).view(len(sizes), self.width, self.width) + eye
 
 
-def _layers(widths: Sequence[int]) -> nn.Sequential:
+def _make_layers(widths: Sequence[int]) -> nn.Sequential:
+    """Make linear layers between successive widths, each with its norm and ReLU."""
     layers: list[nn.Module] = []
     for inputs, outputs in pairwise(widths):
         layers += [nn.Linear(inputs, outputs, bias=False), RowNorm(outputs), nn.ReLU()]

@@ -72,6 +72,7 @@ def prepare_cloud(
         cloud_config: limits: the fewest points, and how far flying pixels are.
         config: how many points of a larger cloud are taken.
     """
+    # The readings that may be the object's.
     is_masked = True
     if isinstance(pose_input, ViewInput):
         view = pose_input
@@ -83,17 +84,18 @@ def prepare_cloud(
         points_m = pose_input.points_m.float()
     readings_m = take_evenly(points_m[is_reading(points_m)], config.max_cloud_points)
     if len(readings_m) == 0:
-        return Refusal(status="too few points", reason=_why_empty(pose_input))
+        return Refusal(status="too few points", reason=_explain_emptiness(pose_input))
 
-    cloud_m = _without_flying_pixels(readings_m, model.diameter_m, cloud_config)
-    refusal = _why_refused(pose_input, readings_m, cloud_m, model, cloud_config)
+    # Those near their middle, if they can be posed.
+    cloud_m = _drop_flying_pixels(readings_m, model.diameter_m, cloud_config)
+    refusal = _refuse_unposable(pose_input, readings_m, cloud_m, model, cloud_config)
     if refusal is not None:
         return refusal
     return ObjectCloud(name=pose_input.name, cloud_m=cloud_m, view=view, is_masked=is_masked)
 
 
-def _why_empty(pose_input: CloudInput | ViewInput) -> str:
-    """Say why an input has no reading at all."""
+def _explain_emptiness(pose_input: CloudInput | ViewInput) -> str:
+    """Explain why an input has no reading at all."""
     if isinstance(pose_input, ViewInput):
         return why_nothing_seen(pose_input)
     if len(pose_input.points_m) == 0:
@@ -104,7 +106,7 @@ def _why_empty(pose_input: CloudInput | ViewInput) -> str:
 
 
 def why_nothing_seen(view: ViewInput) -> str:
-    """Say why no masked pixel of a view has a depth."""
+    """Explain why no masked pixel of a view has a depth."""
     masked = int(view.mask.sum())
     if masked == 0 and view.is_region:
         return "nothing of it is detected in this image: there is no box or mask of it"
@@ -117,14 +119,14 @@ def why_nothing_seen(view: ViewInput) -> str:
     return f"none of the {masked} masked pixels has a depth reading"
 
 
-def _why_refused(
+def _refuse_unposable(
     pose_input: CloudInput | ViewInput,
     readings_m: Float[Tensor, "n 3"],
     cloud_m: Float[Tensor, "m 3"],
     model: ObjectModel,
     cloud_config: CloudConfig,
 ) -> Refusal | None:
-    """Say why a cloud cannot be posed, by its size, place and shape; None where it can.
+    """Refuse a cloud that cannot be posed, by its size, place and shape; None where it can.
 
     ``readings_m`` are all readings in the mask, ``cloud_m`` those without flying pixels.
     """
@@ -132,7 +134,7 @@ def _why_refused(
     too_few = why_too_few(readings_m, cloud_config)
     if too_few is not None:
         return Refusal(status="too few points", reason=too_few)
-    unusable = _why_other_frame_or_unit(pose_input, readings_m, cloud_m, model)
+    unusable = _explain_other_frame_or_unit(pose_input, readings_m, cloud_m, model)
     if unusable is not None:
         return Refusal(status="unusable input", reason=unusable)
     # Then without flying pixels: in a wrong unit nearly all seem to be such, so it is asked last.
@@ -156,19 +158,19 @@ def _why_refused(
     return Refusal(status="not observable", reason=reason)
 
 
-def _why_other_frame_or_unit(
+def _explain_other_frame_or_unit(
     pose_input: CloudInput | ViewInput,
     readings_m: Float[Tensor, "n 3"],
     cloud_m: Float[Tensor, "m 3"],
     model: ObjectModel,
 ) -> str | None:
-    """Say that a cloud is in another frame or unit than the camera and the model; None where not.
+    """Explain that a cloud is in another frame or unit than camera and model; None where it is not.
 
     ``readings_m`` are all readings in the mask, ``cloud_m`` those without flying pixels.
     """
     # The size is measured without flying pixels, if those are few.
     are_few_flying = len(cloud_m) > _MAJORITY * len(readings_m)
-    size_advice = unit_advice(model.diameter_m, cloud_m if are_few_flying else readings_m)
+    size_advice = advise_unit(model.diameter_m, cloud_m if are_few_flying else readings_m)
 
     # A camera sees only points before it: a cloud about the origin is in another frame.
     is_about_origin = float(readings_m.median(0).values.norm()) < model.diameter_m / 2
@@ -179,7 +181,7 @@ def _why_other_frame_or_unit(
             "the cloud lies about the origin, where the camera is: it was centred, or is in "
             "the frame of the model; give it in the camera's frame, as it was seen"
         )
-    axes_advice = frame_advice(readings_m)
+    axes_advice = advise_frame(readings_m)
     if axes_advice is not None:
         return axes_advice
     if size_advice is None:
@@ -187,12 +189,12 @@ def _why_other_frame_or_unit(
     # Some background in the mask makes a cloud larger, and does not mean another unit.
     if are_few_flying and size_advice.is_cloud_larger:
         return None
-    hint = _size_hint(pose_input.mask) if isinstance(pose_input, ViewInput) else ""
+    hint = _hint_at_size_mistakes(pose_input.mask) if isinstance(pose_input, ViewInput) else ""
     return f"{size_advice.message} (the object is {model.diameter_m:.3g} m long{hint})"
 
 
-def _size_hint(mask: Bool[Tensor, "h w"]) -> str:
-    """Say which mistakes with a mask or camera, other than a unit, change the size of its cloud."""
+def _hint_at_size_mistakes(mask: Bool[Tensor, "h w"]) -> str:
+    """Name the mistakes with a mask or camera, other than a unit, that change a cloud's size."""
     share = float(mask.float().mean())
     border = torch.cat([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
     if share > _MAJORITY and float(border.float().mean()) > _MAJORITY:
@@ -224,7 +226,7 @@ def cloud_from_depth(
         InputError: mask and depth differ in size.
     """
     if depth_m.shape != mask.shape:
-        raise other_size(mask, depth_m)
+        raise make_size_error(mask, depth_m)
     is_read = mask & torch.isfinite(depth_m) & (depth_m > 0)
     # As ``back_project`` does, for these pixels alone.
     v, u = is_read.nonzero(as_tuple=True)
@@ -234,10 +236,10 @@ def cloud_from_depth(
     points_m = torch.stack([x, y, torch.ones_like(x)], -1) * depth_m[is_read][:, None]
     if diameter_m is None or len(points_m) == 0:
         return points_m
-    return _without_flying_pixels(points_m, diameter_m, config or CloudConfig())
+    return _drop_flying_pixels(points_m, diameter_m, config or CloudConfig())
 
 
-def _without_flying_pixels(
+def _drop_flying_pixels(
     points_m: Float[Tensor, "n 3"], diameter_m: float, config: CloudConfig
 ) -> Float[Tensor, "m 3"]:
     """Drop points far from the median of one point or more: background at the mask's border."""
@@ -255,7 +257,9 @@ def lift_sample(view: ViewSample, diameter_m: float, config: CloudConfig) -> Clo
     return CloudSample(input=cloud, truth=view.truth)
 
 
-def other_size(mask: Bool[Tensor, "mask_h mask_w"], depth_m: Float[Tensor, "h w"]) -> InputError:
+def make_size_error(
+    mask: Bool[Tensor, "mask_h mask_w"], depth_m: Float[Tensor, "h w"]
+) -> InputError:
     """Make the error of a mask that is not of this depth image."""
     return InputError(
         f"the mask is {mask.shape[1]}x{mask.shape[0]}, but the depth image is "
@@ -267,6 +271,7 @@ def grow_mask(mask: Bool[Tensor, "h w"], grow_px: int) -> Bool[Tensor, "h w"]:
     """Grow a mask by ``grow_px`` pixels in a square; shrink it where the number is negative."""
     if grow_px == 0:
         return mask
+    # To shrink a mask is to grow what is beside it.
     source = (mask if grow_px > 0 else ~mask).float()[None, None]
     size = 2 * abs(grow_px) + 1
     # A square, one axis after the other.
@@ -284,7 +289,7 @@ def is_reading(points_m: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
 
 
 def why_too_few(points_m: Float[Tensor, "n 3"], config: CloudConfig | None = None) -> str | None:
-    """Say why a cloud is too small to be posed; None where it is not."""
+    """Explain why a cloud is too small to be posed; None where it is not."""
     config = CloudConfig() if config is None else config
     if len(points_m) >= config.min_points:
         return None
@@ -312,8 +317,8 @@ class UnitAdvice(NamedTuple):
     message: str  #: how much larger or smaller it is, and the likely units
 
 
-def unit_advice(model_diameter_m: float, points_m: Float[Tensor, "n 3"]) -> UnitAdvice | None:
-    """Say that the model and the cloud seem to be of different units; None where they agree.
+def advise_unit(model_diameter_m: float, points_m: Float[Tensor, "n 3"]) -> UnitAdvice | None:
+    """Advise where the model and the cloud seem to be of different units; None where they agree.
 
     The size of a cloud is twice the distance from its median that 95 % of the points stay within:
     a few flying pixels do not change it.
@@ -324,6 +329,7 @@ def unit_advice(model_diameter_m: float, points_m: Float[Tensor, "n 3"]) -> Unit
     """
     if len(points_m) < 2:
         return None
+    # The size of the cloud over that of the model.
     distance_m = (points_m - points_m.median(0).values).norm(dim=-1)
     rank = 1 + int(0.95 * (len(distance_m) - 1))
     size_m = 2 * float(distance_m.kthvalue(rank).values)
@@ -339,28 +345,28 @@ def unit_advice(model_diameter_m: float, points_m: Float[Tensor, "n 3"]) -> Unit
     smaller = "model" if is_cloud_larger else "cloud"
     # Five times too large is a mask of more than the object sooner than a sliver in inches.
     least = _LIKELY_RATIO if is_cloud_larger else _SMALLEST_RATIO
-    units = _likely_units(ratio, least)
+    units = _name_likely_units(ratio, least)
     if units:
         times = max(ratio, 1 / ratio)
         message = f"your {larger} is {times:.0f} times larger than the {smaller}: is it in {units}?"
         return UnitAdvice(is_cloud_larger, message)
 
     # Or the smaller one in a larger unit, where the other is in mm?
-    units = " or ".join(
-        unit
-        for unit, mm in _MM.items()
-        if _LIKELY_RATIO <= (ratio / mm if is_cloud_larger else ratio * mm) <= _LARGEST_RATIO
-    )
+    likely: list[str] = []
+    for unit, mm in _MM.items():
+        corrected = ratio / mm if is_cloud_larger else ratio * mm
+        if _LIKELY_RATIO <= corrected <= _LARGEST_RATIO:
+            likely.append(unit)
+    other_unit = f" Or is the {smaller} in {' or '.join(likely)}?" if likely else ""
     relation = "larger" if is_cloud_larger else "smaller"
     message = (
         f"the cloud is {max(ratio, 1 / ratio):.1f} times {relation} than the model: is this the "
-        "right object, and does the mask fit it?"
-        f"{f' Or is the {smaller} in {units}?' if units else ''}"
+        f"right object, and does the mask fit it?{other_unit}"
     )
     return UnitAdvice(is_cloud_larger, message)
 
 
-def _likely_units(ratio: float, least: float) -> str:
+def _name_likely_units(ratio: float, least: float) -> str:
     """Name the units of the larger of cloud and model that would explain the ratio of their sizes.
 
     ``ratio`` is that of cloud to model; it must lie above ``least`` in the right unit.
@@ -378,12 +384,12 @@ def _likely_units(ratio: float, least: float) -> str:
     )
 
 
-def frame_advice(points_m: Float[Tensor, "n 3"]) -> str | None:
-    """Say that a cloud lies in another frame than x right, y down, z forward; None where not.
+def advise_frame(points_m: Float[Tensor, "n 3"]) -> str | None:
+    """Advise where a cloud lies in another frame than x right, y down, z forward; None elsewhere.
 
     The points that a camera sees lie before it, less than 60 degrees off its axis.
     """
-    behind = float((points_m[:, 2] <= 0).float().mean())
+    # Does another axis than z point forward?
     across_m = points_m[:, :2].median(0).values.abs()
     forward_m = points_m[:, 2].median().abs()
     if float(across_m.max()) > _WIDEST_TANGENT * float(forward_m):
@@ -393,6 +399,9 @@ def frame_advice(points_m: Float[Tensor, "n 3"]) -> str | None:
             "as x does in LiDAR and robot frames? Turn the cloud to x right, y down, z forward: of "
             "(x forward, y left, z up) that is (-y, -z, x)"
         )
+
+    # Or does z point backward?
+    behind = float((points_m[:, 2] <= 0).float().mean())
     if behind <= _MAJORITY:
         return None
     return (
@@ -429,6 +438,7 @@ def voxelise(points_m: Float[Tensor, "n 3"], config: CloudConfig) -> VoxelGrid:
         # One NaN would move the mean, and with it every point, into one cell.
         count = int((~points_m.isfinite().all(-1)).sum())
         raise InputError(f"voxelise: {count} points are not finite; leave such points out.")
+
     # The cell of each point.
     mean_m = points_m.mean(0)
     grid_from_camera = torch.eye(3).to(points_m)
@@ -452,16 +462,19 @@ def voxelise(points_m: Float[Tensor, "n 3"], config: CloudConfig) -> VoxelGrid:
     kept, rank = first.scatter_reduce_(0, cell, order, "amin").sort()
     row_of_point = rank.argsort()[cell]
 
+    # The number 1 of each cell, and its shape.
     features = torch.ones(len(kept), 1, dtype=torch.float32, device=kept.device)
     if config.with_shape:
-        # The mean of the points of each cell about its middle, in half cells; their number; plane.
+        # The mean of the points of each cell about its middle, in half cells; and their number.
         inside = places - cells
         counts = torch.bincount(row_of_point).to(inside)[:, None]
         sums = inside.new_zeros(len(counts), 3).index_add(0, row_of_point, inside)
+        means = 2 * sums / counts - 1
+        # The plane there.
         normals, curvature = local_planes(points_m.double().cpu(), points_m[kept].double().cpu())
         normals = normals @ grid_from_camera.double().cpu().mT
         plane = torch.cat([normals, curvature], 1).to(sums)
-        shape = torch.cat([2 * sums / counts - 1, counts.log2(), plane], 1)
+        shape = torch.cat([means, counts.log2(), plane], 1)
         features = torch.cat([features, shape.float()], 1)
     return VoxelGrid(
         coordinates=cells[kept],
@@ -496,12 +509,21 @@ def turn_axis_to(direction: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
 def thin(
     points_m: Float64[Tensor, "n 3"], normals: Float64[Tensor, "n 3"], step_m: float
 ) -> Int64[Tensor, " m"]:
-    """Give the index of one point of each cell of a grid and each octant of normals in it."""
+    """Choose one point of each cell of a grid and each octant of normals in it; give the indices.
+
+    Args:
+        points_m: at least one.
+        normals: of the points.
+        step_m: side of a cell.
+    """
     cells = ((points_m - points_m.amin(0)) / step_m).long()
     cells = torch.cat([cells, (normals > 0).long()], 1)
     _, place = torch.unique(cells, dim=0, return_inverse=True)
+
+    # The first point of each.
     first = torch.full((int(place.max()) + 1,), len(points_m))
-    return first.scatter_reduce_(0, place, torch.arange(len(points_m)), "amin").sort().values
+    first = first.scatter_reduce_(0, place, torch.arange(len(points_m)), "amin")
+    return first.sort().values
 
 
 def local_planes(
@@ -513,10 +535,13 @@ def local_planes(
         The normal of each toward the camera; the curvature of the cloud there, from the least
         eigenvalue of the neighbours' scatter: 0 (flat) to 1 (as wide in all directions).
     """
+    # The neighbours of each point, about their mean.
     count = min(_NEIGHBOURS, len(cloud_m))
     index = KDTree(cloud_m.numpy()).query(chosen_m.numpy(), k=count, workers=1)[1]
     near_m = cloud_m[torch.as_tensor(index).reshape(len(chosen_m), count)]
     near_m = near_m - near_m.mean(1, keepdim=True)
+
+    # The normal is the direction in which they extend least.
     eigenvalues, axes = torch.linalg.eigh(near_m.mT @ near_m)
     normals = axes[:, :, 0]
     is_behind = (normals * chosen_m).sum(-1, keepdim=True) > 0

@@ -55,7 +55,7 @@ class ColorAgreement:
 
     @property
     def score(self) -> Float64[Tensor, " b"]:
-        """Mean of the three correlations, -1 to 1."""
+        """The mean of the three correlations, -1 to 1."""
         return self.correlation.mean(-1)
 
     @property
@@ -87,15 +87,20 @@ def color_agreement(
         return ColorAgreement(
             correlation=nothing, independent=nothing, visible=nothing[:, 0].long()
         )
-    surface = _thin(model.colors, samples)
+
+    # So many poses at a time as fit in memory.
+    surface = _take_samples(model.colors, samples)
     image = _blur_image(view.color, poses, surface)
     parts: list[ColorAgreement] = []
     at_once = max(1, _POINTS_AT_ONCE // len(surface.points_m))
     for first in range(0, len(poses.R), at_once):
         chunk = poses[first : first + at_once].double()
         compared = _compare_features(chunk, surface, view, image, _NEAR * model.diameter_m)
-        correlation = _correlation(compared)
-        independent = torch.where(correlation != 0, _independent_points(compared, surface), 0.0)
+        correlation = _correlate(compared)
+        # Colour that explains nothing has no independent points.
+        independent = torch.where(
+            correlation != 0, _count_independent_points(compared, surface), 0.0
+        )
         visible = compared.weight[..., 0].sum(-1).long()
         parts.append(
             ColorAgreement(correlation=correlation, independent=independent, visible=visible)
@@ -107,7 +112,7 @@ def color_agreement(
     )
 
 
-def _thin(colors: SurfaceColors, samples: int) -> SurfaceColors:
+def _take_samples(colors: SurfaceColors, samples: int) -> SurfaceColors:
     """Take at most ``samples`` of the coloured points, evenly."""
     return SurfaceColors(
         points_m=take_evenly(colors.points_m, samples),
@@ -120,9 +125,9 @@ def _thin(colors: SurfaceColors, samples: int) -> SurfaceColors:
 class _BlurredImage(NamedTuple):
     """The part of a colour image about an object, as blurred as the model's colours are."""
 
-    rgb: Float[Tensor, "3 h w"]
-    left: int  # first column of the part
-    top: int  # and its first row
+    rgb: Float[Tensor, "3 h w"]  #: 0..1
+    left: int  #: first column of the part
+    top: int  #: and its first row
 
 
 def _project_to_color(
@@ -138,8 +143,9 @@ def _project_to_color(
 
 def _blur_image(color: ColorImage, poses: Rigid, surface: SurfaceColors) -> _BlurredImage:
     """Blur an image, where the posed models lie, by the spacing of the model's colours."""
-    some_m = take_evenly(surface.points_m, 300).double()
-    pixels, depth_m = _project_to_color(poses.double().apply(some_m), color)
+    # The blur in pixels, where the models lie.
+    few_m = take_evenly(surface.points_m, 300).double()
+    pixels, depth_m = _project_to_color(poses.double().apply(few_m), color)
     is_front = depth_m > 0
     height, width = color.rgb.shape[1:]
     if not bool(is_front.any()):
@@ -169,21 +175,22 @@ def _blur_image(color: ColorImage, poses: Rigid, surface: SurfaceColors) -> _Blu
 class _Compared(NamedTuple):
     """Colour features of a model and of an image at the same points, less mean and shading."""
 
-    weight: Float64[Tensor, "b n 3"]  # 1 where a feature is compared, else 0
-    of_model: Float64[Tensor, "b n 3"]
-    of_image: Float64[Tensor, "b n 3"]
+    weight: Float64[Tensor, "b n 3"]  #: 1 where a feature is compared, else 0
+    of_model: Float64[Tensor, "b n 3"]  #: features of the model
+    of_image: Float64[Tensor, "b n 3"]  #: features of the image
 
 
-def _features(rgb: Float64[Tensor, "*b 3"]) -> Float64[Tensor, "*b 3"]:
-    """Give the logarithms of brightness, of red over green, and of blue over green."""
+def _take_logarithms(rgb: Float64[Tensor, "*b 3"]) -> Float64[Tensor, "*b 3"]:
+    """Take the logarithms of brightness, of red over green, and of blue over green."""
     red, green, blue = (rgb + _BLACK).log().unbind(-1)
-    return torch.stack([(rgb.mean(-1) + _BLACK).log(), red - green, blue - green], -1)
+    brightness = (rgb.mean(-1) + _BLACK).log()
+    return torch.stack([brightness, red - green, blue - green], -1)
 
 
 def _compare_features(
     poses: Rigid, surface: SurfaceColors, view: ViewInput, image: _BlurredImage, near_m: float
 ) -> _Compared:
-    """Give the colour features of posed surfaces and of the image, where both cameras see them.
+    """Compare the colours of posed surfaces and of the image, where both cameras see them.
 
     Args:
         poses: a batch, ``camera_from_model`` of the depth camera.
@@ -223,18 +230,18 @@ def _compare_features(
     has_color = (rgb.amax(-1) < _SATURATED) & (rgb.amax(-1) > _DARK)
     with_color = is_visible & has_color
     weight = torch.stack([is_visible, with_color, with_color], -1).double()
-    of_model = _features(surface.rgb.double()).expand(len(points_m), -1, -1)
+    of_model = _take_logarithms(surface.rgb.double()).expand(len(points_m), -1, -1)
     return _Compared(
         weight=weight,
-        of_model=_without_shading(of_model, normals, weight),
-        of_image=_without_shading(_features(rgb), normals, weight),
+        of_model=_remove_shading(of_model, normals, weight),
+        of_image=_remove_shading(_take_logarithms(rgb), normals, weight),
     )
 
 
 _RIDGE = 1e-4  # added to the normals' second moments: a plane has no second direction
 
 
-def _without_shading(
+def _remove_shading(
     features: Float64[Tensor, "b n 3"],
     normals: Float64[Tensor, "b n 3"],
     weight: Float64[Tensor, "b n 3"],
@@ -252,7 +259,7 @@ def _without_shading(
     return torch.cat([brightness - shading, features[..., 1:]], -1)
 
 
-def _correlation(compared: _Compared) -> Float64[Tensor, "b 3"]:
+def _correlate(compared: _Compared) -> Float64[Tensor, "b 3"]:
     """Correlate model and image; 0 where few points are visible, or either has no print."""
     total = compared.weight.sum(1)
     of_model = compared.of_model.square().sum(1)
@@ -268,8 +275,10 @@ _BINS = 16  # bins of their distances, the nearer the finer
 _POSES_AT_ONCE = 16  # poses whose pairs are counted at a time, for the memory
 
 
-def _independent_points(compared: _Compared, surface: SurfaceColors) -> Float64[Tensor, "b 3"]:
-    """Give the effective number of independent points of each correlation.
+def _count_independent_points(
+    compared: _Compared, surface: SurfaceColors
+) -> Float64[Tensor, "b 3"]:
+    """Count the independent points of each correlation: their effective number.
 
     The variance of the correlation of two unrelated fields is the mean product of their
     autocorrelations over all pairs of points (Dutilleul 1993), and the number its inverse. Products
@@ -345,11 +354,12 @@ def copies_about_axis(
     """
     if model.colors is None or view.color is None:
         return pose.double()[None]
+
     # The largest agreements of a sweep.
     steps = max(3, math.ceil(360 / step_deg))
     step_rad = 2 * math.pi / steps
     sweep_rad = torch.arange(steps, dtype=torch.float64) * step_rad
-    rough = _sweep_scores(_rotated(pose, axis, sweep_rad), model, view, _SWEEP_SAMPLES)
+    rough = _score_sweep(_rotate_about(pose, axis, sweep_rad), model, view, _SWEEP_SAMPLES)
     is_peak = (rough >= rough.roll(1)) & (rough > rough.roll(-1)) & (rough > 0)
     peaks = is_peak.nonzero()[:, 0]
     peaks = peaks[rough[peaks].argsort(descending=True)][:_MOST_PEAKS]
@@ -360,24 +370,23 @@ def copies_about_axis(
     fine_rad = step_rad / _FINE_STEPS
     offsets_rad = torch.arange(-_FINE_STEPS, _FINE_STEPS + 1, dtype=torch.float64) * fine_rad
     angles_rad = sweep_rad[peaks, None] + offsets_rad
-    fine = _sweep_scores(_rotated(pose, axis, angles_rad.flatten()), model, view, _SAMPLES)
+    fine = _score_sweep(_rotate_about(pose, axis, angles_rad.flatten()), model, view, _SAMPLES)
     fine = fine.reshape(angles_rad.shape)
     best = fine.argmax(1).clamp(1, 2 * _FINE_STEPS - 1)
     three = fine.gather(1, best[:, None] + torch.tensor([-1, 0, 1]))
-    best_rad = angles_rad.gather(1, best[:, None])[:, 0]
-    best_rad = best_rad + _parabola_peak(three) * step_rad / _FINE_STEPS
+    middle_rad = angles_rad.gather(1, best[:, None])[:, 0]
+    best_rad = middle_rad + _find_parabola_peak(three) * step_rad / _FINE_STEPS
     order = three[:, 1].argsort(descending=True)
-    return _rotated(pose, axis, best_rad[order])
+    return _rotate_about(pose, axis, best_rad[order])
 
 
-def _rotated(pose: Rigid, axis: Axis, angles_rad: Float64[Tensor, " a"]) -> Rigid:
+def _rotate_about(pose: Rigid, axis: Axis, angles_rad: Float64[Tensor, " a"]) -> Rigid:
     """Rotate the model at a pose about one of its axes by each angle."""
-    return pose.double()[None] @ turn_about(
-        axis.direction.double(), axis.point_m.double(), angles_rad
-    )
+    turns = turn_about(axis.direction.double(), axis.point_m.double(), angles_rad)
+    return pose.double()[None] @ turns
 
 
-def _sweep_scores(
+def _score_sweep(
     poses: Rigid, model: ObjectModel, view: ViewInput, samples: int
 ) -> Float64[Tensor, " b"]:
     """Score poses by how much of the colours they explain, fast enough for sweeps of many poses.
@@ -386,14 +395,14 @@ def _sweep_scores(
     """
     assert model.colors is not None
     assert view.color is not None
-    surface = _thin(model.colors, samples)
+    surface = _take_samples(model.colors, samples)
     image = _blur_image(view.color, poses, surface)
     scores: list[Tensor] = []
     at_once = max(1, _POINTS_AT_ONCE // len(surface.points_m))
     for first in range(0, len(poses.R), at_once):
         chunk = poses[first : first + at_once]
         compared = _compare_features(chunk, surface, view, image, _NEAR * model.diameter_m)
-        explained = _correlation(compared).clamp(0, _MOST_CORRELATION).square()
+        explained = _correlate(compared).clamp(0, _MOST_CORRELATION).square()
         scores.append((-compared.weight.sum(1) * torch.log1p(-explained)).sum(-1))
     return torch.cat(scores)
 
@@ -435,7 +444,9 @@ def color_copies(
     pose = pose.double()
     if model.colors is None or view.color is None:
         return pose[None]
-    of_shape, axes = _ambiguous_motions(model)
+
+    # The motions that may be, and axes to sweep about.
+    of_shape, axes = _find_ambiguous_motions(model)
     motions = of_shape if turns is None else [turns.double()[k] for k in range(len(turns.R))]
 
     # Of motions that differ by a rotation about an axis one is tried: it is swept about the axis.
@@ -447,6 +458,8 @@ def color_copies(
         apart_rad = [float(geodesic_rad(motion.R, other.R)) for other in distinct]
         if not is_swept and min(apart_rad) > _SAME_TURN_RAD:
             distinct.append(motion)
+
+    # Each of them, rotated about the axes to where its print agrees.
     proposed: list[Rigid] = []
     for motion in distinct:
         copy = pose @ motion
@@ -455,7 +468,7 @@ def color_copies(
 
     # The best that are distinct.
     copies = Rigid.cat(proposed)
-    order = _sweep_scores(copies, model, view, _SAMPLES).argsort(descending=True, stable=True)
+    order = _score_sweep(copies, model, view, _SAMPLES).argsort(descending=True, stable=True)
     best = [pose[None]]
     for k in order.tolist():
         better = Rigid.cat(best)
@@ -483,30 +496,31 @@ def settle_spin(pose: Rigid, model: ObjectModel, view: ViewInput) -> Rigid:
         return pose
     steps = torch.arange(-_SETTLE_STEPS, _SETTLE_STEPS + 1).double()
     offsets_rad = steps * _SETTLE_STEP_RAD
-    _, axes = _ambiguous_motions(model)
+    _, axes = _find_ambiguous_motions(model)
     for axis in axes:
-        scores = _sweep_scores(_rotated(pose, axis, offsets_rad), model, view, _SWEEP_SAMPLES)
+        scores = _score_sweep(_rotate_about(pose, axis, offsets_rad), model, view, _SWEEP_SAMPLES)
         best = int(scores.argmax().clamp(1, len(offsets_rad) - 2))
         if float(scores[best]) > 0:
-            peak = _parabola_peak(scores[best - 1 : best + 2])
-            pose = _rotated(pose, axis, offsets_rad[best, None] + peak * _SETTLE_STEP_RAD)[0]
+            peak = _find_parabola_peak(scores[best - 1 : best + 2])
+            pose = _rotate_about(pose, axis, offsets_rad[best, None] + peak * _SETTLE_STEP_RAD)[0]
     return pose
 
 
-def _parabola_peak(values: Float64[Tensor, "*b 3"]) -> Float64[Tensor, "*b"]:
-    """Give where the parabola through three values is largest, -1 to 1 from the middle one."""
+def _find_parabola_peak(values: Float64[Tensor, "*b 3"]) -> Float64[Tensor, "*b"]:
+    """Find the peak of the parabola through three values, -1 to 1 from the middle one."""
     before, middle, after = values.unbind(-1)
     bend = (before - 2 * middle + after).clamp(max=-1e-9)
     return ((before - after) / (2 * bend)).clamp(-1, 1)
 
 
 @lru_cache(maxsize=64)
-def _ambiguous_motions(model: ObjectModel) -> tuple[list[Rigid], list[Axis]]:
-    """Give the motions of a model after which depth looks alike or nearly, and its free axes.
+def _find_ambiguous_motions(model: ObjectModel) -> tuple[list[Rigid], list[Axis]]:
+    """Find the motions of a model after which depth looks alike or nearly, and its free axes.
 
     Declared symmetries are not among them.
     """
     assert model.colors is not None
+    # Those of the shape: near-symmetries, and symmetries that were found.
     turns = [near.model_from_model.double() for near in near_symmetries(model)]
     axes: list[Axis] = []
     if model.symmetries.is_found:
@@ -514,11 +528,12 @@ def _ambiguous_motions(model: ObjectModel) -> tuple[list[Rigid], list[Axis]]:
         if discrete is not None:
             turns += [discrete.double()[k] for k in range(len(discrete.R))]
         axes += model.symmetries.continuous
-    axes += _axes_of_many_turns(turns, axes)
+    axes += _find_axes_of_many_turns(turns, axes)
 
     # A box whose halves differ a little looks alike after half turns about its middle.
     points_m = model.colors.points_m.double()
-    principal = torch.linalg.eigh((points_m - points_m.mean(0)).T.cov()).eigenvectors.T
+    centred_m = points_m - points_m.mean(0)
+    principal = torch.linalg.eigh(centred_m.T.cov()).eigenvectors.T
     along_m = points_m @ principal.T
     middle_m = (along_m.amin(0) + along_m.amax(0)) / 2 @ principal
     half = torch.tensor(math.pi, dtype=torch.float64)
@@ -526,18 +541,19 @@ def _ambiguous_motions(model: ObjectModel) -> tuple[list[Rigid], list[Axis]]:
     return turns, axes
 
 
-def _axes_of_many_turns(turns: Sequence[Rigid], others: Sequence[Axis]) -> list[Axis]:
-    """Find lines about which many of the turns are, beside other axes."""
-    eye = torch.eye(3).double()
+def _find_axes_of_many_turns(turns: Sequence[Rigid], others: Sequence[Axis]) -> list[Axis]:
+    """Find the lines about which many of the turns are, without those parallel to other axes."""
     # The direction of each axis is the one that the rotation leaves as it is.
+    eye = torch.eye(3).double()
     directions = [torch.linalg.svd(turn.R - eye).Vh[-1] for turn in turns]
     axes: list[Axis] = []
     for direction in directions:
-        before = [*others, *axes]
-        is_before = any(_are_parallel(direction, axis.direction.double()) for axis in before)
+        earlier = [*others, *axes]
+        has_axis = any(_are_parallel(direction, axis.direction.double()) for axis in earlier)
         alike = [k for k, other in enumerate(directions) if _are_parallel(other, direction)]
-        if is_before or len(alike) < _MANY_TURNS:
+        if has_axis or len(alike) < _MANY_TURNS:
             continue
+
         # A point that each turn leaves where it is.
         points = [torch.linalg.pinv(eye - turns[k].R, rtol=1e-3) @ turns[k].t_m for k in alike]
         point_m = torch.stack(points).median(0).values

@@ -46,12 +46,12 @@ def with_color(
                 "(--color), or omit its camera"
             )
         return view
-    plain = [model.name for model in models if model.colors is None]
-    if plain:
+    colorless = [model.name for model in models if model.colors is None]
+    if colorless:
         warnings.warn(
-            f"the model file of {', '.join(plain)} has no colours (or one alone), so depth alone "
-            "decides among its copies; give a PLY with colours of its vertices, or an OBJ or GLB "
-            "with a texture",
+            f"the model file of {', '.join(colorless)} has no colours (or one alone), so depth "
+            "alone decides among its copies; give a PLY with colours of its vertices, or an OBJ or "
+            "GLB with a texture",
             Notice,
             stacklevel=3,
         )
@@ -72,13 +72,16 @@ def color_input(
     """
     rgb = as_tensor(color, f"{view.name}: the colour image")
     height, width = rgb.shape[1:]
+
+    # Of a camera of its own.
     if camera is not None:
-        K = _color_intrinsics(camera, width, height, view)
+        K = _read_color_intrinsics(camera, width, height, view)
         transform = None
         if color_from_depth is not None:
             transform = rigid_input(color_from_depth, "color_from_depth", "color_from_depth")
         return ColorImage(rgb=rgb, K=K, color_from_depth=transform)
 
+    # Of the depth camera: aligned to the depth image, pixel by pixel.
     if color_from_depth is not None:
         raise InputError(
             f"{view.name}: color_from_depth is given, so the colour image is of another "
@@ -94,10 +97,10 @@ def color_input(
     return ColorImage(rgb=rgb, K=view.K)
 
 
-def _color_intrinsics(
+def _read_color_intrinsics(
     camera: AnyLens, width: int, height: int, view: ViewInput
 ) -> Float[Tensor, "3 3"]:
-    """Give the intrinsic matrix of a colour camera; raise if its images are of another size."""
+    """Read the intrinsic matrix of a colour camera; raise if its images are of another size."""
     lens = camera if isinstance(camera, Camera) else camera_of(camera, (width, height))
     assert lens is not None
     check_image_matches_camera(lens, width, height, f"{view.name}: the colour image")

@@ -40,17 +40,19 @@ class _Compiled:
         return self._dispatcher(*arguments)
 
     @property
-    def _numba_type_(self) -> Any:  # noqa: ANN401  by which numba knows what another loop calls
+    def _numba_type_(self) -> Any:  # noqa: ANN401  of numba
+        """The type by which numba knows this function where another loop calls it."""
         return self._dispatcher._numba_type_
 
     @cached_property
-    def _dispatcher(self) -> Any:  # noqa: ANN401  numba's, which compiles for each set of types
+    def _dispatcher(self) -> Any:  # noqa: ANN401  of numba
+        """The function of numba, which compiles the loop for each set of types."""
         from numba import njit
 
         # numba keeps compiled code by a function's name and until its file changes; the functions
         # that it calls are in the code too, so the name says of which files they are.
         digest = sha256()
-        for file in sorted(_files(self.loop)):
+        for file in sorted(_find_source_files(self.loop)):
             digest.update(Path(file).read_bytes())
         self.loop.__qualname__ = f"{self.loop.__name__}_{digest.hexdigest()[:16]}"
         try:
@@ -59,18 +61,18 @@ class _Compiled:
             return njit(nogil=True, error_model="numpy")(self.loop)
 
 
-def _files(loop: Callable[..., Any]) -> set[str]:
-    """Give the files of a function and of all compiled ones that it calls."""
+def _find_source_files(loop: Callable[..., Any]) -> set[str]:
+    """Find the files of a function and of all compiled functions that it calls."""
     files = {loop.__code__.co_filename}
     for name in loop.__code__.co_names:
         called = loop.__globals__.get(name)
         if isinstance(called, _Compiled):
-            files |= _files(called.loop)
+            files |= _find_source_files(called.loop)
     return files
 
 
 def array_of(tensor: Tensor) -> np.ndarray:
-    """Give a tensor of the CPU as a contiguous array for compiled loops, without its gradient.
+    """Convert a tensor of the CPU to a contiguous array for compiled loops, without its gradient.
 
     Raises:
         ValueError: a value is not finite.
@@ -102,17 +104,17 @@ def minus(a: Vector, b: Vector) -> Vector:
 
 @compiled
 def dot(a: Vector, b: Vector) -> float:
-    """Give the inner product."""
+    """Give the inner product of two vectors."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @compiled
 def cross(a: Vector, b: Vector) -> Vector:
-    """Give the cross product."""
+    """Give the cross product of two vectors."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @compiled
 def rotate(R: np.ndarray, a: Vector) -> Vector:
-    """Give ``R a``."""
+    """Rotate a vector: give ``R a``."""
     return dot(vector(R, 0), a), dot(vector(R, 1), a), dot(vector(R, 2), a)

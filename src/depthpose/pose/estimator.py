@@ -39,7 +39,7 @@ from depthpose.pose.surface import prepare_surface
 from depthpose.pose.track import TrackedObject, track
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, Refusal, ViewInput
 
-Made = TypeVar("Made")
+Result = TypeVar("Result")
 _NAME = "input"  # what an input is called that came without a name
 
 
@@ -86,23 +86,23 @@ class PoseEstimator:
         if isinstance(inputs, AnyInput):
             raise InputError("estimate_many takes several inputs; give one as [input]")
         total = len(inputs) if isinstance(inputs, Sized) else None
-        each = self._each(inputs, threads)
-        return list(tqdm(each, total=total, unit=" poses", disable=not with_progress))
+        estimates = self._estimate_each(inputs, threads)
+        return list(tqdm(estimates, total=total, unit=" poses", disable=not with_progress))
 
-    def _each(self, inputs: Iterable[AnyInput], threads: int) -> Iterator[PoseEstimate]:
+    def _estimate_each(self, inputs: Iterable[AnyInput], threads: int) -> Iterator[PoseEstimate]:
         """Give each input's estimate, in order; each is expected to show its object."""
         return each_in_threads(partial(unreadable_on_error, self._estimate), inputs, threads)
 
-    def _each_try(self, inputs: Iterable[AnyInput]) -> Iterator[PoseEstimate]:
+    def _estimate_each_try(self, inputs: Iterable[AnyInput]) -> Iterator[PoseEstimate]:
         """Give each input's estimate, in order, where an input may well not show its object.
 
         The evidence decides which of them does. An estimator that expects less of a try than of
         another input has its own.
         """
-        return self._each(inputs, 1)
+        return self._estimate_each(inputs, 1)
 
     def _estimate(self, pose_input: AnyInput) -> PoseEstimate:
-        """Estimate one input; an estimator of many at once has its own :meth:`_each`."""
+        """Estimate one input; an estimator of many at once has its own :meth:`_estimate_each`."""
         raise NotImplementedError
 
     @torch.no_grad()
@@ -115,7 +115,9 @@ class PoseEstimator:
         ``is_expected``: whether the inputs are meant to show their objects; else they are tries.
         """
         answers: list[PoseEstimate] = []
-        for estimate in self._each(inputs, 1) if is_expected else self._each_try(inputs):
+        for estimate in (
+            self._estimate_each(inputs, 1) if is_expected else self._estimate_each_try(inputs)
+        ):
             if estimate.status == "unreadable":
                 raise InputError(estimate.reason)
             answers.append(estimate)
@@ -128,10 +130,12 @@ class PoseEstimator:
         """
         if isinstance(pose_input, ViewInput) and pose_input.is_region:
             return self._search_region(pose_input)
-        prepared = self._object(pose_input.object).prepare()
+        prepared = self._find_object(pose_input.object).prepare()
         estimate = register(pose_input, prepared, self.config, self.refusal)
         if estimate.status != "doubtful" or not isinstance(pose_input, ViewInput):
             return estimate
+
+        # A mask whose pose is doubtful may not fit its object.
         in_region = self._search_region(replace(pose_input, is_region=True))
         seconds = seconds_of_all([estimate, in_region])
         return replace(in_region if in_region.is_posed else estimate, seconds=seconds)
@@ -139,7 +143,7 @@ class PoseEstimator:
     def _search_region(self, view: ViewInput) -> PoseEstimate:
         """Search the one object that is somewhere in the mask of a view, as in a box."""
         targets = SearchTargets(
-            objects={view.object: self._object(view.object).prepare()},
+            objects={view.object: self._find_object(view.object).prepare()},
             config=self.config,
             refusal=self.refusal,
             prior_odds=PRIOR_REGION,
@@ -192,7 +196,8 @@ class PoseEstimator:
             InputError: an unknown object, a file that cannot be read, shapes that do not fit. What
                 the data themselves lack is no error but a refusal.
         """
-        which = self.objects[0] if object is None else self._object(object).model.name
+        # A cloud, or a depth image with what belongs to it.
+        which = self.objects[0] if object is None else self._find_object(object).model.name
         of_view = {
             "depth": depth, "mask": mask, "box": box, "camera": camera, "focal_px": focal_px,
             "color": color, "color_camera": color_camera, "color_from_depth": color_from_depth,
@@ -207,6 +212,7 @@ class PoseEstimator:
         if cloud is not None:
             pose_input = cloud_input(cloud, unit or "m", which, _NAME)
         else:
+            # A view by its mask or its box, with background and colours.
             lens = choose_lens(camera, focal_px)
             if depth is None or lens is None or (mask is None) == (box is None):
                 raise InputError(
@@ -217,8 +223,10 @@ class PoseEstimator:
                 pixels = box_mask(box, *pose_input.depth_m.shape)
                 pose_input = replace(pose_input, mask=pixels, is_region=True)
             pose_input = with_background(pose_input, background, lens, unit)
-            models = self.models if object is None else [self._object(object).model]
+            models = self.models if object is None else [self._find_object(object).model]
             pose_input = with_color(pose_input, models, color, color_camera, color_from_depth)
+
+        # Of one object, or of whichever fits best.
         if object is not None or len(self.models) == 1:
             return self._estimate_or_raise([pose_input], is_expected=True)[0]
         tried = [replace(pose_input, object=name) for name in self.objects]
@@ -256,7 +264,7 @@ class PoseEstimator:
         if lens is None:
             raise InputError("estimate_instances: give camera= or focal_px=")
         labels = labels_input(mask, _NAME)
-        which = self._object(object).model.name
+        which = self._find_object(object).model.name
         view = view_input(depth, labels != 0, lens, which, _NAME, unit)
         pieces = split_instances(labels) or [view.mask]
         views = [replace(view, mask=m, name=f"{_NAME}_{k}") for k, m in enumerate(pieces)]
@@ -290,7 +298,11 @@ class PoseEstimator:
             InputError: as for :meth:`estimate`.
         """
         asked = [objects] if isinstance(objects, str) else objects
-        names = self.objects if asked is None else [self._object(name).model.name for name in asked]
+        names = (
+            self.objects
+            if asked is None
+            else [self._find_object(name).model.name for name in asked]
+        )
         if not names:
             raise InputError("find: objects names none; give those that may be there, or omit it")
         view = view_input(depth, None, camera, names[0], _NAME, unit)
@@ -312,7 +324,7 @@ class PoseEstimator:
             is_single: search once, without further rounds for more of the same object.
         """
         targets = SearchTargets(
-            objects={name: self._object(name).prepare() for name in objects},
+            objects={name: self._find_object(name).prepare() for name in objects},
             config=self.config,
             refusal=self.refusal,
             is_single=is_single,
@@ -353,16 +365,16 @@ class PoseEstimator:
         Raises:
             InputError: an unknown object, or a ``first`` that is no pose.
         """
-        which = self._object(object).model.name
+        which = self._find_object(object).model.name
         if isinstance(frames, str | Path):
             raise InputError(
                 f"track: frames is {str(frames)!r}, one path; give a list of files or arrays in "
                 "their order, such as list_images of depthpose.core.files gives of a folder"
             )
         start = None if first is None else rigid_input(first)
-        made = partial(cloud_input, unit=unit or "m", object=which)
+        convert = partial(cloud_input, unit=unit or "m", object=which)
         if camera is not None:
-            made = partial(view_input, mask=None, camera=camera, object=which, unit=unit)
+            convert = partial(view_input, mask=None, camera=camera, object=which, unit=unit)
 
         def read(number: int, frame: AnyArray | None) -> AnyInput | PoseEstimate:
             """Read a frame; one that cannot be read is an estimate that says so."""
@@ -370,12 +382,13 @@ class PoseEstimator:
             reason = f"{name}: there is no frame, a None in its place"
             if frame is not None:
                 try:
-                    return made(frame, name=name)
+                    return convert(frame, name=name)
                 except InputError as error:
                     reason = str(error)
             return PoseEstimate(name=name, object=which, status="unreadable", reason=reason)
 
-        return self.track_in((read(*numbered) for numbered in enumerate(frames)), which, start)
+        inputs = (read(number, frame) for number, frame in enumerate(frames))
+        return self.track_in(inputs, which, start)
 
     def track_in(
         self, frames: Iterable[AnyInput | PoseEstimate], object: str, first: Rigid | None = None
@@ -386,11 +399,12 @@ class PoseEstimator:
         """
 
         def search(pose_input: AnyInput) -> PoseEstimate:
+            """Pose the object in a frame without a pose of the frame before."""
             if isinstance(pose_input, CloudInput):
                 return self._estimate_or_raise([pose_input], is_expected=False)[0]
             return self.find_in(pose_input, [object], is_single=True)[0]
 
-        prepared = self._object(object)
+        prepared = self._find_object(object)
         target = TrackedObject(
             prepared=prepared,
             refusal=self.refusal,
@@ -399,8 +413,12 @@ class PoseEstimator:
         )
         return each_in_float32(track(frames, target, first))
 
-    def _object(self, name: str | None) -> PreparedObject:
-        """Give an object by its name, with its surface; None where one alone is known."""
+    def _find_object(self, name: str | None) -> PreparedObject:
+        """Find an object by its name, with its surface; None where one alone is known.
+
+        Raises:
+            InputError: no object has this name, or several are known and none is named.
+        """
         names = self.objects
         if name is None:
             if len(names) > 1:
@@ -414,6 +432,8 @@ class PoseEstimator:
         if name not in names:
             nearest = nearest_name(name, names)
             raise InputError(f"object {name!r}: {self._holder} do not know it; {nearest}")
+
+        # Its surface is sampled when it is first asked for.
         if name not in self._prepared_objects:
             number = names.index(name)
             model = self.models[number]
@@ -425,9 +445,9 @@ class PoseEstimator:
 
 
 def unreadable_on_error(
-    work: Callable[[AnyInput], Made], pose_input: AnyInput
-) -> Made | PoseEstimate:
-    """Give what work makes of an input; a refusal where it raises an error of the input."""
+    work: Callable[[AnyInput], Result], pose_input: AnyInput
+) -> Result | PoseEstimate:
+    """Do work on an input; give a refusal in place of an error that the input causes."""
     if not isinstance(pose_input, AnyInput):
         raise InputError(
             "estimate_many takes CloudInput and ViewInput of depthpose.pose.types, not a "

@@ -33,7 +33,8 @@ class GraphConvolutions:
         self._places = coordinates - (low - low % coarsest)
 
         # The number of a cell is its place times the strides of the box.
-        sides = self._places.op("ReduceMax", [0], keepdims=0) + np.array([1, *[1 + 2 * MARGIN] * 3])
+        margins = np.array([1, *[1 + 2 * MARGIN] * 3])
+        sides = self._places.op("ReduceMax", [0], keepdims=0) + margins
         x, y, z = (sides.slice([axis], [axis + 1], [0]) for axis in (1, 2, 3))
         self._strides = self._graph.op("Concat", x * y * z, y * z, z, [1], axis=0)
         cell_count = sides.op("ReduceProd", [0], keepdims=1)
@@ -69,25 +70,30 @@ class GraphConvolutions:
             layer = layer.conv
         volume, inputs, _ = layer.weight.shape
         if layer.kernel > 1:
-            key = (layer.kernel, level_in, level_out)
-            if key not in self._read_rows:
-                step = 1 << min(level_in, level_out)
-                step = -step if level_out < level_in else step
-                offsets = np.array([(0, *offset) for offset in kernel_offsets(layer.kernel)]) * step
-                cell_offsets = self._graph.op("MatMul", offsets, self._strides)  # (kernel^3,)
-                cells = self._level_cells[level_out].op("Unsqueeze", [1]) + cell_offsets
-                self._read_rows[key] = self._row_of_cell[level_in].op("Gather", cells)
             # What is read, (voxels out, kernel^3, inputs): zeros where there is no voxel.
+            read_rows = self._find_read_rows(layer.kernel, level_in, level_out)
             empty = np.zeros((1, inputs), np.float32)
             padded = self._graph.op("Concat", x, empty, axis=0)
-            read = padded.op("Gather", self._read_rows[key])
+            read = padded.op("Gather", read_rows)
             x = read.op("Reshape", [-1, volume * inputs])
         out = x.op("MatMul", layer.weight.flatten(0, 1).detach().float().cpu().numpy())
         return out if layer.bias is None else out + layer.bias.detach().float().cpu().numpy()
 
+    def _find_read_rows(self, kernel: int, level_in: int, level_out: int) -> Value:
+        """Find the rows that each voxel reads, (voxels out, kernel^3); once for each kernel."""
+        key = (kernel, level_in, level_out)
+        if key not in self._read_rows:
+            step = 1 << min(level_in, level_out)
+            step = -step if level_out < level_in else step
+            offsets = np.array([(0, *offset) for offset in kernel_offsets(kernel)]) * step
+            cell_offsets = self._graph.op("MatMul", offsets, self._strides)  # (kernel^3,)
+            cells = self._level_cells[level_out].op("Unsqueeze", [1]) + cell_offsets
+            self._read_rows[key] = self._row_of_cell[level_in].op("Gather", cells)
+        return self._read_rows[key]
+
 
 def direction_graph(network: ResUNet) -> Graph:
-    """Write what ``ResUNet.forward`` does, kernel maps and levels included.
+    """Write ``ResUNet.forward`` as a graph, kernel maps and levels included.
 
     Inputs ``coordinates`` (voxels, 4; int64: cloud, x, y, z; each voxel once) and ``features``
     (voxels, ``config.inputs``; float32: the number 1 where there is one). Output ``directions``
@@ -98,21 +104,27 @@ def direction_graph(network: ResUNet) -> Graph:
     coordinates = graph.input("coordinates", np.int64, ("voxels", 4))
     x = graph.input("features", np.float32, ("voxels", net.config.inputs))
     convolve = GraphConvolutions(coordinates).convolve
+
+    # Down: each level convolves the finer one, and a residual block follows.
     downs = zip(net.down, net.down_blocks, strict=True)
-    ups = zip(net.up, net.up_blocks, strict=True)
-    seen = list[Value]()
+    skips: list[Value] = []
     for level, (down, block) in enumerate(cast("Iterator[tuple[ConvNorm, Block]]", downs)):
         x = convolve(down, x, max(level - 1, 0), level)
         branch = convolve(block.first, x, level, level).op("Relu")
         x = (convolve(block.second, branch, level, level) + x).op("Relu")
-        seen.append(x)
-    x = seen.pop()
+        skips.append(x)
+
+    # Up: the same, and the features of the way down are added as channels.
+    x = skips.pop()
+    ups = zip(net.up, net.up_blocks, strict=True)
     for up, block in cast("Iterator[tuple[ConvNorm, Block]]", ups):
-        level = len(seen) - 1
+        level = len(skips) - 1
         x = convolve(up, x, level + 1, level)
         branch = convolve(block.first, x, level, level).op("Relu")
         x = (convolve(block.second, branch, level, level) + x).op("Relu")
-        x = graph.op("Concat", x, seen.pop(), axis=1)
+        x = graph.op("Concat", x, skips.pop(), axis=1)
+
+    # The last layers, point by point.
     outputs = convolve(net.final, convolve(net.mix, x, 0, 0).op("Relu"), 0, 0)
     shape = ("voxels", net.config.classes, net.config.keypoints, 3)
     graph.output("directions", outputs.op("Reshape", [-1, *shape[1:]]), np.float32, shape)
@@ -138,7 +150,7 @@ def pose_export(weights: PoseWeights, facts: dict[str, Any]) -> Export:
     }
     return Export(
         graph=partial(direction_graph, network),
-        cases=partial(_cases, weights, network),
+        cases=partial(_make_cases, weights, network),
         limits={"directions": Limit(value=1e-4)},
         facts={
             **facts, **model_facts,
@@ -147,16 +159,19 @@ def pose_export(weights: PoseWeights, facts: dict[str, Any]) -> Export:
     )  # fmt: skip
 
 
-def _cases(weights: PoseWeights, network: ResUNet) -> Iterator[Case]:
+def _make_cases(weights: PoseWeights, network: ResUNet) -> Iterator[Case]:
     """Run the network on voxels of surfaces, of one cloud and of several, as the graph must."""
     for counts in _POINTS:
+        # Voxels of the objects' surfaces, in no order.
         clouds: list[Tensor] = []
-        for k, count in enumerate(counts):  # voxels of an object's surface, in no order
+        for k, count in enumerate(counts):
             points_m, _ = sample_surface(weights.models[k % len(weights.models)], count)
             cells = torch.floor(points_m / weights.cloud.voxel_m).long().unique(dim=0)
             chance = torch.Generator().manual_seed(count)
             clouds.append(cells[torch.randperm(len(cells), generator=chance)])
         coordinates = torch.cat([F.pad(xyz, (1, 0), value=i) for i, xyz in enumerate(clouds)])
+
+        # Their features, and what the network answers.
         generator = torch.Generator().manual_seed(0)
         features = torch.ones(len(coordinates), network.config.inputs)
         if network.config.inputs > 1:

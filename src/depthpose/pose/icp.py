@@ -71,17 +71,17 @@ class Residuals(NamedTuple):
     """
 
     jacobian: Float64[np.ndarray, "n unknowns"]  #: of the distances
-    distance: Float64[np.ndarray, " n"]
-    weight: Float64[np.ndarray, " n"]
+    distance: Float64[np.ndarray, " n"]  #: along the normal of the sample
+    weight: Float64[np.ndarray, " n"]  #: by ``tukey_weight``
 
 
 class _Linearised(NamedTuple):
     """Refined poses' residuals, and their information about (rotation, translation)."""
 
-    information: Float64[Tensor, "*batch 6 6"]  # damped
-    jacobian: Float64[Tensor, "*batch n 6"]
-    weight: Float64[Tensor, "*batch n"]
-    residual_m: Float64[Tensor, "*batch n"]
+    information: Float64[Tensor, "*batch 6 6"]  #: damped
+    jacobian: Float64[Tensor, "*batch n 6"]  #: of the residuals
+    weight: Float64[Tensor, "*batch n"]  #: of each point
+    residual_m: Float64[Tensor, "*batch n"]  #: of each point
 
     @property
     def rms_m(self) -> Float64[Tensor, "*batch"]:
@@ -95,19 +95,19 @@ class _Linearised(NamedTuple):
 def tukey_weight(
     square: float | Float64[np.ndarray, "*n"], limit: float
 ) -> float | Float64[np.ndarray, "*n"]:
-    """Give Tukey's weight of squared distances: 1 at 0, and 0 from the limit on.
+    """Compute Tukey's weight of squared distances: 1 at 0, and 0 from the limit on.
 
     Every ICP weights its residuals so. To use another loss, change this function and
-    ``_influence_slope``.
+    ``_differentiate_influence``.
     """
     share = np.maximum(0.0, 1 - square / (limit * limit))
     return share * share
 
 
-def _influence_slope(
+def _differentiate_influence(
     weight: Float64[Tensor, "*batch n"], residual_m: Float64[Tensor, "*batch n"], limit_m: float
 ) -> Float64[Tensor, "*batch n"]:
-    """Give the derivative of weight times residual by the residual, for :func:`tukey_weight`."""
+    """Differentiate weight times residual by the residual, for :func:`tukey_weight`."""
     root = weight.sqrt()
     return root * (root - 4 * (residual_m / limit_m).square())
 
@@ -154,7 +154,7 @@ def refine_pose(
 
     # Covariance about the middle of the cloud, of the residuals and of an offset along the ray.
     cloud_m = take_evenly(points_m.double(), config.cloud_points)
-    covariance = _covariance(cloud_m, equations, limits_m[-1], surface.diameter_m)
+    covariance = _estimate_covariance(cloud_m, equations, limits_m[-1], surface.diameter_m)
     middle_m = cloud_m.mean(0)
     ray = torch.nn.functional.normalize(middle_m, dim=0)
     offset_m = config.sensor_offset_m * torch.cat([torch.zeros(3), ray])
@@ -163,9 +163,9 @@ def refine_pose(
     # The same about the camera: w x (p - c) + v = w x p + (v + c x w).
     eye = torch.eye(3, dtype=torch.float64)
     zero = torch.zeros(3, 3, dtype=torch.float64)
-    camera_from_middle = torch.cat(
-        [torch.cat([eye, zero], 1), torch.cat([cross_matrix(middle_m), eye], 1)]
-    )
+    rotation_rows = torch.cat([eye, zero], 1)
+    translation_rows = torch.cat([cross_matrix(middle_m), eye], 1)
+    camera_from_middle = torch.cat([rotation_rows, translation_rows])
     covariance = camera_from_middle @ covariance @ camera_from_middle.mT
     return RefinedPose(
         camera_from_model=Rigid(pose.R.to(points_m), pose.t_m.to(points_m)),
@@ -197,8 +197,10 @@ def refine_best(
         InputError: there is no point, or one is not finite.
     """
     config = IcpConfig() if config is None else config
+
+    # The best of all starts, roughly refined.
     initial = Rigid(initial.R.reshape(-1, 3, 3), initial.t_m.reshape(-1, 3))
-    starts = _rotated_starts(initial.double(), surface, config.starts)
+    starts = _add_rotated_starts(initial.double(), surface, config.starts)
     rough = refine_roughly(points_m, starts, surface, config)
     end_m = config.end_distance_diameters * surface.diameter_m
     score = _score_poses(points_m, rough, surface, end_m)
@@ -208,7 +210,7 @@ def refine_best(
     is_initial = best < len(initial.R)
     start = initial[best] if is_initial else None
     refined = _refine_exactly(points_m, start, rough[best], surface, config)
-    others = _distinct_poses(rough, score, refined.camera_from_model.double(), surface)
+    others = _choose_distinct_poses(rough, score, refined.camera_from_model.double(), surface)
     return BestStart(refined=refined, others=others)
 
 
@@ -244,8 +246,8 @@ def _refine_exactly(
     return refine_pose(points_m, rough, surface, near)
 
 
-def _rotated_starts(poses: Rigid, surface: Surface, number: int) -> Rigid:
-    """Give poses, then all of them rotated about the object's middle by each of the camera's axes.
+def _add_rotated_starts(poses: Rigid, surface: Surface, number: int) -> Rigid:
+    """Append all poses again, rotated about the object's middle by each of the camera's axes.
 
     ``number`` is the starts from each pose, 1 to 7: itself, then rotated by 15 degrees about x, y
     and z, then the other way.
@@ -258,10 +260,10 @@ def _rotated_starts(poses: Rigid, surface: Surface, number: int) -> Rigid:
     return Rigid((rotations @ poses.R).flatten(0, 1), t_m.flatten(0, 1))
 
 
-def _distinct_poses(
+def _choose_distinct_poses(
     poses: Rigid, score: Float64[Tensor, " b"], best: Rigid, surface: Surface
 ) -> Rigid:
-    """Give up to three poses, the best first, that are distinct from each other and from ``best``.
+    """Choose up to three poses, the best first, distinct from each other and from ``best``.
 
     The distance of two poses is the mean distance between the places that they give the same point
     of the model, the least over the symmetries of the model.
@@ -327,13 +329,17 @@ def _iterate(
             f"ICP of {len(points_m)} points, {int((~points_m.isfinite().all(-1)).sum())} of them "
             "not finite: leave those out, and refuse a cloud of none."
         )
+
+    # Poses are refined in place, and what is known of them then is written into these arrays.
     cloud = array_of(take_evenly(points_m.double(), max_points))
     R = array_of(pose.R).copy()
     t_m = array_of(pose.t_m).copy()
     rotations = R.reshape(-1, 3, 3)
     translations = t_m.reshape(-1, 3)
     batch = (len(translations), len(cloud))
-    jacobian, weight, residual_m = np.zeros((*batch, 6)), np.zeros(batch), np.zeros(batch)
+    jacobian = np.zeros((*batch, 6))
+    weight = np.zeros(batch)
+    residual_m = np.zeros(batch)
     information = np.empty((batch[0], 6, 6))
     for k in range(batch[0]):
         information[k] = _refine(
@@ -346,11 +352,12 @@ def _iterate(
             is_exact,
             Residuals(jacobian[k], residual_m[k], weight[k]),
         )
-    linearised = (information, jacobian, weight, residual_m)
+
+    # Back to the batch axes of the poses.
     shape = pose.t_m.shape[:-1]
-    return Rigid(torch.from_numpy(R), torch.from_numpy(t_m)), _Linearised(
-        *(torch.from_numpy(part).reshape(*shape, *part.shape[1:]) for part in linearised)
-    )
+    parts = (information, jacobian, weight, residual_m)
+    tensors = [torch.from_numpy(part).reshape(*shape, *part.shape[1:]) for part in parts]
+    return Rigid(torch.from_numpy(R), torch.from_numpy(t_m)), _Linearised(*tensors)
 
 
 @compiled
@@ -368,6 +375,16 @@ def _refine(
 
     Exact steps match each point with its nearest sample of the surface in the first half of the
     steps, and with the sample on its ray in the second; other steps look samples up in a table.
+
+    Args:
+        cloud: in the camera frame.
+        R: rotation of the pose; changed.
+        t: its translation; changed.
+        limits: as of :func:`_iterate`.
+        diameter: of the object.
+        target: samples of the surface.
+        is_exact: whether samples are searched, not looked up.
+        residuals: are written.
     """
     middle = cloud.sum(0) / len(cloud)
     places = np.full(len(cloud), -1)
@@ -393,13 +410,13 @@ def _refine(
         # Linearise about the middle of the cloud: a rotation by w about the camera, D away, with
         # the shift that cancels it to first order would leave the object w^2 D / 2 off.
         _linearise(local, eye, places, R, t - middle, limit, target, is_along_rays, residuals)
-        H, b = normal_equations(residuals, 1e-6)
+        H, b = build_normal_equations(residuals, 1e-6)
         if step == last or has_converged:
             break
 
         # One Gauss-Newton step.
         motion = np.linalg.solve(H, b)
-        turn = rotation_matrix(motion)
+        turn = make_rotation(motion)
         t[:] = turn @ (t - middle) + middle + motion[3:]
         R[:] = turn @ R
 
@@ -419,9 +436,15 @@ def _meet_planes(
     target: Target,
     places: Int64[np.ndarray, " n"],
 ) -> Float64[np.ndarray, "n 3"]:
-    """Give where the ray of each point meets the plane of its sample, in the model frame.
+    """Intersect the ray of each point with the plane of its sample, in the model frame.
 
-    The sample itself where the ray grazes the plane; the point where it has no sample.
+    It gives the sample itself where the ray grazes the plane, and the point where it has no sample.
+
+    Args:
+        local: points in the model frame.
+        eye: the camera there.
+        target: the samples.
+        places: of the samples of the points, or -1.
     """
     meet = local.copy()
     for i in range(len(local)):
@@ -510,13 +533,15 @@ def _score_poses(
     A score is the share of points near the surface, less their distance, free-space violations and
     part of the unobserved surface.
     """
+    # What the posed surface would hide, and what of it was not observed.
     cloud_m = take_evenly(points_m.double(), _OCCLUSION_POINTS)
     free_space_violation, unobserved = look_along_rays(cloud_m, poses, surface, every=4)
+
+    # How many points lie near it. Of poses with equal shares the nearer one is better.
     few_m = take_evenly(cloud_m, _ROUGH_POINTS)
     limits_m = [limit_m]  # no step: matches and residuals alone
     _, equations = _iterate(few_m, _ROUGH_POINTS, poses, surface, limits_m, is_exact=False)
     inlier_share = (equations.weight > 0).double().mean(-1)
-    # Of poses with equal shares the nearer one is better.
     closeness = inlier_share - equations.rms_m / surface.diameter_m
     score = closeness - free_space_violation - _UNOBSERVED_WEIGHT * unobserved
     score[0] += _FIRST_POSE_BONUS
@@ -524,16 +549,17 @@ def _score_poses(
 
 
 @compiled
-def normal_equations(
+def build_normal_equations(
     residuals: Residuals, least_size: float
 ) -> tuple[Float64[np.ndarray, "k k"], Float64[np.ndarray, " k"]]:
-    """Give the weighted normal equations of a Gauss-Newton step, ``H @ motion = b``.
+    """Build the weighted normal equations of a Gauss-Newton step, ``H @ motion = b``.
 
     H is damped, so that an unknown that no point constrains stays where it was: by a billionth of
     the largest number of its diagonal, or of ``least_size``.
     """
     unknowns = residuals.jacobian.shape[1]
-    H, b = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
+    H = np.zeros((unknowns, unknowns))
+    b = np.zeros(unknowns)
     for i in range(len(residuals.weight)):
         if residuals.weight[i] <= 0:
             continue
@@ -542,6 +568,8 @@ def normal_equations(
             b[k] += scaled * residuals.distance[i]
             for m in range(unknowns):
                 H[k, m] += scaled * residuals.jacobian[i, m]
+
+    # Damped by its largest number.
     size = least_size
     for k in range(unknowns):
         size = max(size, H[k, k])
@@ -551,34 +579,40 @@ def normal_equations(
 
 
 @compiled
-def rotation_matrix(motion: Float64[np.ndarray, " k"]) -> Float64[np.ndarray, "3 3"]:
-    """Give the rotation by a motion, whose first three numbers are a rotation vector [rad].
+def make_rotation(motion: Float64[np.ndarray, " k"]) -> Float64[np.ndarray, "3 3"]:
+    """Make the rotation of a motion, whose first three numbers are a rotation vector [rad].
 
     Rodrigues' formula.
     """
     x, y, z = motion[0], motion[1], motion[2]
     square = x * x + y * y + z * z
     angle = np.sqrt(square)
-    s, c = 1 - square / 6, 0.5 - square / 24  # sin(a) / a and (1 - cos(a)) / a^2 at a small angle
+    # sin(a) / a and (1 - cos(a)) / a^2, by their series at a small angle.
+    s = 1 - square / 6
+    c = 0.5 - square / 24
     if angle >= 1e-4:
-        s, c = np.sin(angle) / angle, (1 - np.cos(angle)) / square
+        s = np.sin(angle) / angle
+        c = (1 - np.cos(angle)) / square
     R = np.empty((3, 3))
     R[0, 0] = 1 - c * (y * y + z * z)
     R[1, 1] = 1 - c * (x * x + z * z)
     R[2, 2] = 1 - c * (x * x + y * y)
-    R[0, 1], R[1, 0] = c * x * y - s * z, c * x * y + s * z
-    R[0, 2], R[2, 0] = c * x * z + s * y, c * x * z - s * y
-    R[1, 2], R[2, 1] = c * y * z - s * x, c * y * z + s * x
+    R[0, 1] = c * x * y - s * z
+    R[1, 0] = c * x * y + s * z
+    R[0, 2] = c * x * z + s * y
+    R[2, 0] = c * x * z - s * y
+    R[1, 2] = c * y * z - s * x
+    R[2, 1] = c * y * z + s * x
     return R
 
 
-def _covariance(
+def _estimate_covariance(
     cloud_m: Float64[Tensor, "n 3"],
     equations: _Linearised,
     limit_m: float,
     diameter_m: float,
 ) -> Float64[Tensor, "*batch 6 6"]:
-    """Give the covariance of a motion (rotation, translation) about the middle of the cloud.
+    """Estimate the covariance of a motion (rotation, translation) about the middle of the cloud.
 
     That of an M-estimator (Huber 1981), ``s^2 A^-1``, assumes independent residuals; those of a
     depth camera are correlated over many pixels. It is therefore inflated by a block jackknife
@@ -586,10 +620,16 @@ def _covariance(
     far the pose moves. This is repeated for several block sizes, and the largest result counts,
     because the correlation length is not known. With few blocks a direction can look certain by
     chance, so no direction is inflated by less than the mean over all, or by less than 1.
+
+    Args:
+        cloud_m: the points of the residuals, in the camera frame.
+        equations: residuals, weights and information of each pose.
+        limit_m: distance from which a point has no weight.
+        diameter_m: of the object.
     """
-    slope = _influence_slope(equations.weight, equations.residual_m, limit_m)
-    independent, whitening, spread_m = _independent_factor(equations, slope)
-    inflation, directions = _jackknife_inflation(
+    slope = _differentiate_influence(equations.weight, equations.residual_m, limit_m)
+    independent, whitening, spread_m = _factor_independent_covariance(equations, slope)
+    inflation, directions = _measure_inflation(
         cloud_m, equations, slope, independent, whitening, spread_m, diameter_m
     )
     least = inflation.mean(-1, keepdim=True).clamp(min=1)
@@ -598,7 +638,7 @@ def _covariance(
     return (factor * inflation[..., None, :]) @ factor.mT
 
 
-def _independent_factor(
+def _factor_independent_covariance(
     equations: _Linearised, slope: Float64[Tensor, "*batch n"]
 ) -> tuple[
     Float64[Tensor, "*batch 6 6"], Float64[Tensor, "*batch 6 6"], Float64[Tensor, "*batch 1 1"]
@@ -627,7 +667,7 @@ def _independent_factor(
     return factor, inverse_factor, spread_m
 
 
-def _jackknife_inflation(
+def _measure_inflation(
     cloud_m: Float64[Tensor, "n 3"],
     equations: _Linearised,
     slope: Float64[Tensor, "*batch n"],
@@ -636,16 +676,27 @@ def _jackknife_inflation(
     spread_m: Float64[Tensor, "*batch 1 1"],
     diameter_m: float,
 ) -> tuple[Float64[Tensor, "*batch 6"], Float64[Tensor, "*batch 6 6"]]:
-    """Give the ratios of a block jackknife's variances to independent ones, and their directions.
+    """Measure the ratios of a block jackknife's variances to independent ones; and directions.
 
     Of several block sizes the one with the largest sum is taken; the ratios are 1 where no size has
-    a larger sum. Directions are columns, in the coordinates of ``whitening``, the inverse of the
-    factor ``independent``.
+    a larger sum. Directions are columns, in the coordinates of ``whitening``.
+
+    Args:
+        cloud_m: the points of the residuals, in the camera frame.
+        equations: residuals, weights and information of each pose.
+        slope: of the influence of each residual.
+        independent: factor of the covariance under independent residuals.
+        whitening: its inverse.
+        spread_m: standard deviation of the residuals.
+        diameter_m: of the object.
     """
+    # What each point adds to the gradient and to the information.
     inverse_information = independent @ independent.mT / spread_m.square()
     J = equations.jacobian
     gradients = (equations.weight * equations.residual_m)[..., None] * J
     informations = (slope[..., None] * J)[..., None] * J[..., None, :]
+
+    # The largest inflation of all block sizes.
     image_m = cloud_m[:, :2] / cloud_m[:, 2:] * cloud_m[:, 2].mean()
     eye = torch.eye(6, dtype=torch.float64)
     inflation = torch.ones_like(independent[..., 0])
@@ -666,6 +717,8 @@ def _jackknife_inflation(
         moves = torch.linalg.solve(remaining, gradient[..., None]).squeeze(-1)
         moves = whitening @ (moves @ inverse_information).mT
         values, vectors = torch.linalg.eigh(moves @ moves.mT)
+
+        # Is it larger than those of the sizes before?
         is_larger = values.sum(-1, keepdim=True) > inflation.sum(-1, keepdim=True)
         inflation = torch.where(is_larger, values, inflation)
         directions = torch.where(is_larger[..., None], vectors, directions)

@@ -18,10 +18,10 @@ from depthpose.pose.compiled import array_of, compiled, cross, dot, minus, vecto
 from depthpose.pose.config import IcpConfig
 from depthpose.pose.icp import (
     Residuals,
-    normal_equations,
+    build_normal_equations,
+    make_rotation,
     refine_pose,
     refine_roughly,
-    rotation_matrix,
     tukey_weight,
 )
 from depthpose.pose.mesh import MIRROR_ALIKE
@@ -72,7 +72,7 @@ class Scale:
     gain: float
 
 
-def scale_of(
+def measure_scale(
     cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface, object_std_m: float
 ) -> Scale:
     """Measure the scale of the model that fits a cloud best, the pose moving with it.
@@ -91,15 +91,15 @@ def scale_of(
     starts = torch.tensor(_STARTS, dtype=torch.float64)
     few_m = take_evenly(local_m, _ROUGH_POINTS).expand(len(starts), -1, -1)
     times, moved_m = _fit_scale(few_m, starts, surface, is_exact=False)
-    costs = distance_to(moved_m, surface, times, is_exact=False).square()
+    costs = measure_distance(moved_m, surface, times, is_exact=False).square()
     costs[0] -= _FIRST_START_BONUS
     start = starts[costs.argmin()][None]
 
     # From it exactly.
     times, moved_m = _fit_scale(local_m[None], start, surface, is_exact=True)
-    distance = distance_to(moved_m, surface, times, is_exact=True)[0]
-    gain = distance_to(local_m, surface, is_exact=True) - distance
-    residuals = _growth_residuals(
+    distance = measure_distance(moved_m, surface, times, is_exact=True)[0]
+    gain = measure_distance(local_m, surface, is_exact=True) - distance
+    residuals = _linearise_growth(
         array_of(moved_m[0]),
         float(times),
         array_of(surface.middle_m),
@@ -108,17 +108,17 @@ def scale_of(
         True,
         np.full(moved_m.shape[1], -1),
     )
-    return Scale(float(times), _scale_deviation(residuals, object_std_m), float(gain))
+    return Scale(float(times), _estimate_scale_deviation(residuals, object_std_m), float(gain))
 
 
-def _scale_deviation(residuals: Residuals, object_std_m: float) -> float:
-    """Give the standard deviation of a scale.
+def _estimate_scale_deviation(residuals: Residuals, object_std_m: float) -> float:
+    """Estimate the standard deviation of a scale.
 
     It has two causes: noise of the readings, which neighbours share, and sides of the real object
     that deviate from the model by ``object_std_m``.
     """
     weight = residuals.weight
-    H, _ = normal_equations(residuals, _LEAST_INFORMATION)
+    H, _ = build_normal_equations(residuals, _LEAST_INFORMATION)
     inverse = float(np.linalg.inv(H)[6, 6])
     degrees = max(1.0, weight.sum() - 7)
     noise_m2 = (weight * residuals.distance**2).sum() / degrees
@@ -160,21 +160,31 @@ def _grow(
     target: Target,
     is_exact: bool,
 ) -> None:
-    """Take steps of ICP with a scale, until no start moves any more; points and scales change."""
+    """Take steps of ICP with a scale, until no start moves any more.
+
+    Args:
+        local: points in the model frame, for each start; changed.
+        times: scale of each start; changed.
+        middle: about which the surface grows.
+        limits: of the distance, for each step.
+        target: samples of the surface.
+        is_exact: whether samples are searched, not looked up in a table.
+    """
     places = np.full(local.shape[:2], -1)
     for limit in limits:
         largest = 0.0
-        for p in range(len(times)):
-            residuals = _growth_residuals(
-                local[p], times[p], middle, limit, target, is_exact, places[p]
+        for start in range(len(times)):
+            residuals = _linearise_growth(
+                local[start], times[start], middle, limit, target, is_exact, places[start]
             )
-            H, b = normal_equations(residuals, _LEAST_INFORMATION)
+            H, b = build_normal_equations(residuals, _LEAST_INFORMATION)
             motion = np.linalg.solve(H, b)  # rotation, translation, growth
             growth = min(max(motion[6], -0.1), 0.1)
-            times[p] = min(max(times[p] * (1 + growth), 0.5), 2.0)
+            times[start] = min(max(times[start] * (1 + growth), 0.5), 2.0)
+
             # The points move by the inverse of the surface's motion.
-            turn = rotation_matrix(motion)
-            local[p] = (local[p] - middle - motion[3:6]) @ turn + middle
+            turn = make_rotation(motion)
+            local[start] = (local[start] - middle - motion[3:6]) @ turn + middle
             for k in (0, 1, 2, 6):
                 largest = max(largest, abs(motion[k]))
         if largest < _CONVERGED:
@@ -182,7 +192,7 @@ def _grow(
 
 
 @compiled
-def _growth_residuals(
+def _linearise_growth(
     local: Float64[np.ndarray, "n 3"],
     scale: float,
     middle: Float64[np.ndarray, "3"],
@@ -195,7 +205,17 @@ def _growth_residuals(
 
     By rotation and translation of the surface, and by its growth about its middle. Where it is not
     known which side of a surface was seen, all samples count.
+
+    Args:
+        local: points in the model frame.
+        scale: of the surface.
+        middle: about which it grows.
+        limit: distance from which a point has no weight.
+        target: samples of the surface at its own size.
+        is_exact: whether samples are searched, not looked up in a table.
+        places: of the samples of the points, or -1; written.
     """
+    # Matched with the surface at its own size.
     count = len(local)
     unscaled = (local - middle) / scale + middle
     centre = (middle[0], middle[1], middle[2])
@@ -204,6 +224,8 @@ def _growth_residuals(
     for i in range(count):
         if places[i] < 0:
             continue
+
+        # The distance, and how the surface's motion and growth change it.
         normal = vector(target.normals, places[i])
         x, y, z = minus(vector(target.tree.points, places[i]), centre)
         arm = (scale * x, scale * y, scale * z)
@@ -221,16 +243,22 @@ def _growth_residuals(
     return residuals
 
 
-def distance_to(
+def measure_distance(
     local_m: Float64[Tensor, "*batch n 3"],
     surface: Surface,
     times: Float64[Tensor, "*batch"] | None = None,
     *,
     is_exact: bool,
 ) -> Float64[Tensor, "*batch"]:
-    """Give the root mean square distance of points to a surface, in limits of nearness.
+    """Measure the root mean square distance of points to a surface, in limits of nearness.
 
-    Distances are cut off at 1, the limit. With ``times`` the surface is scaled about its middle.
+    Distances are cut off at 1, the limit.
+
+    Args:
+        local_m: points in the model frame.
+        surface: of the model.
+        times: scale of the surface about its middle, of each batch; None: its own size.
+        is_exact: whether the nearest samples are searched, not looked up in a table.
     """
     if times is not None:
         local_m = (local_m - surface.middle_m) / times[:, None, None] + surface.middle_m
@@ -241,7 +269,7 @@ def distance_to(
     return (gap_m / (NEAR * surface.diameter_m)).clamp(max=1).square().mean(-1).sqrt()
 
 
-def mirror_gain(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) -> float:
+def measure_mirror_gain(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) -> float:
     """Measure how much nearer a cloud lies to the mirror image of the model, in its best pose.
 
     The cloud is mirrored in place of the model, so that ICP finds a pose.
@@ -265,10 +293,10 @@ def mirror_gain(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) ->
 
     # Is the mirror image clearly worse?
     few_m = take_evenly(mirrored_m, _ROUGH_MIRROR_POINTS).expand(len(rough.R), -1, -1)
-    distance = distance_to(rough.inverse().apply(few_m), surface, is_exact=False)
+    distance = measure_distance(rough.inverse().apply(few_m), surface, is_exact=False)
     local_m = pose.double().inverse().apply(cloud_m)
     few_m = take_evenly(local_m, _ROUGH_MIRROR_POINTS)
-    unmirrored = distance_to(few_m, surface, is_exact=False)
+    unmirrored = measure_distance(few_m, surface, is_exact=False)
     if float(distance.min() - unmirrored) > _CLEARLY_WORSE:
         return float(unmirrored - distance.min())
 
@@ -277,31 +305,31 @@ def mirror_gain(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) ->
     config = replace(config, start_distance_diameters=config.end_distance_diameters)
     refined = refine_pose(mirrored_m, rough[best], surface, config)
     exact_m = refined.camera_from_model.inverse().apply(mirrored_m[None])
-    distance = distance_to(exact_m, surface, is_exact=True)
-    unmirrored = distance_to(local_m, surface, is_exact=True)
+    distance = measure_distance(exact_m, surface, is_exact=True)
+    unmirrored = measure_distance(local_m, surface, is_exact=True)
     return float(unmirrored - distance.min())
 
 
-def sensor_size_error(distance_m: float, focal_px: float, diameter_m: float) -> float:
-    """Give the share by which an offset and displaced edges of a sensor may change a size."""
+def _bound_size_error(distance_m: float, focal_px: float, diameter_m: float) -> float:
+    """Bound the share by which an offset and displaced edges of a sensor may change a size."""
     edges_m = 2 * EDGE_PX * distance_m / focal_px
-    return _offset_size_error(distance_m) + edges_m / diameter_m
+    return _bound_offset_error(distance_m) + edges_m / diameter_m
 
 
-def _offset_size_error(distance_m: float) -> float:
-    """Give the share by which a sensor's offset may change a size: the same as of the distance."""
+def _bound_offset_error(distance_m: float) -> float:
+    """Bound the share by which a sensor's offset may change a size: that of the distance."""
     return LARGEST_OFFSET_M / distance_m
 
 
 class _Fits(NamedTuple):
     """What other fits of a model to a cloud found, and how far their results may be off."""
 
-    name: str  # of the model
-    scale: Scale
-    mirror_gain: float | None  # None where the mirror image is the model itself
-    size_tolerance: float  # share by which a right object may seem to differ in size
-    mirror_tolerance: float  # gain of the mirror image that deviating sides explain
-    offset_error: float  # share by which a sensor's offset may change the size
+    name: str  #: of the model
+    scale: Scale  #: that fits best
+    mirror_gain: float | None  #: None where the mirror image is the model itself
+    size_tolerance: float  #: share by which a right object may seem to differ in size
+    mirror_tolerance: float  #: gain of the mirror image that deviating sides explain
+    offset_error: float  #: share by which a sensor's offset may change the size
 
 
 def identify(
@@ -328,13 +356,14 @@ def identify(
         max_size_error: by so much a real object may differ in size from its model.
         object_std_m: standard deviation of its surface from the model's.
     """
-    scale = scale_of(cloud_m, pose, surface, object_std_m)
+    # The best fits of another size and of the mirror image.
+    scale = measure_scale(cloud_m, pose, surface, object_std_m)
     has_mirror_image = mirror_deviation > MIRROR_ALIKE
-    gain = mirror_gain(cloud_m, pose, surface) if has_mirror_image else None
+    gain = measure_mirror_gain(cloud_m, pose, surface) if has_mirror_image else None
 
     # Errors that explain a difference: of the sensor, and of sides that deviate from the model.
     distance_m = float(cloud_m[:, 2].double().median())
-    sensor_error = sensor_size_error(distance_m, focal_px, surface.diameter_m)
+    sensor_error = _bound_size_error(distance_m, focal_px, surface.diameter_m)
     sides_m = object_std_m / math.sqrt(INDEPENDENT_SIDES)
     fits = _Fits(
         name=name,
@@ -342,14 +371,15 @@ def identify(
         mirror_gain=gain,
         size_tolerance=max_size_error + sensor_error,
         mirror_tolerance=sides_m / (NEAR * surface.diameter_m),
-        offset_error=_offset_size_error(distance_m),
+        offset_error=_bound_offset_error(distance_m),
     )
 
-    reason = _why_contradicted(fits)
+    # What they say of the object.
+    reason = _explain_contradiction(fits)
     if reason:
         status = "contradicted"
     else:
-        reason = _why_not_confirmed(fits, evidence)
+        reason = _explain_doubt(fits, evidence)
         status = "not excluded" if reason else "confirmed"
     return Identity(
         status=status,
@@ -360,8 +390,8 @@ def identify(
     )
 
 
-def _why_contradicted(fits: _Fits) -> str:
-    """Say which other fit is clearly better than that of the model; an empty text where none is."""
+def _explain_contradiction(fits: _Fits) -> str:
+    """Explain which other fit is clearly better than that of the model; empty where none is."""
     scale = fits.scale
     largest_error = fits.size_tolerance + _DEVIATIONS * scale.sigma
     is_other_size = abs(scale.times - 1) > largest_error and scale.gain > _SIZE_GAIN
@@ -383,15 +413,19 @@ def _why_contradicted(fits: _Fits) -> str:
     return ""
 
 
-def _why_not_confirmed(fits: _Fits, evidence: Evidence) -> str:
-    """Say what keeps a model that nothing contradicts from being confirmed; empty where nothing."""
+def _explain_doubt(fits: _Fits, evidence: Evidence) -> str:
+    """Explain what keeps a model without contradiction from being confirmed; empty if nothing."""
     scale = fits.scale
     size_error = abs(scale.times - 1)
     deviation = _DEVIATIONS * scale.sigma
+
+    # Is another size or the mirror image excluded?
     if size_error + deviation + fits.offset_error > _OTHER_SIZES:
         return f"what was seen does not fix the size: {_describe_size(scale)}"
     if fits.mirror_gain is not None and fits.mirror_gain > -_MIRROR_GAIN:
         return f"the mirror image of {fits.name} fits what was seen as well"
+
+    # And is it the model's own size, with nothing that contradicts it?
     if scale.gain > _SIZE_GAIN:
         return f"{_describe_size(scale)}, which a sensor's errors may explain"
     if size_error > max(_NEAR_SIZE, deviation) + fits.offset_error:
@@ -406,6 +440,7 @@ def _why_not_confirmed(fits: _Fits, evidence: Evidence) -> str:
 
 
 def _describe_size(scale: Scale) -> str:
+    """Describe the size that fits best, and how certain it is."""
     return (
         f"{scale.times:.2f} times the model's size fits best (standard deviation {scale.sigma:.2f})"
     )

@@ -39,18 +39,26 @@ _SMALLEST_INSTANCE = 0.2
 
 
 def cloud_input(cloud: AnyCloud, unit: Unit, object: str, name: str) -> CloudInput:
-    """Convert points of any unit to a cloud in metres."""
+    """Convert points of any unit to a cloud in metres.
+
+    Args:
+        cloud: points, a file, or a cloud of trimesh or Open3D.
+        unit: of the points.
+        object: name of the object that they are of.
+        name: what results and errors call the cloud.
+    """
     if is_shape(cloud):
-        cloud = shape_geometry(cloud)[0]
-    points = read_cloud(cloud).points if isinstance(cloud, str | Path) else _tensor(cloud)
+        cloud, _ = shape_geometry(cloud)
+    points = (
+        read_cloud(cloud).points if isinstance(cloud, str | Path) else _convert_to_tensor(cloud)
+    )
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(
             f"{name}: the cloud is of shape {tuple(points.shape)}; give points as rows of x, y and "
             "z: (n, 3)"
         )
-    return CloudInput(
-        name=name, points_m=(points.double() * metres_of(unit)).float(), object=object
-    )
+    points_m = (points.double() * metres_of(unit)).float()
+    return CloudInput(name=name, points_m=points_m, object=object)
 
 
 def depth_input(
@@ -65,7 +73,9 @@ def depth_input(
         name: what errors call the image, where it is no file.
         unit: of the depth. Whole numbers need it where the camera has no unit.
     """
-    values = read_stored_depth(depth) if isinstance(depth, str | Path) else _tensor(depth)
+    values = (
+        read_stored_depth(depth) if isinstance(depth, str | Path) else _convert_to_tensor(depth)
+    )
     if values.ndim != 2:
         raise InputError(f"{name}: the depth is of shape {tuple(values.shape)}, not (h, w)")
     height, width = values.shape
@@ -103,7 +113,16 @@ def view_input(
     name: str,
     unit: Unit | None = None,
 ) -> ViewInput:
-    """Convert a depth image, a mask and a camera to a view in metres."""
+    """Convert a depth image, a mask and a camera to a view in metres.
+
+    Args:
+        depth: as for :func:`depth_input`.
+        mask: the object's pixels; None: all pixels.
+        camera: of the depth image.
+        object: name of the object.
+        name: what results and errors call the view.
+        unit: of the depth, where its camera says none.
+    """
     depth_m, lens = depth_input(depth, camera, name, unit)
     height, width = depth_m.shape
 
@@ -141,16 +160,16 @@ def rigid_input(
     """Convert a transform, or its 4x4 matrix in metres; ``name`` and ``what`` name it in errors."""
     if isinstance(pose, Rigid):
         return pose
-    matrix = torch.zeros(0) if isinstance(pose, str | Path) else _tensor(pose).double()
+    matrix = torch.zeros(0) if isinstance(pose, str | Path) else _convert_to_tensor(pose).double()
     if tuple(matrix.shape) != (4, 4):
         raise InputError(
             f"{name} is a {type(pose).__name__} of shape {tuple(matrix.shape)}; give a Rigid, or "
             f"the 4x4 matrix {what} in metres"
         )
     R = matrix[:3, :3]
-    last = matrix.new_tensor([0, 0, 0, 1])
-    is_rotation = torch.allclose(R @ R.T, torch.eye(3).to(R), atol=1e-4) and torch.det(R) > 0
-    if not is_rotation or not torch.equal(matrix[3], last):
+    is_orthonormal = torch.allclose(R @ R.T, torch.eye(3).to(R), atol=1e-4)
+    is_rotation = is_orthonormal and torch.det(R) > 0
+    if not is_rotation or not torch.equal(matrix[3], matrix.new_tensor([0, 0, 0, 1])):
         raise InputError(
             f"{name} is no rigid transform; give [R t; 0 0 0 1], R a rotation, t in metres (a "
             "transposed matrix has t in its last row)"
@@ -164,10 +183,13 @@ def split_instances(labels: Int64[Tensor, "h w"]) -> list[Bool[Tensor, "h w"]]:
     Objects are the labels where there are several. Else they are the connected pieces, by corners
     too; those below a fifth of the largest are fragments, and left out.
     """
+    # One mask a number, where there are several.
     numbers, pixels = labels[labels != 0].unique(return_counts=True)
     if len(numbers) > 1:
         order = pixels.argsort(descending=True, stable=True)
         return [labels == number for number in numbers[order]]
+
+    # Else one a connected piece.
     label, pixels = label_parts(labels != 0)
     order = pixels.argsort(descending=True, stable=True)
     least = max(1, math.ceil(_SMALLEST_INSTANCE * int(pixels.max())))
@@ -183,7 +205,7 @@ def labels_input(mask: AnyMask, name: str) -> Int64[Tensor, "_ _"]:
         return read_labels(Path(mask))
     if isinstance(mask, Mapping):
         return decode_rle(*read_runs(mask, name)).long()
-    values = _tensor(mask)
+    values = _convert_to_tensor(mask)
     if values.is_floating_point() and not bool((values % 1 == 0).all()):
         if not bool(((values >= 0) & (values <= 1)).all()):
             raise InputError(
@@ -195,20 +217,23 @@ def labels_input(mask: AnyMask, name: str) -> Int64[Tensor, "_ _"]:
     return number_objects(whole.numpy()) if whole.ndim == 2 else whole
 
 
-def _tensor(values: Any) -> Tensor:  # noqa: ANN401  whatever a caller has
+def _convert_to_tensor(values: Any) -> Tensor:  # noqa: ANN401  whatever a caller has
     """Convert numbers of any library to a tensor on the CPU, of a type that torch computes with."""
     if isinstance(values, Tensor) and not values.is_complex():
         # Of unsigned numbers torch supports few operations, but for bytes.
         is_unsigned = values.dtype in (torch.uint16, torch.uint32, torch.uint64)
         return (values.long() if is_unsigned else values).detach().cpu()
     array = np.asarray(values)
-    if array.dtype.kind not in "biuf":
+    is_numeric = array.dtype.kind in "biuf"
+    if not is_numeric:
         is_complex = array.dtype.kind == "c"
         what = "complex numbers where real" if is_complex else f"a {type(values).__name__} where"
         raise InputError(
             f"{what} numbers belong; give a tensor or array of numbers, "
             "or a file's path (of a camera: a Camera, its file or its matrix K)"
         )
+
+    # Types that torch lacks or hardly supports, and the other byte order.
     if array.dtype.kind == "u" and array.dtype.itemsize > 1:
         array = array.astype(np.int64)
     if array.dtype.kind == "f" and array.dtype.itemsize > 8:

@@ -19,7 +19,7 @@ class Tree(NamedTuple):
     Node ``k`` is split into ``2 k + 1``, of the smaller coordinates, and ``2 k + 2``.
     """
 
-    points: Float64[np.ndarray, "m 3"]
+    points: Float64[np.ndarray, "m 3"]  #: of the surface
     outward: Float64[np.ndarray, "m 3"]  #: normals on their outer side, 0 where none is known
     order: Int64[np.ndarray, " m"]  #: index that each point had before
     axes: Int64[np.ndarray, " nodes"]  #: axis across which each node is split
@@ -29,6 +29,7 @@ class Tree(NamedTuple):
 @compiled
 def build_tree(points: Float64[np.ndarray, "m 3"], outward: Float64[np.ndarray, "m 3"]) -> Tree:
     """Sort points, one at least, and their normals into a tree."""
+    # As many levels as leave a few points to each range of the last one.
     count = len(points)
     order = np.arange(count)
     depth = 0
@@ -36,12 +37,14 @@ def build_tree(points: Float64[np.ndarray, "m 3"], outward: Float64[np.ndarray, 
         depth += 1
     axes = np.zeros((1 << depth) - 1, np.int64)
     values = np.zeros((1 << depth) - 1)
+
+    # Each range is split at the middle of its points, across its longest side.
     for level in range(depth):
         for k in range(1 << level):
-            low, high = _range_of(k, level, count)
-            axis = _widest_axis(points, order, low, high)
+            low, high = _find_range(k, level, count)
+            axis = _find_widest_axis(points, order, low, high)
             middle = (low + high) // 2
-            _select(points, order, low, high - 1, middle, axis)
+            _select_rank(points, order, low, high - 1, middle, axis)
             node = (1 << level) - 1 + k
             axes[node] = axis
             values[node] = points[order[middle], axis]
@@ -49,8 +52,8 @@ def build_tree(points: Float64[np.ndarray, "m 3"], outward: Float64[np.ndarray, 
 
 
 @compiled
-def _range_of(k: int, level: int, count: int) -> tuple[int, int]:
-    """Give the range of points of node ``k`` of a level: each bit of ``k`` chooses a half."""
+def _find_range(k: int, level: int, count: int) -> tuple[int, int]:
+    """Find the range of points of node ``k`` of a level: each bit of ``k`` chooses a half."""
     low, high = 0, count
     for bit in range(level - 1, -1, -1):
         if (k >> bit) & 1:
@@ -61,23 +64,25 @@ def _range_of(k: int, level: int, count: int) -> tuple[int, int]:
 
 
 @compiled
-def _widest_axis(
+def _find_widest_axis(
     points: Float64[np.ndarray, "m 3"], order: Int64[np.ndarray, " m"], low: int, high: int
 ) -> int:
-    """Give the axis along which the points ``order[low:high]`` extend farthest."""
-    widest, axis = -1.0, 0
+    """Find the axis along which the points ``order[low:high]`` extend farthest."""
+    widest = -1.0
+    axis = 0
     for c in range(3):
         least, most = np.inf, -np.inf
         for i in range(low, high):
             least = min(least, points[order[i], c])
             most = max(most, points[order[i], c])
         if most - least > widest:
-            widest, axis = most - least, c
+            widest = most - least
+            axis = c
     return axis
 
 
 @compiled
-def _select(
+def _select_rank(
     points: Float64[np.ndarray, "m 3"],
     order: Int64[np.ndarray, " m"],
     low: int,
@@ -88,6 +93,14 @@ def _select(
     """Partially sort ``order[low:high + 1]`` by a coordinate: rank ``wanted`` gets to its place.
 
     Quickselect (Hoare 1961): smaller ones come before it, larger ones after it.
+
+    Args:
+        points: in any order.
+        order: indices of points; changed.
+        low: first place of the range that is sorted.
+        high: its last place.
+        wanted: the rank, as a place in the range.
+        axis: of the coordinate.
     """
     while low < high:
         pivot = points[order[(low + high) // 2], axis]
@@ -119,8 +132,13 @@ def faces(
 ) -> bool:
     """Whether a point shows a camera, ``eye``, its outer side.
 
-    ``least`` is the least component of the outward normal along the way to the camera, in units of
-    length; below 0 it lets points count that nearly face it, and all at minus infinity.
+    Args:
+        points: of a tree.
+        outward: their normals.
+        place: of the point.
+        eye: the camera.
+        least: the least component of the outward normal along the way to the camera, in units of
+            length; below 0 it lets points count that nearly face it, and all at minus infinity.
     """
     return dot(vector(outward, place), minus(eye, vector(points, place))) >= least
 
@@ -133,7 +151,7 @@ def square_distance(points: Float64[np.ndarray, "m 3"], place: Place, query: Vec
 
 
 @compiled
-def nearest_facing(
+def find_nearest_facing(
     query: Vector,
     tree: Tree,
     eye: Vector,
@@ -141,14 +159,20 @@ def nearest_facing(
     best: Place,
     best_square: float,
 ) -> Place:
-    """Give the place of the nearest point that faces a camera (:func:`faces`).
+    """Find the place of the nearest point that faces a camera (:func:`faces`).
 
-    ``best`` is a guess, at a squared distance of ``best_square``; or -1, and only points nearer
-    than that are searched. It is returned where no point is nearer.
+    Args:
+        query: the point whose neighbour is searched.
+        tree: of the points.
+        eye: the camera.
+        least: how nearly a point must face it (:func:`faces`).
+        best: place of a guess, or -1; it is returned where no point is nearer than
+            ``best_square``.
+        best_square: squared distance of the guess; only points nearer than it are searched.
     """
     points, outward, _, axes, values = tree
-    # The ranges that wait: node, first and last point; squared distance from the query along each
-    # axis, and in all.
+    # The ranges that wait: node, first point and one past the last; and how far they are from the
+    # query, squared, along each axis and in all.
     ranges = np.empty((_MOST_WAITING, 3), np.int64)
     gaps = np.empty((_MOST_WAITING, 4))
     ranges[0, 0], ranges[0, 1], ranges[0, 2] = 0, 0, len(points)
@@ -156,8 +180,10 @@ def nearest_facing(
     waiting = 1
     while waiting > 0:
         waiting -= 1
-        node, low, high = ranges[waiting, 0], ranges[waiting, 1], ranges[waiting, 2]
-        x, y, z, square = gaps[waiting, 0], gaps[waiting, 1], gaps[waiting, 2], gaps[waiting, 3]
+        node = ranges[waiting, 0]
+        low, high = ranges[waiting, 1], ranges[waiting, 2]
+        x, y, z = gaps[waiting, 0], gaps[waiting, 1], gaps[waiting, 2]
+        square = gaps[waiting, 3]
         if square >= best_square:
             continue
 
@@ -178,6 +204,8 @@ def nearest_facing(
                 waiting += 1
             node = 2 * node + (1 if is_low else 2)
             low, high = (low, middle) if is_low else (middle, high)
+
+        # The points of that last range, one by one.
         for place in range(low, high):
             square = square_distance(points, place, query)
             if square < best_square and faces(points, outward, place, eye, least):
@@ -186,14 +214,15 @@ def nearest_facing(
 
 
 @compiled
-def nearest_points(queries: Float64[np.ndarray, "n 3"], tree: Tree) -> Int64[np.ndarray, " n"]:
-    """Give the index, as it was before sorting, of the point nearest to each query."""
+def find_nearest_points(queries: Float64[np.ndarray, "n 3"], tree: Tree) -> Int64[np.ndarray, " n"]:
+    """Find the index, as it was before sorting, of the point nearest to each query."""
     index = np.empty(len(queries), np.int64)
     anywhere = (0.0, 0.0, 0.0)
     place = np.int64(0)
     for i in range(len(queries)):
         query = vector(queries, i)
-        square = square_distance(tree.points, place, query)  # that before is near in an image
-        place = nearest_facing(query, tree, anywhere, -np.inf, place, square)
+        # The answer of the query before is the guess: neighbours in an image lie near each other.
+        square = square_distance(tree.points, place, query)
+        place = find_nearest_facing(query, tree, anywhere, -np.inf, place, square)
         index[i] = tree.order[place]
     return index

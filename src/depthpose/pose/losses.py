@@ -30,7 +30,7 @@ def direction_loss(
     instance: Int[Tensor, " points"],
     mode: str = "mse",
 ) -> Float[Tensor, ""]:
-    """Mean over instances of the least loss that any symmetric copy of the truth gives.
+    """Average over instances the least loss that any symmetric copy of the truth gives.
 
     It is the same whichever of the symmetric truths comes first. The copy is chosen once for a
     whole instance: a choice point by point, or an average of copies, would teach votes that meet at
@@ -52,25 +52,30 @@ def direction_loss(
         return predicted.sum()
     points = torch.bincount(instance, minlength=len(copies_m))
 
-    def means_of(truth_m: Float[Tensor, "instances keypoints 3"]) -> Float[Tensor, " instances"]:
-        # 0 where a point lies on its keypoint.
+    def average_losses(
+        truth_m: Float[Tensor, "instances keypoints 3"],
+    ) -> Float[Tensor, " instances"]:
+        """Average the losses of each instance's points for given true keypoints."""
+        # A direction is 0 where a point lies on its keypoint.
         truth = F.normalize(truth_m[instance] - points_m[:, None], dim=-1, eps=1e-9)
         losses = POINT_LOSSES[mode](predicted, truth)
         sums = losses.new_zeros(len(points)).index_add(0, instance, losses)
         return sums / points.clamp(min=1).to(losses.dtype)
 
     with torch.no_grad():
-        copy = torch.stack([means_of(truth_m) for truth_m in copies_m.unbind(1)]).argmin(0)
-    means = means_of(copies_m[torch.arange(len(copies_m), device=copy.device), copy])
+        losses_of_copies = [average_losses(truth_m) for truth_m in copies_m.unbind(1)]
+        best_copy = torch.stack(losses_of_copies).argmin(0)
+    instances = torch.arange(len(copies_m), device=best_copy.device)
+    means = average_losses(copies_m[instances, best_copy])
     return means.sum() / (points > 0).sum()
 
 
 def model_point_loss(
     predicted: Rigid, truth: Rigid, points_m: Float[Tensor, "b n 3"], copies: Rigid
 ) -> Float[Tensor, " b"]:
-    """ADD [m] of each pose against the nearest symmetric copy of its truth.
+    """Measure ADD [m] of each pose to the nearest symmetric copy of its truth.
 
-    The mean distance of points of each object, differentiable in the predicted pose.
+    It is the mean distance of points of each object, differentiable in the predicted pose.
 
     Args:
         predicted: ``camera_from_model`` (b).
@@ -79,8 +84,9 @@ def model_point_loss(
         copies: symmetries, ``model_from_model`` (b, c), the identity among them.
     """
     predicted_m = predicted.apply(points_m)
+
     # T_true S p for each symmetry S: (b, c, n, 3)
     true = Rigid(truth.R[:, None].expand_as(copies.R), truth.t_m[:, None].expand_as(copies.t_m))
-    of_each_copy_m = points_m[:, None].expand(-1, copies.R.shape[1], -1, -1)
-    true_m = true.apply(copies.apply(of_each_copy_m))
+    repeated_m = points_m[:, None].expand(-1, copies.R.shape[1], -1, -1)
+    true_m = true.apply(copies.apply(repeated_m))
     return (predicted_m[:, None] - true_m).norm(dim=-1).mean(-1).amin(-1)

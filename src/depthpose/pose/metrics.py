@@ -28,21 +28,21 @@ RenderDepth = Callable[[Rigid], Float[Tensor, "h w"]]
 
 
 def add_m(estimated: Rigid, true: Rigid, points_m: Float[Tensor, "n 3"]) -> Float[Tensor, "*batch"]:
-    """ADD [m]: mean distance of each model point at one pose to itself at the other."""
-    gap_m = _posed(estimated, points_m) - _posed(true, points_m)
+    """Measure ADD [m]: the mean distance of each model point at one pose to itself at the other."""
+    gap_m = _pose_points(estimated, points_m) - _pose_points(true, points_m)
     return gap_m.norm(dim=-1).mean(-1)
 
 
 def adds_m(
     estimated: Rigid, true: Rigid, points_m: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "*batch"]:
-    """ADD-S [m]: mean distance of each true point to the nearest estimated one.
+    """Measure ADD-S [m]: the mean distance of each true point to the nearest estimated one.
 
     This is the definition of BOP and Hinterstoisser. DenseFusion and the method's published code
     measure from each estimated point to the nearest true one.
     """
-    true_m = _posed(true, points_m)
-    estimated_m = _posed(estimated, points_m)
+    true_m = _pose_points(true, points_m)
+    estimated_m = _pose_points(estimated, points_m)
     means_m: list[float] = []
     rows = -1, *true_m.shape[-2:]
     for of_truth, of_estimate in zip(true_m.reshape(rows), estimated_m.reshape(rows), strict=True):
@@ -54,7 +54,7 @@ def adds_m(
 def add_of_nearest_m(
     estimated: Rigid, true: Rigid, points_m: Float[Tensor, "n 3"], symmetries: Rigid
 ) -> Float[Tensor, ""]:
-    """ADD [m] to the nearest symmetric copy of the true pose.
+    """Measure ADD [m] to the nearest symmetric copy of the true pose.
 
     ADD-S is lower: it forgives any pose with the surface near the true one, such as a U rotated by
     90 degrees, and not only symmetries.
@@ -66,10 +66,10 @@ def add_of_nearest_m(
         symmetries: ``model_from_model``, a batch with the identity, of
             ``mesh.symmetry_transforms``.
     """
-    estimated_m = _posed(estimated, points_m)
+    estimated_m = _pose_points(estimated, points_m)
     errors_m = [
-        (_posed(copies, points_m) - estimated_m).norm(dim=-1).mean(-1)
-        for copies in _symmetric_copies(true, symmetries, len(points_m))
+        (_pose_points(copies, points_m) - estimated_m).norm(dim=-1).mean(-1)
+        for copies in _split_symmetric_copies(true, symmetries, len(points_m))
     ]
     return torch.cat(errors_m).min()
 
@@ -77,14 +77,14 @@ def add_of_nearest_m(
 def mssd_m(
     estimated: Rigid, true: Rigid, points_m: Float[Tensor, "n 3"], symmetries: Rigid
 ) -> Float[Tensor, ""]:
-    """MSSD [m]: largest distance of a surface point, to the nearest symmetric copy of the truth.
+    """Measure MSSD [m]: the largest distance of a surface point to the nearest symmetric truth.
 
     The arguments are those of :func:`add_of_nearest_m`.
     """
-    estimated_m = _posed(estimated, points_m)
+    estimated_m = _pose_points(estimated, points_m)
     errors_m = [
-        (_posed(copies, points_m) - estimated_m).norm(dim=-1).amax(-1)
-        for copies in _symmetric_copies(true, symmetries, len(points_m))
+        (_pose_points(copies, points_m) - estimated_m).norm(dim=-1).amax(-1)
+        for copies in _split_symmetric_copies(true, symmetries, len(points_m))
     ]
     return torch.cat(errors_m).min()
 
@@ -96,15 +96,15 @@ def mspd_px(
     symmetries: Rigid,
     K: Float[Tensor, "3 3"],
 ) -> Float[Tensor, ""]:
-    """MSPD [px]: largest distance of a projected point, to the nearest symmetric copy of the truth.
+    """Measure MSPD [px]: the largest distance of a projected point to the nearest symmetric truth.
 
     Infinite where a point lies behind the camera. BOP scales it by 640 / image width before its
     thresholds; see :func:`average_recall`.
     """
-    pixels = project(_posed(estimated, points_m), K)
+    pixels = project(_pose_points(estimated, points_m), K)
     errors_px: list[Tensor] = []
-    for copies in _symmetric_copies(true, symmetries, len(points_m)):
-        distance_px = (project(_posed(copies, points_m), K) - pixels).norm(dim=-1)
+    for copies in _split_symmetric_copies(true, symmetries, len(points_m)):
+        distance_px = (project(_pose_points(copies, points_m), K) - pixels).norm(dim=-1)
         errors_px.append(distance_px.nan_to_num(torch.inf).amax(-1))
     return torch.cat(errors_px).min()
 
@@ -118,7 +118,7 @@ def vsd(
     taus_m: Sequence[float],
     delta_m: float = VSD_DELTA_M,
 ) -> Float[Tensor, " t"]:
-    """VSD: share of the visible surface whose distance is off by ``tau`` or more, for each tau.
+    """Measure VSD: the share of the visible surface that is off by ``tau`` or more, for each tau.
 
     Distances are those from the camera's centre, not along its axis. A pixel of a render is
     visible where the measured surface is not more than ``delta_m`` in front of it, or where
@@ -141,19 +141,25 @@ def vsd(
     y = (pixels[..., 1] - K[1, 2]) / K[1, 1]
     x = (pixels[..., 0] - K[0, 2] - K[0, 1] * y) / K[0, 0]
     rays = (x * x + y * y + 1).sqrt()
-    measured_m, estimated_m, true_m = (
-        image_m.double().nan_to_num(nan=0.0, posinf=0.0) * rays
-        for image_m in (depth_m, render(estimated), render(true))
-    )
+
+    def measure_distance(image_m: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+        """Give distances from the centre [m], 0 for none."""
+        return image_m.double().nan_to_num(nan=0.0, posinf=0.0) * rays
+
+    # What is visible of each render, and of both.
+    measured_m = measure_distance(depth_m)
+    estimated_m = measure_distance(render(estimated))
+    true_m = measure_distance(render(true))
     is_true_visible = _is_visible(true_m, measured_m, delta_m)
     is_estimated_visible = _is_visible(estimated_m, measured_m, delta_m)
     is_estimated_visible |= is_true_visible & (estimated_m > 0)
-
     in_both = is_true_visible & is_estimated_visible
     in_either = is_true_visible | is_estimated_visible
     count = int(in_either.sum())
     if count == 0:
         return torch.ones(len(taus_m), dtype=torch.float64)
+
+    # The share that is off by each tolerance.
     gap_m = (true_m[in_both] - estimated_m[in_both]).abs()
     in_one_alone = count - int(in_both.sum())
     off = torch.stack([(gap_m >= tau).sum() for tau in taus_m])
@@ -169,7 +175,7 @@ def _is_visible(
 
 
 def auc(error_m: Float[Tensor, " n"], limit_m: float = 0.1) -> float:
-    """Area under the share of errors below a threshold, for thresholds 0 to ``limit_m``; 0..1.
+    """Measure the area under the share of errors below a threshold of 0 to ``limit_m``; 0..1.
 
     The exact area. PoseCNN's script takes the upper step at each error and is larger by up to one
     part in the number of errors. A missing estimate is NaN or infinite, and counts as 0.
@@ -179,7 +185,7 @@ def auc(error_m: Float[Tensor, " n"], limit_m: float = 0.1) -> float:
 
 
 def average_recall(errors: Float[Tensor, "n t"], thresholds: Sequence[float]) -> float:
-    """BOP's average recall: share of errors below each threshold, mean over thresholds and taus.
+    """Compute BOP's average recall: the share of errors below a threshold, averaged over all.
 
     A missing estimate is infinite or NaN, and counts as wrong.
 
@@ -192,33 +198,37 @@ def average_recall(errors: Float[Tensor, "n t"], thresholds: Sequence[float]) ->
 
 
 def average_precision(is_right: Sequence[bool], targets: int) -> float:
-    """Average precision of detections; 0..1.
+    """Compute the average precision of detections; 0..1.
 
-    The mean, over 101 recalls from 0 to 1, of the best precision at that recall or a higher one:
+    It is the mean over 101 recalls from 0 to 1 of the best precision at a recall or a higher one:
     COCO's interpolation, as BOP takes it for 6D detection since 2024.
 
     Args:
         is_right: of each detection, in the order of falling scores.
         targets: number of objects to be detected, at least 1.
     """
+    # Recall and precision of the first detections, one more each time.
     right = torch.tensor(list(is_right), dtype=torch.float64).cumsum(0)
     if len(right) == 0:
         return 0.0
     recall = right / targets
     precision = right / torch.arange(1, len(right) + 1, dtype=torch.float64)
-    best = precision.flip(0).cummax(0).values.flip(0)  # at this recall or a higher one
+
+    # The best precision at each of 101 recalls or a higher one; 0 at one that is not reached.
+    best = precision.flip(0).cummax(0).values.flip(0)
+    best = torch.cat([best, best.new_zeros(1)])
     recalls = torch.linspace(0, 1, 101, dtype=torch.float64)
     place = torch.searchsorted(recall, recalls)
-    best = torch.cat([best, best.new_zeros(1)])  # a recall that is not reached has a precision of 0
     return float(best[place].mean())
 
 
-def _posed(pose: Rigid, points_m: Float[Tensor, "n 3"]) -> Float[Tensor, "*batch n 3"]:
+def _pose_points(pose: Rigid, points_m: Float[Tensor, "n 3"]) -> Float[Tensor, "*batch n 3"]:
+    """Move points to their places at a pose, or at each of a batch."""
     points = points_m.double()
     return points @ pose.R.double().mT + pose.t_m.double()[..., None, :]
 
 
-def _symmetric_copies(true: Rigid, symmetries: Rigid, points: int) -> list[Rigid]:
+def _split_symmetric_copies(true: Rigid, symmetries: Rigid, points: int) -> list[Rigid]:
     """Give the poses that look like the true one, in batches that fit into memory."""
     pose = true.double()
     R = symmetries.R.double()

@@ -122,14 +122,19 @@ class ResUNet(nn.Module):
         self.config = config = config or ResUNetConfig()
         e = config.encoder
         d = config.decoder
+
+        # Down: the finest level has the first kernel, each coarser one a stride of 2.
         self.down = nn.ModuleList([ConvNorm(config, config.inputs, e[0], config.first_kernel)])
         self.down.extend(ConvNorm(config, e[i - 1], e[i], 3, 2) for i in (1, 2, 3))
         self.down_blocks = nn.ModuleList(Block(width, config) for width in e)
+
+        # Up: all but the coarsest level take the features of the way down beside those below.
         into = {3: e[3], 2: e[2] + d[3], 1: e[1] + d[2]}
         self.up = nn.ModuleList(
             ConvNorm(config, into[i], d[i], 3, 2, SparseConvTranspose) for i in (3, 2, 1)
         )
         self.up_blocks = nn.ModuleList(Block(d[i], config) for i in (3, 2, 1))
+
         # No norm and no neighbours: the skip of the finest level is mixed point by point.
         self.mix = SparseConv(e[0] + d[1], d[0], 1, has_bias=config.with_bias)
         self.final = SparseConv(d[0], config.classes * config.keypoints * 3, 1, has_bias=True)
@@ -168,7 +173,7 @@ class ResUNet(nn.Module):
         return directions
 
     def features(self, voxels: Voxels) -> Voxels:
-        """Give the input of the last layer: the features of figure 3-2 of the thesis."""
+        """Compute the input of the last layer: the features of figure 3-2 of the thesis."""
         skips: list[Voxels] = []
         for down, block in zip(self.down, self.down_blocks, strict=True):
             voxels = block(down(voxels))
@@ -184,30 +189,34 @@ class ResUNet(nn.Module):
 
 @torch.no_grad()
 def fold_norms(network: ResUNet) -> ResUNet:
-    """Give a network without norms, in eval mode, with the outputs of ``network.eval()``.
+    """Build a network without norms, in eval mode, with the outputs of ``network.eval()``.
 
     In eval mode batch norm is ``(x - mean) * scale + shift`` with constant numbers, and a
     convolution before it absorbs them: ``weight * scale``, ``shift + (bias - mean) * scale``.
     """
     if network.config.norm == "none":
         return network
+
+    # The layers that have no norm are the same.
     config = dataclasses.replace(network.config, norm="none", with_bias=True)
     folded = ResUNet(config).to(next(network.parameters()))
     others = {k: v for k, v in network.state_dict().items() if k.startswith(("final.", "mix."))}
     folded.load_state_dict(others, strict=False)
+
+    # All others absorb the norm that follows them.
     for name, source in network.named_modules():
         if not isinstance(source, ConvNorm):
             continue
         target = folded.get_submodule(name)
         assert isinstance(target, ConvNorm)
         norm = source.norm
-        into = target.conv
+        absorbing = target.conv
         assert norm is not None and norm.running_var is not None and norm.running_mean is not None  # noqa: PT018
-        assert into.bias is not None
+        assert absorbing.bias is not None
         scale = norm.weight * (norm.running_var + norm.eps).rsqrt()
         bias = 0.0 if source.conv.bias is None else source.conv.bias
-        into.weight.copy_(source.conv.weight * scale)
-        into.bias.copy_(norm.bias + (bias - norm.running_mean) * scale)
+        absorbing.weight.copy_(source.conv.weight * scale)
+        absorbing.bias.copy_(norm.bias + (bias - norm.running_mean) * scale)
     return folded.eval()
 
 
@@ -227,6 +236,7 @@ def unfold_norms(folded: ResUNet, network: ResUNet, voxels: Voxels) -> None:
     outputs: dict[ConvNorm, Tensor] = {}
 
     def remember(module: ConvNorm, _inputs: object, out: Voxels) -> None:
+        """Keep the output of a convolution, as torch calls it after the module."""
         outputs[module] = out.features
 
     sources = {name: m for name, m in folded.named_modules() if isinstance(m, ConvNorm)}
@@ -234,6 +244,8 @@ def unfold_norms(folded: ResUNet, network: ResUNet, voxels: Voxels) -> None:
     folded.eval()(voxels)
     for hook in hooks:
         hook.remove()
+
+    # Each norm gets these statistics, and undoes them by its weight and bias.
     for name, source in sources.items():
         target = network.get_submodule(name)
         assert isinstance(target, ConvNorm)
@@ -248,6 +260,8 @@ def unfold_norms(folded: ResUNet, network: ResUNet, voxels: Voxels) -> None:
         norm.running_var.copy_(variance)
         norm.weight.copy_((variance + norm.eps).sqrt())
         norm.bias.copy_(mean)
+
+    # The layers without a norm are copied; the last only where both have the same classes.
     is_alike = folded.final.weight.shape == network.final.weight.shape
     parts = ("mix.", "final.") if is_alike else ("mix.",)
     state = network.state_dict()

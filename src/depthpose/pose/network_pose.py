@@ -25,7 +25,7 @@ from depthpose.core.devices import (
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.core.stopwatch import Stopwatch
-from depthpose.pose.baselines import DepthCrop, DepthImageNet, cut_depth, poses_of
+from depthpose.pose.baselines import DepthCrop, DepthImageNet, cut_depth, make_poses
 from depthpose.pose.cloud import (
     ObjectCloud,
     VoxelGrid,
@@ -40,7 +40,7 @@ from depthpose.pose.decide import refused
 from depthpose.pose.estimator import PoseEstimator, unreadable_on_error
 from depthpose.pose.icp import BestStart, RefinedPose, refine_best
 from depthpose.pose.probability import PRIOR_MASKED, PRIOR_PROPOSED
-from depthpose.pose.propose import fits_of, meet_lines, vote_ransac
+from depthpose.pose.propose import fit_poses, meet_lines, vote_ransac
 from depthpose.pose.register import judge
 from depthpose.pose.types import (
     AnyInput,
@@ -62,15 +62,15 @@ _NEEDS_MASK = "a regressed depth image takes a depth image with a mask; give bot
 class VotingDirections(NamedTuple):
     """The points that vote, in the camera frame, and the network's directions at them."""
 
-    points_m: Float[Tensor, "n 3"]
-    directions: Float[Tensor, "n k 3"]
+    points_m: Float[Tensor, "n 3"]  #: where the votes start
+    directions: Float[Tensor, "n k 3"]  #: of any length
 
 
 @dataclass(kw_only=True, eq=False)
 class CloudToPose:
     """An input on its way through the network."""
 
-    pose_input: AnyInput
+    pose_input: AnyInput  #: as it was given
     prepared: PreparedObject  #: its object
     cloud: ObjectCloud  #: all points of the object
     voxels: VoxelGrid  #: those that the network sees and that vote, one a voxel
@@ -79,20 +79,20 @@ class CloudToPose:
     directions: Float[Tensor, "n k 3"] = field(default_factory=lambda: torch.empty(0, 0, 3))
 
 
-def _batches(
+def _group_by_voxels(
     clouds: Iterable[CloudToPose | PoseEstimate], most: int
 ) -> Iterator[list[CloudToPose | PoseEstimate]]:
     """Group clouds so that each group has ``most`` voxels at most, or is one cloud."""
     group: list[CloudToPose | PoseEstimate] = []
-    total = 0
+    voxels = 0
     for job in clouds:
         count = len(job.voxels.points_m) if isinstance(job, CloudToPose) else 0
-        if group and total + count > most:
+        if group and voxels + count > most:
             yield group
             group = []
-            total = 0
+            voxels = 0
         group.append(job)
-        total += count
+        voxels += count
     if group:
         yield group
 
@@ -157,16 +157,16 @@ class GeoPoseNet(PoseEstimator):
 
     def __repr__(self) -> str:
         names = self.objects
-        named = f", weights {self.name!r}" if self.name else ""
+        weights = f", weights {self.name!r}" if self.name else ""
         objects = ", ".join(names) if len(names) <= 5 else f"{len(names)} objects"
         kind = type(self._network).__name__
-        return f"GeoPoseNet({kind} of {objects}{named}, {self.config.device})"
+        return f"GeoPoseNet({kind} of {objects}{weights}, {self.config.device})"
 
-    def _each(self, inputs: Iterable[AnyInput], threads: int) -> Iterator[PoseEstimate]:
+    def _estimate_each(self, inputs: Iterable[AnyInput], threads: int) -> Iterator[PoseEstimate]:
         """Pose inputs by the network; what it doubts is registered where the config wants it."""
         return self._pose_together(inputs, threads, is_expected=True)
 
-    def _each_try(self, inputs: Iterable[AnyInput]) -> Iterator[PoseEstimate]:
+    def _estimate_each_try(self, inputs: Iterable[AnyInput]) -> Iterator[PoseEstimate]:
         """Pose inputs by the network alone, at the lower prior odds of an object at a try."""
         return self._pose_together(inputs, 1, is_expected=False)
 
@@ -179,8 +179,8 @@ class GeoPoseNet(PoseEstimator):
         network's sums. ``is_expected``: whether the inputs are meant to show their objects.
         """
         prepared = each_in_threads(partial(unreadable_on_error, self._prepare), inputs, threads)
-        pose = partial(self._pose, is_expected=is_expected)
-        for group in _batches(prepared, self.config.batch_voxels):
+        pose = partial(self._pose_or_register, is_expected=is_expected)
+        for group in _group_by_voxels(prepared, self.config.batch_voxels):
             self._ask_network(group)
             yield from each_in_threads(pose, group, threads)
 
@@ -215,7 +215,7 @@ class GeoPoseNet(PoseEstimator):
         """
         if isinstance(pose_input, ViewInput) and pose_input.is_region:
             return self._search_region(pose_input)
-        prepared = self._object(pose_input.object)
+        prepared = self._find_object(pose_input.object)
         _ = prepared.copies  # cached now, so that the seconds of no stage hold it
         watch = Stopwatch()
         with watch.stage("cloud"):
@@ -236,6 +236,7 @@ class GeoPoseNet(PoseEstimator):
             return
         watch = Stopwatch()
         with watch.stage("network"):
+            # The voxels of all clouds, one after the other.
             grids = [job.voxels for job in ready]
             counts = [len(grid.points_m) for grid in grids]
             cloud_of_point = torch.repeat_interleave(torch.arange(len(ready)), torch.tensor(counts))
@@ -250,15 +251,19 @@ class GeoPoseNet(PoseEstimator):
                 class_of_point=numbers[cloud_of_point].to(device),
             )
             outputs = self._network.directions(network_input).float().cpu().split(counts)
+
+        # Back to each cloud, in its camera's frame.
         for job, of_cloud, count in zip(ready, outputs, counts, strict=True):
             job.directions = of_cloud @ job.voxels.grid_from_camera
             # Each has a share of the time.
             job.watch.seconds["network"] = watch.seconds["network"] * count / sum(counts)
 
-    def _pose(self, job: CloudToPose | PoseEstimate, *, is_expected: bool) -> PoseEstimate:
+    def _pose_or_register(
+        self, job: CloudToPose | PoseEstimate, *, is_expected: bool
+    ) -> PoseEstimate:
         """Pose a cloud by its votes, or by registration where these are doubted.
 
-        Registered is only an input that is expected to show its object.
+        Only an input that is expected to show its object is registered.
         """
         if isinstance(job, PoseEstimate):
             return job
@@ -287,7 +292,7 @@ class GeoPoseNet(PoseEstimator):
         # Propose: where the directions meet are the keypoints, to which the model's are fitted.
         with watch.stage("proposal"):
             vote = self._vote(job)
-            fits = fits_of(vote, prepared.model, config)
+            fits = fit_poses(vote, prepared.model, config)
         if isinstance(fits, Refusal):
             return refused(pose_input, fits, watch.seconds)
 
@@ -316,7 +321,7 @@ class GeoPoseNet(PoseEstimator):
             self.weights.refusal,
             watch,
             prior_odds=PRIOR_MASKED if is_expected else PRIOR_PROPOSED,
-            votes_rad=partial(self._disagreement, job),
+            votes_rad=partial(self._measure_disagreement, job),
         )
         return replace(
             estimate,
@@ -333,12 +338,15 @@ class GeoPoseNet(PoseEstimator):
             return vote_ransac(points_m, directions, config=voting)
         return meet_lines(points_m, directions, refinements=voting.refinements)
 
-    def _disagreement(self, job: CloudToPose, pose: Rigid) -> float:
-        """Mean angle between the network's directions and those to the keypoints of a pose [rad].
+    def _measure_disagreement(self, job: CloudToPose, pose: Rigid) -> float:
+        """Measure the mean angle between the network's directions and those to a pose [rad].
+
+        The latter point to the keypoints of the model at the pose.
 
         The network was trained to treat symmetric copies of a pose as one: the angle is measured to
         the copy whose keypoints its directions fit best.
         """
+        # The copy that fits some of the directions best.
         keypoints_m = job.prepared.model.keypoints_m.double()
         copies_m = (pose @ job.prepared.copies.trained).apply(keypoints_m)
         points_m = job.voxels.points_m.double()
@@ -346,6 +354,8 @@ class GeoPoseNet(PoseEstimator):
         step = max(1, len(points_m) // _COMPARED)
         toward = normalize(copies_m[:, None] - points_m[::step, None], dim=-1)
         best = int((directions[::step] * toward).sum(-1).mean((-2, -1)).argmax())
+
+        # The angle to it, over all of them.
         toward = normalize(copies_m[best] - points_m[:, None], dim=-1)
         return float((directions * toward).sum(-1).clamp(-1, 1).arccos().mean())
 
@@ -378,6 +388,7 @@ class DepthImageRegressor(PoseEstimator):
     def _estimate_or_raise(
         self, inputs: Sequence[AnyInput], *, is_expected: bool
     ) -> list[PoseEstimate]:
+        """Estimate one input; refuse to choose among several objects."""
         if len(inputs) > 1:
             names = ", ".join(item.object for item in inputs)
             raise InputError(f"object: say which of {names}; a regressor refuses none")
@@ -392,7 +403,7 @@ class DepthImageRegressor(PoseEstimator):
 
     def _estimate(self, pose_input: AnyInput) -> PoseEstimate:
         """Regress the pose from a crop of the depth image, and refine it by ICP."""
-        prepared = self._object(pose_input.object)
+        prepared = self._find_object(pose_input.object)
         if not isinstance(pose_input, ViewInput):
             raise InputError(_NEEDS_MASK)
         # An empty region says that nothing was detected: of that too few pixels are refused below.
@@ -401,6 +412,8 @@ class DepthImageRegressor(PoseEstimator):
         config = self._network.config
         model = prepared.model
         watch = Stopwatch()
+
+        # The crop that the network sees, and the pose that it regresses.
         with watch.stage("network"):
             crop = cut_depth(pose_input, config, model.diameter_m)
         if crop is None:
@@ -411,7 +424,7 @@ class DepthImageRegressor(PoseEstimator):
         with watch.stage("network"):
             batch = DepthCrop(*(part[None].to(self.config.device) for part in crop))
             numbers = torch.tensor([prepared.number], device=self.config.device)
-            poses = poses_of(self._network(batch.image, numbers), batch)
+            poses = make_poses(self._network(batch.image, numbers), batch)
             pose = Rigid(poses.R[0].cpu().float(), poses.t_m[0].cpu().float())
         estimate = PoseEstimate(
             name=pose_input.name,
@@ -423,6 +436,7 @@ class DepthImageRegressor(PoseEstimator):
         if not self.config.with_icp:
             return estimate
 
+        # Refined on the points of the mask.
         with watch.stage("icp"):
             points_m = cloud_from_depth(
                 pose_input.depth_m, pose_input.mask, pose_input.K, model.diameter_m, self._cloud

@@ -18,16 +18,18 @@ def free_motions(axes: tuple[Axis, ...], camera_from_model: Rigid) -> Float[Tens
     They are unit vectors of (rotation, translation). No observation constrains a pose along them;
     it is valid all the same. An object with two axes is a ball, free to rotate about a third too.
     """
+    # The axes: three of a ball, else one at most.
     centre_m = Symmetries(continuous=axes).ball_centre_m
     if centre_m is not None:
         axes = tuple(Axis(direction=row, point_m=centre_m) for row in torch.eye(3).to(centre_m))
     else:  # several that do not make a ball are parallel: one axis
         axes = axes[:1]
-    rows = []
+
+    # A rotation by w about a line through c leaves c where it is: w x c + v = 0.
+    rows: list[Tensor] = []
     for axis in axes:
         direction = camera_from_model.R @ axis.direction.to(camera_from_model.R)
         point_m = camera_from_model.apply(axis.point_m.to(camera_from_model.R)[None])[0]
-        # A rotation by w about a line through c leaves c where it is: w x c + v = 0.
         motion = torch.cat([direction, torch.linalg.cross(point_m, direction)])
         rows.append(motion / motion.norm())
     return torch.stack(rows) if rows else camera_from_model.R.new_zeros(0, 6)
@@ -54,6 +56,7 @@ def observability(
         The observability and that weakest motion ``y``; None where fewer than six points lie near
         the surface.
     """
+    # The points that lie near the surface.
     points_m = take_evenly(cloud_m.double(), _SAMPLED)
     local_m = pose.inverse().apply(points_m)
     index = surface.nearest(local_m)
@@ -74,9 +77,13 @@ def observability(
     translation = free[:, 3:].double()
     motions = torch.cat([rotation * radius_m, translation + rotation @ cross_matrix(middle_m)], -1)
     _, _, rows = torch.linalg.svd(motions)
-    basis = rows[int(torch.linalg.matrix_rank(motions, rtol=1e-9)) :].T
+    rank = int(torch.linalg.matrix_rank(motions, rtol=1e-9))
+    basis = rows[rank:].T
+
+    # The mean square displacement is least for the eigenvector of the least eigenvalue.
     values, vectors = torch.linalg.eigh(basis.T @ (J.T @ J / len(J)) @ basis)
-    return float(values[0].clamp(min=0).sqrt()), basis @ vectors[:, 0]
+    least = float(values[0].clamp(min=0).sqrt())
+    return least, basis @ vectors[:, 0]
 
 
 def without_motions(
@@ -85,8 +92,11 @@ def without_motions(
     """Condition a covariance on no motion along ``free``: it becomes finite, and 0 along them."""
     if len(free) == 0:
         return covariance
+    # A basis of the other motions.
     _, sizes, rows = torch.linalg.svd(free.double())
-    basis = rows[int((sizes > 1e-9 * sizes[0]).sum()) :].T
+    rank = int((sizes > 1e-9 * sizes[0]).sum())
+    basis = rows[rank:].T
+
     # The information is restricted to the other motions, not the covariance, as conditioning asks.
     information = torch.linalg.inv(covariance.double())
     inner = torch.linalg.inv(basis.T @ information @ basis)

@@ -26,6 +26,7 @@ def with_pick_ranks(
         view: the image.
         surfaces: of the objects, by their names.
     """
+    # Every posed object, drawn into the image, and which others lie before it.
     drawings: dict[int, Rendering] = {}
     for number, estimate in enumerate(estimates):
         if estimate.camera_from_model is not None:
@@ -33,33 +34,36 @@ def with_pick_ranks(
             pose = estimate.camera_from_model.double()
             drawings[number] = render_surface(surface, pose, view.K.double(), *view.depth_m.shape)
     occluders = _find_occluders(drawings, view.depth_m.shape)
+
+    # The best of those that nothing hides, then the best of those that are left, and so on.
     ranks: dict[int, int] = {}
     remaining = set(drawings)
     while remaining:
         on_top = [k for k in remaining if not occluders[k] & remaining]
         # Where objects lie in a ring, each before the next, the best of all goes first.
         candidates = on_top or sorted(remaining)
-        best = max(candidates, key=lambda k: (_visible_certainty(estimates[k]), -k))
+        best = max(candidates, key=lambda k: (_weigh_certainty(estimates[k]), -k))
         ranks[best] = len(ranks) + 1
         remaining.remove(best)
     return [replace(estimate, pick_rank=ranks.get(k)) for k, estimate in enumerate(estimates)]
 
 
-def _visible_certainty(estimate: PoseEstimate) -> float:
-    """Give certainty times visible share; 0 where one of them is not known."""
+def _weigh_certainty(estimate: PoseEstimate) -> float:
+    """Multiply certainty and visible share; 0 where one of them is not known."""
     return (estimate.certainty or 0.0) * (estimate.visible_share or 0.0)
 
 
 def _find_occluders(
     drawings: Mapping[int, Rendering], shape: tuple[int, ...]
 ) -> dict[int, set[int]]:
-    """Give for each drawn object those that lie before more of it than it does of them.
+    """Find for each drawn object those that lie before more of it than it does of them.
 
     Args:
         drawings: of the objects, in one image.
         shape: of the image.
     """
     occluders: dict[int, set[int]] = {number: set() for number in drawings}
+    # One object at a time is drawn into the whole image, compared with all, and removed again.
     image_m = np.full(shape, np.nan)
     for other, other_drawing in drawings.items():
         image_m[other_drawing.window] = other_drawing.depth_m

@@ -24,7 +24,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.core.run import claim_folder
 from depthpose.core.runner import Job, Results, run_jobs
 from depthpose.pose.datasets import BopDataset, Detection, Instance, read_mask
-from depthpose.pose.datasets.layouts import MOST, integer, make_pose, number, read_rows
+from depthpose.pose.datasets.layouts import MOST, make_pose, read_integer, read_number, read_rows
 from depthpose.pose.types import (
     POSED,
     Alternative,
@@ -55,9 +55,9 @@ _PLACE = ("scene_id", "im_id", "obj_id")  # keys of a :class:`Place`
 class Place(NamedTuple):
     """The scene, image and object of a BOP data set that an estimate is of."""
 
-    scene_id: int
-    image_id: int
-    object_id: int
+    scene_id: int  #: number of the scene
+    image_id: int  #: number of the image in it
+    object_id: int  #: BOP's ``obj_id``
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -115,7 +115,7 @@ def read_predictions(folder: Path) -> Predictions:
     return predictions
 
 
-def earlier_predictions(folder: Path) -> dict[str, Prediction]:
+def read_earlier_predictions(folder: Path) -> dict[str, Prediction]:
     """Read the predictions of earlier runs by name, of a folder and its parts of several processes.
 
     A damaged file counts as missing, and gives a notice.
@@ -138,7 +138,7 @@ def earlier_predictions(folder: Path) -> dict[str, Prediction]:
 def score_of(estimate: PoseEstimate) -> float:
     """Give the score of an estimate, 0..1: its certainty where known, else its share of inliers.
 
-    1 where neither is known.
+    It is 1 where neither is known.
     """
     if estimate.certainty is not None:
         return estimate.certainty
@@ -146,21 +146,25 @@ def score_of(estimate: PoseEstimate) -> float:
 
 
 def prediction_row(prediction: Prediction) -> dict[str, Any]:
-    """Give the JSON values of an entry of ``poses.json``."""
+    """Convert a prediction to the JSON values of an entry of ``poses.json``."""
+    # What it is of, and how it ended.
     estimate = prediction.estimate
     place = prediction.place
     pose = estimate.camera_from_model
     row: dict[str, Any] = {"version": VERSION, "name": estimate.name, "object": estimate.object}
     row |= dict(zip(_PLACE, place, strict=True)) if place is not None else {}
     row |= {"status": estimate.status, "reason": estimate.reason}
+
+    # Poses and tables.
     row["camera_from_model"] = None if pose is None else pose.matrix().tolist()
     base = estimate.base_from_model
     row["base_from_model"] = None if base is None else base.matrix().tolist()
     for name in ("covariance", "free_motions", "keypoints_m"):
         values: Tensor | None = getattr(estimate, name)
         row[name] = None if values is None else values.double().tolist()
-    # JSON has no infinity: the deviation along a free axis becomes null, and so does the distance
-    # where no point lies near the surface.
+
+    # Numbers. JSON has no infinity: the deviation along a free axis becomes null, and so does the
+    # distance where no point lies near the surface.
     for name in ("origin_std_mm", "rotation_std_deg"):
         values = None if pose is None else getattr(estimate, name)
         deviations = [] if values is None else values.tolist()
@@ -170,6 +174,8 @@ def prediction_row(prediction: Prediction) -> dict[str, Any]:
         row[name] = value if value is not None and math.isfinite(value) else None
     row["visible_share"] = estimate.visible_share
     row["pick_rank"] = estimate.pick_rank
+
+    # Parts with values of their own.
     for name in ("evidence", "identity"):
         record = getattr(estimate, name)
         row[name] = None if record is None else asdict(record)
@@ -211,6 +217,8 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
     if status not in get_args(Status):
         statuses = get_args(Status)
         raise InputError(f"{source}: status {status!r}: {nearest_name(str(status), statuses)}")
+
+    # How it came about, and its pose, which only an answer has.
     tracking = row.get("tracking")
     if tracking is not None and tracking not in get_args(Tracking):
         raise InputError(f"{source}: tracking is {tracking!r}; write one of {get_args(Tracking)}")
@@ -225,24 +233,8 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
             f"{source}: every estimate but one that is ok has a reason; its status is {status!r}"
         )
 
-    # The numbers.
-    values: dict[str, Any] = {
-        "keypoints_m": _parse_table(row, "keypoints_m", 3, source),
-        "covariance": _parse_table(row, "covariance", 6, source, rows=6),
-        "free_motions": _parse_table(row, "free_motions", 6, source),
-    }
-    for key in ("inlier_share", "residual_m", "certainty", "copy_certainty"):
-        values[key] = None if row.get(key) is None else number(row, key, None, source)
-    seconds = row.get("seconds", {})
-    if not isinstance(seconds, dict):
-        raise InputError(f"{source}: seconds is {seconds!r}, where names to numbers belong")
-    values["seconds"] = {str(stage): number(seconds, stage, None, source) for stage in seconds}
-    for key, kind in (("evidence", Evidence), ("identity", Identity)):
-        value = row.get(key)
-        where = f"{source}: {key}"
-        if value is not None and not isinstance(value, dict):
-            raise InputError(f"{where} is {value!r}, where names to values belong")
-        values[key] = None if value is None else config_from_dict(value, kind, source=where)
+    # All that is known of it, and its place.
+    values = _parse_values(row, source)
     estimate = PoseEstimate(
         name=name,
         object=object_name,
@@ -252,12 +244,38 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
         base_from_model=_parse_pose(row, source, "base_from_model"),
         alternatives=_parse_alternatives(row, source),
         tracking=cast("Tracking | None", tracking),
-        pick_rank=None if row.get("pick_rank") is None else integer(row, "pick_rank", source),
+        pick_rank=None if row.get("pick_rank") is None else read_integer(row, "pick_rank", source),
         **values,
     )
     has_place = any(row.get(key) is not None for key in _PLACE)
-    place = Place(*(integer(row, key, source) for key in _PLACE)) if has_place else None
+    place = Place(*(read_integer(row, key, source) for key in _PLACE)) if has_place else None
     return Prediction(estimate=estimate, place=place)
+
+
+def _parse_values(row: dict[str, Any], source: str) -> dict[str, Any]:
+    """Read the tables, numbers and parts of an entry, by the names of an estimate's fields."""
+    values: dict[str, Any] = {
+        "keypoints_m": _parse_table(row, "keypoints_m", 3, source),
+        "covariance": _parse_table(row, "covariance", 6, source, rows=6),
+        "free_motions": _parse_table(row, "free_motions", 6, source),
+    }
+    for key in ("inlier_share", "residual_m", "certainty", "copy_certainty"):
+        values[key] = None if row.get(key) is None else read_number(row, key, None, source)
+
+    # Times of stages.
+    seconds = row.get("seconds", {})
+    if not isinstance(seconds, dict):
+        raise InputError(f"{source}: seconds is {seconds!r}, where names to numbers belong")
+    values["seconds"] = {str(stage): read_number(seconds, stage, None, source) for stage in seconds}
+
+    # Parts with values of their own.
+    for key, kind in (("evidence", Evidence), ("identity", Identity)):
+        value = row.get(key)
+        where = f"{source}: {key}"
+        if value is not None and not isinstance(value, dict):
+            raise InputError(f"{where} is {value!r}, where names to values belong")
+        values[key] = None if value is None else config_from_dict(value, kind, source=where)
+    return values
 
 
 def _parse_alternatives(row: dict[str, Any], source: str) -> tuple[Alternative, ...]:
@@ -274,7 +292,7 @@ def _parse_alternatives(row: dict[str, Any], source: str) -> tuple[Alternative, 
         alternatives.append(
             Alternative(
                 camera_from_model=pose,
-                probability=number(entry, "probability", None, where),
+                probability=read_number(entry, "probability", None, where),
                 difference=str(entry.get("difference", "")),
                 is_copy=bool(entry.get("is_copy", False)),
             )
@@ -329,7 +347,7 @@ class PoseJob(Job[Input]):
     seconds: Mapping[str, float] = field(default_factory=dict)  #: spent before, on a mask
 
 
-def unreadable_estimate(name: str, object: str, error: InputError) -> PoseEstimate:
+def refuse_unreadable(name: str, object: str, error: InputError) -> PoseEstimate:
     """Make the estimate that says why an input cannot be read."""
     reason = f"cannot be read: {error}"
     return PoseEstimate(name=name, object=object, status="unreadable", reason=reason)
@@ -349,10 +367,10 @@ class PoseResults(Results[Input, PoseEstimate]):
 
     def __init__(self, folder: Path, run_folder: Path | None = None) -> None:
         self.folder = folder
-        self.predictions = earlier_predictions(folder)  #: by the names of the inputs
+        self.predictions = read_earlier_predictions(folder)  #: by the names of the inputs
         predictions_of_run = self.predictions
         if run_folder is not None and run_folder != folder:
-            predictions_of_run = earlier_predictions(run_folder)
+            predictions_of_run = read_earlier_predictions(run_folder)
         self._finished = {
             name
             for name, prediction in predictions_of_run.items()
@@ -375,7 +393,7 @@ class PoseResults(Results[Input, PoseEstimate]):
         assert isinstance(job, PoseJob)
         if job.object is None:
             raise error
-        self._keep(job, unreadable_estimate(job.name, job.object, error))
+        self._keep(job, refuse_unreadable(job.name, job.object, error))
 
     def _keep(self, job: PoseJob[Input], estimate: PoseEstimate) -> None:
         """Add an estimate to those that the file gets, and write it now and then."""
@@ -418,7 +436,7 @@ def estimate_missing_poses(
             yield results.predictions[outcome.job.name]
 
 
-def instance_jobs(
+def make_instance_jobs(
     dataset: BopDataset, names: Mapping[int, str], predicted_mask: str | None = None
 ) -> list[PoseJob[ViewInput]]:
     """Make a job for each annotated instance, by its own mask or a predicted one.
@@ -455,7 +473,7 @@ def _read_view(
     return replace(view, name=name, object=object, is_region=is_region)
 
 
-def detection_jobs(
+def make_detection_jobs(
     dataset: BopDataset, names: Mapping[int, str], detections: Sequence[Detection]
 ) -> list[PoseJob[ViewInput]]:
     """Make jobs of the detections with the highest scores, as many as an image shows of an object.
@@ -475,7 +493,7 @@ def detection_jobs(
     shown: dict[Place, list[Instance]] = defaultdict(list)
     for instance in dataset.instances:
         shown[place_of(instance)].append(instance)
-    of_place: dict[Place, list[Detection]] = defaultdict(list)
+    best_of_place: dict[Place, list[Detection]] = defaultdict(list)
     for detection in sorted(detections, key=lambda d: -d.score):
         if detection.scene_id is None or detection.image_id is None or detection.object_id is None:
             raise InputError(
@@ -483,22 +501,23 @@ def detection_jobs(
                 "category_id; detections of a data set have all three"
             )
         place = Place(detection.scene_id, detection.image_id, detection.object_id)
-        if len(of_place[place]) < len(shown.get(place, ())):
-            of_place[place].append(detection)
-    kept = [
+        if len(best_of_place[place]) < len(shown.get(place, ())):
+            best_of_place[place].append(detection)
+    chosen = [
         (place, k, detection)
-        for place, best in of_place.items()
+        for place, best in best_of_place.items()
         for k, detection in enumerate(best)
     ]
-    if not kept:
+    if not chosen:
         raise InputError(
             f"{dataset.folder}: none of the {len(detections)} detections is of an image and object "
             f"of split {dataset.split!r}; give those of this very split"
         )
 
-    jobs_of_image = Counter(place[:2] for place, _, _ in kept)
+    # A job for each, in the order of places.
+    jobs_of_image = Counter(place[:2] for place, _, _ in chosen)
     jobs: list[PoseJob[ViewInput]] = []
-    for place, k, detection in sorted(kept, key=lambda item: item[:2]):
+    for place, k, detection in sorted(chosen, key=lambda item: item[:2]):
         name = f"{place.scene_id:06d}_{place.image_id:06d}_object{place.object_id}_{k}"
         seconds: dict[str, float] = {}
         if detection.seconds is not None:
@@ -511,20 +530,20 @@ def detection_jobs(
 
 
 def additive_seconds(predictions: Sequence[Prediction]) -> list[dict[str, float]]:
-    """Give seconds of each prediction whose sum is the time that all predictions took together.
+    """Divide times among predictions: seconds whose sum is what all of them took together.
 
     The estimates of one search all hold the time of the whole search, which is divided among them
     here. The stages that ran within a search are left out beside it.
     """
     # Estimates of one image that hold the very same time come from one search: regions of an image
     # are searched one by one, and take different times.
-    searches = [
-        (prediction.place[:2] if prediction.place else prediction.estimate.name,
-         prediction.estimate.seconds.get("search"))
-        for prediction in predictions
-    ]  # fmt: skip
+    searches: list[tuple[object, float | None]] = []
+    for prediction in predictions:
+        image = prediction.place[:2] if prediction.place else prediction.estimate.name
+        searches.append((image, prediction.estimate.seconds.get("search")))
     estimate_count = Counter(searches)
 
+    # The share of each in its search, without the stages within it.
     rows: list[dict[str, float]] = []
     for prediction, search in zip(predictions, searches, strict=True):
         seconds = dict(prediction.estimate.seconds)
@@ -554,12 +573,15 @@ def read_bop_results(path: str | Path) -> list[Prediction]:
     Raises:
         InputError: it is missing or damaged, or rows of an image have different times.
     """
+    # The lines of the file.
     data = read_bytes(path)
     refuse_heavy(path, data, {b"\n": 300, b",": 60})
     with refused_as(path, "results file", "write it anew"):
         rows = list(csv.reader(data.decode("utf-8-sig").splitlines()))
     if not rows or [name.strip() for name in rows[0]] != _HEADER:
         raise InputError(f"{path}: the first line is not {','.join(_HEADER)}; put it there")
+
+    # An estimate a line, and the time of each image.
     estimates: list[tuple[Place, PoseEstimate]] = []
     image_s: dict[tuple[int, int], float] = {}
     for line, row in enumerate(rows[1:], 2):
@@ -577,8 +599,13 @@ def read_bop_results(path: str | Path) -> list[Prediction]:
                 f"one row and {time_s} s in another; time is that of the whole image, "
                 "the same in all"
             )
-    rows_of = Counter(place[:2] for place, _ in estimates)
-    shares = {image: {"image": s / rows_of[image]} for image, s in image_s.items() if s >= 0}
+
+    # The time of an image, divided among its estimates.
+    estimate_count = Counter(place[:2] for place, _ in estimates)
+    shares: dict[tuple[int, int], dict[str, float]] = {}
+    for image, time_s in image_s.items():
+        if time_s >= 0:
+            shares[image] = {"image": time_s / estimate_count[image]}
     return [
         Prediction(estimate=replace(estimate, seconds=shares.get(place[:2], {})), place=place)
         for place, estimate in estimates
@@ -589,6 +616,7 @@ def _parse_bop_row(
     row: Sequence[str], number: int, source: str
 ) -> tuple[Place, PoseEstimate, float]:
     """Read a row of BOP's csv: its place, an estimate named by ``number``, and the image's time."""
+    # The numbers of the row.
     if len(row) != len(_HEADER):
         raise InputError(f"{source}: {len(row)} values, where {len(_HEADER)} belong")
     try:
@@ -601,6 +629,8 @@ def _parse_bop_row(
         raise InputError(
             f"{source}: {error}; write numbers, and separate those of R and t by spaces"
         ) from error
+
+    # Are they possible?
     if not all(0 <= value <= MOST for value in place):
         raise InputError(f"{source}: scene, image and object are numbers from 0 to {MOST}")
     if len(R) != 9 or len(t_mm) != 3 or not all(map(math.isfinite, [score, time_s, *R, *t_mm])):
@@ -632,11 +662,14 @@ def write_bop_results(
     Raises:
         InputError: a pose belongs to no scene, or the disk refuses.
     """
+    # The time of each image.
     entries = list(predictions)
     image_s: dict[tuple[int, int], float] = defaultdict(float)
     for prediction, seconds in zip(entries, additive_seconds(entries), strict=True):
         if prediction.place is not None:
             image_s[prediction.place[:2]] += sum(seconds.values())
+
+    # A row for each pose.
     text = StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(_HEADER)

@@ -43,7 +43,7 @@ def warn_of_rays(depth_m: Float[Tensor, "h w"], K: Float[Tensor, "3 3"]) -> None
     camera = tuple(K.flatten().tolist())
     if camera in _told:
         return
-    bend = ray_bend(depth_m, K)
+    bend = measure_ray_bend(depth_m, K)
     if bend is None or not _RAY_BEND[0] < bend < _RAY_BEND[1]:
         return
     _told.add(camera)
@@ -56,7 +56,7 @@ def warn_of_rays(depth_m: Float[Tensor, "h w"], K: Float[Tensor, "3 3"]) -> None
     )
 
 
-def ray_bend(depth_m: Float[Tensor, "h w"], K: Float[Tensor, "3 3"]) -> float | None:
+def measure_ray_bend(depth_m: Float[Tensor, "h w"], K: Float[Tensor, "3 3"]) -> float | None:
     """Measure how planes are bent: 0 where values are depth along the axis, 1 along the ray.
 
     Planes are searched by RANSAC under both assumptions. Those of the assumption under which more
@@ -69,6 +69,7 @@ def ray_bend(depth_m: Float[Tensor, "h w"], K: Float[Tensor, "3 3"]) -> float | 
     Returns:
         The bend that the planes share; None where they are too few or too small to tell.
     """
+    # Some readings, and the lengths of their rays.
     v, u = (depth_m > 0).nonzero(as_tuple=True)
     pixels = take_evenly(torch.stack([u, v, torch.ones_like(u)], 1), _SAMPLE)
     reading_m = depth_m[pixels[:, 1], pixels[:, 0]].double()
@@ -78,11 +79,11 @@ def ray_bend(depth_m: Float[Tensor, "h w"], K: Float[Tensor, "3 3"]) -> float | 
     reading_m = reading_m[is_finite]
     if len(rays) < 10:
         return None
-    stretch = rays.norm(dim=1)
+    ray_length = rays.norm(dim=1)
 
     # Under which assumption do clearly more readings lie on planes?
-    axis_planes = _find_planes(rays, reading_m, torch.ones_like(stretch))
-    ray_planes = _find_planes(rays, reading_m, stretch)
+    axis_planes = _find_planes(rays, reading_m, torch.ones_like(ray_length))
+    ray_planes = _find_planes(rays, reading_m, ray_length)
     axis_count = sum(int(is_on.sum()) for is_on in axis_planes)
     ray_count = sum(int(is_on.sum()) for is_on in ray_planes)
     count = max(axis_count, ray_count)
@@ -90,10 +91,10 @@ def ray_bend(depth_m: Float[Tensor, "h w"], K: Float[Tensor, "3 3"]) -> float | 
         return None
     planes = axis_planes if axis_count > ray_count else ray_planes
 
-    return _shared_bend(planes, rays, reading_m, stretch)
+    return _fit_shared_bend(planes, rays, reading_m, ray_length)
 
 
-def _shared_bend(
+def _fit_shared_bend(
     planes: list[Bool[Tensor, " n"]],
     rays: Float64[Tensor, "n 3"],
     reading_m: Float64[Tensor, " n"],
@@ -120,6 +121,7 @@ def _shared_bend(
     Returns:
         None where the planes are none, or too small to tell.
     """
+    # The regression of residuals on residuals, summed over the planes.
     count = 0
     numerator = 0.0
     denominator = 0.0
@@ -133,6 +135,7 @@ def _shared_bend(
         count += len(points_m)
         numerator += float((ones_residual * regressor_residual).sum())
         denominator += float(regressor_residual.square().sum())
+
     # The residual of the regressor is how far the ray's distance bends a reading off its plane, as
     # a share of its depth.
     if count == 0 or denominator < count * _LEAST_BEND**2:
@@ -155,17 +158,19 @@ def _find_planes(
     tolerance = _TOLERANCE_M / depth_m + _TOLERANCE_PER_M2 * depth_m
     generator = torch.Generator().manual_seed(0)
     is_free = torch.ones(len(rays), dtype=torch.bool)  # of no plane yet
-    least = max(3, _LEAST_SHARE * len(rays))
+    least_count = max(3, _LEAST_SHARE * len(rays))
     planes: list[Bool[Tensor, " n"]] = []
-    while len(planes) < _PLANES and int(is_free.sum()) >= least:
+    while len(planes) < _PLANES and int(is_free.sum()) >= least_count:
         # Planes n . x = 1 through three readings each; the one with the most readings on it.
         free = is_free.nonzero()[:, 0]
-        triples = points_m[free[torch.randint(len(free), (_HYPOTHESES, 3), generator=generator)]]
+        chosen = torch.randint(len(free), (_HYPOTHESES, 3), generator=generator)
+        triples = points_m[free[chosen]]
         is_good = torch.linalg.det(triples).abs() > 1e-9
         triples = triples[is_good]
         if len(triples) == 0:
             break
-        normals = torch.linalg.solve(triples, torch.ones(len(triples), 3, 1, dtype=torch.float64))
+        ones = torch.ones(len(triples), 3, 1, dtype=torch.float64)
+        normals = torch.linalg.solve(triples, ones)
         off = (points_m @ normals[..., 0].mT - 1).abs()
         is_on = (off < tolerance[:, None]) & is_free[:, None]
         is_on_best = is_on[:, int(is_on.sum(0).argmax())]
@@ -175,7 +180,7 @@ def _find_planes(
             ones = torch.ones(int(is_on_best.sum()), 1, dtype=torch.float64)
             normal = torch.linalg.lstsq(points_m[is_on_best], ones).solution[:, 0]
             is_on_best = is_free & ((points_m @ normal - 1).abs() < tolerance)
-        if int(is_on_best.sum()) < least:
+        if int(is_on_best.sum()) < least_count:
             break
         planes.append(is_on_best)
         is_free &= ~is_on_best

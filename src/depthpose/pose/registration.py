@@ -1,6 +1,6 @@
 """Registration: poses of objects from their models alone, without training.
 
-How an object is posed :mod:`depthpose.pose.register` says, step by step.
+The steps by which an object is posed are those of :mod:`depthpose.pose.register`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,10 +15,10 @@ from depthpose.pose.inputs import AnyInput
 from depthpose.pose.mesh import (
     AnyModel,
     AnySymmetry,
+    assign_symmetries,
     declare_symmetry,
     read_model,
     refuse_one_name,
-    symmetry_of_each,
     with_found_symmetries,
 )
 from depthpose.pose.types import ObjectModel, PoseEstimate
@@ -104,9 +104,10 @@ class Registration(PoseEstimator):
     def prepare(self) -> None:
         """Prepare every model now, about a second each; else it is done when first asked for."""
         for name in self.objects:
-            self._object(name).prepare()
+            self._find_object(name).prepare()
 
     def _estimate(self, pose_input: AnyInput) -> PoseEstimate:
+        """Register one input, or search its region."""
         return self._register_or_search(pose_input)
 
 
@@ -120,6 +121,8 @@ def read_parts(
     Arguments and errors are those of :meth:`Registration.load`.
     """
     models = [read_model(path, unit, number=k) for k, path in enumerate(cad, start=1)]
-    declared = symmetry_of_each(symmetry, [model.name for model in models])
-    models = [declare_symmetry(m, declared[m.name]) if m.name in declared else m for m in models]
-    return [with_found_symmetries(m, None, is_taken=True) for m in models]
+    declared = assign_symmetries(symmetry, [model.name for model in models])
+    for k, model in enumerate(models):
+        if model.name in declared:
+            models[k] = declare_symmetry(model, declared[model.name])
+    return [with_found_symmetries(model, None, is_taken=True) for model in models]

@@ -40,8 +40,9 @@ def render_surface(
         height: rows of the image.
         width: its columns.
     """
+    # The triangles, drawn into the part of the image about them.
     pose = pose.double()
-    window = _window_about(surface, pose, K, height, width)
+    window = _find_window_about(surface, pose, K, height, width)
     rows, columns = window
     shape = rows.stop - rows.start, columns.stop - columns.start
     if 0 in shape:
@@ -65,7 +66,7 @@ def render_surface(
     camera_m = -(pose.R.mT @ pose.t_m)  # in the model frame
     distance_m = (surface.plane_offsets_m - surface.plane_normals @ camera_m).abs().numpy()
     cosine = np.ones(shape)
-    ray_length = _ray_lengths(window_K.numpy(), *shape)
+    ray_length = _measure_ray_lengths(window_K.numpy(), *shape)
     cosine[is_drawn] = distance_m[face[is_drawn]] / (depth_m * ray_length)[is_drawn]
     return Rendering(depth_m, cosine, window)
 
@@ -82,6 +83,14 @@ def _draw_triangles(
     """Write the depth and the number of the nearest triangle into the pixels that it covers.
 
     Without clipping: a triangle with a corner nearer than ``_NEAR_M`` is left out.
+
+    Args:
+        corners_m: of the triangles, in the model frame.
+        R: rotation of the pose.
+        t_m: its translation.
+        K: intrinsic matrix of the window.
+        depth_m: infinite at first; changed.
+        face: -1 at first; changed.
     """
     height, width = depth_m.shape
     u = np.empty(3)
@@ -119,22 +128,25 @@ def _draw_triangles(
                     face[row, column] = f
 
 
-def _ray_lengths(K: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Length of the ray of each pixel up to a depth of 1, (h, w)."""
+def _measure_ray_lengths(K: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Measure the length of each pixel's ray up to a depth of 1, (h, w)."""
     y = (np.arange(height)[:, None] - K[1, 2]) / K[1, 1]
     x = (np.arange(width) - K[0, 2] - K[0, 1] * y) / K[0, 0]
     return np.sqrt(x**2 + y**2 + 1)
 
 
-def _window_about(
+def _find_window_about(
     surface: Surface, pose: Rigid, K: Float64[Tensor, "3 3"], height: int, width: int
 ) -> Window:
-    """Rows and columns of an image that a posed surface may cover."""
+    """Find the rows and columns of an image that a posed surface may cover."""
+    # None of a surface behind the camera; all where a part of it is.
     corners_m = pose.apply(surface.box_corners_m)
     if float(corners_m[:, 2].amax()) < _NEAR_M:
         return slice(0, 0), slice(0, 0)
     if float(corners_m[:, 2].amin()) < _NEAR_M:
         return slice(0, height), slice(0, width)
+
+    # Else the box about the projected corners.
     pixels = project(corners_m, K)
     left, top = (int(value) for value in pixels.amin(0).floor().tolist())
     right, bottom = (int(value) for value in pixels.amax(0).ceil().tolist())

@@ -94,7 +94,8 @@ class ResNet18(nn.Module):
 
 def normalise_colors(image: Float[Tensor, "*b 3 h w"]) -> Float[Tensor, "*b 3 h w"]:
     """Subtract ImageNet's mean from RGB in [0, 1], and divide by its standard deviation."""
-    mean, std = (image.new_tensor(values)[:, None, None] for values in (MEAN, STD))
+    mean = image.new_tensor(MEAN)[:, None, None]
+    std = image.new_tensor(STD)[:, None, None]
     return (image - mean) / std
 
 
@@ -103,7 +104,9 @@ def import_resnet18(file: Path, out: Path) -> None:
 
     The classifier's own layer (``fc``) is left out, and so is ``module.``; all else must agree.
 
-    They are a ``.pth`` of tensors, read without running any code in it, or ``.safetensors``.
+    Args:
+        file: a ``.pth`` of tensors, read without running any code in it, or ``.safetensors``.
+        out: path of the encoder's weights.
 
     Raises:
         InputError: not the weights of such a network; nothing is written.
@@ -164,6 +167,8 @@ class FCN(nn.Module):
         self.config = config = config or SegmentationConfig()
         self.classes = classes = objects + 1
         self.encoder = ResNet18(widths=config.widths)
+
+        # Scores of each level that is used, and the enlargements between them.
         levels = {8: 3, 16: 2, 32: 1}[config.stride]
         coarsest_first = config.widths[:0:-1][:levels]
         self.scores = nn.ModuleList(nn.Conv2d(width, classes, 1) for width in coarsest_first)
@@ -212,9 +217,11 @@ class SegmentationWeights:
 
 @dataclass(frozen=True)
 class _FileConfig:
-    network: SegmentationConfig = field(default_factory=SegmentationConfig)
-    objects: tuple[str, ...] = ()
-    numbers: tuple[int, ...] = ()
+    """The config in a file of these weights."""
+
+    network: SegmentationConfig = field(default_factory=SegmentationConfig)  #: its settings
+    objects: tuple[str, ...] = ()  #: names, in the order of the classes
+    numbers: tuple[int, ...] = ()  #: BOP's ``obj_id`` of each
 
 
 def write_segmentation(
@@ -287,13 +294,13 @@ class Segmenter:
             InputError: the tensor is no such image.
         """
         check_image(image, "the image")
-        probability = class_probabilities(self._network, image)
+        probability = predict_probabilities(self._network, image)
         label = probability.argmax(0)
         config = self._network.config
         masks: dict[str, Tensor] = {}
         scores: dict[str, Tensor] = {}
         for number, name in enumerate(self.weights.objects, 1):
-            parts = connected_parts(label == number, config)
+            parts = find_connected_parts(label == number, config)
             if len(parts):
                 score = torch.stack([probability[number][part].mean() for part in parts])
                 order = score.argsort(descending=True)
@@ -303,12 +310,13 @@ class Segmenter:
 
 
 @torch.no_grad()
-def class_probabilities(network: FCN, image: Image) -> Float[Tensor, "classes h w"]:
-    """Give the probability of background and objects at each pixel of an image of any size.
+def predict_probabilities(network: FCN, image: Image) -> Float[Tensor, "classes h w"]:
+    """Predict the probability of background and objects at each pixel of an image of any size.
 
     The image is resized to the network's long side, and padded at the bottom and right to multiples
     of 32 by its last rows and columns. The logits are cropped and resized back.
     """
+    # Resized to the network's long side.
     device = next(network.parameters()).device
     height, width = image.shape[-2:]
     scale = network.config.long_side_px / max(height, width)
@@ -316,17 +324,23 @@ def class_probabilities(network: FCN, image: Image) -> Float[Tensor, "classes h 
     small = image.to(device)
     if size != (height, width):
         small = F.interpolate(small[None], size, mode="bilinear", antialias=True)[0].clamp(0, 1)
-    bottom, right = (-side % 32 for side in size)
+
+    # Padded for the network, and cropped and resized back.
+    bottom = -size[0] % 32
+    right = -size[1] % 32
     padded = F.pad(normalise_colors(small)[None], (0, right, 0, bottom), mode="replicate")
     logits = network(padded)[..., : size[0], : size[1]]
     logits = F.interpolate(logits, (height, width), mode="bilinear", align_corners=False)
     return logits[0].float().softmax(0).cpu()
 
 
-def connected_parts(mask: Bool[Tensor, "h w"], config: SegmentationConfig) -> Bool[Tensor, "n h w"]:
-    """Give the connected parts of a mask that are large enough; the largest alone if so configured.
+def find_connected_parts(
+    mask: Bool[Tensor, "h w"], config: SegmentationConfig
+) -> Bool[Tensor, "n h w"]:
+    """Find the connected parts of a mask that are large enough, or the largest alone.
 
-    ``config`` has the least share of the image, and whether it shows each object once.
+    ``config`` has the least share of the image; and whether an image shows each object once, so
+    that the largest part alone is it.
     """
     label, pixels = label_parts(mask)
     least_px = max(1, math.ceil(config.min_share * mask.numel()))
@@ -360,7 +374,7 @@ def count_overlap(
 
 
 def intersection_over_union(table: Int64[Tensor, "c c"]) -> Float[Tensor, " c"]:
-    """Give the ratio of each class in a table of :func:`count_overlap`; NaN if it never occurs."""
+    """Measure the ratio of each class in a table of :func:`count_overlap`; NaN of a missing one."""
     both = table.diagonal()
     either = table.sum(0) + table.sum(1) - both
     return torch.where(either > 0, both / either, torch.nan)

@@ -76,23 +76,15 @@ _STEEPEST = 0.3
 
 @dataclass(frozen=True, kw_only=True)
 class DepthNoise:
-    """Deviations of readings from the surface of a model, in metres.
+    """Standard deviations of readings from the surface of a model, in metres."""
 
-    Attributes:
-        white_std_m: standard deviation of a reading along the optical axis, independent of others.
-        shared_std_m: standard deviation along the axis of the error that neighbouring readings
-            share.
-        lateral_std_m: standard deviation of the position of a reading across the axis.
-        object_std_m: standard deviation of the real surface from the model, along its normal.
-    """
-
-    white_std_m: float
-    shared_std_m: float
-    lateral_std_m: float
-    object_std_m: float
+    white_std_m: float  #: of a reading along the optical axis, independent of others
+    shared_std_m: float  #: along the axis, of the error that neighbouring readings share
+    lateral_std_m: float  #: of the position of a reading across the axis
+    object_std_m: float  #: of the real surface from the model, along its normal
 
     def deviation_m(self, cosine: np.ndarray, readings: int) -> np.ndarray:
-        """Standard deviation of the mean of neighbouring readings, along the optical axis.
+        """Give the standard deviation of the mean of neighbouring readings, along the optical axis.
 
         It is ``LEAST_DEVIATION_M`` at least, so that residuals can be counted in it.
 
@@ -123,11 +115,14 @@ def measure_noise(
         object_std_m: standard deviation of the real surface from its model.
         focal_px: of the depth image.
     """
+    # The object's own readings, or all where these are too few.
     masked_m = np.where(is_object, depth_m, np.nan)
     distance_m = float(np.nanmedian(masked_m)) if np.isfinite(masked_m).any() else 0.0
-    bend_m, _ = _second_differences(masked_m)
+    bend_m, _ = _take_second_differences(masked_m)
     if len(bend_m) < _FEWEST_DIFFERENCES:
-        bend_m, _ = _second_differences(depth_m)
+        bend_m, _ = _take_second_differences(depth_m)
+
+    # Their noise, or that of a Kinect.
     if len(bend_m) < _FEWEST_DIFFERENCES:
         white_std_m = NOISE_PER_M2 * distance_m**2
     else:
@@ -143,8 +138,8 @@ def measure_noise(
     )
 
 
-def _second_differences(depth_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Give second differences of readings ``LAG_PX`` apart, and the reading in the middle of each.
+def _take_second_differences(depth_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Take second differences of readings ``LAG_PX`` apart, and the reading in the middle of each.
 
     They are taken along rows and columns, where all three readings are finite.
     """
@@ -170,7 +165,7 @@ def measure_noise_per_m2(depth_m: Float64[Tensor, "h w"]) -> float:
         depth_m: 0 where there is no reading.
     """
     read_m = torch.where(depth_m > 0, depth_m, torch.nan)
-    bend_m, middle_m = _second_differences(read_m.numpy())
+    bend_m, middle_m = _take_second_differences(read_m.numpy())
     if len(bend_m) == 0:
         return NOISE_PER_M2
     bend_per_m2 = torch.from_numpy(np.abs(bend_m) / np.square(middle_m))

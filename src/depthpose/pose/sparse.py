@@ -42,6 +42,7 @@ Keys = Int64[Tensor, " _"]
 
 def pack(coordinates: Int[Tensor, "n 4"]) -> Keys:
     """Pack rows of (cloud, x, y, z) into keys."""
+    # Do they fit their fields?
     if len(coordinates):
         lowest = coordinates.amin(0).tolist()
         highest = coordinates.amax(0).tolist()
@@ -63,9 +64,9 @@ def pack(coordinates: Int[Tensor, "n 4"]) -> Keys:
 
 
 def unpack(keys: Keys) -> Int64[Tensor, "n 4"]:
-    """Give the rows of (cloud, x, y, z) that keys pack."""
-    low = (1 << FIELD_BITS) - 1
-    x, y, z = ((keys >> shift * FIELD_BITS & low) - HALF for shift in (2, 1, 0))
+    """Unpack keys to rows of (cloud, x, y, z)."""
+    field_mask = (1 << FIELD_BITS) - 1
+    x, y, z = ((keys >> shift * FIELD_BITS & field_mask) - HALF for shift in (2, 1, 0))
     return torch.stack([keys >> 3 * FIELD_BITS, x, y, z], 1)
 
 
@@ -94,6 +95,8 @@ class VoxelIndex:
         self._table: Tensor | None = None
         if not len(keys):
             return
+
+        # The box about all voxels with a margin, if it is not too large.
         coordinates = unpack(keys)
         coordinates[:, 1:] >>= step.bit_length() - 1
         low = coordinates.amin(0)
@@ -103,6 +106,8 @@ class VoxelIndex:
         cells = sides[0] * sides[1] * sides[2] * sides[3]
         if cells > min(MAX_CELLS, CELLS_PER_VOXEL * len(coordinates) + MAX_CELLS // 256):
             return
+
+        # The row of each cell; one past the last where there is no voxel.
         low[1:] -= MARGIN
         strides = [sides[1] * sides[2] * sides[3], sides[2] * sides[3], sides[3], 1]
         device = low.device
@@ -113,7 +118,7 @@ class VoxelIndex:
         self._table[((coordinates - low) * self._strides).sum(1)] = rows
 
     def find(self, keys: Keys, moves: Moves) -> Int32[Tensor, "moves keys"]:
-        """Give the row of each voxel at ``key + move * step``.
+        """Find the row of each voxel at ``key + move * step``.
 
         Where there is no such voxel it is one past the last row, for which callers add a row of
         zeros.
@@ -121,11 +126,15 @@ class VoxelIndex:
         if not len(self._keys):
             return keys.new_zeros(len(moves), len(keys), dtype=torch.int32)
         offsets = torch.tensor(moves, device=keys.device)
+
+        # By binary search.
         if self._table is None:
             packed = (offsets * self._step * offsets.new_tensor(AXES)).sum(-1)
             neighbours = keys + packed[:, None]
             rows = torch.searchsorted(self._keys, neighbours).clamp_(max=len(self._keys) - 1)
             return torch.where(self._keys[rows] == neighbours, rows, len(self._keys)).int()
+
+        # By the table.
         coordinates = unpack(keys)
         coordinates[:, 1:] >>= self._step.bit_length() - 1
         cells = ((coordinates - self._low) * self._strides).sum(1)
@@ -162,19 +171,23 @@ class NeighbourTable:
     table: Int32[Tensor, "volume coarse_rows"]
     fine_rows: int  #: number of voxels of the finer level
     centre: int | None  #: offset at which each voxel is its own neighbour; None across levels
-    _slots: dict[bool, Slots] = field(default_factory=dict)
+    _slots: dict[bool, Slots] = field(default_factory=dict)  #: by direction, made when asked for
 
     @cached_property
     def pairs(self) -> PairList:
         """The neighbours as a list, without the centre, which pairs each row with itself."""
+        # How many pairs each offset has.
         is_pair = self.table < self.fine_rows
         if self.centre is not None:
             is_pair[self.centre] = False
         counts = is_pair.sum(1)
         numbers = counts.tolist()
         filled = tuple(offset for offset, count in enumerate(numbers) if count)
+
+        # The rows of each pair, offset by offset.
         offset, coarse = is_pair.nonzero(as_tuple=True)
         fine = self.table.flatten().index_select(0, offset * self.table.shape[1] + coarse)
+
         # The pairs of an offset fill its line of the grid from the left.
         most = max(numbers, default=0)
         shifts = torch.arange(len(counts), device=counts.device) * most
@@ -186,7 +199,7 @@ class NeighbourTable:
         )  # fmt: skip
 
     def slots(self, *, is_transposed: bool) -> Slots:
-        """Give the pairs as a grid; ``is_transposed`` is from the coarse rows to the fine ones."""
+        """Arrange the pairs in a grid; ``is_transposed`` is from coarse rows to fine ones."""
         if is_transposed not in self._slots:
             pairs = self.pairs
             read = pairs.fine
@@ -195,8 +208,10 @@ class NeighbourTable:
             outputs = self.table.shape[1]
             if is_transposed:
                 read, inputs, written, outputs = written, outputs, read, inputs
+            # Empty slots read one past the last row.
             grid = read.new_full((len(self.table) * pairs.most,), inputs)
             grid[pairs.slot] = read
+            # Filled slots by the row that they add to.
             order = pairs.slot[torch.argsort(written, stable=True)]
             counts = torch.bincount(written, minlength=outputs)
             self._slots[is_transposed] = Slots(grid, order, counts.cumsum(0) - counts)
@@ -221,7 +236,7 @@ class KernelMap:
 
 
 def kernel_offsets(kernel: int) -> tuple[tuple[int, int, int], ...]:
-    """Offsets (x, y, z) in the order of a weight's rows: x fastest, as in MinkowskiEngine."""
+    """List offsets (x, y, z) in the order of a weight's rows: x fastest, as in MinkowskiEngine."""
     first = -(kernel // 2) if kernel % 2 else 0
     steps = range(first, first + kernel)
     return tuple((x, y, z) for z in steps for y in steps for x in steps)
@@ -236,8 +251,11 @@ class CoordinateCache:
     """
 
     finest: Keys  #: sorted, distinct keys of level 0
-    _coarser: dict[int, Keys] = field(default_factory=dict)
-    _indices: dict[int, VoxelIndex] = field(default_factory=dict)
+    _coarser: dict[int, Keys] = field(default_factory=dict)  #: keys of levels above 0
+    _indices: dict[int, VoxelIndex] = field(
+        default_factory=dict
+    )  #: of the levels that were searched
+    #: by (finer level, kernel, levels between).
     _neighbours: dict[tuple[int, int, int], NeighbourTable] = field(default_factory=dict)
 
     def keys(self, level: int) -> Keys:
@@ -268,6 +286,8 @@ class CoordinateCache:
         # looks both ways from it, an even one forward alone.
         beyond = kernel // 2 + stride - 1 if kernel % 2 else max(kernel, stride) - 1
         assert beyond <= MARGIN, f"kernel {kernel} with stride {stride} looks {beyond} cells beyond"
+
+        # The finer of the two levels, from which the map is made for both directions.
         levels = stride.bit_length() - 1
         fine = level - levels if is_transposed else level
         assert fine >= 0, f"level {level} has no level {levels} finer"
@@ -303,7 +323,7 @@ def conv(
     weight: Float[Tensor, "volume c_in c_out"],
     kernel_map: KernelMap,
 ) -> Float[Tensor, "rows_out c_out"]:
-    """Convolve: ``out[o] = sum over pairs (i, k) of o of features[i] @ weight[k]``.
+    """Convolve features: ``out[o] = sum over pairs (i, k) of o of features[i] @ weight[k]``.
 
     The same bits on every run on the CPU; on CUDA too under
     ``torch.use_deterministic_algorithms(True)``. Autocast is followed. Gradients once, not twice.
@@ -321,6 +341,7 @@ class _Convolution(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, features: Tensor, weight: Tensor, kernel_map: KernelMap) -> Tensor:  # noqa: ANN401
+        """Convolve, and save what the gradients need."""
         ctx.save_for_backward(features, weight)
         ctx.kernel_map = kernel_map
         return _convolve(features, weight, kernel_map)
@@ -341,13 +362,17 @@ class _Convolution(torch.autograd.Function):
         kernel_map: KernelMap = ctx.kernel_map
         gradient = gradient.contiguous()
         wants_x, wants_weight, _ = ctx.needs_input_grad
+
+        # The gradient of the features: seldom wanted of the first layer's input, which is no
+        # parameter's child.
         back = KernelMap(
             neighbours=kernel_map.neighbours, is_transposed=not kernel_map.is_transposed
         )
-        # The first layer's input is no parameter's child: its gradient is seldom wanted.
         for_x = _convolve(gradient, weight.mT, back) if wants_x else None
         if not wants_weight:
             return for_x, None, None
+
+        # The gradient of the weight.
         method = _choose_method(x, weight, kernel_map)
         if method == "table":  # all inputs of each output: one product for all offsets
             return for_x, (_gather_table(x, kernel_map) @ gradient).view(weight.shape), None
@@ -448,8 +473,10 @@ class Voxels:
         """
         if features is None:
             features = torch.ones(len(coordinates), 1, device=coordinates.device)
-        given = pack(coordinates)
-        keys, row_of_point, counts = torch.unique(given, return_inverse=True, return_counts=True)
+        keys_of_points = pack(coordinates)
+        keys, row_of_point, counts = torch.unique(
+            keys_of_points, return_inverse=True, return_counts=True
+        )
         repeated = counts > 1
         if bool(repeated.any()):
             cloud, *xyz = unpack(keys[repeated][:1])[0].tolist()
@@ -457,7 +484,7 @@ class Voxels:
                 f"{int((counts - 1).sum())} points share a voxel with another, the first at {xyz} "
                 f"of cloud {cloud}; keep one point a voxel."
             )
-        features = features[torch.argsort(given)]
+        features = features[torch.argsort(keys_of_points)]
         return cls(features=features, cache=CoordinateCache(keys), row_of_point=row_of_point)
 
     def with_features(self, features: Float[Tensor, "m c2"], level: int | None = None) -> "Voxels":
@@ -469,7 +496,7 @@ class Voxels:
         )
 
     def at_points(self) -> Float[Tensor, "points c"]:
-        """Features of the voxel of each point, in the order in which points were given."""
+        """Give the features of the voxel of each point, in the order in which points were given."""
         assert self.level == 0, f"points lie in voxels of level 0, these are of level {self.level}"
         return self.features[self.row_of_point]
 
@@ -511,7 +538,7 @@ class SparseConv(nn.Module):
         nn.init.normal_(self.weight, std=(2 / (taps * inputs)) ** 0.5)
 
     def forward(self, voxels: Voxels) -> Voxels:
-        """Convolve."""
+        """Convolve voxels; with a stride the answer is of another level."""
         level = voxels.level
         if self.kernel == 1 and self.stride == 1:
             features = voxels.features @ self.weight[0]

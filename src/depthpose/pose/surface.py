@@ -18,8 +18,8 @@ from depthpose.pose.kdtree import (
     Tree,
     build_tree,
     faces,
-    nearest_facing,
-    nearest_points,
+    find_nearest_facing,
+    find_nearest_points,
     square_distance,
 )
 from depthpose.pose.mesh import sample_surface, symmetry_transforms
@@ -58,19 +58,20 @@ class Boxes:
         For a point outside the grid the box at the border is used.
         """
         points = array_of(points_m).reshape(-1, 3)
-        low, counts = self.low_m.numpy(), self.counts.numpy()
+        low = self.low_m.numpy()
+        counts = self.counts.numpy()
         index = _look_up_all(points, low, self.side_m, counts, self.nearest.numpy())
         return torch.from_numpy(index).reshape(points_m.shape[:-1])
 
 
 @compiled
-def _box_of(
+def _find_box(
     point: Vector,
     low: Float64[np.ndarray, "3"],
     side: float,
     counts: Int64[np.ndarray, "3"],
 ) -> int:
-    """Give the number of the box that holds a point, or of the nearest one at the border."""
+    """Find the number of the box that holds a point, or of the nearest one at the border."""
     number = 0
     for c in range(3):
         box = min(max(int((point[c] - low[c]) / side), 0), counts[c] - 1)
@@ -86,10 +87,10 @@ def _look_up_all(
     counts: Int64[np.ndarray, "3"],
     table: Int64[np.ndarray, " boxes"],
 ) -> Int64[np.ndarray, " n"]:
-    """Give what a table holds for the box of each point."""
+    """Look up the value of a table for the box of each point."""
     values = np.empty(len(points), np.int64)
     for i in range(len(points)):
-        values[i] = table[_box_of(vector(points, i), low, side, counts)]
+        values[i] = table[_find_box(vector(points, i), low, side, counts)]
     return values
 
 
@@ -128,25 +129,35 @@ def match(
             sides of a wall the one that faces the camera.
         places: on entry those of the matches before, or -1, from which exact searches begin.
     """
-    tree, table, across = target.tree, target.table, target.across
-    samples, outward = tree.points, tree.outward
-    low, side, counts = target.low, target.side, target.counts
+    # Taken out of the tuple once, not for each point.
+    tree = target.tree
+    samples = tree.points
+    outward = tree.outward
+    across = target.across
+    table = target.table
+    low = target.low
+    side = target.side
+    counts = target.counts
     for i in range(len(points)):
         point = vector(points, i)
         place = places[i]
+
+        # The match before or the sample of the box, if it faces the camera; else none.
         if not is_exact or place < 0:
-            place = np.int64(table[_box_of(point, low, side, counts)])
+            place = np.int64(table[_find_box(point, low, side, counts)])
             if not faces(samples, outward, place, eye, least):
                 place = np.int64(across[place])
         if place >= 0 and not faces(samples, outward, place, eye, least):
             place = -1
+
+        # From there the nearest one is searched.
         if is_exact:
             square = limit * limit
             if place >= 0:
                 square = min(square, square_distance(samples, place, point))
             if square == limit * limit:  # the guess is too far away
                 place = -1
-            place = nearest_facing(point, tree, eye, least, place, square)
+            place = find_nearest_facing(point, tree, eye, least, place, square)
         places[i] = place
 
 
@@ -179,7 +190,7 @@ class Surface:
 
     def nearest(self, points_m: Float64[Tensor, "*batch n 3"]) -> Int64[Tensor, "*batch n"]:
         """Give the index of the surface point nearest to each point of the model frame."""
-        index = nearest_points(array_of(points_m).reshape(-1, 3), self.target.tree)
+        index = find_nearest_points(array_of(points_m).reshape(-1, 3), self.target.tree)
         return torch.from_numpy(index).reshape(points_m.shape[:-1])
 
     @cached_property
@@ -208,7 +219,7 @@ class Surface:
         # The last two rows of each frame are two axes across the direction.
         _, _, frames = torch.linalg.svd(toward[:, None])
         views = [
-            _visible_from(self, direction, frame[1:])
+            _view_from(self, direction, frame[1:])
             for direction, frame in zip(toward, frames, strict=True)
         ]
         return Views(
@@ -246,12 +257,12 @@ class Surface:
 class _View(NamedTuple):
     """The visible points from one direction: a row of each part of :class:`Views`."""
 
-    points_m: Float64[Tensor, "n 3"]
-    normals: Float64[Tensor, "n 3"]
-    is_inner: Bool[Tensor, " n"]
+    points_m: Float64[Tensor, "n 3"]  #: NaN where there are fewer
+    normals: Float64[Tensor, "n 3"]  #: of these points
+    is_inner: Bool[Tensor, " n"]  #: whether it is on no rim or edge
 
 
-def _visible_from(surface: Surface, toward: Tensor, across: Tensor) -> _View:
+def _view_from(surface: Surface, toward: Tensor, across: Tensor) -> _View:
     """Choose the points of a surface that a far camera sees, 160 at most.
 
     Args:
@@ -286,7 +297,7 @@ def _visible_from(surface: Surface, toward: Tensor, across: Tensor) -> _View:
     farthest_m = max_pool2d(depth_m, 3, 1, 1)
     is_inner = (eroded > 0) & (-farthest_m > image_m - _EDGE_STEP * surface.diameter_m)
 
-    # Shuffled, so that every n-th of the points is a sample of all.
+    # The points of these cells, shuffled: every n-th of them is a sample of all.
     cells = is_visible.nonzero()[:, 0]
     shuffle = torch.randperm(len(cells), generator=torch.Generator().manual_seed(0))
     cells = cells[shuffle[:_POINTS]]
@@ -305,21 +316,23 @@ def _pad_rows(rows: Float64[Tensor, "n 3"], count: int) -> Float64[Tensor, "{cou
 
 def prepare_surface(model: ObjectModel, count: int = 10_000) -> Surface:
     """Sample the surface of a model once for many clouds, by ``count`` points."""
+    # Samples, and the triangles that are rendered.
     points_m, normals = (part.double() for part in sample_surface(model, count))
     is_large = len(model.faces) > _MOST_FACES
     triangles_m = triangulate_points(points_m, normals) if is_large else drawn_triangles(model)
     tree = KDTree(points_m.numpy())
 
     # The outer side of each sample, by cells that hold about four samples.
-    some_m = points_m.numpy()[:: max(1, len(points_m) // 500)]
-    near_m, _ = tree.query(some_m, k=min(5, len(points_m)))
-    cell_m = _CELL_SPACINGS * float(np.median(near_m[:, -1])) * np.sqrt(np.pi) / 2
+    few_m = points_m.numpy()[:: max(1, len(points_m) // 500)]
+    distance_m, _ = tree.query(few_m, k=min(5, len(points_m)))
+    cell_m = _CELL_SPACINGS * float(np.median(distance_m[:, -1])) * np.sqrt(np.pi) / 2
     limit_m = 3 * NEAR * model.diameter_m
-    sides = outer_sides(points_m.numpy(), normals.numpy(), cell_m, limit_m)
+    sides = _find_outer_sides(points_m.numpy(), normals.numpy(), cell_m, limit_m)
     outward, across = (torch.from_numpy(part) for part in sides)
 
-    some_m = points_m.numpy()[:: max(1, len(points_m) // 1000)]
-    near_m, _ = tree.query(some_m, k=4, workers=1)
+    # How far samples lie apart, and how far the surface extends.
+    few_m = points_m.numpy()[:: max(1, len(points_m) // 1000)]
+    distance_m, _ = tree.query(few_m, k=4, workers=1)
     middle_m = (points_m.amin(0) + points_m.amax(0)) / 2
     radius_m = (points_m - middle_m).norm(dim=-1).amax()
     return Surface(
@@ -329,7 +342,7 @@ def prepare_surface(model: ObjectModel, count: int = 10_000) -> Surface:
         triangles_m=triangles_m.double(),
         across=across,
         diameter_m=model.diameter_m,
-        spacing_m=float(np.median(near_m[:, -1])),
+        spacing_m=float(np.median(distance_m[:, -1])),
         middle_m=middle_m,
         ball_m=torch.cat([middle_m, radius_m[None]]),
         symmetries=symmetry_transforms(model.symmetries, _AXIS_STEP).double(),
@@ -357,7 +370,7 @@ _LEAST_VISIBLE = 0.1  # least share of directions from which an outer side is vi
 _MOST_INNER = 0.4  # largest share for the inner side, over that of the outer side
 
 
-def outer_sides(
+def _find_outer_sides(
     points: np.ndarray, normals: np.ndarray, cell: float, limit: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Flip normals to the side from which the surface is visible from afar.
@@ -375,28 +388,36 @@ def outer_sides(
         The normals (n, 3); and for each sample the index of the nearest one of an opposite side, or
         -1.
     """
-    share = _visible_shares(points, normals, cell)
+    share = _measure_visible_shares(points, normals, cell)
     # The outer side is visible from clearly more directions than the inner one.
     outer = share.argmax(0)
     is_clear = share.max(0) > _LEAST_VISIBLE
     is_clear &= share.min(0) < _MOST_INNER * share.max(0)
     outward = normals * ((1 - 2 * outer) * is_clear)[:, None]
-    across = _nearest_opposite(points, outward, limit)
+    across = _find_nearest_opposite(points, outward, limit)
     return outward, across
 
 
-def _visible_shares(points: np.ndarray, normals: np.ndarray, cell: float) -> np.ndarray:
-    """Give for both sides of each sample (2, n) from how many directions they are visible.
+def _measure_visible_shares(points: np.ndarray, normals: np.ndarray, cell: float) -> np.ndarray:
+    """Measure the share of directions from which both sides of each sample are visible (2, n).
 
-    As a share of the directions that a side faces. The first side is that of the normal.
+    It is a share of the directions that a side faces. The first side is that of the normal.
+
+    Args:
+        points: samples of the surface (n, 3).
+        normals: to either side (n, 3).
+        cell: side of the cells in which samples hide each other.
     """
     visible_count = np.zeros((2, len(points)))
     facing_count = np.full((2, len(points)), 1e-9)
     for axis in fibonacci_directions(_SIDE_DIRECTIONS).numpy():
+        # The cell of each sample in an image across the direction.
         across = np.linalg.svd(axis[None])[2][1:]
         flat = np.floor(points @ across.T / cell).astype(np.int64)
         flat -= flat.min(0)
         place = flat[:, 0] * (flat[:, 1].max() + 1) + flat[:, 1]
+
+        # Visible are the samples in the plane of the first one of their cell.
         cosine = normals @ axis
         order = np.argsort(points @ axis)
         first = np.empty(place.max() + 1, np.int64)
@@ -412,7 +433,7 @@ def _visible_shares(points: np.ndarray, normals: np.ndarray, cell: float) -> np.
     return visible_count / facing_count
 
 
-def _nearest_opposite(points: np.ndarray, outward: np.ndarray, limit: float) -> np.ndarray:
+def _find_nearest_opposite(points: np.ndarray, outward: np.ndarray, limit: float) -> np.ndarray:
     """Find for each sample the nearest one that faces the other way, as through a wall, or -1.
 
     Samples are searched by six groups of normals, each about a direction of an axis: every normal
@@ -451,11 +472,14 @@ def look_along_rays(
         and the share of the cells of the posed surface in which nothing was observed. Both 1 where
         the surface lies behind the camera.
     """
+    # Points nearer to the camera than most were not observed.
     median_m = float(cloud_m[:, 2].median())
     cloud_m = cloud_m[cloud_m[:, 2] > _NEAREST_SHARE * max(median_m, 0.0)]
     if len(cloud_m) == 0:
         ones = torch.ones(len(poses.R), dtype=torch.float64)
         return ones, ones
+
+    # Cells of rays about the middle of the cloud.
     scale = median_m / (_CELL * surface.diameter_m)
     observed_rays = cloud_m[:, :2] / cloud_m[:, 2:] * scale
     middle = observed_rays.median(0).values.floor()
@@ -493,18 +517,21 @@ def _compare_rays(
         middle: column and row of the middle cell.
         limit: how far before a point the surface must lie to occlude it.
     """
+    # The cells in which something was observed.
     cells = (2 * _REACH + 1) ** 2
     cell_of_point = np.empty(len(cloud), np.int64)
     is_observed = np.zeros(cells, np.bool_)
     for i in range(len(cloud)):
-        cell_of_point[i] = _cell_of(cloud[i, 0], cloud[i, 1], cloud[i, 2], scale, middle)
+        cell_of_point[i] = _find_cell(cloud[i, 0], cloud[i, 1], cloud[i, 2], scale, middle)
         is_observed[cell_of_point[i]] = True
 
+    # Each pose: the cells that it covers, those of them without a point, and points behind it.
     violation, unobserved = np.ones(len(ts)), np.ones(len(ts))
     nearest = np.empty(cells)  # depth of the nearest point of the posed surface in each cell
     for b in range(len(ts)):
         _draw_cells(points, Rs[b], ts[b], scale, middle, nearest)
-        posed, missed = 0, 0
+        posed = 0
+        missed = 0
         for k in range(cells):
             if nearest[k] < np.inf:
                 posed += 1
@@ -527,7 +554,16 @@ def _draw_cells(
     middle: Float64[np.ndarray, "2"],
     nearest: Float64[np.ndarray, " cells"],
 ) -> None:
-    """Write the depth of the nearest posed point in each cell; infinity where there is none."""
+    """Write the depth of the nearest posed point in each cell; infinity where there is none.
+
+    Args:
+        points: of the surface, in the model frame.
+        R: rotation of the pose.
+        t: its translation.
+        scale: cells per unit of x / z and y / z.
+        middle: column and row of the middle cell.
+        nearest: is written.
+    """
     nearest[:] = np.inf
     for i in range(len(points)):
         point = vector(points, i)
@@ -536,13 +572,13 @@ def _draw_cells(
             continue
         x = dot(vector(R, 0), point) + t[0]
         y = dot(vector(R, 1), point) + t[1]
-        cell = _cell_of(x, y, max(z, 1e-6), scale, middle)
+        cell = _find_cell(x, y, max(z, 1e-6), scale, middle)
         nearest[cell] = min(nearest[cell], z)
 
 
 @compiled
-def _cell_of(x: float, y: float, z: float, scale: float, middle: Float64[np.ndarray, "2"]) -> int:
-    """Give the cell of the ray through a point; rays far off are in a cell at the border."""
+def _find_cell(x: float, y: float, z: float, scale: float, middle: Float64[np.ndarray, "2"]) -> int:
+    """Find the cell of the ray through a point; rays far off are in a cell at the border."""
     column = min(max(np.floor(x / z * scale - middle[0]), -_REACH), _REACH) + _REACH
     row = min(max(np.floor(y / z * scale - middle[1]), -_REACH), _REACH) + _REACH
     return int(column) * (2 * _REACH + 1) + int(row)

@@ -50,32 +50,44 @@ _LITTLE = 0.2  # least share of the points near an object that its support must 
 _FLAT = 0.9  # share of a flat object's surface that lies in the plane of its support
 
 
-def scene_about(pose_input: AnyInput, poses: Rigid, surface: Surface) -> Float64[Tensor, "n 3"]:
-    """Give all points in the direction of the object at one of several poses, and about it."""
+def _gather_scene(pose_input: AnyInput, poses: Rigid, surface: Surface) -> Float64[Tensor, "n 3"]:
+    """Gather all points in the direction of the object at one of several poses, and about it."""
+    # A ball about the object at all of these poses.
     middles_m = (poses.R @ surface.points_m.mean(0)) + poses.t_m
     middle_m = middles_m.mean(0)
     radius_m = (0.5 + 2 * MARGIN) * surface.diameter_m
     radius_m += float((middles_m - middle_m).norm(dim=-1).max())
     if isinstance(pose_input, ViewInput):
-        # The square about a ball, cut out of the view.
-        z_m = float(middle_m[2])
-        K = pose_input.K.double()
-        near_m = max(z_m - radius_m, 0.1 * z_m)
-        u, v = (K @ (middle_m / z_m))[:2].tolist()
-        across, down = (float(K[k, k]) * radius_m / near_m for k in range(2))
-        height, width = pose_input.depth_m.shape
-        left, right = (min(max(round(u + s * across), 0), width) for s in (-1, 1))
-        top, bottom = (min(max(round(v + s * down), 0), height) for s in (-1, 1))
-        part = (slice(top, bottom), slice(left, right))
-        part_K = crop_intrinsics(K, left, top)
-        depth_m = pose_input.depth_m[part]
-        points_m = cloud_from_depth(depth_m, pose_input.mask[part], part_K).double()
+        points_m = _lift_square_about(pose_input, middle_m, radius_m)
         return take_evenly(points_m, _MOST_POINTS)
+
+    # Of a cloud the points whose rays meet a square about the ball.
     points_m = pose_input.points_m.double()
     points_m = points_m[points_m.isfinite().all(-1) & (points_m[:, 2] > 0)]
     offset = points_m[:, :2] / points_m[:, 2:] - middle_m[:2] / middle_m[2]
-    near = offset.abs().amax(-1) < radius_m / (middle_m[2] - radius_m).clamp(min=0.1 * middle_m[2])
-    return take_evenly(points_m[near], _MOST_POINTS)
+    nearest_m = (middle_m[2] - radius_m).clamp(min=0.1 * middle_m[2])
+    is_toward = offset.abs().amax(-1) < radius_m / nearest_m
+    return take_evenly(points_m[is_toward], _MOST_POINTS)
+
+
+def _lift_square_about(
+    view: ViewInput, middle_m: Float64[Tensor, "3"], radius_m: float
+) -> Float64[Tensor, "n 3"]:
+    """Lift the masked pixels in a square about a ball to points of the camera frame."""
+    z_m = float(middle_m[2])
+    K = view.K.double()
+    nearest_m = max(z_m - radius_m, 0.1 * z_m)
+    u, v = (K @ (middle_m / z_m))[:2].tolist()
+    across_px = float(K[0, 0]) * radius_m / nearest_m
+    down_px = float(K[1, 1]) * radius_m / nearest_m
+    height, width = view.depth_m.shape
+    left = min(max(round(u - across_px), 0), width)
+    right = min(max(round(u + across_px), 0), width)
+    top = min(max(round(v - down_px), 0), height)
+    bottom = min(max(round(v + down_px), 0), height)
+    window = (slice(top, bottom), slice(left, right))
+    window_K = crop_intrinsics(K, left, top)
+    return cloud_from_depth(view.depth_m[window], view.mask[window], window_K).double()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -90,15 +102,10 @@ class TrackedObject:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _FrameMotion:
-    """How an object moved between two frames: rotated about its own origin, and shifted.
+    """How an object moved between two frames: rotated about its own origin, and shifted."""
 
-    Attributes:
-        R: rotation of the object, in the axes of the camera.
-        shift_m: of its origin, in the camera frame.
-    """
-
-    R: Float64[Tensor, "3 3"]
-    shift_m: Float64[Tensor, "3"]
+    R: Float64[Tensor, "3 3"]  #: rotation of the object, in the axes of the camera
+    shift_m: Float64[Tensor, "3"]  #: of its origin, in the camera frame
 
     @classmethod
     def between(cls, before: Rigid, after: Rigid) -> "_FrameMotion":
@@ -112,19 +119,12 @@ class _FrameMotion:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Track:
-    """What is known of an object that is followed.
+    """What is known of an object that is followed."""
 
-    Attributes:
-        pose: in the last frame.
-        motion: from the frame before to it; None: not known.
-        log_odds: of the pose being right, up to near-symmetries, by all frames.
-        origin: the estimate that the track began with; None: a pose that was given.
-    """
-
-    pose: Rigid
-    motion: _FrameMotion | None
-    log_odds: float
-    origin: PoseEstimate | None
+    pose: Rigid  #: in the last frame
+    motion: _FrameMotion | None  #: from the frame before to it; None: not known
+    log_odds: float  #: of the pose being right, up to near-symmetries, by all frames
+    origin: PoseEstimate | None  #: that the track began with; None: a pose that was given
 
 
 def track(
@@ -134,6 +134,11 @@ def track(
 
     In place of a frame that cannot be read there is an estimate that says so: it is given as it is,
     and the object is looked for in the next where it was before.
+
+    Args:
+        frames: views or clouds, or estimates in place of what cannot be read.
+        target: the object.
+        first: its pose in the first frame, as far as it is known; None: it is searched.
     """
     current = None
     if first is not None:
@@ -158,6 +163,7 @@ def _follow_or_search(
     pose_input: AnyInput, current: _Track | None, target: TrackedObject
 ) -> tuple[PoseEstimate, _Track | None]:
     """Follow the object into a frame, or search it there; give what is known of it then."""
+    # Followed from the frame before.
     watch = Stopwatch()
     if current is not None:
         with watch.stage("tracking"):
@@ -166,7 +172,7 @@ def _follow_or_search(
             estimate, following = followed
             return replace(estimate, name=pose_input.name, seconds=watch.seconds), following
 
-    # Not known from the frame before, or not seen there.
+    # Searched: not known from the frame before, or not seen where it was.
     searched = target.search(pose_input)
     seconds = {**watch.seconds, **searched.seconds}
     pose = searched.camera_from_model
@@ -174,10 +180,12 @@ def _follow_or_search(
     estimate = replace(searched, name=pose_input.name, seconds=seconds, tracking=tracking)
     if pose is None:
         return estimate, None
+
     # A track that begins at something else stays there: what was searched for must be `ok`.
     is_searched = isinstance(pose_input, ViewInput) and searched.certainty is not None
     if is_searched and not searched.is_ok:
         return estimate, None
+    # Odds stay finite, so that later frames can change them.
     certainty = min(max(searched.certainty or 0.0, _LEAST_CERTAINTY), 1 - _LEAST_CERTAINTY)
     log_odds = math.log(certainty / (1 - certainty))
     return estimate, _Track(pose=pose.double(), motion=None, log_odds=log_odds, origin=searched)
@@ -195,9 +203,9 @@ def _follow(
     poses = Rigid.stack(starts)
 
     # The points near these poses, without the plane that the object lies on.
-    scene_m = scene_about(pose_input, poses, surface)
-    near = _is_near(scene_m, poses, surface, MARGIN)
-    is_support = _is_support(scene_m, near, current.pose.apply(surface.points_m))
+    scene_m = _gather_scene(pose_input, poses, surface)
+    near = _mark_near(scene_m, poses, surface, MARGIN)
+    is_support = _mark_support(scene_m, near, current.pose.apply(surface.points_m))
     cloud_m = scene_m[near & ~is_support]
     if len(cloud_m) < _LEAST_POINTS:
         return Refusal(
@@ -209,7 +217,7 @@ def _follow(
     icp = replace(target.config.icp, starts=1)
     refined = refine_best(cloud_m, poses, surface, icp).refined
     pose = refined.camera_from_model.double()
-    object_points_m = scene_m[_is_near(scene_m, pose[None], surface, NEAR) & ~is_support]
+    object_points_m = scene_m[_mark_near(scene_m, pose[None], surface, NEAR) & ~is_support]
     if len(object_points_m) < _LEAST_POINTS:
         return Refusal(
             status="too few points",
@@ -262,19 +270,20 @@ def _follow(
         copy_certainty=certainty,
         tracking="tracked",
     )
-    estimate = _with_copies(estimate, pose, current.origin)
+    estimate = _carry_copies(estimate, pose, current.origin)
     estimate = with_status(estimate, target.config.min_certainty)
     motion = _FrameMotion.between(current.pose, pose)
     following = replace(current, pose=pose, motion=motion, log_odds=log_odds)
     return estimate, following
 
 
-def _with_copies(estimate: PoseEstimate, pose: Rigid, origin: PoseEstimate | None) -> PoseEstimate:
+def _carry_copies(estimate: PoseEstimate, pose: Rigid, origin: PoseEstimate | None) -> PoseEstimate:
     """Carry the near-symmetric copies that the track began with along with its pose."""
     if origin is None or not origin.certainty or origin.copy_certainty is None:
         return estimate
     assert origin.camera_from_model is not None
     assert estimate.certainty is not None
+
     # Which of the copies it is does not change while it is followed.
     scale = estimate.certainty / origin.certainty
     model_from_origin = origin.camera_from_model.double().inverse()
@@ -291,10 +300,17 @@ def _with_copies(estimate: PoseEstimate, pose: Rigid, origin: PoseEstimate | Non
     )
 
 
-def _is_support(
+def _mark_support(
     scene_m: Float64[Tensor, "n 3"], near: Bool[Tensor, " n"], posed_m: Float64[Tensor, "m 3"]
 ) -> Bool[Tensor, " n"]:
-    """Whether points are of a table or wall beside the object, onto which ICP would pull it."""
+    """Mark the points of a table or wall beside the object, onto which ICP would pull it.
+
+    Args:
+        scene_m: points about the object, in the camera frame.
+        near: those that may be the object's.
+        posed_m: its surface at the last pose.
+    """
+    # The largest planes beside the object, one after the other.
     is_support = torch.zeros_like(near)
     is_flat = torch.zeros(len(posed_m), dtype=torch.bool)
     generator = torch.Generator().manual_seed(0)
@@ -310,6 +326,7 @@ def _is_support(
         limit_m = _SUPPORT_DEVIATIONS * gap_m.square().mean().sqrt()
         is_support |= (scene_m @ normal - offset).abs() < limit_m
         is_flat |= (posed_m @ normal - offset).abs() < limit_m
+
     # An object as flat as the noise cannot be told from its support: all points are kept. Of any
     # other one, few points beside the support mean that it was taken away.
     left = int((near & ~is_support).sum())
@@ -318,10 +335,10 @@ def _is_support(
     return torch.zeros_like(near) if is_little_left and is_object_flat else is_support
 
 
-def _is_near(
+def _mark_near(
     points_m: Float64[Tensor, "n 3"], poses: Rigid, surface: Surface, limit: float
 ) -> Bool[Tensor, " n"]:
-    """Whether points are within a limit, in diameters, of the surface at one of several poses."""
+    """Mark the points within a limit, in diameters, of the surface at one of several poses."""
     local_m = poses.inverse().apply(points_m)
     gap_m = (local_m - surface.points_m[surface.boxes.look_up(local_m)]).norm(dim=-1)
     return (gap_m < limit * surface.diameter_m).any(0)

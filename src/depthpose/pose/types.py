@@ -82,8 +82,8 @@ class PoseTruth:
 class CloudSample:
     """One sample of a dataset."""
 
-    input: CloudInput
-    truth: PoseTruth
+    input: CloudInput  #: the cloud
+    truth: PoseTruth  #: its pose
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -129,8 +129,8 @@ AnyInput = CloudInput | ViewInput
 class ViewSample:
     """A view and its truth."""
 
-    input: ViewInput
-    truth: PoseTruth
+    input: ViewInput  #: the view
+    truth: PoseTruth  #: its pose
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -160,16 +160,19 @@ class Symmetries:
 
     @property
     def ball_centre_m(self) -> Float[Tensor, "3"] | None:
-        """Where two axes of revolution meet: every turn about it changes nothing; else None."""
+        """The point where two axes of revolution meet, about which any turn is one; else None."""
         for other in self.continuous[1:]:
             first = self.continuous[0]
             across = torch.linalg.cross(first.direction, other.direction)
-            if float(across.norm()) > _OTHER_AXIS:
-                eye = torch.eye(3).to(across)
-                planes = [eye - torch.outer(a.direction, a.direction) for a in (first, other)]
-                points_m = torch.stack([first.point_m, other.point_m])
-                pulls = (torch.stack(planes) @ points_m[..., None]).sum(0)
-                return torch.linalg.solve(planes[0] + planes[1], pulls).squeeze(-1)
+            if float(across.norm()) <= _OTHER_AXIS:
+                continue
+
+            # The point nearest to both lines.
+            eye = torch.eye(3).to(across)
+            planes = [eye - torch.outer(a.direction, a.direction) for a in (first, other)]
+            points_m = torch.stack([first.point_m, other.point_m])
+            pulls = (torch.stack(planes) @ points_m[..., None]).sum(0)
+            return torch.linalg.solve(planes[0] + planes[1], pulls).squeeze(-1)
         return None
 
 
@@ -240,7 +243,7 @@ class Alternative:
     is_copy: bool = False  #: a near-symmetric copy of the estimate's pose, which looks nearly alike
 
     def __str__(self) -> str:
-        """Say how it differs from the pose, and how likely it is."""
+        """Describe how it differs from the pose, and how likely it is."""
         return f"{self.difference}, {self.probability:.0%}"
 
 
@@ -379,7 +382,7 @@ class PoseEstimate:
         eye = torch.eye(3, dtype=torch.float64)
         t_m = self.camera_from_model.t_m.double()
         turned = torch.linalg.cross(eye, t_m.expand(3, 3)).mT
-        std_m = self._std_along(torch.cat([turned, eye], 1), 1e-3)
+        std_m = self._measure_std_along(torch.cat([turned, eye], 1), 1e-3)
         return None if std_m is None else 1000 * std_m
 
     @property
@@ -391,11 +394,17 @@ class PoseEstimate:
         if self.camera_from_model is None:
             return None
         R = self.camera_from_model.R.double()
-        std = self._std_along(torch.cat([R.mT, torch.zeros_like(R)], 1), 1e-2)
+        std = self._measure_std_along(torch.cat([R.mT, torch.zeros_like(R)], 1), 1e-2)
         return None if std is None else std.rad2deg()
 
-    def _std_along(self, rows: Float64[Tensor, "3 6"], least: float) -> Tensor | None:
-        """Standard deviations of linear functions of the motion; free is what moves as much."""
+    def _measure_std_along(self, rows: Float64[Tensor, "3 6"], least: float) -> Tensor | None:
+        """Give standard deviations of linear functions of the motion, or None.
+
+        Args:
+            rows: the functions' derivatives by (rotation, translation).
+            least: a function is free, and its deviation infinite, where a free motion moves it by
+                more than this.
+        """
         if self.covariance is None:
             return None
         std = (rows @ self.covariance.double() @ rows.mT).diagonal().clamp(min=0).sqrt()

@@ -59,18 +59,23 @@ class PoseWeights:
     facts: Mapping[str, str]  #: the card in short: ``trained_on``, ``licence``, ``terms`` and more
 
     def __post_init__(self) -> None:
+        # A class for each model.
         config = self.network.config
         if len(self.models) != config.classes:
             raise InputError(
                 f"the network knows {config.classes} classes, but {len(self.models)} models are "
                 "given; class k is models[k]. Give one model for each."
             )
+
+        # The features that its clouds give.
         inputs = SHAPE_FEATURES if self.cloud.with_shape else 1
         if isinstance(config, ResUNetConfig) and config.inputs != inputs:
             raise InputError(
                 f"the network takes {config.inputs} features of a voxel, but its clouds give "
                 f"{inputs}. Set with_shape of the cloud as it was in training."
             )
+
+        # The keypoints of each model.
         keypoints = None if isinstance(config, DepthImageConfig) else config.keypoints
         for model in self.models:
             if keypoints not in (None, len(model.keypoints_m)):
@@ -93,6 +98,7 @@ def write_pose_weights(
         with_meshes: write the models' surfaces. A licence may forbid it; then the file cannot be
             used until :func:`complete_weights` has added them again.
     """
+    # The tensors: those of the network, and those of each model.
     network = weights.network
     learnt = halve_state(network) if with_half else network.state_dict()
     state = {f"network.{name}": tensor for name, tensor in learnt.items()}
@@ -103,7 +109,9 @@ def write_pose_weights(
             # A copy: two models may be made of one tensor, which safetensors refuses to write.
             stored = tensor.dtype if tensor.is_floating_point() else torch.int32
             state[f"models.{k}.{name}"] = tensor.to(stored, copy=True)
-        state |= _color_tensors(k, model) if with_meshes else {}
+        state |= _store_colors(k, model) if with_meshes else {}
+
+    # The settings, and what a model is beside its tensors.
     config = {
         "network": config_to_dict(network.config),
         "cloud": config_to_dict(weights.cloud),
@@ -140,6 +148,7 @@ def complete_weights(path: Path, meshes: Mapping[int, ObjectModel], out: Path) -
     """
     checkpoint = read_checkpoint(path)
     state = dict(checkpoint.state)
+    # Each object is compared with its mesh: is it the one that was trained on?
     for k, record in enumerate(checkpoint.config.get("models", ())):
         number = record["number"]
         keypoints_m = state[f"models.{k}.keypoints_m"]
@@ -158,19 +167,21 @@ def complete_weights(path: Path, meshes: Mapping[int, ObjectModel], out: Path) -
                 f"long) lies {gap_m:.3g} m off the model {model.name} ({model.diameter_m:.3g} m "
                 "long): another object, frame or unit. Give the models that it was trained on."
             )
+
+        # Its surface is added.
         for name in _SURFACE:
             tensor = getattr(model, name)
             stored = tensor.dtype if tensor.is_floating_point() else torch.int32
             state[f"models.{k}.{name}"] = tensor.to(stored, copy=True)
-        state |= _color_tensors(k, model)
+        state |= _store_colors(k, model)
     save_checkpoint(out, dataclasses.replace(checkpoint, state=state))
 
 
 _COLORS = "colors."  # prefix of the names of a model's coloured points
 
 
-def _color_tensors(k: int, model: ObjectModel) -> dict[str, Tensor]:
-    """Give the tensors of the colours of model k by their names in a file; a byte a channel."""
+def _store_colors(k: int, model: ObjectModel) -> dict[str, Tensor]:
+    """Convert the colours of model k to tensors by their names in a file; a byte a channel."""
     colors = model.colors
     if colors is None:
         return {}
@@ -184,20 +195,22 @@ def _color_tensors(k: int, model: ObjectModel) -> dict[str, Tensor]:
     return {f"models.{k}.{_COLORS}{name}": tensor for name, tensor in tensors.items()}
 
 
-def _colors_of(state: Mapping[str, Tensor]) -> SurfaceColors | None:
-    """Give the colours among the tensors of a model, if it has any."""
+def _restore_colors(state: Mapping[str, Tensor]) -> SurfaceColors | None:
+    """Restore the colours among the tensors of a model; None where it has none."""
     tensors = {n.removeprefix(_COLORS): t for n, t in state.items() if n.startswith(_COLORS)}
     if not tensors:
         return None
-    points_m, normals, rgb = (tensors[name].float() for name in ("points_m", "normals", "rgb"))
+    points_m = tensors["points_m"].float()
+    normals = tensors["normals"].float()
+    rgb = tensors["rgb"].float()
     if not len(points_m) == len(normals) == len(rgb) > 0:
         raise ValueError(f"{len(points_m)} coloured points have {len(rgb)} colours")
     spacing_m = float(tensors["spacing_m"][0, 0])
     return SurfaceColors(points_m=points_m, normals=normals, rgb=rgb / 255, spacing_m=spacing_m)
 
 
-def known_numbers(path: Path) -> tuple[int, ...]:
-    """Give the numbers of the objects that weights know, with or without their surfaces.
+def read_object_numbers(path: Path) -> tuple[int, ...]:
+    """Read the numbers of the objects that weights know, with or without their surfaces.
 
     Raises:
         InputError: they are of another kind, or damaged.
@@ -222,7 +235,7 @@ def read_pose_weights(path: Path) -> PoseWeights:
     """
     checkpoint = read_checkpoint(path)
     source = str(path)
-    network = network_of(checkpoint, source)
+    network = build_pose_network(checkpoint, source)
     if not any(f"models.0.{name}" in checkpoint.state for name in _SURFACE):
         word = quote(str(path))
         with suppress(InputError):  # a name where it leads there
@@ -244,7 +257,7 @@ def read_pose_weights(path: Path) -> PoseWeights:
             prefix = f"models.{k}."
             stored = checkpoint.state.items()
             state = {n.removeprefix(prefix): t for n, t in stored if n.startswith(prefix)}
-            models.append(_model_of(record, state, f"{source}: model {k}"))
+            models.append(_restore_model(record, state, f"{source}: model {k}"))
 
     # No tensor but theirs and the network's.
     prefixes = ("network.", *(f"models.{k}." for k in range(len(models))))
@@ -260,12 +273,15 @@ def read_pose_weights(path: Path) -> PoseWeights:
     )
 
 
-def _model_of(record: Any, state: Mapping[str, Tensor], source: str) -> ObjectModel:  # noqa: ANN401
+def _restore_model(record: Any, state: Mapping[str, Tensor], source: str) -> ObjectModel:  # noqa: ANN401
     """Make an object of its entry in the config and its tensors; ``source`` is for errors."""
+    # Is all there that an object needs?
     missing = [name for name in _TENSORS if name not in state]
     missing += [name for name in ("name", "number", "diameter_m") if name not in record]
     if missing:
         raise InputError(f"{source} has no {missing[0]!r}; the file is of another version.")
+
+    # Do its tensors fit each other?
     vertices = state["vertices_m"]
     faces = state["faces"].long()
     shapes = {name: tuple(tensor.shape[1:]) for name, tensor in state.items()}
@@ -285,7 +301,7 @@ def _model_of(record: Any, state: Mapping[str, Tensor], source: str) -> ObjectMo
         diameter_m=float(record["diameter_m"]),
         keypoints_m=state["keypoints_m"],
         symmetries=symmetries_from_bop(record, source=source),
-        colors=_colors_of(state),
+        colors=_restore_colors(state),
     )
 
 
@@ -295,15 +311,16 @@ def settings_of(checkpoint: Checkpoint, source: str) -> dict[str, Any]:
     Raises:
         InputError: a setting is unknown, or has a value that is refused.
     """
-    _, kind = POSE_NETWORKS[checkpoint.kind]
-    kinds = {"network": kind, "cloud": CloudConfig, "refusal": RefusalConfig}
-    return {
-        name: config_to_dict(config_from_dict(checkpoint.config[name], of, source=source))
-        for name, of in kinds.items()
-    }
+    _, network_config = POSE_NETWORKS[checkpoint.kind]
+    kinds = {"network": network_config, "cloud": CloudConfig, "refusal": RefusalConfig}
+    settings: dict[str, Any] = {}
+    for name, config_kind in kinds.items():
+        config = config_from_dict(checkpoint.config[name], config_kind, source=source)
+        settings[name] = config_to_dict(config)
+    return settings
 
 
-def network_of(checkpoint: Checkpoint, source: str) -> AnyNetwork:
+def build_pose_network(checkpoint: Checkpoint, source: str) -> AnyNetwork:
     """Build the network alone, in eval mode, of weights with or without their objects' surfaces.
 
     Raises:
@@ -314,14 +331,16 @@ def network_of(checkpoint: Checkpoint, source: str) -> AnyNetwork:
             f"{source}: holds weights of kind {checkpoint.kind!r}, but a pose takes one of "
             f"{', '.join(map(repr, POSE_NETWORKS))}."
         )
-    made, kind = POSE_NETWORKS[checkpoint.kind]
+    network_class, config_kind = POSE_NETWORKS[checkpoint.kind]
     for name in ("network", "cloud", "refusal"):
         if not isinstance(checkpoint.config.get(name), Mapping):
             raise InputError(
                 f"{source}: its config has no {name!r}; the file is of another version."
             )
-    config = config_from_dict(checkpoint.config["network"], kind, source=source)
+    config = config_from_dict(checkpoint.config["network"], config_kind, source=source)
+
+    # The tensors of the network alone.
     learnt = {name: t for name, t in checkpoint.state.items() if name.startswith("network.")}
     state = {name.removeprefix("network."): tensor for name, tensor in learnt.items()}
-    held = dataclasses.replace(checkpoint, state=state)
-    return build_network(lambda: made(config), held, source).eval()
+    of_network = dataclasses.replace(checkpoint, state=state)
+    return build_network(lambda: network_class(config), of_network, source).eval()

@@ -24,8 +24,8 @@ _FIRST_COLUMNS = ("source", "method", "weights", "cap_m", *_METRICS, "protocol")
 class PublishedRow:
     """One printed row: the seven numbers of a method for truth up to ``cap_m``."""
 
-    method: str
-    cap_m: float
+    method: str  #: its name, as printed
+    cap_m: float  #: largest depth of the truth [m]
     printed: str  #: the numbers, in the order of our metrics of depth
     protocol: str = "eigen-raw"  #: by which they were measured
     note: str = ""  #: the row's footnote
@@ -38,17 +38,13 @@ class PublishedRow:
 
 @dataclass(frozen=True, kw_only=True)
 class PublishedTable:
-    """One printed table: every author's row, in the order of print.
+    """One printed table: every author's row, in the order of print."""
 
-    ``own_rows``: names of the thesis's own methods, in the order in which weights are given;
-    ``with_right``: whether the methods see the real right view.
-    """
-
-    number: str
-    title: str
-    rows: tuple[PublishedRow, ...]
-    own_rows: tuple[str, ...]
-    with_right: bool
+    number: str  #: the thesis's
+    title: str  #: what our page calls it
+    rows: tuple[PublishedRow, ...]  #: every row
+    own_rows: tuple[str, ...]  #: methods of the thesis, in the order in which weights are given
+    with_right: bool  #: whether the methods see the real right view
 
 
 def join_published(
@@ -66,6 +62,7 @@ def join_published(
     Returns:
         The columns of each row; ``source`` is ``published``, ``ours`` or ``difference``.
     """
+    # The printed rows.
     published: list[dict[str, Any]] = []
     for row in table.rows:
         columns: dict[str, Any] = dict.fromkeys(_FIRST_COLUMNS, "")
@@ -74,20 +71,21 @@ def join_published(
         columns |= {"protocol": row.protocol, "note": row.note}
         published.append(columns)
 
+    # Ours, each with its difference to the thesis's own.
     rows = list(published)
     for counterpart, row in our_rows:
         assert row.cap_m is not None, "the tables are of depth, and reproduce takes no disparity"
         ours = {**dict.fromkeys(_FIRST_COLUMNS, ""), **row.columns(), "source": "ours"}
         rows.append(ours)
         rows += [
-            _difference(ours, theirs)
+            _subtract_row(ours, theirs)
             for theirs in published
             if theirs["method"] == counterpart and theirs["cap_m"] == row.cap_m
         ]
     return sorted(rows, key=lambda row: -row["cap_m"])
 
 
-def _difference(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> dict[str, Any]:
+def _subtract_row(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> dict[str, Any]:
     """Subtract the thesis's row from one of ours."""
     row = {name: ours[name] for name in _FIRST_COLUMNS}
     row["source"] = "difference"
@@ -188,10 +186,10 @@ def draw_figure_2_5(
     panels = [Drawing(caption="left image", image=pair.left)]
     if pair.right is not None:
         panels.append(Drawing(caption="real right image", image=pair.right))
-    panels.append(_depth_panel("predicted depth", pair, estimate))
+    panels.append(_draw_depth_panel("predicted depth", pair, estimate))
     if estimate.right is not None:
         panels.append(Drawing(caption="predicted right image", image=estimate.right))
-    return panels + _lidar_panels(pair, lidar_m)
+    return panels + _draw_lidar_panels(pair, lidar_m)
 
 
 def draw_figure_2_1(
@@ -218,9 +216,9 @@ def draw_figure_2_1(
         Drawing(caption="(a) left image", image=pair.left),
         Drawing(caption="(b) real right image", image=pair.right),
         Drawing(caption="(c) synthesised right image", image=mono.right),
-        _depth_panel("(d) depth from left and synthesised right", pair, mono),
-        _depth_panel("(e) depth from left and real right", pair, stereo),
-        *_lidar_panels(pair, lidar_m, "(f) LiDAR"),
+        _draw_depth_panel("(d) depth from left and synthesised right", pair, mono),
+        _draw_depth_panel("(e) depth from left and real right", pair, stereo),
+        *_draw_lidar_panels(pair, lidar_m, "(f) LiDAR"),
     ]
 
 
@@ -239,6 +237,7 @@ def arrange(columns: Sequence[Sequence[Drawing]], width_px: int = 621) -> Float[
     for k in range(max(map(len, shrunk))):
         heights = [column[k].shape[1] for column in shrunk if k < len(column)]
         row_heights.append(max(heights) + _GAP_PX)
+
     filled_columns: list[Tensor] = []
     for column in shrunk:
         cells = [
@@ -250,12 +249,13 @@ def arrange(columns: Sequence[Sequence[Drawing]], width_px: int = 621) -> Float[
         filled_columns.append(F.pad(stacked, (0, 0, 0, missing_px), value=1.0))
     grid = torch.cat(filled_columns, 2)[..., :-_GAP_PX]
 
+    # The bar of colours below them.
     ramp_m = torch.logspace(0, 1, grid.shape[2], base=_FAR_M / _NEAR_M) * _NEAR_M
     bar = draw_depth(ramp_m[None], _NEAR_M, _FAR_M).expand(-1, _BAR_PX, -1)
     return torch.cat([grid, bar], 1)
 
 
-def _depth_panel(caption: str, pair: StereoInput, estimate: DepthEstimate) -> Drawing:
+def _draw_depth_panel(caption: str, pair: StereoInput, estimate: DepthEstimate) -> Drawing:
     """Draw estimated depth, in the colours of every panel."""
     if estimate.depth_m is None:
         raise InputError(f"{pair.name}: a figure shows metres; give a camera with a baseline.")
@@ -263,7 +263,7 @@ def _depth_panel(caption: str, pair: StereoInput, estimate: DepthEstimate) -> Dr
     return Drawing(caption=caption, image=image, scale=depth_scale(_NEAR_M, _FAR_M))
 
 
-def _lidar_panels(
+def _draw_lidar_panels(
     pair: StereoInput, lidar_m: Float[Tensor, "h w"] | None, caption: str = "LiDAR"
 ) -> list[Drawing]:
     """Draw the LiDAR points over the left image; no panel without a scan."""

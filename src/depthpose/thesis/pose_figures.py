@@ -33,6 +33,7 @@ _SPECTRAL = (
 
 def spectral(share: Float[Tensor, " n"]) -> Float[Tensor, "n 3"]:
     """Colour numbers from 0 (red) over the middle (yellow) to 1 (blue)."""
+    # Between the two colours of the scale beside each number.
     anchors = torch.tensor(_SPECTRAL, dtype=torch.float32) / 255
     position = share.float().clamp(0, 1) * (len(anchors) - 1)
     below = position.long().clamp(max=len(anchors) - 2)
@@ -51,7 +52,13 @@ def arrange_grid(
         raise InputError("a figure of no picture cannot be arranged; give one at least.")
     height = max(picture.shape[1] for picture in pictures) + _GAP_PX
     width = max(picture.shape[2] for picture in pictures) + _GAP_PX
-    cells = [F.pad(p, (0, width - p.shape[2], 0, height - p.shape[1]), value=1.0) for p in pictures]
+    cells: list[Tensor] = []
+    for picture in pictures:
+        missing_right = width - picture.shape[2]
+        missing_below = height - picture.shape[1]
+        cells.append(F.pad(picture, (0, missing_right, 0, missing_below), value=1.0))
+
+    # Rows of cells, the last filled up with white.
     columns = min(columns, len(cells))
     cells += [torch.ones(3, height, width)] * (-len(cells) % columns)
     rows = [torch.cat(cells[k : k + columns], 2) for k in range(0, len(cells), columns)]
@@ -64,9 +71,13 @@ def draw_discs(
     colors: Float[Tensor, "n 3"],
     radius_px: float,
 ) -> None:
-    """Draw points as discs of colours in [0, 1].
+    """Draw points as discs.
 
-    ``places`` are (u, v) in pixels and the distance: near ones cover far ones.
+    Args:
+        pen: of the picture.
+        places: u and v in pixels, and the distance: near discs cover far ones.
+        colors: of the discs, 0..1.
+        radius_px: of the discs.
     """
     far_to_near = places[:, 2].argsort(descending=True, stable=True)
     rgb = (255 * colors[far_to_near]).round().int().tolist()
@@ -84,10 +95,10 @@ _TILT_OFFSET_RAD = math.radians(20)
 
 
 @torch.inference_mode()
-def featured_points(
+def compute_features(
     net: GeoPoseNet, pose_input: AnyInput
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n c"]] | None:
-    """Give the points that the network takes, in the camera frame, and its features of them.
+    """Compute the network's features of the points that it takes; give these in the camera frame.
 
     The features are those before the last layer; None where the input cannot be posed.
     """
@@ -121,6 +132,7 @@ def draw_features(
         model: the object.
         size_px: width and height of the picture.
     """
+    # Surface and cloud in the picture's pixels.
     surface_m = sample_surface(model, _SURFACE_POINTS)[0].double()
     centre_m = (surface_m.amin(0) + surface_m.amax(0)) / 2
     cloud_m = points_m.double()
@@ -130,6 +142,7 @@ def draw_features(
     surface_px = (surface_m - centre_m) @ view_from_model.T * scale + centre_px
     cloud_px = (cloud_m - centre_m) @ view_from_model.T * scale + centre_px
 
+    # The cloud over the surface.
     canvas = Image.new("RGB", (size_px, size_px), "white")
     pen = ImageDraw.Draw(canvas)
     draw_discs(pen, surface_px, torch.zeros(len(surface_m), 3), 1.0)
@@ -138,7 +151,7 @@ def draw_features(
 
 
 def _look_at_cloud(outward: Float64[Tensor, "3"]) -> Float64[Tensor, "3 3"]:
-    """Give the rotation ``view_from_model`` that looks at the side ``outward`` of a model.
+    """Make the rotation ``view_from_model`` that looks at the side ``outward`` of a model.
 
     The view is turned sideways and upwards from it, and half as steep.
     """
@@ -176,7 +189,15 @@ def draw_field(
 
     All are in the camera frame, directions of unit length, and drawn in the plane of x and y: an
     arrow that points away from the viewer is short. The picture holds the cloud and both keypoints.
+
+    Args:
+        points_m: where the directions begin.
+        directions: to the keypoint.
+        true_m: the true keypoint.
+        voted_m: the voted one; None: none is drawn.
+        size_px: width and height of the picture.
     """
+    # The scale by which everything fits into the picture.
     keypoints_xy = torch.stack([true_m, true_m if voted_m is None else voted_m]).double()[:, :2]
     points_xy = points_m.double()[:, :2]
     all_xy = torch.cat([points_xy, keypoints_xy])
@@ -187,6 +208,7 @@ def draw_field(
     points_px = (points_xy - centre) * scale + size_px / 2
     keypoints_px = (keypoints_xy - centre) * scale + size_px / 2
 
+    # Arrows, and the keypoints over them.
     canvas = Image.new("RGB", (size_px, size_px), "white")
     pen = ImageDraw.Draw(canvas)
     starts = take_evenly(points_px, _ARROWS)
@@ -260,11 +282,15 @@ def embed_line(features: Float[Tensor, "n c"], perplexity: float = 40.0) -> Floa
             f"t-SNE of {len(features)} points with a perplexity of {perplexity:g}: give three "
             "times as many points, or a smaller perplexity"
         )
+
+    # The start: the principal component, very small.
     P = joint_probabilities(features, perplexity)
     centred = features.double() - features.double().mean(0)
     principal_axis = torch.linalg.svd(centred, full_matrices=False)[2][0]
     y = centred @ principal_axis
     y = 1e-4 * y / y.std().clamp(min=1e-12)
+
+    # Gradient descent with momentum and gains.
     speed = torch.zeros_like(y)
     gain = torch.ones_like(y)
     # A rate beyond what the curvature at the start allows tears groups apart, and on a line they
@@ -279,6 +305,8 @@ def embed_line(features: Float[Tensor, "n c"], perplexity: float = 40.0) -> Floa
         gain = torch.where(goes_on_downhill, gain + 0.2, gain * 0.8).clamp(min=0.01)
         speed = momentum * speed - rate * gain * gradient
         y = y + speed
+
+    # To 0 and 1.
     low = y.amin()
     high = y.amax()
     return (y - low) / (high - low).clamp(min=1e-12)
@@ -287,10 +315,11 @@ def embed_line(features: Float[Tensor, "n c"], perplexity: float = 40.0) -> Floa
 def joint_probabilities(
     features: Float[Tensor, "n c"], perplexity: float
 ) -> Float64[Tensor, "n n"]:
-    """Give the similarities P of t-SNE: Gaussian neighbourhoods of one perplexity, symmetric.
+    """Compute the similarities P of t-SNE: Gaussian neighbourhoods of one perplexity, symmetric.
 
     They sum to 1 over all pairs.
     """
+    # Squared distances, those of nearest neighbours subtracted.
     x = features.double()
     squares = torch.cdist(x, x, compute_mode="donot_use_mm_for_euclid_dist").square()
     squares.fill_diagonal_(torch.inf)
@@ -310,13 +339,15 @@ def joint_probabilities(
         is_too_wide = entropy > math.log(perplexity)
         low = torch.where(is_too_wide, precision, low)
         high = torch.where(is_too_wide, high, precision)
+
+    # Each row sums to 1, and then both directions of a pair count alike.
     weights = torch.exp(-shifted * high)
     conditional = weights / weights.sum(1, keepdim=True)
     return (conditional + conditional.T) / (2 * len(x))
 
 
 def kl_gradient(P: Float64[Tensor, "n n"], y: Float64[Tensor, " n"]) -> Float64[Tensor, " n"]:
-    """Give the gradient by y of the divergence of P from the similarities of y (Student's t)."""
+    """Compute the gradient by y of the divergence of P from the similarities of y (Student's t)."""
     differences = y[:, None] - y
     weights = 1 / (1 + differences.square())
     weights.fill_diagonal_(0)

@@ -61,18 +61,14 @@ PEERS = ("PointFusion", "DenseFusion, per pixel", "DenseFusion, iterative")
 
 @dataclass(frozen=True)
 class PublishedRow:
-    """One printed row: percent of the objects of :data:`LINEMOD`, in its order, and their mean.
+    """One printed row: percent of the objects of :data:`LINEMOD`, in its order, and their mean."""
 
-    ``printed`` is empty where only the mean is; ``note`` says what else it takes to compare it,
-    ``source`` where it is printed.
-    """
-
-    method: str
-    input: str
-    printed: str
-    mean: float
-    note: str
-    source: str
+    method: str  #: its name
+    input: str  # of the method; after "#:" the docs would take the builtin for it
+    printed: str  #: percent of each object; empty where only the mean is printed
+    mean: float  #: percent
+    note: str  #: what else it takes to compare it
+    source: str  #: where it is printed
 
 
 _TABLES = "tables in the READMEs of ethnhe/PVN3D and j96w/DenseFusion"
@@ -110,8 +106,8 @@ ROWS = (
 """Every figure as printed. Not like for like: see the notes, and the diameters."""
 
 
-def linemod_number(model: ObjectModel) -> int:
-    """Give BOP's number of the object of LineMOD that a model is, by its name and diameter.
+def find_linemod_number(model: ObjectModel) -> int:
+    """Find BOP's number of the object of LineMOD that a model is, by its name and diameter.
 
     A model without a name is known by its number and diameter.
 
@@ -120,10 +116,11 @@ def linemod_number(model: ObjectModel) -> int:
     """
     is_named = model.name != f"obj_{model.number:06d}"
     number = _NUMBERS.get(model.name.lower(), 0) if is_named else model.number
-    theirs_m = LINEMOD_DIAMETERS_M.get(number, 0.0)
-    if abs(theirs_m / model.diameter_m - 1) <= (_SAME_NAMED if is_named else _SAME_DIAMETER):
+    diameter_m = LINEMOD_DIAMETERS_M.get(number, 0.0)
+    largest_difference = _SAME_NAMED if is_named else _SAME_DIAMETER
+    if abs(diameter_m / model.diameter_m - 1) <= largest_difference:
         return number
-    remark = f"; LineMOD's object {number} is {theirs_m:.4f} m" if theirs_m else ""
+    remark = f"; LineMOD's object {number} is {diameter_m:.4f} m" if diameter_m else ""
     raise InputError(
         f"object {model.number} ({model.name}, {model.diameter_m:.4f} m across) is none of "
         f"LineMOD{remark}. Table 3.2 compares with numbers of LineMOD's objects; for other data "
@@ -139,7 +136,7 @@ def join_by_object(
     Args:
         rows: of ``pose.evaluate``, with their origin and conditions.
         numbers: BOP's number of each object, by the name in the rows; with printed rows that of
-            LineMOD's object (:func:`linemod_number`).
+            LineMOD's object (:func:`find_linemod_number`).
         with_published: set the printed rows of LineMOD before ours, and the differences to
             ``PEERS`` after; else (table 3.1) the differences of the first method to the others.
 
@@ -148,15 +145,21 @@ def join_by_object(
         the other). The mean of ours is over the objects that were measured; a difference of means
         is given only where both are over the same objects.
     """
-    columns = {n: LINEMOD.get(k, n) if with_published else n for n, k in numbers.items()}
+    # Ours: a row for each method and kind of masks, a column for each object.
+    columns: dict[str, str] = {}
+    for name, number in numbers.items():
+        columns[name] = LINEMOD.get(number, name) if with_published else name
     groups: dict[tuple[str, str], list[ObjectRow]] = {}
     for row in rows:
         assert row.origin is not None, "rows of an evaluation say whose they are"
         groups.setdefault((row.origin.method, row.origin.masks), []).append(row)
-    our_rows = [_our_row(group, columns) for group in groups.values()]
+    our_rows = [_make_our_row(group, columns) for group in groups.values()]
     names = list(columns.values())
     if not with_published:
-        return [*our_rows, *(_difference(our_rows[0], other, names) for other in our_rows[1:])]
+        differences = [_subtract_row(our_rows[0], other, names) for other in our_rows[1:]]
+        return [*our_rows, *differences]
+
+    # The printed ones before them, and the differences to our peers after.
     printed = [
         {
             "source": "published",
@@ -172,15 +175,12 @@ def join_by_object(
         for row in ROWS
     ]
     peers = [row for row in printed if row["method"] in PEERS]
-    return [
-        *printed,
-        *our_rows,
-        *(_difference(row, peer, names) for row in our_rows for peer in peers),
-    ]
+    differences = [_subtract_row(row, peer, names) for row in our_rows for peer in peers]
+    return [*printed, *our_rows, *differences]
 
 
-def _our_row(rows: Sequence[ObjectRow], columns: Mapping[str, str]) -> dict[str, Any]:
-    """Give the row of one method of ours: percentages of each object, by the table's columns."""
+def _make_our_row(rows: Sequence[ObjectRow], columns: Mapping[str, str]) -> dict[str, Any]:
+    """Make the row of one method of ours: percentages of each object, by the table's columns."""
     by_name = {row.object: row for row in rows}
     # Of one object there is no row of means: it is its own.
     mean = by_name.get("mean", rows[0])
@@ -208,10 +208,11 @@ def _our_row(rows: Sequence[ObjectRow], columns: Mapping[str, str]) -> dict[str,
     }
 
 
-def _difference(
+def _subtract_row(
     our_row: Mapping[str, Any], other: Mapping[str, Any], names: Sequence[str]
 ) -> dict[str, Any]:
     """Subtract a row from one of ours, by the names of our objects."""
+    # Means are compared only where both are over the same objects.
     compared = names if other["source"] == "ours" else [n for n in LINEMOD.values() if n in other]
     difference = {
         "source": "difference",
@@ -234,22 +235,19 @@ OUR_HYPOTHESES = (50, 128, 1024)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class VotingCase:
-    """One cloud in the camera frame, the network's unit directions from its points, and the truth.
+    """The votes of one cloud, and the truth."""
 
-    ``is_adds``: ADD-S decides, not ADD.
-    """
-
-    points_m: Float[Tensor, "n 3"]
-    directions: Float[Tensor, "n k 3"]
-    model: ObjectModel
-    truth: Rigid
-    is_adds: bool
+    points_m: Float[Tensor, "n 3"]  #: in the camera frame
+    directions: Float[Tensor, "n k 3"]  #: the network's at these points, of length 1
+    model: ObjectModel  #: the object
+    truth: Rigid  #: ``camera_from_model``
+    is_adds: bool  #: whether ADD-S decides, not ADD
 
 
-def voting_cases(
+def collect_votes(
     net: GeoPoseNet, views: Iterable[ViewSample], points: int
 ) -> Iterator[VotingCase | None]:
-    """Give the votes of some points of each view; None where it has too few to be posed.
+    """Collect the votes of some points of each view; None where it has too few to be posed.
 
     The points are chosen at random, the same each time. Each votes from its own position; points of
     one voxel share the network's direction.
@@ -267,6 +265,7 @@ def voting_cases(
         raise InputError("table 3.3 compares ways of voting: give weights of the sparse network")
     numbers = {model.name: k for k, model in enumerate(net.weights.models)}
     for view in views:
+        # Some points of the object.
         number = numbers[view.input.object]
         model = net.weights.models[number]
         view_input = view.input
@@ -278,6 +277,8 @@ def voting_cases(
         if why_too_few(points_m, net.weights.cloud) is not None:
             yield None
             continue
+
+        # The network's directions at their voxels.
         grid = voxelise(points_m, net.weights.cloud)
         coordinates = torch.nn.functional.pad(grid.coordinates, (1, 0))  # all of cloud 0
         voxels = VotingPoints(
@@ -305,7 +306,7 @@ def compare_voting(cases: Sequence[VotingCase | None], points: int) -> list[dict
     methods give. The time is the median of the vote alone, on one thread.
 
     Args:
-        cases: of :func:`voting_cases`; None counts as a failure of every method.
+        cases: of :func:`collect_votes`; None counts as a failure of every method.
         points: most points of a view, for its column.
 
     Raises:
@@ -315,7 +316,7 @@ def compare_voting(cases: Sequence[VotingCase | None], points: int) -> list[dict
     if not usable:
         raise InputError(f"none of the {len(cases)} views has enough points to be posed")
     rows: list[dict[str, Any]] = []
-    for voting in _voting_methods():
+    for voting in _list_voting_methods():
         successes, seconds = _time_votes(usable, voting.vote)
         row = {
             "points": points,
@@ -341,7 +342,7 @@ class _Voting(NamedTuple):
     vote: Callable[[VotingCase], Tensor]
 
 
-def _voting_methods() -> list[_Voting]:
+def _list_voting_methods() -> list[_Voting]:
     """List the methods of table 3.3; the loop, which the others are compared with, is the first."""
     methods = [_Voting("RANSAC, one by one (NumPy)", LOOP_HYPOTHESES, "angle", _vote_by_loop)]
     for hypotheses in OUR_HYPOTHESES:
@@ -417,17 +418,25 @@ def ransac_one_by_one(
     A hypothesis is the point nearest to the lines of two random points; its inliers are the points
     from which the cosine between unit direction and hypothesis is more than ``min_cosine``. The one
     with the most is refitted to its inliers. Published practice is 50 hypotheses for each keypoint.
+
+    Args:
+        points_m: where the votes start.
+        directions: unit vectors.
+        hypotheses: for each keypoint.
+        min_cosine: of inliers.
+        seed: of the pairs of points.
     """
     random = np.random.default_rng(seed)
-    keypoints = []
+    keypoints: list[np.ndarray] = []
     for k in range(directions.shape[1]):
+        # The hypothesis of most inliers.
         n = directions[:, k]
         most_inliers = -1
         best_inliers = np.ones(len(n), bool)
         for _ in range(hypotheses):
             pair = random.choice(len(points_m), 2, replace=False)
             try:
-                hypothesis = np.linalg.solve(*_normal_equations(points_m[pair], n[pair]))
+                hypothesis = np.linalg.solve(*_build_normal_equations(points_m[pair], n[pair]))
             except np.linalg.LinAlgError:
                 continue
             offsets = hypothesis - points_m
@@ -437,16 +446,20 @@ def ransac_one_by_one(
             if count > most_inliers:
                 most_inliers = count
                 best_inliers = inliers
+
+        # Refitted to them.
         try:
-            refitted = np.linalg.solve(*_normal_equations(points_m[best_inliers], n[best_inliers]))
+            refitted = np.linalg.solve(
+                *_build_normal_equations(points_m[best_inliers], n[best_inliers])
+            )
         except np.linalg.LinAlgError:  # no inlier but parallel ones, or none: all votes count
-            refitted = np.linalg.lstsq(*_normal_equations(points_m, n), rcond=None)[0]
+            refitted = np.linalg.lstsq(*_build_normal_equations(points_m, n), rcond=None)[0]
         keypoints.append(refitted)
     return np.stack(keypoints)
 
 
-def _normal_equations(points_m: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Give A and b of the normal equations ``A x = b`` of the point nearest to lines.
+def _build_normal_equations(points_m: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Build A and b of the normal equations ``A x = b`` of the point nearest to lines.
 
     The lines go through ``points_m`` along the unit directions ``n``; A is singular if they are
     parallel.

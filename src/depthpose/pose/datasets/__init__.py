@@ -20,7 +20,7 @@ from depthpose.pose.datasets.layouts import LAYOUTS as LAYOUTS
 from depthpose.pose.datasets.layouts import BopTarget as BopTarget
 from depthpose.pose.datasets.layouts import Instance as Instance
 from depthpose.pose.datasets.layouts import Layout as Layout
-from depthpose.pose.datasets.layouts import object_names as object_names
+from depthpose.pose.datasets.layouts import read_object_names as read_object_names
 from depthpose.pose.datasets.layouts import read_targets as read_targets
 from depthpose.pose.datasets.masks import decode_rle as decode_rle
 from depthpose.pose.datasets.masks import encode_rle as encode_rle

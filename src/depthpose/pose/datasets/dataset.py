@@ -28,19 +28,19 @@ from depthpose.core.files.disk import write_bytes
 from depthpose.core.findings import CheckReport, Problem, make_report, unreadable
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import (
+    advise_unit,
     cloud_from_depth,
     grow_mask,
-    other_size,
-    unit_advice,
+    make_size_error,
     why_too_few,
 )
 from depthpose.pose.datasets.layouts import (
     Instance,
-    bop_splits,
-    layout_of,
-    object_names,
+    find_layout,
+    list_bop_splits,
     read_bop_models,
     read_models_info,
+    read_object_names,
 )
 from depthpose.pose.datasets.masks import mask_box, read_mask
 from depthpose.pose.mesh import (
@@ -69,7 +69,7 @@ class BopDataset:
     @property
     def folder_of_split(self) -> str:
         """The folder of the split: its name without that of the sensor."""
-        splits = bop_splits(self.folder) if self.layout == "BOP" else {}
+        splits = list_bop_splits(self.folder) if self.layout == "BOP" else {}
         return splits[self.split][0] if self.split in splits else self.split
 
     def __getitem__(self, index: int) -> ViewSample:
@@ -97,7 +97,7 @@ class BopDataset:
         mask = read_instance_mask(instance) if mask is None else mask
         depth_m = read_depth_png(instance.depth, instance.depth_unit_m)
         if mask.shape != depth_m.shape:
-            raise other_size(mask, depth_m)
+            raise make_size_error(mask, depth_m)
         return ViewSample(
             input=ViewInput(
                 name=instance.name,
@@ -119,18 +119,19 @@ class BopDataset:
         Raises:
             InputError: none is left.
         """
-        there = sorted({instance.object_id for instance in self.instances})
-        names = object_names(self.folder, there)
+        # The objects that occur, and those of them that are asked for: digits may be a name.
+        present = sorted({instance.object_id for instance in self.instances})
+        names = read_object_names(self.folder, present)
         digits = (o for o in objects if isinstance(o, str) and o.isdecimal())
         wanted = {*objects, *(int(o) for o in digits if o not in names.values())}
-        kept = [i for i in self.instances if {i.object_id, names[i.object_id]} & wanted]
-        if not kept:
+        instances = [i for i in self.instances if {i.object_id, names[i.object_id]} & wanted]
+        if not instances:
             asked = ", ".join(map(repr, objects))
             listing = ", ".join(f"{number} ({name})" for number, name in names.items())
             raise InputError(
                 f"{self.folder}: no instance of {asked}; objects here: {listing}; name one of them"
             )
-        return replace(self, instances=kept)
+        return replace(self, instances=instances)
 
 
 def open_bop(folder: str | Path, split: str = "test") -> BopDataset:
@@ -145,8 +146,10 @@ def open_bop(folder: str | Path, split: str = "test") -> BopDataset:
         InputError: no such folder or split, or an annotation is damaged.
     """
     folder = Path(folder)
-    name, layout = layout_of(folder)
+    name, layout = find_layout(folder)
     instances = list(layout.instances(folder, split))
+
+    # What tells data sets of one name apart.
     digest = hashlib.sha256()
     for instance in instances:
         pose = instance.camera_from_model
@@ -163,7 +166,11 @@ def open_bop(folder: str | Path, split: str = "test") -> BopDataset:
 
 
 def read_instance_mask(instance: Instance) -> Bool[Tensor, "mask_h mask_w"]:
-    """Read the annotated mask of the visible part."""
+    """Read the annotated mask of the visible part.
+
+    Raises:
+        InputError: there is none, or it is damaged.
+    """
     if instance.mask is None:
         raise InputError(
             f"{instance.name}: there is no mask beside {instance.depth.parent}; render mask_visib, "
@@ -187,17 +194,24 @@ def check_bop(
     """Check every file of a data set: are they there and whole, and do they agree?
 
     Units are checked too: a cloud a thousand times smaller than its model, or a metre away from
-    its annotated pose, is reported; without decoding only headers are read. ``split`` None: all.
-    ``progress`` is called with the number of instances done and of all.
+    its annotated pose, is reported.
+
+    Args:
+        folder: of the data set.
+        split: its name; None: all.
+        with_decoding: read images whole; else their headers alone.
+        progress: called with the number of instances done and of all.
 
     Raises:
         InputError: there is no such split.
     """
     folder = Path(folder)
-    name, layout = layout_of(folder)
+    name, layout = find_layout(folder)
     splits = layout.splits(folder)
     if split is not None and split not in splits:
         raise InputError(f"{folder}: no split {split!r}. Here: {', '.join(splits) or 'none'}.")
+
+    # Annotations and models.
     problems: list[Problem] = []
     instances: list[Instance] = []
     for split_name in splits if split is None else [split]:
@@ -206,14 +220,19 @@ def check_bop(
         except InputError as error:
             problems.append(Problem(path=folder, kind="unreadable", message=str(error)))
     models = _check_models(folder, {i.object_id for i in instances}, problems)
+
+    # The files of each instance.
     for done, instance in enumerate(instances, 1):
         model = models.get(instance.object_id) if with_decoding else None
         try:
             problems += _check_instance(instance, model)
         except InputError as error:
+            # Of which file, by the error's words: the depth image where it names no other.
             paths = (p for p in (instance.mask, instance.rgb) if p and str(p) in str(error))
             problem = unreadable(next(paths, instance.depth), error)
-            problems.append(problem if problem.path.is_file() else replace(problem, kind="missing"))
+            if not problem.path.is_file():
+                problem = replace(problem, kind="missing")
+            problems.append(problem)
         if progress is not None:
             progress(done, len(instances))
     counts = {
@@ -237,8 +256,9 @@ def _check_models(
         problems.append(Problem(path=folder, kind="missing", message=str(error)))
         return models
     for number in sorted(numbers):
-        named = (home / f"obj_{number:06d}.ply", home / f"obj_{number:02d}.ply")
-        path = next((path for path in named if path.is_file()), None)
+        # Is there a mesh, and can it be read?
+        candidates = (home / f"obj_{number:06d}.ply", home / f"obj_{number:02d}.ply")
+        path = next((path for path in candidates if path.is_file()), None)
         if path is None:
             message = f"has no mesh of object {number}, which is annotated"
             problems.append(Problem(path=home, kind="missing", message=message))
@@ -261,7 +281,7 @@ def _check_models(
             problems.append(Problem(path=path, kind="mismatch", message=message))
 
     # Estimators know objects by name, and refuse two of one.
-    names = object_names(folder, numbers)
+    names = read_object_names(folder, numbers)
     for name, count in sorted(Counter(names.values()).items()):
         if count > 1:
             of_name = " and ".join(str(n) for n in sorted(names) if names[n] == name)
@@ -272,12 +292,15 @@ def _check_models(
 
 def _check_instance(instance: Instance, model: ObjectModel | None) -> Iterator[Problem]:
     """Compare the sizes of an instance's files, and with a model what they show with its pose."""
+    # What is noted of the annotation.
     if instance.mask is None:
         message = f"has no mask_visib of annotation {instance.index}"
         yield Problem(path=instance.depth, kind="note", message=message)
     if not instance.is_measured:
         message = f"annotation {instance.index} is itself fitted to this depth; quote no accuracy"
         yield Problem(path=instance.depth, kind="note", message=message)
+
+    # Are all images of one size?
     width, height = image_size(instance.depth)
     for path in filter(None, (instance.mask, instance.rgb)):
         size = image_size(path)
@@ -287,6 +310,8 @@ def _check_instance(instance: Instance, model: ObjectModel | None) -> Iterator[P
             return
     if instance.mask is None or model is None:
         return
+
+    # Does the mask show enough points?
     mask = read_instance_mask(instance)
     depth_m = read_depth_png(instance.depth, instance.depth_unit_m)
     cloud = cloud_from_depth(depth_m, mask, instance.K)
@@ -295,10 +320,12 @@ def _check_instance(instance: Instance, model: ObjectModel | None) -> Iterator[P
         # Instances that are fully occluded are annotated too: no fault, but no test either.
         yield Problem(path=instance.mask, kind="note", message=too_few)
         return
+
+    # Do they lie at the annotated pose? And if so, does the posed model lie in the mask?
     centre_m = instance.camera_from_model.apply(model.vertices_m.double()).mean(0)
     away_m = float((cloud.double().median(0).values - centre_m).norm())
     if away_m > _FAR_DIAMETERS * model.diameter_m:
-        advice = unit_advice(model.diameter_m, cloud[cloud[:, 2] < 3 * cloud[:, 2].median()])
+        advice = advise_unit(model.diameter_m, cloud[cloud[:, 2] < 3 * cloud[:, 2].median()])
         message = (
             f"the cloud lies {away_m:.2f} m from the annotated pose; are depth_scale and "
             "cam_t_m2c both for millimetres?"
@@ -306,16 +333,25 @@ def _check_instance(instance: Instance, model: ObjectModel | None) -> Iterator[P
         if advice is not None:
             message = advice.message
         yield Problem(path=instance.depth, kind="mismatch", message=f"{instance.name}: {message}")
-    elif instance.visible_fraction is None or instance.visible_fraction >= _FEW_IN_MASK:
-        # The share of the model's points whose pixel is in the mask, grown by a pixel or two.
-        points = instance.camera_from_model.apply(sample_surface(model, 500)[0].double())
-        u, v = project(points, instance.K).nan_to_num(-9).round().long().unbind(1)
-        grown = grow_mask(mask, 2)
-        is_inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
-        hit = grown[v.clamp(0, height - 1), u.clamp(0, width - 1)] & is_inside
-        if float(hit.double().mean()) < _FEW_IN_MASK:
-            message = f"{instance.name}: the posed model does not lie on its mask; is it another's?"
-            yield Problem(path=instance.mask, kind="mismatch", message=message)
+        return
+    is_visible = instance.visible_fraction is None or instance.visible_fraction >= _FEW_IN_MASK
+    if is_visible and _measure_share_in_mask(instance, model, mask) < _FEW_IN_MASK:
+        message = f"{instance.name}: the posed model does not lie on its mask; is it another's?"
+        yield Problem(path=instance.mask, kind="mismatch", message=message)
+
+
+def _measure_share_in_mask(
+    instance: Instance, model: ObjectModel, mask: Bool[Tensor, "h w"]
+) -> float:
+    """Measure the share of a posed model's points whose pixel is in the mask, or two beside it."""
+    height, width = mask.shape
+    surface_m, _ = sample_surface(model, 500)
+    points_m = instance.camera_from_model.apply(surface_m.double())
+    u, v = project(points_m, instance.K).nan_to_num(-9).round().long().unbind(1)
+    is_inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
+    grown = grow_mask(mask, 2)
+    is_hit = grown[v.clamp(0, height - 1), u.clamp(0, width - 1)] & is_inside
+    return float(is_hit.double().mean())
 
 
 _DEPTH_UNIT_M = 0.0001  # tenths of a millimetre reach 6.5 m, and no imitated sensor is finer
@@ -347,6 +383,12 @@ def write_bop_scene(
 ) -> Path:  # fmt: skip
     """Write a scene whole: images and masks first, so that its JSON never names what is missing.
 
+    Args:
+        folder: of the data set.
+        split: name of the split.
+        scene_id: number of the scene.
+        frames: its images.
+
     Returns:
         The folder of the scene.
 
@@ -357,37 +399,18 @@ def write_bop_scene(
     truths: dict[str, list[dict[str, Any]]] = {}
     infos: dict[str, list[dict[str, Any]]] = {}
     for frame in frames:
+        # The images of a frame.
         name = f"{frame.number:06d}"
-        poses = list[dict[str, Any]]()
-        visibilities = list[dict[str, Any]]()
-        truths[str(frame.number)] = poses
-        infos[str(frame.number)] = visibilities
         write_depth_png(scene / "depth" / f"{name}.png", frame.depth_m, _DEPTH_UNIT_M)
         if frame.rgb is not None:
             write_image(scene / "rgb" / f"{name}.png", frame.rgb)
         for index, shown in enumerate(frame.objects):
             write_mask(scene / "mask_visib" / f"{name}_{index:06d}.png", shown.visible)
             write_mask(scene / "mask" / f"{name}_{index:06d}.png", shown.silhouette)
-            pose = shown.camera_from_model
-            full = int(shown.silhouette.sum())
-            visible = int(shown.visible.sum())
-            poses.append(
-                {
-                    "cam_R_m2c": pose.R.double().flatten().tolist(),
-                    "cam_t_m2c": (1000 * pose.t_m.double()).tolist(),
-                    "obj_id": shown.number,
-                }
-            )
-            visibilities.append(
-                {
-                    "bbox_obj": mask_box(shown.silhouette),
-                    "bbox_visib": mask_box(shown.visible),
-                    "px_count_all": full,
-                    "px_count_valid": int((shown.silhouette & frame.depth_m.isfinite()).sum()),
-                    "px_count_visib": visible,
-                    "visib_fract": visible / full if full else 0.0,
-                }
-            )
+
+        # What is known of its objects.
+        truths[str(frame.number)] = [_describe_pose(shown) for shown in frame.objects]
+        infos[str(frame.number)] = [_describe_visible(shown, frame) for shown in frame.objects]
     scale_mm = 1000 * _DEPTH_UNIT_M
     cameras = {
         str(f.number): {"cam_K": f.K.flatten().tolist(), "depth_scale": scale_mm} for f in frames
@@ -396,6 +419,30 @@ def write_bop_scene(
     write_json(scene / "scene_gt.json", truths)
     write_json(scene / "scene_camera.json", cameras)
     return scene
+
+
+def _describe_pose(shown: BopObject) -> dict[str, Any]:
+    """Make the entry of an object in ``scene_gt.json``."""
+    pose = shown.camera_from_model
+    return {
+        "cam_R_m2c": pose.R.double().flatten().tolist(),
+        "cam_t_m2c": (1000 * pose.t_m.double()).tolist(),
+        "obj_id": shown.number,
+    }
+
+
+def _describe_visible(shown: BopObject, frame: BopFrame) -> dict[str, Any]:
+    """Make the entry of an object in ``scene_gt_info.json``."""
+    silhouette_px = int(shown.silhouette.sum())
+    visible_px = int(shown.visible.sum())
+    return {
+        "bbox_obj": mask_box(shown.silhouette),
+        "bbox_visib": mask_box(shown.visible),
+        "px_count_all": silhouette_px,
+        "px_count_valid": int((shown.silhouette & frame.depth_m.isfinite()).sum()),
+        "px_count_visib": visible_px,
+        "visib_fract": visible_px / silhouette_px if silhouette_px else 0.0,
+    }
 
 
 def write_bop_models(folder: Path, models: Sequence[ObjectModel]) -> Path:
@@ -412,12 +459,15 @@ def write_bop_models(folder: Path, models: Sequence[ObjectModel]) -> Path:
     home = folder / "models"
     info: dict[str, Any] = {}
     for model in models:
+        # Its mesh, or its points.
         vertices = 1000 * model.vertices_m.double().numpy()
         mesh = trimesh.Trimesh(vertices, model.faces.numpy(), process=False)
         shape = mesh if len(model.faces) else trimesh.PointCloud(vertices)
         data = shape.export(file_type="ply")
         assert isinstance(data, bytes)
         write_bytes(home / f"obj_{model.number:06d}.ply", data)
+
+        # Its entry: diameter, name, box and symmetries.
         low = vertices.min(0)
         size = np.ptp(vertices, axis=0)
         entry: dict[str, Any] = {"diameter": 1000 * model.diameter_m, "name": model.name}

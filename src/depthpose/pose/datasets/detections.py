@@ -13,7 +13,7 @@ from torch import Tensor
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import read_json, read_text, write_json
 from depthpose.core.files.disk import refused_suffix
-from depthpose.pose.datasets.layouts import MOST, integer, number, numbers
+from depthpose.pose.datasets.layouts import MOST, read_integer, read_number, read_numbers
 from depthpose.pose.datasets.masks import Runs, decode_rle, mask_box, read_runs
 
 Box = tuple[float, float, float, float]
@@ -30,7 +30,7 @@ class Detection:
         InputError: it has neither or both, or a box whose edges are not in order.
     """
 
-    # All but box or mask is None where the file does not give it.
+    # All but the box or the mask is None where the file does not give it.
     object: str | None = None  # name of its class
     object_id: int | None = None  #: number of its class (``category_id``)
     score: float = 1.0  #: confidence; 1 where the file gives none
@@ -57,7 +57,7 @@ class Detection:
         return str(self.object_id) if self.object is None else self.object
 
     def mask(self, height: int, width: int) -> Bool[Tensor, "height width"]:
-        """Give its pixels: those of the mask, or all that the box touches.
+        """Mark its pixels: those of the mask, or all that the box touches.
 
         Raises:
             InputError: the mask is of an image of another size, or the box lies outside of this.
@@ -100,14 +100,14 @@ def check_box(box: Box) -> None:
     x0, y0, x1, y1 = box
     if not all(math.isfinite(edge) for edge in box) or not x0 < x1 or not y0 < y1:
         raise InputError(
-            f"box {_edges(box)}: the right edge is to lie right of the left edge, and the "
+            f"box {_format_edges(box)}: the right edge is to lie right of the left edge, and the "
             "bottom below the top; give left,top,right,bottom (of left,top,width,height add width "
             "and height)"
         )
 
 
 def box_mask(box: Box, height: int, width: int) -> Bool[Tensor, "height width"]:
-    """Give all pixels of an image that a box touches; the box may reach beyond the image.
+    """Mark all pixels of an image that a box touches; the box may reach beyond the image.
 
     Raises:
         InputError: its centre lies outside of the image.
@@ -116,9 +116,9 @@ def box_mask(box: Box, height: int, width: int) -> Bool[Tensor, "height width"]:
     x0, y0, x1, y1 = box
     if not (0 <= (x0 + x1) / 2 <= width and 0 <= (y0 + y1) / 2 <= height):
         raise InputError(
-            f"box {_edges(box)}: its centre lies outside of the image of {width}x{height} pixels; "
-            "give pixels of the depth image: a box of an image that is s times as large is to be "
-            "divided by s"
+            f"box {_format_edges(box)}: its centre lies outside of the image of {width}x{height} "
+            "pixels; give pixels of the depth image: a box of an image that is s times as large is "
+            "to be divided by s"
         )
     mask = torch.zeros(height, width, dtype=torch.bool)
     rows = slice(max(0, math.floor(y0)), math.ceil(y1))
@@ -154,18 +154,23 @@ def read_detections(path: str | Path, size: tuple[int, int] | None = None) -> li
 
 def _read_coco(path: Path) -> list[Detection]:
     """Read entries of BOP or COCO."""
+    # The names of classes and images, which COCO lists apart.
     content = read_json(path)
     class_names: dict[int, str] = {}
     image_files: dict[int, str] = {}
     if isinstance(content, dict) and "annotations" in content:
-        for category in _entries(content.get("categories", []), f"{path}: categories"):
-            class_names[integer(category, "id", f"{path}: categories")] = str(category.get("name"))
-        for image in _entries(content.get("images", []), f"{path}: images"):
-            image_files[integer(image, "id", f"{path}: images")] = str(image.get("file_name"))
+        for category in _check_entries(content.get("categories", []), f"{path}: categories"):
+            class_names[read_integer(category, "id", f"{path}: categories")] = str(
+                category.get("name")
+            )
+        for image in _check_entries(content.get("images", []), f"{path}: images"):
+            image_files[read_integer(image, "id", f"{path}: images")] = str(image.get("file_name"))
         content = content["annotations"]
+
+    # The detections.
     return [
         _parse_coco_entry(row, class_names, image_files, f"{path}: entry {place}")
-        for place, row in enumerate(_entries(content, str(path)))
+        for place, row in enumerate(_check_entries(content, str(path)))
     ]
 
 
@@ -184,32 +189,32 @@ def _parse_coco_entry(
     name = row.get("name", row.get("category_name"))
     object_id = None
     if "category_id" in row or name is None:
-        object_id = integer(row, "category_id", source)
+        object_id = read_integer(row, "category_id", source)
     if name is None and object_id is not None:
         name = class_names.get(object_id)
 
     # The image, by number or by the name of its file.
-    image_id = integer(row, "image_id", source) if _is_number(row, "image_id") else None
+    image_id = read_integer(row, "image_id", source) if _is_number(row, "image_id") else None
     file = row.get("file_name", row.get("image_id") if image_id is None else None)
     if file is None and image_id is not None:
         file = image_files.get(image_id)
 
-    # The mask, or the box.
-    seconds = number(row, "time", -1.0, source)
+    # The mask, or the box; and the time, which is negative where it is not known.
+    seconds = read_number(row, "time", -1.0, source)
     segmentation = row.get("segmentation")
     box = None
     if row.get("bbox") is not None and not segmentation:
-        left, top, width, height = numbers(row, "bbox", 4, source)
+        left, top, width, height = read_numbers(row, "bbox", 4, source)
         if [left, top, width, height] != _NO_BOX:
             box = (left, top, left + width, top + height)
     try:
         return Detection(
             object=None if name is None else str(name),
             object_id=object_id,
-            score=number(row, "score", 1.0, source),
+            score=read_number(row, "score", 1.0, source),
             box=box,
             segmentation=read_runs(segmentation, source) if segmentation else None,
-            scene_id=integer(row, "scene_id", source) if "scene_id" in row else None,
+            scene_id=read_integer(row, "scene_id", source) if "scene_id" in row else None,
             image_id=image_id,
             image=None if file is None else PurePosixPath(str(file)).stem,
             seconds=seconds if seconds >= 0 else None,
@@ -242,6 +247,8 @@ def _read_yolo(path: Path, size: tuple[int, int] | None) -> list[Detection]:
             shares = [float(word) for word in words[1:]]
         except ValueError as error:
             raise InputError(f"{source}: {error}; write {_YOLO}") from error
+
+        # Are these a class and shares of the image?
         cx, cy, w, h = shares[:4]
         is_share = all(0 <= share <= 1 for share in shares)
         if not is_share or not w * h > 0 or not 0 <= object_id <= MOST:
@@ -249,9 +256,13 @@ def _read_yolo(path: Path, size: tuple[int, int] | None) -> list[Detection]:
                 f"{source}: {text.strip()[:80]!r} is not {_YOLO}, a class of 0 or more, and shares "
                 "of the image from 0 to 1; boxes in pixels go into JSON as COCO's bbox"
             )
+
+        # To edges in pixels.
         width, height = size
-        left, right = (cx - w / 2) * width, (cx + w / 2) * width
-        top, bottom = (cy - h / 2) * height, (cy + h / 2) * height
+        left = (cx - w / 2) * width
+        right = (cx + w / 2) * width
+        top = (cy - h / 2) * height
+        bottom = (cy + h / 2) * height
         box = (left, top, right, bottom)
         score = shares[4] if len(shares) == 5 else 1.0
         detections.append(Detection(object_id=object_id, score=score, box=box, image=path.stem))
@@ -276,6 +287,8 @@ def write_detections(path: str | Path, detections: Sequence[Detection]) -> None:
             raise InputError(
                 f"{path}: a detection of {detection.label!r} has no {missing[0]}; BOP's has"
             )
+
+        # The score, and the mask or the box.
         row["score"] = detection.score
         if detection.segmentation is not None:
             counts, height, width = detection.segmentation
@@ -339,6 +352,7 @@ def name_objects(
     named: list[Detection] = []
     is_one_class = len({detection.label for detection in detections}) == 1
     for detection in detections:
+        # The object of its class.
         label = detection.label
         name = labels.get(label, detection.object)
         if name is None and wanted is not None and is_one_class:
@@ -378,6 +392,7 @@ def group_by_image(
     if len(images) == 1 and len(detected_images) <= 1:
         return {images[0]: list(detections)}
 
+    # By the name of the image, else by its number.
     groups: dict[str, list[Detection]] = {image: [] for image in images}
     by_number = {int(image): image for image in images if image.isascii() and image.isdecimal()}
     for entry, detection in enumerate(detections):
@@ -392,6 +407,7 @@ def group_by_image(
         if image in groups:
             groups[image].append(detection)
 
+    # Is any of them of one of the images?
     if detections and not any(groups.values()):
         first = detections[0]
         wanted = repr(images[0])
@@ -405,15 +421,18 @@ def group_by_image(
     return groups
 
 
-def _entries(content: object, source: str) -> list[dict[str, Any]]:
+def _check_entries(content: object, source: str) -> list[dict[str, Any]]:
+    """Check that content of a file is a list of entries; ``source`` names it in errors."""
     if not isinstance(content, list) or not all(isinstance(row, dict) for row in content):
         raise InputError(f"{source}: is no list of objects, one an entry")
     return content
 
 
 def _is_number(row: Mapping[str, Any], key: str) -> bool:
+    """Whether an entry has a whole number under a key."""
     return isinstance(row.get(key), int) and not isinstance(row[key], bool)
 
 
-def _edges(box: Box) -> str:
+def _format_edges(box: Box) -> str:
+    """Format the edges of a box for a message."""
     return ",".join(f"{edge:g}" for edge in box)

@@ -29,7 +29,7 @@ _OF_YAML = {b"[": 750, b"{": 750, b",": 450, b":": 500, b"\n": 500, b"- ": 500}
 MOST = 10**9  #: of scenes, images and objects: their numbers name files
 
 
-def entry_number(key: object) -> int | None:
+def parse_entry_number(key: object) -> int | None:
     """Parse the number that names a scene, an image or an object; None where it is no number."""
     text = str(key)
     return int(text) if len(text) <= 9 and text.isascii() and text.isdecimal() else None
@@ -56,8 +56,8 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
     return content
 
 
-def numbers(entry: object, key: str, count: int, source: str) -> list[float]:
-    """Get a list of ``count`` finite numbers from an entry."""
+def read_numbers(entry: object, key: str, count: int, source: str) -> list[float]:
+    """Read a list of ``count`` finite numbers from an entry; ``source`` names it in errors."""
     values = entry.get(key) if isinstance(entry, Mapping) else None
     # A whole number beyond 1e300 has no float.
     if (
@@ -65,25 +65,25 @@ def numbers(entry: object, key: str, count: int, source: str) -> list[float]:
         or len(values) != count
         or not all(type(value) in (int, float) and abs(value) < 1e300 for value in values)
     ):
-        raise InputError(f"{source}: {key} is {_short(values)}, where {count} numbers belong")
+        raise InputError(f"{source}: {key} is {_shorten(values)}, where {count} numbers belong")
     return [float(value) for value in values]
 
 
-def integer(entry: object, key: str, source: str) -> int:
-    """Get a whole number of 0 or more from an entry."""
+def read_integer(entry: object, key: str, source: str) -> int:
+    """Read a whole number of 0 or more from an entry; ``source`` names it in errors."""
     value = entry.get(key) if isinstance(entry, Mapping) else None
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= MOST:
         raise InputError(
-            f"{source}: {key} is {_short(value)}, where a number from 0 to {MOST} belongs"
+            f"{source}: {key} is {_shorten(value)}, where a number from 0 to {MOST} belongs"
         )
     return value
 
 
-def number(entry: object, key: str, default: float | None, source: str) -> float:
-    """Get a finite number from an entry; ``default``, if any, where it is missing."""
+def read_number(entry: object, key: str, default: float | None, source: str) -> float:
+    """Read a finite number from an entry; ``default``, if any, where it is missing."""
     value = entry.get(key, default) if isinstance(entry, Mapping) else None
     if not isinstance(value, int | float) or isinstance(value, bool) or not abs(value) < 1e300:
-        raise InputError(f"{source}: {key} is {_short(value)}, where a number belongs")
+        raise InputError(f"{source}: {key} is {_shorten(value)}, where a number belongs")
     return float(value)
 
 
@@ -94,29 +94,31 @@ def make_pose(R: list[float], t_mm: list[float], source: str) -> Rigid:
     """
     rough = torch.tensor(R, dtype=torch.float64).reshape(3, 3)
     u, sizes, vh = torch.linalg.svd(rough)
-    if float((sizes - 1).abs().max()) > _ROTATION_SLACK or float(torch.linalg.det(rough)) < 0:
+    determinant = float(torch.linalg.det(rough))
+    if float((sizes - 1).abs().max()) > _ROTATION_SLACK or determinant < 0:
         raise InputError(
-            f"{source}: the rotation {_short(R)} is none: its determinant is "
-            f"{float(torch.linalg.det(rough)):.3f}, its stretches {_short(sizes.tolist())}. Write "
-            "a rotation, row by row"
+            f"{source}: the rotation {_shorten(R)} is none: its determinant is "
+            f"{determinant:.3f}, its stretches {_shorten(sizes.tolist())}. "
+            "Write a rotation, row by row"
         )
     return Rigid(u @ vh, torch.tensor(t_mm, dtype=torch.float64) * 0.001)
 
 
-def camera_from_bop(entry: object, source: str) -> tuple[Float64[Tensor, "3 3"], float]:
+def read_bop_camera(entry: object, source: str) -> tuple[Float64[Tensor, "3 3"], float]:
     """Read ``cam_K`` and ``depth_scale`` (mm a unit) as K and metres a unit."""
-    K = torch.tensor(numbers(entry, "cam_K", 9, source), dtype=torch.float64).reshape(3, 3)
+    K = torch.tensor(read_numbers(entry, "cam_K", 9, source), dtype=torch.float64).reshape(3, 3)
     try:
         check_intrinsics(K)
     except InputError as error:
         raise InputError(f"{source}: {error}") from error
-    scale_mm = number(entry, "depth_scale", 1.0, source)
+    scale_mm = read_number(entry, "depth_scale", 1.0, source)
     if scale_mm <= 0:
         raise InputError(f"{source}: depth_scale is {scale_mm:g}; it is millimetres a unit")
     return K, 0.001 * scale_mm
 
 
-def _short(value: object) -> str:
+def _shorten(value: object) -> str:
+    """Shorten what a file holds to 80 characters, for a message."""
     text = repr(value)
     return text if len(text) <= 80 else f"{text[:77]}..."
 
@@ -147,8 +149,8 @@ class Instance:
         return f"{self.scene_id:06d}_{self.image_id:06d}_{self.index:06d}"
 
 
-def bop_splits(folder: Path) -> dict[str, tuple[str, str]]:
-    """Give the splits of a data set by name, with the folder and the suffix of file names of each.
+def list_bop_splits(folder: Path) -> dict[str, tuple[str, str]]:
+    """List the splits of a data set by name, with the folder and the suffix of file names of each.
 
     Where the scenes are of several sensors, as in BOP-Industrial, each sensor has its own files,
     such as ``scene_camera_photoneo.json`` beside ``depth_photoneo``. The split ``test`` of that
@@ -166,9 +168,9 @@ def bop_splits(folder: Path) -> dict[str, tuple[str, str]]:
     return dict(sorted(splits.items()))
 
 
-def bop_scenes(folder: Path, split: str) -> tuple[list[Path], str]:
+def list_bop_scenes(folder: Path, split: str) -> tuple[list[Path], str]:
     """List the scenes of a split, and give the suffix of its files' names."""
-    splits = bop_splits(folder)
+    splits = list_bop_splits(folder)
     if split not in splits:
         sensors = [name for name, (home, end) in splits.items() if home == split and end]
         if sensors:
@@ -183,13 +185,14 @@ def bop_scenes(folder: Path, split: str) -> tuple[list[Path], str]:
     home, end = splits[split]
     scenes = sorted(path.parent for path in (folder / home).glob(f"*/scene_camera{end}.json"))
     for scene in scenes:
-        if entry_number(scene.name) is None:
+        if parse_entry_number(scene.name) is None:
             raise InputError(f"{scene}: scenes have numbers for names, as 000001; rename it")
     return scenes, end
 
 
-def bop_instances(scene: Path, end: str = "") -> Iterator[Instance]:
+def read_bop_instances(scene: Path, end: str = "") -> Iterator[Instance]:
     """Read the annotations of one scene; ``end`` is the suffix of its files' names (_photoneo)."""
+    # The files of the scene.
     camera_path = scene / f"scene_camera{end}.json"
     truth_path = scene / f"scene_gt{end}.json"
     info_path = scene / f"scene_gt_info{end}.json"
@@ -201,62 +204,72 @@ def bop_instances(scene: Path, end: str = "") -> Iterator[Instance]:
     cameras = read_mapping(camera_path)
     truths = read_mapping(truth_path)
     infos = read_mapping(info_path) if info_path.is_file() else {}
-    wrong = [key for key in truths if entry_number(key) is None]
+    wrong = [key for key in truths if parse_entry_number(key) is None]
     if wrong:
         raise InputError(
             f"{truth_path.name}: {wrong[0][:80]!r} is no number of an image; name images 0, 1, ..."
         )
+
+    # Image by image.
     for key in sorted(truths, key=int):
         source = f"{truth_path}: image {key}"
         if key not in cameras:
             raise InputError(f"{source} has no entry in {camera_path.name}; add its camera")
         entries = truths[key]
-        more = infos.get(key, [])
-        if not isinstance(entries, list) or not isinstance(more, list):
+        visibilities = infos.get(key, [])
+        if not isinstance(entries, list) or not isinstance(visibilities, list):
             raise InputError(f"{source}: is no list of annotations")
-        at_camera = f"{camera_path}: image {int(key)}"
+        camera_source = f"{camera_path}: image {int(key)}"
         image = f"{int(key):06d}"
         tiff = scene / f"depth{end}" / f"{image}.tif"  # of ITODD
-        pictures = (scene / f"{folder}{end}" / f"{image}{suffix}"
-                    for folder in _IMAGE_FOLDERS for suffix in LISTED_SUFFIXES)  # fmt: skip
+        pictures = (
+            scene / f"{folder}{end}" / f"{image}{suffix}"
+            for folder in _IMAGE_FOLDERS
+            for suffix in LISTED_SUFFIXES
+        )
         rgb = next((path for path in pictures if path.is_file()), None)
+
+        # Annotation by annotation.
         for index, entry in enumerate(entries):
-            K, unit_m = camera_from_bop(cameras[key], at_camera)
-            extra = more[index] if index < len(more) and isinstance(more[index], dict) else {}
+            K, unit_m = read_bop_camera(cameras[key], camera_source)
+            info = visibilities[index] if index < len(visibilities) else {}
+            info = info if isinstance(info, dict) else {}
             mask = scene / f"mask_visib{end}" / f"{image}_{index:06d}.png"
-            here = f"{source}, annotation {index}"
-            visible = number(extra, "visib_fract", -1.0, here)
+            annotation_source = f"{source}, annotation {index}"
+            visible = read_number(info, "visib_fract", -1.0, annotation_source)
             yield Instance(
                 scene_id=int(scene.name),
                 image_id=int(key),
                 index=index,
-                object_id=integer(entry, "obj_id", here),
+                object_id=read_integer(entry, "obj_id", annotation_source),
                 K=K,
                 depth=tiff if tiff.is_file() else tiff.with_suffix(".png"),
                 depth_unit_m=unit_m,
                 mask=mask if mask.is_file() else None,
                 rgb=rgb,
                 camera_from_model=make_pose(
-                    numbers(entry, "cam_R_m2c", 9, here), numbers(entry, "cam_t_m2c", 3, here), here
+                    read_numbers(entry, "cam_R_m2c", 9, annotation_source),
+                    read_numbers(entry, "cam_t_m2c", 3, annotation_source),
+                    annotation_source,
                 ),
                 visible_fraction=visible if visible >= 0 else None,
-                is_measured=not str(extra.get("pose_source", "")).startswith("pseudo"),
+                is_measured=not str(info.get("pose_source", "")).startswith("pseudo"),
             )
 
 
-def _bop_split(folder: Path, split: str) -> Iterator[Instance]:
+def _read_bop_split(folder: Path, split: str) -> Iterator[Instance]:
     """Read the annotations of all scenes of a split."""
-    scenes, end = bop_scenes(folder, split)
+    scenes, end = list_bop_scenes(folder, split)
     for scene in scenes:
-        yield from bop_instances(scene, end)
+        yield from read_bop_instances(scene, end)
 
 
 @dataclass(frozen=True, kw_only=True)
 class BopTarget:
     """An entry of a list of targets: instances that are to be posed in an image."""
 
-    scene_id: int
-    image_id: int
+    scene_id: int  #: number of the scene
+    image_id: int  #: number of the image
     object_id: int | None = None  #: None: all objects in the image
     count: int | None = None  #: number of instances of the object; None: all
 
@@ -271,17 +284,17 @@ def read_targets(path: str | Path, folder: str | Path = ".") -> list[BopTarget]:
         InputError: the file is missing or damaged.
     """
     path = Path(path) if Path(path).is_file() else Path(folder, path)
-    targets = []
+    targets: list[BopTarget] = []
     for row_number, row in enumerate(read_rows(path)):
         source = f"{path}: entry {row_number}"
-        keys = ("obj_id", "inst_count")
-        wanted, count = (integer(row, key, source) if key in row else None for key in keys)
+        has_object = "obj_id" in row
+        has_count = "inst_count" in row
         targets.append(
             BopTarget(
-                scene_id=integer(row, "scene_id", source),
-                image_id=integer(row, "im_id", source),
-                object_id=wanted,
-                count=count,
+                scene_id=read_integer(row, "scene_id", source),
+                image_id=read_integer(row, "im_id", source),
+                object_id=read_integer(row, "obj_id", source) if has_object else None,
+                count=read_integer(row, "inst_count", source) if has_count else None,
             )
         )
     return targets
@@ -292,7 +305,7 @@ _MAX_BYTES = 2**22  # of a list of images
 SYMMETRIC = (10, 11)  #: Eggbox and glue: measured by ADD-S ever since Hinterstoisser et al. (2012).
 
 
-def linemod_instances(folder: Path, split: str) -> Iterator[Instance]:
+def read_linemod_instances(folder: Path, split: str) -> Iterator[Instance]:
     """Read the annotations of a split: ``train`` or ``test``, by the lists beside the data.
 
     The folder of an object shows others too (in that of object 2 they are annotated); only its own
@@ -305,24 +318,28 @@ def linemod_instances(folder: Path, split: str) -> Iterator[Instance]:
         truths = read_mapping(scene / "gt.yml")
         infos = read_mapping(scene / "info.yml")
         for line in read_text(listed, _MAX_BYTES).split():
-            if entry_number(line) is None:
+            if parse_entry_number(line) is None:
                 raise InputError(f"{listed}: {line[:40]!r} is no number of an image")
+
+            # The one annotation of the folder's own object.
             image = int(line)
             number = int(scene.name)
             source = f"{scene / 'gt.yml'}: image {image}"
             entries = truths.get(image)
             if not isinstance(entries, list):
                 raise InputError(f"{source} has no annotation; is the list of another download?")
-            of_object = [e for e in entries if integer(e, "obj_id", source) == number]
+            of_object = [e for e in entries if read_integer(e, "obj_id", source) == number]
             if len(of_object) != 1:
                 raise InputError(
                     f"{source} annotates object {number} {len(of_object)} times, where once belongs"
                 )
-            at_camera = f"{scene / 'info.yml'}: image {image}"
-            K, unit_m = camera_from_bop(infos.get(image), at_camera)
-            depth, mask, rgb = (
-                scene / name / f"{image:04d}.png" for name in ("depth", "mask", "rgb")
-            )
+
+            # Its camera and its images.
+            camera_source = f"{scene / 'info.yml'}: image {image}"
+            K, unit_m = read_bop_camera(infos.get(image), camera_source)
+            depth = scene / "depth" / f"{image:04d}.png"
+            mask = scene / "mask" / f"{image:04d}.png"
+            rgb = scene / "rgb" / f"{image:04d}.png"
             yield Instance(
                 scene_id=number,
                 image_id=image,
@@ -334,8 +351,8 @@ def linemod_instances(folder: Path, split: str) -> Iterator[Instance]:
                 mask=mask if mask.is_file() else None,
                 rgb=rgb if rgb.is_file() else None,
                 camera_from_model=make_pose(
-                    numbers(of_object[0], "cam_R_m2c", 9, source),
-                    numbers(of_object[0], "cam_t_m2c", 3, source),
+                    read_numbers(of_object[0], "cam_R_m2c", 9, source),
+                    read_numbers(of_object[0], "cam_t_m2c", 3, source),
                     source,
                 ),
             )
@@ -359,21 +376,21 @@ LAYOUTS: dict[str, Layout] = {
         splits=lambda folder: (
             ("train", "test") if any(folder.glob("data/[0-9][0-9]/gt.yml")) else ()
         ),
-        instances=linemod_instances,
+        instances=read_linemod_instances,
         half_turns=SYMMETRIC,  # as BOP's models_info.json of the same meshes declares
         predicted_mask="segnet_results/{object:02d}_label/{image:04d}_label.png",
     ),
     "BOP": Layout(
-        splits=lambda folder: list(bop_splits(folder)),
-        instances=_bop_split,
+        splits=lambda folder: list(list_bop_splits(folder)),
+        instances=_read_bop_split,
     ),
 }
 """Name to layout: one more entry, and every command takes it. A folder is of the first that finds a
 split in it."""
 
 
-def layout_of(folder: Path) -> tuple[str, Layout]:
-    """Give the name and the layout of a folder; BOP's where none fits."""
+def find_layout(folder: Path) -> tuple[str, Layout]:
+    """Find the name and the layout of a folder; BOP's where none fits."""
     name = next((name for name, layout in LAYOUTS.items() if layout.splits(folder)), "BOP")
     return name, LAYOUTS[name]
 
@@ -394,7 +411,9 @@ def read_models_info(folder: Path) -> tuple[Path, dict[int, dict[str, Any]]]:
         raise InputError(f"{folder}: no folder {' or '.join(_MODEL_FOLDERS)}; put the meshes there")
     files = (home / "models_info.json", home / "models_info.yml")
     content = next((read_mapping(path) for path in files if path.is_file()), {})
-    wrong = [k for k, v in content.items() if entry_number(k) is None or not isinstance(v, dict)]
+    wrong = [
+        k for k, v in content.items() if parse_entry_number(k) is None or not isinstance(v, dict)
+    ]
     if wrong:
         raise InputError(
             f"{home}: models_info entry {str(wrong[0])[:80]!r} is no object's; correct it"
@@ -411,13 +430,15 @@ def read_bop_models(
     two symmetric objects of Linemod_preprocessed, which declares none, get theirs.
     """
     home, infos = read_models_info(folder)
-    _, layout = layout_of(folder)
+    _, layout = find_layout(folder)
     models: dict[int, ObjectModel] = {}
     for wanted in sorted(set(numbers)):
-        named = (home / f"obj_{wanted:06d}.ply", home / f"obj_{wanted:02d}.ply")
-        path = next((path for path in named if path.is_file()), None)
+        candidates = (home / f"obj_{wanted:06d}.ply", home / f"obj_{wanted:02d}.ply")
+        path = next((path for path in candidates if path.is_file()), None)
         if path is None:
             raise InputError(f"{home}: no obj_{wanted:06d}.ply for object {wanted}; put it there")
+
+        # Its declared symmetries, and the half turn of an object that declares none.
         info = infos.get(wanted, {})
         source = f"{home / 'models_info.json'}: object {wanted}"
         symmetries = symmetries_from_bop(info, source=source)
@@ -426,6 +447,8 @@ def read_bop_models(
             origin = torch.zeros(3).double()
             turn = turn_about(up, origin, torch.tensor([math.pi]).double())
             symmetries = Symmetries(discrete=turn)
+
+        # The mesh, with the declared name and diameter.
         model = read_model(
             path,
             "mm",
@@ -434,13 +457,13 @@ def read_bop_models(
             symmetries=symmetries,
             config=config,
         )
-        declared_m = 0.001 * number(info, "diameter", 1000 * model.diameter_m, source)
+        declared_m = 0.001 * read_number(info, "diameter", 1000 * model.diameter_m, source)
         models[wanted] = replace(model, diameter_m=declared_m)
     return models
 
 
-def object_names(folder: Path, numbers: Iterable[int] | None = None) -> dict[int, str]:
-    """Give the names of objects by number; of all in ``models_info`` where none are given.
+def read_object_names(folder: Path, numbers: Iterable[int] | None = None) -> dict[int, str]:
+    """Read the names of objects by number; of all in ``models_info`` where none are given.
 
     Raises:
         InputError: there is no folder of models, or the file is damaged.

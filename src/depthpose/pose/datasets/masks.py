@@ -62,7 +62,7 @@ def read_labels(
                 "name a list of BOP detections by --masks, beside --bop"
             )
         return decode_rle(*read_runs(entries[0], str(path))).long()
-    pixels = _mask_pixels(path, with_palette=labels is None)
+    pixels = _read_pixels(path, with_palette=labels is None)
 
     # Each colour becomes a number.
     values = pixels[..., 0]
@@ -82,12 +82,13 @@ def read_labels(
     return number_objects(values) if labels is None else _keep_labels(values, labels, path)
 
 
-def _mask_pixels(path: Path, *, with_palette: bool) -> np.ndarray:
+def _read_pixels(path: Path, *, with_palette: bool) -> np.ndarray:
     """Read the pixels of a mask image (h, w, channels): 1 of numbers, 3 of colours, 4 with alpha.
 
     ``with_palette`` gives the colours of a palette, else its indices.
     """
     with open_image(path) as image:
+        # With alpha, indices of a palette, numbers, or colours.
         if image.mode in ("LA", "PA", "RGBA", "RGBa", "La") or "transparency" in image.info:
             pixels = np.asarray(image.convert("RGBA"))
         elif not with_palette and image.mode == "P":
@@ -97,7 +98,9 @@ def _mask_pixels(path: Path, *, with_palette: bool) -> np.ndarray:
             pixels = np.asarray(image).astype(kind)[..., None]
         else:
             pixels = np.asarray(image.convert("RGB"))
-        if image.format == "JPEG":  # compression leaves grey pixels at edges, which are no object
+
+        # Compression of JPEG leaves grey pixels at edges, which are no object.
+        if image.format == "JPEG":
             is_grey = (pixels > _SOFT) & (pixels < 255 - _SOFT)
             if is_grey.sum() > (pixels >= 255 - _SOFT).sum():
                 raise InputError(
@@ -116,7 +119,7 @@ def _keep_labels(
     Raises:
         InputError: another number fills a square of three by three pixels somewhere.
     """
-    for other in sorted(_solid_numbers(values) - set(labels)):
+    for other in sorted(_find_solid_numbers(values) - set(labels)):
         raise InputError(
             f"{path}: {int((values == other).sum())} pixels have the number {other}, which the "
             f"labels do not name; add {other}=OBJECT, or {other}= to leave it out"
@@ -124,8 +127,9 @@ def _keep_labels(
     return torch.from_numpy(np.where(np.isin(values, list(labels)), values, 0)).long()
 
 
-def _solid_numbers(values: np.ndarray) -> set[int]:
-    """Give the numbers other than 0 that fill a square of three by three pixels somewhere."""
+def _find_solid_numbers(values: np.ndarray) -> set[int]:
+    """Find the numbers other than 0 that fill a square of three by three pixels somewhere."""
+    # Pixels whose eight neighbours have the same number.
     middle = values[1:-1, 1:-1]
     is_solid = middle != 0
     for row, column in np.ndindex(3, 3):
@@ -143,7 +147,7 @@ def number_objects(values: np.ndarray) -> Int64[Tensor, "h w"]:
     shown = values[values != 0]
     if len(shown) == 0 or (shown == shown[0]).all():
         return torch.from_numpy(values != 0).long()
-    numbers = _solid_numbers(values)
+    numbers = _find_solid_numbers(values)
     if not 2 <= len(numbers) <= _MOST_LABELS:
         return torch.from_numpy(values != 0).long()
     return torch.from_numpy(np.where(np.isin(values, list(numbers)), values, 0)).long()
@@ -168,7 +172,13 @@ def one_mask(labels: Int64[Tensor, "h w"], name: str) -> Bool[Tensor, "h w"]:
 
 
 def decode_rle(counts: tuple[int, ...], height: int, width: int) -> Bool[Tensor, "h w"]:
-    """Turn run lengths, column by column and beginning with the background, into a mask."""
+    """Turn run lengths, column by column and beginning with the background, into a mask.
+
+    Args:
+        counts: the run lengths.
+        height: rows of the mask.
+        width: its columns.
+    """
     values = np.arange(len(counts)) % 2 == 1
     flat = np.repeat(values, counts)
     return torch.from_numpy(flat.reshape(width, height).T.copy())
@@ -176,9 +186,11 @@ def decode_rle(counts: tuple[int, ...], height: int, width: int) -> Bool[Tensor,
 
 def encode_rle(mask: Bool[Tensor, "h w"]) -> Runs:
     """Turn a mask into run lengths and its size."""
+    # A run ends where the next pixel of a column differs.
     flat = mask.cpu().numpy().T.reshape(-1)
     ends = np.flatnonzero(np.diff(flat)) + 1
     runs = np.diff(np.concatenate([[0], ends, [flat.size]])).tolist()
+    # The first run is of the background: of no pixel, where the mask starts on the object.
     starts_on_object = flat.size > 0 and bool(flat[0])
     return tuple([0, *runs] if starts_on_object else runs), mask.shape[0], mask.shape[1]
 
@@ -191,6 +203,7 @@ def read_runs(entry: object, source: str) -> Runs:
     Raises:
         InputError: there are none, or they do not add up to their size.
     """
+    # Run lengths, and neither a polygon nor anything else.
     if isinstance(entry, Mapping) and "segmentation" in entry:
         entry = entry["segmentation"]
     what = f"{source}: the segmentation is no run lengths"
@@ -201,6 +214,8 @@ def read_runs(entry: object, source: str) -> Runs:
         )
     if not isinstance(entry, Mapping) or "counts" not in entry:
         raise InputError(f'{what}; write {{"size": [height, width], "counts": [...]}}')
+
+    # Their size.
     size = entry.get("size")
     counts = entry["counts"]
     if (
@@ -209,6 +224,8 @@ def read_runs(entry: object, source: str) -> Runs:
         or not all(type(v) is int and v > 0 for v in size)
     ):
         raise InputError(f"{what}: its size is {size!r}, where [height, width] belongs")
+
+    # Numbers that add up to it.
     height, width = size
     text = counts.decode("latin-1") if isinstance(counts, bytes) else counts
     runs: Any = _decompress_runs(text, what) if isinstance(text, str) else text
@@ -235,6 +252,8 @@ def _decompress_runs(text: str, what: str) -> list[int]:
         has_more = bits & 0x20
         if has_more:
             continue
+
+        # The last bits of a number say whether it is negative.
         is_negative = bits & 0x10
         if is_negative:
             value -= 1 << shift

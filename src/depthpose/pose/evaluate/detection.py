@@ -33,17 +33,17 @@ Pairs = Mapping[tuple[str, str], Mapping[str, Errors]]
 class _Image:
     """The instances and estimates of one object in one image."""
 
-    instances: list[Instance] = field(default_factory=list)
-    predictions: list[Prediction] = field(default_factory=list)
+    instances: list[Instance] = field(default_factory=list)  #: what is annotated
+    predictions: list[Prediction] = field(default_factory=list)  #: the highest scores first
 
 
-def detection_scores(
+def score_detections(
     dataset: BopDataset,
     predictions: Sequence[Prediction],
     contexts: Mapping[int, ErrorContext],
     measured: Pairs,
 ) -> dict[int, dict[str, float | None]]:
-    """Give ``ap_mssd``, ``ap_mspd`` and their mean ``ap`` of each object, by its number.
+    """Compute ``ap_mssd``, ``ap_mspd`` and their mean ``ap`` of each object, by its number.
 
     For each error and threshold the estimates of an image, those of the highest scores first, are
     matched with the instance of the least error below the threshold that is not matched yet. An
@@ -58,33 +58,33 @@ def detection_scores(
         contexts: by the number of the object.
         measured: errors that were measured before.
     """
-    images = _by_image(dataset, predictions)
+    images = _group_by_image(dataset, predictions)
     scores: dict[int, dict[str, float | None]] = {}
     for number, context in contexts.items():
         images_of_object = [image for place, image in images.items() if place.object_id == number]
-        tables = [_error_tables(image, context, measured) for image in images_of_object]
+        tables = [_measure_errors(image, context, measured) for image in images_of_object]
         precisions: dict[str, float | None] = {}
         for name, limits in _LIMITS.items():
             scale = context.diameter_m if name == "mssd_m" else 1.0
             tables_of_error = [table[name] for table in tables]
-            precisions[_COLUMNS[name]] = _mean(
-                [
-                    _average_precision(images_of_object, tables_of_error, scale * limit)
-                    for limit in limits
-                ]
-            )
-        scores[number] = {"ap": _mean(list(precisions.values())), **precisions}
+            at_limits = [
+                _measure_precision(images_of_object, tables_of_error, scale * limit)
+                for limit in limits
+            ]
+            precisions[_COLUMNS[name]] = _average(at_limits)
+        scores[number] = {"ap": _average(list(precisions.values())), **precisions}
     return scores
 
 
-def _mean(values: Sequence[float | None]) -> float | None:
+def _average(values: Sequence[float | None]) -> float | None:
     """Average the values that are not None; None where there are none."""
     numbers = [value for value in values if value is not None]
     return sum(numbers) / len(numbers) if numbers else None
 
 
-def _by_image(dataset: BopDataset, predictions: Sequence[Prediction]) -> dict[Place, _Image]:
+def _group_by_image(dataset: BopDataset, predictions: Sequence[Prediction]) -> dict[Place, _Image]:
     """Group instances and estimates by image and object, estimates of the highest scores first."""
+    # The instances of each object in each image.
     images: dict[Place, _Image] = defaultdict(_Image)
     places = {instance.name: place_of(instance) for instance in dataset.instances}
     for instance in dataset.instances:
@@ -106,7 +106,7 @@ def _by_image(dataset: BopDataset, predictions: Sequence[Prediction]) -> dict[Pl
     return images
 
 
-def _error_tables(
+def _measure_errors(
     image: _Image, context: ErrorContext, measured: Pairs
 ) -> dict[str, Float[Tensor, "estimates instances"]]:
     """Measure each estimate against each instance; infinite where it is certainly beyond limits."""
@@ -120,12 +120,12 @@ def _error_tables(
             for name, table in tables.items():
                 if name in errors:
                     table[row, column] = float(errors[name])
-                elif not _is_far(name, pose, instance, context):
+                elif not _is_certainly_far(name, pose, instance, context):
                     table[row, column] = float(METRICS[name].measure(pose, instance, context))
     return tables
 
 
-def _is_far(name: str, pose: Rigid, instance: Instance, context: ErrorContext) -> bool:
+def _is_certainly_far(name: str, pose: Rigid, instance: Instance, context: ErrorContext) -> bool:
     """Whether an error is certainly beyond all its limits, by a bound that is fast to compute."""
     points_m = context.model.vertices_m.double()
     estimated_m = pose.double().apply(points_m)
@@ -145,13 +145,18 @@ def _is_far(name: str, pose: Rigid, instance: Instance, context: ErrorContext) -
     return gap_px * BOP_WIDTH_PX / image_size(instance.depth)[0] > BOP_PIXELS[-1]
 
 
-def _average_precision(
+def _measure_precision(
     images: Sequence[_Image], tables: Sequence[Float[Tensor, "_ _"]], limit: float
 ) -> float | None:
-    """Give the average precision of one object at one threshold; None where no instance counts.
+    """Measure the average precision of one object at one threshold; None if no instance counts.
 
     In each image, the highest score first, an estimate is matched with the nearest instance that is
     left. One that is matched with a mostly hidden instance is neither right nor wrong, as in BOP.
+
+    Args:
+        images: of the object.
+        tables: errors of each image's estimates against its instances.
+        limit: error below which an estimate is right.
     """
     counted: list[tuple[float, bool]] = []  # score, and whether it is right
     targets = 0

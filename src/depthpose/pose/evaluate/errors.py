@@ -67,10 +67,10 @@ class Metric:
     has_median: bool = False  #: whether rows hold the median over estimates, ``NAME_median``
 
 
-def nearest_copy(
+def find_nearest_copy(
     estimated: Rigid, true: Rigid, symmetries: Rigid, declared: Symmetries | None = None
 ) -> Rigid:
-    """Give the symmetric copy of the true pose whose rotation is nearest to an estimate's.
+    """Find the symmetric copy of the true pose whose rotation is nearest to an estimate's.
 
     Args:
         estimated: ``camera_from_model``.
@@ -79,9 +79,11 @@ def nearest_copy(
         declared: the symmetries that these are steps of; then rotations about their axes are exact,
             not rounded to a step.
     """
+    # The nearest of the given copies.
     R = symmetries.R.double()
     t_m = symmetries.t_m.double()
-    copies = Rigid(true.R.double() @ R, (true.R.double() @ t_m[..., None])[..., 0] + true.t_m)
+    true_R = true.R.double()
+    copies = Rigid(true_R @ R, (true_R @ t_m[..., None])[..., 0] + true.t_m)
     nearest = int(geodesic_rad(estimated.R.double().expand_as(R), copies.R).argmin())
     copy = copies[nearest]
     if declared is None or not declared.continuous:
@@ -97,7 +99,7 @@ def nearest_copy(
 
     # Else the copy is rotated about each axis to the angle of the largest trace of
     # relative^T rotation(angle), which is that of the least difference.
-    rotated = []
+    rotated: list[Rigid] = []
     for axis in declared.continuous:
         a = axis.direction.to(estimated_R) / axis.direction.norm()
         skew = relative - relative.mT
@@ -107,7 +109,9 @@ def nearest_copy(
     return min(rotated, key=lambda pose: float(geodesic_rad(estimated_R, pose.R)))
 
 
-def _vsd(estimated: Rigid, instance: Instance, context: ErrorContext) -> Float[Tensor, "10"]:
+def _measure_vsd(
+    estimated: Rigid, instance: Instance, context: ErrorContext
+) -> Float[Tensor, "10"]:
     """Measure the visible surface discrepancy at each of BOP's ten tolerances, 0..1."""
     assert context.vsd_delta_m is not None
     depth_m = _read_depth(instance.depth, instance.depth_unit_m)
@@ -131,6 +135,7 @@ def _vsd(estimated: Rigid, instance: Instance, context: ErrorContext) -> Float[T
     height, width = window.shape
 
     def render(pose: Rigid) -> Float[Tensor, "h w"]:
+        """Draw the depth [m] of the object in the window."""
         triangles_m = pose.double().apply(context.triangles_m)
         return rasterize(triangles_m, K, width, height, with_barycentric=False).depth_m
 
@@ -141,24 +146,24 @@ def _vsd(estimated: Rigid, instance: Instance, context: ErrorContext) -> Float[T
 _read_depth = lru_cache(maxsize=4)(read_depth_png)  # instances of one image follow each other
 
 
-def _add(estimated: Rigid, instance: Instance, context: ErrorContext) -> Tensor:
+def _measure_add(estimated: Rigid, instance: Instance, context: ErrorContext) -> Tensor:
     """Measure ADD [m], or ADD-S where that decides a success."""
     measure = adds_m if context.is_adds else add_m
     return measure(estimated, instance.camera_from_model, context.model.vertices_m)
 
 
-def _adds(estimated: Rigid, instance: Instance, context: ErrorContext) -> Tensor:
+def _measure_adds(estimated: Rigid, instance: Instance, context: ErrorContext) -> Tensor:
     """Measure ADD-S [m]."""
     return adds_m(estimated, instance.camera_from_model, context.model.vertices_m)
 
 
-def _mssd(estimated: Rigid, instance: Instance, context: ErrorContext) -> Tensor:
+def _measure_mssd(estimated: Rigid, instance: Instance, context: ErrorContext) -> Tensor:
     """Measure MSSD [m]."""
     points_m = context.model.vertices_m
     return mssd_m(estimated, instance.camera_from_model, points_m, context.symmetries)
 
 
-def _mspd(estimated: Rigid, instance: Instance, context: ErrorContext) -> Tensor:
+def _measure_mspd(estimated: Rigid, instance: Instance, context: ErrorContext) -> Tensor:
     """Measure MSPD [px], scaled to an image 640 wide."""
     points_m = context.model.vertices_m
     true = instance.camera_from_model
@@ -166,29 +171,31 @@ def _mspd(estimated: Rigid, instance: Instance, context: ErrorContext) -> Tensor
     return (BOP_WIDTH_PX / image_size(instance.depth)[0]) * error_px
 
 
-def _true_copy(estimated: Rigid, instance: Instance, context: ErrorContext) -> Rigid:
-    """Give the symmetric copy of the annotated pose that is nearest to an estimate."""
+def _find_true_copy(estimated: Rigid, instance: Instance, context: ErrorContext) -> Rigid:
+    """Find the symmetric copy of the annotated pose that is nearest to an estimate."""
     true = instance.camera_from_model
-    return nearest_copy(estimated, true, context.symmetries, context.model.symmetries)
+    return find_nearest_copy(estimated, true, context.symmetries, context.model.symmetries)
 
 
-def _rotation_deg(estimated: Rigid, instance: Instance, context: ErrorContext) -> Tensor:
+def _measure_rotation_deg(estimated: Rigid, instance: Instance, context: ErrorContext) -> Tensor:
     """Measure the angle to the nearest symmetric copy of the true pose [deg]."""
-    true = _true_copy(estimated, instance, context)
+    true = _find_true_copy(estimated, instance, context)
     return geodesic_rad(estimated.R.double(), true.R.double()).rad2deg()
 
 
-def _translation_m(estimated: Rigid, instance: Instance, context: ErrorContext) -> Tensor:
+def _measure_translation_m(estimated: Rigid, instance: Instance, context: ErrorContext) -> Tensor:
     """Measure the distance to the nearest symmetric copy of the true pose [m]."""
-    true = _true_copy(estimated, instance, context)
+    true = _find_true_copy(estimated, instance, context)
     return (true.t_m.double() - estimated.t_m.double()).norm(dim=-1)
 
 
 METRICS = {
-    "error_m": Metric(measure=_add, summaries={"auc": lambda errors, _: auc(errors[:, 0])}),
-    "adds_m": Metric(measure=_adds, summaries={"auc_adds": lambda errors, _: auc(errors[:, 0])}),
+    "error_m": Metric(measure=_measure_add, summaries={"auc": lambda errors, _: auc(errors[:, 0])}),
+    "adds_m": Metric(
+        measure=_measure_adds, summaries={"auc_adds": lambda errors, _: auc(errors[:, 0])}
+    ),
     "mssd_m": Metric(
-        measure=_mssd,
+        measure=_measure_mssd,
         summaries={
             "ar_mssd": lambda errors, diameters_m: average_recall(
                 errors / diameters_m[:, None], BOP_SHARES
@@ -196,13 +203,13 @@ METRICS = {
         },
     ),
     "mspd_px": Metric(
-        measure=_mspd,
+        measure=_measure_mspd,
         summaries={"ar_mspd": lambda errors, _: average_recall(errors, BOP_PIXELS)},
     ),
-    "rotation_deg": Metric(measure=_rotation_deg, has_median=True),
-    "translation_m": Metric(measure=_translation_m, has_median=True),
+    "rotation_deg": Metric(measure=_measure_rotation_deg, has_median=True),
+    "translation_m": Metric(measure=_measure_translation_m, has_median=True),
     "vsd": Metric(
-        measure=_vsd,
+        measure=_measure_vsd,
         missing=(1.0,) * len(BOP_SHARES),
         is_wanted=lambda context: context.vsd_delta_m is not None,
         summaries={"ar_vsd": lambda errors, _: average_recall(errors, BOP_SHARES)},
@@ -229,6 +236,7 @@ def match_instances(
     the sum of ADD-S, at most a diameter each, is least. BOP does so anew for each error and
     threshold. Refusals are matched with instances that are left over.
     """
+    # Estimates that have the name of their instance.
     places = {instance.name: place_of(instance) for instance in instances}
     matched: dict[str, PoseEstimate] = {}
     unnamed: list[Prediction] = []
@@ -248,6 +256,8 @@ def match_instances(
     for prediction in unnamed:
         if prediction.place is not None and prediction.place in unmatched:
             offered[prediction.place].append(prediction.estimate)
+
+    # Of each place the poses of the highest scores, then refusals.
     for place, estimates in offered.items():
         instances_there = unmatched[place]
         model = models[place.object_id]
@@ -300,11 +310,11 @@ _COUNTED_FROM = {"smaller (are yours counted from 1?)": -1, "larger (from 0?)": 
 class _Change:
     """A change of all predictions: of their image and object numbers, and of their poses."""
 
-    words: str = ""  # that describe it
-    image_step: int = 0  # that is added to the numbers of images
-    object_step: int = 0  # and of objects
-    convention: str = ""  # a key of ``_CONVENTIONS``
-    scale: float = 1.0  # of translations
+    words: str = ""  #: that describe it
+    image_step: int = 0  #: that is added to the numbers of images
+    object_step: int = 0  #: and of objects
+    convention: str = ""  #: a key of ``_CONVENTIONS``
+    scale: float = 1.0  #: of translations
 
     def renumber(self, prediction: Prediction) -> Prediction:
         """Give a prediction with its numbers of image and object changed."""
@@ -324,16 +334,12 @@ class _Change:
         return replace(prediction, estimate=replace(prediction.estimate, camera_from_model=pose))
 
 
-def _changes() -> list[_Change]:
-    """Give the changes that are tried: numbers by one, and conventions with units."""
-    changes = [
-        change
-        for words, step in _COUNTED_FROM.items()
-        for change in (
-            _Change(words=f"image numbers were one {words}", image_step=step),
-            _Change(words=f"object numbers were one {words}", object_step=step),
-        )
-    ]
+def _list_changes() -> list[_Change]:
+    """List the changes that are tried: numbers by one, and conventions with units."""
+    changes: list[_Change] = []
+    for words, step in _COUNTED_FROM.items():
+        changes.append(_Change(words=f"image numbers were one {words}", image_step=step))
+        changes.append(_Change(words=f"object numbers were one {words}", object_step=step))
     for convention in _CONVENTIONS:
         for scale, words in _SCALES.items():
             both = " and ".join(filter(None, (words, convention)))
@@ -341,18 +347,26 @@ def _changes() -> list[_Change]:
     return changes
 
 
-def convention_advice(
+def advise_convention(
     dataset: BopDataset,
     predictions: Sequence[Prediction],
     contexts: Mapping[int, ErrorContext],
 ) -> str | None:
-    """Say by which change of all predictions many more would be right; None where by none."""
+    """Advise a change of all predictions by which many more would be right; None if there is none.
+
+    Args:
+        dataset: instances with truth.
+        predictions: of any method.
+        contexts: of the errors, by the number of the object.
+    """
+    # Are few right as they are?
     posed = [p for p in predictions if p.estimate.is_posed]
     right, tried = _count_right(dataset, posed, contexts, _Change())
     if right > (1 - _GAIN) * tried > 0:
         return None
 
-    changes = _changes()
+    # Of all changes the one by which most are.
+    changes = _list_changes()
     counts = [_count_right(dataset, posed, contexts, change) for change in changes]
     best = max(range(len(changes)), key=lambda k: counts[k][0])
     best_right, best_tried = counts[best]
@@ -371,6 +385,7 @@ def _count_right(
     change: _Change,
 ) -> tuple[int, int]:
     """Count the predictions that are right by a change, of some instances, and these instances."""
+    # Some instances that have an estimate, once numbers are changed.
     renumbered = [change.renumber(prediction) for prediction in posed]
     matched = match_instances(dataset.instances, renumbered, dataset.objects)
     with_estimate = [instance for instance in dataset.instances if instance.name in matched]

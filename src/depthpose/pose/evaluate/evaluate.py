@@ -15,12 +15,12 @@ from depthpose.core.errors import InputError
 from depthpose.core.frame import data_frame
 from depthpose.pose.config import EvaluationConfig
 from depthpose.pose.datasets import BopDataset, BopTarget, Instance
-from depthpose.pose.evaluate.detection import detection_scores
+from depthpose.pose.evaluate.detection import score_detections
 from depthpose.pose.evaluate.errors import (
     METRICS,
     ErrorContext,
     Errors,
-    convention_advice,
+    advise_convention,
     match_instances,
 )
 from depthpose.pose.mesh import drawn_triangles, symmetry_transforms
@@ -56,7 +56,7 @@ class Conditions:
 
     diameters: str  #: whose table of diameters
     frames: str  #: data set and split
-    frames_sha256: str  #: first digits of :func:`frames_hash`
+    frames_sha256: str  #: first digits of :func:`hash_frames`
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -147,7 +147,7 @@ _RECALLS = ("ar_vsd", "ar_mssd", "ar_mspd")
 _DECILES = 10
 
 
-def object_row(name: str, rows: Sequence[InstanceRow]) -> ObjectRow:
+def sum_up_object(name: str, rows: Sequence[InstanceRow]) -> ObjectRow:
     """Sum up the instances of an object, or of all objects.
 
     ``success``, ``refused`` and ``wrong`` add up to 1: an instance without a pose is refused.
@@ -165,11 +165,11 @@ def object_row(name: str, rows: Sequence[InstanceRow]) -> ObjectRow:
         wrong=coverage - success,
         coverage=coverage,
         scores=_summarise_errors(rows),
-        ms={stage: _mean([row.ms[stage] for row in rows]) for stage in rows[0].ms},
+        ms={stage: _average([row.ms[stage] for row in rows]) for stage in rows[0].ms},
     )
 
 
-def mean_row(rows: Sequence[ObjectRow]) -> ObjectRow:
+def average_objects(rows: Sequence[ObjectRow]) -> ObjectRow:
     """Average the rows of objects: each object counts the same, as in LineMOD's tables."""
     count = len(rows)
     scores: dict[str, Number] = {}
@@ -178,7 +178,7 @@ def mean_row(rows: Sequence[ObjectRow]) -> ObjectRow:
         # A recall needs all objects. A median may lack those without a pose, and BOP's precision
         # those of which too little is visible.
         may_lack = name in _PRECISIONS or name.endswith("_median")
-        scores[name] = _mean(values) if may_lack or None not in values else None
+        scores[name] = _average(values) if may_lack or None not in values else None
     return ObjectRow(
         object="mean",
         instances=sum(row.instances for row in rows),
@@ -188,15 +188,16 @@ def mean_row(rows: Sequence[ObjectRow]) -> ObjectRow:
         wrong=sum(row.wrong for row in rows) / count,
         coverage=sum(row.coverage for row in rows) / count,
         scores=scores,
-        ms={stage: _mean([row.ms[stage] for row in rows]) for stage in rows[0].ms},
+        ms={stage: _average([row.ms[stage] for row in rows]) for stage in rows[0].ms},
     )
 
 
-def risk_rows(rows: Sequence[InstanceRow]) -> list[RiskRow]:
+def measure_risk(rows: Sequence[InstanceRow]) -> list[RiskRow]:
     """Measure the share of wrong poses among those of the highest scores, at ten coverages.
 
     A ``coverage`` of 0.1 is a tenth of all instances. The rows end where there are no more poses.
     """
+    # The answers, the surest first, and how many of them make each coverage.
     answered = [row for row in rows if row.status in POSED and row.score is not None]
     answered.sort(key=lambda row: -(row.score or 0.0))
     tenths = (round(k * len(rows) / _DECILES) for k in range(1, _DECILES + 1))
@@ -219,6 +220,7 @@ def _summarise_errors(rows: Sequence[InstanceRow]) -> dict[str, Number]:
     Recalls and areas are over all instances, of which one without an estimate is missed; medians
     are over the instances with an estimate.
     """
+    # The summaries of each error.
     diameters_m = torch.tensor([row.diameter_m for row in rows], dtype=torch.float64)
     scores: dict[str, Number] = {}
     for name, metric in METRICS.items():
@@ -233,6 +235,7 @@ def _summarise_errors(rows: Sequence[InstanceRow]) -> dict[str, Number]:
     is_complete = len(measured_recalls) == len(recalls)
     scores["ar"] = sum(measured_recalls) / len(recalls) if is_complete else None
 
+    # Medians, of poses alone.
     posed = [row for row in rows if row.status in POSED]
     for name, metric in METRICS.items():
         if metric.has_median:
@@ -241,13 +244,14 @@ def _summarise_errors(rows: Sequence[InstanceRow]) -> dict[str, Number]:
     return scores
 
 
-def _mean(values: Sequence[Number]) -> Number:
+def _average(values: Sequence[Number]) -> Number:
+    """Average the values that are not None; None where there are none."""
     numbers = [value for value in values if value is not None]
     return sum(numbers) / len(numbers) if numbers else None
 
 
-def frames_hash(instances: Sequence[Instance]) -> str:
-    """Give the SHA-256 of a list of instances: scene, image, object and place, each in a line."""
+def hash_frames(instances: Sequence[Instance]) -> str:
+    """Compute the SHA-256 of a list of instances, a line each: scene, image, object and place."""
     lines = (f"{i.scene_id} {i.image_id} {i.object_id} {i.index}\n" for i in instances)
     return hashlib.sha256("".join(sorted(lines)).encode()).hexdigest()
 
@@ -258,11 +262,14 @@ def select_targets(dataset: BopDataset, targets: Sequence[BopTarget]) -> BopData
     Raises:
         InputError: a target has fewer annotations than its count, or none of them has any.
     """
+    # What is annotated, by place and by image.
     of_place: dict[Place, list[Instance]] = defaultdict(list)
     of_image: dict[tuple[int, int], list[Instance]] = defaultdict(list)
     for instance in dataset.instances:
         of_place[place_of(instance)].append(instance)
         of_image[instance.scene_id, instance.image_id].append(instance)
+
+    # Of each target as many as it asks for.
     chosen: list[Instance] = []
     for target in targets:
         instances = of_image[target.scene_id, target.image_id]
@@ -295,7 +302,7 @@ PVNET_DIAMETERS_M = {
 _OTHER_DATA_SET = 0.25
 
 
-def error_context(model: ObjectModel, config: EvaluationConfig) -> ErrorContext:
+def prepare_errors(model: ObjectModel, config: EvaluationConfig) -> ErrorContext:
     """Prepare an object for the measurement of errors, by the settings of an evaluation.
 
     Raises:
@@ -364,7 +371,7 @@ def evaluate(
 
     A success is an ADD (ADD-S of a symmetric object) below a tenth of the diameter, ``auc`` the
     area to 10 cm; BOP's errors and recalls as ``pose.metrics`` has them, and its precision of 6D
-    detection as :func:`~depthpose.pose.evaluate.detection.detection_scores` has it.
+    detection as :func:`~depthpose.pose.evaluate.detection.score_detections` has it.
 
     Args:
         dataset: instances with truth.
@@ -377,6 +384,7 @@ def evaluate(
         InputError: there is no instance, no prediction is of this data set, or a file of it is
             damaged.
     """
+    # Which estimate is of which instance?
     config = EvaluationConfig() if config is None else config
     matched = match_instances(dataset.instances, predictions, dataset.objects)
     if len(dataset) == 0:
@@ -390,25 +398,26 @@ def evaluate(
             f"{prediction.place or prediction.estimate.name!r}. Give the predictions of "
             "this very split"
         )
-    contexts = {number: error_context(model, config) for number, model in dataset.objects.items()}
-    # Stages in the order of work; those of other methods come last.
+
+    # Rows of instances. Stages in the order of work; those of other methods come last.
     timed = dict.fromkeys(stage for p in predictions for stage in p.estimate.seconds)
     stages = [s for s in STAGES if s in timed] + [s for s in timed if s not in STAGES]
     seconds_of = {
         prediction.estimate: seconds
         for prediction, seconds in zip(predictions, additive_seconds(predictions), strict=True)
     }
+    contexts = {number: prepare_errors(model, config) for number, model in dataset.objects.items()}
     rows: list[InstanceRow] = []
     for instance in progress(dataset.instances):
         estimate = matched.get(instance.name)
-        row = _instance_row(instance, estimate, contexts[instance.object_id])
-        ms = {} if estimate is None else _stage_ms(estimate, seconds_of[estimate])
+        row = _measure_instance(instance, estimate, contexts[instance.object_id])
+        ms = {} if estimate is None else _list_stage_ms(estimate, seconds_of[estimate])
         columns = [*stages, "total"]
         rows.append(replace(row, ms={column: ms.get(column) for column in columns}))
     conditions = Conditions(
         diameters=config.diameters,
         frames=f"{dataset.folder.resolve().name} {dataset.split}",
-        frames_sha256=frames_hash(dataset.instances)[:12],
+        frames_sha256=hash_frames(dataset.instances)[:12],
     )
 
     # Rows of objects, with BOP's precision of detection.
@@ -417,30 +426,30 @@ def evaluate(
         for row in rows
         if row.instance in matched
     }
-    precision = detection_scores(dataset, predictions, contexts, measured)
+    precision = score_detections(dataset, predictions, contexts, measured)
     rows_of_object: dict[int, list[InstanceRow]] = defaultdict(list)
     for row, instance in zip(rows, dataset.instances, strict=True):
         rows_of_object[instance.object_id].append(row)
     object_rows: list[ObjectRow] = []
     for number, context in sorted(contexts.items()):
-        row = object_row(context.model.name, rows_of_object[number])
+        row = sum_up_object(context.model.name, rows_of_object[number])
         row = replace(row, scores={**row.scores, **precision[number]})
         metric = rows_of_object[number][0].metric
         object_rows.append(replace(row, metric=metric, diameter_m=context.diameter_m))
     if len(object_rows) > 1:
         # BOP's precision is that of an object, or the mean over objects: "all" has none.
-        all_row = object_row("all", rows)
+        all_row = sum_up_object("all", rows)
         all_row = replace(all_row, scores={**all_row.scores, **dict.fromkeys(_PRECISIONS)})
-        object_rows += [mean_row(object_rows), all_row]
+        object_rows += [average_objects(object_rows), all_row]
     return Evaluation(
         rows=[replace(row, conditions=conditions, origin=origin) for row in object_rows],
         per_instance=[replace(row, origin=origin) for row in rows],
-        risk=[replace(r, conditions=conditions, origin=origin) for r in risk_rows(rows)],
-        advice=convention_advice(dataset, predictions, contexts),
+        risk=[replace(r, conditions=conditions, origin=origin) for r in measure_risk(rows)],
+        advice=advise_convention(dataset, predictions, contexts),
     )
 
 
-def _instance_row(
+def _measure_instance(
     instance: Instance, estimate: PoseEstimate | None, context: ErrorContext
 ) -> InstanceRow:
     """Measure one instance, without its times.
@@ -469,8 +478,8 @@ def _instance_row(
     )
 
 
-def _stage_ms(estimate: PoseEstimate, additive: Mapping[str, float]) -> dict[str, float]:
-    """Give the milliseconds of each stage of an estimate, and in ``total``, if it has any.
+def _list_stage_ms(estimate: PoseEstimate, additive: Mapping[str, float]) -> dict[str, float]:
+    """List the milliseconds of each stage of an estimate, and in ``total``, if it has any.
 
     ``additive``: its seconds of :func:`additive_seconds`, whose sum is the total.
     """

@@ -3,9 +3,9 @@
 from depthpose.pose.mesh.colors import average_colors as average_colors
 from depthpose.pose.mesh.colors import read_colors as read_colors
 from depthpose.pose.mesh.declared import AnySymmetry as AnySymmetry
+from depthpose.pose.mesh.declared import assign_symmetries as assign_symmetries
 from depthpose.pose.mesh.declared import declare_symmetry as declare_symmetry
 from depthpose.pose.mesh.declared import read_symmetry as read_symmetry
-from depthpose.pose.mesh.declared import symmetry_of_each as symmetry_of_each
 from depthpose.pose.mesh.files import FIXED_UNITS as FIXED_UNITS
 from depthpose.pose.mesh.files import MESH_READERS as MESH_READERS
 from depthpose.pose.mesh.files import AnyModel as AnyModel

@@ -15,7 +15,7 @@ _SMALL = 0.05  # of the part's area: a smaller body far away is left out
 _MOST_NAMED = 3  # bodies in a message
 
 
-def faces_of_part(
+def mark_part(
     path: AnyPath, vertices: np.ndarray, faces: np.ndarray, area: np.ndarray
 ) -> np.ndarray:
     """Mark the faces of a file's part: all but those of small bodies that lie far from the rest.
@@ -58,7 +58,8 @@ def faces_of_part(
         part_low = low[is_part].min(0)
         part_high = high[is_part].max(0)
         diagonal = float(np.linalg.norm(part_high - part_low))
-        gap = np.linalg.norm(np.maximum(0, np.maximum(low - part_high, part_low - high)), axis=1)
+        gap_along_axes = np.maximum(low - part_high, part_low - high)
+        gap = np.linalg.norm(np.maximum(0, gap_along_axes), axis=1)
         is_small = size < _SMALL * size[is_part].sum()
         is_near = gap <= diagonal * np.where(is_small, _SMALL_BODY_GAP, _BODY_GAP)
         if not (is_near & ~is_part).any():
@@ -67,22 +68,23 @@ def faces_of_part(
     if is_part.all():
         return all_faces
 
+    # The others are named: left out where they are small, else refused.
     left_out = np.flatnonzero(~is_part)
     extent = np.linalg.norm(high - low, axis=1)
     listing = ", ".join(
         f"one of {extent[k]:.3g} at ({', '.join(f'{value:.4g}' for value in low[k])})"
         for k in left_out[:_MOST_NAMED]
     )
-    more = f" and {len(left_out) - _MOST_NAMED} more" if len(left_out) > _MOST_NAMED else ""
+    others = f" and {len(left_out) - _MOST_NAMED} more" if len(left_out) > _MOST_NAMED else ""
     if size[left_out].sum() >= _SMALL * size[is_part].sum():
         raise InputError(
             f"{path}: holds bodies that lie farther from each other than they are long (a part of "
-            f"{diagonal:.4g}; {listing}{more}), and it cannot be known which of them is the "
+            f"{diagonal:.4g}; {listing}{others}), and it cannot be known which of them is the "
             "object; export that one alone"
         )
     bodies = f"{len(left_out)} small {'body' if len(left_out) == 1 else 'bodies'}"
     warnings.warn(
-        f"{path}: left out {bodies} far from the part of {diagonal:.4g} ({listing}{more}, in the "
+        f"{path}: left out {bodies} far from the part of {diagonal:.4g} ({listing}{others}, in the "
         "file's unit); export the part alone",
         Notice,
         stacklevel=3,

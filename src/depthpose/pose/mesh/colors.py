@@ -52,7 +52,7 @@ def read_colors(path: AnyPath, scale: float, model: ObjectModel) -> SurfaceColor
         return None
     try:
         with refused_as(path, "model with colours", "export it again"):
-            samples, lost = _colored_samples(path, suffix)
+            samples, lost = _sample_colors(path, suffix)
     except InputError as error:
         message = f"{path}: {str(error).removeprefix(f'{path}: ')}"
         warnings.warn(f"{message} (its shape is read, its colours are not)", Notice, stacklevel=3)
@@ -66,8 +66,9 @@ def read_colors(path: AnyPath, scale: float, model: ObjectModel) -> SurfaceColor
         )
     if samples is None:
         return None
+
+    # Those of the shape alone. The shape is read by another reader, which leaves stray bodies out.
     points_m = scale * samples.points
-    # The shape is read by another reader, which leaves stray bodies out.
     low_m = model.vertices_m.amin(0).double()
     high_m = model.vertices_m.amax(0).double()
     slack_m = _SAME_BOX * float((high_m - low_m).max())
@@ -92,26 +93,29 @@ def average_colors(
     """
     if float(rgb.double().std(0).max()) < _LEAST_CONTRAST:
         return None
-    kept_m = points_m[::_DENSE].double()
-    kept_normals = normals[::_DENSE].double()
-    tree = KDTree(kept_m.numpy())
-    distance_m, _ = tree.query(kept_m.numpy()[:: max(1, len(kept_m) // 1000)], k=2)
+
+    # The fourth part of the samples, and how far they lie apart.
+    chosen_m = points_m[::_DENSE].double()
+    chosen_normals = normals[::_DENSE].double()
+    tree = KDTree(chosen_m.numpy())
+    few_m = chosen_m.numpy()[:: max(1, len(chosen_m) // 1000)]
+    distance_m, _ = tree.query(few_m, k=2)
     spacing_m = float(np.median(distance_m[:, 1]))
 
-    # The mean of the samples nearest to each one kept. On a thin sheet a sample of the other side,
+    # The mean of the samples nearest to each of them. On a thin sheet a sample of the other side,
     # which may have another colour, is left out.
     _, nearest = tree.query(points_m.double().numpy())
     owner = torch.from_numpy(np.asarray(nearest))
-    is_same_side = (normals.double() * kept_normals[owner]).sum(-1) > 0
+    is_same_side = (normals.double() * chosen_normals[owner]).sum(-1) > 0
     owner = owner[is_same_side]
     values = rgb.double()[is_same_side]
-    count = torch.zeros(len(kept_m), dtype=torch.float64)
+    count = torch.zeros(len(chosen_m), dtype=torch.float64)
     count.index_add_(0, owner, torch.ones_like(owner, dtype=torch.float64))
-    total = torch.zeros_like(kept_m).index_add_(0, owner, values)
+    total = torch.zeros_like(chosen_m).index_add_(0, owner, values)
     mean = torch.where(count[:, None] > 0, total / count[:, None], rgb[::_DENSE].double())
     return SurfaceColors(
-        points_m=kept_m.float(),
-        normals=kept_normals.float(),
+        points_m=chosen_m.float(),
+        normals=chosen_normals.float(),
         rgb=mean.float(),
         spacing_m=spacing_m,
     )
@@ -149,20 +153,21 @@ def _read_point_colors(path: AnyPath, model: ObjectModel) -> SurfaceColors | Non
 class _Samples(NamedTuple):
     """Coloured points of a surface."""
 
-    points: Float[Tensor, "n 3"]  # in the file's own unit
-    normals: Float[Tensor, "n 3"]
-    rgb: Float[Tensor, "n 3"]
+    points: Float[Tensor, "n 3"]  #: in the file's own unit
+    normals: Float[Tensor, "n 3"]  #: outward
+    rgb: Float[Tensor, "n 3"]  #: 0..1
 
 
-def _colored_samples(path: AnyPath, suffix: str) -> tuple[_Samples | None, list[str]]:
+def _sample_colors(path: AnyPath, suffix: str) -> tuple[_Samples | None, list[str]]:
     """Sample the coloured surface of a file; give the samples, and names of files not beside it.
 
     The samples are None where no part of the surface has a colour.
     """
     import trimesh
 
-    files = _files_beside(path)
-    with _quiet():
+    # The file, as a scene of meshes.
+    files = _make_resolver(path)
+    with _silence_trimesh():
         scene: Any = trimesh.load_scene(
             BytesIO(read_bytes(path)),
             file_type=suffix[1:],
@@ -170,6 +175,7 @@ def _colored_samples(path: AnyPath, suffix: str) -> tuple[_Samples | None, list[
             process=False,
             allow_remote=False,
         )
+
     # The meshes of the scene, and their vertices where the scene places them.
     parts: list[tuple[Any, np.ndarray]] = []
     for node in scene.graph.nodes_geometry:
@@ -187,6 +193,7 @@ def _colored_samples(path: AnyPath, suffix: str) -> tuple[_Samples | None, list[
     points = (corners[face] * share[..., None]).sum(-2)
     sides = corners[:, 1:] - corners[:, :1]
     doubled = torch.linalg.cross(sides[:, 0], sides[:, 1])
+
     # Faces of a negative volume look inward: their normals are flipped.
     middle = corners.flatten(0, 1).mean(0)
     volume = float(((corners.mean(1) - middle) * doubled).sum())
@@ -201,7 +208,7 @@ def _colored_samples(path: AnyPath, suffix: str) -> tuple[_Samples | None, list[
         face_of_mesh = (face[is_of_mesh] - first).numpy()
         first += len(mesh.faces)
         barycentric = share[is_of_mesh].numpy()
-        colors = _colors_of(mesh, face_of_mesh, barycentric, is_file_missing=bool(files.lost))
+        colors = _color_points(mesh, face_of_mesh, barycentric, is_file_missing=bool(files.lost))
         if colors is not None:
             rgb[is_of_mesh] = torch.from_numpy(colors)
     has_color = rgb.isfinite().all(-1)
@@ -210,14 +217,14 @@ def _colored_samples(path: AnyPath, suffix: str) -> tuple[_Samples | None, list[
     return _Samples(points[has_color], normals[has_color], rgb[has_color]), files.lost
 
 
-def _colors_of(
+def _color_points(
     mesh: Any,  # noqa: ANN401  trimesh's classes carry no types
     face: np.ndarray,
     barycentric: np.ndarray,
     *,
     is_file_missing: bool,
 ) -> np.ndarray | None:
-    """Give the colours of points of a mesh (n, 3), 0..1; None where it has none.
+    """Color points of a mesh (n, 3), 0..1, by whatever colours it has; None where it has none.
 
     Args:
         mesh: of trimesh.
@@ -234,17 +241,24 @@ def _colors_of(
         return _interpolate_corners(visual.vertex_colors, corners, barycentric) / 255
     if visual.kind != "texture":
         return None
-    return _material_colors(visual, corners, barycentric, is_file_missing=is_file_missing)
+    return _color_by_material(visual, corners, barycentric, is_file_missing=is_file_missing)
 
 
-def _material_colors(
+def _color_by_material(
     visual: Any,  # noqa: ANN401  trimesh's classes carry no types
     corners: np.ndarray,
     barycentric: np.ndarray,
     *,
     is_file_missing: bool,
 ) -> np.ndarray | None:
-    """Give the colours of points by a texture, else by vertices, else by the material's colour."""
+    """Color points by a texture, else by vertices, else by the material's colour.
+
+    Args:
+        visual: of trimesh.
+        corners: indices of the three corners of each point's face (n, 3).
+        barycentric: coordinates of each point in its face (n, 3).
+        is_file_missing: as of :func:`_color_points`.
+    """
     from trimesh.visual.color import uv_to_interpolated_color
 
     material = visual.material
@@ -258,6 +272,8 @@ def _material_colors(
             f"its texture is {image.width}x{image.height}, more than {_MOST_TEXELS} pixels; save "
             "it smaller"
         )
+
+    # The first of the three that there is.
     if image is not None and visual.uv is not None:
         uv = _interpolate_corners(visual.uv, corners, barycentric)
         return uv_to_interpolated_color(uv, image)[:, :3] / 255 * tint
@@ -275,7 +291,7 @@ def _interpolate_corners(values: Any, corners: np.ndarray, barycentric: np.ndarr
     return (at_corners * barycentric[..., None]).sum(1)
 
 
-def _files_beside(path: AnyPath) -> Any:  # noqa: ANN401  trimesh's classes carry no types
+def _make_resolver(path: AnyPath) -> Any:  # noqa: ANN401  trimesh's classes carry no types
     """Make the resolver by which trimesh reads files beside a model; it notes missing ones."""
     from trimesh.resolvers import FilePathResolver
 
@@ -298,7 +314,7 @@ def _files_beside(path: AnyPath) -> Any:  # noqa: ANN401  trimesh's classes carr
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def _silence_trimesh() -> Iterator[None]:
     """Keep trimesh from logging a traceback of a missing texture, of which a notice tells."""
     log = logging.getLogger("trimesh")
     level = log.level

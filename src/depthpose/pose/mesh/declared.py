@@ -60,10 +60,11 @@ def read_symmetry(text: str) -> tuple[DeclaredTurns, ...]:
     """
     declared: list[DeclaredTurns] = []
     for part in text.split("+"):
+        # An axis and how many turns about it; a length of 0 where it is none.
         axis, _, count = (word.strip().lower() for word in part.rpartition(","))
         try:
-            named = {"x": (1.0, 0, 0), "y": (0, 1.0, 0), "z": (0, 0, 1.0)}
-            numbers = named.get(axis) or [float(word) for word in axis.split()]
+            directions = {"x": (1.0, 0, 0), "y": (0, 1.0, 0), "z": (0, 0, 1.0)}
+            numbers = directions.get(axis) or [float(word) for word in axis.split()]
             direction = torch.tensor(numbers, dtype=torch.float64).reshape(3)
             length = float(direction.norm())
             turns = None if count == "free" else int(count)
@@ -93,9 +94,10 @@ def declare_symmetry(model: ObjectModel, symmetry: AnySymmetry) -> ObjectModel:
     Raises:
         InputError: it is no symmetry, or a file of none.
     """
+    # In whatever form it is given.
     surface = SurfaceDeviation(model)
     if isinstance(symmetry, str) and not symmetry.lower().endswith(".json"):
-        declared = _from_words(read_symmetry(symmetry), surface, model)
+        declared = _place_axes(read_symmetry(symmetry), surface, model)
     elif isinstance(symmetry, Symmetries):
         declared = replace(symmetry, is_found=False)
     elif isinstance(symmetry, str | Path):
@@ -106,7 +108,9 @@ def declare_symmetry(model: ObjectModel, symmetry: AnySymmetry) -> ObjectModel:
         raise InputError(f"symmetry is a {type(symmetry).__name__}; {_FORM}")
     if declared.is_none:
         raise InputError(f"symmetry of {model.name}: there is none in it; {_FORM}")
-    deviation = _deviation(declared, surface, model)
+
+    # Does the surface have it?
+    deviation = _measure_deviation(declared, surface, model)
     if deviation > _CONTRADICTED:
         source = symmetry if isinstance(symmetry, str | Path) else "that was given"
         warnings.warn(
@@ -119,10 +123,10 @@ def declare_symmetry(model: ObjectModel, symmetry: AnySymmetry) -> ObjectModel:
     return replace(model, symmetries=declared)
 
 
-def symmetry_of_each(
+def assign_symmetries(
     given: AnySymmetry | Mapping[str, AnySymmetry] | Sequence[str] | None, names: Sequence[str]
 ) -> dict[str, AnySymmetry]:
-    """Give the declared symmetry of each object that has one.
+    """Assign declared symmetries to the objects that have one.
 
     Args:
         given: one, where one object is known; a mapping from names; or words that begin by a name
@@ -134,20 +138,24 @@ def symmetry_of_each(
     """
     if given is None:
         return {}
+
+    # A mapping from names.
     is_bop = isinstance(given, Mapping) and any(key.startswith("symmetries_") for key in given)
     if isinstance(given, Mapping) and not is_bop:
         for name in given:
-            _refuse_other(name, names, f"symmetry of {name!r}")
+            _refuse_unknown_name(name, names, f"symmetry of {name!r}")
         return dict(given)
-    is_one = isinstance(given, str | Path | Mapping | Symmetries)
-    every: Sequence[AnySymmetry] = [given] if is_one else list(given)
+
+    # One symmetry or several, which may begin by the name of their object.
+    is_single = isinstance(given, str | Path | Mapping | Symmetries)
+    declarations: Sequence[AnySymmetry] = [given] if is_single else list(given)
     declared: dict[str, AnySymmetry] = {}
-    for declaration in every:
-        name, colon, rest = (
-            declaration.partition(":") if isinstance(declaration, str) else ("", "", "")
-        )
+    for declaration in declarations:
+        name = colon = rest = ""
+        if isinstance(declaration, str):
+            name, colon, rest = declaration.partition(":")
         if colon and (name in names or "," in rest):
-            _refuse_other(name, names, f"symmetry {declaration!r}")
+            _refuse_unknown_name(name, names, f"symmetry {declaration!r}")
             symmetry: AnySymmetry = rest
         elif len(names) == 1:
             name = names[0]
@@ -163,13 +171,14 @@ def symmetry_of_each(
     return declared
 
 
-def _refuse_other(name: str, names: Sequence[str], message: str) -> None:
+def _refuse_unknown_name(name: str, names: Sequence[str], message: str) -> None:
+    """Refuse the name of no object; ``message`` says what it was given for."""
     if name not in names:
         raise InputError(f"{message}: no object is called so; {nearest_name(name, names)}")
 
 
 def _read_entry(path: Path, model: ObjectModel) -> Mapping[str, Any]:
-    """Give BOP's entry of an object: the file itself, its only entry, or that of its number."""
+    """Read BOP's entry of an object: the file itself, its only entry, or that of its number."""
     content = read_json(path)
     if isinstance(content, Mapping) and any(str(k).startswith("symmetries_") for k in content):
         return content
@@ -183,12 +192,21 @@ def _read_entry(path: Path, model: ObjectModel) -> Mapping[str, Any]:
     return entry
 
 
-def _from_words(
+def _place_axes(
     terms: Sequence[DeclaredTurns], surface: SurfaceDeviation, model: ObjectModel
 ) -> Symmetries:
-    """Place the axes by the surface, and complete their rotations to a group."""
+    """Place the axes by the surface, and complete their rotations to a group.
+
+    Args:
+        terms: of the symmetry in words.
+        surface: of the model.
+        model: the object.
+
+    Raises:
+        InputError: the rotations make more copies than a symmetry has.
+    """
     axes = [
-        Axis(direction=term.direction, point_m=_point_on_axis(term, surface, model))
+        Axis(direction=term.direction, point_m=_find_point_on_axis(term, surface, model))
         for term in terms
     ]
     pairs = list(zip(terms, axes, strict=True))
@@ -220,7 +238,7 @@ _FOLLOW_STEPS = 20  # by which an axis is placed
 _NEAREST = 0.9  # share of the points that place an axis: a keyway, without a counterpart, does not
 
 
-def _point_on_axis(
+def _find_point_on_axis(
     term: DeclaredTurns, surface: SurfaceDeviation, model: ObjectModel
 ) -> Float64[Tensor, "3"]:
     """Find a point on an axis of given direction, such that the surface rotated about it fits best.
@@ -229,6 +247,7 @@ def _point_on_axis(
     is rotated by about a half turn, and the axis moves to where the rotated points would lie on
     the surface.
     """
+    # The rotation that is tried, and where the axis may be to begin with.
     axis = term.direction
     across = torch.linalg.svd(axis[None]).Vh[1:]  # two axes across it
     half = (term.turns or 2) // 2
@@ -238,6 +257,7 @@ def _point_on_axis(
     origin = -surface.centre_m / model.diameter_m
     candidates: list[tuple[float, Tensor]] = []
     for start in (torch.zeros(3).double(), (low + high) / 2, origin):
+        # Moved until the rotated surface lies on itself.
         point = start
         for _ in range(_FOLLOW_STEPS):
             turn = turn_about(axis, point, angle_rad)
@@ -248,16 +268,22 @@ def _point_on_axis(
             # Moving the axis by p shifts the rotated points by (1 - R) p, solved across the axis.
             lever = across @ (torch.eye(3).double() - turn.R) @ across.T
             point = point + across.T @ torch.linalg.solve(lever, across @ gap)
+
+        # How well that fits, by some of the rotations.
         turns = turn_about(axis, point, term.angles_rad[:: max(1, len(term.angles_rad) // 6)])
         candidates.append((float(surface.deviation(turns.R, turns.t_m).max()), point))
     _, best = min(candidates, key=lambda pair: pair[0])
     return best * model.diameter_m + surface.centre_m
 
 
-def _deviation(declared: Symmetries, surface: SurfaceDeviation, model: ObjectModel) -> float:
+def _measure_deviation(
+    declared: Symmetries, surface: SurfaceDeviation, model: ObjectModel
+) -> float:
     """Measure how far the surface lies off itself after any of the rotations, in diameters."""
+    # Not all of many rotations are measured.
     turns = symmetry_transforms(declared, 2 * math.pi / _CHECKED / 2).double()[1:]
-    some = turns[:: max(1, len(turns.R) // (2 * _CHECKED))]
+    turns = turns[:: max(1, len(turns.R) // (2 * _CHECKED))]
+
     # From the model's frame and metres to the surface's centre and unit.
-    moved_m = some.R @ surface.centre_m + some.t_m - surface.centre_m
-    return float(surface.deviation(some.R, moved_m / model.diameter_m).max())
+    moved_m = turns.R @ surface.centre_m + turns.t_m - surface.centre_m
+    return float(surface.deviation(turns.R, moved_m / model.diameter_m).max())

@@ -22,7 +22,7 @@ from depthpose.core.files import CLOUD_READERS, AnyPath, read_bytes, read_cloud
 from depthpose.core.files.disk import refused_as, refused_suffix
 from depthpose.core.files.points import Ragged, read_ply_elements
 from depthpose.core.units import Unit
-from depthpose.pose.mesh.bodies import faces_of_part
+from depthpose.pose.mesh.bodies import mark_part
 from depthpose.pose.mesh.shapes import shape_geometry, shape_unit
 
 _MOST_VALUES = 2 * 10**7  # that the accessors of a GLB may declare: six million points
@@ -73,6 +73,7 @@ def read_geometry(path: AnyModel) -> tuple[np.ndarray, np.ndarray]:
     Warns:
         Notice: a small body far from the rest is left out.
     """
+    # By the reader of its suffix; bare points need nothing more.
     if not isinstance(path, str | Path):
         vertices, faces = shape_geometry(path)
     else:
@@ -88,14 +89,18 @@ def read_geometry(path: AnyModel) -> tuple[np.ndarray, np.ndarray]:
             f"{path}: holds {len(vertices)} points, or one that is not finite or beyond "
             f"{_FARTHEST:g}; a model needs 4 and more. Export it again."
         )
-    triangles = _to_triangles(str(path), vertices, faces)
+
+    # Polygons become triangles, of which those of the part stay.
+    triangles = _convert_to_triangles(str(path), vertices, faces)
     if len(triangles) == 0:
         return vertices, triangles
     return _clean_surface(str(path), vertices, triangles)
 
 
-def _to_triangles(path: AnyPath, vertices: np.ndarray, faces: np.ndarray | Ragged) -> np.ndarray:
-    """Give faces as triangles (m, 3): as they are, or polygons cut."""
+def _convert_to_triangles(
+    path: AnyPath, vertices: np.ndarray, faces: np.ndarray | Ragged
+) -> np.ndarray:
+    """Convert faces to triangles (m, 3): as they are, or polygons cut."""
     if isinstance(faces, np.ndarray):
         faces = Ragged(np.full(len(faces), faces.shape[1]), faces.reshape(-1))
     sizes = faces.sizes
@@ -120,6 +125,7 @@ def _clean_surface(
     Raises:
         InputError: the faces have no area, or bodies lie far from each other.
     """
+    # Is there a surface at all?
     sides = vertices[faces[:, 1:]] - vertices[faces[:, :1]]
     area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=-1) / 2
     extent_squared = float(np.ptp(vertices, axis=0).max()) ** 2
@@ -135,9 +141,10 @@ def _clean_surface(
     _, first = np.unique(np.sort(merged, axis=-1), axis=0, return_index=True)
     is_kept = np.isin(np.arange(len(faces)), first) & (area > _NO_AREA * extent_squared)
     faces = faces[is_kept]
-    is_part = faces_of_part(path, unique_points, merged[is_kept], area[is_kept])
+    is_part = mark_part(path, unique_points, merged[is_kept], area[is_kept])
     if is_part.all():
         return vertices, faces  # vertices of no face stay, and all keep their numbers
+
     # The vertices of dropped bodies go, and with them all others of no face.
     used, faces = np.unique(faces[is_part], return_inverse=True)
     return vertices[used], faces.reshape(-1, 3)
@@ -152,20 +159,21 @@ def _read_ply(path: AnyPath) -> tuple[np.ndarray, Ragged]:
         vertices = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], -1)
 
     # The list of a face has one of several names: vertex_indices, vertex_index, ...
-    faces = [name for name in lists if name.split()[0] in ("face", "tristrips")]
-    indices = [name for name in faces if name.startswith("face ") and "ind" in name]
-    named = [name for name in indices if "vert" in name] or indices
-    values = lists[named[0]].values if len(named) == 1 else np.array([math.nan])
-    if faces and not ((np.abs(values) < _FARTHEST).all() and (values % 1 == 0).all()):
+    face_lists = [name for name in lists if name.split()[0] in ("face", "tristrips")]
+    index_lists = [name for name in face_lists if name.startswith("face ") and "ind" in name]
+    vertex_lists = [name for name in index_lists if "vert" in name] or index_lists
+    is_unique = len(vertex_lists) == 1
+    values = lists[vertex_lists[0]].values if is_unique else np.array([math.nan])
+    if face_lists and not ((np.abs(values) < _FARTHEST).all() and (values % 1 == 0).all()):
         raise InputError(
-            f"{path}: the lists of its faces are {faces}, where one 'face vertex_indices' of whole "
-            "numbers is needed. Export it again."
+            f"{path}: the lists of its faces are {face_lists}, where one 'face vertex_indices' of "
+            "whole numbers is needed. Export it again."
         )
-    return vertices, lists[named[0]] if named else _NO_FACES
+    return vertices, lists[vertex_lists[0]] if vertex_lists else _NO_FACES
 
 
-def _rows_of(path: AnyPath, data: bytes) -> Iterator[tuple[int, list[bytes]]]:
-    """Give the number and the words of each line of text, without comments.
+def _split_lines(path: AnyPath, data: bytes) -> Iterator[tuple[int, list[bytes]]]:
+    """Split text into lines; yield the number and the words of each, without comments.
 
     The first word is in lower case. A backslash at the end of a line joins it with the next.
     """
@@ -174,15 +182,15 @@ def _rows_of(path: AnyPath, data: bytes) -> Iterator[tuple[int, list[bytes]]]:
             f"{path}: {len(data)} bytes of text, more than the {_MOST_TEXT} that are read; save it "
             "as binary PLY or STL"
         )
-    before = bytearray()  # it grows in place, as bytes do not
+    joined = bytearray()  # of lines so far; it grows in place, as bytes do not
     text = data.removeprefix(BOM_UTF8).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     # An empty line is added, for a backslash may end the file.
     for number, line in enumerate(BytesIO(text + b"\n\n"), 1):
         if line.endswith(b"\\\n"):
-            before += line[:-2]
+            joined += line[:-2]
             continue
-        words = bytes(before + line).partition(b"#")[0].split()
-        before.clear()
+        words = bytes(joined + line).partition(b"#")[0].split()
+        joined.clear()
         if words:
             yield number, [words[0].lower(), *words[1:]]
 
@@ -201,6 +209,7 @@ def _read_point(path: AnyPath, line: int, words: list[bytes]) -> list[float]:
 
 def _read_stl(path: AnyPath) -> tuple[np.ndarray, Ragged]:
     """Read triangles; as text if the file says so and its length is not that of its triangles."""
+    # What the header declares, and what follows it.
     data = read_bytes(path)
     (count,) = struct.unpack("<I", data[80:84]) if len(data) >= 84 else (0,)
     records, spare_bytes = divmod(len(data) - 84, 50)
@@ -208,6 +217,7 @@ def _read_stl(path: AnyPath) -> tuple[np.ndarray, Ragged]:
     is_text = head.startswith(b"solid") and b"facet" in head and b"\0" not in head
     if is_text and (records, spare_bytes) != (count, 0):
         return _read_stl_text(path, data)
+
     # Writers that stream leave the count at 0; a byte or two after the last record do no harm.
     if records < 1 or (records != count and (count or spare_bytes)):
         raise InputError(
@@ -224,7 +234,7 @@ def _read_stl_text(path: AnyPath, data: bytes) -> tuple[np.ndarray, Ragged]:
     points = array("d")
     ends = array("q", [0])  # of loops, in points
     keyword = b""
-    for line, words in _rows_of(path, data):
+    for line, words in _split_lines(path, data):
         keyword = words[0]
         if keyword == b"vertex":
             points.extend(_read_point(path, line, words))
@@ -246,7 +256,8 @@ def _read_obj(path: AnyPath) -> tuple[np.ndarray, Ragged]:
     has_curves = False
     highest = 0
     highest_line = 0
-    for line, words in _rows_of(path, read_bytes(path)):
+    # Points and faces, line by line.
+    for line, words in _split_lines(path, read_bytes(path)):
         if words[0] == b"v":
             points.extend(_read_point(path, line, words))
         elif words[0] in (b"f", b"fo"):  # fo of old writers is the same
@@ -259,6 +270,8 @@ def _read_obj(path: AnyPath) -> tuple[np.ndarray, Ragged]:
             # Indices begin with 1; negative ones count back from the points before the line.
             corners.extend(k - 1 if k > 0 else count + k for k in indices)
         has_curves |= words[0] in (b"surf", b"curv", b"curv2", b"l")
+
+    # Do they make a surface?
     vertices = np.array(points).reshape(-1, 3)
     if has_curves and not sizes:
         raise InputError(
@@ -313,13 +326,17 @@ def _refuse_scene(path: AnyPath, data: bytes) -> None:
         (size,) = struct.unpack("<I", data[12:16])
         if size > _MOST_SCENE_BYTES:
             raise InputError(f"{path}: {size} bytes of JSON in a GLB; export the part alone")
+
+        # What the scene declares.
         scene: Any = json.loads(data[20 : 20 + size])
         nodes = scene.get("nodes", [])
         values = _count_values(scene)
         work = _refuse_nodes(path, nodes)
-        unread = _unread_features(scene)
+        unread = _list_unread_features(scene)
         links = [str(buffer.get("uri") or "data:") for buffer in scene.get("buffers", [])]
         outside = [link for link in links if not link.startswith("data:")]
+
+    # Is it all read, and in seconds?
     if outside:
         raise InputError(
             f"{path}: its numbers are in another file, {outside[0][:60]!r}, and a GLB is read "
@@ -344,6 +361,7 @@ def _refuse_scene(path: AnyPath, data: bytes) -> None:
 
 def _count_values(scene: Any) -> int:  # noqa: ANN401  JSON
     """Count the numbers of a glTF scene: of its accessors, or of the points that nodes place."""
+    # The numbers of each accessor, and those of the points of every node.
     accessors = scene.get("accessors", [])
     values = [abs(int(entry["count"])) * _WIDTHS[entry["type"]] for entry in accessors]
     placed = 0
@@ -356,8 +374,9 @@ def _count_values(scene: Any) -> int:  # noqa: ANN401  JSON
     return max(sum(values), placed)
 
 
-def _unread_features(scene: Any) -> list[str]:  # noqa: ANN401  JSON
+def _list_unread_features(scene: Any) -> list[str]:  # noqa: ANN401  JSON
     """Name the features of a glTF scene that change its surface, and are not read."""
+    # Extensions and ways to make triangles.
     unread = [n for n in scene.get("extensionsRequired", []) if not n.startswith(_KNOWN)]
     accessors = scene.get("accessors", [])
     meshes = scene.get("meshes", [])
@@ -370,6 +389,7 @@ def _unread_features(scene: Any) -> list[str]:  # noqa: ANN401  JSON
     unread += ["normalized positions" for k in positions if accessors[k].get("normalized")]
     unread += ["sparse accessors" for k in (*positions, *indices) if accessors[k].get("sparse")]
 
+    # What moves the points of a mesh.
     mesh_nodes = [node for node in scene.get("nodes", []) if "mesh" in node]
     unread += ["a skin" for node in mesh_nodes if "skin" in node]
     unread += ["morph targets" for entry in (*meshes, *mesh_nodes) if any(entry.get("weights", []))]
@@ -382,6 +402,7 @@ def _refuse_nodes(path: AnyPath, nodes: list[dict[str, Any]]) -> float:
     Readers place such nodes differently, or lose their meshes. The cost is that of trimesh's
     products of matrices: the sum of the cubes of the nodes' depths.
     """
+    # One parent at most, and numbers that a sensor's world has.
     parents: dict[int, int] = {}
     for number, node in enumerate(nodes):
         for child in node.get("children", []):
@@ -449,19 +470,21 @@ def cut_polygons(
     Raises:
         InputError: an index is out of range, a polygon has too many corners or crosses itself.
     """
+    # Do all corners exist, and has each polygon a number of them that can be cut?
     starts = np.cumsum(sizes) - sizes
-    wrong = (corners < 0) | (corners >= len(vertices))
-    if wrong.any():
-        at = int(wrong.argmax())
-        face = int(np.searchsorted(starts, at, "right")) - 1
+    is_wrong = (corners < 0) | (corners >= len(vertices))
+    if is_wrong.any():
+        first = int(is_wrong.argmax())
+        face = int(np.searchsorted(starts, first, "right")) - 1
         raise InputError(
-            f"{path}: face {face} names point {corners[at]}, but the {len(vertices)} points are "
+            f"{path}: face {face} names point {corners[first]}, but the {len(vertices)} points are "
             f"numbered 0 .. {len(vertices) - 1}; the file is damaged. Export it again."
         )
-    wrong = ((sizes > 0) & (sizes < 3)) | (sizes > _MOST_CORNERS)
-    if wrong.any():
+    is_wrong = ((sizes > 0) & (sizes < 3)) | (sizes > _MOST_CORNERS)
+    if is_wrong.any():
+        face = int(is_wrong.argmax())
         raise InputError(
-            f"{path}: face {wrong.argmax()} has {sizes[wrong.argmax()]} corners, and 3 to "
+            f"{path}: face {face} has {sizes[face]} corners, and 3 to "
             f"{_MOST_CORNERS} are read; the file is truncated, or export it as triangles"
         )
 
@@ -471,7 +494,7 @@ def cut_polygons(
     overlap = np.zeros(len(sizes))  # area of each polygon that its triangles cover twice
     area = 0.0
     steps = 0.0
-    for group in _groups_by_size(sizes):
+    for group in _group_by_size(sizes):
         size = int(sizes[group[0]])
         polygons = corners[starts[group, None] + np.arange(size)]
         normals, is_reflex = _find_reflex(vertices[polygons])
@@ -482,19 +505,16 @@ def cut_polygons(
                 f"{path}: its polygons that are not convex have too many corners to be cut in some "
                 f"seconds (one of {size} among them); export it as triangles"
             )
-        local = _cut(vertices[polygons], normals, is_reflex)
+
+        # Cut, as indices of the polygon's corners, then of the points.
+        local = _cut_equal_polygons(vertices[polygons], normals, is_reflex)
         triangles = np.take_along_axis(polygons[:, None], local, 2)
         pieces.append(triangles.reshape(-1, 3))
         owners.append(group.repeat(size - 2))
         if size > 3:
-            sides = vertices[triangles[..., 1:]] - vertices[triangles[..., :1]]
-            doubled = np.cross(sides[..., 0, :], sides[..., 1, :])
-            length = np.linalg.norm(normals, axis=-1)
-            along = np.abs(np.einsum("mtc,mc->mt", doubled, normals)).sum(-1)
-            each = np.linalg.norm(doubled, axis=-1).sum(-1)
-            projected = np.divide(along, length, where=length > _FLAT * each, out=each.copy())
-            overlap[group] = projected - length
-            area += float(each.sum())
+            areas, covered_twice = _measure_overlap(vertices[triangles], normals)
+            overlap[group] = covered_twice
+            area += float(areas.sum())
     if overlap.sum() > _OVERLAP * area:
         raise InputError(
             f"{path}: face {overlap.argmax()} crosses itself (its corners are not in the order of "
@@ -503,8 +523,27 @@ def cut_polygons(
     return np.concatenate(pieces)[np.argsort(np.concatenate(owners), kind="stable")]
 
 
-def _groups_by_size(sizes: np.ndarray) -> Iterator[np.ndarray]:
-    """Give the indices of polygons of equally many corners, in groups that fit in memory."""
+def _measure_overlap(corners: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Measure the area of polygons' triangles, and how much of it covers their polygon twice.
+
+    Both are doubled, as the length of a normal is the doubled area of its polygon. A polygon
+    without area, whose normal is 0, counts whole.
+
+    Args:
+        corners: of the triangles of each polygon (m, t, 3, 3).
+        normals: of the polygons (m, 3).
+    """
+    sides = corners[..., 1:, :] - corners[..., :1, :]
+    doubled = np.cross(sides[..., 0, :], sides[..., 1, :])
+    length = np.linalg.norm(normals, axis=-1)
+    along = np.abs(np.einsum("mtc,mc->mt", doubled, normals)).sum(-1)
+    area = np.linalg.norm(doubled, axis=-1).sum(-1)
+    projected = np.divide(along, length, where=length > _FLAT * area, out=area.copy())
+    return area, projected - length
+
+
+def _group_by_size(sizes: np.ndarray) -> Iterator[np.ndarray]:
+    """Group polygons of equally many corners, as their indices; no group exceeds the memory."""
     order = np.argsort(sizes, kind="stable")
     for same_size in np.split(order, np.flatnonzero(np.diff(sizes[order])) + 1):
         size = int(sizes[same_size[0]]) if len(same_size) else 0
@@ -516,7 +555,7 @@ def _groups_by_size(sizes: np.ndarray) -> Iterator[np.ndarray]:
 
 
 def _find_reflex(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Give the normals (m, 3) of polygons (m, n, 3), and which corners are reflex (m, n)."""
+    """Find the normals (m, 3) of polygons (m, n, 3), and which corners are reflex (m, n)."""
     points = points - points[:, :1]
     after = np.roll(points, -1, 1)
     before = np.roll(points, 1, 1)
@@ -525,16 +564,21 @@ def _find_reflex(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return normals, turns < -_FLAT * (normals**2).sum(-1, keepdims=True)
 
 
-def _cut(points: np.ndarray, normals: np.ndarray, is_reflex: np.ndarray) -> np.ndarray:
+def _cut_equal_polygons(
+    points: np.ndarray, normals: np.ndarray, is_reflex: np.ndarray
+) -> np.ndarray:
     """Cut polygons (m, n, 3) into triangles; give the corners of each, as indices (m, n - 2, 3).
 
     Convex polygons are cut as fans, others by ear clipping.
     """
+    # As fans.
     count = points.shape[1]
     points = points - points[:, :1]
     steps = np.arange(count - 2)
     fan = np.stack([0 * steps, steps + 1, steps + 2], -1)
     local = np.repeat(fan[None], len(points), 0)
+
+    # By ears, where a corner is reflex.
     for k in np.flatnonzero(is_reflex.any(1)):
         # Projected along its normal, which then points at the viewer.
         across = np.cross(normals[k], np.eye(3)[np.abs(normals[k]).argmin()])
@@ -545,7 +589,7 @@ def _cut(points: np.ndarray, normals: np.ndarray, is_reflex: np.ndarray) -> np.n
 
 
 def _clip_ears(points: np.ndarray, is_reflex: np.ndarray) -> list[list[int]]:
-    """Cut off ears, corners whose triangles hold no other corner; points (n, 2), in order.
+    """Cut off ears: corners whose triangles hold no other corner.
 
     A triangle that holds any corner holds a reflex one, so that only these are tested. A cut
     changes its two neighbours alone, which are then examined again.
@@ -557,17 +601,17 @@ def _clip_ears(points: np.ndarray, is_reflex: np.ndarray) -> list[list[int]]:
     Returns:
         Corners of the triangles, as indices.
     """
+    # The corners beside each one that are left, and the corners that are to be examined.
     count = len(points)
-    ears = list[list[int]]()
-    rounds = 0
-    before = [*range(-1, count - 1)]
+    ears: list[list[int]] = []
+    before = [count - 1, *range(count - 1)]
     after = [*range(1, count), 0]
-    before[0] = count - 1
     least = _FLAT * float(np.ptp(points, axis=0).max()) ** 2
     is_left = [True] * count
     is_waiting = [True] * count
     waiting = deque([*range(1, count), 0])
-    is_cut = False
+    rounds = 0
+    is_cut = False  # whether an ear was cut in this round
     must_cut = False
     while len(ears) < count - 3:
         if not waiting:
@@ -579,6 +623,8 @@ def _clip_ears(points: np.ndarray, is_reflex: np.ndarray) -> list[list[int]]:
             must_cut = not is_cut
             is_cut = False
             rounds = rounds + 1
+
+        # Is the next one an ear?
         k = waiting.popleft()
         is_waiting[k] = False
         if not is_left[k]:
@@ -586,12 +632,15 @@ def _clip_ears(points: np.ndarray, is_reflex: np.ndarray) -> list[list[int]]:
         ear = [before[k], k, after[k]]
         if not (must_cut or rounds > _MOST_ROUNDS or _is_ear(points, ear, is_reflex, least)):
             continue
+
+        # Then it is cut off, and its neighbours become those of each other.
         ears.append(ear)
         is_left[k] = False
         is_reflex[k] = False
         is_cut = True
         must_cut = False
-        after[ear[0]], before[ear[2]] = ear[2], ear[0]
+        after[ear[0]] = ear[2]
+        before[ear[2]] = ear[0]
         # The corner before comes later: a fan of needles is cut where it can be avoided.
         for beside in (ear[2], ear[0]):
             if not is_waiting[beside]:
@@ -605,14 +654,15 @@ def _is_ear(points: np.ndarray, corners: list[int], is_reflex: np.ndarray, least
 
     ``least`` is twice the area below which the middle corner is straight, and an ear.
     """
+    # A straight corner is cut off with no area; a reflex one is no ear.
     ear = points[corners]
     sides = np.roll(ear, -1, 0) - ear
     turn = sides[0, 0] * sides[1, 1] - sides[0, 1] * sides[1, 0]
-    is_flat = abs(turn) <= least
-    if is_flat:  # a straight corner is cut off with no area
+    if abs(turn) <= least:
         return True
     if turn < 0:
         return False
+
     # Another corner lies within if it is on the inner side of all three sides.
     offsets = points[is_reflex] - ear[:, None]  # from each corner of the ear to each other corner
     is_within = (sides[:, :1] * offsets[..., 1] >= sides[:, 1:] * offsets[..., 0]).all(0)

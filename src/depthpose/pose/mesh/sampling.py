@@ -15,10 +15,13 @@ def surface_places(
     Points are at equal steps of the cumulated area, and placed in their triangle by a sequence of
     low discrepancy (Roberts 2018), which is more even than random numbers.
     """
+    # The triangle of each point, by equal steps of the area.
     doubled = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     bounds = doubled.norm(dim=-1).cumsum(0)
     steps = (torch.arange(count, dtype=torch.float64) + 0.5) / count * bounds[-1]
     face = torch.searchsorted(bounds, steps).clamp(max=len(bounds) - 1)
+
+    # Its place there: two numbers of the sequence, spread evenly by the root of the first.
     order = torch.arange(1, count + 1, dtype=torch.float64)
     u = (order / _PLASTIC) % 1
     v = (order / _PLASTIC**2) % 1

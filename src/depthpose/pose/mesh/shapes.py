@@ -22,7 +22,7 @@ def is_shape(value: object) -> bool:
 
 
 def shape_geometry(shape: Any) -> tuple[np.ndarray, np.ndarray]:  # noqa: ANN401  no types of theirs
-    """Give points (n, 3) and triangles (m, 3); a cloud has no triangles.
+    """Take points (n, 3) and triangles (m, 3) of a shape; a cloud has no triangles.
 
     Takes ``trimesh.Trimesh``, ``Scene`` and ``PointCloud``, and Open3D's ``TriangleMesh`` and
     ``PointCloud``, of its tensors too.

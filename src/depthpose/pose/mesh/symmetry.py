@@ -30,23 +30,31 @@ from depthpose.pose.types import Axis, ObjectModel, Symmetries
 
 @lru_cache(maxsize=64)
 def cached(model: ObjectModel, compute: Callable[..., Any], name: str, *settings: float) -> Any:  # noqa: ANN401
-    """Give ``compute(model, *settings)``, JSON values that take long, from the cache if possible.
+    """Compute ``compute(model, *settings)``, JSON values that take long, or read them from a cache.
 
     The cache is ``$DEPTHPOSE_CACHE``, where that can be written to. Its key is made of the bytes of
     the shape and its symmetries, and of the code that computes.
+
+    Args:
+        model: the object.
+        compute: the function.
+        name: of the folder of its values in the cache.
+        settings: further arguments.
     """
+    # What the values depend on.
     symmetries = model.symmetries
     tensors = [model.vertices_m, model.faces]
     if symmetries.discrete is not None:
         tensors.append(symmetries.discrete.R)
     tensors += [axis.direction for axis in symmetries.continuous]
-
     digest = sha256(f"{symmetries.is_found}".encode())
     code = {*Path(__file__).parent.glob("*.py"), Path(compute.__code__.co_filename)}
     for path in sorted(code):
         digest.update(path.read_bytes())
     for tensor in tensors:
         digest.update(tensor.contiguous().numpy().tobytes())
+
+    # Read, or computed and written.
     folder = "_".join(map(str, (name, *settings)))
     path = cache_folder() / folder / f"{digest.hexdigest()}.json"
     try:
@@ -90,31 +98,25 @@ class SymmetryProposal(NamedTuple):
 
 
 class SurfaceDeviation:
-    """Measures how far a moved surface lies from itself, in diameters.
-
-    Attributes:
-        centre_m: of the surface, about which it is rotated.
-        points: samples of the surface about the centre, in diameters.
-        few: a hundred of them, for a rough measure of thousands of rotations.
-        many: a thousand of them.
-        dense: five thousand of them.
-        axes: principal axes, one a row.
-    """
+    """Measures how far a moved surface lies from itself, in diameters."""
 
     def __init__(self, model: ObjectModel) -> None:
         samples_m, normals = sample_surface(model, 20000)
-        self.centre_m = samples_m.double().mean(0)
+        self.centre_m = samples_m.double().mean(0)  #: of the surface, about which it is rotated
+        #: samples of the surface about the centre, in diameters.
         self.points = (samples_m.double() - self.centre_m) / model.diameter_m
+        self.few = take_evenly(self.points, 100)  #: of them, to measure thousands of rotations
+        self.many = take_evenly(self.points, 1000)  #: of them, for usual measures
+        self.dense = take_evenly(self.points, 5000)  #: of them, for exact measures
+        self.axes = torch.linalg.eigh(
+            self.points.T @ self.points
+        ).eigenvectors.T  #: principal, rows
         self._normals = normals.double().numpy()
         self._tree = KDTree(self.points.numpy())
-        self.few = take_evenly(self.points, 100)
-        self.many = take_evenly(self.points, 1000)
-        self.dense = take_evenly(self.points, 5000)
         self._rough_tree = KDTree(take_evenly(self.points, 2500).numpy())
-        self.axes = torch.linalg.eigh(self.points.T @ self.points).eigenvectors.T
 
     def nearest(self, moved: Float[Tensor, "*batch m 3"]) -> tuple[np.ndarray, np.ndarray]:
-        """Give the distance [diameters] and index of the sample nearest to each point."""
+        """Find the sample nearest to each point: its distance [diameters] and index."""
         distance, index = self._tree.query(moved.numpy(), workers=torch.get_num_threads())
         return np.asarray(distance), np.asarray(index)
 
@@ -141,14 +143,16 @@ class SurfaceDeviation:
             share: of the points; from ``ALMOST_ALL`` on more points and samples are compared.
         """
         forward = Rigid(R, torch.zeros_like(R[..., 0]) if shift is None else shift)
-        there = self.deviation_one_way(forward, share)
-        return torch.maximum(there, self.deviation_one_way(forward.inverse(), share))
+        forward_deviation = self.deviation_one_way(forward, share)
+        backward_deviation = self.deviation_one_way(forward.inverse(), share)
+        return torch.maximum(forward_deviation, backward_deviation)
 
     def deviation_one_way(self, motion: Rigid, share: float = 0.98) -> Float[Tensor, "*batch"]:
         """Measure how far the moved surface lies off the surface, as :meth:`deviation` does.
 
         It is a lower bound of that, in half of the time.
         """
+        # The nearest samples of each moved point; in an exact measure several.
         is_exact = share >= ALMOST_ALL
         points = self.dense if is_exact else self.many
         count = _NEAREST_SAMPLES if is_exact else 1
@@ -168,13 +172,13 @@ class SurfaceDeviation:
 
 
 @lru_cache(maxsize=4)
-def _surface_of(model: ObjectModel) -> SurfaceDeviation:
-    """Give the surface of a model, made once for its several searches."""
+def _prepare_surface(model: ObjectModel) -> SurfaceDeviation:
+    """Prepare the surface of a model, once for its several searches."""
     return SurfaceDeviation(model)
 
 
 def propose_symmetries(model: ObjectModel, tolerance: float = 0.02) -> list[SymmetryProposal]:
-    """Search for rotations that leave the shape as it is, and say how certain each is.
+    """Search for rotations that leave the shape as it is, each with a certainty.
 
     Every symmetry leaves the centre of the surface where it is. Rotations by 1/2 to 1/6 of the
     circle about the principal axes and about 400 directions are measured coarsely; the promising
@@ -190,17 +194,19 @@ def propose_symmetries(model: ObjectModel, tolerance: float = 0.02) -> list[Symm
     Returns:
         Proposals of a certainty of 1/5 and more, continuous first, then the surest.
     """
-    surface = _surface_of(model)
+    surface = _prepare_surface(model)
     limit = 2 * tolerance
     proposals: list[SymmetryProposal] = []
     tried_axes: list[Tensor] = []
     revolution_axes: list[Tensor] = []
-    for coarse in promising_turns(surface):
+    for coarse in _find_promising_turns(surface):
         if len(revolution_axes) >= 2 or len(tried_axes) >= _MOST_AXES:
             break
-        if _is_covered(_axis_of(coarse), tried_axes, revolution_axes):
+        if _is_covered(_find_axis(coarse), tried_axes, revolution_axes):
             continue
-        axis = _axis_of(_follow_surface(surface, coarse))
+
+        # Refined to an exact axis, about which all rotations are measured.
+        axis = _find_axis(_follow_surface(surface, coarse))
         if not _is_covered(axis, tried_axes, revolution_axes):
             tried_axes.append(axis)
             measured = _measure_axis(surface, axis, limit, tolerance)
@@ -209,8 +215,8 @@ def propose_symmetries(model: ObjectModel, tolerance: float = 0.02) -> list[Symm
     return sorted(proposals, key=lambda p: (p.kind != "continuous", -p.certainty))
 
 
-def _axis_of(R: Tensor) -> Tensor:
-    """Give the direction that a rotation leaves alone; well defined for half turns too."""
+def _find_axis(R: Tensor) -> Tensor:
+    """Find the direction that a rotation leaves alone; well defined for half turns too."""
     return torch.linalg.svd(R - _EYE).Vh[-1]
 
 
@@ -237,6 +243,7 @@ def symmetries_from_proposals(proposals: list[SymmetryProposal]) -> Symmetries:
     They are axes of revolution, and rotations that do not follow from an axis. Without an axis the
     rotations are completed to a group, for the product of two symmetries is one.
     """
+    # The axes of the certain ones.
     sure = [p for p in proposals if p.certainty >= SURE]
     lines = [
         Axis(
@@ -246,28 +253,30 @@ def symmetries_from_proposals(proposals: list[SymmetryProposal]) -> Symmetries:
         for p in sure
     ]
     axes = tuple(line for line, p in zip(lines, sure, strict=True) if p.kind == "continuous")
+
+    # Rotations that follow neither from an axis nor from an earlier rotation.
     turns: list[Rigid] = []
     for line, proposal in zip(lines, sure, strict=True):
         if proposal.angle_rad is None:
             continue
         angle_rad = torch.tensor(proposal.angle_rad, dtype=torch.float64)
         turn = turn_about(line.direction, line.point_m, angle_rad)
-        # Two that move an axis of revolution alike differ by a rotation about that axis.
-        is_same = any(
-            float(geodesic_rad(turn.R, earlier.R)) < _SAME_RAD
-            or any(
-                float((turn.R @ axis.direction - earlier.R @ axis.direction).norm()) < _SAME_RAD
-                for axis in axes
-            )
-            for earlier in turns
-        )
-        if not is_same:
+        if not any(_are_equivalent(turn, earlier, axes) for earlier in turns):
             turns.append(turn)
     if not turns:
         return Symmetries(continuous=axes)
 
     group = turns if axes else _complete_group(turns)
     return Symmetries(discrete=Rigid.stack(group), continuous=axes)
+
+
+def _are_equivalent(turn: Rigid, other: Rigid, axes: Sequence[Axis]) -> bool:
+    """Whether two rotations are the same, or differ by a rotation about an axis of revolution."""
+    if float(geodesic_rad(turn.R, other.R)) < _SAME_RAD:
+        return True
+    # Two that move an axis alike differ by a rotation about it.
+    apart = [float((turn.R @ a.direction - other.R @ a.direction).norm()) for a in axes]
+    return any(distance < _SAME_RAD for distance in apart)
 
 
 def _complete_group(turns: list[Rigid]) -> list[Rigid]:
@@ -305,11 +314,15 @@ def with_found_symmetries(
     declared = model.symmetries
     if not (is_taken or on_message) or declared.discrete is not None or declared.continuous:
         return model
+
+    # What the shape has.
     rows = cached(model, propose_symmetries, "symmetries", tolerance)
     proposals = [SymmetryProposal(*row) for row in rows]
     symmetries = replace(symmetries_from_proposals(proposals), is_found=True)
     if symmetries.discrete is None and not symmetries.continuous:
         return model
+
+    # Said, and taken if wanted.
     turns = 0 if symmetries.discrete is None else len(symmetries.discrete.R)
     certainty = min(p.certainty for p in proposals if p.certainty >= SURE)
     if on_message is not None:
@@ -325,19 +338,19 @@ def with_found_symmetries(
     return replace(model, symmetries=symmetries) if is_taken else model
 
 
-def _rotations(
+def _rotate_about(
     direction: Float[Tensor, "3"], angles: Float[Tensor, " a"]
 ) -> Float[Tensor, "a 3 3"]:
-    """Give the rotation matrices about a direction by each angle."""
+    """Make the rotation matrices about a direction by each angle."""
     return turn_about(direction, torch.zeros_like(direction), angles).R
 
 
 @lru_cache(maxsize=4)
-def promising_turns(surface: SurfaceDeviation) -> tuple[Float[Tensor, "3 3"], ...]:
-    """Give the rotations about principal axes and many directions that fit roughly, best first."""
+def _find_promising_turns(surface: SurfaceDeviation) -> tuple[Float[Tensor, "3 3"], ...]:
+    """Find the rotations about principal axes and many directions that fit roughly, best first."""
     directions = torch.cat([surface.axes, fibonacci_directions(_DIRECTIONS)])
     angles = torch.tensor([2 * math.pi / order for order in _COARSE_ORDERS], dtype=torch.float64)
-    rotations = torch.stack([_rotations(direction, angles) for direction in directions])
+    rotations = torch.stack([_rotate_about(direction, angles) for direction in directions])
     rotations = rotations.flatten(0, 1)
     distance = surface.rough_distance(rotations)
     order = distance.argsort().tolist()
@@ -350,15 +363,14 @@ def _is_covered(direction: Tensor, tried_axes: list[Tensor], revolution_axes: li
     All lines at right angles to an axis of revolution are equivalent.
     """
     is_tried = any(abs(float(direction @ tried)) > math.cos(_SAME_RAD) for tried in tried_axes)
-    right_angle_cosine = math.sin(_SAME_RAD)  # up to which two lines are at right angles
-    perpendicular = [
-        axis for axis in revolution_axes if abs(float(axis @ direction)) < right_angle_cosine
-    ]
-    is_equivalent = any(
-        abs(float(axis @ tried)) < right_angle_cosine
-        for axis in perpendicular
-        for tried in tried_axes
-    )
+
+    def are_perpendicular(first: Tensor, second: Tensor) -> bool:
+        """Whether two lines are at right angles."""
+        return abs(float(first @ second)) < math.sin(_SAME_RAD)
+
+    # Is there an axis of revolution across both this line and one that was tried?
+    across = [axis for axis in revolution_axes if are_perpendicular(axis, direction)]
+    is_equivalent = any(are_perpendicular(axis, tried) for axis in across for tried in tried_axes)
     return is_tried or is_equivalent
 
 
@@ -370,14 +382,16 @@ def _measure_axis(
     They are the full circle and, unless that is within the tolerance, rotations of order 2 to 12;
     and a rotation by one of many teeth.
     """
-    # Angle and deviation of each symmetry; an angle of None is that of the full circle.
+    # The full circle, as an angle of None with its deviation.
     step = 2 * math.pi / _CIRCLE_TURNS
-    circle = _rotations(direction, torch.arange(1, _CIRCLE_TURNS) * step)
+    circle = _rotate_about(direction, torch.arange(1, _CIRCLE_TURNS) * step)
     full: list[tuple[None, float]] = []
     worst = math.inf
     if bool((surface.rough_distance(circle) <= _MAX_ROUGH_DEVIATION).all()):
         worst = float(surface.deviation(circle).max())
         full = [(None, worst)] if worst <= limit else []
+
+    # Else single rotations, as angles with their deviations.
     turns = _measure_orders(surface, direction, limit) if worst > tolerance else []
     teeth = [] if full else _measure_teeth(surface, direction, tolerance)
     return [
@@ -397,13 +411,16 @@ def _measure_orders(
     surface: SurfaceDeviation, direction: Tensor, limit: float
 ) -> list[tuple[float, float]]:
     """Measure rotations of order 2 to 12; give angle and deviation of the best within ``limit``."""
+    # Those that fit roughly.
     shares = sorted({k / order for order in _ORDERS for k in range(1, order)})
     angles = torch.tensor(shares, dtype=torch.float64) * (2 * math.pi)
-    rough = surface.rough_distance(_rotations(direction, angles))
+    rough = surface.rough_distance(_rotate_about(direction, angles))
     angles = angles[rough <= _MAX_ROUGH_DEVIATION]
     if len(angles) == 0:
         return []
-    deviation = surface.deviation(_rotations(direction, angles))
+
+    # The best of each symmetry.
+    deviation = surface.deviation(_rotate_about(direction, angles))
     chosen: list[tuple[float, float]] = []
     for i in deviation.argsort().tolist():
         angle = float(angles[i])
@@ -425,18 +442,19 @@ def _measure_teeth(
     for order in _TEETH:
         step = 2 * math.pi / order
         angles = torch.tensor([step, 0.5 * step, 1.5 * step], dtype=torch.float64)
-        tooth_R, *between_R = _rotations(direction, angles)
+        tooth_R, *between_R = _rotate_about(direction, angles)
         if float(surface.rough_distance(tooth_R)) > _MAX_ROUGH_DEVIATION:
             continue
+        # The fast lower bound first.
         turn = Rigid(tooth_R, torch.zeros(3, dtype=torch.float64))
         if float(surface.deviation_one_way(turn)) > tolerance:
             continue
-        tooth = float(surface.deviation(tooth_R))
-        if tooth > tolerance:
+        tooth_deviation = float(surface.deviation(tooth_R))
+        if tooth_deviation > tolerance:
             continue
-        between = float(surface.deviation(torch.stack(between_R)).min())
-        if between > 2 * tooth + ALIKE:
-            measured.append((step, tooth))
+        between_deviation = float(surface.deviation(torch.stack(between_R)).min())
+        if between_deviation > 2 * tooth_deviation + ALIKE:
+            measured.append((step, tooth_deviation))
     return sorted(measured, key=lambda pair: pair[1])[:1]
 
 
@@ -465,8 +483,8 @@ def mirror_deviation(model: ObjectModel) -> float:
 
 
 def _search_mirror(model: ObjectModel) -> float:
-    """Give the least deviation of a surface from its mirror images, in diameters."""
-    surface = _surface_of(model)
+    """Search the least deviation of a surface from its mirror images, in diameters."""
+    surface = _prepare_surface(model)
     # Reflections across planes with normal n, followed by rotations about n by 0, 90, 180 and 270
     # degrees: cos (1 - nn') + sin [n] - nn'. The best that are distinct are the starts.
     normals = torch.cat([surface.axes, fibonacci_directions(_MIRROR_PLANES)])
@@ -479,11 +497,11 @@ def _search_mirror(model: ObjectModel) -> float:
     for k in surface.rough_distance(reflections).argsort().tolist():
         if len(starts) == _MIRROR_STARTS:
             break
-        if all(
-            float(geodesic_rad(reflections[k], start)) > _MIN_START_DISTANCE_RAD for start in starts
-        ):
+        apart_rad = [float(geodesic_rad(reflections[k], start)) for start in starts]
+        if all(angle_rad > _MIN_START_DISTANCE_RAD for angle_rad in apart_rad):
             starts.append(reflections[k])
 
+    # Each is refined.
     refined = [refine_turn(surface, R @ _FLIP, _FLIP) for R in starts]
     R = torch.stack([motion.R for motion in refined]) @ _FLIP
     shift = torch.stack([motion.t_m for motion in refined])
@@ -518,9 +536,8 @@ ALIKE = 0.004
 """Deviation in diameters up to which a symmetry that was found in a shape is exact: as much as a
 cylinder of 25 facets deviates. A copy that deviates by more, as a scan's dents or a keyway do, is
 another pose, though a view may not tell which."""
-ALMOST_ALL = (
-    0.998  #: share of the surface within ``ALIKE``; a key or a notch is a few percent of it
-)
+ALMOST_ALL = 0.998
+"""Share of the surface within ``ALIKE``; a key or a notch is a few percent of it."""
 _NEAR_TOLERANCE = 0.05
 """Deviation in diameters at which a sensor's noise begins to mask the difference of two poses: real
 points of LineMOD and YCB lie 1.4 to 2.6 % of the diameter off the posed surface. Twice as much is
@@ -559,12 +576,14 @@ def near_symmetries(model: ObjectModel) -> tuple[NearSymmetry, ...]:
 def true_symmetries(
     model: ObjectModel, alike: tuple[list[bool], list[bool]] | None = None
 ) -> Symmetries:
-    """Give the symmetries whose copies count as one pose.
+    """Select the symmetries whose copies count as one pose.
 
     These are all that were declared. Of those that were found in the geometry, near-symmetries,
     whose copies deviate by more than ``ALIKE``, are left out.
 
-    ``alike`` says which discrete symmetries and which axes deviate by less; None: it is searched.
+    Args:
+        model: the object.
+        alike: which discrete symmetries and which axes deviate by less; None: it is searched.
     """
     symmetries = model.symmetries
     if not symmetries.is_found:
@@ -588,15 +607,16 @@ def _search_near_symmetries(model: ObjectModel) -> dict[str, Any]:
     Gives JSON values, which are cached: ``near``, transforms with their deviations, the best first;
     and ``alike``, flags of the discrete and the continuous symmetries.
     """
-    surface = _surface_of(model)
-    alike = _which_are_alike(model.symmetries, surface)
-    measured = _deviations(_near_candidates(model.symmetries, surface), surface)
+    # Symmetries that were found, and rotations that nearly are some.
+    surface = _prepare_surface(model)
+    alike = _find_alike(model.symmetries, surface)
+    measured = _measure_deviations(_propose_near_symmetries(model.symmetries, surface), surface)
 
     # Products of the best candidates are candidates too: a can upside down, then about its axis.
     by_deviation = sorted(measured, key=lambda pair: pair[0])
     good = [motion for deviation, motion in by_deviation if deviation <= _NEAR_TOLERANCE]
     products = [first @ second for first in good[:_NEAR_STARTS] for second in good[:3]]
-    measured += _deviations(products, surface)
+    measured += _measure_deviations(products, surface)
 
     # The best, each far from better ones and from all copies of these that look alike.
     same = symmetry_transforms(true_symmetries(model, alike), _FINE_AXIS_STEP_RAD).R.double()
@@ -614,28 +634,27 @@ def _search_near_symmetries(model: ObjectModel) -> dict[str, Any]:
     return {"near": rows, "alike": alike}
 
 
-def _which_are_alike(
-    symmetries: Symmetries, surface: SurfaceDeviation
-) -> tuple[list[bool], list[bool]]:
-    """Say which discrete symmetries, and which axes, have copies that lie on the surface."""
-    discrete = list[bool]()
+def _find_alike(symmetries: Symmetries, surface: SurfaceDeviation) -> tuple[list[bool], list[bool]]:
+    """Find which discrete symmetries, and which axes, have copies that lie on the surface."""
+    discrete: list[bool] = []
     if symmetries.discrete is not None:
         R = symmetries.discrete.R.double()
         discrete = (surface.deviation(R, share=ALMOST_ALL) <= ALIKE).tolist()
     circle = torch.arange(1, 8, dtype=torch.float64) * (math.pi / 4)
-    continuous = list[bool]()
+    continuous: list[bool] = []
     for axis in symmetries.continuous:
-        R = _rotations(axis.direction.double(), circle)
+        R = _rotate_about(axis.direction.double(), circle)
         continuous.append(float(surface.deviation(R, share=ALMOST_ALL).max()) <= ALIKE)
     return discrete, continuous
 
 
-def _near_candidates(symmetries: Symmetries, surface: SurfaceDeviation) -> list[Rigid]:
-    """Give motions that may be near-symmetries: symmetries that were found, and refined rotations.
+def _propose_near_symmetries(symmetries: Symmetries, surface: SurfaceDeviation) -> list[Rigid]:
+    """Propose motions as near-symmetries: symmetries that were found, and refined rotations.
 
     Refinement may shift the surface too: a scan whose points are denser on one side has its centre
     where no symmetry has it.
     """
+    # Symmetries that were found.
     candidates: list[Rigid] = []
     if symmetries.is_found:
         copies = symmetry_transforms(symmetries, _AXIS_STEP_RAD).R.double()[1:]
@@ -643,17 +662,19 @@ def _near_candidates(symmetries: Symmetries, surface: SurfaceDeviation) -> list[
 
     # Refined from quarter turns about the principal axes, and the best of many other rotations.
     quarters = torch.arange(1, 4).double() * (math.pi / 2)
-    starts = [R for axis in surface.axes for R in _rotations(axis, quarters)]
-    for R in promising_turns(surface):
+    starts = [R for axis in surface.axes for R in _rotate_about(axis, quarters)]
+    for R in _find_promising_turns(surface):
         if len(starts) >= _NEAR_STARTS:
             break
-        distances = [float(geodesic_rad(R, start)) for start in (_EYE, *starts)]
-        if min(distances) > _NEAR_SUPPRESSION_RAD:
+        apart_rad = [float(geodesic_rad(R, start)) for start in (_EYE, *starts)]
+        if min(apart_rad) > _NEAR_SUPPRESSION_RAD:
             starts.append(R)
     return candidates + [refine_turn(surface, R) for R in starts]
 
 
-def _deviations(motions: list[Rigid], surface: SurfaceDeviation) -> list[tuple[float, Rigid]]:
+def _measure_deviations(
+    motions: list[Rigid], surface: SurfaceDeviation
+) -> list[tuple[float, Rigid]]:
     """Pair each motion with how far it moves the surface off itself, in diameters."""
     if not motions:
         return []

@@ -24,9 +24,9 @@ _EIGENVALUE_ROUNDING = 1e-7
 class Lines(NamedTuple):
     """Lines through points; coordinates are about the mean of the points, and come before them."""
 
-    points: Float[Tensor, "*batch 1 3 n"]
-    directions: Float[Tensor, "*batch k 3 n"]  # unit vectors
-    weights: Float[Tensor, "*batch k n"]  # 0 leaves a line out
+    points: Float[Tensor, "*batch 1 3 n"]  #: one on each line
+    directions: Float[Tensor, "*batch k 3 n"]  #: unit vectors
+    weights: Float[Tensor, "*batch k n"]  #: 0 leaves a line out
 
 
 def meet_lines(
@@ -71,12 +71,15 @@ def _make_lines(
     Raises:
         InputError: fewer than two lines of a keypoint have weight.
     """
+    # Coordinates about the mean of the points, and unit vectors.
     centre_m = points_m.mean(-2, keepdim=True)
     local = (points_m - centre_m).mT[..., None, :, :].contiguous()
     n = directions.movedim(-3, -1).contiguous()
     lengths = n.square().sum(-2).sqrt_()
     w = (lengths > _SMALLEST).to(n)
     n = n / lengths.clamp_(min=_SMALLEST)[..., None, :]
+
+    # A direction of length 0 has no weight, as those that are left out.
     w = w if weight is None else w * weight.mT
     least = int((w > 0).sum(-1).min()) if w.numel() else 0
     if least < 2:
@@ -89,7 +92,7 @@ def _make_lines(
 
 def _meet(lines: Lines, centre_m: Float[Tensor, "*batch 1 3"], refinements: int) -> Vote:
     """Find where lines meet best, as :func:`meet_lines`; ``centre_m`` is added to the points."""
-    local, n, w = lines
+    local, n, w = lines  # points, unit directions n and weights w, as in the formulas
     eye = torch.eye(3, dtype=torch.float64, device=n.device)
 
     # The point nearest to all lines. Divided by the sum of weights, A has a trace of 2.
@@ -98,7 +101,9 @@ def _meet(lines: Lines, centre_m: Float[Tensor, "*batch 1 3"], refinements: int)
     wn = n * w[..., None, :]
     A = (total * eye - (wn @ n.mT).double()) / total
     b = (local @ w[..., None] - wn @ along.mT).double() / total
-    p = torch.linalg.solve(_damped(A), b).squeeze(-1)
+    p = torch.linalg.solve(_damp(A), b).squeeze(-1)
+
+    # How well they fix it, and the gradient of each line there.
     values = torch.linalg.eigvalsh(A)
     least = values[..., 0].clamp(min=_EIGENVALUE_ROUNDING)
     is_crossing = values[..., 0] > _EIGENVALUE_ROUNDING
@@ -121,7 +126,8 @@ def _meet(lines: Lines, centre_m: Float[Tensor, "*batch 1 3"], refinements: int)
         amount = pull / distance * cosine.clamp(min=0.5)
         outer = ((q * amount[..., None, :]) @ q.mT).double()
         A = amount.sum(-1).double()[..., None, None] * eye - outer
-        step = torch.linalg.solve(_damped(A), gradient.sum(-1).double()[..., None]).squeeze(-1)
+        step = torch.linalg.solve(_damp(A), gradient.sum(-1).double()[..., None]).squeeze(-1)
+
         # No step is longer than the root mean square distance of the keypoint to the points.
         spread = local.square().sum(-2).mean(-1).double()
         limit = (p.square().sum(-1) + spread).sqrt()
@@ -129,7 +135,7 @@ def _meet(lines: Lines, centre_m: Float[Tensor, "*batch 1 3"], refinements: int)
         p = p + step * shortening[..., None]
 
     # Each line gives 2 equations for 3 unknowns: the correction for the degrees of freedom.
-    inverse = torch.linalg.inv(_damped(A))
+    inverse = torch.linalg.inv(_damp(A))
     votes = (w > 0).sum(-1)
     correction = (2 * votes.double() / (2 * votes - 3).clamp(min=1))[..., None, None]
     covariance = correction * (inverse @ (gradient @ gradient.mT).double() @ inverse)
@@ -141,7 +147,7 @@ def _meet(lines: Lines, centre_m: Float[Tensor, "*batch 1 3"], refinements: int)
     )
 
 
-def _damped(A: Float64[Tensor, "*b k 3 3"]) -> Float64[Tensor, "*b k 3 3"]:
+def _damp(A: Float64[Tensor, "*b k 3 3"]) -> Float64[Tensor, "*b k 3 3"]:
     """Add a little to the diagonal: parallel lines then meet near the mean of the points."""
     size = A.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None].clamp(min=1e-300)
     return A + 1e-12 * size * torch.eye(3, dtype=A.dtype, device=A.device)
@@ -208,6 +214,7 @@ def _draw_pairs(
 
     Gives the indices of the first and the second vote of each hypothesis.
     """
+    # Two different numbers below the count of votes with weight.
     counts = (weights > 0).sum(-1, keepdim=True)
     generator = torch.Generator().manual_seed(config.seed)
     shape = (2, *counts.shape[:-1], config.hypotheses)
@@ -217,6 +224,8 @@ def _draw_pairs(
     second = (first + 1 + (draws[1] * (counts - 1)).long()) % counts
     if int(counts.min()) == weights.shape[-1]:
         return first, second
+
+    # To the indices of these votes.
     voters = (weights > 0).to(torch.uint8).argsort(dim=-1, descending=True, stable=True)
     return voters.gather(-1, first), voters.gather(-1, second)
 
@@ -224,13 +233,16 @@ def _draw_pairs(
 def _cross_pairs(
     lines: Lines, first: Int64[Tensor, "*batch k h"], second: Int64[Tensor, "*batch k h"]
 ) -> tuple[Float[Tensor, "*batch k h 3"], Bool[Tensor, "*batch k h"]]:
-    """Give the middle of the common perpendicular of pairs of lines, and which are not parallel."""
+    """Find the middle of the common perpendicular of pairs of lines, and which are not parallel."""
+    # A point and a direction of each line.
     wide = (*first.shape[:-1], 3, first.shape[-1])
     x1, x2, n1, n2 = (
         values.expand_as(lines.directions).gather(-1, index[..., None, :].expand(wide))
         for values in (lines.points, lines.directions)
         for index in (first, second)
     )
+
+    # The points of the perpendicular on both lines.
     gap = x1 - x2
     cosine = (n1 * n2).sum(-2, keepdim=True)
     d = (n1 * gap).sum(-2, keepdim=True)
@@ -253,6 +265,7 @@ class InlierTest:
     """
 
     def __init__(self, lines: Lines, config: VotingConfig) -> None:
+        # The polynomials' coefficients of each line.
         local, n, w = lines
         self._limit = config.max_distance_m**2 if config.inlier_test == "distance" else None
         along = torch.cat([n, -(n * local).sum(-2, keepdim=True)], -2)
@@ -269,6 +282,7 @@ class InlierTest:
     @torch.no_grad()
     def score(self, hypotheses: Float[Tensor, "*batch k h 3"]) -> Float[Tensor, "*batch k h"]:
         """Add up the weights of the lines that agree with each hypothesis."""
+        # As many hypotheses at a time as keep to the cache.
         flat = hypotheses.flatten(0, -3)
         votes = self._w.shape[-1]
         keypoints, rows = flat.shape[:2]
@@ -286,7 +300,14 @@ class InlierTest:
     def agree(
         self, hypotheses: Float[Tensor, "*batch k h 3"], memory: Tensor | None = None
     ) -> Float[Tensor, "*batch k h n"]:
-        """Give 1 where a line agrees with a hypothesis, else 0; a view of ``memory``, if given."""
+        """Test each line against each hypothesis: 1 where they agree, else 0.
+
+        Args:
+            hypotheses: points.
+            memory: two rows, each for as many numbers as there are answers, into one of which these
+                are written; None: it is made.
+        """
+        # Both polynomials, as products of matrices.
         flat = hypotheses.detach().flatten(0, -3)
         square = flat.square().sum(-1, keepdim=True)
         ones = torch.ones_like(flat[..., :1])
@@ -296,6 +317,8 @@ class InlierTest:
         along, far = (part[:size].view(shape) for part in memory)
         torch.bmm(torch.cat([flat, ones], -1), self._along, out=along)
         torch.bmm(torch.cat([flat, square, ones], -1), self._far, out=far)
+
+        # By distance, or by angle.
         if self._limit is not None:
             agreed = far.addcmul_(along, along, value=-1).lt_(self._limit)
         else:  # a vote that points away gets an along of 0, and does not agree
@@ -307,7 +330,7 @@ _LEAST_KEYPOINTS = 4  # that must agree: three fix a pose with nothing left to c
 _STEPS = 4  # Gauss-Newton from Kabsch: the fourth step is below float64's noise
 
 
-def fits_of(vote: Vote, model: ObjectModel, config: EstimateConfig) -> PoseFit | Refusal:
+def fit_poses(vote: Vote, model: ObjectModel, config: EstimateConfig) -> PoseFit | Refusal:
     """Fit a pose to the keypoints that are consistent; where ICP follows, also to all of them.
 
     Returns:
@@ -325,11 +348,11 @@ def fits_of(vote: Vote, model: ObjectModel, config: EstimateConfig) -> PoseFit |
         )
 
     # Of these the ones with the model's distances.
-    limit_diameters = (
-        config.rough_rigidity_diameters if config.with_icp else config.voting.rigidity_diameters
-    )
+    limit_diameters = config.voting.rigidity_diameters
+    if config.with_icp:
+        limit_diameters = config.rough_rigidity_diameters
     limit_m = model.diameter_m * limit_diameters
-    is_consistent = consistent_keypoints(vote.keypoints_m, model.keypoints_m, limit_m, is_met)
+    is_consistent = find_consistent_keypoints(vote.keypoints_m, model.keypoints_m, limit_m, is_met)
     consistent = int(is_consistent.sum())
     choices = [is_consistent] if consistent >= _LEAST_KEYPOINTS else []
     if config.with_icp and not torch.equal(is_consistent, is_met):
@@ -341,6 +364,8 @@ def fits_of(vote: Vote, model: ObjectModel, config: EstimateConfig) -> PoseFit |
             f"{limit_m:.2g} m, but {_LEAST_KEYPOINTS} are needed: another object, or too much of "
             "it occluded",
         )
+
+    # A fit to each choice.
     count = len(choices)
     return fit_pose(
         vote.keypoints_m.expand(count, -1, -1),
@@ -381,20 +406,24 @@ def fit_pose(
     floor_m2 = (1e-12 * spread_m2)[..., None, None, None] * torch.eye(3).to(model_m)
     information = torch.linalg.inv(covariance_m2.double() + floor_m2) * used[..., None, None]
 
-    # Kabsch. One keypoint that looks exact must not decide alone; a rotation takes three.
+    # Kabsch. One keypoint that looks exact must not decide alone, since a rotation takes three: no
+    # weight is above a hundred times the median of those used.
     trace = information.diagonal(dim1=-2, dim2=-1).sum(-1)
-    most = 100 * trace.median(-1, keepdim=True).values.clamp(min=1e-300)
+    usual = trace.masked_fill(~used, torch.nan).nanmedian(-1, keepdim=True).values
+    most = 100 * usual.clamp(min=1e-300)
     pose = fit_rigid(model_m, observed_m, trace.clamp(max=most))
 
-    for _ in range(_STEPS):  # of Gauss-Newton
+    # Gauss-Newton from there.
+    for _ in range(_STEPS):
         moved_m = pose.apply(model_m)
-        weighted, H = _pose_information(moved_m, information)
+        weighted, H = _weigh_motion(moved_m, information)
         gradient = (weighted @ (observed_m - moved_m)[..., None]).sum(-3).squeeze(-1)
         motion = torch.linalg.solve(H, gradient)
         pose = Rigid(rotation_by(motion[..., :3]), motion[..., 3:]) @ pose
 
+    # Covariance and residual of what it comes to.
     moved_m = pose.apply(model_m)
-    _, H = _pose_information(moved_m, information)
+    _, H = _weigh_motion(moved_m, information)
     error_m = moved_m - observed_m
     mean_square_m2 = (error_m.square().sum(-1) * used).sum(-1) / used.sum(-1)
     return PoseFit(
@@ -404,10 +433,10 @@ def fit_pose(
     )
 
 
-def _pose_information(
+def _weigh_motion(
     moved_m: Float64[Tensor, "*batch k 3"], information: Float64[Tensor, "*batch k 3 3"]
 ) -> tuple[Float64[Tensor, "*batch k 6 3"], Float64[Tensor, "*batch 6 6"]]:
-    """Give ``J^T C^-1`` of each keypoint and ``sum J^T C^-1 J``, by left perturbations of a pose.
+    """Compute ``J^T C^-1`` of each keypoint, and ``sum J^T C^-1 J``, by left perturbations.
 
     Args:
         moved_m: keypoints of the model at the pose.
@@ -419,7 +448,7 @@ def _pose_information(
     return weighted, (weighted @ J).sum(-3)
 
 
-def consistent_keypoints(
+def find_consistent_keypoints(
     keypoints_m: Float[Tensor, "*batch k 3"],
     model_keypoints_m: Float[Tensor, "k 3"],
     tolerance_m: float,
@@ -440,8 +469,9 @@ def consistent_keypoints(
     Returns:
         Those that remain; three or more of them fix a pose.
     """
-    distance_m = _pairwise_distance(keypoints_m)
-    model_distance_m = _pairwise_distance(model_keypoints_m.to(keypoints_m))
+    # By how much the distance of each pair is off.
+    distance_m = _measure_pairs(keypoints_m)
+    model_distance_m = _measure_pairs(model_keypoints_m.to(keypoints_m))
     errors_m = (distance_m - model_distance_m).abs()
     count = keypoints_m.shape[-2]
     remains = torch.ones(keypoints_m.shape[:-1], dtype=torch.bool, device=keypoints_m.device)
@@ -457,5 +487,6 @@ def consistent_keypoints(
     return remains
 
 
-def _pairwise_distance(points_m: Float[Tensor, "*batch k 3"]) -> Float[Tensor, "*batch k k"]:
+def _measure_pairs(points_m: Float[Tensor, "*batch k 3"]) -> Float[Tensor, "*batch k k"]:
+    """Measure the distance of every pair of points."""
     return (points_m[..., :, None, :] - points_m[..., None, :, :]).norm(dim=-1)

@@ -85,24 +85,17 @@ _MOST_TURNS = 36
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PairTable:
-    """Pairs of points of a model, sorted by their features.
+    """Pairs of points of a model, sorted by their features."""
 
-    Attributes:
-        points_m: points of the surface that is visible from outside, 0.07 diameters apart or more,
-            in the order of the model's faces.
-        frames: outward normal and two tangents of each point, as columns.
-        bounds: pairs ``bounds[k]`` to ``bounds[k + 1]`` have feature ``k``.
-        first: index of the first point of each pair.
-        turn_rad: angle of the second point about the normal of the first, from its first tangent.
-        surface: surface of the model.
-    """
-
+    #: of the surface that is visible from outside, 0.07 diameters apart or more, in the order of
+    #: the model's faces.
     points_m: Float64[Tensor, "m 3"]
-    frames: Float64[Tensor, "m 3 3"]
-    bounds: Int32[Tensor, " bounds"]
-    first: Int32[Tensor, " pairs"]
+    frames: Float64[Tensor, "m 3 3"]  #: outward normal and two tangents of each point, as columns
+    bounds: Int32[Tensor, " bounds"]  #: pairs ``bounds[k]`` to ``bounds[k + 1]`` have feature ``k``
+    first: Int32[Tensor, " pairs"]  #: index of the first point of each pair
+    #: angle of the second point about the normal of the first, from its first tangent.
     turn_rad: Float32[Tensor, " pairs"]
-    surface: Surface
+    surface: Surface  #: of the model
 
 
 def find_turns(model: ObjectModel) -> dict[str, Any]:
@@ -115,29 +108,30 @@ def find_turns(model: ObjectModel) -> dict[str, Any]:
         JSON values: ``turns``, 4x4 matrices ``model_from_model`` in metres, the best first, and
         ``near``, how many of the first ones are near-symmetries, with 80 % of the surface or more.
     """
+    # Motions that pairs of points vote for.
     surface = prepare_surface(replace(model, symmetries=true_symmetries(model)))
     table = prepare_pairs(surface)
     # References from all sides, not from the first faces alone.
     references = take_evenly(torch.arange(len(table.points_m)), _SELF_REFERENCES)
     candidates, _ = vote_poses(table.points_m, table.frames[..., 0], references, table, _SELF_PEAKS)
-    candidates = candidates[_distinct_turns(candidates, surface)[0]]
+    candidates = candidates[_choose_distinct_turns(candidates, surface)[0]]
 
     # Refined as poses before a camera in the middle of the model, from where all is visible.
     points_m = surface.points_m - surface.middle_m
     starts = Rigid(candidates.R, candidates.t_m - surface.middle_m)
     candidates = refine_roughly(points_m, starts, surface, IcpConfig())
     candidates = Rigid(candidates.R, candidates.t_m + surface.middle_m)
-    candidates = candidates[_distinct_turns(candidates, surface)[0]]
+    candidates = candidates[_choose_distinct_turns(candidates, surface)[0]]
 
     # Products of two are candidates too, which fill gaps between those that were found.
     products = candidates[:, None] @ candidates
     products = Rigid(products.R.flatten(0, 1), products.t_m.flatten(0, 1))
     candidates = Rigid.cat([candidates, products])
-    chosen, near = _distinct_turns(candidates, surface)
+    chosen, near = _choose_distinct_turns(candidates, surface)
     return {"turns": candidates[chosen].matrix().tolist(), "near": near}
 
 
-def _distinct_turns(turns: Rigid, surface: Surface) -> tuple[list[int], int]:
+def _choose_distinct_turns(turns: Rigid, surface: Surface) -> tuple[list[int], int]:
     """Choose the motions after which most of a surface lies on itself, the best first.
 
     None is within 12 degrees of a better one, of a symmetry, or of a product of these; one that is
@@ -148,11 +142,11 @@ def _distinct_turns(turns: Rigid, surface: Surface) -> tuple[list[int], int]:
         Indices of the chosen motions, and how many of them are near-symmetries.
     """
     # The share of the surface that each motion moves onto the surface.
-    every = max(1, len(surface.points_m) // _SELF_COMPARED)
-    local_m = turns.inverse().apply(surface.points_m[::every])
+    step = max(1, len(surface.points_m) // _SELF_COMPARED)
+    local_m = turns.inverse().apply(surface.points_m[::step])
     index = surface.boxes.look_up(local_m)
     is_alike = (local_m - surface.points_m[index]).norm(dim=-1) < NEAR * surface.diameter_m
-    cosine = ((surface.normals[index] @ turns.R.mT) * surface.normals[::every]).sum(-1)
+    cosine = ((surface.normals[index] @ turns.R.mT) * surface.normals[::step]).sum(-1)
     share = (is_alike & (cosine.abs() > _MIN_COSINE)).double().mean(-1)
 
     chosen: list[int] = []
@@ -175,23 +169,27 @@ def prepare_pairs(surface: Surface) -> PairTable:
         surface: of the model; normals may point to either side.
     """
     # Points of the visible surface, few enough.
-    points_m, normals = _visible_from_outside(surface)
+    points_m, normals = _find_visible_points(surface)
     step_m = STEP * surface.diameter_m
-    while len(kept := thin(points_m, normals, step_m)) > _MODEL_POINTS:
+    chosen = thin(points_m, normals, step_m)
+    while len(chosen) > _MODEL_POINTS:
         step_m *= _COARSER
-    points_m = points_m[kept]
-    frames = _frames(normals[kept])
+        chosen = thin(points_m, normals, step_m)
+    points_m = points_m[chosen]
+    frames = _make_frames(normals[chosen])
 
     # All pairs of two different points, by feature. Within a feature they are shuffled, so that the
     # first ones are a sample of all.
     count = len(points_m)
     first = torch.arange(count).repeat_interleave(count - 1)
     bin_m = STEP * surface.diameter_m
-    keys, turns = _features_of_all(array_of(points_m), array_of(frames), bin_m)
+    keys, turns = _describe_all_pairs(array_of(points_m), array_of(frames), bin_m)
     turn_rad = torch.from_numpy(turns)
     shuffle = torch.randperm(len(first), generator=torch.Generator().manual_seed(0))
     feature, order = torch.from_numpy(keys)[shuffle].sort(stable=True)
     order = shuffle[order]
+
+    # Where the pairs of each feature begin.
     sizes = torch.bincount(feature, minlength=(DISTANCES + 1) * ANGLES**3)
     bounds = torch.cat([sizes.new_zeros(1), sizes.cumsum(0)])
     return PairTable(
@@ -231,10 +229,10 @@ def propose_poses(
     return poses[best]
 
 
-def _visible_from_outside(
+def _find_visible_points(
     surface: Surface,
 ) -> tuple[Float64[Tensor, "n 3"], Float64[Tensor, "n 3"]]:
-    """Give the points that a far camera sees from anywhere, with normals toward it.
+    """Find the points that a far camera sees from anywhere, with normals toward it.
 
     A point of a thin sheet, both of whose sides are visible, is given twice.
     """
@@ -252,6 +250,8 @@ def _visible_from_outside(
         nearest_m = torch.full(((int(column.max()) + 1) * width,), -torch.inf, dtype=torch.float64)
         nearest_m.scatter_reduce_(0, cell, toward_m, "amax")
         visible_from.append(toward_m > nearest_m[cell] - surface.diameter_m / _CELLS)
+
+    # The sides that face one of these cameras.
     is_visible = torch.stack(visible_from)
     cosine = directions @ surface.normals.T
     front = (is_visible & (cosine > _LEAST_COSINE)).any(0)
@@ -260,18 +260,19 @@ def _visible_from_outside(
     return points_m, torch.cat([surface.normals[front], -surface.normals[back]])
 
 
-def _frames(normals: Float64[Tensor, "n 3"]) -> Float64[Tensor, "n 3 3"]:
-    """Give each normal and two tangents, as columns."""
+def _make_frames(normals: Float64[Tensor, "n 3"]) -> Float64[Tensor, "n 3 3"]:
+    """Make a frame of each normal: it and two tangents, as columns."""
+    # The first tangent is across the axis along which the normal points least.
     least = torch.eye(3, dtype=torch.float64)[normals.abs().argmin(-1)]
     first = normalize(torch.linalg.cross(normals, least), dim=-1)
     return torch.stack([normals, first, torch.linalg.cross(normals, first)], -1)
 
 
 @compiled
-def _features_of_all(
+def _describe_all_pairs(
     points: Float64[np.ndarray, "m 3"], frames: Float64[np.ndarray, "m 3 3"], step: float
 ) -> tuple[Int64[np.ndarray, " pairs"], Float64[np.ndarray, " pairs"]]:
-    """Give the key of the feature of every pair of two points, and the turn of its second point."""
+    """Compute the key of the feature of every pair of points, and the turn of its second point."""
     count = len(points)
     keys = np.empty(count * (count - 1), np.int64)
     turns = np.empty(count * (count - 1))
@@ -282,7 +283,7 @@ def _features_of_all(
             if j == i:
                 continue
             turns[pair] = _write_feature(points, frames, i, j, step, feature)
-            keys[pair] = _key(feature)
+            keys[pair] = _make_key(feature)
             pair += 1
     return keys, turns
 
@@ -300,10 +301,20 @@ def _write_feature(
 
     The feature is the distance, the angles of both normals to the line between the points, and the
     angle between the normals (Drost et al., equation 1); as fractions of bins.
+
+    Args:
+        points: of the model or the scene.
+        frames: normal and two tangents of each, as columns.
+        i: index of the first point of the pair.
+        j: index of the second.
+        step: a bin of the distance.
+        feature: is written.
     """
     # The way from the first point to the second along the first's normal and tangents, and along
     # the second's normal; and the cosine of the two normals.
-    along, aside, up, along_second, cosine = 0.0, 0.0, 0.0, 0.0, 0.0
+    along, aside, up = 0.0, 0.0, 0.0
+    along_second = 0.0
+    cosine = 0.0
     square = 0.0
     for c in range(3):
         way = points[j, c] - points[i, c]
@@ -315,21 +326,21 @@ def _write_feature(
         cosine += frames[i, c, 0] * frames[j, c, 0]
     distance = max(np.sqrt(square), 1e-12)
     feature[0] = distance / step
-    feature[1] = _angle_bins(along / distance)
-    feature[2] = _angle_bins(along_second / distance)
-    feature[3] = _angle_bins(cosine)
+    feature[1] = _measure_angle(along / distance)
+    feature[2] = _measure_angle(along_second / distance)
+    feature[3] = _measure_angle(cosine)
     return np.arctan2(up, aside)
 
 
 @compiled
-def _angle_bins(cosine: float) -> float:
-    """Give the angle of a cosine in bins."""
+def _measure_angle(cosine: float) -> float:
+    """Convert a cosine to its angle in bins."""
     return np.arccos(min(1.0, max(-1.0, cosine))) * (ANGLES / np.pi)
 
 
 @compiled
-def _key(feature: Float64[np.ndarray, "4"]) -> int:
-    """Give one number for the bins of a feature."""
+def _make_key(feature: Float64[np.ndarray, "4"]) -> int:
+    """Make one number of the bins of a feature."""
     key = 0
     for k in range(4):
         key = key * ANGLES + _clamp_bin(int(feature[k]), k)
@@ -338,7 +349,7 @@ def _key(feature: Float64[np.ndarray, "4"]) -> int:
 
 @compiled
 def _clamp_bin(number: int, k: int) -> int:
-    """Give the bin of part ``k`` of a feature; values beyond the bins are in the last one."""
+    """Find the bin of part ``k`` of a feature; values beyond the bins are in the last one."""
     last = DISTANCES if k == 0 else ANGLES - 1
     return min(max(number, 0), last)
 
@@ -366,7 +377,7 @@ def vote_poses(
     Returns:
         Poses and their votes, reference after reference.
     """
-    frames = _frames(normals)
+    frames = _make_frames(normals)
     peaks_of_each = _vote(
         array_of(points_m),
         array_of(frames),
@@ -390,9 +401,9 @@ def vote_poses(
 class _PairArrays(NamedTuple):
     """Parts of :class:`PairTable` for compiled loops."""
 
-    bounds: Int32[np.ndarray, " bounds"]
-    first: Int32[np.ndarray, " pairs"]
-    turn: Float32[np.ndarray, " pairs"]
+    bounds: Int32[np.ndarray, " bounds"]  #: of the features
+    first: Int32[np.ndarray, " pairs"]  #: point of each pair
+    turn: Float32[np.ndarray, " pairs"]  #: of each pair [rad]
 
 
 @compiled
@@ -407,7 +418,7 @@ def _vote(
 ) -> tuple[
     Int64[np.ndarray, "r peaks"], Int64[np.ndarray, "r peaks"], Float64[np.ndarray, "r peaks"]
 ]:
-    """Let every pair of a reference point vote; give the points, turns and votes of its peaks.
+    """Let every pair of a reference point vote; give points, turns and votes of its peaks.
 
     Args:
         points: of the scene.
@@ -429,27 +440,36 @@ def _vote(
         i = references[r]
         counts[:] = 0
         voted[:] = 0
+        # With every other point that is neither too near nor too far.
         for j in range(len(points)):
             square = 0.0
             for c in range(3):
                 square += (points[j, c] - points[i, c]) ** 2
             if square > step * step and square < (DISTANCES * step) ** 2:
                 turn = _write_feature(points, frames, i, j, step, feature)
-                _vote_of_pair(feature, turn, pairs, voted, counts)
+                _vote_by_pair(feature, turn, pairs, voted, counts)
         _find_peaks(counts, best_point[r], best_turn[r], best_votes[r])
     return best_point, best_turn, best_votes
 
 
 @compiled
-def _vote_of_pair(
+def _vote_by_pair(
     feature: Float64[np.ndarray, "4"],
     turn: float,
     pairs: _PairArrays,
     voted: UInt32[np.ndarray, " bounds"],
     counts: Float32[np.ndarray, "m turns"],
 ) -> None:
-    """Add the votes of the model's pairs with the feature of a pair of the scene, or nearly so."""
-    key = _key(feature)
+    """Add the votes of the model's pairs with the feature of a pair of the scene, or nearly so.
+
+    Args:
+        feature: of the pair of the scene, as fractions of bins.
+        turn: of its second point about the normal of the first.
+        pairs: of the model.
+        voted: for each feature, which turns have voted; changed.
+        counts: votes of each model point and turn; changed.
+    """
+    key = _make_key(feature)
     _add_votes(key, turn, pairs, voted, counts)
 
     # In each part of the feature the bin next to the pair's too; beyond the last it is the same.
@@ -470,19 +490,20 @@ def _add_votes(
     counts: Float32[np.ndarray, "m turns"],
 ) -> None:
     """Add the votes of the model's pairs with a feature; a turn votes once for it."""
-    low, high = pairs.bounds[key], pairs.bounds[key + 1]
+    low = pairs.bounds[key]
+    high = pairs.bounds[key + 1]
     bit = np.uint32(1 << min(int((turn + np.pi) / (2 * np.pi) * TURNS), TURNS - 1))
     if high == low or voted[key] & bit:
         return
     voted[key] |= bit
     weight = np.float32(1 / np.sqrt(high - low))  # rare features weigh more
     for p in range(low, min(high, low + _MOST_ALIKE)):
-        counts[pairs.first[p], _turn_bin(turn - pairs.turn[p])] += weight
+        counts[pairs.first[p], _find_turn_bin(turn - pairs.turn[p])] += weight
 
 
 @compiled
-def _turn_bin(turn: float) -> int:
-    """Give the bin of the difference of two angles between -pi and pi."""
+def _find_turn_bin(turn: float) -> int:
+    """Find the bin of the difference of two angles between -pi and pi."""
     value = turn * (TURNS / (2 * np.pi))
     b = int(value + TURNS if value < 0 else value)
     return b - TURNS if b >= TURNS else b
@@ -495,19 +516,33 @@ def _find_peaks(
     best_turn: Int64[np.ndarray, " peaks"],
     best_votes: Float64[np.ndarray, " peaks"],
 ) -> None:
-    """Write the model points with the most votes, at the best turn of each."""
+    """Write the model points with the most votes, at the best turn of each.
+
+    Args:
+        counts: votes of each model point and turn.
+        best_point: is written: model points, those of the most votes first.
+        best_turn: is written: bins of turns.
+        best_votes: is written.
+    """
+    # The best turn of each model point.
     models = len(counts)
-    most, turn = np.empty(models), np.empty(models, np.int64)
+    most = np.empty(models)
+    turn = np.empty(models, np.int64)
     for m in range(models):
         most[m] = -1.0
         for b in range(TURNS):
             # Neighbouring turns share their votes.
             votes = 2 * counts[m, b] + counts[m, b - 1] + counts[m, (b + 1) % TURNS]
             if votes > most[m]:
-                most[m], turn[m] = votes, b
+                most[m] = votes
+                turn[m] = b
+
+    # The points of the most votes, one after the other.
     for k in range(len(best_point)):
         m = np.argmax(most)
-        best_point[k], best_turn[k], best_votes[k] = m, turn[m], most[m]
+        best_point[k] = m
+        best_turn[k] = turn[m]
+        best_votes[k] = most[m]
         most[m] = -1.0
 
 
@@ -521,6 +556,7 @@ def _score_poses(
 
     These are free-space violations and part of the unobserved surface.
     """
+    # Points near the surface, by how their normals fit.
     inverse = poses.inverse()
     local_m = points_m[:_SCORED_POINTS] @ inverse.R.mT + inverse.t_m[:, None]
     local_normals = normals[:_SCORED_POINTS] @ inverse.R.mT
@@ -528,6 +564,8 @@ def _score_poses(
     limit_m = _NEAR_ROUGHLY * surface.diameter_m
     is_near = (local_m - surface.points_m[index]).norm(dim=-1) < limit_m
     cosine = (local_normals * surface.normals[index]).sum(-1).abs()
-    free_space_violation, unobserved = look_along_rays(points_m, poses, surface, every=_RAYS_EVERY)
     support = (is_near * cosine).mean(-1)
+
+    # And what contradicts the pose.
+    free_space_violation, unobserved = look_along_rays(points_m, poses, surface, every=_RAYS_EVERY)
     return support - free_space_violation - _UNOBSERVED_WEIGHT * unobserved

@@ -28,24 +28,24 @@ _COLOUR_SEED = 0xC0102
 class Pattern:
     """The colour of a surface by place: a base colour that waves in space change."""
 
-    base: Float[Tensor, "3"]  # linear RGB
-    waves: Float[Tensor, "w 3"]  # amplitude of each wave in RGB, a share of the base
-    frequencies: Float[Tensor, "w 3"]  # [rad/m] along x, y and z
-    phases: Float[Tensor, " w"]  # [rad]
-    gloss: float  # share of the lamp's light that is mirrored
+    base: Float[Tensor, "3"]  #: linear RGB
+    waves: Float[Tensor, "w 3"]  #: amplitude of each wave in RGB, a share of the base
+    frequencies: Float[Tensor, "w 3"]  #: [rad/m] along x, y and z
+    phases: Float[Tensor, " w"]  #: [rad]
+    gloss: float  #: share of the lamp's light that is mirrored
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Solid:
     """A body of a scene, in its own frame."""
 
-    triangles_m: Float[Tensor, "n 3 3"]
-    normals: Float[Tensor, "n 3 3"]  # at each corner
-    pattern: Pattern
-    number: int | None  # ``obj_id``; None for clutter
+    triangles_m: Float[Tensor, "n 3 3"]  #: corners
+    normals: Float[Tensor, "n 3 3"]  #: at each corner
+    pattern: Pattern  #: its colour
+    number: int | None  #: ``obj_id``; None for clutter
 
 
-def random_pattern(
+def draw_pattern(
     generator: torch.Generator, size_m: float, colourful: tuple[float, float] = (0.0, 0.8)
 ) -> Pattern:
     """Draw a pattern whose features are about a third of a size.
@@ -68,24 +68,24 @@ def random_pattern(
     )
 
 
-def random_clutter(generator: torch.Generator) -> Solid:
+def draw_clutter(generator: torch.Generator) -> Solid:
     """Draw clutter: a box, a ball or a can."""
     import trimesh
 
     size_m = uniform(generator, 0.04, 0.15)
-    flat = uniform(generator, 0.3, 1.0)
-    thin = uniform(generator, 0.3, 1.0)
+    depth_share = uniform(generator, 0.3, 1.0)
+    height_share = uniform(generator, 0.3, 1.0)
     match random_index(generator, 3):
-        case 0:
-            mesh = trimesh.creation.box((size_m, flat * size_m, thin * size_m))
-        case 1:
+        case 0:  # a box
+            mesh = trimesh.creation.box((size_m, depth_share * size_m, height_share * size_m))
+        case 1:  # a ball
             mesh = trimesh.creation.icosphere(3, 0.5 * size_m)
-        case _:
-            mesh = trimesh.creation.cylinder(0.5 * flat * size_m, size_m, 32)
+        case _:  # a can
+            mesh = trimesh.creation.cylinder(0.5 * depth_share * size_m, size_m, 32)
     corners = torch.tensor(mesh.triangles, dtype=torch.float32)
     normals = torch.tensor(mesh.face_normals, dtype=torch.float32)[:, None].expand(-1, 3, 3)
     return Solid(
-        triangles_m=corners, normals=normals, pattern=random_pattern(generator, size_m), number=None
+        triangles_m=corners, normals=normals, pattern=draw_pattern(generator, size_m), number=None
     )
 
 
@@ -177,20 +177,21 @@ def make_frames(
             f"distance_m begins at {config.distance_m[0]:g} m, but the largest object is "
             f"{widest_m:.3g} m wide and would fill the image; begin at {3 * widest_m:.2g}"
         )
-    solids = list[Solid]()
-    for model in models:  # an object looks alike in every frame of every data set
-        chance = sample_generator(model.number, _COLOUR_SEED)
-        pattern = random_pattern(chance, model.diameter_m, (0.7, 1.0))
-        corners = drawn_triangles(model)
-        normals = model.normals[model.faces]
-        if not len(model.faces):  # each point is a disc of several triangles
-            each = len(corners) // len(model.vertices_m)
-            normals = model.normals.repeat_interleave(each, 0)[:, None].expand(-1, 3, 3)
-        solids.append(
-            Solid(triangles_m=corners, normals=normals, pattern=pattern, number=model.number)
-        )
+    solids = [_make_solid(model) for model in models]
     for index in range(first, first + number):
         yield _make_frame(models, solids, config, index)
+
+
+def _make_solid(model: ObjectModel) -> Solid:
+    """Make the body of an object, which looks alike in every frame of every data set."""
+    random = sample_generator(model.number, _COLOUR_SEED)
+    pattern = draw_pattern(random, model.diameter_m, (0.7, 1.0))
+    corners = drawn_triangles(model)
+    normals = model.normals[model.faces]
+    if not len(model.faces):  # each point is a disc of several triangles
+        triangles_of_disc = len(corners) // len(model.vertices_m)
+        normals = model.normals.repeat_interleave(triangles_of_disc, 0)[:, None].expand(-1, 3, 3)
+    return Solid(triangles_m=corners, normals=normals, pattern=pattern, number=model.number)
 
 
 def _make_frame(
@@ -200,12 +201,14 @@ def _make_frame(
     # The scene in the table's frame (z up), and the camera.
     generator = sample_generator(index, config.seed + _FRAMES_SEED)
     if config.frame_pile:
-        scene = _pile(models, solids, config, generator)
+        scene = _drop_pile(models, solids, config, generator)
     else:
         scene = _arrange(solids, config, generator)
-    scene.append((_random_table(generator), Rigid(torch.eye(3), torch.zeros(3))))
-    camera_from_table = _random_viewpoint(config, generator)
+    scene.append((_draw_table(generator), Rigid(torch.eye(3), torch.zeros(3))))
+    camera_from_table = _draw_viewpoint(config, generator)
     placed = [(solid, camera_from_table @ pose) for solid, pose in scene]
+
+    # The intrinsic matrix.
     assert config.centre_px is not None, "the config computes a centre left out"
     fx, fy = config.focal_px
     cx, cy = config.centre_px
@@ -219,9 +222,9 @@ def _make_frame(
     visible = torch.where(raster.primitive >= 0, owner[raster.primitive.clamp(min=0)], -1)
 
     # The picture: a background, lit bodies before it, and a camera's errors.
-    image = _blurred_background(height, width, generator)
+    image = _draw_background(height, width, generator)
     up = camera_from_table.R[:, 2]
-    towards, lamp, ambient = _random_light(up, generator)
+    towards, lamp, ambient = _draw_light(up, generator)
     image[:, raster.primitive >= 0] = shade(placed, raster, K, towards, lamp, ambient).mT
     rgb = _photograph(image, generator)
 
@@ -246,19 +249,20 @@ def _make_frame(
     return BopFrame(number=index, K=K, depth_m=depth_m, objects=shown, rgb=rgb)
 
 
-def _random_table(generator: torch.Generator) -> Solid:
+def _draw_table(generator: torch.Generator) -> Solid:
     """Draw the top of a table, at height 0."""
     h = 0.5 * uniform(generator, 0.8, 3.0)
+    first = [[-h, -h, 0.0], [h, -h, 0.0], [h, h, 0.0]]
+    second = [[-h, -h, 0.0], [h, h, 0.0], [-h, h, 0.0]]
     return Solid(
-        triangles_m=torch.tensor([[[-h, -h, 0.0], [h, -h, 0.0], [h, h, 0.0]],
-                                  [[-h, -h, 0.0], [h, h, 0.0], [-h, h, 0.0]]]),
+        triangles_m=torch.tensor([first, second]),
         normals=torch.tensor([0.0, 0.0, 1.0]).expand(2, 3, 3),
-        pattern=random_pattern(generator, uniform(generator, 0.05, 0.5)),
+        pattern=draw_pattern(generator, uniform(generator, 0.05, 0.5)),
         number=None,
-    )  # fmt: skip
+    )
 
 
-def _blurred_background(
+def _draw_background(
     height: int, width: int, generator: torch.Generator
 ) -> Float[Tensor, "3 {height} {width}"]:
     """Draw a background out of focus: blots of several sizes over a colour."""
@@ -270,7 +274,7 @@ def _blurred_background(
     return image.clamp(0, 1)
 
 
-def _random_light(
+def _draw_light(
     up: Float[Tensor, "3"], generator: torch.Generator
 ) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"], Float[Tensor, "3"]]:
     """Draw a lamp above a table: the direction to it, its colour, and that of ambient light."""
@@ -285,10 +289,13 @@ def _random_light(
 def _photograph(
     image: Float[Tensor, "3 h w"], generator: torch.Generator
 ) -> Float[Tensor, "3 h w"]:
-    """Blur, tint and expose linear light, add noise, and encode it as sRGB."""
+    """Imitate a camera: blur, tint and expose linear light, add noise, and encode it as sRGB."""
+    # Blurred.
     blur = uniform(generator, 0.0, 0.3)
     near = F.avg_pool2d(image[None], 3, 1, 1, count_include_pad=False)[0]
     image = torch.lerp(image, near, blur)
+
+    # Tinted, exposed, with noise.
     tint = 1 + 0.15 * (2 * torch.rand(3, 1, 1, generator=generator) - 1)
     gain = math.exp(uniform(generator, -0.8, 0.2))
     noise = uniform(generator, 0.0, 0.02) * torch.randn(image.shape, generator=generator)
@@ -306,7 +313,7 @@ def _arrange(
     chosen = [solids[i] for i in order[:objects].tolist()]
     low, high = config.frame_clutter
     clutter = low + random_index(generator, high - low + 1)
-    chosen += [random_clutter(generator) for _ in range(clutter)]
+    chosen += [draw_clutter(generator) for _ in range(clutter)]
 
     # Each is tried at places farther and farther from the middle until its circle is free; one that
     # never finds a free place is left out.
@@ -321,9 +328,9 @@ def _arrange(
             reach_m = 0.08 + 0.015 * attempt + 0.03 * len(circles)
             x, y = (uniform(generator, -reach_m, reach_m) for _ in range(2))
             if all(math.hypot(x - a, y - b) > radius_m + r for a, b, r in circles):
-                shift = torch.tensor([x - float(middle[0]), y - float(middle[1]),
-                                      -float(corners[:, 2].min())])  # fmt: skip
-                placed.append((solid, Rigid(R, shift)))
+                height_m = -float(corners[:, 2].min())  # at which the body stands on the table
+                shift_m = [x - float(middle[0]), y - float(middle[1]), height_m]
+                placed.append((solid, Rigid(R, torch.tensor(shift_m))))
                 circles.append((x, y, radius_m))
                 break
     return placed
@@ -333,7 +340,7 @@ _CELL_M = 0.004  # side of a cell of the height map of a pile
 _DROPS = 10  # places that are tried for each body of a pile
 
 
-def _pile(
+def _drop_pile(
     models: Sequence[ObjectModel],
     solids: Sequence[Solid],
     config: ObjectsConfig,
@@ -343,16 +350,19 @@ def _pile(
 
     Of several drops of each copy the one is taken by which its middle comes to lie lowest.
     """
+    # One of the objects, and a map of the pile's height.
     chosen = random_index(generator, len(solids))
-    points = sample_surface(models[chosen], 20000)[0]
+    points, _ = sample_surface(models[chosen], 20000)
     middle = (points.amin(0) + points.amax(0)) / 2
     points = points - middle
     radius_m = float(points.norm(dim=1).max())
     reach_m = 0.6 * radius_m * math.sqrt(config.frame_pile)
     cells = math.ceil((reach_m + radius_m) / _CELL_M)
     height_m = torch.zeros((2 * cells + 1) ** 2)
+
     placed: list[tuple[Solid, Rigid]] = []
     for _ in range(config.frame_pile):
+        # Several drops: turned and shifted at random, and as low as the pile lets them.
         drops: list[tuple[float, Rigid, Tensor, Tensor]] = []
         for _ in range(_DROPS):
             R = random_rotation(generator).float()
@@ -365,17 +375,20 @@ def _pile(
             z = float((height_m - bottom)[bottom.isfinite()].max())
             t = torch.tensor([x, y, z]) - R @ middle
             drops.append((z, Rigid(R, t), cell, moved[:, 2] + z))
+
+        # The lowest is taken, and the pile grows by it.
         _, pose, cell, top = min(drops, key=lambda drop: drop[0])
         height_m = height_m.scatter_reduce(0, cell, top, "amax")
         placed.append((solids[chosen], pose))
     return placed
 
 
-def _random_viewpoint(config: ObjectsConfig, generator: torch.Generator) -> Rigid:
+def _draw_viewpoint(config: ObjectsConfig, generator: torch.Generator) -> Rigid:
     """Draw a camera that looks down at about the middle of the table; ``camera_from_table``.
 
     It is 25 to 85 degrees above the table.
     """
+    # Where it stands, looking at the middle.
     elevation = math.radians(uniform(generator, 25.0, 85.0))
     azimuth = uniform(generator, 0.0, 2 * math.pi)
     distance_m = uniform(generator, *config.distance_m)

@@ -69,12 +69,13 @@ def random_rotation(generator: torch.Generator) -> Float[Tensor, "3 3"]:
     return torch.tensor(rows, dtype=torch.float64)
 
 
-def random_levels(height: int, width: int, generator: torch.Generator) -> Depth:
+def draw_levels(height: int, width: int, generator: torch.Generator) -> Depth:
     """Draw an image whose sublevel sets are half-planes, ellipses, boxes or convex polygons.
 
     Where it lies below a quantile of its values on an object, exactly that share of the object is
     occluded.
     """
+    # Coordinates about a random place, along a random direction and across it.
     size = max(height, width)
     angle = uniform(generator, 0.0, 2 * math.pi)
     stretch = uniform(generator, 0.3, 1.0)
@@ -85,22 +86,30 @@ def random_levels(height: int, width: int, generator: torch.Generator) -> Depth:
     along = math.cos(angle) * u + math.sin(angle) * v
     across = (math.cos(angle) * v - math.sin(angle) * u) * stretch
     match random_index(generator, 4):
-        case 0:
+        case 0:  # half-planes
             return along
-        case 1:
+        case 1:  # ellipses
             return along.square() + across.square()
-        case 2:
+        case 2:  # boxes
             return torch.maximum(along.abs(), across.abs())
-        case _:  # a convex polygon
-            sides = 3 + random_index(generator, 4)
-            gaps = torch.rand(sides, generator=generator).cumsum(0)
-            angles = 2 * math.pi * gaps / (gaps[-1] + uniform(generator, 0.2, 0.8))
-            extents = 0.5 + torch.rand(sides, generator=generator)
-            level = torch.full_like(along, -torch.inf)
-            for side_angle, extent in zip(angles.tolist(), extents.tolist(), strict=True):
-                side = math.cos(side_angle) * along + math.sin(side_angle) * across
-                level = torch.maximum(level, side / extent)
-            return level
+        case _:
+            return _draw_polygon_levels(along, across, generator)
+
+
+def _draw_polygon_levels(along: Depth, across: Depth, generator: torch.Generator) -> Depth:
+    """Draw an image whose sublevel sets are convex polygons of three to six sides.
+
+    ``along`` and ``across`` are the coordinates of each pixel.
+    """
+    sides = 3 + random_index(generator, 4)
+    gaps = torch.rand(sides, generator=generator).cumsum(0)
+    angles = 2 * math.pi * gaps / (gaps[-1] + uniform(generator, 0.2, 0.8))
+    extents = 0.5 + torch.rand(sides, generator=generator)
+    level = torch.full_like(along, -torch.inf)
+    for angle, extent in zip(angles.tolist(), extents.tolist(), strict=True):
+        side = math.cos(angle) * along + math.sin(angle) * across
+        level = torch.maximum(level, side / extent)
+    return level
 
 
 def occlude(
@@ -108,11 +117,17 @@ def occlude(
 ) -> tuple[Depth, Mask]:
     """Occlude exactly a share of a silhouette by something before it.
 
+    Args:
+        depth_m: of the object and what is behind it.
+        silhouette: pixels of the object.
+        share: of them, that is occluded.
+        generator: of random numbers.
+
     Returns:
         The depth with the occluder, and the part of the silhouette that stays visible.
     """
     count = round(share * int(silhouette.sum()))
-    levels = random_levels(depth_m.shape[0], depth_m.shape[1], generator)
+    levels = draw_levels(depth_m.shape[0], depth_m.shape[1], generator)
     gap_m = uniform(generator, 0.005, 0.15)
     if count == 0:
         return depth_m, silhouette
@@ -138,13 +153,14 @@ def simulate_depth(
         config: kinds of sensor, and their errors.
         generator: of random numbers.
     """
+    # The sensor of this view, and the pixels that it does not read.
     kind: SensorKind = config.kinds[random_index(generator, len(config.kinds))]
     noise = uniform(generator, *config.noise)
     missing = uniform(generator, *config.missing)
     if kind == "none":
         return depth_m
-    is_lost = _is_too_steep(depth_m, focal_px[0], is_laser=kind == "laser")
-    is_lost |= _random_gaps(depth_m.shape, missing, generator)
+    is_lost = _mark_steep(depth_m, focal_px[0], is_laser=kind == "laser")
+    is_lost |= _mark_gaps(depth_m.shape, missing, generator)
 
     # Noise that neighbours share, by a width in pixels of the full image.
     correlation_px = config.noise_correlation_px
@@ -152,17 +168,20 @@ def simulate_depth(
         correlation_px = correlation_px or _STEREO_CORRELATION_PX
     scale = focal_px[0] / focal_px[1]
     width_px = scale * uniform(generator, *correlation_px) if correlation_px else 0.0
-    unit_noise = noise * smooth_noise((depth_m.shape[0], depth_m.shape[1]), width_px, generator)
+    unit_noise = noise * draw_smooth_noise(
+        (depth_m.shape[0], depth_m.shape[1]), width_px, generator
+    )
 
+    # What each kind of sensor reads.
     if kind == "structured light":
-        is_lost |= _is_shadowed(depth_m, focal_px[0])
+        is_lost |= _mark_shadow(depth_m, focal_px[0])
         read_m = _swap_neighbours(depth_m, generator)
         # Nguyen, Izadi and Lovell 2012: sigma_z = 0.0012 + 0.0019 (z - 0.4)^2 [m].
         read_m = read_m + unit_noise * (0.0012 + 0.0019 * (read_m - 0.4).square())
         scale_px_m = _KINECT_STEPS_PER_PX * focal_px[1] * _KINECT_BASELINE_M
         read_m = _round_disparity(read_m, scale_px_m)
     elif kind == "active stereo":
-        is_lost |= _is_shadowed(depth_m.flip(1), focal_px[0], _STEREO_BASELINE_M).flip(1)
+        is_lost |= _mark_shadow(depth_m.flip(1), focal_px[0], _STEREO_BASELINE_M).flip(1)
         first, second = (_displace(depth_m, scale, generator) for _ in range(2))
         read_m = torch.lerp(first, second, torch.rand(depth_m.shape, generator=generator))
         read_m = read_m + unit_noise * 0.003 * read_m.square()
@@ -171,13 +190,15 @@ def simulate_depth(
     elif kind == "time of flight":
         read_m = _mix_at_jumps(depth_m, generator)
         read_m = read_m + unit_noise * (0.001 + 0.002 * read_m.square())
-    else:
+    else:  # a laser
         read_m = depth_m + 0.0005 * unit_noise
+
+    # All readings are off alike.
     read_m = read_m + uniform(generator, *config.offset_m)
     return torch.where(is_lost, torch.nan, read_m)
 
 
-def _is_too_steep(depth_m: Depth, focal_px: float, *, is_laser: bool) -> Mask:
+def _mark_steep(depth_m: Depth, focal_px: float, *, is_laser: bool) -> Mask:
     """Mark pixels of a surface seen at a grazing angle, which a sensor does not read."""
     steepest = 2 * _STEEPEST if is_laser else _STEEPEST
     limit_m = depth_m * (steepest / focal_px)  # largest change of depth to the next pixel
@@ -190,16 +211,19 @@ def _is_too_steep(depth_m: Depth, focal_px: float, *, is_laser: bool) -> Mask:
     return is_steep
 
 
-def _random_gaps(size: torch.Size, share: float, generator: torch.Generator) -> Mask:
+def _mark_gaps(size: torch.Size, share: float, generator: torch.Generator) -> Mask:
     """Mark a share of the pixels as missing, half of them singly, half in patches."""
+    # Single ones.
     height, width = size
     is_missing = torch.rand(height, width, generator=generator) < 0.5 * share
+
+    # Patches, where a smooth image is low.
     coarse = torch.rand(1, 1, 2 + height // 12, 2 + width // 12, generator=generator)
     patches = F.interpolate(coarse, (height, width), mode="bilinear", align_corners=False)[0, 0]
     # The level of the patches is a quantile of every fourth row and column, which is near enough.
-    some = patches[::4, ::4].flatten()
-    if count := round(0.5 * share * len(some)):
-        is_missing |= patches <= some.kthvalue(count).values
+    sampled = patches[::4, ::4].flatten()
+    if count := round(0.5 * share * len(sampled)):
+        is_missing |= patches <= sampled.kthvalue(count).values
     return is_missing
 
 
@@ -239,23 +263,26 @@ def _mix_at_jumps(depth_m: Depth, generator: torch.Generator) -> Depth:
     return mixed_m
 
 
-def smooth_noise(size: tuple[int, int], width_px: float, generator: torch.Generator) -> Depth:
+def draw_smooth_noise(size: tuple[int, int], width_px: float, generator: torch.Generator) -> Depth:
     """Draw normal noise of deviation 1, correlated between neighbours.
 
     It is white noise convolved with a Gaussian of deviation ``width_px``, 0 for white noise;
     ``size`` is rows and columns.
     """
+    # White noise, with a margin for the Gaussian.
     radius = math.ceil(3 * width_px)
     white = torch.randn(size[0] + 2 * radius, size[1] + 2 * radius, generator=generator)
     if radius == 0:
         return white
+
+    # The Gaussian, one axis after the other.
     weights = (-0.5 * (torch.arange(-radius, radius + 1) / width_px).square()).exp()
     weights = weights / weights.norm()
     along = F.conv2d(white[None, None], weights.view(1, 1, 1, -1))
     return F.conv2d(along, weights.view(1, 1, -1, 1))[0, 0]
 
 
-def _is_shadowed(depth_m: Depth, focal_px: float, baseline_m: float = _KINECT_BASELINE_M) -> Mask:
+def _mark_shadow(depth_m: Depth, focal_px: float, baseline_m: float = _KINECT_BASELINE_M) -> Mask:
     """Mark pixels in shadow: a nearer surface hides them from the projector beside the camera."""
     column = torch.arange(depth_m.shape[1])
     projector_column = column + (focal_px * baseline_m / depth_m).nan_to_num(-torch.inf)
@@ -269,7 +296,7 @@ def _displace(depth_m: Depth, scale: float, generator: torch.Generator) -> Depth
     ``scale`` is that of the window to the full image, in whose pixels the displacement is drawn.
     """
     height, width = depth_m.shape
-    shifts = [1.2 * smooth_noise((height, width), 3.0 * scale, generator) for _ in range(2)]
+    shifts = [1.2 * draw_smooth_noise((height, width), 3.0 * scale, generator) for _ in range(2)]
     farthest = _STEREO_WINDOW_PX * scale
     dy, dx = ((scale * shift).clamp(-farthest, farthest).round().long() for shift in shifts)
     rows = (torch.arange(height)[:, None] + dy).clamp(0, height - 1)
@@ -310,8 +337,8 @@ class _StoredView:
     K: Float[Tensor, "3 3"]  #: intrinsic matrix of the window
     camera_from_model: Rigid  #: the pose
 
-    def full_depth(self) -> CleanView:
-        """Give the view with its depth."""
+    def restore_depth(self) -> CleanView:
+        """Restore the depth of the view."""
         depth_m = self.offset_m.float() + self.distance_m
         return CleanView(depth_m=depth_m, K=self.K, camera_from_model=self.camera_from_model)
 
@@ -327,25 +354,25 @@ def make_shape(model: ObjectModel) -> Shape:
     return Shape(triangles_m=triangles, hull_m=hull_m - middle, middle_m=middle)
 
 
-def gaze(direction: Float[Tensor, "3"], roll_rad: float) -> Float[Tensor, "3 3"]:
-    """Give the rotation that rolls a camera and then points its optical axis at a direction."""
+def aim_camera(direction: Float[Tensor, "3"], roll_rad: float) -> Float[Tensor, "3 3"]:
+    """Make the rotation that rolls a camera and then points its optical axis at a direction."""
     cosine = math.cos(roll_rad)
     sine = math.sin(roll_rad)
     roll = [[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]]
     return turn_axis_to(direction) @ torch.tensor(roll, dtype=torch.float64)
 
 
-def pixel_to_ray(K: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
+def invert_intrinsics(K: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
     """Invert an intrinsic matrix without skew, in a tenth of the time of a general inverse."""
     (fx, _, cx), (_, fy, cy), _ = K.tolist()
     rows = [[1 / fx, 0, -cx / fx], [0, 1 / fy, -cy / fy], [0, 0, 1]]
     return torch.tensor(rows, dtype=torch.float64)
 
 
-def window_of(
+def find_window(
     shape: Shape, pose: Rigid, K: Float[Tensor, "3 3"]
 ) -> tuple[Float[Tensor, "3 3"], int, int]:
-    """Give the window in which an object lies, with a margin: its intrinsics, width and height."""
+    """Find the window in which an object lies, with a margin: its intrinsics, width and height."""
     corners = shape.hull_m @ pose.R.mT + (pose.t_m + pose.R @ shape.middle_m)
     pixels = (corners @ K.mT)[:, :2] / corners[:, 2:]
     left, top = (pixels.amin(0).floor() - MARGIN_PX).tolist()
@@ -356,7 +383,7 @@ def window_of(
 
 def draw_view(shape: Shape, pose: Rigid, K: Float[Tensor, "3 3"]) -> CleanView:
     """Draw an object in the window around it."""
-    window_K, width, height = window_of(shape, pose, K)
+    window_K, width, height = find_window(shape, pose, K)
     # float64 poses: the corners are rounded once.
     triangles = (shape.triangles_m.double() @ pose.R.mT + pose.t_m).float()
     raster = rasterize(triangles, window_K, width, height, with_barycentric=False)
@@ -376,10 +403,10 @@ def turn_view(
     """
     old = view.camera_from_model
     pose = Rigid(turn @ old.R, turn @ old.t_m)
-    window_K, width, height = window_of(shape, pose, K)
+    window_K, width, height = find_window(shape, pose, K)
 
     # The old pixel of each new one, and w, the old depth over the new one.
-    ray_from_pixel = turn.mT @ pixel_to_ray(window_K)
+    ray_from_pixel = turn.mT @ invert_intrinsics(window_K)
     (a, b, c), (d, e, f), (g, h, i) = (view.K @ ray_from_pixel).tolist()
     u = torch.arange(width)[None]
     v = torch.arange(height)[:, None]
@@ -398,18 +425,24 @@ def turn_view(
     index = (top * columns + left).long()
     flat = inverse.reshape(-1)
     nw, ne, sw, se = (flat[index + beyond] for beyond in (0, 1, columns, columns + 1))
-    smooth = torch.lerp(torch.lerp(nw, ne, x), torch.lerp(sw, se, x), y)
-    nearest = torch.where(y < 0.5, torch.where(x < 0.5, nw, ne), torch.where(x < 0.5, sw, se))
+    upper = torch.lerp(nw, ne, x)
+    lower = torch.lerp(sw, se, x)
+    smooth = torch.lerp(upper, lower, y)
+    nearest_upper = torch.where(x < 0.5, nw, ne)
+    nearest_lower = torch.where(x < 0.5, sw, se)
+    nearest = torch.where(y < 0.5, nearest_upper, nearest_lower)
     # A comparison with NaN is false: where one of the four pixels is empty the nearest is taken.
     highest = torch.maximum(torch.maximum(nw, ne), torch.maximum(sw, se))
     lowest = torch.minimum(torch.minimum(nw, ne), torch.minimum(sw, se))
     resampled = torch.where(highest - lowest < _JUMP * smooth, smooth, nearest)
+
+    # Pixels beyond the old window see nothing.
     is_inside = (x - 0.5).abs().maximum((y - 0.5).abs()) <= 1
     resampled = torch.where(is_inside, resampled, torch.nan)
     return CleanView(depth_m=1 / (resampled * w), K=window_K, camera_from_model=pose)
 
 
-def _random_offset(generator: torch.Generator, most: int) -> int:
+def _draw_offset(generator: torch.Generator, most: int) -> int:
     """Draw a whole number, -most to most, all equally likely."""
     return random_index(generator, 2 * most + 1) - most
 
@@ -481,33 +514,33 @@ class Objects:
         """Draw all stored views now, in ``workers`` threads: processes forked later share them."""
         keys = [(n, k) for k in range(self.config.views or 0) for n in range(len(self.models))]
         with ThreadPoolExecutor(workers) as pool:
-            for _ in pool.map(self._stored, keys):
+            for _ in pool.map(self._find_stored, keys):
                 pass
 
     def view(self, index: int) -> ViewSample:
         """Make the window of depth and the mask that a sample is lifted from."""
         number = index % len(self.models)
         generator = sample_generator(index, self.config.seed)
-        clean = self._clean_view(number, generator)
+        clean = self._make_clean_view(number, generator)
         silhouette = clean.depth_m.isfinite()
         depth_m = clean.depth_m
         visible = silhouette
 
         # A background behind the object, and something that occludes a part of it.
         if self.config.with_background:
-            depth_m = self._before_background(clean, self._shapes[number], generator)
+            depth_m = self._add_background(clean, self._shapes[number], generator)
         if uniform(generator, 0.0, 1.0) < self.config.occluded_share:
             share = uniform(generator, *self.config.occlusion)
             depth_m, visible = occlude(depth_m, silhouette, share, generator)
 
         # The errors of a mask, and those of a sensor.
         scale = float(clean.K[0, 0]) / self.config.focal_px[0]  # to pixels of the full image
-        grow_px = _random_offset(generator, self.config.mask_error_px)
+        grow_px = _draw_offset(generator, self.config.mask_error_px)
         mask = grow_mask(visible, round(grow_px * scale))
         focal_px = (float(clean.K[0, 0]), self.config.focal_px[0])
         measured_m = simulate_depth(depth_m, focal_px, self.config.sensor, generator)
-        down = round(_random_offset(generator, self.config.mask_shift_px) * scale)
-        right = round(_random_offset(generator, self.config.mask_shift_px) * scale)
+        down = round(_draw_offset(generator, self.config.mask_shift_px) * scale)
+        right = round(_draw_offset(generator, self.config.mask_shift_px) * scale)
         mask = _shift_mask(mask, down, right)
 
         model = self.models[number]
@@ -524,7 +557,7 @@ class Objects:
         )
         return ViewSample(input=view, truth=truth)
 
-    def _clean_view(self, number: int, generator: torch.Generator) -> CleanView:
+    def _make_clean_view(self, number: int, generator: torch.Generator) -> CleanView:
         """Make a view of an object without errors: drawn anew, or a stored one, rotated."""
         shape = self._shapes[number]
         views = self.config.views
@@ -535,20 +568,21 @@ class Objects:
             R = random_rotation(generator)
             distance_m = uniform(generator, *self.config.distance_m)
             K = self.intrinsics(uniform(generator, *self.config.resolution))
-            turn = self._gaze(number, distance_m, K, generator)
+            turn = self._draw_gaze(number, distance_m, K, generator)
             R = turn @ R
             pose = Rigid(R, turn[:, 2] * distance_m - R @ shape.middle_m)
             return draw_view(shape, pose, K)
 
         # A stored view, in which the object lies on the axis: its pixels are turned likewise.
-        stored = self._stored((number, random_index(generator, views)))
+        stored = self._find_stored((number, random_index(generator, views)))
         K = self.intrinsics(float(stored.K[0, 0]) / self.config.focal_px[0])
-        turn = self._gaze(number, stored.distance_m, K, generator)
-        return turn_view(stored.full_depth(), turn, shape, K)
+        turn = self._draw_gaze(number, stored.distance_m, K, generator)
+        return turn_view(stored.restore_depth(), turn, shape, K)
 
-    def _stored(self, key: tuple[int, int]) -> _StoredView:
-        """Give a stored view by the numbers of its object and of the view; drawn when needed."""
+    def _find_stored(self, key: tuple[int, int]) -> _StoredView:
+        """Find a stored view by the numbers of its object and of the view; drawn when needed."""
         if key not in self._views:
+            # Drawn on the optical axis, by a seed of its own.
             number, place = key
             index = place * len(self.models) + number
             generator = sample_generator(index, self.config.seed + _BANK_SEED)
@@ -578,23 +612,33 @@ class Objects:
         ]
         return torch.tensor([*rows, [0, 0, 1]], dtype=torch.float64)
 
-    def _gaze(
+    def _draw_gaze(
         self, number: int, distance_m: float, K: Tensor, generator: torch.Generator
     ) -> Float[Tensor, "3 3"]:
-        """Draw a rotation of the camera by which an object lies wholly in the image, anywhere."""
+        """Draw a rotation of the camera by which an object lies wholly in the image, anywhere.
+
+        Args:
+            number: of the object.
+            distance_m: of its middle.
+            K: intrinsic matrix of the image.
+            generator: of random numbers.
+        """
+        # A place at which the whole object is in the image; the middle, where it is too large.
         diameter = self.models[number].diameter_m
         scale = float(K[0, 0]) / self.config.focal_px[0]
         radius_px = float(K[0, 0]) * 0.5 * diameter / max(distance_m - 0.5 * diameter, 1e-3)
-        place = []
+        place: list[float] = []
         for size, middle in zip(self.config.image_px, K[:2, 2].tolist(), strict=True):
             low = radius_px
             high = scale * size - 1 - radius_px
             place.append(uniform(generator, low, high) if low < high else middle)
+
+        # A camera that looks there, rolled.
         roll_rad = uniform(generator, 0.0, 2 * math.pi)
         pixel = torch.tensor([*place, 1.0], dtype=torch.float64)
-        return gaze(pixel_to_ray(K) @ pixel, roll_rad)
+        return aim_camera(invert_intrinsics(K) @ pixel, roll_rad)
 
-    def _before_background(
+    def _add_background(
         self, clean: CleanView, shape: Shape, generator: torch.Generator
     ) -> Float[Tensor, "h w"]:
         """Put a table or wall behind an object, and clutter beside it; give the depth."""
@@ -603,12 +647,13 @@ class Objects:
         hull_m = shape.hull_m @ pose.R.mT + (pose.t_m + pose.R @ shape.middle_m)
         tilt = uniform(generator, 0.0, _MOST_TILT_RAD)
         side = uniform(generator, 0.0, 2 * math.pi)
-        normal = gaze(hull_m.mean(0), side) @ torch.tensor(
-            [math.sin(tilt), 0.0, -math.cos(tilt)], dtype=torch.float64
-        )
+        tilted = torch.tensor([math.sin(tilt), 0.0, -math.cos(tilt)], dtype=torch.float64)
+        normal = aim_camera(hull_m.mean(0), side) @ tilted
+
+        # Its depth in each pixel; none where the ray does not meet it.
         gap_m = max(0.0, uniform(generator, -0.2, 0.3))
         offset = float((hull_m @ normal).min()) - gap_m
-        a, b, c = (normal @ pixel_to_ray(clean.K)).tolist()
+        a, b, c = (normal @ invert_intrinsics(clean.K)).tolist()
         height, width = clean.depth_m.shape
         slope = a * torch.arange(width)[None] + b * torch.arange(height)[:, None] + c
         behind_m = torch.where(slope * offset > 0, offset / slope, torch.nan)
@@ -616,7 +661,7 @@ class Objects:
         # Clutter: a shape parallel to the image, at about the depth of the object.
         nearest_m = float(hull_m[:, 2].min())
         farthest_m = float(hull_m[:, 2].max())
-        levels = random_levels(height, width, generator)
+        levels = draw_levels(height, width, generator)
         lowest = float(levels.amin())
         level = lowest + uniform(generator, 0.0, 0.6) * float(levels.amax() - levels.amin())
         clutter_m = uniform(generator, nearest_m, farthest_m + 0.2)

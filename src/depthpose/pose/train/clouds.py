@@ -45,12 +45,12 @@ BEYOND_TRAINING = 2**32  #: samples of each object: no training has so many
 class Cloud(NamedTuple):
     """One training sample: the point of each voxel, and the true pose, in the axes of the grid."""
 
-    points_m: Float[Tensor, "n 3"]
-    coordinates: Int[Tensor, "n 3"]
-    features: Float[Tensor, "n c"]
-    class_number: int
-    R: Float[Tensor, "3 3"]
-    t_m: Float[Tensor, "3"]
+    points_m: Float[Tensor, "n 3"]  #: in the axes of the grid about its camera
+    coordinates: Int[Tensor, "n 3"]  #: (x, y, z) of their voxels
+    features: Float[Tensor, "n c"]  #: of their voxels
+    class_number: int  #: of the object
+    R: Float[Tensor, "3 3"]  #: rotation of the pose
+    t_m: Float[Tensor, "3"]  #: its translation
 
 
 class CloudBatch(NamedTuple):
@@ -108,8 +108,8 @@ class TrainingViews(Generic[Config]):
             return len(self.synthetic)
         return max(1, round(len(self._real) / self._frames.share))
 
-    def _view(self, place: int, generator: torch.Generator) -> tuple[ViewSample, bool]:
-        """Give a frame, with the probability of their share, or a synthetic view; and which it is.
+    def _choose_view(self, place: int, generator: torch.Generator) -> tuple[ViewSample, bool]:
+        """Choose a frame, with the probability of their share, or a synthetic view.
 
         The second value is whether it is a frame.
         """
@@ -129,7 +129,7 @@ class TrainingClouds(TrainingViews[PoseTraining]):
             InputError: 20 in a row have too few points, so that the config must be wrong.
         """
         generator = sample_generator(index, self.seed)
-        cloud = self.config.cloud
+        cloud_config = self.config.cloud
         # Sample i shows object i modulo their number.
         objects = len(self.models)
         for attempt in range(TRIES):
@@ -138,30 +138,33 @@ class TrainingClouds(TrainingViews[PoseTraining]):
             # At the start all show the first object, as multiples of the number do.
             if place < self.config.first_alone:
                 place *= objects
-            view, is_frame = self._view(place, generator)
+
+            # Its cloud; that of a frame as a rolled camera sees it.
+            view, is_frame = self._choose_view(place, generator)
             number = self._class_of[view.input.object]
-            sample = lift_sample(view, self.models[number].diameter_m, cloud)
+            sample = lift_sample(view, self.models[number].diameter_m, cloud_config)
             if self._frames is not None and is_frame:
                 angle_rad = 2 * math.pi * float(torch.rand((), generator=generator))
                 if self._frames.with_roll:
                     sample = _roll_camera(sample, angle_rad)
-            if why_too_few(sample.input.points_m, cloud) is None:
-                return voxelised_cloud(sample, number, cloud, generator)
+            if why_too_few(sample.input.points_m, cloud_config) is None:
+                return voxelise_sample(sample, number, cloud_config, generator)
         raise InputError(
             f"sample {index}: {TRIES} samples in a row have fewer than "
-            f"{cloud.min_points} points; bring the camera nearer (distance_m), or lower "
+            f"{cloud_config.min_points} points; bring the camera nearer (distance_m), or lower "
             "min_points"
         )
 
     @staticmethod
     def collate(clouds: Sequence[Cloud]) -> CloudBatch:
         """Make a batch of clouds, one after the other."""
-        numbers = [torch.full((len(c.points_m), 1), k) for k, c in enumerate(clouds)]
+        coordinates: list[Tensor] = []
+        for number, cloud in enumerate(clouds):
+            numbers = torch.full((len(cloud.points_m), 1), number)
+            coordinates.append(torch.cat([numbers, cloud.coordinates], 1))
         return CloudBatch(
             points_m=torch.cat([c.points_m for c in clouds]),
-            coordinates=torch.cat(
-                [torch.cat([n, c.coordinates], 1) for n, c in zip(numbers, clouds, strict=True)]
-            ),
+            coordinates=torch.cat(coordinates),
             features=torch.cat([c.features for c in clouds]),
             class_of=torch.tensor([c.class_number for c in clouds]),
             R=torch.stack([c.R for c in clouds]),
@@ -170,7 +173,7 @@ class TrainingClouds(TrainingViews[PoseTraining]):
 
 
 def _roll_camera(sample: CloudSample, angle_rad: float) -> CloudSample:
-    """Give a sample as a camera rolled about its optical axis sees it: cloud and pose rotate."""
+    """Roll the camera of a sample about its optical axis: its cloud and pose rotate."""
     c = math.cos(angle_rad)
     s = math.sin(angle_rad)
     roll = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -183,12 +186,18 @@ def _roll_camera(sample: CloudSample, angle_rad: float) -> CloudSample:
     )
 
 
-def voxelised_cloud(
+def voxelise_sample(
     sample: CloudSample, class_number: int, config: CloudConfig, generator: torch.Generator
 ) -> Cloud:
     """Choose points of a sample and voxelise them, as an estimate does.
 
     Cloud and true pose are rotated to the axes of the grid.
+
+    Args:
+        sample: cloud and pose.
+        class_number: of its object in the network.
+        config: how many points, and the grid.
+        generator: chooses the points.
     """
     points = sample_points(sample.input.points_m, config.max_points, generator)
     voxels = voxelise(points, config)
@@ -215,6 +224,7 @@ def read_models(
         InputError: no model is named, or models of two kinds, CAD files without their unit, two of
             one name, or a damaged file.
     """
+    # From one of three sources.
     sources = [name for name in ("cad", "bop", "parts") if getattr(config, name)]
     if len(sources) > 1:
         raise InputError(f"{' and '.join(sources)} are given; take the models from one of them")
@@ -224,14 +234,7 @@ def read_models(
         raise InputError("there is no object to learn; name its CAD file (--cad FILE --unit mm)")
     if config.bop:
         folder = Path(config.bop)
-        numbers = config.objects
-        if not numbers:
-            home, infos = read_models_info(folder)
-            files = [path.stem.removeprefix("obj_") for path in home.glob("obj_*.ply")]
-            numbers_of_models = {int(name) for name in files if name.isdigit()} | set(infos)
-            numbers = tuple(sorted(numbers_of_models))
-            if not numbers:
-                raise InputError(f"{home}: holds no obj_NNNNNN.ply; put the models there")
+        numbers = config.objects or _list_model_numbers(folder)
         models = tuple(read_bop_models(folder, numbers, config.mesh).values())
     else:
         models = tuple(
@@ -239,6 +242,8 @@ def read_models(
             for number, path in enumerate(config.cad, start=1)
         )
         refuse_one_name(models)
+
+    # With the symmetries of their shapes, where these are wanted.
     return tuple(
         with_found_symmetries(
             model,
@@ -248,6 +253,20 @@ def read_models(
         )
         for model in models
     )
+
+
+def _list_model_numbers(folder: Path) -> tuple[int, ...]:
+    """List the numbers of all models of a data set, by their files and ``models_info``.
+
+    Raises:
+        InputError: there is none.
+    """
+    home, infos = read_models_info(folder)
+    files = [path.stem.removeprefix("obj_") for path in home.glob("obj_*.ply")]
+    numbers = {int(name) for name in files if name.isdigit()} | set(infos)
+    if not numbers:
+        raise InputError(f"{home}: holds no obj_NNNNNN.ply; put the models there")
+    return tuple(sorted(numbers))
 
 
 HELD_OUT_SEED = 0x4E1D  #: added to the seed of the views that are trained on
@@ -272,8 +291,8 @@ class ViewsTask:
         self.optimizers = {"network": (make_adam(network.parameters(), config.adam), config.adam)}
         self._held_out: dict[float, list[ViewSample]] = {}
 
-    def held_out_error(self, view: ViewSample, index: int) -> float:
-        """ADD of a held-out view, posed without ICP and refusal: see ``add_error``."""
+    def measure_held_out(self, view: ViewSample, index: int) -> float:
+        """Pose a held-out view without ICP and refusal, and measure ADD by ``measure_add``."""
         raise NotImplementedError
 
     @torch.no_grad()
@@ -283,13 +302,16 @@ class ViewsTask:
         self.modules["network"].eval()
         config = self.training
         for occlusion in config.held_out.occlusions:
+            # Views are drawn once.
             if occlusion not in self._held_out:
-                drawn = held_out_objects(
+                objects = make_held_out_objects(
                     self.models, config.objects, config.cloud, config.held_out, occlusion
                 )
-                self._held_out[occlusion] = [drawn.view(index) for index in range(len(drawn))]
+                self._held_out[occlusion] = [objects.view(k) for k in range(len(objects))]
+
+            # The error of each, and what the numbers of all are.
             views = self._held_out[occlusion]
-            errors = torch.tensor([self.held_out_error(view, k) for k, view in enumerate(views)])
+            errors = torch.tensor([self.measure_held_out(view, k) for k, view in enumerate(views)])
             place = f"held_out/occluded_{round(100 * occlusion)}/{self.method}"
             numbers[f"{place}_add_10"] = float((errors < SUCCESS_SHARE).float().mean())
             numbers[f"{place}_median"] = float(errors.median())
@@ -297,14 +319,22 @@ class ViewsTask:
         return ValidationResult(numbers=numbers)
 
 
-def held_out_objects(
+def make_held_out_objects(
     models: Sequence[ObjectModel],
     synthetic: ObjectsConfig,
     cloud: CloudConfig,
     config: HeldOutConfig,
     occlusion: float,
 ) -> Objects:
-    """Make views that no training uses, all of one occlusion."""
+    """Make views that no training uses, all of one occlusion.
+
+    Args:
+        models: of the objects.
+        synthetic: the views of the training, of which these differ by seed and resolution.
+        cloud: how they are lifted to clouds.
+        config: how many views of each object.
+        occlusion: occluded share of the silhouette.
+    """
     held_out_config = dataclasses.replace(
         synthetic,
         number=config.number * len(models),
@@ -317,8 +347,8 @@ def held_out_objects(
     return Objects(models, held_out_config, cloud)
 
 
-def add_error(estimated: Rigid | None, truth: Rigid, model: ObjectModel) -> float:
-    """ADD to the nearest symmetric pose, in diameters; infinite where there is no estimate."""
+def measure_add(estimated: Rigid | None, truth: Rigid, model: ObjectModel) -> float:
+    """Measure ADD to the nearest symmetric pose, in diameters; infinite without an estimate."""
     if estimated is None:
         return math.inf
     points_m, _ = sample_surface(model, _SURFACE_POINTS)
@@ -336,12 +366,17 @@ Table = Mapping[str, Mapping[str, float | None]]
 def score_held_out(weights: PoseWeights, synthetic: ObjectsConfig, config: HeldOutConfig) -> Table:
     """Measure the shares of right, ambiguous, wrong and refused estimates, by occlusion.
 
-    Ambiguous are poses of too low a certainty, whether right or not.
+    A pose of too low a certainty is ambiguous, whether right or not.
+
+    Args:
+        weights: the network and its objects.
+        synthetic: the views, but for their occlusion.
+        config: occlusions, and views of each object at each.
     """
     table: dict[str, dict[str, float | None]] = {}
     for occlusion in config.occlusions:
-        objects = held_out_objects(weights.models, synthetic, weights.cloud, config, occlusion)
-        estimates, errors = _posed(weights, objects)
+        objects = make_held_out_objects(weights.models, synthetic, weights.cloud, config, occlusion)
+        estimates, errors = _estimate_views(weights, objects)
         answered = [e for e, estimate in zip(errors, estimates, strict=True) if estimate.is_ok]
         posed = sorted(e for e in errors if e < math.inf)
         right = sum(e < SUCCESS_SHARE for e in answered)
@@ -355,7 +390,7 @@ def score_held_out(weights: PoseWeights, synthetic: ObjectsConfig, config: HeldO
     return table
 
 
-def table_text(table: Table) -> str:
+def format_table(table: Table) -> str:
     """Format a table as Markdown."""
     lines = [
         "Synthetic views that no training saw, posed with ICP and refusal; right is an "
@@ -373,12 +408,14 @@ def table_text(table: Table) -> str:
     return "\n".join(lines)
 
 
-def _posed(weights: PoseWeights, objects: Objects) -> tuple[list[PoseEstimate], list[float]]:
-    """Estimate views of objects; give the estimates and their errors (ADD or ADD-S) [diameters]."""
+def _estimate_views(
+    weights: PoseWeights, objects: Objects
+) -> tuple[list[PoseEstimate], list[float]]:
+    """Estimate views of objects; give the estimates and their errors by ADD [diameters]."""
     is_regressed = isinstance(weights.network, DepthImageNet)
     net = DepthImageRegressor(weights) if is_regressed else GeoPoseNet(weights)
-    estimates = []
-    errors = []
+    estimates: list[PoseEstimate] = []
+    errors: list[float] = []
     for start in range(0, len(objects), _CLOUDS_AT_ONCE):
         places = range(start, min(start + _CLOUDS_AT_ONCE, len(objects)))
         samples = [objects.view(place) for place in places]
@@ -387,5 +424,5 @@ def _posed(weights: PoseWeights, objects: Objects) -> tuple[list[PoseEstimate], 
         for place, estimate, sample in zip(places, posed, samples, strict=True):
             model = weights.models[place % len(weights.models)]
             pose = estimate.camera_from_model
-            errors.append(add_error(pose, sample.truth.camera_from_model, model))
+            errors.append(measure_add(pose, sample.truth.camera_from_model, model))
     return estimates, errors

@@ -151,7 +151,7 @@ class PoseTraining(ViewsTraining):
 
 
 def own_part(start: str) -> PoseTraining:
-    """Settings of a training of one part from a trained backbone, as in own-part.yaml.
+    """Give the settings to train one part from a trained backbone, as in own-part.yaml.
 
     The backbone learns on as it ships, with batch norm folded into its convolutions, at a third of
     the rate: new norms would take the place of statistics that it learnt with, and after 600 steps

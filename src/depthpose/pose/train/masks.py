@@ -26,22 +26,22 @@ from depthpose.core.loop import (
     write_card,
 )
 from depthpose.core.run import find_rank
-from depthpose.pose.datasets import Instance, object_names, open_bop
+from depthpose.pose.datasets import Instance, open_bop, read_object_names
 from depthpose.pose.datasets.dataset import read_instance_mask
 from depthpose.pose.segmentation import (
     ENCODER_KIND,
     FCN,
     KIND,
     SegmentationWeights,
-    class_probabilities,
     count_overlap,
     intersection_over_union,
     normalise_colors,
+    predict_probabilities,
     write_segmentation,
 )
 from depthpose.pose.synthetic.views import random_index, uniform
 from depthpose.pose.train.config import ImageAugmentConfig, ImagesConfig, SegmentationTraining
-from depthpose.pose.train.poses import claim_run, with_origin
+from depthpose.pose.train.poses import add_origin, claim_run
 
 
 class LabelledImage(NamedTuple):
@@ -57,6 +57,8 @@ class AnnotatedImages:
     def __init__(self, config: ImagesConfig, objects: Mapping[int, str] | None = None) -> None:
         if not config.folder:
             raise InputError("there is no image to learn from; name a folder in BOP's layout")
+
+        # The instances of each image that has a picture.
         dataset = open_bop(config.folder, config.split)
         images: dict[tuple[int, int], list[Instance]] = {}
         for instance in dataset.instances:
@@ -64,6 +66,8 @@ class AnnotatedImages:
                 images.setdefault((instance.scene_id, instance.image_id), []).append(instance)
         if not images:
             raise InputError(f"{config.folder}: split {config.split!r} has no picture (rgb)")
+
+        # The objects that are classes: those given, or those that are wanted and shown.
         if objects is None:
             shown_numbers = sorted({i.object_id for shown in images.values() for i in shown})
             wanted = [n for n in shown_numbers if not config.objects or n in config.objects]
@@ -72,7 +76,7 @@ class AnnotatedImages:
                     f"{config.folder}: shows none of the objects {list(config.objects)}; it has "
                     f"{shown_numbers}"
                 )
-            objects = object_names(Path(config.folder), wanted)
+            objects = read_object_names(Path(config.folder), wanted)
         self.objects = objects  # names by number, in the order of the classes
         self._class_of = {number: k for k, number in enumerate(objects, 1)}
         self._images = list(images.values())
@@ -128,6 +132,7 @@ class TrainingImages:
 
     def __getitem__(self, index: int) -> LabelledImage:
         """Make the sample of an index."""
+        # A window of an image at a random scale.
         generator = sample_generator(index, self.seed)
         labelled = self.images[shuffled_index(index, len(self), self.seed)]
         scale = self.long_side_px / max(labelled.image.shape[-2:])
@@ -210,7 +215,7 @@ class SegmentationTask:
             self._held_out = AnnotatedImages(config.held_out, objects)
 
     def step(self, batch: LabelledImage) -> Iterator[Update]:
-        """One update: the loss of a batch, and its intersection over union."""
+        """Make one update: the loss of a batch, and its intersection over union."""
         logits = self.network(normalise_colors(batch.image)).float()
         weight = logits.new_full((logits.shape[1],), self.config.object_weight)
         weight[0] = 1.0
@@ -223,19 +228,23 @@ class SegmentationTask:
         """Measure intersection over union on held-out images; give the first one as a picture."""
         if self._held_out is None:
             return ValidationResult()
+
+        # All images count in one table.
         self.network.eval()
         classes = self.network.classes
         pictures = {}
         table = torch.zeros(classes, classes, dtype=torch.int64)
         for index in range(len(self._held_out)):
             image, labels = self._held_out[index]
-            predicted = class_probabilities(self.network, image).argmax(0)
+            predicted = predict_probabilities(self.network, image).argmax(0)
             table += count_overlap(predicted, labels, classes)
             if index == 0:
                 segmented = _tint_objects(image, predicted, classes)
                 truth = _tint_objects(image, labels, classes)
                 pictures["found_truth"] = torch.cat([segmented, truth], -1)
         self.network.train()
+
+        # The numbers of each class that occurs, and their mean over objects.
         iou = intersection_over_union(table)
         numbers = {
             f"held_out/iou_{name}": float(value)
@@ -259,6 +268,7 @@ def _tint_objects(
 @releases_folder
 def train_segmentation(config: SegmentationTraining, run: Run) -> Path:
     """Train FCN; give the path of its weights."""
+    # What is learnt from, and the network, perhaps with a trained encoder.
     torch.manual_seed(config.loop.seed)
     images = AnnotatedImages(config.images)
     network = FCN(len(images.objects), config.network)
@@ -266,6 +276,8 @@ def train_segmentation(config: SegmentationTraining, run: Run) -> Path:
         path = find_weights(config.start)
         encoder = Checkpoint(kind=KIND, config={}, state=read_checkpoint(path, ENCODER_KIND).state)
         load_weights(network.encoder, encoder, str(path))
+
+    # The folder is claimed only now: until here a setting may be refused.
     claim_run(config, run)
     task = SegmentationTask(network, config, images.objects)
     samples = TrainingImages(images, config.augment, config.network.long_side_px, config.loop.seed)
@@ -273,13 +285,15 @@ def train_segmentation(config: SegmentationTraining, run: Run) -> Path:
     path = run.folder / "segmentation.safetensors"
     if find_rank().rank:
         return path
+
+    # Weights and their card.
     licence = "not stated; that of the training data binds"
     facts = {"trained_on": Path(config.images.folder).name, "licence": licence}
     weights = SegmentationWeights(
         network=network.cpu().eval(),
         objects=tuple(images.objects.values()),
         numbers=tuple(images.objects),
-        facts=with_origin(facts, config),
+        facts=add_origin(facts, config),
     )
     write_segmentation(path, weights, with_half=config.with_half)
     measured = held_out_text(run.folder, "Images that were held out: intersection over union.")

@@ -36,7 +36,7 @@ from depthpose.pose.baselines import (
     PointNet,
     PointNetConfig,
     cut_depth,
-    poses_of,
+    make_poses,
 )
 from depthpose.pose.cloud import lift_sample, why_too_few
 from depthpose.pose.config import SHAPE_FEATURES, RefusalConfig
@@ -54,11 +54,11 @@ from depthpose.pose.train.clouds import (
     TrainingClouds,
     TrainingViews,
     ViewsTask,
-    add_error,
+    format_table,
+    measure_add,
     read_models,
     score_held_out,
-    table_text,
-    voxelised_cloud,
+    voxelise_sample,
 )
 from depthpose.pose.train.config import DepthImageTraining, PoseTraining, ViewsTraining
 from depthpose.pose.types import ObjectModel, ViewSample
@@ -66,7 +66,7 @@ from depthpose.pose.weights import (
     AnyNetwork,
     DirectionNet,
     PoseWeights,
-    network_of,
+    build_pose_network,
     read_pose_weights,
     write_pose_weights,
 )
@@ -89,12 +89,12 @@ class PoseTask(ViewsTask):
         self.network = network
         self.config = config
         # Keypoints of each object under each of its symmetries (classes, copies, k, 3).
-        copies = symmetric_copies(models, _SYMMETRY_STEP)
+        copies = stack_symmetries(models, _SYMMETRY_STEP)
         keypoints_m = torch.stack([model.keypoints_m.double() for model in models])
         self._copies_m = (keypoints_m[:, None] @ copies.R.mT + copies.t_m[:, :, None]).float()
 
     def step(self, batch: CloudBatch) -> Iterator[Update]:
-        """One update: all clouds at once."""
+        """Make one update: the loss of all clouds at once."""
         directions = self.network.directions(batch.network_input).float()
         copies = self._copies_m.to(batch.R)[batch.class_of]
         copies_m = copies @ batch.R.mT[:, None] + batch.t_m[:, None, None]
@@ -102,8 +102,9 @@ class PoseTask(ViewsTask):
         loss = direction_loss(directions, batch.points_m, copies_m, instance, self.config.loss)
         yield Update("network", loss, {"directions": loss.detach()})
 
-    def held_out_error(self, view: ViewSample, index: int) -> float:
+    def measure_held_out(self, view: ViewSample, index: int) -> float:
         """Pose the cloud of a view by voting and measure ADD; infinite for too few points."""
+        # The cloud of the view, in the axes of its grid.
         number = index % len(self.models)
         generator = sample_generator(index, HELD_OUT_SEED)
         model = self.models[number]
@@ -111,17 +112,19 @@ class PoseTask(ViewsTask):
         sample = lift_sample(view, model.diameter_m, config)
         if why_too_few(sample.input.points_m, config) is not None:
             return math.inf
-        cloud = voxelised_cloud(sample, number, config, generator)
+        cloud = voxelise_sample(sample, number, config, generator)
+
+        # Its votes, and the pose that they fit best.
         device = next(self.network.parameters()).device
         batch = TrainingClouds.collate([cloud])
         points = CloudBatch(*(part.to(device) for part in batch)).network_input
         vote = vote_ransac(points.points_m, self.network.directions(points).float())
         fit = fit_pose(vote.keypoints_m.cpu(), vote.covariance_m2.cpu(), model.keypoints_m)
-        return add_error(fit.camera_from_model, Rigid(cloud.R, cloud.t_m), model)
+        return measure_add(fit.camera_from_model, Rigid(cloud.R, cloud.t_m), model)
 
 
-def symmetric_copies(models: Sequence[ObjectModel], step_rad: float) -> Rigid:
-    """Give the symmetries of each object, ``model_from_model`` (classes, copies).
+def stack_symmetries(models: Sequence[ObjectModel], step_rad: float) -> Rigid:
+    """Stack the symmetries of all objects, ``model_from_model`` (classes, copies).
 
     Objects with fewer are filled up with the identity.
     """
@@ -148,7 +151,7 @@ def claim_run(config: Any, run: Run, files: Sequence[str] = ()) -> None:  # noqa
     run.claim(config, weights, checksums, without=("held_out",))
 
 
-def packed(
+def pack_weights(
     network: AnyNetwork, models: tuple[ObjectModel, ...], config: ViewsTraining
 ) -> PoseWeights:
     """Make weights of a trained network and its objects, with the facts for their card."""
@@ -162,12 +165,12 @@ def packed(
         models=models,
         cloud=config.cloud,
         refusal=RefusalConfig(),
-        facts=with_origin(facts, config),
+        facts=add_origin(facts, config),
     )
 
 
-def with_origin(facts: Mapping[str, str], config: Any) -> dict[str, str]:  # noqa: ANN401
-    """Give facts with the stage and the start weights added, whose terms bind the new ones too."""
+def add_origin(facts: Mapping[str, str], config: Any) -> dict[str, str]:  # noqa: ANN401
+    """Add to facts the stage and the start weights, whose terms bind the new ones too."""
     origin = {**facts, "stage": type(config).__name__}
     if config.start is None:
         return origin
@@ -182,10 +185,10 @@ that remains after training."""
 class CropSample(NamedTuple):
     """A crop, or a batch of them, with truth."""
 
-    crop: DepthCrop
-    class_of: Int[Tensor, "*b"]
-    R: Float[Tensor, "*b 3 3"]
-    t_m: Float[Tensor, "*b 3"]
+    crop: DepthCrop  #: that the network sees
+    class_of: Int[Tensor, "*b"]  #: class of its object
+    R: Float[Tensor, "*b 3 3"]  #: rotation of the pose
+    t_m: Float[Tensor, "*b 3"]  #: its translation
 
 
 class TrainingCrops(TrainingViews[DepthImageTraining]):
@@ -196,7 +199,7 @@ class TrainingCrops(TrainingViews[DepthImageTraining]):
         for attempt in range(TRIES):
             # A further attempt takes an index beyond any training, of the same object.
             place = index + attempt * len(self.models) * BEYOND_TRAINING
-            view, _ = self._view(place, sample_generator(place, self.seed))
+            view, _ = self._choose_view(place, sample_generator(place, self.seed))
             number = self._class_of[view.input.object]
             crop = cut_depth(view.input, self.config.network, self.models[number].diameter_m)
             if crop is not None:
@@ -225,22 +228,22 @@ class DepthImageTask(ViewsTask):
         self._points_m = torch.stack([
             points_m[torch.arange(count) % len(points_m)] for points_m in surfaces_m
         ])  # fmt: skip
-        self._copies = symmetric_copies(models, _IMAGE_SYMMETRY_STEP).float()
+        self._copies = stack_symmetries(models, _IMAGE_SYMMETRY_STEP).float()
         self._diameter_m = torch.tensor([model.diameter_m for model in models])
 
     def step(self, batch: CropSample) -> Iterator[Update]:
-        """One update: regress poses and compare the points of the models; in diameters."""
+        """Make one update: regress poses and compare the points of the models, in diameters."""
         class_of = batch.class_of
         device = batch.R.device
         outputs = self.network(batch.crop.image, class_of).float()
         copies = Rigid(self._copies.R.to(device)[class_of], self._copies.t_m.to(device)[class_of])
         points_m = self._points_m.to(device)[class_of]
         truth = Rigid(batch.R, batch.t_m)
-        error_m = model_point_loss(poses_of(outputs, batch.crop), truth, points_m, copies)
+        error_m = model_point_loss(make_poses(outputs, batch.crop), truth, points_m, copies)
         diameter_m = self._diameter_m.to(device)[class_of]
         yield Update("network", (error_m / diameter_m).mean(), {})
 
-    def held_out_error(self, view: ViewSample, index: int) -> float:
+    def measure_held_out(self, view: ViewSample, index: int) -> float:
         """Regress the pose of a view and measure ADD; infinite for too few pixels."""
         number = index % len(self.models)
         model = self.models[number]
@@ -249,8 +252,8 @@ class DepthImageTask(ViewsTask):
         if crop is None:
             return math.inf
         batch = DepthCrop(*(part[None].to(device) for part in crop))
-        poses = poses_of(self.network(batch.image, torch.tensor([number], device=device)), batch)
-        return add_error(
+        poses = make_poses(self.network(batch.image, torch.tensor([number], device=device)), batch)
+        return measure_add(
             Rigid(poses.R[0].cpu(), poses.t_m[0].cpu()), view.truth.camera_from_model, model
         )
 
@@ -267,35 +270,38 @@ def train_pose_network(config: PoseTraining | DepthImageTraining, run: Run) -> P
     """
     torch.manual_seed(config.loop.seed)
     models = read_models(config.models, run.on_message)
-    config = _with_sizes(config, models)
+    config = _set_network_sizes(config, models)
     kind, task, samples = _build_training(config, models)
     if config.start is not None:
         _copy_start(task.network, config.start, samples)
+
     # The folder is claimed only now: until here a setting may be refused.
     claim_run(config, run, config.models.cad)
-
     seconds = run.train(task, samples, config.loop)
     path = run.folder / f"{kind}.safetensors"
     if run.on_message is not None:
         run.on_message("trained; now it is measured on synthetic views: a minute or more")
     if find_rank().rank:
         return path  # statistics of batch norm are rank 0's, and so is the file
+
+    # Weights, with norms folded into their convolutions.
     network = task.network
     inference_network = fold_norms(network) if isinstance(network, ResUNet) else network
-    packed_weights = packed(inference_network, models, config)
+    packed_weights = pack_weights(inference_network, models, config)
     write_pose_weights(path, packed_weights, with_half=config.with_half)
 
-    weights = read_pose_weights(path)  # as the file holds them: 16 bits round them
+    # Their card, measured with the weights as the file holds them: 16 bits round them.
+    weights = read_pose_weights(path)
     held_out_rows = score_held_out(weights, config.objects, config.held_out)
     write_json(path.with_suffix(".json"), {"held_out": held_out_rows})
-    _write_pose_card(path, weights, config, seconds, table_text(held_out_rows))
+    _write_pose_card(path, weights, config, seconds, format_table(held_out_rows))
     return path
 
 
-def _with_sizes(
+def _set_network_sizes(
     config: PoseTraining | DepthImageTraining, models: Sequence[ObjectModel]
 ) -> PoseTraining | DepthImageTraining:
-    """Give the network the classes and keypoints of the objects, and the inputs of the cloud."""
+    """Set the network's classes and keypoints by the objects, and its inputs by the cloud."""
     sizes = {
         "classes": len(models),
         "keypoints": len(models[0].keypoints_m),
@@ -309,7 +315,7 @@ def _with_sizes(
 def _build_training(
     config: PoseTraining | DepthImageTraining, models: tuple[ObjectModel, ...]
 ) -> tuple[str, PoseTask | DepthImageTask, TrainingClouds | TrainingCrops]:
-    """Give the kind of weights that a config trains, its task with a new network, and samples."""
+    """Build what a config trains: the kind of its weights, its task with a new network, samples."""
     if isinstance(config, DepthImageTraining):
         crops = TrainingCrops(models, config, config.loop.seed)
         return "depth-image", DepthImageTask(DepthImageNet(config.network), models, config), crops
@@ -329,10 +335,13 @@ def _write_pose_card(
     held_out: str,
 ) -> None:
     """Write the card beside weights: the command, the objects, and what was measured of them."""
+    # The command, as far as options say it.
     cad_options = [word for file in config.models.cad for word in ("--cad", file)]
     if cad_options and config.models.unit:
         cad_options += ["--unit", config.models.unit]
     command = shlex.join(["pose", "train", "--what", path.stem, *cad_options])
+
+    # The objects, and the rotations that no view of them may tell apart.
     objects = ", ".join(f"{m.name} ({1000 * m.diameter_m:.0f} mm)" for m in weights.models)
     facts = {"objects": objects}
     rotations = {
@@ -355,8 +364,9 @@ def _copy_start(network: AnyNetwork, start: str, samples: TrainingViews[Any]) ->
     Raises:
         InputError: the file is of another network, or of other settings.
     """
+    # What may differ between the two networks.
     path = find_weights(start)
-    loaded = network_of(read_checkpoint(path), str(path))
+    loaded = build_pose_network(read_checkpoint(path), str(path))
     has_norms = isinstance(network, ResUNet) and network.config.norm == "batch"
     independent = () if isinstance(network, DepthImageNet) else ("classes",)
     if has_norms:
