@@ -450,7 +450,7 @@ def test_proposals_at_one_place_leave_room_for_others(
     net: Registration, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Sixty lie on a first part, and only then some on a second: these are looked at too."""
-    prepared = net._object("bracket").prepare()
+    prepared = net._find_object("bracket").prepare()
     truths = [pose_at(x_m).double() for x_m in (-0.15, 0.15)]
     depth_m, _ = view_of(prepared.model, *(truth.float() for truth in truths))
     view = view_input(depth_m.float(), None, CAMERA, "bracket", "x", None)

@@ -297,29 +297,31 @@ def measure_each(
     return evaluations
 
 
-def with_source(result: Evaluation, name: str, settings: dict[str, Any] | None) -> Evaluation:
+def with_source(evaluation: Evaluation, name: str, settings: dict[str, Any] | None) -> Evaluation:
     """Return an evaluation whose rows say which method, weights and input made the predictions.
 
     ``settings``: those of the run that made them; None of files by other software, whose method is
     ``name`` then.
     """
     settings = settings or {"matcher": name, "input": ""}
+    # Only runs that may take one image record their input: a matcher always has both views.
+    view = settings.get("input", "both views")
     method = settings.get("matcher", "")
     if "with_filled_holes" in settings:  # OpenCV's matcher ran; no other has holes
         method += " (holes filled)" if settings["with_filled_holes"] else " (matched pixels)"
     source = {
         "method": method,
-        "input": settings.get("input", "both views"),
+        "input": view,
         "speed": settings.get("speed", ""),
         "weights": settings.get("weights", ""),
     }
     # Rows of frames and deciles stand beside the rows of means, which have the checksum.
     sha256 = settings.get("weights_sha256", "")[:12]
     return replace(
-        result,
-        rows=[replace(row, weights_sha256=sha256, **source) for row in result.rows],
-        per_frame=[replace(row, **source) for row in result.per_frame],
-        deciles=[replace(row, **source) for row in result.deciles],
+        evaluation,
+        rows=[replace(row, weights_sha256=sha256, **source) for row in evaluation.rows],
+        per_frame=[replace(row, **source) for row in evaluation.per_frame],
+        deciles=[replace(row, **source) for row in evaluation.deciles],
     )
 
 

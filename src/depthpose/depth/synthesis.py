@@ -582,14 +582,18 @@ def select_views(
     height, width = left.shape[-2:]
     size = (height, width) if size is None else size
     multiple = generator.config.side_multiple_px
-    rows = _round_to_even(_round_to_multiple(height, multiple, ROWS_SHARE))
-    columns = _round_to_even(_round_to_multiple(width, multiple, COLUMNS_SHARE))
+    # Stretched where a side is near a multiple, else padded. Sides are even, for logits have half
+    # of the resolution.
+    rows = _round_to_even(_stretch_to_near_multiple(height, multiple, ROWS_SHARE))
+    columns = _round_to_even(_stretch_to_near_multiple(width, multiple, COLUMNS_SHARE))
     padded = pad_to_multiple(resize_image(left, rows, columns), multiple)
 
+    # The logits of both views, without the padding.
     features = generator.encoder(padded)
     left_logits, right_logits = (
         logits[..., : rows // 2, : columns // 2] for logits in generator.decode(features)
     )
+
     planes = generator.planes * (size[1] / columns)
     left_view = _read_view(left_logits, planes, size)
     right_view = _read_view(right_logits, planes, size)
@@ -623,14 +627,14 @@ def draw_right(generator: Generator, left: Views) -> Views:
         return _warp_by_estimate(left, select_views(generator, left)[1])
     height, width = left.shape[-2:]
     multiple = generator.config.side_multiple_px
-    rows = _round_to_multiple(height, multiple, ROWS_SHARE)
-    columns = _round_to_multiple(width, multiple, COLUMNS_SHARE)
+    rows = _stretch_to_near_multiple(height, multiple, ROWS_SHARE)
+    columns = _stretch_to_near_multiple(width, multiple, COLUMNS_SHARE)
     padded = pad_to_multiple(2 * resize_image(left, rows, columns) - 1, multiple)
     right = (generator(padded)[..., :rows, :columns] + 1) / 2
     return resize_image(right, height, width)
 
 
-def _round_to_multiple(side_px: int, multiple: int, share: float) -> int:
+def _stretch_to_near_multiple(side_px: int, multiple: int, share: float) -> int:
     """Round to the nearest multiple if it is within a share of the side, else keep the side."""
     nearest = max(round(side_px / multiple), 1) * multiple
     return nearest if abs(nearest - side_px) <= share * side_px else side_px

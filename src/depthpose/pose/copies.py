@@ -27,6 +27,7 @@ from depthpose.pose.types import Axis, ObjectModel
 SAME_DIAMETERS = 0.1  #: mean distance of the model's points up to which two poses are one
 SAME_RAD = math.radians(8)  #: and angle; both must hold
 _STEP_RAD = math.pi / 32  # half of the step between rotations about an axis: within SAME_RAD
+_TRAINED_STEP_RAD = math.pi / 8  # the same of a network's training, which needs them no denser
 _TOLERATED_STEP_RAD = math.pi / 24  # the same about an axis of a symmetry within a tolerance
 _COPY_DIAMETERS = 0.05  # largest deviation of a near-symmetric copy; a look-alike deviates by more
 _CLOSE_RAD = math.radians(45)  # a copy after a smaller rotation is one of a row about its axis
@@ -88,7 +89,8 @@ class SymmetricCopies:
         if float(angle.min()) > _CLOSE_RAD:
             return None
         direction, point_m = axis_of_turn(self.near_copies[int(angle.argmin())])
-        # All round, with no wider gaps, there are at least so many.
+        # Enough of them to lie all round at this angle: near-symmetries about an axis are found at
+        # even steps, so their number is enough to tell.
         is_about = self.near_copies.R @ direction @ direction > _ALONG
         if int(is_about.sum()) < 2 * math.pi / _CLOSE_RAD - 1:
             return None
@@ -96,6 +98,7 @@ class SymmetricCopies:
 
     @property
     def _is_ball(self) -> bool:
+        """A ball is compared by its middle alone: its rotation says nothing."""
         return len(self.points_m) == 1
 
 
@@ -171,12 +174,16 @@ def _exact_copies(
     axes: Float64[Tensor, "3 3"],
     lengths_m: Float64[Tensor, "3"],
 ) -> SymmetricCopies:
-    """Give the exact symmetries of a model, without near-symmetries or look-alikes yet."""
+    """Give the exact symmetries of a model, without near-symmetries or look-alikes yet.
+
+    Declared or found symmetries may be exact only within a tolerance: poses are one after those
+    that the surface has, and a network was trained to treat poses as one after all of them.
+    """
     return SymmetricCopies(
         symmetries=symmetry_transforms(true_symmetries(model), _STEP_RAD).double(),
         near_copies=_empty(),
         lookalikes=_empty(),
-        trained=symmetry_transforms(model.symmetries, 4 * _STEP_RAD).double(),
+        trained=symmetry_transforms(model.symmetries, _TRAINED_STEP_RAD).double(),
         mirror=mirror_deviation(model),
         points_m=compared_m,
         middle_m=middle_m,

@@ -128,28 +128,46 @@ def compete(
     # And which of its copies? Others of the poses may be copies too, as about an axis.
     copies = [winner.refined]
     copies += _refine_distinct_copies(cloud_m, winner.refined, prepared, config, view)
-    is_copy = [_add_if_copy(hypothesis.refined, copies, prepared) for hypothesis in different]
+    copy_poses = Rigid.stack([copy.camera_from_model.double() for copy in copies])
+    symmetries = _all_symmetries(prepared)
+    is_copy = [
+        bool(prepared.copies.is_same(hypothesis.pose, copy_poses, symmetries).any())
+        for hypothesis in different
+    ]
+    copies += [
+        hypothesis.refined
+        for hypothesis, belongs in zip(different, is_copy, strict=True)
+        if belongs and hypothesis is not winner
+    ]
     group = [hypothesize(pose) for pose in copies]  # with its own colours, in place of the best's
-    share_in_group = share_among_copies(group, is_masked=observation.is_masked)
-    copy_shares = float(shares[torch.tensor(is_copy)].sum()) * share_in_group
-    best = int(copy_shares.argmax())
+    group_share = float(shares[torch.tensor(is_copy)].sum())
+    copy_shares = group_share * share_among_copies(group, is_masked=observation.is_masked)
+    distinct = _merge_same_poses(group, copy_shares.tolist(), prepared)
+    best, best_share = max(distinct, key=lambda copy: copy[1])
     return Competition(
-        best=group[best],
-        best_share=float(copy_shares[best]),
-        copies=[(h, float(copy_shares[k])) for k, h in enumerate(group) if k != best],
+        best=best,
+        best_share=best_share,
+        copies=[(copy, share) for copy, share in distinct if copy is not best],
         others=[(h, float(shares[k])) for k, h in enumerate(different) if not is_copy[k]],
     )
 
 
-def _add_if_copy(pose: RefinedPose, copies: list[RefinedPose], prepared: PreparedObject) -> bool:
-    """Whether a pose is a near-symmetric copy of one of some; a new one is added to them."""
-    is_same = partial(prepared.copies.is_same, pose.camera_from_model)
-    copy_poses = Rigid.stack([copy.camera_from_model.double() for copy in copies])
-    if not bool(is_same(copy_poses, _all_symmetries(prepared)).any()):
-        return False
-    if not bool(is_same(copy_poses, prepared.copies.symmetries).any()):
-        copies.append(pose)
-    return True
+def _merge_same_poses(
+    hypotheses: Sequence[Hypothesis], shares: Sequence[float], prepared: PreparedObject
+) -> list[tuple[Hypothesis, float]]:
+    """Merge hypotheses of one pose: the likeliest stands for all of them, and has their shares."""
+    distinct: list[tuple[Hypothesis, float]] = []
+    for k in sorted(range(len(shares)), key=lambda k: -shares[k]):
+        same = None
+        if distinct:
+            poses = Rigid.stack([hypothesis.pose for hypothesis, _ in distinct])
+            is_same = prepared.copies.is_same(hypotheses[k].pose, poses, prepared.copies.symmetries)
+            same = int(is_same.int().argmax()) if bool(is_same.any()) else None
+        if same is None:
+            distinct.append((hypotheses[k], shares[k]))
+        else:
+            distinct[same] = (distinct[same][0], distinct[same][1] + shares[k])
+    return distinct
 
 
 def _refine_different_poses(

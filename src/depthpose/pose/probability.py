@@ -162,11 +162,14 @@ def probability_of_instances(
         prior_many: odds of any number of instances, and not one at most; 0 in a detector's box.
     """
     by_itself = log_odds.sigmoid()
-    none_or_one = torch.cat([log_odds.new_zeros(1), log_odds])
+    log_weights_none_or_one = torch.cat([log_odds.new_zeros(1), log_odds])
     # Of any number of instances every choice of places is possible.
-    log_many = log_odds.new_tensor(prior_many).log() + softplus(log_odds).sum()
-    many = (log_many - none_or_one.logsumexp(0)).sigmoid()
-    return many * by_itself + (1 - many) * none_or_one.softmax(0)[1:]
+    log_weight_many = log_odds.new_tensor(prior_many).log() + softplus(log_odds).sum()
+    probability_many = (log_weight_many - log_weights_none_or_one.logsumexp(0)).sigmoid()
+    return (
+        probability_many * by_itself
+        + (1 - probability_many) * log_weights_none_or_one.softmax(0)[1:]
+    )
 
 
 def share_among_objects(evidences: Sequence[Evidence]) -> Float64[Tensor, " n"]:

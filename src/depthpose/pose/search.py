@@ -220,7 +220,7 @@ def _propose(
 ) -> list[_Place]:
     """Propose poses: the best of all objects, and some places of each; none at a claimed place."""
 
-    def propose(name: str) -> list[_Proposal]:
+    def propose_object(name: str) -> list[_Proposal]:
         pairs = targets.objects[name].pairs
         poses, score = propose_in_frame(frame, is_unclaimed, pairs, len(names))
         return [
@@ -230,12 +230,13 @@ def _propose(
 
     proposals = [
         proposal
-        for group in each_in_threads(propose, names, torch.get_num_threads())
+        for group in each_in_threads(propose_object, names, torch.get_num_threads())
         for proposal in group
     ]
     proposals.sort(key=lambda proposal: -proposal.score)
 
-    # The best of them, and for each object the best at some places, which others' may outnumber.
+    # The best of all objects, several at one place too: they are joint starts of its refinement.
+    # Beyond these, only proposals at new places of objects with few places yet.
     places: list[_Place] = []
     count_of_object = Counter[str]()
     for number, proposal in enumerate(proposals):

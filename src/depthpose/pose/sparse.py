@@ -412,7 +412,10 @@ def _convolve(x: Tensor, weight: Tensor, kernel_map: KernelMap) -> Tensor:
 
 
 def _gather_slots(x: Tensor, kernel_map: KernelMap) -> Tensor:
-    """Gather the slots of (volume, most); empty ones read a row of zeros."""
+    """Gather the input row of each pair into a padded grid (volume, most, channels).
+
+    ``most`` is the number of pairs of the fullest offset; empty slots are zero.
+    """
     near = kernel_map.neighbours
     padded = F.pad(x, (0, 0, 0, 1))
     read = padded.index_select(0, near.slots(is_transposed=kernel_map.is_transposed).read)

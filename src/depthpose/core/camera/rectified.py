@@ -305,13 +305,14 @@ def _find_change(left: Grey, right: Grey, corners: Pixels) -> str | None:
         "upside down": right.flip(0, 1),
         "mirrored top to bottom": right.flip(0),
     }
-    for change, unchanged in flips.items():
-        matches, _, _ = _match_corners(left, unchanged, tried_corners)
+    for change, restored in flips.items():
+        matches, _, _ = _match_corners(left, restored, tried_corners)
         if len(matches) >= _MIN_TRIED_MATCHES:
             return f"the right image is {change} beside the left one; turn it back"
     for rotation_deg, scale in _TRIED_CHANGES:
-        unchanged = _warp(right, -rotation_deg, scale)
-        left_px, right_px, _ = _match_corners(left, unchanged, tried_corners)
+        # Sampled at points farther apart by the scale, an image that was enlarged shrinks back.
+        restored = _warp(right, -rotation_deg, scale)
+        left_px, right_px, _ = _match_corners(left, restored, tried_corners)
         if len(left_px) >= _MIN_TRIED_MATCHES:
             remaining_deg, remaining_scale, _ = _fit_rows(left_px, (right_px - left_px)[:, 1])
             return (

@@ -328,7 +328,7 @@ def _protect_local_cluster() -> None:
 
     Whoever reaches a port of Ray may run any code. Ray reads these variables as it is imported.
     """
-    # Ray's switch for clusters of several machines: without them a node is 127.0.0.1.
+    # On every system, in spite of its name: "0" makes Ray listen on 127.0.0.1 alone.
     os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
     os.environ.setdefault("RAY_AUTH_MODE", "token")
     if "RAY_AUTH_TOKEN_PATH" not in os.environ:

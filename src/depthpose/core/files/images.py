@@ -235,7 +235,8 @@ def _has_hole(data: bytes) -> bool:
                 first_symbols[segment[0]] = segment[17]
                 segment = segment[17 + sum(segment[1:17]) :]
         if marker == _START_OF_SCAN and len(segment) > 2:
-            # Tables of coefficients begin at 16; the scan names that of its first component.
+            # Tables of coefficients begin at 16. The low four bits of the third byte name that of
+            # the first component, and those of a symbol are the coefficient's size: 0 ends a block.
             table = 16 + (segment[2] & 15)
             is_coefficient = first_symbols.get(table, 0) & 15 > 0
             next_marker = _NEXT_MARKER.search(data, end)

@@ -180,6 +180,7 @@ def _add_clump(
     b: MeshBuilder, centre: Values, radii: np.ndarray, count: int, length_m: Number
 ) -> None:
     """Add a clump of leaves: a dark core that occludes the background, and leaves about it."""
+    # Grey: the clump gets its colour where it is placed.
     light = b.rng.uniform(0.8, 1.15)
     dark = 0.3 * light
     pale = light * 0.7
