@@ -73,8 +73,9 @@ VOTES_RAD = 0.15
 """Mean angle between a network's directions and those to the keypoints at a right pose."""
 LEAST_AGREEMENT = 2 / 3
 """Share of what was compared that must support a pose."""
-MOST_CONTINUED = 0.4
-"""Where the surface goes on across so much of the silhouette, the pose lies on something larger."""
+MOST_CONTINUED = 0.3
+"""Where the surface goes on across more of the silhouette, the pose lies on something larger: one
+side in four may touch a thing of the same height."""
 LEAST_POSSIBLE = 0.02
 """A proposal of a search that is less likely goes no further."""
 LEAST_AREA = 1.0
@@ -85,7 +86,7 @@ def probability_right(evidence: Evidence, prior_odds: float) -> float:
     """Probability that a pose is right, up to near-symmetry, and not the best of wrong ones.
 
     It is 0 where less than two thirds of what was observed supports the pose, and where the surface
-    goes on across two fifths of its silhouette.
+    goes on across much of its silhouette.
     """
     if evidence.agreement < LEAST_AGREEMENT:
         return 0.0
