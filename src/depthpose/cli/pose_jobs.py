@@ -146,9 +146,12 @@ def _choose_wanted(
 ) -> WantedObjects:
     """Decide which detections are posed, and which objects have a result in every image.
 
-    Posed are the detections of ``only``, or of every object where it is None. A result, a refusal
-    where it was not detected, have ``only``; else the objects of ``labels``; else, where there are
-    no labels, all objects of a method that expects all, and none of another method.
+    With ``only``, its detections alone are posed; else those of every object. Every image has a
+    result, a refusal where nothing was detected, of these objects:
+
+    - of ``only``, where it is given;
+    - else of those in ``labels``, where there are labels;
+    - else of all objects, if the method expects all of them in an image; else of none.
     """
     names = [model.name for model in method.models]
     if only is not None:

@@ -123,10 +123,10 @@ def refine_pose(
     Every point of a partial cloud has a place on the whole model, so points seek the surface and
     not the reverse. Each step minimises ``sum w (n . (T^-1 x - s))^2`` over the nearest surface
     point ``s`` with normal ``n`` (Chen and Medioni 1991) that faces the camera; the weight is
-    Tukey's, and its limit shrinks from ``start_distance`` to ``end_distance``. After half of
-    the steps ``s`` is where the ray of ``x`` meets the surface: noise is along the ray, and the
-    nearest point would be on another face where it errs inward near an edge, and draw the model
-    toward the camera.
+    Tukey's, and its limit shrinks from ``start_distance`` to ``end_distance``. In the second half
+    of the steps ``s`` is where the ray of ``x`` meets the surface, for noise is along the ray. The
+    nearest point would do harm there: of a reading that noise puts behind an edge it lies on
+    another face, and such readings draw the model toward the camera.
 
     Where no point of the cloud comes near the surface a pose stays as it was, with an
     ``inlier_share`` of 0.
@@ -141,8 +141,8 @@ def refine_pose(
         InputError: there is no point, or one is not finite.
     """
     config = IcpConfig() if config is None else config
-    # The limit shrinks in even ratios over half of the steps, then stays. A last limit is for the
-    # residuals of the final pose.
+    # The limit shrinks in even ratios over half of the steps, then stays; then the compiled loop
+    # matches along rays. A last limit is for the residuals of the final pose.
     start = config.start_distance_diameters
     end = config.end_distance_diameters
     half = max(1, config.iterations // 2)

@@ -487,7 +487,7 @@ def make_detection_jobs(
         detections: those of images that are not in the data set are left out.
 
     Raises:
-        InputError: no detection is of the data set.
+        InputError: a detection lacks its scene, image or object, or none is of the data set.
     """
     # The best detections of each object in each image.
     shown: dict[Place, list[Instance]] = defaultdict(list)
@@ -522,7 +522,7 @@ def make_detection_jobs(
         seconds: dict[str, float] = {}
         if detection.seconds is not None:
             seconds = {"segmentation": detection.seconds / jobs_of_image[place[:2]]}
-        instance = shown[place][0]
+        instance = shown[place][0]  # any of the object: only its image and camera are used
         object = names[place.object_id]
         read = partial(_read_view, dataset, instance, name, object, detection)
         jobs.append(PoseJob(name=name, read=read, place=place, seconds=seconds))

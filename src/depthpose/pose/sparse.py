@@ -408,6 +408,7 @@ def _convolve(x: Tensor, weight: Tensor, kernel_map: KernelMap) -> Tensor:
         kernels = weight.unbind()
         for offset, read, write in kernel_map.by_offset():
             out.index_add_(0, write, x.index_select(0, read) @ kernels[offset])
+    # Pairs leave out the voxel itself, which the table has.
     return out if near.centre is None else out.addmm_(x, weight[near.centre])
 
 

@@ -301,7 +301,7 @@ def _find_odometry(folder: Path) -> Iterable[Frame]:
 
 
 def _find_benchmark(folder: Path, left_name: str, right_name: str, ending: str) -> Iterable[Frame]:
-    """Find the frames of KITTI object, 2012 or 2015: of the stereo sets those of truth, NNNNNN_10.
+    """Find the frames of KITTI object, 2012 or 2015; of 2012 and 2015 only those with truth.
 
     ``ending``: ending of the names of folders with true disparity.
     """
@@ -309,6 +309,7 @@ def _find_benchmark(folder: Path, left_name: str, right_name: str, ending: str) 
     lefts = _list_files(root / left_name)
     # Frames of the stereo sets are NNNNNN_10 and, without truth, NNNNNN_11; object has neither.
     lefts = [left for left in lefts if stem_of(left).endswith("_10")] or lefts
+    # The calibration NNNNNN.txt is that of object's frame NNNNNN, or of the stereo sets' NNNNNN_10.
     texts = _list_by_stem(root / "calib_cam_to_cam", (".txt",)) | _list_by_stem(
         root / "calib", (".txt",)
     )

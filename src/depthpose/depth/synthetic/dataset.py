@@ -428,7 +428,10 @@ class Projector:
 
 @cache
 def _make_dots() -> Float[Tensor, "1024 1024"]:
-    """Make a pattern of 341 x 341 dots that can be tiled; each dot has a cell of 3 x 3 pixels."""
+    """Make a pattern of dots at random places that can be tiled: one for 3 x 3 pixels on average.
+
+    Its sides of 1024 pixels, a power of two, are quick to tile; the last row and column are dark.
+    """
     rng = np.random.default_rng(79)
     cells = 341
     pattern = torch.zeros(3 * cells + 1, 3 * cells + 1)

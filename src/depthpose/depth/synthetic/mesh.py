@@ -340,7 +340,8 @@ def _paint_thing(name: str, noise: _Noise, variant: int) -> Plane | Picture:
                 colored[10:50, x : x + int(rng.integers(8, 22))] = 0.08
             colored[:, :14] = (0.1, 0.2, 0.9)
         case "lamp":
-            return 1 + 0.15 * np.sign(np.sin(_x * 40 * np.pi)) + 0 * noise.broad()
+            noise.broad()  # drawn, so that the numbers after it stay those of earlier scenes
+            return 1 + 0.15 * np.sign(np.sin(_x * 40 * np.pi))
         case "sign":  # dark figures on a light ground: bars, arrows, words
             colors = [(0.1, 0.1, 0.1), (0.05, 0.05, 0.05), (1.0, 0.08, 0.08), (0.1, 0.2, 0.9)]
             color = np.array(colors[variant % 4])

@@ -519,24 +519,27 @@ def _make_ring(
 
 
 def _add_trim(b: MeshBuilder, length: float, width: float, height: float) -> None:
-    """Add lights, mirrors, plates and bumpers of a vehicle of a size [m]."""
-    low = min(height, 1.6)
-    sill = 0.16 * min(height, 1.8) + 0.03
+    """Add lights, mirrors, plates, bumpers and a tall one's rear window to a vehicle of a size [m].
+
+    It drives along z, its ground is y = 0, and y points down.
+    """
+    low = min(height, 1.6)  # lights of tall vehicles are no higher than those of a car
+    sill = 0.16 * min(height, 1.8) + 0.03  # as the body's lower edge
     white = Surface("lamp", (0.8, 0.81, 0.83))
     red = Surface("lamp", (0.4, 0.02, 0.02))
-    b.box((0, -sill + 0.02, 0), (width * 0.9, 0.14, length * 0.94), _BLACK)
+    b.box((0, -sill + 0.02, 0), (width * 0.9, 0.14, length * 0.94), _BLACK)  # the underbody
     for side in (-1, 1):
-        front = side * width * 0.36
-        rear = side * width * 0.4
-        b.box((front, -0.46 * low, 0.487 * length), (0.32, 0.13, 0.08), white)
-        b.box((rear, -0.55 * low, -0.488 * length), (0.2, 0.22, 0.06), red)
+        headlight_x = side * width * 0.36
+        rear_light_x = side * width * 0.4
+        b.box((headlight_x, -0.46 * low, 0.487 * length), (0.32, 0.13, 0.08), white)
+        b.box((rear_light_x, -0.55 * low, -0.488 * length), (0.2, 0.22, 0.06), red)
         mirror = (side * (width / 2 + 0.08), -0.66 * min(height, 2), 0.2 * length)
         b.box(mirror, (0.18, 0.13, 0.1), Surface("paint"))
     plate = Surface("plate", (0.8, 0.8, 0.76), 0.52)
     b.box((0, -0.42 * low, -0.502 * length), (0.52, 0.12, 0.03), plate)
     b.box((0, -0.28 * low, 0.503 * length), (0.52, 0.12, 0.03), plate)
-    b.box((0, -0.33 * low, 0.495 * length), (width * 0.55, 0.12, 0.04), _BLACK)
-    b.box((0, -0.24 * low, -0.496 * length), (width * 0.94, 0.16, 0.06), _BLACK)
+    b.box((0, -0.33 * low, 0.495 * length), (width * 0.55, 0.12, 0.04), _BLACK)  # the grille
+    b.box((0, -0.24 * low, -0.496 * length), (width * 0.94, 0.16, 0.06), _BLACK)  # rear bumper
     if height > 1.9:  # the rear window of tall vehicles is upright
         pane = Surface("glass", (0.03, 0.03, 0.035))
         where = (0, -0.74 * height, -0.499 * length)

@@ -450,7 +450,7 @@ _MOST_CLIPPED = 2e8
 times 1,000 plus its reflex corners."""
 _MOST_TOGETHER = 2**20  # corners of polygons that are cut at a time
 _MOST_ROUNDS = 3  # about a polygon in search of ears; one that needs more crosses itself
-_FLAT = 1e-9  # of the square of a polygon's area: a corner that is reflex by less is straight
+_FLAT = 1e-9  # of the square of a polygon's extent: an area that is smaller is none
 _OVERLAP = 1e-3  # of all area: share that polygons which cross themselves may cover twice
 
 
@@ -610,6 +610,8 @@ def _clip_ears(points: np.ndarray, is_reflex: np.ndarray) -> list[list[int]]:
     is_left = [True] * count
     is_waiting = [True] * count
     waiting = deque([*range(1, count), 0])
+    # Each corner is examined once a round. A cut may straighten a reflex corner, and makes none: a
+    # flag that is out of date costs a test alone.
     rounds = 0
     is_cut = False  # whether an ear was cut in this round
     must_cut = False
@@ -641,7 +643,7 @@ def _clip_ears(points: np.ndarray, is_reflex: np.ndarray) -> list[list[int]]:
         must_cut = False
         after[ear[0]] = ear[2]
         before[ear[2]] = ear[0]
-        # The corner before comes later: a fan of needles is cut where it can be avoided.
+        # The corner after the ear comes first: so ears do not fan out from one corner as needles.
         for beside in (ear[2], ear[0]):
             if not is_waiting[beside]:
                 waiting.append(beside)
