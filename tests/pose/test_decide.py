@@ -79,7 +79,7 @@ def test_each_kind_of_contradiction_lowers_the_probability() -> None:
             evidence = replace(GOOD, supported=38.0 - patches, **{kind: patches})
             assert evidence.contradicted == patches
             after = probability_right(evidence, PRIOR_MASKED)
-            assert after < before, (kind, patches)
+            assert after < before or after == before == 0, (kind, patches)
             before = after
         # Where the rest lies no nearer than it does by accident, it is refused.
         assert probability_right(replace(evidence, rms=1.7), PRIOR_PROPOSED) < 0.1, kind
