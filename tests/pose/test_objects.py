@@ -13,6 +13,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.config import ObjectsConfig, SyntheticSensorConfig
 from depthpose.pose.datasets import check_bop, open_bop, write_bop_models, write_bop_scene
 from depthpose.pose.mesh import drawn_triangles, make_model
+from depthpose.pose.mesh.models import triangulate_points
 from depthpose.pose.synthetic import Objects, make_frames, views
 from depthpose.pose.synthetic.views import (
     aim_camera,
@@ -213,6 +214,24 @@ def test_triangles_between_points_stand_for_their_surface(
     assert float(difference_m.median()) < 5e-4
     # Nothing of the far side shows through gaps, and no hole of the body is closed.
     assert float((difference_m > 2e-3).float().mean()) < 0.02
+
+
+@pytest.mark.parametrize(
+    ("count", "scale", "repeats", "is_surface"),
+    [(3, (1, 1, 1), 1, False), (600, (1, 1, 0), 1, True), (600, (1, 1, 0), 2, True),
+     (600, (1, 0, 0), 1, False)],
+    ids=["three points", "a plane", "each point twice", "a line"],
+)  # fmt: skip
+def test_points_that_are_no_body_are_joined_where_they_are_a_surface(
+    count: int, scale: tuple[float, ...], repeats: int, is_surface: bool
+) -> None:
+    points_m = torch.rand(count, 3, generator=torch.Generator().manual_seed(0))
+    points_m = (points_m * torch.tensor(scale, dtype=torch.float32)).repeat(repeats, 1)
+    normals = torch.tensor([0.0, 0.0, 1.0]).expand(len(points_m), 3)
+    triangles_m = triangulate_points(points_m, normals)
+    sides_m = triangles_m - triangles_m.roll(1, 1)
+    area_m2 = torch.linalg.cross(sides_m[:, 0], sides_m[:, 1]).norm(dim=-1) / 2
+    assert (float(area_m2.sum()) > 0.9) == is_surface
 
 
 def test_errors_say_what_to_do() -> None:

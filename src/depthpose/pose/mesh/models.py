@@ -239,6 +239,8 @@ def triangulate_points(
     surface by its normals. Triangles within a body remain too: nothing sees them.
     """
     points = points_m.double().numpy()
+    if len(points) <= 4:  # a tetrahedron is no surface
+        return points_m.new_zeros(0, 3, 3)
     tree = KDTree(points)
     count = min(_NEIGHBOURS + 1, len(points))  # the nearest is the point itself
     distance_m, _ = tree.query(points, count, workers=1)
