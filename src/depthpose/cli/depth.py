@@ -67,7 +67,9 @@ def predict_depth(
     if engine.engine == "ray":
         packed = source.with_packed_weights()
         make_work = partial(depth_predict.image_work, lens, scale, output, packed)
-        return depth_predict.predict_on_ray(images, depth_predict.IMAGES, make_work, out, engine)
+        return depth_predict.predict_depth_on_ray(
+            images, depth_predict.IMAGES, make_work, out, engine
+        )
 
     # In this process.
     paths = depth_predict.list_sources(images, Path(out))
@@ -79,7 +81,9 @@ def predict_depth(
             "--precision and --max-memory are for a matcher with weights, and none runs here; "
             "leave them out"
         )
-    return depth_predict.predict_files([(path,) for path in paths], work, method, Path(out))
+    return depth_predict.predict_depth_of_files(
+        [(path,) for path in paths], work, method, Path(out)
+    )
 
 
 def match_pairs(
@@ -127,7 +131,9 @@ def match_pairs(
         packed = source.with_packed_weights()
         make_work = partial(depth_predict.pair_work, camera, pairs, packed)
         sides = [left] if right is None else [left, right]
-        return depth_predict.predict_on_ray(sides, depth_predict.PAIRS, make_work, out, engine)
+        return depth_predict.predict_depth_on_ray(
+            sides, depth_predict.PAIRS, make_work, out, engine
+        )
 
     # In this process.
     if right is None:
@@ -135,7 +141,7 @@ def match_pairs(
     files = depth_predict.list_pairs(left, right)
     refuse_among_inputs(Path(out), (left, right), [path for pair in files for path in pair])
     work = depth_predict.pair_work(camera, pairs, source, files[0])
-    return depth_predict.predict_files(files, work, source.build(), Path(out))
+    return depth_predict.predict_depth_of_files(files, work, source.build(), Path(out))
 
 
 def evaluate_depth(
@@ -166,7 +172,7 @@ def evaluate_depth(
         measure,
         measure_shards,
         open_frames,
-        predict_dataset,
+        predict_depth_of_dataset,
     )
     from depthpose.core.engine import PLAN
     from depthpose.core.files import stores
@@ -197,7 +203,9 @@ def evaluate_depth(
     claim_folder(out, settings, files)
 
     # Predict what is missing, then measure it with the predictions that are given.
-    folders = [predict_dataset(dataset, method, rule, out / "predictions") for method in chosen]
+    folders = [
+        predict_depth_of_dataset(dataset, method, rule, out / "predictions") for method in chosen
+    ]
     protocol = comparison.protocol
     caps_m = comparison.cap
     predictions = methods.predictions

@@ -51,7 +51,9 @@ def open_frames(data: Path, split: str | None) -> Dataset:
     return dataset
 
 
-def predict_dataset(dataset: Dataset, method: DepthMethod, rule: Protocol, folder: Path) -> Path:
+def predict_depth_of_dataset(
+    dataset: Dataset, method: DepthMethod, rule: Protocol, folder: Path
+) -> Path:
     """Predict every frame that has truth, and a right view if the method needs it.
 
     Of several processes each predicts its share, and the first waits for the files of all. Gives

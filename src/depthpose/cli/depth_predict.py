@@ -437,7 +437,7 @@ class DepthWork:
         return estimate
 
 
-def predict_on_ray(
+def predict_depth_on_ray(
     words: Sequence[str],
     files: Files,
     make_work: Callable[[Sequence[Path]], DepthWork],
@@ -474,7 +474,7 @@ def predict_on_ray(
     return print_shards(engine.run(work, inputs, out, settings), out, noun)
 
 
-def predict_files(
+def predict_depth_of_files(
     sources: Sequence[tuple[Path, ...]], work: DepthWork, method: DepthMethod, out: Path
 ) -> int:
     """Estimate what is not finished, and give the exit code.

@@ -45,7 +45,11 @@ def predict_poses(
     """
     from depthpose.cli.pose_frames import search_dataset, search_files
     from depthpose.cli.pose_methods import make_method_source
-    from depthpose.cli.pose_predict import predict_dataset, predict_files, predict_on_ray
+    from depthpose.cli.pose_predict import (
+        predict_poses_of_dataset,
+        predict_poses_of_files,
+        predict_poses_on_ray,
+    )
 
     # One kind of input; a pair is matched first, to depth images.
     pose_inputs = options.PoseInputs(**vars(inputs), **vars(details))
@@ -57,9 +61,9 @@ def predict_poses(
             "depth image with --mask and --camera, a pair with --camera, or a data set"
         )
     if pair.left is not None:
-        from depthpose.cli.pose_pairs import match_pairs
+        from depthpose.cli.pose_pairs import match_pairs_for_poses
 
-        depth = match_pairs(pair, pose_inputs.camera, estimates.device, Path(out))
+        depth = match_pairs_for_poses(pair, pose_inputs.camera, estimates.device, Path(out))
         pose_inputs = replace(pose_inputs, depth=str(depth))
 
     # The estimator: a trained network, or registration of CAD files. Workers build their own.
@@ -74,7 +78,7 @@ def predict_poses(
     )
     batch = estimates.batch
     if engine.engine == "ray":
-        return predict_on_ray(pose_inputs, source, batch, out, engine)
+        return predict_poses_on_ray(pose_inputs, source, batch, out, engine)
     method = source.build()
 
     # Pose a data set, or search whole images, or pose clouds and masked parts of images.
@@ -84,7 +88,9 @@ def predict_poses(
             raise InputError("--color is beside --depth; leave it out where --bop is given")
         if dataset.masks == "search":
             return search_dataset(method, dataset, pose_inputs.object, home)
-        return predict_dataset(method, dataset, pose_inputs.object, source.config, home, batch)
+        return predict_poses_of_dataset(
+            method, dataset, pose_inputs.object, source.config, home, batch
+        )
     if pose_inputs.cloud is not None and not method.takes_clouds:
         raise InputError(
             f"--cloud {pose_inputs.cloud}: the weights {weights} need depth images; give --depth, "
@@ -93,7 +99,7 @@ def predict_poses(
     has_lens = pose_inputs.lens is not None
     if pose_inputs.depth is not None and has_lens and not pose_inputs.has_regions:
         return search_files(method, pose_inputs, home)
-    return predict_files(method, pose_inputs, home, batch)
+    return predict_poses_of_files(method, pose_inputs, home, batch)
 
 
 def evaluate_poses(

@@ -24,7 +24,7 @@ DEVIATION = "depth_std"
 """Folder of the standard deviation of that depth."""
 
 
-def match_pairs(pair: PairOptions, camera: Path | None, device: str, out: Path) -> Path:
+def match_pairs_for_poses(pair: PairOptions, camera: Path | None, device: str, out: Path) -> Path:
     """Match pairs, write their depth, and give its path: of one pair NAME.npy, else the folder.
 
     OUT/matched gets what 'depth match' writes, OUT/depth the depth [m] whose confidence is
@@ -61,7 +61,7 @@ def match_pairs(pair: PairOptions, camera: Path | None, device: str, out: Path) 
     )
     networks = PairNetworks(matcher=pair.matcher)
     work = depth_predict.pair_work(camera, networks, source, pairs[0])
-    depth_predict.predict_files(pairs, work, source.build(), out / MATCHED)
+    depth_predict.predict_depth_of_files(pairs, work, source.build(), out / MATCHED)
     if find_rank().world > 1:  # every process poses its share of all pairs
         depth_predict.wait_for_results(pairs, work, out / MATCHED)
 

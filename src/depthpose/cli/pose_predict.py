@@ -51,7 +51,7 @@ ENDING = "pose.json"
 """Ending of the file of one estimate in a shard: an entry of ``poses.json``."""
 
 
-def predict_files(method: PoseMethod, inputs: PoseInputs, out: Path, batch: int) -> int:
+def predict_poses_of_files(method: PoseMethod, inputs: PoseInputs, out: Path, batch: int) -> int:
     """Pose clouds, or masked parts of depth images, in this process; give the exit code."""
     plan = plan_jobs(method, inputs, out)
     settings = {**method.settings, **plan.settings}
@@ -63,7 +63,7 @@ def predict_files(method: PoseMethod, inputs: PoseInputs, out: Path, batch: int)
     return print_result(predictions, out)
 
 
-def predict_dataset(
+def predict_poses_of_dataset(
     method: PoseMethod,
     options: DataSetOptions,
     object: str | None,
@@ -227,7 +227,7 @@ class PoseWork:
         return Job(name=name, read=read)
 
 
-def predict_on_ray(
+def predict_poses_on_ray(
     options: PoseInputs, source: PoseMethodSource, batch: int, out: str, engine: EngineOptions
 ) -> int:
     """Pose clouds, or depth images with masks or a box, by the workers of an engine.

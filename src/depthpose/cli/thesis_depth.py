@@ -70,7 +70,9 @@ def reproduce_table(
     # Predict, in all processes; the first measures and joins.
     rule = find_protocol(protocol)
     home = out / "predictions"
-    folders = [evaluation.predict_dataset(dataset, method, rule, home) for _, method in methods]
+    folders = [
+        evaluation.predict_depth_of_dataset(dataset, method, rule, home) for _, method in methods
+    ]
     if find_rank().rank > 0:
         return 0
     measured = evaluation.join(evaluation.measure_each(dataset, folders, protocol, caps_m))
