@@ -3,6 +3,7 @@
 import math
 import re
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -152,22 +153,24 @@ def test_copies_of_a_plate_stay_where_its_symmetry_has_them(seed: int) -> None:
     assert min(errors) < 0.004
 
 
+def turned_about_near_axis(prepared: PreparedObject, pose: Rigid, degrees: float) -> RefinedPose:
+    """A pose after a rotation about the axis of the object's near-symmetric copies."""
+    axis = prepared.copies.near_axis
+    assert axis is not None
+    angle = torch.tensor(math.radians(degrees), dtype=torch.float64)
+    turn = turn_about(axis.direction.double(), axis.point_m.double(), angle)
+    return RefinedPose(
+        camera_from_model=pose @ turn, covariance=torch.eye(6), residual_m=torch.zeros(()),
+        inlier_share=torch.ones(()),
+    )  # fmt: skip
+
+
 def test_a_copy_that_drifts_competes_where_it_began_too(monkeypatch: pytest.MonkeyPatch) -> None:
     """One drifts onto the winner and one to another angle: each start stays, and the new angle."""
     mug = make_part("mug", 1)
     prepared = PreparedObject(number=0, model=mug, surface=prepare_surface(mug))
-    axis = prepared.copies.near_axis
-    assert axis is not None
-
-    def turned(degrees: float) -> RefinedPose:
-        angle = torch.tensor(math.radians(degrees), dtype=torch.float64)
-        turn = turn_about(axis.direction.double(), axis.point_m.double(), angle)
-        return RefinedPose(
-            camera_from_model=truth @ turn, covariance=torch.eye(6), residual_m=torch.zeros(()),
-            inlier_share=torch.ones(()),
-        )  # fmt: skip
-
     truth = pose_at(seed=1).double()
+    turned = partial(turned_about_near_axis, prepared, truth)
     competitors = [
         hypotheses._Competitor(refined=turned(0.0), unrefined=turned(60.0)),
         hypotheses._Competitor(refined=turned(150.0), unrefined=turned(120.0)),
@@ -190,16 +193,7 @@ def test_a_pose_that_is_one_of_the_copies_competes_with_none(
     mug = make_part("mug", 1)
     prepared = PreparedObject(number=0, model=mug, surface=prepare_surface(mug))
     truth = pose_at(seed=1).double()
-    axis = prepared.copies.near_axis
-    assert axis is not None
-
-    def turned(degrees: float) -> RefinedPose:
-        angle = torch.tensor(math.radians(degrees), dtype=torch.float64)
-        turn = turn_about(axis.direction.double(), axis.point_m.double(), angle)
-        return RefinedPose(
-            camera_from_model=truth @ turn, covariance=torch.eye(6), residual_m=torch.zeros(()),
-            inlier_share=torch.ones(()),
-        )  # fmt: skip
+    turned = partial(turned_about_near_axis, prepared, truth)
 
     upside_down = rotation_by(torch.tensor([math.pi, 0.0, 0.0])).double()
     other = replace(turned(0), camera_from_model=Rigid(truth.R @ upside_down, truth.t_m))

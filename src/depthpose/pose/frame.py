@@ -207,8 +207,9 @@ def _fit_normals(
 
             # Sums over the neighbours of the same surface: their number, their offsets x and y
             # [px], the difference q of their 1 / depth to that of the middle, and products.
-            n, x, y, q = 0, 0.0, 0.0, 0.0
-            xx, xy, yy, xq, yq = 0.0, 0.0, 0.0, 0.0, 0.0
+            n = 0
+            x = y = q = 0.0
+            xx = xy = yy = xq = yq = 0.0
             for v in range(max(0, row - _WINDOW), min(height, row + _WINDOW + 1)):
                 for u in range(max(0, column - _WINDOW), min(width, column + _WINDOW + 1)):
                     if depth_m[v, u] <= 0:
@@ -216,7 +217,8 @@ def _fit_normals(
                     gap = 1 / depth_m[v, u] - inverse
                     if abs(gap) >= limit:
                         continue
-                    right, down = u - column, v - row
+                    right = u - column
+                    down = v - row
                     n += 1
                     x += right
                     y += down
@@ -228,9 +230,14 @@ def _fit_normals(
                     yq += down * gap
 
             # Means, and second moments about them.
-            x, y, q = x / n, y / n, q / n
-            xx, xy, yy = xx / n - x * x, xy / n - x * y, yy / n - y * y
-            xq, yq = xq / n - x * q, yq / n - y * q
+            x /= n
+            y /= n
+            q /= n
+            xx = xx / n - x * x
+            xy = xy / n - x * y
+            yy = yy / n - y * y
+            xq = xq / n - x * q
+            yq = yq / n - y * q
 
             # The slopes a and b of q by x and y, of least squares.
             spread = xx * yy - xy * xy
@@ -238,7 +245,8 @@ def _fit_normals(
             b = (yq * xx - xq * xy) / max(spread, 1e-9)
 
             # The plane n . X = -1 has 1 / depth = -(n_x x' + n_y y' + n_z) on the ray (x', y', 1).
-            normal_x, normal_y = a * K[0, 0], b * K[1, 1]
+            normal_x = a * K[0, 0]
+            normal_y = b * K[1, 1]
             along = normal_x * rays[row, column, 0] + normal_y * rays[row, column, 1]
             normal_z = inverse + q - a * x - b * y - along
             length = math.sqrt(normal_x * normal_x + normal_y * normal_y + normal_z * normal_z)

@@ -125,7 +125,7 @@ def compete(
     winner_number = int(shares.argmax())
     winner = different[winner_number]
 
-    # And which of its copies? Others of the poses may be copies too, as about an axis.
+    # And which of its copies? Another of the poses may be a copy too, as between two about an axis.
     copies = [winner.refined]
     copies += _refine_distinct_copies(cloud_m, winner.refined, prepared, config, view)
     copy_poses = Rigid.stack([copy.camera_from_model.double() for copy in copies])
@@ -139,7 +139,7 @@ def compete(
         for hypothesis, belongs in zip(different, is_copy, strict=True)
         if belongs and hypothesis is not winner
     ]
-    group = [hypothesize(pose) for pose in copies]  # with its own colours, in place of the best's
+    group = [hypothesize(pose) for pose in copies]  # each with its own colours
     group_share = float(shares[torch.tensor(is_copy)].sum())
     copy_shares = group_share * share_among_copies(group, is_masked=observation.is_masked)
     distinct = _merge_same_poses(group, copy_shares.tolist(), prepared)
