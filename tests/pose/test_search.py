@@ -408,7 +408,16 @@ def test_a_second_place_needs_more_than_the_first() -> None:
     (first,), misses = search._weigh_instances(of_one_object(5.0, math.log(2)), TARGETS)
     assert first.log_odds == 5
     assert len(misses) == 1
-    assert "beside" in misses[0].reason
+    assert "other poses and places" in misses[0].reason
+
+
+def test_a_place_that_another_pose_explains_as_well_is_a_miss() -> None:
+    """The place is right with 99 %, but each of two poses there with less than a half."""
+    (place,) = of_one_object(5.0)
+    undecided = replace(place, estimate=replace(place.estimate, certainty=0.47))
+    remaining, misses = search._weigh_instances([undecided], TARGETS)
+    assert not remaining
+    assert "47%" in misses[0].reason
 
 
 def test_a_box_holds_one() -> None:

@@ -376,7 +376,11 @@ def _miss_at(
 def _weigh_instances(
     accepted: Sequence[_Judged], targets: SearchTargets
 ) -> tuple[list[_Judged], list[_Miss]]:
-    """Weigh the places of each object by each other; separate those that are not likely enough."""
+    """Weigh the places of each object by each other; separate poses that are likelier wrong.
+
+    A pose may be likelier wrong than right because another place is surer, and a table holds one
+    of each object; or because another pose explains its place as well.
+    """
     remaining: list[_Judged] = []
     misses: list[_Miss] = []
     for name in dict.fromkeys(place.object for place in accepted):
@@ -385,16 +389,17 @@ def _weigh_instances(
         prior_many = 0.0 if targets.is_single else PRIOR_MANY
         probabilities = probability_of_instances(log_odds, prior_many)
         shares = probabilities / log_odds.sigmoid()  # of the probability that each has by itself
-        for k, place in enumerate(places):
-            probability = float(probabilities[k])
-            if probability >= targets.refusal.min_probability:
-                estimate = with_share(place.estimate, float(shares[k]))
+        for place, share in zip(places, shares.tolist(), strict=True):
+            estimate = with_share(place.estimate, share)
+            assert estimate.certainty is not None, "judged poses have evidence"
+            if estimate.certainty >= targets.refusal.min_probability:
                 remaining.append(replace(place, estimate=estimate))
             else:
                 reason = (
-                    f"beside the surer ones it is right with a probability of {probability:.0%}"
+                    "weighed against other poses and places, it is right with a probability of "
+                    f"{estimate.certainty:.0%}"
                 )
-                misses.append(_miss_at(place, place.estimate.evidence, reason, targets))
+                misses.append(_miss_at(place, estimate.evidence, reason, targets))
     return remaining, misses
 
 
