@@ -201,6 +201,15 @@ def test_a_refusal_says_what_contradicts_the_pose_most(kind: str, words: str) ->
     assert "mask" not in searched, "a search was given none"
 
 
+def test_a_pose_on_something_larger_is_refused_for_this_reason_beside_larger_areas() -> None:
+    evidence = replace(GOOD, silhouette=20.0, continued=7.0, unobserved=30.0)
+    assert probability_right(evidence, 1e6) == 0
+    assert "goes on beyond it" in contradiction(evidence, 0.0, is_masked=False)
+    evidence = replace(evidence, continued=5.0)
+    assert probability_right(evidence, 1e6) > 0.5, "objects touch"
+    assert "was not observed" in contradiction(evidence, 0.0, is_masked=False)
+
+
 def test_an_answer_below_the_wanted_certainty_is_ambiguous() -> None:
     pose = Rigid(torch.eye(3), torch.zeros(3))
     other = Alternative(camera_from_model=pose, probability=0.2, difference="so")

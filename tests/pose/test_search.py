@@ -332,7 +332,7 @@ EVIDENCE = Evidence(
 
 def judged(
     object: str, log_odds: float, columns: slice, number: int = 0, seen_through: float = 0.0
-) -> "search._Judged":
+) -> "search._JudgedPlace":
     """An answer that explains some columns of an image of 4 x 40, of a certainty of 1."""
     explained = torch.zeros(4, 40, dtype=torch.bool)
     explained[:, columns] = True
@@ -342,7 +342,7 @@ def judged(
         name="", object=object, status="ok", certainty=1.0, copy_certainty=1.0,
         camera_from_model=pose.float(), evidence=evidence,
     )  # fmt: skip
-    return search._Judged(
+    return search._JudgedPlace(
         object=object, pose=pose, explained=explained, estimate=estimate, log_odds=log_odds
     )
 
@@ -391,7 +391,7 @@ def test_poses_of_one_object_on_the_same_readings_are_one_answer() -> None:
     assert [place.log_odds for place in kept] == [3.0]
 
 
-def of_one_object(*log_odds: float) -> list["search._Judged"]:
+def of_one_object(*log_odds: float) -> list["search._JudgedPlace"]:
     """Places of one object, whose probabilities are those of their log odds."""
     places = [judged("a", odds, slice(8 * k, 8 * k + 8), k) for k, odds in enumerate(log_odds)]
     return [

@@ -20,6 +20,7 @@ from depthpose.pose.observability import free_motions, observability, without_mo
 from depthpose.pose.probability import (
     LEAST_AREA,
     WRONG_RMS,
+    is_on_larger,
     probability_right,
     share_among_objects,
 )
@@ -50,7 +51,7 @@ def decide(
     config: EstimateConfig,
     prior_odds: float,
 ) -> PoseEstimate:
-    """Give the likeliest of competing poses as the estimate, or say why it is withheld.
+    """Return the likeliest of competing poses as the estimate, or a refusal that says why not.
 
     Args:
         cloud: points of the object.
@@ -159,7 +160,7 @@ def why_not_observable(
 def _alternatives(
     competition: Competition, probability: float, prepared: PreparedObject
 ) -> tuple[Alternative, ...]:
-    """Give the poses that may be right in place of the best, the likeliest first."""
+    """List the poses that may be right in place of the best, the likeliest first."""
     competitors = [(h, share, True) for h, share in competition.copies]
     competitors += [(h, share, False) for h, share in competition.others]
     competitors.sort(key=lambda competitor: -competitor[1])
@@ -185,31 +186,28 @@ def contradiction(evidence: Evidence, probability: float, *, is_masked: bool) ->
     """
     compared = max(evidence.supported + evidence.contradicted, 1e-9)
     visible = max(evidence.visible, 1e-9)
-    reasons = [
-        (
-            evidence.seen_through,
-            f"the camera saw through {evidence.seen_through / visible:.0%} of the posed surface",
-        ),
-        (
-            evidence.bulging,
-            f"{evidence.bulging / compared:.0%} of its readings lie before the posed surface",
-        ),
+    through_share = evidence.seen_through / visible
+    bulging_share = evidence.bulging / compared
+    beside_share = evidence.beside / compared
+    unobserved_share = evidence.unobserved / visible
+    goes_on = "the surface within the posed silhouette goes on beyond it"
+    findings = [
+        (evidence.seen_through, f"the camera saw through {through_share:.0%} of the posed surface"),
+        (evidence.bulging, f"{bulging_share:.0%} of its readings lie before the posed surface"),
         (
             evidence.beside,
-            f"{evidence.beside / compared:.0%} of the object's readings lie beside the posed "
-            "silhouette",
+            f"{beside_share:.0%} of the object's readings lie beside the posed silhouette",
         ),
-        (
-            evidence.continued,
-            "the surface within the posed silhouette goes on beyond it",
-        ),
+        (evidence.continued, goes_on),
         (
             _UNOBSERVED_WEIGHT * evidence.unobserved,
-            f"{evidence.unobserved / visible:.0%} of the posed surface was not observed",
+            f"{unobserved_share:.0%} of the posed surface was not observed",
         ),
     ]
-    area, worst = max(reasons, key=lambda reason: reason[0])
-    if area < _LEAST_CONTRADICTING:
+    area, worst = max(findings)
+    if is_on_larger(evidence):
+        worst = goes_on
+    elif area < _LEAST_CONTRADICTING:
         worst = "too little of the object was observed"
         if evidence.rms > WRONG_RMS:
             worst = f"its residuals are {evidence.rms:.1f} times what the sensor explains"
@@ -240,7 +238,7 @@ def with_status(estimate: PoseEstimate, min_certainty: float) -> PoseEstimate:
 
 
 def refused(pose_input: AnyInput, refusal: Refusal, seconds: dict[str, float]) -> PoseEstimate:
-    """Give the estimate of an input without a pose."""
+    """Make the estimate of an input without a pose."""
     return PoseEstimate(
         name=pose_input.name,
         object=pose_input.object,
@@ -297,7 +295,7 @@ def seconds_of_all(estimates: Iterable[PoseEstimate]) -> dict[str, float]:
 def likeliest_object(
     estimates: Sequence[PoseEstimate],
 ) -> tuple[PoseEstimate, Float64[Tensor, " n"]]:
-    """Give the likeliest of the estimates for one place, and the share of each object.
+    """Choose the likeliest of the estimates for one place; return it and the share of each object.
 
     All of them have evidence. The probabilities of the likeliest are multiplied by its share.
     """

@@ -90,11 +90,11 @@ class PoseEstimator:
         return list(tqdm(estimates, total=total, unit=" poses", disable=not with_progress))
 
     def _estimate_each(self, inputs: Iterable[AnyInput], threads: int) -> Iterator[PoseEstimate]:
-        """Give each input's estimate, in order; each is expected to show its object."""
+        """Estimate each input, in order; each is expected to show its object."""
         return each_in_threads(partial(unreadable_on_error, self._estimate), inputs, threads)
 
     def _estimate_each_try(self, inputs: Iterable[AnyInput]) -> Iterator[PoseEstimate]:
-        """Give each input's estimate, in order, where an input may well not show its object.
+        """Estimate each input, in order, where an input may well not show its object.
 
         The evidence decides which of them does. An estimator that expects less of a try than of
         another input has its own.
@@ -114,14 +114,14 @@ class PoseEstimator:
 
         ``is_expected``: whether the inputs are meant to show their objects; else they are tries.
         """
-        answers: list[PoseEstimate] = []
-        for estimate in (
-            self._estimate_each(inputs, 1) if is_expected else self._estimate_each_try(inputs)
-        ):
+        if is_expected:
+            estimates = list(self._estimate_each(inputs, 1))
+        else:
+            estimates = list(self._estimate_each_try(inputs))
+        for estimate in estimates:
             if estimate.status == "unreadable":
                 raise InputError(estimate.reason)
-            answers.append(estimate)
-        return answers
+        return estimates
 
     def _register_or_search(self, pose_input: AnyInput) -> PoseEstimate:
         """Register one object to the points of its mask, or search it in the mask as in a box.

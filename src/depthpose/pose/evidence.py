@@ -66,26 +66,16 @@ _MARGIN_DIAMETERS = 0.6  # margin of the window about the points of an object
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Observation:
-    """What a camera observed about an object, in a window of its image, thinned if it is large.
+    """What a camera observed about an object, in a window of its image, thinned if it is large."""
 
-    Attributes:
-        depth_m: (h, w), NaN where there is no reading.
-        is_masked: whether a mask says which pixels are of the object.
-        is_object: (h, w) these pixels, without their border; none without a mask.
-        is_background: (h, w) pixels whose readings lie on a known background.
-        K: intrinsic matrix of the window.
-        noise: of readings on the object.
-        step: every ``step``-th row and column of the image is used.
-        patch_px: side of a square of readings that is one observation, in pixels of the window.
-    """
-
-    depth_m: np.ndarray
-    is_masked: bool
-    is_object: np.ndarray
-    is_background: np.ndarray
-    K: Float64[Tensor, "3 3"]
-    noise: DepthNoise
-    step: int = 1
+    depth_m: np.ndarray  #: (h, w), NaN where there is no reading
+    is_masked: bool  #: whether a mask says which pixels are of the object
+    is_object: np.ndarray  #: (h, w) these pixels, without their border; none without a mask
+    is_background: np.ndarray  #: (h, w) pixels whose readings lie on a known background
+    K: Float64[Tensor, "3 3"]  #: intrinsic matrix of the window
+    noise: DepthNoise  #: of readings on the object
+    step: int = 1  #: every ``step``-th row and column of the image is used
+    #: side of a square of readings that is one observation, in pixels of the window.
     patch_px: float = CORRELATION_PX
 
     @property

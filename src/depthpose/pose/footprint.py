@@ -67,7 +67,7 @@ def _lies_on_surface(
 def _window_of_pose(
     shape: tuple[int, ...], K: Float[Tensor, "3 3"], pose: Rigid, surface: Surface
 ) -> Window:
-    """Give the rows and columns in which a posed surface lies, with a margin; clipped to the image.
+    """Find the rows and columns in which a posed surface lies, with a margin; clipped to the image.
 
     ``shape`` is (height, width) of the image. Nothing of a surface behind the camera lies in it.
     """

@@ -60,39 +60,32 @@ lie in one plane and touch."""
 
 WHOLE = (slice(None), slice(None))
 """The window that is the whole image."""
-Plane = tuple[Float64[Tensor, "3"], Float64[Tensor, ""]]
-"""Unit normal, and the distance [m] of the origin along it."""
+
+
+class Plane(NamedTuple):
+    """A plane in the camera frame: the points whose dot product with the normal is the offset."""
+
+    normal: Float64[Tensor, "3"]  #: of length 1
+    offset_m: Float64[Tensor, ""]  #: distance of the plane from the camera, along the normal
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Frame:
-    """A depth image, thinned to some hundred thousand pixels.
+    """A depth image, thinned to some hundred thousand pixels."""
 
-    Attributes:
-        step: every ``step``-th row and column of the image is used.
-        depth_m: depth along the optical axis; 0 where there is no reading.
-        K: intrinsic matrix of the thinned image.
-        points_m: the readings as points of the camera frame.
-        normals: unit normals of the surface, toward the camera.
-        is_smooth: pixels whose normal could be fitted.
-        background_limit_m: largest diameter [m] of an object for which the pixel is background: the
-            wide plane there is too large to be a side of it. Infinite on a known background, 0
-            where there is none.
-        nearest_m: least depth of the pixels up to two away; infinite where none has a reading.
-        noise_per_m2: standard deviation of a reading, for the square of the depth in metres.
-        backgrounds: the background that was given, if any, and the wide planes.
-    """
-
-    step: int
-    depth_m: Float64[Tensor, "h w"]
-    K: Float64[Tensor, "3 3"]
-    points_m: Float64[Tensor, "h w 3"]
-    normals: Float64[Tensor, "h w 3"]
-    is_smooth: Bool[Tensor, "h w"]
+    step: int  #: every ``step``-th row and column of the image is used
+    depth_m: Float64[Tensor, "h w"]  #: along the optical axis; 0 where there is no reading
+    K: Float64[Tensor, "3 3"]  #: intrinsic matrix of the thinned image
+    points_m: Float64[Tensor, "h w 3"]  #: the readings as points of the camera frame
+    normals: Float64[Tensor, "h w 3"]  #: unit normals of the surface, toward the camera
+    is_smooth: Bool[Tensor, "h w"]  #: pixels whose normal could be fitted
+    #: largest diameter of an object for which the pixel is background: the wide plane there is too
+    #: large to be a side of it. Infinite on a known background, 0 where there is none.
     background_limit_m: Float64[Tensor, "h w"]
+    #: least depth of the pixels up to two away; infinite where none has a reading.
     nearest_m: Float64[Tensor, "h w"]
-    noise_per_m2: float
-    backgrounds: Sequence["Background"]
+    noise_per_m2: float  #: standard deviation of a reading, for the square of the depth in metres
+    backgrounds: Sequence["Background"]  #: the one that was given, if any, and the wide planes
 
     def may_show(self, diameter_m: float, window: Window = WHOLE) -> Bool[Tensor, "h w"]:
         """Mark the pixels of a window that are no background for an object of this diameter."""
@@ -101,16 +94,12 @@ class Frame:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Background:
-    """A surface before which objects lie: a known bin or table, or a wide plane.
+    """A surface before which objects lie: a known bin or table, or a wide plane."""
 
-    Attributes:
-        depth_m: depth at which the ray of a pixel meets the surface, also behind objects; infinite
-            where the ray does not meet it, or where that is not known.
-        diameter_m: largest diameter of an object that cannot have it as a side.
-    """
-
+    #: depth at which the ray of a pixel meets the surface, also behind objects; infinite where the
+    #: ray does not meet it, or where that is not known.
     depth_m: Float64[Tensor, "h w"]
-    diameter_m: float
+    diameter_m: float  #: largest diameter of an object that cannot have it as a side
 
 
 def prepare_frame(
@@ -166,7 +155,7 @@ def prepare_frame(
 def _thinning_step(
     depth_m: Float64[Tensor, "h w"], focal_px: float, smallest_m: float | None
 ) -> int:
-    """Give the step between rows that are used: few pixels remain, but enough of an object."""
+    """Choose the step between rows that are used: few pixels remain, but enough of an object."""
     step = math.ceil(math.sqrt(depth_m.numel() / _MOST_PIXELS))
     is_read = depth_m > 0
     if smallest_m is None or not bool(is_read.any()):
@@ -289,7 +278,7 @@ def _wide_planes(
             break
 
         # Its largest connected piece, and the pieces of the surface as the sensor bends it.
-        is_parallel = is_free & ((normals @ plane[0]).abs() > _PARALLEL_COSINE)
+        is_parallel = is_free & ((normals @ plane.normal).abs() > _PARALLEL_COSINE)
         is_bent = is_near | _is_on_bent_plane(points_m, plane, is_near, is_parallel, noise_per_m2)
         piece, surface = _pieces_of_plane(depth_m, is_near, is_bent)
         is_free &= ~is_near
@@ -298,7 +287,7 @@ def _wide_planes(
         is_free &= ~surface
 
         # No readings lie behind a table or wall; a plane through the tops of parts has gaps.
-        plane_depth_m = plane[1] / (rays @ plane[0])
+        plane_depth_m = plane.offset_m / (rays @ plane.normal)
         plane_depth_m = torch.where(plane_depth_m > 0, plane_depth_m, torch.inf)
         behind_share = _share_of_readings_behind(depth_m, plane_depth_m, surface, noise_per_m2)
         if behind_share > _MOST_BEHIND:
@@ -313,7 +302,7 @@ def _wide_planes(
 def _pieces_of_plane(
     depth_m: Float64[Tensor, "h w"], is_near: Bool[Tensor, "h w"], is_bent: Bool[Tensor, "h w"]
 ) -> tuple[Bool[Tensor, "h w"], Bool[Tensor, "h w"]]:
-    """Give the largest connected piece of a plane, and all of the bent plane that belongs to it.
+    """Find the largest connected piece of a plane, and all of the bent plane that belongs to it.
 
     Args:
         depth_m: 0 where there is no reading.
@@ -337,7 +326,7 @@ def _share_of_readings_behind(
     surface: Bool[Tensor, "h w"],
     noise_per_m2: float,
 ) -> float:
-    """Give the share of readings within the outline of a surface that lie behind its plane."""
+    """Measure the share of readings within the outline of a surface that lie behind its plane."""
     margin_m = 2 * plane_tolerance_m(plane_depth_m, noise_per_m2)
     is_behind = depth_m > plane_depth_m + margin_m
     is_read_within = _fill_outline(surface) & (depth_m > 0)
@@ -345,7 +334,7 @@ def _share_of_readings_behind(
 
 
 def _largest_background_diameter(points_m: Float64[Tensor, "n 3"]) -> float:
-    """Give the diameter of the largest object of which a plane is too wide or long to be a side."""
+    """Measure the diameter from which on an object may have a plane so wide and long as a side."""
     some_m = take_evenly(points_m, _SAMPLE)
     offset_m = some_m - some_m.mean(0)
     # Ascending: the first axis is the plane's normal, the second its width, the third its length.
@@ -384,7 +373,7 @@ def _is_on_bent_plane(
         is_parallel: readings whose normals are parallel to the plane's; no others are marked.
         noise_per_m2: as in :class:`Frame`.
     """
-    off_m = points_m @ plane[0] - plane[1]
+    off_m = points_m @ plane.normal - plane.offset_m
     x, y = (points_m[..., :2] / points_m[..., 2:].clamp(min=1e-6)).unbind(-1)
     terms = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], -1)
     tolerance_m = plane_tolerance_m(points_m[..., 2], noise_per_m2)
@@ -403,7 +392,7 @@ def _is_on_bent_plane(
 def largest_plane(
     points_m: Float64[Tensor, "n 3"], generator: torch.Generator, noise_per_m2: float = NOISE_PER_M2
 ) -> Plane | None:
-    """Give the plane that most points lie on, by RANSAC; None for fewer than 60 points."""
+    """Find the plane that most points lie on, by RANSAC; None for fewer than 60 points."""
     some_m = take_evenly(points_m, _SAMPLE)
     if len(some_m) < _LEAST_POINTS:
         return None
@@ -419,7 +408,7 @@ def largest_plane(
     is_on = (some_m @ normal.T - offset_m).abs() < tolerance_m[:, None]
     is_on &= length[:, 0] > 1e-8  # three points on a line make no plane
     best = int(is_on.sum(0).argmax())
-    plane = (normal[best], offset_m[best])
+    plane = Plane(normal[best], offset_m[best])
 
     # Refitted to the points on it.
     for _ in range(_REFITS):
@@ -428,7 +417,7 @@ def largest_plane(
             return None
         middle_m = near_m.mean(0)
         _, axes = torch.linalg.eigh((near_m - middle_m).T @ (near_m - middle_m))
-        plane = (axes[:, 0], axes[:, 0] @ middle_m)
+        plane = Plane(axes[:, 0], axes[:, 0] @ middle_m)
     return plane
 
 
@@ -454,7 +443,7 @@ def readings_toward(frame: Frame, points_m: Float64[Tensor, "*n 3"]) -> Readings
 def share_behind(
     frame: Frame, background: Background, points_m: Float64[Tensor, "n 3"], margin_m: float
 ) -> float:
-    """Give the share of points that lie behind a background, where it is not observed to end.
+    """Measure the share of points that lie behind a background, where it is not observed to end.
 
     Args:
         frame: the image.
@@ -507,7 +496,7 @@ def is_on_background(
 
 
 def _largest_about(values: Float64[Tensor, "h w"], reach: int) -> Float64[Tensor, "h w"]:
-    """Give the largest finite value up to ``reach`` pixels away; infinite where there is none."""
+    """Return the largest finite value up to ``reach`` pixels away; infinite where there is none."""
     finite = torch.where(values.isfinite(), values, -torch.inf)
     size = 2 * reach + 1
     wide = max_pool2d(finite[None], (1, size), 1, (0, reach))
@@ -519,9 +508,8 @@ def is_on_plane(
     points_m: Float64[Tensor, "*batch 3"], plane: Plane, noise_per_m2: float = NOISE_PER_M2
 ) -> Bool[Tensor, "*batch"]:
     """Whether points of the camera frame lie on a plane, within the noise of a depth sensor."""
-    normal, offset = plane
     tolerance_m = plane_tolerance_m(points_m[..., 2], noise_per_m2)
-    return (points_m @ normal - offset).abs() < tolerance_m
+    return (points_m @ plane.normal - plane.offset_m).abs() < tolerance_m
 
 
 def label_regions(

@@ -31,27 +31,19 @@ _SHARE_POINTS = 1000  # points of the cloud that measure what a pose leaves unex
 _UNEXPLAINED_MORE = 0.25
 """A competing pose that leaves by so much more of the readings unexplained is not compared."""
 _MOST_LEADING = 8  # largest number of different poses that are compared
-_MOST_COPIES = (
-    45  # and of near-symmetric copies of the best of them: about an axis, 15 degrees apart
-)
+_MOST_COPIES = 45  # and of near-symmetric copies of the best of them
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Hypothesis:
-    """A refined pose and the evidence for it.
+    """A refined pose and the evidence for it."""
 
-    Attributes:
-        refined: the pose, with its covariance and residual.
-        evidence: of the pose.
-        votes_rad: mean angle between a network's directions and those to the keypoints of the
-            pose; None without a network.
-        log_color: log likelihood of the colour image; 0 without one.
-    """
-
-    refined: RefinedPose
-    evidence: Evidence
+    refined: RefinedPose  #: the pose, with its covariance and residual
+    evidence: Evidence  #: of the pose
+    #: mean angle between a network's directions and those to the keypoints of the pose; None
+    #: without a network.
     votes_rad: float | None = None
-    log_color: float = 0.0
+    log_color: float = 0.0  #: log likelihood of the colour image; 0 without one
 
     @property
     def pose(self) -> Rigid:
@@ -61,19 +53,12 @@ class Hypothesis:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Competition:
-    """Poses that compete for one object, and how they share the probability of one.
+    """Poses that compete for one object, and how they share the probability of one."""
 
-    Attributes:
-        best: the likeliest pose.
-        best_share: its share.
-        copies: near-symmetric copies of it, with their shares.
-        others: other poses, with theirs.
-    """
-
-    best: Hypothesis
-    best_share: float
-    copies: list[tuple[Hypothesis, float]]
-    others: list[tuple[Hypothesis, float]]
+    best: Hypothesis  #: the likeliest pose
+    best_share: float  #: its share
+    copies: list[tuple[Hypothesis, float]]  #: near-symmetric copies of it, with their shares
+    others: list[tuple[Hypothesis, float]]  #: other poses, with theirs
 
     @property
     def group_share(self) -> float:
@@ -177,7 +162,7 @@ def _refine_different_poses(
     prepared: PreparedObject,
     config: EstimateConfig,
 ) -> list[RefinedPose]:
-    """Give the leading pose, and refined others that are neither it nor a copy of one before.
+    """List the leading pose, and refined others that are neither it nor a copy of one before.
 
     Others are the ones given, and the look-alikes of the leading pose.
     """
@@ -291,7 +276,7 @@ def _refine_distinct_copies(
 def _with_color_of_best_copy(
     hypotheses: Sequence[Hypothesis], prepared: PreparedObject, view: ViewInput
 ) -> list[Hypothesis]:
-    """Give each pose the colour evidence of the best of its copies, for it stands for all of them.
+    """Return poses with the colour evidence of their best copies: each stands for all of them.
 
     Poses whose best copies are one pose are copies of each other: the first stands for them.
     """

@@ -416,9 +416,9 @@ def _refine(
 
         # One Gauss-Newton step.
         motion = np.linalg.solve(H, b)
-        turn = make_rotation(motion)
-        t[:] = turn @ (t - middle) + middle + motion[3:]
-        R[:] = turn @ R
+        rotation = make_rotation(motion)
+        t[:] = rotation @ (t - middle) + middle + motion[3:]
+        R[:] = rotation @ R
 
         # A pose that hardly moved, with the last limit and the last kind of match, has converged.
         largest = 0.0

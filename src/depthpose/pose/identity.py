@@ -183,8 +183,8 @@ def _grow(
             times[start] = min(max(times[start] * (1 + growth), 0.5), 2.0)
 
             # The points move by the inverse of the surface's motion.
-            turn = make_rotation(motion)
-            local[start] = (local[start] - middle - motion[3:6]) @ turn + middle
+            rotation = make_rotation(motion)
+            local[start] = (local[start] - middle - motion[3:6]) @ rotation + middle
             for k in (0, 1, 2, 6):
                 largest = max(largest, abs(motion[k]))
         if largest < _CONVERGED:

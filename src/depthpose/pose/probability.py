@@ -88,12 +88,15 @@ def probability_right(evidence: Evidence, prior_odds: float) -> float:
     It is 0 where less than two thirds of what was observed supports the pose, and where the surface
     goes on across much of its silhouette.
     """
-    if evidence.agreement < LEAST_AGREEMENT:
-        return 0.0
-    if evidence.continued > MOST_CONTINUED * max(LEAST_AREA, evidence.silhouette):
+    if evidence.agreement < LEAST_AGREEMENT or is_on_larger(evidence):
         return 0.0
     log_odds = math.log(prior_odds) + log_likelihood_ratio(evidence)
     return 1 / (1 + math.exp(-min(log_odds, 50.0)))
+
+
+def is_on_larger(evidence: Evidence) -> bool:
+    """Whether the surface goes on across so much of the silhouette that it is a larger thing's."""
+    return evidence.continued > MOST_CONTINUED * max(LEAST_AREA, evidence.silhouette)
 
 
 def log_likelihood_ratio(evidence: Evidence) -> float:
@@ -153,7 +156,7 @@ def _log_likelihood_of_residuals(rms: float) -> float:
 def probability_of_instances(
     log_odds: Float64[Tensor, " n"], prior_many: float
 ) -> Float64[Tensor, " n"]:
-    """Give the probability of each place of one object, of which there is one or any number.
+    """Compute the probability of each place of one object, of which there is one or any number.
 
     A table holds one of each object, a bin holds many: so a second place needs more evidence than
     the first, and where several have it further ones need no more.
@@ -174,7 +177,7 @@ def probability_of_instances(
 
 
 def share_among_objects(evidences: Sequence[Evidence]) -> Float64[Tensor, " n"]:
-    """Give the probability of each object, if the readings are of one of them.
+    """Compute the probability of each object, if the readings are of one of them.
 
     Each is weighed by the evidence of its best pose.
     """

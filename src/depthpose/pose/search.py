@@ -58,30 +58,22 @@ _LEAST_PIXELS = 100
 """Of the image at full resolution, that a pose must explain: fewer show no shape."""
 _SHARED = 0.3
 """Estimates that explain so large a share of the same readings are of one thing; one stays."""
-_RIVAL = 0.5
+_SAME_PLACE = 0.5
 """Poses that explain so much of the same readings are at one place; two objects compete there."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SearchTargets:
-    """What is looked for.
+    """What is looked for."""
 
-    Attributes:
-        objects: by their names.
-        config: of ICP, and of what a real object is off from its model.
-        refusal: when a pose is withheld.
-        prior_odds: of the best pose at a place being right.
-        is_single: at most one instance of each object is expected, as in a detector's box or a
-            frame of a track. Then (1) one round searches the image, (2) a place is left out that
-            lies mostly beside the mask, (3) places of one object are weighed without the case that
-            there are many of it (prior odds 0 in place of ``PRIOR_MANY``), and (4) no order of
-            picking is given.
-    """
-
-    objects: Mapping[str, PreparedObject]
-    config: EstimateConfig
-    refusal: RefusalConfig
-    prior_odds: float = PRIOR_PROPOSED
+    objects: Mapping[str, PreparedObject]  #: by their names
+    config: EstimateConfig  #: of ICP, and of what a real object is off from its model
+    refusal: RefusalConfig  #: when a pose is withheld
+    prior_odds: float = PRIOR_PROPOSED  #: of the best pose at a place being right
+    #: at most one instance of each object is expected, as in a detector's box or a frame of a
+    #: track. Then (1) one round searches the image, (2) a place is left out that lies mostly beside
+    #: the mask, (3) places of one object are weighed without the case that there are many of it
+    #: (prior odds 0 in place of ``PRIOR_MANY``), and (4) no order of picking is given.
     is_single: bool = False
 
 
@@ -105,7 +97,7 @@ class _Place:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Judged(_Place):
+class _JudgedPlace(_Place):
     """A place whose object was estimated."""
 
     estimate: PoseEstimate
@@ -114,19 +106,12 @@ class _Judged(_Place):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Miss:
-    """A place at which an object was refused.
+    """A place at which an object was refused."""
 
-    Attributes:
-        object: its name.
-        middle_m: of the proposed pose, in the camera frame.
-        agreement: share of what was compared that supports the pose.
-        reason: of the refusal.
-    """
-
-    object: str
-    middle_m: Float[Tensor, "3"]
-    agreement: float
-    reason: str
+    object: str  #: its name
+    middle_m: Float[Tensor, "3"]  #: of the proposed object, in the camera frame
+    agreement: float  #: share of what was compared that supports the pose
+    reason: str  #: of the refusal
 
 
 def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
@@ -150,8 +135,8 @@ def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
 
     # Round after round: propose, refine, judge, suppress. What is posed claims its readings.
     names = list(targets.objects)
-    posed: list[_Judged] = []
-    claimed: list[_Judged] = []  # posed, or of one of several objects
+    posed: list[_JudgedPlace] = []
+    claimed: list[_JudgedPlace] = []  # posed, or of one of several objects
     misses: list[_Miss] = []
     for _ in range(1 if targets.is_single else _ROUNDS):
         proposals = _propose(frame, is_unclaimed, names, claimed, targets)
@@ -198,17 +183,11 @@ def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
 
 
 class _Proposal(NamedTuple):
-    """A pose that votes propose.
+    """A pose that votes propose."""
 
-    Attributes:
-        score: by which the image agrees with it.
-        object: its name.
-        pose: of the object.
-    """
-
-    score: float
-    object: str
-    pose: Rigid
+    score: float  #: by :func:`~depthpose.pose.propose.image.score_by_image`
+    object: str  #: its name
+    pose: Rigid  #: of the object
 
 
 def _propose(
@@ -249,7 +228,7 @@ def _propose(
         if is_claimed or len(place.pixels) * frame.step**2 < _LEAST_PIXELS:
             continue
         same_object = [other for other in places if other.object == place.object]
-        is_new = all(place.shared_with(other) <= _RIVAL for other in same_object)
+        is_new = all(place.shared_with(other) <= _SAME_PLACE for other in same_object)
         if is_new:
             count_of_object[proposal.object] += 1
         if is_new or number < _MOST_PLACES:
@@ -291,7 +270,7 @@ def _refine(
 
 
 def _readings_of(place: _Place, frame: Frame, view: ViewInput) -> Float[Tensor, "n 3"]:
-    """Give the readings that a place explains, of all pixels of the view, in the camera frame."""
+    """Collect the readings that a place explains, of the unthinned view, in the camera frame."""
     height, width = view.depth_m.shape
     mask = place.explained.repeat_interleave(frame.step, 0).repeat_interleave(frame.step, 1)
     part = window_of_region(replace(view, mask=mask[:height, :width]), margin=0)
@@ -303,7 +282,7 @@ def _group(places: Sequence[_Place]) -> list[list[_Place]]:
     groups: list[list[_Place]] = []
     for place in places:
         same = [group for group in groups if group[0].object == place.object]
-        group = next((group for group in same if place.shared_with(group[0]) > _RIVAL), None)
+        group = next((group for group in same if place.shared_with(group[0]) > _SAME_PLACE), None)
         if group is None:
             groups.append([place])
         elif len(group) < _MOST_TOGETHER:
@@ -313,7 +292,7 @@ def _group(places: Sequence[_Place]) -> list[list[_Place]]:
 
 def _judge(
     groups: Sequence[Sequence[_Place]], frame: Frame, view: ViewInput, targets: SearchTargets
-) -> tuple[list[_Judged], list[_Miss]]:
+) -> tuple[list[_JudgedPlace], list[_Miss]]:
     """Estimate the object of each place from what its best pose explains; separate refusals."""
 
     def estimate_place(numbered: tuple[int, Sequence[_Place]]) -> PoseEstimate:
@@ -335,7 +314,7 @@ def _judge(
             prior_odds=targets.prior_odds,
         )
 
-    judged: list[_Judged] = []
+    judged: list[_JudgedPlace] = []
     misses: list[_Miss] = []
     estimates = each_in_threads(estimate_place, enumerate(groups), torch.get_num_threads())
     for estimate, group in zip(estimates, groups, strict=True):
@@ -349,7 +328,7 @@ def _judge(
             continue
         pose = estimate.camera_from_model.double()
         judged.append(
-            _Judged(
+            _JudgedPlace(
                 object=estimate.object,
                 pose=pose,
                 explained=explained_frame_mask(frame, pose, surface),
@@ -374,14 +353,14 @@ def _miss_at(
 
 
 def _weigh_instances(
-    accepted: Sequence[_Judged], targets: SearchTargets
-) -> tuple[list[_Judged], list[_Miss]]:
+    accepted: Sequence[_JudgedPlace], targets: SearchTargets
+) -> tuple[list[_JudgedPlace], list[_Miss]]:
     """Weigh the places of each object by each other; separate poses that are likelier wrong.
 
     A pose may be likelier wrong than right because another place is surer, and a table holds one
     of each object; or because another pose explains its place as well.
     """
-    remaining: list[_Judged] = []
+    remaining: list[_JudgedPlace] = []
     misses: list[_Miss] = []
     for name in dict.fromkeys(place.object for place in accepted):
         places = [place for place in accepted if place.object == name]
@@ -404,10 +383,10 @@ def _weigh_instances(
 
 
 def _within(
-    judged: Sequence[_Judged], is_region: Bool[Tensor, "h w"], targets: SearchTargets
-) -> tuple[list[_Judged], list[_Miss]]:
+    judged: Sequence[_JudgedPlace], is_region: Bool[Tensor, "h w"], targets: SearchTargets
+) -> tuple[list[_JudgedPlace], list[_Miss]]:
     """Separate places that lie mostly beside a region: they are of something else."""
-    inside: list[_Judged] = []
+    inside: list[_JudgedPlace] = []
     misses: list[_Miss] = []
     for place in judged:
         if float(is_region[place.explained].double().mean()) > 0.5:
@@ -419,15 +398,15 @@ def _within(
 
 
 def _suppress(
-    judged: Sequence[_Judged], before: Sequence[_Judged], targets: SearchTargets
-) -> tuple[list[_Judged], list[_Judged], list[_Miss]]:
+    judged: Sequence[_JudgedPlace], before: Sequence[_JudgedPlace], targets: SearchTargets
+) -> tuple[list[_JudgedPlace], list[_JudgedPlace], list[_Miss]]:
     """Non-maximum suppression: in order of probability, keep what explains other readings.
 
     Returns:
         What is kept; all whose readings are taken, by what may be one of several objects too; and
         places at which an object is not kept for the sake of another.
     """
-    kept: list[_Judged] = []
+    kept: list[_JudgedPlace] = []
     misses: list[_Miss] = []
     taken = list(before)
     ranked = sorted(judged, key=lambda place: -place.log_odds)
@@ -441,7 +420,7 @@ def _suppress(
         taken.append(place)
         rivals = {place.object: place}
         for other in ranked[number + 1 :]:
-            if place.shared_with(other) > _RIVAL:
+            if place.shared_with(other) > _SAME_PLACE:
                 rivals.setdefault(other.object, other)
         estimate, shares = likeliest_object([rival.estimate for rival in rivals.values()])
         if float(shares.max()) >= LEAST_SHARE:
