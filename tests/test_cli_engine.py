@@ -30,7 +30,7 @@ from tests.test_cli_depth import write_doubtful_pairs
 from depthpose.cli import engine, main
 from depthpose.cli.depth_predict import PAIRS
 from depthpose.core.camera import write_camera
-from depthpose.core.engine import find_items
+from depthpose.core.engine import list_inputs
 from depthpose.core.errors import InputError
 from depthpose.core.files import (
     Cloud,
@@ -155,11 +155,11 @@ def test_files_of_two_sides_are_paired_by_number(tmp_path: Path) -> None:
         (tmp_path / f"{name}.png").parent.mkdir(exist_ok=True)
         (tmp_path / f"{name}.png").touch()
     sides = [str(tmp_path / "left"), str(tmp_path / "right")]
-    found = [[Path(file).stem for file in item.files] for item in find_items(sides, PAIRS)]
+    found = [[Path(file).stem for file in item.files] for item in list_inputs(sides, PAIRS)]
     assert found == [["left_2", "right_2"], ["left_10", "right_10"]]
     (tmp_path / "odd/right_3.png").rename(tmp_path / "right/right_3.png")
     with pytest.raises(InputError, match=r"hold 2 and 3 files, and no partner .* 'right_3'"):
-        find_items(sides, PAIRS)
+        list_inputs(sides, PAIRS)
 
 
 def test_other_settings_need_another_folder(

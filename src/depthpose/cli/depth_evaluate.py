@@ -369,8 +369,8 @@ def measure_shards(
     settings = read_settings(predictions)
     index_of = {frame.name: index for index, frame in enumerate(dataset.frames)}
     measured: dict[str, list[Measured] | str] = {}
-    for shard in tqdm(engine.read_results(predictions), name, disable=None, unit=" shards"):
-        for frame, files in engine.shard_results(predictions, shard):
+    for shard in tqdm(engine.read_records(predictions), name, disable=None, unit=" shards"):
+        for frame, files in engine.read_shard(predictions, shard):
             if frame not in index_of:
                 continue
             with tempfile.TemporaryDirectory(prefix="depthpose-") as folder:
