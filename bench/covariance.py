@@ -31,7 +31,7 @@ from depthpose.pose.icp import refine_pose
 from depthpose.pose.mesh import drawn_triangles
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.synthetic.views import random_rotation, simulate_depth
-from depthpose.report.page import markdown_table
+from depthpose.report.page import format_markdown_table
 
 KINDS: tuple[SensorKind, ...] = ("structured light", "active stereo", "time of flight", "laser")
 WIDTH, HEIGHT, FOCAL_PX = 640, 480, 600.0
@@ -136,7 +136,7 @@ def main() -> None:
             }
         )
         print(rows[-1], flush=True)
-    print(markdown_table(rows))
+    print(format_markdown_table(rows))
 
 
 PARTS = [

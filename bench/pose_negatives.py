@@ -35,7 +35,7 @@ from depthpose.pose.registration import Registration
 from depthpose.pose.synthetic import Objects
 from depthpose.pose.train.clouds import measure_add
 from depthpose.pose.types import CloudSample, ObjectModel, ViewSample
-from depthpose.report.page import markdown_table
+from depthpose.report.page import format_markdown_table
 
 SEED = 0x0DD
 BATCH_SIZE = 32
@@ -176,7 +176,7 @@ def main() -> None:
         negatives = [row for row in all_rows if row["kind"] not in (ITSELF, ALIKE)]
         if negatives:
             table.append({**summary(negatives), "kind": "all negatives"})
-        print(f"{name}, {total_s:.0f} s\n{markdown_table(table)}")
+        print(f"{name}, {total_s:.0f} s\n{format_markdown_table(table)}")
         if options.save:
             options.save.mkdir(parents=True, exist_ok=True)
             path = options.save / f"{Path(name).stem}.json"

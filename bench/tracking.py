@@ -39,7 +39,7 @@ from depthpose.pose.metrics import add_m, adds_m
 from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.pose.synthetic.views import random_rotation, simulate_depth
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
-from depthpose.report.page import markdown_table
+from depthpose.report.page import format_markdown_table
 
 SEED = 0x7AC4
 WIDTH, HEIGHT, FOCAL_PX = 640, 480, 572.0
@@ -329,9 +329,9 @@ def main() -> None:
             if options.anew:
                 every_nth = frames[options.anew // 2 :: options.anew]
                 searched.append(search_each(net, model, every_nth))
-        print(f"{name}, followed\n{markdown_table(tracked)}")
+        print(f"{name}, followed\n{format_markdown_table(tracked)}")
         if searched:
-            print(f"{name}, every {options.anew} frames anew\n{markdown_table(searched)}")
+            print(f"{name}, every {options.anew} frames anew\n{format_markdown_table(searched)}")
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from depthpose.core.config import write_config
 from depthpose.core.errors import InputError
 from depthpose.core.export import Export, Graph, freeze
 from depthpose.core.files import (
-    Cloud,
+    PointCloud,
     atomic_write,
     read_bytes,
     stores,
@@ -191,7 +191,7 @@ def test_every_writer_names_a_full_disk_and_leaves_nothing(tmp_path: Path) -> No
         "config": lambda p: write_config(p / "c.yaml", Knobs()),
         "page": lambda p: write_page(p / "page.html", "t", [Section(title="t", text=long)], {}),
         "table": lambda p: write_table(p, [{"a": long}]),
-        "cloud": lambda p: write_cloud(p / "c.ply", Cloud(points=torch.rand(50_000, 3))),
+        "cloud": lambda p: write_cloud(p / "c.ply", PointCloud(points=torch.rand(50_000, 3))),
         "map": lambda p: write_map(p / "m.npy", images[0][0].repeat(2, 2)),
         "picture": lambda p: write_image(p / "p.png", images[0]),
         "depth": lambda p: write_depth_png(p / "d.png", 200 * images[0][0]),

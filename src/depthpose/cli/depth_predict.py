@@ -51,7 +51,7 @@ from depthpose.depth.predictions import (
 from depthpose.depth.stereo import SGBMMatcher
 from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.depth.weights import MATCHERS, Use
-from depthpose.report.depth import depth_section
+from depthpose.report.depth import make_depth_section
 from depthpose.report.page import MOST_VIEWS, Film, Section, spread_evenly, write_page
 
 IMAGES = InputFormat(roles=("image",), suffixes=LISTED_SUFFIXES)
@@ -593,7 +593,9 @@ def write_depth_page(
         sections.append(Section(title="Videos", films=films))
     for depth_input in shown_inputs:
         estimate = read_estimate(out, depth_input.name, depth_input.camera)
-        section = depth_section(depth_input.name, depth_input, estimate, range_m=(near_m, far_m))
+        section = make_depth_section(
+            depth_input.name, depth_input, estimate, range_m=(near_m, far_m)
+        )
         sections.append(section)
     title = f"Depth of {len(names)} image{'s' * (len(names) != 1)}"
     write_page(out / _PAGE, title, sections, run.environment())

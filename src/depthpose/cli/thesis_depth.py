@@ -19,7 +19,7 @@ from depthpose.depth.datasets import Dataset, Frame, has_lidar, lidar_truth
 from depthpose.depth.evaluate import find_protocol
 from depthpose.depth.predictions import has_prediction, read_estimate
 from depthpose.report import page
-from depthpose.report.page import Drawing, Picture, Section
+from depthpose.report.page import Drawing, PictureFile, Section
 from depthpose.thesis.depth import (
     DEPTH_SCALE,
     PublishedTable,
@@ -64,7 +64,7 @@ def reproduce_table(
         "caps_m": list(caps_m),
         "methods": {method.name: method.settings for _, method in methods},
     }
-    results = (*page.table_files("rows", "frames", "confidence"), "report.md", "report.html")
+    results = (*page.list_table_files("rows", "frames", "confidence"), "report.md", "report.html")
     claim_folder(out, settings, (*results, "predictions", "figures"))
 
     # Predict, in all processes; the first measures and joins.
@@ -154,7 +154,7 @@ def write_report(title: str, sections: Sequence[Section], out: Path) -> None:
     """Write report.md and report.html of a table, and print its rows."""
     page.write_markdown(out / "report.md", title, sections, environment())
     page.write_page(out / "report.html", title, sections, environment())
-    print(page.markdown_table(sections[0].rows))
+    print(page.format_markdown_table(sections[0].rows))
     print(f"the page: {out / 'report.html'}")
 
 
@@ -216,9 +216,9 @@ def write_figure(
 
 def _make_panel_section(title: str, panels: Sequence[Drawing], stem: Path) -> Section:
     """Write each panel as a file, STEM.1.jpg, ..., small enough for a page of many; show them."""
-    pictures: list[Picture] = []
+    pictures: list[PictureFile] = []
     for k, panel in enumerate(panels, 1):
         path = stem.with_name(f"{stem.name}.{k}.jpg")
         write_image(path, shrink_to_width(panel.image, _PANEL_WIDTH_PX))
-        pictures.append(Picture(path=path, caption=panel.caption, scale=panel.scale))
+        pictures.append(PictureFile(path=path, caption=panel.caption, color_bar=panel.color_bar))
     return Section(title=title, text=DEPTH_SCALE, pictures=pictures)

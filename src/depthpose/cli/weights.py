@@ -29,7 +29,7 @@ def list_weights(folder: Path | None = None) -> int:
         folder: list the weights in this folder instead.
     """
     from depthpose.core.checkpoint import SHIPPED, read_checkpoint
-    from depthpose.report.page import plain_table
+    from depthpose.report.page import format_plain_table
 
     home = folder or SHIPPED
     files = sorted(home.glob("*.safetensors"))
@@ -49,7 +49,7 @@ def list_weights(folder: Path | None = None) -> int:
             "trained on": shorten(trained_on, _DATA_WIDTH, placeholder=" ..."),
         }
         rows.append(row)
-    print(plain_table(rows), end="")
+    print(format_plain_table(rows), end="")
     print("'depthpose weights show NAME' prints origin, terms and settings of one.")
     return 0
 
@@ -304,7 +304,7 @@ def _write_graph(
     """
     from depthpose.core.checkpoint import file_sha256, warn_of_terms
     from depthpose.core.export import freeze
-    from depthpose.report.page import markdown_table
+    from depthpose.report.page import format_markdown_table
 
     warn_of_terms(facts)
     origin = {"format": "onnx", "weights": Path(weights).name, "weights_sha256": file_sha256(path)}
@@ -313,7 +313,7 @@ def _write_graph(
         {name: f"{value:.1e}" if isinstance(value, float) else value for name, value in row.items()}
         for row in differences
     ]
-    print(markdown_table(rows), end="")
+    print(format_markdown_table(rows), end="")
     size_mb = out.stat().st_size / 1e6
     proof = out.with_suffix(".proof.json").name
     print(f"{out}: {size_mb:.1f} MB; the differences are in {proof}")

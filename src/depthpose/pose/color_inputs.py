@@ -10,7 +10,7 @@ from torch import Tensor
 from depthpose.core.camera import AnyLens, Camera, camera_of, check_image_matches_camera
 from depthpose.core.camera.camera_file import intrinsics_of
 from depthpose.core.errors import InputError, Notice
-from depthpose.core.files import Picture, as_tensor
+from depthpose.core.files import AnyPicture, as_tensor
 from depthpose.core.rigid import Rigid
 from depthpose.pose.inputs import AnyArray, rigid_input
 from depthpose.pose.types import ColorImage, ObjectModel, ViewInput
@@ -19,7 +19,7 @@ from depthpose.pose.types import ColorImage, ObjectModel, ViewInput
 def with_color(
     view: ViewInput,
     models: Sequence[ObjectModel],
-    color: Picture | None,
+    color: AnyPicture | None,
     camera: AnyLens | None = None,
     color_from_depth: Rigid | AnyArray | None = None,
 ) -> ViewInput:
@@ -59,7 +59,7 @@ def with_color(
 
 
 def color_input(
-    color: Picture,
+    color: AnyPicture,
     view: ViewInput,
     camera: AnyLens | None = None,
     color_from_depth: Rigid | AnyArray | None = None,

@@ -12,7 +12,7 @@ from tqdm import tqdm
 from depthpose.core.camera import AnyCamera, choose_lens
 from depthpose.core.devices import each_in_float32, each_in_threads, force_float32
 from depthpose.core.errors import InputError, describe_full_memory, nearest_name
-from depthpose.core.files import Picture
+from depthpose.core.files import AnyPicture
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
 from depthpose.pose.background import AnyBackground, with_background
@@ -164,7 +164,7 @@ class PoseEstimator:
         focal_px: float | None = None,
         object: str | None = None,
         box: Box | None = None,
-        color: Picture | None = None,
+        color: AnyPicture | None = None,
         color_camera: AnyCamera | None = None,
         color_from_depth: Rigid | AnyArray | None = None,
         background: AnyBackground | None = None,

@@ -5,7 +5,7 @@ leave a whole file or none.
 """
 
 from depthpose.core.files.cloud import CLOUD_READERS as CLOUD_READERS
-from depthpose.core.files.cloud import Cloud as Cloud
+from depthpose.core.files.cloud import PointCloud as PointCloud
 from depthpose.core.files.cloud import read_cloud as read_cloud
 from depthpose.core.files.cloud import read_points_bin as read_points_bin
 from depthpose.core.files.cloud import write_cloud as write_cloud
@@ -33,7 +33,7 @@ from depthpose.core.files.images import read_stored_depth as read_stored_depth
 from depthpose.core.files.images import write_depth_png as write_depth_png
 from depthpose.core.files.images import write_image as write_image
 from depthpose.core.files.images import write_map as write_map
-from depthpose.core.files.pictures import Picture as Picture
+from depthpose.core.files.pictures import AnyPicture as AnyPicture
 from depthpose.core.files.pictures import as_tensor as as_tensor
 from depthpose.core.files.video import VIDEO_SUFFIXES as VIDEO_SUFFIXES
 from depthpose.core.files.video import Video as Video

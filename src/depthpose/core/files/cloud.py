@@ -43,7 +43,7 @@ _MAX_SCAN_BYTES = 2**26  # largest scan of a LiDAR that is read, thirty times KI
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Cloud:
+class PointCloud:
     """Points as a file holds them; their unit and frame are not in the file."""
 
     points: Float32[Tensor, "n 3"]  #: coordinates
@@ -63,7 +63,7 @@ class Cloud:
         return cloud
 
 
-def read_cloud(path: AnyPath) -> Cloud:
+def read_cloud(path: AnyPath) -> PointCloud:
     """Read a point cloud: ``.ply``, ``.pcd``, ``.npy`` or text (``.xyz``, ``.txt``).
 
     NPY and text hold one point a row. Columns after x, y and z are ignored, and so is a first
@@ -82,7 +82,7 @@ def read_cloud(path: AnyPath) -> Cloud:
     return reader(path)
 
 
-def write_cloud(path: AnyPath, cloud: Cloud) -> None:
+def write_cloud(path: AnyPath, cloud: PointCloud) -> None:
     """Write a point cloud as binary ``.ply`` or ``.pcd``, colours in 8 bits.
 
     Raises:
@@ -117,7 +117,7 @@ def read_points_bin(path: AnyPath, columns: int = 4) -> Float32[Tensor, "n colum
     return torch.from_numpy(rows)
 
 
-def _cloud_from_columns(path: AnyPath, columns: Columns) -> Cloud:
+def _cloud_from_columns(path: AnyPath, columns: Columns) -> PointCloud:
     """Make a cloud of columns x, y, z and perhaps colours; points with NaN are left out."""
     missing = [name for name in "xyz" if name not in columns]
     if missing and columns:
@@ -131,7 +131,7 @@ def _cloud_from_columns(path: AnyPath, columns: Columns) -> Cloud:
     is_complete = ~np.isnan(points).any(-1)
     if not is_complete.any():
         raise InputError(f"{path}: {len(points)} points, none with finite coordinates; give some")
-    return Cloud(
+    return PointCloud(
         points=torch.from_numpy(points[is_complete]),
         color=None if color is None else torch.from_numpy(color[is_complete]),
     )
@@ -160,7 +160,7 @@ def _color_from_columns(path: AnyPath, columns: Columns) -> np.ndarray | None:
     return to_float32(color)
 
 
-def _cloud_from_table(path: AnyPath, table: np.ndarray) -> Cloud:
+def _cloud_from_table(path: AnyPath, table: np.ndarray) -> PointCloud:
     """Make a cloud of a table without names: x, y, z, perhaps behind a column of point numbers."""
     if table.ndim != 2 or table.shape[1] < 3:
         raise InputError(f"{path}: points are rows of 3 numbers or more, got shape {table.shape}")
@@ -191,7 +191,7 @@ def _cloud_from_table(path: AnyPath, table: np.ndarray) -> Cloud:
     return _cloud_from_columns(path, {axis: table[:, first + k] for k, axis in enumerate("xyz")})
 
 
-def _read_text(path: AnyPath) -> Cloud:
+def _read_text(path: AnyPath) -> PointCloud:
     """Read a cloud of text: rows of numbers, perhaps below names, a count or comments."""
     text = TextIOWrapper(BytesIO(read_bytes(path, MAX_TEXT_BYTES)), "utf-8-sig")
     comments: list[str] = []
@@ -299,7 +299,7 @@ def _make_blanker(path: AnyPath, head: list[str], names: list[str]) -> Callable[
     return lambda row: row.replace(",", " ").replace(";", " ")
 
 
-CLOUD_READERS: dict[str, Callable[[AnyPath], Cloud]] = {
+CLOUD_READERS: dict[str, Callable[[AnyPath], PointCloud]] = {
     ".ply": lambda path: _cloud_from_columns(path, read_ply_elements(path, "vertex")[0]),
     ".pcd": lambda path: _cloud_from_columns(path, read_pcd(path)),
     ".npy": lambda path: _cloud_from_table(path, read_npy(path)),

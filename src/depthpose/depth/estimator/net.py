@@ -27,7 +27,7 @@ from depthpose.core.camera import (
 from depthpose.core.checkpoint import find_weights, join_terms, warn_of_terms
 from depthpose.core.devices import each_in_threads, force_float32
 from depthpose.core.errors import InputError, Notice
-from depthpose.core.files import Picture as Picture
+from depthpose.core.files import AnyPicture as AnyPicture
 from depthpose.core.files import as_tensor, read_exif_focal
 from depthpose.depth.config import Answer, MatcherConfig, SGBMConfig
 from depthpose.depth.estimator.pair import depth_from_pair
@@ -252,12 +252,12 @@ class FakestereoNet:
     @force_float32()
     def estimate(
         self,
-        image: Picture,
+        image: AnyPicture,
         camera: AnyCamera | None = None,
         *,
         focal_px: float | None = None,
         fov_deg: float | None = None,
-        right: Picture | None = None,
+        right: AnyPicture | None = None,
         known_distance: tuple[float, float, float] | None = None,
         mount: MountFilter | None = None,
         name: str | None = None,
@@ -322,7 +322,7 @@ class FakestereoNet:
     @force_float32()
     def estimate_many(
         self,
-        images: Iterable[StereoInput] | Iterable[Picture] | Picture,
+        images: Iterable[StereoInput] | Iterable[AnyPicture] | AnyPicture,
         camera: AnyLens | None = None,
         *,
         focal_px: float | None = None,
@@ -360,7 +360,7 @@ class FakestereoNet:
         lens = choose_lens(camera, focal_px, fov_deg)
         is_single = isinstance(images, str | Path | Image.Image | StereoInput)
         if is_single or (isinstance(images, np.ndarray | Tensor) and images.ndim < 4):
-            images = [cast("Picture", images)]
+            images = [cast("AnyPicture", images)]
         sequence = cast("Iterable[object]", images)
         total = len(sequence) if isinstance(sequence, Sized) else None
 
