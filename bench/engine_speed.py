@@ -19,7 +19,7 @@ import torch
 from shared import make_parser
 
 from depthpose.core.files import write_image
-from depthpose.core.run import environment
+from depthpose.core.run import describe_environment
 from depthpose.report.page import format_markdown_table, write_table
 
 
@@ -35,7 +35,7 @@ def main() -> None:
         rows = measure(Path(folder), options)
     write_table(options.out, rows, name="engine_speed")
     print(format_markdown_table(rows))
-    print(environment())
+    print(describe_environment())
 
 
 def measure(folder: Path, options: argparse.Namespace) -> list[dict[str, object]]:

@@ -30,7 +30,7 @@ from score_scenes import BINS, FRAMES
 from score_tracking import TRACKING
 from shared import make_parser, with_cpu_seconds
 
-from depthpose.core.run import environment
+from depthpose.core.run import describe_environment
 from depthpose.report.page import format_markdown_table
 
 SECTIONS: dict[str, Section] = {
@@ -76,7 +76,7 @@ def main() -> None:
         table = section.table(rows)
         results[name] = {
             "seeds": options.seeds,
-            "environment": environment(),
+            "environment": describe_environment(),
             "cpu_s": cpu_s,
             "table": table,
             "rows": rows,

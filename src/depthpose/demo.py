@@ -13,7 +13,7 @@ from depthpose.core.camera import Camera, StereoRig, back_project, write_camera
 from depthpose.core.draw import draw_depth
 from depthpose.core.files import PointCloud, write_cloud, write_depth_png, write_image
 from depthpose.core.rigid import Rigid
-from depthpose.core.run import claim_folder, environment
+from depthpose.core.run import claim_folder, describe_environment
 from depthpose.depth.config import COLOR_RANGE_M, SGBMConfig, StreetsConfig
 from depthpose.depth.disparity import depth_from_disparity
 from depthpose.depth.estimator import FakestereoNet
@@ -393,5 +393,5 @@ def make_demo(
     pages.write_table(out, poses, name="poses")
     page = out / _PAGE
     title = "depthpose: a depth sensor to poses, images to metric depth"
-    pages.write_page(page, title, [*pose_sections, *depth_sections], environment())
+    pages.write_page(page, title, [*pose_sections, *depth_sections], describe_environment())
     return DemoResult(page, depths, poses)

@@ -12,7 +12,7 @@ from depthpose.core.run import (
     ProcessRank,
     claim_folder,
     claim_names,
-    environment,
+    describe_environment,
     find_rank,
     is_whole,
     note_result,
@@ -144,7 +144,7 @@ def test_a_file_is_not_replaced_without_consent(tmp_path: Path) -> None:
 
 
 def test_the_environment_names_versions_and_date() -> None:
-    facts = environment()
+    facts = describe_environment()
     assert {"date", "python", "depthpose", "torch", "numpy", "machine"} <= facts.keys()
 
 

@@ -15,7 +15,7 @@ from depthpose.cli.depth_options import MethodOptions
 from depthpose.cli.depth_predict import DepthMethod, DepthMethodSource
 from depthpose.core import engine
 from depthpose.core.errors import InputError
-from depthpose.core.run import environment, find_rank, read_settings, wait_for
+from depthpose.core.run import describe_environment, find_rank, read_settings, wait_for
 from depthpose.core.runner import Job
 from depthpose.depth.baselines import NearestImageBaseline, RowDepthBaseline
 from depthpose.depth.config import Answer, BaselineName, MatcherConfig, Speed
@@ -233,7 +233,7 @@ def measure(
         *write_details(measured, out),
     ]
     title = f"{protocol} on {dataset.name}"
-    page.write_page(out / "report.html", title, sections, environment())
+    page.write_page(out / "report.html", title, sections, describe_environment())
 
     metrics = [metric.name for metric in METRICS.values() if metric.is_printed]
     origin = ["method", "weights", "speed", "cap_m", "frames", "coverage"]

@@ -598,7 +598,7 @@ def write_depth_page(
         )
         sections.append(section)
     title = f"Depth of {len(names)} image{'s' * (len(names) != 1)}"
-    write_page(out / _PAGE, title, sections, run.environment())
+    write_page(out / _PAGE, title, sections, run.describe_environment())
     print(f"the page: {out / _PAGE}")
 
 

@@ -17,7 +17,7 @@ from depthpose.cli.pose_methods import PoseMethod
 from depthpose.core.checkpoint import file_sha256
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image
-from depthpose.core.run import environment, read_settings
+from depthpose.core.run import describe_environment, read_settings
 from depthpose.pose.config import EvaluationConfig
 from depthpose.pose.datasets import BopDataset, open_bop, read_targets
 from depthpose.pose.evaluate import (
@@ -207,7 +207,7 @@ def measure(
         *write_details(measured, out),
     ]
     title = f"Poses on {dataset.folder.resolve().name}, {dataset.split}"
-    page.write_page(out / "report.html", title, sections, environment())
+    page.write_page(out / "report.html", title, sections, describe_environment())
     print(page.format_plain_table(rows, _PRINTED_COLUMNS))
     print(f"every column: {out / 'table.md'}, rows.csv; the page: {out / 'report.html'}")
     return 0

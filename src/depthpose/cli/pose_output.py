@@ -317,7 +317,7 @@ def _write_page(
         text += f" The table holds the first {_MAX_PAGE_ROWS}, refusals before answers; all are in "
         text += "poses.json."
     results = Section(title="What was found", text=text, rows=rows)
-    write_page(out / _PAGE, f"Poses of {total}", [results, *sections], run.environment())
+    write_page(out / _PAGE, f"Poses of {total}", [results, *sections], run.describe_environment())
     print(f"the page: {out / _PAGE}")
 
 

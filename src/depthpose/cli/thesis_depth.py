@@ -14,7 +14,7 @@ from depthpose.cli import depth_evaluate as evaluation
 from depthpose.cli.depth_predict import DepthMethod
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import write_image
-from depthpose.core.run import claim_folder, environment, find_rank
+from depthpose.core.run import claim_folder, describe_environment, find_rank
 from depthpose.depth.datasets import Dataset, Frame, has_lidar, lidar_truth
 from depthpose.depth.evaluate import find_protocol
 from depthpose.depth.predictions import has_prediction, read_estimate
@@ -152,8 +152,8 @@ def _read_lidar(frame: Frame) -> Float[Tensor, "h w"] | None:
 
 def write_report(title: str, sections: Sequence[Section], out: Path) -> None:
     """Write report.md and report.html of a table, and print its rows."""
-    page.write_markdown(out / "report.md", title, sections, environment())
-    page.write_page(out / "report.html", title, sections, environment())
+    page.write_markdown(out / "report.md", title, sections, describe_environment())
+    page.write_page(out / "report.html", title, sections, describe_environment())
     print(page.format_markdown_table(sections[0].rows))
     print(f"the page: {out / 'report.html'}")
 
@@ -208,7 +208,7 @@ def write_figure(
     path = out / f"figure-{number}.png"
     write_image(path, arrange(columns))
     sections.append(_make_settings_section([method]))
-    page.write_page(out / "report.html", f"Figure {number}", sections, environment())
+    page.write_page(out / "report.html", f"Figure {number}", sections, describe_environment())
     captions = "; ".join(panel.caption for panel in columns[0])
     print(f"{path}: each column from top to bottom: {captions}. {DEPTH_SCALE}; see the bar below.")
     return 0

@@ -19,7 +19,7 @@ from depthpose.core.checkpoint import file_sha256, find_weights
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_image
-from depthpose.core.run import claim_folder, environment
+from depthpose.core.run import claim_folder, describe_environment
 from depthpose.pose.config import EvaluationConfig, ObjectsConfig
 from depthpose.pose.datasets import BopDataset, Instance
 from depthpose.pose.datasets.dataset import read_instance_mask
@@ -312,7 +312,7 @@ def write_figure(
         write_image(file, panel.image)
         pictures.append(PictureFile(path=file, caption=panel.caption))
     section = Section(title="Panels", text=text, pictures=pictures)
-    page.write_page(out / "report.html", f"Figure {figure}", [section], environment())
+    page.write_page(out / "report.html", f"Figure {figure}", [section], describe_environment())
     print(f"{path}: {'; '.join(panel.caption for panel in panels)}. {text}")
     return 0
 

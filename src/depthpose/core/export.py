@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from depthpose.core.checkpoint import file_sha256
 from depthpose.core.errors import InputError, import_extra
 from depthpose.core.files import atomic_write, write_json
-from depthpose.core.run import environment, refuse_to_replace
+from depthpose.core.run import describe_environment, refuse_to_replace
 
 OPSET = 18
 _IR_VERSION = 10  # that of onnx 1.16: a younger one would shut out older runtimes
@@ -264,7 +264,7 @@ def freeze(path: Path, export: Export) -> list[Row]:
             "file": path.name,
             "sha256": file_sha256(part),
             "opset": OPSET,
-            "environment": environment() | runtimes,
+            "environment": describe_environment() | runtimes,
             "facts": facts,
             "differences": rows,
         }

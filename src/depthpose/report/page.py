@@ -472,7 +472,8 @@ def write_page(
         path: the file.
         title: title of the page.
         sections: contents of the page.
-        environment: facts about what made the results (:func:`depthpose.core.run.environment`).
+        environment: what the results were computed with, by name
+            (:func:`depthpose.core.run.describe_environment`).
     """
     templates = Environment(
         loader=PackageLoader("depthpose.report", "."),

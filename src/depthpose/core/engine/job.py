@@ -22,7 +22,7 @@ from depthpose.core.files.disk import file_system
 from depthpose.core.run import (
     NOT_OURS,
     RECORD,
-    environment,
+    describe_environment,
     read_settings,
     refuse_other_settings,
 )
@@ -166,7 +166,7 @@ def _claim_url(out: str, settings: Mapping[str, Any]) -> None:
         url = stores.join(out, name)
         if stores.exists(url):
             raise InputError(f"{url}: {NOT_OURS}")
-    content = {"settings": dict(settings), "environment": environment()}
+    content = {"settings": dict(settings), "environment": describe_environment()}
     record = f"{json.dumps(content, indent=2)}\n"
     stores.publish(record.encode(), stores.join(out, RECORD))
 

@@ -20,7 +20,7 @@ from depthpose.core.errors import InputError, Notice, import_extra
 from depthpose.core.files import atomic_write, read_text, remove_parts, write_image
 from depthpose.core.files.disk import refuse_heavy, refused_as, refused_write
 from depthpose.core.loop.task import ValidationResult
-from depthpose.core.run import environment
+from depthpose.core.run import describe_environment
 
 STATE = "state.pt"  # the last saved state of a training
 BEFORE = "state.before.pt"  # the one before, for the case that the last is damaged
@@ -165,7 +165,7 @@ def write_card(
         measured: Markdown of what was measured, such as :func:`held_out_text`.
     """
     folder = weights.parent
-    versions = environment()
+    versions = describe_environment()
     machine = ", ".join(versions[name] for name in ("machine", "gpu") if name in versions)
     step = 0  # step of the last state that is not damaged
     for path in reversed(saved_states(folder)):
