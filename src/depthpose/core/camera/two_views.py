@@ -6,7 +6,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from depthpose.core.camera.rectified import check_rectified, grey_of
+from depthpose.core.camera.rectified import check_rectified, grey_from_rgb
 
 Arrangement = Literal["side by side", "top and bottom"]
 _ROWS = 32  # rows of the small copies of both halves, which are compared
@@ -47,7 +47,7 @@ def _find_best_correlation(first_half: Tensor, second_half: Tensor) -> float:
     """Correlate small copies of both halves, at the shift along rows where it is largest."""
     small_copies: list[Tensor] = []
     for half in (first_half, second_half):
-        grey = grey_of(half).float()[None, None]
+        grey = grey_from_rgb(half).float()[None, None]
         copy = functional.interpolate(grey, (_ROWS, _COLUMNS), mode="area")
         small_copies.append(copy[0, 0])
     first, second = small_copies

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 
-from depthpose.core.camera.rectified import grey_of
+from depthpose.core.camera.rectified import grey_from_rgb
 from depthpose.core.checkpoint import Checkpoint, find_weights, load_weights, read_checkpoint
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image
@@ -145,7 +145,7 @@ class TrainingImages:
         balance = 1 + (changes[3:, None, None] - 1) / 3
         bright = window.image * brightness * balance
         bright = (bright - bright.mean()) * contrast + bright.mean()
-        grey = grey_of(bright)
+        grey = grey_from_rgb(bright)
         image = (grey + (bright - grey) * saturation).clamp(0, 1)
         return LabelledImage(image, window.labels)
 
