@@ -14,7 +14,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from depthpose.core.camera import Camera, StereoRig
-from depthpose.core.camera.pinhole import CameraFacts, camera_from_facts
+from depthpose.core.camera.camera_facts import CameraFacts, camera_from_facts
 from depthpose.core.camera.stored_camera import (
     facts_from_fields,
     facts_from_ros_pair,

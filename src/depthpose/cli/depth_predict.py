@@ -17,7 +17,7 @@ from depthpose.cli.depth_options import LensOptions, PairNetworks, PredictOutput
 from depthpose.cli.engine import EngineOptions, Weights, print_shards
 from depthpose.core import run
 from depthpose.core.camera import Camera, FieldOfView, StereoRig, camera_of, read_camera, read_rig
-from depthpose.core.camera.pinhole import camera_keys
+from depthpose.core.camera.camera_facts import camera_keys
 from depthpose.core.checkpoint import file_sha256, find_weights, read_checkpoint
 from depthpose.core.devices import device_of_process, usable_device, usable_precision
 from depthpose.core.draw import draw_depth

@@ -177,7 +177,7 @@ def _describe_camera(path: Path, camera: cameras.Camera) -> FileFacts:
     if camera.depth_unit_m is not None:
         description += f", depth in units of {camera.depth_unit_m:.4g} m"
     oddities: list[str] = []
-    centre_advice = cameras.suspicious_centre(camera)
+    centre_advice = cameras.describe_suspicious_centre(camera)
     if centre_advice is not None:
         oddities.append(centre_advice)
     if abs(fx / fy - 1) > _MAX_FOCAL_DIFFERENCE:

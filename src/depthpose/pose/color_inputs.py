@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.camera import AnyLens, Camera, camera_of, check_image_matches_camera
-from depthpose.core.camera.camera_file import intrinsics_of
+from depthpose.core.camera.any_camera import intrinsics_of
 from depthpose.core.errors import InputError, Notice
 from depthpose.core.files import AnyPicture, as_tensor
 from depthpose.core.rigid import Rigid
