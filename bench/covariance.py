@@ -22,7 +22,7 @@ from torch import Tensor
 from depthpose import GeoPoseNet
 from depthpose.core.camera.pinhole import intrinsics
 from depthpose.core.checkpoint import find_weights
-from depthpose.core.loop import sample_generator
+from depthpose.core.loop import make_sample_generator
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid, cross_matrix
 from depthpose.pose.cloud import cloud_from_depth
@@ -55,7 +55,7 @@ def measure_view(
     """Measure one view of a part repeatedly; return errors and claimed deviations at its middle."""
     model = PARTS[number]
     surface = SURFACES[number]
-    generator = sample_generator(seed, SEED)
+    generator = make_sample_generator(seed, SEED)
     R = random_rotation(generator).double()
     middle_m = surface.points_m.mean(0)
     truth = Rigid(R, torch.tensor([0.02, -0.03, DISTANCE_M]).double() - R @ middle_m)

@@ -26,7 +26,7 @@ from negatives import SCALES, NegativeKind, negative_of
 from shared import make_parser, with_cpu_seconds
 
 from depthpose.core.checkpoint import find_weights
-from depthpose.core.loop import sample_generator
+from depthpose.core.loop import make_sample_generator
 from depthpose.pose.config import EstimateConfig, ObjectsConfig
 from depthpose.pose.estimator import PoseEstimator
 from depthpose.pose.mesh import MIRROR_ALIKE, mirror_deviation
@@ -63,7 +63,7 @@ def models_in_view(
     """Make the model that is in view for each requested object: itself or a negative of it."""
     if kind == ITSELF:
         return list(requested)
-    generator = sample_generator(sum(map(ord, kind)), seed)
+    generator = make_sample_generator(sum(map(ord, kind)), seed)
     name, _, factor = kind.partition(" by ")
     scale = float(factor) if factor else None
     negative_kind = cast(NegativeKind, name)

@@ -30,7 +30,7 @@ from torch import Tensor
 
 from depthpose.core.camera.pinhole import intrinsics
 from depthpose.core.checkpoint import find_weights
-from depthpose.core.loop import sample_generator
+from depthpose.core.loop import make_sample_generator
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid, rotation_by
 from depthpose.pose.config import SyntheticSensorConfig
@@ -162,7 +162,7 @@ def sequence(
     model: ObjectModel, number: int, speed: float, seed: int, *, is_resting: bool = False
 ) -> Iterator[Frame]:
     """Render the frames of one object."""
-    generator = sample_generator(seed, SEED)
+    generator = make_sample_generator(seed, SEED)
     corners_m = drawn_triangles(model).double().reshape(-1, 3)
     centre_of_model_m = corners_m.mean(0)
     if is_resting:

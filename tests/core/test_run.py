@@ -7,7 +7,7 @@ import pytest
 from depthpose.core.devices import computes_bf16, device_of_process, usable_device
 from depthpose.core.errors import InputError
 from depthpose.core.files.images import refuse_among_inputs
-from depthpose.core.loop import LoopConfig, Run
+from depthpose.core.loop import LoopConfig, TrainingRun
 from depthpose.core.run import (
     ProcessRank,
     claim_folder,
@@ -253,7 +253,7 @@ class TrainedConfig:
 
 
 def test_a_finished_training_says_how_to_train_on(tmp_path: Path) -> None:
-    run = Run(folder=tmp_path)
+    run = TrainingRun(folder=tmp_path)
     run.claim(TrainedConfig(), ("net",))
     (tmp_path / "net.safetensors").write_bytes(b"1")
     longer = TrainedConfig(loop=LoopConfig(steps=9))

@@ -168,9 +168,9 @@ def pack_weights(
         terms: of use, printed whenever the weights are loaded; those of the parts are kept too.
         half: store 16-bit floats: half the size.
     """
-    from depthpose.core.checkpoint import bound_facts, find_weights, warn_of_terms
+    from depthpose.core.checkpoint import add_terms, find_weights, warn_of_terms
     from depthpose.core.files import atomic_write
-    from depthpose.core.loop import card_text
+    from depthpose.core.loop import format_card
     from depthpose.core.run import refuse_to_replace
     from depthpose.depth.weights import read_depth_weights, read_matcher, write_depth_weights
 
@@ -179,11 +179,11 @@ def pack_weights(
     refuse_to_replace(card)
     depth_weights = read_depth_weights(find_weights(weights))
     parts = [weights] if matcher is None else [weights, matcher]
-    warn_of_terms(bound_facts({}, parts))
+    warn_of_terms(add_terms({}, parts))
     own_facts = {"trained_on": trained_on, "licence": licence}
     if terms:
         own_facts["terms"] = terms
-    facts = bound_facts(own_facts, parts)
+    facts = add_terms(own_facts, parts)
     write_depth_weights(
         out,
         generator=depth_weights.generator,
@@ -192,7 +192,7 @@ def pack_weights(
         with_half=half,
     )
     with atomic_write(card) as unfinished:
-        unfinished.write_text(card_text(out.stem, dict(sorted(facts.items()))))
+        unfinished.write_text(format_card(out.stem, dict(sorted(facts.items()))))
     print(f"card: {card}")
     return show_weights(str(out))
 
