@@ -17,7 +17,7 @@ from depthpose.cli import main
 from depthpose.core.checkpoint import Checkpoint, save_checkpoint
 from depthpose.core.config import write_config
 from depthpose.core.errors import InputError
-from depthpose.core.export import Export, Graph, freeze
+from depthpose.core.export import Export, Graph, write_export
 from depthpose.core.files import (
     PointCloud,
     atomic_write,
@@ -197,7 +197,7 @@ def test_every_writer_names_a_full_disk_and_leaves_nothing(tmp_path: Path) -> No
         "depth": lambda p: write_depth_png(p / "d.png", 200 * images[0][0]),
         "avi": lambda p: write_video(p / "v.avi", images, 10.0),
         "mp4": lambda p: write_video(p / "v.mp4", images, 10.0),
-        "graph": lambda p: freeze(p / "g.onnx", graph),
+        "graph": lambda p: write_export(p / "g.onnx", graph),
     }
     for name, write in writers.items():
         with (

@@ -15,7 +15,7 @@ from depthpose.cli.pose_methods import PoseMethod
 from depthpose.cli.pose_options import PoseInputs
 from depthpose.core.camera import AnyLens
 from depthpose.core.checkpoint import file_sha256
-from depthpose.core.errors import InputError, nearest_name
+from depthpose.core.errors import InputError, suggest_name
 from depthpose.core.files import CLOUD_READERS, MAP_SUFFIXES, list_images, read_stored_depth
 from depthpose.core.files.disk import natural_order, refuse_equal_stems
 from depthpose.core.files.images import refuse_among_inputs
@@ -171,7 +171,7 @@ def object_named(name: str | None, method: PoseMethod) -> str:
         raise InputError(f"the {method.holder} know {', '.join(names)}; say which by --object")
     if name is not None and name not in names:
         raise InputError(
-            f"--object {name}: the {method.holder} do not know it; {nearest_name(name, names)}"
+            f"--object {name}: the {method.holder} do not know it; {suggest_name(name, names)}"
         )
     return names[0] if name is None else name
 

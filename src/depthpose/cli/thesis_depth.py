@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from depthpose.cli import depth_evaluate as evaluation
 from depthpose.cli.depth_predict import DepthMethod
-from depthpose.core.errors import InputError, nearest_name
+from depthpose.core.errors import InputError, suggest_name
 from depthpose.core.files import write_image
 from depthpose.core.run import claim_folder, describe_environment, find_rank
 from depthpose.depth.datasets import Dataset, Frame, has_lidar, lidar_truth
@@ -167,7 +167,7 @@ def choose_frames(dataset: Dataset, names: Sequence[str], number: int) -> list[i
         index_of = {frame.name: i for i, frame in enumerate(dataset.frames)}
         unknown = [name for name in names if name not in index_of]
         if unknown:
-            hint = nearest_name(unknown[0], index_of)[:300]
+            hint = suggest_name(unknown[0], index_of)[:300]
             raise InputError(f"{dataset.name}: no frame {unknown[0]!r}; {hint}")
         return [index_of[name] for name in names]
     pairs = [i for i, frame in enumerate(dataset.frames) if frame.right is not None]

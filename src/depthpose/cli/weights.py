@@ -303,12 +303,12 @@ def _write_graph(
         make_export: makes the graph, given the facts that it is to hold.
     """
     from depthpose.core.checkpoint import file_sha256, warn_of_terms
-    from depthpose.core.export import freeze
+    from depthpose.core.export import write_export
     from depthpose.report.page import format_markdown_table
 
     warn_of_terms(facts)
     origin = {"format": "onnx", "weights": Path(weights).name, "weights_sha256": file_sha256(path)}
-    differences = freeze(out, make_export({**facts, **origin}))
+    differences = write_export(out, make_export({**facts, **origin}))
     rows = [
         {name: f"{value:.1e}" if isinstance(value, float) else value for name, value in row.items()}
         for row in differences

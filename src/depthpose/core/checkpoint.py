@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
 from depthpose.core.config import config_to_dict
-from depthpose.core.errors import InputError, Notice, nearest_name
+from depthpose.core.errors import InputError, Notice, suggest_name
 from depthpose.core.files.disk import finite_number, refused_as, write_bytes
 from depthpose.core.hub import ON_HUB, WEIGHTS_FILE, fetch_weights
 
@@ -109,7 +109,7 @@ def find_weights(name: str | Path) -> Path:
         )
     raise InputError(
         f"weights {str(name)!r}: neither a file nor the name of weights that came with depthpose; "
-        f"{nearest_name(str(name), shipped)} 'depthpose weights import' imports published ones, "
+        f"{suggest_name(str(name), shipped)} 'depthpose weights import' imports published ones, "
         "hf://OWNER/NAME those on the hub."
     )
 

@@ -6,9 +6,9 @@ from typing import Any
 
 
 def data_frame(rows: Iterable[Mapping[str, Any]]) -> Any:  # noqa: ANN401  pandas is no dependency
-    """Convert rows to a ``pandas.DataFrame``.
+    """Convert rows, mappings of column names to values, to a ``pandas.DataFrame``.
 
-    A mapping inside a row becomes one column for each of its entries, called ``NAME.ENTRY``.
+    A mapping inside a row becomes a column for each of its entries, called ``NAME.ENTRY``.
 
     Raises:
         ImportError: pandas is not installed.

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.camera import StereoRig
-from depthpose.core.errors import InputError, Notice, nearest_name
+from depthpose.core.errors import InputError, Notice, suggest_name
 from depthpose.core.files import read_image
 from depthpose.core.frame import data_frame
 from depthpose.depth import disparity
@@ -88,7 +88,7 @@ def find_protocol(name: str) -> Protocol:
         InputError: there is none; the error suggests the most similar name.
     """
     if name not in PROTOCOLS:
-        raise InputError(f"protocol {name!r}: {nearest_name(name, PROTOCOLS)}")
+        raise InputError(f"protocol {name!r}: {suggest_name(name, PROTOCOLS)}")
     return PROTOCOLS[name]
 
 

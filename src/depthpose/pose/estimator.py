@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from depthpose.core.camera import AnyCamera, choose_lens
 from depthpose.core.devices import each_in_float32, each_in_threads, force_float32
-from depthpose.core.errors import InputError, describe_full_memory, nearest_name
+from depthpose.core.errors import InputError, describe_full_memory, suggest_name
 from depthpose.core.files import AnyPicture
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
@@ -430,7 +430,7 @@ class PoseEstimator:
             listing = ", ".join(map(repr, names))
             raise InputError(f"object {name!r} is no text; give the name of one: {listing}")
         if name not in names:
-            nearest = nearest_name(name, names)
+            nearest = suggest_name(name, names)
             raise InputError(f"object {name!r}: {self._holder} do not know it; {nearest}")
 
         # Its surface is sampled when it is first asked for.

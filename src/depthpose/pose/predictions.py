@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from depthpose.core.config import config_from_dict
-from depthpose.core.errors import InputError, Notice, nearest_name
+from depthpose.core.errors import InputError, Notice, suggest_name
 from depthpose.core.files import image_size, write_json
 from depthpose.core.files.disk import read_bytes, refuse_heavy, refused_as, write_bytes
 from depthpose.core.frame import data_frame
@@ -216,7 +216,7 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
     reason = row.get("reason", "")
     if status not in get_args(Status):
         statuses = get_args(Status)
-        raise InputError(f"{source}: status {status!r}: {nearest_name(str(status), statuses)}")
+        raise InputError(f"{source}: status {status!r}: {suggest_name(str(status), statuses)}")
 
     # How it came about, and its pose, which only an answer has.
     tracking = row.get("tracking")

@@ -21,7 +21,7 @@ from depthpose.core.camera.stored_camera import (
     read_baseline_m,
     with_fisheye,
 )
-from depthpose.core.errors import InputError, nearest_name
+from depthpose.core.errors import InputError, suggest_name
 
 DOFFS_KEY = "cx_right_minus_left_px"
 """Key of the difference between the principal points of a pair, Middlebury's ``doffs``."""
@@ -50,7 +50,7 @@ def facts_from_json(content: object) -> CameraFacts:
         raise InputError(f"no camera that is known; its keys are {keys:.80}. Known: {KNOWN_FILES}")
     for key in content:
         if key not in _KEYS:
-            raise InputError(f"unknown key {key!r}; {nearest_name(key, _KEYS)}")
+            raise InputError(f"unknown key {key!r}; {suggest_name(key, _KEYS)}")
     missing = [key for key in _NEEDED if key not in content]
     if missing:
         raise InputError(f"missing {', '.join(map(repr, missing))}; add it to the camera")

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from depthpose.core.errors import InputError, nearest_name
+from depthpose.core.errors import InputError, suggest_name
 from depthpose.core.files import read_json, read_text, write_json
 from depthpose.core.files.disk import refused_suffix
 from depthpose.pose.datasets.layouts import MOST, read_integer, read_number, read_numbers
@@ -323,7 +323,7 @@ def parse_labels(text: str, objects: Sequence[str]) -> dict[str, str]:
         if name and name not in objects:
             raise InputError(
                 f"labels {text!r}: class {label} is {name!r}, which is no known object; "
-                f"{nearest_name(name, objects)}"
+                f"{suggest_name(name, objects)}"
             )
         labels[label] = name
     return labels
@@ -364,7 +364,7 @@ def name_objects(
             )
         if name and name not in objects and wanted is None:
             raise InputError(
-                f"{source}: class {name!r} is no known object; {nearest_name(name, objects)} Say "
+                f"{source}: class {name!r} is no known object; {suggest_name(name, objects)} Say "
                 f"by --labels {label}=OBJECT which it is, or leave it out by --labels {label}="
             )
         if name == wanted or (name and wanted is None):
