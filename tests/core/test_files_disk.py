@@ -30,7 +30,7 @@ from depthpose.core.files import (
     write_map,
     write_video,
 )
-from depthpose.core.files.disk import natural_order
+from depthpose.core.files.disk import natural_sort_key
 from depthpose.core.loop import RunLogger
 from depthpose.core.run import claim_folder, lock_folder
 from depthpose.report.page import Section, write_page, write_table
@@ -230,7 +230,7 @@ def test_a_folder_may_be_called_as_a_pattern_is_written(tmp_path: Path) -> None:
 
 def in_order(*names: str) -> list[str]:
     """Sort names, given in their order, from the other end."""
-    paths = sorted((Path(name) for name in reversed(names)), key=natural_order)
+    paths = sorted((Path(name) for name in reversed(names)), key=natural_sort_key)
     return [str(path) for path in paths]
 
 

@@ -21,7 +21,7 @@ from torch.overrides import TorchFunctionMode
 
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError, Notice, suggest_name
-from depthpose.core.files.disk import finite_number, refused_as, write_bytes
+from depthpose.core.files.disk import parse_finite, refused_as, write_bytes
 from depthpose.core.hub import ON_HUB, WEIGHTS_FILE, fetch_weights
 
 NetworkT = TypeVar("NetworkT", bound=nn.Module)
@@ -158,7 +158,7 @@ def read_checkpoint(path: Path, kind: str | None = None) -> Checkpoint:
             f"{path}: holds weights of kind {stored_kind!r}, but {kind!r} is needed here."
         )
     try:
-        config = json.loads(metadata.pop("config"), parse_constant=finite_number)
+        config = json.loads(metadata.pop("config"), parse_constant=parse_finite)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: its 'config' is not JSON ({error}).") from error
     if not isinstance(config, dict):

@@ -10,7 +10,7 @@ from torch import Tensor
 from depthpose.core.camera import AnyLens, Camera, camera_of, check_image_matches_camera
 from depthpose.core.camera.any_camera import intrinsics_of
 from depthpose.core.errors import InputError, Notice
-from depthpose.core.files import AnyPicture, as_tensor
+from depthpose.core.files import AnyPicture, rgb_from_picture
 from depthpose.core.rigid import Rigid
 from depthpose.pose.inputs import AnyArray, rigid_input
 from depthpose.pose.types import ColorImage, ObjectModel, ViewInput
@@ -70,7 +70,7 @@ def color_input(
     intrinsic matrix of the depth image, and no transform. Arguments and errors are those of
     :func:`with_color`.
     """
-    rgb = as_tensor(color, f"{view.name}: the colour image")
+    rgb = rgb_from_picture(color, f"{view.name}: the colour image")
     height, width = rgb.shape[1:]
 
     # Of a camera of its own.

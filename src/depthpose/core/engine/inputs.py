@@ -18,7 +18,7 @@ from pathlib import Path, PurePosixPath
 
 from depthpose.core.errors import InputError
 from depthpose.core.files import stores
-from depthpose.core.files.disk import file_system, find_partners, refuse_equal_names
+from depthpose.core.files.disk import find_partners, open_file_system, refuse_equal_names
 
 PLAN = "plan.jsonl"
 """The blocks of a job, one a line."""
@@ -222,7 +222,7 @@ def read_tar(url: str) -> Iterator[tuple[str, bytes]]:
     """
     names: set[str] = set()
     try:
-        with file_system(url, "read") as (fs, inner):
+        with open_file_system(url, "read") as (fs, inner):
             file = fs.open(inner, "rb")
         with file, tarfile.open(fileobj=file, mode="r|*") as tar:
             for member in tar:

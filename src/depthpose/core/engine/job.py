@@ -18,7 +18,7 @@ from depthpose.core.engine.shards import (
 )
 from depthpose.core.errors import InputError
 from depthpose.core.files import remove_parts, stores
-from depthpose.core.files.disk import file_system
+from depthpose.core.files.disk import open_file_system
 from depthpose.core.run import (
     NOT_OURS,
     RECORD,
@@ -96,7 +96,7 @@ def _find_finished(out: str, blocks: Sequence[Block]) -> dict[str, ShardRecord]:
         record_url = stores.join(folder, f"{block.shard}.json")
         if record is None or not _is_shard_whole(folder, block, record, sizes):
             if f"{block.shard}.json" in sizes:
-                with file_system(record_url, "removed") as (fs, inner):
+                with open_file_system(record_url, "removed") as (fs, inner):
                     fs.rm_file(inner)
             continue
 

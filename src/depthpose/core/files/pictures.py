@@ -9,7 +9,7 @@ from PIL import Image
 from torch import Tensor
 
 from depthpose.core.errors import InputError
-from depthpose.core.files.images import check_image, picture_tensor, read_image
+from depthpose.core.files.images import check_image, read_image, rgb_from_pillow
 
 AnyPicture = str | Path | Image.Image | Shaped[Tensor, "..."] | Shaped[np.ndarray, "..."]
 """A file, a picture of Pillow's, an array or a tensor: RGB, RGBA (alpha is dropped) or grey, whole
@@ -22,7 +22,7 @@ _ALLOWED_VALUES = (
 )
 
 
-def as_tensor(image: object, name: str = "the image") -> Float[Tensor, "3 h w"]:
+def rgb_from_picture(image: object, name: str = "the image") -> Float[Tensor, "3 h w"]:
     """Read or convert a picture in any form (:data:`AnyPicture`) to RGB in [0, 1].
 
     Args:
@@ -36,7 +36,7 @@ def as_tensor(image: object, name: str = "the image") -> Float[Tensor, "3 h w"]:
         case str() | Path():
             return read_image(Path(image))
         case Image.Image():
-            return picture_tensor(image, name)
+            return rgb_from_pillow(image, name)
         case np.ndarray() if image.dtype != np.uint8 and image.dtype.kind != "f":
             raise InputError(f"{name} is an array of {image.dtype}; {_ALLOWED_VALUES}")
         case np.ndarray():

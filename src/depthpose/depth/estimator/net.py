@@ -28,7 +28,7 @@ from depthpose.core.checkpoint import find_weights, join_terms, warn_of_terms
 from depthpose.core.devices import each_in_threads, force_float32
 from depthpose.core.errors import InputError, Notice
 from depthpose.core.files import AnyPicture as AnyPicture
-from depthpose.core.files import as_tensor, read_exif_focal
+from depthpose.core.files import read_exif_focal, rgb_from_picture
 from depthpose.depth.config import Answer, MatcherConfig, SGBMConfig
 from depthpose.depth.estimator.pair import depth_from_pair
 from depthpose.depth.estimator.single_image import depth_from_images, virtual_sizes
@@ -58,7 +58,7 @@ def as_input(
         with_exif: read the focal length from the picture's EXIF where ``camera`` is None, with a
             notice.
     """
-    left = as_tensor(image, f"{name}: the image")
+    left = rgb_from_picture(image, f"{name}: the image")
     lens = camera
     if camera is None and with_exif and isinstance(image, str | Path | Image.Image):
         exif_focal = read_exif_focal(image)
@@ -295,7 +295,7 @@ class FakestereoNet:
         lens = choose_lens(camera, focal_px, fov_deg)
         pair = as_input(image, name, lens, with_exif=right is None)
         if right is not None:
-            pair = replace(pair, right=as_tensor(right, f"{name}: the right image"))
+            pair = replace(pair, right=rgb_from_picture(right, f"{name}: the right image"))
             if known_distance is not None:
                 raise InputError(f"{name}: a pair has metres of its own; omit known_distance")
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from depthpose.core.errors import InputError, suggest_name
 from depthpose.core.files import read_json, read_text, write_json
-from depthpose.core.files.disk import refused_suffix
+from depthpose.core.files.disk import make_suffix_error
 from depthpose.pose.datasets.layouts import MOST, read_integer, read_number, read_numbers
 from depthpose.pose.datasets.masks import Runs, decode_rle, mask_box, read_runs
 
@@ -149,7 +149,7 @@ def read_detections(path: str | Path, size: tuple[int, int] | None = None) -> li
         return _read_coco(path)
     if suffix == ".txt":
         return _read_yolo(path, size)
-    raise refused_suffix(path, "file of detections", (".json", ".txt"))
+    raise make_suffix_error(path, "file of detections", (".json", ".txt"))
 
 
 def _read_coco(path: Path) -> list[Detection]:
