@@ -64,10 +64,10 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     state = {name: tensor.detach().cpu().contiguous() for name, tensor in checkpoint.state.items()}
     content = save(state, metadata={**checkpoint.facts, **metadata})
     # Not by safetensors' own writer, whose error does not name a full disk.
-    write_bytes(path, _with_sorted_header(content))
+    write_bytes(path, _sort_header(content))
 
 
-def _with_sorted_header(content: bytes) -> bytes:
+def _sort_header(content: bytes) -> bytes:
     """Sort the JSON header of a safetensors file, so that equal weights have equal checksums.
 
     The library writes metadata in random order. A file is the size of its header (8 bytes), the
@@ -99,7 +99,7 @@ def find_weights(name: str | Path) -> Path:
     if str(name) in shipped:
         return shipped[str(name)]
     if path.is_dir():
-        return _weights_in_folder(path)
+        return _find_weights_in_folder(path)
     if str(name).startswith(ON_HUB):
         return fetch_weights(str(name))
     if str(name) in _NOT_IN_WHEEL:
@@ -114,7 +114,7 @@ def find_weights(name: str | Path) -> Path:
     )
 
 
-def _weights_in_folder(folder: Path) -> Path:
+def _find_weights_in_folder(folder: Path) -> Path:
     """Find the only ``.safetensors`` file of a folder, or the one with the usual name.
 
     Raises:

@@ -47,7 +47,7 @@ class Settings:
     """
 
     def __post_init__(self) -> None:
-        for name, rule in _rules_of(type(self)).items():
+        for name, rule in _read_rules(type(self)).items():
             value = getattr(self, name)
             default = getattr(type(self), name, None)
 
@@ -84,7 +84,7 @@ def _is_in_interval(number: float, interval: str) -> bool:
 
 
 @cache
-def _rules_of(kind: type) -> dict[str, _Rule]:
+def _read_rules(kind: type) -> dict[str, _Rule]:
     """Read the rules of a class of settings from its type hints, by the names of the settings."""
     rules: dict[str, _Rule] = {}
     for name, hint in get_type_hints(kind, include_extras=True).items():

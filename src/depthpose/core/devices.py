@@ -48,7 +48,7 @@ def force_float32() -> Iterator[None]:
             torch.set_default_dtype(callers_dtype)
 
 
-def each_in_float32(items: Iterator[Result]) -> Iterator[Result]:
+def iterate_in_float32(items: Iterator[Result]) -> Iterator[Result]:
     """Yield the items of a generator, computing each of them inside :func:`force_float32`.
 
     Between two items the caller's own settings hold.
@@ -62,7 +62,7 @@ def each_in_float32(items: Iterator[Result]) -> Iterator[Result]:
         yield cast(Result, item)
 
 
-def each_in_threads(
+def map_in_threads(
     function: Callable[[Item], Result], items: Iterable[Item], threads: int
 ) -> Iterator[Result]:
     """Apply a function to items in several threads; yield the results in the order of the items.

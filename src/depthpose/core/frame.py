@@ -5,7 +5,7 @@ from importlib import import_module
 from typing import Any
 
 
-def data_frame(rows: Iterable[Mapping[str, Any]]) -> Any:  # noqa: ANN401  pandas is no dependency
+def make_data_frame(rows: Iterable[Mapping[str, Any]]) -> Any:  # noqa: ANN401  pandas is no dependency
     """Convert rows, mappings of column names to values, to a ``pandas.DataFrame``.
 
     A mapping inside a row becomes a column for each of its entries, called ``NAME.ENTRY``.

@@ -18,7 +18,7 @@ from torch import Tensor
 from depthpose.core.camera import StereoRig
 from depthpose.core.errors import InputError, Notice, suggest_name
 from depthpose.core.files import read_image
-from depthpose.core.frame import data_frame
+from depthpose.core.frame import make_data_frame
 from depthpose.depth import disparity
 from depthpose.depth import predictions as files
 from depthpose.depth.datasets import Dataset, Frame, has_lidar, lidar_truth, read_disparity
@@ -153,7 +153,7 @@ class Evaluation:
         Raises:
             ImportError: pandas is not installed.
         """
-        return data_frame(row.columns() for row in self.per_frame)
+        return make_data_frame(row.columns() for row in self.per_frame)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,7 @@ import torch
 from tqdm import tqdm
 
 from depthpose.core.camera import AnyCamera, choose_lens
-from depthpose.core.devices import each_in_float32, each_in_threads, force_float32
+from depthpose.core.devices import force_float32, iterate_in_float32, map_in_threads
 from depthpose.core.errors import InputError, describe_full_memory, suggest_name
 from depthpose.core.files import AnyPicture
 from depthpose.core.rigid import Rigid
@@ -91,7 +91,7 @@ class PoseEstimator:
 
     def _estimate_each(self, inputs: Iterable[AnyInput], threads: int) -> Iterator[PoseEstimate]:
         """Give each input's estimate, in order; each is expected to show its object."""
-        return each_in_threads(partial(unreadable_on_error, self._estimate), inputs, threads)
+        return map_in_threads(partial(unreadable_on_error, self._estimate), inputs, threads)
 
     def _estimate_each_try(self, inputs: Iterable[AnyInput]) -> Iterator[PoseEstimate]:
         """Give each input's estimate, in order, where an input may well not show its object.
@@ -411,7 +411,7 @@ class PoseEstimator:
             config=self.config,
             search=search,
         )
-        return each_in_float32(track(frames, target, first))
+        return iterate_in_float32(track(frames, target, first))
 
     def _find_object(self, name: str | None) -> PreparedObject:
         """Find an object by its name, with its surface; None where one alone is known.

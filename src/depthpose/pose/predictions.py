@@ -19,7 +19,7 @@ from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError, Notice, suggest_name
 from depthpose.core.files import image_size, write_json
 from depthpose.core.files.disk import read_bytes, refuse_heavy, refused_as, write_bytes
-from depthpose.core.frame import data_frame
+from depthpose.core.frame import make_data_frame
 from depthpose.core.rigid import Rigid
 from depthpose.core.run import claim_folder
 from depthpose.core.runner import Job, Results, run_jobs
@@ -80,7 +80,7 @@ class Predictions(list[Prediction]):
         Raises:
             ImportError: pandas is not installed.
         """
-        return data_frame(prediction_row(prediction) for prediction in self)
+        return make_data_frame(prediction_row(prediction) for prediction in self)
 
 
 def place_of(instance: Instance) -> Place:

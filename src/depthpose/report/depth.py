@@ -95,7 +95,7 @@ def make_depth_section(
     if estimate.depth_m is not None and pair.camera is not None:
         scene = make_depth_scene(pair, estimate, far_m, f"{title}: the cloud")
         if error is not None and error.true_depth_m is not None:
-            scene = _with_truth(scene, error.true_depth_m, pair.camera, far_m)
+            scene = _add_truth(scene, error.true_depth_m, pair.camera, far_m)
         scenes.append(scene)
     facts = list_depth_facts(pair, estimate)
     return Section(title=title, text=text, facts=facts, pictures=pictures, scenes=scenes)
@@ -138,7 +138,7 @@ def _draw_errors(
     return drawings
 
 
-def _with_truth(scene: Scene, true_m: Map, camera: Camera, far_m: float) -> Scene:
+def _add_truth(scene: Scene, true_m: Map, camera: Camera, far_m: float) -> Scene:
     """Add the points of the true depth up to ``far_m`` to a 3D view, in green."""
     points_m = back_project(true_m, camera.K).reshape(-1, 3).float()
     is_included = points_m.isfinite().all(-1) & (points_m[:, 2] <= far_m)

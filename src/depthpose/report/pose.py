@@ -306,7 +306,7 @@ def make_pose_section(
     """
     drawings: list[Drawing] = []
     if isinstance(pose_input, ViewInput):
-        drawings = _pose_drawings(pose_input, estimate, model, image, truth)
+        drawings = _draw_view(pose_input, estimate, model, image, truth)
     points_m = select_object_points(pose_input, model.diameter_m)
     return Section(
         title=title,
@@ -319,7 +319,7 @@ def make_pose_section(
     )
 
 
-def _pose_drawings(
+def _draw_view(
     view: ViewInput,
     estimate: PoseEstimate,
     model: ObjectModel,

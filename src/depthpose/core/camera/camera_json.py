@@ -93,9 +93,9 @@ def _read_foreign_json(content: object) -> CameraFacts | None:
         return facts
     open3d_intrinsic = content.get("intrinsic", content)
     if "cam_K" in content:
-        facts = _from_scene_camera({"0": content})
+        facts = _facts_from_scene_camera({"0": content})
     elif isinstance(open3d_intrinsic, dict) and "intrinsic_matrix" in open3d_intrinsic:
-        facts = _from_open3d(open3d_intrinsic)
+        facts = _facts_from_open3d(open3d_intrinsic)
     elif content.keys() >= set(_BOP_KEYS):
         fx, fy, cx, cy = (_read_json_number(content, key) for key in _BOP_KEYS)
         facts = CameraFacts(
@@ -109,12 +109,12 @@ def _read_foreign_json(content: object) -> CameraFacts | None:
     elif content and all(
         isinstance(image, dict) and "cam_K" in image for image in content.values()
     ):
-        facts = _from_scene_camera(content)
+        facts = _facts_from_scene_camera(content)
 
     return None if facts is None else with_fisheye(facts, is_fisheye=is_fisheye)
 
 
-def _from_open3d(keys: dict[str, Any]) -> CameraFacts:
+def _facts_from_open3d(keys: dict[str, Any]) -> CameraFacts:
     """Read Open3D's ``PinholeCameraIntrinsic``, whose flat matrix is stored column by column."""
     K = _read_matrix(keys["intrinsic_matrix"])
     is_by_columns = isinstance(keys["intrinsic_matrix"][0], int | float)
@@ -124,7 +124,7 @@ def _from_open3d(keys: dict[str, Any]) -> CameraFacts:
     return CameraFacts(kind="a camera of Open3D", K=K, size=size)
 
 
-def _from_scene_camera(images: dict[str, dict[str, Any]]) -> CameraFacts:
+def _facts_from_scene_camera(images: dict[str, dict[str, Any]]) -> CameraFacts:
     """Read the camera of BOP's scene_camera.json, which must be the same for all images."""
     entries = list(images.values())
     first = entries[0]

@@ -122,7 +122,6 @@ def check_rectified(
         finding = "left and right are the same picture; give the view of each camera"
         return RectificationReport(is_pair=False, message=finding)
     with torch.no_grad():
-        # Images without texture match nothing.
         left_grey, right_grey = (_reduce_to_grey(image, _COARSE_PIXELS) for image in (left, right))
         for side, grey in (("left", left_grey), ("right", right_grey)):
             deviation = float(grey.std(correction=0))
@@ -134,25 +133,12 @@ def check_rectified(
                 )
                 return RectificationReport(is_pair=False, message=finding)
 
-        # Where few corners match, one image may be changed, or of another scene.
         corners = _find_corners(left_grey)
         coarse = _match_corners(left_grey, right_grey, corners)
-        match_count = len(coarse.source_px)
-        if match_count < _MIN_MATCHES:
-            unmatched = RectificationReport(corners=len(corners), matches=match_count, message="")
-            change = _find_change(left_grey, right_grey, corners)
-            if change is not None:
-                return replace(unmatched, is_rectified=False, message=change)
-            has_few_matches = match_count < _MIN_MATCHED_SHARE * len(corners)
-            has_repeated_pattern = coarse.good_count >= _MAX_ALIKE_SHARE * len(corners)
-            is_textured = len(corners) >= _MIN_TEXTURED
-            if has_few_matches and not has_repeated_pattern and is_textured:
-                finding = (
-                    f"the images do not belong together: {match_count} of {len(corners)} corners "
-                    f"of the left image are found in the right one (at least "
-                    f"{_MIN_MATCHED_SHARE:.0%} are needed); give both views of one moment"
-                )
-                return replace(unmatched, is_pair=False, message=finding)
+        if len(coarse.source_px) < _MIN_MATCHES:
+            report = _explain_few_matches(left_grey, right_grey, corners, coarse)
+            if report is not None:
+                return report
         matches = _refine_matches(left, right, coarse)
 
     report = _judge_matches(matches, len(corners), left.shape[-1], cx_difference_px)
@@ -162,6 +148,36 @@ def check_rectified(
         places_px=matches.from_centre_px + centre_px,
         disparities_px=-matches.shift_px[:, 0].float(),
     )
+
+
+def _explain_few_matches(
+    left: _GreyImage, right: _GreyImage, corners: _Pixels, coarse: "_CoarseMatches"
+) -> RectificationReport | None:
+    """Report that the right image is changed, or of another scene; None where neither is clear.
+
+    Args:
+        left: coarse copy of the left image.
+        right: coarse copy of the right image.
+        corners: all corners of the left one.
+        coarse: the few of them that match.
+    """
+    match_count = len(coarse.source_px)
+    unmatched = RectificationReport(corners=len(corners), matches=match_count, message="")
+    change = _find_change(left, right, corners)
+    if change is not None:
+        return replace(unmatched, is_rectified=False, message=change)
+
+    has_few_matches = match_count < _MIN_MATCHED_SHARE * len(corners)
+    has_repeated_pattern = coarse.good_count >= _MAX_ALIKE_SHARE * len(corners)
+    is_textured = len(corners) >= _MIN_TEXTURED
+    if not has_few_matches or has_repeated_pattern or not is_textured:
+        return None
+    finding = (
+        f"the images do not belong together: {match_count} of {len(corners)} corners of the left "
+        f"image are found in the right one (at least {_MIN_MATCHED_SHARE:.0%} are needed); give "
+        "both views of one moment"
+    )
+    return replace(unmatched, is_pair=False, message=finding)
 
 
 def _find_corners(grey: _GreyImage) -> _Pixels:
@@ -396,12 +412,11 @@ def _judge_matches(
         offset_px = float(row_shift_px.median())
         spread_px = _MAD_TO_DEVIATION * float((row_shift_px - offset_px).abs().median())
 
-    # Limits that grow with the image.
     growth = max(1.0, width / _LIMITS_WIDTH)
+    unmoved_px = growth * _SAME_PX
+    unmoved_share = float((matches.shift_px.abs().amax(-1) <= unmoved_px).float().mean())
     max_offset_px = growth * _MAX_OFFSET_PX
     max_spread_px = growth * _MAX_SPREAD_PX
-    same_px = growth * _SAME_PX
-    unmoved_share = float((matches.shift_px.abs().amax(-1) <= same_px).float().mean())
     is_level = abs(offset_px) <= max_offset_px and spread_px <= max_spread_px
     is_decided = match_count >= _MIN_MATCHES or (match_count >= _MIN_WRONG and not is_level)
     is_order_decided = len(clear_px) >= _MIN_MATCHES
@@ -427,9 +442,8 @@ def _judge_matches(
     findings: list[str] = []
     if report.is_pair is False:
         findings.append(
-            f"left and right show the same view: {unmoved_share:.0%} of what "
-            f"matches lies within {same_px:.2g} px of its place; give the view of each "
-            "camera"
+            f"left and right show the same view: {unmoved_share:.0%} of what matches lies within "
+            f"{unmoved_px:.2g} px of its place; give the view of each camera"
         )
     elif report.is_swapped:
         findings.append(

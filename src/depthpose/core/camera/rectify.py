@@ -146,9 +146,9 @@ def _warn_if_transposed(path: AnyPath, right_from_left: Rigid) -> None:
     """
     R = right_from_left.R
     t_m = right_from_left.t_m
-    right_deg = _baseline_angle_deg(t_m)
-    as_read_deg = _baseline_angle_deg(R.mT @ t_m) + right_deg
-    transposed_deg = _baseline_angle_deg(R @ t_m) + right_deg
+    right_deg = _measure_baseline_angle(t_m)
+    as_read_deg = _measure_baseline_angle(R.mT @ t_m) + right_deg
+    transposed_deg = _measure_baseline_angle(R @ t_m) + right_deg
     is_far_less = transposed_deg < _TRANSPOSED_SHARE * as_read_deg
     if is_far_less and as_read_deg - transposed_deg > _MIN_ROTATION_DEG:
         message = (
@@ -159,7 +159,7 @@ def _warn_if_transposed(path: AnyPath, right_from_left: Rigid) -> None:
         warnings.warn(message, Notice, stacklevel=3)
 
 
-def _baseline_angle_deg(baseline_m: Tensor) -> float:
+def _measure_baseline_angle(baseline_m: Tensor) -> float:
     """Compute the angle between the baseline, in a camera's frame, and the camera's rows [deg]."""
     off_axis_m = float(baseline_m[1:].norm())
     return math.degrees(math.atan2(off_axis_m, abs(float(baseline_m[0]))))

@@ -202,7 +202,7 @@ def _facts_without_lens(fields: Fields) -> CameraFacts | None:
         )
     for prefix in ("camera", "camera1"):
         if f"{prefix}fx" in fields:
-            return _from_orb_slam(fields, prefix)
+            return _facts_from_orb_slam(fields, prefix)
 
     size = find_size(fields)
     distortion = find_distortion(fields)
@@ -215,18 +215,18 @@ def _facts_without_lens(fields: Fields) -> CameraFacts | None:
         left = _require_matrix(left, "P1")
         facts = facts_from_projections("a rig of OpenCV", left, right, size)
     elif Q is not None:
-        facts = _from_reprojection_matrix(Q, size)
+        facts = _facts_from_reprojection_matrix(Q, size)
     elif left is None or left[0, 0] == 0:
-        return _from_intrinsics(fields, kind, distortion)
+        return _facts_from_intrinsics(fields, kind, distortion)
     elif left[0, 3] == 0 and left[1, 3] == 0:  # of a single camera
         facts = facts_from_projections(kind, left, None, size)
         undistort = _UNDISTORT_P
     else:
-        facts = _from_right_projection(left, kind, size)
+        facts = _facts_from_right_projection(left, kind, size)
     return replace(facts, distortion=distortion, undistort=undistort)
 
 
-def _from_orb_slam(fields: Fields, prefix: str) -> CameraFacts:
+def _facts_from_orb_slam(fields: Fields, prefix: str) -> CameraFacts:
     """Read the settings of ORB-SLAM, whose keys of intrinsics begin with ``prefix``."""
     fx, fy, cx, cy = (
         find_number(fields, f"{prefix}{key}") or 0.0 for key in ("fx", "fy", "cx", "cy")
@@ -250,7 +250,7 @@ def _from_orb_slam(fields: Fields, prefix: str) -> CameraFacts:
     )
 
 
-def _from_reprojection_matrix(Q: np.ndarray, size: Size | None) -> CameraFacts:
+def _facts_from_reprojection_matrix(Q: np.ndarray, size: Size | None) -> CameraFacts:
     """Read the rig of stereoRectify's ``(x, y, z, w) = Q (u, v, disparity, 1)``.
 
     ``Q[3, 2]`` is 1 / baseline.
@@ -266,7 +266,7 @@ def _from_reprojection_matrix(Q: np.ndarray, size: Size | None) -> CameraFacts:
     )
 
 
-def _from_right_projection(P: np.ndarray, kind: str, size: Size | None) -> CameraFacts:
+def _facts_from_right_projection(P: np.ndarray, kind: str, size: Size | None) -> CameraFacts:
     """Read a rig from the right camera's projection alone, whose ``Tx`` is -fx times the baseline.
 
     That does not hold where both cameras are measured from a third one: the facts warn of that.
@@ -358,7 +358,7 @@ def order_ros_pair(first: Fields, second: Fields) -> tuple[Fields, Fields]:
     return (first, second) if first_Tx > second_Tx else (second, first)
 
 
-def _from_intrinsics(
+def _facts_from_intrinsics(
     fields: Fields, kind: str, distortion: tuple[float, ...]
 ) -> CameraFacts | None:
     """Read K, or fx, fy, cx and cy; None where there are neither.

@@ -205,14 +205,14 @@ def _read_text(path: AnyPath) -> PointCloud:
     """Read a cloud of text: rows of numbers, perhaps after column names, a count or comments."""
     text = TextIOWrapper(BytesIO(read_bytes(path, MAX_TEXT_BYTES)), "utf-8-sig")
     comments: list[str] = []
-    rows = _rows_without_comments(text, comments)
+    rows = _strip_comments(text, comments)
     with refused_as(path, "text", "save it as UTF-8"):
         head = list(islice(rows, _INSPECTED_ROWS))
 
     # Names of columns in the first line.
     names: list[str] = []
     if head and not _is_row_of_numbers(head[0]):
-        names = _column_names(head[0])
+        names = _split_names(head[0])
         if not set("xyz") <= set(names):
             raise InputError(
                 f"{path}: begins by {head[0][:60]!r}, neither numbers nor names of columns with x, "
@@ -229,7 +229,7 @@ def _read_text(path: AnyPath) -> PointCloud:
     # Or the names are in a comment that has as many words as a row.
     width = len(_SEPARATORS.split(head[0])) if head else 0
     for comment in comments if not names else ():
-        words = _column_names(comment)
+        words = _split_names(comment)
         if len(words) == width and set("xyz") <= set(words):
             names = words
             break
@@ -248,7 +248,7 @@ def _read_text(path: AnyPath) -> PointCloud:
     return _cloud_from_table(path, table)
 
 
-def _column_names(line: str) -> list[str]:
+def _split_names(line: str) -> list[str]:
     """Split a line into names of columns, in lower case and without quotation marks."""
     return [word.strip("\"'").lower() for word in _SEPARATORS.split(line.strip())]
 
@@ -256,14 +256,14 @@ def _column_names(line: str) -> list[str]:
 def _is_row_of_numbers(line: str) -> bool:
     """Whether all words of a line are numbers."""
     try:
-        for word in filter(None, _column_names(line)):
+        for word in filter(None, _split_names(line)):
             float(word)
     except ValueError:
         return False
     return True
 
 
-def _rows_without_comments(text: Iterable[str], comments: list[str]) -> Iterator[str]:
+def _strip_comments(text: Iterable[str], comments: list[str]) -> Iterator[str]:
     """Yield the rows of a text without their comments.
 
     A comment begins with ``#``, or at the beginning of a line with ``//``. Comments before the

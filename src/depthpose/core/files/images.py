@@ -204,13 +204,13 @@ def _decode_jpeg(name: AnyPath, data: bytes, colours: str) -> Image.Image:
     try:
         pixels = simplejpeg.decode_jpeg(data, colours, strict=True).squeeze()
     except ValueError as error:
-        raise _damaged_jpeg(name, str(error)) from error
+        raise _make_jpeg_error(name, str(error)) from error
     if _has_hole(data):
-        raise _damaged_jpeg(name, "zeros in place of compressed pixels")
+        raise _make_jpeg_error(name, "zeros in place of compressed pixels")
     return Image.fromarray(pixels)
 
 
-def _damaged_jpeg(name: AnyPath, reason: str) -> InputError:
+def _make_jpeg_error(name: AnyPath, reason: str) -> InputError:
     """Make the error of a JPEG whose pixels are damaged."""
     return InputError(
         f"{name}: a damaged JPEG ({reason}), whose pixels are wrong from there on; copy it anew, "
@@ -566,16 +566,16 @@ def read_exif_focal(picture: AnyPath | Image.Image) -> tuple[float, str] | None:
         InputError: the file is no picture.
     """
     if isinstance(picture, Image.Image):
-        focal, doubt = _exif_focal(picture)
+        focal, doubt = _read_exif_tags(picture)
     else:
         with open_image(picture) as opened:
-            focal, doubt = _exif_focal(opened)
+            focal, doubt = _read_exif_tags(opened)
     if doubt:
         warnings.warn(doubt, Notice, stacklevel=2)
     return focal
 
 
-def _exif_focal(picture: Image.Image) -> tuple[tuple[float, str] | None, str]:
+def _read_exif_tags(picture: Image.Image) -> tuple[tuple[float, str] | None, str]:
     """Read what :func:`read_exif_focal` returns, and its notice: "" where there is none."""
     if _has_hidden_exif(picture):
         return None, ""

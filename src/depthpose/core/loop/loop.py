@@ -346,7 +346,7 @@ class _Training:
                 "precision fp32; 'start' can take weights from before."
             )
         scaled_loss = self.parts.scaler.scale(update.loss / micro_batches)
-        scaled_loss.backward(inputs=_parameters_of(self.parts.optimizers[name]))
+        scaled_loss.backward(inputs=_list_parameters(self.parts.optimizers[name]))
         for fact, value in {"loss": loss, **update.facts}.items():
             total, terms = self.sums.get(f"{name}/{fact}", (0.0, 0))
             self.sums[f"{name}/{fact}"] = (total + float(value), terms + 1)
@@ -371,7 +371,7 @@ class _Training:
         optimizer, adam = self.task.optimizers[name]
         for group in optimizer.param_groups:
             group["lr"] = adam.rate_at(self.step, self.steps) * group.get("rate", 1.0)
-        parameters = _parameters_of(optimizer)
+        parameters = _list_parameters(optimizer)
         if self.process_count > 1:
             gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
             flat = torch.cat([gradient.flatten() for gradient in gradients])
@@ -439,7 +439,7 @@ def _copy_weights(task: Task) -> dict[str, dict[str, Tensor]]:
     }
 
 
-def _parameters_of(optimizer: Any) -> list[Tensor]:  # noqa: ANN401
+def _list_parameters(optimizer: Any) -> list[Tensor]:  # noqa: ANN401
     """List the parameters of an optimiser."""
     return [parameter for group in optimizer.param_groups for parameter in group["params"]]
 

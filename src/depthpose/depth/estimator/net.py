@@ -25,7 +25,7 @@ from depthpose.core.camera import (
     choose_lens,
 )
 from depthpose.core.checkpoint import find_weights, join_terms, warn_of_terms
-from depthpose.core.devices import each_in_threads, force_float32
+from depthpose.core.devices import force_float32, map_in_threads
 from depthpose.core.errors import InputError, Notice
 from depthpose.core.files import AnyPicture as AnyPicture
 from depthpose.core.files import read_exif_focal, rgb_from_picture
@@ -368,7 +368,7 @@ class FakestereoNet:
         estimate = partial(self.estimate_batch, lens=lens, with_check=with_check)
         batches = _named_batches(sequence, batch)
         with tqdm(total=total, unit=" images", disable=not with_progress) as bar:
-            for estimates_of_batch in each_in_threads(estimate, batches, threads):
+            for estimates_of_batch in map_in_threads(estimate, batches, threads):
                 estimates += estimates_of_batch
                 bar.update(len(estimates_of_batch))
         return estimates
