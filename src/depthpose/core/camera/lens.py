@@ -73,8 +73,8 @@ def is_fisheye_lens(fields: Mapping[str, Any], owner: str = "its") -> bool | Non
     named_lenses: dict[str, tuple[str, bool]] = {}  # by key the name, and whether it is a fisheye
     for key in (*_MODEL_KEYS, *_OTHER_KEYS):
         value = fields.get(key)
-        is_number = isinstance(value, int) and not isinstance(value, bool)
-        if is_number and "ppx" in fields:  # of librealsense
+        is_realsense = "ppx" in fields
+        if is_realsense and isinstance(value, int) and not isinstance(value, bool):
             value = _REALSENSE[value] if 0 <= value < len(_REALSENSE) else None
         if not isinstance(value, str):
             continue
