@@ -18,7 +18,7 @@ from typing import Any
 
 from shared import make_parser
 
-from depthpose.report.page import markdown_table
+from depthpose.report.page import format_markdown_table
 
 RIG = (
     '{"width": 1242, "height": 375, "baseline_m": 0.54, '
@@ -94,8 +94,8 @@ def main() -> None:
                 "ratio": now_s / before_s,
             }
         )
-        print(markdown_table(rows[-1:]), flush=True)
-    print(markdown_table(rows))
+        print(format_markdown_table(rows[-1:]), flush=True)
+    print(format_markdown_table(rows))
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ from depthpose.pose.copies import SymmetricCopies, find_copies
 from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.pose.synthetic import Objects
 from depthpose.pose.weights import read_pose_weights
-from depthpose.report.page import markdown_table, write_table
+from depthpose.report.page import format_markdown_table, write_table
 
 SEED = 0xCE47
 NOISES = (1.0, 1.0, 3.0)  # times the sensor's usual noise; a third of the views for each
@@ -137,11 +137,11 @@ def main() -> None:
         answers_or_refusals = list(answers_of(name, options.number))
         answers = [answer for answer in answers_or_refusals if answer is not None]
         print(f"{name}: {len(answers_or_refusals)} views, {len(answers)} answered", flush=True)
-        print(markdown_table(limit_rows(answers)), flush=True)
+        print(format_markdown_table(limit_rows(answers)), flush=True)
         answers_by_weights[Path(name).stem] = answers
     all_answers = [answer for answers in answers_by_weights.values() for answer in answers]
-    print(markdown_table(band_rows(all_answers)))
-    print(markdown_table(limit_rows(all_answers)))
+    print(format_markdown_table(band_rows(all_answers)))
+    print(format_markdown_table(limit_rows(all_answers)))
     write_table(options.out, [answer._asdict() for answer in all_answers], name="answers")
     curves = {
         name: [(row["mean"], row["right"]) for row in band_rows(answers)]

@@ -23,7 +23,7 @@ from depthpose.core.checkpoint import find_weights
 from depthpose.depth.config import MatcherConfig, SGBMConfig
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.types import StereoInput
-from depthpose.report.page import markdown_table
+from depthpose.report.page import format_markdown_table
 
 DISPARITIES = 192
 FOCAL_PX = 721.5
@@ -312,7 +312,7 @@ def main() -> None:
         for name in matchers
     ]
     print(f"{options.threads} threads, {size[0]}x{size[1]}, least of {options.repeats}")
-    print(markdown_table(rows))
+    print(format_markdown_table(rows))
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from torch import Tensor
 from depthpose import GeoPoseNet
 from depthpose.core.camera.pinhole import intrinsics
 from depthpose.core.checkpoint import find_weights
-from depthpose.core.loop import sample_generator
+from depthpose.core.loop import make_sample_generator
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid, cross_matrix
 from depthpose.pose.cloud import cloud_from_depth
@@ -31,7 +31,7 @@ from depthpose.pose.icp import refine_pose
 from depthpose.pose.mesh import drawn_triangles
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.synthetic.views import random_rotation, simulate_depth
-from depthpose.report.page import markdown_table
+from depthpose.report.page import format_markdown_table
 
 KINDS: tuple[SensorKind, ...] = ("structured light", "active stereo", "time of flight", "laser")
 WIDTH, HEIGHT, FOCAL_PX = 640, 480, 600.0
@@ -55,7 +55,7 @@ def measure_view(
     """Measure one view of a part repeatedly; return errors and claimed deviations at its middle."""
     model = PARTS[number]
     surface = SURFACES[number]
-    generator = sample_generator(seed, SEED)
+    generator = make_sample_generator(seed, SEED)
     R = random_rotation(generator).double()
     middle_m = surface.points_m.mean(0)
     truth = Rigid(R, torch.tensor([0.02, -0.03, DISTANCE_M]).double() - R @ middle_m)
@@ -136,7 +136,7 @@ def main() -> None:
             }
         )
         print(rows[-1], flush=True)
-    print(markdown_table(rows))
+    print(format_markdown_table(rows))
 
 
 PARTS = [

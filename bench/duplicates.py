@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from depthpose.core.files import read_image
 from depthpose.depth.datasets import Dataset, open_dataset
-from depthpose.report.page import markdown_table
+from depthpose.report.page import format_markdown_table
 
 _ROWS, _COLUMNS = 40, 128
 _SHIFT_ROWS, _SHIFT_COLUMNS = 2, 6
@@ -142,7 +142,7 @@ def main() -> None:
     progress = partial(tqdm, unit=" frames", disable=None)
     duplicates = find_duplicates(first, second, options.at_least, progress)
     rows = [asdict(pair) for pair in duplicates if pair.similarity >= options.at_least]
-    print(markdown_table(rows) if rows else "none")
+    print(format_markdown_table(rows) if rows else "none")
     best = duplicates[0]
     print(
         f"{len(first)} x {len(second)} images: {len(rows)} pairs of similarity "

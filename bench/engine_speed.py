@@ -19,8 +19,8 @@ import torch
 from shared import make_parser
 
 from depthpose.core.files import write_image
-from depthpose.core.run import environment
-from depthpose.report.page import markdown_table, write_table
+from depthpose.core.run import describe_environment
+from depthpose.report.page import format_markdown_table, write_table
 
 
 def main() -> None:
@@ -34,8 +34,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         rows = measure(Path(folder), options)
     write_table(options.out, rows, name="engine_speed")
-    print(markdown_table(rows))
-    print(environment())
+    print(format_markdown_table(rows))
+    print(describe_environment())
 
 
 def measure(folder: Path, options: argparse.Namespace) -> list[dict[str, object]]:

@@ -31,7 +31,7 @@ from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.pose.registration import Registration
 from depthpose.pose.synthetic import make_frames
 from depthpose.pose.types import ObjectModel, PoseEstimate
-from depthpose.report.page import markdown_table
+from depthpose.report.page import format_markdown_table
 
 SEED = 0x7AB1E  # of the synthetic frames; no training has it
 RIGHT = 0.1  # largest error of a right answer, in diameters
@@ -159,7 +159,7 @@ def main() -> None:
             print(rows[-1], flush=True)
         columns = ("instances", "right", "missed", "wrong", "s", "cpu s")
         total = {column: sum(row[column] for row in rows) for column in columns}
-        print(markdown_table([{"weights": name, "frames": len(rows), **total}]))
+        print(format_markdown_table([{"weights": name, "frames": len(rows), **total}]))
 
 
 _PREPARED: dict[tuple[str, ...], Registration] = {}

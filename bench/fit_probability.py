@@ -38,7 +38,7 @@ from depthpose.pose import hypotheses, probability
 from depthpose.pose.hypotheses import Hypothesis
 from depthpose.pose.probability import LEAST_AGREEMENT, LEAST_AREA, GammaShare
 from depthpose.pose.types import Evidence
-from depthpose.report.page import markdown_table
+from depthpose.report.page import format_markdown_table
 
 REAL = "real instances"
 SURE = 0.9  # least probability of a sure pose
@@ -90,7 +90,7 @@ def main() -> None:
     fitted_without = {
         group: fit([view for view in choice if view.group != group]) for group in groups
     }
-    print(markdown_table(coefficient_rows(fitted, list(fitted_without.values()))))
+    print(format_markdown_table(coefficient_rows(fitted, list(fitted_without.values()))))
 
     left_out = [(view, fitted_without[view.group]) for view in choice]
     prediction_rows = [
@@ -99,7 +99,7 @@ def main() -> None:
         prediction_row("held back, file", [(view, Coefficients()) for view in held_out]),
         prediction_row("held back, fit", [(view, fitted) for view in held_out]),
     ]
-    print(markdown_table(prediction_rows))
+    print(format_markdown_table(prediction_rows))
 
 
 def coefficient_rows(fitted: Coefficients, without_a_group: Sequence[Coefficients]) -> list[Row]:

@@ -17,7 +17,7 @@ from depthpose.core.errors import import_extra
 from depthpose.core.rigid import Rigid
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
-from depthpose.report.pose import object_points
+from depthpose.report.pose import select_object_points
 
 VOXEL_DIAMETERS = 0.03  # side of a voxel, in diameters of the object
 MODEL_POINTS = 20_000  # sampled of the surface of a model
@@ -66,7 +66,7 @@ class FpfhEstimator:
         start_s = time.perf_counter()
         name = cloud_or_view.name
         model = self._models[cloud_or_view.object]
-        points_m = object_points(cloud_or_view, model.diameter_m)
+        points_m = select_object_points(cloud_or_view, model.diameter_m)
         if len(points_m) < MIN_POINTS:
             reason = f"the cloud has {len(points_m)} points, and a pose takes {MIN_POINTS}"
             return PoseEstimate(

@@ -39,7 +39,7 @@ from depthpose.depth.stereo.matcher import NetworkMatcher
 from depthpose.depth.stereo.search_range import choose_search_range, measure_disparity_range
 from depthpose.depth.synthetic import draw_near
 from depthpose.depth.types import DepthEstimate, StereoInput, StereoSample, StereoTruth
-from depthpose.report.page import markdown_table
+from depthpose.report.page import format_markdown_table
 
 MAX_PX = 100_000
 BANDS_PX = ((0, 50), (50, 70), (70, 100), (100, MAX_PX))
@@ -358,15 +358,15 @@ def main() -> None:
     net = FakestereoNet.load(options.weights, config=MatcherConfig(speed=options.speed))
     if options.wide is not None:
         results = match_wide(wide_samples(options.wide, options.seed), net)
-        print(markdown_table(pixel_rows(results)))
+        print(format_markdown_table(pixel_rows(results)))
     else:
         samples = indoor_samples(options.folder, with_motorcycle=options.near is None)
         if options.near is not None:
             dataset = open_dataset(options.near)
             samples = (dataset[index] for index in range(len(dataset)))
         results = compare(samples, net, f"{options.weights}, {options.speed}")
-        print(markdown_table(band_rows(results)))
-        print(markdown_table(depth_rows(results)))
+        print(format_markdown_table(band_rows(results)))
+        print(format_markdown_table(depth_rows(results)))
     if options.out is not None:
         write_json(options.out, results)
 

@@ -22,7 +22,7 @@ from depthpose.depth.config import MatcherConfig, SGBMConfig
 from depthpose.depth.datasets import open_dataset
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.types import StereoSample
-from depthpose.report.page import markdown_table
+from depthpose.report.page import format_markdown_table
 
 SGBM = "SGBM, holes filled"
 LIMITS_PX = (1.0, 2.0, 3.0)
@@ -122,7 +122,7 @@ def main() -> None:
         for name, net in nets.items():
             results[name].append(measure(net, sample))
     table = [table_row(name, pairs, results[SGBM]) for name, pairs in results.items()]
-    print(markdown_table(table))
+    print(format_markdown_table(table))
 
 
 if __name__ == "__main__":

@@ -37,7 +37,7 @@ from depthpose.depth.stereo import NetworkMatcher, PSMNet, PSMNetMatcher
 from depthpose.depth.synthesis import UNetGenerator, make_synthesiser
 from depthpose.depth.types import StereoInput
 from depthpose.depth.weights import MATCHERS
-from depthpose.report.page import markdown_table
+from depthpose.report.page import format_markdown_table
 
 HEIGHT, WIDTH, FOCAL_PX = 375, 1242, 721.5377
 
@@ -185,7 +185,7 @@ def main() -> None:
         print(json.dumps(run_once(weights, precision, options.device)))
         return
     if options.compare:
-        print(markdown_table(compare(options.compare)))
+        print(format_markdown_table(compare(options.compare)))
         return
     rows = []
     for weights in options.weights:

@@ -45,7 +45,7 @@ from depthpose.depth.synthetic.dataset import draw_light, draw_sensors, expose, 
 from depthpose.depth.synthetic.scene import make_scene
 from depthpose.depth.synthetic.shading import prepare
 from depthpose.depth.types import DepthEstimate, StereoInput
-from depthpose.report.page import markdown_table, write_table
+from depthpose.report.page import format_markdown_table, write_table
 
 WIDTH, HEIGHT = 640, 360
 HEIGHTS_M = (1.2, 1.65, 2.5)
@@ -467,7 +467,7 @@ def main() -> None:
                 drive = view.drive
                 rows += measure_view(view, net, mount_filter)
         all_rows += [{"weights": weights} | row for row in rows]
-        print(markdown_table(summary(rows, weights)))
+        print(format_markdown_table(summary(rows, weights)))
     write_table(options.out, all_rows, name="mounts")
 
 

@@ -34,7 +34,7 @@ from depthpose.depth.datasets import open_dataset
 from depthpose.depth.disparity import resize_image
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.types import StereoInput
-from depthpose.report.page import markdown_table, write_table
+from depthpose.report.page import format_markdown_table, write_table
 
 TRAINED = ("street_pairs/kitti2015_train_drives", "street_pairs/kitti_object_more",
            "street_pairs/kitti_single", "more/kitti_road", "more/kitti_object_csc420",
@@ -320,8 +320,8 @@ def main() -> None:
     (options.out / "images.json").write_text(json.dumps(images, indent=0))
     rows = summary(images)
     write_table(options.out, rows, name="out_of_distribution")
-    print(markdown_table(rows))
-    print(markdown_table([measure_motorcycle(weights) for weights in options.weights]))
+    print(format_markdown_table(rows))
+    print(format_markdown_table([measure_motorcycle(weights) for weights in options.weights]))
 
 
 if __name__ == "__main__":

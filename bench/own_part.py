@@ -26,7 +26,7 @@ from depthpose.pose.registration import Registration
 from depthpose.pose.train.clouds import make_held_out_objects, measure_add
 from depthpose.pose.train.config import PoseTraining
 from depthpose.pose.weights import PoseWeights, read_pose_weights
-from depthpose.report.page import markdown_table
+from depthpose.report.page import format_markdown_table
 
 CONFIG = Path(__file__).parents[1] / "configs/pose/own-part.yaml"
 
@@ -105,7 +105,7 @@ def main() -> None:
     options = parser.parse_args()
     if options.weights:
         torch.set_num_threads(1)
-        print(markdown_table(measure(read_pose_weights(options.weights), options.number)))
+        print(format_markdown_table(measure(read_pose_weights(options.weights), options.number)))
         return
     options.file.parent.mkdir(parents=True, exist_ok=True)
     mesh = valve()

@@ -43,7 +43,7 @@ from depthpose.pose.registration import Registration
 from depthpose.pose.synthetic.parts import PARTS, make_part
 from depthpose.pose.synthetic.views import draw_view, make_shape, random_rotation, simulate_depth
 from depthpose.pose.types import ViewInput
-from depthpose.report.page import markdown_table
+from depthpose.report.page import format_markdown_table
 
 MIN_CONFIDENCE = 0.5  # the default of ``pose predict --left``
 DRAWN_BASELINE_M = 0.5
@@ -336,7 +336,7 @@ def main() -> None:
         scene_rows = measure_table(net, registration, surfaces_m, scene, index)
         print_poses(f"{rig}, {look}, {index}", scene_rows)
         rows += [{"rig": rig, "look": look, **row} for row in scene_rows]
-    print(markdown_table(summary(rows)))
+    print(format_markdown_table(summary(rows)))
     if options.out is not None:
         for row in rows:
             row["error"] = None if row["error"] == math.inf else row["error"]

@@ -26,7 +26,7 @@ from negatives import SCALES, NegativeKind, negative_of
 from shared import make_parser, with_cpu_seconds
 
 from depthpose.core.checkpoint import find_weights
-from depthpose.core.loop import sample_generator
+from depthpose.core.loop import make_sample_generator
 from depthpose.pose.config import EstimateConfig, ObjectsConfig
 from depthpose.pose.estimator import PoseEstimator
 from depthpose.pose.mesh import MIRROR_ALIKE, mirror_deviation
@@ -35,7 +35,7 @@ from depthpose.pose.registration import Registration
 from depthpose.pose.synthetic import Objects
 from depthpose.pose.train.clouds import measure_add
 from depthpose.pose.types import CloudSample, ObjectModel, ViewSample
-from depthpose.report.page import markdown_table
+from depthpose.report.page import format_markdown_table
 
 SEED = 0x0DD
 BATCH_SIZE = 32
@@ -63,7 +63,7 @@ def models_in_view(
     """Make the model that is in view for each requested object: itself or a negative of it."""
     if kind == ITSELF:
         return list(requested)
-    generator = sample_generator(sum(map(ord, kind)), seed)
+    generator = make_sample_generator(sum(map(ord, kind)), seed)
     name, _, factor = kind.partition(" by ")
     scale = float(factor) if factor else None
     negative_kind = cast(NegativeKind, name)
@@ -176,7 +176,7 @@ def main() -> None:
         negatives = [row for row in all_rows if row["kind"] not in (ITSELF, ALIKE)]
         if negatives:
             table.append({**summary(negatives), "kind": "all negatives"})
-        print(f"{name}, {total_s:.0f} s\n{markdown_table(table)}")
+        print(f"{name}, {total_s:.0f} s\n{format_markdown_table(table)}")
         if options.save:
             options.save.mkdir(parents=True, exist_ok=True)
             path = options.save / f"{Path(name).stem}.json"

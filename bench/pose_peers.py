@@ -23,7 +23,7 @@ from shared import make_parser, with_cpu_seconds
 from depthpose import GeoPoseNet
 from depthpose.core.checkpoint import find_weights
 from depthpose.pose.types import CloudInput, PoseEstimate, ViewInput
-from depthpose.report.page import markdown_table, write_table
+from depthpose.report.page import format_markdown_table, write_table
 
 
 class Method(Protocol):
@@ -111,7 +111,7 @@ def main() -> None:
             table.append(line(f"{name}, others", others))
         rows += run_rows
     write_table(options.out, rows)
-    print(markdown_table(table))
+    print(format_markdown_table(table))
 
 
 if __name__ == "__main__":

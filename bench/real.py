@@ -30,8 +30,8 @@ from score_scenes import BINS, FRAMES
 from score_tracking import TRACKING
 from shared import make_parser, with_cpu_seconds
 
-from depthpose.core.run import environment
-from depthpose.report.page import markdown_table
+from depthpose.core.run import describe_environment
+from depthpose.report.page import format_markdown_table
 
 SECTIONS: dict[str, Section] = {
     "masks": MASKS,
@@ -76,7 +76,7 @@ def main() -> None:
         table = section.table(rows)
         results[name] = {
             "seeds": options.seeds,
-            "environment": environment(),
+            "environment": describe_environment(),
             "cpu_s": cpu_s,
             "table": table,
             "rows": rows,
@@ -84,7 +84,7 @@ def main() -> None:
 
         earlier = earlier_results.get(name, {})
         print(f"\n## {section.title} ({name})\n")
-        print(markdown_table(with_earlier(table, earlier.get("table", []))))
+        print(format_markdown_table(with_earlier(table, earlier.get("table", []))))
         print(f"{cpu_s:.0f} CPU s with all preparation, {wall_s:.0f} s")
         if earlier:
             print(f"in brackets: {describe_run(earlier)}")

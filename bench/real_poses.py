@@ -28,7 +28,7 @@ from depthpose.pose.types import (
     ViewInput,
     ViewSample,
 )
-from depthpose.report.pose import object_points
+from depthpose.report.pose import select_object_points
 
 MASK_TOLERANCE_M = 0.03
 """Inside a mask, the depth differs less than this from the rendered annotated pose."""
@@ -63,7 +63,7 @@ class RealCase:
     @property
     def points_m(self) -> torch.Tensor:
         """The points of the object."""
-        return object_points(self.sample.input, self.model.diameter_m)
+        return select_object_points(self.sample.input, self.model.diameter_m)
 
 
 def lm_cases(folder: Path) -> Iterator[RealCase]:

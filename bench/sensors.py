@@ -36,7 +36,7 @@ from depthpose.pose.evidence import _ACROSS, _MEETING, _mean_depth
 from depthpose.pose.frame import prepare_frame
 from depthpose.pose.sensor import AVERAGED_PER_WHITE, FLAT_M
 from depthpose.pose.synthetic.views import simulate_depth
-from depthpose.report.page import markdown_table
+from depthpose.report.page import format_markdown_table
 
 _BASELINE_M = 0.075
 _LAGS = (1, 2, 4, 8)
@@ -231,7 +231,7 @@ def main() -> None:
         ("time of flight", None, kinect),
     ]
     frames += [synthetic_frame(*arguments) for arguments in simulated]
-    print(markdown_table([row_of(frame) for frame in frames]))
+    print(format_markdown_table([row_of(frame) for frame in frames]))
 
 
 if __name__ == "__main__":

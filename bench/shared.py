@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 import torch
 
-from depthpose.report.page import markdown_table
+from depthpose.report.page import format_markdown_table
 
 Row = Mapping[str, Any]
 AnyRow = TypeVar("AnyRow", bound=Row)
@@ -51,7 +51,7 @@ def with_cpu_seconds(run: Callable[[], Result]) -> tuple[Result, float]:
 
 def report(name: str, rows: Sequence[Row]) -> None:
     """Print rows as a Markdown table and write them to ``out/bench/NAME.json``."""
-    print(markdown_table(rows), flush=True)
+    print(format_markdown_table(rows), flush=True)
     path = Path("out/bench", f"{name}.json")
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(rows, indent=1))

@@ -16,7 +16,7 @@ from depthpose import FakestereoNet
 from depthpose.depth.config import StreetsConfig
 from depthpose.depth.synthetic import Streets
 from depthpose.depth.types import StereoSample
-from depthpose.report.page import markdown_table
+from depthpose.report.page import format_markdown_table
 
 SEED = 90  # no weights were trained on streets of this seed
 FAR_M = 80.0
@@ -63,7 +63,7 @@ def main() -> None:
     rendered = Streets(StreetsConfig(seed=SEED, scale=options.scale))
     streets = [rendered[k] for k in tqdm(range(options.number), "streets")]
     rows = [measure(name, input, streets) for name in options.weights for input in ("one", "both")]
-    print(markdown_table(rows))
+    print(format_markdown_table(rows))
 
 
 if __name__ == "__main__":

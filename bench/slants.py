@@ -28,7 +28,7 @@ from depthpose.pose.evidence import Observation
 from depthpose.pose.rendering import render_surface
 from depthpose.pose.surface import Surface
 from depthpose.pose.types import PoseEstimate, ViewInput
-from depthpose.report.page import markdown_table
+from depthpose.report.page import format_markdown_table
 
 TANGENTS = (0.0, 0.4, 0.8, 1.2, 1.7, 2.3, 3.2)  # of the angle between ray and normal
 MAX_RESIDUAL_M = 0.03  # readings farther off the model show something else
@@ -66,9 +66,9 @@ def main() -> None:
     hypotheses.compare = remember
     for name in SETS:
         measured = list(of_masks(samples, name, compared))
-        print(f"\n{name}: {len(measured)} instances\n\n{markdown_table(rows_of(measured))}")
+        print(f"\n{name}: {len(measured)} instances\n\n{format_markdown_table(rows_of(measured))}")
     measured = list(of_bins(samples / "pose/bins", compared))
-    print(f"\nelbows: {len(measured)} instances\n\n{markdown_table(rows_of(measured))}")
+    print(f"\nelbows: {len(measured)} instances\n\n{format_markdown_table(rows_of(measured))}")
 
 
 def of_masks(samples: Path, kind: str, compared: list[Compared]) -> Iterator[Residuals]:

@@ -37,7 +37,7 @@ from depthpose.depth.synthetic.scene import make_scene
 from depthpose.depth.synthetic.shading import prepare
 from depthpose.depth.types import StereoInput
 from depthpose.depth.weights import read_depth_weights, write_depth_weights
-from depthpose.report.page import markdown_table
+from depthpose.report.page import format_markdown_table
 
 ROWS, COLUMNS = 224, 480
 
@@ -246,7 +246,7 @@ def main() -> None:
                 "most": logit.max(),
             }
         )
-    print(markdown_table(rows))
+    print(format_markdown_table(rows))
     *slopes, offset = fit(x, is_street, kinds, options.l2)
     generator.config = dataclasses.replace(generator.config, with_street=True, least_confidence=0.5)
     generator.street = torch.nn.Linear(x.shape[1], 1)

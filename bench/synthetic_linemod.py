@@ -40,7 +40,7 @@ from depthpose.pose.registration import Registration
 from depthpose.pose.synthetic import PARTS, Objects, make_part
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput, ViewSample
 from depthpose.pose.weights import read_pose_weights
-from depthpose.report.page import markdown_table, write_table
+from depthpose.report.page import format_markdown_table, write_table
 
 SEED = 0x7E57ED
 POINTS = 1000  # of the surface, by which errors are measured
@@ -339,7 +339,7 @@ def main() -> None:
         rows += new_rows
         views += new_views
         rows_of_all = [row for row in rows if row["object"] == "all"]
-        print(markdown_table(rows_of_all[-len(methods) :]), flush=True)
+        print(format_markdown_table(rows_of_all[-len(methods) :]), flush=True)
         write_table(options.out, rows)
         write_table(options.out, views, name="views")
         draw_success(rows, options.out)

@@ -30,7 +30,7 @@ from torch import Tensor
 
 from depthpose.core.camera.pinhole import intrinsics
 from depthpose.core.checkpoint import find_weights
-from depthpose.core.loop import sample_generator
+from depthpose.core.loop import make_sample_generator
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid, rotation_by
 from depthpose.pose.config import SyntheticSensorConfig
@@ -39,7 +39,7 @@ from depthpose.pose.metrics import add_m, adds_m
 from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.pose.synthetic.views import random_rotation, simulate_depth
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
-from depthpose.report.page import markdown_table
+from depthpose.report.page import format_markdown_table
 
 SEED = 0x7AC4
 WIDTH, HEIGHT, FOCAL_PX = 640, 480, 572.0
@@ -162,7 +162,7 @@ def sequence(
     model: ObjectModel, number: int, speed: float, seed: int, *, is_resting: bool = False
 ) -> Iterator[Frame]:
     """Render the frames of one object."""
-    generator = sample_generator(seed, SEED)
+    generator = make_sample_generator(seed, SEED)
     corners_m = drawn_triangles(model).double().reshape(-1, 3)
     centre_of_model_m = corners_m.mean(0)
     if is_resting:
@@ -329,9 +329,9 @@ def main() -> None:
             if options.anew:
                 every_nth = frames[options.anew // 2 :: options.anew]
                 searched.append(search_each(net, model, every_nth))
-        print(f"{name}, followed\n{markdown_table(tracked)}")
+        print(f"{name}, followed\n{format_markdown_table(tracked)}")
         if searched:
-            print(f"{name}, every {options.anew} frames anew\n{markdown_table(searched)}")
+            print(f"{name}, every {options.anew} frames anew\n{format_markdown_table(searched)}")
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ import trimesh
 from torch import Tensor
 
 from depthpose.core.camera.pinhole import intrinsics
-from depthpose.core.loop import sample_generator
+from depthpose.core.loop import make_sample_generator
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import SensorKind, SyntheticSensorConfig
@@ -278,7 +278,7 @@ def views(
     centre_of_model_m = triangles_m.reshape(-1, 3).mean(0)
     view_count = 0
     for attempt in range(MAX_TRIES * number):
-        generator = sample_generator(attempt, SEED + seed)
+        generator = make_sample_generator(attempt, SEED + seed)
         length_px = uniform(generator, *LENGTH_PX)
         distance_m = max(MIN_DISTANCE_M, FOCAL_PX * model.diameter_m / length_px)
         R = random_rotation(generator).double()

@@ -12,7 +12,7 @@ from tests.pose.synthetic_objects import K, bracket, cloud_of, pose_at, view_of
 from depthpose.cli import main
 from depthpose.core.camera import Camera, StereoRig, write_camera
 from depthpose.core.errors import Notice
-from depthpose.core.files import Cloud, write_cloud, write_depth_png, write_image, write_map
+from depthpose.core.files import PointCloud, write_cloud, write_depth_png, write_image, write_map
 from depthpose.pose.types import ObjectModel
 
 
@@ -27,7 +27,7 @@ def things(tmp_path: Path) -> Path:
     write_depth_png(tmp_path / "depth.png", depth_m, 0.001)
     write_map(tmp_path / "depth.npy", depth_m)
     Image.fromarray(mask.numpy()).save(tmp_path / "mask.png")
-    write_cloud(tmp_path / "cloud.ply", Cloud(points=cloud_of(part, pose).float()))
+    write_cloud(tmp_path / "cloud.ply", PointCloud(points=cloud_of(part, pose).float()))
     write_obj(tmp_path / "part.obj", part, 1000)
     write_camera(tmp_path / "sensor.json", Camera(width=320, height=240, K=K, depth_unit_m=0.001))
     wide = torch.tensor([[400.0, 0, 239.5], [0, 400, 119.5], [0, 0, 1]], dtype=torch.float64)

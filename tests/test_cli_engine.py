@@ -30,10 +30,10 @@ from tests.test_cli_depth import write_doubtful_pairs
 from depthpose.cli import engine, main
 from depthpose.cli.depth_predict import PAIRS
 from depthpose.core.camera import write_camera
-from depthpose.core.engine import find_items
+from depthpose.core.engine import list_inputs
 from depthpose.core.errors import InputError
 from depthpose.core.files import (
-    Cloud,
+    PointCloud,
     write_cloud,
     write_depth_png,
     write_image,
@@ -155,11 +155,11 @@ def test_files_of_two_sides_are_paired_by_number(tmp_path: Path) -> None:
         (tmp_path / f"{name}.png").parent.mkdir(exist_ok=True)
         (tmp_path / f"{name}.png").touch()
     sides = [str(tmp_path / "left"), str(tmp_path / "right")]
-    found = [[Path(file).stem for file in item.files] for item in find_items(sides, PAIRS)]
+    found = [[Path(file).stem for file in item.files] for item in list_inputs(sides, PAIRS)]
     assert found == [["left_2", "right_2"], ["left_10", "right_10"]]
     (tmp_path / "odd/right_3.png").rename(tmp_path / "right/right_3.png")
     with pytest.raises(InputError, match=r"hold 2 and 3 files, and no partner .* 'right_3'"):
-        find_items(sides, PAIRS)
+        list_inputs(sides, PAIRS)
 
 
 def test_other_settings_need_another_folder(
@@ -252,7 +252,7 @@ def test_clouds_have_the_poses_of_the_plain_command(
 ) -> None:
     write_pose_weights(tmp_path / "w.safetensors", tiny_weights(bracket(), bottle()))
     for seed in range(3):
-        cloud = Cloud(points=cloud_of(bracket(), pose_at(seed=seed)))
+        cloud = PointCloud(points=cloud_of(bracket(), pose_at(seed=seed)))
         write_cloud(tmp_path / "in" / f"{seed}.ply", cloud)
     (tmp_path / "in" / "9.ply").write_bytes(b"ply\nnothing")
     words = ["pose", "predict", "--cloud", str(tmp_path / "in"), "--object", "bracket",
@@ -294,7 +294,7 @@ def test_a_cad_file_alone_is_registered_by_workers_too(
 ) -> None:
     write_part("connector", tmp_path)
     views = Objects([make_part("connector")], ObjectsConfig(views=None, occluded_share=0.0, seed=5))
-    write_cloud(tmp_path / "in" / "0.ply", Cloud(points=1000 * views[0].input.points_m))
+    write_cloud(tmp_path / "in" / "0.ply", PointCloud(points=1000 * views[0].input.points_m))
     words = ["pose", "predict", "--method", "register", "--cad", str(tmp_path / "connector.stl"),
              "--unit", "mm", "--cloud", str(tmp_path / "in"), "--out"]  # fmt: skip
     assert main([*words, str(tmp_path / "plain")]) == 0

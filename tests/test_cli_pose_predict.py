@@ -31,7 +31,7 @@ from depthpose.core.camera import Camera, write_camera
 from depthpose.core.errors import InputError
 from depthpose.core.files import (
     CLOUD_READERS,
-    Cloud,
+    PointCloud,
     read_cloud,
     read_image,
     write_cloud,
@@ -83,7 +83,7 @@ def test_a_folder_gives_the_poses_of_clouds_of_every_format(weights: Path, tmp_p
     for suffix in CLOUD_READERS:
         path = folder / f"of{suffix[1:]}{suffix.upper()}"
         if suffix in (".ply", ".pcd"):
-            write_cloud(path, Cloud(points=points))
+            write_cloud(path, PointCloud(points=points))
         elif suffix == ".npy":
             path.write_bytes(npy_bytes(points.numpy()))
         else:
@@ -107,7 +107,7 @@ def test_a_cloud_gives_its_pose_and_the_posed_model(
     weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     cloud = cloud_of(bracket(), TRUTH)
-    write_cloud(tmp_path / "part.ply", Cloud(points=1000 * cloud))
+    write_cloud(tmp_path / "part.ply", PointCloud(points=1000 * cloud))
     words = ["--cloud", str(tmp_path / "part.ply"), "--unit", "mm", "--object", "bracket"]
     out = tmp_path / "out"
     assert main(["pose", "predict", *words, "--weights", str(weights), "--out", str(out)]) == 0
@@ -190,7 +190,7 @@ def test_results_never_take_the_place_of_inputs(
     one.mkdir()
     for kind in ("depth", "mask"):
         shutil.copy(tmp_path / kind / "seen.png", one / f"{kind}.png")
-    write_cloud(one / "scan.ply", Cloud(points=cloud_of(bracket(), TRUTH)))
+    write_cloud(one / "scan.ply", PointCloud(points=cloud_of(bracket(), TRUTH)))
     before = {path: path.read_bytes() for path in one.iterdir()}
     depth = ["--depth", str(one / "depth.png"), "--mask", str(one / "mask.png"), *words[4:]]
     cloud = ["--cloud", str(one / "scan.ply"), "--object", "bracket"]
@@ -211,7 +211,7 @@ def test_results_never_take_the_place_of_inputs(
 def test_a_file_of_somebody_else_is_not_written_over(
     weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:
-    write_cloud(tmp_path / "part.ply", Cloud(points=cloud_of(bracket(), TRUTH)))
+    write_cloud(tmp_path / "part.ply", PointCloud(points=cloud_of(bracket(), TRUTH)))
     (tmp_path / name).write_text("mine")
     words = ["pose", "predict", "--cloud", str(tmp_path / "part.ply"), "--object", "bracket"]
     assert main([*words, "--weights", str(weights), "--out", str(tmp_path)]) == 2
@@ -577,7 +577,7 @@ def test_inputs_of_an_earlier_run_stay_in_the_file(weights: Path, tmp_path: Path
     out = tmp_path / "out"
     words = ["pose", "predict", "--object", "bracket", "--weights", str(weights), "--out", str(out)]
     for name in ("a", "b"):
-        write_cloud(tmp_path / f"{name}.ply", Cloud(points=cloud_of(bracket(), TRUTH)))
+        write_cloud(tmp_path / f"{name}.ply", PointCloud(points=cloud_of(bracket(), TRUTH)))
         assert main([*words, "--cloud", str(tmp_path / f"{name}.ply")]) == 0
     assert list(poses_of(out)) == ["a", "b"]
 
@@ -586,7 +586,7 @@ def test_two_inputs_of_one_name_are_refused(
     weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name in ("a.ply", "a.pcd"):
-        write_cloud(tmp_path / "clouds" / name, Cloud(points=cloud_of(bracket(), TRUTH)))
+        write_cloud(tmp_path / "clouds" / name, PointCloud(points=cloud_of(bracket(), TRUTH)))
     words = ["pose", "predict", "--weights", str(weights), "--out", str(tmp_path / "out")]
     cloud = ["--cloud", str(tmp_path / "clouds"), "--object", "bracket"]
     assert main([*words, *cloud]) == 2
@@ -607,7 +607,7 @@ def test_a_cloud_for_weights_that_regress_a_depth_image_is_refused(
     network = DepthImageNet(DepthImageConfig(crop_px=32, widths=(4, 4, 8, 8))).eval()
     path = tmp_path / "depth-image.safetensors"
     write_pose_weights(path, replace(tiny_weights(bracket()), network=network))
-    write_cloud(tmp_path / "a.ply", Cloud(points=cloud_of(bracket(), TRUTH)))
+    write_cloud(tmp_path / "a.ply", PointCloud(points=cloud_of(bracket(), TRUTH)))
     words = ["pose", "predict", "--weights", str(path), "--out", str(tmp_path / "out")]
     assert main([*words, "--cloud", str(tmp_path / "a.ply")]) == 2
     said = capsys.readouterr().err

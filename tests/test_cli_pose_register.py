@@ -15,7 +15,7 @@ from tests.pose.synthetic_objects import write_part
 from depthpose.cli import main
 from depthpose.core.camera import Camera, write_camera
 from depthpose.core.errors import Notice
-from depthpose.core.files import Cloud, read_cloud, write_cloud, write_depth_png, write_image
+from depthpose.core.files import PointCloud, read_cloud, write_cloud, write_depth_png, write_image
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.datasets import write_bop_models, write_bop_scene
 from depthpose.pose.inputs import rigid_input
@@ -37,7 +37,7 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_part("bracket", folder)
     config = ObjectsConfig(views=None, resolution=(1.0, 1.0), occluded_share=0.0, seed=5)
     views = Objects([make_part("bracket")], config)
-    write_cloud(folder / "scan.ply", Cloud(points=1000 * views[0].input.points_m))
+    write_cloud(folder / "scan.ply", PointCloud(points=1000 * views[0].input.points_m))
     window = views.view(0).input
     centre_px = torch.tensor(config.centre_px)
     left, top = (centre_px - window.K[:2, 2]).round().long().tolist()
@@ -156,7 +156,7 @@ def test_a_cad_file_is_followed_through_frames(
     scan = read_cloud(tmp_path / "scan.ply").points
     for k in range(3):
         moved = scan + torch.tensor([2.0 * k, 0.0, 0.0])
-        write_cloud(tmp_path / f"frames/{k}.ply", Cloud(points=moved))
+        write_cloud(tmp_path / f"frames/{k}.ply", PointCloud(points=moved))
     words = ["--cad", str(cad), "--unit", "mm"]  # a CAD file is registered
     frames = ["--cloud", str(tmp_path / "frames"), "--out", str(tmp_path / "out")]
     assert main(["pose", "track", *words, *frames]) == 0

@@ -10,7 +10,7 @@ from tests.pose.synthetic_objects import write_part
 
 from depthpose.cli import main
 from depthpose.core.config import read_config
-from depthpose.core.loop import Run
+from depthpose.core.loop import TrainingRun
 from depthpose.pose.train import STAGES, PoseTraining
 from depthpose.pose.weights import read_pose_weights
 
@@ -119,7 +119,7 @@ def test_a_cad_file_begins_with_the_weights_that_ship(
     started: list[tuple[str | None, str]] = []
     configs: list[PoseTraining] = []
 
-    def stand_in(config: PoseTraining, run: Run) -> Path:
+    def stand_in(config: PoseTraining, run: TrainingRun) -> Path:
         started.append((config.start, config.network.norm))
         configs.append(config)
         return run.folder / "pose.safetensors"
@@ -142,7 +142,7 @@ def test_a_config_may_hold_the_unit_of_a_cad_file(
 ) -> None:
     configs: list[PoseTraining] = []
 
-    def stand_in(config: PoseTraining, run: Run) -> Path:
+    def stand_in(config: PoseTraining, run: TrainingRun) -> Path:
         configs.append(config)
         return run.folder / "pose.safetensors"
 

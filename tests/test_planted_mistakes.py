@@ -17,8 +17,8 @@ from depthpose.core.camera import (
     Camera,
     StereoRig,
     check_image_matches_camera,
+    describe_suspicious_centre,
     read_camera,
-    suspicious_centre,
 )
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_depth_png
@@ -66,7 +66,7 @@ def camera(folder: Path, text: str = "", **changes: object) -> Camera:
 def doubts(K: list[list[float]], width: int, height: int) -> str | None:
     """What the doctor says of a camera that names its size."""
     matrix = torch.tensor(K, dtype=torch.float64)
-    return suspicious_centre(Camera(width=width, height=height, K=matrix))
+    return describe_suspicious_centre(Camera(width=width, height=height, K=matrix))
 
 
 @cache

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from depthpose.cli import main
-from depthpose.core.files import Cloud, write_cloud, write_image
+from depthpose.core.files import PointCloud, write_cloud, write_image
 
 MISTAKES = {
     "unit of a cloud": (
@@ -180,7 +180,7 @@ def test_a_device_that_is_not_there_ends_in_a_line(
     words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_image(tmp_path / "x.png", torch.rand(3, 48, 64))
-    write_cloud(tmp_path / "x.ply", Cloud(points=torch.rand(9, 3)))
+    write_cloud(tmp_path / "x.ply", PointCloud(points=torch.rand(9, 3)))
     with contextlib.chdir(tmp_path):
         assert main([*words, "--device", "toaster", "--out", "out"]) == 2
     assert "device 'toaster' cannot be used here" in capsys.readouterr().err

@@ -12,7 +12,7 @@ from tests.pose.synthetic_objects import bracket
 from torch import nn
 
 from depthpose.core.config import config_to_dict, read_config
-from depthpose.core.loop import Run
+from depthpose.core.loop import TrainingRun
 from depthpose.depth.config import PairsConfig
 from depthpose.depth.datasets import read_split
 from depthpose.depth.stereo import PSMNet
@@ -110,7 +110,7 @@ def depth_training(name: str, monkeypatch: pytest.MonkeyPatch, folder: Path) -> 
     kind, run_stage = DEPTH_STAGES[name]
     config = read_config(CONFIGS / f"depth/{name}.yaml", kind)
     monkeypatch.setattr(depth_runs, "TrainingPairs", _NamedPairs)
-    run = Run(folder=folder)
+    run = TrainingRun(folder=folder)
     task, pairs, config, _ = begun(
         monkeypatch, depth_runs, "_run_stage", lambda: run_stage(config, run)
     )
@@ -138,8 +138,8 @@ def pose_training(
         if hasattr(config, part)
     }
     config = dataclasses.replace(config, **there)
-    run = Run(folder=folder)
-    _, task, samples, *_ = begun(monkeypatch, Run, "train", lambda: run_stage(config, run))
+    run = TrainingRun(folder=folder)
+    _, task, samples, *_ = begun(monkeypatch, TrainingRun, "train", lambda: run_stage(config, run))
     return Training(task, samples, task.config)
 
 

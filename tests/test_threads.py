@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from depthpose import FakestereoNet, GeoPoseNet, Registration
-from depthpose.core.devices import each_in_threads
+from depthpose.core.devices import map_in_threads
 from depthpose.core.errors import InputError
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.synthetic import Objects, make_part
@@ -53,7 +53,7 @@ def test_an_estimator_may_be_shared_by_threads(kind: str) -> None:
 
 
 def test_threads_keep_the_order_and_raise_what_is_raised() -> None:
-    assert list(each_in_threads(lambda k: k * k, iter(range(7)), 3)) == [k * k for k in range(7)]
+    assert list(map_in_threads(lambda k: k * k, iter(range(7)), 3)) == [k * k for k in range(7)]
 
     def broken(k: int) -> int:
         if k == 3:
@@ -63,5 +63,5 @@ def test_threads_keep_the_order_and_raise_what_is_raised() -> None:
     found: list[int] = []
     cores = torch.get_num_threads()
     with pytest.raises(InputError, match="three"):
-        found.extend(each_in_threads(broken, iter(range(100)), 2))
+        found.extend(map_in_threads(broken, iter(range(100)), 2))
     assert torch.get_num_threads() == cores

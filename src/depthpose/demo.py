@@ -11,9 +11,9 @@ import torch
 
 from depthpose.core.camera import Camera, StereoRig, back_project, write_camera
 from depthpose.core.draw import draw_depth
-from depthpose.core.files import Cloud, write_cloud, write_depth_png, write_image
+from depthpose.core.files import PointCloud, write_cloud, write_depth_png, write_image
 from depthpose.core.rigid import Rigid
-from depthpose.core.run import claim_folder, environment
+from depthpose.core.run import claim_folder, describe_environment
 from depthpose.depth.config import COLOR_RANGE_M, SGBMConfig, StreetsConfig
 from depthpose.depth.disparity import depth_from_disparity
 from depthpose.depth.estimator import FakestereoNet
@@ -32,9 +32,16 @@ from depthpose.pose.predictions import CLOUD, Prediction, place_of, write_predic
 from depthpose.pose.synthetic import make_frames
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 from depthpose.report import page as pages
-from depthpose.report.depth import depth_section
-from depthpose.report.page import Layer, Picture, Scene, Section, depth_scale
-from depthpose.report.pose import draw_pose, grey_depth, object_points, pose_layers, posed_cloud
+from depthpose.report.depth import make_depth_section
+from depthpose.report.page import Layer, PictureFile, Scene, Section, make_depth_color_bar
+from depthpose.report.pose import (
+    draw_grey_depth,
+    draw_pose,
+    join_posed_cloud,
+    make_pose_layers,
+    make_truth_layers,
+    select_object_points,
+)
 
 _STREETS_SEED = 9
 """Of streets that no weights were trained on."""
@@ -156,7 +163,7 @@ def _show_scene(
         error_px = (estimate.disparity_px - truth.disparity_px).abs()
         error = DepthError(error=error_px, is_disparity=True)
         title = f"{pair.name}: {method}, {views}"
-        section = depth_section(
+        section = make_depth_section(
             title, net_input, estimate, range_m=range_m, error=error, with_image=False
         )
         sections.append(section)
@@ -165,12 +172,14 @@ def _show_scene(
     first_method = next(iter(nets))
     estimated_picture = homes[first_method] / f"{pair.name}.color.png"
     true_picture = folder / "depth.color.png"
-    scale = depth_scale(*range_m)
+    color_bar = make_depth_color_bar(*range_m)
     pictures = [
-        Picture(path=folder / "left.png", caption="left image"),
-        Picture(path=folder / "right.png", caption="right image"),
-        Picture(path=estimated_picture, caption=f"depth from both: {first_method}", scale=scale),
-        Picture(path=true_picture, caption="true depth; grey: none", scale=scale),
+        PictureFile(path=folder / "left.png", caption="left image"),
+        PictureFile(path=folder / "right.png", caption="right image"),
+        PictureFile(
+            path=estimated_picture, caption=f"depth from both: {first_method}", color_bar=color_bar
+        ),
+        PictureFile(path=true_picture, caption="true depth; grey: none", color_bar=color_bar),
     ]
     opening = Section(title=f"The {pair.name}", text=text, rows=rows, pictures=pictures)
     return rows, [opening, *sections]
@@ -271,7 +280,7 @@ def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
     points_m = back_project(frame.depth_m, frame.K).reshape(-1, 3)
     has_reading = points_m.isfinite().all(-1) & (points_m[:, 2] > 0)
     color = frame.rgb.permute(1, 2, 0).reshape(-1, 3)[has_reading]
-    table = Cloud(points=points_m[has_reading].float(), color=color)
+    table = PointCloud(points=points_m[has_reading].float(), color=color)
 
     # The poses over it, and over the picture.
     picture = frame.rgb
@@ -282,18 +291,18 @@ def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
         pose = estimate.camera_from_model
         if pose is not None:
             picture = draw_pose(picture, pose, model, K)
-            cloud = posed_cloud(object_points(view, model.diameter_m), pose, model)
+            cloud = join_posed_cloud(select_object_points(view, model.diameter_m), pose, model)
             write_cloud(folder / f"{view.object}.{CLOUD}", cloud)
-            layers += pose_layers(pose, model)
+            layers += make_pose_layers(pose, model)
         picture = draw_pose(picture, None, model, K, truth=instance.camera_from_model)
-        layers += pose_layers(instance.camera_from_model, model, is_true=True)
+        layers += make_truth_layers(instance.camera_from_model, model)
 
     # The section of the page.
     write_image(folder / "poses.png", picture)
-    write_image(folder / "depth.grey.png", grey_depth(frame.depth_m))
+    write_image(folder / "depth.grey.png", draw_grey_depth(frame.depth_m))
     pictures = [
-        Picture(path=folder / "depth.grey.png", caption="depth image, near bright"),
-        Picture(path=folder / "poses.png", caption="poses, estimated and true"),
+        PictureFile(path=folder / "depth.grey.png", caption="depth image, near bright"),
+        PictureFile(path=folder / "poses.png", caption="poses, estimated and true"),
     ]
     scenes = [Scene(caption="The sensor's cloud with the posed parts in it", layers=layers)]
     title = "Parts on a table"
@@ -371,7 +380,7 @@ def make_demo(
         on_message: called with what is done next.
     """
     # Both parts of the demo.
-    files = [*_RESULT_FOLDERS, *pages.table_files("depths", "poses"), _PAGE]
+    files = [*_RESULT_FOLDERS, *pages.list_table_files("depths", "poses"), _PAGE]
     claim_folder(out, {"command": "demo"}, files)
     on_message = on_message or (lambda _: None)
     on_message("synthetic parts on a table are posed from a depth image ...")
@@ -384,5 +393,5 @@ def make_demo(
     pages.write_table(out, poses, name="poses")
     page = out / _PAGE
     title = "depthpose: a depth sensor to poses, images to metric depth"
-    pages.write_page(page, title, [*pose_sections, *depth_sections], environment())
+    pages.write_page(page, title, [*pose_sections, *depth_sections], describe_environment())
     return DemoResult(page, depths, poses)

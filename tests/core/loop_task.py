@@ -10,12 +10,12 @@ from torch import Tensor, nn
 from depthpose.core.loop import (
     AdamConfig,
     LoopConfig,
-    Run,
+    TrainingRun,
     Update,
     ValidationResult,
     make_adam,
-    sample_generator,
-    shuffled_index,
+    make_sample_generator,
+    shuffle_index,
 )
 
 ADAM = AdamConfig(learning_rate=0.01, schedule="cosine")
@@ -54,8 +54,8 @@ class ToySamples:
         return 20
 
     def __getitem__(self, sample_index: int) -> tuple[Tensor, Tensor]:
-        index = shuffled_index(sample_index, 20, 3)
-        noise = torch.randn(3, generator=sample_generator(sample_index, 3))
+        index = shuffle_index(sample_index, 20, 3)
+        noise = torch.randn(3, generator=make_sample_generator(sample_index, 3))
         x = torch.tensor([index / 20, 1.0, -0.5]) + 0.1 * noise
         return x, x.sum(0, keepdim=True)
 
@@ -92,4 +92,4 @@ def train_toy(
     )
     if with_slow_disk:
         Path.write_bytes = write_slowly  # pyright: ignore[reportAttributeAccessIssue]
-    Run(folder=folder, resume=True).train(ToyTask(pause_s), ToySamples(), config)
+    TrainingRun(folder=folder, resume=True).train(ToyTask(pause_s), ToySamples(), config)

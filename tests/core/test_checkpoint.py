@@ -13,7 +13,7 @@ from torch import nn
 
 from depthpose.core.checkpoint import (
     Checkpoint,
-    bound_facts,
+    add_terms,
     build_network,
     file_sha256,
     find_weights,
@@ -82,10 +82,10 @@ def test_a_card_is_bound_by_what_the_weights_are_made_of(tmp_path: Path) -> None
         made = Checkpoint(kind="toy", config={}, state=state, facts=terms)
         save_checkpoint(tmp_path / f"{name}.safetensors", made)
     free, bound = (tmp_path / f"{name}.safetensors" for name in ("free", "bound"))
-    assert bound_facts({"licence": "MIT"}, [free]) == {"licence": "MIT"}
-    assert bound_facts({"terms": "Cite us."}, [free, bound]) == {"terms": "Cite us. For research."}
+    assert add_terms({"licence": "MIT"}, [free]) == {"licence": "MIT"}
+    assert add_terms({"terms": "Cite us."}, [free, bound]) == {"terms": "Cite us. For research."}
     with pytest.raises(InputError, match="neither a file nor the name"):
-        bound_facts({}, ["nowhere"])
+        add_terms({}, ["nowhere"])
 
 
 def _truncate(path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from depthpose import FakestereoNet
-from depthpose.core.devices import each_in_float32, force_float32
+from depthpose.core.devices import force_float32, iterate_in_float32
 from depthpose.core.errors import InputError
 from depthpose.depth.stereo import CallableMatcher
 
@@ -49,7 +49,7 @@ def test_a_generator_computes_in_ours_and_its_caller_does_not() -> None:
         yield arithmetic()
         yield arithmetic()
 
-    for one in each_in_float32(made()):
+    for one in iterate_in_float32(made()):
         assert one == (torch.float32, torch.float32)
         assert torch.get_default_dtype() == torch.float64
 

@@ -16,7 +16,12 @@ from depthpose.core.draw import (
     draw_points,
     draw_share,
 )
-from depthpose.report.page import Drawing, depth_scale, embed_picture, rising_scale
+from depthpose.report.page import (
+    Drawing,
+    embed_picture,
+    make_depth_color_bar,
+    make_rising_color_bar,
+)
 
 
 def test_near_is_brighter_than_far_all_along() -> None:
@@ -79,20 +84,20 @@ def test_the_outline_lies_inside_the_mask() -> None:
 
 def test_the_marks_of_a_bar_stand_where_their_colours_are() -> None:
     for near_m, far_m in ((3.0, 80.0), (0.25, 7.0), (1.5, 8.0)):
-        scale = depth_scale(near_m, far_m)
-        places, words = zip(*scale.marks, strict=True)
+        bar = make_depth_color_bar(near_m, far_m)
+        places, words = zip(*bar.marks, strict=True)
         assert (words[0], words[-1]) == (f"{near_m:g}", f"{far_m:g}")
         assert min(b - a for a, b in pairwise(places)) >= 0.08 - 1e-9
         metres = torch.tensor([[float(word) for word in words]])
         shares = torch.tensor([list(places)]).float()
         assert torch.allclose(draw_depth(metres, near_m, far_m), draw_share(shares), atol=1e-5)
-    assert [word for _, word in depth_scale().marks] == ["3", "5", "10", "20", "50", "80"]
+    assert [word for _, word in make_depth_color_bar().marks] == ["3", "5", "10", "20", "50", "80"]
 
 
 def test_a_rising_bar_ends_in_the_brightest_colour() -> None:
-    scale = rising_scale("error [px]", 4.0, has_more=True)
-    assert scale.marks == [(0.0, "0"), (0.5, "2"), (1.0, "4+")]
-    for color, share in ((scale.colors[0], 1.0), (scale.colors[-1], 0.0)):
+    bar = make_rising_color_bar("error [px]", 4.0, has_more=True)
+    assert bar.marks == [(0.0, "0"), (0.5, "2"), (1.0, "4+")]
+    for color, share in ((bar.colors[0], 1.0), (bar.colors[-1], 0.0)):
         assert draw_share(torch.tensor([[share]])).flatten().tolist() == pytest.approx(color)
 
 

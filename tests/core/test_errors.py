@@ -9,19 +9,19 @@ from depthpose.core.errors import (
     MissingExtraError,
     describe_full_memory,
     import_extra,
-    nearest_name,
+    suggest_name,
 )
 
 
 def test_the_nearest_name_is_offered() -> None:
-    assert nearest_name("eigen-rw", ["eigen-raw", "kitti"]) == (
+    assert suggest_name("eigen-rw", ["eigen-raw", "kitti"]) == (
         "did you mean 'eigen-raw'? Known: 'eigen-raw', 'kitti'."
     )
 
 
 def test_far_names_are_only_listed() -> None:
-    assert nearest_name("zzz", ["b", "a"]) == "Known: 'a', 'b'."
-    assert nearest_name("zzz", []) == "Known: none."
+    assert suggest_name("zzz", ["b", "a"]) == "Known: 'a', 'b'."
+    assert suggest_name("zzz", []) == "Known: none."
 
 
 def test_a_missing_extra_says_what_to_install() -> None:

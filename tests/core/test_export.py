@@ -11,7 +11,7 @@ from torch import nn
 
 from depthpose.core.checkpoint import file_sha256
 from depthpose.core.errors import InputError, MissingExtraError
-from depthpose.core.export import Case, Export, Graph, Limit, freeze, network_model
+from depthpose.core.export import Case, Export, Graph, Limit, convert_network, write_export
 
 onnxruntime = pytest.importorskip("onnxruntime")
 X = np.array([[1, 2, 3], [4, 5, 6]], np.float32)
@@ -39,7 +39,7 @@ def line_export(
 
 def test_a_proven_file_runs_and_says_what_it_is(tmp_path: Path) -> None:
     path = tmp_path / "new" / "line.onnx"
-    rows = freeze(path, line_export())
+    rows = write_export(path, line_export())
     assert [row["largest difference"] for row in rows] == [0.0, 0.0]
     session = onnxruntime.InferenceSession(str(path))
     assert np.array_equal(session.run(["y"], {"x": X[:1]})[0], [[3, 5, 7]])
@@ -74,7 +74,7 @@ def test_answers_that_differ_are_not_written(
     y: np.ndarray, limit: dict[str, Any], message: str, tmp_path: Path
 ) -> None:
     with pytest.raises(InputError, match=message):
-        freeze(tmp_path / "line.onnx", line_export(y, **limit))
+        write_export(tmp_path / "line.onnx", line_export(y, **limit))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -82,8 +82,8 @@ def test_one_large_difference_is_compared_by_its_kind(tmp_path: Path) -> None:
     y = 2 * X + 1
     y[0, 0] += 3e-6
     with pytest.raises(InputError, match="differ by"):
-        freeze(tmp_path / "line.onnx", line_export(y))
-    rows = freeze(tmp_path / "line.onnx", line_export(y, of="mean"))
+        write_export(tmp_path / "line.onnx", line_export(y))
+    rows = write_export(tmp_path / "line.onnx", line_export(y, of="mean"))
     assert 0 < float(rows[0]["mean difference"]) < 1e-6
 
 
@@ -92,14 +92,14 @@ def test_a_share_may_flip_and_is_said(wrong: float, tmp_path: Path) -> None:
     """One of six numbers is far off, or NaN in one answer alone: a sixth may, a tenth may not."""
     y = 2 * X + 1
     y[0, 0] = wrong
-    rows = freeze(tmp_path / "line.onnx", line_export(y, flips=0.2))
+    rows = write_export(tmp_path / "line.onnx", line_export(y, flips=0.2))
     assert rows[0]["flipped"] == pytest.approx(1 / 6)
     assert rows[0]["largest difference"] == 0.0
     assert "flipped" not in rows[1]
     with pytest.raises(InputError, match=r"by more than 1e-06 on 16\.667% .* 10\.000% may"):
-        freeze(tmp_path / "other.onnx", line_export(y, flips=0.1))
+        write_export(tmp_path / "other.onnx", line_export(y, flips=0.1))
     with pytest.raises(InputError, match=r"on 100\.000% of the numbers"):
-        freeze(tmp_path / "other.onnx", line_export(np.full_like(X, np.nan), flips=0.9))
+        write_export(tmp_path / "other.onnx", line_export(np.full_like(X, np.nan), flips=0.9))
     assert not (tmp_path / "other.onnx").exists()
 
 
@@ -110,7 +110,7 @@ def test_an_interrupt_leaves_no_half_file(tmp_path: Path) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        freeze(path, line_export(graph=stopped))
+        write_export(path, line_export(graph=stopped))
     assert not list(tmp_path.iterdir())
 
 
@@ -118,7 +118,7 @@ def test_an_older_file_is_not_written_over(tmp_path: Path) -> None:
     path = tmp_path / "line.onnx"
     path.write_bytes(b"old")
     with pytest.raises(InputError, match=r"line\.onnx: is there already"):
-        freeze(path, line_export(graph=never))
+        write_export(path, line_export(graph=never))
     assert path.read_bytes() == b"old"
 
 
@@ -129,12 +129,12 @@ def never() -> Graph:
 def test_a_place_that_cannot_be_written_is_refused_before_the_work(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match="is a file, but a folder is needed"):
-        freeze(tmp_path / "file" / "line.onnx", line_export(graph=never))
+        write_export(tmp_path / "file" / "line.onnx", line_export(graph=never))
     (tmp_path / "folder.onnx").mkdir()
     with pytest.raises(InputError, match="is there already"):
-        freeze(tmp_path / "folder.onnx", line_export(graph=never))
+        write_export(tmp_path / "folder.onnx", line_export(graph=never))
     with pytest.raises(InputError, match=r"line\.pt: the graph is written as ONNX; end the name"):
-        freeze(tmp_path / "line.pt", line_export(graph=never))
+        write_export(tmp_path / "line.pt", line_export(graph=never))
 
 
 @pytest.mark.parametrize("package", ["onnx", "onnxscript", "onnxruntime"])
@@ -143,7 +143,7 @@ def test_a_missing_extra_is_named(
 ) -> None:
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(MissingExtraError, match=r"pip install -e '.\[export\]'"):
-        freeze(tmp_path / "line.onnx", line_export(graph=never))
+        write_export(tmp_path / "line.onnx", line_export(graph=never))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -153,7 +153,7 @@ def test_a_network_keeps_its_sizes_free_and_its_maker_to_itself() -> None:
     graph = Graph()
     x = graph.input("x", np.float32, ("n", 1, "h", "w"))
     # Twice, one after the other: names of two networks do not meet.
-    model = network_model(network, [torch.rand(2, 1, 16, 24)], 4)
+    model = convert_network(network, [torch.rand(2, 1, 16, 24)], 4)
     (once,) = graph.call(model, x)
     (twice,) = graph.call(model, once)
     graph.output("y", twice, np.float32, ("n", 1, "h4", "w4"))
@@ -170,7 +170,7 @@ def test_a_network_keeps_its_sizes_free_and_its_maker_to_itself() -> None:
 
 def test_a_camera_of_the_same_name_stays(tmp_path: Path) -> None:
     (tmp_path / "line.json").write_text("my camera")
-    freeze(tmp_path / "line.onnx", line_export())
+    write_export(tmp_path / "line.onnx", line_export())
     assert (tmp_path / "line.json").read_text() == "my camera"
     assert (tmp_path / "line.proof.json").is_file()
 
@@ -196,7 +196,7 @@ def test_what_nothing_is_compared_with_is_not_proven(
     limits = {"y": Limit(value=0.0)}
     export = Export(graph=line_graph, cases=lambda: cases, limits=limits, facts={})
     with pytest.raises(InputError, match=message):
-        freeze(tmp_path / "line.onnx", export)
+        write_export(tmp_path / "line.onnx", export)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -207,4 +207,4 @@ def test_only_the_part_that_is_named_is_compared(tmp_path: Path) -> None:
     export = Export(
         graph=line_graph, cases=lambda: [case], limits={"y": Limit(value=0.0)}, facts={}
     )
-    assert freeze(tmp_path / "line.onnx", export)[0]["largest difference"] == 0
+    assert write_export(tmp_path / "line.onnx", export)[0]["largest difference"] == 0

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from depthpose.core.errors import InputError
-from depthpose.core.files import Cloud, read_cloud, read_points_bin, write_cloud
+from depthpose.core.files import PointCloud, read_cloud, read_points_bin, write_cloud
 from depthpose.core.files.points import decompress_lzf
 
 POINTS = torch.tensor([[0.0, 1.5, -2.0], [3.25, 4.0, 5.0]])
@@ -25,7 +25,9 @@ PCD_HEADER = (
 )
 
 
-def same(found: Cloud, points: torch.Tensor = POINTS, color: torch.Tensor | None = COLOR) -> bool:
+def same(
+    found: PointCloud, points: torch.Tensor = POINTS, color: torch.Tensor | None = COLOR
+) -> bool:
     if color is None or found.color is None:
         return torch.equal(found.points, points) and found.color is color
     return torch.equal(found.points, points) and torch.allclose(found.color, color)
@@ -75,7 +77,7 @@ def test_written_clouds_come_back(
 ) -> None:
     path = tmp_path_factory.mktemp("cloud") / f"x{suffix}"
     color = torch.randint(0, 256, points.shape) / 255 if with_color else None
-    write_cloud(path, Cloud(points=torch.from_numpy(points), color=color))
+    write_cloud(path, PointCloud(points=torch.from_numpy(points), color=color))
     assert same(read_cloud(path), torch.from_numpy(points), color)
 
 

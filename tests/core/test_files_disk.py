@@ -17,9 +17,9 @@ from depthpose.cli import main
 from depthpose.core.checkpoint import Checkpoint, save_checkpoint
 from depthpose.core.config import write_config
 from depthpose.core.errors import InputError
-from depthpose.core.export import Export, Graph, freeze
+from depthpose.core.export import Export, Graph, write_export
 from depthpose.core.files import (
-    Cloud,
+    PointCloud,
     atomic_write,
     read_bytes,
     stores,
@@ -30,7 +30,7 @@ from depthpose.core.files import (
     write_map,
     write_video,
 )
-from depthpose.core.files.disk import natural_order
+from depthpose.core.files.disk import natural_sort_key
 from depthpose.core.loop import RunLogger
 from depthpose.core.run import claim_folder, lock_folder
 from depthpose.report.page import Section, write_page, write_table
@@ -191,13 +191,13 @@ def test_every_writer_names_a_full_disk_and_leaves_nothing(tmp_path: Path) -> No
         "config": lambda p: write_config(p / "c.yaml", Knobs()),
         "page": lambda p: write_page(p / "page.html", "t", [Section(title="t", text=long)], {}),
         "table": lambda p: write_table(p, [{"a": long}]),
-        "cloud": lambda p: write_cloud(p / "c.ply", Cloud(points=torch.rand(50_000, 3))),
+        "cloud": lambda p: write_cloud(p / "c.ply", PointCloud(points=torch.rand(50_000, 3))),
         "map": lambda p: write_map(p / "m.npy", images[0][0].repeat(2, 2)),
         "picture": lambda p: write_image(p / "p.png", images[0]),
         "depth": lambda p: write_depth_png(p / "d.png", 200 * images[0][0]),
         "avi": lambda p: write_video(p / "v.avi", images, 10.0),
         "mp4": lambda p: write_video(p / "v.mp4", images, 10.0),
-        "graph": lambda p: freeze(p / "g.onnx", graph),
+        "graph": lambda p: write_export(p / "g.onnx", graph),
     }
     for name, write in writers.items():
         with (
@@ -230,7 +230,7 @@ def test_a_folder_may_be_called_as_a_pattern_is_written(tmp_path: Path) -> None:
 
 def in_order(*names: str) -> list[str]:
     """Sort names, given in their order, from the other end."""
-    paths = sorted((Path(name) for name in reversed(names)), key=natural_order)
+    paths = sorted((Path(name) for name in reversed(names)), key=natural_sort_key)
     return [str(path) for path in paths]
 
 

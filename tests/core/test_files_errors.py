@@ -13,7 +13,7 @@ from PIL import Image
 
 from depthpose.core.errors import InputError
 from depthpose.core.files import (
-    Cloud,
+    PointCloud,
     image_size,
     list_images,
     read_cloud,
@@ -236,10 +236,13 @@ BAD_WRITES: list[tuple[Callable[[Path], None], str]] = [
     (lambda p: write_map(p / "x.npy", IMAGE[0] + torch.inf), "mark invalid pixels by NaN"),
     (lambda p: write_map(p / "x.tif", IMAGE[0]), r"\.tif is no map format"),
     (
-        lambda p: write_cloud(p / "x.obj", Cloud(points=IMAGE[:, 0].new_ones(1, 3))),
+        lambda p: write_cloud(p / "x.obj", PointCloud(points=IMAGE[:, 0].new_ones(1, 3))),
         "use .ply, .pcd",
     ),
-    (lambda p: write_cloud(p / "x.ply", Cloud(points=torch.ones(1, 3) / 0)), "NaN or infinity"),
+    (
+        lambda p: write_cloud(p / "x.ply", PointCloud(points=torch.ones(1, 3) / 0)),
+        "NaN or infinity",
+    ),
     (lambda p: write_json(p / "x.json", float("nan")), "cannot be written as JSON: .*; use null"),
     (lambda p: write_json(p / "x.json", {"a": {1, 2}}), "cannot be written as JSON: .* set"),
     (lambda _: write_json("/proc/none/x.json", {}), r"/proc/none/x\.json: cannot be written"),

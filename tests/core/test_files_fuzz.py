@@ -17,7 +17,7 @@ from PIL import Image
 from depthpose.core.camera import read_camera, read_rig
 from depthpose.core.errors import InputError
 from depthpose.core.files import (
-    Cloud,
+    PointCloud,
     image_size,
     read_cloud,
     read_depth_png,
@@ -85,7 +85,9 @@ def turned_jpeg() -> bytes:
 
 
 SEEDED = torch.Generator().manual_seed(0)
-CLOUD = Cloud(points=torch.rand(3, 3, generator=SEEDED), color=torch.rand(3, 3, generator=SEEDED))
+CLOUD = PointCloud(
+    points=torch.rand(3, 3, generator=SEEDED), color=torch.rand(3, 3, generator=SEEDED)
+)
 CASES: dict[str, tuple[str, tuple[Reader, ...], bytes]] = {
     "png": (".png", (read_image, image_size), encoded("PNG")),
     "palette": (".png", (read_image,), encoded("PNG", "P", transparency=bytes(9))),

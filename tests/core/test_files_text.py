@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_json, read_key_values, read_text, write_json
-from depthpose.core.files.disk import find_partners, parse_yaml, stem_of
+from depthpose.core.files.disk import find_partners, normalise_stem, parse_yaml
 
 JSON = st.recursive(
     st.none()
@@ -103,4 +103,4 @@ def test_names_pair_however_their_accents_are_stored() -> None:
     composed, apart = "stra\u00dfe_\u00e9", "stra\u00dfe_e\u0301"
     assert composed != apart
     assert find_partners([composed, "b"], ["b", apart], "x") == [1, 0]
-    assert stem_of(Path(f"{composed}.png")) == stem_of(Path(f"{apart}.jpg"))
+    assert normalise_stem(Path(f"{composed}.png")) == normalise_stem(Path(f"{apart}.jpg"))

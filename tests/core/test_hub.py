@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from depthpose.core import checkpoint as hub
+from depthpose.core import hub
 from depthpose.core.checkpoint import Checkpoint, find_weights, read_checkpoint, save_checkpoint
 from depthpose.core.errors import InputError, MissingExtraError
 

@@ -13,7 +13,7 @@ from tests.core.forked import hold, start
 from tests.core.loop_task import ToySamples, ToyTask
 
 from depthpose.core.errors import InputError
-from depthpose.core.loop import LoopConfig, Run, releases_folder
+from depthpose.core.loop import LoopConfig, TrainingRun, releases_folder
 from depthpose.core.run import (
     claim_folder,
     held_folders,
@@ -86,13 +86,13 @@ def test_a_training_lets_its_folder_go(tmp_path: Path) -> None:
     config = LoopConfig(steps=1, batch_size=2, device="cpu")
 
     @releases_folder
-    def stage(config: LoopConfig, run: Run) -> Path:
+    def stage(config: LoopConfig, run: TrainingRun) -> Path:
         claim_folder(run.folder, {"a": 1})
         run.train(ToyTask(), ToySamples(), config)
         assert held_folders() == {run.folder}
         return run.folder
 
-    stage(config, Run(folder=tmp_path.resolve()))
+    stage(config, TrainingRun(folder=tmp_path.resolve()))
     assert not held_folders()
     with holder(tmp_path, 0) as process:
         process.join()

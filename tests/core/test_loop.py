@@ -22,13 +22,13 @@ from depthpose.core.loop import (
     Interrupted,
     LoopConfig,
     Progress,
-    Run,
+    TrainingRun,
     ValidationResult,
-    card_text,
-    held_out_text,
+    format_card,
+    format_held_out,
+    make_sample_generator,
     read_metrics,
-    sample_generator,
-    shuffled_index,
+    shuffle_index,
     write_card,
 )
 
@@ -41,7 +41,7 @@ def loop(**changes: object) -> LoopConfig:
 
 def trained(folder: Path, config: LoopConfig, **words: object) -> ToyTask:
     task = ToyTask()
-    run = Run(folder=folder, **words)  # pyright: ignore[reportArgumentType]
+    run = TrainingRun(folder=folder, **words)  # pyright: ignore[reportArgumentType]
     run.train(task, ToySamples(), config)
     return task
 
@@ -157,22 +157,24 @@ def test_the_time_of_a_training_counts_the_runs_that_it_resumes(tmp_path: Path) 
     state = torch.load(tmp_path / "state.pt", weights_only=True)
     assert 0 < state["seconds"] < 1000
     torch.save({**state, "seconds": 1000.0}, tmp_path / "state.pt")
-    assert Run(folder=tmp_path, resume=True).train(ToyTask(), ToySamples(), loop()) > 1000
+    assert TrainingRun(folder=tmp_path, resume=True).train(ToyTask(), ToySamples(), loop()) > 1000
     del state["seconds"]  # as older versions left it
     torch.save(state, tmp_path / "state.pt")
-    assert 0 < Run(folder=tmp_path, resume=True).train(ToyTask(), ToySamples(), loop()) < 1000
+    assert (
+        0 < TrainingRun(folder=tmp_path, resume=True).train(ToyTask(), ToySamples(), loop()) < 1000
+    )
 
 
 def test_a_card_says_what_how_how_long_and_how_good(tmp_path: Path) -> None:
     folder = tmp_path / "my part"
-    assert held_out_text(folder, "Errors.") == ("Nothing was held out, so nothing was measured.")
+    assert format_held_out(folder, "Errors.") == ("Nothing was held out, so nothing was measured.")
     folder.mkdir()
     rows = [{"step": 4, "held_out/error": 0.5}, {"step": 8, "held_out/error": 1 / 3},
             {"step": 12, "net/loss": 0.1}]  # fmt: skip
     (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     trained(tmp_path / "run", loop(steps=12))
     (tmp_path / "run" / "state.pt").rename(folder / "state.pt")
-    measured = held_out_text(folder, "Errors (m).")
+    measured = format_held_out(folder, "Errors (m).")
     assert measured == "Errors (m).\n\n| held out | |\n| --- | --- |\n| error | 0.3333 |"
     facts = {"trained_on": "kitti", "terms": "For research."}
     write_card(folder / "net.safetensors", "depth train view", 7300.0, facts, measured)
@@ -188,7 +190,7 @@ def test_a_card_says_what_how_how_long_and_how_good(tmp_path: Path) -> None:
     for seconds, said in ((3.4, "3 s"), (119.0, "119 s"), (300.0, "5 min")):
         write_card(folder / "net.safetensors", "", seconds, {}, "")
         assert f" steps in {said} on " in (folder / "net.md").read_text()
-    assert card_text("net", {"licence": "MIT"}) == "# net\n\n- **Licence**: MIT\n"
+    assert format_card("net", {"licence": "MIT"}) == "# net\n\n- **Licence**: MIT\n"
 
 
 def test_what_is_logged_is_the_mean_of_the_steps_since(tmp_path: Path) -> None:
@@ -230,7 +232,7 @@ def test_gradients_are_clipped_where_asked(tmp_path: Path, limit: float | None) 
         norms.append(float(torch.cat(grads).norm()))
 
     optimizer.register_step_pre_hook(note)
-    Run(folder=tmp_path).train(task, ToySamples(), loop(clip_norm=limit))
+    TrainingRun(folder=tmp_path).train(task, ToySamples(), loop(clip_norm=limit))
     assert len(norms) == 12
     assert (max(norms) <= 0.05 * 1.001) == (limit is not None)
 
@@ -286,7 +288,7 @@ def test_the_average_of_weights_is_what_comes_out(tmp_path: Path) -> None:
 
     average = weights(task)["discriminator.weight"].clone()
     config = loop(steps=6, ema_decay=0.8, validate_every_steps=100)
-    Run(folder=tmp_path, on_step=note).train(task, ToySamples(), config)
+    TrainingRun(folder=tmp_path, on_step=note).train(task, ToySamples(), config)
     for step, weight in enumerate(path):
         decay = min(0.8, (1 + step) / (10 + step))
         average = decay * average + (1 - decay) * weight
@@ -303,7 +305,7 @@ def test_validation_sees_the_average_and_leaves_the_weights(tmp_path: Path) -> N
     plain = trained(tmp_path / "plain", loop(ema_decay=0.8, validate_every_steps=100))
     task = Watched()
     config = loop(ema_decay=0.8, validate_every_steps=5)
-    Run(folder=tmp_path / "watched").train(task, ToySamples(), config)
+    TrainingRun(folder=tmp_path / "watched").train(task, ToySamples(), config)
     assert_equal(weights(plain), weights(task))
     three = trained(tmp_path / "five", loop(steps=12, ema_decay=0.8), on_step=None)
     assert len(seen) == 3
@@ -450,7 +452,7 @@ def test_the_state_of_another_training_is_explained(tmp_path: Path, name: str) -
 
 def test_a_loss_that_is_not_finite_stops_with_advice(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"loss is inf at step 0\. Start anew in another folder"):
-        Run(folder=tmp_path).train(ToyTask(factor=float("inf")), ToySamples(), loop())
+        TrainingRun(folder=tmp_path).train(ToyTask(factor=float("inf")), ToySamples(), loop())
 
 
 def test_nothing_to_train_on_is_refused(tmp_path: Path) -> None:
@@ -459,7 +461,7 @@ def test_nothing_to_train_on_is_refused(tmp_path: Path) -> None:
             return 0
 
     with pytest.raises(InputError, match="no sample to train on"):
-        Run(folder=tmp_path).train(ToyTask(), Nothing(), loop())
+        TrainingRun(folder=tmp_path).train(ToyTask(), Nothing(), loop())
 
 
 def test_half_precision_without_a_gpu_is_refused(tmp_path: Path) -> None:
@@ -507,14 +509,14 @@ def test_a_device_beside_that_of_an_earlier_training_is_refused(
 
 
 def test_each_epoch_is_a_shuffle_of_its_own() -> None:
-    epochs = [[shuffled_index(20 * e + i, 20, 7) for i in range(20)] for e in range(2)]
+    epochs = [[shuffle_index(20 * e + i, 20, 7) for i in range(20)] for e in range(2)]
     assert [sorted(epoch) for epoch in epochs] == [list(range(20))] * 2
     assert epochs[0] != epochs[1]
-    assert epochs[0] != [shuffled_index(i, 20, 8) for i in range(20)]
+    assert epochs[0] != [shuffle_index(i, 20, 8) for i in range(20)]
 
 
 def test_a_sample_index_draws_the_same_numbers_again() -> None:
-    one, again, other = (torch.rand(4, generator=sample_generator(t, 1)) for t in (5, 5, 6))
+    one, again, other = (torch.rand(4, generator=make_sample_generator(t, 1)) for t in (5, 5, 6))
     assert torch.equal(one, again)
     assert not torch.equal(one, other)
 

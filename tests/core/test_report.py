@@ -8,18 +8,18 @@ from pathlib import Path
 import torch
 from PIL import Image
 
-from depthpose.core.files import Cloud, write_image
+from depthpose.core.files import PointCloud, write_image
 from depthpose.report.page import (
     Drawing,
     Layer,
-    Picture,
+    PictureFile,
     Scene,
     Section,
     embed_picture,
-    frame_axes,
-    markdown_table,
-    plain_table,
-    rising_scale,
+    format_markdown_table,
+    format_plain_table,
+    make_frame_axes,
+    make_rising_color_bar,
     write_markdown,
     write_page,
     write_table,
@@ -29,7 +29,7 @@ ROWS = [{"name": "a|b", "x": 0.123456, "n": 3}, {"name": "c", "x": 80.0, "more":
 
 
 def test_markdown_has_every_column_in_order() -> None:
-    assert markdown_table(ROWS) == (
+    assert format_markdown_table(ROWS) == (
         "| name | x | n | more |\n| --- | --- | --- | --- |\n"
         "| a\\|b | 0.1235 | 3 |  |\n| c | 80 |  |  |\n"
     )
@@ -39,7 +39,7 @@ def test_a_frame_is_drawn_by_where_its_axes_point() -> None:
     """Turned by 90 degrees about z: x points along the camera's y, y against its x."""
     R = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     origin_m = torch.tensor([1.0, 2, 3])
-    axes = frame_axes(origin_m, R, 0.5)
+    axes = make_frame_axes(origin_m, R, 0.5)
     assert axes.ends_m[:, 0].tolist() == [[1, 2, 3]] * 3
     assert axes.ends_m[:, 1].tolist() == [[1, 2.5, 3], [0.5, 2, 3], [1, 2, 3.5]]
 
@@ -58,7 +58,7 @@ def test_the_table_is_written_three_times(tmp_path: Path) -> None:
 
 def test_the_page_stands_alone_and_escapes_what_it_shows(tmp_path: Path) -> None:
     write_image(tmp_path / "p.png", torch.zeros(3, 2, 2))
-    picture = Picture(path=tmp_path / "p.png", caption="a <picture>")
+    picture = PictureFile(path=tmp_path / "p.png", caption="a <picture>")
     sections = [Section(title="T & S", text="<script>x</script>", rows=ROWS, pictures=[picture])]
     write_page(tmp_path / "page.html", "Title", sections, {"torch": "2"})
     html = (tmp_path / "page.html").read_text()
@@ -83,21 +83,21 @@ def test_the_head_of_a_column_says_what_it_is(tmp_path: Path) -> None:
 
 
 def test_a_page_holds_its_scenes_and_the_viewer_once(tmp_path: Path) -> None:
-    cloud = Layer(name="</script><b>", shape=Cloud(points=torch.zeros(2, 3)))
+    cloud = Layer(name="</script><b>", shape=PointCloud(points=torch.zeros(2, 3)))
     scene = Scene(caption="a <cloud>", layers=[cloud])
     sections = [Section(title="One", scenes=[scene, scene]), Section(title="Two", scenes=[scene])]
     write_page(tmp_path / "page.html", "Title", sections, {})
     html = (tmp_path / "page.html").read_text()
     assert html.count("const showScene") == 1
     found = re.findall(r'<script type="application/json">(.*?)</script>', html, re.DOTALL)
-    assert [json.loads(text) for text in found] == [scene.encoded()] * 3
+    assert [json.loads(text) for text in found] == [scene.encode()] * 3
     assert "a &lt;cloud&gt;" in html
     assert "://" not in html
 
 
 def test_a_page_shows_facts_numbers_and_pictures_of_no_file(tmp_path: Path) -> None:
-    scale = rising_scale("error <px>", 4.0)
-    drawing = Drawing(image=torch.rand(3, 1000, 1000), caption="a <drawing>", scale=scale)
+    bar = make_rising_color_bar("error <px>", 4.0)
+    drawing = Drawing(image=torch.rand(3, 1000, 1000), caption="a <drawing>", color_bar=bar)
     section = Section(
         title="One",
         facts=[("size", "2 < 3")],
@@ -136,16 +136,16 @@ def test_a_table_for_the_terminal_has_the_columns_that_are_asked_for() -> None:
         {"method": "ours", "d1": 0.5, "much": 1, "none": None},
         {"method": "theirs", "d1": 0.25, "much": 2, "none": None},
     ]
-    assert plain_table(rows, ["method", "d1", "none", "elsewhere"]) == (
+    assert format_plain_table(rows, ["method", "d1", "none", "elsewhere"]) == (
         "method  d1\nours    0.5000\ntheirs  0.2500\n"
     )
-    assert plain_table(rows).startswith("method  d1      much\n")
+    assert format_plain_table(rows).startswith("method  d1      much\n")
 
 
 def test_a_large_picture_is_made_small_enough_for_a_page(tmp_path: Path) -> None:
     noise = torch.rand(3, 800, 1000, generator=torch.Generator().manual_seed(0))
     write_image(tmp_path / "p.png", noise)
-    picture = Picture(path=tmp_path / "p.png", caption="noise")
+    picture = PictureFile(path=tmp_path / "p.png", caption="noise")
     width, height, address = embed_picture(picture)
     assert (width, height) == (1000, 800)
     assert address.startswith("data:image/jpeg;base64,")

@@ -7,12 +7,12 @@ import pytest
 from depthpose.core.devices import computes_bf16, device_of_process, usable_device
 from depthpose.core.errors import InputError
 from depthpose.core.files.images import refuse_among_inputs
-from depthpose.core.loop import LoopConfig, Run
+from depthpose.core.loop import LoopConfig, TrainingRun
 from depthpose.core.run import (
     ProcessRank,
     claim_folder,
     claim_names,
-    environment,
+    describe_environment,
     find_rank,
     is_whole,
     note_result,
@@ -144,7 +144,7 @@ def test_a_file_is_not_replaced_without_consent(tmp_path: Path) -> None:
 
 
 def test_the_environment_names_versions_and_date() -> None:
-    facts = environment()
+    facts = describe_environment()
     assert {"date", "python", "depthpose", "torch", "numpy", "machine"} <= facts.keys()
 
 
@@ -253,7 +253,7 @@ class TrainedConfig:
 
 
 def test_a_finished_training_says_how_to_train_on(tmp_path: Path) -> None:
-    run = Run(folder=tmp_path)
+    run = TrainingRun(folder=tmp_path)
     run.claim(TrainedConfig(), ("net",))
     (tmp_path / "net.safetensors").write_bytes(b"1")
     longer = TrainedConfig(loop=LoopConfig(steps=9))

@@ -23,7 +23,7 @@ from depthpose import FakestereoNet
 from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.checkpoint import LicenceNotice, read_checkpoint
 from depthpose.core.errors import InputError, Notice
-from depthpose.core.files import as_tensor
+from depthpose.core.files import rgb_from_picture
 from depthpose.depth.config import (
     Answer,
     GeneratorConfig,
@@ -355,7 +355,7 @@ def test_values_that_are_no_picture_are_refused(
 )
 def test_what_is_no_picture_says_what_is_taken(given: object, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        as_tensor(given)
+        rgb_from_picture(given)
 
 
 GREY = np.arange(40 * 60).reshape(40, 60).astype(np.uint8)
@@ -385,7 +385,7 @@ RGBA = np.concatenate([RGB, GREY[..., None]], -1)
 )
 def test_any_form_of_a_picture_is_the_same_picture(given: object) -> None:
     expected = torch.from_numpy(RGB).permute(2, 0, 1).float() / 255
-    torch.testing.assert_close(as_tensor(given), expected)
+    torch.testing.assert_close(rgb_from_picture(given), expected)
 
 
 @pytest.mark.parametrize(
@@ -395,7 +395,7 @@ def test_any_form_of_a_picture_is_the_same_picture(given: object) -> None:
 )
 def test_grey_is_three_equal_channels(given: object) -> None:
     expected = torch.from_numpy(GREY).expand(3, -1, -1).float() / 255
-    torch.testing.assert_close(as_tensor(given), expected)
+    torch.testing.assert_close(rgb_from_picture(given), expected)
 
 
 def test_a_batch_is_estimated_image_by_image(generator: UNetGenerator) -> None:

@@ -17,7 +17,7 @@ from tests.depth.test_stereo_light import SMALL
 
 from depthpose.cli import main
 from depthpose.core.errors import InputError
-from depthpose.core.export import network_model
+from depthpose.core.export import convert_network
 from depthpose.core.files import write_image
 from depthpose.depth.config import (
     GeneratorConfig,
@@ -89,7 +89,7 @@ def selection_network(encoder: str) -> Any:  # noqa: ANN401 - an ONNX model
     """The network of :func:`of_streets`, exported once: that is what takes the time."""
     assert encoder
     module, multiple = DynamicSelection(of_streets()).eval(), CONFIG.side_multiple_px
-    return network_model(module, [torch.rand(2, 3, 2 * multiple, 3 * multiple)], multiple)
+    return convert_network(module, [torch.rand(2, 3, 2 * multiple, 3 * multiple)], multiple)
 
 
 @pytest.fixture
@@ -103,9 +103,9 @@ def selection(
     def exported_once(module: torch.nn.Module, images: list[torch.Tensor], multiple: int) -> Any:  # noqa: ANN401
         if isinstance(module, DynamicSelection):
             return selection_network
-        return network_model(module, images, multiple)
+        return convert_network(module, images, multiple)
 
-    monkeypatch.setattr("depthpose.depth.export.network_model", exported_once)
+    monkeypatch.setattr("depthpose.depth.export.convert_network", exported_once)
     write_depth_weights(tmp_path / "w.safetensors", generator=of_all_kinds(), facts=TERMS)
     return tmp_path
 
@@ -144,7 +144,7 @@ def test_the_graph_of_the_light_network_takes_any_size() -> None:
     assert light.refinement is not None
     torch.nn.init.normal_(light.refinement.correction.weight)
     network = DynamicLightStereo(light).eval()
-    model = network_model(network, [torch.rand(2, 3, 64, 96) for _ in range(2)], 32)
+    model = convert_network(network, [torch.rand(2, 3, 64, 96) for _ in range(2)], 32)
     session = onnxruntime.InferenceSession(model.SerializeToString())
     pair = torch.randn(2, 3, 3, 32, 128).unbind()
     names = [given.name for given in session.get_inputs()]

@@ -14,7 +14,7 @@ from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError
 from depthpose.core.export import Case, Export, Graph, Limit
 from depthpose.core.files import read_map, write_depth_png, write_image, write_map
-from depthpose.core.loop import LoopConfig, Run
+from depthpose.core.loop import LoopConfig, TrainingRun
 from depthpose.depth.augment import TrainingPair
 from depthpose.depth.config import (
     AugmentConfig,
@@ -137,7 +137,9 @@ def test_extending_matchers_with_training(
     words = {"other": {"flat": {"most_px": 12.0}}, "loop": {"steps": 1, "batch_size": 1}}
     words["pairs"] = {"folders": [str(pairs)], "augment": {"crop_px": [16, 16]}}
     training = config_from_dict(words, StereoTraining, source="flat.yaml")
-    trained = read_depth_weights(train_stereo(training, Run(folder=tmp_path / "stereo"))).matcher
+    trained = read_depth_weights(
+        train_stereo(training, TrainingRun(folder=tmp_path / "stereo"))
+    ).matcher
     assert isinstance(trained, FlatNetwork)
     assert trained.config.most_px == 12.0
 
@@ -153,7 +155,7 @@ def test_extending_matchers_with_training(
         pairs=PairsConfig(folders=(str(pairs),), augment=AugmentConfig(crop_px=(16, 16))),
         loop=LoopConfig(steps=1, batch_size=1),
     )
-    out = train_finetune(config, Run(folder=tmp_path / "run"))
+    out = train_finetune(config, TrainingRun(folder=tmp_path / "run"))
     assert isinstance(read_depth_weights(out).matcher, FlatNetwork)
 
 

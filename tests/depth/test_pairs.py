@@ -10,7 +10,7 @@ from tests.depth.test_kitti_folders import make_object, make_raw, write
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError, Notice
 from depthpose.core.files import read_json, write_depth_png, write_image
-from depthpose.core.loop import LoopConfig, Run
+from depthpose.core.loop import LoopConfig, TrainingRun
 from depthpose.depth.config import AugmentConfig, PairsConfig, PSMNetConfig, StreetsConfig
 from depthpose.depth.datasets import open_dataset
 from depthpose.depth.train import TrainingPairs, train_stereo
@@ -129,7 +129,7 @@ def test_the_record_of_a_run_says_the_truth_of_each_folder(tmp_path: Path) -> No
         ),
         loop=LoopConfig(steps=1, batch_size=1, device="cpu"),
     )
-    path = train_stereo(config, Run(folder=tmp_path / "run"))
+    path = train_stereo(config, TrainingRun(folder=tmp_path / "run"))
     record = read_json(tmp_path / "run" / "run.json")
     assert isinstance(record, dict)
     assert record["settings"]["truth"] == ["synthetic streets: disparity", "mine: scan"]

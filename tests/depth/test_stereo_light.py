@@ -13,7 +13,7 @@ from depthpose.core.camera import Camera
 from depthpose.core.checkpoint import Checkpoint, save_checkpoint
 from depthpose.core.config import read_config, write_config
 from depthpose.core.errors import InputError
-from depthpose.core.loop import LoopConfig, Run
+from depthpose.core.loop import LoopConfig, TrainingRun
 from depthpose.depth.augment import TrainingPair
 from depthpose.depth.config import (
     LightConfig,
@@ -404,7 +404,7 @@ def test_an_encoder_takes_a_file_as_far_as_it_reaches(tmp_path: Path) -> None:
 
 def test_beginnings_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     pairs = PairsConfig(streets=StreetsConfig(frames=2, scale=0.1))
-    run, loop = Run(folder=tmp_path / "run"), LoopConfig(steps=1)
+    run, loop = TrainingRun(folder=tmp_path / "run"), LoopConfig(steps=1)
     with pytest.raises(InputError, match="give --encoder"):
         train_stereo(StereoTraining(light=SMALL, sky_weight=0.5, pairs=pairs, loop=loop), run)
     with pytest.raises(InputError, match="give the config a light network"):

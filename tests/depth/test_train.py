@@ -13,7 +13,7 @@ from torch import Tensor
 from depthpose.core.camera import StereoRig
 from depthpose.core.checkpoint import LicenceNotice
 from depthpose.core.errors import InputError
-from depthpose.core.loop import AdamConfig, LoopConfig, Run, read_metrics
+from depthpose.core.loop import AdamConfig, LoopConfig, TrainingRun, read_metrics
 from depthpose.depth.augment import TrainingPair
 from depthpose.depth.config import (
     AugmentConfig,
@@ -136,13 +136,13 @@ def test_the_three_stages_run_and_their_weights_estimate(
     view = ViewTraining(
         generator=GENERATOR, discriminator_width=4, pairs=pairs, held_out=held_out, loop=LOOP
     )
-    generator = train_view(view, Run(folder=tmp_path / "view"))
+    generator = train_view(view, TrainingRun(folder=tmp_path / "view"))
     stereo = StereoTraining(matcher=MATCHER, pairs=pairs, held_out=held_out, loop=LOOP)
-    matcher = train_stereo(stereo, Run(folder=tmp_path / "stereo"))
+    matcher = train_stereo(stereo, TrainingRun(folder=tmp_path / "stereo"))
     tune = FinetuneTraining(
         generator=str(generator), matcher=str(matcher), pairs=pairs, held_out=held_out, loop=LOOP
     )
-    both = train_finetune(tune, Run(folder=tmp_path / "tune"))
+    both = train_finetune(tune, TrainingRun(folder=tmp_path / "tune"))
     found = read_depth_weights(both)
     assert found.generator is not None
     assert found.matcher is not None
@@ -178,7 +178,7 @@ def test_the_generator_learns_the_held_out_view(folder: Path, tmp_path: Path) ->
         pairs=pairs,
         loop=dataclasses.replace(LOOP, steps=60, log_every_steps=5),
     )
-    train_view(config, Run(folder=tmp_path))
+    train_view(config, TrainingRun(folder=tmp_path))
     l1 = [row["generator/l1"] for row in read_metrics(tmp_path)]
     assert l1[-1] < 0.4 * l1[0]
 
@@ -241,7 +241,7 @@ def test_another_rig_than_the_generators_is_refused(pairs: PairsConfig) -> None:
 def test_another_focal_length_than_the_generators_is_refused(
     pairs: PairsConfig, tmp_path: Path
 ) -> None:
-    run = Run(folder=tmp_path)
+    run = TrainingRun(folder=tmp_path)
     config = ViewTraining(generator=GENERATOR, pairs=pairs, loop=LOOP)
     other = dataclasses.replace(config, pairs=dataclasses.replace(pairs, focal_px=99.0))
     with pytest.raises(InputError, match=r"pairs\.focal_px is 99\.0, but the generator imitates"):
@@ -254,35 +254,35 @@ def test_another_focal_length_than_the_generators_is_refused(
 
 def test_a_start_of_another_network_names_the_setting(pairs: PairsConfig, tmp_path: Path) -> None:
     config = ViewTraining(generator=GENERATOR, discriminator="none", pairs=pairs, loop=LOOP)
-    first = train_view(config, Run(folder=tmp_path / "first"))
+    first = train_view(config, TrainingRun(folder=tmp_path / "first"))
     wider = dataclasses.replace(GENERATOR, width=6)
     other = dataclasses.replace(config, generator=wider, start=str(first))
     with pytest.raises(InputError, match="was trained with width = 4, but the config says 6"):
-        train_view(other, Run(folder=tmp_path / "second"))
+        train_view(other, TrainingRun(folder=tmp_path / "second"))
 
 
 def test_a_matcher_may_start_from_one_of_another_range(pairs: PairsConfig, tmp_path: Path) -> None:
     config = StereoTraining(matcher=MATCHER, pairs=pairs, loop=LOOP)
-    first = train_stereo(config, Run(folder=tmp_path / "first"))
+    first = train_stereo(config, TrainingRun(folder=tmp_path / "first"))
     farther = dataclasses.replace(MATCHER, max_disparity_px=MATCHER.max_disparity_px + 16)
     other = dataclasses.replace(config, matcher=farther, start=str(first))
-    second = read_matcher(train_stereo(other, Run(folder=tmp_path / "second")))
+    second = read_matcher(train_stereo(other, TrainingRun(folder=tmp_path / "second")))
     assert second.config == farther
 
 
 def test_fine_tuning_asks_for_both_weights(pairs: PairsConfig, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="needs weights of a generator to begin with"):
-        train_finetune(FinetuneTraining(pairs=pairs), Run(folder=tmp_path))
+        train_finetune(FinetuneTraining(pairs=pairs), TrainingRun(folder=tmp_path))
 
 
 def test_other_settings_do_not_share_a_run(
     folder: Path, pairs: PairsConfig, tmp_path: Path
 ) -> None:
     config = ViewTraining(generator=GENERATOR, discriminator="none", pairs=pairs, loop=LOOP)
-    train_view(config, Run(folder=tmp_path))
+    train_view(config, TrainingRun(folder=tmp_path))
     other = dataclasses.replace(config, l1_weight=10.0)
     with pytest.raises(InputError, match=r"l1_weight = 100\.0, but now it is 10\.0"):
-        train_view(other, Run(folder=tmp_path, resume=True))
+        train_view(other, TrainingRun(folder=tmp_path, resume=True))
 
 
 def test_a_run_does_not_go_on_with_other_frames(pairs: PairsConfig, tmp_path: Path) -> None:
@@ -294,11 +294,11 @@ def test_a_run_does_not_go_on_with_other_frames(pairs: PairsConfig, tmp_path: Pa
         pairs=dataclasses.replace(pairs, folders=(str(home),)),
         loop=LOOP,
     )
-    train_view(config, Run(folder=tmp_path / "run"))
-    train_view(config, Run(folder=tmp_path / "run", resume=True))
+    train_view(config, TrainingRun(folder=tmp_path / "run"))
+    train_view(config, TrainingRun(folder=tmp_path / "run", resume=True))
     (home / "left/02.png").unlink()
     with pytest.raises(InputError, match="frames_sha256"):
-        train_view(config, Run(folder=tmp_path / "run", resume=True))
+        train_view(config, TrainingRun(folder=tmp_path / "run", resume=True))
 
 
 def test_what_is_trained_on_is_not_held_out(pairs: PairsConfig, tmp_path: Path) -> None:
@@ -310,15 +310,15 @@ def test_what_is_trained_on_is_not_held_out(pairs: PairsConfig, tmp_path: Path) 
         loop=LOOP,
     )
     with pytest.raises(InputError, match="2 of the pairs held out are trained on too, 01 first"):
-        train_view(config, Run(folder=tmp_path))
+        train_view(config, TrainingRun(folder=tmp_path))
 
 
 def test_a_warm_start_begins_with_the_given_weights(pairs: PairsConfig, tmp_path: Path) -> None:
     config = ViewTraining(generator=GENERATOR, discriminator="none", pairs=pairs, loop=LOOP)
-    first = train_view(config, Run(folder=tmp_path / "first"))
+    first = train_view(config, TrainingRun(folder=tmp_path / "first"))
     frozen = AdamConfig(learning_rate=1e-30)
     again = dataclasses.replace(config, start=str(first), generator_adam=frozen)
-    second = train_view(again, Run(folder=tmp_path / "second"))
+    second = train_view(again, TrainingRun(folder=tmp_path / "second"))
     one, other = (read_depth_weights(p).generator for p in (first, second))
     assert one is not None
     assert other is not None
@@ -341,13 +341,13 @@ def test_terms_of_what_a_training_begins_with_bind_what_comes_of_it(
         generator=GENERATOR, discriminator="none", pairs=pairs, loop=loop, start=str(generator)
     )
     with pytest.warns(LicenceNotice, match="Cite us"):
-        drawn = train_view(view, Run(folder=tmp_path / "view"))
+        drawn = train_view(view, TrainingRun(folder=tmp_path / "view"))
     stereo = StereoTraining(matcher=MATCHER, pairs=pairs, loop=loop, start=str(matcher))
     with pytest.warns(LicenceNotice, match="For research alone"):
-        matched = train_stereo(stereo, Run(folder=tmp_path / "stereo"))
+        matched = train_stereo(stereo, TrainingRun(folder=tmp_path / "stereo"))
     tune = FinetuneTraining(generator=str(drawn), matcher=str(matched), pairs=pairs, loop=loop)
     with pytest.warns(LicenceNotice, match="Cite us. For research alone"):
-        both = train_finetune(tune, Run(folder=tmp_path / "tune"))
+        both = train_finetune(tune, TrainingRun(folder=tmp_path / "tune"))
     for path, terms in (
         (drawn, "Cite us."),
         (matched, "For research alone."),
@@ -357,7 +357,7 @@ def test_terms_of_what_a_training_begins_with_bind_what_comes_of_it(
         assert found == terms
         assert f"- **Terms**: {terms}\n" in card
     assert read_depth_weights(both).facts["began_with"] == "generator, matcher"
-    free = train_view(dataclasses.replace(view, start=None), Run(folder=tmp_path / "free"))
+    free = train_view(dataclasses.replace(view, start=None), TrainingRun(folder=tmp_path / "free"))
     found, card = terms_and_card(free)
     assert found is None
     assert "Terms" not in card
@@ -384,4 +384,4 @@ def test_gradients_that_a_cpu_gets_wrong_are_refused(pairs: PairsConfig, tmp_pat
         loop=LoopConfig(steps=1, precision="bf16"),
     )
     with pytest.raises(InputError, match=r"max_disparity_px 48, or precision fp32"):
-        train_stereo(config, Run(folder=tmp_path))
+        train_stereo(config, TrainingRun(folder=tmp_path))

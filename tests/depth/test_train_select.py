@@ -10,7 +10,7 @@ from tests.depth.small_training import LOOP, folder, held_folder, pairs, snapsho
 
 from depthpose.core.checkpoint import Checkpoint, save_checkpoint
 from depthpose.core.errors import InputError
-from depthpose.core.loop import AdamConfig, Run, read_metrics
+from depthpose.core.loop import AdamConfig, TrainingRun, read_metrics
 from depthpose.depth.config import (
     AugmentConfig,
     DegradeConfig,
@@ -166,7 +166,7 @@ def test_it_learns_disparity_and_view(held_folder: str, tmp_path: Path, pairs: P
         degrade=DegradeConfig(colour=0.0, hue_share=0.0, haze_share=0.0, glare_share=0.0),
         loop=dataclasses.replace(LOOP, steps=80, log_every_steps=10),
     )
-    path = train_select(config, Run(folder=tmp_path))
+    path = train_select(config, TrainingRun(folder=tmp_path))
     rows = read_metrics(tmp_path)
     logged = [row for row in rows if "generator/left" in row]
     assert logged[-1]["generator/left"] < 0.65 * logged[0]["generator/left"]
@@ -189,13 +189,14 @@ def test_held_out_pairs_are_measured_at_the_focal_length_of_the_generator(
     for focal_px in (130.0, None):
         given = dataclasses.replace(held_out, focal_px=focal_px)
         train_select(
-            dataclasses.replace(config, held_out=given), Run(folder=tmp_path / str(focal_px))
+            dataclasses.replace(config, held_out=given),
+            TrainingRun(folder=tmp_path / str(focal_px)),
         )
         found.append(read_metrics(tmp_path / str(focal_px))[-1]["held_out/abs_rel"])
     assert found[0] == found[1]
     other = dataclasses.replace(config, held_out=dataclasses.replace(held_out, focal_px=200.0))
     with pytest.raises(InputError, match=r"leave held_out\.focal_px out"):
-        train_select(other, Run(folder=tmp_path / "other"))
+        train_select(other, TrainingRun(folder=tmp_path / "other"))
 
 
 def test_pairs_may_be_trained_on_at_another_focal_length(
@@ -209,7 +210,7 @@ def test_pairs_may_be_trained_on_at_another_focal_length(
         pairs=larger,
         loop=dataclasses.replace(LOOP, steps=1),
     )
-    path = train_select(config, Run(folder=tmp_path))
+    path = train_select(config, TrainingRun(folder=tmp_path))
     assert "focal_px: 260.0" in (tmp_path / "config.yaml").read_text()
     assert read_generator(path).config.virtual_focal_px == 130.0
 
@@ -229,13 +230,15 @@ def test_it_begins_with_the_encoder_and_goes_on_from_its_weights(
     loop = dataclasses.replace(LOOP, steps=1)
     full = dataclasses.replace(TINY, encoder_width=1.0)
     config = SelectTraining(generator=full, encoder=str(file), adam=still, pairs=pairs, loop=loop)
-    first = train_select(config, Run(folder=tmp_path / "first"))
+    first = train_select(config, TrainingRun(folder=tmp_path / "first"))
     found = read_depth_weights(first).generator
     assert isinstance(found, SelectionGenerator)
     for name, tensor in encoder.state_dict().items():
         torch.testing.assert_close(found.encoder.state_dict()[name], tensor)
     again = dataclasses.replace(config, encoder=None, start=str(first))
-    second = read_depth_weights(train_select(again, Run(folder=tmp_path / "second"))).generator
+    second = read_depth_weights(
+        train_select(again, TrainingRun(folder=tmp_path / "second"))
+    ).generator
     assert isinstance(second, SelectionGenerator)
     torch.testing.assert_close(second.head.weight, found.head.weight)
 
@@ -250,7 +253,7 @@ def test_a_start_may_refuse_unlike_images_and_what_comes_of_it_does_not_yet(
     loop = dataclasses.replace(LOOP, steps=1)
     config = SelectTraining(generator=TINY, start=str(start), pairs=pairs, loop=loop)
     config = dataclasses.replace(config, adam=AdamConfig(learning_rate=1e-30))
-    found = read_depth_weights(train_select(config, Run(folder=tmp_path / "run"))).generator
+    found = read_depth_weights(train_select(config, TrainingRun(folder=tmp_path / "run"))).generator
     assert isinstance(found, SelectionGenerator)
     assert found.config == TINY
     torch.testing.assert_close(found.head.weight, careful.head.weight)
@@ -276,7 +279,7 @@ def test_it_is_tuned_through_the_matcher(pairs: PairsConfig, tmp_path: Path) -> 
         pairs=pairs,
         loop=dataclasses.replace(LOOP, steps=1),
     )
-    both = read_depth_weights(train_finetune(config, Run(folder=tmp_path / "tune")))
+    both = read_depth_weights(train_finetune(config, TrainingRun(folder=tmp_path / "tune")))
     assert isinstance(both.generator, SelectionGenerator)
     assert both.generator.config == TINY
     assert both.matcher is not None
@@ -290,7 +293,7 @@ def test_zoom_is_for_the_generator_that_selects(pairs: PairsConfig, tmp_path: Pa
         pairs=dataclasses.replace(pairs, augment=zoom),
         loop=LOOP,
     )
-    assert train_select(config, Run(folder=tmp_path)).is_file()
+    assert train_select(config, TrainingRun(folder=tmp_path)).is_file()
 
 
 @pytest.mark.parametrize(
@@ -308,7 +311,7 @@ def test_weights_that_are_none_are_refused(changes: dict[str, Any], message: str
 def test_fixed_layers_need_something_to_begin_with(pairs: PairsConfig, tmp_path: Path) -> None:
     config = SelectTraining(generator=TINY, pairs=pairs, loop=LOOP)
     with pytest.raises(InputError, match="nothing says what they begin with: give --encoder"):
-        train_select(config, Run(folder=tmp_path))
+        train_select(config, TrainingRun(folder=tmp_path))
 
 
 @pytest.mark.parametrize(

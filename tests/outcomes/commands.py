@@ -13,7 +13,7 @@ from tests.synthetic_street import make_street, write_pairs
 from tests.test_cli_engine import make_home
 
 from depthpose.core.camera import write_camera
-from depthpose.core.files import Cloud, write_cloud, write_depth_png, write_image
+from depthpose.core.files import PointCloud, write_cloud, write_depth_png, write_image
 from depthpose.depth.types import StereoSample
 from depthpose.depth.weights import write_depth_weights
 from depthpose.pose.datasets import write_bop_models
@@ -126,7 +126,7 @@ def make_inputs(home: Path) -> Path:
     write_pose_weights(home / "bare.safetensors", tiny_weights(part), with_meshes=False)
     torch.save(ResNet18().state_dict(), home / "resnet18.pth")
     for k in range(2):
-        cloud = Cloud(points=cloud_of(bracket(), pose_at(seed=k)))
+        cloud = PointCloud(points=cloud_of(bracket(), pose_at(seed=k)))
         write_cloud(home / "clouds" / f"{k}.ply", cloud)
     write_part("bracket", home).rename(home / "bracket.stl")
     street = make_street(0.25)

@@ -4,8 +4,8 @@ from hypothesis import strategies as st
 
 from depthpose.report.page import (
     MOST_VIEWS,
-    choose_answers,
     choose_ranked,
+    choose_views,
     share_views,
     spread_evenly,
 )
@@ -20,7 +20,7 @@ def test_the_middle_of_each_part_is_chosen(total: int, number: int, places: list
 
 @given(st.lists(st.booleans(), max_size=40))
 def test_views_are_few_and_refusals_among_them(is_ok: list[bool]) -> None:
-    chosen = choose_answers(is_ok)
+    chosen = choose_views(is_ok)
     assert len(chosen) == min(len(is_ok), MOST_VIEWS)
     assert chosen == sorted(set(chosen))
     refused = is_ok.count(False)

@@ -8,9 +8,9 @@ from tests.pages.read_page import drawings
 from tests.synthetic_street import make_street
 
 from depthpose.core.draw import draw_depth, draw_share
-from depthpose.core.files import Cloud
+from depthpose.core.files import PointCloud
 from depthpose.depth.types import DepthError, DepthEstimate
-from depthpose.report.depth import depth_section
+from depthpose.report.depth import make_depth_section
 
 SAMPLE = make_street(0.1)
 PAIR = replace(SAMPLE.input, right=None)
@@ -30,23 +30,23 @@ def estimate(**more: torch.Tensor) -> DepthEstimate:
 def test_what_there_is_is_shown_in_its_colours() -> None:
     confidence = torch.rand(truth_m().shape)
     found = estimate(confidence=confidence, right=PAIR.left)
-    section = depth_section("a frame", PAIR, found, range_m=(2.0, 40.0))
+    section = make_depth_section("a frame", PAIR, found, range_m=(2.0, 40.0))
     image, depth, sure, right = drawings(section)
     assert [p.caption.split(",")[0] for p in (image, right)] == ["image", "right view as drawn"]
     assert torch.equal(depth.image, draw_depth(truth_m(), 2.0, 40.0))
     assert torch.equal(sure.image, draw_share(1 - confidence))
-    assert depth.scale is not None
-    assert [depth.scale.marks[0], depth.scale.marks[-1]] == [(0.0, "2"), (1.0, "40")]
-    assert sure.scale is not None
-    assert sure.scale.title == "confidence"
+    assert depth.color_bar is not None
+    assert [depth.color_bar.marks[0], depth.color_bar.marks[-1]] == [(0.0, "2"), (1.0, "40")]
+    assert sure.color_bar is not None
+    assert sure.color_bar.title == "confidence"
     (scene,) = section.scenes
     cloud = scene.layers[0].shape
-    assert isinstance(cloud, Cloud)
+    assert isinstance(cloud, PointCloud)
     assert len(cloud.points) == int((truth_m() <= 40.0).sum())
 
 
 def test_the_facts_are_those_of_the_map() -> None:
-    facts = dict(depth_section("a", PAIR, estimate()).facts)
+    facts = dict(make_depth_section("a", PAIR, estimate()).facts)
     known_m = truth_m()[truth_m().isfinite()]
     numbers = [float(known_m.double().quantile(share)) for share in (0.01, 0.5, 0.99)]
     assert facts["1, 50, 99 % are nearer than"] == "{:.2f}, {:.2f}, {:.2f} m".format(*numbers)
@@ -60,24 +60,24 @@ def test_the_sky_is_grey_and_said_and_has_no_points() -> None:
     is_sky[:9] = True
     depth_m = torch.where(is_sky, torch.nan, 7.0)
     found = replace(estimate(), depth_m=depth_m, is_sky=is_sky)
-    section = depth_section("a", PAIR, found)
+    section = make_depth_section("a", PAIR, found)
     _, depth = drawings(section)
     assert depth.caption.endswith("grey: sky or no answer")
     assert bool((depth.image[:, :9] == 0.5).all())
     assert dict(section.facts)["sky"] == f"{float(is_sky.float().mean()):.1%} of the pixels"
     cloud = section.scenes[0].layers[0].shape
-    assert isinstance(cloud, Cloud)
+    assert isinstance(cloud, PointCloud)
     assert len(cloud.points) == int((~is_sky).sum())
-    plain = depth_section("a", PAIR, estimate())
+    plain = make_depth_section("a", PAIR, estimate())
     assert drawings(plain)[1].caption.endswith("grey: none")
     assert "sky" not in dict(plain.facts)
 
 
 def test_without_a_camera_there_is_disparity_and_no_cloud() -> None:
     found = replace(estimate(), depth_m=None)
-    section = depth_section("a", replace(PAIR, camera=None), found)
-    assert section.pictures[1].scale is not None
-    assert section.pictures[1].scale.title == "disparity [px]"
+    section = make_depth_section("a", replace(PAIR, camera=None), found)
+    assert section.pictures[1].color_bar is not None
+    assert section.pictures[1].color_bar.title == "disparity [px]"
     assert not section.scenes
 
 
@@ -88,7 +88,7 @@ def test_the_error_is_where_the_truth_is(is_sparse: bool) -> None:
     part = (slice(20, 22), slice(30, 32)) if is_sparse else (slice(None), slice(None))
     error[part], known_m[part] = 0.3, 10.0
     wrong = DepthError(error=error, is_disparity=False, true_depth_m=known_m)
-    section = depth_section("a", PAIR, estimate(), error=wrong, with_image=False)
+    section = make_depth_section("a", PAIR, estimate(), error=wrong, with_image=False)
     _, truth, errors = drawings(section)
     bright = draw_share(torch.zeros(1, 1))[:, 0, 0]
     ten = draw_depth(torch.full((1, 1), 10.0))[:, 0, 0]
@@ -98,10 +98,10 @@ def test_the_error_is_where_the_truth_is(is_sparse: bool) -> None:
         # Points are grown by two pixels, and no further.
         assert torch.equal(image[:, 23, 33], ink)
         assert torch.equal(image[:, 25, 35], 0.35 * PAIR.left[:, 25, 35] if is_sparse else ink)
-    assert errors.scale is not None
-    assert errors.scale.marks[-1] == (1.0, "30+")
+    assert errors.color_bar is not None
+    assert errors.color_bar.marks[-1] == (1.0, "30+")
     layers = section.scenes[0].layers
     assert [layer.name for layer in layers] == ["points", "true points"]
     points = layers[1].shape
-    assert isinstance(points, Cloud)
+    assert isinstance(points, PointCloud)
     assert bool(points.points[:, 2].allclose(torch.tensor(10.0)))

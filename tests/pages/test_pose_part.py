@@ -14,7 +14,7 @@ from depthpose.pose.observability import free_motions
 from depthpose.pose.predictions import Prediction, prediction_row
 from depthpose.pose.types import Axis, CloudInput, PoseEstimate, ViewInput
 from depthpose.report.page import Section
-from depthpose.report.pose import ESTIMATED, TRUTH, pose_section
+from depthpose.report.pose import ESTIMATED, TRUTH, make_pose_section
 
 POSE = pose_at(seed=1)
 FOUND_HERE = PoseEstimate(
@@ -34,7 +34,7 @@ REFUSED = PoseEstimate(
 def shown(estimate: PoseEstimate, truth: Rigid | None = None) -> Section:
     depth_m, mask = view_of(bracket(), POSE)
     view = ViewInput(name="one", depth_m=depth_m, mask=mask, K=K, object="bracket")
-    return pose_section("one", view, estimate, bracket(), truth=truth)
+    return make_pose_section("one", view, estimate, bracket(), truth=truth)
 
 
 def has_ink(section: Section, color: tuple[float, float, float]) -> list[bool]:
@@ -84,7 +84,7 @@ def test_a_refusal_says_why_and_shows_the_mask() -> None:
 
 def test_a_cloud_has_no_picture() -> None:
     cloud = CloudInput(name="one", points_m=cloud_of(bracket(), POSE), object="bracket")
-    section = pose_section("one", cloud, FOUND_HERE, bracket())
+    section = make_pose_section("one", cloud, FOUND_HERE, bracket())
     assert not section.pictures
     assert "all else" not in [layer.name for layer in section.scenes[0].layers]
 
@@ -93,7 +93,7 @@ def test_an_empty_mask_is_not_shown_from_near_by() -> None:
     depth_m, mask = view_of(bracket(), POSE)
     view = ViewInput(name="one", depth_m=depth_m, mask=mask & False, K=K, object="bracket")
     estimate = replace(REFUSED, reason="nothing")
-    section = pose_section("one", view, estimate, bracket())
+    section = make_pose_section("one", view, estimate, bracket())
     assert len(section.pictures) == 1
 
 

@@ -28,7 +28,7 @@ from depthpose.pose.datasets.layouts import read_bop_models
 from depthpose.pose.mesh import make_model, turn_about
 from depthpose.pose.train.poses import stack_symmetries
 from depthpose.pose.types import ObjectModel, Symmetries
-from depthpose.report.pose import object_points
+from depthpose.report.pose import select_object_points
 
 K = torch.tensor([[500.0, 0, 40], [0, 500, 30], [0, 0, 1]]).double()
 
@@ -92,7 +92,7 @@ def test_what_is_written_is_read_back(synthetic: Path) -> None:
         "000003_000007_000000", "000003_000007_000001",
     ]  # fmt: skip
     sample, instance = data[1], data.instances[1]
-    points_m = object_points(sample.input, block(2).diameter_m)
+    points_m = select_object_points(sample.input, block(2).diameter_m)
     assert torch.equal(instance.camera_from_model.t_m, facing(0.02).t_m)
     assert sample.input.object == "block 2"
     assert sample.truth.visible_fraction == pytest.approx(19 / 39)
@@ -305,7 +305,7 @@ def test_the_real_frames(real: Path) -> None:
     for sample, limit_m in ((cat, 0.0025), (ape, 0.0025)):
         number = next(i.object_id for i in lm.instances if i.name == sample.input.name)
         points = sample.truth.camera_from_model.apply(lm.objects[number].vertices_m.double())
-        seen_m = object_points(sample.input, lm.objects[number].diameter_m)
+        seen_m = select_object_points(sample.input, lm.objects[number].diameter_m)
         gap = torch.cdist(seen_m.double()[::4], points).amin(-1)
         assert float(gap.median()) < limit_m
     ycb = open_bop(real / "pose/ycb_frames")

@@ -18,7 +18,7 @@ from depthpose.pose.cloud import (
 )
 from depthpose.pose.config import SHAPE_FEATURES, CloudConfig
 from depthpose.pose.types import CloudInput
-from depthpose.report.pose import object_points
+from depthpose.report.pose import select_object_points
 
 K = torch.tensor([[500.0, 0, 32], [0, 500, 24], [0, 0, 1]]).double()
 
@@ -116,7 +116,7 @@ def test_a_point_in_the_camera_is_no_reading() -> None:
                            [0, 0, torch.finfo(torch.float32).max]])  # fmt: skip
     assert is_reading(points).tolist() == [False, True, False, True, False, False]
     given = CloudInput(name="a", points_m=points, object="b")
-    assert torch.equal(object_points(given, 1.0), points[[1, 3]])
+    assert torch.equal(select_object_points(given, 1.0), points[[1, 3]])
 
 
 def test_samples_are_a_subset_in_order_and_reproducible() -> None:

@@ -10,7 +10,7 @@ from PIL import Image
 from tests.pose.textured_objects import BOX_M, Mesh, saved_glb, textured_box, trimesh
 
 from depthpose.core.errors import Notice
-from depthpose.core.files import Cloud, write_cloud
+from depthpose.core.files import PointCloud, write_cloud
 from depthpose.pose.mesh import read_model
 from depthpose.pose.types import SurfaceColors
 
@@ -137,7 +137,7 @@ def test_print_finer_than_the_samples_is_averaged(tmp_path: Path) -> None:
 def test_points_with_colours(tmp_path: Path) -> None:
     mesh = six_sided()
     points, face = trimesh.sample.sample_surface(mesh, 4000, seed=1)
-    cloud = Cloud(
+    cloud = PointCloud(
         points=torch.from_numpy(points).float(), color=torch.from_numpy(SIDES[face // 2]).float()
     )
     write_cloud(tmp_path / "c.ply", cloud)

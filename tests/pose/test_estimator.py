@@ -24,7 +24,7 @@ import depthpose
 from depthpose.core.camera import back_project, write_camera
 from depthpose.core.checkpoint import LicenceNotice
 from depthpose.core.errors import InputError
-from depthpose.core.files import Cloud, write_cloud, write_depth_png, write_image
+from depthpose.core.files import PointCloud, write_cloud, write_depth_png, write_image
 from depthpose.core.rigid import Rigid, geodesic_rad, rotation_by
 from depthpose.pose.cloud import ObjectCloud, prepare_cloud
 from depthpose.pose.config import CloudConfig, EstimateConfig, VotingConfig
@@ -101,7 +101,7 @@ def test_millimetres_are_millimetres(part: ObjectModel, tmp_path: Path) -> None:
     truth = pose_at()
     net = Oracle(tiny_weights(part), [truth])
     cloud = cloud_of(part, truth)
-    write_cloud(tmp_path / "c.ply", Cloud(points=1000 * cloud))
+    write_cloud(tmp_path / "c.ply", PointCloud(points=1000 * cloud))
     assert_close(net.estimate(cloud=tmp_path / "c.ply", unit="mm"), truth)
     assert_close(net.estimate(cloud=cloud.double().numpy()), truth)
 

@@ -15,7 +15,7 @@ from depthpose.cli import main
 from depthpose.cli.pose_jobs import cloud_jobs
 from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError
-from depthpose.core.files import CLOUD_READERS, Cloud, read_cloud
+from depthpose.core.files import CLOUD_READERS, PointCloud, read_cloud
 from depthpose.core.files.disk import AnyPath
 from depthpose.core.rigid import Rigid
 from depthpose.pose.datasets import LAYOUTS, Instance, Layout, open_bop
@@ -29,9 +29,9 @@ from depthpose.pose.train import PoseTraining
 from depthpose.web.answer import KINDS
 
 
-def read_json_points(path: AnyPath) -> Cloud:
+def read_json_points(path: AnyPath) -> PointCloud:
     """A format of our own: a JSON list of points."""
-    return Cloud(points=torch.tensor(json.loads(Path(path).read_text())))
+    return PointCloud(points=torch.tensor(json.loads(Path(path).read_text())))
 
 
 def test_extending_clouds(

@@ -21,7 +21,7 @@ from depthpose.pose.propose import (
 )
 from depthpose.pose.surface import prepare_surface
 from depthpose.pose.types import Axis
-from depthpose.report.pose import object_points
+from depthpose.report.pose import select_object_points
 
 
 def misfit(pose: Rigid, model: Tensor, found: Tensor, covariance: Tensor) -> Tensor:
@@ -169,7 +169,10 @@ def test_the_whole_way_on_the_real_cat(real: Path) -> None:
     """Depth, voxels, votes of a network that errs by 3 degrees and is wrong a tenth of the time."""
     data = open_bop(real / "pose/lm")
     view, model = data[0], data.objects[data.instances[0].object_id]
-    true, points_m = view.truth.camera_from_model, object_points(view.input, model.diameter_m)
+    true, points_m = (
+        view.truth.camera_from_model,
+        select_object_points(view.input, model.diameter_m),
+    )
     points = points_m[voxelise(points_m, CloudConfig(voxel_m=0.004)).kept].double()
     keypoints = true.apply(model.keypoints_m.double())
     directions = torch.nn.functional.normalize(keypoints - points[:, None], dim=-1)

@@ -5,12 +5,19 @@ import torch
 from tests.pose.synthetic_objects import Oracle, box_faces, bracket, cloud_of, pose_at, tiny_weights
 
 from depthpose.core.camera import project
-from depthpose.core.files import Cloud
+from depthpose.core.files import PointCloud
 from depthpose.core.rigid import Rigid
 from depthpose.pose.mesh import make_model
 from depthpose.pose.types import CloudInput, ObjectModel
-from depthpose.report.page import Lines
-from depthpose.report.pose import TRUTH, close_up, keypoint_layers, pose_layers, vote_layer
+from depthpose.report.page import LineSegments
+from depthpose.report.pose import (
+    TRUTH,
+    cut_close_up,
+    make_keypoint_layers,
+    make_pose_layers,
+    make_truth_layers,
+    make_vote_layer,
+)
 
 
 def cube(*, with_repeats: bool = False, faces: int = 12) -> ObjectModel:
@@ -22,9 +29,9 @@ def cube(*, with_repeats: bool = False, faces: int = 12) -> ObjectModel:
 
 def lengths(model: ObjectModel) -> list[float]:
     unmoved = Rigid(torch.eye(3).double(), torch.zeros(3).double())
-    layers = {layer.name: layer.shape for layer in pose_layers(unmoved, model)}
+    layers = {layer.name: layer.shape for layer in make_pose_layers(unmoved, model)}
     edges = layers["its edges"]
-    assert isinstance(edges, Lines)
+    assert isinstance(edges, LineSegments)
     return (edges.ends_m[:, 0] - edges.ends_m[:, 1]).norm(dim=-1).tolist()
 
 
@@ -39,10 +46,10 @@ def test_an_open_sheet_shows_its_border() -> None:
 
 def test_a_posed_model_lies_where_its_pose_says() -> None:
     pose, model = pose_at(), bracket()
-    layers = {layer.name: layer.shape for layer in pose_layers(pose, model)}
+    layers = {layer.name: layer.shape for layer in make_pose_layers(pose, model)}
     surface, box = layers["posed model"], layers["its box"]
-    assert isinstance(surface, Cloud)
-    assert isinstance(box, Lines)
+    assert isinstance(surface, PointCloud)
+    assert isinstance(box, LineSegments)
     back_m = pose.inverse().apply(surface.points)
     low_m, high_m = model.vertices_m.amin(0), model.vertices_m.amax(0)
     assert (back_m > low_m - 1e-6).all()
@@ -50,11 +57,11 @@ def test_a_posed_model_lies_where_its_pose_says() -> None:
     corners_m = pose.inverse().apply(box.ends_m.flatten(0, 1))
     torch.testing.assert_close(corners_m.amin(0), low_m)
     torch.testing.assert_close(corners_m.amax(0), high_m)
-    truth = {layer.name: layer.shape for layer in pose_layers(pose, model, is_true=True)}
+    truth = {layer.name: layer.shape for layer in make_truth_layers(pose, model)}
     for own, true in (("its box", "true box"), ("its edges", "true edges")):
         one, other = layers[own], truth.pop(true)
-        assert isinstance(one, Lines)
-        assert isinstance(other, Lines)
+        assert isinstance(one, LineSegments)
+        assert isinstance(other, LineSegments)
         assert torch.equal(one.ends_m, other.ends_m)
         assert torch.equal(other.color, torch.tensor(TRUTH).expand(len(other.ends_m), 3))
     assert not truth
@@ -62,7 +69,7 @@ def test_a_posed_model_lies_where_its_pose_says() -> None:
 
 def test_a_model_of_points_has_no_edges() -> None:
     model = make_model(torch.rand(50, 3), torch.empty(0, 3, dtype=torch.long), name="points")
-    assert "its edges" not in [layer.name for layer in pose_layers(pose_at(), model)]
+    assert "its edges" not in [layer.name for layer in make_pose_layers(pose_at(), model)]
 
 
 def test_true_votes_end_at_their_keypoints() -> None:
@@ -78,8 +85,8 @@ def test_true_votes_end_at_their_keypoints() -> None:
     assert torch.equal(found.camera_from_model.t_m, alone.camera_from_model.t_m)
     assert voted is not None
     keypoints_m = pose.apply(model.keypoints_m)
-    layer = vote_layer(voted.points_m, voted.directions[..., :3], keypoints_m)
-    assert isinstance(layer.shape, Lines)
+    layer = make_vote_layer(voted.points_m, voted.directions[..., :3], keypoints_m)
+    assert isinstance(layer.shape, LineSegments)
     assert not layer.is_shown
     tips_m = layer.shape.ends_m[:, 1].unflatten(0, (-1, 8))
     torch.testing.assert_close(tips_m, keypoints_m.expand_as(tips_m), atol=1e-5, rtol=0.0)
@@ -95,11 +102,11 @@ def test_what_cannot_be_posed_casts_no_votes() -> None:
 
 def test_a_refused_pose_still_shows_what_was_voted() -> None:
     model = bracket()
-    (voted,) = keypoint_layers(model.keypoints_m, None, model)
-    assert isinstance(voted.shape, Lines)
+    (voted,) = make_keypoint_layers(model.keypoints_m, None, model)
+    assert isinstance(voted.shape, LineSegments)
     middles_m = voted.shape.ends_m.mean(1).unflatten(0, (-1, 3))
     torch.testing.assert_close(middles_m, model.keypoints_m[:, None].expand_as(middles_m))
-    assert len(keypoint_layers(model.keypoints_m, pose_at(), model)) == 2
+    assert len(make_keypoint_layers(model.keypoints_m, pose_at(), model)) == 2
 
 
 @pytest.mark.parametrize("place", [(120, 90), (0, 5), (198, 149)])
@@ -111,7 +118,7 @@ def test_a_close_up_draws_a_pose_where_the_picture_shows_it(place: tuple[int, in
     image[:, row, column] = 1
     mask = torch.zeros(150, 200, dtype=torch.bool)
     mask[max(row - 8, 0) : row + 9, max(column - 12, 0) : column + 13] = True
-    near, near_K = close_up(image, mask, K)
+    near, near_K = cut_close_up(image, mask, K)
     rows, columns = (near[0] > 0.5).nonzero(as_tuple=True)
     middle = torch.stack([columns.double().mean(), rows.double().mean()])
     ray = torch.linalg.inv(K) @ torch.tensor([column, row, 1.0], dtype=torch.float64)

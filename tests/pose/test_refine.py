@@ -23,7 +23,7 @@ from depthpose.pose.metrics import add_m
 from depthpose.pose.surface import Surface, prepare_surface
 from depthpose.pose.synthetic.views import simulate_depth
 from depthpose.pose.types import ObjectModel, Symmetries
-from depthpose.report.pose import object_points
+from depthpose.report.pose import select_object_points
 
 ORIGIN = torch.zeros(3).double()
 
@@ -356,7 +356,7 @@ def test_the_real_cat_and_ape(real: Path) -> None:
         starts = [pose_near(true, seed, math.radians(8), 0.04 * model.diameter_m)
                   for seed in range(5)]  # fmt: skip
         batch = Rigid(torch.stack([s.R for s in starts]), torch.stack([s.t_m for s in starts]))
-        points_m = object_points(sample.input, model.diameter_m)
+        points_m = select_object_points(sample.input, model.diameter_m)
         refined = refine_pose(points_m, batch, prepare_surface(model))
         known = Rigid(true.R.expand(5, 3, 3), true.t_m.expand(5, 3))
         error_m = add_m(refined.camera_from_model, known, model.vertices_m[::7])

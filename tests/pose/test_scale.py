@@ -16,7 +16,7 @@ from tests.pose.synthetic_objects import (
 )
 
 from depthpose.core.arrays import take_evenly
-from depthpose.core.loop import sample_generator
+from depthpose.core.loop import make_sample_generator
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.icp import refine_pose
@@ -115,7 +115,7 @@ def test_without_icp_nobody_asks_whether_it_is_the_object() -> None:
 @pytest.mark.parametrize("kind", get_args(NegativeKind))
 def test_negatives_bear_the_name_and_are_something_else(kind: NegativeKind) -> None:
     model = bracket()
-    other = negative_of(model, kind, [model], sample_generator(1, 0))
+    other = negative_of(model, kind, [model], make_sample_generator(1, 0))
     assert other.name == model.name
     assert 0.2 < other.diameter_m / model.diameter_m < 3
     if kind in ("scaled", "mirrored"):

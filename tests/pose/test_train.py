@@ -17,7 +17,7 @@ from tests.pose.synthetic_objects import bottle, bracket, tiny_weights, write_pa
 from depthpose.core.checkpoint import read_checkpoint
 from depthpose.core.config import read_config
 from depthpose.core.errors import InputError
-from depthpose.core.loop import AdamConfig, LoopConfig, Run
+from depthpose.core.loop import AdamConfig, LoopConfig, TrainingRun
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import CloudConfig, MeshConfig, ObjectsConfig, SyntheticSensorConfig
 from depthpose.pose.datasets import write_bop_models, write_bop_scene
@@ -80,7 +80,9 @@ def _training(**changes: object) -> PoseTraining:
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Weights of :func:`_training`, in the folder of its run."""
-    return train_pose_network(_training(), Run(folder=tmp_path_factory.mktemp("trained") / "run"))
+    return train_pose_network(
+        _training(), TrainingRun(folder=tmp_path_factory.mktemp("trained") / "run")
+    )
 
 
 def _clouds(models: Sequence[ObjectModel], **settings: Any) -> TrainingClouds:  # noqa: ANN401
@@ -285,7 +287,7 @@ def test_a_training_leaves_weights_a_card_and_its_config(trained: Path) -> None:
     again = read_config(trained.parent / "config.yaml", PoseTraining)
     assert again.network.classes == 1
     with pytest.raises(InputError, match="holds a training"):
-        train_pose_network(_training(), Run(folder=trained.parent))
+        train_pose_network(_training(), TrainingRun(folder=trained.parent))
 
 
 def test_a_training_begins_with_what_other_objects_taught(trained: Path, tmp_path: Path) -> None:
@@ -298,7 +300,9 @@ def test_a_training_begins_with_what_other_objects_taught(trained: Path, tmp_pat
     paths = [trained]
     for start in (trained, bare):
         config = _training(models=parts, start=str(start), adam=still, loop=loop)
-        paths.append(train_pose_network(config, Run(folder=tmp_path / f"then {start.stem}")))
+        paths.append(
+            train_pose_network(config, TrainingRun(folder=tmp_path / f"then {start.stem}"))
+        )
     networks = [build_pose_network(read_checkpoint(path), str(path)) for path in paths]
     cloud = TrainingClouds(_models(), PoseTraining(objects=_VIEWS, cloud=_CLOUD), seed=1)[0]
     voxels = Voxels.from_points(F.pad(cloud.coordinates, (1, 0)))
@@ -310,13 +314,13 @@ def test_a_training_begins_with_what_other_objects_taught(trained: Path, tmp_pat
     with pytest.raises(InputError, match="trained with keypoints = 8"):
         train_pose_network(
             dataclasses.replace(config, network=other, models=_FOUR_KEYPOINTS),
-            Run(folder=tmp_path / "other"),
+            TrainingRun(folder=tmp_path / "other"),
         )
 
 
 def test_terms_of_the_start_bind_what_comes_of_it(tmp_path: Path) -> None:
     bound = dataclasses.replace(_training().models, terms="For research alone.")
-    first = train_pose_network(_training(models=bound), Run(folder=tmp_path / "first"))
+    first = train_pose_network(_training(models=bound), TrainingRun(folder=tmp_path / "first"))
     for terms, expected in (
         ("", "For research alone."),
         ("Cite us.", "Cite us. For research alone."),
@@ -324,7 +328,7 @@ def test_terms_of_the_start_bind_what_comes_of_it(tmp_path: Path) -> None:
         models = dataclasses.replace(bound, terms=terms)
         config = _training(models=models, start=str(first))
         with pytest.warns(UserWarning, match="For research alone"):
-            then = train_pose_network(config, Run(folder=tmp_path / f"then{len(terms)}"))
+            then = train_pose_network(config, TrainingRun(folder=tmp_path / f"then{len(terms)}"))
         facts = read_pose_weights(then).facts
         assert facts["terms"] == expected
         assert facts["began_with"] == "pose"
@@ -335,7 +339,7 @@ def test_a_start_with_other_voxel_features_is_refused(trained: Path, tmp_path: P
     cloud = dataclasses.replace(_CLOUD, with_shape=True)
     with pytest.raises(InputError, match="inputs = 1, but the config says 9"):
         train_pose_network(
-            _training(cloud=cloud, start=str(trained)), Run(folder=tmp_path / "more")
+            _training(cloud=cloud, start=str(trained)), TrainingRun(folder=tmp_path / "more")
         )
     with pytest.raises(InputError, match=r"takes 1 features of a voxel, .* clouds give 9\. Set"):
         dataclasses.replace(read_pose_weights(trained), cloud=cloud)
@@ -349,7 +353,7 @@ def test_a_training_without_norms_begins_with_weights_that_have_its_biases(tmp_p
     plain = dataclasses.replace(_SMALL, norm="none")
     with pytest.raises(InputError) as error:
         train_pose_network(
-            _training(start=str(path), network=plain), Run(folder=tmp_path / "plain")
+            _training(start=str(path), network=plain), TrainingRun(folder=tmp_path / "plain")
         )
     assert str(error.value) == (
         f"{path}: was trained with with_bias = True, but the config says False. Give the config "
@@ -357,7 +361,9 @@ def test_a_training_without_norms_begins_with_weights_that_have_its_biases(tmp_p
     )
     biased = dataclasses.replace(plain, with_bias=True)
     still = _training(start=str(path), network=biased, adam=AdamConfig(learning_rate=1e-12))
-    then = read_pose_weights(train_pose_network(still, Run(folder=tmp_path / "biased"))).network
+    then = read_pose_weights(
+        train_pose_network(still, TrainingRun(folder=tmp_path / "biased"))
+    ).network
     for name, tensor in network.state_dict().items():
         assert torch.allclose(then.state_dict()[name], tensor, atol=1e-6), name
 
@@ -366,9 +372,11 @@ def test_a_resumed_training_ends_as_one_that_nothing_stopped(trained: Path, tmp_
     loop = LoopConfig(steps=3, batch_size=2, device="cpu", log_every_steps=1, save_every_steps=1)
     with pytest.raises(StoppedError):
         train_pose_network(
-            _training(loop=loop), Run(folder=tmp_path / "cut", on_step=stop_after(2))
+            _training(loop=loop), TrainingRun(folder=tmp_path / "cut", on_step=stop_after(2))
         )
-    cut = train_pose_network(_training(loop=loop), Run(folder=tmp_path / "cut", resume=True))
+    cut = train_pose_network(
+        _training(loop=loop), TrainingRun(folder=tmp_path / "cut", resume=True)
+    )
     one, other = (read_pose_weights(path).network.state_dict() for path in (trained, cut))
     assert all(torch.equal(one[name], other[name]) for name in one)
 
@@ -383,7 +391,7 @@ def test_weights_are_measured_as_the_file_has_them(
         return {}
 
     monkeypatch.setattr("depthpose.pose.train.poses.score_held_out", counted)
-    path = train_pose_network(_training(with_half=True), Run(folder=tmp_path / "run"))
+    path = train_pose_network(_training(with_half=True), TrainingRun(folder=tmp_path / "run"))
     written = read_pose_weights(path)
     (measured,) = seen
     for name, tensor in written.network.state_dict().items():

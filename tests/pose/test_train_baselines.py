@@ -22,10 +22,10 @@ from depthpose.core.files import write_image
 from depthpose.core.loop import (
     AdamConfig,
     LoopConfig,
-    Run,
+    TrainingRun,
+    make_sample_generator,
     read_metrics,
-    sample_generator,
-    shuffled_index,
+    shuffle_index,
 )
 from depthpose.core.rigid import Rigid
 from depthpose.pose.baselines import DepthImageConfig, DepthImageNet, PointNetConfig
@@ -85,7 +85,7 @@ def test_the_pointnet_trains_and_its_file_is_an_estimators(
     models_folder: Path, tmp_path: Path
 ) -> None:
     config = pointnet_config(models_folder)
-    path = STAGES["pointnet"][1](config, Run(folder=tmp_path))
+    path = STAGES["pointnet"][1](config, TrainingRun(folder=tmp_path))
     assert path == tmp_path / "pointnet.safetensors"
     rows = read_metrics(tmp_path)
     assert "held_out/occluded_0/ransac_add_10" in rows[-1]
@@ -101,7 +101,7 @@ def test_the_depth_image_trains_and_its_file_is_a_regressors(
     config = depth_image_config(models_folder)
     models = dataclasses.replace(config.models, licence="MIT", terms="For research alone.")
     config = dataclasses.replace(config, models=models)
-    path = STAGES["depth-image"][1](config, Run(folder=tmp_path))
+    path = STAGES["depth-image"][1](config, TrainingRun(folder=tmp_path))
     assert path == tmp_path / "depth-image.safetensors"
     assert "held_out/occluded_0/regressed_median" in read_metrics(tmp_path)[-1]
     card = path.with_suffix(".md").read_text()
@@ -138,15 +138,19 @@ def test_the_depth_image_trains_and_its_file_is_a_regressors(
 def test_weights_of_the_other_kind_are_refused_with_the_class_to_take(
     models_folder: Path, tmp_path: Path
 ) -> None:
-    votes = STAGES["pointnet"][1](pointnet_config(models_folder), Run(folder=tmp_path / "p"))
-    depth = STAGES["depth-image"][1](depth_image_config(models_folder), Run(folder=tmp_path / "d"))
+    votes = STAGES["pointnet"][1](
+        pointnet_config(models_folder), TrainingRun(folder=tmp_path / "p")
+    )
+    depth = STAGES["depth-image"][1](
+        depth_image_config(models_folder), TrainingRun(folder=tmp_path / "d")
+    )
     with pytest.raises(InputError, match="to DepthImageRegressor"):
         GeoPoseNet.load(depth)
     with pytest.raises(InputError, match="load them as GeoPoseNet"):
         DepthImageRegressor(read_pose_weights(votes))
     other = dataclasses.replace(depth_image_config(models_folder), start=str(votes))
     with pytest.raises(InputError, match="Give weights of that network"):
-        STAGES["depth-image"][1](other, Run(folder=tmp_path / "o"))
+        STAGES["depth-image"][1](other, TrainingRun(folder=tmp_path / "o"))
 
 
 def test_the_loss_of_a_depth_image_falls(models_folder: Path, tmp_path: Path) -> None:
@@ -155,7 +159,7 @@ def test_the_loss_of_a_depth_image_falls(models_folder: Path, tmp_path: Path) ->
         loop=LoopConfig(steps=40, batch_size=4, device="cpu", log_every_steps=10),
         adam=AdamConfig(learning_rate=3e-3),
     )
-    STAGES["depth-image"][1](config, Run(folder=tmp_path))
+    STAGES["depth-image"][1](config, TrainingRun(folder=tmp_path))
     losses = [row["network/loss"] for row in read_metrics(tmp_path) if "network/loss" in row]
     assert losses[-1] < 0.85 * losses[0]
 
@@ -281,7 +285,7 @@ def segmentation_config(folder: Path, steps: int) -> SegmentationTraining:
 
 def test_segmentation_learns_colored_boxes_and_says_where(colored: Path, tmp_path: Path) -> None:
     config = segmentation_config(colored, 60)
-    path = STAGES["segmentation"][1](config, Run(folder=tmp_path / "whole"))
+    path = STAGES["segmentation"][1](config, TrainingRun(folder=tmp_path / "whole"))
     last = read_metrics(tmp_path / "whole")[-1]
     assert last["held_out/iou_objects"] > 0.5
     image = colored_frame(7).rgb
@@ -315,7 +319,7 @@ def test_segmentation_starts_from_an_encoder(colored: Path, tmp_path: Path) -> N
         segmentation_config(colored, 1), start=str(path), adam=AdamConfig(learning_rate=1e-9)
     )
     with pytest.warns(LicenceNotice, match="For research alone"):
-        trained = STAGES["segmentation"][1](config, Run(folder=tmp_path / "run"))
+        trained = STAGES["segmentation"][1](config, TrainingRun(folder=tmp_path / "run"))
     assert "- **Began with**: encoder\n- **Terms**: For research alone.\n" in (
         trained.with_suffix(".md").read_text()
     )
@@ -336,10 +340,10 @@ def test_a_resumed_training_ends_as_one_that_nothing_stopped(
     }[what]()
     loop = LoopConfig(steps=3, batch_size=2, device="cpu", log_every_steps=1, save_every_steps=1)
     config, train = dataclasses.replace(config, loop=loop), STAGES[what][1]
-    whole = train(config, Run(folder=tmp_path / "whole"))
+    whole = train(config, TrainingRun(folder=tmp_path / "whole"))
     with pytest.raises(StoppedError):
-        train(config, Run(folder=tmp_path / "cut", on_step=stop_after(2)))
-    cut = train(config, Run(folder=tmp_path / "cut", resume=True))
+        train(config, TrainingRun(folder=tmp_path / "cut", on_step=stop_after(2)))
+    cut = train(config, TrainingRun(folder=tmp_path / "cut", resume=True))
     one, other = (read_checkpoint(path).state for path in (whole, cut))
     assert one.keys() == other.keys()
     assert all(torch.equal(one[name], other[name]) for name in one)
@@ -362,7 +366,7 @@ def test_colors_change_within_their_bounds_and_nothing_else_does(colored: Path) 
         TrainingImages(images, dataclasses.replace(config.augment, jitter=jitter), side_px, 3)[11]
         for jitter in (0.0, 0.3)
     )
-    given, generator = images[shuffled_index(11, len(images), 3)], sample_generator(11, 3)
+    given, generator = images[shuffle_index(11, len(images), 3)], make_sample_generator(11, 3)
     scale = side_px / max(given.image.shape[-2:]) * uniform(generator, *config.augment.scale)
     cut = cut_window(given, scale, config.augment.crop_px, generator)
     torch.testing.assert_close(plain.image, cut.image)

@@ -7,7 +7,7 @@ from tests.pose.synthetic_objects import write_part
 from torch.nn.functional import pad
 
 from depthpose.core.camera import Camera, write_camera
-from depthpose.core.files import Cloud, write_cloud, write_depth_png, write_image
+from depthpose.core.files import PointCloud, write_cloud, write_depth_png, write_image
 from depthpose.core.rigid import Rigid
 from depthpose.depth.config import StreetsConfig
 from depthpose.depth.synthetic import Streets
@@ -47,7 +47,7 @@ def write_view(folder: Path) -> Rigid:
     write_depth_png(folder / "depth.png", depth_m, 0.0001)
     write_mask(folder / "mask.png", mask)
     points_m = cloud_from_depth(depth_m, mask, K).float()
-    write_cloud(folder / "cloud.ply", Cloud(points=1000 * points_m))
+    write_cloud(folder / "cloud.ply", PointCloud(points=1000 * points_m))
     write_part(PART, folder)
     write_part("mug", folder)
     return sample.truth.camera_from_model

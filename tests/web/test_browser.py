@@ -16,8 +16,8 @@ from playwright.sync_api import Browser, Page, sync_playwright
 from tests.web.samples import PART, write_street, write_view
 
 from depthpose.cli import main
-from depthpose.core.files import Cloud
-from depthpose.report.page import Layer, Scene, Section, colored_lines, write_page
+from depthpose.core.files import PointCloud
+from depthpose.report.page import Layer, Scene, Section, make_lines, write_page
 
 pytestmark = pytest.mark.slow
 
@@ -225,8 +225,8 @@ def test_pose_bad(page: Page, address: str, samples: Path) -> None:
 
 
 def test_a_report_turns_hides_sorts_and_needs_no_server(page: Page, tmp_path: Path) -> None:
-    cloud = Cloud(points=torch.rand(5000, 3) + torch.tensor([0.0, 0.0, 2.0]))
-    box = colored_lines(torch.tensor([[[0.0, 0, 2], [1, 1, 3]]]), (1.0, 0.0, 0.0))
+    cloud = PointCloud(points=torch.rand(5000, 3) + torch.tensor([0.0, 0.0, 2.0]))
+    box = make_lines(torch.tensor([[[0.0, 0, 2], [1, 1, 3]]]), (1.0, 0.0, 0.0))
     scene = Scene(
         caption="c", layers=[Layer(name="cloud", shape=cloud), Layer(name="box", shape=box)]
     )
@@ -283,7 +283,9 @@ def test_without_webgl_there_is_a_sentence(page: Page, tmp_path: Path) -> None:
       HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
         return kind === "webgl" ? null : real.call(this, kind, ...rest);
       };""")
-    scene = Scene(caption="c", layers=[Layer(name="cloud", shape=Cloud(points=torch.zeros(2, 3)))])
+    scene = Scene(
+        caption="c", layers=[Layer(name="cloud", shape=PointCloud(points=torch.zeros(2, 3)))]
+    )
     write_page(tmp_path / "r.html", "T", [Section(title="S", scenes=[scene])], {})
     page.goto((tmp_path / "r.html").as_uri())
     page.locator(".lacking").wait_for()

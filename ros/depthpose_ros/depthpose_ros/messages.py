@@ -14,14 +14,14 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from depthpose.core.camera import Camera, StereoRig
-from depthpose.core.camera.pinhole import CameraFacts, camera_from_facts
+from depthpose.core.camera.camera_facts import CameraFacts, camera_from_facts
 from depthpose.core.camera.stored_camera import (
     facts_from_fields,
     facts_from_ros_pair,
     normalise_keys,
 )
 from depthpose.core.errors import InputError, refuse_unknown
-from depthpose.core.files.images import from_16_bit
+from depthpose.core.files.images import scale_16_bit
 from depthpose.core.rigid import Rigid, cross_matrix
 from depthpose.pose.predictions import score_of
 from depthpose.pose.types import ObjectModel, PoseEstimate
@@ -104,7 +104,9 @@ def picture_of(message: Any) -> np.ndarray:  # noqa: ANN401  ROS's classes carry
         values = _rows(message, np.uint8, channels)
         return np.ascontiguousarray(values[..., _PICTURES[message.encoding]])
     grey = _rows(message, _GREYS[message.encoding], 1)[..., 0]
-    return grey if grey.dtype == np.uint8 else from_16_bit(grey, message.header.frame_id or "image")
+    if grey.dtype == np.uint8:
+        return grey
+    return scale_16_bit(grey, message.header.frame_id or "image")
 
 
 def depth_of(message: Any) -> np.ndarray:  # noqa: ANN401

@@ -21,7 +21,7 @@ from depthpose.core.errors import (
     MissingExtraError,
     Notice,
     describe_full_memory,
-    nearest_name,
+    suggest_name,
 )
 
 COMMANDS = {
@@ -321,11 +321,11 @@ def _list_commands(words: Sequence[str]) -> int:
     group = words[0] if words and not words[0].startswith("-") else ""
     groups = {name.partition(" ")[0] for name in COMMANDS}
     if group and group not in groups:
-        return _print_failure(f"error: no command {group!r}; {nearest_name(group, groups)}")
+        return _print_failure(f"error: no command {group!r}; {suggest_name(group, groups)}")
     summaries = {name: summary for name, (_, summary) in COMMANDS.items() if name.startswith(group)}
     verb = next((word for word in words[1:] if not word.startswith("-")), "")
     if group and verb:
-        nearest = nearest_name(verb, [name.partition(" ")[2] for name in summaries])
+        nearest = suggest_name(verb, [name.partition(" ")[2] for name in summaries])
         print(f"depthpose {group}: error: no command {verb!r}; {nearest}", file=sys.stderr)
         return 2
 

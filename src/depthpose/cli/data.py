@@ -535,7 +535,7 @@ def _check_rows(
     from statistics import median
 
     rig = rectifier.rig
-    x, y = rectifier.left_maps
+    x, y = rectifier.left_tables
     is_visible = (x >= 0) & (x <= rig.width - 1) & (y >= 0) & (y <= rig.height - 1)
     print(
         f"rectified camera: {rig.width}x{rig.height}, fx {float(rig.K[0, 0]):.1f} px, baseline "

@@ -36,10 +36,10 @@ def demo(
     from functools import partial
 
     from depthpose.demo import make_demo
-    from depthpose.report.page import plain_table
+    from depthpose.report.page import format_plain_table
 
     result = make_demo(out, weights, pose_weights, on_message=partial(print, flush=True))
-    print(plain_table(result.poses, _POSE_COLUMNS))
-    print(plain_table(result.depths, _DEPTH_COLUMNS))
+    print(format_plain_table(result.poses, _POSE_COLUMNS))
+    print(format_plain_table(result.depths, _DEPTH_COLUMNS))
     print(f"The page: {result.page}")
     return 0

@@ -178,7 +178,7 @@ def evaluate_depth(
     from depthpose.core.files import stores
     from depthpose.core.run import claim_folder
     from depthpose.depth.evaluate import find_protocol
-    from depthpose.report.page import table_files
+    from depthpose.report.page import list_table_files
 
     if not (methods.weights or methods.matcher or methods.predictions or methods.baseline):
         raise InputError(
@@ -199,7 +199,7 @@ def evaluate_depth(
         "protocol": comparison.protocol,
         "cap": list(comparison.cap),
     }
-    files = [*table_files("rows", "frames", "confidence"), "report.html", "predictions"]
+    files = [*list_table_files("rows", "frames", "confidence"), "report.html", "predictions"]
     claim_folder(out, settings, files)
 
     # Predict what is missing, then measure it with the predictions that are given.

@@ -15,7 +15,7 @@ from depthpose.cli.depth_options import MethodOptions
 from depthpose.cli.depth_predict import DepthMethod, DepthMethodSource
 from depthpose.core import engine
 from depthpose.core.errors import InputError
-from depthpose.core.run import environment, find_rank, read_settings, wait_for
+from depthpose.core.run import describe_environment, find_rank, read_settings, wait_for
 from depthpose.core.runner import Job
 from depthpose.depth.baselines import NearestImageBaseline, RowDepthBaseline
 from depthpose.depth.config import Answer, BaselineName, MatcherConfig, Speed
@@ -37,7 +37,7 @@ from depthpose.depth.metrics import METRICS, RANKING
 from depthpose.depth.predictions import estimate_missing_depth, is_finished
 from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.report import page
-from depthpose.report.depth import depth_section
+from depthpose.report.depth import make_depth_section
 from depthpose.report.page import Section
 
 _COLUMNS_OF_METHOD = ("method", "input", "speed", "weights", "protocol", "dataset")
@@ -233,11 +233,11 @@ def measure(
         *write_details(measured, out),
     ]
     title = f"{protocol} on {dataset.name}"
-    page.write_page(out / "report.html", title, sections, environment())
+    page.write_page(out / "report.html", title, sections, describe_environment())
 
     metrics = [metric.name for metric in METRICS.values() if metric.is_printed]
     origin = ["method", "weights", "speed", "cap_m", "frames", "coverage"]
-    print(page.plain_table(rows, [*origin, *metrics, "ause"]))
+    print(page.format_plain_table(rows, [*origin, *metrics, "ause"]))
     for name, reason in measured.skipped.items():
         print(f"skipped: {name}: {reason}", file=sys.stderr)
     print(f"{len(measured.skipped)} frames skipped")
@@ -273,7 +273,7 @@ def _show_frames(
         index = index_of[row.frame or ""]
         estimate, error = frame_result(dataset, index, folder, protocol, row.cap_m)
         value = row.metrics[metric.name]
-        section = depth_section(
+        section = make_depth_section(
             f"{folder.name}: {row.frame}, {role}",
             dataset.read_input(index),
             estimate,
@@ -349,7 +349,7 @@ def write_details(measured: Evaluation, out: Path) -> list[Section]:
     if deciles:
         page.write_table(out, deciles, name="confidence")
     else:  # an earlier run may have measured a method with confidence here
-        for file in page.table_files("confidence"):
+        for file in page.list_table_files("confidence"):
             (out / file).unlink(missing_ok=True)
     text = "Mean error of the least sure tenth of each frame's pixels (1) to the surest (10)"
     skipped = [{"frame": name, "why": reason} for name, reason in measured.skipped.items()]
@@ -369,8 +369,8 @@ def measure_shards(
     settings = read_settings(predictions)
     index_of = {frame.name: index for index, frame in enumerate(dataset.frames)}
     measured: dict[str, list[Measured] | str] = {}
-    for shard in tqdm(engine.read_results(predictions), name, disable=None, unit=" shards"):
-        for frame, files in engine.shard_results(predictions, shard):
+    for shard in tqdm(engine.read_records(predictions), name, disable=None, unit=" shards"):
+        for frame, files in engine.read_shard(predictions, shard):
             if frame not in index_of:
                 continue
             with tempfile.TemporaryDirectory(prefix="depthpose-") as folder:

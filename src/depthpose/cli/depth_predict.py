@@ -17,11 +17,11 @@ from depthpose.cli.depth_options import LensOptions, PairNetworks, PredictOutput
 from depthpose.cli.engine import EngineOptions, Weights, print_shards
 from depthpose.core import run
 from depthpose.core.camera import Camera, FieldOfView, StereoRig, camera_of, read_camera, read_rig
-from depthpose.core.camera.pinhole import camera_keys
+from depthpose.core.camera.camera_facts import camera_keys
 from depthpose.core.checkpoint import file_sha256, find_weights, read_checkpoint
 from depthpose.core.devices import device_of_process, usable_device, usable_precision
 from depthpose.core.draw import draw_depth
-from depthpose.core.engine import Files, Function, Inputs, Sample, Work
+from depthpose.core.engine import Computation, InputFormat, JobInputs, LocalInput, ResultWriter
 from depthpose.core.errors import InputError
 from depthpose.core.files import (
     VIDEO_SUFFIXES,
@@ -51,11 +51,11 @@ from depthpose.depth.predictions import (
 from depthpose.depth.stereo import SGBMMatcher
 from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.depth.weights import MATCHERS, Use
-from depthpose.report.depth import depth_section
+from depthpose.report.depth import make_depth_section
 from depthpose.report.page import MOST_VIEWS, Film, Section, spread_evenly, write_page
 
-IMAGES = Files(roles=("image",), suffixes=LISTED_SUFFIXES)
-PAIRS = Files(roles=("left", "right"), suffixes=LISTED_SUFFIXES)
+IMAGES = InputFormat(roles=("image",), suffixes=LISTED_SUFFIXES)
+PAIRS = InputFormat(roles=("left", "right"), suffixes=LISTED_SUFFIXES)
 _PAGE = "report.html"
 _VIDEO = ".color.mp4"
 """Ending of the video of a video's depth."""
@@ -344,7 +344,7 @@ class DepthWork:
     output: PredictOutput
     scale: ScaleOptions = field(default_factory=ScaleOptions)
     with_check: bool = True
-    files: Files = IMAGES
+    files: InputFormat = IMAGES
 
     def make_input(self, name: str, left: Tensor | Path, right: Path | None = None) -> StereoInput:
         """Make the input of an image or a pair; files are read, a frame of a video is there."""
@@ -420,11 +420,11 @@ class DepthWork:
             settings["min_confidence"] = self.output.min_confidence
         return settings
 
-    def start(self) -> Function:
+    def start(self) -> ResultWriter:
         """Build the networks, and give the function that estimates a batch of a worker."""
         method = self.source.build()
 
-        def estimate(samples: Sequence[Sample], out: Path) -> list[str]:
+        def estimate(samples: Sequence[LocalInput], out: Path) -> list[str]:
             """Write the depth of a batch into a folder; give why each has none, "" if it has."""
             depth_run = DepthRun(work=self, method=method, out=out)
             jobs = [
@@ -439,7 +439,7 @@ class DepthWork:
 
 def predict_depth_on_ray(
     words: Sequence[str],
-    files: Files,
+    files: InputFormat,
     make_work: Callable[[Sequence[Path]], DepthWork],
     out: str,
     engine: EngineOptions,
@@ -456,8 +456,8 @@ def predict_depth_on_ray(
     video = next(filter(_is_video, words), None)
     if video is not None:
         raise InputError(f"{video}: --engine ray takes no videos; omit --engine for them")
-    inputs = Inputs.find(words, files)
-    with inputs.first() as first_files:
+    inputs = JobInputs.find(words, files)
+    with inputs.open_first() as first_files:
         depth_work = make_work(first_files)
     if depth_work.scale.one_mount:
         raise InputError("--one-mount takes the images one after the other; omit it, or --engine")
@@ -469,7 +469,12 @@ def predict_depth_on_ray(
     if "device" in method_settings:
         method_settings["device"] = config.device
     settings = depth_work.settings(method_settings)
-    work = Work(start=depth_work.start, files=files, endings=ENDINGS, batch=depth_work.output.batch)
+    work = Computation(
+        make_writer=depth_work.start,
+        input_format=files,
+        endings=ENDINGS,
+        batch=depth_work.output.batch,
+    )
     noun = "pairs" if files == PAIRS else "depth maps"
     return print_shards(engine.run(work, inputs, out, settings), out, noun)
 
@@ -588,10 +593,12 @@ def write_depth_page(
         sections.append(Section(title="Videos", films=films))
     for depth_input in shown_inputs:
         estimate = read_estimate(out, depth_input.name, depth_input.camera)
-        section = depth_section(depth_input.name, depth_input, estimate, range_m=(near_m, far_m))
+        section = make_depth_section(
+            depth_input.name, depth_input, estimate, range_m=(near_m, far_m)
+        )
         sections.append(section)
     title = f"Depth of {len(names)} image{'s' * (len(names) != 1)}"
-    write_page(out / _PAGE, title, sections, run.environment())
+    write_page(out / _PAGE, title, sections, run.describe_environment())
     print(f"the page: {out / _PAGE}")
 
 

@@ -40,9 +40,13 @@ def doctor(files: tyro.conf.Positional[tuple[NewPath, ...]] = ()) -> int:
 
         return describe_files(files)
     from depthpose.core.checkpoint import SHIPPED
-    from depthpose.core.run import environment
+    from depthpose.core.run import describe_environment
 
-    for name, value in {**environment(), "device": device_names(), "weights in": SHIPPED}.items():
+    for name, value in {
+        **describe_environment(),
+        "device": device_names(),
+        "weights in": SHIPPED,
+    }.items():
         print(f"{name}: {value}")
     for extra, packages in _missing_packages().items():
         outcome = f"lacks {', '.join(packages)}" if packages else "installed"

@@ -13,7 +13,7 @@ from depthpose.cli.pose_transforms import read_pose
 from depthpose.core import camera as cameras
 from depthpose.core import files
 from depthpose.core.errors import InputError
-from depthpose.core.files.images import open_image, read_numbers, value_range
+from depthpose.core.files.images import find_value_range, open_image, read_numbers
 from depthpose.core.rigid import geodesic_rad
 from depthpose.pose.cloud import advise_frame, advise_unit
 from depthpose.pose.datasets import decode_rle
@@ -177,7 +177,7 @@ def _describe_camera(path: Path, camera: cameras.Camera) -> FileFacts:
     if camera.depth_unit_m is not None:
         description += f", depth in units of {camera.depth_unit_m:.4g} m"
     oddities: list[str] = []
-    centre_advice = cameras.suspicious_centre(camera)
+    centre_advice = cameras.describe_suspicious_centre(camera)
     if centre_advice is not None:
         oddities.append(centre_advice)
     if abs(fx / fy - 1) > _MAX_FOCAL_DIFFERENCE:
@@ -222,14 +222,14 @@ def _describe_picture(path: Path) -> FileFacts:
     height, width = picture.shape[1:]
     description = f"picture of {width}x{height}"
     if units is not None:
-        low, high = value_range(units.numpy())
+        low, high = find_value_range(units.numpy())
         description += f", 16 bits a value, from {low} to {high}"
     return FileFacts(path=path, description=description, size=(width, height), image=picture)
 
 
 def _is_depth(units: Tensor) -> bool:
     """Whether 16-bit values are depth: many pixels have no reading, or neighbours are alike."""
-    low, high = value_range(units.numpy())
+    low, high = find_value_range(units.numpy())
     unread_share = 1 - float((units > 0).float().mean())
     mean_step = float((units[:, 1:] - units[:, :-1]).abs().mean()) / max(high - low, 1)
     return unread_share > _MIN_UNREAD_SHARE or mean_step < _MAX_SMOOTH_STEP

@@ -12,7 +12,7 @@ from depthpose.cli.arguments import shown_as
 from depthpose.core.errors import InputError
 
 if TYPE_CHECKING:  # --help imports this module and must answer at once
-    from depthpose.core.engine import Inputs, RayEngine, ShardRecord, Work
+    from depthpose.core.engine import Computation, JobInputs, RayEngine, ShardRecord
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,18 +52,18 @@ class EngineOptions:
         )  # fmt: skip
 
     def run(
-        self, work: "Work", inputs: "Inputs", out: str, settings: dict[str, Any]
+        self, computation: "Computation", inputs: "JobInputs", out: str, settings: dict[str, Any]
     ) -> "Sequence[ShardRecord]":
         """Do the work on all inputs, and give the records of its shards."""
         from depthpose.core.engine import ShardedJob, run_job
 
         job = ShardedJob(
-            work=work,
-            items=inputs.items,
+            computation=computation,
+            inputs=inputs.listed,
             tars=inputs.tars,
             out=out,
             settings=settings,
-            block=self.block,
+            block_size=self.block,
         )
         return run_job(job, self.build())
 

@@ -139,12 +139,17 @@ def evaluate_poses(
     from depthpose.core.config import config_to_dict
     from depthpose.core.run import claim_folder
     from depthpose.pose.config import EvaluationConfig
-    from depthpose.report.page import table_files
+    from depthpose.report.page import list_table_files
 
     if not (weights or csv or predictions):
         raise InputError("measure --weights FILE, --csv FILE or --predictions DIR, or several.")
     dataset = open_instances(bop, split, objects, estimates.targets)
-    files = [*table_files("rows", "instances", "risk"), "report.html", "predictions", "detections"]
+    files = [
+        *list_table_files("rows", "instances", "risk"),
+        "report.html",
+        "predictions",
+        "detections",
+    ]
     rule = EvaluationConfig(diameters=estimates.diameters, with_vsd=estimates.vsd, adds=adds)
     # Objects and targets are no settings of the folder: a later run may ask for more of them.
     settings = {"bop": str(bop.resolve()), "split": split, "rule": config_to_dict(rule)}

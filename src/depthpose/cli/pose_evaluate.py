@@ -17,7 +17,7 @@ from depthpose.cli.pose_methods import PoseMethod
 from depthpose.core.checkpoint import file_sha256
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image
-from depthpose.core.run import environment, read_settings
+from depthpose.core.run import describe_environment, read_settings
 from depthpose.pose.config import EvaluationConfig
 from depthpose.pose.datasets import BopDataset, open_bop, read_targets
 from depthpose.pose.evaluate import (
@@ -39,7 +39,7 @@ from depthpose.pose.predictions import (
 )
 from depthpose.report import page
 from depthpose.report.page import Section
-from depthpose.report.pose import pose_section
+from depthpose.report.pose import make_pose_section
 
 SCORING_NOTE = (
     "Refused and wrong answers stay in every number. The row 'mean' counts each object the same, "
@@ -207,8 +207,8 @@ def measure(
         *write_details(measured, out),
     ]
     title = f"Poses on {dataset.folder.resolve().name}, {dataset.split}"
-    page.write_page(out / "report.html", title, sections, environment())
-    print(page.plain_table(rows, _PRINTED_COLUMNS))
+    page.write_page(out / "report.html", title, sections, describe_environment())
+    print(page.format_plain_table(rows, _PRINTED_COLUMNS))
     print(f"every column: {out / 'table.md'}, rows.csv; the page: {out / 'report.html'}")
     return 0
 
@@ -230,7 +230,7 @@ def _show_instances(
             symmetries = symmetry_transforms(model.symmetries)
             truth = find_nearest_copy(pose, truth, symmetries, model.symmetries)
         columns = row.columns()
-        section = pose_section(
+        section = make_pose_section(
             f"{predictions.stem}: {row.object} in {row.instance}, {role}",
             dataset.view(instance).input,
             estimate,

@@ -15,9 +15,9 @@ from depthpose.cli.pose_methods import PoseMethod
 from depthpose.cli.pose_options import PoseInputs
 from depthpose.core.camera import AnyLens
 from depthpose.core.checkpoint import file_sha256
-from depthpose.core.errors import InputError, nearest_name
+from depthpose.core.errors import InputError, suggest_name
 from depthpose.core.files import CLOUD_READERS, MAP_SUFFIXES, list_images, read_stored_depth
-from depthpose.core.files.disk import natural_order, refuse_equal_stems
+from depthpose.core.files.disk import natural_sort_key, refuse_equal_stems
 from depthpose.core.files.images import refuse_among_inputs
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
@@ -171,7 +171,7 @@ def object_named(name: str | None, method: PoseMethod) -> str:
         raise InputError(f"the {method.holder} know {', '.join(names)}; say which by --object")
     if name is not None and name not in names:
         raise InputError(
-            f"--object {name}: the {method.holder} do not know it; {nearest_name(name, names)}"
+            f"--object {name}: the {method.holder} do not know it; {suggest_name(name, names)}"
         )
     return names[0] if name is None else name
 
@@ -192,7 +192,7 @@ def cloud_jobs(cloud: Path, unit: Unit, object: str, out: Path) -> list[PoseJob[
     """Make a job of a cloud, or of every cloud of a folder."""
     suffixes = tuple(CLOUD_READERS)
     files = _list_visible(cloud, suffixes) if cloud.is_dir() else [cloud]
-    files.sort(key=natural_order)
+    files.sort(key=natural_sort_key)
     if not files:
         raise InputError(f"{cloud}: no {', '.join(suffixes)} file there; give a cloud, or a folder")
     refuse_equal_stems(files)
@@ -566,4 +566,4 @@ def _list_depths(depth: Path) -> list[Path]:
         maps = [p for p in depth.glob("*") if p.suffix.lower() in MAP_SUFFIXES]
         if not maps:
             raise
-        return sorted(maps, key=natural_order)
+        return sorted(maps, key=natural_sort_key)

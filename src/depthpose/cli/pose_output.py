@@ -29,7 +29,7 @@ from depthpose.pose.predictions import (
 )
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 from depthpose.report import pose as drawn
-from depthpose.report.page import Section, choose_answers, plain_table, write_page
+from depthpose.report.page import Section, choose_views, format_plain_table, write_page
 
 _PAGE = "report.html"
 _WITH_ALTERNATIVES = "depthpose-alternatives"
@@ -154,7 +154,7 @@ def _write_dataset_files(
         if is_whole(out, name, [name]):
             continue
         instance = image_of[scene_id, image_id]
-        picture = drawn.picture_of(instance)
+        picture = drawn.read_instance_image(instance)
         for estimate in estimates:
             pose = estimate.camera_from_model
             assert pose is not None
@@ -179,12 +179,12 @@ def _write_job_files(
             view = job.read()
         except InputError:  # unreadable by now
             continue
-        points_m = drawn.object_points(view, model.diameter_m)
+        points_m = drawn.select_object_points(view, model.diameter_m)
         cloud_file = out / f"{job.name}.{CLOUD}"
-        write_cloud(cloud_file, drawn.posed_cloud(points_m, pose.double(), model))
+        write_cloud(cloud_file, drawn.join_posed_cloud(points_m, pose.double(), model))
         files = [cloud_file]
         if isinstance(view, ViewInput):
-            picture = drawn.draw_region(drawn.grey_depth(view.depth_m), view, pose)
+            picture = drawn.draw_region(drawn.draw_grey_depth(view.depth_m), view, pose)
             picture = drawn.draw_pose(picture, pose, model, view.K)
             picture_file = out / f"{job.name}.{PICTURE}"
             write_image(picture_file, picture)
@@ -234,7 +234,7 @@ def _print_table(estimates: Sequence[PoseEstimate]) -> None:
         row |= _pose_cells(estimate.base_from_model, prefix="base ")
         row |= {name: f"{row[name]:.3f}" for name in _SHARES if row[name] is not None}
         rows.append(row)
-    print(plain_table(rows, _PRINTED_COLUMNS), end="")
+    print(format_plain_table(rows, _PRINTED_COLUMNS), end="")
     print(_LEGEND)
     if any(estimate.pick_rank is not None for estimate in estimates):
         print(_PICK_RANK_LEGEND)
@@ -317,7 +317,7 @@ def _write_page(
         text += f" The table holds the first {_MAX_PAGE_ROWS}, refusals before answers; all are in "
         text += "poses.json."
     results = Section(title="What was found", text=text, rows=rows)
-    write_page(out / _PAGE, f"Poses of {total}", [results, *sections], run.environment())
+    write_page(out / _PAGE, f"Poses of {total}", [results, *sections], run.describe_environment())
     print(f"the page: {out / _PAGE}")
 
 
@@ -337,7 +337,7 @@ def _pose_sections(
     ]
 
     sections: list[Section] = []
-    for k in choose_answers([prediction.estimate.is_posed for prediction, _ in readable]):
+    for k in choose_views([prediction.estimate.is_posed for prediction, _ in readable]):
         prediction, job = readable[k]
         estimate = prediction.estimate
         try:
@@ -351,7 +351,7 @@ def _pose_sections(
 
         rgb = None if prediction.place is None else rgb_of[prediction.place[:2]]
         image = None if rgb is None else read_image(rgb)
-        section = drawn.pose_section(
+        section = drawn.make_pose_section(
             estimate.name, pose_input, estimate, models[estimate.object], image=image
         )
         sections.append(section)

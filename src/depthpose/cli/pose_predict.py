@@ -26,7 +26,7 @@ from depthpose.core import run
 from depthpose.core.camera import Camera, camera_of
 from depthpose.core.checkpoint import find_weights
 from depthpose.core.config import config_to_dict
-from depthpose.core.engine import Files, Function, Inputs, Sample, Work
+from depthpose.core.engine import Computation, InputFormat, JobInputs, LocalInput, ResultWriter
 from depthpose.core.errors import InputError
 from depthpose.core.files import CLOUD_READERS, image_size, write_json
 from depthpose.core.files.images import LISTED_SUFFIXES
@@ -196,11 +196,11 @@ class PoseWork:
     camera: Camera | None
     box: Box | None
 
-    def start(self) -> Function:
+    def start(self) -> ResultWriter:
         """Build the estimator, and give the function that poses a batch of a worker."""
         method = self.source.build()
 
-        def estimate(samples: Sequence[Sample], out: Path) -> list[str]:
+        def estimate(samples: Sequence[LocalInput], out: Path) -> list[str]:
             """Write the poses of a batch into a folder; give why each has none, "" if it has."""
             jobs = [self._make_job(sample) for sample in samples]
             results = EntryFiles(out)
@@ -210,7 +210,7 @@ class PoseWork:
 
         return estimate
 
-    def _make_job(self, sample: Sample) -> Job[Any]:
+    def _make_job(self, sample: LocalInput) -> Job[Any]:
         """Make the job of a cloud, or of a depth image and its mask or box."""
         name = sample.name
         if self.camera is None:
@@ -241,13 +241,13 @@ def predict_poses_on_ray(
         raise InputError("--mask and --box say where objects are; give one of them")
     box = parse_box(options.box[0]) if options.box else None
     if options.depth is None:
-        files = Files(roles=("cloud",), suffixes=tuple(CLOUD_READERS))
+        files = InputFormat(roles=("cloud",), suffixes=tuple(CLOUD_READERS))
     elif box is None:
-        files = Files(roles=("depth", "mask"), suffixes=(*LISTED_SUFFIXES, ".json"))
+        files = InputFormat(roles=("depth", "mask"), suffixes=(*LISTED_SUFFIXES, ".json"))
     else:
-        files = Files(roles=("depth",), suffixes=LISTED_SUFFIXES)
+        files = InputFormat(roles=("depth",), suffixes=LISTED_SUFFIXES)
     paths = [path for path in (options.cloud, options.depth, options.mask) if path is not None]
-    inputs = Inputs.find(paths, files)
+    inputs = JobInputs.find(paths, files)
     if len(paths) == 2:  # a single path is a manifest, which pairs files of any names
         _refuse_other_mask_names(inputs, paths[1])
 
@@ -259,7 +259,7 @@ def predict_poses_on_ray(
     object = object_named(options.object or None, method)
     camera = None
     if options.lens is not None:
-        with inputs.first() as first:
+        with inputs.open_first() as first:
             camera = camera_of(options.lens, image_size(first[0]))
     poses = PoseWork(source=source, object=object, unit=options.unit, camera=camera, box=box)
 
@@ -275,16 +275,16 @@ def predict_poses_on_ray(
     if camera is not None:
         settings["K"] = camera.K.tolist()
         settings["depth_unit_m"] = camera.depth_unit_m
-    work = Work(start=poses.start, files=files, endings=(ENDING,), batch=batch)
+    work = Computation(make_writer=poses.start, input_format=files, endings=(ENDING,), batch=batch)
     return print_shards(engine.run(work, inputs, out, settings), out, "inputs")
 
 
-def _refuse_other_mask_names(inputs: Inputs, masks: str) -> None:
+def _refuse_other_mask_names(inputs: JobInputs, masks: str) -> None:
     """Refuse masks that are not named after their depth images; a single pair may differ."""
-    if len(inputs.items) == 1:
+    if len(inputs.listed) == 1:
         return
-    for item in inputs.items:
-        depth, mask = (PurePosixPath(file).stem for file in item.files)
+    for listed in inputs.listed:
+        depth, mask = (PurePosixPath(file).stem for file in listed.files)
         if depth != mask:
             raise InputError(
                 f"{masks}: no mask called {depth!r}; a mask has the name of its depth image"

@@ -12,14 +12,14 @@ from tqdm import tqdm
 
 from depthpose.cli import depth_evaluate as evaluation
 from depthpose.cli.depth_predict import DepthMethod
-from depthpose.core.errors import InputError, nearest_name
+from depthpose.core.errors import InputError, suggest_name
 from depthpose.core.files import write_image
-from depthpose.core.run import claim_folder, environment, find_rank
+from depthpose.core.run import claim_folder, describe_environment, find_rank
 from depthpose.depth.datasets import Dataset, Frame, has_lidar, lidar_truth
 from depthpose.depth.evaluate import find_protocol
 from depthpose.depth.predictions import has_prediction, read_estimate
 from depthpose.report import page
-from depthpose.report.page import Drawing, Picture, Section
+from depthpose.report.page import Drawing, PictureFile, Section
 from depthpose.thesis.depth import (
     DEPTH_SCALE,
     PublishedTable,
@@ -64,7 +64,7 @@ def reproduce_table(
         "caps_m": list(caps_m),
         "methods": {method.name: method.settings for _, method in methods},
     }
-    results = (*page.table_files("rows", "frames", "confidence"), "report.md", "report.html")
+    results = (*page.list_table_files("rows", "frames", "confidence"), "report.md", "report.html")
     claim_folder(out, settings, (*results, "predictions", "figures"))
 
     # Predict, in all processes; the first measures and joins.
@@ -152,9 +152,9 @@ def _read_lidar(frame: Frame) -> Float[Tensor, "h w"] | None:
 
 def write_report(title: str, sections: Sequence[Section], out: Path) -> None:
     """Write report.md and report.html of a table, and print its rows."""
-    page.write_markdown(out / "report.md", title, sections, environment())
-    page.write_page(out / "report.html", title, sections, environment())
-    print(page.markdown_table(sections[0].rows))
+    page.write_markdown(out / "report.md", title, sections, describe_environment())
+    page.write_page(out / "report.html", title, sections, describe_environment())
+    print(page.format_markdown_table(sections[0].rows))
     print(f"the page: {out / 'report.html'}")
 
 
@@ -167,7 +167,7 @@ def choose_frames(dataset: Dataset, names: Sequence[str], number: int) -> list[i
         index_of = {frame.name: i for i, frame in enumerate(dataset.frames)}
         unknown = [name for name in names if name not in index_of]
         if unknown:
-            hint = nearest_name(unknown[0], index_of)[:300]
+            hint = suggest_name(unknown[0], index_of)[:300]
             raise InputError(f"{dataset.name}: no frame {unknown[0]!r}; {hint}")
         return [index_of[name] for name in names]
     pairs = [i for i, frame in enumerate(dataset.frames) if frame.right is not None]
@@ -208,7 +208,7 @@ def write_figure(
     path = out / f"figure-{number}.png"
     write_image(path, arrange(columns))
     sections.append(_make_settings_section([method]))
-    page.write_page(out / "report.html", f"Figure {number}", sections, environment())
+    page.write_page(out / "report.html", f"Figure {number}", sections, describe_environment())
     captions = "; ".join(panel.caption for panel in columns[0])
     print(f"{path}: each column from top to bottom: {captions}. {DEPTH_SCALE}; see the bar below.")
     return 0
@@ -216,9 +216,9 @@ def write_figure(
 
 def _make_panel_section(title: str, panels: Sequence[Drawing], stem: Path) -> Section:
     """Write each panel as a file, STEM.1.jpg, ..., small enough for a page of many; show them."""
-    pictures: list[Picture] = []
+    pictures: list[PictureFile] = []
     for k, panel in enumerate(panels, 1):
         path = stem.with_name(f"{stem.name}.{k}.jpg")
         write_image(path, shrink_to_width(panel.image, _PANEL_WIDTH_PX))
-        pictures.append(Picture(path=path, caption=panel.caption, scale=panel.scale))
+        pictures.append(PictureFile(path=path, caption=panel.caption, color_bar=panel.color_bar))
     return Section(title=title, text=DEPTH_SCALE, pictures=pictures)

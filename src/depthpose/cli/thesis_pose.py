@@ -19,7 +19,7 @@ from depthpose.core.checkpoint import file_sha256, find_weights
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_image
-from depthpose.core.run import claim_folder, environment
+from depthpose.core.run import claim_folder, describe_environment
 from depthpose.pose.config import EvaluationConfig, ObjectsConfig
 from depthpose.pose.datasets import BopDataset, Instance
 from depthpose.pose.datasets.dataset import read_instance_mask
@@ -30,8 +30,8 @@ from depthpose.pose.propose import vote_ransac
 from depthpose.pose.synthetic import Objects
 from depthpose.pose.types import ViewSample
 from depthpose.report import page
-from depthpose.report.page import Drawing, Picture, Section
-from depthpose.report.pose import close_up, draw_pose, grey_depth, picture_of
+from depthpose.report.page import Drawing, PictureFile, Section
+from depthpose.report.pose import cut_close_up, draw_grey_depth, draw_pose, read_instance_image
 from depthpose.thesis import pose_figures, pose_tables
 
 _SYNTHETIC_SEED = 3303
@@ -63,10 +63,10 @@ class Views:
         instance = self.instances[index]
         view = self.samples[index].input
         if instance is None or instance.rgb is None:
-            picture = grey_depth(view.depth_m)
+            picture = draw_grey_depth(view.depth_m)
         else:
-            picture = picture_of(instance)
-        return close_up(picture, view.mask, view.K)
+            picture = read_instance_image(instance)
+        return cut_close_up(picture, view.mask, view.K)
 
 
 def open_views(net: GeoPoseNet, data: PoseDataOptions, number: int | None, synthetic: int) -> Views:
@@ -155,7 +155,11 @@ def reproduce_by_object(
         "masks": [_describe_masks(kind) for kind in options.masks] if methods else [],
         "csv": [file_names.name_with_checksum(path) for path in csv],
     }
-    results = (*page.table_files("rows", "all", "instances", "risk"), "report.md", "report.html")
+    results = (
+        *page.list_table_files("rows", "all", "instances", "risk"),
+        "report.md",
+        "report.html",
+    )
     claim_folder(out, settings, (*results, "predictions", "detections", "figures"))
 
     # Predict what is missing, measure, and join with the published rows.
@@ -203,19 +207,21 @@ def _draw_figure_3_5(dataset: BopDataset, predictions: Path, out: Path, number: 
         number: how many instances, spread evenly; one without an estimate is left out.
     """
     estimates = {p.estimate.name: p.estimate for p in read_predictions(predictions)}
-    pictures: list[Picture] = []
+    pictures: list[PictureFile] = []
     for index in page.spread_evenly(len(dataset), number):
         instance = dataset.instances[index]
         estimate = estimates.get(instance.name)
         if estimate is None:  # estimates of detections do not have the names of instances
             continue
-        picture, K = close_up(picture_of(instance), read_instance_mask(instance), instance.K)
+        picture, K = cut_close_up(
+            read_instance_image(instance), read_instance_mask(instance), instance.K
+        )
         model = dataset.objects[instance.object_id]
         drawn = draw_pose(picture, estimate.camera_from_model, model, K, instance.camera_from_model)
         path = out / "figures" / predictions.name / f"3-5_{instance.name}.jpg"
         write_image(path, drawn)
         caption = instance.name if estimate.is_posed else f"{instance.name}: {estimate.reason}"
-        pictures.append(Picture(path=path, caption=caption))
+        pictures.append(PictureFile(path=path, caption=caption))
     title = f"Figure 3-5: {predictions.name}"
     return Section(title=title, text=_FIGURE_TEXTS["3-5"], pictures=pictures)
 
@@ -252,7 +258,7 @@ def reproduce_voting(
         "points": list(points),
         **views.settings,
     }
-    claim_folder(out, settings, [*page.table_files("rows"), "report.md", "report.html"])
+    claim_folder(out, settings, [*page.list_table_files("rows"), "report.md", "report.html"])
 
     rows: list[dict[str, Any]] = []
     for count in points:
@@ -300,13 +306,13 @@ def write_figure(
     claim_folder(out, settings, (path.name, "panels", "report.html"))
     panels = draw_panels(net, views, **drawing_settings)
     write_image(path, pose_figures.arrange_grid([panel.image for panel in panels], columns))
-    pictures: list[Picture] = []
+    pictures: list[PictureFile] = []
     for k, panel in enumerate(panels, 1):
         file = out / "panels" / f"{figure}.{k}.png"
         write_image(file, panel.image)
-        pictures.append(Picture(path=file, caption=panel.caption))
+        pictures.append(PictureFile(path=file, caption=panel.caption))
     section = Section(title="Panels", text=text, pictures=pictures)
-    page.write_page(out / "report.html", f"Figure {figure}", [section], environment())
+    page.write_page(out / "report.html", f"Figure {figure}", [section], describe_environment())
     print(f"{path}: {'; '.join(panel.caption for panel in panels)}. {text}")
     return 0
 

@@ -103,7 +103,7 @@ class TrainingOptions:
         """
         from tqdm import tqdm
 
-        from depthpose.core.loop import Run
+        from depthpose.core.loop import TrainingRun
         from depthpose.core.run import find_rank
 
         is_first = find_rank().rank == 0  # other processes never show a step
@@ -124,7 +124,7 @@ class TrainingOptions:
                 if log is not None:
                     log.show(progress)
 
-            run = Run(
+            run = TrainingRun(
                 folder=out,
                 resume=self.resume,
                 finish=self.finish,

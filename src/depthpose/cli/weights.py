@@ -29,7 +29,7 @@ def list_weights(folder: Path | None = None) -> int:
         folder: list the weights in this folder instead.
     """
     from depthpose.core.checkpoint import SHIPPED, read_checkpoint
-    from depthpose.report.page import plain_table
+    from depthpose.report.page import format_plain_table
 
     home = folder or SHIPPED
     files = sorted(home.glob("*.safetensors"))
@@ -49,7 +49,7 @@ def list_weights(folder: Path | None = None) -> int:
             "trained on": shorten(trained_on, _DATA_WIDTH, placeholder=" ..."),
         }
         rows.append(row)
-    print(plain_table(rows), end="")
+    print(format_plain_table(rows), end="")
     print("'depthpose weights show NAME' prints origin, terms and settings of one.")
     return 0
 
@@ -168,9 +168,9 @@ def pack_weights(
         terms: of use, printed whenever the weights are loaded; those of the parts are kept too.
         half: store 16-bit floats: half the size.
     """
-    from depthpose.core.checkpoint import bound_facts, find_weights, warn_of_terms
+    from depthpose.core.checkpoint import add_terms, find_weights, warn_of_terms
     from depthpose.core.files import atomic_write
-    from depthpose.core.loop import card_text
+    from depthpose.core.loop import format_card
     from depthpose.core.run import refuse_to_replace
     from depthpose.depth.weights import read_depth_weights, read_matcher, write_depth_weights
 
@@ -179,11 +179,11 @@ def pack_weights(
     refuse_to_replace(card)
     depth_weights = read_depth_weights(find_weights(weights))
     parts = [weights] if matcher is None else [weights, matcher]
-    warn_of_terms(bound_facts({}, parts))
+    warn_of_terms(add_terms({}, parts))
     own_facts = {"trained_on": trained_on, "licence": licence}
     if terms:
         own_facts["terms"] = terms
-    facts = bound_facts(own_facts, parts)
+    facts = add_terms(own_facts, parts)
     write_depth_weights(
         out,
         generator=depth_weights.generator,
@@ -192,7 +192,7 @@ def pack_weights(
         with_half=half,
     )
     with atomic_write(card) as unfinished:
-        unfinished.write_text(card_text(out.stem, dict(sorted(facts.items()))))
+        unfinished.write_text(format_card(out.stem, dict(sorted(facts.items()))))
     print(f"card: {card}")
     return show_weights(str(out))
 
@@ -303,17 +303,17 @@ def _write_graph(
         make_export: makes the graph, given the facts that it is to hold.
     """
     from depthpose.core.checkpoint import file_sha256, warn_of_terms
-    from depthpose.core.export import freeze
-    from depthpose.report.page import markdown_table
+    from depthpose.core.export import write_export
+    from depthpose.report.page import format_markdown_table
 
     warn_of_terms(facts)
     origin = {"format": "onnx", "weights": Path(weights).name, "weights_sha256": file_sha256(path)}
-    differences = freeze(out, make_export({**facts, **origin}))
+    differences = write_export(out, make_export({**facts, **origin}))
     rows = [
         {name: f"{value:.1e}" if isinstance(value, float) else value for name, value in row.items()}
         for row in differences
     ]
-    print(markdown_table(rows), end="")
+    print(format_markdown_table(rows), end="")
     size_mb = out.stat().st_size / 1e6
     proof = out.with_suffix(".proof.json").name
     print(f"{out}: {size_mb:.1f} MB; the differences are in {proof}")

@@ -1,7 +1,7 @@
-"""The type of an image, the conventions of all arrays, and rows taken at even steps.
+"""The conventions of arrays, the type of an image, and thinning.
 
-All data are tensors; only files hold bytes. Batched forms put ``*batch`` in front. Invalid values
-of a map are NaN in memory and in NPY files, and 0 in 16-bit PNG files.
+All data are tensors. Batched forms have ``*batch`` axes in front. Invalid values of a map are NaN
+in memory and in NPY files, and 0 in 16-bit PNG files.
 """
 
 import torch
@@ -13,7 +13,7 @@ Image = Float[Tensor, "3 h w"]
 
 
 def take_evenly(rows: Shaped[Tensor, "n ..."], count: int) -> Shaped[Tensor, "m ..."]:
-    """Take ``count`` rows at even steps, beginning with the first; all if there are no more."""
+    """Take ``count`` rows at even steps, beginning with the first; all where there are fewer."""
     if len(rows) <= count:
         return rows
     return rows[torch.arange(count, device=rows.device) * len(rows) // count]

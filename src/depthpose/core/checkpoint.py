@@ -1,20 +1,15 @@
 """Weights files: safetensors with the network's config inside, and published PyTorch checkpoints.
 
-Weights are named by a file, a folder, a name in the package, or one on the Hugging Face hub:
-``hf://OWNER/NAME``, ``hf://OWNER/NAME@REVISION`` or ``hf://OWNER/NAME/FILE.safetensors``, as
-huggingface_hub's own file system writes it. Nothing else is fetched. Files lie in that library's
-cache, and its settings hold: HF_HOME, HF_ENDPOINT, HF_HUB_OFFLINE, the token of ``hf auth login``.
+Weights are named by a file, a folder, a name in the package, or one on the hub (``core.hub``). Each
+file has a card: facts such as ``licence``, ``trained_on``, and ``terms`` if they restrict its use.
 """
 
 import hashlib
 import json
 import pickle
-import re
 import warnings
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
-from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -25,54 +20,42 @@ from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
 from depthpose.core.config import config_to_dict
-from depthpose.core.errors import InputError, Notice, import_extra, nearest_name
-from depthpose.core.files.disk import finite_number, refused_as, write_bytes
+from depthpose.core.errors import InputError, Notice, suggest_name
+from depthpose.core.files.disk import parse_finite, refused_as, write_bytes
+from depthpose.core.hub import ON_HUB, WEIGHTS_FILE, fetch_weights
 
 NetworkT = TypeVar("NetworkT", bound=nn.Module)
 _RANDOM_INITS = (
     nn.init.normal_, nn.init.uniform_, nn.init.kaiming_normal_, nn.init.kaiming_uniform_
 )  # fmt: skip
 """Functions that fill a tensor with random weights, and do nothing else."""
-_SAFETENSORS = (
-    "safetensors file", "a published checkpoint is imported by 'depthpose weights import'"
-)  # fmt: skip
-"""What a file should be, and what to do where it is not."""
-
-WEIGHTS_FILE = "model.safetensors"
-"""Usual name of the weights file in a repository on the hub."""
-
-_REPOSITORY = r"[\w-][\w.-]*/[\w-][\w.-]*"
-# A pathlib.Path of the name has one slash where the name has two.
-_HUB_NAME = re.compile(
-    rf"hf://?(?P<repository>{_REPOSITORY})(@(?P<revision>[^/@]+))?(/(?P<file>.+))?"
-)
-
-ON_HUB = "hf:/"
-"""What the names of weights on the hub begin with, also as paths."""
 SHIPPED = Path(__file__).parents[1] / "weights"
 """Folder of the weights that come with the package."""
 
 _NOT_IN_WHEEL = ("kitti-nc", "linemod-nc", "bunny-nc", "ycb")
-"""Weights that are in the repository of the source alone."""
-_LONGEST_REASON = 200  # letters that are shown of another library's message
+"""Names of weights that are in the repository, and not in the wheel."""
 
 
 class LicenceNotice(Notice):
-    """Weights whose terms restrict their use."""
+    """Terms that restrict the use of weights."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Checkpoint:
     """The contents of a weights file."""
 
-    kind: str  #: which network the weights belong to, e.g. ``psmnet``
-    config: Mapping[str, Any]  #: config of that network, as ``config_to_dict`` gives it
-    state: Mapping[str, Tensor]  #: tensors by the names of the network's ``state_dict``
+    kind: str  #: kind of network, such as ``psmnet``
+    config: Mapping[str, Any]  #: its config (:func:`depthpose.core.config.config_to_dict`)
+    state: Mapping[str, Tensor]  #: its ``state_dict``: tensors by name
     facts: Mapping[str, str] = field(default_factory=dict)  #: the card, such as ``licence``
 
 
 def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
-    """Write weights and config to one ``.safetensors`` file, all or nothing."""
+    """Write a checkpoint to one ``.safetensors`` file, whole or not at all.
+
+    Raises:
+        InputError: the suffix is another, or the disk refuses.
+    """
     if path.suffix != ".safetensors":
         raise InputError(
             f"{path}: weights are written as safetensors; end the name in .safetensors."
@@ -81,14 +64,14 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     state = {name: tensor.detach().cpu().contiguous() for name, tensor in checkpoint.state.items()}
     content = save(state, metadata={**checkpoint.facts, **metadata})
     # Not by safetensors' own writer, whose error does not name a full disk.
-    write_bytes(path, _with_sorted_header(content))
+    write_bytes(path, _sort_header(content))
 
 
-def _with_sorted_header(content: bytes) -> bytes:
+def _sort_header(content: bytes) -> bytes:
     """Sort the JSON header of a safetensors file, so that equal weights have equal checksums.
 
-    safetensors writes the metadata in random order. A file is the length of its header (8 bytes),
-    the header, and the tensors.
+    The library writes metadata in random order. A file is the size of its header (8 bytes), the
+    header, and the tensors.
     """
     size = int.from_bytes(content[:8], "little")
     entries = json.loads(content[8 : 8 + size])
@@ -99,14 +82,15 @@ def _with_sorted_header(content: bytes) -> bytes:
 
 
 def find_weights(name: str | Path) -> Path:
-    """Find a weights file: by its path, its folder, its name in the package, or on the hub.
+    """Find a weights file by its path, its folder, its name in the package, or its name on the hub.
 
     Args:
-        name: a file; weights that came with the package, by name; a folder with one file of
-            weights, or with ``model.safetensors``; or ``hf://OWNER/NAME``.
+        name: a file; the name of weights that come with the package; a folder with one file of
+            weights, or with ``model.safetensors``; or ``hf://OWNER/NAME``, which is downloaded.
 
     Raises:
-        InputError: none of these; the message suggests the nearest name.
+        InputError: it is none of these (the message suggests the nearest name), or the hub does not
+            answer.
     """
     path = Path(name)
     shipped = {file.stem: file for file in SHIPPED.glob("*.safetensors")}
@@ -115,7 +99,7 @@ def find_weights(name: str | Path) -> Path:
     if str(name) in shipped:
         return shipped[str(name)]
     if path.is_dir():
-        return _weights_in_folder(path)
+        return _find_weights_in_folder(path)
     if str(name).startswith(ON_HUB):
         return fetch_weights(str(name))
     if str(name) in _NOT_IN_WHEEL:
@@ -125,12 +109,12 @@ def find_weights(name: str | Path) -> Path:
         )
     raise InputError(
         f"weights {str(name)!r}: neither a file nor the name of weights that came with depthpose; "
-        f"{nearest_name(str(name), shipped)} 'depthpose weights import' imports published ones, "
+        f"{suggest_name(str(name), shipped)} 'depthpose weights import' imports published ones, "
         "hf://OWNER/NAME those on the hub."
     )
 
 
-def _weights_in_folder(folder: Path) -> Path:
+def _find_weights_in_folder(folder: Path) -> Path:
     """Find the only ``.safetensors`` file of a folder, or the one with the usual name.
 
     Raises:
@@ -148,75 +132,6 @@ def _weights_in_folder(folder: Path) -> Path:
     )
 
 
-@cache
-def fetch_weights(name: str) -> Path:
-    """Return the local file of weights on the hub, downloaded where it is not in the cache.
-
-    A process gets the same file each time, so that a checksum of it is that of what is loaded.
-
-    Raises:
-        InputError: no such name, repository, revision or file; no access; no connection.
-        MissingExtraError: the extra ``hub`` is not installed.
-    """
-    reference = _HUB_NAME.fullmatch(name)
-    if reference is None:
-        raise InputError(
-            f"{name!r}: weights on the hub are hf://OWNER/NAME, hf://OWNER/NAME@REVISION or "
-            "hf://OWNER/NAME/FILE.safetensors."
-        )
-    file = reference["file"] or WEIGHTS_FILE
-    if not file.endswith(".safetensors"):
-        raise InputError(f"{name!r}: only .safetensors are fetched: they cannot run code.")
-    hub = import_extra("huggingface_hub", "huggingface_hub", "hub", "weights on the hub")
-    try:
-        path = hub.hf_hub_download(reference["repository"], file, revision=reference["revision"])
-    except Exception as error:
-        refusal = _explain_hub_error(error)
-        if refusal is None:
-            raise
-        raise InputError(f"{name}: {refusal}") from error
-    return Path(path)
-
-
-def _explain_hub_error(error: Exception) -> str | None:
-    """Explain why the hub gave no file, and what to do; None for an error of another origin."""
-    errors = import_module("huggingface_hub.errors")
-    reason = " ".join(str(error).split())[:_LONGEST_REASON] or type(error).__name__
-    # The library's errors derive from those of the HTTP library that it is built on: requests,
-    # httpx or its successor.
-    http_errors = [
-        base for base in errors.HfHubHTTPError.__mro__[1:] if base.__module__ != "builtins"
-    ]
-    refusals = (  # of the first that fits; special errors come before their base classes
-        (errors.HFValidationError, f"no name that the hub allows: {reason}"),
-        (
-            errors.GatedRepoError,
-            "its owner asks for consent; give it on the repository's page, then 'hf auth login'.",
-        ),
-        (
-            errors.RepositoryNotFoundError,
-            "there is no such repository, or it is private: check the name, or 'hf auth login' "
-            "with an account that may read it.",
-        ),
-        (errors.RevisionNotFoundError, "the repository has no such revision."),
-        (
-            (errors.LocalEntryNotFoundError, errors.OfflineModeIsEnabled),
-            "the hub cannot be reached, and it is not in the cache. Connect once, unset "
-            "HF_HUB_OFFLINE, or copy the repository's folder here and give its path.",
-        ),
-        (
-            errors.EntryNotFoundError,
-            f"the repository has no such file ({WEIGHTS_FILE} by default); "
-            "name it: hf://OWNER/NAME/FILE.safetensors.",
-        ),
-        (
-            (OSError, *http_errors),  # of the connection, of access, of a full disk
-            f"the hub refused: {reason}; try again, or copy the file here and give its path.",
-        ),
-    )
-    return next((refusal for kinds, refusal in refusals if isinstance(error, kinds)), None)
-
-
 def read_checkpoint(path: Path, kind: str | None = None) -> Checkpoint:
     """Read a file that :func:`save_checkpoint` wrote.
 
@@ -225,8 +140,8 @@ def read_checkpoint(path: Path, kind: str | None = None) -> Checkpoint:
         kind: the kind that the caller can use; None takes any.
 
     Raises:
-        InputError: missing, truncated, not safetensors, without our metadata, of another kind, or
-            with numbers that are not finite.
+        InputError: the file is missing, damaged, no safetensors, without the metadata of
+            depthpose's weights, of another kind, or holds numbers that are not finite.
     """
     path = Path(path)
     if not path.is_file():
@@ -243,7 +158,7 @@ def read_checkpoint(path: Path, kind: str | None = None) -> Checkpoint:
             f"{path}: holds weights of kind {stored_kind!r}, but {kind!r} is needed here."
         )
     try:
-        config = json.loads(metadata.pop("config"), parse_constant=finite_number)
+        config = json.loads(metadata.pop("config"), parse_constant=parse_finite)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: its 'config' is not JSON ({error}).") from error
     if not isinstance(config, dict):
@@ -254,7 +169,11 @@ def read_checkpoint(path: Path, kind: str | None = None) -> Checkpoint:
 
 def _read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Read the tensors of a safetensors file by name, and its metadata."""
-    with refused_as(path, *_SAFETENSORS), safe_open(path, framework="pt") as file:
+    remedy = "a published checkpoint is imported by 'depthpose weights import'"
+    with (
+        refused_as(path, "safetensors file", remedy),
+        safe_open(path, framework="pt") as file,
+    ):
         state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         return state, dict(file.metadata() or {})
 
@@ -266,11 +185,15 @@ def file_sha256(path: Path) -> str:
 
 
 def load_weights(network: nn.Module, checkpoint: Checkpoint, source: str) -> None:
-    """Copy the weights of ``checkpoint`` into ``network``; every name and shape must agree.
+    """Copy the weights of a checkpoint into a network; every name and shape must agree.
+
+    Args:
+        network: the network; changed in place.
+        checkpoint: the weights.
+        source: what errors call the weights, such as their file.
 
     Raises:
-        InputError: they do not; it names ``source`` and the first tensors that are missing,
-            unexpected or of another shape.
+        InputError: tensors are missing, unexpected or of another shape; the first ones are named.
     """
     problems = list_misfits(network.state_dict(), checkpoint.state)
     if problems:
@@ -284,12 +207,12 @@ def load_weights(network: nn.Module, checkpoint: Checkpoint, source: str) -> Non
 def refuse_other_network(
     network: nn.Module, loaded: nn.Module, source: str, independent: Collection[str] = ()
 ) -> None:
-    """Refuse to begin a training with weights of another network.
+    """Refuse to begin a training with the weights of another network.
 
     Args:
-        network: the network that is trained; its ``config`` is a dataclass, as that of ``loaded``.
-        loaded: the network with the weights.
-        source: their file, for errors.
+        network: the network that is to be trained; its ``config`` is a dataclass.
+        loaded: the network that the weights were loaded into; its ``config`` is one too.
+        source: what errors call the weights, such as their file.
         independent: settings that may differ, since the weights do not depend on them.
 
     Raises:
@@ -311,17 +234,18 @@ def refuse_other_network(
 
 
 def build_network(make: Callable[[], NetworkT], checkpoint: Checkpoint, source: str) -> NetworkT:
-    """Make a network and copy the weights into it, as :func:`load_weights` does.
+    """Make a network and copy the weights of a checkpoint into it.
 
     Shapes are compared before the network takes memory: a damaged config may name any size.
 
     Args:
         make: makes the network of the checkpoint's config.
         checkpoint: its weights.
-        source: the name of the weights in errors.
+        source: what errors call the weights, such as their file.
 
     Raises:
-        InputError: as :func:`load_weights`, or no network can be made of the config.
+        InputError: no network can be made of the config, or tensors do not fit it
+            (:func:`load_weights`).
     """
     with (
         refused_as(source, "config of a network", "file and config are of different versions"),
@@ -335,9 +259,9 @@ def build_network(make: Callable[[], NetworkT], checkpoint: Checkpoint, source: 
 
 
 class _SkipRandomInit(TorchFunctionMode):
-    """Leaves tensors as they are where torch would fill them with random weights.
+    """Skips the initialisation of weights, which are replaced anyway.
 
-    On the meta device torch would import its compiler for that, which takes 1 s.
+    On the meta device torch would import its compiler for it, which takes 1 s.
     """
 
     def __torch_function__(
@@ -354,10 +278,11 @@ class _SkipRandomInit(TorchFunctionMode):
 
 
 def list_misfits(wanted: Mapping[str, Tensor], tensors: Mapping[str, Tensor]) -> list[str]:
-    """Compare named tensors with the wanted ones: those missing, unexpected or of another shape.
+    """List by what the names and shapes of tensors differ from wanted ones.
 
     Returns:
-        A phrase for each, such as ``conv.bias is missing``, sorted; none where all agree.
+        A phrase for each tensor that is missing, unexpected or of another shape, such as
+        ``conv.bias is missing``, sorted; empty where all agree.
     """
     problems = [f"{name} is missing" for name in wanted.keys() - tensors.keys()]
     problems += [f"{name} is unexpected" for name in tensors.keys() - wanted.keys()]
@@ -370,12 +295,15 @@ def list_misfits(wanted: Mapping[str, Tensor], tensors: Mapping[str, Tensor]) ->
 
 
 def read_torch_file(path: Path) -> Mapping[str, Any]:
-    """Read a foreign PyTorch checkpoint without running any code in it.
+    """Read a PyTorch checkpoint of other people without running any code in it.
 
     ``torch.load(weights_only=True)`` refuses every pickled object but tensors and containers.
 
+    Returns:
+        The mapping that the file holds, of names to tensors or whatever else.
+
     Raises:
-        InputError: missing, not a PyTorch file, or holding pickled code.
+        InputError: the file is missing, no PyTorch file, no mapping, or holds pickled code.
     """
     path = Path(path)
     if not path.is_file():
@@ -399,13 +327,15 @@ def read_torch_file(path: Path) -> Mapping[str, Any]:
 
 
 def read_published(path: Path, network: str) -> Mapping[str, Tensor]:
-    """Read the tensors of a published checkpoint: safetensors by its suffix, else a PyTorch file.
+    """Read the tensors of a published checkpoint, by name.
 
-    ``network`` is the name of the network in errors.
+    Args:
+        path: a ``.safetensors`` file, else a PyTorch file.
+        network: what errors call the network.
 
     Raises:
-        InputError: missing, damaged, holding pickled code, no tensors by name, or numbers that are
-            not finite.
+        InputError: the file is missing or damaged, or holds pickled code, other things than tensors
+            by name, or numbers that are not finite.
     """
     path = Path(path)
     if path.suffix == ".safetensors":
@@ -425,17 +355,23 @@ def read_published(path: Path, network: str) -> Mapping[str, Tensor]:
 def save_imported(
     out: Path, kind: str, network: nn.Module, source: Path, facts: Mapping[str, str]
 ) -> None:
-    """Write the weights of an imported network, with the checksum of ``source``, their file.
+    """Write the weights of a network that was imported from a published checkpoint.
 
-    ``facts`` are those of its card: ``trained_on``, ``licence`` and, if there are any, ``terms``.
+    Args:
+        out: the ``.safetensors`` file.
+        kind: kind of the network.
+        network: the network with the weights.
+        source: the published file, whose checksum goes onto the card.
+        facts: the card: ``trained_on``, ``licence`` and, if there are any, ``terms``.
     """
     origin = {"origin": f"imported from a file with sha256 {file_sha256(source)}"}
-    state = network.state_dict()
-    save_checkpoint(out, Checkpoint(kind=kind, config={}, state=state, facts={**origin, **facts}))
+    card = {**origin, **facts}
+    checkpoint = Checkpoint(kind=kind, config={}, state=network.state_dict(), facts=card)
+    save_checkpoint(out, checkpoint)
 
 
 def halve_state(network: nn.Module) -> dict[str, Tensor]:
-    """Return the state of a network with its floating-point tensors converted to float16."""
+    """Return the ``state_dict`` of a network with its floating-point tensors as float16."""
     state = network.state_dict()
     return {
         name: tensor.to(torch.float16) if tensor.is_floating_point() else tensor
@@ -444,32 +380,32 @@ def halve_state(network: nn.Module) -> dict[str, Tensor]:
 
 
 def warn_of_terms(facts: Mapping[str, str]) -> None:
-    """Warn (:class:`LicenceNotice`) where the card of weights holds terms of use."""
+    """Warn (:class:`LicenceNotice`) if the card of weights has terms of use."""
     if terms := facts.get("terms", ""):
         warnings.warn(terms, LicenceNotice, stacklevel=3)
 
 
 def join_terms(*cards: Mapping[str, str]) -> str:
     """Join the terms of use of all cards, each once: the terms of every part bind the whole."""
-
-    def contains(text: str, part: str) -> bool:
-        """Whether a text holds a part as whole words: "commercial" is not "non-commercial"."""
-        return f" {part} " in f" {text} "
-
     joined = ""
     for card in cards:
         terms = card.get("terms", "")
-        if not terms or contains(joined, terms):
+        if not terms or _has_phrase(joined, terms):
             continue
-        joined = terms if contains(terms, joined) else f"{joined} {terms}".strip()
+        joined = terms if _has_phrase(terms, joined) else f"{joined} {terms}".strip()
     return joined
 
 
-def bound_facts(facts: Mapping[str, str], made_of: Iterable[str | Path]) -> dict[str, str]:
-    """Return a copy of a card with the terms of all weights that the new weights are made of.
+def _has_phrase(text: str, phrase: str) -> bool:
+    """Whether a text has a phrase as whole words: "commercial" is not in "non-commercial"."""
+    return f" {phrase} " in f" {text} "
+
+
+def add_terms(facts: Mapping[str, str], made_of: Iterable[str | Path]) -> dict[str, str]:
+    """Add the terms of weights to the card of new weights that are made of them.
 
     Args:
-        facts: the card, with terms of its own if it has any.
+        facts: the card, with terms of its own if it has any; it is not changed.
         made_of: names of these weights, as :func:`find_weights` takes them.
 
     Raises:
@@ -483,14 +419,13 @@ def bound_facts(facts: Mapping[str, str], made_of: Iterable[str | Path]) -> dict
 def _refuse_impossible_numbers(path: Path, state: Mapping[str, Tensor]) -> None:
     """Refuse tensors with NaN or infinity, and negative variances of batch norm.
 
-    A network would make plausible nonsense of them.
+    A network with such weights may give plausible, but wrong results.
     """
     for name, tensor in state.items():
-        # A sum takes no memory; where it overflows the numbers themselves are looked at.
-        has_finite_sum = (
-            not tensor.is_floating_point() or tensor.sum(dtype=torch.float32).isfinite()
-        )
-        bad_count = 0 if has_finite_sum else tensor.numel() - int(tensor.isfinite().sum())
+        # A sum takes no memory. Only where it is not finite are the numbers counted.
+        bad_count = 0
+        if tensor.is_floating_point() and not tensor.sum(dtype=torch.float32).isfinite():
+            bad_count = tensor.numel() - int(tensor.isfinite().sum())
         if bad_count:
             raise InputError(
                 f"{path}: {bad_count} of the {tensor.numel()} numbers of {name!r} are NaN or "

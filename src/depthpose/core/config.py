@@ -1,4 +1,4 @@
-"""Settings: YAML to a frozen dataclass and back, with the dataclass's defaults and checks."""
+"""Settings as frozen dataclasses: ranges in their types, and conversion from and to YAML."""
 
 import dataclasses
 import json
@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import yaml
 
-from depthpose.core.errors import InputError, nearest_name, refuse_unknown
+from depthpose.core.errors import InputError, refuse_unknown, suggest_name
 
 ConfigT = TypeVar("ConfigT")
 _LONGEST = 500  # letters of a value that an error shows
@@ -27,26 +27,27 @@ ASCENDING = "ascending"
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Rule:
-    """The rule that the values of a setting must fulfil."""
+    """The rule that a setting must keep to, as its type says."""
 
     words: tuple[str, ...]  # the allowed words; none: any value
-    interval: str  # such as "[16, inf)", for each number of the setting; "": any number
+    interval: str  # such as "[16, inf)", for each number in the setting; "": any number
     multiples_of: tuple[Any, ...]  # the setting must be a multiple of each
     is_ascending: bool  # whether the first of two numbers may not exceed the second
 
 
 class Settings:
-    """Base of settings whose types say ranges: ``Annotated[int, "[16, inf)", 16]``.
+    """Base of dataclasses of settings whose types say what is allowed.
 
-    A number behind the range is one that the setting must be a multiple of; ``ASCENDING`` there
-    says that the lower end of a range comes first.
+    ``Annotated[int, "[16, inf)", 16]`` is an interval, and a number that the setting must be a
+    multiple of. ``ASCENDING`` behind the interval says that the first of two numbers must not
+    exceed the second. Of ``Literal`` the words are allowed.
 
     Raises:
-        InputError: a number that breaks these rules, or a word that the type does not know.
+        InputError: a value breaks these rules.
     """
 
     def __post_init__(self) -> None:
-        for name, rule in _rules_of(type(self)).items():
+        for name, rule in _read_rules(type(self)).items():
             value = getattr(self, name)
             default = getattr(type(self), name, None)
 
@@ -75,7 +76,7 @@ class Settings:
 
 
 def _is_in_interval(number: float, interval: str) -> bool:
-    """Whether a number lies in an interval such as ``[16, inf)``; "[" and "]" include the end."""
+    """Whether a number lies in an interval such as ``[16, inf)``: brackets include their end."""
     low, high = (float(end) for end in interval[1:-1].split(", "))
     is_above = number >= low if interval[0] == "[" else number > low
     is_below = number <= high if interval[-1] == "]" else number < high
@@ -83,8 +84,8 @@ def _is_in_interval(number: float, interval: str) -> bool:
 
 
 @cache
-def _rules_of(kind: type) -> dict[str, _Rule]:
-    """Read the rules of the settings of a class from their type hints, by name."""
+def _read_rules(kind: type) -> dict[str, _Rule]:
+    """Read the rules of a class of settings from its type hints, by the names of the settings."""
     rules: dict[str, _Rule] = {}
     for name, hint in get_type_hints(kind, include_extras=True).items():
         interval = ""
@@ -94,7 +95,7 @@ def _rules_of(kind: type) -> dict[str, _Rule]:
             interval, *notes = hint.__metadata__
             plain = get_args(hint)[0]
 
-        # A Literal may be the type itself, or a part of it, as in ``Literal["a", "b"] | None``.
+        # A Literal may be the type itself or a part of it, as in ``Literal["a", "b"] | None``.
         parts = (plain, *get_args(plain))
         literal = next((part for part in parts if get_origin(part) is Literal), None)
         words = get_args(literal)
@@ -111,11 +112,15 @@ def _rules_of(kind: type) -> dict[str, _Rule]:
 
 
 def read_config(path: Path, kind: type[ConfigT]) -> ConfigT:
-    """Read a YAML file that holds the differences from the defaults of ``kind``.
+    """Read settings from a YAML file; those that it leaves out have their defaults.
+
+    Args:
+        path: the file.
+        kind: the dataclass of the settings.
 
     Raises:
-        InputError: not YAML, an unknown key (the message suggests the nearest), or a value that
-            ``kind`` refuses.
+        InputError: the file is missing or no YAML, a key is unknown (the message suggests the
+            nearest), or ``kind`` refuses a value.
     """
     # Imported here, so that the command line knows its options without loading torch.
     from depthpose.core.files import read_text
@@ -133,10 +138,11 @@ def read_config(path: Path, kind: type[ConfigT]) -> ConfigT:
 
 
 def _merge_nested_defaults(content: Mapping[Any, Any], kind: type) -> dict[Any, Any]:
-    """Complete the nested settings in ``content`` by the defaults that ``kind`` has for them.
+    """Fill in the nested settings that ``content`` leaves out, with the defaults of ``kind``.
 
-    A nested dataclass may have other defaults as a field of ``kind`` than by itself. Its class
-    variable ``INSTEAD`` maps a setting to the one whose default it removes.
+    A field of ``kind`` that is a dataclass may have another default than that dataclass itself. If
+    its class variable ``INSTEAD`` maps a setting in ``content`` to another one, the default of that
+    other one is left out.
     """
     merged = dict(content)
     for field in dataclasses.fields(kind):
@@ -146,10 +152,10 @@ def _merge_nested_defaults(content: Mapping[Any, Any], kind: type) -> dict[Any, 
             default = field.default_factory()
         if not isinstance(differences, Mapping) or not dataclasses.is_dataclass(default):
             continue
-        removes = getattr(default, "INSTEAD", {})
-        removed = {removes[key] for key in differences if key in removes}
+        replaced_by = getattr(default, "INSTEAD", {})
+        replaced = {replaced_by[key] for key in differences if key in replaced_by}
         defaults = config_to_dict(default)
-        remaining = {key: value for key, value in defaults.items() if key not in removed}
+        remaining = {key: value for key, value in defaults.items() if key not in replaced}
         merged[field.name] = remaining | _merge_nested_defaults(differences, type(default))
     return merged
 
@@ -160,10 +166,10 @@ def config_from_dict(
     """Build the dataclass ``kind`` from a mapping.
 
     Args:
-        content: settings by name; what is left out has its default.
-        kind: a dataclass.
-        source: what the mapping is called in errors, such as the path of its file.
-        prefix: what the names of its settings begin with in errors, such as ``loop.``.
+        content: settings by name; those that are left out have their defaults.
+        kind: the dataclass of the settings.
+        source: what errors call the mapping, such as the path of its file.
+        prefix: prefix of the settings' names in errors, such as ``loop.``.
 
     Raises:
         InputError: an unknown key, a wrong type, or a value that ``kind`` refuses.
@@ -176,7 +182,7 @@ def config_from_dict(
         if key not in defaults:
             raise InputError(
                 f"{source}: unknown key {prefix + str(key)!r:.{_LONGEST}}; "
-                f"{nearest_name(str(key)[:_LONGEST], defaults)}"
+                f"{suggest_name(str(key)[:_LONGEST], defaults)}"
             )
         # A default may be infinite, where no other number may.
         is_default = isinstance(value, float) and value == defaults[key]
@@ -195,8 +201,8 @@ def _convert(value: Any, hint: Any, source: str, name: str) -> Any:  # noqa: ANN
     Args:
         value: what the file holds.
         hint: type of the setting.
-        source: what the file is called in errors.
-        name: name of the setting, for errors.
+        source: what errors call the file.
+        name: what errors call the setting.
 
     Raises:
         InputError: it cannot be converted without loss.
@@ -227,7 +233,11 @@ def _convert(value: Any, hint: Any, source: str, name: str) -> Any:  # noqa: ANN
 
 
 def _convert_to_union(value: Any, hints: tuple[Any, ...], source: str, name: str) -> Any:  # noqa: ANN401
-    """Convert a value to the first type that takes it, or raise the error of the last type."""
+    """Convert a value to the first of several types that accepts it.
+
+    Raises:
+        InputError: none does; the message is that of the last type.
+    """
     if value is None and type(None) in hints:
         return None
     *first_hints, last_hint = (hint for hint in hints if hint is not type(None))
@@ -243,7 +253,7 @@ def _convert_to_sequence(
     source: str,
     name: str,
 ) -> list[Any] | tuple[Any, ...]:
-    """Convert a value to a list or a tuple, of any or of a fixed length, entry by entry."""
+    """Convert a value, entry by entry, to a list, or to a tuple of any or of a fixed length."""
     shown = f"{source}: {name} is {value!r:.{_LONGEST}}"
     is_list = get_origin(hint) is list
     entry_hints = get_args(hint)
@@ -270,7 +280,7 @@ def _convert_to_sequence(
 def _convert_to_float(value: Any, shown: str) -> float:  # noqa: ANN401
     """Convert a number, or text such as ``1e-4`` (no number in YAML 1.1), to a finite float.
 
-    ``shown`` begins the error.
+    ``shown`` is the setting and its value, with which the error begins.
     """
     needed = "finite number is needed: write one, or leave the key out for the default"
     try:
@@ -291,7 +301,7 @@ def config_to_dict(config: object) -> dict[str, Any]:
 
 
 def write_config(path: Path, config: object) -> None:
-    """Write every setting of ``config``, defaults too, so that the file is a full record."""
+    """Write all settings as YAML, defaults too, so that the file is a full record."""
     from depthpose.core.files import atomic_write  # as in read_config
 
     with atomic_write(path) as temporary:

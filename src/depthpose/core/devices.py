@@ -1,4 +1,4 @@
-"""Devices, threads and precision of the computation on this machine."""
+"""Devices, threads, precision and memory of the computation on this machine."""
 
 import os
 import warnings
@@ -14,21 +14,21 @@ from depthpose.core.errors import InputError, Notice, describe_full_memory
 
 _IMPORTING_PROCESS = os.getpid()  # a process that is forked later has another number
 Item = TypeVar("Item")
-Made = TypeVar("Made")
+Result = TypeVar("Result")
 
 
 class PrecisionNotice(Notice):
-    """A precision was asked for that this machine does not compute in; another is taken."""
+    """This machine does not compute in the wanted precision, and another one is taken."""
 
 
 @contextmanager
 def force_float32() -> Iterator[None]:
-    """Make float32 on the processor torch's default, without autocast, inside the block.
+    """Inside the block, make float32 on the CPU torch's default, and switch autocast off.
 
     With a caller's autocast, default dtype or default device, weights and inputs would differ in
-    dtype or device; the caller's settings hold again afterwards. In a process that was forked after
-    this module was imported, torch computes with one thread: OpenMP's other threads do not exist
-    there, and torch would wait for them forever.
+    dtype or device. The caller's settings are restored afterwards. In a process that was forked
+    after this module was imported, torch is set to one thread: the other threads of OpenMP do not
+    exist there, and torch would wait for them forever.
     """
     if os.getpid() != _IMPORTING_PROCESS:
         torch.set_num_threads(1)
@@ -48,8 +48,8 @@ def force_float32() -> Iterator[None]:
             torch.set_default_dtype(callers_dtype)
 
 
-def each_in_float32(items: Iterator[Made]) -> Iterator[Made]:
-    """Yield the items of a generator, each of which is computed inside :func:`force_float32`.
+def iterate_in_float32(items: Iterator[Result]) -> Iterator[Result]:
+    """Yield the items of a generator, computing each of them inside :func:`force_float32`.
 
     Between two items the caller's own settings hold.
     """
@@ -59,36 +59,41 @@ def each_in_float32(items: Iterator[Made]) -> Iterator[Made]:
             item = next(items, end)
         if item is end:
             return
-        yield cast(Made, item)
+        yield cast(Result, item)
 
 
-def each_in_threads(
-    work: Callable[[Item], Made], items: Iterable[Item], threads: int
-) -> Iterator[Made]:
-    """Apply ``work`` to items in several threads, and yield the results in the order of the items.
+def map_in_threads(
+    function: Callable[[Item], Result], items: Iterable[Item], threads: int
+) -> Iterator[Result]:
+    """Apply a function to items in several threads; yield the results in the order of the items.
 
-    It runs without gradients. At most ``threads`` items are in work or wait to be yielded, so that
-    the inputs of a long run need not fit into memory. The threads share torch's processor cores.
+    At most ``threads`` items are being processed or wait to be yielded, so that the inputs of a
+    long run need not fit into memory.
+
+    Args:
+        function: called without gradients.
+        items: taken one by one.
+        threads: number of threads, which share torch's processor cores.
 
     Raises:
         InputError: fewer than one thread.
     """
     if threads < 1:
         raise InputError(f"threads is {threads}; take 1 or more, 2 where two cores are free")
-    work_without_gradients = torch.no_grad()(work)
+    function_without_gradients = torch.no_grad()(function)
     if threads == 1:
-        yield from map(work_without_gradients, items)
+        yield from map(function_without_gradients, items)
         return
 
     cores = torch.get_num_threads()
     cores_per_thread = max(1, cores // threads)
-    futures: deque[Future[Made]] = deque()
+    futures: deque[Future[Result]] = deque()
     with ThreadPoolExecutor(
         threads, initializer=torch.set_num_threads, initargs=(cores_per_thread,)
     ) as pool:
         try:
             for item in items:
-                futures.append(pool.submit(work_without_gradients, item))
+                futures.append(pool.submit(function_without_gradients, item))
                 if len(futures) == threads:
                     yield futures.popleft().result()
             while futures:
@@ -115,7 +120,7 @@ def refused_memory(name: str) -> Iterator[None]:
 
 
 def usable_device(name: str | torch.device) -> torch.device:
-    """Return the device of a name, such as ``cpu`` or ``cuda:1``, once it has computed something.
+    """Return the device of a name, such as ``cpu`` or ``cuda:1``, after a small computation on it.
 
     Raises:
         InputError: this machine has no such device, or it cannot compute in float64.
@@ -137,9 +142,10 @@ def usable_device(name: str | torch.device) -> torch.device:
 
 
 def device_of_process(device: str) -> str:
-    """Replace ``cuda`` by the GPU that a launcher chose for this process (``LOCAL_RANK``).
+    """Return the device of this process: for ``cuda`` the GPU of its rank, such as ``cuda:1``.
 
-    Any other device, and ``cuda`` without a launcher, is returned as it is.
+    The rank is that of a launcher (``LOCAL_RANK``). Without a launcher ``cuda`` is returned as it
+    is, and so is any other device.
     """
     local_rank = os.environ.get("LOCAL_RANK", "")
     if device == "cuda" and local_rank.isdecimal():
@@ -150,7 +156,7 @@ def device_of_process(device: str) -> str:
 def computes_bf16(device: str | torch.device) -> bool:
     """Whether a device has instructions for bfloat16.
 
-    Every accelerator is taken to have them. Of processors those count for which oneDNN has such
+    Every accelerator is taken to have them. Of processors those have for which oneDNN has bfloat16
     kernels: with AVX-512 (BW, VL and DQ), AMX or AVX-NE-CONVERT, and ARM's with BF16. On others
     oneDNN refuses bfloat16, or PyTorch computes it 20 to 30 times slower than float32.
     """

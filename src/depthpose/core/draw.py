@@ -10,15 +10,19 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional as F
 
+Rgb = tuple[float, float, float]
+"""Red, green and blue of a colour, each in [0, 1]."""
+
 # From near to far: a warm, bright end and a dark, cold one, of falling lightness, so that the order
 # survives a grey-scale print and colour blindness.
-NEAR_TO_FAR = (
+NEAR_TO_FAR: tuple[Rgb, ...] = (
     (1.00, 0.97, 0.70), (0.99, 0.76, 0.35), (0.94, 0.49, 0.28), (0.80, 0.26, 0.38),
     (0.57, 0.16, 0.47), (0.33, 0.12, 0.45), (0.14, 0.08, 0.30), (0.02, 0.02, 0.10),
 )  # fmt: skip
-_INVALID = (0.5, 0.5, 0.5)  # RGB of pixels without a value
-_LARGEST_PX = 96.0  # disparity of the brightest colour
-_DIMMED = 0.35  # brightness of an image under points, as a share of its own
+_INVALID: Rgb = (0.5, 0.5, 0.5)  # colour of pixels without a value
+MAX_DISPARITY_PX = 96.0
+"""Disparity of the brightest colour; a larger one has it too [px]."""
+_DIMMED = 0.35  # factor by which an image under points is darkened
 _LONGEST_LINE_PX = 1e5  # a longer line has an end beyond any picture
 _LINE_STEP_PX = 0.5  # between the samples of a line: no pixel on its way is missed
 
@@ -26,9 +30,9 @@ _LINE_STEP_PX = 0.5  # between the samples of a line: no pixel on its way is mis
 def draw_depth(
     depth_m: Float[Tensor, "h w"], near_m: float = 3.0, far_m: float = 80.0
 ) -> Float[Tensor, "3 h w"]:
-    """Colour depth by its logarithm, near bright and far dark, on a scale fixed by the arguments.
+    """Colour depth by its logarithm: ``near_m`` is brightest, ``far_m`` darkest, NaN grey.
 
-    A fixed scale makes two pictures comparable and a video steady; grey marks invalid pixels.
+    Since the arguments fix the scale, pictures are comparable and a video does not flicker.
     """
     return draw_share((depth_m / near_m).log() / math.log(far_m / near_m))
 
@@ -36,15 +40,15 @@ def draw_depth(
 def draw_disparity(
     disparity_px: Float[Tensor, "h w"], is_sky: Bool[Tensor, "h w"] | None = None
 ) -> Float[Tensor, "3 h w"]:
-    """Colour disparity, large (near) bright, on the fixed scale 0..96 px; sky is grey."""
-    share = 1 - disparity_px / _LARGEST_PX
+    """Colour disparity: 0 is darkest, ``MAX_DISPARITY_PX`` brightest, NaN and the sky grey."""
+    share = 1 - disparity_px / MAX_DISPARITY_PX
     if is_sky is not None:
         share = torch.where(is_sky, torch.nan, share)
     return draw_share(share)
 
 
 def draw_share(share: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
-    """Colour a map by its share of the colour scale, 0 (bright) to 1 (dark); NaN becomes grey."""
+    """Colour a map of positions on the colour scale, 0 (bright) to 1 (dark); NaN becomes grey."""
     anchors = torch.tensor(NEAR_TO_FAR, dtype=torch.float32)
     position = share.nan_to_num(0.0).clamp(0, 1) * (len(anchors) - 1)
 
@@ -64,9 +68,10 @@ def draw_points(
     radius_px: int = 1,
     near_m: float = 3.0,
 ) -> Float[Tensor, "3 h w"]:
-    """Draw sparse depth (LiDAR) on a darkened image, each point as a square.
+    """Draw sparse depth (LiDAR) on a darkened image, in the colours of :func:`draw_depth`.
 
-    Its side is ``2 radius_px + 1`` pixels; where squares overlap the nearest point is visible.
+    Each point is a square of ``2 radius_px + 1`` pixels; where squares overlap the nearest point is
+    visible.
     """
     squares_m = -_dilate(-depth_m, radius_px)
     colors = draw_depth(squares_m, near_m=near_m, far_m=far_m)
@@ -74,42 +79,45 @@ def draw_points(
 
 
 def draw_error_points(
-    image: Float[Tensor, "3 h w"], error: Float[Tensor, "h w"], top: float, radius_px: int = 1
+    image: Float[Tensor, "3 h w"], error: Float[Tensor, "h w"], worst: float, radius_px: int = 1
 ) -> Float[Tensor, "3 h w"]:
-    """Draw sparse errors on a darkened image as :func:`draw_points` does: 0 dark, ``top`` bright.
+    """Draw sparse errors as squares on a darkened image: 0 is darkest, ``worst`` brightest.
 
     Where squares overlap the largest error is visible.
     """
     squares = _dilate(error, radius_px)
-    colors = draw_share(1 - squares / top)
+    colors = draw_share(1 - squares / worst)
     return torch.where(torch.isnan(squares), _DIMMED * image, colors)
 
 
 def _dilate(values: Float[Tensor, "h w"], radius_px: int) -> Float[Tensor, "h w"]:
-    """Grow each value of a sparse map to a square; the largest wins, NaN is between squares."""
+    """Take the largest value within the square of each pixel; NaN where it has none.
+
+    The square reaches ``radius_px`` pixels to each side.
+    """
     filled = values.nan_to_num(-torch.inf)[None]
-    largest = F.max_pool2d(filled, 2 * radius_px + 1, 1, radius_px)[0]
+    largest = F.max_pool2d(filled, 2 * radius_px + 1, stride=1, padding=radius_px)[0]
     return torch.where(torch.isfinite(largest), largest, torch.nan)
 
 
 def draw_lines(
     image: Float[Tensor, "3 h w"],
     ends_px: Float[Tensor, "n 2 2"],
-    color: tuple[float, float, float],
+    color: Rgb,
     dash_px: float | None = None,
 ) -> Float[Tensor, "3 h w"]:
-    """Draw lines two pixels wide, clipped to the picture; a line with a NaN end is not drawn.
+    """Draw lines two pixels wide on a copy of an image; a line with a NaN end is left out.
 
     Args:
-        image: RGB; the lines are drawn on a copy of it.
+        image: RGB in [0, 1]; it is not changed.
         ends_px: (u, v) of both ends of each line.
-        color: RGB in [0, 1].
+        color: colour of the lines.
         dash_px: length of the dashes, and of the gaps between them; None: solid lines.
     """
     height, width = image.shape[1:]
     drawn = image.clone()
     pixel_color = torch.tensor(color).to(image)[:, None]
-    brush = torch.cartesian_prod(torch.arange(2), torch.arange(2))  # 2x2 pixels
+    brush = torch.cartesian_prod(torch.arange(2), torch.arange(2))  # offsets of 2x2 pixels
     for start, end in ends_px.double().tolist():
         length_px = math.dist(start, end)
         if not 0 < length_px < _LONGEST_LINE_PX:  # False for NaN too
@@ -132,9 +140,9 @@ def draw_lines(
 
 
 def draw_outline(
-    image: Float[Tensor, "3 h w"], mask: Bool[Tensor, "h w"], color: tuple[float, float, float]
+    image: Float[Tensor, "3 h w"], mask: Bool[Tensor, "h w"], color: Rgb
 ) -> Float[Tensor, "3 h w"]:
-    """Draw the border of a mask on a copy of an image: its outermost pixels, one pixel wide."""
-    is_near_outside = F.max_pool2d((~mask).float()[None], 3, 1, 1)[0] > 0
+    """Draw the outermost pixels of a mask on a copy of an image: a line one pixel wide."""
+    is_near_outside = F.max_pool2d((~mask).float()[None], 3, stride=1, padding=1)[0] > 0
     border_color = torch.tensor(color).to(image)[:, None, None]
     return torch.where(mask & is_near_outside, border_color, image)

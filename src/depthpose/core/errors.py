@@ -1,4 +1,4 @@
-"""The error that bad input raises, the notice that stops nothing, and parts of their messages."""
+"""The errors and notices that users see, and functions that word their messages."""
 
 import re
 from collections.abc import Iterable
@@ -8,10 +8,10 @@ from typing import Any
 
 
 class InputError(ValueError):
-    """Something the user gave cannot be used.
+    """What the user gave cannot be used.
 
-    The message names the value, the rule it breaks and the remedy. A reader of files raises no
-    other error, whatever bytes it reads; the command line turns this one into exit code 2.
+    The message names the value, the rule that it breaks and the remedy. Readers of files raise no
+    other error, whatever bytes they read; commands print it and end with exit code 2.
     """
 
 
@@ -25,13 +25,13 @@ class MissingExtraError(ImportError):
 
 
 def install_command(extra: str) -> str:
-    """Describe how an extra is installed: from a clone or a wheel, for no index has a release."""
+    """Describe how an extra is installed: from a clone or a wheel; no index has a release yet."""
     clone = f"pip install -e '.[{extra}]' in the clone of depthpose"
     return f"{clone}, or pip install 'WHEEL[{extra}]' with the file of the wheel"
 
 
 class Notice(UserWarning):
-    """A warning that stops nothing; the command line prints it as one line."""
+    """A warning for the user, which commands print as one line."""
 
 
 _OUT_OF_MEMORY = re.compile(
@@ -43,9 +43,9 @@ _LONGEST_CAUSE = 200  # letters that are shown of another library's message
 
 
 def describe_full_memory(error: BaseException) -> str | None:
-    """Describe an out-of-memory error of any library, with remedies; None for any other error.
+    """Describe an out-of-memory error of any library, with remedies; None for another error.
 
-    Libraries raise errors of many types, which are recognised by their message.
+    Libraries raise it by many types; it is recognised by the message.
     """
     if not isinstance(error, MemoryError) and _OUT_OF_MEMORY.search(str(error)) is None:
         return None
@@ -57,13 +57,13 @@ def describe_full_memory(error: BaseException) -> str | None:
 
 
 def import_extra(module: str, package: str, extra: str, purpose: str) -> Any:  # noqa: ANN401
-    """Import an optional dependency where it is used.
+    """Import and return an optional dependency.
 
     Args:
-        module: its name in Python.
+        module: its name in Python, such as ``cv2``.
         package: its name for pip.
         extra: the extra of depthpose that installs it.
-        purpose: what needs it, for the message.
+        purpose: what needs it, with which errors begin.
 
     Raises:
         MissingExtraError: it is not installed.
@@ -73,7 +73,7 @@ def import_extra(module: str, package: str, extra: str, purpose: str) -> Any:  #
         return import_module(module)
     except (ImportError, OSError) as error:  # OSError: of a library that ctypes loads
         top_module = module.partition(".")[0]
-        # A module of another name that is missing is one which this dependency needs itself.
+        # Where another module is missing, it is one that this dependency needs itself.
         if isinstance(error, ModuleNotFoundError) and error.name in (module, top_module):
             raise MissingExtraError(package, extra, purpose) from error
         reason = describe_full_memory(error)
@@ -86,30 +86,33 @@ def import_extra(module: str, package: str, extra: str, purpose: str) -> Any:  #
 
 
 def import_opencv(purpose: str) -> Any:  # noqa: ANN401  OpenCV's classes carry no types
-    """Import OpenCV's ``cv2``, the extra ``opencv``, as :func:`import_extra` does."""
+    """Import and return OpenCV's ``cv2`` (the extra ``opencv``), as :func:`import_extra` does."""
     return import_extra("cv2", "opencv-python-headless", "opencv", purpose)
 
 
 def refuse_unknown(what: str, name: object, names: Iterable[str]) -> None:
-    """Refuse a name that is not among the known ``names``.
+    """Refuse a name that is not among the allowed ones.
 
-    ``what`` says in the message what the name is that of, such as ``unit``.
+    Args:
+        what: what has that name, such as ``unit``, for the error.
+        name: the name.
+        names: the allowed names.
 
     Raises:
         InputError: it is not among them; the message suggests the nearest.
     """
-    known_names = tuple(names)
-    if name not in known_names:
-        raise InputError(f"{what} is {name!r}; {nearest_name(str(name), known_names)}")
+    allowed_names = tuple(names)
+    if name not in allowed_names:
+        raise InputError(f"{what} is {name!r}; {suggest_name(str(name), allowed_names)}")
 
 
-def nearest_name(name: str, candidates: Iterable[str]) -> str:
-    """Word the end of an error message: the candidate nearest to ``name``, and all candidates.
+def suggest_name(name: str, candidates: Iterable[str]) -> str:
+    """Word the end of an error about an unknown name: the most similar candidate, and all of them.
 
     Returns:
         ``did you mean 'x'? Known: 'a', 'x'.``, or only the list where no candidate is similar.
     """
-    known_names = sorted(candidates)
-    similar = get_close_matches(name, known_names, n=1)
+    sorted_names = sorted(candidates)
+    similar = get_close_matches(name, sorted_names, n=1)
     suggestion = f"did you mean {similar[0]!r}? " if similar else ""
-    return f"{suggestion}Known: {', '.join(map(repr, known_names)) or 'none'}."
+    return f"{suggestion}Known: {', '.join(map(repr, sorted_names)) or 'none'}."

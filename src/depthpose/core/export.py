@@ -1,8 +1,8 @@
 """Export of networks to ONNX files that run without torch, and the proof that outputs agree.
 
-Operators are those of opset 18 (https://onnx.ai/onnx/operators), the first whose Resize averages
-where it shrinks. The proof: the largest and the mean difference between the outputs of onnxruntime
-and PyTorch, and the limit that they are held to.
+Graphs are built of the operators of opset 18 (https://onnx.ai/onnx/operators), the first whose
+Resize averages where it shrinks. The proof is a table: for each output the largest and the mean
+difference between onnxruntime and PyTorch, and their limit.
 """
 
 import json
@@ -24,14 +24,15 @@ from torch import Tensor, nn
 from depthpose.core.checkpoint import file_sha256
 from depthpose.core.errors import InputError, import_extra
 from depthpose.core.files import atomic_write, write_json
-from depthpose.core.run import environment, refuse_to_replace
+from depthpose.core.run import describe_environment, refuse_to_replace
 
 OPSET = 18
-_IR_VERSION = 10  # that of onnx 1.16: a younger one would shut out older runtimes
-Shape = Sequence[int | str]  # text names a side that is known only when the graph runs
+_IR_VERSION = 10  # that of onnx 1.16: older runtimes do not read a newer one
+TensorShape = Sequence[int | str]
+"""Lengths of the axes; a name stands for a length that is known only when the graph runs."""
 
 
-def import_export() -> Any:  # noqa: ANN401  what protobuf generates carries no types
+def import_onnx() -> Any:  # noqa: ANN401  what protobuf generates carries no types
     """Import ``onnx`` with the submodules and packages that an export needs.
 
     Raises:
@@ -45,10 +46,10 @@ def import_export() -> Any:  # noqa: ANN401  what protobuf generates carries no 
 
 @dataclass(frozen=True, eq=False)
 class Value:
-    """A tensor of a graph; arithmetic on it adds nodes to the graph."""
+    """A tensor of a graph. Arithmetic with it adds nodes to the graph."""
 
     graph: "Graph"
-    name: str
+    name: str  #: unique in the graph
 
     def op(self, kind: str, *others: Any, **attributes: Any) -> "Value":  # noqa: ANN401
         """Add an operator whose first input is this tensor, and return its first output."""
@@ -73,21 +74,21 @@ class Graph:
     Inputs of an operator are values, arrays, or numbers: an int becomes int64, a float float64.
     """
 
-    onnx: Any = field(default_factory=import_export)
+    onnx: Any = field(default_factory=import_onnx)  #: the package ``onnx``
     nodes: list[Any] = field(default_factory=list)
     constants: list[Any] = field(default_factory=list)
     inputs: list[Any] = field(default_factory=list)
     outputs: list[Any] = field(default_factory=list)
-    numbers: Iterator[int] = field(default_factory=partial(count, 1))  # make names unique
+    numbers: Iterator[int] = field(default_factory=partial(count, 1))  #: they make names unique
 
-    def input(self, name: str, dtype: type, shape: Shape) -> Value:
-        """Add an input of the graph."""
+    def input(self, name: str, dtype: type, shape: TensorShape) -> Value:
+        """Add an input to the graph, and return it."""
         helper = self.onnx.helper
         element_type = helper.np_dtype_to_tensor_dtype(np.dtype(dtype))
         self.inputs.append(helper.make_tensor_value_info(name, element_type, list(shape)))
         return Value(self, name)
 
-    def output(self, name: str, value: Value, dtype: type, shape: Shape) -> None:
+    def output(self, name: str, value: Value, dtype: type, shape: TensorShape) -> None:
         """Make a value an output of the graph."""
         helper = self.onnx.helper
         element_type = helper.np_dtype_to_tensor_dtype(np.dtype(dtype))
@@ -112,7 +113,7 @@ class Graph:
         return Value(self, output_name)
 
     def call(self, network: Any, *inputs: Value) -> tuple[Value, ...]:  # noqa: ANN401
-        """Add all nodes of another model, fed by ``inputs``, and return its outputs."""
+        """Add all nodes of another ONNX model, connected to ``inputs``, and return its outputs."""
         prefix = f"network_{next(self.numbers)}/"
         inner = self.onnx.compose.add_prefix(network, prefix).graph
         for value, inner_input in zip(inputs, inner.input, strict=True):
@@ -123,7 +124,7 @@ class Graph:
         return tuple(Value(self, output.name) for output in inner.output)
 
     def model(self, facts: Mapping[str, Any]) -> Any:  # noqa: ANN401
-        """Assemble and check the ONNX model, with ``facts`` as its metadata."""
+        """Build and check the ONNX model of the graph, with ``facts`` as its metadata."""
         helper = self.onnx.helper
         graph = helper.make_graph(
             self.nodes, "depthpose", self.inputs, self.outputs, self.constants
@@ -140,40 +141,48 @@ class Graph:
         return model
 
 
-Row = dict[str, str | float]
+ProofRow = dict[str, str | float]
+"""A row of the proof: the comparison of one output of one case."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Case:
-    """One input and PyTorch's outputs for it, by the names of the graph's inputs and outputs."""
+    """Inputs of a graph, and PyTorch's outputs for them."""
 
-    name: str  # its size, for the table
-    inputs: Mapping[str, np.ndarray]
-    expected: Mapping[str, np.ndarray]  # outputs that are not named here are not compared
-    where: Mapping[str, np.ndarray] = field(default_factory=dict)  # masks: only there, if not all
+    name: str  #: in the proof, such as the size of the inputs
+    inputs: Mapping[str, np.ndarray]  #: by name
+    expected: Mapping[str, np.ndarray]  #: by name; outputs that are left out are not compared
+    #: masks by the names of outputs that are compared only there
+    where: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Limit:
-    """The limit within which an output may differ from PyTorch's.
+    """By how much an output may differ from PyTorch's.
 
-    Where a discrete decision depends on a rounding, numbers flip: they differ by more, or are NaN
-    in one output alone. A share of ``flips`` may do so, and is left out of the differences.
+    Where a decision depends on a rounding, a number may flip: it differs by more, or is NaN in one
+    of the two outputs alone. Flipped numbers are left out of the differences.
     """
 
     value: float  #: the limit, in the output's unit
-    of: Literal["largest", "mean"] = "largest"  #: mean where the output is discontinuous
-    is_relative: bool = False  #: differences are shares of PyTorch's numbers
-    flips: float = 0.0  #: share of the numbers that may differ by more
+    of: Literal["largest", "mean"] = "largest"  #: limited difference; mean of discontinuous outputs
+    is_relative: bool = False  #: differences are divided by PyTorch's numbers
+    flips: float = 0.0  #: largest share of flipped numbers
 
 
 def _compare_output(
     case: str, output: str, onnx_output: np.ndarray, torch_output: np.ndarray, limit: Limit
-) -> Row:
-    """Compare an output of onnxruntime with PyTorch's; return the row of the proof.
+) -> ProofRow:
+    """Compare an output of onnxruntime with PyTorch's: make its row of the proof.
 
-    NaN must be in the same places, but for the share of ``limit.flips``. Whether the differences
-    keep to ``limit.value`` is left to the caller.
+    Whether the differences keep to ``limit.value`` is left to the caller.
+
+    Args:
+        case: name of the case.
+        output: name of the output.
+        onnx_output: numbers of onnxruntime.
+        torch_output: numbers of PyTorch.
+        limit: decides which differences are computed, and how many numbers may flip.
 
     Raises:
         InputError: shapes or places of NaN differ, too many numbers flip, or there is nothing to
@@ -191,7 +200,7 @@ def _compare_output(
             f"{torch_nan.sum()}; nothing is written."
         )
 
-    # Differences of all numbers that are not NaN in both outputs.
+    # Differences of all numbers that are not NaN in both outputs; infinite of NaN in one alone.
     difference = np.abs(onnx_values - torch_values)
     if limit.is_relative:
         difference /= np.abs(torch_values)
@@ -199,7 +208,7 @@ def _compare_output(
     difference = difference[~np.isnan(difference)]
 
     # Numbers that flipped are counted and left out.
-    flipped: Row = {}
+    flipped: ProofRow = {}
     if limit.flips:
         is_within = difference <= limit.value
         difference = difference[is_within]
@@ -232,14 +241,14 @@ def _compare_output(
 class Export:
     """An export: the graph to write, and the cases by which it is compared with PyTorch."""
 
-    graph: Callable[[], Graph]
-    cases: Callable[[], Iterable[Case]]
-    limits: Mapping[str, Limit]  # by the name of the output
-    facts: Mapping[str, Any]  # for users of the file, in its metadata
+    graph: Callable[[], Graph]  #: builds the graph
+    cases: Callable[[], Iterable[Case]]  #: makes the cases
+    limits: Mapping[str, Limit]  #: by the names of the outputs
+    facts: Mapping[str, Any]  #: metadata of the file, for its users
 
 
-def freeze(path: Path, export: Export) -> list[Row]:
-    """Write ``NAME.onnx``, and the proof ``NAME.proof.json``, if its outputs agree with PyTorch's.
+def write_export(path: Path, export: Export) -> list[ProofRow]:
+    """Write ``NAME.onnx`` and its proof, ``NAME.proof.json``, if its outputs agree with PyTorch's.
 
     Returns:
         The rows of the proof: the differences of each output of each case, and their limit.
@@ -253,7 +262,7 @@ def freeze(path: Path, export: Export) -> list[Row]:
     proof = path.with_suffix(".proof.json")  # NAME.json may be a camera
     for file in (path, proof):
         refuse_to_replace(file)
-    onnx = import_export()
+    onnx = import_onnx()
     with atomic_write(path) as part:
         part.touch()  # a place that cannot be written is refused before the work
         facts = {**export.facts, "depthpose": version("depthpose")}
@@ -264,7 +273,7 @@ def freeze(path: Path, export: Export) -> list[Row]:
             "file": path.name,
             "sha256": file_sha256(part),
             "opset": OPSET,
-            "environment": environment() | runtimes,
+            "environment": describe_environment() | runtimes,
             "facts": facts,
             "differences": rows,
         }
@@ -272,8 +281,8 @@ def freeze(path: Path, export: Export) -> list[Row]:
     return rows
 
 
-def _compare_with_torch(onnx_file: Path, export: Export) -> list[Row]:
-    """Run an ONNX file on all cases; return the rows of the proof that it agrees with PyTorch.
+def _compare_with_torch(onnx_file: Path, export: Export) -> list[ProofRow]:
+    """Run an ONNX file on all cases and compare it with PyTorch: make the rows of the proof.
 
     Raises:
         InputError: an output differs by more than its limit, or there is no case.
@@ -281,7 +290,7 @@ def _compare_with_torch(onnx_file: Path, export: Export) -> list[Row]:
     session = import_module("onnxruntime").InferenceSession(
         str(onnx_file), providers=["CPUExecutionProvider"]
     )
-    rows: list[Row] = []
+    rows: list[ProofRow] = []
     for case in export.cases():
         onnx_outputs = session.run(list(case.expected), dict(case.inputs))
         for name, onnx_output in zip(case.expected, onnx_outputs, strict=True):
@@ -311,16 +320,16 @@ _MAX_SIZE = 1 << 10
 """Largest batch, and multiple of a side, for the exporter; the graph itself has no limit."""
 
 
-def network_model(module: nn.Module, images: Sequence[Tensor], multiple: int) -> Any:  # noqa: ANN401
+def convert_network(module: nn.Module, images: Sequence[Tensor], multiple: int) -> Any:  # noqa: ANN401
     """Convert a network of images to an ONNX model whose batch, rows and columns are variable.
 
     Args:
         module: the network, in eval mode.
-        images: examples of its inputs, (b, c, h, w) each, with b, h and w larger than the least
-            possible: else the exporter would take them for constants.
-        multiple: every height and width is a multiple of it.
+        images: examples of its inputs, each (b, c, h, w) with b, h and w larger than the least
+            possible; else the exporter would take these for constants.
+        multiple: number of which every height and width is a multiple.
     """
-    onnx = import_export()
+    onnx = import_onnx()
     batch = torch.export.Dim("batch", min=1, max=_MAX_SIZE)
     rows = torch.export.Dim("rows", min=1, max=_MAX_SIZE)
     columns = torch.export.Dim("columns", min=1, max=_MAX_SIZE)

@@ -5,10 +5,10 @@ from importlib import import_module
 from typing import Any
 
 
-def data_frame(rows: Iterable[Mapping[str, Any]]) -> Any:  # noqa: ANN401  pandas is no dependency
-    """Convert rows to a ``pandas.DataFrame``.
+def make_data_frame(rows: Iterable[Mapping[str, Any]]) -> Any:  # noqa: ANN401  pandas is no dependency
+    """Convert rows, mappings of column names to values, to a ``pandas.DataFrame``.
 
-    A mapping inside a row becomes one column for each of its entries, called ``NAME.ENTRY``.
+    A mapping inside a row becomes a column for each of its entries, called ``NAME.ENTRY``.
 
     Raises:
         ImportError: pandas is not installed.

@@ -1,11 +1,11 @@
 """A z-buffer in plain tensor operations: the visible triangle of each pixel, and its depth.
 
 Visibility is exact at the pixel centres: triangles are never clipped or snapped to a grid. The
-edge functions live in homogeneous pixels (Olano and Greer, Triangle Scan Conversion Using 2D
+edge functions are those of homogeneous pixels (Olano and Greer, Triangle Scan Conversion Using 2D
 Homogeneous Coordinates, 1997), so a triangle may reach behind the camera. Everything runs on the
-device of the triangles, in memory that does not grow with the scene, and gives the same bits
-every time. It is made for synthetic images, whose textures need exact coordinates on the triangles;
-where many poses are compared with an image, a compiled loop is faster.
+device of the triangles, in bounded memory, and the result is the same to the bit every time. It is
+made for synthetic images, whose textures need exact coordinates on the triangles; where many poses
+are compared with an image, the compiled loop of ``pose/rendering.py`` is faster.
 """
 
 from collections.abc import Callable, Iterator
@@ -19,8 +19,8 @@ from torch import Tensor
 from depthpose.core.camera.pinhole import check_intrinsics
 from depthpose.core.errors import InputError
 
-_EMPTY = (1 << 63) - 1  # the largest key: a pixel of the buffer without a triangle
-# How many rows of triangles, and pixels of rows, are expanded at a time: some 200 MB at most.
+_EMPTY = (1 << 63) - 1  # the largest key: that of a pixel without a triangle
+# Rows of triangles, and pixels of rows, that are computed at a time: some 200 MB at most.
 _MAX_ROWS = 1 << 20
 _MAX_PIXELS = 1 << 18
 
@@ -29,9 +29,9 @@ _MAX_PIXELS = 1 << 18
 class Raster:
     """Depth and visible triangle of each pixel."""
 
-    depth_m: Float[Tensor, "h w"]  #: distance along the viewing axis; NaN where nothing is visible
-    primitive: Int64[Tensor, "h w"]  #: number of the visible triangle; -1 where there is none
-    barycentric: Float[Tensor, "h w 3"] | None  #: its barycentric coordinates, if asked for
+    depth_m: Float[Tensor, "h w"]  #: along the viewing axis [m]; NaN where nothing is visible
+    primitive: Int64[Tensor, "h w"]  #: index of the visible triangle; -1 where there is none
+    barycentric: Float[Tensor, "h w 3"] | None  #: of each pixel in its triangle; None: left out
 
 
 def rasterize(
@@ -45,7 +45,7 @@ def rasterize(
 ) -> Raster:
     """Render triangles, visible from both sides, with a pinhole camera.
 
-    Where two are equally far, the one with the lower number is visible.
+    Where two are equally far, the one with the lower index is visible.
 
     Args:
         triangles: corners in the camera's frame (x right, y down, z forward) [m].
@@ -81,7 +81,7 @@ def rasterize_orthographic(
     *,
     with_barycentric: bool = True,
 ) -> Raster:
-    """Render triangles by parallel rays, as for shadow maps and height maps.
+    """Render triangles with parallel rays, as for shadow maps and height maps.
 
     Args:
         triangles_px: corners (u [px], v [px], depth [m]); the smallest depth is visible, and it
@@ -110,14 +110,15 @@ def edge_functions(
 ) -> tuple[Float64[Tensor, "n 3 3"], Float64[Tensor, " n"]]:
     """Compute the edge functions of triangles, linear in the pixel (u, v), and their volumes.
 
-    ``edges[i] @ (u, v, 1) / volume`` are the barycentric coordinates divided by the depth, so
-    their sum is 1 / depth, and all three are positive inside the triangle.
+    ``edges[i] @ (u, v, 1) / volume[i]`` are the three barycentric coordinates of triangle i at that
+    pixel, divided by the depth there: they sum to 1 / depth, and are positive inside the triangle.
 
     Args:
         corners: homogeneous pixels ``K @ (x, y, z)`` of each triangle.
 
     Returns:
-        Edges and volumes; the volume is 0 where the plane of the triangle contains the camera.
+        Edges, and the signed volumes of the parallelepipeds that the corners span; a volume is 0
+        where the plane of the triangle contains the camera.
     """
     # The edge opposite to a corner is the cross product of the other two. Products are rounded
     # before they are subtracted, so that the edge two triangles share has, up to the sign, the same
@@ -149,6 +150,8 @@ def barycentric_shares(
     shares = torch.zeros(height * width, 3, device=edges.device)
     covered = (primitive.reshape(-1) >= 0).nonzero()[:, 0]
     triangle = primitive.reshape(-1)[covered]
+
+    # The edge functions at the pixel centres, divided by their sum.
     u = (covered % width).double()[:, None]
     v = (covered // width).double()[:, None]
     u_slope, v_slope, constant = edges.index_select(0, triangle).unbind(-1)
@@ -160,12 +163,37 @@ def barycentric_shares(
 
 
 def _refuse_unusable(triangles: Tensor, width: int, height: int) -> None:
-    """Refuse an empty picture, and corners that are not finite."""
+    """Refuse a picture without pixels, and corners that are not finite."""
     for name, size in (("width", width), ("height", height)):
         if size < 1:
             raise InputError(f"{name} is {size}, but a picture has a pixel at least; correct it")
     if not bool(triangles.isfinite().all()):
         raise InputError("a corner of the triangles is not finite; leave such triangles out")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Triangles:
+    """The triangles whose bounding box contains a pixel centre."""
+
+    number: Int64[Tensor, " n"]  # index among all triangles
+    edges: Float64[Tensor, "n 3 3"]  # edge functions, not negative inside
+    plane: Float64[Tensor, "n 3"]  # linear in (u, v): 1 / depth, or of parallel rays the depth
+    first_column: Int64[Tensor, " n"]  # the box, as far as it lies in the picture
+    last_column: Int64[Tensor, " n"]
+    first_row: Int64[Tensor, " n"]
+    last_row: Int64[Tensor, " n"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Spans:
+    """Adjacent pixels of a row that lie inside of a triangle; a triangle has one span a row."""
+
+    number: Int64[Tensor, " n"]  # index of the triangle among all
+    row: Int64[Tensor, " n"]
+    first_column: Int64[Tensor, " n"]
+    last_column: Int64[Tensor, " n"]
+    plane_slope: Float64[Tensor, " n"]  # along the row the plane is slope * u + offset
+    plane_offset: Float64[Tensor, " n"]
 
 
 def _draw(
@@ -178,7 +206,7 @@ def _draw(
     near_m: float,
     with_barycentric: bool,
 ) -> Raster:
-    """Fill the z-buffer with triangles: the rows of each, and the pixels of each row.
+    """Draw triangles into a z-buffer: the rows of each triangle, and the pixels of each row.
 
     Args:
         corners: homogeneous pixels of the triangles.
@@ -190,69 +218,16 @@ def _draw(
         near_m: what is nearer than this is invisible.
         with_barycentric: compute barycentric coordinates too.
     """
-    # Only triangles whose box contains a pixel centre; ``number`` is the index among all.
-    first = pixels.amin(1).ceil().clamp(min=0)
-    last = torch.minimum(pixels.amax(1).floor(), pixels.new_tensor([width - 1, height - 1]))
-    has_pixels = (first <= last).all(1)
-    if is_front is not None:
-        has_pixels = has_pixels & is_front.any(1)
-    number = has_pixels.nonzero()[:, 0]
-    first_column, first_row = first[number].long().unbind(-1)
-    last_column, last_row = last[number].long().unbind(-1)
-
-    # Edges that are not negative inside, and the plane: at (u, v, 1) it is 1 / depth, or, of
-    # parallel rays, the depth.
-    signed_edges, volume = edge_functions(corners.index_select(0, number))
-    scale = torch.where(volume != 0, 1 / volume, 0)[:, None]
-    edges = signed_edges * volume.sign()[:, None, None]
-    if parallel_depth_m is None:
-        plane = signed_edges.sum(1) * scale
-    else:
-        corner_depth_m = parallel_depth_m.index_select(0, number)[..., None]
-        plane = (signed_edges * scale[..., None] * corner_depth_m).sum(1)
+    triangles = _select_triangles(corners, pixels, is_front, parallel_depth_m, width, height)
+    is_parallel = parallel_depth_m is not None
 
     # A key has the bits of the depth above the number of the triangle, so that the smallest key of
     # a pixel is that of the visible triangle.
     buffer = torch.full((width * height,), _EMPTY, dtype=torch.int64, device=corners.device)
-    for triangles in _split_by_sum(last_row - first_row + 1, _MAX_ROWS):
-        # Rows of some triangles, each with the columns that lie inside of all three edges.
-        triangle, row = _expand_ranges(first_row[triangles], last_row[triangles])
-        triangle = triangle + triangles.start
-        v = row.double()
-        u_slope, v_slope, constant = edges.index_select(0, triangle).unbind(-1)
-        offset = torch.addcmul(constant, v_slope, v[:, None])
-        start, stop = _find_columns_inside(
-            u_slope, offset, first_column[triangle], last_column[triangle]
-        )
-        not_empty = (start <= stop).nonzero()[:, 0]
-        triangle, row, start, stop, v = (
-            values.index_select(0, not_empty) for values in (triangle, row, start, stop, v)
-        )
-
-        # The plane along these rows.
-        plane_slope, v_slope, constant = plane.index_select(0, triangle).unbind(-1)
-        plane_offset = v_slope * v + constant
-        row_start = row * width
-        triangle_number = number.index_select(0, triangle)
-
-        for rows in _split_by_sum(stop - start + 1, _MAX_PIXELS):
-            # Pixels of some rows; each takes the smallest key.
-            span, u = _expand_ranges(start[rows], stop[rows])
-            plane_value = torch.addcmul(
-                plane_offset[rows].index_select(0, span),
-                plane_slope[rows].index_select(0, span),
-                u,
-            )
-            if parallel_depth_m is None:
-                depth = (1 / plane_value).float()
-            else:
-                depth = plane_value.clamp(min=0).float()
-            depth_bits = depth.view(torch.int32).long()
-            key = (depth_bits << 32) | triangle_number[rows].index_select(0, span)
-            # Where 1 / depth is not positive, the ray meets the plane behind the camera.
-            key = torch.where((depth >= near_m) & depth.isfinite(), key, _EMPTY)
-            pixel = row_start[rows].index_select(0, span) + u
-            buffer.scatter_reduce_(0, pixel, key, "amin")
+    for chunk in _split_by_sum(triangles.last_row - triangles.first_row + 1, _MAX_ROWS):
+        spans = _find_spans(triangles, chunk)
+        for part in _split_by_sum(spans.last_column - spans.first_column + 1, _MAX_PIXELS):
+            _draw_spans(buffer, spans, part, width, near_m, is_parallel=is_parallel)
 
     # Depth and number out of the keys.
     is_drawn = buffer != _EMPTY
@@ -263,16 +238,123 @@ def _draw(
     return Raster(depth_m=depth_m, primitive=primitive, barycentric=shares)
 
 
+def _select_triangles(
+    corners: Float64[Tensor, "n 3 3"],
+    pixels: Float64[Tensor, "n 3 2"],
+    is_front: Bool[Tensor, "n 3"] | None,
+    parallel_depth_m: Float64[Tensor, "n 3"] | None,
+    width: int,
+    height: int,
+) -> _Triangles:
+    """Select the triangles that may cover a pixel; arguments are those of :func:`_draw`."""
+    first = pixels.amin(1).ceil().clamp(min=0)
+    last = torch.minimum(pixels.amax(1).floor(), pixels.new_tensor([width - 1, height - 1]))
+    has_pixels = (first <= last).all(1)
+    if is_front is not None:
+        has_pixels = has_pixels & is_front.any(1)
+    number = has_pixels.nonzero()[:, 0]
+    first_column, first_row = first[number].long().unbind(-1)
+    last_column, last_row = last[number].long().unbind(-1)
+
+    # The three edge functions, each divided by the volume, sum to 1 / depth. Weighted by the depths
+    # of the corners along parallel rays, they sum to the depth.
+    signed_edges, volume = edge_functions(corners.index_select(0, number))
+    scale = torch.where(volume != 0, 1 / volume, 0)[:, None]
+    if parallel_depth_m is None:
+        plane = signed_edges.sum(1) * scale
+    else:
+        corner_depth_m = parallel_depth_m.index_select(0, number)[..., None]
+        plane = (signed_edges * scale[..., None] * corner_depth_m).sum(1)
+    return _Triangles(
+        number=number,
+        edges=signed_edges * volume.sign()[:, None, None],
+        plane=plane,
+        first_column=first_column,
+        last_column=last_column,
+        first_row=first_row,
+        last_row=last_row,
+    )
+
+
+def _find_spans(triangles: _Triangles, chunk: slice) -> _Spans:
+    """Find the spans of some triangles: in each row the columns inside of all three edges."""
+    triangle, row = _expand_ranges(triangles.first_row[chunk], triangles.last_row[chunk])
+    triangle = triangle + chunk.start
+    v = row.double()
+    u_slope, v_slope, constant = triangles.edges.index_select(0, triangle).unbind(-1)
+    offset = torch.addcmul(constant, v_slope, v[:, None])
+    first, last = _find_columns_inside(
+        u_slope, offset, triangles.first_column[triangle], triangles.last_column[triangle]
+    )
+    not_empty = (first <= last).nonzero()[:, 0]
+    triangle, row, first, last, v = (
+        values.index_select(0, not_empty) for values in (triangle, row, first, last, v)
+    )
+
+    plane_slope, v_slope, constant = triangles.plane.index_select(0, triangle).unbind(-1)
+    return _Spans(
+        number=triangles.number.index_select(0, triangle),
+        row=row,
+        first_column=first,
+        last_column=last,
+        plane_slope=plane_slope,
+        plane_offset=v_slope * v + constant,
+    )
+
+
+def _draw_spans(
+    buffer: Int64[Tensor, " pixels"],
+    spans: _Spans,
+    part: slice,
+    width: int,
+    near_m: float,
+    *,
+    is_parallel: bool,
+) -> None:
+    """Draw some spans into the buffer: each of their pixels keeps the smallest key.
+
+    Args:
+        buffer: keys of all pixels, row by row; changed in place.
+        spans: spans of pixels.
+        part: those of them that are drawn.
+        width: columns of the picture [px].
+        near_m: what is nearer than this is invisible.
+        is_parallel: rays are parallel, so that the plane is the depth, and not 1 / depth.
+    """
+    span, u = _expand_ranges(spans.first_column[part], spans.last_column[part])
+    plane_value = torch.addcmul(
+        spans.plane_offset[part].index_select(0, span),
+        spans.plane_slope[part].index_select(0, span),
+        u,
+    )
+    depth_m = plane_value.clamp(min=0) if is_parallel else 1 / plane_value
+    depth_m = depth_m.float()
+
+    # Where 1 / depth is not positive, the ray meets the plane behind the camera.
+    is_visible = (depth_m >= near_m) & depth_m.isfinite()
+    depth_bits = depth_m.view(torch.int32).long()
+    key = (depth_bits << 32) | spans.number[part].index_select(0, span)
+    key = torch.where(is_visible, key, _EMPTY)
+    pixel = (spans.row * width)[part].index_select(0, span) + u
+    buffer.scatter_reduce_(0, pixel, key, "amin")
+
+
 def _find_columns_inside(
     slope: Float64[Tensor, "n 3"],
     offset: Float64[Tensor, "n 3"],
     first: Int64[Tensor, " n"],
     last: Int64[Tensor, " n"],
 ) -> tuple[Int64[Tensor, " n"], Int64[Tensor, " n"]]:
-    """Find the first and the last column of rows inside of all three edges.
+    """Find the first and the last column of rows inside of all three edges of their triangles.
 
-    Inside, ``slope * u + offset`` of no edge is negative; ``first`` and ``last`` bound the columns.
-    The last column is before the first where there is none.
+    Args:
+        slope: along a row, an edge function is ``slope * u + offset``, not negative inside.
+        offset: its value at u = 0.
+        first: first column that may be inside.
+        last: last column that may be.
+
+    Returns:
+        The first and the last column inside; the last is before the first where there is none.
     """
     # An edge that rises with u bounds the row on the left, one that falls on the right.
     crossing = -offset / slope
@@ -291,7 +373,7 @@ def _find_columns_inside(
 
 
 def _reduce_columns(join: Callable[[Tensor, Tensor], Tensor], values: Tensor) -> Tensor:
-    """Reduce an (n, 3) tensor to (n,) by ``join``: ten times as fast as torch's own reductions."""
+    """Reduce an (n, 3) tensor to (n,) by ``join``, ten times as fast as torch's own reductions."""
     return join(join(values[:, 0], values[:, 1]), values[:, 2])
 
 
@@ -301,18 +383,19 @@ def _expand_ranges(
     """List the integers of all ranges ``first .. last``, one range after the other.
 
     Returns:
-        The index of the range that each integer is of, and the integers.
+        For each integer the index of its range, and the integers.
     """
     count = last - first + 1
     range_index = torch.repeat_interleave(torch.arange(len(count), device=first.device), count)
-    # The integers of a range are their position in the list plus the same number each.
-    shift = first - (count.cumsum(0) - count)
+    # In a range, the difference of an integer and its position in the list is constant.
+    position_of_first = count.cumsum(0) - count
+    shift = first - position_of_first
     position = torch.arange(len(range_index), device=first.device)
     return range_index, position + shift.index_select(0, range_index)
 
 
 def _split_by_sum(counts: Int64[Tensor, " n"], limit: int) -> Iterator[slice]:
-    """Split a list into slices whose counts sum to at most ``limit``, or that hold one item."""
+    """Yield slices of a list whose counts sum to at most ``limit``, or that hold one item alone."""
     ends = counts.cumsum(0).cpu().numpy()
     start = 0
     sum_before = 0

@@ -63,7 +63,7 @@ class Rigid:
         return torch.cat([upper_rows, last_row], -2)
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:  # noqa: ANN401
-        """Convert :meth:`matrix` for numpy, so that ``np.asarray`` takes a transform."""
+        """Convert :meth:`matrix` for numpy: so ``np.asarray`` accepts a transform."""
         return np.array(self.matrix().detach().cpu().numpy(), dtype=dtype, copy=copy)
 
     def __repr__(self) -> str:
@@ -71,12 +71,13 @@ class Rigid:
         if self.t_m.ndim > 1:
             return f"Rigid(a batch of {tuple(self.t_m.shape[:-1])})"
 
-        def decimals(vector: list[float]) -> str:
-            """Print a vector with its brackets."""
-            return f"[{', '.join(f'{number:.4f}' for number in vector)}]"
+        R_rows = ", ".join(_format_vector(row) for row in self.R.tolist())
+        return f"Rigid(R=[{R_rows}], t_m={_format_vector(self.t_m.tolist())})"
 
-        R_rows = ", ".join(decimals(row) for row in self.R.tolist())
-        return f"Rigid(R=[{R_rows}], t_m={decimals(self.t_m.tolist())})"
+
+def _format_vector(vector: list[float]) -> str:
+    """Format a vector in brackets, with four decimals."""
+    return f"[{', '.join(f'{number:.4f}' for number in vector)}]"
 
 
 def fit_rigid(

@@ -1,7 +1,11 @@
-"""The output folder of a run: the record of what made it, its lock, and the list of its results.
+"""The output folder of a run: its lock, and records of settings, sources and finished results.
 
-``run.json`` records settings, versions, machine and commit. A line of ``results.jsonl`` names a
-finished result, with size and time of its files, by which the next run tells that it is whole.
+A command claims its folder: it locks it, and writes ``run.json`` with settings, versions, machine
+and commit. ``sources.json`` has the file that each result is made from. A line of ``results.jsonl``
+names a finished result, with size and time of its files, by which the next run tells that it is
+whole. Several processes that ``torchrun`` or ``accelerate launch`` starts with one command share a
+folder: each makes its share of the results (:class:`ProcessRank`), and they see each other's in
+``results.jsonl``.
 """
 
 import json
@@ -12,11 +16,11 @@ import subprocess
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 
@@ -39,7 +43,7 @@ NOT_OURS = (
     "is there already, and no run of this command wrote it; choose another --out, or move it away"
 )
 """Error about a file that a run would write over."""
-_FRAME = re.compile(r"_\d{6}$")  # ends the name of a result of a frame of a video
+_FRAME = re.compile(r"_\d{6}$")  # number of a frame, which ends the name of its result
 _PACKAGES = ("depthpose", "torch", "numpy", "opencv-python-headless")
 _LOCK_POLL_S = 0.1  # between two tries to lock a folder
 _RESULTS_POLL_S = 0.2  # between two looks at what other processes have finished
@@ -51,9 +55,9 @@ _locks: dict[Path, int] = {}  # folders that are locked, and the descriptors of 
 
 
 def lock_folder(folder: Path, *, is_shared: bool, timeout_s: float = 10.0) -> bool:
-    """Lock a folder against other commands until :func:`release_folders`, or the process ends.
+    """Lock a folder against other commands until :func:`release_folders` or the process's end.
 
-    Where the file system or the machine has no locks, other commands are not kept out.
+    A file system or a machine without locks keeps no other command out.
 
     Args:
         folder: made where it is missing.
@@ -72,17 +76,17 @@ def lock_folder(folder: Path, *, is_shared: bool, timeout_s: float = 10.0) -> bo
         return False
     with refused_write(folder / _LOCK):
         folder.mkdir(parents=True, exist_ok=True)
-        file = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT, 0o666)
+        descriptor = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT, 0o666)
 
     deadline = time.monotonic() + timeout_s
     while fcntl is not None:
         try:
             kind = fcntl.LOCK_SH if is_shared else fcntl.LOCK_EX
-            fcntl.flock(file, kind | fcntl.LOCK_NB)
+            fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
             break
         except BlockingIOError as error:
             if time.monotonic() > deadline:
-                os.close(file)
+                os.close(descriptor)
                 raise InputError(
                     f"{folder}: another command is writing there; wait until it has ended, or "
                     "choose another folder"
@@ -91,7 +95,7 @@ def lock_folder(folder: Path, *, is_shared: bool, timeout_s: float = 10.0) -> bo
         except OSError:  # no locks on this file system
             break
 
-    _locks[folder.resolve()] = file
+    _locks[folder.resolve()] = descriptor
     return True
 
 
@@ -103,28 +107,30 @@ def held_folders() -> frozenset[Path]:
 def release_folders(but: Collection[Path] = ()) -> None:
     """Unlock the folders that this process has locked, except those in ``but``."""
     for folder in _locks.keys() - set(but):
-        file = _locks.pop(folder)
+        descriptor = _locks.pop(folder)
         with suppress(OSError):
             if fcntl is not None:
                 # Closing is not enough: forked processes have the file open too.
-                fcntl.flock(file, fcntl.LOCK_UN)
-        os.close(file)
+                fcntl.flock(descriptor, fcntl.LOCK_UN)
+        os.close(descriptor)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProcessRank:
-    """The rank of this process among those of a launch, which exchange results through files."""
+    """The rank of this process among those that a launcher started with one command."""
 
     rank: int = 0  #: 0 .. world - 1
-    world: int = 1  #: how many processes there are
+    world: int = 1  #: number of processes
 
     def share_of(self, items: Sequence[Item]) -> Sequence[Item]:
-        """Take this process's part of a list: every ``world``-th item, beginning with ``rank``."""
+        """Return this process's share of a list: every ``world``-th item, beginning at ``rank``."""
         return items[self.rank :: self.world]
 
 
 def find_rank() -> ProcessRank:
-    """Read RANK and WORLD_SIZE, as ``torchrun`` and ``accelerate launch`` set them.
+    """Read the rank of this process from RANK and WORLD_SIZE; without them it is the only one.
+
+    ``torchrun`` and ``accelerate launch`` set these variables.
 
     Raises:
         InputError: they are not whole numbers, or the rank is not below the number of processes.
@@ -141,23 +147,23 @@ def find_rank() -> ProcessRank:
 
 def wait_for(
     names: Sequence[str],
-    is_there: Callable[[str], bool],
+    is_finished: Callable[[str], bool],
     timeout_s: float = 3600.0,
     count_steps: Callable[[], int] | None = None,
 ) -> None:
-    """Wait until other processes have finished the results of all ``names``.
+    """Wait until the processes of a launch have finished the results of all ``names``.
 
     Args:
         names: names of the results.
-        is_there: whether the result of a name is finished.
-        timeout_s: how long there may be no progress, as where a process has died.
-        count_steps: counts what else shows progress, such as frames of a long video; None: only
-            finished names do.
+        is_finished: whether the result of a name is finished.
+        timeout_s: longest time without progress; then a process is taken to have died.
+        count_steps: a count whose growth is progress too, such as frames of a long video; None:
+            only finished names are progress.
 
     Raises:
-        InputError: the time is up; the message names the first result that is missing.
+        InputError: there was no progress for that time; names the first result that is missing.
     """
-    missing = [name for name in names if not is_there(name)]
+    missing = [name for name in names if not is_finished(name)]
     step_count = 0
     last_progress = time.monotonic()
     while missing:
@@ -168,7 +174,7 @@ def wait_for(
                 "what is finished is kept."
             )
         time.sleep(min(_RESULTS_POLL_S, timeout_s))
-        still_missing = [name for name in missing if not is_there(name)]
+        still_missing = [name for name in missing if not is_finished(name)]
         new_step_count = 0 if count_steps is None else count_steps()
         if len(still_missing) < len(missing) or new_step_count > step_count:
             last_progress = time.monotonic()
@@ -176,8 +182,8 @@ def wait_for(
         step_count = new_step_count
 
 
-def environment() -> dict[str, str]:
-    """Describe what a result is computed with: versions, machine, threads, GPU, commit, date."""
+def describe_environment() -> dict[str, str]:
+    """Describe what results are computed with: date, versions, machine, threads, GPU, commit."""
     facts = {"date": datetime.now(UTC).strftime("%Y-%m-%d"), "python": platform.python_version()}
     for name in _PACKAGES:
         with suppress(PackageNotFoundError):
@@ -198,12 +204,12 @@ def _read_commit() -> str:
     package_folder = str(Path(__file__).resolve().parent)
     command = ["git", "-C", package_folder, "describe", "--always", "--dirty", "--exclude", "*"]
     try:
-        answer = subprocess.run(  # noqa: S603
+        process = subprocess.run(  # noqa: S603
             command, capture_output=True, text=True, check=False, timeout=_GIT_TIMEOUT_S
         )
     except (OSError, subprocess.TimeoutExpired):
         return ""
-    return answer.stdout.strip() if answer.returncode == 0 else ""
+    return process.stdout.strip() if process.returncode == 0 else ""
 
 
 def claim_folder(
@@ -215,7 +221,7 @@ def claim_folder(
     """Make ``folder`` the output folder of a run with these settings, or continue such a run.
 
     It is locked for this process, or for all processes of one launch, until
-    :func:`depthpose.core.run.release_folders`. What a killed run left half written is removed.
+    :func:`depthpose.core.run.release_folders`. Partial files of a killed run are removed.
 
     Args:
         folder: made where it is missing.
@@ -249,7 +255,7 @@ def claim_folder(
         is_replaceable = is_only_process and has_no_results
         if earlier is None or (is_replaceable and earlier != settings):
             (folder / _SOURCES).unlink(missing_ok=True)
-            write_json(record, {"settings": dict(settings), "environment": environment()})
+            write_json(record, {"settings": dict(settings), "environment": describe_environment()})
         elif earlier != settings:
             refuse_other_settings(folder, earlier, settings, remedy)
     except InputError:
@@ -267,14 +273,14 @@ def claim_names(
     videos: Collection[str] = (),
     is_finished: Callable[[str], bool] | None = None,
 ) -> None:
-    """Reserve names of results for the files that they are made from, in ``sources.json``.
+    """Record in ``sources.json`` which file each result is made from, and refuse another file.
 
     Args:
         folder: folder of the results, claimed before (:func:`claim_folder`).
-        sources: the source file of each name, or several: the first identifies the source, and a
-            change of any is noticed.
+        sources: the source file of each result, by the result's name, or several: the first
+            identifies the source, and a change of any is noticed.
         endings: what follows a name in the names of its result files.
-        videos: those of the names whose result files also have the number of a frame.
+        videos: names whose result files also have the number of a frame, ``NAME_000000``.
         is_finished: whether a name has a result; None: whether there is a file of the name and one
             of the endings.
 
@@ -282,50 +288,60 @@ def claim_names(
         InputError: an earlier run made a result of that name from another file, or the file has
             changed since, or a file that no run wrote has the name of a result.
     """
-    record = folder / _SOURCES
     # Listed before the record is read, which other processes write before their results.
-    results = _list_files_by_stem(folder, endings)
+    files_by_stem = _list_files_by_stem(folder, endings)
     recorded = read_sources(folder)
-    finished = {*results, *(_FRAME.sub("", stem) for stem in results)}
-    wanted = {name: _make_source_entry(files) for name, files in sources.items()}
+    present = {name: _describe_source(files) for name, files in sources.items()}
 
-    # Refuse a name that an earlier run gave to another file, and a file that has changed since.
-    for name, (path, stamp) in wanted.items():
-        recorded_path, recorded_stamp = recorded.get(name, [path, stamp])
-        if recorded_path != path:
+    if is_finished is None:
+        names_of_frames = [_FRAME.sub("", stem) for stem in files_by_stem]
+        is_finished = {*files_by_stem, *names_of_frames}.__contains__
+    for name, source in present.items():
+        earlier = recorded.get(name, source)
+        if earlier.path != source.path:
             raise InputError(
-                f"{folder}: {name!r} is the result of {recorded_path}, not of {path}; two files of "
-                "one name need two folders: choose another"
+                f"{folder}: {name!r} is the result of {earlier.path}, not of {source.path}; two "
+                "files of one name need two folders: choose another"
             )
-        has_changed = recorded_stamp and stamp and recorded_stamp != stamp
-        if not has_changed:
-            continue
-        has_result = name in finished if is_finished is None else is_finished(name)
-        if has_result:
+        if earlier.has_changed(source) and is_finished(name):
             files = sources[name]
-            shown = path if isinstance(files, Path) else " or ".join(map(str, files))
+            shown = source.path if isinstance(files, Path) else " or ".join(map(str, files))
             raise InputError(
                 f"{shown}: has changed since its result {name!r} in {folder} was "
                 "made; choose another folder, or delete this one"
             )
 
-    # Refuse files of a new name that no run wrote. Those that a run did write, from a source that
-    # is not recorded any more, are to be made again.
-    new_names = wanted.keys() - recorded.keys()
-    new_videos = new_names & set(videos)
+    new_names = present.keys() - recorded.keys()
+    result_files: dict[str, Path] = {}
+    for stem, file in files_by_stem.items():
+        is_of_new_video = _FRAME.sub("", stem) in new_names & set(videos)
+        if stem in new_names or (is_of_new_video and stem not in recorded):
+            result_files[stem] = file
+    _discard_results(folder, new_names, result_files)
+
+    if any(recorded.get(name) != source for name, source in present.items()):
+        write_json(folder / _SOURCES, recorded | present)
+
+
+def _discard_results(folder: Path, names: Collection[str], files: Mapping[str, Path]) -> None:
+    """Note that the results of names without a recorded source are to be made again.
+
+    Args:
+        folder: folder of the results.
+        names: names of the results.
+        files: files of the results, by their names, or those of their frames.
+
+    Raises:
+        InputError: no run wrote one of the files.
+    """
     noted = read_results(folder)
-    for stem, file in results.items():
-        has_new_name = stem in new_names or _FRAME.sub("", stem) in new_videos
-        if has_new_name and stem not in recorded:
-            if file.relative_to(folder).as_posix() not in noted.get(stem, {}):
-                raise InputError(f"{file}: {NOT_OURS}")
-            note_result(folder, stem, [])
-    for name in new_names:
+    for stem, file in files.items():
+        if file.relative_to(folder).as_posix() not in noted.get(stem, {}):
+            raise InputError(f"{file}: {NOT_OURS}")
+        note_result(folder, stem, [])
+    for name in names:
         if noted.get(name):
             note_result(folder, name, [])
-
-    if any(recorded.get(name) != entry for name, entry in wanted.items()):
-        write_json(record, recorded | wanted)
 
 
 def _list_files_by_stem(folder: Path, endings: Sequence[str]) -> dict[str, Path]:
@@ -338,8 +354,19 @@ def _list_files_by_stem(folder: Path, endings: Sequence[str]) -> dict[str, Path]
     return files
 
 
-def _make_source_entry(files: Path | Sequence[Path]) -> list[str]:
-    """Make the entry of a source in the record: its path, and size and time of all its files."""
+class Source(NamedTuple):
+    """What a result is made from, as ``sources.json`` records it."""
+
+    path: str  #: of the first file
+    stamp: str  #: sizes and times of the last change of all files; "" where there are none
+
+    def has_changed(self, now: "Source") -> bool:
+        """Whether the files are others than when this was recorded, as far as is known."""
+        return bool(self.stamp and now.stamp) and self.stamp != now.stamp
+
+
+def _describe_source(files: Path | Sequence[Path]) -> Source:
+    """Read size and time of the last change of the files of a source."""
     paths = [files] if isinstance(files, Path) else list(files)
     stamps: list[str] = []
     for path in paths:
@@ -347,13 +374,13 @@ def _make_source_entry(files: Path | Sequence[Path]) -> list[str]:
             status = path.stat()
             if path.is_file():
                 stamps.append(f"{status.st_size} bytes of {status.st_mtime_ns}")
-    return [str(paths[0].resolve()), ", ".join(stamps)]
+    return Source(path=str(paths[0].resolve()), stamp=", ".join(stamps))
 
 
-def read_sources(folder: Path) -> dict[str, list[str]]:
-    """Read the path and stamp (size and time) of each result's source, by the result's name.
+def read_sources(folder: Path) -> dict[str, Source]:
+    """Read the source of each result from ``sources.json``, by the result's name.
 
-    Empty where the record is missing or damaged.
+    Empty where the record is missing or damaged; damaged entries are left out.
     """
     if not (folder / _SOURCES).exists():
         return {}
@@ -362,19 +389,19 @@ def read_sources(folder: Path) -> dict[str, list[str]]:
         content = read_json(folder / _SOURCES)
     if not isinstance(content, dict):
         return {}
-    return {name: entry for name, entry in content.items() if _is_source_entry(entry)}
-
-
-def _is_source_entry(entry: object) -> bool:
-    """Whether an entry of the record is a path and a stamp."""
-    return isinstance(entry, list) and len(entry) == 2 and all(isinstance(v, str) for v in entry)
+    sources: dict[str, Source] = {}
+    for name, entry in content.items():
+        is_intact = isinstance(entry, list) and len(entry) == 2
+        if is_intact and all(isinstance(part, str) for part in entry):
+            sources[name] = Source(*entry)
+    return sources
 
 
 def refuse_to_replace(path: Path) -> None:
-    """Refuse to write over something that exists, a broken link too.
+    """Refuse to write over what exists at a path, be it a file, a folder or a broken link.
 
     Raises:
-        InputError: ``path`` exists.
+        InputError: something exists there.
     """
     if os.path.lexists(path):
         raise InputError(f"{path}: is there already; delete it, or give another name")
@@ -426,7 +453,7 @@ def refuse_other_settings(
     before = _flatten(earlier)
     now = _flatten(settings)
     for name in sorted(before.keys() | now.keys()):
-        # A later version may add settings: where one side lacks it, it counts as switched off.
+        # A later version may add settings: one that a side lacks counts there as switched off.
         is_missing = name not in before or name not in now
         is_off = is_missing and not (before | now)[name]
         if before.get(name) != now.get(name) and not is_off:
@@ -437,7 +464,7 @@ def refuse_other_settings(
 
 
 def _flatten(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Name nested settings by their path, such as ``pairs.limit``."""
+    """Flatten nested settings: each is named by its path, such as ``pairs.limit``."""
     flat: dict[str, Any] = {}
     for name, value in settings.items():
         if isinstance(value, Mapping):
@@ -447,32 +474,34 @@ def _flatten(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-@dataclass(frozen=True, kw_only=True)
-class _ReadResults:
-    """The results and failures in a results file, up to where it has been read."""
+@dataclass(kw_only=True)
+class _ResultsLog:
+    """The content of a ``results.jsonl``, up to where it has been read."""
 
-    inode: int
-    end: int = 0  # byte up to which it was read
-    results: dict[str, dict[str, list[int]]] = field(default_factory=dict)
-    failures: dict[str, str] = field(default_factory=dict)
+    inode: int  # identifies the file, which may be replaced by another
+    end: int = 0  # byte up to which it has been read
+    results: dict[str, dict[str, list[int]]] = field(
+        default_factory=dict
+    )  # stamps by file, by name
+    failures: dict[str, str] = field(default_factory=dict)  # reasons by name
 
 
-_read_results: dict[Path, _ReadResults] = {}  # by results file, so that only new lines are read
+_logs: dict[Path, _ResultsLog] = {}  # what was read of each file, so that only new lines are read
 
 
 def note_result(folder: Path, name: str, files: Iterable[Path]) -> None:
     """Append to ``results.jsonl`` that a result is finished, with its files and their stamps.
 
-    Without files it is noted that the result is to be made again.
+    Without files the note says the contrary: the result is to be made again.
     """
     stamps = {file.relative_to(folder).as_posix(): _read_stamp(file) for file in files}
     _append_result(folder, {"name": name, "files": stamps})
 
 
 def note_failure(folder: Path, name: str, reason: str) -> None:
-    """Append to ``results.jsonl`` why there is no result, for the other processes of a launch.
+    """Append to ``results.jsonl`` why a result could not be made.
 
-    The next run makes it again.
+    Other processes of a launch then wait for it no longer; the next run tries it again.
     """
     _append_result(folder, {"name": name, "files": {}, "failure": reason})
 
@@ -501,57 +530,60 @@ def is_whole(folder: Path, name: str, needed: Collection[str]) -> bool:
         name: name of the result.
         needed: files, relative to the folder, that must be among those of the result.
     """
-    noted = read_results(folder).get(name, {})
-    if not noted:
+    noted_stamps = read_results(folder).get(name, {})
+    if not noted_stamps:
         return False
     try:
-        stamps = {file: _read_stamp(folder / file) for file in {*noted, *needed}}
+        stamps = {file: _read_stamp(folder / file) for file in {*noted_stamps, *needed}}
     except OSError:
         return False
-    return stamps == noted
+    return stamps == noted_stamps
 
 
 def read_results(folder: Path) -> dict[str, dict[str, list[int]]]:
-    """Read the finished results of a folder, by name: their files, relative to the folder.
+    """Read which results of a folder are finished, from ``results.jsonl``.
 
-    Each file has its stamp: size [bytes] and time of the last change [ns]. A result that is to be
-    made again has no files. Empty where nothing is noted or it cannot be read.
+    Returns:
+        By the name of a result the stamps of its files: size [bytes] and time of the last change
+        [ns] by path, relative to the folder. A result that is to be made again has no files. Empty
+        where nothing is noted or the file cannot be read.
     """
-    return _read_new_lines(folder).results
+    return _read_log(folder).results
 
 
 def read_failures(folder: Path) -> dict[str, str]:
     """Read why results of a folder could not be made, by name (:func:`note_failure`).
 
-    A result that was made later is left out.
+    Results that were made later are left out.
     """
-    return _read_new_lines(folder).failures
+    return _read_log(folder).failures
 
 
-def _read_new_lines(folder: Path) -> _ReadResults:
+def _read_log(folder: Path) -> _ResultsLog:
     """Read ``results.jsonl``; of a file that was read before, only the lines added since."""
     path = (folder / RESULTS).absolute()
     try:
         status = path.stat()
-        earlier = _read_results.get(path)
-        if earlier is None or earlier.inode != status.st_ino or earlier.end > status.st_size:
-            earlier = _ReadResults(inode=status.st_ino)  # the file was replaced or cut since
+        log = _logs.get(path)
+        if log is None or log.inode != status.st_ino or log.end > status.st_size:
+            log = _ResultsLog(inode=status.st_ino)  # the file is new, or was replaced or cut
         text = b""
-        if status.st_size > earlier.end:
+        if status.st_size > log.end:
             with path.open("rb") as file:
-                file.seek(earlier.end)
+                file.seek(log.end)
                 text = file.read()
     except OSError:
-        return _ReadResults(inode=0)
+        return _ResultsLog(inode=0)
 
     whole_lines = text.rfind(b"\n") + 1  # another process may be writing the last line
     for line in filter(None, text[:whole_lines].split(b"\n")):
         with suppress(ValueError, KeyError, TypeError, AttributeError):  # a damaged line
             row = json.loads(line)
             name = str(row["name"])
-            earlier.results[name] = dict(row["files"].items())
-            earlier.failures.pop(name, None)
+            log.results[name] = dict(row["files"].items())
+            log.failures.pop(name, None)
             if "failure" in row:
-                earlier.failures[name] = str(row["failure"])
-    _read_results[path] = replace(earlier, end=earlier.end + whole_lines)
-    return _read_results[path]
+                log.failures[name] = str(row["failure"])
+    log.end += whole_lines
+    _logs[path] = log
+    return log

@@ -1,7 +1,9 @@
-"""The loop of every command over many inputs: depth, poses, searches and measurements.
+"""The loop of a command over many inputs, in one process: depth, poses, searches, measurements.
 
 Inputs that an earlier run finished are skipped, and one that fails does not stop the others. What
-is computed for an input is a function; where results are stored is a :class:`Results`.
+is computed for an input is a function; where results are stored is a :class:`Results`. Where a
+launcher starts several processes, each runs this loop over its share of the inputs
+(``core.run.ProcessRank``); workers on many machines have a loop of their own (``core.engine``).
 """
 
 from abc import ABC, abstractmethod
@@ -18,33 +20,38 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Job(Generic[Input]):
-    """One input of a run: its name, how it is read, and the files that it is read from."""
+    """One input of a run, which is read when it is its turn."""
 
-    name: str  #: unique in a run; the name of its results
-    read: Callable[[], Input]  #: called only where there is no result yet
-    source: Path | tuple[Path, ...] | None = None  #: file or files; None: not read from files
+    name: str  #: name of its results, unique in a run
+    read: Callable[[], Input]  #: reads the input; called only where there is no result yet
+    source: Path | tuple[Path, ...] | None = None  #: its file or files; None: not read from files
 
 
 class Results(ABC, Generic[Input, Result]):
-    """The store of a run's results, which knows those that an earlier run has finished."""
+    """Where the results of a run are stored, and which of them an earlier run has finished."""
 
     def is_finished(self, job: Job[Input]) -> bool:  # noqa: ARG002  for subclasses
-        """Whether the result of a job is there from an earlier run; by default it never is."""
+        """Whether an earlier run stored the result of a job; by default none did."""
         return False
 
     @abstractmethod
     def store(self, job: Job[Input], data: Input, result: Result) -> None:
-        """Store a result.
+        """Store the result of a job.
+
+        Args:
+            job: the job.
+            data: the input that it read.
+            result: the result.
 
         Raises:
-            InputError: it cannot be stored, so that the job has failed.
+            InputError: it cannot be stored: the job has then failed.
         """
 
     def store_failure(self, job: Job[Input], error: InputError) -> None:
-        """Store why a job failed; by default nothing is stored. Raising stops the whole run."""
+        """Store why a job failed; by default nothing is. What it raises stops the whole run."""
 
     def flush(self) -> None:
-        """Write what is still in memory; called when the run ends or is interrupted."""
+        """Write what is still in memory; called when the run ends, also by an error."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -67,9 +74,9 @@ def run_jobs(
     Args:
         jobs: all jobs, the finished ones too; taken one by one, so that the frames of a video need
             not fit into memory.
-        estimate_many: computes for each input a result, or the reason why there is none.
+        estimate_many: computes the results of some inputs: for each a result, or why it has none.
         results: where the results are stored.
-        batch: how many inputs are estimated together.
+        batch: number of inputs that ``estimate_many`` gets together.
     """
     read_jobs: list[tuple[Job[Input], Input | InputError]] = []
 

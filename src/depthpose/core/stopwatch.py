@@ -1,4 +1,4 @@
-"""What each stage of a computation took."""
+"""Measurement of the time that each stage of a computation takes."""
 
 import time
 from collections.abc import Iterator
@@ -6,7 +6,7 @@ from contextlib import contextmanager
 
 
 class Stopwatch:
-    """A stopwatch for named stages, in wall seconds.
+    """Measures named stages in seconds of wall time.
 
     Example::
 
@@ -17,11 +17,11 @@ class Stopwatch:
     """
 
     def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
+        self.seconds: dict[str, float] = {}  #: time of each stage so far, by name [s]
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Measure a ``with`` block, and add its time to that of a stage."""
+        """Measure a ``with`` block, and add its time to ``seconds[name]``."""
         began = time.perf_counter()
         try:
             yield

@@ -1,4 +1,4 @@
-"""Units of length that a file or a user may have."""
+"""Units of length of files and users."""
 
 from typing import Literal
 

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from depthpose.core.camera.rectified import grey_of
+from depthpose.core.camera.rectified import grey_from_rgb
 from depthpose.core.errors import InputError
 from depthpose.depth.config import AugmentConfig, DegradeConfig
 from depthpose.depth.types import View
@@ -44,7 +44,7 @@ def degrade(image: View, config: DegradeConfig, generator: torch.Generator) -> V
     exposure, contrast, saturation, gamma = (between(low, high) for _ in range(4))
     third = config.colour / 3
     tint = torch.tensor([between(1 - third, 1 + third) for _ in range(3)])
-    grey = grey_of(image)
+    grey = grey_from_rgb(image)
     image = grey + (image - grey) * saturation
     mean = image.mean()
     image = ((image - mean) * contrast + mean) * exposure * tint[:, None, None]
@@ -232,7 +232,7 @@ def jitter_colors(pair: TrainingPair, strength: float, generator: torch.Generato
 
     def change(view: View) -> View:
         contrasted = (view - mean) * contrast + mean
-        grey = grey_of(contrasted)
+        grey = grey_from_rgb(contrasted)
         return (grey + (contrasted - grey) * saturation).clamp(0, 1)
 
     return pair._replace(left=change(left), right=change(right))

@@ -16,9 +16,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.camera import StereoRig
-from depthpose.core.errors import InputError, Notice, nearest_name
+from depthpose.core.errors import InputError, Notice, suggest_name
 from depthpose.core.files import read_image
-from depthpose.core.frame import data_frame
+from depthpose.core.frame import make_data_frame
 from depthpose.depth import disparity
 from depthpose.depth import predictions as files
 from depthpose.depth.datasets import Dataset, Frame, has_lidar, lidar_truth, read_disparity
@@ -88,7 +88,7 @@ def find_protocol(name: str) -> Protocol:
         InputError: there is none; the error suggests the most similar name.
     """
     if name not in PROTOCOLS:
-        raise InputError(f"protocol {name!r}: {nearest_name(name, PROTOCOLS)}")
+        raise InputError(f"protocol {name!r}: {suggest_name(name, PROTOCOLS)}")
     return PROTOCOLS[name]
 
 
@@ -153,7 +153,7 @@ class Evaluation:
         Raises:
             ImportError: pandas is not installed.
         """
-        return data_frame(row.columns() for row in self.per_frame)
+        return make_data_frame(row.columns() for row in self.per_frame)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.errors import InputError, refuse_unknown
-from depthpose.core.export import Case, Export, Graph, Limit, Value, network_model
+from depthpose.core.export import Case, Export, Graph, Limit, Value, convert_network
 from depthpose.depth.config import MatcherConfig
 from depthpose.depth.disparity import LEAST_PX, SKY_M
 from depthpose.depth.estimator import FakestereoNet
@@ -214,7 +214,7 @@ def _generate(left: Value, generator: Generator) -> _Generated:
         return _generate_by_selection(left, size, network_size, generator)
     example = _example_image(multiple)
     image = _resize_image(left, network_size) * _2 - _1
-    network = network_model(generator, [example], multiple)
+    network = convert_network(generator, [example], multiple)
     (output,) = left.graph.call(network, _pad_by_reflection(image, network_size, multiple))
     right = (output + _1).slice([0, 0], network_size, [2, 3]) / _2
     return _Generated(_resize_image(right, size))
@@ -231,7 +231,7 @@ def _generate_by_selection(
     multiple = generator.config.side_multiple_px
     even_size = (network_size / 2 * 2).op("Max", 2)  # logits stand for two rows and two columns
     image = _pad_by_reflection(_resize_image(left, even_size), even_size, multiple)
-    network = network_model(
+    network = convert_network(
         DynamicSelection(generator).eval(), [_example_image(multiple)], multiple
     )
     outputs = left.graph.call(network, image)
@@ -413,7 +413,7 @@ def _match(
     ]
 
     example = [torch.rand(2, 3, min_side + step, min_side + 2 * step) for _ in range(2)]
-    outputs = graph.call(network_model(network, example, step), *padded)
+    outputs = graph.call(convert_network(network, example, step), *padded)
 
     # Maps without the padding, at the size of the images.
     first = graph.op("Concat", rows_above, [0], axis=0)

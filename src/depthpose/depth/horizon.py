@@ -17,7 +17,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from depthpose.core.camera import Camera
-from depthpose.core.camera.rectified import grey_of
+from depthpose.core.camera.rectified import grey_from_rgb
 from depthpose.depth.types import View
 
 _MAX_PIXELS = 500_000
@@ -202,7 +202,7 @@ def find_angles(image: View, camera: Camera, expected: Angles) -> Angles:
     # Segments in a smaller copy of a large image.
     halvings = max(math.ceil(math.log2(image.shape[1] * image.shape[2] / _MAX_PIXELS) / 2), 0)
     scale = 2**halvings
-    grey = grey_of(image.detach().cpu().float())
+    grey = grey_from_rgb(image.detach().cpu().float())
     if halvings:
         grey = torch.nn.functional.avg_pool2d(grey[None, None], scale)[0, 0]
     segments = find_segments(grey.numpy())[:_MAX_SEGMENTS]

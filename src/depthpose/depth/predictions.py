@@ -73,7 +73,7 @@ class _EstimateFile(NamedTuple):
     content: Callable[[DepthEstimate, _FileOptions], Any]
 
 
-def _make_cloud(estimate: DepthEstimate, options: _FileOptions) -> files.Cloud | None:
+def _make_cloud(estimate: DepthEstimate, options: _FileOptions) -> files.PointCloud | None:
     """Make the cloud of an estimate, if one is asked for."""
     if options.cloud_m is None:
         return None

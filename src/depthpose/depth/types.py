@@ -10,7 +10,7 @@ from torch import Tensor
 
 from depthpose.core.camera import Camera, StereoRig, back_project
 from depthpose.core.errors import InputError
-from depthpose.core.files import Cloud
+from depthpose.core.files import PointCloud
 
 View = Float[Tensor, "3 h w"]  # an image, RGB in [0, 1]
 Views = Float[Tensor, "b 3 h w"]
@@ -148,7 +148,7 @@ class DepthEstimate:
             return is_estimated
         return is_estimated & (self.confidence >= min_confidence)
 
-    def cloud(self, far_m: float = 80.0, min_confidence: float | None = None) -> Cloud:
+    def cloud(self, far_m: float = 80.0, min_confidence: float | None = None) -> PointCloud:
         """Give the coloured points nearer than ``far_m``, in metres in the left camera's frame.
 
         Args:
@@ -168,7 +168,7 @@ class DepthEstimate:
         is_near = torch.isfinite(points_m).all(-1) & (points_m[:, 2] <= far_m)
         is_included = self.is_sure(min_confidence).reshape(-1) & is_near
         color = self.input.left.permute(1, 2, 0).reshape(-1, 3)
-        return Cloud(points=points_m[is_included].float(), color=color[is_included])
+        return PointCloud(points=points_m[is_included].float(), color=color[is_included])
 
     def to_open3d(self, far_m: float = 80.0) -> Any:  # noqa: ANN401  Open3D carries no types
         """Give :meth:`cloud` as ``open3d.geometry.PointCloud`` (extra ``open3d``).

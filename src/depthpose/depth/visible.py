@@ -9,7 +9,7 @@ from scipy import ndimage
 from torch import Tensor
 from torch.nn import functional as F
 
-from depthpose.core.camera.rectified import grey_of
+from depthpose.core.camera.rectified import grey_from_rgb
 
 _MAX_VARIATION = 3 / 255
 """Largest variation of the values in a border of one colour: noise of JPEG and videos."""
@@ -127,7 +127,7 @@ def texture(image: Float[Tensor, "3 h w"]) -> Float[Tensor, "h w"]:
     It is 0 where the patch around a pixel is plain, such as on a wall or where it is over-exposed,
     and 1 where the standard deviation of its grey values is larger than rounding makes it.
     """
-    grey = grey_of(image).float()
+    grey = grey_from_rgb(image).float()
     radius = max(_MIN_RADIUS_PX, round(_RADIUS_SHARE * grey.shape[1]))
     grey = F.pad(grey[None], (radius,) * 4, mode="replicate")[0].double()
     # Means over each patch, along the rows and then along the columns.

@@ -8,9 +8,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.camera import AnyLens, Camera, camera_of, check_image_matches_camera
-from depthpose.core.camera.camera_file import intrinsics_of
+from depthpose.core.camera.any_camera import intrinsics_of
 from depthpose.core.errors import InputError, Notice
-from depthpose.core.files import Picture, as_tensor
+from depthpose.core.files import AnyPicture, rgb_from_picture
 from depthpose.core.rigid import Rigid
 from depthpose.pose.inputs import AnyArray, rigid_input
 from depthpose.pose.types import ColorImage, ObjectModel, ViewInput
@@ -19,7 +19,7 @@ from depthpose.pose.types import ColorImage, ObjectModel, ViewInput
 def with_color(
     view: ViewInput,
     models: Sequence[ObjectModel],
-    color: Picture | None,
+    color: AnyPicture | None,
     camera: AnyLens | None = None,
     color_from_depth: Rigid | AnyArray | None = None,
 ) -> ViewInput:
@@ -59,7 +59,7 @@ def with_color(
 
 
 def color_input(
-    color: Picture,
+    color: AnyPicture,
     view: ViewInput,
     camera: AnyLens | None = None,
     color_from_depth: Rigid | AnyArray | None = None,
@@ -70,7 +70,7 @@ def color_input(
     intrinsic matrix of the depth image, and no transform. Arguments and errors are those of
     :func:`with_color`.
     """
-    rgb = as_tensor(color, f"{view.name}: the colour image")
+    rgb = rgb_from_picture(color, f"{view.name}: the colour image")
     height, width = rgb.shape[1:]
 
     # Of a camera of its own.

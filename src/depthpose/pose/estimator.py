@@ -10,9 +10,9 @@ import torch
 from tqdm import tqdm
 
 from depthpose.core.camera import AnyCamera, choose_lens
-from depthpose.core.devices import each_in_float32, each_in_threads, force_float32
-from depthpose.core.errors import InputError, describe_full_memory, nearest_name
-from depthpose.core.files import Picture
+from depthpose.core.devices import force_float32, iterate_in_float32, map_in_threads
+from depthpose.core.errors import InputError, describe_full_memory, suggest_name
+from depthpose.core.files import AnyPicture
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
 from depthpose.pose.background import AnyBackground, with_background
@@ -91,7 +91,7 @@ class PoseEstimator:
 
     def _estimate_each(self, inputs: Iterable[AnyInput], threads: int) -> Iterator[PoseEstimate]:
         """Estimate each input, in order; each is expected to show its object."""
-        return each_in_threads(partial(unreadable_on_error, self._estimate), inputs, threads)
+        return map_in_threads(partial(unreadable_on_error, self._estimate), inputs, threads)
 
     def _estimate_each_try(self, inputs: Iterable[AnyInput]) -> Iterator[PoseEstimate]:
         """Estimate each input, in order, where an input may well not show its object.
@@ -164,7 +164,7 @@ class PoseEstimator:
         focal_px: float | None = None,
         object: str | None = None,
         box: Box | None = None,
-        color: Picture | None = None,
+        color: AnyPicture | None = None,
         color_camera: AnyCamera | None = None,
         color_from_depth: Rigid | AnyArray | None = None,
         background: AnyBackground | None = None,
@@ -411,7 +411,7 @@ class PoseEstimator:
             config=self.config,
             search=search,
         )
-        return each_in_float32(track(frames, target, first))
+        return iterate_in_float32(track(frames, target, first))
 
     def _find_object(self, name: str | None) -> PreparedObject:
         """Find an object by its name, with its surface; None where one alone is known.
@@ -430,7 +430,7 @@ class PoseEstimator:
             listing = ", ".join(map(repr, names))
             raise InputError(f"object {name!r} is no text; give the name of one: {listing}")
         if name not in names:
-            nearest = nearest_name(name, names)
+            nearest = suggest_name(name, names)
             raise InputError(f"object {name!r}: {self._holder} do not know it; {nearest}")
 
         # Its surface is sampled when it is first asked for.

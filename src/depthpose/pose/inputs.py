@@ -18,7 +18,7 @@ from depthpose.core.camera import (
     refuse_other_resolution,
     refuse_outside,
 )
-from depthpose.core.camera.camera_file import intrinsics_of
+from depthpose.core.camera.any_camera import intrinsics_of
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_cloud, read_stored_depth
 from depthpose.core.rigid import Rigid

@@ -17,8 +17,8 @@ from torch.nn.functional import normalize
 
 from depthpose.core.checkpoint import find_weights, warn_of_terms
 from depthpose.core.devices import (
-    each_in_threads,
     force_float32,
+    map_in_threads,
     refused_memory,
     usable_device,
 )
@@ -178,11 +178,11 @@ class GeoPoseNet(PoseEstimator):
         The answer for an input does not depend on those beside it, but for the rounding of the
         network's sums. ``is_expected``: whether the inputs are meant to show their objects.
         """
-        prepared = each_in_threads(partial(unreadable_on_error, self._prepare), inputs, threads)
+        prepared = map_in_threads(partial(unreadable_on_error, self._prepare), inputs, threads)
         pose = partial(self._pose_or_register, is_expected=is_expected)
         for group in _group_by_voxels(prepared, self.config.batch_voxels):
             self._ask_network(group)
-            yield from each_in_threads(pose, group, threads)
+            yield from map_in_threads(pose, group, threads)
 
     @torch.no_grad()
     @force_float32()

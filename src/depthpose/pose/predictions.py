@@ -16,10 +16,10 @@ import torch
 from torch import Tensor
 
 from depthpose.core.config import config_from_dict
-from depthpose.core.errors import InputError, Notice, nearest_name
+from depthpose.core.errors import InputError, Notice, suggest_name
 from depthpose.core.files import image_size, write_json
 from depthpose.core.files.disk import read_bytes, refuse_heavy, refused_as, write_bytes
-from depthpose.core.frame import data_frame
+from depthpose.core.frame import make_data_frame
 from depthpose.core.rigid import Rigid
 from depthpose.core.run import claim_folder
 from depthpose.core.runner import Job, Results, run_jobs
@@ -80,7 +80,7 @@ class Predictions(list[Prediction]):
         Raises:
             ImportError: pandas is not installed.
         """
-        return data_frame(prediction_row(prediction) for prediction in self)
+        return make_data_frame(prediction_row(prediction) for prediction in self)
 
 
 def place_of(instance: Instance) -> Place:
@@ -216,7 +216,7 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
     reason = row.get("reason", "")
     if status not in get_args(Status):
         statuses = get_args(Status)
-        raise InputError(f"{source}: status {status!r}: {nearest_name(str(status), statuses)}")
+        raise InputError(f"{source}: status {status!r}: {suggest_name(str(status), statuses)}")
 
     # How it came about, and its pose, which only an answer has.
     tracking = row.get("tracking")

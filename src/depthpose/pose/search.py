@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from depthpose.core.devices import each_in_threads
+from depthpose.core.devices import map_in_threads
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import cloud_from_depth, why_nothing_seen
 from depthpose.pose.config import EstimateConfig, RefusalConfig
@@ -209,7 +209,7 @@ def _propose(
 
     proposals = [
         proposal
-        for group in each_in_threads(propose_object, names, torch.get_num_threads())
+        for group in map_in_threads(propose_object, names, torch.get_num_threads())
         for proposal in group
     ]
     proposals.sort(key=lambda proposal: -proposal.score)
@@ -256,7 +256,7 @@ def _refine(
 
     likely: list[tuple[float, _Place]] = []
     hopeless: list[_Miss] = []
-    refined = each_in_threads(refine, places, torch.get_num_threads())
+    refined = map_in_threads(refine, places, torch.get_num_threads())
     for place, (pose, evidence) in zip(places, refined, strict=True):
         probability = probability_right(evidence, targets.prior_odds)
         if probability < LEAST_POSSIBLE:
@@ -316,7 +316,7 @@ def _judge(
 
     judged: list[_JudgedPlace] = []
     misses: list[_Miss] = []
-    estimates = each_in_threads(estimate_place, enumerate(groups), torch.get_num_threads())
+    estimates = map_in_threads(estimate_place, enumerate(groups), torch.get_num_threads())
     for estimate, group in zip(estimates, groups, strict=True):
         surface = targets.objects[estimate.object].surface
         evidence = estimate.evidence

@@ -1,6 +1,7 @@
-"""What a page shows: tables (also as Markdown, CSV, JSON), pictures, and clouds in 3D.
+"""The parts of a report page, and their writing: 3D views, pictures, videos and tables.
 
-``viewer.js`` draws the clouds; the page is one HTML file that needs no other.
+A page is one HTML file that needs no other; ``viewer.js``, which is written into it, draws the 3D
+views. Tables are written as Markdown, CSV and JSON too.
 """
 
 import base64
@@ -21,8 +22,8 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from torch import Tensor
 from torch.nn import functional as F
 
-from depthpose.core.draw import NEAR_TO_FAR
-from depthpose.core.files import Cloud, encode_image, image_size, read_image, write_json
+from depthpose.core.draw import NEAR_TO_FAR, Rgb
+from depthpose.core.files import PointCloud, encode_image, image_size, read_image, write_json
 from depthpose.core.files.disk import write_bytes
 
 MOST_POINTS = 60_000
@@ -34,66 +35,70 @@ _GREY = 0.55
 """Grey of points without a colour: visible on white and on black."""
 _STEPS = 65535
 """Steps into which the extent of a layer is divided along each axis, for 16 bits."""
-_RED_GREEN_BLUE = ((0.85, 0.2, 0.2), (0.15, 0.65, 0.25), (0.25, 0.45, 0.95))
+_AXIS_COLORS: tuple[Rgb, ...] = ((0.85, 0.2, 0.2), (0.15, 0.65, 0.25), (0.25, 0.45, 0.95))
+"""Red, green and blue, of the axes x, y and z."""
+_SAMPLING_SEED = 0
+"""Makes the thinning of a layer the same every time."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Lines:
-    """Straight pieces of line."""
+class LineSegments:
+    """Line segments in a 3D view."""
 
-    ends_m: Float[Tensor, "n 2 3"]  #: both ends of each
-    color: Float[Tensor, "n 3"]  #: RGB in [0, 1], one for each piece
+    ends_m: Float[Tensor, "n 2 3"]  #: both ends of each [m]
+    color: Float[Tensor, "n 3"]  #: RGB in [0, 1] of each
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Layer:
-    """A part of a scene that can be hidden."""
+    """A part of a 3D view that can be shown and hidden."""
 
-    name: str  #: what the viewer calls it; layers of one name are hidden together
-    shape: Cloud | Lines  #: coloured points (NaN left out), or lines; metres, camera frame
-    is_shown: bool = True  #: whether it is seen at first
+    name: str  #: label in the viewer; layers of one name are hidden together
+    shape: PointCloud | LineSegments  #: finite, in metres, in the camera's frame
+    is_shown: bool = True  #: whether it is visible when the page opens
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Scene:
-    """The content of one 3D view."""
+    """A 3D view: layers drawn together."""
 
-    caption: str  #: stands below it
-    layers: Sequence[Layer]  #: drawn together
+    caption: str  #: text below the view
+    layers: Sequence[Layer]
 
-    def encoded(self) -> dict[str, Any]:
-        """Encode as the JSON that ``viewer.js`` reads: base64 of 16-bit places and 8-bit colours.
+    def encode(self) -> dict[str, Any]:
+        """Encode the view as the JSON object that ``viewer.js`` reads.
 
-        Places are steps of 1/65535 of their extent: of a street of 80 m, 1.2 mm. ``note`` says
-        which layers are thinned.
+        Coordinates are 16-bit steps of 1/65535 of a layer's extent (1.2 mm in a street of 80 m),
+        colours 8 bits a channel, both in base64. Large layers are thinned, and ``note`` names them.
         """
         encoded_layers: list[dict[str, Any]] = []
         notes: list[str] = []
         for layer in self.layers:
             shape = layer.shape
-            if isinstance(shape, Cloud):
+            if isinstance(shape, PointCloud):
                 kind = "points"
                 max_count = MOST_POINTS
-                places = shape.points
+                coordinates_m = shape.points
                 color = shape.color
-                color = torch.full_like(places, _GREY) if color is None else color
+                color = torch.full_like(coordinates_m, _GREY) if color is None else color
             else:
                 kind = "lines"
                 max_count = MOST_LINES
-                places = shape.ends_m
+                coordinates_m = shape.ends_m
                 color = shape.color
 
-            if len(places) > max_count:
-                notes.append(f"{layer.name}: {max_count} of {len(places)}, thinned evenly")
-                sampled = _sample_runs(len(places), max_count)
-                places = places[sampled]
+            count = len(coordinates_m)
+            if count > max_count:
+                notes.append(f"{layer.name}: {max_count} of {count}, thinned evenly")
+                sampled = _sample_runs(count, max_count)
+                coordinates_m = coordinates_m[sampled]
                 color = color[sampled]
             encoded = {
                 "name": layer.name,
                 "kind": kind,
                 "shown": layer.is_shown,
-                "count": len(places),
-                **_encode_places(places),
+                "count": len(coordinates_m),
+                **_encode_coordinates(coordinates_m),
                 "colors": _encode_colors(color),
             }
             encoded_layers.append(encoded)
@@ -101,19 +106,24 @@ class Scene:
 
 
 def _sample_runs(total: int, count: int) -> Int64[Tensor, " count"]:
-    """Choose ``count`` of ``total`` rows: one at random of each of equal runs, always the same.
+    """Choose ``count`` of ``total`` indices: a random one of each of ``count`` equal runs.
 
-    Equal steps through the rows of a depth image would leave lines of points.
+    Equal steps through the pixels of a depth image would leave lines of points. The choice is the
+    same every time.
     """
-    generator = torch.Generator().manual_seed(0)
-    offsets = torch.rand(count, generator=generator, dtype=torch.float64)
+    generator = torch.Generator().manual_seed(_SAMPLING_SEED)
+    offsets = torch.rand(count, generator=generator, dtype=torch.float64)  # within each run
     chosen = ((torch.arange(count) + offsets) * (total / count)).long()
     return chosen.clamp(max=total - 1)
 
 
-def _encode_places(places: Float[Tensor, "*shape 3"]) -> dict[str, Any]:
-    """Encode places as 16-bit steps from their least coordinates, with ``low`` and ``step``."""
-    flat_m = places.detach().cpu().numpy().astype(np.float64).reshape(-1, 3)
+def _encode_coordinates(coordinates_m: Float[Tensor, "*shape 3"]) -> dict[str, Any]:
+    """Encode coordinates as ``places``: base64 of 16-bit steps from the least along each axis.
+
+    Returns:
+        ``places``; ``low``, the least coordinates [m]; ``step``, the length of a step [m].
+    """
+    flat_m = coordinates_m.detach().cpu().numpy().astype(np.float64).reshape(-1, 3)
     low = flat_m.min(0) if len(flat_m) else np.zeros(3)
     step = (flat_m.max(0) - low) / _STEPS if len(flat_m) else np.zeros(3)
     steps = np.round((flat_m - low) / np.where(step > 0, step, 1))
@@ -125,60 +135,73 @@ def _encode_places(places: Float[Tensor, "*shape 3"]) -> dict[str, Any]:
 
 
 def _encode_colors(color: Float[Tensor, "n 3"]) -> str:
-    """Encode colours in [0, 1] by 8 bits a channel."""
+    """Encode colours in [0, 1] as base64 of 8 bits a channel."""
     values = (color.detach().cpu().clamp(0, 1) * 255).round().byte()
     return base64.b64encode(values.numpy().tobytes()).decode()
 
 
-def page_file(name: Literal["viewer.js", "page.css"]) -> str:
-    """Read the viewer, which defines ``showScene(element, scene)``, or the style of all pages."""
+def read_page_file(name: Literal["viewer.js", "page.css"]) -> str:
+    """Read a file that pages embed: ``page.css``, the style of all, or ``viewer.js``.
+
+    The script defines ``showScene(element, scene)``, which draws a scene of :meth:`Scene.encode`.
+    """
     return files("depthpose.report").joinpath(name).read_text(encoding="utf-8")
 
 
-def colored_lines(ends_m: Float[Tensor, "n 2 3"], color: tuple[float, float, float]) -> Lines:
-    """Make lines of one colour."""
-    return Lines(ends_m=ends_m, color=torch.tensor(color).expand(len(ends_m), 3))
+def make_lines(ends_m: Float[Tensor, "n 2 3"], color: Rgb) -> LineSegments:
+    """Make line segments of one colour from both ends of each [m]."""
+    return LineSegments(ends_m=ends_m, color=torch.tensor(color).expand(len(ends_m), 3))
 
 
-def frame_axes(origin_m: Float[Tensor, "3"], R: Float[Tensor, "3 3"], length_m: float) -> Lines:
-    """Draw the axes of a frame (columns of R) in the camera frame: x red, y green, z blue.
+def make_frame_axes(
+    origin_m: Float[Tensor, "3"], R: Float[Tensor, "3 3"], length_m: float
+) -> LineSegments:
+    """Make three line segments that show a frame: its x axis red, y green, z blue.
 
-    ``length_m``: length of each axis.
+    Args:
+        origin_m: origin of the frame, in the camera's frame [m].
+        R: rotation from the frame to the camera's; its columns are the axes.
+        length_m: length of each segment [m].
     """
     tips_m = origin_m + length_m * R.mT
     ends_m = torch.stack([origin_m.expand(3, 3), tips_m], 1)
-    return Lines(ends_m=ends_m.float(), color=torch.tensor(_RED_GREEN_BLUE))
+    return LineSegments(ends_m=ends_m.float(), color=torch.tensor(_AXIS_COLORS))
 
 
 MOST_VIEWS = 6
-"""Most inputs that a page shows by pictures."""
+"""Most inputs that a page shows with pictures."""
 _LEAST_REFUSALS = 2
-"""Refusals that are shown at least, if there are as many."""
+"""Refused inputs among them at least, if there are as many."""
 
 
 def spread_evenly(total: int, count: int) -> list[int]:
-    """Choose ``count`` numbers of 0 .. total - 1, the middle of each of equal parts.
+    """Choose ``count`` indices below ``total``: the middle of each of ``count`` equal parts.
 
-    All of them where there are fewer.
+    All indices where there are fewer.
     """
     count = min(count, total)
     return [(2 * k + 1) * total // (2 * count) for k in range(count)]
 
 
-def choose_answers(is_ok: Sequence[bool]) -> list[int]:
-    """Choose answers and some refusals to show, each spread evenly; give their indices in order."""
-    answered = [k for k, ok in enumerate(is_ok) if ok]
-    refused = [k for k, ok in enumerate(is_ok) if not ok]
-    refused_count = min(len(refused), max(_LEAST_REFUSALS, MOST_VIEWS - len(answered)))
+def choose_views(has_estimate: Sequence[bool]) -> list[int]:
+    """Choose the inputs that a page shows: some with an estimate and some refused ones.
+
+    Returns:
+        Indices of ``MOST_VIEWS`` inputs at most, in order; of either kind spread evenly.
+    """
+    estimated = [index for index, is_estimated in enumerate(has_estimate) if is_estimated]
+    refused = [index for index, is_estimated in enumerate(has_estimate) if not is_estimated]
+    refused_count = min(len(refused), max(_LEAST_REFUSALS, MOST_VIEWS - len(estimated)))
     chosen = [refused[i] for i in spread_evenly(len(refused), refused_count)]
-    chosen += [answered[i] for i in spread_evenly(len(answered), MOST_VIEWS - refused_count)]
+    chosen += [estimated[i] for i in spread_evenly(len(estimated), MOST_VIEWS - refused_count)]
     return sorted(chosen)
 
 
 def choose_ranked(errors: Sequence[float], most: int = 3) -> list[tuple[str, int]]:
-    """Choose the worst, the median and the best of finite errors, ``most`` of them at most.
+    """Choose the worst, the median and the best of finite errors: the first ``most`` of these.
 
-    Gives the role of each and its index; of two errors there is no median, and one is the only.
+    Returns:
+        The word and the index of each. Of two errors there is no median; a single one is ``only``.
     """
     order = sorted(range(len(errors)), key=errors.__getitem__)
     if len(order) <= 1:
@@ -190,40 +213,41 @@ def choose_ranked(errors: Sequence[float], most: int = 3) -> list[tuple[str, int
 
 
 def share_views(sets: int) -> list[int]:
-    """Give the number of views of each of several sets of predictions on a page.
+    """Share the views of a page among several sets of predictions: the number of each set.
 
-    Of many sets the last get none.
+    Of more than ``MOST_VIEWS`` sets the last get none.
     """
     each = max(1, MOST_VIEWS // max(1, sets))
-    return [each if k * each < MOST_VIEWS else 0 for k in range(sets)]
+    return [each if index * each < MOST_VIEWS else 0 for index in range(sets)]
 
 
 Row = Mapping[str, Any]
+"""A row of a table: values by the names of their columns."""
 
 _LEAST_GAP = 0.08
-"""Between two marks of a bar, as a share of its length: nearer ones would touch."""
+"""Between two marks of a colour bar, as a share of its length: nearer ones would touch."""
 _MOST_PIXELS = 480_000
-"""Most pixels of a drawing on a page of many; a frame of KITTI keeps its size."""
+"""Most pixels of a picture that is encoded for a page; a frame of KITTI keeps its size."""
 _JPEG_QUALITY = 85
 _ENCODING_ERRORS = "backslashreplace"
 """How names of files are written whose bytes are no UTF-8."""
-_MOST_BYTES = 250_000
-"""Largest size of a picture file that goes onto a page as it is."""
+_MOST_PICTURE_BYTES = 250_000
+"""Largest picture file that is embedded as it is; a larger one is encoded anew."""
 _MOST_FILM_BYTES = 8_000_000
-"""Largest size of a video file on a page; a larger one is shown from its own file."""
+"""Largest video file that is embedded; the page links to a larger one."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scale:
+class ColorBar:
     """The colour bar of a picture: its colours and their meaning."""
 
     title: str  #: the quantity, with its unit
-    colors: Sequence[tuple[float, float, float]]  #: RGB in [0, 1] at even steps from left to right
+    colors: Sequence[Rgb]  #: colours at even steps from left to right
     marks: Sequence[tuple[float, str]]  #: positions, 0 (left) to 1, and the text at each
 
 
-def depth_scale(near_m: float = 3.0, far_m: float = 80.0) -> Scale:
-    """Make the colour bar of ``core.draw.draw_depth``: logarithmic, with marks at round metres."""
+def make_depth_color_bar(near_m: float = 3.0, far_m: float = 80.0) -> ColorBar:
+    """Make the colour bar of ``core.draw.draw_depth``: logarithmic, marked at round metres."""
     marks = [(0.0, f"{near_m:g}"), (1.0, f"{far_m:g}")]
     exponents = range(math.floor(math.log10(near_m)), math.ceil(math.log10(far_m)) + 1)
     round_metres = [digit * 10.0**exponent for exponent in exponents for digit in (1, 2, 5)]
@@ -232,52 +256,57 @@ def depth_scale(near_m: float = 3.0, far_m: float = 80.0) -> Scale:
         has_room = all(abs(position - other) >= _LEAST_GAP for other, _ in marks)
         if has_room and 0 < position < 1:
             marks.append((position, f"{round_m:g}"))
-    return Scale(title="depth [m]", colors=NEAR_TO_FAR, marks=sorted(marks))
+    return ColorBar(title="depth [m]", colors=NEAR_TO_FAR, marks=sorted(marks))
 
 
-def rising_scale(title: str, top: float, *, has_more: bool = False) -> Scale:
+def make_rising_color_bar(title: str, top: float, *, has_more: bool = False) -> ColorBar:
     """Make the colour bar of a quantity that is dark at 0 and bright at ``top``.
 
     Args:
         title: the quantity, with its unit.
         top: value of the brightest colour.
-        has_more: larger values have that colour too.
+        has_more: larger values have that colour too, which a ``+`` says.
     """
-    marks = [(0.0, "0"), (0.5, f"{top / 2:g}"), (1.0, f"{top:g}{'+' if has_more else ''}")]
-    return Scale(title=title, colors=NEAR_TO_FAR[::-1], marks=marks)
+    last_mark = f"{top:g}+" if has_more else f"{top:g}"
+    marks = [(0.0, "0"), (0.5, f"{top / 2:g}"), (1.0, last_mark)]
+    return ColorBar(title=title, colors=NEAR_TO_FAR[::-1], marks=marks)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Picture:
-    """A picture file with a caption."""
+class PictureFile:
+    """A picture file on a page."""
 
     path: Path
     caption: str
-    scale: Scale | None = None  #: what its colours mean; None: they are no numbers
+    color_bar: ColorBar | None = None  #: meaning of its colours; None: they are no values
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Drawing:
-    """A picture without a file of its own, small enough for a page of many."""
+    """A picture on a page that has no file of its own."""
 
     image: Float[Tensor, "3 h w"]
     caption: str
-    scale: Scale | None = None
+    color_bar: ColorBar | None = None
 
 
 def embed_picture(
-    picture: Picture | Drawing, most_pixels: int = _MOST_PIXELS
+    picture: PictureFile | Drawing, most_pixels: int = _MOST_PIXELS
 ) -> tuple[int, int, str]:
-    """Embed a picture: its width and height [px], and its data as a ``data:`` address.
+    """Encode a picture as a ``data:`` address, so that a page needs no other file.
 
-    With these the page needs no other file, and does not move while a picture loads. A small file
-    is taken as it is; another picture is shrunk to about ``most_pixels``, its proportions kept.
+    A small file is taken as it is. Any other picture becomes a JPEG, shrunk to about
+    ``most_pixels`` with its proportions kept.
+
+    Returns:
+        Width and height of the picture before it is shrunk [px], with which a page reserves its
+        place, and the address.
     """
-    if isinstance(picture, Picture) and picture.path.stat().st_size <= _MOST_BYTES:
+    if isinstance(picture, PictureFile) and picture.path.stat().st_size <= _MOST_PICTURE_BYTES:
         kind = "jpeg" if picture.path.suffix.lower() in (".jpg", ".jpeg") else "png"
         data = base64.b64encode(picture.path.read_bytes()).decode()
         return *image_size(picture.path), f"data:image/{kind};base64,{data}"
-    image = read_image(picture.path) if isinstance(picture, Picture) else picture.image
+    image = read_image(picture.path) if isinstance(picture, PictureFile) else picture.image
     height, width = image.shape[1:]
     scale = math.sqrt(most_pixels / (height * width))
     if scale < 1:
@@ -289,14 +318,14 @@ def embed_picture(
 
 @dataclass(frozen=True, kw_only=True)
 class Film:
-    """A video file beside the page; a small one is on the page itself."""
+    """A video file on a page: embedded if it is small, else linked."""
 
     path: Path
     caption: str
 
     @property
     def address(self) -> str:
-        """Make the address of the video: its bytes (``data:``), or its name if it is large."""
+        """Make the address of the video: its content (``data:``), or its name if it is large."""
         if self.path.stat().st_size > _MOST_FILM_BYTES:
             return quote(self.path.name)
         return "data:video/mp4;base64," + base64.b64encode(self.path.read_bytes()).decode()
@@ -304,12 +333,12 @@ class Film:
 
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """A part of a page; what it holds is shown in this order."""
+    """A part of a page; its contents are shown in the order of these fields."""
 
     title: str
     text: str = ""  #: a paragraph
     facts: Sequence[tuple[str, str]] = ()  #: names and values
-    pictures: Sequence[Picture | Drawing] = field(default_factory=tuple)
+    pictures: Sequence[PictureFile | Drawing] = field(default_factory=tuple)
     films: Sequence[Film] = ()
     rows: Sequence[Row] = ()  #: rows of a table that can be sorted
     tables: Mapping[str, Sequence[Sequence[str]]] = field(default_factory=dict)
@@ -317,8 +346,8 @@ class Section:
     scenes: Sequence[Scene] = field(default_factory=tuple)  #: 3D views
 
 
-def table_files(*names: str) -> list[str]:
-    """Give the names of the files that :func:`write_table` writes for tables of these names."""
+def list_table_files(*names: str) -> list[str]:
+    """List the files that :func:`write_table` writes for tables of these names."""
     files: list[str] = []
     for name in names:
         markdown_stem = "table" if name == "rows" else name
@@ -327,43 +356,44 @@ def table_files(*names: str) -> list[str]:
 
 
 def write_table(folder: Path, rows: Sequence[Row], name: str = "rows") -> None:
-    """Write rows as ``NAME.json``, ``NAME.csv`` with every digit and ``NAME.md``.
+    """Write a table as ``NAME.json`` and ``NAME.csv``, with every digit, and as ``NAME.md``.
 
-    The last is ``table.md`` where the name is ``rows``.
+    The last is called ``table.md`` where the name is ``rows``.
     """
-    as_json, as_csv, as_markdown = table_files(name)
+    as_json, as_csv, as_markdown = list_table_files(name)
     write_json(folder / as_json, [dict(row) for row in rows])
     text = io.StringIO()
-    writer = csv.DictWriter(text, column_names(rows), lineterminator="\n")
+    writer = csv.DictWriter(text, list_columns(rows), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     write_bytes(folder / as_csv, text.getvalue().encode(errors=_ENCODING_ERRORS))
-    write_bytes(folder / as_markdown, markdown_table(rows).encode(errors=_ENCODING_ERRORS))
+    write_bytes(folder / as_markdown, format_markdown_table(rows).encode(errors=_ENCODING_ERRORS))
 
 
-def markdown_table(rows: Sequence[Row]) -> str:
-    """Format rows as a Markdown table; "none" if there are no rows."""
+def format_markdown_table(rows: Sequence[Row]) -> str:
+    """Format a table as Markdown; "none" if it has no rows."""
     if not rows:
         return "none\n"
-    names = column_names(rows)
+    names = list_columns(rows)
     lines = [names, ["---"] * len(names)]
-    lines += [[show_value(row.get(name)).replace("|", "\\|") for name in names] for row in rows]
+    lines += [[format_value(row.get(name)).replace("|", "\\|") for name in names] for row in rows]
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
-def plain_table(rows: Sequence[Row], names: Sequence[str] = ()) -> str:
-    """Format rows as a table for a terminal, with the columns of these names, by default all.
+def format_plain_table(rows: Sequence[Row], names: Sequence[str] = ()) -> str:
+    """Format a table for a terminal; columns without a value are left out.
 
-    Columns without a value are left out.
+    Args:
+        rows: the rows.
+        names: columns to show, in this order; by default all.
     """
-
-    def has_value(name: str) -> bool:
-        """Whether any row has a value in a column."""
-        return any(row.get(name) not in (None, "") for row in rows)
-
-    shown_names = list(filter(has_value, names or column_names(rows)))
+    shown_names = [
+        name
+        for name in names or list_columns(rows)
+        if any(row.get(name) not in (None, "") for row in rows)
+    ]
     lines = [shown_names]
-    lines += [[show_value(row.get(name)) for name in shown_names] for row in rows]
+    lines += [[format_value(row.get(name)) for name in shown_names] for row in rows]
 
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     text = ""
@@ -376,20 +406,23 @@ def plain_table(rows: Sequence[Row], names: Sequence[str] = ()) -> str:
 def write_markdown(
     path: Path, title: str, sections: Sequence[Section], environment: Mapping[str, str]
 ) -> None:
-    """Write the text and tables of :func:`write_page` as Markdown, without pictures."""
+    """Write the titles, texts and rows of the sections as Markdown, and below them the environment.
+
+    Arguments are those of :func:`write_page`.
+    """
     parts = [f"# {title}\n"]
     for section in sections:
         parts.append(f"## {section.title}\n")
         if section.text:
             parts.append(f"{section.text}\n")
         if section.rows:
-            parts.append(markdown_table(section.rows))
+            parts.append(format_markdown_table(section.rows))
     parts.append(" · ".join(f"{name} {value}" for name, value in environment.items()) + "\n")
     write_bytes(path, "\n".join(parts).encode(errors=_ENCODING_ERRORS))
 
 
-def column_names(rows: Sequence[Row]) -> list[str]:
-    """Give the names of all columns that any row has, in order of their first appearance."""
+def list_columns(rows: Sequence[Row]) -> list[str]:
+    """List the names of all columns that any row has, in order of their first appearance."""
     return list(dict.fromkeys(name for row in rows for name in row))
 
 
@@ -419,8 +452,8 @@ _COLUMN_MEANINGS = {
 """Shown when the pointer is on the head of a column."""
 
 
-def show_value(value: object) -> str:
-    """Format a value for a person: four decimals, whole numbers without any, nothing for None."""
+def format_value(value: object) -> str:
+    """Format a cell of a table: floats with four decimals or none if whole; None as ``""``."""
     match value:
         case None:
             return ""
@@ -433,25 +466,30 @@ def show_value(value: object) -> str:
 def write_page(
     path: Path, title: str, sections: Sequence[Section], environment: Mapping[str, str]
 ) -> None:
-    """Write one HTML file that shows the sections and needs no network and no other file.
+    """Write one HTML file that shows the sections and needs neither network nor other files.
 
-    ``environment``: what the numbers were measured with (see ``core.run.environment``).
+    Args:
+        path: the file.
+        title: title of the page.
+        sections: contents of the page.
+        environment: what the results were computed with, by name
+            (:func:`depthpose.core.run.describe_environment`).
     """
-    pages = Environment(
+    templates = Environment(
         loader=PackageLoader("depthpose.report", "."),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    pages.globals.update(
-        show_value=show_value,
-        column_names=column_names,
-        page_file=page_file,
+    templates.globals.update(
+        format_value=format_value,
+        list_columns=list_columns,
+        read_page_file=read_page_file,
         embed_picture=embed_picture,
         about=_COLUMN_MEANINGS,
     )
-    html = pages.get_template("report.html").render(
+    html = templates.get_template("report.html").render(
         title=title, sections=sections, environment=environment
     )
     write_bytes(path, html.encode(errors=_ENCODING_ERRORS))

@@ -1,4 +1,4 @@
-"""A pose on a page: the object over its picture, numbers, and the cloud with it in 3D."""
+"""The section of a report page that shows an estimated pose: pictures, facts, tables, a 3D view."""
 
 import math
 from collections.abc import Sequence
@@ -9,8 +9,8 @@ from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.camera import Camera, crop_camera, project, resize_camera
-from depthpose.core.draw import draw_lines, draw_outline
-from depthpose.core.files import Cloud, read_depth_png, read_image
+from depthpose.core.draw import Rgb, draw_lines, draw_outline
+from depthpose.core.files import PointCloud, read_depth_png, read_image
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import cloud_from_depth, is_reading
@@ -24,37 +24,37 @@ from depthpose.report.page import (
     Row,
     Scene,
     Section,
-    colored_lines,
-    frame_axes,
+    make_frame_axes,
+    make_lines,
 )
 
-Color = tuple[float, float, float]
-ESTIMATED: Color = (0.15, 0.35, 1.0)
+ESTIMATED: Rgb = (0.15, 0.35, 1.0)
 """Colour of an estimate: blue."""
-TRUTH: Color = (0.1, 0.8, 0.2)
+TRUTH: Rgb = (0.1, 0.8, 0.2)
 """Colour of the truth: green."""
-VOTED: Color = (1.0, 0.55, 0.1)
+VOTED: Rgb = (1.0, 0.55, 0.1)
 """Colour of voted keypoints: orange."""
-ALTERNATIVE: Color = (0.6, 0.3, 0.85)
+ALTERNATIVE: Rgb = (0.6, 0.3, 0.85)
 """Colour of an alternative: violet."""
 _SURFACE_POINTS = 5000
-"""Number of points of the posed model in a cloud."""
+"""Number of points by which the surface of a posed model is shown."""
 _SHARP_RAD = math.radians(30)
 """Least angle between the faces at an edge that is drawn."""
 _CROSS_ARM = 0.04
-"""Half of the cross at a keypoint, in diameters of the object."""
+"""Half the width of the cross at a keypoint, in diameters of the object."""
 _DRAWN_VOTES = 40
-"""Points whose votes are drawn."""
+"""Number of points whose votes are drawn."""
 _DASH_PX = 6.0
+"""Length of the dashes of the true box."""
 _GREY = 0.6
 """Grey of the points of an observed cloud."""
 
 
-def picture_of(instance: Instance) -> Float[Tensor, "3 h w"]:
-    """Read the picture of an instance, or its depth in grey where there is none."""
+def read_instance_image(instance: Instance) -> Float[Tensor, "3 h w"]:
+    """Read the colour image of an instance, or draw its depth in grey where it has none."""
     if instance.rgb is not None:
         return read_image(instance.rgb)
-    return grey_depth(read_depth_png(instance.depth, instance.depth_unit_m))
+    return draw_grey_depth(read_depth_png(instance.depth, instance.depth_unit_m))
 
 
 def draw_pose(
@@ -64,17 +64,17 @@ def draw_pose(
     K: Float[Tensor, "3 3"],
     truth: Rigid | None = None,
 ) -> Float[Tensor, "3 h w"]:
-    """Draw the projected box of a posed object and the border of its silhouette, in blue.
+    """Draw the projected box of a posed object and the outline of its silhouette, in blue.
 
     Args:
         image: image of the camera; it is not changed.
         pose: ``camera_from_model``; None: the truth alone is drawn.
-        model: the object; one of points alone is drawn by small discs.
+        model: the object; points without faces are drawn as small discs.
         K: intrinsic matrix of the image.
         truth: ``camera_from_model``, whose box is drawn too, green and dashed; None: it is unknown.
     """
     K = K.double()
-    box_m = box_edges(model).double()
+    box_m = list_box_edges(model).double()
     if pose is not None:
         ends_px = project(pose.double().apply(box_m), K)
         posed_m = pose.double().apply(drawn_triangles(model).double())
@@ -90,9 +90,9 @@ def draw_pose(
 def draw_region(
     image: Float[Tensor, "3 h w"], view: ViewInput, pose: Rigid | None
 ) -> Float[Tensor, "3 h w"]:
-    """Draw the border of the box in which an object was searched, or of its mask, in yellow.
+    """Draw the outline of the region in which an object was searched, or of its mask, in yellow.
 
-    A mask is drawn only where there is no pose, whose silhouette would cover it.
+    A mask is drawn only without a pose, whose silhouette would cover it.
 
     Args:
         image: image of the camera; it is not changed.
@@ -104,8 +104,8 @@ def draw_region(
     return image
 
 
-def box_edges(model: ObjectModel) -> Float[Tensor, "12 2 3"]:
-    """Compute both ends of the edges of the model's box, along its axes [m]."""
+def list_box_edges(model: ObjectModel) -> Float[Tensor, "12 2 3"]:
+    """List the 12 edges of a model's axis-aligned bounding box: both ends of each [m]."""
     low = model.vertices_m.amin(0)
     high = model.vertices_m.amax(0)
     corners = torch.cartesian_prod(*torch.stack([low, high], -1))
@@ -115,44 +115,40 @@ def box_edges(model: ObjectModel) -> Float[Tensor, "12 2 3"]:
     return corners[torch.tensor(pairs)]
 
 
-def pose_layers(
-    pose: Rigid, model: ObjectModel, *, is_true: bool = False, with_box: bool = False
-) -> list[Layer]:
-    """Make the layers of a posed object: surface, edges, box and axes.
-
-    Edges are where the surface ends, or bends by more than 30 degrees.
+def make_pose_layers(pose: Rigid, model: ObjectModel, *, with_box: bool = False) -> list[Layer]:
+    """Make the layers of an estimated pose: the model's surface, sharp edges, box and axes.
 
     Args:
         pose: ``camera_from_model``.
         model: the object.
-        is_true: the pose is the truth: it is shown by edges and box alone, in green.
-        with_box: the box of an estimate is shown at first, and not only when it is switched on.
+        with_box: show the box when the page opens; else it is hidden until it is switched on.
     """
     pose = pose.double()
-    box_m = pose.apply(box_edges(model).double()).float()
-    edges_m = _find_sharp_edges(model)
-    if edges_m is not None:
-        edges_m = pose.apply(edges_m).float()
-    if is_true:
-        layers = [Layer(name="true box", shape=colored_lines(box_m, TRUTH))]
-        if edges_m is not None:
-            layers.append(Layer(name="true edges", shape=colored_lines(edges_m, TRUTH)))
-        return layers
-    layers = [Layer(name="posed model", shape=posed_cloud(torch.empty(0, 3), pose, model))]
-    if edges_m is not None:
-        layers.append(Layer(name="its edges", shape=colored_lines(edges_m, ESTIMATED)))
-    axes = frame_axes(pose.t_m, pose.R, model.diameter_m / 2)
-    box = Layer(name="its box", shape=colored_lines(box_m, ESTIMATED), is_shown=with_box)
-    return [*layers, box, Layer(name="its axes (x red, y green, z blue)", shape=axes)]
+    layers = [Layer(name="posed model", shape=join_posed_cloud(torch.empty(0, 3), pose, model))]
+    if len(model.faces):
+        edges_m = pose.apply(_find_sharp_edges(model)).float()
+        layers.append(Layer(name="its edges", shape=make_lines(edges_m, ESTIMATED)))
+    box_m = pose.apply(list_box_edges(model).double()).float()
+    box = make_lines(box_m, ESTIMATED)
+    layers.append(Layer(name="its box", shape=box, is_shown=with_box))
+    axes = make_frame_axes(pose.t_m, pose.R, model.diameter_m / 2)
+    layers.append(Layer(name="its axes (x red, y green, z blue)", shape=axes))
+    return layers
 
 
-def _find_sharp_edges(model: ObjectModel) -> Float64[Tensor, "n 2 3"] | None:
-    """Find the edges where a mesh ends, or bends by more than ``_SHARP_RAD``: both ends [m].
+def make_truth_layers(pose: Rigid, model: ObjectModel) -> list[Layer]:
+    """Make the layers of the true pose, ``camera_from_model``: box and sharp edges in green."""
+    pose = pose.double()
+    box_m = pose.apply(list_box_edges(model).double()).float()
+    layers = [Layer(name="true box", shape=make_lines(box_m, TRUTH))]
+    if len(model.faces):
+        edges_m = pose.apply(_find_sharp_edges(model)).float()
+        layers.append(Layer(name="true edges", shape=make_lines(edges_m, TRUTH)))
+    return layers
 
-    None of a model without faces.
-    """
-    if not len(model.faces):
-        return None
+
+def _find_sharp_edges(model: ObjectModel) -> Float64[Tensor, "n 2 3"]:
+    """Find the edges where a mesh ends, or bends by more than ``_SHARP_RAD``: both ends [m]."""
     # Vertices at one place are one: STL repeats the points of every face.
     places_m, place_of_vertex = torch.unique(model.vertices_m, dim=0, return_inverse=True)
     corners = place_of_vertex[model.faces]
@@ -171,10 +167,16 @@ def _find_sharp_edges(model: ObjectModel) -> Float64[Tensor, "n 2 3"] | None:
     return places_m[edges[is_sharp | is_border]].double()
 
 
-def keypoint_layers(
+def make_keypoint_layers(
     voted_m: Float[Tensor, "k 3"], pose: Rigid | None, model: ObjectModel
 ) -> list[Layer]:
-    """Draw crosses at the voted keypoints, and at those of the posed model, in the camera frame."""
+    """Make layers of crosses at the voted keypoints and, if there is a pose, at the model's own.
+
+    Args:
+        voted_m: the voted keypoints, in the camera's frame [m].
+        pose: ``camera_from_model``; None: it was refused.
+        model: the object.
+    """
     keypoints = [("keypoints, voted", voted_m, VOTED)]
     if pose is not None:
         posed_m = pose.apply(model.keypoints_m.to(pose.R))
@@ -185,18 +187,23 @@ def keypoint_layers(
         starts_m = centres_m[:, None] - arms_m
         ends_m = centres_m[:, None] + arms_m
         lines_m = torch.stack([starts_m, ends_m], 2).flatten(0, 1).float()
-        layers.append(Layer(name=name, shape=colored_lines(lines_m, color)))
+        layers.append(Layer(name=name, shape=make_lines(lines_m, color)))
     return layers
 
 
-def vote_layer(
+def make_vote_layer(
     points_m: Float[Tensor, "n 3"],
     directions: Float[Tensor, "n k 3"],
     voted_m: Float[Tensor, "k 3"],
 ) -> Layer:
-    """Draw the votes of some points: lines along their directions to beside the voted keypoints.
+    """Make a layer of the votes of some points, hidden at first.
 
-    A line ends where it is nearest to the keypoint. ``directions`` need not be of unit length.
+    A vote is a line from the point along its direction, up to where it is nearest to the keypoint.
+
+    Args:
+        points_m: points of the object, in the camera's frame [m].
+        directions: from each point to each keypoint, of any length.
+        voted_m: the voted keypoints [m].
     """
     points_m = take_evenly(points_m, _DRAWN_VOTES)
     directions = torch.nn.functional.normalize(take_evenly(directions, _DRAWN_VOTES), dim=-1)
@@ -204,29 +211,35 @@ def vote_layer(
     lengths_m = ((voted_m - starts_m) * directions).sum(-1, keepdim=True).clamp(min=0)
     ends_m = starts_m + lengths_m * directions
     lines_m = torch.stack([starts_m, ends_m], -2).flatten(0, 1).float()
-    return Layer(name="votes", shape=colored_lines(lines_m, VOTED), is_shown=False)
+    return Layer(name="votes", shape=make_lines(lines_m, VOTED), is_shown=False)
 
 
-def posed_cloud(cloud_m: Float[Tensor, "n 3"], pose: Rigid | None, model: ObjectModel) -> Cloud:
-    """Join the observed cloud (grey) and the posed surface of the model (blue).
+def join_posed_cloud(
+    cloud_m: Float[Tensor, "n 3"], pose: Rigid | None, model: ObjectModel
+) -> PointCloud:
+    """Join the observed cloud [m] in grey and points of the model's posed surface in blue.
 
-    Without a pose, the cloud alone.
+    Without a pose, the result is the cloud alone.
     """
     cloud_color = torch.full((len(cloud_m), 3), _GREY)
     if pose is None:
-        return Cloud(points=cloud_m.float(), color=cloud_color)
+        return PointCloud(points=cloud_m.float(), color=cloud_color)
     surface_m = pose.apply(sample_surface(model, _SURFACE_POINTS)[0].to(pose.R))
     surface_color = torch.tensor(ESTIMATED).expand(len(surface_m), 3)
-    return Cloud(
+    return PointCloud(
         points=torch.cat([cloud_m.float(), surface_m.float()]),
         color=torch.cat([cloud_color, surface_color]),
     )
 
 
-def object_points(pose_input: CloudInput | ViewInput, diameter_m: float) -> Float[Tensor, "n 3"]:
-    """Take the valid points of a cloud, or of a masked depth image without its flying pixels [m].
+def select_object_points(
+    pose_input: CloudInput | ViewInput, diameter_m: float
+) -> Float[Tensor, "n 3"]:
+    """Select the points of the object [m]: of a masked depth image without flying pixels.
 
-    ``diameter_m``: diameter of the object, by which flying pixels are told.
+    Args:
+        pose_input: a cloud, of which all valid points are taken, or a view.
+        diameter_m: diameter of the object, by which flying pixels are recognised.
     """
     if isinstance(pose_input, ViewInput):
         return cloud_from_depth(
@@ -235,10 +248,10 @@ def object_points(pose_input: CloudInput | ViewInput, diameter_m: float) -> Floa
     return pose_input.points_m[is_reading(pose_input.points_m)].float()
 
 
-def grey_depth(depth_m: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
-    """Draw depth in grey, near bright and far dark, black without a reading.
+def draw_grey_depth(depth_m: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
+    """Draw depth in grey: near bright, far dark, and black without a reading.
 
-    The scale goes from the 1st to the 99th percentile of the readings, so stray ones do not set it.
+    The grey scale spans the 1st to the 99th percentile of the readings: outliers do not set it.
     """
     readings_m = depth_m[depth_m.isfinite() & (depth_m > 0)].sort().values
     if len(readings_m) == 0:
@@ -246,25 +259,27 @@ def grey_depth(depth_m: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
     last = len(readings_m) - 1
     near_m = float(readings_m[round(0.01 * last)])
     far_m = float(readings_m[round(0.99 * last)])
-    nearness = 1 - ((depth_m - near_m) / max(far_m - near_m, 1e-6)).clamp(0, 1)
+    extent_m = max(far_m - near_m, 1e-6)  # not 0, as of a plane
+    nearness = 1 - ((depth_m - near_m) / extent_m).clamp(0, 1)
     grey = torch.where(depth_m > 0, _DARKEST_GREY + (1 - _DARKEST_GREY) * nearness, 0.0)
     return grey.nan_to_num(0.0).float().expand(3, -1, -1)
 
 
 _DARKEST_GREY = 0.15
 """Grey of the farthest depth; black has no reading."""
-_OBJECT_COLOR = (0.55, 0.55, 0.55)
-_SURROUNDINGS_COLOR = (0.7, 0.66, 0.6)
-_BACKGROUND_COLOR = (0.45, 0.6, 0.75)
-_REGION_COLOR = (1.0, 0.85, 0.1)
+_OBJECT_COLOR: Rgb = (0.55, 0.55, 0.55)
+_SURROUNDINGS_COLOR: Rgb = (0.7, 0.66, 0.6)
+_BACKGROUND_COLOR: Rgb = (0.45, 0.6, 0.75)
+_REGION_COLOR: Rgb = (1.0, 0.85, 0.1)
 _MAX_SURROUNDINGS = 20_000
-"""Points of all that is not the object, and of the known background."""
+"""Most points of the surroundings of the object, and of the known background."""
 _MARGIN = 0.6
-"""Margin of a close-up about the object, as a share of the object's extent."""
+"""By how much a close-up is larger than the object, as a share of the object's larger side."""
 _CLOSE_UP_PX = 360
+"""Side of a close-up [px]."""
 
 
-def pose_section(
+def make_pose_section(
     title: str,
     pose_input: AnyInput,
     estimate: PoseEstimate,
@@ -275,48 +290,50 @@ def pose_section(
     truth: Rigid | None = None,
     rows: Sequence[Row] = (),
 ) -> Section:
-    """Show one estimate: sentence and numbers, the picture, the cloud with the model in 3D.
+    """Make the section of an estimate: a sentence, facts, tables, pictures and a 3D view.
 
-    Pictures are of the whole view and of the object from near by, with the box in which it was
-    searched, and the mask where there is no pose.
+    Pictures, of a view alone, show the whole view and a close-up of the object.
 
     Args:
         title: title of the section.
-        pose_input: cloud or view that was posed.
-        estimate: its pose, or why there is none.
+        pose_input: cloud or view of which the pose was estimated.
+        estimate: the pose, or why it was refused.
         model: the object.
-        text: before the sentence about the pose.
-        image: image of the view's camera, which the pose is drawn over; None: the depth in grey.
+        text: text before the sentence about the pose.
+        image: image of the view's camera, over which the pose is drawn; None: the depth in grey.
         truth: ``camera_from_model``; None: it is unknown.
         rows: rows of a table below.
     """
     drawings: list[Drawing] = []
     if isinstance(pose_input, ViewInput):
-        drawings = _pose_drawings(pose_input, estimate, model, image, truth)
-    points_m = object_points(pose_input, model.diameter_m)
+        drawings = _draw_view(pose_input, estimate, model, image, truth)
+    points_m = select_object_points(pose_input, model.diameter_m)
     return Section(
         title=title,
-        text=f"{text} {pose_sentence(estimate)}".strip(),
-        facts=pose_facts(estimate, model),
+        text=f"{text} {describe_pose(estimate)}".strip(),
+        facts=list_pose_facts(estimate, model),
         rows=rows,
-        tables=pose_tables(estimate),
+        tables=make_pose_tables(estimate),
         pictures=drawings,
-        scenes=[pose_scene(pose_input, points_m, estimate, model, truth)],
+        scenes=[make_pose_scene(pose_input, points_m, estimate, model, truth)],
     )
 
 
-def _pose_drawings(
+def _draw_view(
     view: ViewInput,
     estimate: PoseEstimate,
     model: ObjectModel,
     image: Float[Tensor, "3 h w"] | None,
     truth: Rigid | None,
 ) -> list[Drawing]:
-    """Draw a pose over the whole view, and over a close-up of the object."""
+    """Draw a pose over the whole view, and over a close-up of the object if its mask has pixels.
+
+    Arguments are those of :func:`make_pose_section`.
+    """
     pose = estimate.camera_from_model
     if image is None:
         subject = "depth image, near bright"
-        image = grey_depth(view.depth_m)
+        image = draw_grey_depth(view.depth_m)
     else:
         subject = "picture"
     image = draw_region(image, view, pose)
@@ -333,13 +350,13 @@ def _pose_drawings(
     whole = draw_pose(image, pose, model, view.K, truth)
     drawings = [Drawing(image=whole, caption=f"{subject}; {legend}")]
     if bool(view.mask.any()):
-        near, near_K = close_up(image, view.mask, view.K)
+        near, near_K = cut_close_up(image, view.mask, view.K)
         near = draw_pose(near, pose, model, near_K, truth)
         drawings.append(Drawing(image=near, caption=f"the object from near by; {legend}"))
     return drawings
 
 
-def pose_sentence(estimate: PoseEstimate) -> str:
+def describe_pose(estimate: PoseEstimate) -> str:
     """Describe in a sentence where the object is, or why it is refused."""
     if estimate.camera_from_model is None:
         return f"Refused ({estimate.status}): {estimate.reason}."
@@ -357,15 +374,19 @@ def pose_sentence(estimate: PoseEstimate) -> str:
     return f"{sentence} Other poses fit as well: {'; '.join(map(str, estimate.alternatives))}."
 
 
-def pose_facts(
+def list_pose_facts(
     estimate: PoseEstimate,
     model: ObjectModel,
     method: str = "",
     agreeing: str = "votes or points that agree",
 ) -> list[tuple[str, str]]:
-    """List the facts of an estimate other than its pose: names and values.
+    """List facts about an estimate other than its pose, each a name and a value, for people.
 
-    ``method``: method that estimated it, if not empty; ``agreeing``: name of its ``inlier_share``.
+    Args:
+        estimate: the estimate.
+        model: the object.
+        method: name of the method; "" leaves it out.
+        agreeing: name of the fact ``inlier_share``, which differs with the method.
     """
     facts = [("object", f"{estimate.object}, {model.diameter_m:.4f} m long")]
     if method:
@@ -410,8 +431,11 @@ def pose_facts(
     return facts
 
 
-def pose_tables(estimate: PoseEstimate) -> dict[str, Sequence[Sequence[str]]]:
-    """Make the tables of a pose, by title: its matrix, standard deviations and covariance."""
+def make_pose_tables(estimate: PoseEstimate) -> dict[str, Sequence[Sequence[str]]]:
+    """Make the tables of an estimate, by their captions: matrix, standard deviations, covariance.
+
+    A refused estimate has none.
+    """
     tables: dict[str, Sequence[Sequence[str]]] = {}
     pose = estimate.camera_from_model
     if pose is not None:
@@ -436,7 +460,7 @@ def pose_tables(estimate: PoseEstimate) -> dict[str, Sequence[Sequence[str]]]:
 
 
 def _format_std(value: float) -> str:
-    """Format a standard deviation; along a free motion, of a declared symmetry, it is infinite."""
+    """Format a standard deviation; an infinite one, along a declared symmetry, is ``free``."""
     return f"{value:.3f}" if math.isfinite(value) else "free"
 
 
@@ -446,37 +470,40 @@ def _format_matrix(pose: Rigid) -> list[list[str]]:
     return [[f"{value:.5f}" for value in row] for row in rows]
 
 
-def pose_scene(
+def make_pose_scene(
     pose_input: AnyInput,
     points_m: Float[Tensor, "n 3"],
     estimate: PoseEstimate,
     model: ObjectModel,
     truth: Rigid | None = None,
 ) -> Scene:
-    """Make the 3D view of an estimate: the object's points, the posed model, and the rest.
+    """Make the 3D view of an estimate, in the camera's frame.
+
+    It shows the object's points, the posed model, alternatives, the truth, keypoints and the
+    surroundings, as far as there are any.
 
     Args:
-        pose_input: cloud or view that was posed.
-        points_m: those of the object in it (:func:`object_points`).
-        estimate: its pose, or why there is none.
+        pose_input: cloud or view of which the pose was estimated.
+        points_m: points of the object in it (:func:`select_object_points`).
+        estimate: the pose, or why it was refused.
         model: the object.
-        truth: ``camera_from_model``, shown in green; None: it is unknown.
+        truth: ``camera_from_model``; None: it is unknown.
     """
     pose = estimate.camera_from_model
     layers = [_make_point_layer("the object, as seen", points_m, _OBJECT_COLOR)]
     if pose is not None:
-        layers += pose_layers(pose, model, with_box=truth is not None)
+        layers += make_pose_layers(pose, model, with_box=truth is not None)
     for alternative in estimate.alternatives:
-        placed = alternative.camera_from_model.double()
-        box_m = placed.apply(box_edges(model).double()).float()
-        box = colored_lines(box_m, ALTERNATIVE)
+        other_pose = alternative.camera_from_model.double()
+        box_m = other_pose.apply(list_box_edges(model).double()).float()
+        box = make_lines(box_m, ALTERNATIVE)
         layers.append(Layer(name=f"box if {alternative}", shape=box, is_shown=False))
-        axes = frame_axes(placed.t_m, placed.R, model.diameter_m / 2)
+        axes = make_frame_axes(other_pose.t_m, other_pose.R, model.diameter_m / 2)
         layers.append(Layer(name=f"axes if {alternative}", shape=axes, is_shown=False))
     if truth is not None:
-        layers += pose_layers(truth, model, is_true=True)
+        layers += make_truth_layers(truth, model)
     if estimate.keypoints_m is not None:
-        layers += keypoint_layers(estimate.keypoints_m, pose, model)
+        layers += make_keypoint_layers(estimate.keypoints_m, pose, model)
     if isinstance(pose_input, ViewInput):
         layers += _make_surroundings(pose_input)
     caption = "The cloud and the posed model" if pose is not None else "The cloud; there is no pose"
@@ -484,10 +511,10 @@ def pose_scene(
 
 
 def _make_surroundings(view: ViewInput) -> list[Layer]:
-    """Make the layers of all that is not the object, and of the known background; both hidden."""
-    around_m = cloud_from_depth(view.depth_m, ~view.mask, view.K).float()
-    around_m = take_evenly(around_m, _MAX_SURROUNDINGS)
-    layers = [_make_point_layer("all else", around_m, _SURROUNDINGS_COLOR, is_shown=False)]
+    """Make the layers of all points beside the object, and of the known background; both hidden."""
+    other_m = cloud_from_depth(view.depth_m, ~view.mask, view.K).float()
+    other_m = take_evenly(other_m, _MAX_SURROUNDINGS)
+    layers = [_make_point_layer("all else", other_m, _SURROUNDINGS_COLOR, is_shown=False)]
     if view.background is not None:
         depth_m = view.background.depth_m
         background_m = cloud_from_depth(depth_m, depth_m > 0, view.K).float()
@@ -500,23 +527,26 @@ def _make_surroundings(view: ViewInput) -> list[Layer]:
 
 
 def _make_point_layer(
-    name: str, points_m: Float[Tensor, "n 3"], color: Color, *, is_shown: bool = True
+    name: str, points_m: Float[Tensor, "n 3"], color: Rgb, *, is_shown: bool = True
 ) -> Layer:
     """Make a layer of points of one colour."""
     colors = torch.tensor(color).expand(len(points_m), 3)
-    return Layer(name=name, shape=Cloud(points=points_m, color=colors), is_shown=is_shown)
+    return Layer(name=name, shape=PointCloud(points=points_m, color=colors), is_shown=is_shown)
 
 
-def close_up(
+def cut_close_up(
     image: Float[Tensor, "3 h w"], mask: Bool[Tensor, "h w"], K: Float[Tensor, "3 3"]
 ) -> tuple[Float[Tensor, "3 _ _"], Float[Tensor, "3 3"]]:
-    """Cut out a square about the mask, black beyond the image, and enlarge it.
+    """Cut a square about the mask out of an image, and resize it; it is black beyond the image.
 
-    Gives the picture and its intrinsic matrix (float64); without a mask, image and K as they are.
+    Returns:
+        The square, of ``_CLOSE_UP_PX`` pixels a side, and its intrinsic matrix (float64); image and
+        K as they are where the mask is empty.
     """
     rows, columns = mask.nonzero(as_tuple=True)
     if len(rows) == 0:
         return image, K
+    # The square about the centre of the mask's box, in columns and rows.
     low = torch.stack([columns.amin(), rows.amin()])
     high = torch.stack([columns.amax(), rows.amax()]) + 1
     side = int((1 + _MARGIN) * float((high - low).max()))

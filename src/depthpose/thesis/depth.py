@@ -14,7 +14,7 @@ from depthpose.core.errors import InputError
 from depthpose.depth.evaluate import EvaluationRow
 from depthpose.depth.metrics import METRICS
 from depthpose.depth.types import DepthEstimate, StereoInput
-from depthpose.report.page import Drawing, depth_scale
+from depthpose.report.page import Drawing, make_depth_color_bar
 
 _METRICS = tuple(name for name, metric in METRICS.items() if metric.of == "depth")
 _FIRST_COLUMNS = ("source", "method", "weights", "cap_m", *_METRICS, "protocol")
@@ -260,7 +260,7 @@ def _draw_depth_panel(caption: str, pair: StereoInput, estimate: DepthEstimate) 
     if estimate.depth_m is None:
         raise InputError(f"{pair.name}: a figure shows metres; give a camera with a baseline.")
     image = draw_depth(estimate.depth_m, _NEAR_M, _FAR_M)
-    return Drawing(caption=caption, image=image, scale=depth_scale(_NEAR_M, _FAR_M))
+    return Drawing(caption=caption, image=image, color_bar=make_depth_color_bar(_NEAR_M, _FAR_M))
 
 
 def _draw_lidar_panels(
@@ -271,7 +271,7 @@ def _draw_lidar_panels(
         return []
     # Figures show frames at half their size, where a single pixel would fade: points are 5 wide.
     image = draw_points(pair.left, lidar_m, _FAR_M, radius_px=2)
-    return [Drawing(caption=caption, image=image, scale=depth_scale(_NEAR_M, _FAR_M))]
+    return [Drawing(caption=caption, image=image, color_bar=make_depth_color_bar(_NEAR_M, _FAR_M))]
 
 
 def shrink_to_width(image: Float[Tensor, "3 _ _"], width_px: int) -> Float[Tensor, "3 _ _"]:

@@ -14,7 +14,7 @@ from torch.nn import functional as F
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.errors import InputError
-from depthpose.core.files.images import picture_tensor
+from depthpose.core.files.images import rgb_from_pillow
 from depthpose.pose.cloud import prepare_cloud, sample_and_voxelise
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.network import ResUNet
@@ -147,7 +147,7 @@ def draw_features(
     pen = ImageDraw.Draw(canvas)
     draw_discs(pen, surface_px, torch.zeros(len(surface_m), 3), 1.0)
     draw_discs(pen, cloud_px, spectral(share), max(2.0, size_px / 110))
-    return picture_tensor(canvas, "figure 3-2")
+    return rgb_from_pillow(canvas, "figure 3-2")
 
 
 def _look_at_cloud(outward: Float64[Tensor, "3"]) -> Float64[Tensor, "3 3"]:
@@ -219,7 +219,7 @@ def draw_field(
     _draw_star(pen, true_px)
     if voted_m is not None:
         _draw_cross(pen, voted_px)
-    return picture_tensor(canvas, "figure 3-4")
+    return rgb_from_pillow(canvas, "figure 3-4")
 
 
 def _draw_arrow(pen: ImageDraw.ImageDraw, start: Sequence[float], shaft: Sequence[float]) -> None:

@@ -14,7 +14,7 @@ from depthpose.core.files import CLOUD_READERS, DEPTH_SUFFIXES, write_json
 from depthpose.core.files.disk import write_bytes
 from depthpose.core.files.images import LISTED_SUFFIXES
 from depthpose.pose.mesh import MESH_READERS
-from depthpose.report.page import Scale, Scene
+from depthpose.report.page import ColorBar, Scene
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -25,7 +25,7 @@ class Shown:
     caption: str
     values: str | None = None  #: file with a number for each pixel, shown under the pointer
     unit: str = ""  #: unit of these numbers
-    scale: Scale | None = None  #: what the colours mean; None: they are no numbers
+    scale: ColorBar | None = None  #: what the colours mean; None: they are no numbers
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -41,7 +41,7 @@ from depthpose import __version__
 from depthpose.core.errors import InputError, MissingExtraError
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.pose.network_pose import GeoPoseNet
-from depthpose.report.page import page_file
+from depthpose.report.page import read_page_file
 from depthpose.web.answer import KINDS, Answer, Form, keep_file, remove_paths
 from depthpose.web.depth import answer_depth, depth_example
 from depthpose.web.pose import answer_pose, pose_example
@@ -314,8 +314,8 @@ class Handlers:
         folder = Path(__file__).parent
         self._assets = {
             "": ("text/html", page),
-            "page.css": ("text/css", page_file("page.css") + (folder / "web.css").read_text()),
-            "viewer.js": ("text/javascript", page_file("viewer.js")),
+            "page.css": ("text/css", read_page_file("page.css") + (folder / "web.css").read_text()),
+            "viewer.js": ("text/javascript", read_page_file("viewer.js")),
             "web.js": ("text/javascript", (folder / "web.js").read_text()),
         }
 
@@ -449,7 +449,7 @@ class Handlers:
             "facts": list(answer.facts),
             "tables": dict(answer.tables),
             "pictures": pictures,
-            "scene": answer.scene.encoded(),
+            "scene": answer.scene.encode(),
             "files": [{"name": name, "bytes": len(data)} for name, data in answer.files.items()],
             "folder": f"results/{key}/",
         }

@@ -16,8 +16,8 @@ from depthpose.depth.predictions import write_estimate
 from depthpose.depth.stereo import CameraMatcher
 from depthpose.depth.synthetic import Streets
 from depthpose.depth.types import DepthEstimate, StereoInput
-from depthpose.report.depth import depth_facts, depth_scene
-from depthpose.report.page import depth_scale, rising_scale
+from depthpose.report.depth import list_depth_facts, make_depth_scene
+from depthpose.report.page import make_depth_color_bar, make_rising_color_bar
 from depthpose.web.answer import (
     EXAMPLE_SEED,
     Answer,
@@ -63,14 +63,14 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
     if estimate.confidence is not None:
         write_image(folder / f"{pair.name}.confidence.png", draw_share(1 - estimate.confidence))
     # The warning is in the sentence already.
-    facts = depth_facts(pair, estimate, focal_origin)
+    facts = list_depth_facts(pair, estimate, focal_origin)
     facts = [(name, value) for name, value in facts if name != "warning"]
     return Answer(
         is_ok=not estimate.warning,
         sentence=_describe_depth(pair, estimate),
         facts=[*facts, ("computed in", f"{seconds:.2f} s")],
         pictures=pictures,
-        scene=depth_scene(pair, estimate, far_m),
+        scene=make_depth_scene(pair, estimate, far_m),
         terms=net.terms,
         files={path.name: path.read_bytes() for path in sorted(folder.iterdir())},
     )
@@ -195,7 +195,7 @@ def _list_pictures(
         caption=f"depth: {colours}; {grey}",
         values=f"{name}.depth_m.npy",
         unit="m",
-        scale=depth_scale(*range_m),
+        scale=make_depth_color_bar(*range_m),
     )
     pictures = [Shown(file=f"{name}.input.jpg", caption="the image"), depth]
     if estimate.right is not None:
@@ -205,7 +205,7 @@ def _list_pictures(
             file=f"{name}.confidence.png",
             caption="confidence: bright is high, dark low",
             values=f"{name}.confidence.npy",
-            scale=rising_scale("confidence", 1.0),
+            scale=make_rising_color_bar("confidence", 1.0),
         )
         pictures.append(confidence)
     return pictures

@@ -25,7 +25,7 @@ from depthpose.pose.synthetic import make_frames
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
 from depthpose.report import pose as report
 from depthpose.report.page import Layer, Scene
-from depthpose.report.pose import object_points
+from depthpose.report.pose import select_object_points
 from depthpose.web.answer import (
     EXAMPLE_SEED,
     Answer,
@@ -80,15 +80,15 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
     # What the page shows: the best of them, and a row and a layer for each.
     best = shown_poses[0]
     agreeing = "votes that agree" if isinstance(target.net, GeoPoseNet) else "points near the model"
-    tables = report.pose_tables(best.estimate)
+    tables = report.make_pose_tables(best.estimate)
     if len(shown_poses) > 1:
         head = ["", "status", "x [m]", "y [m]", "z [m]", "certainty", "visible", "pick rank"]
         rows = [[shown.input.name, *_format_row(shown.estimate)] for shown in shown_poses]
         tables = {"found in this image": [head, *rows]} | tables
     return Answer(
         is_ok=best.estimate.is_posed,
-        sentence=report.pose_sentence(best.estimate),
-        facts=report.pose_facts(best.estimate, target.model, target.method, agreeing),
+        sentence=report.describe_pose(best.estimate),
+        facts=report.list_pose_facts(best.estimate, target.model, target.method, agreeing),
         tables=tables,
         pictures=pictures,
         scene=_make_scene(shown_poses, votes, target.model),
@@ -142,15 +142,15 @@ def _make_scene(
 ) -> Scene:
     """Make the 3D view: the best pose with its votes, and a layer for each of the others."""
     best = shown_poses[0]
-    points_m = object_points(best.input, model.diameter_m)
-    scene = report.pose_scene(best.input, points_m, best.estimate, model)
+    points_m = select_object_points(best.input, model.diameter_m)
+    scene = report.make_pose_scene(best.input, points_m, best.estimate, model)
     layers = list(scene.layers)
     keypoints_m = best.estimate.keypoints_m
     if keypoints_m is not None and votes is not None:
-        layers.append(report.vote_layer(votes.points_m, votes.directions, keypoints_m))
+        layers.append(report.make_vote_layer(votes.points_m, votes.directions, keypoints_m))
     for shown in shown_poses[1:]:
-        points_m = object_points(shown.input, model.diameter_m)
-        cloud = report.posed_cloud(points_m, shown.estimate.camera_from_model, model)
+        points_m = select_object_points(shown.input, model.diameter_m)
+        cloud = report.join_posed_cloud(points_m, shown.estimate.camera_from_model, model)
         layers.append(Layer(name=shown.input.name, shape=cloud))
     return replace(scene, layers=layers)
 
@@ -192,14 +192,14 @@ def _write_results(
     predictions = [Prediction(estimate=shown_pose.estimate) for shown_pose in shown_poses]
     write_predictions(folder, predictions)
     for shown_pose in shown_poses:
-        points_m = object_points(shown_pose.input, model.diameter_m)
-        cloud = report.posed_cloud(points_m, shown_pose.estimate.camera_from_model, model)
+        points_m = select_object_points(shown_pose.input, model.diameter_m)
+        cloud = report.join_posed_cloud(points_m, shown_pose.estimate.camera_from_model, model)
         files.write_cloud(folder / f"{shown_pose.input.name}.{CLOUD}", cloud)
 
     pose_input = shown_poses[0].input
     if not isinstance(pose_input, ViewInput):
         return []
-    picture = report.grey_depth(pose_input.depth_m)
+    picture = report.draw_grey_depth(pose_input.depth_m)
     caption = "depth image, near bright"
     pose_count = 0
     for shown_pose in shown_poses:

@@ -5,39 +5,42 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from depthpose.core.engine import (
-    Files,
-    Function,
-    Sample,
+    Computation,
+    InputFormat,
+    LocalInput,
+    ResultWriter,
     ShardRecord,
-    Work,
-    read_results,
-    shard_results,
+    read_records,
+    read_shard,
 )
-from depthpose.core.engine.work import Block, Runner
+from depthpose.core.engine.inputs import Block
+from depthpose.core.engine.shards import BlockProcessor
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_text
 
-TEXTS = Files(roles=("text",), suffixes=(".txt",))
+TEXTS = InputFormat(roles=("text",), suffixes=(".txt",))
 
 
-def reverse_work(log: str) -> Work:
+def reverse_work(log: str) -> Computation:
     """Turn the letters of text files round; a file with "bad" in it fails. Each call is logged."""
     start = Reverser(log).start
-    return Work(start=start, files=TEXTS, endings=("back.txt", "length"), batch=2)
+    return Computation(
+        make_writer=start, input_format=TEXTS, endings=("back.txt", "length"), batch=2
+    )
 
 
 @dataclass(frozen=True)
 class Reverser:
     log: str
 
-    def start(self) -> Function:
+    def start(self) -> ResultWriter:
         self._note("start")
         return self._reverse
 
-    def _reverse(self, samples: Sequence[Sample], out: Path) -> list[str]:
+    def _reverse(self, samples: Sequence[LocalInput], out: Path) -> list[str]:
         return [self._one(sample, out) for sample in samples]
 
-    def _one(self, sample: Sample, out: Path) -> str:
+    def _one(self, sample: LocalInput, out: Path) -> str:
         self._note(sample.name)
         try:
             text = "".join(read_text(path) for path in sample.files)
@@ -62,12 +65,14 @@ class InProcessEngine:
     def __init__(self, dies_at: int | None = None) -> None:
         self.dies_at = dies_at
 
-    def __call__(self, blocks: Sequence[Block], work: Work, out: str) -> Iterator[ShardRecord]:
-        runner = Runner(work, out)
+    def __call__(
+        self, blocks: Sequence[Block], computation: Computation, out: str
+    ) -> Iterator[ShardRecord]:
+        processor = BlockProcessor(computation, out)
         for number, block in enumerate(blocks):
             if number == self.dies_at:
                 raise InputError("the double died, as it was asked to")
-            yield runner.run(block)
+            yield processor.process(block)
 
 
 def write_texts(folder: Path, texts: dict[str, str]) -> Path:
@@ -80,8 +85,8 @@ def write_texts(folder: Path, texts: dict[str, str]) -> Path:
 def unpacked(out: Path) -> dict[str, dict[str, bytes]]:
     """All results of a folder of shards; a name that is there twice fails."""
     found: dict[str, dict[str, bytes]] = {}
-    for done in read_results(str(out)):
-        for name, files in shard_results(str(out), done):
+    for done in read_records(str(out)):
+        for name, files in read_shard(str(out), done):
             assert name not in found
             found[name] = files
     return found

@@ -11,14 +11,22 @@ from pathlib import Path
 
 from tests.core.engine.doubles import TEXTS
 
-from depthpose.core.engine import Function, RayEngine, Sample, ShardedJob, Work, find_items, run_job
+from depthpose.core.engine import (
+    Computation,
+    LocalInput,
+    RayEngine,
+    ResultWriter,
+    ShardedJob,
+    list_inputs,
+    run_job,
+)
 
 
-def _start() -> Function:
+def _start() -> ResultWriter:
     return _write_peaks
 
 
-def _write_peaks(samples: Sequence[Sample], out: Path) -> list[str]:
+def _write_peaks(samples: Sequence[LocalInput], out: Path) -> list[str]:
     """Give for each input the peak memory of the process that took it, in kB."""
     for sample in samples:
         assert sample.files[0].read_text() == "small"
@@ -35,11 +43,13 @@ def main(total: int, home: Path) -> None:
     rows = [f"small.txt,{k:06d}" for k in range(total)]
     (home / "list.csv").write_text("\n".join(["text,name", *rows]))
     job = ShardedJob(
-        work=Work(start=_start, files=TEXTS, endings=("peak_kb",), batch=16),
-        items=find_items([str(home / "list.csv")], TEXTS),
+        computation=Computation(
+            make_writer=_start, input_format=TEXTS, endings=("peak_kb",), batch=16
+        ),
+        inputs=list_inputs([str(home / "list.csv")], TEXTS),
         out=str(home / "out"),
         settings={},
-        block=500,
+        block_size=500,
     )
     done = run_job(job, RayEngine(workers=2))
     said = {"inputs": sum(len(one.entries) for one in done), "command_kb": _peak_kb()}

@@ -4,36 +4,36 @@ import fsspec
 import pytest
 from tests.core.engine.doubles import write_texts
 
-from depthpose.core.engine import Files, Inputs, find_items
+from depthpose.core.engine import InputFormat, JobInputs, list_inputs
 from depthpose.core.errors import InputError
 from depthpose.core.files.stores import list_files, local_copy, publish, read_all
 
-ONE = Files(roles=("text",), suffixes=(".txt",))
-TWO = Files(roles=("left", "right"), suffixes=(".txt",))
+ONE = InputFormat(roles=("text",), suffixes=(".txt",))
+TWO = InputFormat(roles=("left", "right"), suffixes=(".txt",))
 
 
 def test_a_folder_a_pattern_and_a_url_list_the_same_files(tmp_path: Path) -> None:
     write_texts(tmp_path, {"b": "1", "a": "2", ".hidden": "3"})
     (tmp_path / "c.png").write_bytes(b"")
     named = [
-        [(item.name, item.files) for item in find_items([word], ONE)]
+        [(item.name, item.files) for item in list_inputs([word], ONE)]
         for word in (str(tmp_path), f"{tmp_path}/*.txt")
     ]
     assert named[0] == named[1]
     assert [name for name, _ in named[0]] == ["a", "b"]
-    assert [i.name for i in find_items([f"file://{tmp_path}"], ONE)] == ["a", "b"]
+    assert [i.name for i in list_inputs([f"file://{tmp_path}"], ONE)] == ["a", "b"]
 
 
 def test_pairs_go_together_in_the_order_of_their_names(tmp_path: Path) -> None:
     left = write_texts(tmp_path / "l", {"1": "", "2": ""})
     right = write_texts(tmp_path / "r", {"1": "", "2": ""})
-    items = find_items([str(left), str(right)], TWO)
+    items = list_inputs([str(left), str(right)], TWO)
     assert [tuple(Path(f).parent.name for f in item.files) for item in items] == [("l", "r")] * 2
     (right / "2.txt").unlink()
     with pytest.raises(InputError, match=r"hold 2 and 1 files, and no partner .* is there for '2'"):
-        find_items([str(left), str(right)], TWO)
+        list_inputs([str(left), str(right)], TWO)
     with pytest.raises(InputError, match="an input has left and right"):
-        find_items([str(left)], TWO)
+        list_inputs([str(left)], TWO)
 
 
 def test_a_manifest_names_inputs_and_is_read_from_where_it_lies(
@@ -43,7 +43,7 @@ def test_a_manifest_names_inputs_and_is_read_from_where_it_lies(
     table.write_text("left,right,name\nl/1.txt,/r/1.txt,drive/1\nl/2.txt,s3://b/2.txt,\n")
     monkeypatch.chdir(tmp_path)
     for word in (str(table), "list.csv"):
-        first, second = find_items([word], TWO)
+        first, second = list_inputs([word], TWO)
         assert first.name == "drive/1"
         assert first.files == (f"{tmp_path}/l/1.txt", "/r/1.txt")
         assert (second.name, second.files[1]) == ("2", "s3://b/2.txt")
@@ -61,21 +61,21 @@ def test_a_manifest_names_inputs_and_is_read_from_where_it_lies(
 def test_a_manifest_that_cannot_be_used_says_why(tmp_path: Path, table: str, said: str) -> None:
     (tmp_path / "list.csv").write_text(table)
     with pytest.raises(InputError, match=said):
-        find_items([str(tmp_path / "list.csv")], ONE)
+        list_inputs([str(tmp_path / "list.csv")], ONE)
 
 
 def test_two_files_of_one_name_are_refused(tmp_path: Path) -> None:
     folders = [str(write_texts(tmp_path / f, {"same": ""})) for f in "ab"]
     with pytest.raises(InputError, match="give a manifest with a column 'name'"):
-        find_items(folders, ONE)
+        list_inputs(folders, ONE)
 
 
 def test_nothing_found_is_an_error(tmp_path: Path) -> None:
     for word in (str(tmp_path), str(tmp_path / "no"), f"{tmp_path}/*.txt", "memory://no/where"):
         with pytest.raises(InputError, match=r"no \.txt file there"):
-            find_items([word], ONE)
+            list_inputs([word], ONE)
     with pytest.raises(InputError, match=r"no \.tar.* file there"):
-        Inputs.find([str(tmp_path / "no.tar")], ONE)
+        JobInputs.find([str(tmp_path / "no.tar")], ONE)
 
 
 def test_a_remote_file_is_copied_and_a_missing_one_refused(tmp_path: Path) -> None:

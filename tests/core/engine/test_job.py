@@ -11,23 +11,24 @@ import pytest
 from tests.core.engine.doubles import InProcessEngine, reverse_work, unpacked, write_texts
 
 from depthpose.core.engine import (
-    Inputs,
+    JobInputs,
     ShardedJob,
     ShardRecord,
-    find_items,
-    read_results,
+    list_inputs,
+    read_records,
+    read_shard,
     run_job,
-    shard_results,
 )
-from depthpose.core.engine.work import Block, Work
+from depthpose.core.engine.inputs import Block
+from depthpose.core.engine.shards import Computation
 from depthpose.core.errors import InputError
 
 
 def job_of(tmp_path: Path, words: list[str], **changed: object) -> ShardedJob:
     work = reverse_work(str(tmp_path / "log"))
-    given = {"out": str(tmp_path / "out"), "settings": {"way": "back"}, "block": 2} | changed
-    items = find_items(words, work.files) if words else []
-    return ShardedJob(work=work, items=items, **given)  # pyright: ignore[reportArgumentType]
+    given = {"out": str(tmp_path / "out"), "settings": {"way": "back"}, "block_size": 2} | changed
+    inputs = list_inputs(words, work.input_format) if words else []
+    return ShardedJob(computation=work, inputs=inputs, **given)  # pyright: ignore[reportArgumentType]
 
 
 def calls(tmp_path: Path) -> list[str]:
@@ -100,17 +101,17 @@ def test_inputs_that_are_new_get_shards_of_their_own(tmp_path: Path) -> None:
     write_texts(folder, {"a": "4", "e": "5"})
     run_job(job_of(tmp_path, [str(folder)]), InProcessEngine())
     assert calls(tmp_path) == ["start", "b", "d", "f", "start", "a", "e"]
-    named = [[name for name, _ in one.entries] for one in read_results(str(tmp_path / "out"))]
+    named = [[name for name, _ in one.entries] for one in read_records(str(tmp_path / "out"))]
     assert named == [["b", "d"], ["f"], ["a", "e"]]
 
 
 def test_a_failure_stops_no_other_and_is_tried_again(tmp_path: Path) -> None:
     folder = write_texts(tmp_path / "in", {"a": "one", "b": "bad", "c": "two"})
-    done = run_job(job_of(tmp_path, [str(folder)], block=3), InProcessEngine())
+    done = run_job(job_of(tmp_path, [str(folder)], block_size=3), InProcessEngine())
     assert done[0].failures == [("b", f"{folder / 'b.txt'}: is bad")]
     assert list(unpacked(tmp_path / "out")) == ["a", "c"]
     (folder / "b.txt").write_text("mended")
-    done = run_job(job_of(tmp_path, [str(folder)], block=3), InProcessEngine())
+    done = run_job(job_of(tmp_path, [str(folder)], block_size=3), InProcessEngine())
     assert not done[0].failures
     assert list(unpacked(tmp_path / "out")) == ["a", "b", "c"]
 
@@ -193,7 +194,7 @@ def test_a_shard_whose_record_names_other_results_is_refused(tmp_path: Path) -> 
     entries, endings = (("b", ""),), ("length",)
     done = ShardRecord(shard="s.tar", entries=entries, endings=endings, stamp=(), block=0)
     with pytest.raises(InputError, match=r"holds 'a\.length', which its record does not name"):
-        list(shard_results(str(tmp_path), done))
+        list(read_shard(str(tmp_path), done))
 
 
 def test_what_engines_lose_is_missed(tmp_path: Path) -> None:
@@ -201,7 +202,9 @@ def test_what_engines_lose_is_missed(tmp_path: Path) -> None:
     job = job_of(tmp_path, [str(folder)])
 
     class Forgetful(InProcessEngine):
-        def __call__(self, blocks: Sequence[Block], work: Work, out: str) -> Iterator[ShardRecord]:
+        def __call__(
+            self, blocks: Sequence[Block], work: Computation, out: str
+        ) -> Iterator[ShardRecord]:
             return super().__call__(blocks[:1], work, out)
 
     with pytest.raises(InputError, match="1 of 2 shards are missing, first 000001"):
@@ -219,7 +222,7 @@ def test_a_full_disk_for_temporary_files_is_named(
 
     home = write_texts(tmp_path / "in", {"a": "abc"})
     job = job_of(tmp_path, [str(home)])
-    monkeypatch.setattr("depthpose.core.engine.work.tarfile.TarFile.addfile", refuse)
+    monkeypatch.setattr("depthpose.core.engine.shards.tarfile.TarFile.addfile", refuse)
     with pytest.raises(InputError, match=r"depthpose-.*cannot be written: No space left on device"):
         run_job(job, InProcessEngine())
 
@@ -297,6 +300,8 @@ def test_an_empty_tar_is_named_and_the_others_are_done(tmp_path: Path) -> None:
     assert other.entries == (("1", ""),)
     with (
         pytest.raises(InputError, match="holds no file"),
-        Inputs(items=[], tars=[str(empty)], files=job.work.files).first(),
+        JobInputs(
+            listed=[], tars=[str(empty)], input_format=job.computation.input_format
+        ).open_first(),
     ):
         pass

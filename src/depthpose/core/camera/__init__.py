@@ -1,13 +1,18 @@
 """Pinhole camera and rectified stereo rig."""
 
-from depthpose.core.camera.camera_file import AnyCamera as AnyCamera
-from depthpose.core.camera.camera_file import AnyLens as AnyLens
-from depthpose.core.camera.camera_file import FieldOfView as FieldOfView
-from depthpose.core.camera.camera_file import camera_of as camera_of
+from depthpose.core.camera.any_camera import AnyCamera as AnyCamera
+from depthpose.core.camera.any_camera import AnyLens as AnyLens
+from depthpose.core.camera.any_camera import FieldOfView as FieldOfView
+from depthpose.core.camera.any_camera import camera_of as camera_of
+from depthpose.core.camera.any_camera import choose_lens as choose_lens
+from depthpose.core.camera.camera_facts import (
+    describe_suspicious_centre as describe_suspicious_centre,
+)
+from depthpose.core.camera.camera_facts import refuse_other_resolution as refuse_other_resolution
+from depthpose.core.camera.camera_facts import refuse_outside as refuse_outside
 from depthpose.core.camera.camera_file import (
     check_image_matches_camera as check_image_matches_camera,
 )
-from depthpose.core.camera.camera_file import choose_lens as choose_lens
 from depthpose.core.camera.camera_file import read_camera as read_camera
 from depthpose.core.camera.camera_file import read_rig as read_rig
 from depthpose.core.camera.camera_file import write_camera as write_camera
@@ -17,10 +22,7 @@ from depthpose.core.camera.pinhole import back_project as back_project
 from depthpose.core.camera.pinhole import crop_camera as crop_camera
 from depthpose.core.camera.pinhole import pixel_grid as pixel_grid
 from depthpose.core.camera.pinhole import project as project
-from depthpose.core.camera.pinhole import refuse_other_resolution as refuse_other_resolution
-from depthpose.core.camera.pinhole import refuse_outside as refuse_outside
 from depthpose.core.camera.pinhole import resize_camera as resize_camera
-from depthpose.core.camera.pinhole import suspicious_centre as suspicious_centre
 from depthpose.core.camera.rectified import RectificationReport as RectificationReport
 from depthpose.core.camera.rectified import check_rectified as check_rectified
 from depthpose.core.camera.rectify import RawCamera as RawCamera

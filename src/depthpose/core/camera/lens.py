@@ -1,7 +1,7 @@
-"""The lens that a camera file names: a pinhole, an equidistant fisheye, or one that is refused.
+"""The lens model that a camera file names: a pinhole, an equidistant fisheye, or a refused one.
 
-The coefficients do not tell it: four numbers are k1, k2, p1, p2 of a pinhole as well as k1 to k4 of
-a fisheye, and a fisheye whose coefficients are 0 still bends what it shows.
+The coefficients do not tell it: four numbers may be k1, k2, p1, p2 of a pinhole, or k1 to k4 of a
+fisheye, and a fisheye whose coefficients are 0 still distorts.
 """
 
 import re
@@ -13,7 +13,7 @@ from depthpose.core.errors import InputError
 _PINHOLE = {
     "pinhole", "simplepinhole", "perspective", "rectified", "undistorted", "linear", "none", "",
 }  # fmt: skip
-"""Projections without distortion; a model of distortion, of any lens, may stand beside them."""
+"""Projections without distortion. Under another key a file may name a model of distortion."""
 _RADIAL = {
     "plumbbob", "radtan", "radialtangential", "rationalpolynomial", "rational", "thinprism",
     "brownconrady", "inversebrownconrady", "modifiedbrownconrady", "brown", "simpleradial",
@@ -41,16 +41,17 @@ _REFUSED = {
     "simpledivision": _BY_COLMAP, "equirectangular": _CUBE, "panorama": _CUBE,
     "panoramic": _CUBE, "spherical": _CUBE, "cylindrical": _CUBE,
 }  # fmt: skip
-"""Lenses that are neither, and how their images become those of a pinhole."""
+"""Lens models that are refused, and how their images are undistorted."""
 _OTHER_LENS = re.compile("fisheye|omnidir|omnicam|equirect|equidist|panoram|spherical|cylind")
-"""Parts of names that are no pinhole's, for lenses that are in no list."""
-_SURE_KEYS = ("distortionmodel", "distortiontype", "projectionmodel")
-"""Keys that name the lens alone; others may name the maker's product too."""
-_KEYS = (
+"""Parts of names of wide lenses, for names that are in no list."""
+_MODEL_KEYS = ("distortionmodel", "distortiontype", "projectionmodel")
+"""Keys that name a lens model."""
+_OTHER_KEYS = (
     "cameramodel", "cameratype", "lensmodel", "modeltype", "lenstype", "model", "type",
     "projectiontype", "projection", "camera1type", "lens",
 )  # fmt: skip
-_FLAGS = ("fisheyemodel", "isfisheye", "fisheye")
+"""Keys that name a lens model, or the maker's product."""
+_FISHEYE_FLAGS = ("fisheyemodel", "isfisheye", "fisheye")
 _REALSENSE = ("none", "modifiedbrownconrady", "inversebrownconrady", "ftheta", "brownconrady",
               "kannalabrandt4")  # fmt: skip
 """Models of librealsense (``rs2_distortion``) in the order of their numbers."""
@@ -64,15 +65,16 @@ def is_fisheye_lens(fields: Mapping[str, Any], owner: str = "its") -> bool | Non
         owner: whose lens it is, for the error.
 
     Returns:
-        None where the file names no lens, or a projection alone (a pinhole of any distortion).
+        None where the file names no lens, or only a projection without distortion.
 
     Raises:
         InputError: the lens is neither, or two names contradict each other.
     """
-    named_lenses: dict[str, tuple[str, bool]] = {}  # name, and whether a fisheye, by key
-    for key in (*_SURE_KEYS, *_KEYS):
+    named_lenses: dict[str, tuple[str, bool]] = {}  # by key the name, and whether it is a fisheye
+    for key in (*_MODEL_KEYS, *_OTHER_KEYS):
         value = fields.get(key)
-        if isinstance(value, int) and not isinstance(value, bool) and "ppx" in fields:
+        is_realsense = "ppx" in fields
+        if is_realsense and isinstance(value, int) and not isinstance(value, bool):
             value = _REALSENSE[value] if 0 <= value < len(_REALSENSE) else None
         if not isinstance(value, str):
             continue
@@ -83,7 +85,7 @@ def is_fisheye_lens(fields: Mapping[str, Any], owner: str = "its") -> bool | Non
             raise _make_lens_error(f"{owner} {_spell_key(key)} is {value!r}", remedy)
         if lens in _RADIAL or lens in _FISHEYE:
             named_lenses[key] = (value, lens in _FISHEYE)
-    for key in _FLAGS:
+    for key in _FISHEYE_FLAGS:
         if _is_set(fields.get(key)):
             named_lenses[key] = (str(fields[key]), True)
 
@@ -107,16 +109,16 @@ def is_fisheye_lens(fields: Mapping[str, Any], owner: str = "its") -> bool | Non
 
 
 def _is_other_lens(lens: str, key: str) -> bool:
-    """Whether a name that is in no list is that of a lens which is no pinhole.
+    """Whether a name is in no list, and is taken for a lens that is refused.
 
-    Under a key that names the lens alone any unknown name is.
+    Under a key that names a lens model every unknown name is; under others that of a wide lens.
     """
     is_listed = lens in _PINHOLE or lens in _RADIAL or lens in _FISHEYE
-    return not is_listed and (key in _SURE_KEYS or _OTHER_LENS.search(lens) is not None)
+    return not is_listed and (key in _MODEL_KEYS or _OTHER_LENS.search(lens) is not None)
 
 
 def _is_set(value: object) -> bool:
-    """Whether a flag is true or a coefficient is not 0; of a matrix or list the first number."""
+    """Whether a flag is true, or a coefficient is not 0; of a matrix or list the first entry."""
     if isinstance(value, Mapping):
         value = value.get("data")
     if isinstance(value, list):
@@ -128,7 +130,7 @@ def _is_set(value: object) -> bool:
 
 
 def _spell_key(key: str) -> str:
-    """Spell a normalised key as files do, with underscores."""
+    """Spell a normalised key with underscores, as files do: ``distortion_model``."""
     words = re.sub("(distortion|camera1?|lens|projection|fisheye)(?=model|type)", r"\1_", key)
     return re.sub("^is", "is_", words)
 

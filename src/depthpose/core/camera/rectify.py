@@ -1,29 +1,27 @@
-"""Two cameras as they were calibrated (ROS, OpenCV, Kalibr), and their rectification by OpenCV."""
+"""The calibration of two raw cameras (of ROS, OpenCV or Kalibr), and rectification by OpenCV."""
 
 import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float32, Float64
 from torch import Tensor
 
-from depthpose.core.camera.camera_file import errors_naming
-from depthpose.core.camera.lens import is_fisheye_lens
-from depthpose.core.camera.pinhole import (
+from depthpose.core.camera.camera_facts import (
     WIDE_BASELINE_M,
-    Size,
-    StereoRig,
     camera_from_facts,
-    check_intrinsics,
     facts_from_projections,
-    intrinsics,
     refuse_baseline,
     refuse_unequal_focal_lengths,
 )
+from depthpose.core.camera.camera_file import prefixed_errors
+from depthpose.core.camera.lens import is_fisheye_lens
+from depthpose.core.camera.pinhole import Size, StereoRig, check_intrinsics, intrinsics
 from depthpose.core.camera.stored_camera import (
     Fields,
     find_matrix,
@@ -41,6 +39,7 @@ from depthpose.core.files import AnyPath, read_json, read_text
 from depthpose.core.files.disk import MAX_LIST_BYTES
 from depthpose.core.rigid import Rigid
 
+# Keys of OpenCV's calibrations, in lower case, letters and digits only.
 _K = {
     "left": ("k1", "m1", "cameramatrix1", "cameramatrixleft", "leftcameramatrix"),
     "right": ("k2", "m2", "cameramatrix2", "cameramatrixright", "rightcameramatrix"),
@@ -55,11 +54,13 @@ _R = ("r", "rotation", "rotationmatrix")
 _T = ("t", "translation", "translationvector")
 _PINHOLE_COUNTS = (4, 5, 8, 12, 14)  # numbers of distortion coefficients that OpenCV takes
 _FISHEYE_COUNTS = (4,)
-_MAX_BASELINE_M = 10.0
-_MIN_ROTATION_DEG = 0.2  # a difference that can be told from an error of the calibration
-_TRANSPOSED_SHARE = 0.5  # R looks transposed if its transpose rotates the cameras by less of that
-_MAX_ENLARGEMENT = 4  # largest enlargement of a raw image by its rectification
+_MAX_BASELINE_M = 10.0  # where the user says the unit
+_MIN_ROTATION_DEG = 0.2  # a smaller difference may be an error of the calibration
+# R seems transposed if its transpose would turn the cameras by less than this share of what R does.
+_TRANSPOSED_SHARE = 0.5
+_MAX_ENLARGEMENT = 4  # largest ratio of fx after rectification to fx before
 _MAX_FOCAL_RATIO = 1.5  # largest ratio of fx of a pair; a larger one is of images of two sizes
+_ROTATION_TOLERANCE = 1e-3  # by which entries of R R^T may differ from those of the identity
 _KNOWN = (
     "a camchain of Kalibr, OpenCV's K1, D1, K2, D2, R and T (in one file, or intrinsics.yml and "
     "extrinsics.yml in a folder), or a folder with left.yaml and right.yaml of ROS"
@@ -68,15 +69,12 @@ _KNOWN = (
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RawCamera:
-    """A camera with its lens distortion, in OpenCV's order of coefficients.
-
-    k1, k2, p1, p2, k3, ... of a pinhole; k1 to k4 of a fisheye lens, which distorts the angle from
-    the axis (Kannala and Brandt 2006).
-    """
+    """A camera whose lens distorts."""
 
     K: Float64[Tensor, "3 3"]  #: intrinsic matrix [px]
-    distortion: tuple[float, ...]  #: coefficients
-    is_fisheye: bool = False  #: whether the lens is a fisheye
+    #: OpenCV's coefficients: k1, k2, p1, p2, k3, ... of a pinhole; k1 to k4 of a fisheye
+    distortion: tuple[float, ...]
+    is_fisheye: bool = False  #: an equidistant fisheye (Kannala and Brandt 2006), else a pinhole
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -96,30 +94,36 @@ def read_raw_pair(
 
     Args:
         path: the file, or the folder of the pair's two files.
-        unit_m: metres a unit of the translation between the cameras; None: metres, unless the
-            cameras would then stand farther apart than those of common rigs.
-        is_fisheye: the kind of the lenses, for files that do not name it (OpenCV's); pinholes by
-            default.
+        unit_m: length of a unit of the translation between the cameras [m]; None: it is in metres,
+            and refused if the cameras then stand farther apart than those of common rigs.
+        is_fisheye: whether lenses are fisheyes that the file does not name (OpenCV's does not);
+            None: they are pinholes.
 
     Raises:
-        InputError: the file is missing or damaged, describes no two cameras, is of a lens of
-            another model, or a value cannot be right: the rotation, the distance, the order.
+        InputError: the file is missing or damaged, does not describe two cameras, names another
+            lens model, or a value cannot be right: the rotation, the distance, the order.
+
+    Warns:
+        Notice: the rotation seems transposed.
     """
-    with errors_naming(path):
+    with prefixed_errors(path):
         pair = _read_pair(Path(path), unit_m or 1.0, is_fisheye)
         R = pair.right_from_left.R
 
         # The distance of the cameras, and the rotation between them.
-        length = float(pair.right_from_left.t_m.norm())
-        if not length:
+        baseline_m = float(pair.right_from_left.t_m.norm())
+        if not baseline_m:
             raise InputError("T is 0: both cameras stand in one place; calibrate as a pair")
         remedy = "--unit cm or mm scales it, and --unit m says that it is in metres"
-        refuse_baseline(length, remedy, _MAX_BASELINE_M if unit_m else WIDE_BASELINE_M)
-        if not torch.allclose(R @ R.mT, torch.eye(3).double(), atol=1e-3) or torch.det(R) < 0:
+        refuse_baseline(baseline_m, remedy, _MAX_BASELINE_M if unit_m else WIDE_BASELINE_M)
+        if (
+            not torch.allclose(R @ R.mT, torch.eye(3).double(), atol=_ROTATION_TOLERANCE)
+            or torch.det(R) < 0
+        ):
             raise InputError(f"R is {R.tolist()}, which is no rotation; copy it anew")
         _warn_if_transposed(path, pair.right_from_left)
 
-        # The place of the second camera in the frame of the first.
+        # The position of the second camera in the frame of the first.
         x, y, z = pair.right_from_left.inverse().t_m.tolist()
         if abs(x) < max(abs(y), abs(z)):
             raise InputError(
@@ -135,16 +139,16 @@ def read_raw_pair(
 
 
 def _warn_if_transposed(path: AnyPath, right_from_left: Rigid) -> None:
-    """Warn where R rotates the cameras far more from the baseline than its transpose would.
+    """Warn if R turns the cameras far more away from their baseline than its transpose would.
 
-    A wrong rotation about the vertical changes only disparities, so that rows still agree and the
-    check of a rectified pair finds nothing.
+    Where that is a rotation about the vertical, it changes only disparities: rows agree all the
+    same, and the check of the rectified pair finds nothing.
     """
     R = right_from_left.R
     t_m = right_from_left.t_m
-    right_deg = _baseline_angle_deg(t_m)
-    as_read_deg = _baseline_angle_deg(R.mT @ t_m) + right_deg
-    transposed_deg = _baseline_angle_deg(R @ t_m) + right_deg
+    right_deg = _measure_baseline_angle(t_m)
+    as_read_deg = _measure_baseline_angle(R.mT @ t_m) + right_deg
+    transposed_deg = _measure_baseline_angle(R @ t_m) + right_deg
     is_far_less = transposed_deg < _TRANSPOSED_SHARE * as_read_deg
     if is_far_less and as_read_deg - transposed_deg > _MIN_ROTATION_DEG:
         message = (
@@ -155,16 +159,16 @@ def _warn_if_transposed(path: AnyPath, right_from_left: Rigid) -> None:
         warnings.warn(message, Notice, stacklevel=3)
 
 
-def _baseline_angle_deg(baseline_m: Tensor) -> float:
+def _measure_baseline_angle(baseline_m: Tensor) -> float:
     """Compute the angle between the baseline, in a camera's frame, and the camera's rows [deg]."""
     off_axis_m = float(baseline_m[1:].norm())
     return math.degrees(math.atan2(off_axis_m, abs(float(baseline_m[0]))))
 
 
 def _read_pair(path: Path, unit_m: float, is_fisheye: bool | None) -> RawPair:
-    """Read the calibration of a pair: two files of ROS or OpenCV in a folder, or one file of both.
+    """Read the calibration of a pair: two files of ROS or OpenCV in a folder, or one file.
 
-    ``unit_m`` is the unit of its translations [m].
+    Its values are not checked. Arguments are those of :func:`read_raw_pair`.
     """
     if path.is_dir():
         first, second = read_pair_files(path)
@@ -187,12 +191,12 @@ def _read_ros_pair(
 ) -> RawPair:
     """Read ROS's two ``camera_info``, whose R and P describe the rectified pair.
 
-    Each R rotates a raw camera to its rectified one, and the rectified cameras differ by x alone:
-    so ``right_from_left`` has the rotation ``R_right^T R_left`` and the translation
+    Each R carries points from a raw camera to the rectified one, and the rectified cameras differ
+    in x alone. So ``right_from_left`` has the rotation ``R_right^T R_left`` and the translation
     ``R_right^T (x_left - x_right, 0, 0)``.
     """
     pair = order_ros_pair(first, second)
-    xs: list[float] = []  # x of the rectified cameras, from the left one or from a third
+    xs: list[float] = []  # x of both rectified cameras, in the frame of the left or of a third one
     for fields in pair:
         P = find_matrix(fields, ("projectionmatrix", "p"), 12)
         if P is None or P[0, 0] <= 0:
@@ -210,8 +214,9 @@ def _read_ros_pair(
             raise InputError(f"no rectification_matrix of the {side} camera; write the whole pair")
         rotations.append(R)
     left_R, right_R = rotations
-    translation_m = np.array([unit_m * (xs[0] - xs[1]), 0, 0])
-    motion = (right_R.T @ left_R, right_R.T @ translation_m)
+    left_x, right_x = xs
+    translation_m = np.array([unit_m * (left_x - right_x), 0, 0])
+    motion = _make_rigid(right_R.T @ left_R, right_R.T @ translation_m)
     return _make_pair(cameras[0], cameras[1], motion, find_size(first))
 
 
@@ -235,7 +240,7 @@ def _read_opencv_pair(fields: Fields, unit_m: float, is_fisheye: bool | None) ->
     T = _find_numbers(fields, _T)
     if R is None or T is None or len(T) != 3:
         raise InputError("no R of 9 numbers and T of 3, from camera 1 to 2; write both")
-    return _make_pair(left, right, (R, unit_m * np.array(T)), find_size(fields))
+    return _make_pair(left, right, _make_rigid(R, unit_m * np.array(T)), find_size(fields))
 
 
 def _read_kalibr_pair(fields: Fields, unit_m: float, is_fisheye: bool | None) -> RawPair:
@@ -259,11 +264,12 @@ def _read_kalibr_pair(fields: Fields, unit_m: float, is_fisheye: bool | None) ->
             raise InputError(f"{owner} has no intrinsics [fx, fy, cx, cy]; copy the camchain anew")
         D = parse_numbers(camera.get("distortioncoeffs"))
         cameras.append(_make_camera(intrinsics(*values).numpy(), D, has_fisheye, owner))
-    return _make_pair(cameras[0], cameras[1], (motion[:3, :3], unit_m * motion[:3, 3]), size)
+    right_from_left = _make_rigid(motion[:3, :3], unit_m * motion[:3, 3])
+    return _make_pair(cameras[0], cameras[1], right_from_left, size)
 
 
 def _find_numbers(fields: Fields, keys: tuple[str, ...]) -> list[float] | None:
-    """Read the numbers of the first of some keys that has any; None where none has."""
+    """Return the numbers of the first of some keys that has any; None where none has."""
     for key in keys:
         values = parse_numbers(fields.get(key))
         if values:
@@ -272,7 +278,12 @@ def _find_numbers(fields: Fields, keys: tuple[str, ...]) -> list[float] | None:
 
 
 def _choose_lens_model(fields: Fields, is_fisheye: bool | None, owner: str = "its") -> bool:
-    """Decide whether a lens is a fisheye: by its file, or else by ``is_fisheye``, the user's word.
+    """Decide whether a lens is a fisheye: as its file says, else as the user does.
+
+    Args:
+        fields: values of the file.
+        is_fisheye: what the user says; None: nothing, so that the lens is a pinhole.
+        owner: whose lens it is, for errors.
 
     Raises:
         InputError: the user calls a lens a fisheye that the file calls a pinhole.
@@ -288,7 +299,13 @@ def _choose_lens_model(fields: Fields, is_fisheye: bool | None, owner: str = "it
 def _make_camera(
     K: np.ndarray | None, distortion: list[float] | None, is_fisheye: bool, owner: str
 ) -> RawCamera:
-    """Make a raw camera; ``owner`` names it in errors.
+    """Make a raw camera of the values of a file.
+
+    Args:
+        K: intrinsic matrix; None: the file has none.
+        distortion: coefficients; None: the file has none.
+        is_fisheye: whether the lens is a fisheye.
+        owner: what errors call the camera.
 
     Raises:
         InputError: K or the distortion is missing, or not of the lens model.
@@ -310,10 +327,17 @@ def _make_camera(
     return RawCamera(K=matrix, distortion=tuple(distortion), is_fisheye=is_fisheye)
 
 
+def _make_rigid(R: np.ndarray, t_m: np.ndarray) -> Rigid:
+    """Make a transform of numpy's R and t, in float64."""
+    return Rigid(
+        torch.from_numpy(np.array(R, np.float64)), torch.from_numpy(np.array(t_m, np.float64))
+    )
+
+
 def _make_pair(
-    left: RawCamera, right: RawCamera, motion: tuple[np.ndarray, np.ndarray], size: Size | None
+    left: RawCamera, right: RawCamera, right_from_left: Rigid, size: Size | None
 ) -> RawPair:
-    """Make a pair of two raw cameras and their motion, R and t [m] from left to right.
+    """Make a pair of two raw cameras, of one lens model and of images of one size.
 
     Raises:
         InputError: the cameras cannot be those of one pair.
@@ -327,25 +351,26 @@ def _make_pair(
             f"fx is {left_fx:g} on the left and {right_fx:g} on the right, as of images of two "
             "sizes; scale one camera matrix and its images to those of the other"
         )
-    R, t_m = (torch.from_numpy(np.array(array, np.float64)) for array in motion)
-    return RawPair(left=left, right=right, right_from_left=Rigid(R, t_m), size=size)
+    return RawPair(left=left, right=right, right_from_left=right_from_left, size=size)
 
 
-Maps = tuple[np.ndarray, np.ndarray]
+class RemapTables(NamedTuple):
+    """Where each pixel of a rectified image lies in the raw one [px]."""
+
+    column: Float32[np.ndarray, "h w"]
+    row: Float32[np.ndarray, "h w"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Rectifier:
-    """Maps from the images of a calibrated pair to rectified ones.
-
-    ``rectified_from_raw``, a rotation, carries along what is calibrated to the raw left camera,
-    such as the pose of a LiDAR.
-    """
+    """Rectifies the images of a calibrated pair."""
 
     rig: StereoRig  #: the camera of the rectified pair
-    rectified_from_raw: Rigid  #: carries points from the raw left camera's frame to its
-    left_maps: Maps  #: column and row of the raw left image for each pixel of the rectified one
-    right_maps: Maps  #: column and row of the raw right image, likewise
+    #: rotation from the frame of the raw left camera to that of the rectified one, by which a pose
+    #: that is calibrated to the raw camera (of a LiDAR, say) is carried along
+    rectified_from_raw: Rigid
+    left_tables: RemapTables  #: of the left image
+    right_tables: RemapTables  #: of the right image
 
     def rectify(
         self,
@@ -355,21 +380,26 @@ class Rectifier:
     ) -> tuple[Float32[Tensor, "3 h w"], Float32[Tensor, "3 h w"]]:
         """Rectify the two images of a pair; what a raw image does not show is black.
 
+        Args:
+            left: the raw left image, RGB in [0, 1].
+            right: the raw right one.
+            names: what errors call the two.
+
         Raises:
-            InputError: an image, which is called by its name, is not of the calibration's size.
+            InputError: an image is not of the calibration's size.
         """
         cv2 = import_opencv("rectifying a pair")
         size = (self.rig.width, self.rig.height)
         warped: list[Tensor] = []
-        views = zip((left, right), names, (self.left_maps, self.right_maps), strict=True)
-        for image, name, maps in views:
+        views = zip((left, right), names, (self.left_tables, self.right_tables), strict=True)
+        for image, name, tables in views:
             if (image.shape[2], image.shape[1]) != size:
                 raise InputError(
                     f"{name} is {image.shape[2]}x{image.shape[1]}, but the cameras were calibrated "
                     f"at {size[0]}x{size[1]}; give the raw images in that size"
                 )
             pixels = np.ascontiguousarray(image.permute(1, 2, 0).numpy())
-            cubic = torch.from_numpy(cv2.remap(pixels, *maps, cv2.INTER_CUBIC))
+            cubic = torch.from_numpy(cv2.remap(pixels, *tables, cv2.INTER_CUBIC))
             warped.append(cubic.permute(2, 0, 1).clamp(0, 1).contiguous())
         return warped[0], warped[1]
 
@@ -380,7 +410,8 @@ def make_rectifier(pair: RawPair, size: Size, keep: float = 0.0) -> Rectifier:
     Args:
         pair: the calibration.
         size: width and height of the images [px], for calibrations without it.
-        keep: 0 crops to what both raw images show, 1 keeps all that they show, with black borders.
+        keep: 0 crops to what both raw images show; 1 keeps all that they show, with black borders;
+            numbers between are between.
 
     Raises:
         InputError: ``keep`` is out of range, or a distortion that no lens has.
@@ -397,16 +428,16 @@ def make_rectifier(pair: RawPair, size: Size, keep: float = 0.0) -> Rectifier:
 
     # OpenCV's rotations R1 and R2 to the rectified cameras, whose projections are P1 and P2.
     flags = cv2.CALIB_ZERO_DISPARITY
-    make_maps = cv2.initUndistortRectifyMap
+    make_tables = cv2.initUndistortRectifyMap
     if pair.left.is_fisheye:
-        make_maps = cv2.fisheye.initUndistortRectifyMap
+        make_tables = cv2.fisheye.initUndistortRectifyMap
         R1, R2, P1, P2, *_ = cv2.fisheye.stereoRectify(
             *left, *right, size, R, t, flags, newImageSize=size, balance=keep
         )
     else:
         R1, R2, P1, P2, *_ = cv2.stereoRectify(*left, *right, size, R, t, flags=flags, alpha=keep)
 
-    # The rig, unless the picture would be enlarged as no real lens needs.
+    # The rig; images are enlarged by so much only where the calibration is wrong.
     rig = camera_from_facts(facts_from_projections("the rectified pair", P1, P2, size), size)
     assert isinstance(rig, StereoRig), "two projections have a baseline"
     raw_px = float(pair.left.K[0, 0])
@@ -420,6 +451,6 @@ def make_rectifier(pair: RawPair, size: Size, keep: float = 0.0) -> Rectifier:
     return Rectifier(
         rig=rig,
         rectified_from_raw=Rigid(torch.from_numpy(R1), torch.zeros(3).double()),
-        left_maps=make_maps(*left, R1, P1[:, :3], size, cv2.CV_32FC1),
-        right_maps=make_maps(*right, R2, P2[:, :3], size, cv2.CV_32FC1),
+        left_tables=RemapTables(*make_tables(*left, R1, P1[:, :3], size, cv2.CV_32FC1)),
+        right_tables=RemapTables(*make_tables(*right, R2, P2[:, :3], size, cv2.CV_32FC1)),
     )

@@ -4,30 +4,26 @@ import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
 import torch
 import yaml
 
+from depthpose.core.camera.camera_facts import KNOWN_FILES, CameraFacts, facts_from_projections
 from depthpose.core.camera.lens import is_fisheye_lens
-from depthpose.core.camera.pinhole import (
-    KNOWN_FILES,
-    CameraFacts,
-    Size,
-    facts_from_projections,
-    intrinsics,
-)
+from depthpose.core.camera.pinhole import Size, intrinsics
 from depthpose.core.errors import InputError
 from depthpose.core.files import AnyPath, read_text
 from depthpose.core.files.disk import MAX_LIST_BYTES, YamlLoader, refuse_yaml_bomb, refused_as
 
-Fields = dict[str, Any]  # values of a file by its keys: lower case, letters and digits
+Fields = dict[str, Any]
+"""Values of a file by its keys, these in lower case, letters and digits only."""
 
 _YAML_HEAD = re.compile(r"\A\s*%YAML[^\n]*\n")
 _XML_DECLARATION = re.compile(r"<!(?!--)")
-_MAX_TEXT = 2**18  # longest YAML or XML that is parsed: ten times the largest camera file
+_MAX_TEXT = 2**18  # longest YAML or XML that is parsed [letters]: ten times a large camera file
 
 
 def parse_storage(path: AnyPath, text: str) -> Fields | None:
@@ -50,11 +46,13 @@ def parse_storage(path: AnyPath, text: str) -> Fields | None:
     if not documents or not isinstance(documents[0], Mapping):
         return None
 
-    # A recorded topic of ROS has a document for each message: the same camera at other times.
+    # A recorded topic of ROS has a document for each message: the same camera at other times, which
+    # are in the header.
     fields = normalise_keys(documents[0])
-    camera = fields | {"header": 0}
+    without_header = fields | {"header": 0}
     for other in documents[1:]:
-        if isinstance(other, Mapping) and normalise_keys(other) | {"header": 0} != camera:
+        is_mapping = isinstance(other, Mapping)
+        if is_mapping and normalise_keys(other) | {"header": 0} != without_header:
             raise InputError(
                 f"{path}: describes several cameras, one after the other; write each into a file "
                 "of its own (those of a pair into a folder)"
@@ -72,17 +70,24 @@ def _read_opencv_xml(path: AnyPath, text: str) -> Fields | None:
         root = ElementTree.fromstring(text)  # noqa: S314  entities are refused above
     if root.tag != "opencv_storage":
         return None
-    nodes = {node.tag: {leaf.tag: leaf.text for leaf in node} or node.text for node in root}
-    return normalise_keys(nodes)
+    # A matrix is a node of leaves (rows, cols, data), a number or text is a node alone.
+    values: dict[str, Any] = {}
+    for node in root:
+        leaves = {leaf.tag: leaf.text for leaf in node}
+        values[node.tag] = leaves or node.text
+    return normalise_keys(values)
 
 
 def normalise_keys(content: Mapping[Any, Any]) -> Fields:
-    """Convert the keys of a file to lower case, letters and digits only."""
+    """Normalise the keys of a file: lower case, letters and digits only."""
     return {re.sub(r"[^a-z0-9]", "", str(key).lower()): value for key, value in content.items()}
 
 
 def find_matrix(fields: Fields, keys: tuple[str, ...], count: int) -> np.ndarray | None:
-    """Find the first of some keys with a matrix of 9, 12 or 16 numbers, as ``count`` says."""
+    """Return the matrix of the first of some keys that has ``count`` numbers: 9, 12 or 16.
+
+    The matrix is 3x3, 3x4 or 4x4; None where no key has so many numbers.
+    """
     columns = 3 if count == 9 else 4
     for key in keys:
         values = parse_numbers(fields.get(key))
@@ -92,7 +97,7 @@ def find_matrix(fields: Fields, keys: tuple[str, ...], count: int) -> np.ndarray
 
 
 def find_number(fields: Fields, key: str) -> float | None:
-    """Read the number of a key; None where it has none, or several."""
+    """Return the number of a key; None where it has none, or several."""
     values = parse_numbers(fields.get(key))
     return None if values is None or len(values) != 1 else values[0]
 
@@ -100,7 +105,10 @@ def find_number(fields: Fields, key: str) -> float | None:
 def parse_numbers(value: object) -> list[float] | None:
     """Convert a matrix of OpenCV, a list, a list of lists, text or a number to a list of numbers.
 
-    None where there is none, or something else among them.
+    None where there are none, or something else is among them.
+
+    Raises:
+        InputError: one of them is NaN or infinite.
     """
     content: Any = value.get("data") if isinstance(value, Mapping) else value
     words: list[Any] = []
@@ -147,7 +155,7 @@ _WIDTH = ("width", "imagewidth")
 _HEIGHT = ("height", "imageheight")
 _ROS = ("projectionmatrix", "distortionmodel", "p")
 _DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-_LEVEL = 1e-3  # off which R and T may be for the cameras to count as parallel
+_PARALLEL_TOLERANCE = 1e-3  # of R, and of T beside its x, for cameras to count as parallel
 _UNDISTORT_P = "cv2.undistort(image, K, distortion, None, P[:, :3]) (image_proc in ROS)"
 _UNDISTORT_FISHEYE = (
     "cv2.fisheye.undistortImage(image, K, distortion, Knew=K), or Knew=P[:, :3] where there is a P"
@@ -163,7 +171,7 @@ _RECTIFY = (
 
 
 def facts_from_fields(fields: Fields) -> CameraFacts | None:
-    """Read the camera that fields describe, with its lens; None where they describe none.
+    """Read the camera and the lens that fields describe; None where they describe no camera.
 
     Raises:
         InputError: the lens is neither a pinhole nor an equidistant fisheye, or a value is wrong.
@@ -174,7 +182,7 @@ def facts_from_fields(fields: Fields) -> CameraFacts | None:
 
 
 def with_fisheye(facts: CameraFacts, *, is_fisheye: bool) -> CameraFacts:
-    """Add to the facts of a fisheye lens that it is one, and how its images are undistorted."""
+    """Add that the lens is a fisheye, if it is, and how its images are undistorted."""
     if not is_fisheye:
         return facts
     undistort = _UNDISTORT_FISHEYE if facts.baseline_m is None else _RECTIFY_FISHEYE
@@ -182,9 +190,10 @@ def with_fisheye(facts: CameraFacts, *, is_fisheye: bool) -> CameraFacts:
 
 
 def _facts_without_lens(fields: Fields) -> CameraFacts | None:
-    """Read the camera that fields describe, apart from its lens; None where they describe none.
+    """Read the camera that fields describe, but for its lens model; None where they describe none.
 
-    In this order: settings of ORB-SLAM, two projections, Q of stereoRectify, one projection, K.
+    The first of these that the fields have is read: settings of ORB-SLAM, two projections, the
+    matrix Q of stereoRectify, one projection, K.
     """
     if "cam0" in fields and "cam1" in fields:
         raise InputError(
@@ -193,7 +202,7 @@ def _facts_without_lens(fields: Fields) -> CameraFacts | None:
         )
     for prefix in ("camera", "camera1"):
         if f"{prefix}fx" in fields:
-            return _from_orb_slam(fields, prefix)
+            return _facts_from_orb_slam(fields, prefix)
 
     size = find_size(fields)
     distortion = find_distortion(fields)
@@ -206,18 +215,18 @@ def _facts_without_lens(fields: Fields) -> CameraFacts | None:
         left = _require_matrix(left, "P1")
         facts = facts_from_projections("a rig of OpenCV", left, right, size)
     elif Q is not None:
-        facts = _from_reprojection_matrix(Q, size)
+        facts = _facts_from_reprojection_matrix(Q, size)
     elif left is None or left[0, 0] == 0:
-        return _from_intrinsics(fields, kind, distortion)
+        return _facts_from_intrinsics(fields, kind, distortion)
     elif left[0, 3] == 0 and left[1, 3] == 0:  # of a single camera
         facts = facts_from_projections(kind, left, None, size)
         undistort = _UNDISTORT_P
     else:
-        facts = _from_right_projection(left, kind, size)
+        facts = _facts_from_right_projection(left, kind, size)
     return replace(facts, distortion=distortion, undistort=undistort)
 
 
-def _from_orb_slam(fields: Fields, prefix: str) -> CameraFacts:
+def _facts_from_orb_slam(fields: Fields, prefix: str) -> CameraFacts:
     """Read the settings of ORB-SLAM, whose keys of intrinsics begin with ``prefix``."""
     fx, fy, cx, cy = (
         find_number(fields, f"{prefix}{key}") or 0.0 for key in ("fx", "fy", "cx", "cy")
@@ -241,7 +250,7 @@ def _from_orb_slam(fields: Fields, prefix: str) -> CameraFacts:
     )
 
 
-def _from_reprojection_matrix(Q: np.ndarray, size: Size | None) -> CameraFacts:
+def _facts_from_reprojection_matrix(Q: np.ndarray, size: Size | None) -> CameraFacts:
     """Read the rig of stereoRectify's ``(x, y, z, w) = Q (u, v, disparity, 1)``.
 
     ``Q[3, 2]`` is 1 / baseline.
@@ -257,10 +266,10 @@ def _from_reprojection_matrix(Q: np.ndarray, size: Size | None) -> CameraFacts:
     )
 
 
-def _from_right_projection(P: np.ndarray, kind: str, size: Size | None) -> CameraFacts:
-    """Read the rig of the right camera's projection alone, whose ``Tx`` is -fx times the baseline.
+def _facts_from_right_projection(P: np.ndarray, kind: str, size: Size | None) -> CameraFacts:
+    """Read a rig from the right camera's projection alone, whose ``Tx`` is -fx times the baseline.
 
-    That holds unless both cameras are counted from a third one, which the facts doubt.
+    That does not hold where both cameras are measured from a third one: the facts warn of that.
     """
     left = np.c_[P[:, :3], [0, 0, 0]]
     facts = facts_from_projections(kind, left, P, size)
@@ -327,14 +336,18 @@ def facts_from_ros_pair(first: Fields, second: Fields) -> CameraFacts:
 
 
 def order_ros_pair(first: Fields, second: Fields) -> tuple[Fields, Fields]:
-    """Put the left ``camera_info`` of a pair before the right one.
+    """Return the left ``camera_info`` of a pair, then the right one.
 
-    ``Tx`` is -fx times the x of a camera, from the left one or, as in KITTI, from a third.
+    ``Tx``, -fx times the x of a camera, tells them apart.
+
+    Raises:
+        InputError: both have the same Tx, or images of other sizes.
     """
-    first_Tx, second_Tx = (
-        _require_matrix(find_matrix(fields, _P, 12), "projection_matrix")[0, 3]
+    projections = [
+        _require_matrix(find_matrix(fields, _P, 12), "projection_matrix")
         for fields in (first, second)
-    )
+    ]
+    first_Tx, second_Tx = (P[0, 3] for P in projections)
     if first_Tx == second_Tx:
         raise InputError(
             f"the projections of the two camera_info have Tx {first_Tx:g} and {second_Tx:g}, where "
@@ -345,7 +358,7 @@ def order_ros_pair(first: Fields, second: Fields) -> tuple[Fields, Fields]:
     return (first, second) if first_Tx > second_Tx else (second, first)
 
 
-def _from_intrinsics(
+def _facts_from_intrinsics(
     fields: Fields, kind: str, distortion: tuple[float, ...]
 ) -> CameraFacts | None:
     """Read K, or fx, fy, cx and cy; None where there are neither.
@@ -377,8 +390,12 @@ def _from_intrinsics(
     R = parse_numbers(fields.get("r"))
     if T is not None and len(T) == 3:
         no_rotation = np.eye(3).ravel()
-        is_rotated = R is not None and len(R) == 9 and not np.allclose(R, no_rotation, atol=_LEVEL)
-        if is_rotated or max(abs(T[1]), abs(T[2])) > _LEVEL * abs(T[0]):
+        is_rotated = (
+            R is not None
+            and len(R) == 9
+            and not np.allclose(R, no_rotation, atol=_PARALLEL_TOLERANCE)
+        )
+        if is_rotated or max(abs(T[1]), abs(T[2])) > _PARALLEL_TOLERANCE * abs(T[0]):
             raise InputError(
                 "R and T of a pair that is not rectified, and no P1 and P2; rectify the images by "
                 "'depthpose data rectify', or by cv2.stereoRectify and write its P1 and P2 too"
@@ -402,7 +419,7 @@ def read_baseline_m(fields: Fields) -> float | None:
 def find_distortion(fields: Fields) -> tuple[float, ...]:
     """Collect the distortion coefficients under any key, of both lenses where there are two.
 
-    They decide only whether there is distortion: their order is not that of a lens model.
+    They tell only whether a lens distorts; their order is none of a lens model.
     """
     loose = [find_number(fields, key) for key in _DISTORTION_KEYS]
     coefficients = [number for number in loose if number is not None]
@@ -421,24 +438,37 @@ def find_distortion(fields: Fields) -> tuple[float, ...]:
 
 
 def find_published_matrix(fields: Fields, keys: tuple[str, ...], count: int) -> np.ndarray | None:
-    """Find K or P, converted to the image that ROS publishes: cropped to its ROI, then binned."""
+    """Find K or P, and convert it to the image that ROS publishes: cropped to its ROI, then binned.
+
+    Arguments are those of :func:`find_matrix`; None where there is no such matrix.
+    """
     matrix = find_matrix(fields, keys, count)
     if matrix is None:
         return None
-    (left, top), _, binning = _read_window(fields)
-    matrix[:2] -= [[left], [top]] * matrix[2]
-    # Pixel centres are whole numbers: that of a binned pixel lies between those of its parts.
-    scale = 1 / np.array(binning)[:, None]
+    window = _read_window(fields)
+    matrix[:2] -= [[window.left], [window.top]] * matrix[2]
+    # Pixel centres are whole numbers, so binning maps u to (u + 0.5) scale - 0.5.
+    scale = np.array([[1 / window.x_binning], [1 / window.y_binning]])
     matrix[:2] = matrix[:2] * scale + (scale / 2 - 0.5) * matrix[2]
     return matrix
 
 
-def _read_window(fields: Fields) -> tuple[Size, Size, Size]:
-    """Read the ROI and the binning of ROS, columns before rows.
+class _Window(NamedTuple):
+    """The part of the full image that ROS publishes: the ROI [px], and pixels binned to one."""
 
-    Returns:
-        Corner and size of the ROI [px of the full image], and the pixels that are binned to one.
-        The size is 0 where the ROI is the whole image.
+    left: int
+    top: int
+    width: int  # 0 where the ROI is the whole image
+    height: int
+    x_binning: int
+    y_binning: int
+
+
+def _read_window(fields: Fields) -> _Window:
+    """Read the ROI and the binning of ROS; without them the window is the whole image.
+
+    Raises:
+        InputError: a number is negative.
     """
     content = fields.get("roi")
     roi = normalise_keys(content) if isinstance(content, Mapping) else {}
@@ -447,7 +477,7 @@ def _read_window(fields: Fields) -> tuple[Size, Size, Size]:
     x_binning, y_binning = (int(find_number(fields, f"binning{axis}") or 0) for axis in "xy")
     if min(left, top, width, height, x_binning, y_binning) < 0:
         raise InputError("its roi or its binning holds a negative number; write what was published")
-    return (left, top), (width, height), (x_binning or 1, y_binning or 1)
+    return _Window(left, top, width, height, x_binning or 1, y_binning or 1)
 
 
 def find_size(fields: Fields) -> Size | None:
@@ -459,17 +489,19 @@ def find_size(fields: Fields) -> Size | None:
         width, height = size
     if not width or not height:
         return None
-    (left, top), (roi_width, roi_height), (x_binning, y_binning) = _read_window(fields)
-    if left + roi_width > width or top + roi_height > height:
+    window = _read_window(fields)
+    if window.left + window.width > width or window.top + window.height > height:
         raise InputError(
-            f"its roi, {roi_width}x{roi_height} at ({left}, {top}), leaves the image of "
-            f"{width:g}x{height:g}; width and height are those of the full image"
+            f"its roi, {window.width}x{window.height} at ({window.left}, {window.top}), leaves the "
+            f"image of {width:g}x{height:g}; width and height are those of the full image"
         )
-    return int(roi_width or width) // x_binning, int(roi_height or height) // y_binning
+    columns = int(window.width or width) // window.x_binning
+    rows = int(window.height or height) // window.y_binning
+    return columns, rows
 
 
 def _find_first_number(fields: Fields, keys: tuple[str, ...]) -> float | None:
-    """Read the number of the first of some keys that has one."""
+    """Return the number of the first of some keys that has one; None where none has."""
     for key in keys:
         number = find_number(fields, key)
         if number is not None:
@@ -478,7 +510,7 @@ def _find_first_number(fields: Fields, keys: tuple[str, ...]) -> float | None:
 
 
 def _require_matrix(matrix: np.ndarray | None, name: str) -> np.ndarray:
-    """Return a matrix of 12 numbers, or refuse a file that lacks it."""
+    """Return a projection matrix, or refuse a file that lacks it; ``name`` is its key."""
     if matrix is None:
         raise InputError(f"there is no {name} of 12 numbers; write the whole pair")
     return matrix

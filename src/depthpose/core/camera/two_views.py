@@ -6,12 +6,12 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from depthpose.core.camera.rectified import check_rectified, grey_of
+from depthpose.core.camera.rectified import check_rectified, grey_from_rgb
 
 Arrangement = Literal["side by side", "top and bottom"]
 _ROWS = 32  # rows of the small copies of both halves, which are compared
-_COLUMNS = 64
-_MAX_SHIFT = 12  # columns by which the copies are shifted
+_COLUMNS = 64  # columns of these copies
+_MAX_SHIFT = 12  # most columns by which one copy is shifted against the other
 _MIN_CORRELATION = 0.6
 """Least correlation of the two halves, without the means of rows and columns, where they are two
 views: it is 0.77 to 0.95 for the two views of 25 KITTI pairs put together, and -0.2 to 0.43 for the
@@ -21,7 +21,10 @@ _MIN_MATCHES = 25  # least matches of corners between both halves
 
 
 def split_halves(image: Float[Tensor, "3 h w"], arrangement: Arrangement) -> tuple[Tensor, Tensor]:
-    """Split a picture into its left and right half, or its upper and lower one."""
+    """Split a picture into its left and right half, or its upper and lower one.
+
+    Of an odd number of columns or rows the middle one is in neither half.
+    """
     if arrangement == "side by side":
         width = image.shape[2] // 2
         return image[:, :, :width].contiguous(), image[:, :, -width:].contiguous()
@@ -30,7 +33,7 @@ def split_halves(image: Float[Tensor, "3 h w"], arrangement: Arrangement) -> tup
 
 
 def find_two_views(image: Float[Tensor, "3 h w"]) -> Arrangement | None:
-    """Find how a picture holds two views of one scene; None where it is a single view."""
+    """Find out how a picture combines two views of one scene; None where it is a single view."""
     if min(image.shape[1:]) < 2 * _ROWS:
         return None
     for arrangement in ("side by side", "top and bottom"):
@@ -44,17 +47,20 @@ def find_two_views(image: Float[Tensor, "3 h w"]) -> Arrangement | None:
 
 
 def _find_best_correlation(first_half: Tensor, second_half: Tensor) -> float:
-    """Correlate small copies of both halves, at the shift along rows where it is largest."""
+    """Compute the largest correlation of small copies of two halves over shifts along the rows."""
     small_copies: list[Tensor] = []
     for half in (first_half, second_half):
-        grey = grey_of(half).float()[None, None]
+        grey = grey_from_rgb(half).float()[None, None]
         copy = functional.interpolate(grey, (_ROWS, _COLUMNS), mode="area")
         small_copies.append(copy[0, 0])
     first, second = small_copies
     best = 0.0
     for shift in range(-_MAX_SHIFT, _MAX_SHIFT + 1):
-        a = _subtract_means(first[:, max(shift, 0) : _COLUMNS + min(shift, 0)])
-        b = _subtract_means(second[:, max(-shift, 0) : _COLUMNS + min(-shift, 0)])
+        # The columns that both copies share at this shift.
+        first_columns = slice(max(shift, 0), _COLUMNS + min(shift, 0))
+        second_columns = slice(max(-shift, 0), _COLUMNS + min(-shift, 0))
+        a = _subtract_means(first[:, first_columns])
+        b = _subtract_means(second[:, second_columns])
         if min(float(a.std()), float(b.std())) > _MIN_DEVIATION:
             correlation = float((a * b).sum() / (a.norm() * b.norm()))
             best = max(best, correlation)
@@ -62,13 +68,13 @@ def _find_best_correlation(first_half: Tensor, second_half: Tensor) -> float:
 
 
 def _subtract_means(grey: Tensor) -> Tensor:
-    """Subtract the means of rows and columns: any two halves share a bright sky above a road."""
+    """Subtract the means of rows and columns, since most halves have a bright sky above a road."""
     return grey - grey.mean(0) - grey.mean(1, keepdim=True) + grey.mean()
 
 
 def order_views(
     first: Float[Tensor, "3 h w"], second: Float[Tensor, "3 h w"]
 ) -> tuple[Tensor, Tensor]:
-    """Put the left view before the right one: files such as JPS begin with the right one."""
+    """Return the left view, then the right one, as the images tell; JPS begins with the right."""
     is_swapped = check_rectified(first, second).is_swapped
     return (second, first) if is_swapped else (first, second)

@@ -1,7 +1,7 @@
 """Bytes, text, JSON and YAML from and to disks; the order of file names, and their pairing.
 
-Readers refuse what is too large, writers leave a whole file or none. A path through a tar shard,
-``000000.tar/a.left.png``, is read as through a folder.
+Readers refuse what is too large, writers leave a whole file or none. Files in a tar shard are read
+as those of a folder, by a path such as ``000000.tar/a.left.png``.
 """
 
 import errno
@@ -28,17 +28,17 @@ from depthpose.core.errors import InputError
 AnyPath = str | os.PathLike[str]
 """A path as users give it."""
 
-MAX_FILE_BYTES = 2**28  # largest file that is read whole; a bigger one is a mistake or an attack
-MAX_TEXT_BYTES = 2**26  # a table of a million points, annotations of ten thousand images
-MAX_LIST_BYTES = 2**20  # largest text that lists a few numbers: a calibration, a camera, a config
-_MAX_MEMORY = 700_000_000  # [bytes] of JSON once it is read, estimated from its text
-_MAX_YAML_DEPTH = 50  # lists in lists of YAML
-_MAX_YAML_VALUES = 2_000_000  # most values of YAML whose references are written out
+MAX_FILE_BYTES = 2**28  # largest file that is read whole; a larger one is a mistake or an attack
+MAX_TEXT_BYTES = 2**26  # largest text: a million points, annotations of ten thousand images
+MAX_LIST_BYTES = 2**20  # largest text of a few numbers: a calibration, a camera, a config
+_MAX_JSON_MEMORY = 700_000_000  # memory of JSON once it is read, estimated from its text [bytes]
+_MAX_YAML_DEPTH = 50  # most lists within lists of YAML
+_MAX_YAML_VALUES = 2_000_000  # most values of YAML once its references are written out
 _SAFE_LOADER: type[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 """Ten times faster where PyYAML was built with libyaml, as its wheels are."""
 _MERGE = "tag:yaml.org,2002:merge"  # tag of the key ``<<``
 _JSON_SIGN_BYTES = {b",": 60, b"[": 100, b"{": 100, b":": 200}
-"""Memory that a sign of JSON stands for once it is read [bytes]."""
+"""Memory of the Python object that begins with such a sign of JSON [bytes]."""
 _LONGEST_CAUSE = 200  # letters that are shown of another library's message
 
 _KEY_VALUE = re.compile(r"([^\s:=]+)\s*[:=](.*)")
@@ -51,10 +51,15 @@ _PART = ".part-"  # begins the names of files that are being written
 
 @contextmanager
 def refused_as(path: AnyPath, kind: str, remedy: str) -> Iterator[None]:
-    """Turn whatever a decoder raises on bad bytes into an :class:`InputError`.
+    """Turn any error of a decoder in the block into an :class:`InputError`.
 
-    It says that ``path`` is not a readable ``kind``, and ends with ``remedy``. Warnings of decoders
-    are silenced: they are about metadata that is not read here, and sizes are checked here.
+    Warnings of decoders are silenced: they are about metadata that is not read, and about sizes,
+    which are checked here.
+
+    Args:
+        path: the file, for the error.
+        kind: what the file should be, such as ``picture``.
+        remedy: what the user can do, with which the error ends.
     """
     try:
         with warnings.catch_warnings(action="ignore"):
@@ -91,7 +96,7 @@ def refuse_broken_link(path: AnyPath) -> None:
 
 @contextmanager
 def refused_write(path: AnyPath) -> Iterator[None]:
-    """Turn the errors of a disk that cannot be written into an :class:`InputError`."""
+    """Turn errors of the disk in the block, which writes to ``path``, into :class:`InputError`."""
     try:
         yield
     except OSError as error:
@@ -120,9 +125,9 @@ def cache_folder() -> Path:
 def atomic_write(path: AnyPath) -> Iterator[Path]:
     """Write a file whole or not at all.
 
-    Yields a temporary path in the same folder, with the same suffix, to be written inside the
-    block. On success it takes the place of ``path``; on any failure or interrupt it is removed
-    and ``path`` stays as it was. Missing folders are made.
+    Yields a temporary path in the same folder, with the same suffix, which the block writes. On
+    success that file replaces ``path``; on any failure or interrupt it is removed, and ``path``
+    stays as it was. Missing folders are made.
 
     Raises:
         InputError: the disk is full, or the place cannot be written to.
@@ -147,7 +152,10 @@ def atomic_write(path: AnyPath) -> Iterator[Path]:
 
 
 def remove_parts(folder: Path) -> None:
-    """Remove partial files of killed writers in a folder, not below; no writer may be running."""
+    """Remove partial files that killed writers left in a folder; no writer may be running.
+
+    Subfolders are not searched.
+    """
     for part in folder.glob(f"{_PART}*"):
         with suppress(OSError):
             part.unlink()
@@ -159,8 +167,11 @@ def write_bytes(path: AnyPath, data: bytes) -> None:
         part.write_bytes(data)
 
 
-def refused_suffix(path: AnyPath, kind: str, suffixes: tuple[str, ...]) -> InputError:
-    """Make the error for a file name with an unknown suffix."""
+def make_suffix_error(path: AnyPath, kind: str, suffixes: tuple[str, ...]) -> InputError:
+    """Make the error of a file whose suffix is none of the known ones.
+
+    ``kind`` is what the file should be, such as ``map``.
+    """
     suffix = Path(path).suffix or "no suffix"
     return InputError(f"{path}: {suffix} is no {kind} format; use {', '.join(suffixes)}")
 
@@ -213,7 +224,7 @@ def read_bytes(path: AnyPath, most: int = MAX_FILE_BYTES) -> bytes:
 
 
 def _find_shard(path: Path) -> Path | None:
-    """Find the tar shard that a path leads through, on the disk or not yet; None where none."""
+    """Find the tar shard that a path leads through, which may not be fetched yet; else None."""
     for parent in path.parents:
         if parent.suffix == ".tar" and not parent.is_dir():
             return parent
@@ -247,7 +258,7 @@ def _read_in_shard(shard: Path, name: str, most: int) -> bytes:
 def _index_shard(shard: Path, _changed_ns: int, _size: int) -> dict[str, tuple[int, int]]:
     """List offset and size [bytes] of each file of a shard, by name.
 
-    Time and size of the shard are part of the cache's key, so that a changed shard is read again.
+    Time and size of the shard are arguments so that the cache reads a changed shard again.
     """
     try:
         with tarfile.open(shard, "r:") as tar:
@@ -262,19 +273,19 @@ def _index_shard(shard: Path, _changed_ns: int, _size: int) -> dict[str, tuple[i
 
 def fetch(url: str, path: Path) -> None:
     """Copy the file of a URL to the disk, whole or not at all."""
-    with atomic_write(path) as part, file_system(url, "read") as (fs, inner):
+    with atomic_write(path) as part, open_file_system(url, "read") as (fs, inner):
         fs.get_file(inner, str(part))
 
 
 @contextmanager
-def file_system(url: str, done: str) -> Iterator[tuple[Any, str]]:
-    """Open fsspec's file system of a URL; yields it and the path of the URL there.
+def open_file_system(url: str, action: str) -> Iterator[tuple[Any, str]]:
+    """Open fsspec's file system of a URL; yields it and the URL's path in it.
 
-    Errors inside the block become :class:`InputError`; ``done`` says in it what could not be done,
-    such as ``read``.
+    Errors inside the block become :class:`InputError`. ``action`` is the participle for them, of
+    what the block does: such as ``read``, for "cannot be read".
     """
     try:
-        from fsspec.core import url_to_fs  # takes time to load
+        from fsspec.core import url_to_fs  # imported here, as loading it takes time
 
         fs, inner = url_to_fs(url)
         fs.invalidate_cache()
@@ -288,7 +299,7 @@ def file_system(url: str, done: str) -> Iterator[tuple[Any, str]]:
     except Exception as error:  # each file system raises errors of its own
         cause = " ".join(f"{type(error).__name__}: {error}".split())[:_LONGEST_CAUSE]
         raise InputError(
-            f"{url}: cannot be {done} ({cause}); check the address and the credentials"
+            f"{url}: cannot be {action} ({cause}); check the address and the credentials"
         ) from error
 
 
@@ -327,60 +338,69 @@ def read_text(path: AnyPath, most: int = MAX_TEXT_BYTES) -> str:
 
 
 def read_json(path: AnyPath) -> object:
-    """Read JSON as the standard defines it, unlike Python's own parser.
+    """Read JSON as its standard defines it, which Python's parser does not.
 
     Raises:
-        InputError: the file is missing or no JSON, holds NaN, infinity or a number beyond float64,
-            gives a key twice, or would fill the memory.
+        InputError: the file is missing or no JSON, has NaN, infinity, a number beyond float64 or a
+            repeated key, or would fill the memory.
     """
     text = read_text(path, MAX_FILE_BYTES)
     refuse_heavy(path, text.encode(), _JSON_SIGN_BYTES)
-
-    def make_object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        """Make the dict of a JSON object, and refuse a repeated key."""
-        members: dict[str, Any] = {}
-        for key, value in pairs:
-            if key in members:
-                raise ValueError(f"key {key!r} is given twice")
-            members[key] = value
-        return members
-
     with refused_as(path, "JSON file", "correct it there"):
         return json.loads(
             text,
-            parse_constant=finite_number,
-            parse_float=finite_number,
-            object_pairs_hook=make_object,
+            parse_constant=parse_finite,
+            parse_float=parse_finite,
+            object_pairs_hook=_make_json_object,
         )
+
+
+def _make_json_object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Make the dict of a JSON object, and refuse a repeated key."""
+    members: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in members:
+            raise ValueError(f"key {key!r} is given twice")
+        members[key] = value
+    return members
 
 
 def refuse_heavy(path: AnyPath, data: bytes, memory_of: Mapping[bytes, int]) -> None:
     """Refuse JSON that would fill the memory, before it is parsed.
 
-    ``memory_of`` estimates the memory [bytes] of the object that a sign of the text stands for.
+    Args:
+        path: the file, for the error.
+        data: its bytes.
+        memory_of: memory [bytes] of the Python object that begins with a sign of the text.
+
+    Raises:
+        InputError: the estimated memory is too large.
     """
     bytes_a_letter = 2 if data.isascii() else 5
-    need = bytes_a_letter * len(data)
-    need += sum(size * data.count(sign) for sign, size in memory_of.items())
-    if need > _MAX_MEMORY:
+    memory_bytes = bytes_a_letter * len(data)
+    memory_bytes += sum(size * data.count(sign) for sign, size in memory_of.items())
+    if memory_bytes > _MAX_JSON_MEMORY:
         raise InputError(
-            f"{path}: {len(data)} bytes that would take about {need / 1e6:.0f} MB of memory, more "
-            f"than the {_MAX_MEMORY / 1e6:.0f} MB allowed; split it"
+            f"{path}: {len(data)} bytes that would take about {memory_bytes / 1e6:.0f} MB of "
+            f"memory, more than the {_MAX_JSON_MEMORY / 1e6:.0f} MB allowed; split it"
         )
 
 
 def parse_yaml(path: AnyPath, text: str) -> object:
-    """Parse YAML of plain values; references (``*name``) are followed within a bound."""
+    """Parse YAML of plain values, with references (``*name``) within a bound.
+
+    Raises:
+        InputError: it is no such YAML, or would fill the memory.
+    """
     refuse_yaml_bomb(path, text)
     with refused_as(path, "YAML file", "correct it there"):
         return yaml.load(text, YamlLoader)  # noqa: S506  a safe loader
 
 
 def refuse_yaml_bomb(path: AnyPath, text: str) -> None:
-    """Refuse YAML that is too deep, refers to itself, or grows beyond all bounds by references.
+    """Refuse YAML that is too deep, refers to itself, or becomes huge by references (``*name``).
 
-    The number of values is counted as if each reference (``*name``) were written out, without
-    doing so.
+    The values are counted as they would be with each reference written out.
     """
     sizes: dict[str, int] = {}  # values in the part of each anchor (``&name``)
     open_collections: list[tuple[str | None, int]] = []  # anchor, and values so far
@@ -419,14 +439,14 @@ def refuse_yaml_bomb(path: AnyPath, text: str) -> None:
                 )
 
 
-def write_json(path: AnyPath, obj: object) -> None:
-    """Write JSON with an indent of 2, keys in the order of ``obj``, ending in a newline.
+def write_json(path: AnyPath, value: object) -> None:
+    """Write JSON with an indent of 2, keys in the order of ``value``, ending in a newline.
 
     Raises:
-        InputError: something in ``obj`` has no JSON form, NaN among them, or the disk refuses.
+        InputError: something in it has no JSON form, such as NaN, or the disk refuses.
     """
     try:
-        text = json.dumps(obj, indent=2, allow_nan=False, ensure_ascii=False)
+        text = json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False)
         # A name that is not UTF-8 is kept as JSON's escapes of its bytes, which are read back.
         data = f"{text}\n".encode(errors="backslashreplace")
     except (ValueError, TypeError, RecursionError) as error:
@@ -435,10 +455,10 @@ def write_json(path: AnyPath, obj: object) -> None:
 
 
 def read_key_values(path: AnyPath) -> dict[str, list[float]]:
-    """Read ``KEY: numbers`` lines, as in KITTI's calibration files.
+    """Read ``KEY: numbers`` lines, as of KITTI's calibrations: the numbers by key.
 
-    ``key=[a b; c d]``, as in Middlebury's, is read row by row. Values that are not all numbers
-    (dates) are left out, and so are blank lines and what follows ``#``.
+    ``key=[a b; c d]``, as of Middlebury's, is read row by row. Keys of other values, such as dates,
+    are left out, and so are blank lines and what follows ``#``.
 
     Raises:
         InputError: the file is missing or not text, a line has no key or repeats one, or a number
@@ -464,54 +484,57 @@ def read_key_values(path: AnyPath) -> dict[str, list[float]]:
     return values
 
 
-def finite_number(text: str) -> float:
-    """Convert a number of JSON to float; NaN and infinity, which JSON has not, are errors."""
+def parse_finite(text: str) -> float:
+    """Convert a number of JSON to float; ValueError for NaN and infinity, which JSON lacks."""
     value = float(text)
     if not math.isfinite(value):
         raise ValueError(f"{text} is not a JSON number")
     return value
 
 
-_MOST_SHOWN = 6  # file names without a partner that an error lists
-
-
+_MOST_SHOWN = 6  # most file names without a partner that an error lists
 _NUMBER = re.compile(r"((?<![\d.])\d+\.\d+(?!\d|\.\d)|\d+)")
+"""A decimal, unless a third number follows as in 1.2.10, or a whole number."""
 
 
-def natural_order(path: Path) -> tuple[list[list[str | tuple[int, str]]], Path]:
-    """Make the key that sorts paths by name, and numbers in names by value: 2 before 10.
+def natural_sort_key(path: Path) -> tuple[list[list[str | tuple[int, str]]], Path]:
+    """Make the key by which paths are sorted: by name, but numbers in names by value (2 before 10).
 
     Two runs of digits with a point between them are a decimal, as of a time in seconds: 0.45 comes
     before 0.5. Three are separate numbers (1.2.10).
     """
-
-    def key_of(part: str) -> list[str | tuple[int, str]]:
-        """Make the key of a folder or file name: text and numbers in turn, beginning with text."""
-        key: list[str | tuple[int, str]] = []
-        for index, piece in enumerate(_NUMBER.split(part)):
-            is_number = index % 2 == 1
-            if is_number:
-                whole, _, decimals = piece.partition(".")
-                key.append((int(whole), decimals))  # digits behind the point sort as letters do
-            else:
-                key.append(piece)
-        return key
-
-    return [key_of(part) for part in (*path.parent.parts, path.stem)], path
+    names = (*path.parent.parts, path.stem)
+    return [_split_numbers(name) for name in names], path
 
 
-def refuse_equal_names(files_by_name: Iterable[tuple[str, str | Path]], remedy: str) -> None:
+def _split_numbers(name: str) -> list[str | tuple[int, str]]:
+    """Split a name into text and numbers in turn, beginning with text.
+
+    A number is its whole part, and its decimals, which sort as text does.
+    """
+    pieces: list[str | tuple[int, str]] = []
+    for index, piece in enumerate(_NUMBER.split(name)):
+        is_number = index % 2 == 1
+        if is_number:
+            whole, _, decimals = piece.partition(".")
+            pieces.append((int(whole), decimals))
+        else:
+            pieces.append(piece)
+    return pieces
+
+
+def refuse_equal_names(named_files: Iterable[tuple[str, str | Path]], remedy: str) -> None:
     """Refuse two inputs of one name: the results of one would overwrite those of the other.
 
     Args:
-        files_by_name: the name and the file of each input.
-        remedy: what the user may do, for the error.
+        named_files: the name and the file of each input.
+        remedy: what the user can do, for the error.
 
     Raises:
-        InputError: names both files.
+        InputError: two have one name; both files are named.
     """
     file_of: dict[str, str | Path] = {}
-    for name, file in files_by_name:
+    for name, file in named_files:
         if name in file_of:
             raise InputError(
                 f"{file_of[name]} and {file} would both be {name!r} in the results; {remedy}"
@@ -529,7 +552,7 @@ def refuse_equal_stems(files: Iterable[Path]) -> None:
     refuse_equal_names([(path.stem, path) for path in files], remedy)
 
 
-def stem_of(path: Path) -> str:
+def normalise_stem(path: Path) -> str:
     """Return a file's name without its suffix, normalised to one Unicode form (NFC).
 
     A letter with an accent may be stored as one character (NFC) or two (NFD: disks of macOS).
@@ -538,16 +561,19 @@ def stem_of(path: Path) -> str:
 
 
 def find_partners(first: Sequence[str], second: Sequence[str], sides: str) -> list[int]:
-    """Pair the names of two sides: for each name of the first, the index of its partner.
+    """Pair the names of two sets of files, such as left and right images.
 
-    Names belong together that are equal; else those that are equal without what all names of their
-    side share (``left_0004`` and ``right_0004``, ``1_L`` and ``1_R``), numbers by value. Two lone
-    names belong together unless each has numbers and none of them is the other's.
+    Equal names are partners. If none are equal, those are partners that are equal without what all
+    names of their set share (``left_0004`` and ``right_0004``, ``1_L`` and ``1_R``), numbers by
+    value. Single names are partners unless both have numbers, and none in common.
 
     Args:
-        first: names of files, without suffixes.
-        second: names of the files on the other side.
-        sides: what both sides are called, for the error.
+        first: names of the first set, without suffixes.
+        second: names of the second set.
+        sides: what errors call the two sets.
+
+    Returns:
+        For each name of the first set the index of its partner in the second.
 
     Raises:
         InputError: a name has no partner, or several.
@@ -583,10 +609,10 @@ def find_partners(first: Sequence[str], second: Sequence[str], sides: str) -> li
 def _make_pairing_keys(
     first: Sequence[str], second: Sequence[str]
 ) -> tuple[list[Hashable], list[Hashable]]:
-    """Remove from each name what all names of its side share, and read numbers by value.
+    """Make keys of names that are equal if two names are partners (:func:`find_partners`).
 
     Returns:
-        Keys of the first and the second names; equal where two names belong together.
+        Keys of the first and of the second names.
     """
     # Text and numbers in turn, beginning with text.
     pieces = [[re.split(r"(\d+)", name) for name in side] for side in (first, second)]
@@ -607,7 +633,7 @@ def _make_pairing_keys(
     for index in range(len(pieces[0][0])):
         columns = [[split_name[index] for split_name in side] for side in pieces]
         if all(len(set(column)) == 1 for column in columns):
-            continue  # it names the side, or is common to both
+            continue  # all names of a set share it
         for side, column in enumerate(columns):
             keys_of_pieces = map(_strip_leading_zeros, _remove_common_ends(column))
             keys[side] = [
@@ -617,14 +643,14 @@ def _make_pairing_keys(
 
 
 def _remove_common_ends(texts: Sequence[str]) -> list[str]:
-    """Remove the beginning and the ending that all texts share; digits at their border are kept."""
+    """Remove the beginning and the ending that all texts share, but no part of a number."""
     without_prefix = _remove_common_prefix(texts)
     reversed_texts = _remove_common_prefix([text[::-1] for text in without_prefix])
     return [text[::-1] for text in reversed_texts]
 
 
 def _remove_common_prefix(texts: Sequence[str]) -> list[str]:
-    """Remove the beginning that all texts share, without digits that it ends with."""
+    """Remove the beginning that all texts share, up to digits that it ends with."""
     # What the first and the last in alphabetical order share, all share.
     first = min(texts)
     last = max(texts)

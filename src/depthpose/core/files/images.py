@@ -1,4 +1,4 @@
-"""Pictures as RGB tensors, their listing, EXIF; maps in NPY and PFM, depth in 16-bit PNG."""
+"""Reading and writing of pictures, and of maps: NPY, PFM, and depth in 16-bit PNG."""
 
 import math
 import re
@@ -20,10 +20,10 @@ from torch import Tensor
 from depthpose.core.errors import InputError, Notice
 from depthpose.core.files.disk import (
     AnyPath,
-    natural_order,
+    make_suffix_error,
+    natural_sort_key,
     read_bytes,
     refused_as,
-    refused_suffix,
     write_bytes,
 )
 
@@ -39,7 +39,7 @@ _UNREAD = re.compile(
     r"|mpo|jps)",
     re.IGNORECASE,
 )
-"""Suffixes of pictures that are not read: in a folder they are named."""
+"""Suffixes of pictures that are not read; a notice names those in a folder."""
 _ARCHIVES = (".tar", ".tgz", ".gz", ".bz2", ".xz", ".zst", ".lz4", ".zip", ".7z", ".rar")
 """Suffixes of archives, which are no pictures whatever they hold."""
 FAST_PNG = {"compress_level": 1}
@@ -50,18 +50,21 @@ MAX_PIXELS = 2**25  # 0.4 GB of floats; a small file may declare any size
 # Named one by one: Pillow also opens formats that start other programs.
 _FORMATS = ("PNG", "JPEG", "BMP", "PPM", "TIFF", "WEBP", "GIF")
 _JPEG_COLOURS = {"RGB": "RGB", "L": "GRAY"}
-"""Modes of Pillow's, and what simplejpeg calls them."""
+"""Names of simplejpeg's colour spaces, by Pillow's modes."""
 _HOLE = bytes(16)
-"""Zeros of a damaged JPEG: 2,600 pictures of all qualities hold no more than 6 in a row."""
+"""Zeros that show a damaged JPEG: 2,600 pictures of all qualities have no more than 6 in a row."""
 _NEXT_MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
-"""The end of a JPEG's compressed pixels."""
-_FILL = 0xFF  # JPEG markers: padding before a marker
+"""The marker at which a JPEG's compressed pixels end."""
+# Markers of JPEG.
+_FILL = 0xFF  # padding before a marker
 _PROGRESSIVE = 0xC2  # start of a progressive frame
 _HUFFMAN_TABLES = 0xC4
 _START_OF_SCAN = 0xDA
-_GREY_16 = ("I;16", "I;16L", "I;16B", "I;16N")
+
+_GREY_16_MODES = ("I;16", "I;16L", "I;16B", "I;16N")
 _EXIF_ORIENTATION = 0x0112
 _PHOTOMETRIC = 0x0106  # tag of TIFF: 0 where the value 0 is white
+# How Pillow turns a picture upright, by its EXIF orientation.
 _UPRIGHT = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
@@ -76,9 +79,9 @@ _UPRIGHT = {
 def read_image(path: AnyPath) -> Float32[Tensor, "3 h w"]:
     """Read a picture as RGB in [0, 1].
 
-    Greyscale becomes three equal channels, a palette its colours; alpha is dropped, the EXIF
-    orientation applied, and 16 bits a channel scaled by ``from_16_bit``. Of several pictures in one
-    file the first is read, with a notice.
+    Greyscale becomes three equal channels, a palette its colours. Alpha is dropped, the EXIF
+    orientation applied, and 16 bits a channel are scaled by :func:`scale_16_bit`. Of several
+    pictures in one file the first is read, with a notice.
 
     Raises:
         InputError: the file is missing, damaged, too large, not a picture, or holds both views of a
@@ -96,8 +99,8 @@ def read_image(path: AnyPath) -> Float32[Tensor, "3 h w"]:
     return _make_rgb_tensor(pixels, path)
 
 
-def picture_tensor(image: Image.Image, name: AnyPath) -> Float32[Tensor, "3 h w"]:
-    """Bring a picture of Pillow's to RGB in [0, 1], as :func:`read_image` does a file.
+def rgb_from_pillow(image: Image.Image, name: AnyPath) -> Float32[Tensor, "3 h w"]:
+    """Convert a picture of Pillow's to RGB in [0, 1], as :func:`read_image` does a file.
 
     Raises:
         InputError: it has 32 bits a pixel, or its file is damaged.
@@ -110,7 +113,7 @@ def picture_tensor(image: Image.Image, name: AnyPath) -> Float32[Tensor, "3 h w"
 def _decode(name: AnyPath, image: Image.Image) -> np.ndarray:
     """Decode a picture of Pillow's to RGB or grey, of 8 or 16 bits, turned upright by EXIF.
 
-    Pillow keeps 8 bits of colours of 16, and decodes damaged JPEGs without a word: those formats
+    Pillow keeps only 8 bits of colours of 16 bits, and does not report damaged JPEGs: these formats
     are decoded in other ways.
     """
     rotation = _UPRIGHT.get(_read_orientation(image))
@@ -119,7 +122,7 @@ def _decode(name: AnyPath, image: Image.Image) -> np.ndarray:
     tiles = (getattr(image, "tile", None) or []) if is_of_file else []
     raw_modes = [tile.args if isinstance(tile.args, str) else tile.args[0] for tile in tiles]
 
-    # Colours of 16 bits: Pillow reads the upper bytes, and the lower ones where they are exchanged.
+    # Colours of 16 bits: Pillow reads the upper bytes, and of exchanged bytes the lower ones.
     if raw_modes and all(re.fullmatch("RGBA?;16[BLN]", str(mode)) for mode in raw_modes):
         lower = _open_with_bytes_exchanged(opened, raw_modes)
         upper_bytes, lower_bytes = (
@@ -174,7 +177,7 @@ def _turn_upright(
     """Turn a picture of Pillow's by ``rotation``; return its pixels as RGB, or grey of 16 bits."""
     picture = image if rotation is None else image.transpose(rotation)
     # Pillow scales 16-bit PGM to 65535.
-    if picture.mode in _GREY_16 or (picture.mode == "I" and image.format == "PPM"):
+    if picture.mode in _GREY_16_MODES or (picture.mode == "I" and image.format == "PPM"):
         values = np.asarray(picture).astype(np.uint16)
         tiff: Any = image
         # Where white is 0, grey is inverted; of 8 bits Pillow does this itself.
@@ -188,21 +191,26 @@ def _turn_upright(
 
 
 def _decode_jpeg(name: AnyPath, data: bytes, colours: str) -> Image.Image:
-    """Decode a JPEG by the same library as Pillow, and refuse what its decoder warns of.
+    """Decode a JPEG with libjpeg, as Pillow does, and refuse damaged pixels.
 
-    Of damaged pixels libjpeg only warns, and goes on with shifted, wrong or grey ones; Pillow does
-    not pass its warnings on.
+    libjpeg only warns of these, and goes on with shifted, wrong or grey ones; Pillow does not pass
+    its warnings on.
+
+    Args:
+        name: the file, for errors.
+        data: its bytes.
+        colours: simplejpeg's name of the colour space.
     """
     try:
         pixels = simplejpeg.decode_jpeg(data, colours, strict=True).squeeze()
     except ValueError as error:
-        raise _damaged_jpeg(name, str(error)) from error
+        raise _make_jpeg_error(name, str(error)) from error
     if _has_hole(data):
-        raise _damaged_jpeg(name, "zeros in place of compressed pixels")
+        raise _make_jpeg_error(name, "zeros in place of compressed pixels")
     return Image.fromarray(pixels)
 
 
-def _damaged_jpeg(name: AnyPath, reason: str) -> InputError:
+def _make_jpeg_error(name: AnyPath, reason: str) -> InputError:
     """Make the error of a JPEG whose pixels are damaged."""
     return InputError(
         f"{name}: a damaged JPEG ({reason}), whose pixels are wrong from there on; copy it anew, "
@@ -254,22 +262,22 @@ def _make_rgb_tensor(pixels: np.ndarray, name: AnyPath) -> Float32[Tensor, "3 h 
     # Channels are separated while a pixel is an integer, so that the floats exist only once.
     planes = np.ascontiguousarray(pixels[None] if pixels.ndim == 2 else pixels.transpose(2, 0, 1))
     if planes.dtype.itemsize == 2:
-        rgb = torch.from_numpy(from_16_bit(planes, name))
+        rgb = torch.from_numpy(scale_16_bit(planes, name))
     else:
         rgb = torch.from_numpy(planes.astype(np.float32)).div_(255)
     return rgb.expand(3, -1, -1).contiguous()
 
 
-def from_16_bit(values: np.ndarray, name: AnyPath) -> np.ndarray:
-    """Scale 16-bit numbers to floats in [0, 1]: by 65535, or by the part of the range in use.
+def scale_16_bit(values: np.ndarray, name: AnyPath) -> np.ndarray:
+    """Scale 16-bit values to floats in [0, 1]: by 65535, or by the part of the range in use.
 
-    Cameras of 10, 12 or 14 bits, and thermal ones, use a part of it: white is then the value that
-    only 0.1 % exceed, and black 0, or the like value at the dark end where all lie far above 0.
+    Cameras of 10, 12 or 14 bits, and thermal ones, use a part of it. White is then the value that
+    only 0.1 % exceed, and black 0, or the value that only 0.1 % fall below if all lie far above 0.
 
     Warns:
         Notice: black or white is another value than 0 and 65535; once for a folder.
     """
-    low, high = value_range(values)
+    low, high = find_value_range(values)
     if not _LEAST_SPAN <= high - low < _FULL_SPAN:
         return values.astype(np.float32) / 65535
     black = low if low > high - low else 0
@@ -283,7 +291,12 @@ def from_16_bit(values: np.ndarray, name: AnyPath) -> np.ndarray:
 
 
 def check_image(image: object, name: str, slack: float = 0.5) -> Float[Tensor, "3 h w"]:
-    """Return ``image`` if it is an RGB image; its values may leave [0, 1] by ``slack``.
+    """Check that a tensor is an RGB image, and return it.
+
+    Args:
+        image: the tensor.
+        name: what errors call it.
+        slack: by how much its values may lie beyond [0, 1].
 
     Raises:
         InputError: it is not a float tensor (3, h, w), is empty, not finite, or out of range.
@@ -314,19 +327,19 @@ def check_image(image: object, name: str, slack: float = 0.5) -> Float[Tensor, "
     return image
 
 
-def value_range(values: np.ndarray) -> tuple[int, int]:
-    """Find the darkest and the brightest value but for the extreme 0.1 %, which may be defects."""
+def find_value_range(values: np.ndarray) -> tuple[int, int]:
+    """Find the 0.1st and the 99.9th percentile of values: values beyond may be defects."""
     low, high = np.quantile(values, (0.001, 0.999), method="nearest")
     return int(low), int(high)
 
 
-_LEAST_SPAN = 64  # values between the darkest and the brightest; a mask has fewer
-_FULL_SPAN = 2**14  # values that span more are taken for 16 bits
-_NOTICED: set[tuple[Path, str]] = set()  # folders, and topics of which a notice was given there
+_LEAST_SPAN = 64  # difference of the brightest and the darkest value; a mask's is smaller
+_FULL_SPAN = 2**14  # a larger difference is taken for the full range of 16 bits
+_NOTICED: set[tuple[Path, str]] = set()  # folders, and topics of notices about their files
 
 
 def _is_first_notice(name: AnyPath, topic: str) -> bool:
-    """Whether no notice on a topic was given of the folder of a file; remembers that one is now."""
+    """Whether this is the first notice on a topic about the files of a folder; it is remembered."""
     key = Path(name).parent, topic
     is_first = key not in _NOTICED
     _NOTICED.add(key)
@@ -368,7 +381,7 @@ def encode_image(image: Tensor, name: AnyPath, quality: int = 95) -> bytes:
     """
     suffix = Path(name).suffix.lower()
     if suffix not in WRITTEN_SUFFIXES:
-        raise refused_suffix(name, "picture", WRITTEN_SUFFIXES)
+        raise make_suffix_error(name, "picture", WRITTEN_SUFFIXES)
     check_image(image, f"{name}: the image", slack=0.25)
     pixels = image.detach().cpu().float().clamp(0, 1).mul(255).round().byte().permute(1, 2, 0)
     format_name = "PNG"
@@ -383,7 +396,7 @@ def encode_image(image: Tensor, name: AnyPath, quality: int = 95) -> bytes:
 
 
 def list_images(path: AnyPath) -> list[Path]:
-    """List pictures: a file itself, those of a folder by their suffixes, or those of a pattern.
+    """List pictures: a single file, those of a folder by their suffixes, or those of a pattern.
 
     Args:
         path: a file, a folder or a pattern with ``*``, ``?``, ``[...]`` or ``**``.
@@ -403,7 +416,7 @@ def list_images(path: AnyPath) -> list[Path]:
         raise InputError(f"{str(path)!r}: cannot be listed: {error}") from error
     visible = [file for file in files if file.name[0] != "."]
     pictures = [file for file in visible if file.suffix.lower() in LISTED_SUFFIXES]
-    pictures.sort(key=natural_order)
+    pictures.sort(key=natural_sort_key)
     unread = [file.name for file in visible if _UNREAD.fullmatch(file.suffix)]
     if unread and pictures:
         message = f"{path}: {len(unread)} files are left out, {min(unread)} first: save them as PNG"
@@ -445,10 +458,10 @@ def refuse_among_inputs(out: Path, words: Iterable[str | Path], files: Iterable[
 
 
 def read_views(path: AnyPath) -> list[Float32[Tensor, "3 _ _"]]:
-    """Read the two views of an MPO, or the picture of another file, as :func:`read_image` does.
+    """Read all views of a picture file, RGB in [0, 1]: two of an MPO of a stereo camera, else one.
 
     Raises:
-        InputError: as there, but not for files of a stereo camera.
+        InputError: the file is missing, damaged, too large or not a picture.
     """
     with open_image(path, with_views=True) as image:
         pixels = [_decode(path, image)]
@@ -520,48 +533,50 @@ def _read_orientation(image: Image.Image) -> int:
 
 
 def _has_hidden_exif(image: Image.Image) -> bool:
-    """Whether EXIF could only stand behind the pixels of a PNG, which Pillow would decode first."""
+    """Whether EXIF can only follow the pixels of a PNG, which Pillow would have to decode first."""
     return image.format == "PNG" and "exif" not in image.info
 
 
+# Tags of EXIF.
 _EXIF_IFD = 0x8769
-_FOCAL_MM = 0x920A
-_FOCAL_35MM = 0xA405
-_RESOLUTION = 0xA20E
-_RESOLUTION_UNIT = 0xA210
-_PIXELS = 0xA002
-_PIXELS_DOWN = 0xA003
-_SAME_ASPECT = 1.02  # scaled pictures are rounded to whole pixels, and cameras cut some rows
-_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # millimetres of TIFF's units: inch, cm, mm, micrometre
-_DIAGONAL_MM = math.hypot(36, 24)
+_FOCAL_MM = 0x920A  # FocalLength
+_FOCAL_35MM = 0xA405  # FocalLengthIn35mmFilm
+_RESOLUTION = 0xA20E  # FocalPlaneXResolution
+_RESOLUTION_UNIT = 0xA210  # FocalPlaneResolutionUnit
+_TAKEN_WIDTH = 0xA002  # PixelXDimension
+_TAKEN_HEIGHT = 0xA003  # PixelYDimension
+_SAME_ASPECT = 1.02  # ratio of aspects of one picture: scaling rounds sizes, cameras cut some rows
+_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # TIFF's units: inch, cm, mm, micrometre
+_FILM_DIAGONAL_MM = math.hypot(36, 24)
 
 
 def read_exif_focal(picture: AnyPath | Image.Image) -> tuple[float, str] | None:
-    """Read the focal length of a photograph [px] from EXIF, and a text that names the tags.
+    """Read the focal length of a photograph [px] from EXIF.
 
-    ``FocalLengthIn35mmFilm`` is scaled by the diagonal, as CIPA DC-008 defines it; else
+    ``FocalLengthIn35mmFilm`` is scaled by the diagonal, as CIPA DC-008 defines it. Without it,
     ``FocalLength`` is divided by the width of a pixel on the sensor (``FocalPlaneXResolution``),
-    times the ratio of this width and the one that was taken (``PixelXDimension``).
+    and scaled by the ratio of this width to the one that was taken (``PixelXDimension``).
 
     Returns:
-        None where the picture has no such tags, or zeros, which mean unknown; and, with a notice,
-        where they are of a picture of another aspect, from which this one was cropped.
+        The focal length [px], and a text that names its tags. None where the picture has no such
+        tags, or zeros, which mean unknown; and, with a notice, where they are of a picture of
+        another aspect, from which this one was cropped.
 
     Raises:
         InputError: the file is no picture.
     """
     if isinstance(picture, Image.Image):
-        focal, doubt = _exif_focal(picture)
+        focal, doubt = _read_exif_tags(picture)
     else:
         with open_image(picture) as opened:
-            focal, doubt = _exif_focal(opened)
+            focal, doubt = _read_exif_tags(opened)
     if doubt:
         warnings.warn(doubt, Notice, stacklevel=2)
     return focal
 
 
-def _exif_focal(picture: Image.Image) -> tuple[tuple[float, str] | None, str]:
-    """Read the focal length [px] and its tags; or None, with a doubt where tags do not fit."""
+def _read_exif_tags(picture: Image.Image) -> tuple[tuple[float, str] | None, str]:
+    """Read what :func:`read_exif_focal` returns, and its notice: "" where there is none."""
     if _has_hidden_exif(picture):
         return None, ""
     tags = picture.getexif().get_ifd(_EXIF_IFD)
@@ -569,8 +584,8 @@ def _exif_focal(picture: Image.Image) -> tuple[tuple[float, str] | None, str]:
     focal_mm = _read_positive_number(tags.get(_FOCAL_MM))
 
     # A crop has another aspect than the picture that was taken.
-    taken_width = _read_positive_number(tags.get(_PIXELS))
-    taken_height = _read_positive_number(tags.get(_PIXELS_DOWN))
+    taken_width = _read_positive_number(tags.get(_TAKEN_WIDTH))
+    taken_height = _read_positive_number(tags.get(_TAKEN_HEIGHT))
     if (film_mm or focal_mm) and taken_width and taken_height:
         taken_aspect = max(taken_width, taken_height) / min(taken_width, taken_height)
         aspect = max(picture.size) / min(picture.size)
@@ -584,10 +599,10 @@ def _exif_focal(picture: Image.Image) -> tuple[tuple[float, str] | None, str]:
 
     # By the diagonal of 35 mm film, or else by the pixels of the sensor in a unit of length.
     if film_mm is not None:
-        focal_px = film_mm / _DIAGONAL_MM * math.hypot(*picture.size)
+        focal_px = film_mm / _FILM_DIAGONAL_MM * math.hypot(*picture.size)
         return (focal_px, f"FocalLengthIn35mmFilm {film_mm:g} mm"), ""
     pixels_per_unit = _read_positive_number(tags.get(_RESOLUTION))
-    unit_mm = _MM.get(tags.get(_RESOLUTION_UNIT, 2))
+    unit_mm = _UNIT_MM.get(tags.get(_RESOLUTION_UNIT, 2))
     if focal_mm is None or pixels_per_unit is None or unit_mm is None:
         return None, ""
     # The longer side, because a picture may be stored turned.
@@ -598,7 +613,7 @@ def _exif_focal(picture: Image.Image) -> tuple[tuple[float, str] | None, str]:
 
 
 def _read_positive_number(value: Any) -> float | None:  # noqa: ANN401  whatever a file holds
-    """Convert a value of a file to a positive finite number; None where it is none."""
+    """Convert a value of EXIF to a positive finite number; None where it is none."""
     try:
         number = float(value)
     except (TypeError, ValueError, ZeroDivisionError):
@@ -610,12 +625,13 @@ MAP_SUFFIXES = (".npy", ".pfm")
 """Suffixes of files that hold a map of floats."""
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff", *MAP_SUFFIXES)
 """Suffixes of depth images of a sensor."""
+# Readers of NPY headers, by version.
 _HEADER_READERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
 }
-_MAX_DIMENSIONS = 8
-_MAX_VALUES = 2**26
+_MAX_DIMENSIONS = 8  # most axes of an array
+_MAX_VALUES = 2**26  # most numbers of an array
 _PFM_HEADER = re.compile(
     rb"P([fF])\s+(\d{1,9})\s+(\d{1,9})\s+([-+]?[0-9.]{1,32}(?:[eE][-+]?\d{1,3})?)(?:\r\n|\s)"
 )
@@ -634,7 +650,7 @@ def read_map(path: AnyPath) -> Float32[Tensor, "h w"]:
     if suffix == ".pfm":
         return torch.from_numpy(_read_pfm(path))
     if suffix != ".npy":
-        raise refused_suffix(path, "map", MAP_SUFFIXES)
+        raise make_suffix_error(path, "map", MAP_SUFFIXES)
     array = read_npy(path)
     if array.ndim != 2 or array.size == 0:
         raise InputError(f"{path}: a map is (H, W), got {array.shape}; save one channel alone")
@@ -644,7 +660,7 @@ def read_map(path: AnyPath) -> Float32[Tensor, "h w"]:
 
 
 def _read_pfm(path: AnyPath) -> np.ndarray:
-    """Read a one-channel PFM file, (h, w) from the upper row down; NaN where it is not finite."""
+    """Read a one-channel PFM file as (h, w), NaN where a value is not finite."""
     data = read_bytes(path)
     header = _PFM_HEADER.match(data)
     if header is None:
@@ -663,6 +679,7 @@ def _read_pfm(path: AnyPath) -> np.ndarray:
         scale = float(header[4])
     if scale == 0 or not math.isfinite(scale):
         raise InputError(f"{path}: PFM scale {scale}; its sign gives the byte order, so not 0")
+    # The first row of the file is the lowest of the map.
     rows_upwards = np.frombuffer(body, "<f4" if scale < 0 else ">f4").reshape(height, width)
     array = to_float32(rows_upwards[::-1])
     array[~np.isfinite(array)] = np.nan
@@ -677,7 +694,7 @@ def write_map(path: AnyPath, map: Float[Tensor, "h w"]) -> None:
     """
     suffix = Path(path).suffix.lower()
     if suffix not in MAP_SUFFIXES:
-        raise refused_suffix(path, "map", MAP_SUFFIXES)
+        raise make_suffix_error(path, "map", MAP_SUFFIXES)
     array = map.detach().cpu().float().contiguous().numpy()
     if array.size == 0 or np.isinf(array).any():
         raise InputError(f"{path}: the map is empty or holds infinity; mark invalid pixels by NaN")
@@ -692,7 +709,11 @@ def write_map(path: AnyPath, map: Float[Tensor, "h w"]) -> None:
 
 
 def read_npy(path: AnyPath) -> np.ndarray:
-    """Read a float array of any shape from ``.npy`` as float32; pickled objects are refused."""
+    """Read a float array of any shape from ``.npy`` as float32; pickled objects are refused.
+
+    Raises:
+        InputError: the file is missing or damaged, or holds other things than floats.
+    """
     array = read_numbers(path)
     if array.dtype.kind != "f":
         raise InputError(
@@ -704,7 +725,11 @@ def read_npy(path: AnyPath) -> np.ndarray:
 
 
 def read_numbers(path: AnyPath) -> np.ndarray:
-    """Read numbers of any shape and type from ``.npy``; pickled objects are refused."""
+    """Read numbers of any shape and type from ``.npy``; pickled objects are refused.
+
+    Raises:
+        InputError: the file is missing, damaged or too large, or holds other things than numbers.
+    """
     stream = BytesIO(read_bytes(path))
     with refused_as(path, "NPY file", "save it again with numpy.save"):
         version = np.lib.format.read_magic(stream)
@@ -736,12 +761,12 @@ def read_numbers(path: AnyPath) -> np.ndarray:
 
 
 def to_float32(array: np.ndarray) -> np.ndarray:
-    """Copy an array to contiguous float32; numbers beyond its range become infinite."""
+    """Copy an array to contiguous float32; numbers beyond the range of float32 become infinite."""
     with np.errstate(over="ignore", invalid="ignore"):
         return np.array(array, dtype=np.float32, order="C")
 
 
-KITTI_UNIT = 1 / 256  # KITTI stores metres and pixels of disparity times 256
+KITTI_UNIT = 1 / 256  # of KITTI's depth [m] and disparity [px]
 _NO_UNIT = "a unit of {} is not positive; KITTI's is 1/256, BOP's 0.001"
 
 
@@ -768,16 +793,16 @@ def read_depth_png(path: AnyPath, unit_m: float = KITTI_UNIT) -> Float32[Tensor,
 
 
 def read_stored_depth(path: AnyPath) -> Shaped[Tensor, "h w"]:
-    """Read depth in the unit of its file: whole numbers of a 16-bit PNG, TIFF or NPY, else floats.
+    """Read depth as its file stores it: whole numbers of a 16-bit PNG, TIFF or NPY, else floats.
 
-    Where there is no reading, whole numbers are 0 and floats NaN.
+    Without a reading, whole numbers are 0 and floats NaN.
 
     Raises:
         InputError: the file is missing, damaged, no map, or a picture of a map.
     """
     suffix = Path(path).suffix.lower()
     if suffix not in DEPTH_SUFFIXES:
-        raise refused_suffix(path, "depth image", DEPTH_SUFFIXES)
+        raise make_suffix_error(path, "depth image", DEPTH_SUFFIXES)
     if suffix == ".npy":
         array = read_numbers(path)
         if array.dtype.kind != "f":

@@ -1,4 +1,4 @@
-"""Columns of point files: PLY (Turk 1994) and PCD (Point Cloud Library, version 0.7).
+"""Reading and writing of PLY (Turk 1994) and PCD (Point Cloud Library, version 0.7) by columns.
 
 Text and binary of both byte orders are read; little-endian binary is written.
 """
@@ -21,35 +21,44 @@ from depthpose.core.files.disk import MAX_TEXT_BYTES, AnyPath, read_bytes, refus
 _MICROSOFT_NAN = re.compile(r"[-+]?(?:nan\(\w*\)|1[.,]#(?:QNAN|SNAN|IND|INF)\w*)")
 """NaN and infinity as Microsoft's C library prints them."""
 _TOO_FEW_ROWS = "declares {} but {} rows follow; it is truncated, save it again"
-Columns = dict[str, np.ndarray]  # one array a name, all equally long
+Columns = dict[str, np.ndarray]
+"""The values of all points by the names of their columns; all are equally long."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Field:
-    """A named column of a record."""
+class RecordField:
+    """A field of the records of a file: a number, several numbers, or a list."""
 
     name: str
-    code: str  # numpy's type code without byte order, such as "f4"
-    count: int = 1  # numbers a record; of several only the first is read
-    size_code: str | None = None  # type of the length of a list; None: it is no list
+    code: str  #: numpy's type code without byte order, such as "f4"
+    count: int = 1  #: numbers of a record; of several only the first is read
+    size_code: str | None = None  #: type code of the length of a list; None: it is no list
 
 
 @dataclass(frozen=True, eq=False)
-class Ragged:
-    """Lists of differing length: the number of values of each, and all values in a row."""
+class RaggedLists:
+    """Lists of differing length."""
 
-    sizes: np.ndarray
-    values: np.ndarray
+    sizes: np.ndarray  #: number of values of each list
+    values: np.ndarray  #: the values of all lists, one after the other
 
 
 def split_records(
-    path: AnyPath, body: memoryview, fields: list[Field], count: int, order: str = "<"
+    path: AnyPath, body: memoryview, fields: list[RecordField], count: int, order: str = "<"
 ) -> Columns:
-    """Split ``count`` packed binary records into columns, as views of ``body``.
+    """Split packed binary records into columns, as views of their bytes.
 
-    ``order`` is numpy's sign of the byte order.
+    Args:
+        path: the file, for errors.
+        body: the bytes of the records, and perhaps more.
+        fields: fields of a record.
+        count: number of records.
+        order: numpy's sign of the byte order.
+
+    Raises:
+        InputError: there are too few bytes.
     """
-    # Named by place, since a file may use one name for several fields of padding.
+    # Named by position, since a file may use one name for several fields of padding.
     with refused_as(path, "list of fields", "save it again"):
         dtype = np.dtype([(f"{i}", order + f.code, (f.count,)) for i, f in enumerate(fields)])
     require_bytes(path, len(body), count * dtype.itemsize, f"{count} points")
@@ -57,26 +66,36 @@ def split_records(
     return {f.name: records[f"{i}"][:, 0] for i, f in enumerate(fields)}
 
 
-def text_rows(path: AnyPath, body: memoryview) -> Iterator[str]:
-    """Yield the lines of points in text, without empty ones; NaN is spelled ``nan``."""
+def read_text_rows(path: AnyPath, body: memoryview) -> Iterator[str]:
+    """Yield the lines of a text of points without empty ones; NaN is spelled ``nan``.
+
+    Raises:
+        InputError: the text is too long.
+    """
     if len(body) > MAX_TEXT_BYTES:
         raise InputError(
             f"{path}: {len(body)} bytes of points in text, more than {MAX_TEXT_BYTES}; save it as "
             "binary"
         )
     lines = TextIOWrapper(BytesIO(body), "latin-1")
-    return (plain_numbers(line) for line in lines if line.strip())
+    return (spell_nan(line) for line in lines if line.strip())
 
 
-def plain_numbers(line: str) -> str:
-    """Replace NaN and infinity as Microsoft's C library prints them by ``nan`` and ``inf``."""
+def spell_nan(line: str) -> str:
+    """Replace NaN and infinity, as Microsoft's C library prints them, by ``nan`` and ``inf``."""
     if "#" not in line and "(" not in line:
         return line
     return _MICROSOFT_NAN.sub(lambda match: "inf" if "INF" in match[0] else "nan", line)
 
 
-def split_rows(path: AnyPath, rows: Iterator[str], fields: list[Field], count: int) -> Columns:
-    """Split the next ``count`` rows of text into columns of the declared types."""
+def split_rows(
+    path: AnyPath, rows: Iterator[str], fields: list[RecordField], count: int
+) -> Columns:
+    """Split the next ``count`` rows of a text into columns of the declared types.
+
+    Raises:
+        InputError: there are fewer rows, or a value is no number of its type.
+    """
     table = parse_rows(path, islice(rows, count))
     if len(table) < count:
         raise InputError(f"{path}: {_TOO_FEW_ROWS.format(f'{count} points', len(table))}")
@@ -96,7 +115,7 @@ def split_rows(path: AnyPath, rows: Iterator[str], fields: list[Field], count: i
                 raise InputError(
                     f"{path}: {f.name!r} holds a value outside {dtype.name}; correct it"
                 )
-            # As floats, 64-bit limits round up to what does not fit: those columns stay floats.
+            # Limits of 64 bits are no floats: rounded they do not fit, so such columns stay floats.
             dtype = column.dtype if dtype.itemsize == 8 else dtype
         with np.errstate(over="ignore"):
             columns[f.name] = column.astype(dtype)
@@ -114,9 +133,16 @@ def parse_rows(path: AnyPath, rows: Iterable[str]) -> np.ndarray:
 
 
 def require_bytes(path: AnyPath, have: int, need: int, what: str) -> None:
-    """Refuse a body that is shorter than its header declares, before memory is allocated for it.
+    """Refuse a file that is shorter than its header declares, before memory is allocated for it.
 
-    ``what`` is what the header declares, such as ``100 points``.
+    Args:
+        path: the file, for the error.
+        have: bytes that there are.
+        need: bytes that are declared.
+        what: what the header declares, such as ``100 points``.
+
+    Raises:
+        InputError: there are fewer bytes than declared.
     """
     if have < need:
         raise InputError(
@@ -135,22 +161,24 @@ _MAX_HEADER = 2**16  # bytes in which the end of a header is looked for
 _END = re.compile(rb"(?:^|[\r\n])end_header[ \t]*(?:\r\n|\n|\r)")
 
 
-_MAX_RUNS = 500_000  # most runs of binary lists of one length, read at once; more take over 10 s
-_LEAST_ROWS_AHEAD = 64  # rows of binary lists that are taken to be as long as the first of a run
-_SURPLUS_BYTES = 3  # behind binary data do no harm: a line end
+_MAX_RUNS = 500_000  # most runs of binary rows with lists of one length; more take over 10 s
+_LEAST_ROWS_AHEAD = 64  # rows that are tried at least as a run
+_SURPLUS_BYTES = 3  # bytes that may follow binary data: a line end
 
 
 @dataclass(kw_only=True)
-class _Element:
+class _PlyElement:
     """An element of a PLY header, such as ``vertex`` or ``face``."""
 
     name: str
-    count: int
-    fields: list[Field] = field(default_factory=list)
+    count: int  # number of its records
+    fields: list[RecordField] = field(default_factory=list)
 
 
-def read_ply_elements(path: AnyPath, last: str | None = None) -> tuple[Columns, dict[str, Ragged]]:
-    """Read the columns of the ``vertex`` element, and the lists of the others.
+def read_ply_elements(
+    path: AnyPath, last: str | None = None
+) -> tuple[Columns, dict[str, RaggedLists]]:
+    """Read the columns of the ``vertex`` element of a PLY file, and the lists of the others.
 
     Args:
         path: the file.
@@ -169,10 +197,10 @@ def read_ply_elements(path: AnyPath, last: str | None = None) -> tuple[Columns, 
     order, elements = _parse_header(path, data[: end.start()].decode("latin-1").splitlines())
     body = memoryview(data)[end.end() :]
 
-    # Elements one after the other: of records in bytes, or of rows of text.
-    rows = None if order else text_rows(path, body)
+    # Elements follow one another, as binary records or as rows of text.
+    rows = None if order else read_text_rows(path, body)
     columns: Columns = {}
-    lists: dict[str, Ragged] = {}
+    lists: dict[str, RaggedLists] = {}
     for element in elements:
         if element.name == "vertex" and rows is None:
             columns = split_records(path, body, element.fields, element.count, order)
@@ -201,8 +229,13 @@ def read_ply_elements(path: AnyPath, last: str | None = None) -> tuple[Columns, 
     return columns, lists
 
 
-def _read_text_lists(path: AnyPath, rows: Iterator[str], element: _Element) -> dict[str, Ragged]:
-    """Read the lists of an element from its rows of text: the length of a list, then its values."""
+def _read_text_lists(
+    path: AnyPath, rows: Iterator[str], element: _PlyElement
+) -> dict[str, RaggedLists]:
+    """Read the lists of an element from rows of text: in a row the length of each, then its values.
+
+    The keys of the result are ``ELEMENT PROPERTY``.
+    """
     sizes = {f.name: array("q") for f in element.fields if f.size_code}
     values = {name: array("d") for name in sizes}
     row_count = 0
@@ -230,18 +263,23 @@ def _read_text_lists(path: AnyPath, rows: Iterator[str], element: _Element) -> d
         declared = f"{element.count} {element.name}"
         raise InputError(f"{path}: {_TOO_FEW_ROWS.format(declared, row_count)}")
     return {
-        f"{element.name} {name}": Ragged(np.array(sizes[name], np.int64), np.array(values[name]))
+        f"{element.name} {name}": RaggedLists(
+            np.array(sizes[name], np.int64), np.array(values[name])
+        )
         for name in sizes
     }
 
 
 def _read_binary_lists(
-    path: AnyPath, body: memoryview, element: _Element, order: str
-) -> tuple[dict[str, Ragged], int]:
-    """Read the lists of an element from binary rows, and count the bytes that they take.
+    path: AnyPath, body: memoryview, element: _PlyElement, order: str
+) -> tuple[dict[str, RaggedLists], int]:
+    """Read the lists of an element from binary rows.
 
-    A run of rows whose lists have equal lengths is read at once: the lengths of its first row give
-    the type of its records.
+    A run of rows whose lists have equal lengths is read at once, as records whose type follows from
+    the lengths of the first row.
+
+    Returns:
+        The lists by ``ELEMENT PROPERTY``, and the number of bytes of all rows.
     """
     declared = f"{element.count} {element.name}"
     runs: list[Any] = []  # structured arrays, one row each record
@@ -269,12 +307,12 @@ def _read_binary_lists(
         rows_left -= len(records)
         rows_ahead = 2 * len(records) + _LEAST_ROWS_AHEAD
 
-    lists: dict[str, Ragged] = {}
+    lists: dict[str, RaggedLists] = {}
     for f in element.fields:
         if f.size_code:
             sizes = [run[f"{f.name} size"] for run in runs]
             values = [run[f.name].reshape(-1) for run in runs]
-            lists[f"{element.name} {f.name}"] = Ragged(
+            lists[f"{element.name} {f.name}"] = RaggedLists(
                 sizes=np.concatenate([np.empty(0, int), *sizes]),
                 values=np.concatenate([np.empty(0, f.code), *values]),
             )
@@ -282,9 +320,9 @@ def _read_binary_lists(
 
 
 def _read_list_lengths(
-    path: AnyPath, body: memoryview, position: int, element: _Element, order: str
+    path: AnyPath, body: memoryview, position: int, element: _PlyElement, order: str
 ) -> tuple[int, ...]:
-    """Read the number of values of each field of the binary row at ``position``; 1 of no list."""
+    """Read the length of each list of the binary row at ``position``; 1 of a field without one."""
     declared = f"{element.count} {element.name}"
     lengths: list[int] = []
     end = position
@@ -303,8 +341,8 @@ def _read_list_lengths(
     return tuple(lengths)
 
 
-def _make_record_type(fields: list[Field], lengths: tuple[int, ...], order: str) -> np.dtype:
-    """Make numpy's type of a binary row whose fields have these numbers of values."""
+def _make_record_type(fields: list[RecordField], lengths: tuple[int, ...], order: str) -> np.dtype:
+    """Make numpy's type of a binary row from the number of values of each field."""
     parts: list[Any] = []
     for f, length in zip(fields, lengths, strict=True):
         if f.size_code:
@@ -327,10 +365,10 @@ def encode_ply(points: np.ndarray, color: np.ndarray | None) -> bytes:
     return f"{header}end_header\n".encode() + records.tobytes()
 
 
-def _parse_header(path: AnyPath, lines: list[str]) -> tuple[str, list[_Element]]:
+def _parse_header(path: AnyPath, lines: list[str]) -> tuple[str, list[_PlyElement]]:
     """Parse the header of a PLY file: byte order ("" for text) and elements with their fields."""
     order: str | None = None
-    elements: list[_Element] = []
+    elements: list[_PlyElement] = []
     for line in lines[1:]:
         match line.split():
             case [] | ["comment" | "obj_info", *_]:
@@ -338,15 +376,15 @@ def _parse_header(path: AnyPath, lines: list[str]) -> tuple[str, list[_Element]]
             case ["format", form, "1.0"] if form in _ORDERS:
                 order = _ORDERS[form]
             case ["element", name, count] if re.fullmatch(r"[0-9]{1,18}", count):
-                elements.append(_Element(name=name, count=int(count)))
+                elements.append(_PlyElement(name=name, count=int(count)))
             case ["property", "list", size, kind, name] if (
                 {size, kind} <= _CODES.keys() and _CODES[size][0] != "f" and elements
             ):
                 elements[-1].fields.append(
-                    Field(name=name, code=_CODES[kind], size_code=_CODES[size])
+                    RecordField(name=name, code=_CODES[kind], size_code=_CODES[size])
                 )
             case ["property", kind, name] if kind in _CODES and elements:
-                elements[-1].fields.append(Field(name=name, code=_CODES[kind]))
+                elements[-1].fields.append(RecordField(name=name, code=_CODES[kind]))
             case _:
                 raise InputError(
                     f"{path}: PLY header line {line[:60]!r} is not understood; correct it"
@@ -357,7 +395,7 @@ def _parse_header(path: AnyPath, lines: list[str]) -> tuple[str, list[_Element]]
     return order, elements
 
 
-def _refuse_unusable_elements(path: AnyPath, elements: Sequence[_Element]) -> None:
+def _refuse_unusable_elements(path: AnyPath, elements: Sequence[_PlyElement]) -> None:
     """Refuse a header without one element of vertices, or with unusable properties."""
     names = [e.name for e in elements]
     if names.count("vertex") != 1:
@@ -377,13 +415,13 @@ _PCD_CODES = {
     **{("I", size): f"i{size}" for size in "1248"},
     **{("U", size): f"u{size}" for size in "1248"},
 }
-_MAX_PACKED = 2**25  # bytes of compressed points, which are decompressed byte by byte
-_MAX_UNPACKED = 2**27  # bytes of them decompressed: eight million points
+_MAX_PACKED = 2**25  # most bytes of compressed points, since decompressing them is slow
+_MAX_UNPACKED = 2**27  # most bytes of them once decompressed: eight million points
 _DATA = re.compile(rb"(?:^|\n)DATA[ \t]+(ascii|binary|binary_compressed)[ \t]*(?:\r\n|\n)")
 
 
 def read_pcd(path: AnyPath) -> Columns:
-    """Read the columns of a PCD file; ``rgb`` stays packed.
+    """Read the columns of a PCD file; a packed colour, ``rgb``, stays packed.
 
     Raises:
         InputError: the file is missing, damaged, or not what its header declares.
@@ -413,11 +451,11 @@ def read_pcd(path: AnyPath) -> Columns:
         return split_records(path, body, fields, count)
     if end[1] == b"binary_compressed":
         return _split_compressed(path, body, fields, count)
-    return split_rows(path, text_rows(path, body), fields, count)
+    return split_rows(path, read_text_rows(path, body), fields, count)
 
 
-def _read_pcd_fields(path: AnyPath, header: Mapping[str, list[str]]) -> list[Field]:
-    """Read the fields of a PCD header, whose words are listed by the first word of their line."""
+def _read_pcd_fields(path: AnyPath, header: Mapping[str, list[str]]) -> list[RecordField]:
+    """Read the fields of a PCD header: the words of its lines, by the first word of each."""
     names = header.get("FIELDS", [])
     counts = header.get("COUNT", ["1"] * len(names))
     rows = list(zip(names, header.get("TYPE", []), header.get("SIZE", []), counts, strict=False))
@@ -431,11 +469,11 @@ def _read_pcd_fields(path: AnyPath, header: Mapping[str, list[str]]) -> list[Fie
         )
     if len(set(real)) != len(real):
         raise InputError(f"{path}: PCD fields {names} repeat a name; keep one of them")
-    return [Field(name=n, code=_PCD_CODES[k, s], count=int(c)) for n, k, s, c in rows]
+    return [RecordField(name=n, code=_PCD_CODES[k, s], count=int(c)) for n, k, s, c in rows]
 
 
 def _warn_of_viewpoint(path: AnyPath, viewpoint: str) -> None:
-    """Warn that the pose of the sensor in a PCD header, if it is any, is not applied."""
+    """Warn that the sensor's pose in a PCD header is not applied, unless it is the identity."""
     if viewpoint and not _is_identity(viewpoint):
         warnings.warn(
             f"{path}: its VIEWPOINT {viewpoint[:100]} (x y z, qw qx qy qz of the sensor) is not "
@@ -446,7 +484,9 @@ def _warn_of_viewpoint(path: AnyPath, viewpoint: str) -> None:
         )
 
 
-def _split_compressed(path: AnyPath, body: memoryview, fields: list[Field], count: int) -> Columns:
+def _split_compressed(
+    path: AnyPath, body: memoryview, fields: list[RecordField], count: int
+) -> Columns:
     """Split the body of a ``binary_compressed`` PCD file into columns.
 
     It is the compressed and the uncompressed size (4 bytes each), then the columns of all points,
@@ -476,7 +516,7 @@ def _split_compressed(path: AnyPath, body: memoryview, fields: list[Field], coun
 def _is_identity(viewpoint: str) -> bool:
     """Whether a viewpoint, ``x y z qw qx qy qz``, is the identity.
 
-    Its quaternion may be 0, as programs write it that know no viewpoint.
+    A quaternion of 0 counts as the identity: programs without a viewpoint write it.
     """
     try:
         *translation, qw, qx, qy, qz = (float(word) for word in viewpoint.split())

@@ -1,4 +1,4 @@
-"""Videos, frame by frame; OpenCV (the extra ``opencv``) decodes and encodes."""
+"""Reading and writing of videos, frame by frame, by OpenCV (the extra ``opencv``)."""
 
 import math
 import warnings
@@ -13,11 +13,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from depthpose.core.errors import InputError, Notice, import_opencv
-from depthpose.core.files.disk import AnyPath, atomic_write, refused_suffix
+from depthpose.core.files.disk import AnyPath, atomic_write, make_suffix_error
 from depthpose.core.files.images import MAX_PIXELS
 
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v")
-"""Files that are taken for a video."""
+"""Suffixes of files that are taken for a video."""
 
 _NO_VIDEO = "not a video that OpenCV can decode; convert it to MP4 (H.264)"
 _CODECS = {".mp4": "vp09", ".avi": "MJPG"}  # VP9: OpenCV's own wheels have no H.264
@@ -29,8 +29,8 @@ class Video:
 
     path: Path  #: the file
     fps: float  #: frames a second
-    frames: int  #: the number in the file's header; 0 where it has none
-    size: tuple[int, int]  #: width and height of a frame with square pixels
+    frames: int  #: number of frames, as the file's header says; 0 where it does not
+    size: tuple[int, int]  #: width and height of a frame, once its pixels are square [px]
 
     def __iter__(self) -> Iterator[tuple[str, Float[Tensor, "3 h w"]]]:
         """Yield the name (``STEM_000000``, ``STEM_000001``, ...) and RGB in [0, 1] of each frame.
@@ -63,16 +63,19 @@ class Video:
 def read_video(path: AnyPath) -> Video:
     """Open a video, decoding only its first frame.
 
-    Where the file says that pixels are not square, frames are stretched until they are, with a
-    notice: widened where pixels are wider than high, else heightened.
+    If the file says that pixels are not square, frames are stretched until they are, in width or in
+    height.
 
     Raises:
         InputError: no such file, no video, or not one frame can be decoded.
         MissingExtraError: OpenCV is not installed.
+
+    Warns:
+        Notice: frames are stretched.
     """
     path = Path(path)
     if path.suffix.lower() not in VIDEO_SUFFIXES:
-        raise refused_suffix(path, "video", VIDEO_SUFFIXES)
+        raise make_suffix_error(path, "video", VIDEO_SUFFIXES)
     cv2 = import_opencv("reading a video")
     if not path.is_file():  # OpenCV would take a pattern, an address or a camera's number too
         raise InputError(f"{path}: no such file; check the path")
@@ -107,7 +110,7 @@ def read_video(path: AnyPath) -> Video:
 
 
 def write_video(path: AnyPath, images: Iterable[Float[Tensor, "3 _ _"]], fps: float) -> int:
-    """Write RGB images in [0, 1] as a video, whole or not at all.
+    """Write RGB images in [0, 1] as a video, whole or not at all, and count its frames.
 
     Args:
         path: ``.mp4`` (VP9, which browsers play) or ``.avi`` (motion JPEG). An OpenCV without
@@ -124,7 +127,7 @@ def write_video(path: AnyPath, images: Iterable[Float[Tensor, "3 _ _"]], fps: fl
     """
     suffix = Path(path).suffix.lower()
     if suffix not in _CODECS:
-        raise refused_suffix(path, "writable video", tuple(_CODECS))
+        raise make_suffix_error(path, "writable video", tuple(_CODECS))
     if not 0 < fps < math.inf:
         raise InputError(f"{path}: fps is {fps:g}, but a video has a positive rate; give, say, 10")
     cv2 = import_opencv("writing a video")
@@ -168,7 +171,15 @@ def _open_writer(
     fps: float,
     size: tuple[int, int],
 ) -> Any:  # noqa: ANN401
-    """Open OpenCV's encoder of ``part``, which becomes ``path``; MPEG-4 where it has no VP9."""
+    """Open OpenCV's encoder to a file; without VP9 it is MPEG-4, with a notice.
+
+    Args:
+        cv2: OpenCV.
+        path: what the notice calls the file.
+        part: the file that is written.
+        fps: frames a second.
+        size: width and height of the frames [px].
+    """
     codec = cv2.VideoWriter_fourcc(*_CODECS[part.suffix.lower()])
     writer = cv2.VideoWriter(str(part), codec, float(fps), size)
     if part.suffix.lower() == ".mp4" and not writer.isOpened():

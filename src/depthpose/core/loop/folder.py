@@ -1,4 +1,4 @@
-"""The folder of a training: metrics, pictures, TensorBoard, saved states, and the card."""
+"""The files of a training in its folder: metrics, pictures, TensorBoard, states, and the card."""
 
 import json
 import os
@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass
 from io import BytesIO, StringIO
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any, NamedTuple, TypeGuard
 from zipfile import ZipFile
 
 import torch
@@ -20,32 +20,32 @@ from depthpose.core.errors import InputError, Notice, import_extra
 from depthpose.core.files import atomic_write, read_text, remove_parts, write_image
 from depthpose.core.files.disk import refuse_heavy, refused_as, refused_write
 from depthpose.core.loop.task import ValidationResult
-from depthpose.core.run import environment
+from depthpose.core.run import describe_environment
 
 STATE = "state.pt"  # the last saved state of a training
-BEFORE = "state.before.pt"  # the one before, for the case that the last is damaged
+STATE_BEFORE = "state.before.pt"  # the one before, in case the last is damaged
 _STATE_KEYS = ("step", "modules", "optimizers", "scaler", "average")
 _METRICS = "metrics.jsonl"
 _PICTURES = "pictures"
-RUN_FILES = ("config.yaml", _METRICS, _PICTURES, "tensorboard", STATE, BEFORE)
+RUN_FILES = ("config.yaml", _METRICS, _PICTURES, "tensorboard", STATE, STATE_BEFORE)
 """What a training leaves in its folder beside weights."""
 _HELD_OUT = "held_out/"  # begins the names of metrics of the validation
 _METRICS_SIGN_BYTES = {b"{": 250, b",": 60}
-"""Memory that a sign of the metrics file stands for once it is read [bytes]."""
+"""Memory of the Python object that begins with such a sign of the metrics file [bytes]."""
 
 
 @dataclass(eq=False)
 class RunLogger:
-    """Writes metrics, pictures and states of a training, in its main process alone."""
+    """Writes metrics, pictures and states of a training; only that of the main process does."""
 
-    folder: Path
+    folder: Path  #: of the training
     _: KW_ONLY
-    is_writer: bool  #: whether this is the main process; in others nothing is written
-    has_good_last: bool = True  #: else the next save keeps the state before the last
+    is_writer: bool  #: whether this is the main process; others write nothing
+    is_last_intact: bool = True  #: whether the last state is undamaged, and worth keeping
     board: Any = None  #: TensorBoard's writer, once opened
 
     def open(self, step: int) -> None:
-        """Begin at ``step``: later metrics and partial files of a killed run are removed."""
+        """Open the log at ``step``, and remove later metrics and partial files of a killed run."""
         if not self.is_writer:
             return
         for folder in (self.folder, self.folder / _PICTURES):
@@ -70,7 +70,7 @@ class RunLogger:
                 self.board.add_scalar(name, value, step)
 
     def show(self, step: int, result: ValidationResult) -> None:
-        """Write the metrics and the images of a validation."""
+        """Log the metrics and write the images of a validation."""
         if not self.is_writer:
             return
         if result.numbers:
@@ -81,36 +81,41 @@ class RunLogger:
                 self.board.add_image(name, picture, step)
 
     def save(self, state: Mapping[str, Any]) -> None:
-        """Write the last state, all or nothing; the previous one is kept beside it."""
+        """Write the last state, whole or not at all, and keep the previous one beside it.
+
+        If that is damaged, the one before it is kept.
+        """
         if not self.is_writer:
             return
         encoded = BytesIO()  # in memory, as errors of torch.save do not name a full disk
         torch.save(dict(state), encoded)
         last = self.folder / STATE
-        before = self.folder / BEFORE
+        before = self.folder / STATE_BEFORE
         with atomic_write(last) as part:
             part.write_bytes(encoded.getbuffer())
-            if self.has_good_last and last.is_file():
+            if self.is_last_intact and last.is_file():
                 before.unlink(missing_ok=True)
                 try:
                     os.link(last, before)  # not a move, so that there is always a last state
                 except OSError:  # a disk without links
                     with suppress(OSError):
                         last.replace(before)
-        self.has_good_last = True
+        self.is_last_intact = True
 
     def close(self) -> None:
-        """Close TensorBoard's writer, which writes what it still holds in memory."""
+        """Close TensorBoard's writer, which then writes what it still holds in memory."""
         if self.board is not None:
             with refused_write(self.folder):
                 self.board.close()
 
 
 def read_metrics(folder: Path) -> list[dict[str, Any]]:
-    """Read the metrics of a run; a last line that a kill cut short is left out.
+    """Read the metrics of a training: for each logged step the numbers by name, ``step`` included.
+
+    A last line that a kill cut short is left out.
 
     Raises:
-        InputError: another line is damaged: no step and numbers by name.
+        InputError: another line is damaged.
     """
     path = folder / _METRICS
     if not path.is_file():
@@ -143,8 +148,8 @@ def _is_metrics_row(row: object) -> TypeGuard[dict[str, Any]]:
     return True
 
 
-def card_text(name: str, facts: Mapping[str, str], measured: str = "") -> str:
-    """Write the model card of weights in Markdown: name, a line for each fact, and ``measured``."""
+def format_card(name: str, facts: Mapping[str, str], measured: str = "") -> str:
+    """Format a card of weights as Markdown: the name, a line for each fact, then ``measured``."""
     lines = [f"# {name}", ""]
     lines += [f"- **{key.replace('_', ' ').capitalize()}**: {fact}" for key, fact in facts.items()]
     if measured:
@@ -159,16 +164,16 @@ def write_card(
 
     Args:
         weights: the file of the weights, in the folder of the training.
-        words: those of the command, such as ``depth train view``.
+        words: words of the command, such as ``depth train view``.
         seconds: duration of the training.
-        facts: what the card says, besides the command and the time.
-        measured: Markdown of what was measured, such as :func:`held_out_text`.
+        facts: facts for the card, besides the command and the time.
+        measured: Markdown of what was measured, such as :func:`format_held_out`.
     """
     folder = weights.parent
-    versions = environment()
+    versions = describe_environment()
     machine = ", ".join(versions[name] for name in ("machine", "gpu") if name in versions)
     step = 0  # step of the last state that is not damaged
-    for path in reversed(saved_states(folder)):
+    for path in reversed(list_saved_states(folder)):
         with suppress(InputError):
             step = _read_state(path)["step"]
     duration = _describe_duration(seconds)
@@ -177,11 +182,11 @@ def write_card(
         "time": f"{step} steps in {duration} on {machine}; {versions['date']}",
     }
     with atomic_write(weights.with_suffix(".md")) as part:
-        part.write_text(card_text(weights.stem, {**facts, **record}, measured))
+        part.write_text(format_card(weights.stem, {**facts, **record}, measured))
 
 
 def _describe_duration(seconds: float) -> str:
-    """Word a duration in seconds, minutes or hours."""
+    """Format a duration in seconds, minutes or hours."""
     if seconds < 120:
         return f"{seconds:.0f} s"
     if seconds < 7200:
@@ -189,10 +194,12 @@ def _describe_duration(seconds: float) -> str:
     return f"{seconds / 3600:.1f} h"
 
 
-def held_out_text(folder: Path, sentence: str) -> str:
-    """Make a Markdown table of a training's last validation, below a sentence.
+def format_held_out(folder: Path, sentence: str) -> str:
+    """Format the metrics of a training's last validation as a Markdown table.
 
-    ``sentence`` says on what it was measured, and what the numbers mean.
+    Args:
+        folder: folder of the training.
+        sentence: stands above the table: what was validated on, and what the numbers mean.
     """
     last_metrics: dict[str, float] = {}
     for row in read_metrics(folder):
@@ -208,15 +215,15 @@ def held_out_text(folder: Path, sentence: str) -> str:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Parts:
-    """The parts of a training that its steps change, by name: what a saved state holds."""
+    """The parts of a training that its steps change, and that a saved state holds."""
 
-    modules: Mapping[str, nn.Module]
-    optimizers: Mapping[str, Any]
-    scaler: torch.amp.GradScaler  # its state is empty except in fp16
-    average: Mapping[str, dict[str, Tensor]]  # moving averages of the weights
+    modules: Mapping[str, nn.Module]  #: networks by name
+    optimizers: Mapping[str, Any]  #: optimisers by name
+    scaler: torch.amp.GradScaler  #: its state is empty except in fp16
+    average: Mapping[str, dict[str, Tensor]]  #: moving averages of weights, by network and tensor
 
-    def state(self) -> dict[str, Any]:
-        """Collect the state that is saved."""
+    def collect_state(self) -> dict[str, Any]:
+        """Collect the states of all parts, for saving."""
         return {
             "modules": {name: module.state_dict() for name, module in self.modules.items()},
             "optimizers": {name: adam.state_dict() for name, adam in self.optimizers.items()},
@@ -228,7 +235,7 @@ class Parts:
         """Load a saved state into all parts.
 
         Raises:
-            InputError: it does not fit; the message names the first tensors that differ.
+            InputError: tensors do not fit; the first ones are named.
         """
         problems = self._list_misfits(state)
         for name, optimizer in self.optimizers.items():
@@ -247,8 +254,8 @@ class Parts:
             self.scaler.load_state_dict(state["scaler"])
 
     def _list_misfits(self, state: Mapping[str, Any]) -> list[str]:
-        """List the tensors of networks and averages that do not fit a saved state."""
-        present = self.state()
+        """List the tensors of a saved state that do not fit the networks and averages."""
+        present = self.collect_state()
         problems: list[str] = []
         for prefix, part in (("", "modules"), ("average of ", "average")):
             for name, tensors in present[part].items():
@@ -261,14 +268,14 @@ class Parts:
 def _restore_optimizer(
     name: str, optimizer: torch.optim.Optimizer, saved: dict[str, Any]
 ) -> list[str]:
-    """Load the saved state of an optimiser, and list what of it does not fit its parameters."""
+    """Load the saved state of an optimiser, and list its tensors that do not fit the parameters."""
     counts = [len(group["params"]) for group in optimizer.param_groups]
     saved_counts = [len(group["params"]) for group in saved["param_groups"]]
     if counts != saved_counts:
         return [
             f"optimiser of {name}: it moved groups of {saved_counts} parameters, not of {counts}"
         ]
-    # Only a loaded state has its tensors by parameter.
+    # Loaded first, because the saved tensors are then listed by parameter.
     optimizer.load_state_dict(saved)
     problems: list[str] = []
     for number, (parameter, values) in enumerate(optimizer.state.items()):
@@ -281,16 +288,26 @@ def _restore_optimizer(
     return problems
 
 
-def saved_states(folder: Path) -> list[Path]:
-    """List the saved states of a folder, the last one first."""
-    return [path for name in (STATE, BEFORE) if (path := folder / name).is_file()]
+def list_saved_states(folder: Path) -> list[Path]:
+    """List the files of saved states in a folder, the last one first."""
+    paths = [folder / STATE, folder / STATE_BEFORE]
+    return [path for path in paths if path.is_file()]
 
 
-def restore_last(folder: Path, parts: Parts) -> tuple[Path, int, float]:
+class RestoredState(NamedTuple):
+    """What is known of a state that was restored."""
+
+    path: Path  #: its file
+    step: int  #: steps until then
+    seconds: float  #: duration of the training until then
+
+
+def restore_last(folder: Path, parts: Parts) -> RestoredState:
     """Restore the last state that is not damaged.
 
-    Returns:
-        Its path, its step, and the duration of the training until then [s].
+    Args:
+        folder: folder of the training.
+        parts: what the state is loaded into.
 
     Raises:
         InputError: all states are damaged or of another network.
@@ -299,7 +316,7 @@ def restore_last(folder: Path, parts: Parts) -> tuple[Path, int, float]:
         Notice: the last state is damaged, and the one before is taken.
     """
     damages: list[str] = []
-    for path in saved_states(folder):
+    for path in list_saved_states(folder):
         try:
             state = _read_state(path)
             remedy = "it is damaged, or of another training"
@@ -316,7 +333,7 @@ def restore_last(folder: Path, parts: Parts) -> tuple[Path, int, float]:
             reason = "; ".join(damages) or f"{folder}: there is no {STATE}"
             notice = f"{reason}; the training goes on from {path.name}, step {step}"
             warnings.warn(notice, Notice, stacklevel=2)
-        return path, step, seconds
+        return RestoredState(path=path, step=step, seconds=seconds)
     raise InputError(
         f"{'; '.join(damages)}; no state is left to go on from. Take another folder, whose "
         "training may 'start' from weights, or delete these states to begin anew"

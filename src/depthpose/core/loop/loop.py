@@ -1,8 +1,9 @@
 """The training loop, on Hugging Face accelerate, and the claim of a folder for one training.
 
-Accelerate provides devices and processes, torch the precision. Gradients are averaged here, after
-the backward pass: that way a step may run any network any number of times (a discriminator judges a
-real and a fake pair), and N processes equal one that accumulates N micro-batches.
+Accelerate provides devices and processes, torch the precision. Gradients are averaged over the
+processes here, after the backward pass. So a step may run a network any number of times (a
+discriminator judges a real and a fake pair), and N processes equal one that accumulates N times as
+many micro-batches.
 """
 
 import math
@@ -31,10 +32,10 @@ from depthpose.core.loop.folder import (
     STATE,
     Parts,
     RunLogger,
+    list_saved_states,
     restore_last,
-    saved_states,
 )
-from depthpose.core.loop.task import LoopConfig, Samples, Task, Update, mixed_seed
+from depthpose.core.loop.task import LoopConfig, Samples, Task, Update, mix_seed
 from depthpose.core.run import claim_folder, find_rank, held_folders, release_folders
 
 SECOND_CTRL_C_S = 3.0  # between the first Ctrl-C, which stops, and the second, which finishes
@@ -57,18 +58,18 @@ class Interrupted(KeyboardInterrupt):
 class Progress:
     """The progress of a training."""
 
-    step: int  #: steps done
+    step: int  #: steps taken
     steps: int  #: steps in all
-    numbers: dict[str, float]  #: the latest metrics; empty between two log steps
+    numbers: dict[str, float]  #: metrics by name; empty but for every ``log_every_steps`` steps
 
 
 @dataclass(frozen=True, kw_only=True)
-class Run:
-    """A training in its folder, and callbacks."""
+class TrainingRun:
+    """A run of a training: its folder, how it begins, and callbacks."""
 
-    folder: Path  #: gets states, metrics, weights (named after what was trained) and their card
-    resume: bool = False  #: go on from the last state in it
-    finish: bool = False  #: export the weights of that state, without another step
+    folder: Path  #: for states, metrics, weights (named after what was trained) and their card
+    resume: bool = False  #: go on from the last state in the folder
+    finish: bool = False  #: write the weights of that state, without another step
     on_step: Callable[[Progress], None] | None = None  #: called after each optimiser step
     on_message: Callable[[str], None] | None = None  #: called with each message for the user
 
@@ -82,10 +83,10 @@ class Run:
         """Claim the folder for a training with this config, and write the config into it.
 
         Args:
-            config: config of any training; it has ``loop``.
-            weights: names of the weights that such a training writes.
+            config: the config, a dataclass with a field ``loop``.
+            weights: names of the weights that the training writes.
             more: what decides the weights besides the config, such as checksums of files.
-            without: settings of the config that change no weight.
+            without: settings of the config that change no weight, and may differ when resumed.
 
         Raises:
             InputError: the folder is that of another config.
@@ -109,25 +110,25 @@ class Run:
         write_config(self.folder / "config.yaml", config)
 
     def train(self, task: Task, samples: Samples, config: LoopConfig) -> float:
-        """Train ``task`` until its last step; its modules hold the result.
+        """Train a task to the last step; the result is in the task's networks.
 
-        A resumed training goes on from the folder's last state; if that is damaged, with a notice
-        from the one before. The result equals that of an uninterrupted run. Under ``accelerate
-        launch`` every process calls this; batch norm statistics are rank 0's.
+        A resumed training goes on from the folder's last state or, with a notice, from the one
+        before if that is damaged. The result equals that of an uninterrupted run. Under
+        ``accelerate launch`` every process calls this; statistics of batch norm are rank 0's.
 
         Args:
             task: the networks, their losses and optimisers.
             samples: training samples by index.
-            config: how long and how it is trained.
+            config: settings of the loop.
 
         Returns:
-            The duration of the training, with the runs that it resumed [s].
+            The duration of the training, including earlier runs that it resumed [s].
 
         Raises:
-            InputError: nothing to train on, a folder with a state and no ``resume``, states that
-                are all damaged or of another network, a precision that this machine lacks, or a
-                loss that is no longer finite.
-            Interrupted: asked to stop; the state is saved first.
+            InputError: there are no samples, the folder has a state and ``resume`` is not set, all
+                its states are damaged or of another network, the machine lacks the precision, or a
+                loss is not finite.
+            Interrupted: the training was asked to stop, and its state is saved.
         """
         if not len(samples):
             raise InputError("there is no sample to train on; the dataset is empty.")
@@ -138,15 +139,17 @@ class Run:
                 f"{self.folder}: holds no state of a training, so there is none to finish."
             )
         training.steps = training.step if self.finish else training.steps
-        with stop_requests() as requests:
+        with collect_stop_requests() as requests:
             return training.take_steps(self.on_step, requests)
 
 
-def releases_folder(stage: Callable[[_Config, Run], Path]) -> Callable[[_Config, Run], Path]:
+def releases_folder(
+    stage: Callable[[_Config, TrainingRun], Path],
+) -> Callable[[_Config, TrainingRun], Path]:
     """Decorate a training stage so that it unlocks its folder for other commands when it ends."""
 
     @wraps(stage)
-    def run_stage(config: _Config, run: Run) -> Path:
+    def run_stage(config: _Config, run: TrainingRun) -> Path:
         """Run the stage, and unlock the folders that it claimed, also where it fails."""
         before = held_folders()
         try:
@@ -158,7 +161,7 @@ def releases_folder(stage: Callable[[_Config, Run], Path]) -> Callable[[_Config,
 
 
 class _Training:
-    """A training in progress: its parts, its step, and what is logged."""
+    """The state of a training in progress, and its steps."""
 
     def __init__(
         self, task: Task, samples: Samples, config: LoopConfig, folder: Path, *, resume: bool
@@ -176,22 +179,22 @@ class _Training:
             )
         self.autocast_type = _AUTOCAST_TYPES[usable_precision(config.precision, device)]
 
-        # How long it goes, and where it stands.
-        self.world = self.accelerator.num_processes
-        self.steps = config.total_steps(len(samples), self.world)
+        # Its length, and how far it is.
+        self.process_count = self.accelerator.num_processes
+        self.steps = config.total_steps(len(samples), self.process_count)
         self.logger = RunLogger(folder, is_writer=self.accelerator.is_main_process)
         self.step = 0
         self.began = time.monotonic()
         self.sums: dict[str, tuple[float, int]] = {}  # sum and number of terms of each metric
 
-        saved = saved_states(folder)
+        saved = list_saved_states(folder)
         if saved and not resume:
             raise InputError(f"{folder}: holds a training. Add --resume, or take another folder.")
 
         # The networks on the device, with equal weights in all processes.
         for module in task.modules.values():
             module.to(device)
-        if not saved and self.world > 1:
+        if not saved and self.process_count > 1:
             _copy_weights_of_rank_0(task)
         self.parts = Parts(
             modules=task.modules,
@@ -201,19 +204,21 @@ class _Training:
         )
 
         if saved:
-            path, self.step, seconds = restore_last(folder, self.parts)
-            self.began -= seconds
-            self.logger.has_good_last = path.name == STATE
+            restored = restore_last(folder, self.parts)
+            self.step = restored.step
+            self.began -= restored.seconds
+            self.logger.is_last_intact = restored.path.name == STATE
         self.logger.open(self.step)
 
     def take_steps(
         self, on_step: Callable[[Progress], None] | None, requests: Sequence[tuple[int, float]]
     ) -> float:
-        """Take the remaining steps, with their log, validations and saved states.
+        """Take the remaining steps; log, validate and save as often as the config says.
 
         Args:
             on_step: called after each step.
-            requests: signals that ask to stop, by number and time; the list grows meanwhile.
+            requests: signals that asked to stop, collected by :func:`collect_stop_requests`; the
+                list grows meanwhile.
 
         Returns:
             The duration of the whole training [s].
@@ -226,7 +231,7 @@ class _Training:
             self._take_step([next(batches) for _ in range(self.config.accumulate)])
             self.step += 1
 
-            # Whether it was asked to stop: once to save and stop, twice to finish here.
+            # One request saves and stops, two finish with the weights of this step.
             is_stopped = self._is_true_in_any_process(bool(requests))
             is_finish_requested = _wait_for_second_press(requests)
             if is_stopped and self._is_true_in_any_process(is_finish_requested):
@@ -246,7 +251,9 @@ class _Training:
 
             if is_stopped or is_last or self.step % self.config.save_every_steps == 0:
                 seconds = time.monotonic() - self.began
-                self.logger.save({"step": self.step, "seconds": seconds, **self.parts.state()})
+                self.logger.save(
+                    {"step": self.step, "seconds": seconds, **self.parts.collect_state()}
+                )
             if on_step is not None and self.accelerator.is_main_process:
                 on_step(Progress(step=self.step, steps=self.steps, numbers=metrics))
 
@@ -271,15 +278,16 @@ class _Training:
         self._load_weights(trained)
 
     def _load_batches(self) -> Iterator[Any]:
-        """Load this process's micro-batches of the remaining steps to the device."""
+        """Yield this process's micro-batches of the remaining steps, on its device."""
         from accelerate.utils import send_to_device
 
         # Processes take micro-batches in turn: N processes use in a step the same samples as one
         # process that accumulates N times as many.
         rank = self.accelerator.process_index
         size = self.config.batch_size
-        micro_steps = range(self.step * self.config.accumulate, self.steps * self.config.accumulate)
-        starts = ((micro_step * self.world + rank) * size for micro_step in micro_steps)
+        accumulate = self.config.accumulate
+        rounds = range(self.step * accumulate, self.steps * accumulate)  # a micro-batch a process
+        starts = ((number * self.process_count + rank) * size for number in rounds)
         loader = DataLoader(
             self.samples,  # pyright: ignore[reportArgumentType]
             batch_sampler=(list(range(start, start + size)) for start in starts),
@@ -291,17 +299,17 @@ class _Training:
         return (send_to_device(batch, self.accelerator.device) for batch in loader)
 
     def _take_step(self, micro_batches: list[Any]) -> None:
-        """Take a step: the first optimiser's update for all micro-batches, then the second's.
+        """Take a step of all optimisers: of each for all micro-batches, before the next one's.
 
-        A task yields one loss for each of its optimisers (``Task.step``).
+        The task yields an update for each optimiser (``Task.step``).
         """
         updates_of_batches = [iter(self.task.step(batch)) for batch in micro_batches]
         for update_number in count():
             optimizer_name = None
             for index, updates in enumerate(updates_of_batches):
                 # Dropout depends on the micro-batch, not on the process that computes it.
-                micro_batch = index * self.world + self.accelerator.process_index
-                seed = mixed_seed(self.config.seed, self.step, micro_batch, update_number)
+                micro_batch = index * self.process_count + self.accelerator.process_index
+                seed = mix_seed(self.config.seed, self.step, micro_batch, update_number)
                 torch.manual_seed(seed)
                 with torch.autocast(
                     self.accelerator.device.type,
@@ -319,7 +327,15 @@ class _Training:
             self._update_average(self.config.ema_decay)
 
     def _backpropagate(self, update: Update, micro_batches: int) -> None:
-        """Add the gradients of the loss of a micro-batch, and its numbers to the log."""
+        """Add the gradients of a micro-batch's loss, and its numbers to the metrics.
+
+        Args:
+            update: its loss and numbers.
+            micro_batches: number of micro-batches of the step, over which gradients are averaged.
+
+        Raises:
+            InputError: the loss is not finite.
+        """
         name = update.optimizer
         loss = update.loss.detach()
         # fp16 overflows now and then, and its scaler skips such steps by itself.
@@ -330,15 +346,15 @@ class _Training:
                 "precision fp32; 'start' can take weights from before."
             )
         scaled_loss = self.parts.scaler.scale(update.loss / micro_batches)
-        scaled_loss.backward(inputs=_parameters_of(self.parts.optimizers[name]))
+        scaled_loss.backward(inputs=_list_parameters(self.parts.optimizers[name]))
         for fact, value in {"loss": loss, **update.facts}.items():
             total, terms = self.sums.get(f"{name}/{fact}", (0.0, 0))
             self.sums[f"{name}/{fact}"] = (total + float(value), terms + 1)
 
     def _update_average(self, ema_decay: float) -> None:
-        """Move the average of the weights towards them.
+        """Move the moving average of the weights towards the weights.
 
-        The first steps move it faster, so that the random initial weights are soon forgotten.
+        The decay is lower in the first steps, so that the initial weights are soon forgotten.
         """
         decay = min(ema_decay, (1 + self.step) / (10 + self.step))
         with torch.no_grad():
@@ -351,12 +367,12 @@ class _Training:
                         average.copy_(tensor)
 
     def _step_optimizer(self, name: str) -> None:
-        """Average the gradients over processes and step the optimiser."""
+        """Average the gradients over all processes, and step an optimiser."""
         optimizer, adam = self.task.optimizers[name]
         for group in optimizer.param_groups:
             group["lr"] = adam.rate_at(self.step, self.steps) * group.get("rate", 1.0)
-        parameters = _parameters_of(optimizer)
-        if self.world > 1:
+        parameters = _list_parameters(optimizer)
+        if self.process_count > 1:
             gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
             flat = torch.cat([gradient.flatten() for gradient in gradients])
             mean: Tensor = self.accelerator.reduce(flat, "mean")
@@ -377,15 +393,15 @@ class _Training:
             self.task.modules[name].load_state_dict(state)
 
     def _is_true_in_any_process(self, is_true: bool) -> bool:
-        """Whether something is true in any process; all of them must ask at the same point."""
-        if self.world == 1:
+        """Whether a condition holds in any process; all must call this at the same point."""
+        if self.process_count == 1:
             return is_true
         flag = torch.tensor([float(is_true)], device=self.accelerator.device)
         return bool(float(self.accelerator.reduce(flag, "sum")) > 0)
 
 
 def _make_accelerator(config: LoopConfig) -> Any:  # noqa: ANN401  accelerate is loaded where it is used
-    """Make accelerate's view of the device and the processes of this launch.
+    """Make accelerate's ``Accelerator``, which knows the device and the processes of this launch.
 
     Raises:
         InputError: this process has trained on another device.
@@ -423,13 +439,13 @@ def _copy_weights(task: Task) -> dict[str, dict[str, Tensor]]:
     }
 
 
-def _parameters_of(optimizer: Any) -> list[Tensor]:  # noqa: ANN401
+def _list_parameters(optimizer: Any) -> list[Tensor]:  # noqa: ANN401
     """List the parameters of an optimiser."""
     return [parameter for group in optimizer.param_groups for parameter in group["params"]]
 
 
 def _wait_for_second_press(requests: Sequence[tuple[int, float]]) -> bool:
-    """Whether Ctrl-C was pressed twice; after one press, wait some seconds for the second."""
+    """Whether Ctrl-C was pressed twice; after a first press, wait some seconds for a second."""
     while True:
         presses = [pressed_s for number, pressed_s in requests if number == signal.SIGINT]
         if len(presses) != 1 or time.monotonic() - presses[0] >= SECOND_CTRL_C_S:
@@ -438,11 +454,10 @@ def _wait_for_second_press(requests: Sequence[tuple[int, float]]) -> bool:
 
 
 @contextmanager
-def stop_requests() -> Iterator[list[tuple[int, float]]]:
-    """Collect SIGTERM and Ctrl-C inside the block, in place of ending the process.
+def collect_stop_requests() -> Iterator[list[tuple[int, float]]]:
+    """Collect SIGTERM and Ctrl-C inside the block, where they do not end the process.
 
-    Yields a list that grows by the number and the time of each signal; the loop looks at it after
-    each step.
+    Yields a list of signals that grows by the number and the time [s] of each.
     """
     requests: list[tuple[int, float]] = []
 
@@ -468,5 +483,5 @@ def stop_requests() -> Iterator[list[tuple[int, float]]]:
 
 
 def _leave_process_group(_: int) -> None:
-    """Start a session of its own for a data worker: a signal to the job must not end it too."""
+    """Put a data worker into a session of its own, where signals to the training do not end it."""
     os.setsid()

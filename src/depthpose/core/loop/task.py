@@ -1,4 +1,4 @@
-"""The inputs of a training: settings of the loop and of Adam, the task, and samples by index."""
+"""What the training loop takes: its settings and those of Adam, a task, and samples by index."""
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
@@ -24,7 +24,7 @@ class AdamConfig(Settings):
     """Decay of the mean of the gradient; 0.5 for adversarial training."""
 
     beta2: Annotated[float, "[0, 1)"] = 0.999
-    """Decay of the mean of its square."""
+    """Decay of the mean of the squared gradient."""
 
     schedule: Literal["constant", "constant-linear", "halving", "cosine"] = "constant"
     """constant; constant-linear (second half falls to zero); halving; cosine (falls to zero)."""
@@ -36,7 +36,7 @@ class AdamConfig(Settings):
     """Steps over which the rate rises linearly from zero."""
 
     weight_decay: Annotated[float, "[0, inf)"] = 0.0
-    """Share of the weights taken off at a rate of 1, apart from the gradient (AdamW)."""
+    """Share of the weights that a step subtracts, times its learning rate (AdamW)."""
 
     def rate_at(self, step: int, steps: int) -> float:
         """Compute the learning rate of ``step`` (0, 1, ...) in a training of ``steps``."""
@@ -108,7 +108,12 @@ class LoopConfig(Settings):
             )
 
     def total_steps(self, samples: int, processes: int) -> int:
-        """Compute the optimiser steps of a training on ``samples`` with ``processes``."""
+        """Compute the number of optimiser steps of a training.
+
+        Args:
+            samples: number of samples of an epoch.
+            processes: number of processes that train together.
+        """
         if self.steps is not None:
             return self.steps
         assert self.epochs is not None
@@ -121,28 +126,35 @@ def make_adam(
 ) -> torch.optim.Adam:
     """Make the optimiser; the loop sets its learning rate before each step.
 
-    A group of ``parameters`` may have a ``rate``: its share of the learning rate.
+    Args:
+        parameters: parameters, or groups of them. A group may have a ``rate``, the factor of its
+            learning rate.
+        config: settings of Adam.
     """
     kind = torch.optim.AdamW if config.weight_decay else torch.optim.Adam
-    # Fused: a quarter of the time of torch's other two ways, on a CPU too.
-    return kind(parameters, lr=config.learning_rate, betas=(config.beta1, config.beta2),
-                weight_decay=config.weight_decay, fused=True)  # fmt: skip
+    return kind(
+        parameters,
+        lr=config.learning_rate,
+        betas=(config.beta1, config.beta2),
+        weight_decay=config.weight_decay,
+        fused=True,  # a quarter of the time of torch's other implementations, on a CPU too
+    )
 
 
 class Update(NamedTuple):
-    """One optimiser's part of a step: the loss that it minimises, and numbers for the log."""
+    """The part of a step that one optimiser takes."""
 
-    optimizer: str
-    loss: Float[Tensor, ""]
-    facts: Mapping[str, Tensor]
+    optimizer: str  #: its name among the task's optimisers
+    loss: Float[Tensor, ""]  #: what it minimises
+    facts: Mapping[str, Tensor]  #: further numbers for the log, by name
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ValidationResult:
-    """Metrics and images of a validation, by name."""
+    """The result of a validation."""
 
-    numbers: Mapping[str, float] = field(default_factory=dict)
-    pictures: Mapping[str, Float[Tensor, "3 _ _"]] = field(default_factory=dict)
+    numbers: Mapping[str, float] = field(default_factory=dict)  #: metrics by name
+    pictures: Mapping[str, Float[Tensor, "3 _ _"]] = field(default_factory=dict)  #: images by name
 
 
 @runtime_checkable
@@ -151,24 +163,24 @@ class Task(Protocol):
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
-        """List the networks by name; all of them are saved and resumed."""
+        """Return the networks by name; all of them are saved and resumed."""
         ...
 
     @property
     def optimizers(self) -> Mapping[str, tuple[torch.optim.Optimizer, AdamConfig]]:
-        """List the optimisers with their settings; each parameter is in at most one of them."""
+        """Return the optimisers and their settings by name; a parameter is in one at most."""
         ...
 
     def step(self, batch: Any) -> Iterator[Update]:  # noqa: ANN401 - the task's own batch
-        """Yield one update after the other; each optimiser steps before the next is computed.
+        """Compute a step on a batch: yield the update of one optimiser after the other.
 
-        An adversarial task yields the discriminator's update, then the generator's, whose loss then
-        uses the updated discriminator.
+        Each optimiser steps before the next update is computed: an adversarial task yields the
+        discriminator's update, then the generator's, whose loss uses the updated discriminator.
         """
         ...
 
     def validate(self) -> ValidationResult:
-        """Evaluate held-out samples; the task sets and restores the networks' mode."""
+        """Evaluate held-out samples; the networks' mode (train or eval) is restored afterwards."""
         ...
 
 
@@ -176,34 +188,40 @@ class Task(Protocol):
 class Samples(Protocol):
     """Training samples by their index in the whole training, over all epochs.
 
-    Sample n depends on n alone, so any process can make it at any time: order, resuming and the
-    number of processes change nothing.
+    Sample n depends on n alone, and any process can make it at any time: so a resumed training, and
+    one with more processes, sees the same samples.
 
-    Where samples differ in size, there may be a method ``collate`` (a list of samples to a batch).
+    If samples differ in size, a method ``collate`` makes a batch of a list of samples.
     """
 
     def __len__(self) -> int:
-        """Give the number of samples of an epoch."""
+        """Return the number of samples of an epoch."""
         ...
 
     def __getitem__(self, sample_index: int, /) -> Any:  # noqa: ANN401 - a tuple of tensors
-        """Make a sample."""
+        """Make the sample of an index, 0 or more; there is no upper limit."""
         ...
 
 
-def shuffled_index(sample_index: int, count: int, seed: int) -> int:
+# Streams of random numbers that are independent of each other, by what they are for.
+_ORDER_STREAM = 1
+_SAMPLE_STREAM = 2
+
+
+def shuffle_index(sample_index: int, count: int, seed: int) -> int:
     """Map an index in the whole training to one of ``count`` data, in a new order each epoch."""
     epoch, position = divmod(sample_index, count)
-    generator = torch.Generator().manual_seed(mixed_seed(seed, epoch, 1))
-    return int(torch.randperm(count, generator=generator)[position])
+    order_seed = mix_seed(seed, epoch, _ORDER_STREAM)
+    order = torch.randperm(count, generator=torch.Generator().manual_seed(order_seed))
+    return int(order[position])
 
 
-def sample_generator(sample_index: int, seed: int) -> torch.Generator:
-    """Make the generator of random numbers for the augmentation of one sample."""
-    return torch.Generator().manual_seed(mixed_seed(seed, sample_index, 2))
+def make_sample_generator(sample_index: int, seed: int) -> torch.Generator:
+    """Make the generator of random numbers by which one sample is augmented."""
+    return torch.Generator().manual_seed(mix_seed(seed, sample_index, _SAMPLE_STREAM))
 
 
-def mixed_seed(*numbers: int) -> int:
+def mix_seed(*numbers: int) -> int:
     """Mix numbers into one seed (splitmix64), so that similar numbers make unrelated seeds."""
     state = 0
     # Shifts and constants are those of splitmix64.

@@ -11,9 +11,9 @@ from torch.nn import functional as F
 from depthpose.core.camera import Camera, RectificationReport, StereoRig, check_rectified
 from depthpose.core.errors import InputError
 from depthpose.core.files import MAP_SUFFIXES, image_size, read_image, read_points_bin
-from depthpose.core.files.disk import stem_of
+from depthpose.core.files.disk import normalise_stem
 from depthpose.core.files.images import LISTED_SUFFIXES
-from depthpose.core.findings import CheckReport, Problem, make_report, unreadable
+from depthpose.core.findings import CheckReport, Problem, make_report, make_unreadable
 from depthpose.depth.datasets.dataset import read_split
 from depthpose.depth.datasets.frames import Frame, frame_camera, kitti_calibration, read_depth
 from depthpose.depth.datasets.layouts import find_frames
@@ -104,15 +104,15 @@ def _check_folder(folder: Path, frames: list[Frame]) -> Iterator[Problem]:
     folders = {
         (frame.left.parent, frame.right.parent)
         for frame in frames
-        if frame.right and stem_of(frame.right) == stem_of(frame.left)
+        if frame.right and normalise_stem(frame.right) == normalise_stem(frame.left)
     }
     for left_folder, right_folder in sorted(folders):
         if left_folder == right_folder or not left_folder.is_dir():  # in a shard
             continue
-        stems = {stem_of(path) for path in left_folder.iterdir()}
+        stems = {normalise_stem(path) for path in left_folder.iterdir()}
         for path in sorted(right_folder.iterdir()):
             is_view = path.suffix.lower() in LISTED_SUFFIXES and path.name[0] != "."
-            if is_view and stem_of(path) not in stems:
+            if is_view and normalise_stem(path) not in stems:
                 yield Problem(path=path, kind="missing", message="has no left view")
 
     # Folders of a plain dataset of which no frame has a file.
@@ -144,7 +144,7 @@ def _check_frame(frame: Frame, *, with_decoding: bool) -> Iterator[Problem]:
             else:
                 image_px = image_size(path)
         except InputError as error:
-            yield unreadable(path, error)
+            yield make_unreadable(path, error)
             continue
         if size is not None and image_px != size:
             message = f"is {image_px[0]}x{image_px[1]}, but its left image is {size[0]}x{size[1]}"
@@ -190,14 +190,14 @@ def _check_measurements(frame: Frame) -> Iterator[Problem]:
                 message = f"says nothing of the LiDAR, and {frame.velodyne.name} is there"
                 yield Problem(path=frame.calibration, kind="missing", message=message)
         except InputError as error:
-            yield unreadable(frame.calibration, error)
+            yield make_unreadable(frame.calibration, error)
 
     if frame.velodyne is not None:
         try:
             if not len(read_points_bin(frame.velodyne)):
                 yield Problem(path=frame.velodyne, kind="empty", message="holds no LiDAR point")
         except InputError as error:
-            yield unreadable(frame.velodyne, error)
+            yield make_unreadable(frame.velodyne, error)
 
 
 def _check_truth(
@@ -220,7 +220,7 @@ def _check_truth(
     try:
         truth = read_depth(path)
     except InputError as error:
-        yield unreadable(path, error)
+        yield make_unreadable(path, error)
         return
     height, width = truth.shape
     if (width, height) != size:

@@ -9,7 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from depthpose.core.camera import StereoRig
-from depthpose.core.errors import InputError, nearest_name
+from depthpose.core.errors import InputError, suggest_name
 from depthpose.core.files import image_size, read_image, read_text
 from depthpose.depth.datasets.frames import (
     Frame,
@@ -65,7 +65,7 @@ def read_split(name: str | Path) -> Split:
     except OSError:  # a name too long for the disk
         is_file = False
     if not is_file:
-        hint = nearest_name(str(name), SPLIT_NAMES)
+        hint = suggest_name(str(name), SPLIT_NAMES)
         raise InputError(f"split {str(name)!r}: no such file; {hint}")
 
     text = read_text(path, _MAX_BYTES)
@@ -211,7 +211,7 @@ def join_datasets(datasets: Sequence[Dataset], without: Sequence[str] = ()) -> D
     if unknown:
         raise InputError(
             f"no frame of {', '.join(d.name for d in datasets)} is called {unknown[0]!r}; "
-            f"{nearest_name(unknown[0], {frame.name for frame in frames})[:300]}"
+            f"{suggest_name(unknown[0], {frame.name for frame in frames})[:300]}"
         )
     return Dataset(
         name=" + ".join(dataset.name for dataset in datasets),

@@ -23,23 +23,23 @@ from depthpose.core.camera import (
     read_camera,
     read_rig,
 )
+from depthpose.core.camera.camera_facts import (
+    CameraFacts,
+    camera_from_facts,
+    facts_from_projections,
+)
 from depthpose.core.camera.camera_file import (
     KITTI_COLOR,
     KITTI_GREY,
     KittiPair,
     Matrix,
     choose_kitti_pair,
-    errors_naming,
-    kitti_matrix,
-    plain_facts,
+    facts_from_lines,
+    prefixed_errors,
+    read_kitti_matrix,
     read_kitti_size,
 )
-from depthpose.core.camera.pinhole import (
-    CameraFacts,
-    Size,
-    camera_from_facts,
-    facts_from_projections,
-)
+from depthpose.core.camera.pinhole import Size
 from depthpose.core.errors import InputError
 from depthpose.core.files.images import KITTI_UNIT
 from depthpose.depth.config import TruthKind
@@ -82,10 +82,10 @@ def read_object_calibration(
 
     # The LiDAR.
     if "Tr_velo_to_cam" in keys:
-        camera_from_velodyne = kitti_matrix(path, keys, "Tr_velo_to_cam", (3, 4))
-        rectify = kitti_matrix(path, keys, "R0_rect", (3, 3))
+        camera_from_velodyne = read_kitti_matrix(path, keys, "Tr_velo_to_cam", (3, 4))
+        rectify = read_kitti_matrix(path, keys, "R0_rect", (3, 3))
     elif "Tr" in keys:
-        camera_from_velodyne = kitti_matrix(path, keys, "Tr", (3, 4))
+        camera_from_velodyne = read_kitti_matrix(path, keys, "Tr", (3, 4))
         rectify = np.eye(3)
     else:
         return KittiCalibration(rig=rig, pixels_from_velodyne=None)
@@ -112,7 +112,7 @@ def read_plain_calibration(path: Path, name: str, width: int, height: int) -> St
     text = files.read_text(path, _MAX_PAIRS_BYTES)
     if re.search(r"^[ \t]*focal_px[ \t]*:", text, re.MULTILINE):
         keys = files.read_key_values(path)
-        return _make_rig(path, plain_facts(path, keys), (width, height))
+        return _make_rig(path, facts_from_lines(path, keys), (width, height))
 
     # The line of the pair; other pairs' names may begin with this one's, and a space.
     lines = re.findall(rf"^[ \t]*{re.escape(name)}[ \t]+(.+)$", text, re.MULTILINE)
@@ -134,7 +134,7 @@ def read_plain_calibration(path: Path, name: str, width: int, height: int) -> St
     values = {column: [number] for column, number in zip(columns, numbers[2:], strict=False)}
     try:
         size = int(numbers[0]), int(numbers[1])
-        return _make_rig(path, replace(plain_facts(path, values), size=size), size)
+        return _make_rig(path, replace(facts_from_lines(path, values), size=size), size)
     except (ValueError, OverflowError) as error:
         raise InputError(f"{path}: the line of {name!r} is no calibration ({error}).") from error
 
@@ -152,7 +152,7 @@ def _leading_numbers(line: str) -> list[float]:
 
 def _make_rig(path: Path, facts: CameraFacts, size: Size | None) -> StereoRig:
     """Make the rig of a calibration, whose file ``path`` is named in errors."""
-    with errors_naming(path):
+    with prefixed_errors(path):
         rig = camera_from_facts(facts, size)
     assert isinstance(rig, StereoRig), "datasets name both cameras"
     return rig
@@ -165,7 +165,7 @@ def _projected_rig(
 
     ``pair``: the keys of both cameras; ``size``: width and height of the images.
     """
-    left, right = (kitti_matrix(path, keys, name, (3, 4)) for name in (pair.left, pair.right))
+    left, right = (read_kitti_matrix(path, keys, name, (3, 4)) for name in (pair.left, pair.right))
     stated_size = read_kitti_size(keys, pair) or size
     if stated_size != size:
         raise InputError(
@@ -173,7 +173,7 @@ def _projected_rig(
             f"{size[0]}x{size[1]}. It was cropped or scaled: give its own calibration, in a "
             "folder of pairs."
         )
-    with errors_naming(path):
+    with prefixed_errors(path):
         facts = facts_from_projections("a KITTI calibration", left, right)
     return _make_rig(path, facts, size), left
 
@@ -340,10 +340,10 @@ def kitti_calibration(frame: Frame) -> KittiCalibration:
     rig, left = _projected_rig(camera_file, camera_keys, raw_pair, size)
     if not lidar_file.is_file():
         return KittiCalibration(rig=rig, pixels_from_velodyne=None)
-    rectify = kitti_matrix(camera_file, camera_keys, "R_rect_00", (3, 3))
+    rectify = read_kitti_matrix(camera_file, camera_keys, "R_rect_00", (3, 3))
     lidar_keys = files.read_key_values(lidar_file)
-    R = kitti_matrix(lidar_file, lidar_keys, "R", (3, 3))
-    t = kitti_matrix(lidar_file, lidar_keys, "T", (3, 1))
+    R = read_kitti_matrix(lidar_file, lidar_keys, "R", (3, 3))
+    t = read_kitti_matrix(lidar_file, lidar_keys, "T", (3, 1))
     pixels_from_velodyne = _compose_projection(lidar_file, left, rectify, np.hstack([R, t]))
     return KittiCalibration(rig=rig, pixels_from_velodyne=pixels_from_velodyne)
 

@@ -18,7 +18,7 @@ import torch
 
 from depthpose.core import files
 from depthpose.core.errors import InputError
-from depthpose.core.files.disk import SOURCE, find_partners, stem_of, write_bytes
+from depthpose.core.files.disk import SOURCE, find_partners, normalise_stem, write_bytes
 from depthpose.core.files.images import LISTED_SUFFIXES
 from depthpose.core.run import is_whole, note_result
 from depthpose.depth.datasets.frames import CalibrationStyle, Frame
@@ -210,7 +210,7 @@ def _make_frames(
     ``parts``: for each other field of :class:`Frame`, its files by the stems of the left images.
     """
     for left in lefts:
-        stem = stem_of(left)
+        stem = normalise_stem(left)
         others = {field: by_stem.get(stem) for field, by_stem in parts.items()}
         yield Frame(name=prefix + stem, left=left, style=style, **others)
 
@@ -229,7 +229,7 @@ def _find_raw(folder: Path) -> Iterable[Frame]:
             lefts,
             "raw",
             f"{drive.name}_",
-            calibration={stem_of(left): date for left in lefts if is_calibrated},
+            calibration={normalise_stem(left): date for left in lefts if is_calibrated},
             right=_list_by_stem(drive / "image_03/data"),
             velodyne=_list_by_stem(drive / "velodyne_points/data", (".bin",)),
             scan=_list_by_stem(_find_depth_maps(drive, "velodyne_raw", "velodyne")),
@@ -266,7 +266,7 @@ def _find_depth_selection(folder: Path) -> Iterable[Frame]:
     scans = _list_by_stem(root / "velodyne_raw")
     depth = _list_by_stem(root / "groundtruth_depth")
     for left in _list_files(root / "image"):
-        stem = stem_of(left)
+        stem = normalise_stem(left)
         yield Frame(
             name=stem,
             left=left,
@@ -294,7 +294,7 @@ def _find_odometry(folder: Path) -> Iterable[Frame]:
             lefts,
             "grey" if is_grey else "object",
             "" if sequence == folder else f"{sequence.name}_",
-            calibration={stem_of(left): sequence / "calib.txt" for left in lefts},
+            calibration={normalise_stem(left): sequence / "calib.txt" for left in lefts},
             right=_list_by_stem(sequence / ("image_1" if is_grey else "image_3")),
             velodyne=_list_by_stem(sequence / "velodyne", (".bin",)),
         )
@@ -308,7 +308,7 @@ def _find_benchmark(folder: Path, left_name: str, right_name: str, ending: str) 
     root = folder / "training" if (folder / "training" / left_name).is_dir() else folder
     lefts = _list_files(root / left_name)
     # Frames of the stereo sets are NNNNNN_10 and, without truth, NNNNNN_11; object has neither.
-    lefts = [left for left in lefts if stem_of(left).endswith("_10")] or lefts
+    lefts = [left for left in lefts if normalise_stem(left).endswith("_10")] or lefts
     # The calibration NNNNNN.txt is that of object's frame NNNNNN, or of the stereo sets' NNNNNN_10.
     texts = _list_by_stem(root / "calib_cam_to_cam", (".txt",)) | _list_by_stem(
         root / "calib", (".txt",)
@@ -354,15 +354,19 @@ def _find_pairs(folder: Path) -> Iterable[Frame]:
     # Right views by the stems of the left ones, which may differ: left_0004 and right_0004.
     lefts = _list_files(folder / "left")
     right = _list_by_stem(folder / "right")
-    if right and not any(stem_of(left) in right for left in lefts):
+    if right and not any(normalise_stem(left) in right for left in lefts):
         with suppress(InputError):  # no pairs of names: the left images are single
-            partners = find_partners([stem_of(left) for left in lefts], list(right), str(folder))
+            partners = find_partners(
+                [normalise_stem(left) for left in lefts], list(right), str(folder)
+            )
             views = list(right.values())
-            right = {stem_of(left): views[k] for left, k in zip(lefts, partners, strict=True)}
+            right = {
+                normalise_stem(left): views[k] for left, k in zip(lefts, partners, strict=True)
+            }
     return _make_frames(
         lefts,
         "camera" if camera else "plain",
-        calibration={stem_of(left): calibration for left in lefts if calibration},
+        calibration={normalise_stem(left): calibration for left in lefts if calibration},
         right=right,
         depth=_list_by_stem(folder / "lidar_depth"),
         disparity=_list_by_stem(folder / "disp_occ"),
@@ -398,7 +402,7 @@ def _list_by_stem(
     paths = sorted(
         _list_files(folder, suffixes), key=lambda path: suffixes.index(path.suffix.lower())
     )
-    return {stem_of(path): path for path in reversed(paths)}
+    return {normalise_stem(path): path for path in reversed(paths)}
 
 
 def _list_files(folder: Path, suffixes: tuple[str, ...] = LISTED_SUFFIXES) -> list[Path]:

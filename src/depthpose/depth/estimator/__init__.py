@@ -1,7 +1,7 @@
 """One image, or a rectified pair, to one depth estimate in metres."""
 
+from depthpose.depth.estimator.net import AnyPicture as AnyPicture
 from depthpose.depth.estimator.net import FakestereoNet as FakestereoNet
-from depthpose.depth.estimator.net import Picture as Picture
 from depthpose.depth.estimator.pair import refuse_unrectified as refuse_unrectified
 from depthpose.depth.estimator.pictures import DepthPipeline as DepthPipeline
 from depthpose.depth.estimator.pictures import pipeline as pipeline

@@ -25,10 +25,10 @@ from depthpose.core.camera import (
     choose_lens,
 )
 from depthpose.core.checkpoint import find_weights, join_terms, warn_of_terms
-from depthpose.core.devices import each_in_threads, force_float32
+from depthpose.core.devices import force_float32, map_in_threads
 from depthpose.core.errors import InputError, Notice
-from depthpose.core.files import Picture as Picture
-from depthpose.core.files import as_tensor, read_exif_focal
+from depthpose.core.files import AnyPicture as AnyPicture
+from depthpose.core.files import read_exif_focal, rgb_from_picture
 from depthpose.depth.config import Answer, MatcherConfig, SGBMConfig
 from depthpose.depth.estimator.pair import depth_from_pair
 from depthpose.depth.estimator.single_image import depth_from_images, virtual_sizes
@@ -58,7 +58,7 @@ def as_input(
         with_exif: read the focal length from the picture's EXIF where ``camera`` is None, with a
             notice.
     """
-    left = as_tensor(image, f"{name}: the image")
+    left = rgb_from_picture(image, f"{name}: the image")
     lens = camera
     if camera is None and with_exif and isinstance(image, str | Path | Image.Image):
         exif_focal = read_exif_focal(image)
@@ -252,12 +252,12 @@ class FakestereoNet:
     @force_float32()
     def estimate(
         self,
-        image: Picture,
+        image: AnyPicture,
         camera: AnyCamera | None = None,
         *,
         focal_px: float | None = None,
         fov_deg: float | None = None,
-        right: Picture | None = None,
+        right: AnyPicture | None = None,
         known_distance: tuple[float, float, float] | None = None,
         mount: MountFilter | None = None,
         name: str | None = None,
@@ -295,7 +295,7 @@ class FakestereoNet:
         lens = choose_lens(camera, focal_px, fov_deg)
         pair = as_input(image, name, lens, with_exif=right is None)
         if right is not None:
-            pair = replace(pair, right=as_tensor(right, f"{name}: the right image"))
+            pair = replace(pair, right=rgb_from_picture(right, f"{name}: the right image"))
             if known_distance is not None:
                 raise InputError(f"{name}: a pair has metres of its own; omit known_distance")
 
@@ -322,7 +322,7 @@ class FakestereoNet:
     @force_float32()
     def estimate_many(
         self,
-        images: Iterable[StereoInput] | Iterable[Picture] | Picture,
+        images: Iterable[StereoInput] | Iterable[AnyPicture] | AnyPicture,
         camera: AnyLens | None = None,
         *,
         focal_px: float | None = None,
@@ -360,7 +360,7 @@ class FakestereoNet:
         lens = choose_lens(camera, focal_px, fov_deg)
         is_single = isinstance(images, str | Path | Image.Image | StereoInput)
         if is_single or (isinstance(images, np.ndarray | Tensor) and images.ndim < 4):
-            images = [cast("Picture", images)]
+            images = [cast("AnyPicture", images)]
         sequence = cast("Iterable[object]", images)
         total = len(sequence) if isinstance(sequence, Sized) else None
 
@@ -368,7 +368,7 @@ class FakestereoNet:
         estimate = partial(self.estimate_batch, lens=lens, with_check=with_check)
         batches = _named_batches(sequence, batch)
         with tqdm(total=total, unit=" images", disable=not with_progress) as bar:
-            for estimates_of_batch in each_in_threads(estimate, batches, threads):
+            for estimates_of_batch in map_in_threads(estimate, batches, threads):
                 estimates += estimates_of_batch
                 bar.update(len(estimates_of_batch))
         return estimates

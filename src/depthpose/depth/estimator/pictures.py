@@ -21,8 +21,8 @@ from depthpose.core.errors import InputError, Notice, refuse_unknown
 from depthpose.depth.config import MatcherConfig
 from depthpose.depth.estimator.net import (
     DEFAULT,
+    AnyPicture,
     FakestereoNet,
-    Picture,
     as_input,
 )
 from depthpose.depth.types import Map, StereoInput
@@ -40,10 +40,10 @@ class DepthPipeline:
 
     def __call__(
         self,
-        inputs: Picture | Iterable[Picture] | None = None,
+        inputs: AnyPicture | Iterable[AnyPicture] | None = None,
         camera: AnyCamera | None = None,
         *,
-        images: Picture | Iterable[Picture] | None = None,
+        images: AnyPicture | Iterable[AnyPicture] | None = None,
         focal_px: float | None = None,
         fov_deg: float | None = None,
         batch_size: int | None = None,
@@ -76,14 +76,18 @@ class DepthPipeline:
         argument = images if inputs is None else inputs
         lens = choose_lens(camera, focal_px, fov_deg)
         is_single = isinstance(argument, str | Path | Image.Image | np.ndarray | Tensor)
-        pictures = [argument] if is_single else cast("Iterable[Picture]", argument)
+        pictures = [argument] if is_single else cast("Iterable[AnyPicture]", argument)
         estimates = self._estimate_each(pictures, lens, batch_size or self.batch_size, timeout)
         if is_single:
             return next(estimates)
         return list(estimates) if isinstance(argument, list | tuple) else estimates
 
     def _estimate_each(
-        self, pictures: Iterable[Picture], lens: AnyLens | None, batch: int, timeout: float | None
+        self,
+        pictures: Iterable[AnyPicture],
+        lens: AnyLens | None,
+        batch: int,
+        timeout: float | None,
     ) -> Iterator[dict[str, Any]]:
         """Estimate pictures in batches; without a camera a phone's is assumed, with a notice."""
         remaining = iter(pictures)
@@ -175,7 +179,7 @@ def pipeline(
     return DepthPipeline(net, batch_size)
 
 
-def _open_picture(picture: Picture, timeout: float | None) -> Picture:
+def _open_picture(picture: AnyPicture, timeout: float | None) -> AnyPicture:
     """Open an address or base64 text as transformers does; return anything else unchanged."""
     if not isinstance(picture, str) or os.path.isfile(picture):  # noqa: PTH113  long text is no path
         return picture

@@ -13,7 +13,7 @@ import torch
 
 from depthpose.core.camera import StereoRig
 from depthpose.core.camera.pinhole import intrinsics
-from depthpose.core.camera.rectified import grey_of
+from depthpose.core.camera.rectified import grey_from_rgb
 from depthpose.core.errors import InputError
 from depthpose.depth.config import NearConfig, StreetsConfig
 from depthpose.depth.synthetic.dataset import Projector, StreetFrame, draw_scene
@@ -145,7 +145,7 @@ def draw_near(config: NearConfig, index: int) -> StreetFrame:
         shares = torch.from_numpy(rng.dirichlet([2, 2, 2])).float()[:, None, None]
         views = [(view * shares).sum(0, keepdim=True).expand(3, -1, -1) for view in views]
     elif rng.random() < config.grey_share:
-        views = [grey_of(view).expand(3, -1, -1) for view in views]
+        views = [grey_from_rgb(view).expand(3, -1, -1) for view in views]
 
     left_px = frame.disparity_px
     right_px = frame.right_disparity_px

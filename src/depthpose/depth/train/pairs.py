@@ -8,7 +8,7 @@ import torch
 
 from depthpose.core.camera import StereoRig
 from depthpose.core.errors import InputError, Notice
-from depthpose.core.loop import sample_generator, shuffled_index
+from depthpose.core.loop import make_sample_generator, shuffle_index
 from depthpose.depth.augment import TrainingPair, augment, scale_pair
 from depthpose.depth.config import PairsConfig, TruthKind
 from depthpose.depth.datasets import Dataset, Frame, lidar_truth, open_dataset, truth_kinds
@@ -129,8 +129,8 @@ class TrainingPairs:
 
     def __getitem__(self, sample_index: int) -> TrainingPair:
         """Make a sample: a random pair, randomly changed."""
-        index = shuffled_index(sample_index, len(self), self.seed)
-        generator = sample_generator(sample_index, self.seed)
+        index = shuffle_index(sample_index, len(self), self.seed)
+        generator = make_sample_generator(sample_index, self.seed)
         return augment(self.read(index), self.config.augment, generator)
 
     def read(self, index: int) -> TrainingPair:

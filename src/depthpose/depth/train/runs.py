@@ -10,14 +10,14 @@ import torch
 from torch import nn
 
 from depthpose.core.checkpoint import (
-    bound_facts,
+    add_terms,
     file_sha256,
     find_weights,
     refuse_other_network,
     warn_of_terms,
 )
 from depthpose.core.errors import InputError
-from depthpose.core.loop import Run, Task, held_out_text, releases_folder, write_card
+from depthpose.core.loop import Task, TrainingRun, format_held_out, releases_folder, write_card
 from depthpose.core.run import find_rank
 from depthpose.depth.config import GeneratorConfig, PairsConfig, SelectionConfig
 from depthpose.depth.datasets import Frame, refuse_common
@@ -112,7 +112,7 @@ _VALIDATION_TEXTS = {
 
 
 @releases_folder
-def train_view(config: ViewTraining, run: Run) -> Path:
+def train_view(config: ViewTraining, run: TrainingRun) -> Path:
     """Train the U-Net generator; give its weights file."""
     torch.manual_seed(config.loop.seed)
     config = _at_virtual_focal(config, config.generator)
@@ -127,7 +127,7 @@ def train_view(config: ViewTraining, run: Run) -> Path:
 
 
 @releases_folder
-def train_select(config: SelectTraining, run: Run) -> Path:
+def train_select(config: SelectTraining, run: TrainingRun) -> Path:
     """Train the generator that selects; give its weights file."""
     refuse_frozen_random(config)
     torch.manual_seed(config.loop.seed)
@@ -154,7 +154,7 @@ def train_select(config: SelectTraining, run: Run) -> Path:
 
 
 @releases_folder
-def train_stereo(config: StereoTraining, run: Run) -> Path:
+def train_stereo(config: StereoTraining, run: TrainingRun) -> Path:
     """Train the matcher; give its weights file."""
     # With torch 2.13, gradients of a 3x3x3 convolution over two planes in 16 bits are values near
     # 1e35 or NaN, while those over one, three or more planes agree with fp32 within 0.5 %.
@@ -175,7 +175,7 @@ def train_stereo(config: StereoTraining, run: Run) -> Path:
 
 
 @releases_folder
-def train_finetune(config: FinetuneTraining, run: Run) -> Path:
+def train_finetune(config: FinetuneTraining, run: TrainingRun) -> Path:
     """Fine-tune the generator through the frozen matcher; give the weights file of both."""
     torch.manual_seed(config.loop.seed)
     for setting in ("generator", "matcher"):
@@ -212,7 +212,7 @@ def _run_stage(
     task: Task,
     samples: TrainingPairs | stages.SelectionSamples,
     config: Any,  # noqa: ANN401
-    run: Run,
+    run: TrainingRun,
 ) -> tuple[dict[str, str], float]:
     """Claim the folder for this config, and train; give the facts of the card, and the seconds.
 
@@ -256,7 +256,7 @@ def _run_stage(
     began_with = tuple(initial_weights.values())
     if began_with:
         facts["began_with"] = ", ".join(Path(name).stem for name in began_with)
-    facts = bound_facts(facts, began_with)
+    facts = add_terms(facts, began_with)
     warn_of_terms(facts)
 
     run.claim(config, ("generator", "matcher", "fakestereo"), checksums, ("held_out",))
@@ -273,7 +273,7 @@ def _frames_sha256(frames: Sequence[Frame]) -> str:
 
 
 def _write_weights(
-    run: Run,
+    run: TrainingRun,
     stage: str,
     facts: Mapping[str, str],
     seconds: float,
@@ -291,7 +291,7 @@ def _write_weights(
         return path  # the statistics of batch norm that count are those of rank 0
 
     write_depth_weights(path, generator=generator, matcher=matcher, facts=facts)
-    measured = held_out_text(run.folder, _VALIDATION_TEXTS[stage])
+    measured = format_held_out(run.folder, _VALIDATION_TEXTS[stage])
     write_card(path, f"depth train {stage}", seconds, facts, measured)
     return path
 

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from depthpose.core.draw import draw_disparity
-from depthpose.core.loop import Update, ValidationResult, make_adam, sample_generator
+from depthpose.core.loop import Update, ValidationResult, make_adam, make_sample_generator
 from depthpose.depth import losses, synthesis
 from depthpose.depth.augment import TrainingPair, degrade
 from depthpose.depth.config import DegradeConfig
@@ -361,7 +361,7 @@ class SelectionSamples:
         # Where one image stands for both views, the right one's truth follows from the left one's.
         has_right = not torch.equal(pair.left, pair.right)
         right_px = pair.right_px if has_right else right_disparity_from_left(pair.left_px)
-        generator = sample_generator(sample_index, self.seed + 1)
+        generator = make_sample_generator(sample_index, self.seed + 1)
         return SelectionSample(
             degraded=degrade(pair.left, self.config, generator),
             left=pair.left,

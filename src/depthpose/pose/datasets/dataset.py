@@ -25,7 +25,7 @@ from depthpose.core.files import (
     write_json,
 )
 from depthpose.core.files.disk import write_bytes
-from depthpose.core.findings import CheckReport, Problem, make_report, unreadable
+from depthpose.core.findings import CheckReport, Problem, make_report, make_unreadable
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import (
     advise_unit,
@@ -229,7 +229,7 @@ def check_bop(
         except InputError as error:
             # Of which file, by the error's words: the depth image where it names no other.
             paths = (p for p in (instance.mask, instance.rgb) if p and str(p) in str(error))
-            problem = unreadable(next(paths, instance.depth), error)
+            problem = make_unreadable(next(paths, instance.depth), error)
             if not problem.path.is_file():
                 problem = replace(problem, kind="missing")
             problems.append(problem)
@@ -267,7 +267,7 @@ def _check_models(
             symmetries_from_bop(infos.get(number, {}), source=f"object {number}")
             models[number] = read_model(path, "mm", number=number)
         except InputError as error:
-            problems.append(unreadable(path, error))
+            problems.append(make_unreadable(path, error))
             continue
 
         # Is it as large as the data set says?

@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from depthpose.core.errors import InputError, nearest_name
+from depthpose.core.errors import InputError, suggest_name
 from depthpose.core.files import read_json, read_text, write_json
-from depthpose.core.files.disk import refused_suffix
+from depthpose.core.files.disk import make_suffix_error
 from depthpose.pose.datasets.layouts import MOST, read_integer, read_number, read_numbers
 from depthpose.pose.datasets.masks import Runs, decode_rle, mask_box, read_runs
 
@@ -149,7 +149,7 @@ def read_detections(path: str | Path, size: tuple[int, int] | None = None) -> li
         return _read_coco(path)
     if suffix == ".txt":
         return _read_yolo(path, size)
-    raise refused_suffix(path, "file of detections", (".json", ".txt"))
+    raise make_suffix_error(path, "file of detections", (".json", ".txt"))
 
 
 def _read_coco(path: Path) -> list[Detection]:
@@ -323,7 +323,7 @@ def parse_labels(text: str, objects: Sequence[str]) -> dict[str, str]:
         if name and name not in objects:
             raise InputError(
                 f"labels {text!r}: class {label} is {name!r}, which is no known object; "
-                f"{nearest_name(name, objects)}"
+                f"{suggest_name(name, objects)}"
             )
         labels[label] = name
     return labels
@@ -364,7 +364,7 @@ def name_objects(
             )
         if name and name not in objects and wanted is None:
             raise InputError(
-                f"{source}: class {name!r} is no known object; {nearest_name(name, objects)} Say "
+                f"{source}: class {name!r} is no known object; {suggest_name(name, objects)} Say "
                 f"by --labels {label}=OBJECT which it is, or leave it out by --labels {label}="
             )
         if name == wanted or (name and wanted is None):

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from depthpose.core.errors import InputError
-from depthpose.core.frame import data_frame
+from depthpose.core.frame import make_data_frame
 from depthpose.pose.config import EvaluationConfig
 from depthpose.pose.datasets import BopDataset, BopTarget, Instance
 from depthpose.pose.evaluate.detection import score_detections
@@ -345,7 +345,7 @@ class Evaluation:
         Raises:
             ImportError: pandas is not installed.
         """
-        return data_frame(row.columns() for row in self.per_instance)
+        return make_data_frame(row.columns() for row in self.per_instance)
 
 
 def read_any(path: Path) -> list[Prediction]:

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from depthpose.core.errors import InputError, Notice, nearest_name
+from depthpose.core.errors import InputError, Notice, suggest_name
 from depthpose.core.files import read_json
 from depthpose.core.rigid import Rigid, geodesic_rad
 from depthpose.pose.mesh.models import symmetries_from_bop, symmetry_transforms, turn_about
@@ -174,7 +174,7 @@ def assign_symmetries(
 def _refuse_unknown_name(name: str, names: Sequence[str], message: str) -> None:
     """Refuse the name of no object; ``message`` says what it was given for."""
     if name not in names:
-        raise InputError(f"{message}: no object is called so; {nearest_name(name, names)}")
+        raise InputError(f"{message}: no object is called so; {suggest_name(name, names)}")
 
 
 def _read_entry(path: Path, model: ObjectModel) -> Mapping[str, Any]:

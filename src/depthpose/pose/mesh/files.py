@@ -19,15 +19,15 @@ import numpy as np
 
 from depthpose.core.errors import InputError
 from depthpose.core.files import CLOUD_READERS, AnyPath, read_bytes, read_cloud
-from depthpose.core.files.disk import refused_as, refused_suffix
-from depthpose.core.files.points import Ragged, read_ply_elements
+from depthpose.core.files.disk import make_suffix_error, refused_as
+from depthpose.core.files.points import RaggedLists, read_ply_elements
 from depthpose.core.units import Unit
 from depthpose.pose.mesh.bodies import mark_part
 from depthpose.pose.mesh.shapes import shape_geometry, shape_unit
 
 _MOST_VALUES = 2 * 10**7  # that the accessors of a GLB may declare: six million points
 _MOST_TEXT = 2**25  # bytes of an OBJ or STL in text, which are read in some seconds
-_NO_FACES = Ragged(np.empty(0, np.int64), np.empty(0, np.int64))
+_NO_FACES = RaggedLists(np.empty(0, np.int64), np.empty(0, np.int64))
 _MOST_NODES = 10_000  # of a GLB's scene
 _MOST_SCENE_BYTES = 2**22  # of the JSON that describes it
 _MOST_NESTED = 6e7  # sum of the cubes of the depths of a GLB's nodes: some ten seconds of trimesh
@@ -81,7 +81,7 @@ def read_geometry(path: AnyModel) -> tuple[np.ndarray, np.ndarray]:
         if suffix not in MESH_READERS:
             if suffix not in CLOUD_READERS:
                 suffixes = dict.fromkeys((*MESH_READERS, *CLOUD_READERS))
-                raise refused_suffix(path, "model", tuple(suffixes))
+                raise make_suffix_error(path, "model", tuple(suffixes))
             return read_cloud(path).points.double().numpy(), np.empty((0, 3), np.int64)
         vertices, faces = MESH_READERS[suffix](path)
     if len(vertices) < 4 or not (np.abs(vertices) < _FARTHEST).all():
@@ -98,11 +98,11 @@ def read_geometry(path: AnyModel) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _convert_to_triangles(
-    path: AnyPath, vertices: np.ndarray, faces: np.ndarray | Ragged
+    path: AnyPath, vertices: np.ndarray, faces: np.ndarray | RaggedLists
 ) -> np.ndarray:
     """Convert faces to triangles (m, 3): as they are, or polygons cut."""
     if isinstance(faces, np.ndarray):
-        faces = Ragged(np.full(len(faces), faces.shape[1]), faces.reshape(-1))
+        faces = RaggedLists(np.full(len(faces), faces.shape[1]), faces.reshape(-1))
     sizes = faces.sizes
     corners = faces.values.astype(np.int64)
     if (sizes == 3).all() and ((corners >= 0) & (corners < len(vertices))).all():
@@ -150,7 +150,7 @@ def _clean_surface(
     return vertices[used], faces.reshape(-1, 3)
 
 
-def _read_ply(path: AnyPath) -> tuple[np.ndarray, Ragged]:
+def _read_ply(path: AnyPath) -> tuple[np.ndarray, RaggedLists]:
     """Read vertices and faces of a PLY file."""
     columns, lists = read_ply_elements(path)
     if not columns.keys() >= set("xyz"):
@@ -207,7 +207,7 @@ def _read_point(path: AnyPath, line: int, words: list[bytes]) -> list[float]:
     )
 
 
-def _read_stl(path: AnyPath) -> tuple[np.ndarray, Ragged]:
+def _read_stl(path: AnyPath) -> tuple[np.ndarray, RaggedLists]:
     """Read triangles; as text if the file says so and its length is not that of its triangles."""
     # What the header declares, and what follows it.
     data = read_bytes(path)
@@ -226,10 +226,10 @@ def _read_stl(path: AnyPath) -> tuple[np.ndarray, Ragged]:
         )
     record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", 9), ("attribute", "<u2")])
     corners = np.frombuffer(data, record, records, 84)["corners"].reshape(-1, 3)
-    return corners.astype(np.float64), Ragged(np.full(records, 3), np.arange(3 * records))
+    return corners.astype(np.float64), RaggedLists(np.full(records, 3), np.arange(3 * records))
 
 
-def _read_stl_text(path: AnyPath, data: bytes) -> tuple[np.ndarray, Ragged]:
+def _read_stl_text(path: AnyPath, data: bytes) -> tuple[np.ndarray, RaggedLists]:
     """Read the facets of one or more solids; a loop of four corners and more is a polygon."""
     points = array("d")
     ends = array("q", [0])  # of loops, in points
@@ -245,10 +245,10 @@ def _read_stl_text(path: AnyPath, data: bytes) -> tuple[np.ndarray, Ragged]:
             f"{path}: STL in text that ends by {keyword.decode('latin-1')[:20]!r}, not by "
             "'endsolid'; it is truncated. Export it again."
         )
-    return np.array(points).reshape(-1, 3), Ragged(np.diff(ends), np.arange(ends[-1]))
+    return np.array(points).reshape(-1, 3), RaggedLists(np.diff(ends), np.arange(ends[-1]))
 
 
-def _read_obj(path: AnyPath) -> tuple[np.ndarray, Ragged]:
+def _read_obj(path: AnyPath) -> tuple[np.ndarray, RaggedLists]:
     """Read vertices and polygons of an OBJ file."""
     points = array("d")
     sizes = array("q")
@@ -282,7 +282,7 @@ def _read_obj(path: AnyPath) -> tuple[np.ndarray, Ragged]:
             f"{path}: line {highest_line} names point {highest} of {len(vertices)}; it is damaged. "
             "Export it again."
         )
-    return vertices, Ragged(np.array(sizes, np.int64), np.array(corners, np.int64))
+    return vertices, RaggedLists(np.array(sizes, np.int64), np.array(corners, np.int64))
 
 
 def _read_face(path: AnyPath, line: int, words: list[bytes], count: int) -> list[int]:
@@ -435,7 +435,7 @@ def _refuse_nodes(path: AnyPath, nodes: list[dict[str, Any]]) -> float:
     return sum(float(depth) ** 3 for depth in depths.values())
 
 
-MESH_READERS: dict[str, Callable[[AnyPath], tuple[np.ndarray, np.ndarray | Ragged]]] = {
+MESH_READERS: dict[str, Callable[[AnyPath], tuple[np.ndarray, np.ndarray | RaggedLists]]] = {
     ".ply": _read_ply,
     ".stl": _read_stl,
     ".obj": _read_obj,

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from depthpose.core.camera import back_project
 from depthpose.core.errors import InputError
-from depthpose.core.loop import sample_generator
+from depthpose.core.loop import make_sample_generator
 from depthpose.core.render import Raster, rasterize
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import ObjectsConfig
@@ -184,7 +184,7 @@ def make_frames(
 
 def _make_solid(model: ObjectModel) -> Solid:
     """Make the body of an object, which looks alike in every frame of every data set."""
-    random = sample_generator(model.number, _COLOUR_SEED)
+    random = make_sample_generator(model.number, _COLOUR_SEED)
     pattern = draw_pattern(random, model.diameter_m, (0.7, 1.0))
     corners = drawn_triangles(model)
     normals = model.normals[model.faces]
@@ -199,7 +199,7 @@ def _make_frame(
 ) -> BopFrame:
     """Render a frame: objects on a table before a blurred background, in colour and depth."""
     # The scene in the table's frame (z up), and the camera.
-    generator = sample_generator(index, config.seed + _FRAMES_SEED)
+    generator = make_sample_generator(index, config.seed + _FRAMES_SEED)
     if config.frame_pile:
         scene = _drop_pile(models, solids, config, generator)
     else:

@@ -9,7 +9,7 @@ import math
 import numpy as np
 import torch
 
-from depthpose.core.errors import InputError, nearest_name
+from depthpose.core.errors import InputError, suggest_name
 from depthpose.core.units import metres_of
 from depthpose.pose.config import MeshConfig
 from depthpose.pose.mesh import make_model, turn_about
@@ -69,7 +69,7 @@ def make_part_mesh(name: str) -> Mesh:
         case "spool":
             return _make_spool()
         case _:
-            raise InputError(f"no part is called {name!r}; {nearest_name(name, PARTS)}")
+            raise InputError(f"no part is called {name!r}; {suggest_name(name, PARTS)}")
 
 
 def _make_bracket() -> Mesh:

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from depthpose.core.camera.pinhole import crop_intrinsics
 from depthpose.core.errors import InputError
-from depthpose.core.loop import sample_generator
+from depthpose.core.loop import make_sample_generator
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import grow_mask, lift_sample, turn_axis_to
@@ -520,7 +520,7 @@ class Objects:
     def view(self, index: int) -> ViewSample:
         """Make the window of depth and the mask that a sample is lifted from."""
         number = index % len(self.models)
-        generator = sample_generator(index, self.config.seed)
+        generator = make_sample_generator(index, self.config.seed)
         clean = self._make_clean_view(number, generator)
         silhouette = clean.depth_m.isfinite()
         depth_m = clean.depth_m
@@ -585,7 +585,7 @@ class Objects:
             # Drawn on the optical axis, by a seed of its own.
             number, place = key
             index = place * len(self.models) + number
-            generator = sample_generator(index, self.config.seed + _BANK_SEED)
+            generator = make_sample_generator(index, self.config.seed + _BANK_SEED)
             shape = self._shapes[number]
             R = random_rotation(generator)
             distance_m = uniform(generator, *self.config.distance_m)

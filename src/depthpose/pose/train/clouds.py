@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from depthpose.core.errors import InputError
-from depthpose.core.loop import ValidationResult, make_adam, sample_generator, shuffled_index
+from depthpose.core.loop import ValidationResult, make_adam, make_sample_generator, shuffle_index
 from depthpose.core.rigid import Rigid
 from depthpose.pose.baselines import DepthImageNet
 from depthpose.pose.cloud import lift_sample, sample_points, voxelise, why_too_few
@@ -115,7 +115,7 @@ class TrainingViews(Generic[Config]):
         """
         share = 0.0 if self._frames is None else self._frames.share
         if self._real is not None and float(torch.rand((), generator=generator)) < share:
-            return self._real[shuffled_index(place, len(self._real), self.seed)], True
+            return self._real[shuffle_index(place, len(self._real), self.seed)], True
         return self.synthetic.view(place), False
 
 
@@ -128,7 +128,7 @@ class TrainingClouds(TrainingViews[PoseTraining]):
         Raises:
             InputError: 20 in a row have too few points, so that the config must be wrong.
         """
-        generator = sample_generator(index, self.seed)
+        generator = make_sample_generator(index, self.seed)
         cloud_config = self.config.cloud
         # Sample i shows object i modulo their number.
         objects = len(self.models)

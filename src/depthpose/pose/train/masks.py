@@ -10,19 +10,19 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 
-from depthpose.core.camera.rectified import grey_of
+from depthpose.core.camera.rectified import grey_from_rgb
 from depthpose.core.checkpoint import Checkpoint, find_weights, load_weights, read_checkpoint
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image
 from depthpose.core.loop import (
-    Run,
+    TrainingRun,
     Update,
     ValidationResult,
-    held_out_text,
+    format_held_out,
     make_adam,
+    make_sample_generator,
     releases_folder,
-    sample_generator,
-    shuffled_index,
+    shuffle_index,
     write_card,
 )
 from depthpose.core.run import find_rank
@@ -133,8 +133,8 @@ class TrainingImages:
     def __getitem__(self, index: int) -> LabelledImage:
         """Make the sample of an index."""
         # A window of an image at a random scale.
-        generator = sample_generator(index, self.seed)
-        labelled = self.images[shuffled_index(index, len(self), self.seed)]
+        generator = make_sample_generator(index, self.seed)
+        labelled = self.images[shuffle_index(index, len(self), self.seed)]
         scale = self.long_side_px / max(labelled.image.shape[-2:])
         scale *= uniform(generator, *self.config.scale)
         window = cut_window(labelled, scale, self.config.crop_px, generator)
@@ -145,7 +145,7 @@ class TrainingImages:
         balance = 1 + (changes[3:, None, None] - 1) / 3
         bright = window.image * brightness * balance
         bright = (bright - bright.mean()) * contrast + bright.mean()
-        grey = grey_of(bright)
+        grey = grey_from_rgb(bright)
         image = (grey + (bright - grey) * saturation).clamp(0, 1)
         return LabelledImage(image, window.labels)
 
@@ -266,7 +266,7 @@ def _tint_objects(
 
 
 @releases_folder
-def train_segmentation(config: SegmentationTraining, run: Run) -> Path:
+def train_segmentation(config: SegmentationTraining, run: TrainingRun) -> Path:
     """Train FCN; give the path of its weights."""
     # What is learnt from, and the network, perhaps with a trained encoder.
     torch.manual_seed(config.loop.seed)
@@ -296,7 +296,7 @@ def train_segmentation(config: SegmentationTraining, run: Run) -> Path:
         facts=add_origin(facts, config),
     )
     write_segmentation(path, weights, with_half=config.with_half)
-    measured = held_out_text(run.folder, "Images that were held out: intersection over union.")
+    measured = format_held_out(run.folder, "Images that were held out: intersection over union.")
     card = {"objects": ", ".join(weights.objects), **weights.facts}
     write_card(path, "pose train --what segmentation", seconds, card, measured)
     return path

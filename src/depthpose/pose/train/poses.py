@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from depthpose.core.checkpoint import (
-    bound_facts,
+    add_terms,
     file_sha256,
     find_weights,
     read_checkpoint,
@@ -22,10 +22,10 @@ from depthpose.core.checkpoint import (
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_json
 from depthpose.core.loop import (
-    Run,
+    TrainingRun,
     Update,
+    make_sample_generator,
     releases_folder,
-    sample_generator,
     write_card,
 )
 from depthpose.core.rigid import Rigid
@@ -106,7 +106,7 @@ class PoseTask(ViewsTask):
         """Pose the cloud of a view by voting and measure ADD; infinite for too few points."""
         # The cloud of the view, in the axes of its grid.
         number = index % len(self.models)
-        generator = sample_generator(index, HELD_OUT_SEED)
+        generator = make_sample_generator(index, HELD_OUT_SEED)
         model = self.models[number]
         config = self.config.cloud
         sample = lift_sample(view, model.diameter_m, config)
@@ -141,12 +141,12 @@ def stack_symmetries(models: Sequence[ObjectModel], step_rad: float) -> Rigid:
 _ROTATIONS_ON_CARD = 3  # rotations by which an object looks nearly alike, on a card
 
 
-def claim_run(config: Any, run: Run, files: Sequence[str] = ()) -> None:  # noqa: ANN401
+def claim_run(config: Any, run: TrainingRun, files: Sequence[str] = ()) -> None:  # noqa: ANN401
     """Claim the folder of a run for a config, with the checksums of ``files`` and of its start."""
     checksums: dict[str, Any] = {"sha256": [file_sha256(Path(path)) for path in files]}
     if config.start is not None:
         checksums["start_sha256"] = file_sha256(find_weights(config.start))
-        warn_of_terms(bound_facts({}, [config.start]))
+        warn_of_terms(add_terms({}, [config.start]))
     weights = ("pose", "pointnet", "depth-image", "segmentation")
     run.claim(config, weights, checksums, without=("held_out",))
 
@@ -174,7 +174,7 @@ def add_origin(facts: Mapping[str, str], config: Any) -> dict[str, str]:  # noqa
     origin = {**facts, "stage": type(config).__name__}
     if config.start is None:
         return origin
-    return bound_facts({**origin, "began_with": Path(config.start).stem}, [config.start])
+    return add_terms({**origin, "began_with": Path(config.start).stem}, [config.start])
 
 
 _IMAGE_SYMMETRY_STEP = 0.2
@@ -199,7 +199,7 @@ class TrainingCrops(TrainingViews[DepthImageTraining]):
         for attempt in range(TRIES):
             # A further attempt takes an index beyond any training, of the same object.
             place = index + attempt * len(self.models) * BEYOND_TRAINING
-            view, _ = self._choose_view(place, sample_generator(place, self.seed))
+            view, _ = self._choose_view(place, make_sample_generator(place, self.seed))
             number = self._class_of[view.input.object]
             crop = cut_depth(view.input, self.config.network, self.models[number].diameter_m)
             if crop is not None:
@@ -262,7 +262,7 @@ _STATISTICS_CLOUDS = 64  # from which statistics of batch norm, lost by folding,
 
 
 @releases_folder
-def train_pose_network(config: PoseTraining | DepthImageTraining, run: Run) -> Path:
+def train_pose_network(config: PoseTraining | DepthImageTraining, run: TrainingRun) -> Path:
     """Train the network that a config has, ours or a baseline; give its weights file.
 
     Raises:
