@@ -11,8 +11,9 @@ from depthpose.core.config import config_to_dict, read_config
 from depthpose.depth.augment import TrainingPair
 from depthpose.depth.datasets import open_dataset, read_split
 from depthpose.depth.disparity import size_at_focal_length
+from depthpose.depth.generators import UNetGenerator
 from depthpose.depth.stereo import PSMNet
-from depthpose.depth.synthesis import ROWS_SHARE, UNetGenerator
+from depthpose.depth.synthesis import ROWS_SHARE
 from depthpose.depth.synthetic import kitti_rig
 from depthpose.depth.train import STAGES, FinetuneTask, ViewTask
 from depthpose.depth.train.config import FinetuneTraining, StereoTraining, ViewTraining

@@ -17,9 +17,9 @@ from depthpose.core.run import claim_folder, environment
 from depthpose.depth.config import COLOR_RANGE_M, SGBMConfig, StreetsConfig
 from depthpose.depth.disparity import depth_from_disparity
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.evaluate import clamped_depth
 from depthpose.depth.metrics import measure
 from depthpose.depth.predictions import CLOUD_M, write_estimate
+from depthpose.depth.protocols import clamped_depth
 from depthpose.depth.synthetic import Streets
 from depthpose.depth.types import DepthError, StereoInput, StereoSample, StereoTruth
 from depthpose.pose.config import ObjectsConfig

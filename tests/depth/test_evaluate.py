@@ -17,13 +17,7 @@ from depthpose.core.runner import Job
 from depthpose.depth.datasets import Dataset, check_dataset, open_dataset
 from depthpose.depth.disparity import depth_from_disparity, disparity_advice, resized_map
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.evaluate import (
-    Measured,
-    clamped_depth,
-    evaluate,
-    frame_result,
-    measure_frame,
-)
+from depthpose.depth.evaluate import Measured, evaluate, frame_result, measure_frame
 from depthpose.depth.predictions import (
     estimate_missing_depth,
     is_finished,
@@ -31,6 +25,7 @@ from depthpose.depth.predictions import (
     read_estimate,
     write_estimate,
 )
+from depthpose.depth.protocols import clamped_depth
 from depthpose.depth.stereo import CallableMatcher
 from depthpose.depth.types import DepthEstimate, StereoInput
 

@@ -25,16 +25,16 @@ from depthpose.depth.config import (
     PSMNetConfig,
 )
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.export import (
+from depthpose.depth.export import depth_export
+from depthpose.depth.generators import SelectionGenerator, UNetGenerator
+from depthpose.depth.graphs import (
     DynamicLightStereo,
     DynamicPSMNet,
     DynamicSelection,
-    depth_export,
     gathered_volume,
 )
 from depthpose.depth.stereo import LightStereo, PSMNet
 from depthpose.depth.stereo.psmnet import concatenation_volume
-from depthpose.depth.synthesis import SelectionGenerator, UNetGenerator
 from depthpose.depth.weights import DepthWeights, write_depth_weights
 
 onnxruntime = pytest.importorskip("onnxruntime")
@@ -105,7 +105,7 @@ def selection(
             return selection_network
         return network_model(module, images, multiple)
 
-    monkeypatch.setattr("depthpose.depth.export.network_model", exported_once)
+    monkeypatch.setattr("depthpose.depth.graphs.network_model", exported_once)
     write_depth_weights(tmp_path / "w.safetensors", generator=of_all_kinds(), facts=TERMS)
     return tmp_path
 

@@ -29,10 +29,10 @@ from depthpose.depth.datasets.frames import Frame
 from depthpose.depth.datasets.layouts import LAYOUTS, Layout
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.export import TARGETS, Target, depth_export
+from depthpose.depth.generators import SelectionGenerator, UNetGenerator
 from depthpose.depth.losses import ADVERSARIAL_LOSSES, GENERATOR_DISPARITY_LOSSES, adversarial_loss
 from depthpose.depth.metrics import METRICS, Metric
 from depthpose.depth.stereo import StereoNetwork
-from depthpose.depth.synthesis import SelectionGenerator, UNetGenerator
 from depthpose.depth.train.config import FinetuneTraining, SelectTraining, StereoTraining
 from depthpose.depth.train.runs import train_finetune, train_stereo
 from depthpose.depth.train.stages import SelectionSample, SelectTask, StereoTask

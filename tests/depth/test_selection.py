@@ -13,12 +13,10 @@ from torch import Tensor
 
 from depthpose.core.errors import InputError
 from depthpose.depth.config import SelectionConfig
+from depthpose.depth.encoder import LiteEncoder, import_encoder, load_encoder
+from depthpose.depth.generators import SelectionGenerator
 from depthpose.depth.synthesis import (
-    LiteEncoder,
-    SelectionGenerator,
     draw_right,
-    import_encoder,
-    load_encoder,
     make_synthesiser,
     mix_shifts,
     read_logits,

@@ -22,18 +22,18 @@ from depthpose.depth.config import (
     PSMNetConfig,
     StreetsConfig,
 )
+from depthpose.depth.encoder import LiteEncoder, load_encoder
 from depthpose.depth.stereo import LightMatcher, LightStereo, PSMNet, normalise
-from depthpose.depth.stereo.light import (
+from depthpose.depth.stereo.light import confidence_near, light_bytes
+from depthpose.depth.stereo.light_layers import (
     STEM,
     ConvexUpsampling,
     Refinement,
-    confidence_near,
     correlation_volume,
-    light_bytes,
     unit_groups,
 )
-from depthpose.depth.stereo.matcher import CameraMatcher, pad_top_right
-from depthpose.depth.synthesis import LiteEncoder, load_encoder
+from depthpose.depth.stereo.matcher import CameraMatcher
+from depthpose.depth.stereo.network_matcher import pad_top_right
 from depthpose.depth.train import StereoTask
 from depthpose.depth.train.config import StereoTraining
 from depthpose.depth.train.runs import make_matcher_network, train_stereo

@@ -22,7 +22,7 @@ from depthpose.depth.labels import LabelConfig, label_pair
 from depthpose.depth.losses import sky_loss
 from depthpose.depth.predictions import read_estimate, write_estimate
 from depthpose.depth.stereo import LightMatcher, LightStereo, StereoNetwork, light, normalise
-from depthpose.depth.stereo.matcher import lower_where_disagreeing
+from depthpose.depth.stereo.network_matcher import lower_where_disagreeing
 from depthpose.depth.train import StereoTask
 from depthpose.depth.train.config import StereoTraining
 from depthpose.depth.train.pairs import TrainingPairs

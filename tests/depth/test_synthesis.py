@@ -6,13 +6,8 @@ from torch import Tensor, nn
 
 from depthpose.core.errors import InputError
 from depthpose.depth.config import GeneratorConfig
-from depthpose.depth.synthesis import (
-    Discriminator,
-    UNetGenerator,
-    draw_right,
-    make_synthesiser,
-    pad_to_multiple,
-)
+from depthpose.depth.generators import Discriminator, UNetGenerator
+from depthpose.depth.synthesis import draw_right, make_synthesiser, pad_to_multiple
 
 
 def parameters(module: nn.Module) -> int:

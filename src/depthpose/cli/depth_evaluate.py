@@ -22,19 +22,17 @@ from depthpose.depth.config import Answer, BaselineName, MatcherConfig, Speed
 from depthpose.depth.datasets import Dataset, join_datasets, open_dataset, refuse_common
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.evaluate import (
-    PROTOCOLS,
     Evaluation,
     EvaluationRow,
     Measured,
-    Protocol,
     evaluate,
     frame_result,
-    has_truth,
     measure_frame,
     summarise,
 )
 from depthpose.depth.metrics import METRICS, RANKING
 from depthpose.depth.predictions import estimate_missing_depth, is_finished
+from depthpose.depth.protocols import PROTOCOLS, Protocol, has_truth
 from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.report import page
 from depthpose.report.depth import depth_section

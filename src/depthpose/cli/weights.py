@@ -139,7 +139,7 @@ def import_weights(
 
         import_resnet18(file, out)
     else:
-        from depthpose.depth.synthesis import import_encoder
+        from depthpose.depth.encoder import import_encoder
 
         import_encoder(file, out)
     return show_weights(str(out))

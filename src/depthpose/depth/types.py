@@ -85,7 +85,7 @@ class Match:
 class Ground:
     """The road as a plane below a camera: fitted to one depth map, or combined from all cues.
 
-    The latter is the camera's mount (``find_mount`` of ``depth/ground.py``).
+    The latter is the camera's mount (``find_mount`` of ``depth/mount.py``).
     """
 
     height_m: float  #: height of the camera above the plane

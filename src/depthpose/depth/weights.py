@@ -22,7 +22,7 @@ from depthpose.depth.config import (
     PSMNetConfig,
     SelectionConfig,
 )
-from depthpose.depth.synthesis import Generator, SelectionGenerator, UNetGenerator
+from depthpose.depth.generators import Generator, SelectionGenerator, UNetGenerator
 
 
 @dataclass(frozen=True, kw_only=True)

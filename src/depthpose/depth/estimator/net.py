@@ -32,16 +32,13 @@ from depthpose.core.files import as_tensor, read_exif_focal
 from depthpose.depth.config import Answer, MatcherConfig, SGBMConfig
 from depthpose.depth.estimator.pair import depth_from_pair
 from depthpose.depth.estimator.single_image import depth_from_images, virtual_sizes
-from depthpose.depth.ground import MountFilter, scale_by_distance
+from depthpose.depth.generators import SelectionGenerator
+from depthpose.depth.mount import MountFilter, scale_by_distance
 from depthpose.depth.stereo import (
     Matcher,
     SGBMMatcher,
 )
-from depthpose.depth.synthesis import (
-    SelectionGenerator,
-    Synthesiser,
-    make_synthesiser,
-)
+from depthpose.depth.synthesis import Synthesiser, make_synthesiser
 from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.depth.weights import DepthWeights, Use, make_matcher, read_depth_weights
 

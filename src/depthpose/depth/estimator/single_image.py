@@ -15,7 +15,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.files.images import check_image
 from depthpose.depth.config import SelectionConfig
 from depthpose.depth.disparity import estimate_from_virtual, resize_image, size_at_focal_length
-from depthpose.depth.ground import MountFilter, scale_by_mount
+from depthpose.depth.mount import MountFilter, scale_by_mount
 from depthpose.depth.stereo import CameraMatcher, Matcher
 from depthpose.depth.synthesis import SynthesisedViews, Synthesiser
 from depthpose.depth.types import DepthEstimate, Match, StereoInput, Views

@@ -26,7 +26,7 @@ from depthpose.core.errors import InputError
 from depthpose.depth.config import PSMNetConfig
 from depthpose.depth.stereo import layers
 from depthpose.depth.stereo.layers import ConvNorm, Volume
-from depthpose.depth.stereo.matcher import NetworkMatcher, StereoNetwork
+from depthpose.depth.stereo.network_matcher import NetworkMatcher, StereoNetwork
 from depthpose.depth.types import Map, Maps, Match, Views
 
 CHUNK_BYTES = 6 << 20

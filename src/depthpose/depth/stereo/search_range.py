@@ -18,7 +18,7 @@ from torch.nn import functional as F
 
 from depthpose.core.camera import Camera
 from depthpose.depth.disparity import map_match, warp_right_to_left
-from depthpose.depth.stereo.matcher import (
+from depthpose.depth.stereo.network_matcher import (
     STEP_PX,
     NetworkMatcher,
     SearchRange,

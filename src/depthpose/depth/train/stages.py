@@ -15,13 +15,13 @@ from torch import Tensor, nn
 
 from depthpose.core.draw import draw_disparity
 from depthpose.core.loop import Update, ValidationResult, make_adam, sample_generator
-from depthpose.depth import losses, synthesis
+from depthpose.depth import generators, losses, synthesis
 from depthpose.depth.augment import TrainingPair, degrade
 from depthpose.depth.config import DegradeConfig
 from depthpose.depth.disparity import right_disparity_from_left
 from depthpose.depth.metrics import measure
 from depthpose.depth.stereo import StereoNetwork, normalise
-from depthpose.depth.stereo.matcher import pad_top_right
+from depthpose.depth.stereo.network_matcher import pad_top_right
 from depthpose.depth.train.config import (
     FinetuneTraining,
     SelectTraining,
@@ -127,7 +127,7 @@ def _end_point_error(
 
 @torch.no_grad()
 def validate_pairs(
-    matcher: StereoNetwork, held_out: TrainingPairs, generator: synthesis.Generator | None = None
+    matcher: StereoNetwork, held_out: TrainingPairs, generator: generators.Generator | None = None
 ) -> ValidationResult:
     """Measure a matcher in eval mode on held-out pairs.
 
@@ -192,7 +192,7 @@ class ViewTask:
 
     def __init__(
         self,
-        generator: synthesis.UNetGenerator,
+        generator: generators.UNetGenerator,
         config: ViewTraining,
         held_out: TrainingPairs | None,
     ) -> None:
@@ -203,7 +203,7 @@ class ViewTask:
         adam = config.generator_adam
         self.optimizers = {"generator": (make_adam(generator.parameters(), adam), adam)}
         if config.discriminator != "none":
-            discriminator = synthesis.Discriminator(
+            discriminator = generators.Discriminator(
                 config.discriminator, config.discriminator_width
             )
             self.modules["discriminator"] = discriminator.train()
@@ -271,7 +271,7 @@ class FinetuneTask:
 
     def __init__(
         self,
-        generator: synthesis.Generator,
+        generator: generators.Generator,
         matcher: StereoNetwork,
         config: FinetuneTraining,
         held_out: TrainingPairs | None,
@@ -385,7 +385,7 @@ class SelectTask:
 
     def __init__(
         self,
-        generator: synthesis.SelectionGenerator,
+        generator: generators.SelectionGenerator,
         config: SelectTraining,
         held_out: TrainingPairs | None,
     ) -> None:
