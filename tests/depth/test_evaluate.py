@@ -15,7 +15,7 @@ from depthpose.core.files import write_depth_png, write_image, write_map
 from depthpose.core.run import note_result
 from depthpose.core.runner import Job
 from depthpose.depth.datasets import Dataset, check_dataset, open_dataset
-from depthpose.depth.disparity import depth_from_disparity, disparity_advice, resized_map
+from depthpose.depth.disparity import depth_from_disparity, find_unit_mistake, resize_map
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.evaluate import Measured, evaluate, frame_result, measure_frame
 from depthpose.depth.predictions import (
@@ -173,11 +173,11 @@ def test_what_a_poor_estimate_could_be_too_is_a_notice() -> None:
         (1 / 9, "9 times .* is it without a scale"),
     ):
         with pytest.warns(Notice, match=said):
-            assert disparity_advice(factor * true_px, true_px) is None
+            assert find_unit_mistake(factor * true_px, true_px) is None
     with pytest.warns(Notice, match="is it inverse depth"):
-        assert disparity_advice(6 / true_px, true_px) is None
+        assert find_unit_mistake(6 / true_px, true_px) is None
     for fair in (1.2 * true_px, true_px + torch.randn(40, 50) / 4, torch.full((40, 50), 3.0)):
-        assert disparity_advice(fair, true_px) is None
+        assert find_unit_mistake(fair, true_px) is None
 
 
 @pytest.mark.parametrize("unknown", [0.0, -1.0, 64.0, 65535.0, 1e30])
@@ -245,11 +245,11 @@ def test_a_prediction_of_another_shape_is_stretched_with_a_notice_or_refused(
     cut = written("cut", lambda px: px[top:, left:-left].contiguous())
     with pytest.raises(InputError, match=rf"cut out at column {left}, row {top} .* NaN around it"):
         evaluate(pairs, cut, "kitti-2015")
-    squeezed = written("squeezed", lambda px: resized_map(px, H, W // 2) / 2)
+    squeezed = written("squeezed", lambda px: resize_map(px, H, W // 2) / 2)
     with pytest.warns(Notice, match="of another aspect, so it is stretched"):
         found = evaluate(pairs, squeezed, "kitti-2015")
     # Columns alone were squeezed: rows, which are as many as before, scale no disparity.
-    plain = written("plain", lambda px: resized_map(resized_map(px, H, W // 2), H, W))
+    plain = written("plain", lambda px: resize_map(resize_map(px, H, W // 2), H, W))
     expected = evaluate(pairs, plain, "kitti-2015").rows[0].metrics["epe_px"]
     assert found.rows[0].metrics["epe_px"] == pytest.approx(expected, abs=1e-4)
 

@@ -304,7 +304,7 @@ def frame_result(
     # The whole prediction, without the sky.
     depth_m = None if rig is None else disparity.depth_from_disparity(prepared.disparity_px, rig)
     sky = files.read_part(predictions, name, "sky.png")
-    is_sky = None if sky is None else disparity.resized_map((sky[0] > 0).float(), *size) > 0.5
+    is_sky = None if sky is None else disparity.resize_map((sky[0] > 0).float(), *size) > 0.5
     if is_sky is not None and depth_m is not None:
         depth_m = torch.where(is_sky, torch.nan, depth_m)
     right = files.read_part(predictions, name, "right.png")

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from depthpose.core.arrays import IMAGENET_MEAN, IMAGENET_STD
 from depthpose.core.errors import InputError
 from depthpose.core.export import Graph, Value, network_model
-from depthpose.depth.disparity import LEAST_PX, SKY_M
+from depthpose.depth.disparity import MIN_DISPARITY_PX, SKY_M
 from depthpose.depth.generators import Generator, SelectionGenerator
 from depthpose.depth.stereo import LightStereo, PSMNet, StereoNetwork
 from depthpose.depth.stereo.layers import interpolation_matrix, linear_taps
@@ -358,7 +358,7 @@ def pair_graph(weights: DepthWeights) -> Graph:
     disparity_px, confidence, sky = _match(left, right, focal_px, weights.matcher)
     if sky is not None:
         is_sky = sky.op("Greater", _HALF)
-        disparity_px = is_sky.op("Where", np.float32(LEAST_PX), disparity_px)
+        disparity_px = is_sky.op("Where", np.float32(MIN_DISPARITY_PX), disparity_px)
         graph.output("is_sky", is_sky, np.bool_, _MAPS_SHAPE)
     graph.output("disparity_px", disparity_px, np.float32, _MAPS_SHAPE)
     graph.output("confidence", confidence, np.float32, _MAPS_SHAPE)

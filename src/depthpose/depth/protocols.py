@@ -162,13 +162,15 @@ def prepare_frame(
 
     # Units and signs; where principal points differ, the disparity of far points is negative.
     cx_difference_px = 0.0 if rig is None else rig.cx_right_minus_left_px
-    advice = disparity.disparity_advice(predicted_px + cx_difference_px, true_px + cx_difference_px)
+    advice = disparity.find_unit_mistake(
+        predicted_px + cx_difference_px, true_px + cx_difference_px
+    )
     if advice is not None:
         raise InputError(f"{predictions / frame.name}: {advice}")
 
     confidence = files.read_part(predictions, frame.name, "confidence.npy")
     if confidence is not None and confidence.shape != truth.shape:
-        confidence = disparity.resized_map(confidence, height, width)
+        confidence = disparity.resize_map(confidence, height, width)
     return PreparedFrame(
         frame=frame,
         truth=truth,
@@ -206,7 +208,7 @@ def _resize_to_truth(true_px: Map, stored_px: Float[Tensor, "_ _"], path: Path) 
     """
     height, width = true_px.shape
     rows, columns = stored_px.shape
-    stretched_px = disparity.resized_map(stored_px, height, width) * (width / columns)
+    stretched_px = disparity.resize_map(stored_px, height, width) * (width / columns)
     aspect_ratio = columns * height / (rows * width)
     if 1 / _ASPECT_TOLERANCE < aspect_ratio < _ASPECT_TOLERANCE:
         return stretched_px

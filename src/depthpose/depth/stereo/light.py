@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from depthpose.core.errors import InputError
 from depthpose.depth.config import LightConfig
-from depthpose.depth.disparity import LEAST_PX
+from depthpose.depth.disparity import MIN_DISPARITY_PX
 from depthpose.depth.encoder import LiteEncoder
 from depthpose.depth.stereo import layers
 from depthpose.depth.stereo.layers import by_rows
@@ -181,7 +181,7 @@ class LightStereo(StereoNetwork):
         enlarged_px, *rest = by_rows(self.enlargement, parts, halo=2, rows=self.rows).unbind(1)
         parts = (enlarged_px, left_half, right_half)
         half_rows = None if self.rows is None else 2 * self.rows
-        refine = partial(self.refinement, least_px=first_px + LEAST_PX)
+        refine = partial(self.refinement, least_px=first_px + MIN_DISPARITY_PX)
         heads = (by_rows(refine, parts, halo=5, rows=half_rows),)
         if coarse_px is not None:
             wide_px = F.interpolate(coarse_px, scale_factor=4.0, mode="bilinear")[:, 0]

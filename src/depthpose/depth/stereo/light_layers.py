@@ -22,7 +22,7 @@ from torch import Tensor, nn
 
 from depthpose.core.arrays import IMAGENET_MEAN, IMAGENET_STD
 from depthpose.depth.config import LightConfig
-from depthpose.depth.disparity import LEAST_PX
+from depthpose.depth.disparity import MIN_DISPARITY_PX
 from depthpose.depth.encoder import LiteEncoder
 from depthpose.depth.stereo.layers import ConvNorm, Features, Volume, by_rows
 from depthpose.depth.types import Maps, Views
@@ -134,7 +134,7 @@ class Refinement(nn.Module):
         enlarged_px: Maps,
         left_half: Features,
         right_half: Features,
-        least_px: float = LEAST_PX,
+        least_px: float = MIN_DISPARITY_PX,
     ) -> Maps:
         """Correct a disparity of the left view [px] by features of both views at half size."""
         # The disparities of the four pixels that a pixel at half size is, and their mean.

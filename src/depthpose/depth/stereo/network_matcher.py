@@ -163,7 +163,7 @@ class NetworkMatcher(ABC):
         home = pairs[0][0].device
         return [
             disparity.resize_match(
-                disparity.map_match(match, lambda values: values.to(home)), *left.shape[1:]
+                disparity.apply_to_maps(match, lambda values: values.to(home)), *left.shape[1:]
             )
             for match, (left, _) in zip(matches, pairs, strict=True)
         ]
@@ -227,7 +227,7 @@ class NetworkMatcher(ABC):
         self._refuse_memory(network_config, *padded_left.shape[-2:])
         matches = self.run(padded_left, padded_right, network_config, first_px)
         crop = itemgetter((slice(-height, None), slice(width)))  # values[-height:, :width]
-        return [disparity.map_match(match, crop) for match in matches]
+        return [disparity.apply_to_maps(match, crop) for match in matches]
 
     def _refuse_memory(self, network_config: Any, height: int, width: int) -> None:  # noqa: ANN401
         """Refuse images whose matching takes more memory than the config allows."""

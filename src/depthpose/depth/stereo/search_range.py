@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from depthpose.core.camera import Camera
-from depthpose.depth.disparity import map_match, warp_right_to_left
+from depthpose.depth.disparity import apply_to_maps, warp_right_to_left
 from depthpose.depth.stereo.network_matcher import (
     STEP_PX,
     NetworkMatcher,
@@ -25,7 +25,7 @@ from depthpose.depth.stereo.network_matcher import (
     lower_where_disagreeing,
 )
 from depthpose.depth.types import Map, Mask, Match
-from depthpose.depth.visible import without_picture
+from depthpose.depth.visible import find_blank_borders
 
 _TAIL = 0.001
 """Share of the copy's pixels that may lie beyond either end: single pixels at edges are wrong."""
@@ -79,7 +79,7 @@ def move_match_back(match: Match, first_px: int) -> Match:
     if first_px == 0:
         return match
     added = max(-first_px, 0)
-    moved = map_match(match, lambda values: values[:, added:])
+    moved = apply_to_maps(match, lambda values: values[:, added:])
     moved = replace(moved, disparity_px=moved.disparity_px + first_px)
     if moved.confidence is None:
         return moved
@@ -158,8 +158,8 @@ def _search_of_narrow_copy(matcher: NetworkMatcher, width: int, infinity_px: flo
 
 def _shows_picture(left: Tensor, right: Tensor, disparity_px: Map) -> Mask:
     """Mark where neither a pixel nor what it is matched with lies in a border without a picture."""
-    left_blank = without_picture(left).to(disparity_px.device)
-    right_blank = without_picture(right).to(disparity_px)
+    left_blank = find_blank_borders(left).to(disparity_px.device)
+    right_blank = find_blank_borders(right).to(disparity_px)
     matched_blank = warp_right_to_left(right_blank[None], disparity_px)[0]
     return ~left_blank & ~(matched_blank > 0)
 
