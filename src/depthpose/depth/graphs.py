@@ -17,7 +17,7 @@ from depthpose.depth.generators import Generator, SelectionGenerator
 from depthpose.depth.stereo import LightStereo, PSMNet, StereoNetwork
 from depthpose.depth.stereo.layers import interpolation_matrix, linear_taps
 from depthpose.depth.stereo.psmnet import WINDOW_PX
-from depthpose.depth.synthesis import COLUMNS_SHARE, ROWS_SHARE, read_logits
+from depthpose.depth.synthesis import MAX_COLUMN_STRETCH, MAX_ROW_STRETCH, read_logits
 from depthpose.depth.types import Views
 from depthpose.depth.weights import DepthWeights
 
@@ -189,14 +189,14 @@ class _Generated(NamedTuple):
 
 
 def _generate(left: Value, generator: Generator) -> _Generated:
-    """Add a generator to a graph: ``draw_right``, and the left maps of ``select_views``."""
+    """Add a generator to a graph: ``synthesise_right``, and the left maps of ``estimate_views``."""
     size = left.op("Shape", start=2, end=4)
     multiple = generator.config.side_multiple_px
 
     # The multiple that a side is close to, or the side itself.
     sides = size.cast(np.float64)
     nearest = (sides / float(multiple)).op("Round").op("Max", 1.0) * float(multiple)
-    limits = sides * np.array([ROWS_SHARE, COLUMNS_SHARE])
+    limits = sides * np.array([MAX_ROW_STRETCH, MAX_COLUMN_STRETCH])
     is_near = (nearest - sides).op("Abs").op("LessOrEqual", limits)
     network_size = is_near.op("Where", nearest, sides).cast(np.int64)
 

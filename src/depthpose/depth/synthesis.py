@@ -1,7 +1,7 @@
-"""Right views synthesised from left images of any size, and what a selecting generator estimates.
+"""Right views synthesised from left images of any size, by one of the two generators.
 
-Images are RGB in [0, 1]; they are stretched or padded to sides that the network takes. Networks use
-the norm statistics of their training.
+A selecting generator estimates the disparity of both views too. Images are RGB in [0, 1]; they are
+stretched or padded to sides that the network takes.
 """
 
 import math
@@ -27,16 +27,15 @@ from depthpose.depth.generators import (
 from depthpose.depth.types import Maps, Views
 
 _MAX_SHARE_OF_RANGE = 0.4
-"""Largest usable share of the largest disparity that a size can have: above it expectations come
-out too small, for trainings have few objects so near, and the shipped generators hardly give more
-than half of it."""
-_SURE_RATIO = 1.15
-"""Disparities within this ratio of the expectation count as confidence in it."""
+"""Share of the largest disparity of the planes up to which an estimate is trusted: above it
+expectations come out too small, for trainings have few objects so near."""
+_CONFIDENCE_RATIO = 1.15
+"""The confidence is the probability of the disparities within this ratio of the expectation."""
 
 
 @dataclass(frozen=True, eq=False)
-class Selected:
-    """Disparity, sky and confidence of one view, by its distributions over disparities."""
+class ViewEstimate:
+    """Disparity, sky and confidence of one view, by a selecting generator."""
 
     disparity_px: Maps  #: exponential of the mean logarithm of disparity, without the sky
     sky: Maps  #: probability of the sky
@@ -45,27 +44,27 @@ class Selected:
     street_probability: Float[Tensor, " b"] | None = None
 
 
-def average_sizes(views: Sequence[Selected], limits_px: Sequence[float]) -> Selected:
+def average_sizes(estimates: Sequence[ViewEstimate], limits_px: Sequence[float]) -> ViewEstimate:
     """Average the estimates of one view that were made from the image at several sizes.
 
     A mean over sizes has the smaller error. The confidence stays that of the first size, which
     ranks these errors better than a mean of confidences (AUSE 0.34 and 0.41 of chance).
 
     Args:
-        views: the estimates, resized to one size. Where the disparity of the first is near the
+        estimates: the estimates, resized to one size. Where the disparity of the first is near the
             limit of another, that other does not count.
         limits_px: the largest disparity that each can have, at that one size.
     """
-    first = views[0]
-    if len(views) == 1:
+    first = estimates[0]
+    if len(estimates) == 1:
         return first
     is_within = [first.disparity_px < _MAX_SHARE_OF_RANGE * limit_px for limit_px in limits_px]
-    counts = torch.stack(is_within)
-    counts[0] = True
-    weights = counts / counts.sum(0)
-    log_px = torch.stack([view.disparity_px.log() for view in views])
-    sky = torch.stack([view.sky for view in views])
-    return Selected(
+    is_counted = torch.stack(is_within)  # (sizes, b, h, w)
+    is_counted[0] = True
+    weights = is_counted / is_counted.sum(0)
+    log_px = torch.stack([estimate.disparity_px.log() for estimate in estimates])
+    sky = torch.stack([estimate.sky for estimate in estimates])
+    return ViewEstimate(
         disparity_px=(weights * log_px).sum(0).exp(),
         sky=(weights * sky).sum(0),
         confidence=first.confidence,
@@ -74,11 +73,19 @@ def average_sizes(views: Sequence[Selected], limits_px: Sequence[float]) -> Sele
 
 
 def read_logits(logits: Logits, planes: Planes) -> tuple[Tensor, Tensor, Tensor]:
-    """Give the log of disparity, the probability of sky, and the confidence of the disparity.
+    """Compute log of disparity, probability of the sky, and confidence of the disparity.
 
-    Each is (b, rows, columns), at the size of the logits. The log of disparity is the mean over the
-    planes, because in the mean of disparity itself one plane at 88 px would outweigh many at 2 px.
-    The confidence is the probability of planes near that mean. Both leave out the sky.
+    The log of disparity is the expected log over the planes: in the mean of disparity itself one
+    plane at 88 px would outweigh many at 2 px. The confidence is the probability of planes within
+    15 % of it. For both the sky is left out.
+
+    Args:
+        logits: those of the sky, then of each plane.
+        planes: disparities of the planes [px].
+
+    Returns:
+        Three maps (b, rows, columns) of the size of the logits: the natural logarithm of the
+        disparity [px], probability, and confidence, 0..1.
     """
     logits = logits.float()
     sky = logits.softmax(1)[:, 0]
@@ -86,7 +93,7 @@ def read_logits(logits: Logits, planes: Planes) -> tuple[Tensor, Tensor, Tensor]
     probabilities = logits[:, 1:].softmax(1)
     log_planes = planes.log()
     log_px = torch.einsum("bkhw,k->bhw", probabilities, log_planes)
-    is_near = (log_planes[:, None, None] - log_px[:, None]).abs() <= math.log(_SURE_RATIO)
+    is_near = (log_planes[:, None, None] - log_px[:, None]).abs() <= math.log(_CONFIDENCE_RATIO)
     confidence = (probabilities * is_near).sum(1)
     return log_px, sky, confidence
 
@@ -94,8 +101,8 @@ def read_logits(logits: Logits, planes: Planes) -> tuple[Tensor, Tensor, Tensor]
 def warp_left_to_right(left: Views, right_px: Maps) -> Views:
     """Synthesise the right view: sample ``left`` at ``x + disparity`` for each right pixel x.
 
-    Beyond the border the border repeats. Unlike a mixture of shifts (:func:`mix_shifts`), whose L1
-    error is lower, it has no ghosts, which no matcher can match.
+    Beyond the border the border repeats. Compared with a mixture of shifts (:func:`mix_shifts`) the
+    L1 error is larger, but nothing is seen twice, which no matcher can match.
     """
     height, width = left.shape[-2:]
     columns = torch.arange(width, device=left.device) + right_px
@@ -110,29 +117,34 @@ def warp_left_to_right(left: Views, right_px: Maps) -> Views:
 def mix_shifts(left: Views, logits: Logits, planes: Planes) -> Views:
     """Synthesise the right view as the mean of shifted left images, weighted by probability.
 
-    Used in training, since every shift gets a gradient. ``logits`` have the size of ``left``, and
-    ``planes`` count its pixels.
+    Used in training, since every shift gets a gradient.
+
+    Args:
+        left: the left views.
+        logits: those of the right view, at the size of ``left``.
+        planes: disparities of the planes, in pixels of ``left``.
     """
     width = left.shape[-1]
-    max_shift = math.ceil(float(planes[-1])) + 1
-    padded = F.pad(left, (0, max_shift, 0, 0), mode="replicate")
+    max_shift_px = math.ceil(float(planes[-1])) + 1
+    padded = F.pad(left, (0, max_shift_px, 0, 0), mode="replicate")
     probabilities = logits.softmax(1)
-    mixed = probabilities[:, :1] * left  # the sky is not shifted
-    for number, shift in enumerate(planes.tolist(), 1):
-        whole = math.floor(shift)
-        fraction = shift - whole
-        lower = padded[..., whole : whole + width]
-        upper = padded[..., whole + 1 : whole + 1 + width]
+    mixed = probabilities[:, :1] * left  # class 0, the sky, is not shifted
+    for class_index, shift_px in enumerate(planes.tolist(), 1):
+        # Linear between the shifts by whole pixels.
+        whole_px = math.floor(shift_px)
+        fraction = shift_px - whole_px
+        lower = padded[..., whole_px : whole_px + width]
+        upper = padded[..., whole_px + 1 : whole_px + 1 + width]
         shifted = torch.lerp(lower, upper, fraction)
-        mixed = mixed + probabilities[:, number : number + 1] * shifted
+        mixed = mixed + probabilities[:, class_index : class_index + 1] * shifted
     return mixed
 
 
-ROWS_SHARE = 0.03
+MAX_ROW_STRETCH = 0.03
 """Largest share by which rows are stretched to a side that a network takes: no disparity depends on
 them."""
 
-COLUMNS_SHARE = 0.01
+MAX_COLUMN_STRETCH = 0.01
 """Largest share by which columns are stretched to a side that a network takes: depth is off by as
 much."""
 
@@ -151,10 +163,10 @@ class SynthesisedViews:
 
 
 class SelectionSynthesiser:
-    """Synthesises right views by a generator that selects; estimates the left view's disparity too.
+    """Synthesises right views by a selecting generator, and estimates the left view's disparity.
 
-    At the fine speed it averages the estimates of an image at 1 and at 1.4 times its size at the
-    virtual focal length; at the quick speed it has the first alone.
+    At the speed ``fine`` an image is estimated at two sizes, 1 and 1.4 times that at the virtual
+    focal length, and both are averaged; at ``quick`` at the first alone. ``scales`` says so.
     """
 
     def __init__(
@@ -185,25 +197,25 @@ class SelectionSynthesiser:
                 check_image(image, "the left image")
         on_device = [images.to(self.device, torch.float32) for images in inputs]
 
-        # Estimates of both views by each size of the image, averaged.
+        # Both views as estimated from each size of the image, averaged over the sizes.
         size = (left.shape[-2], left.shape[-1])
         max_px = float(self.generator.planes[-1])
         limits_px = [max_px * size[1] / images.shape[-1] for images in on_device]
-        views_by_size = [select_views(self.generator, images, size) for images in on_device]
-        lefts, rights = zip(*views_by_size, strict=True)
-        left_view = average_sizes(lefts, limits_px)
-        right_view = average_sizes(rights, limits_px)
+        by_size = [estimate_views(self.generator, images, size) for images in on_device]
+        left_estimates, right_estimates = zip(*by_size, strict=True)
+        left_estimate = average_sizes(left_estimates, limits_px)
+        right_estimate = average_sizes(right_estimates, limits_px)
 
-        right = _warp_by_estimate(on_device[0], right_view)
-        is_sky = left_view.sky > 0.5
-        disparity_confidence = left_view.confidence * (1 - left_view.sky)
-        confidence = torch.where(is_sky, left_view.sky, disparity_confidence)
-        street_probability = left_view.street_probability
+        right = _warp_by_estimate(on_device[0], right_estimate)
+        is_sky = left_estimate.sky > 0.5
+        disparity_confidence = left_estimate.confidence * (1 - left_estimate.sky)
+        confidence = torch.where(is_sky, left_estimate.sky, disparity_confidence)
+        street_probability = left_estimate.street_probability
         if street_probability is not None:
             street_probability = street_probability.to(left.device)
         return SynthesisedViews(
             right=right.to(left.device),
-            disparity_px=left_view.disparity_px.to(left.device),
+            disparity_px=left_estimate.disparity_px.to(left.device),
             confidence=confidence.to(left.device),
             is_sky=is_sky.to(left.device),
             street_probability=street_probability,
@@ -211,7 +223,7 @@ class SelectionSynthesiser:
 
 
 class UNetSynthesiser:
-    """Synthesises right views of images of any size with pix2pix's U-Net.
+    """Synthesises right views with pix2pix's U-Net.
 
     Batch norm uses the statistics of training, and there is no dropout.
     """
@@ -233,32 +245,32 @@ class UNetSynthesiser:
         assert not larger, "it has one scale"
         for image in left:
             check_image(image, "the left image")
-        drawn = draw_right(self.generator, left.to(self.device, torch.float32))
-        return SynthesisedViews(right=drawn.to(left.device))
+        right = synthesise_right(self.generator, left.to(self.device, torch.float32))
+        return SynthesisedViews(right=right.to(left.device))
 
 
 Synthesiser = SelectionSynthesiser | UNetSynthesiser
-"""Synthesises right views of images of any size, as one rig would have taken them."""
+"""Synthesises right views of images of any size, at the baseline of the virtual rig."""
 
 
 def make_synthesiser(
     generator: Generator, device: torch.device | str = "cpu", speed: Speed = "fine"
 ) -> Synthesiser:
-    """Make the synthesiser of a generator of either kind; a U-Net has one speed."""
+    """Make the synthesiser of a generator, of either kind; a U-Net has one speed."""
     if isinstance(generator, SelectionGenerator):
         return SelectionSynthesiser(generator, device, speed)
     return UNetSynthesiser(generator, device)
 
 
-def select_views(
+def estimate_views(
     generator: SelectionGenerator, left: Views, size: tuple[int, int] | None = None
-) -> tuple[Selected, Selected]:
+) -> tuple[ViewEstimate, ViewEstimate]:
     """Estimate disparity, sky and confidence of the left and of the right view, with gradients.
 
     Args:
         generator: the network.
-        left: RGB in [0, 1], of any size.
-        size: rows and columns of the result, in whose pixels disparity counts; None: those of
+        left: left views, RGB in [0, 1], of any size.
+        size: rows and columns of the result, in whose pixels disparity is counted; None: those of
             ``left``.
     """
     height, width = left.shape[-2:]
@@ -266,8 +278,8 @@ def select_views(
     multiple = generator.config.side_multiple_px
     # Stretched where a side is near a multiple, else padded. Sides are even, for logits have half
     # of the resolution.
-    rows = _round_to_even(_stretch_to_near_multiple(height, multiple, ROWS_SHARE))
-    columns = _round_to_even(_stretch_to_near_multiple(width, multiple, COLUMNS_SHARE))
+    rows = _round_to_even(_stretch_to_near_multiple(height, multiple, MAX_ROW_STRETCH))
+    columns = _round_to_even(_stretch_to_near_multiple(width, multiple, MAX_COLUMN_STRETCH))
     padded = pad_to_multiple(resize_image(left, rows, columns), multiple)
 
     # The logits of both views, without the padding.
@@ -277,28 +289,28 @@ def select_views(
     )
 
     planes = generator.planes * (size[1] / columns)
-    left_view = _read_view(left_logits, planes, size)
-    right_view = _read_view(right_logits, planes, size)
+    left_estimate = _estimate_view(left_logits, planes, size)
+    right_estimate = _estimate_view(right_logits, planes, size)
     street_probability = generator.street_probability(features[-1])
-    return replace(left_view, street_probability=street_probability), right_view
+    return replace(left_estimate, street_probability=street_probability), right_estimate
 
 
-def _read_view(logits: Logits, planes: Planes, size: tuple[int, int]) -> Selected:
-    """Read the logits of one view, and resize what they give to rows and columns ``size``."""
+def _estimate_view(logits: Logits, planes: Planes, size: tuple[int, int]) -> ViewEstimate:
+    """Estimate one view from its logits, at ``size`` (rows and columns)."""
     log_px, sky, confidence = (
         F.interpolate(values[:, None], size, mode="bilinear")[:, 0]
         for values in read_logits(logits, planes)
     )
-    return Selected(disparity_px=log_px.exp(), sky=sky, confidence=confidence)
+    return ViewEstimate(disparity_px=log_px.exp(), sky=sky, confidence=confidence)
 
 
-def _warp_by_estimate(left: Views, right_view: Selected) -> Views:
+def _warp_by_estimate(left: Views, right_estimate: ViewEstimate) -> Views:
     """Synthesise the right view by its estimated disparity; the sky is not shifted."""
-    right_px = torch.where(right_view.sky > 0.5, 0.0, right_view.disparity_px)
+    right_px = torch.where(right_estimate.sky > 0.5, 0.0, right_estimate.disparity_px)
     return warp_left_to_right(left, right_px)
 
 
-def draw_right(generator: Generator, left: Views) -> Views:
+def synthesise_right(generator: Generator, left: Views) -> Views:
     """Synthesise right views of images of any size, RGB in [0, 1], with gradients.
 
     Sides close to a multiple of what the network takes are resized to it, others are padded by
@@ -306,24 +318,25 @@ def draw_right(generator: Generator, left: Views) -> Views:
     depth: 193 rows padded to 256, where 192 were trained, gave views of 15 % too little disparity.
     """
     if isinstance(generator, SelectionGenerator):
-        return _warp_by_estimate(left, select_views(generator, left)[1])
+        _, right_estimate = estimate_views(generator, left)
+        return _warp_by_estimate(left, right_estimate)
     height, width = left.shape[-2:]
     multiple = generator.config.side_multiple_px
-    rows = _stretch_to_near_multiple(height, multiple, ROWS_SHARE)
-    columns = _stretch_to_near_multiple(width, multiple, COLUMNS_SHARE)
+    rows = _stretch_to_near_multiple(height, multiple, MAX_ROW_STRETCH)
+    columns = _stretch_to_near_multiple(width, multiple, MAX_COLUMN_STRETCH)
     padded = pad_to_multiple(2 * resize_image(left, rows, columns) - 1, multiple)
     right = (generator(padded)[..., :rows, :columns] + 1) / 2
     return resize_image(right, height, width)
 
 
 def _stretch_to_near_multiple(side_px: int, multiple: int, share: float) -> int:
-    """Round to the nearest multiple if it is within a share of the side, else keep the side."""
+    """Round a side to the nearest multiple if that is within a share of it, else keep the side."""
     nearest = max(round(side_px / multiple), 1) * multiple
     return nearest if abs(nearest - side_px) <= share * side_px else side_px
 
 
 def _round_to_even(side_px: int) -> int:
-    """Round a side down to an even number, for logits stand for two rows and two columns."""
+    """Round a side down to an even number, for a logit stands for two rows and two columns."""
     return max(side_px // 2 * 2, 2)
 
 
@@ -332,7 +345,7 @@ def pad_to_multiple(
 ) -> Float[Tensor, "b c padded_h padded_w"]:
     """Pad the right and lower border by reflection until both sides are multiples of ``multiple``.
 
-    A reflection is as long as the image at most, so small images are padded several times.
+    A reflection is no longer than the image, so small images are padded several times.
     """
     while image.shape[-2] % multiple or image.shape[-1] % multiple:
         height, width = image.shape[-2:]

@@ -149,7 +149,7 @@ def validate_pairs(
         pair = held_out.read(index)
         right = pair.right
         if generator is not None:
-            right = synthesis.draw_right(generator, pair.left[None].to(device))[0].cpu()
+            right = synthesis.synthesise_right(generator, pair.left[None].to(device))[0].cpu()
         predicted_px, is_sky = _match(matcher, pair.left, right)
         if is_sky is not None:
             predicted_px = torch.where(is_sky, 0.0, predicted_px)
@@ -249,7 +249,7 @@ class ViewTask:
         pictures: dict[str, Tensor] = {}
         for index in range(len(self.held_out)):
             pair = self.held_out.read(index)
-            drawn = synthesis.draw_right(self.generator, pair.left[None].to(device))[0].cpu()
+            drawn = synthesis.synthesise_right(self.generator, pair.left[None].to(device))[0].cpu()
             difference = drawn - pair.right
             l1.append(float(difference.abs().mean()))
             psnr_db.append(float(-10 * torch.log10(difference.square().mean())))
@@ -287,7 +287,7 @@ class FinetuneTask:
 
     def step(self, batch: TrainingPair) -> Iterator[Update]:
         """Synthesise right views and match them; give the one update of the generator."""
-        drawn = synthesis.draw_right(self.generator, batch.left)
+        drawn = synthesis.synthesise_right(self.generator, batch.left)
         (predicted_px,) = self.matcher(normalise(batch.left), normalise(drawn))
         predicted_px = predicted_px.float()
         max_disparity_px = self.matcher.config.max_disparity_px
