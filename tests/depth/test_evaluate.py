@@ -17,7 +17,7 @@ from depthpose.core.runner import Job
 from depthpose.depth.datasets import Dataset, check_dataset, open_dataset
 from depthpose.depth.disparity import depth_from_disparity, find_unit_mistake, resize_map
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.evaluate import Measured, evaluate, frame_result, measure_frame
+from depthpose.depth.evaluate import FrameMetrics, evaluate, measure_frame, read_frame_result
 from depthpose.depth.predictions import (
     estimate_missing_depth,
     is_finished,
@@ -25,7 +25,7 @@ from depthpose.depth.predictions import (
     read_estimate,
     write_estimate,
 )
-from depthpose.depth.protocols import clamped_depth
+from depthpose.depth.protocols import clamped_depth_from_disparity
 from depthpose.depth.stereo import CallableMatcher
 from depthpose.depth.types import DepthEstimate, StereoInput
 
@@ -73,7 +73,7 @@ def test_the_sky_of_a_prediction_is_shown_as_sky(pairs: Dataset, tmp_path: Path)
     again = read_estimate(tmp_path / "p", "a", rig())
     assert again.is_sky is not None
     assert torch.equal(again.is_sky, is_sky)
-    shown = frame_result(pairs, 0, tmp_path / "p", "kitti-2015", None)[0].depth_m
+    shown = read_frame_result(pairs, 0, tmp_path / "p", "kitti-2015", None)[0].depth_m
     assert shown is not None
     assert torch.equal(shown.isnan(), is_sky)
 
@@ -94,7 +94,7 @@ def test_a_prediction_of_another_size_is_shown_at_that_of_the_truth(
     write_estimate(tmp_path / "p", pairs.read_input(0), estimate)
     without_right = replace(pairs.frames[0], right=None)  # a right image must have the drawn size
     single = replace(pairs, frames=[without_right])
-    shown, error = frame_result(single, 0, tmp_path / "p", "kitti-2015", None)
+    shown, error = read_frame_result(single, 0, tmp_path / "p", "kitti-2015", None)
     maps = (shown.depth_m, shown.confidence, shown.is_sky, shown.right, error.error)
     assert [None if values is None else values.shape[-2:] for values in maps] == 5 * [(H, W)]
     assert shown.depth_m is not None
@@ -137,7 +137,7 @@ def test_depth_of_one_camera_needs_no_baseline(alone: Dataset, tmp_path: Path, e
     for row in evaluate(alone, tmp_path / "p", "eigen-raw-camera").rows:
         assert row.metrics["abs_rel"] == 0
         assert row.coverage == 1
-    _, wrong = frame_result(alone, 0, tmp_path / "p", "eigen-raw-camera", 80.0)
+    _, wrong = read_frame_result(alone, 0, tmp_path / "p", "eigen-raw-camera", 80.0)
     assert float(wrong.error.nanmean()) == 0
 
 
@@ -334,7 +334,7 @@ def test_confidence_is_scored(pairs: Dataset, tmp_path: Path) -> None:
 
 def test_the_clamp_follows_the_published_script() -> None:
     disparity_px = torch.tensor([[0.0, -1.0, 1e-9, 400.0, 1e9, torch.nan]])
-    clamped_m = clamped_depth(disparity_px, rig(), 80.0)[0]
+    clamped_m = clamped_depth_from_disparity(disparity_px, rig(), 80.0)[0]
     assert clamped_m[:5].tolist() == pytest.approx([1e-3, 1e-3, 80.0, 0.1, 1e-3])
     assert bool(torch.isnan(clamped_m[5]))
 
@@ -485,7 +485,7 @@ def test_a_measured_frame_survives_json(pairs: Dataset, tmp_path: Path) -> None:
     for protocol in ("eigen-improved", "kitti-2015"):
         found = measure_frame(pairs, 0, folder, protocol, (80.0,))
         assert not isinstance(found, str)
-        again = Measured(**json.loads(json.dumps(asdict(found[0]))))
+        again = FrameMetrics(**json.loads(json.dumps(asdict(found[0]))))
         assert again == found[0]
         assert (again.frame, again.cap_m) == ("a", None if protocol == "kitti-2015" else 80.0)
 

@@ -24,10 +24,10 @@ from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.evaluate import (
     Evaluation,
     EvaluationRow,
-    Measured,
+    FrameMetrics,
     evaluate,
-    frame_result,
     measure_frame,
+    read_frame_result,
     summarise,
 )
 from depthpose.depth.metrics import METRICS, RANKING
@@ -269,7 +269,7 @@ def _show_frames(
     for role, k in page.choose_ranked(errors, max_count):
         row = rows_at_cap[k]
         index = index_of[row.frame or ""]
-        estimate, error = frame_result(dataset, index, folder, protocol, row.cap_m)
+        estimate, error = read_frame_result(dataset, index, folder, protocol, row.cap_m)
         value = row.metrics[metric.name]
         section = depth_section(
             f"{folder.name}: {row.frame}, {role}",
@@ -366,7 +366,7 @@ def measure_shards(
     name = PurePosixPath(predictions).stem
     settings = read_settings(predictions)
     index_of = {frame.name: index for index, frame in enumerate(dataset.frames)}
-    measured: dict[str, list[Measured] | str] = {}
+    measured: dict[str, list[FrameMetrics] | str] = {}
     for shard in tqdm(engine.read_results(predictions), name, disable=None, unit=" shards"):
         for frame, files in engine.shard_results(predictions, shard):
             if frame not in index_of:

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,9 +29,9 @@ from depthpose.depth.types import DepthError, DepthEstimate, Map, StereoInput
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationRow:
-    """Metrics of one frame, their mean over frames (each counts the same), or those of a decile.
+    """A row of a table: metrics of one frame, their mean over frames, or those of a decile.
 
-    The columns of a table are the fields in this order.
+    Each frame counts the same. The columns of the table are the fields in this order.
     """
 
     method: str | None = None  #: method that predicted; None, as in the next four fields: not known
@@ -54,7 +53,7 @@ class EvaluationRow:
     metrics: Mapping[str, float]
 
     def columns(self) -> dict[str, str | int | float]:
-        """Give the columns of files and tables: the fields that are not None, and each metric."""
+        """Return the columns of files and tables: the fields that are not None, and each metric."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         metrics = values.pop("metrics")
         columns = {name: value for name, value in values.items() if value is not None}
@@ -73,7 +72,7 @@ class Evaluation:
     skipped: dict[str, str]  #: frames that do not count, each with the reason
 
     def to_frame(self) -> Any:  # noqa: ANN401  pandas is no dependency
-        """Give ``per_frame`` as a ``pandas.DataFrame``; the columns are those of its table.
+        """Return ``per_frame`` as a ``pandas.DataFrame``; the columns are those of its table.
 
         Raises:
             ImportError: pandas is not installed.
@@ -82,7 +81,7 @@ class Evaluation:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Measured:
+class FrameMetrics:
     """Metrics of one frame at one cap."""
 
     frame: str  #: its name
@@ -113,17 +112,27 @@ def evaluate(
     Raises:
         InputError: an unknown protocol, a missing prediction, or no frame with truth.
     """
-    measured = {
+    metrics_by_frame = {
         dataset.frames[index].name: measure_frame(dataset, index, predictions, protocol, caps_m)
         for index in progress(range(len(dataset)))
     }
-    return summarise(dataset, protocol, measured)
+    return summarise(dataset, protocol, metrics_by_frame)
 
 
 def measure_frame(
     dataset: Dataset, index: int, predictions: Path, protocol: str, caps_m: Sequence[float]
-) -> list[Measured] | str:
-    """Measure one frame at each cap, or give the reason why it does not count.
+) -> list[FrameMetrics] | str:
+    """Measure one frame at each cap.
+
+    Args:
+        dataset: frames with truth.
+        index: number of the frame.
+        predictions: folder of the predictions.
+        protocol: a key of ``PROTOCOLS``.
+        caps_m: as for :func:`evaluate`.
+
+    Returns:
+        Metrics at each cap within which the frame has truth, or the reason why it does not count.
 
     Raises:
         InputError: an unknown protocol, or a missing or damaged prediction.
@@ -133,19 +142,19 @@ def measure_frame(
     if isinstance(prepared, str):
         return prepared
     caps: Sequence[float | None] = [None] if rule.is_disparity else caps_m
-    results = [_measure_at_cap(prepared, rule, cap_m) for cap_m in caps]
-    measured = [result for result in results if result is not None]
-    return measured or "no truth within the caps and the crop"
+    metrics_of_caps = [_measure_at_cap(prepared, rule, cap_m) for cap_m in caps]
+    metrics = [at_cap for at_cap in metrics_of_caps if at_cap is not None]
+    return metrics or "no truth within the caps and the crop"
 
 
 def _measure_at_cap(
     prepared: PreparedFrame, rule: Protocol, cap_m: float | None
-) -> Measured | None:
+) -> FrameMetrics | None:
     """Measure a frame at one cap (None for disparity); None where it has no truth within it."""
     predicted, truth = apply_protocol(prepared, rule, cap_m)
-    has_truth = torch.isfinite(truth)
-    is_compared = has_truth & torch.isfinite(predicted)
-    if not bool(has_truth.any()):
+    is_true = torch.isfinite(truth)
+    is_compared = is_true & torch.isfinite(predicted)
+    if not bool(is_true.any()):
         return None
 
     metrics: dict[str, float] = {}
@@ -165,11 +174,11 @@ def _measure_at_cap(
             confidences = prepared.confidence[is_compared]
             metrics |= score_confidence(errors, confidences)
             deciles = error_by_decile(errors, confidences).tolist()
-    return Measured(
+    return FrameMetrics(
         frame=prepared.frame.name,
         cap_m=cap_m,
         pixels=int(is_compared.sum()),
-        coverage=float(is_compared.sum() / has_truth.sum()),
+        coverage=float(is_compared.sum() / is_true.sum()),
         metrics=metrics,
         deciles=deciles,
     )
@@ -187,82 +196,111 @@ def _measure_non_occluded(prepared: PreparedFrame) -> dict[str, float]:
 
 
 def summarise(
-    dataset: Dataset, protocol: str, results: Mapping[str, list[Measured] | str]
+    dataset: Dataset, protocol: str, metrics_by_frame: Mapping[str, list[FrameMetrics] | str]
 ) -> Evaluation:
     """Make the rows of all frames and their means, wherever the frames were measured.
 
-    ``results``: what :func:`measure_frame` gave, by the name of the frame.
+    Args:
+        dataset: the frames.
+        protocol: a key of ``PROTOCOLS``.
+        metrics_by_frame: what :func:`measure_frame` returned, by the name of the frame.
 
     Raises:
         InputError: no frame has truth.
     """
-    # One result for each frame and cap.
-    measured: list[Measured] = []
+    # Metrics of each frame at each cap.
+    measured: list[FrameMetrics] = []
     skipped: dict[str, str] = {}
     for frame in dataset.frames:
-        outcome = results[frame.name]
-        if isinstance(outcome, str):
-            skipped[frame.name] = outcome
+        frame_metrics = metrics_by_frame[frame.name]
+        if isinstance(frame_metrics, str):
+            skipped[frame.name] = frame_metrics
         else:
-            measured += outcome
+            measured += frame_metrics
     if not measured:
-        raise _nothing_measured(dataset, protocol, skipped)
+        raise _make_nothing_measured_error(dataset, protocol, skipped)
 
-    make_row = partial(EvaluationRow, protocol=protocol, dataset=dataset.name)
     per_frame = [
-        make_row(
-            frame=result.frame,
-            cap_m=result.cap_m,
-            pixels=result.pixels,
-            coverage=result.coverage,
-            metrics=result.metrics,
+        EvaluationRow(
+            protocol=protocol,
+            dataset=dataset.name,
+            frame=metrics.frame,
+            cap_m=metrics.cap_m,
+            pixels=metrics.pixels,
+            coverage=metrics.coverage,
+            metrics=metrics.metrics,
         )
-        for result in measured
+        for metrics in measured
     ]
-
-    # The means of each cap.
-    ranking_metric = RANKING["disparity" if find_protocol(protocol).is_disparity else "depth"]
     rows: list[EvaluationRow] = []
     deciles: list[EvaluationRow] = []
-    for cap_m in dict.fromkeys(result.cap_m for result in measured):
-        at_cap = [result for result in measured if result.cap_m == cap_m]
-        if not any(result.pixels for result in at_cap):
-            raise InputError(f"{dataset.name}: no prediction has a pixel where there is truth")
-        rows.append(
-            make_row(
-                cap_m=cap_m,
-                frames=len(at_cap),
-                pixels=sum(result.pixels for result in at_cap),
-                coverage=sum(result.coverage for result in at_cap) / len(at_cap),
-                metrics=_average_metrics(at_cap),
-            )
-        )
-
-        # Mean errors of tenths of the pixels, from the least confidence to the largest.
-        by_decile = [result.deciles for result in at_cap if result.deciles is not None]
-        if by_decile:
-            errors = torch.tensor(by_decile, dtype=torch.float64).nanmean(0).tolist()
-            deciles += [
-                make_row(
-                    cap_m=cap_m,
-                    frames=len(by_decile),
-                    confidence_decile=decile,
-                    metrics={ranking_metric: error},
-                )
-                for decile, error in enumerate(errors, 1)
-            ]
+    for cap_m in dict.fromkeys(metrics.cap_m for metrics in measured):
+        at_cap = [metrics for metrics in measured if metrics.cap_m == cap_m]
+        rows.append(_make_mean_row(dataset.name, protocol, at_cap))
+        deciles += _make_decile_rows(dataset.name, protocol, at_cap)
     return Evaluation(rows=rows, per_frame=per_frame, deciles=deciles, skipped=skipped)
 
 
-def _average_metrics(results: Sequence[Measured]) -> dict[str, float]:
-    """Average over frames with a compared pixel the metrics that all of them have."""
-    compared = [result.metrics for result in results if result.pixels]
-    common = [name for name in compared[0] if all(name in metrics for metrics in compared)]
-    return {name: sum(metrics[name] for metrics in compared) / len(compared) for name in common}
+def _make_mean_row(name: str, protocol: str, at_cap: Sequence[FrameMetrics]) -> EvaluationRow:
+    """Make the row of the means over the frames of the data set ``name``, measured at one cap.
+
+    Raises:
+        InputError: no pixel was compared.
+    """
+    if not any(metrics.pixels for metrics in at_cap):
+        raise InputError(f"{name}: no prediction has a pixel where there is truth")
+    return EvaluationRow(
+        protocol=protocol,
+        dataset=name,
+        cap_m=at_cap[0].cap_m,
+        frames=len(at_cap),
+        pixels=sum(metrics.pixels for metrics in at_cap),
+        coverage=sum(metrics.coverage for metrics in at_cap) / len(at_cap),
+        metrics=_average_metrics(at_cap),
+    )
 
 
-def _nothing_measured(dataset: Dataset, protocol: str, skipped: Mapping[str, str]) -> InputError:
-    """Make the error of a dataset of which no frame could be measured, with the remedy."""
+def _make_decile_rows(
+    name: str, protocol: str, at_cap: Sequence[FrameMetrics]
+) -> list[EvaluationRow]:
+    """Make the rows of the mean errors of tenths of the pixels, from the least confidence up.
+
+    There is none where no frame of the data set ``name`` has a confidence.
+    """
+    with_confidence = [metrics.deciles for metrics in at_cap if metrics.deciles is not None]
+    if not with_confidence:
+        return []
+    ranking_metric = RANKING["disparity" if find_protocol(protocol).is_disparity else "depth"]
+    mean_errors = torch.tensor(with_confidence, dtype=torch.float64).nanmean(0).tolist()
+    return [
+        EvaluationRow(
+            protocol=protocol,
+            dataset=name,
+            cap_m=at_cap[0].cap_m,
+            frames=len(with_confidence),
+            confidence_decile=decile,
+            metrics={ranking_metric: mean_error},
+        )
+        for decile, mean_error in enumerate(mean_errors, 1)
+    ]
+
+
+def _average_metrics(at_cap: Sequence[FrameMetrics]) -> dict[str, float]:
+    """Average the metrics that all frames with a compared pixel have, over these frames."""
+    compared = [frame.metrics for frame in at_cap if frame.pixels]
+    common_names = [name for name in compared[0] if all(name in metrics for metrics in compared)]
+    return {
+        name: sum(metrics[name] for metrics in compared) / len(compared) for name in common_names
+    }
+
+
+def _make_nothing_measured_error(
+    dataset: Dataset, protocol: str, skipped: Mapping[str, str]
+) -> InputError:
+    """Make the error of a dataset of which no frame could be measured, with the remedy.
+
+    ``skipped``: the reasons, by the name of the frame.
+    """
     unpredicted = [name for name, reason in skipped.items() if reason == NO_PREDICTION]
     if unpredicted:
         return InputError(
@@ -270,25 +308,34 @@ def _nothing_measured(dataset: Dataset, protocol: str, skipped: Mapping[str, str
             f"truth and {NO_PREDICTION}. Predictions are called {files.EXPECTED}"
         )
     rule = find_protocol(protocol)
-    fitting = [
+    fitting_names = [
         name
         for name, other in PROTOCOLS.items()
         if other.truth != rule.truth and any(has_truth(frame, other) for frame in dataset.frames)
     ]
-    remedy = f"--protocol {' or '.join(fitting)} fits." if fitting else "Choose another folder."
+    remedy = "Choose another folder."
+    if fitting_names:
+        remedy = f"--protocol {' or '.join(fitting_names)} fits."
     return InputError(
         f"{dataset.name}: none of its {len(dataset)} frames has the truth that protocol "
         f"{protocol!r} needs ({rule.truth}). {remedy}"
     )
 
 
-def frame_result(
+def read_frame_result(
     dataset: Dataset, index: int, predictions: Path, protocol: str, cap_m: float | None
 ) -> tuple[DepthEstimate, DepthError]:
-    """Read the estimate of one frame, and its error at each pixel, as :func:`evaluate` has them.
+    """Read the estimate of one frame, and compute its error at each pixel, for a page.
 
-    Every map and picture has the size of the truth. By a protocol of disparity the error is that of
-    disparity [px], and ``cap_m`` None; else it is that of depth as a share of the true depth.
+    Every map and picture has the size of the truth.
+
+    Args:
+        dataset: frames with truth.
+        index: number of the frame.
+        predictions: folder of the predictions.
+        protocol: a key of ``PROTOCOLS``. By one of disparity the error is that of disparity [px],
+            else that of depth as a share of the true depth.
+        cap_m: truth beyond it does not count; None for disparity.
 
     Raises:
         InputError: the frame does not count, or a file is damaged.
@@ -314,11 +361,12 @@ def frame_result(
     # The error at the pixels that count.
     predicted, truth = apply_protocol(prepared, rule, cap_m)
     error = (predicted - truth).abs()
-    true_m: Map | None = truth
-    if not rule.is_disparity:
-        error = error / truth
-    else:
+    true_m: Map | None
+    if rule.is_disparity:
         true_m = None if rig is None else disparity.depth_from_disparity(truth, rig)
+    else:
+        error = error / truth
+        true_m = truth
 
     estimate = DepthEstimate(
         depth_m=depth_m,
@@ -331,7 +379,7 @@ def frame_result(
 
 
 def measure_image_confidence(net: FakestereoNet, images: Iterable[StereoInput]) -> list[float]:
-    """Estimate images, and give the ``DepthEstimate.image_confidence`` of each, 0..1.
+    """Estimate images, and return the ``DepthEstimate.image_confidence`` of each, 0..1.
 
     Raises:
         InputError: the weights have no such confidence, or an image cannot be estimated.

@@ -26,9 +26,10 @@ _ASPECT_TOLERANCE = 1.01
 """Ratio of two aspects that are still the same: the sides of a scaled image are rounded to whole
 pixels, often to multiples of 32."""
 _CROP_ERROR_SHARE = 0.7
-"""Share of the error of a stretched map: a map with less error than that as a crop is a crop of the
-image."""
+"""A map is a crop of the image where its error as a crop is below this share of its error as a
+stretched map."""
 _noticed_sizes: set[str] = set()
+"""Sizes of stretched maps of which a notice was given already."""
 NO_PREDICTION = "no right view to match, and no prediction"
 
 
@@ -70,7 +71,7 @@ PROTOCOLS = {
 
 
 def find_protocol(name: str) -> Protocol:
-    """Give a protocol by name.
+    """Return the protocol of a name.
 
     Raises:
         InputError: there is none; the error suggests the most similar name.
@@ -80,32 +81,34 @@ def find_protocol(name: str) -> Protocol:
     return PROTOCOLS[name]
 
 
-def has_truth(frame: Frame, rule: Protocol) -> bool:
+def has_truth(frame: Frame, protocol: Protocol) -> bool:
     """Whether a frame has files of the truth that a protocol needs; none is read."""
-    match rule.truth:
+    match protocol.truth:
         case "disparity":
             return frame.disparity is not None
         case "depth":
             return frame.depth is not None
         case _:
-            return has_lidar(frame, rule.truth)
+            return has_lidar(frame, protocol.truth)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PreparedFrame:
-    """A frame's truth and prediction, at the size of the image."""
+    """A frame's truth and prediction, at the size of the truth."""
 
-    frame: Frame
-    truth: Map  # depth [m] or disparity [px], as the protocol says
-    disparity_px: Map
-    depth_m: Map | None  # where depth was predicted and no disparity
-    confidence: Map | None
+    frame: Frame  #: the frame
+    truth: Map  #: depth [m] or disparity [px], as the protocol says
+    disparity_px: Map  #: predicted disparity
+    depth_m: Map | None  #: predicted depth, where depth was predicted and no disparity
+    confidence: Map | None  #: confidence of the prediction; None where it has none
+    #: the frame's rig, or where depth was predicted without one, a rig that stands in for it; None
+    #: where disparity is compared and the frame has no rig
     rig: StereoRig | None
-    view_metrics: dict[str, float]  # metrics of the synthesised right view
+    view_metrics: dict[str, float]  #: metrics of the synthesised right view, by name
 
 
-def clamped_depth(disparity_px: Map, rig: StereoRig, cap_m: float) -> Map:
-    """Convert disparity to depth between 0.001 m and a cap, as the published Eigen script does.
+def clamped_depth_from_disparity(disparity_px: Map, rig: StereoRig, cap_m: float) -> Map:
+    """Convert disparity to depth, clamped to 0.001 m .. ``cap_m``, as the published Eigen script.
 
     NaN (no prediction) stays NaN; zero and negative disparity become the smallest depth, as there.
     """
@@ -115,62 +118,64 @@ def clamped_depth(disparity_px: Map, rig: StereoRig, cap_m: float) -> Map:
 
 
 def prepare_frame(
-    dataset: Dataset, index: int, predictions: Path, rule: Protocol
+    dataset: Dataset, index: int, predictions: Path, protocol: Protocol
 ) -> PreparedFrame | str:
-    """Read truth and prediction of a frame, or give the reason why it is not measured.
+    """Read truth and prediction of a frame, at the size of the truth.
+
+    Args:
+        dataset: the frames.
+        index: number of the frame.
+        predictions: folder of the predictions.
+        protocol: says which truth is read.
+
+    Returns:
+        Both, or the reason why the frame is not measured.
 
     Raises:
         InputError: the prediction is missing or damaged, or of another unit, sign or size.
     """
     frame = dataset.frames[index]
-    if not has_truth(frame, rule):
-        return f"no truth of the kind {rule.truth}"
+    path = predictions / frame.name
+    if not has_truth(frame, protocol):
+        return f"no truth of the kind {protocol.truth}"
     if frame.right is None and not files.has_prediction(predictions, frame.name):
         return NO_PREDICTION
+    truth = _read_truth(dataset, index, protocol)
 
-    # The truth.
-    if rule.truth in ("velodyne_x", "camera_z"):
-        truth = lidar_truth(frame, rule.truth)
-    else:
-        stored_truth = dataset.read_truth(index)
-        truth = stored_truth.disparity_px if rule.is_disparity else stored_truth.depth_m
-    assert truth is not None, "has_truth said so"
-    height, width = truth.shape
-
-    # The prediction. Depth is compared as it was predicted, or made from the predicted disparity.
+    # The prediction: depth is compared as it was predicted, or made from the predicted disparity.
     rig = dataset.read_rig(index)
     depth_m = None
-    has_disparity = files.has_prediction(predictions, frame.name, of_disparity=True)
-    if not rule.is_disparity and (rig is None or not has_disparity):
-        depth_m = files.read_depth(predictions, frame.name)
-    if not rule.is_disparity and rig is None:
-        if depth_m is None:
+    if not protocol.is_disparity:
+        has_disparity = files.has_prediction(predictions, frame.name, of_disparity=True)
+        if rig is None or not has_disparity:
+            depth_m = files.read_depth(predictions, frame.name)
+        if rig is None and depth_m is None:
             raise InputError(
                 f"{frame.name}: no calibration of a pair, so its disparity cannot become metres; "
                 f"predict depth ({frame.name}.depth_m.npy), or give the frame its baseline"
             )
-        # Any rig will do: it is undone where depth is compared.
-        K = torch.tensor([[width, 0, 0], [0, width, 0], [0, 0, 1]], dtype=torch.float64)
-        rig = StereoRig(width=width, height=height, K=K, baseline_m=1.0)
+        if rig is None:
+            rig = _make_stand_in_rig(truth)
     stored_px = files.read_disparity(
-        predictions, frame.name, rig, with_disparity_png=rule.is_disparity
+        predictions, frame.name, rig, with_disparity_png=protocol.is_disparity
     )
     true_px = truth
-    if not rule.is_disparity and rig is not None:
+    if not protocol.is_disparity and rig is not None:
         true_px = disparity.disparity_from_depth(truth, rig)
-    predicted_px = _resize_to_truth(true_px, stored_px, predictions / frame.name)
+    predicted_px = _resize_to_truth(true_px, stored_px, path)
 
-    # Units and signs; where principal points differ, the disparity of far points is negative.
+    # Refuse mistaken units and signs. Where principal points differ, the disparity of far points is
+    # negative; the sum with their difference is not.
     cx_difference_px = 0.0 if rig is None else rig.cx_right_minus_left_px
-    advice = disparity.find_unit_mistake(
+    mistake = disparity.find_unit_mistake(
         predicted_px + cx_difference_px, true_px + cx_difference_px
     )
-    if advice is not None:
-        raise InputError(f"{predictions / frame.name}: {advice}")
+    if mistake is not None:
+        raise InputError(f"{path}: {mistake}")
 
     confidence = files.read_part(predictions, frame.name, "confidence.npy")
     if confidence is not None and confidence.shape != truth.shape:
-        confidence = disparity.resize_map(confidence, height, width)
+        confidence = disparity.resize_map(confidence, *truth.shape)
     return PreparedFrame(
         frame=frame,
         truth=truth,
@@ -182,8 +187,28 @@ def prepare_frame(
     )
 
 
+def _read_truth(dataset: Dataset, index: int, protocol: Protocol) -> Map:
+    """Read the truth of a frame that has the files of it: depth [m] or disparity [px]."""
+    if protocol.truth in ("velodyne_x", "camera_z"):
+        return lidar_truth(dataset.frames[index], protocol.truth)
+    stored_truth = dataset.read_truth(index)
+    truth = stored_truth.disparity_px if protocol.is_disparity else stored_truth.depth_m
+    assert truth is not None, "has_truth said so"
+    return truth
+
+
+def _make_stand_in_rig(truth_m: Map) -> StereoRig:
+    """Make a rig by which depth becomes disparity and back, for a frame that has no rig.
+
+    Any rig will do, for it is undone where depth is compared.
+    """
+    height, width = truth_m.shape
+    K = torch.tensor([[width, 0, 0], [0, width, 0], [0, 0, 1]], dtype=torch.float64)
+    return StereoRig(width=width, height=height, K=K, baseline_m=1.0)
+
+
 def _measure_view(frame: Frame, predictions: Path) -> dict[str, float]:
-    """Compare the synthesised right view of a frame with the real one; {} where one is missing."""
+    """Measure the synthesised right view of a frame by the real one; {} where one is missing."""
     synthesised = files.read_part(predictions, frame.name, "right.png")
     if synthesised is None or frame.right is None:
         return {}
@@ -198,10 +223,10 @@ def _measure_view(frame: Frame, predictions: Path) -> dict[str, float]:
 
 
 def _resize_to_truth(true_px: Map, stored_px: Float[Tensor, "_ _"], path: Path) -> Map:
-    """Resize a predicted disparity to the size of the truth.
+    """Resize a predicted disparity, in pixels of its own width, to the size of the truth.
 
-    A map of another aspect, as networks give it that take squeezed images, is stretched, with a
-    notice. ``path`` names the prediction in errors.
+    A map of another aspect, as of a network that takes squeezed images, is stretched, with a
+    notice. ``true_px``: the true disparity; ``path``: names the prediction in errors.
 
     Raises:
         InputError: the map is transposed, or a crop of the image's.
@@ -235,43 +260,57 @@ def _refuse_crop(
 ) -> None:
     """Refuse a predicted disparity that fits a crop of the truth better than all of it.
 
-    Crops are cut out of the middle of the columns, and of the middle or the bottom of the rows, as
-    KITTI's of 1216x352. ``stretched_px`` is the prediction at the size of the truth, ``context``
-    begins the error.
+    Crops are tried in the middle of the columns, and in the middle or at the bottom of the rows, as
+    KITTI's of 1216x352.
+
+    Args:
+        true_px: the true disparity.
+        stored_px: the prediction, as it was read.
+        stretched_px: the prediction, stretched to the size of the truth.
+        context: begins the error.
     """
     height, width = true_px.shape
     rows, columns = stored_px.shape
     left = (width - columns) // 2
-    errors_px: dict[int, float] = {}
+    error_of_top_px: dict[int, float] = {}  # median error by the crop's first row
     for top in ((height - rows) // 2, height - rows):
         window_px = true_px[top : top + rows, left : left + columns]
-        errors_px[top] = float((stored_px - window_px).abs().nanmedian())
-    top = min(errors_px, key=lambda row: errors_px[row])
+        error_of_top_px[top] = float((stored_px - window_px).abs().nanmedian())
+    best_top = min(error_of_top_px, key=lambda top: error_of_top_px[top])
+    crop_error_px = error_of_top_px[best_top]
     stretched_error_px = float((stretched_px - true_px).abs().nanmedian())
-    if errors_px[top] < _CROP_ERROR_SHARE * stretched_error_px:
+    if crop_error_px < _CROP_ERROR_SHARE * stretched_error_px:
         raise InputError(
             f"{context}: it is a part of the image, cut out at column {left}, row "
-            f"{top} (there the median error is {errors_px[top]:.2f} px, stretched to all of it "
+            f"{best_top} (there the median error is {crop_error_px:.2f} px, stretched to all of it "
             f"{stretched_error_px:.2f} px); put it into a map of {width}x{height}, NaN around it"
         )
 
 
-def apply_protocol(prepared: PreparedFrame, rule: Protocol, cap_m: float | None) -> tuple[Map, Map]:
+def apply_protocol(
+    prepared: PreparedFrame, protocol: Protocol, cap_m: float | None
+) -> tuple[Map, Map]:
     """Clamp the prediction and mask the truth as the protocol says.
 
-    Both are disparity [px] or depth [m], as the protocol compares; NaN where there is no
-    prediction, and where there is no truth or it does not count. Only depth has a ``cap_m``.
+    Args:
+        prepared: truth and prediction of the frame.
+        protocol: the protocol.
+        cap_m: depth beyond which truth does not count; None for disparity.
+
+    Returns:
+        The prediction, NaN where there is none; and the truth, NaN where there is none or it does
+        not count. Both are disparity [px] or depth [m], as the protocol compares.
     """
     truth = prepared.truth
-    if rule.is_disparity:
+    if protocol.is_disparity:
         return prepared.disparity_px, truth
     assert cap_m is not None, "depth is compared up to a cap"
     is_counted = (truth > SMALLEST_DEPTH_M) & (truth < cap_m)
-    if rule.with_crop:
+    if protocol.with_crop:
         is_counted &= garg_crop(*truth.shape)
     predicted_m = prepared.depth_m
     if predicted_m is None:
         assert prepared.rig is not None
-        predicted_m = clamped_depth(prepared.disparity_px, prepared.rig, cap_m)
+        predicted_m = clamped_depth_from_disparity(prepared.disparity_px, prepared.rig, cap_m)
     clamped_m = predicted_m.clamp(SMALLEST_DEPTH_M, cap_m)
     return clamped_m, torch.where(is_counted, truth, torch.nan)
