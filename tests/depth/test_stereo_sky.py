@@ -157,7 +157,7 @@ def test_what_is_surely_matched_is_not_the_sky(
             where, name, lambda *given, value=value, **_: torch.full_like(given[1], value)
         )
     with torch.no_grad():
-        read = network.read(left, right, SMALL.max_disparity_px, with_confidence=True)
+        read = network.match_views(left, right, SMALL.max_disparity_px, with_confidence=True)
     assert read.sky is not None
     assert bool((read.sky > 0.5).all()) == with_sky
     assert bool((read.sky > 0.5).any()) == with_sky

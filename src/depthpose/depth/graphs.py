@@ -128,7 +128,7 @@ class DynamicLightStereo(_Dynamic):
         The sky is left out where the network does not recognise it.
         """
         max_disparity_px = self.network.config.max_disparity_px
-        output = self.network.read(left, right, max_disparity_px, with_confidence=True)
+        output = self.network.match_views(left, right, max_disparity_px, with_confidence=True)
         assert output.confidence is not None
         if output.sky is None:
             return output.heads[-1], output.confidence

@@ -16,57 +16,59 @@ from depthpose.depth.config import LightConfig
 from depthpose.depth.disparity import MIN_DISPARITY_PX
 from depthpose.depth.encoder import LiteEncoder
 from depthpose.depth.stereo import layers
-from depthpose.depth.stereo.layers import by_rows
+from depthpose.depth.stereo.layers import Features, by_rows
 from depthpose.depth.stereo.light_layers import (
+    HALF_CHANNELS,
     Aggregation,
     ConvexUpsampling,
     LightFeatures,
-    Quarter,
+    QuarterMaps,
     Refinement,
     Scores,
     SkyHead,
+    ViewFeatures,
 )
 from depthpose.depth.stereo.network_matcher import STEP_PX, NetworkMatcher, StereoNetwork
 from depthpose.depth.types import Maps, Match, Views
 
 _CANDIDATES = 2
-"""Disparities of the highest scores whose mean is the answer."""
-_WINDOW = 0.15
-"""Share of a disparity: what lies nearer to it than that counts for its confidence."""
+"""Number of the highest scores over whose disparities the expectation is taken."""
+_WINDOW_SHARE = 0.15
+"""The confidence is the probability of disparities within this share of the estimated one."""
 
 
-def confidence_near(scores: Scores, disparity_px: Quarter, first_px: int = 0) -> Quarter:
-    """Give the probability of what lies within 15 % of a disparity, as selecting generators do.
+def confidence_near(scores: Scores, disparity_px: QuarterMaps, first_px: int = 0) -> QuarterMaps:
+    """Compute the probability of disparities within 15 % of an estimated one, at quarter size.
 
-    Between the disparities that have a score, scores are interpolated. The first score is that of
-    ``first_px``.
+    Args:
+        scores: scores at steps of ``STEP_PX``; between them scores are interpolated.
+        disparity_px: the estimated disparity [px of the full size].
+        first_px: disparity of the first score.
     """
     bins = scores.shape[1]
-    count = STEP_PX * (bins - 1) + 1
-    matrix = layers.interpolation_matrix(
-        layers.linear_taps(bins, count, scores, align_corners=True), bins
-    )
+    count = STEP_PX * (bins - 1) + 1  # of whole disparities
+    taps = layers.linear_taps(bins, count, scores, align_corners=True)
+    matrix = layers.interpolation_matrix(taps, bins)
     probability = F.conv2d(scores, matrix[..., None, None]).softmax(1)
     steps_px = torch.arange(count, dtype=scores.dtype, device=scores.device)[:, None, None]
     distance_px = (first_px + steps_px - disparity_px[:, None]).abs()
-    window_px = _WINDOW * disparity_px.clamp(min=1)[:, None]
+    window_px = _WINDOW_SHARE * disparity_px.clamp(min=1)[:, None]
     # Each whole disparity stands for the half pixel on both sides of it.
-    share = (window_px + 0.5 - distance_px).clamp(0, 1)
-    return (probability * share).sum(1).clamp(0, 1)
+    share_in_window = (window_px + 0.5 - distance_px).clamp(0, 1)
+    return (probability * share_in_window).sum(1).clamp(0, 1)
 
 
-class Reading(NamedTuple):
-    """Disparity, confidence and sky of the left view, as read off the scores.
+class LightOutput(NamedTuple):
+    """Disparity, confidence and sky of the left view, at the size of the image."""
 
-    While training there is a head of all scores, enlarged without the image, one before the
-    refinement, and one after it; in eval mode the last alone. What a head says in the sky means
-    nothing where the network has that class; in eval mode the sky is at most a half where the
-    confidence of the match is higher: white walls look like the sky.
-    """
-
-    heads: tuple[Maps, ...]  # disparity [px], the last one the answer
-    confidence: Maps | None  # 0..1, in the sky its probability; None where it was not asked for
-    sky: Maps | None  # its probability; None where the network has no such class
+    #: disparity [px]: in eval mode that after the refinement alone; in training first the
+    #: expectation over all scores, enlarged without the image, then the disparity before the
+    #: refinement, and that after it. In the sky it has no meaning, if the network has that class
+    heads: tuple[Maps, ...]
+    confidence: Maps | None  #: 0..1; in the sky its probability. None where it was not asked for
+    #: probability of the sky, None where the network has no such class. In eval mode at most a half
+    #: where the confidence of the match is higher, for white walls look like the sky
+    sky: Maps | None
 
 
 class LightStereo(StereoNetwork):
@@ -75,8 +77,8 @@ class LightStereo(StereoNetwork):
     Images are RGB normalised by ImageNet's mean and deviation; both sides are multiples of 32.
     """
 
-    #: at 1/4 size, an even number, that are computed at a time where something large would be held,
-    #: with no gradient; None, as in training and in exported graphs: all
+    #: rows at 1/4 size, an even number, that are computed at a time where a large volume would be
+    #: held, with no gradient; None, as in training and in exported graphs: all
     rows: int | None = None
 
     def __init__(self, config: LightConfig | None = None) -> None:
@@ -105,15 +107,15 @@ class LightStereo(StereoNetwork):
         return self.sky_head
 
     def forward(self, left: Views, right: Views) -> tuple[Maps, ...]:
-        """Give the disparity maps of :meth:`read`."""
-        return self.read(left, right, self.config.max_disparity_px).heads
+        """Estimate the disparity maps of :class:`LightOutput`."""
+        return self.match_views(left, right, self.config.max_disparity_px).heads
 
     def forward_with_sky(self, left: Views, right: Views) -> tuple[tuple[Maps, ...], Maps | None]:
-        """Give the disparity maps of :meth:`read`, and the probability of the sky."""
-        read = self.read(left, right, self.config.max_disparity_px)
-        return read.heads, read.sky
+        """Estimate the disparity maps of :class:`LightOutput`, and the probability of the sky."""
+        output = self.match_views(left, right, self.config.max_disparity_px)
+        return output.heads, output.sky
 
-    def read(
+    def match_views(
         self,
         left: Views,
         right: Views,
@@ -121,8 +123,8 @@ class LightStereo(StereoNetwork):
         *,
         first_px: int = 0,
         with_confidence: bool = False,
-    ) -> Reading:
-        """Match the pair, and read disparity, confidence and sky off the scores.
+    ) -> LightOutput:
+        """Estimate disparity, confidence and sky of the left views.
 
         Args:
             left: normalised left views.
@@ -130,71 +132,101 @@ class LightStereo(StereoNetwork):
             max_disparity_px: number of disparities that are searched.
             first_px: the least of them, a multiple of 4; negative where rigs have principal points
                 apart.
-            with_confidence: say how sure each pixel is.
+            with_confidence: estimate the confidence too.
 
         Raises:
             InputError: the images' size does not suit the network.
         """
-        h, w = left.shape[-2:]
-        if h % 32 or w % 32:
+        height, width = left.shape[-2:]
+        if height % 32 or width % 32:
             raise InputError(
-                f"the light matcher takes sides that are multiples of 32, got {h}x{w}; pad the "
-                "pair, as LightMatcher does"
+                f"the light matcher takes sides that are multiples of 32, got {height}x{width}; "
+                "pad the pair, as LightMatcher does"
             )
         left_features = self.features(left)
-        right_features = self.features(right)
-        descriptions = (
-            self.describe(left_features.levels[0]),
-            self.describe(right_features.levels[0]),
+        scores, right_half = self._score_disparities(
+            left_features, right, max_disparity_px // STEP_PX, first_px // STEP_PX
         )
-        right_half = right_features.half
-        del right_features  # its levels are large
 
-        # Disparity at 1/4 size: the mean over the few best.
-        bins = max_disparity_px // STEP_PX
-        first = first_px // STEP_PX
-        scores = self.aggregation(*descriptions, bins, left_features.levels, self.rows, first)
-        # In float32 at least: 8 bits would round the expectation to whole pixels.
-        scores = scores.to(torch.promote_types(scores.dtype, torch.float32))
-        best = scores.topk(_CANDIDATES, 1)
-        quarter_px = first_px + STEP_PX * (best.values.softmax(1) * best.indices).sum(1)
-
-        # Confidence and sky at 1/4 size.
-        quarters = [quarter_px]
+        # Disparity, confidence and sky at 1/4 size.
+        quarter_maps = [_expect_best(scores, first_px)]
         if with_confidence or self.sky_head is not None:
+            near = partial(confidence_near, first_px=first_px)
             with torch.no_grad():
                 # By rows: probabilities between the scores are the largest volume.
-                parts = (scores, quarter_px)
-                near_px = partial(confidence_near, first_px=first_px)
-                quarters.append(by_rows(near_px, parts, halo=0, rows=self.rows))
+                confidence = by_rows(near, (scores, *quarter_maps), halo=0, rows=self.rows)
+            quarter_maps.append(confidence)
         if self.sky_head is not None:
-            quarters.append(self.sky_head(left_features.levels, *quarters))
-        coarse_px = None
-        if self.training:  # the mean over all disparities
-            steps = torch.arange(bins, dtype=scores.dtype, device=scores.device)[:, None, None]
-            coarse_px = first_px + STEP_PX * (scores.softmax(1) * steps).sum(1, keepdim=True)
-        del scores
+            quarter_maps.append(self.sky_head(left_features.levels, *quarter_maps))
+        coarse_px = _expect_all(scores, first_px) if self.training else None
+        del scores  # the largest tensor that is still held
 
         # All of them at full size, and the disparity refined there.
-        left_half = left_features.half
-        parts = (torch.stack(quarters, 1), left_half, left_features.levels[0], right_half)
-        enlarged_px, *rest = by_rows(self.enlargement, parts, halo=2, rows=self.rows).unbind(1)
-        parts = (enlarged_px, left_half, right_half)
-        half_rows = None if self.rows is None else 2 * self.rows
+        quarters = torch.stack(quarter_maps, 1)
+        inputs = (quarters, left_features.half, left_features.levels[0], right_half)
+        enlarged = by_rows(self.enlargement, inputs, halo=2, rows=self.rows)
+        enlarged_px, *others = enlarged.unbind(1)
         refine = partial(self.refinement, least_px=first_px + MIN_DISPARITY_PX)
-        heads = (by_rows(refine, parts, halo=5, rows=half_rows),)
-        if coarse_px is not None:
-            wide_px = F.interpolate(coarse_px, scale_factor=4.0, mode="bilinear")[:, 0]
-            heads = (wide_px, enlarged_px, *heads)
-        confidence = rest[0] if with_confidence else None
+        half_rows = None if self.rows is None else 2 * self.rows
+        inputs = (enlarged_px, left_features.half, right_half)
+        refined_px = by_rows(refine, inputs, halo=5, rows=half_rows)
+
+        heads = (refined_px,) if coarse_px is None else (coarse_px, enlarged_px, refined_px)
         if self.sky_head is None:
-            return Reading(heads, confidence, None)
-        matched, sky = rest  # the match's confidence, and the probability of the sky
+            return LightOutput(heads, others[0] if with_confidence else None, None)
+        match_confidence, sky = others
         if not self.training:
-            sky = torch.where(sky > matched, sky, sky.clamp(max=0.5))
-        if confidence is not None:
-            confidence = torch.where(sky > 0.5, sky, matched * (1 - sky))
-        return Reading(heads, confidence, sky)
+            # The sky wins only where it is surer than the match.
+            sky = torch.where(sky > match_confidence, sky, sky.clamp(max=0.5))
+        if not with_confidence:
+            return LightOutput(heads, None, sky)
+        confidence = torch.where(sky > 0.5, sky, match_confidence * (1 - sky))
+        return LightOutput(heads, confidence, sky)
+
+    def _score_disparities(
+        self, left_features: ViewFeatures, right: Views, bins: int, first: int
+    ) -> tuple[Scores, Features]:
+        """Score each disparity of each pixel at 1/4 size.
+
+        Args:
+            left_features: features of the left views.
+            right: normalised right views.
+            bins: number of disparities at 1/4 size.
+            first: the least of them.
+
+        Returns:
+            The scores; and the features of the right views at half size.
+        """
+        right_features = self.features(right)
+        right_half = right_features.half
+        left_description = self.describe(left_features.levels[0])
+        right_description = self.describe(right_features.levels[0])
+        del right_features  # its levels are large
+        scores = self.aggregation(
+            left_description, right_description, bins, left_features.levels, self.rows, first
+        )
+        # In float32 at least: 8 bits would round the expectation to whole pixels.
+        return scores.to(torch.promote_types(scores.dtype, torch.float32)), right_half
+
+
+def _expect_best(scores: Scores, first_px: int) -> QuarterMaps:
+    """Compute the expected disparity over those of the highest scores [px of the full size].
+
+    ``first_px``: disparity of the first score.
+    """
+    best = scores.topk(_CANDIDATES, 1)
+    return first_px + STEP_PX * (best.values.softmax(1) * best.indices).sum(1)
+
+
+def _expect_all(scores: Scores, first_px: int) -> Maps:
+    """Compute the expected disparity over all scores [px], enlarged bilinearly to full size.
+
+    ``first_px``: disparity of the first score.
+    """
+    steps = torch.arange(scores.shape[1], dtype=scores.dtype, device=scores.device)
+    expected_step = (scores.softmax(1) * steps[:, None, None]).sum(1, keepdim=True)
+    quarter_px = first_px + STEP_PX * expected_step
+    return F.interpolate(quarter_px, scale_factor=4.0, mode="bilinear")[:, 0]
 
 
 ROWS = 16
@@ -204,28 +236,32 @@ ROWS = 16
 def light_bytes(
     config: LightConfig, height: int, width: int, dtype: torch.dtype, rows: int = ROWS
 ) -> int:
-    """Estimate the peak memory of a padded pair [bytes], with margin for the allocator.
+    """Estimate the peak memory of matching a padded pair [bytes], with margin for the allocator.
 
     One volume of the largest size is held whole; ``rows`` at quarter size are computed at a time.
     """
-    pixels = height * width // 16
-    slab_pixels = min((rows + 4) * width // 4, pixels)
-    feature_bytes = pixels * (2 * 4 * 16 + 3 * config.width) * dtype.itemsize
-    # Both views in float32: at this size, normalised, padded.
-    images = 6 * 3 * 4 * height * width
+    float_bytes = 4
+    quarter_pixels = height * width // 16
+    slab_pixels = min((rows + 4) * width // 4, quarter_pixels)  # of the rows, with their halo
+    # Of each pixel at quarter size, four at half size.
+    half_features = 2 * 4 * HALF_CHANNELS  # of both views
+    quarter_features = 3 * config.width
+    feature_bytes = quarter_pixels * (half_features + quarter_features) * dtype.itemsize
+    # Both views, three channels: at this size, normalised, padded.
+    image_bytes = 2 * 3 * 3 * float_bytes * height * width
     # A volume at quarter size, the smaller ones, and three of the rows at a time.
     widest = max(config.groups, config.volume_widths[0])
-    voxel_bytes = widest * (config.max_disparity_px // 4) * dtype.itemsize
-    volumes = voxel_bytes * (7 * pixels // 4 + 3 * slab_pixels)
-    # Weights that enlarge maps, thrice, and what they are made of at half size; the refinement
-    # takes less.
-    joined = 4 * (16 + config.width + 32) * dtype.itemsize
-    compared = 4 * (4 * 16 + 9 + 3 * 9) * 4
-    weights = slab_pixels * (joined + compared + 3 * 4 * 36 * 4)
-    return (
-        int(layers.MARGIN * (images + feature_bytes + max(volumes, weights)))
-        + layers.OVERHEAD_BYTES // 2
-    )
+    volume_pixel_bytes = widest * (config.max_disparity_px // STEP_PX) * dtype.itemsize
+    volume_bytes = volume_pixel_bytes * (7 * quarter_pixels // 4 + 3 * slab_pixels)
+    # Weights that enlarge maps, thrice, and what they are made of at half size: joined features,
+    # and nine comparisons in float32. The refinement takes less.
+    joined_bytes = 4 * (HALF_CHANNELS + config.width + 32) * dtype.itemsize
+    compared_bytes = 4 * (4 * HALF_CHANNELS + 9 + 3 * 9) * float_bytes
+    weight_bytes = 3 * 4 * 36 * float_bytes
+    enlargement_bytes = slab_pixels * (joined_bytes + compared_bytes + weight_bytes)
+
+    total_bytes = image_bytes + feature_bytes + max(volume_bytes, enlargement_bytes)
+    return int(layers.MARGIN * total_bytes) + layers.OVERHEAD_BYTES // 2
 
 
 class LightMatcher(NetworkMatcher):
@@ -248,15 +284,19 @@ class LightMatcher(NetworkMatcher):
         self, left: Views, right: Views, network_config: LightConfig, first_px: int = 0
     ) -> list[Match]:
         """Match normalised pairs whose sides suit the network."""
-        read = self._network.read(
+        output = self._network.match_views(
             left.to(self.dtype),
             right.to(self.dtype),
             network_config.max_disparity_px,
             first_px=first_px,
             with_confidence=self.config.with_confidence,
         )
-        nothing = [None] * len(left)
-        confidence = nothing if read.confidence is None else read.confidence
-        sky = nothing if read.sky is None else read.sky > 0.5
-        parts = zip(read.heads[-1], confidence, sky, strict=True)
-        return [Match(disparity_px=d, confidence=c, is_sky=s) for d, c, s in parts]
+        is_sky = None if output.sky is None else output.sky > 0.5
+        return [
+            Match(
+                disparity_px=disparity_px,
+                confidence=None if output.confidence is None else output.confidence[index],
+                is_sky=None if is_sky is None else is_sky[index],
+            )
+            for index, disparity_px in enumerate(output.heads[-1])
+        ]
