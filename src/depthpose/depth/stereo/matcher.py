@@ -15,15 +15,14 @@ from depthpose.core.camera import Camera
 from depthpose.core.errors import InputError, import_opencv
 from depthpose.core.files.images import check_image
 from depthpose.depth.config import SGBMConfig
-from depthpose.depth.types import Match
+from depthpose.depth.types import Map, Match, View
 
 
 @runtime_checkable
 class Matcher(Protocol):
-    """Anything that turns a rectified pair into the disparity of its left image.
+    """Anything that estimates the disparity of the left image of a rectified pair.
 
-    A matcher may be a :class:`CameraMatcher` too, which is given several pairs at once and what
-    camera took them.
+    One that is a :class:`CameraMatcher` too is given several pairs at once, with their camera.
     """
 
     def match(self, left: Tensor, right: Tensor) -> Match:
@@ -58,7 +57,7 @@ class CameraMatcher(Matcher, Protocol):
         ...
 
     def work_size(self, camera: Camera) -> tuple[int, int]:
-        """Give the rows and columns at which the images of a camera are matched [px]."""
+        """Compute the rows and columns at which the images of a camera are matched [px]."""
         ...
 
 
@@ -70,9 +69,9 @@ class CallableMatcher:
         matcher = CallableMatcher(lambda left, right: my_network(left[None], right[None])[0])
 
     Args:
-        function: takes the two images and answers disparity [px] of the left one, ``(H, W)``,
-            as a tensor or array; NaN where it has no answer.
-        with_numpy_images: give the function ``(H, W, 3)`` arrays instead of tensors.
+        function: from the two images to the disparity [px] of the left one, ``(H, W)``, as a tensor
+            or array; NaN where it is unknown.
+        with_numpy_images: call the function with ``(H, W, 3)`` arrays instead of tensors.
     """
 
     def __init__(
@@ -87,24 +86,24 @@ class CallableMatcher:
         """Call the function, and refuse a result that is no disparity map.
 
         Raises:
-            InputError: unusable images, or an answer of another type or size, infinite, negative,
-                or without a single value.
+            InputError: unusable images, or a result of another type or size, infinite, negative, or
+                NaN everywhere.
         """
         check_pair(left, right)
         views = (left, right)
         if self.with_numpy_images:
             views = tuple(view.permute(1, 2, 0).cpu().numpy() for view in views)
-        answer = self.function(*views)
+        result = self.function(*views)
 
         # Refuse what is no map of numbers of the images' size.
-        if isinstance(answer, np.ndarray) and answer.dtype.kind in "fiu":
-            answer = torch.from_numpy(np.ascontiguousarray(answer, dtype=np.float32))
-        if not isinstance(answer, Tensor) or answer.is_complex():
+        if isinstance(result, np.ndarray) and result.dtype.kind in "fiu":
+            result = torch.from_numpy(np.ascontiguousarray(result, dtype=np.float32))
+        if not isinstance(result, Tensor) or result.is_complex():
             raise InputError(
-                f"the wrapped matcher answered {type(answer).__name__}; let it answer a tensor or "
+                f"the wrapped matcher answered {type(result).__name__}; let it answer a tensor or "
                 f"array of disparities"
             )
-        disparity_px = answer.detach().to(torch.float32)
+        disparity_px = result.detach().to(torch.float32)
         size = tuple(left.shape[-2:])
         if tuple(disparity_px.shape) != size:
             raise InputError(
@@ -120,8 +119,8 @@ class CallableMatcher:
             f"negative disparity (least {least_px:.4g} px); is the pair swapped? NaN says no "
             "answer": least_px < 0,
         }
-        for fault, is_there in faults.items():
-            if is_there:
+        for fault, is_present in faults.items():
+            if is_present:
                 raise InputError(f"the wrapped matcher answered {fault}")
         return Match(disparity_px=disparity_px)
 
@@ -144,9 +143,9 @@ def check_pair(left: object, right: object) -> None:
 
 
 class SGBMMatcher:
-    """A matcher that needs no weights; holes are NaN unless it fills them.
+    """OpenCV's StereoSGBM, which needs no weights. Its holes are NaN, unless they are filled.
 
-    OpenCV has no answer in the leftmost ``num_disparities`` columns.
+    The leftmost ``num_disparities`` columns are a hole.
 
     Raises:
         MissingExtraError: OpenCV is not installed.
@@ -157,7 +156,9 @@ class SGBMMatcher:
         self._cv2 = import_opencv("matching with StereoSGBM")
 
     def match(self, left: Tensor, right: Tensor) -> Match:
-        """Match one pair. With filled holes the confidence is 0 there and 1 elsewhere; else None.
+        """Match one pair.
+
+        With filled holes the confidence is 0 there and 1 elsewhere; else it is None.
 
         Raises:
             InputError: unusable images, or images narrower than the disparity range.
@@ -181,11 +182,7 @@ class SGBMMatcher:
             speckleRange=2,  # ... where they step by more than this [px]
             mode=self._cv2.STEREO_SGBM_MODE_SGBM_3WAY,
         )
-        # The 8-bit BGR that OpenCV reads from a file.
-        images = ((view.detach().cpu().clamp(0, 1) * 255).round().byte() for view in (left, right))
-        fixed_point = matcher.compute(
-            *(np.ascontiguousarray(image.flip(0).permute(1, 2, 0).numpy()) for image in images)
-        )
+        fixed_point = matcher.compute(_convert_to_bgr(left), _convert_to_bgr(right))
         disparity_px = torch.from_numpy(fixed_point.astype(np.float32) / 16).to(left.device)
         disparity_px = disparity_px.where(disparity_px > 0, torch.nan)
         if not self.config.with_filled_holes:
@@ -194,30 +191,37 @@ class SGBMMatcher:
         return Match(disparity_px=fill_holes(disparity_px), confidence=confidence)
 
 
-def fill_holes(disparity_px: Tensor) -> Tensor:
+def _convert_to_bgr(image: View) -> np.ndarray:
+    """Convert RGB in [0, 1] to the 8-bit BGR (H, W, 3) that OpenCV reads from a file."""
+    rgb = (image.detach().cpu().clamp(0, 1) * 255).round().byte()
+    return np.ascontiguousarray(rgb.flip(0).permute(1, 2, 0).numpy())
+
+
+def fill_holes(disparity_px: Map) -> Map:
     """Fill NaN along rows as the KITTI devkit does.
 
-    A hole takes the smaller of its row's two valid neighbours, for a hole is mostly background;
-    at a border of the row it takes the one neighbour it has. A row without any value takes the
-    nearest row that has some.
-
-    Args:
-        disparity_px: ``(H, W)``.
+    A pixel of a hole takes the smaller of the two values that bound the hole in its row, for a hole
+    is mostly background; at a border of the image it takes the only one. A row without any value
+    takes the nearest row that has one.
 
     Raises:
         InputError: there is no value at all to fill from.
     """
-    valid = torch.isfinite(disparity_px)
-    if not bool(valid.any()):
+    is_valid = torch.isfinite(disparity_px)
+    if not bool(is_valid.any()):
         raise InputError("no pixel was matched, so no hole can be filled; is the pair rectified?")
-    values = disparity_px.where(valid, torch.inf)
-    column = torch.arange(values.shape[1], device=values.device).expand_as(values)
-    before = column.where(valid, -1).cummax(1).values
-    after = column.where(valid, values.shape[1]).flip(1).cummin(1).values.flip(1)
-    # An absent neighbour is infinite, so the smaller of the two is the one that is there.
-    padded = F.pad(values, (0, 1), value=torch.inf)
-    before = before.where(before >= 0, values.shape[1])
-    filled = torch.minimum(padded.gather(1, before), padded.gather(1, after))
-    rows = torch.arange(len(valid), device=valid.device)
-    filled_rows = rows[valid.any(1)]
-    return filled[filled_rows[(rows[:, None] - filled_rows).abs().argmin(1)]]
+    height, width = disparity_px.shape
+
+    # Columns of the last valid pixel before each pixel and the first one after it, or itself.
+    column = torch.arange(width, device=disparity_px.device).expand_as(disparity_px)
+    column_before = column.where(is_valid, -1).cummax(1).values
+    column_after = column.where(is_valid, width).flip(1).cummin(1).values.flip(1)
+    # Where there is none, an added column of infinite values, of which the other is the smaller.
+    column_before = column_before.where(column_before >= 0, width)
+    padded = F.pad(disparity_px.where(is_valid, torch.inf), (0, 1), value=torch.inf)
+    filled = torch.minimum(padded.gather(1, column_before), padded.gather(1, column_after))
+
+    rows = torch.arange(height, device=disparity_px.device)
+    valid_rows = rows[is_valid.any(1)]
+    nearest = (rows[:, None] - valid_rows).abs().argmin(1)
+    return filled[valid_rows[nearest]]

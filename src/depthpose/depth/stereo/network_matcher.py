@@ -5,7 +5,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from operator import itemgetter
+from operator import methodcaller
 from typing import Any, ClassVar
 
 import torch
@@ -24,20 +24,20 @@ from depthpose.depth.stereo.matcher import check_pair
 from depthpose.depth.types import Map, Maps, Match, View, Views
 
 STEP_PX = 4
-"""Between neighbouring disparities that have a score, of every network here: their volumes are of a
-quarter of the image's size."""
+"""Distance of neighbouring disparities that have a score, in every network here: their volumes have
+a quarter of the image's size."""
 DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16}
 AGREEMENT_PX = 3.0
-"""Difference of left and right disparity at which their agreement is down to 1/e."""
+"""Difference of left and right disparity at which their agreement falls to 1/e."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SearchRange:
     """The size at which a pair is matched, and the disparities that are searched there."""
 
-    scale: float  #: rows and columns are so many times those of the images
-    first_px: int  #: the least disparity, in pixels at that scale, a multiple of 4
-    span_px: int  #: how many disparities are searched from there on
+    scale: float  #: the size, as a multiple of that of the images
+    first_px: int  #: the least disparity, in pixels at that size, a multiple of 4
+    span_px: int  #: how many disparities are searched from ``first_px`` on
 
     @property
     def last_in_images_px(self) -> float:
@@ -57,17 +57,21 @@ class StereoNetwork(nn.Module):
     sky: nn.Module | None = None  #: the class of the sky, which may be trained alone
 
     def forward_with_sky(self, left: Views, right: Views) -> tuple[tuple[Maps, ...], Maps | None]:
-        """Give the disparity maps [px], and P(sky) where the network has that class."""
+        """Estimate the disparity maps [px], and P(sky) where the network has that class."""
         return self(left, right), None
 
 
 class NetworkMatcher(ABC):
     """A network with pre- and post-processing: normalisation, padding, device, memory.
 
-    A kind of network adds :meth:`fold`, :meth:`run`, :meth:`activation_bytes` and ``fine_pixels``;
-    what ``fold`` gives has ``rows``, how many rows of a volume are computed at a time, or None. The
-    weights are copied: training ``network`` further does not change this matcher. Where the
+    A kind of network adds :meth:`fold`, :meth:`run`, :meth:`activation_bytes` and ``fine_pixels``.
+    The weights are copied: training ``network`` further does not change this matcher. Where the
     processor has no bf16, ``config`` says fp32 in its place.
+
+    Args:
+        network: the network. Its attribute ``rows`` is how many rows of a volume are computed at a
+            time; None: all.
+        config: how it is run; None: the defaults.
 
     Raises:
         InputError: the device does not exist on this machine; a largest disparity for a network
@@ -75,11 +79,11 @@ class NetworkMatcher(ABC):
     """
 
     fine_pixels: ClassVar[int]
-    """Pixels of a fine match at most."""
+    """Most pixels of an image that is matched at the speed ``fine``."""
     largest_upscale: ClassVar[float] = 1.0
-    """Times the size of the images at which a fine match may be."""
+    """Largest factor by which the sides of an image are enlarged for a fine match."""
     largest_span_factor: ClassVar[float] = 1.5
-    """Times the disparities of training that a fine match looks through at most."""
+    """Most disparities that a fine match searches, as a multiple of those of the training."""
     finds_range: bool = False
     """Whether the disparities of a pair are measured first, and searched where they lie."""
     activation_bytes: ClassVar[Callable[..., int]]
@@ -103,7 +107,10 @@ class NetworkMatcher(ABC):
 
     @abstractmethod
     def fold(self, network: Any, example: Tensor) -> Any:  # noqa: ANN401
-        """Fold batch norm into the convolutions; weights get the type of ``example``."""
+        """Fold batch norm into the convolutions, in place, and return the network.
+
+        Weights get the type and the device of ``example``.
+        """
 
     @abstractmethod
     def run(
@@ -119,8 +126,8 @@ class NetworkMatcher(ABC):
             left: left views.
             right: right views, the same size.
             network_config: config of the network, perhaps of more disparities than in training.
-            first_px: the least disparity that is searched, a multiple of 4; other
-                than 0 for networks alone that find the range.
+            first_px: the least disparity that is searched, a multiple of 4; 0 for networks that do
+                not find the range.
         """
 
     @torch.no_grad()
@@ -141,8 +148,14 @@ class NetworkMatcher(ABC):
     ) -> list[Match]:
         """Match pairs: together if all become one size and memory is unbounded, else one by one.
 
-        Pairs of a known camera are matched at the size of :meth:`work_size`, or all at that of
-        ``search``. A processor is busy with one pair; it is a GPU that gains from several.
+        Args:
+            pairs: left and right images, as for :meth:`match`.
+            camera: camera of the left images, which are then matched at :meth:`work_size`; None: it
+                is not known.
+            search: size and disparities of the search, in place of those of the camera.
+
+        Returns:
+            A match of each pair, at its size and on its device.
 
         Raises:
             InputError: as :meth:`match`.
@@ -154,19 +167,16 @@ class NetworkMatcher(ABC):
         is_one_size = len({left.shape for left, _ in views}) == 1
         is_together = is_one_size and self.config.max_memory_bytes is None
         groups = [views] if is_together else [[pair] for pair in views]
-        matches = [
-            match
-            for group in groups
-            for match in self._match_group(group, network_config, first_px)
-        ]
+        matches: list[Match] = []
+        for group in groups:
+            matches += self._match_group(group, network_config, first_px)
+
         # Back to the size and the device of the images.
-        home = pairs[0][0].device
-        return [
-            disparity.resize_match(
-                disparity.apply_to_maps(match, lambda values: values.to(home)), *left.shape[1:]
-            )
-            for match, (left, _) in zip(matches, pairs, strict=True)
-        ]
+        matches_of_images: list[Match] = []
+        for match, (left, _) in zip(matches, pairs, strict=True):
+            moved = disparity.apply_to_maps(match, methodcaller("to", left.device))
+            matches_of_images.append(disparity.resize_match(moved, *left.shape[1:]))
+        return matches_of_images
 
     def _resize_views(
         self,
@@ -174,7 +184,12 @@ class NetworkMatcher(ABC):
         camera: Camera | None,
         search: SearchRange | None,
     ) -> tuple[Sequence[tuple[Tensor, ...]], Any]:
-        """Resize pairs to the size at which they are matched, with the settings for that size."""
+        """Resize pairs to the size at which they are matched.
+
+        Returns:
+            The resized pairs; and the network's config, with the number of disparities for that
+            size.
+        """
         trained = self.network_config
         if search is not None:
             sizes = [_scaled_size(left, search.scale, camera) for left, _ in pairs]
@@ -197,17 +212,18 @@ class NetworkMatcher(ABC):
         first_px: int,
     ) -> list[Match]:
         """Match pairs of one size in one call of the network, or two with the left-right check."""
-        left, right = (
-            normalise(torch.stack(side).to(self.device, torch.float32))
-            for side in zip(*group, strict=True)
-        )
+        lefts, rights = zip(*group, strict=True)
+        left = normalise(torch.stack(lefts).to(self.device, torch.float32))
+        right = normalise(torch.stack(rights).to(self.device, torch.float32))
         matches = self._match_padded(left, right, network_config, first_px)
         if not self.config.with_left_right_check:
             return matches
         # Mirrored, the right view is a left one.
         mirrored = self._match_padded(right.flip(-1), left.flip(-1), network_config, first_px)
-        right_px = (match.disparity_px.flip(-1) for match in mirrored)
-        return list(map(lower_where_disagreeing, matches, right_px))
+        return [
+            lower_where_disagreeing(match, mirrored_match.disparity_px.flip(-1))
+            for match, mirrored_match in zip(matches, mirrored, strict=True)
+        ]
 
     def _match_padded(
         self,
@@ -216,7 +232,7 @@ class NetworkMatcher(ABC):
         network_config: Any,  # noqa: ANN401
         first_px: int,
     ) -> list[Match]:
-        """Match pairs padded to sides that suit the network; give matches of their own size.
+        """Pad pairs to sides that suit the network, match them, and crop the matches again.
 
         Raises:
             InputError: the network needs more memory than the config allows.
@@ -226,8 +242,10 @@ class NetworkMatcher(ABC):
         padded_right = pad_top_right(right, network_config)
         self._refuse_memory(network_config, *padded_left.shape[-2:])
         matches = self.run(padded_left, padded_right, network_config, first_px)
-        crop = itemgetter((slice(-height, None), slice(width)))  # values[-height:, :width]
-        return [disparity.apply_to_maps(match, crop) for match in matches]
+        return [
+            disparity.apply_to_maps(match, lambda values: values[-height:, :width])
+            for match in matches
+        ]
 
     def _refuse_memory(self, network_config: Any, height: int, width: int) -> None:  # noqa: ANN401
         """Refuse images whose matching takes more memory than the config allows."""
@@ -236,7 +254,7 @@ class NetworkMatcher(ABC):
             return
         rows = self._network.rows or height // 4
         needed_bytes = self.activation_bytes(network_config, height, width, self.dtype, rows)
-        if needed_bytes > limit_bytes:  # volumes are held whole
+        if needed_bytes > limit_bytes:
             quick = "" if network_config.work_focal_px is None else " or speed='quick'"
             raise InputError(
                 f"max_memory_bytes={limit_bytes} is too small for images of "
@@ -245,19 +263,20 @@ class NetworkMatcher(ABC):
             )
 
     def work_size(self, camera: Camera) -> tuple[int, int]:
-        """Give the rows and columns at which images of a camera are matched [px]."""
+        """Compute the rows and columns at which images of a camera are matched [px]."""
         if self.network_config.work_focal_px is None:
             return camera.height, camera.width
         return disparity.size_at_focal_length(camera, self.work_focal_px(camera))
 
     def work_disparities(self, camera: Camera) -> int:
-        """Give the number of disparities that are searched at :meth:`work_size` [px]."""
+        """Compute the number of disparities that are searched at :meth:`work_size` [px]."""
         trained = self.network_config
         if trained.work_focal_px is None:
             return trained.max_disparity_px
-        # A larger size needs more disparities; the same filters look through them.
-        larger = min(self.work_focal_px(camera) / trained.work_focal_px, self.largest_span_factor)
-        return self.whole_steps(trained.max_disparity_px * larger)
+        # Disparities grow with the focal length; the same filters search more of them.
+        ratio = self.work_focal_px(camera) / trained.work_focal_px
+        span_factor = min(ratio, self.largest_span_factor)
+        return self.whole_steps(trained.max_disparity_px * span_factor)
 
     def whole_steps(self, disparity_px: float) -> int:
         """Round a number of disparities [px] up to a multiple of the network's step."""
@@ -265,18 +284,23 @@ class NetworkMatcher(ABC):
         return max(1, math.ceil(round(disparity_px, 3) / step_px)) * step_px
 
     def work_focal_px(self, camera: Camera) -> float:
-        """Give the focal length at which images of a camera are matched [px]."""
+        """Compute the focal length at which images of a camera are matched [px].
+
+        At the speed ``fine`` it is that of an image of ``fine_pixels``, but at least that of the
+        training.
+        """
         trained_px = self.network_config.work_focal_px
         if trained_px is None:
             return float(camera.K[0, 0])
         if self.config.speed == "quick":
             return trained_px
-        share = math.sqrt(self.fine_pixels / (camera.height * camera.width))
-        return max(trained_px, float(camera.K[0, 0]) * min(share, self.largest_upscale))
+        scale = math.sqrt(self.fine_pixels / (camera.height * camera.width))
+        fine_px = float(camera.K[0, 0]) * min(scale, self.largest_upscale)
+        return max(trained_px, fine_px)
 
 
 def _scaled_size(left: View, scale: float, camera: Camera | None) -> tuple[int, int]:
-    """Give the rows and columns of a view that is scaled; with a camera, pixels become square."""
+    """Compute the rows and columns of a scaled view; with a camera, pixels become square."""
     if camera is not None:
         return disparity.size_at_focal_length(camera, scale * float(camera.K[0, 0]))
     return max(1, round(left.shape[1] * scale)), max(1, round(left.shape[2] * scale))
@@ -291,35 +315,44 @@ def normalise(image: Float[Tensor, "*batch 3 h w"]) -> Float[Tensor, "*batch 3 h
 def pad_top_right(
     image: Float[Tensor, "*batch 3 h w"], network: NetworkConfig
 ) -> Float[Tensor, "*batch 3 h2 w2"]:
-    """Pad a normalised image with zeros, top and right, to a size that suits the network.
+    """Pad a normalised image with zeros, at the top and right, to a size that suits the network.
 
-    Top and right, as PSMNet's authors do: columns stay where they are, so disparity does too.
+    So PSMNet's authors do. Columns keep their numbers, and so disparity stays the same.
     """
-    step = network.step_px
-    least = network.min_side_px
-    h, w = (max(least, -(-side // step) * step) for side in image.shape[-2:])
-    return F.pad(image, (0, w - image.shape[-1], h - image.shape[-2], 0))
+    height, width = image.shape[-2:]
+    rows_above = _suitable_side_px(height, network) - height
+    columns_right = _suitable_side_px(width, network) - width
+    return F.pad(image, (0, columns_right, rows_above, 0))
+
+
+def _suitable_side_px(side_px: int, network: NetworkConfig) -> int:
+    """Round a side up to the next one that the network takes."""
+    steps = math.ceil(side_px / network.step_px)
+    return max(network.min_side_px, steps * network.step_px)
 
 
 def lower_where_disagreeing(
-    match: Match, right_px: Map, tolerance_px: float = 0.0, falls_px: float = AGREEMENT_PX
+    match: Match, right_px: Map, tolerance_px: float = 0.0, decay_px: float = AGREEMENT_PX
 ) -> Match:
-    """Lower the confidence where the right view's own disparity is another.
+    """Lower the confidence where the disparity of the right view differs from that of the left one.
 
-    Halved where the matching point lies outside the right view, for nothing there can agree. The
-    sky keeps its confidence.
+    The agreement of both is ``exp(-difference / decay_px)``, and 0 where the matching point lies
+    outside the right view. The confidence is multiplied by ``(1 + agreement) / 2``; without one,
+    the agreement becomes the confidence. The sky keeps its confidence.
 
     Args:
         match: match of the left view.
         right_px: disparity of the right view.
-        tolerance_px: a difference that says nothing.
-        falls_px: what is larger by so much takes the agreement down to 1/e.
+        tolerance_px: a difference up to this counts as none.
+        decay_px: difference beyond the tolerance at which the agreement falls to 1/e.
     """
-    # Small where both views agree, large at occlusions; NaN outside the right view.
-    there_px = disparity.warp_right_to_left(right_px[None], match.disparity_px)[0]
-    difference_px = ((match.disparity_px - there_px).abs() - tolerance_px).clamp(min=0)
-    agreement = torch.exp(-difference_px / falls_px).nan_to_num(0.0)
-    confidence = agreement if match.confidence is None else match.confidence * (1 + agreement) / 2
-    if match.confidence is not None and match.is_sky is not None:
+    # Disparities at the matching points: NaN outside the right view.
+    matched_px = disparity.warp_right_to_left(right_px[None], match.disparity_px)[0]
+    difference_px = ((match.disparity_px - matched_px).abs() - tolerance_px).clamp(min=0)
+    agreement = torch.exp(-difference_px / decay_px).nan_to_num(0.0)
+    if match.confidence is None:
+        return replace(match, confidence=agreement)
+    confidence = match.confidence * (1 + agreement) / 2
+    if match.is_sky is not None:
         confidence = torch.where(match.is_sky, match.confidence, confidence)
     return replace(match, confidence=confidence)
