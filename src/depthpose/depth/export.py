@@ -24,24 +24,24 @@ from depthpose.depth.weights import DepthWeights, make_matcher
 _LIMITS = {
     "depth_m": Limit(value=0.01, is_relative=True),
     "disparity_px": Limit(value=0.05),
-    # A plane counts as near the disparity or not: where it lies on that border, confidence jumps.
+    # Its mean: single values jump where a plane lies at the border of those that count as near.
     "confidence": Limit(value=1e-3, of="mean"),
     "right": Limit(value=1e-3),
     "image_confidence": Limit(value=1e-3),
 }
-_FLIPPED_SHARE = 1e-3
-"""Share of pixels that may be sky in one of two results, with all that follows from it."""
-_FLIPPING_LIMITS = {
-    name: limit if limit.of == "mean" else replace(limit, flips=_FLIPPED_SHARE)
+_MAX_FLIPPED_SHARE = 1e-3
+"""Share of pixels that may be sky in one result and not in the other, and so differ in all maps."""
+_SELECTING_LIMITS = {
+    name: limit if limit.of == "mean" else replace(limit, flips=_MAX_FLIPPED_SHARE)
     for name, limit in _LIMITS.items()
-} | {"is_sky": Limit(value=_FLIPPED_SHARE, of="mean")}
+} | {"is_sky": Limit(value=_MAX_FLIPPED_SHARE, of="mean")}
 """Limits of networks that choose between candidates: where two scores tie, the last bit decides."""
-_FLIPPING: tuple[type[StereoNetwork], ...] = (LightStereo,)
+_SELECTING_MATCHERS: tuple[type[StereoNetwork], ...] = (LightStereo,)
 """Matchers that choose between candidates."""
 
 
 @dataclass(frozen=True)
-class _Size:
+class _CaseSize:
     """Size and number of the images of a case."""
 
     rows: int
@@ -50,14 +50,14 @@ class _Size:
     count: int = 1
 
 
-_SIZES = (
-    _Size(256, 512, 1.0),
-    _Size(375, 1242, 2.0),
-    _Size(190, 300, 0.8, count=2),
-    _Size(233, 401, 1.3),
+_CASE_SIZES = (
+    _CaseSize(256, 512, 1.0),
+    _CaseSize(375, 1242, 2.0),
+    _CaseSize(190, 300, 0.8, count=2),
+    _CaseSize(233, 401, 1.3),
 )
-"""Multiples of the sides that networks take; sides that are stretched to them; images that are
-enlarged; and sides that are padded."""
+"""Sides that networks take; sides that are stretched to such; images that are enlarged; and sides
+that are padded."""
 _SHIFT_PX = 6
 """Disparity of the scenes at the network's focal length."""
 _SKY_COLOR = (0.72, 0.82, 0.95)
@@ -65,26 +65,25 @@ _SKY_COLOR = (0.72, 0.82, 0.95)
 _QUICK = MatcherConfig(speed="quick")
 """Graphs match pairs at the focal length of the weights' training, as this speed does."""
 _MIN_COMPARED_PX = 1.0
-"""Disparity from which depths are compared: below it depth hangs on the last bit of disparity."""
+"""Disparity from which depths are compared: below it depth depends on the last bit of disparity."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Target:
     """A kind of graph that weights are exported as."""
 
-    fits: Callable[[DepthWeights], bool]  # whether weights may be exported so by default
-    export: Callable[
-        [DepthWeights, dict[str, Any]], Export
-    ]  # takes weights, and facts for its user
+    fits: Callable[[DepthWeights], bool]  #: whether it is the default for weights
+    #: describes the export of weights, with facts for the user of the file
+    export: Callable[[DepthWeights, dict[str, Any]], Export]
 
 
-def depth_export(weights: DepthWeights, what: str | None, facts: dict[str, Any]) -> Export:
-    """Describe the export of weights: the graph, and the cases that prove it.
+def describe_export(weights: DepthWeights, what: str | None, facts: dict[str, Any]) -> Export:
+    """Describe the export of weights: the graph, and the cases that compare it with PyTorch.
 
     Args:
         weights: the networks.
         what: a key of ``TARGETS``; None: the first that fits the weights.
-        facts: facts of the weights, for the user of the file.
+        facts: facts of the weights, for the user of the file, by name.
 
     Raises:
         InputError: there is no such target.
@@ -96,89 +95,83 @@ def depth_export(weights: DepthWeights, what: str | None, facts: dict[str, Any])
 
 
 def _describe_pair_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
-    """Describe the export of a matcher: its graph, and cases by which the graph is proven."""
-
-    def cases() -> Iterator[Case]:
-        """Match synthetic pairs of several sizes by PyTorch."""
-        assert weights.matcher is not None
-        matcher = make_matcher(weights.matcher, _QUICK)
-        if isinstance(matcher, NetworkMatcher):
-            matcher.finds_range = False  # as in a graph
-        net = FakestereoNet(matcher)
-        outputs = ["disparity_px", "confidence"]
-        has_sky = getattr(weights.matcher.config, "with_sky", False)
-        if has_sky:
-            outputs.append("is_sky")
-        work_focal_px = weights.matcher.config.work_focal_px
-        for size in _SIZES:
-            left, right, camera = _make_scenes(size, work_focal_px or 1.0, with_sky=has_sky)
-            inputs = {"left": left.numpy(), "right": right.numpy()}
-            rig = None
-            if work_focal_px is not None:
-                rig = StereoRig(
-                    width=camera.width, height=camera.height, K=camera.K, baseline_m=0.5
-                )
-                inputs["K"] = camera.K.numpy()
-            pairs = (
-                StereoInput(name="proof", left=left_view, right=right_view, camera=rig)
-                for left_view, right_view in zip(left, right, strict=True)
-            )
-            estimates = [net.estimate_input(pair, with_check=False) for pair in pairs]
-            yield _make_case(inputs, estimates, outputs)
-
+    """Describe the export of a matcher: its graph, and cases that compare it with PyTorch."""
     return Export(
         graph=lambda: pair_graph(weights),
-        cases=cases,
-        limits=_FLIPPING_LIMITS if isinstance(weights.matcher, _FLIPPING) else _LIMITS,
+        cases=lambda: _make_pair_cases(weights),
+        limits=_SELECTING_LIMITS if isinstance(weights.matcher, _SELECTING_MATCHERS) else _LIMITS,
         facts={**facts, "what": "rectified pair, RGB in [0, 1] -> disparity [px], ..."},
     )
 
 
-def _describe_image_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
-    """Describe the export of a generator: its graph, and cases by which the graph is proven."""
-
-    def cases() -> Iterator[Case]:
-        """Estimate synthetic images of several sizes by PyTorch."""
-        assert weights.generator is not None
-        matcher = None if weights.matcher is None else make_matcher(weights.matcher, _QUICK)
-        # The scenes of the proof need not be like the images that the weights were trained on.
-        synthesiser = make_synthesiser(weights.generator, speed=_QUICK.speed)
-        net = FakestereoNet(matcher, synthesiser, allow_ood=True)
-        outputs = ["depth_m", "disparity_px", "confidence", "right"]
-        matcher_config = None if weights.matcher is None else weights.matcher.config
-        has_sky = isinstance(weights.generator, SelectionGenerator) or getattr(
-            matcher_config, "with_sky", False
+def _make_pair_cases(weights: DepthWeights) -> Iterator[Case]:
+    """Make cases of synthetic pairs of several sizes, with PyTorch's estimates."""
+    assert weights.matcher is not None
+    matcher = make_matcher(weights.matcher, _QUICK)
+    if isinstance(matcher, NetworkMatcher):
+        matcher.finds_range = False  # as in a graph
+    net = FakestereoNet(matcher)
+    outputs = ["disparity_px", "confidence"]
+    has_sky = getattr(weights.matcher.config, "with_sky", False)
+    if has_sky:
+        outputs.append("is_sky")
+    work_focal_px = weights.matcher.config.work_focal_px
+    for size in _CASE_SIZES:
+        left, right, camera = _make_scenes(size, work_focal_px or 1.0, with_sky=has_sky)
+        inputs = {"left": left.numpy(), "right": right.numpy()}
+        rig = None
+        if work_focal_px is not None:
+            rig = StereoRig(width=camera.width, height=camera.height, K=camera.K, baseline_m=0.5)
+            inputs["K"] = camera.K.numpy()
+        pairs = (
+            StereoInput(name="case", left=left_view, right=right_view, camera=rig)
+            for left_view, right_view in zip(left, right, strict=True)
         )
-        if has_sky:
-            outputs.append("is_sky")
-        if getattr(weights.generator, "street", None):
-            outputs.append("image_confidence")
-        focal_px = weights.generator.config.virtual_focal_px
-        for size in _SIZES:
-            images, _, camera = _make_scenes(size, focal_px, with_sky=has_sky)
-            inputs = {"image": images.numpy(), "K": camera.K.numpy()}
-            views = (
-                StereoInput(name="proof", left=view, right=None, camera=camera) for view in images
-            )
-            estimates = [net.estimate_input(view) for view in views]
-            case = _make_case(inputs, estimates, outputs)
-            is_compared = case.expected["disparity_px"] >= _MIN_COMPARED_PX
-            if has_sky:
-                is_compared = is_compared | case.expected["is_sky"]
-            yield replace(case, where={"depth_m": is_compared})
+        estimates = [net.estimate_input(pair, with_check=False) for pair in pairs]
+        yield _make_case(inputs, estimates, outputs)
 
+
+def _make_image_cases(weights: DepthWeights) -> Iterator[Case]:
+    """Make cases of synthetic images of several sizes, with PyTorch's estimates."""
+    assert weights.generator is not None
+    matcher = None if weights.matcher is None else make_matcher(weights.matcher, _QUICK)
+    # The scenes need not be like the images that the weights were trained on.
+    synthesiser = make_synthesiser(weights.generator, speed=_QUICK.speed)
+    net = FakestereoNet(matcher, synthesiser, allow_ood=True)
+    outputs = ["depth_m", "disparity_px", "confidence", "right"]
+    matcher_config = None if weights.matcher is None else weights.matcher.config
+    is_selecting = isinstance(weights.generator, SelectionGenerator)
+    has_sky = is_selecting or getattr(matcher_config, "with_sky", False)
+    if has_sky:
+        outputs.append("is_sky")
+    if getattr(weights.generator, "street", None):
+        outputs.append("image_confidence")
+    focal_px = weights.generator.config.virtual_focal_px
+    for size in _CASE_SIZES:
+        images, _, camera = _make_scenes(size, focal_px, with_sky=has_sky)
+        inputs = {"image": images.numpy(), "K": camera.K.numpy()}
+        views = (StereoInput(name="case", left=view, right=None, camera=camera) for view in images)
+        estimates = [net.estimate_input(view) for view in views]
+        case = _make_case(inputs, estimates, outputs)
+        is_compared = case.expected["disparity_px"] >= _MIN_COMPARED_PX
+        if has_sky:
+            is_compared = is_compared | case.expected["is_sky"]
+        yield replace(case, where={"depth_m": is_compared})
+
+
+def _describe_image_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
+    """Describe the export of a generator: its graph, and cases that compare it with PyTorch."""
     generator = weights.generator
     rig_facts: dict[str, Any] = {}
     if generator is not None:
         names = ("virtual_focal_px", "virtual_baseline_m", "answer")
         rig_facts = {name: getattr(generator.config, name) for name in names}
-    is_flipping = isinstance(generator, SelectionGenerator) or isinstance(
-        weights.matcher, _FLIPPING
-    )
+    has_selecting_matcher = isinstance(weights.matcher, _SELECTING_MATCHERS)
+    is_selecting = isinstance(generator, SelectionGenerator) or has_selecting_matcher
     return Export(
         graph=lambda: image_graph(weights),
-        cases=cases,
-        limits=_FLIPPING_LIMITS if is_flipping else _LIMITS,
+        cases=lambda: _make_image_cases(weights),
+        limits=_SELECTING_LIMITS if is_selecting else _LIMITS,
         facts={**facts, **rig_facts, "what": "image, RGB in [0, 1], and K [px] -> depth [m], ..."},
     )
 
@@ -195,7 +188,7 @@ TARGETS = {
 def _make_case(
     inputs: dict[str, np.ndarray], estimates: list[DepthEstimate], outputs: Sequence[str]
 ) -> Case:
-    """Make a case of inputs and of the outputs that PyTorch estimates from them."""
+    """Make a case of inputs and of the fields ``outputs`` of PyTorch's estimates from them."""
     expected: dict[str, np.ndarray] = {}
     for output in outputs:
         values = [torch.as_tensor(getattr(estimate, output)) for estimate in estimates]
@@ -205,9 +198,12 @@ def _make_case(
 
 
 def _make_scenes(
-    size: _Size, network_focal_px: float, *, with_sky: bool
+    size: _CaseSize, network_focal_px: float, *, with_sky: bool
 ) -> tuple[Tensor, Tensor, Camera]:
-    """Make left and right views of smooth noise, shifted by one disparity, and their camera."""
+    """Make left and right views of smooth noise, shifted by one disparity, and their camera.
+
+    ``network_focal_px``: focal length at which the network sees images.
+    """
     rows = size.rows
     columns = size.columns
     focal_px = size.focal_share * network_focal_px
@@ -220,7 +216,8 @@ def _make_scenes(
     noise = torch.rand(size.count, 3, rows // 6, columns // 6, generator=random)
     scene = F.interpolate(noise, (rows, columns + shift), mode="bicubic").clamp(0, 1)
     if with_sky:  # bright and nearly without texture, over the upper two fifths
-        top = rows * 2 // 5
-        sky = torch.tensor(_SKY_COLOR)[:, None, None] * torch.linspace(0.9, 1.0, top)[:, None]
-        scene[:, :, :top] = torch.lerp(scene[:, :, :top], sky, 0.97)
+        sky_rows = rows * 2 // 5
+        brightness = torch.linspace(0.9, 1.0, sky_rows)[:, None]
+        sky = torch.tensor(_SKY_COLOR)[:, None, None] * brightness
+        scene[:, :, :sky_rows] = torch.lerp(scene[:, :, :sky_rows], sky, 0.97)
     return scene[..., :columns].contiguous(), scene[..., shift:].contiguous(), camera

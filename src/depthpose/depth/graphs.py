@@ -21,7 +21,7 @@ from depthpose.depth.synthesis import MAX_COLUMN_STRETCH, MAX_ROW_STRETCH, read_
 from depthpose.depth.types import Views
 from depthpose.depth.weights import DepthWeights
 
-# float32 constants of graphs.
+# float32 constants of graphs: operators of ONNX take no Python floats beside float32.
 _0 = np.float32(0)
 _1 = np.float32(1)
 _2 = np.float32(2)
@@ -30,7 +30,7 @@ _NAN = np.float32(np.nan)
 
 
 def _side(size: Value, axis: int) -> Value:
-    """Give the number of rows (axis 0) or columns (1) of a size, as a list of one number."""
+    """Take the rows (axis 0) or columns (1) of a size, as a list of one number."""
     return size.slice([axis], [axis + 1], [0])
 
 
@@ -52,17 +52,17 @@ def _resize_map(values: Value, size: Value) -> Value:
 
 
 def _width_ratio(size: Value, other: Value) -> Value:
-    """Give the width of a size as a multiple of another's, by which disparities scale."""
+    """Compute the width of a size as a multiple of another's, by which disparities scale."""
     width = _side(size, 1).cast(np.float64)
     other_width = _side(other, 1).cast(np.float64)
     return (width / other_width).cast(np.float32)
 
 
 def _size_at_focal_length(size: Value, target_px: float, focal_px: Value | np.ndarray) -> Value:
-    """Give (rows, columns) at which images have a focal length, as ``size_at_focal_length`` does.
+    """Compute (rows, columns) at which images have a focal length, as ``size_at_focal_length``.
 
-    ``size``: (rows, columns) of the images; ``target_px``: that focal length; ``focal_px``: those
-    of the images in the same order, (fy, fx).
+    ``size``: (rows, columns) of the images; ``target_px``: the focal length; ``focal_px``: those of
+    the images in the same order, (fy, fx).
     """
     scaled = size.cast(np.float64) * target_px / focal_px
     return scaled.op("Round").op("Max", 1.0).cast(np.int64)
@@ -72,9 +72,10 @@ Maps = Float[Tensor, "b rows columns"]
 
 
 class DynamicPSMNet(nn.Module):
-    """PSMNet with its soft arg-min in eval mode, in operators that allow images of any size.
+    """PSMNet with its soft arg-min and its confidence, in operators that allow any image size.
 
-    Disparities are few and fixed, so their interpolation is a matrix; rows and columns are resized.
+    The number of disparities is fixed, so their interpolation is a matrix; rows and columns are
+    resized.
     """
 
     matrix: Tensor
@@ -92,7 +93,7 @@ class DynamicPSMNet(nn.Module):
     def forward(
         self, left: Views, right: Views
     ) -> tuple[Float[Tensor, "b h w"], Float[Tensor, "b h w"]]:
-        """Give disparity [px] and confidence of normalised images."""
+        """Estimate disparity [px] and confidence from normalised images."""
         config = self.network.config
         left_features = self.network.features(left)
         right_features = self.network.features(right)
@@ -111,19 +112,19 @@ class DynamicPSMNet(nn.Module):
         return disparity_px, (probability * is_near).sum(1).clamp(0, 1)
 
 
-class _Dynamic(nn.Module):
-    """A module that computes what an export needs of a network."""
+class _ExportedNetwork(nn.Module):
+    """A network with the post-processing that its graph contains."""
 
     def __init__(self, network: Any) -> None:  # noqa: ANN401
         super().__init__()
         self.network = network
 
 
-class DynamicLightStereo(_Dynamic):
-    """The light network with its matcher's post-processing."""
+class DynamicLightStereo(_ExportedNetwork):
+    """The light network with the post-processing of its matcher."""
 
     def forward(self, left: Views, right: Views) -> tuple[Maps, ...]:
-        """Give disparity [px] and confidence of normalised images, then 1 in the sky.
+        """Estimate disparity [px], confidence and sky (1, elsewhere 0) from normalised images.
 
         The sky is left out where the network does not recognise it.
         """
@@ -142,11 +143,11 @@ DYNAMIC_SHAPE_NETWORKS: dict[type[StereoNetwork], Callable[[Any], nn.Module]] = 
 """Modules that matcher networks are exported as, for any image size: a new kind is one entry."""
 
 
-class DynamicSelection(_Dynamic):
-    """The generator that selects with the post-processing of its logits, at half the image size."""
+class DynamicSelection(_ExportedNetwork):
+    """The selecting generator with the post-processing of its logits, at half the image size."""
 
     def forward(self, image: Views) -> tuple[Tensor, ...]:
-        """Give log of disparity, sky and confidence of the left view; the first two of the right.
+        """Estimate log of disparity, sky and confidence of the left view; log and sky of the right.
 
         Disparity is counted in pixels of the image's width. The probability of a street follows,
         (b,), where the weights have a layer for it.
@@ -164,7 +165,7 @@ class DynamicSelection(_Dynamic):
 def gathered_volume(
     left: Float[Tensor, "b c h w"], right: Float[Tensor, "b c h w"], bins: int
 ) -> Float[Tensor, "b c2 {bins} h w"]:
-    """Make ``concatenation_volume`` by one gather in place of a copy for each disparity."""
+    """Make the ``concatenation_volume`` of PSMNet by one gather, which ONNX can express."""
     right_column = torch.arange(left.shape[-1]) - torch.arange(bins)[:, None]
     is_inside = (right_column >= 0).to(left.dtype)
     left_part = left[..., None, :] * is_inside
@@ -180,7 +181,7 @@ class _Maps(NamedTuple):
     sky: Value | None = None  # 1 in the sky; None where the weights do not recognise it
 
 
-class _Generated(NamedTuple):
+class _GeneratorOutputs(NamedTuple):
     """Outputs of a generator for left views in a graph."""
 
     right: Value
@@ -188,12 +189,12 @@ class _Generated(NamedTuple):
     street_probability: Value | None = None  # None where the weights do not give it
 
 
-def _generate(left: Value, generator: Generator) -> _Generated:
-    """Add a generator to a graph: ``synthesise_right``, and the left maps of ``estimate_views``."""
+def _add_generator(left: Value, generator: Generator) -> _GeneratorOutputs:
+    """Add a generator to a graph, with its resizing and padding, as its synthesiser runs it."""
     size = left.op("Shape", start=2, end=4)
     multiple = generator.config.side_multiple_px
 
-    # The multiple that a side is close to, or the side itself.
+    # Each side is stretched to the nearest multiple, if that is close enough, else kept.
     sides = size.cast(np.float64)
     nearest = (sides / float(multiple)).op("Round").op("Max", 1.0) * float(multiple)
     limits = sides * np.array([MAX_ROW_STRETCH, MAX_COLUMN_STRETCH])
@@ -201,25 +202,26 @@ def _generate(left: Value, generator: Generator) -> _Generated:
     network_size = is_near.op("Where", nearest, sides).cast(np.int64)
 
     if isinstance(generator, SelectionGenerator):
-        return _generate_by_selection(left, size, network_size, generator)
+        return _add_selection_generator(left, size, network_size, generator)
     example = _example_image(multiple)
     image = _resize_image(left, network_size) * _2 - _1
     network = network_model(generator, [example], multiple)
     (output,) = left.graph.call(network, _pad_by_reflection(image, network_size, multiple))
     right = (output + _1).slice([0, 0], network_size, [2, 3]) / _2
-    return _Generated(_resize_image(right, size))
+    return _GeneratorOutputs(_resize_image(right, size))
 
 
-def _generate_by_selection(
+def _add_selection_generator(
     left: Value, size: Value, network_size: Value, generator: SelectionGenerator
-) -> _Generated:
-    """Add a generator that selects to a graph.
+) -> _GeneratorOutputs:
+    """Add a selecting generator to a graph.
 
     ``size``: rows and columns of ``left``; ``network_size``: those to which the network's input is
     resized before it is padded.
     """
     multiple = generator.config.side_multiple_px
-    even_size = (network_size / 2 * 2).op("Max", 2)  # logits stand for two rows and two columns
+    # Even sides, for a logit stands for two rows and two columns; integers are divided.
+    even_size = (network_size / 2 * 2).op("Max", 2)
     image = _pad_by_reflection(_resize_image(left, even_size), even_size, multiple)
     network = network_model(
         DynamicSelection(generator).eval(), [_example_image(multiple)], multiple
@@ -240,11 +242,16 @@ def _generate_by_selection(
     # The right view; the sky is not shifted.
     is_right_sky = right_sky.op("Greater", _HALF)
     right_px = is_right_sky.op("Where", _0, right_log_px.op("Exp") * scale)
-    return _Generated(_warp_left_to_right(left, right_px, size), left_maps, street_probability)
+    return _GeneratorOutputs(
+        _warp_left_to_right(left, right_px, size), left_maps, street_probability
+    )
 
 
 def _warp_left_to_right(left: Value, right_px: Value, size: Value) -> Value:
-    """Sample left views at ``x + disparity``; beyond the border the border repeats."""
+    """Add the warp of left views to right ones, as ``warp_left_to_right`` of ``synthesis`` does.
+
+    ``right_px``: disparity of the right views; ``size``: rows and columns.
+    """
     graph = left.graph
     row, column = (
         graph.op("Range", 0, _side(size, axis).op("Squeeze", [0]), 1).cast(np.float32)
@@ -252,8 +259,8 @@ def _warp_left_to_right(left: Value, right_px: Value, size: Value) -> Value:
     )
     # GridSample's coordinates: -1 and 1 are the outer borders of the image.
     y, x = (
-        (values * _2 + _1) / _side(size, axis).cast(np.float32) - _1
-        for axis, values in enumerate((row.op("Unsqueeze", [1]), right_px + column))
+        (positions * _2 + _1) / _side(size, axis).cast(np.float32) - _1
+        for axis, positions in enumerate((row.op("Unsqueeze", [1]), right_px + column))
     )
     shape = right_px.op("Shape")
     coordinates = (values.op("Expand", shape).op("Unsqueeze", [-1]) for values in (x, y))
@@ -262,15 +269,16 @@ def _warp_left_to_right(left: Value, right_px: Value, size: Value) -> Value:
 
 
 def _example_image(multiple: int) -> Tensor:
-    """Make an image of sides that are multiples, by which a generator's network is traced."""
+    """Make an image of suitable sides, by which a generator's network is traced."""
     return torch.rand(2, 3, 2 * multiple, 3 * multiple)
 
 
 def _pad_by_reflection(image: Value, size: Value, multiple: int) -> Value:
     """Pad images of a size at the right and below, until both sides are multiples."""
-    lacking = (size + (multiple - 1)) / multiple * multiple - size
-    none = [0, 0]
-    pads = image.graph.op("Concat", none, none, none, lacking, axis=0)
+    padded_size = (size + (multiple - 1)) / multiple * multiple  # integers are divided
+    no_pads = [0, 0]
+    # Pads before and after each of the axes batch, channel, row, column.
+    pads = image.graph.op("Concat", no_pads, no_pads, no_pads, padded_size - size, axis=0)
     return image.op("Pad", pads, mode="reflect")
 
 
@@ -297,7 +305,7 @@ def image_graph(weights: DepthWeights) -> Graph:
             f"{'generator' if generator is None else 'matcher'}; 'depthpose weights pack' makes "
             "one file of both."
         )
-    rig = generator.config
+    config = generator.config
     graph = Graph()
     image = graph.input("image", np.float32, _IMAGES_SHAPE)
     K = graph.input("K", np.float64, (3, 3)).op("Reshape", [-1])
@@ -305,20 +313,20 @@ def image_graph(weights: DepthWeights) -> Graph:
     # The virtual rig: the right view, and maps of the left one.
     size = image.op("Shape", start=2, end=4)
     focal_px = K.op("Gather", [4, 0])  # fy, fx
-    virtual_size = _size_at_focal_length(size, float(rig.virtual_focal_px), focal_px)
+    virtual_size = _size_at_focal_length(size, float(config.virtual_focal_px), focal_px)
     left = _resize_image(image, virtual_size)
-    right, generator_maps, street_probability = _generate(left, generator)
+    right, generator_maps, street_probability = _add_generator(left, generator)
     maps = generator_maps
-    if rig.answer == "matched":
+    if config.answer == "matched":
         assert weights.matcher is not None, "checked before"
-        maps = _match(left, right, np.array([rig.virtual_focal_px] * 2), weights.matcher)
+        maps = _add_matcher(left, right, np.array([config.virtual_focal_px] * 2), weights.matcher)
         if generator_maps is not None:
             maps = maps._replace(sky=generator_maps.sky)
     assert maps is not None
 
     # Depth at the size of the image.
     disparity_px = _resize_map(maps.disparity_px, size) * _width_ratio(size, virtual_size)
-    focal_m_px = K.op("Gather", 0).cast(np.float32) * np.float32(rig.virtual_baseline_m)
+    focal_m_px = K.op("Gather", 0).cast(np.float32) * np.float32(config.virtual_baseline_m)
     is_positive = disparity_px.op("Greater", _0)
     depth_m = is_positive.op("Where", focal_m_px / disparity_px, _NAN)
     if maps.sky is not None:
@@ -355,7 +363,7 @@ def pair_graph(weights: DepthWeights) -> Graph:
     if getattr(weights.matcher.config, "work_focal_px", None) is not None:
         K = graph.input("K", np.float64, (3, 3))
         focal_px = K.op("Reshape", [-1]).op("Gather", [4, 0])  # fy, fx
-    disparity_px, confidence, sky = _match(left, right, focal_px, weights.matcher)
+    disparity_px, confidence, sky = _add_matcher(left, right, focal_px, weights.matcher)
     if sky is not None:
         is_sky = sky.op("Greater", _HALF)
         disparity_px = is_sky.op("Where", np.float32(MIN_DISPARITY_PX), disparity_px)
@@ -365,12 +373,22 @@ def pair_graph(weights: DepthWeights) -> Graph:
     return graph
 
 
-def _match(
+def _add_matcher(
     left: Value, right: Value, focal_px: Value | np.ndarray | None, matcher: StereoNetwork
 ) -> _Maps:
-    """Add a matcher to a graph, at the focal length of its training; maps have the images' size.
+    """Add a matcher to a graph, which matches at the focal length of its training.
 
-    ``focal_px``: focal lengths of the images along rows and columns, where the matcher needs them.
+    Args:
+        left: left views.
+        right: right views.
+        focal_px: focal lengths of the images, (fy, fx), where the matcher needs them.
+        matcher: the network.
+
+    Returns:
+        Maps of the images' size.
+
+    Raises:
+        InputError: the network is of a kind that is not exported.
     """
     if type(matcher) not in DYNAMIC_SHAPE_NETWORKS:
         kinds = ", ".join(kind.__name__ for kind in DYNAMIC_SHAPE_NETWORKS)
