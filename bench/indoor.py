@@ -35,7 +35,7 @@ from depthpose.depth.datasets import open_dataset, read_disparity
 from depthpose.depth.disparity import depth_from_disparity
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.stereo import SGBMMatcher
-from depthpose.depth.stereo.matcher import NetworkMatcher
+from depthpose.depth.stereo.network_matcher import NetworkMatcher
 from depthpose.depth.stereo.search_range import choose_search_range, measure_disparity_range
 from depthpose.depth.synthetic import draw_near
 from depthpose.depth.types import DepthEstimate, StereoInput, StereoSample, StereoTruth

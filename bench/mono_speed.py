@@ -33,8 +33,9 @@ from depthpose.core.checkpoint import find_weights
 from depthpose.depth.config import GeneratorConfig, MatcherConfig, Speed
 from depthpose.depth.disparity import resize_image, size_at_focal_length
 from depthpose.depth.estimator import FakestereoNet
+from depthpose.depth.generators import UNetGenerator
 from depthpose.depth.stereo import NetworkMatcher, PSMNet, PSMNetMatcher
-from depthpose.depth.synthesis import UNetGenerator, make_synthesiser
+from depthpose.depth.synthesis import make_synthesiser
 from depthpose.depth.types import StereoInput
 from depthpose.depth.weights import MATCHERS
 from depthpose.report.page import format_markdown_table

@@ -40,7 +40,8 @@ from depthpose.core.files import read_image
 from depthpose.depth.config import MatcherConfig, SelectionConfig
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.estimator.single_image import depth_before_mount
-from depthpose.depth.ground import MountFilter, fit_ground, scale_by_mount
+from depthpose.depth.ground import fit_ground
+from depthpose.depth.mount import MountFilter, scale_by_mount
 from depthpose.depth.synthetic.dataset import draw_light, draw_sensors, expose, view_from
 from depthpose.depth.synthetic.scene import make_scene
 from depthpose.depth.synthetic.shading import prepare

@@ -29,7 +29,7 @@ from depthpose.core.camera.pinhole import intrinsics
 from depthpose.core.files import write_image, write_json
 from depthpose.core.rigid import Rigid
 from depthpose.depth.config import MatcherConfig, StreetsConfig
-from depthpose.depth.disparity import depth_deviation
+from depthpose.depth.disparity import depth_std_from_confidence
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.synthetic import draw_scene
 from depthpose.depth.synthetic.dataset import Projector
@@ -215,7 +215,7 @@ def match_table(net: FakestereoNet, scene: TableScene) -> tuple[Tensor, Tensor, 
     assert estimate.depth_m is not None
     assert estimate.confidence is not None
     is_sure = estimate.is_sure(MIN_CONFIDENCE)
-    deviation_m = depth_deviation(estimate.depth_m, estimate.confidence, scene.rig)
+    deviation_m = depth_std_from_confidence(estimate.depth_m, estimate.confidence, scene.rig)
     share_left_out = 1 - float(is_sure.float().mean())
     return estimate.depth_m.where(is_sure, torch.nan), deviation_m, share_left_out
 

@@ -26,7 +26,7 @@ from depthpose.depth.stereo import (
     normalise,
     psmnet_from_published,
 )
-from depthpose.depth.stereo.matcher import pad_top_right
+from depthpose.depth.stereo.network_matcher import pad_top_right
 from depthpose.depth.stereo.psmnet import expected_disparity
 from depthpose.depth.weights import read_matcher
 

@@ -30,7 +30,8 @@ from torch.nn import functional as F
 
 from depthpose.core.checkpoint import find_weights
 from depthpose.depth.disparity import resize_image
-from depthpose.depth.synthesis import SelectionGenerator, pad_to_multiple
+from depthpose.depth.generators import SelectionGenerator
+from depthpose.depth.synthesis import pad_to_multiple
 from depthpose.depth.synthetic.dataset import draw_light, draw_sensors, expose, view_from
 from depthpose.depth.synthetic.mesh import NUMBER
 from depthpose.depth.synthetic.scene import make_scene

@@ -18,8 +18,8 @@ from torch.utils.data import DataLoader
 from depthpose.core.config import read_config
 from depthpose.depth.augment import TrainingPair
 from depthpose.depth.config import PairsConfig, StreetsConfig
+from depthpose.depth.generators import UNetGenerator
 from depthpose.depth.stereo import PSMNet
-from depthpose.depth.synthesis import UNetGenerator
 from depthpose.depth.train import FinetuneTask, StereoTask, TrainingPairs, ViewTask
 from depthpose.depth.train.config import FinetuneTraining, StereoTraining, ViewTraining
 

@@ -16,7 +16,7 @@ from depthpose.core.camera.pinhole import intrinsics
 from depthpose.core.checkpoint import SHIPPED
 from depthpose.core.files import read_map, write_image
 from depthpose.depth.config import StreetsConfig
-from depthpose.depth.disparity import depth_deviation
+from depthpose.depth.disparity import depth_std_from_confidence
 from depthpose.depth.synthetic import draw_scene
 from depthpose.depth.synthetic.mesh import MeshBuilder, Surface
 from depthpose.depth.synthetic.scene import Markings, StreetScene, draw_weather
@@ -118,7 +118,9 @@ def test_the_deviation_of_depth_grows_with_its_square_and_with_doubt() -> None:
     # Disparities of 5, 2.5 and 0.25 px: a share of the disparity, then the least that is told.
     depth_m = torch.tensor([[1.0, 2.0, 10.0, 20.0, 1.0, torch.nan]])
     confidence = torch.tensor([[0.95, 0.95, 1.0, 1.0, 0.4, 0.9]])
-    first, second, far, farther, unsure, unknown = depth_deviation(depth_m, confidence, rig)[0]
+    first, second, far, farther, unsure, unknown = depth_std_from_confidence(
+        depth_m, confidence, rig
+    )[0]
     assert float(first) == pytest.approx(0.2 / 5)
     assert float(second) == pytest.approx(4 * 0.2 / 5)
     assert float(farther) == pytest.approx(4 * float(far))

@@ -11,8 +11,9 @@ from depthpose.core.config import config_to_dict, read_config
 from depthpose.depth.augment import TrainingPair
 from depthpose.depth.datasets import open_dataset, read_split
 from depthpose.depth.disparity import size_at_focal_length
+from depthpose.depth.generators import UNetGenerator
 from depthpose.depth.stereo import PSMNet
-from depthpose.depth.synthesis import ROWS_SHARE, UNetGenerator
+from depthpose.depth.synthesis import MAX_ROW_STRETCH
 from depthpose.depth.synthetic import kitti_rig
 from depthpose.depth.train import STAGES, FinetuneTask, ViewTask
 from depthpose.depth.train.config import FinetuneTraining, StereoTraining, ViewTraining
@@ -116,7 +117,7 @@ def test_a_crop_is_the_whole_height_of_every_rig(name: str) -> None:
     assert crop_rows % config.generator.side_multiple_px == 0
     for number in range(5):
         rows, _ = size_at_focal_length(kitti_rig(number), config.generator.virtual_focal_px)
-        assert crop_rows <= rows <= (1 + ROWS_SHARE) * crop_rows
+        assert crop_rows <= rows <= (1 + MAX_ROW_STRETCH) * crop_rows
 
 
 def pair(height: int, width: int) -> TrainingPair:

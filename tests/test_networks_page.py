@@ -13,8 +13,8 @@ import torch
 from tests.written import ROOT
 
 from depthpose.depth.config import GeneratorConfig, PSMNetConfig
+from depthpose.depth.generators import Discriminator, UNetGenerator
 from depthpose.depth.stereo import PSMNet
-from depthpose.depth.synthesis import Discriminator, UNetGenerator
 from depthpose.pose.network import ResUNet, ResUNetConfig
 from depthpose.pose.segmentation import FCN
 

@@ -24,7 +24,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import write_depth_png
 from depthpose.core.files.images import check_image
 from depthpose.core.units import Unit
-from depthpose.depth.disparity import disparity_advice, disparity_from_depth
+from depthpose.depth.disparity import disparity_from_depth, find_unit_mistake
 from depthpose.depth.estimator import refuse_unrectified
 from depthpose.depth.types import StereoInput
 from depthpose.pose.cloud import prepare_cloud
@@ -137,7 +137,7 @@ def truth_m() -> torch.Tensor:
 
 
 def advice_for(depth_m: torch.Tensor) -> str | None:
-    return disparity_advice(
+    return find_unit_mistake(
         disparity_from_depth(depth_m, RIG), disparity_from_depth(truth_m(), RIG)
     )
 
@@ -318,8 +318,8 @@ MISTAKES: dict[str, tuple[Work, Work, str]] = {
         "is its depth metres x 256, as KITTI's PNG holds it (divide by 256)?",
     ),
     "disparity of the other sign": (
-        lambda _: disparity_advice(-torch.full((4, 5), 9.0), torch.full((4, 5), 9.0)),
-        lambda _: disparity_advice(torch.full((4, 5), 9.0), torch.full((4, 5), 9.0)),
+        lambda _: find_unit_mistake(-torch.full((4, 5), 9.0), torch.full((4, 5), 9.0)),
+        lambda _: find_unit_mistake(torch.full((4, 5), 9.0), torch.full((4, 5), 9.0)),
         "100% of the disparities are negative: left and right were exchanged",
     ),
 }

@@ -117,7 +117,8 @@ from depthpose import FakestereoNet, GeoPoseNet, Registration
 from depthpose.core.camera import Camera
 from depthpose.core.errors import InputError
 from depthpose.depth.config import GeneratorConfig
-from depthpose.depth.synthesis import UNetGenerator, make_synthesiser
+from depthpose.depth.generators import UNetGenerator
+from depthpose.depth.synthesis import make_synthesiser
 from depthpose.pose.config import EstimateConfig, EvaluationConfig, VotingConfig
 from depthpose.pose.mesh import read_model
 from depthpose.pose.types import CloudInput

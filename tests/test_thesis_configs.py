@@ -15,8 +15,8 @@ from depthpose.core.config import config_to_dict, read_config
 from depthpose.core.loop import TrainingRun
 from depthpose.depth.config import PairsConfig
 from depthpose.depth.datasets import read_split
+from depthpose.depth.generators import UNetGenerator
 from depthpose.depth.stereo import PSMNet
-from depthpose.depth.synthesis import UNetGenerator
 from depthpose.depth.train import STAGES as DEPTH_STAGES
 from depthpose.depth.train import runs as depth_runs
 from depthpose.depth.train.config import StereoTraining, ViewTraining

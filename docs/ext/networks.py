@@ -20,9 +20,9 @@ from torch import Tensor, nn
 from depthpose.core.camera import back_project
 from depthpose.core.config import read_config
 from depthpose.core.rigid import fit_rigid
+from depthpose.depth.generators import Discriminator, UNetGenerator
 from depthpose.depth.losses import disparity_loss
 from depthpose.depth.stereo import PSMNet
-from depthpose.depth.synthesis import Discriminator, UNetGenerator
 from depthpose.depth.train.config import StereoTraining, ViewTraining
 from depthpose.pose.cloud import voxelise
 from depthpose.pose.network import ResUNet

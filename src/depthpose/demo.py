@@ -17,9 +17,9 @@ from depthpose.core.run import claim_folder, describe_environment
 from depthpose.depth.config import COLOR_RANGE_M, SGBMConfig, StreetsConfig
 from depthpose.depth.disparity import depth_from_disparity
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.evaluate import clamped_depth
 from depthpose.depth.metrics import measure
 from depthpose.depth.predictions import CLOUD_M, write_estimate
+from depthpose.depth.protocols import clamped_depth_from_disparity
 from depthpose.depth.synthetic import Streets
 from depthpose.depth.types import DepthError, StereoInput, StereoSample, StereoTruth
 from depthpose.pose.config import ObjectsConfig
@@ -150,7 +150,7 @@ def _show_scene(
         write_estimate(homes[method], net_input, estimate, range_m, CLOUD_M)
 
         # The numbers, over pixels that have a truth within the cap and an answer.
-        predicted_m = clamped_depth(estimate.disparity_px, pair.camera, _CAP_M)
+        predicted_m = clamped_depth_from_disparity(estimate.disparity_px, pair.camera, _CAP_M)
         is_measured = truth.depth_m < _CAP_M
         mask = is_measured & torch.isfinite(estimate.disparity_px)
         row: dict[str, Any] = {"scene": pair.name, "method": method, "input": views}

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from depthpose.depth.config import Answer, SelectionConfig
-from depthpose.depth.synthesis import SelectionGenerator
+from depthpose.depth.generators import SelectionGenerator
 
 FOCAL_PX, BASELINE_M = 120.0, 0.5
 CONFIG = SelectionConfig(

@@ -5,15 +5,13 @@ from contextlib import contextmanager
 
 import pytest
 
-from depthpose.depth import synthesis
+from depthpose.depth import encoder
 
 
 @contextmanager
 def short_encoder() -> Iterator[None]:
     """Build encoders of the same strides, kernels and channels, of one block a stage."""
     with pytest.MonkeyPatch.context() as patch:
-        stages = tuple(
-            (1, kernel, step, 1, width) for _, kernel, step, _, width in synthesis._STAGES
-        )
-        patch.setattr(synthesis, "_STAGES", stages)
+        stages = tuple(stage._replace(blocks=1, expansion=1) for stage in encoder._STAGES)
+        patch.setattr(encoder, "_STAGES", stages)
         yield

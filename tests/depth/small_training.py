@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 from depthpose.core.loop import LoopConfig
 from depthpose.depth.config import AugmentConfig, GeneratorConfig, PairsConfig, PSMNetConfig
+from depthpose.depth.generators import UNetGenerator
 from depthpose.depth.stereo import PSMNet
-from depthpose.depth.synthesis import UNetGenerator
 from depthpose.depth.weights import write_depth_weights
 
 LOOP = LoopConfig(steps=3, batch_size=2, device="cpu", log_every_steps=1)

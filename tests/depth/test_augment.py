@@ -17,10 +17,10 @@ from depthpose.depth.augment import (
     crop_pair,
     flip_and_swap,
     jitter_colors,
+    make_views_differ,
     pad_pair,
     scale_pair,
-    set_apart,
-    shift_rows,
+    shift_up,
 )
 from depthpose.depth.config import AugmentConfig, DegradeConfig
 from depthpose.depth.disparity import right_disparity_from_left, warp_right_to_left
@@ -124,7 +124,7 @@ CHANGES: dict[str, Callable[[TrainingPair, torch.Generator], TrainingPair]] = {
     "cropped": lambda pair, drawn: crop_pair(pair, (60, 150), drawn),
     "flipped twice": lambda pair, _: flip_and_swap(flip_and_swap(pair)),
     "recoloured": lambda pair, drawn: jitter_colors(pair, 0.3, drawn),
-    "set apart": lambda pair, drawn: set_apart(
+    "set apart": lambda pair, drawn: make_views_differ(
         pair, AugmentConfig(erased_share=1.0, misaligned_px=1.0), drawn
     ),
     "padded": lambda pair, _: pad_pair(pair, (90, 300)),
@@ -251,14 +251,14 @@ def test_bad_settings_are_refused(changes: dict[str, object], message: str) -> N
 
 def test_rows_of_one_view_are_off_in_proportion() -> None:
     image = torch.arange(20.0)[None, :, None].expand(3, 20, 9).contiguous()
-    torch.testing.assert_close(shift_rows(image, 2.0, 2.0)[:, :-2], image[:, 2:], rtol=0, atol=1e-4)
-    turned = shift_rows(image, -1.0, 1.0)[0, 10] - 10
+    torch.testing.assert_close(shift_up(image, 2.0, 2.0)[:, :-2], image[:, 2:], rtol=0, atol=1e-4)
+    turned = shift_up(image, -1.0, 1.0)[0, 10] - 10
     torch.testing.assert_close(turned, torch.linspace(-1, 1, 9), rtol=0, atol=1e-4)
 
 
 def test_a_patch_of_the_right_view_is_erased() -> None:
     pair = street_pair()
-    found = set_apart(pair, AugmentConfig(erased_share=1.0), generator(0))
+    found = make_views_differ(pair, AugmentConfig(erased_share=1.0), generator(0))
     assert torch.equal(found.left, pair.left)
     changed = (found.right != pair.right).any(0)
     height, width = changed.shape
@@ -270,10 +270,10 @@ def test_a_patch_of_the_right_view_is_erased() -> None:
 def test_views_are_degraded_each_on_its_own() -> None:
     pair = street_pair()._replace(right=street_pair().left)
     config = AugmentConfig(per_view=DegradeConfig(colour=0.3, hue_share=0.0))
-    found = set_apart(pair, config, generator(3))
+    found = make_views_differ(pair, config, generator(3))
     assert not torch.allclose(found.left, found.right, atol=0.02)
     assert torch.equal(found.left_px.nan_to_num(-1.0), pair.left_px.nan_to_num(-1.0))
-    assert set_apart(pair, AugmentConfig(), generator(3)) == pair
+    assert make_views_differ(pair, AugmentConfig(), generator(3)) == pair
 
 
 def test_no_scale_is_drawn_at_which_half_of_the_crop_would_be_black() -> None:

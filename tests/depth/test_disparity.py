@@ -5,8 +5,8 @@ from torch import Tensor
 from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.camera.pinhole import intrinsics
 from depthpose.depth.disparity import (
-    depth_deviation,
     depth_from_disparity,
+    depth_std_from_confidence,
     disparity_from_depth,
     resize_match,
     right_disparity_from_left,
@@ -33,7 +33,7 @@ def test_the_deviation_of_depth_is_what_that_of_its_disparity_does_to_it() -> No
     depth_m = depth_from_disparity(disparity_px, rig())
     for sure, deviation_px in ((0.3, 0.1 * disparity_px), (1.0, torch.full((1, 3), 0.2))):
         confidence = torch.full_like(disparity_px, sure)
-        found_m = depth_deviation(depth_m, confidence, rig())
+        found_m = depth_std_from_confidence(depth_m, confidence, rig())
         step_px = 1e-4 * deviation_px
         moved_m = (depth_m - depth_from_disparity(disparity_px + step_px, rig())) / 1e-4
         torch.testing.assert_close(found_m, moved_m, rtol=1e-3, atol=0)
@@ -45,8 +45,8 @@ def test_principal_points_do_not_change_the_deviation_of_depth(offset_px: float)
     depth_m = torch.tensor([[2.0, 10.0, 40.0, torch.nan]])
     confidence = torch.full_like(depth_m, 0.3)
     torch.testing.assert_close(
-        depth_deviation(depth_m, confidence, rig(offset_px)),
-        depth_deviation(depth_m, confidence, rig()),
+        depth_std_from_confidence(depth_m, confidence, rig(offset_px)),
+        depth_std_from_confidence(depth_m, confidence, rig()),
         equal_nan=True,
     )
 

@@ -35,8 +35,9 @@ from depthpose.depth.config import (
 from depthpose.depth.disparity import disparity_from_depth, resize_image
 from depthpose.depth.estimator import DepthPipeline
 from depthpose.depth.evaluate import measure_image_confidence
+from depthpose.depth.generators import SelectionGenerator, UNetGenerator
 from depthpose.depth.stereo import CallableMatcher, PSMNet, PSMNetMatcher
-from depthpose.depth.synthesis import SelectionGenerator, UNetGenerator, make_synthesiser
+from depthpose.depth.synthesis import make_synthesiser
 from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.depth.weights import (
     calibrate_weights,

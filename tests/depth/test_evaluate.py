@@ -15,15 +15,9 @@ from depthpose.core.files import write_depth_png, write_image, write_map
 from depthpose.core.run import note_result
 from depthpose.core.runner import Job
 from depthpose.depth.datasets import Dataset, check_dataset, open_dataset
-from depthpose.depth.disparity import depth_from_disparity, disparity_advice, resized_map
+from depthpose.depth.disparity import depth_from_disparity, find_unit_mistake, resize_map
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.evaluate import (
-    Measured,
-    clamped_depth,
-    evaluate,
-    frame_result,
-    measure_frame,
-)
+from depthpose.depth.evaluate import FrameMetrics, evaluate, measure_frame, read_frame_result
 from depthpose.depth.predictions import (
     estimate_missing_depth,
     is_finished,
@@ -31,6 +25,7 @@ from depthpose.depth.predictions import (
     read_estimate,
     write_estimate,
 )
+from depthpose.depth.protocols import clamped_depth_from_disparity
 from depthpose.depth.stereo import CallableMatcher
 from depthpose.depth.types import DepthEstimate, StereoInput
 
@@ -78,7 +73,7 @@ def test_the_sky_of_a_prediction_is_shown_as_sky(pairs: Dataset, tmp_path: Path)
     again = read_estimate(tmp_path / "p", "a", rig())
     assert again.is_sky is not None
     assert torch.equal(again.is_sky, is_sky)
-    shown = frame_result(pairs, 0, tmp_path / "p", "kitti-2015", None)[0].depth_m
+    shown = read_frame_result(pairs, 0, tmp_path / "p", "kitti-2015", None)[0].depth_m
     assert shown is not None
     assert torch.equal(shown.isnan(), is_sky)
 
@@ -99,7 +94,7 @@ def test_a_prediction_of_another_size_is_shown_at_that_of_the_truth(
     write_estimate(tmp_path / "p", pairs.read_input(0), estimate)
     without_right = replace(pairs.frames[0], right=None)  # a right image must have the drawn size
     single = replace(pairs, frames=[without_right])
-    shown, error = frame_result(single, 0, tmp_path / "p", "kitti-2015", None)
+    shown, error = read_frame_result(single, 0, tmp_path / "p", "kitti-2015", None)
     maps = (shown.depth_m, shown.confidence, shown.is_sky, shown.right, error.error)
     assert [None if values is None else values.shape[-2:] for values in maps] == 5 * [(H, W)]
     assert shown.depth_m is not None
@@ -142,7 +137,7 @@ def test_depth_of_one_camera_needs_no_baseline(alone: Dataset, tmp_path: Path, e
     for row in evaluate(alone, tmp_path / "p", "eigen-raw-camera").rows:
         assert row.metrics["abs_rel"] == 0
         assert row.coverage == 1
-    _, wrong = frame_result(alone, 0, tmp_path / "p", "eigen-raw-camera", 80.0)
+    _, wrong = read_frame_result(alone, 0, tmp_path / "p", "eigen-raw-camera", 80.0)
     assert float(wrong.error.nanmean()) == 0
 
 
@@ -178,11 +173,11 @@ def test_what_a_poor_estimate_could_be_too_is_a_notice() -> None:
         (1 / 9, "9 times .* is it without a scale"),
     ):
         with pytest.warns(Notice, match=said):
-            assert disparity_advice(factor * true_px, true_px) is None
+            assert find_unit_mistake(factor * true_px, true_px) is None
     with pytest.warns(Notice, match="is it inverse depth"):
-        assert disparity_advice(6 / true_px, true_px) is None
+        assert find_unit_mistake(6 / true_px, true_px) is None
     for fair in (1.2 * true_px, true_px + torch.randn(40, 50) / 4, torch.full((40, 50), 3.0)):
-        assert disparity_advice(fair, true_px) is None
+        assert find_unit_mistake(fair, true_px) is None
 
 
 @pytest.mark.parametrize("unknown", [0.0, -1.0, 64.0, 65535.0, 1e30])
@@ -250,11 +245,11 @@ def test_a_prediction_of_another_shape_is_stretched_with_a_notice_or_refused(
     cut = written("cut", lambda px: px[top:, left:-left].contiguous())
     with pytest.raises(InputError, match=rf"cut out at column {left}, row {top} .* NaN around it"):
         evaluate(pairs, cut, "kitti-2015")
-    squeezed = written("squeezed", lambda px: resized_map(px, H, W // 2) / 2)
+    squeezed = written("squeezed", lambda px: resize_map(px, H, W // 2) / 2)
     with pytest.warns(Notice, match="of another aspect, so it is stretched"):
         found = evaluate(pairs, squeezed, "kitti-2015")
     # Columns alone were squeezed: rows, which are as many as before, scale no disparity.
-    plain = written("plain", lambda px: resized_map(resized_map(px, H, W // 2), H, W))
+    plain = written("plain", lambda px: resize_map(resize_map(px, H, W // 2), H, W))
     expected = evaluate(pairs, plain, "kitti-2015").rows[0].metrics["epe_px"]
     assert found.rows[0].metrics["epe_px"] == pytest.approx(expected, abs=1e-4)
 
@@ -339,7 +334,7 @@ def test_confidence_is_scored(pairs: Dataset, tmp_path: Path) -> None:
 
 def test_the_clamp_follows_the_published_script() -> None:
     disparity_px = torch.tensor([[0.0, -1.0, 1e-9, 400.0, 1e9, torch.nan]])
-    clamped_m = clamped_depth(disparity_px, rig(), 80.0)[0]
+    clamped_m = clamped_depth_from_disparity(disparity_px, rig(), 80.0)[0]
     assert clamped_m[:5].tolist() == pytest.approx([1e-3, 1e-3, 80.0, 0.1, 1e-3])
     assert bool(torch.isnan(clamped_m[5]))
 
@@ -490,7 +485,7 @@ def test_a_measured_frame_survives_json(pairs: Dataset, tmp_path: Path) -> None:
     for protocol in ("eigen-improved", "kitti-2015"):
         found = measure_frame(pairs, 0, folder, protocol, (80.0,))
         assert not isinstance(found, str)
-        again = Measured(**json.loads(json.dumps(asdict(found[0]))))
+        again = FrameMetrics(**json.loads(json.dumps(asdict(found[0]))))
         assert again == found[0]
         assert (again.frame, again.cap_m) == ("a", None if protocol == "kitti-2015" else 80.0)
 

@@ -25,16 +25,16 @@ from depthpose.depth.config import (
     PSMNetConfig,
 )
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.export import (
+from depthpose.depth.export import describe_export
+from depthpose.depth.generators import SelectionGenerator, UNetGenerator
+from depthpose.depth.graphs import (
     DynamicLightStereo,
     DynamicPSMNet,
     DynamicSelection,
-    depth_export,
     gathered_volume,
 )
 from depthpose.depth.stereo import LightStereo, PSMNet
 from depthpose.depth.stereo.psmnet import concatenation_volume
-from depthpose.depth.synthesis import SelectionGenerator, UNetGenerator
 from depthpose.depth.weights import DepthWeights, write_depth_weights
 
 onnxruntime = pytest.importorskip("onnxruntime")
@@ -105,7 +105,7 @@ def selection(
             return selection_network
         return convert_network(module, images, multiple)
 
-    monkeypatch.setattr("depthpose.depth.export.convert_network", exported_once)
+    monkeypatch.setattr("depthpose.depth.graphs.convert_network", exported_once)
     write_depth_weights(tmp_path / "w.safetensors", generator=of_all_kinds(), facts=TERMS)
     return tmp_path
 
@@ -243,12 +243,12 @@ def test_the_matcher_is_asked_where_the_weights_say_so(selection: Path) -> None:
     assert {row["output"] for row in rows} >= {"depth_m", "is_sky"}
     lone = DepthWeights(generator=generator, matcher=None, facts=TERMS)
     with pytest.raises(InputError, match="lack the matcher"):
-        depth_export(lone, None, {}).graph()
+        describe_export(lone, None, {}).graph()
 
 
 def test_another_sky_is_no_proof(selection: Path) -> None:
     """What is held to the limits is the sky too: the proof must fail where it is another."""
-    limits = depth_export(
+    limits = describe_export(
         DepthWeights(generator=of_all_kinds(), matcher=None, facts=TERMS), None, {}
     ).limits
     assert 0 < limits["depth_m"].flips <= 1e-3
@@ -298,8 +298,8 @@ def test_weights_that_cannot_are_refused(tmp_path: Path) -> None:
     no_matcher = dataclasses.replace(whole, matcher=None)
     no_generator = dataclasses.replace(whole, generator=None)
     with pytest.raises(InputError, match=r"lack the matcher; 'depthpose weights pack'"):
-        depth_export(no_matcher, "image", {}).graph()
+        describe_export(no_matcher, "image", {}).graph()
     with pytest.raises(InputError, match=r"lack the generator; 'depthpose weights pack'"):
-        depth_export(no_generator, "image", {}).graph()
+        describe_export(no_generator, "image", {}).graph()
     with pytest.raises(InputError, match="hold no matcher, only a generator"):
-        depth_export(no_matcher, "pair", {}).graph()
+        describe_export(no_matcher, "pair", {}).graph()

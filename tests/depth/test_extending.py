@@ -28,11 +28,11 @@ from depthpose.depth.datasets import open_dataset
 from depthpose.depth.datasets.frames import Frame
 from depthpose.depth.datasets.layouts import LAYOUTS, Layout
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.export import TARGETS, Target, depth_export
+from depthpose.depth.export import TARGETS, Target, describe_export
+from depthpose.depth.generators import SelectionGenerator, UNetGenerator
 from depthpose.depth.losses import ADVERSARIAL_LOSSES, GENERATOR_DISPARITY_LOSSES, adversarial_loss
 from depthpose.depth.metrics import METRICS, Metric
 from depthpose.depth.stereo import StereoNetwork
-from depthpose.depth.synthesis import SelectionGenerator, UNetGenerator
 from depthpose.depth.train.config import FinetuneTraining, SelectTraining, StereoTraining
 from depthpose.depth.train.runs import train_finetune, train_stereo
 from depthpose.depth.train.stages import SelectionSample, SelectTask, StereoTask
@@ -167,7 +167,7 @@ def test_a_matcher_without_a_graph_is_not_exported(
     weights = tmp_path / "flat.safetensors"
     write_depth_weights(weights, matcher=FlatNetwork(FlatConfig()), facts=FACTS)
     with pytest.raises(InputError, match="the matcher is FlatNetwork, and no file is made of it"):
-        depth_export(read_depth_weights(weights), "pair", {}).graph()
+        describe_export(read_depth_weights(weights), "pair", {}).graph()
 
 
 def test_extending_layouts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -269,8 +269,8 @@ def test_extending_export_targets(monkeypatch: pytest.MonkeyPatch) -> None:
 
     weights = DepthWeights(generator=None, matcher=FlatNetwork(FlatConfig()), facts=FACTS)
     with pytest.raises(InputError, match=r"what is 'views'; .*'image', 'pair'"):
-        depth_export(weights, "views", {})
+        describe_export(weights, "views", {})
     monkeypatch.setitem(TARGETS, "views", Target(fits=lambda _: False, export=views))
-    export = depth_export(weights, "views", {"licence": "MIT"})
+    export = describe_export(weights, "views", {"licence": "MIT"})
     assert list(export.limits) == ["right"]
-    assert depth_export(weights, None, {}).facts["what"].startswith("rectified pair")
+    assert describe_export(weights, None, {}).facts["what"].startswith("rectified pair")

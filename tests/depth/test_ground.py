@@ -15,12 +15,8 @@ from torch import Tensor
 
 from depthpose.core.camera import Camera
 from depthpose.core.errors import InputError
-from depthpose.depth.ground import (
-    MountFilter,
-    fit_ground,
-    scale_by_distance,
-    scale_by_mount,
-)
+from depthpose.depth.ground import fit_ground
+from depthpose.depth.mount import MountFilter, scale_by_distance, scale_by_mount
 from depthpose.depth.predictions import write_estimate
 from depthpose.depth.types import DepthEstimate, StereoInput
 

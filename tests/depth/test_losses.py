@@ -9,6 +9,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.loop import Update
 from depthpose.depth.augment import TrainingPair
 from depthpose.depth.config import GeneratorConfig
+from depthpose.depth.generators import UNetGenerator
 from depthpose.depth.losses import (
     adversarial_loss,
     disparity_loss,
@@ -17,7 +18,6 @@ from depthpose.depth.losses import (
     plane_loss,
     view_loss,
 )
-from depthpose.depth.synthesis import UNetGenerator
 from depthpose.depth.train import ViewTask
 from depthpose.depth.train.config import FinetuneTraining, StereoTraining, ViewTraining
 

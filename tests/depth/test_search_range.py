@@ -23,7 +23,7 @@ from depthpose.depth.stereo import (
     move_match_back,
     move_views,
 )
-from depthpose.depth.stereo.light import correlation_volume, unit_groups
+from depthpose.depth.stereo.light_layers import correlation_volume, unit_groups
 from depthpose.depth.types import Match, StereoInput
 
 needs_weights = pytest.mark.skipif(

@@ -13,15 +13,13 @@ from torch import Tensor
 
 from depthpose.core.errors import InputError
 from depthpose.depth.config import SelectionConfig
+from depthpose.depth.encoder import LiteEncoder, import_encoder, load_encoder
+from depthpose.depth.generators import SelectionGenerator
 from depthpose.depth.synthesis import (
-    LiteEncoder,
-    SelectionGenerator,
-    draw_right,
-    import_encoder,
-    load_encoder,
     make_synthesiser,
     mix_shifts,
     read_logits,
+    synthesise_right,
     warp_left_to_right,
 )
 
@@ -135,7 +133,7 @@ def test_neighbours_in_a_batch_change_nothing() -> None:
 
 def test_gradients_reach_the_right_view_through_the_drawn_one() -> None:
     network = tiny().train()
-    draw_right(network, torch.rand(1, 3, 64, 64)).square().mean().backward()
+    synthesise_right(network, torch.rand(1, 3, 64, 64)).square().mean().backward()
     head = network.head.weight.grad
     assert head is not None
     assert float(head[TINY.planes + 1 :].abs().sum()) > 0

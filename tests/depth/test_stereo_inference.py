@@ -21,10 +21,7 @@ from depthpose.depth.stereo import (
     normalise,
     psmnet,
 )
-from depthpose.depth.stereo.matcher import (
-    lower_where_disagreeing,
-    pad_top_right,
-)
+from depthpose.depth.stereo.network_matcher import lower_where_disagreeing, pad_top_right
 from depthpose.depth.stereo.psmnet import (
     concatenation_volume,
     expected_disparity,

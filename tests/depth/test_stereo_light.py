@@ -22,18 +22,18 @@ from depthpose.depth.config import (
     PSMNetConfig,
     StreetsConfig,
 )
+from depthpose.depth.encoder import LiteEncoder, load_encoder
 from depthpose.depth.stereo import LightMatcher, LightStereo, PSMNet, normalise
-from depthpose.depth.stereo.light import (
-    STEM,
+from depthpose.depth.stereo.light import confidence_near, light_bytes
+from depthpose.depth.stereo.light_layers import (
+    HALF_CHANNELS,
     ConvexUpsampling,
     Refinement,
-    confidence_near,
     correlation_volume,
-    light_bytes,
     unit_groups,
 )
-from depthpose.depth.stereo.matcher import CameraMatcher, pad_top_right
-from depthpose.depth.synthesis import LiteEncoder, load_encoder
+from depthpose.depth.stereo.matcher import CameraMatcher
+from depthpose.depth.stereo.network_matcher import pad_top_right
 from depthpose.depth.train import StereoTask
 from depthpose.depth.train.config import StereoTraining
 from depthpose.depth.train.runs import make_matcher_network, train_stereo
@@ -106,7 +106,7 @@ def test_confidence_is_the_probability_near_the_answer() -> None:
 
 def test_a_map_is_enlarged_by_its_nine_neighbours() -> None:
     quarter, upsampling = torch.arange(12.0).view(1, 1, 3, 4), ConvexUpsampling(8)
-    half, features = torch.randn(1, STEM, 6, 8), torch.randn(1, 8, 3, 4)
+    half, features = torch.randn(1, HALF_CHANNELS, 6, 8), torch.randn(1, 8, 3, 4)
     torch.nn.init.zeros_(upsampling.weights.weight)
     bias = upsampling.weights.bias
     assert bias is not None
@@ -125,7 +125,7 @@ def test_a_map_is_enlarged_by_its_nine_neighbours() -> None:
 
 def test_views_agree_under_the_disparity_that_is_right() -> None:
     chance = torch.Generator().manual_seed(0)
-    left, right = torch.randn(2, 1, STEM, 8, 16, generator=chance).unbind()
+    left, right = torch.randn(2, 1, HALF_CHANNELS, 8, 16, generator=chance).unbind()
     right[..., :-3] = left[..., 3:]
     quarter_px = torch.full((1, 1, 4, 8), 2.0)
     quarter_px[..., 5:] = 6.0  # three pixels at half size
@@ -163,7 +163,7 @@ def test_weights_without_the_sky_are_trained_on_with_it(tmp_path: Path) -> None:
 
 
 def test_the_refinement_compares_the_views_around_a_disparity() -> None:
-    left = torch.randn(1, STEM, 4, 16, generator=torch.Generator().manual_seed(0))
+    left = torch.randn(1, HALF_CHANNELS, 4, 16, generator=torch.Generator().manual_seed(0))
     right = left.roll(-3, -1)  # right[x - 3] is left[x]
     refinement = Refinement()
     refinement.compared = torch.nn.Identity()  # pyright: ignore[reportAttributeAccessIssue]

@@ -17,12 +17,12 @@ from depthpose.depth.augment import TrainingPair
 from depthpose.depth.config import LightConfig, MatcherConfig
 from depthpose.depth.disparity import estimate_from_pair, resize_match
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.export import depth_export
+from depthpose.depth.export import describe_export
 from depthpose.depth.labels import LabelConfig, label_pair
 from depthpose.depth.losses import sky_loss
 from depthpose.depth.predictions import read_estimate, write_estimate
 from depthpose.depth.stereo import LightMatcher, LightStereo, StereoNetwork, light, normalise
-from depthpose.depth.stereo.matcher import lower_where_disagreeing
+from depthpose.depth.stereo.network_matcher import lower_where_disagreeing
 from depthpose.depth.train import StereoTask
 from depthpose.depth.train.config import StereoTraining
 from depthpose.depth.train.pairs import TrainingPairs
@@ -157,7 +157,7 @@ def test_what_is_surely_matched_is_not_the_sky(
             where, name, lambda *given, value=value, **_: torch.full_like(given[1], value)
         )
     with torch.no_grad():
-        read = network.read(left, right, SMALL.max_disparity_px, with_confidence=True)
+        read = network.match_views(left, right, SMALL.max_disparity_px, with_confidence=True)
     assert read.sky is not None
     assert bool((read.sky > 0.5).all()) == with_sky
     assert bool((read.sky > 0.5).any()) == with_sky
@@ -292,7 +292,7 @@ def test_the_graph_of_a_pair_has_the_sky() -> None:
     onnxruntime = pytest.importorskip("onnxruntime")
     with short_encoder():
         network = partly_sky(replace(SMALL, work_focal_px=90.0))
-    export = depth_export(DepthWeights(generator=None, matcher=network, facts={}), "pair", {})
+    export = describe_export(DepthWeights(generator=None, matcher=network, facts={}), "pair", {})
     session = onnxruntime.InferenceSession(export.graph().model({}).SerializeToString())
     names = [output.name for output in session.get_outputs()]
     assert sorted(names) == ["confidence", "disparity_px", "is_sky"]

@@ -6,13 +6,8 @@ from torch import Tensor, nn
 
 from depthpose.core.errors import InputError
 from depthpose.depth.config import GeneratorConfig
-from depthpose.depth.synthesis import (
-    Discriminator,
-    UNetGenerator,
-    draw_right,
-    make_synthesiser,
-    pad_to_multiple,
-)
+from depthpose.depth.generators import Discriminator, UNetGenerator
+from depthpose.depth.synthesis import make_synthesiser, pad_to_multiple, synthesise_right
 
 
 def parameters(module: nn.Module) -> int:
@@ -105,7 +100,7 @@ def test_padding_mirrors_and_leaves_the_image_alone() -> None:
 
 def test_drawing_is_differentiable_to_the_weights() -> None:
     network = small()
-    draw_right(network, torch.rand(2, 3, 20, 24)).mean().backward()
+    synthesise_right(network, torch.rand(2, 3, 20, 24)).mean().backward()
     assert all(p.grad is not None and bool(p.grad.isfinite().all()) for p in network.parameters())
 
 
@@ -147,8 +142,8 @@ def test_a_side_near_a_multiple_is_not_padded() -> None:
     image = image.clamp(0, 1)
     taller = torch.nn.functional.interpolate(image, (193, 192), mode="bilinear")
     with torch.no_grad():
-        drawn = draw_right(network.eval(), image)
-        other = draw_right(network.eval(), taller)
+        drawn = synthesise_right(network.eval(), image)
+        other = synthesise_right(network.eval(), taller)
     assert other.shape[-2] == 193
     back = torch.nn.functional.interpolate(other, (192, 192), mode="bilinear")
     assert float((back - drawn).abs().mean()) < 0.01

@@ -24,8 +24,8 @@ from depthpose.depth.config import (
     StreetsConfig,
 )
 from depthpose.depth.disparity import warp_right_to_left
+from depthpose.depth.generators import UNetGenerator
 from depthpose.depth.stereo import LightStereo, PSMNet
-from depthpose.depth.synthesis import UNetGenerator
 from depthpose.depth.train import (
     FinetuneTask,
     StereoTask,

@@ -20,8 +20,9 @@ from depthpose.depth.config import (
     StreetsConfig,
 )
 from depthpose.depth.disparity import warp_right_to_left
+from depthpose.depth.encoder import LiteEncoder
+from depthpose.depth.generators import SelectionGenerator
 from depthpose.depth.stereo import PSMNet
-from depthpose.depth.synthesis import LiteEncoder, SelectionGenerator
 from depthpose.depth.train import (
     FinetuneTask,
     SelectTask,

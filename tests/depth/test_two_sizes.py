@@ -9,7 +9,7 @@ from tests.depth.constant_selection import BASELINE_M, FOCAL_PX, sure_of
 from depthpose.core.camera import Camera
 from depthpose.depth.config import Speed
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.synthesis import Selected, SelectionSynthesiser, average_sizes
+from depthpose.depth.synthesis import SelectionSynthesiser, ViewEstimate, average_sizes
 from depthpose.depth.types import StereoInput
 
 
@@ -43,8 +43,8 @@ def test_what_both_sizes_say_is_averaged(
 
 
 def test_an_average_is_as_sure_as_the_first() -> None:
-    def seen(disparity_px: float, sky: float, sure: float) -> Selected:
-        return Selected(*(torch.full((1, 2, 3), v) for v in (disparity_px, sky, sure)))
+    def seen(disparity_px: float, sky: float, sure: float) -> ViewEstimate:
+        return ViewEstimate(*(torch.full((1, 2, 3), v) for v in (disparity_px, sky, sure)))
 
     found = average_sizes([seen(4.0, 0.9, 0.7), seen(9.0, 0.3, 0.2)], [80.0, 40.0])
     torch.testing.assert_close(found.disparity_px, torch.full((1, 2, 3), 6.0))

@@ -12,7 +12,7 @@ from depthpose.depth.config import SelectionConfig
 from depthpose.depth.disparity import estimate_from_pair, estimate_from_virtual
 from depthpose.depth.stereo import CallableMatcher
 from depthpose.depth.types import Match, StereoInput
-from depthpose.depth.visible import texture, without_picture
+from depthpose.depth.visible import find_blank_borders, measure_texture
 
 H, W = 96, 160
 
@@ -38,15 +38,15 @@ def wedge(image: Tensor) -> Tensor:
 
 @pytest.mark.parametrize("value", [0.0, 16 / 255, 1.0])
 def test_bars_are_no_picture(value: float) -> None:
-    blank = without_picture(bars(noise(), value))
+    blank = find_blank_borders(bars(noise(), value))
     assert bool(blank[:12].all())
     assert bool(blank[-12:].all())
     assert not bool(blank[14:-14].any())
-    assert torch.equal(without_picture(bars(noise(), value).mT), blank.mT)
+    assert torch.equal(find_blank_borders(bars(noise(), value).mT), blank.mT)
 
 
 def test_what_rectification_leaves_black_is_no_picture() -> None:
-    blank = without_picture(wedge(noise()))
+    blank = find_blank_borders(wedge(noise()))
     is_black = torch.arange(W) + 2 * torch.arange(H)[:, None] < 60
     assert bool(blank[is_black].all())
     assert not bool(blank[60:64, 100:104].any()), "a dark thing in the picture"
@@ -93,25 +93,25 @@ def car(image: Tensor) -> Tensor:
     ],
 )
 def test_a_picture_has_no_blank_border(image: Tensor) -> None:
-    assert not bool(without_picture(image).any())
+    assert not bool(find_blank_borders(image).any())
 
 
 def test_texture_is_what_spreads_by_more_than_rounding() -> None:
     image = noise()
     image[:, 20:70, 30:120] = 1.0
     levels = torch.randint(0, 2, (50, 90), generator=torch.Generator().manual_seed(1)) / 255
-    seen = texture(image)
+    seen = measure_texture(image)
     assert float(seen[30:60, 40:110].max()) == 0
     assert float(seen[:10].min()) == 1
     image[:, 20:70, 30:120] = 0.9 + 3 * levels
-    assert float(texture(image)[30:60, 40:110].min()) == 1
+    assert float(measure_texture(image)[30:60, 40:110].min()) == 1
 
 
 def test_texture_of_a_large_image_is_that_of_the_picture_not_of_its_pixels() -> None:
     """Bricks of 32 columns in an image of 2484, which a matcher sees at half that size."""
     stripes = (torch.arange(2484) // 32 % 2).float().expand(3, 60, -1)
-    assert float(texture(stripes[:, :30, ::2])[:, 32:-32].min()) == 1
-    assert float(texture(stripes)[:, 64:-64].min()) == 1
+    assert float(measure_texture(stripes[:, :30, ::2])[:, 32:-32].min()) == 1
+    assert float(measure_texture(stripes)[:, 64:-64].min()) == 1
 
 
 def rig() -> StereoRig:
@@ -127,7 +127,7 @@ def test_a_pair_has_no_depth_where_there_is_no_picture(change: Callable[[Tensor]
     found = net.estimate_input(
         StereoInput(name="x", left=left, right=right, camera=rig()), with_check=False
     )
-    blank = without_picture(left)
+    blank = find_blank_borders(left)
     assert found.depth_m is not None
     assert bool(found.depth_m[blank].isnan().all())
     assert bool(found.disparity_px[blank].isnan().all())

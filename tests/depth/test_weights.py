@@ -7,8 +7,8 @@ import torch
 from depthpose.core.checkpoint import Checkpoint, read_checkpoint, save_checkpoint
 from depthpose.core.errors import InputError
 from depthpose.depth.config import GeneratorConfig, PSMNetConfig, SelectionConfig
+from depthpose.depth.generators import UNetGenerator
 from depthpose.depth.stereo import PSMNet
-from depthpose.depth.synthesis import UNetGenerator
 from depthpose.depth.weights import (
     read_depth_weights,
     read_generator,

@@ -41,8 +41,8 @@ from depthpose.core.run import claim_folder, claim_names, read_settings
 from depthpose.depth.config import GeneratorConfig, PSMNetConfig
 from depthpose.depth.datasets import open_dataset, read_split, write_raw_frame
 from depthpose.depth.datasets.frames import read_object_calibration, read_plain_calibration
+from depthpose.depth.generators import UNetGenerator
 from depthpose.depth.stereo import PSMNet
-from depthpose.depth.synthesis import UNetGenerator
 from depthpose.depth.train import STAGES as DEPTH_STAGES
 from depthpose.depth.types import RawFrame
 from depthpose.depth.weights import read_depth_weights, write_depth_weights

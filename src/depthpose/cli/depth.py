@@ -177,7 +177,7 @@ def evaluate_depth(
     from depthpose.core.engine import PLAN
     from depthpose.core.files import stores
     from depthpose.core.run import claim_folder
-    from depthpose.depth.evaluate import find_protocol
+    from depthpose.depth.protocols import find_protocol
     from depthpose.report.page import list_table_files
 
     if not (methods.weights or methods.matcher or methods.predictions or methods.baseline):

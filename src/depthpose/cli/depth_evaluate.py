@@ -22,19 +22,17 @@ from depthpose.depth.config import Answer, BaselineName, MatcherConfig, Speed
 from depthpose.depth.datasets import Dataset, join_datasets, open_dataset, refuse_common
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.evaluate import (
-    PROTOCOLS,
     Evaluation,
     EvaluationRow,
-    Measured,
-    Protocol,
+    FrameMetrics,
     evaluate,
-    frame_result,
-    has_truth,
     measure_frame,
+    read_frame_result,
     summarise,
 )
 from depthpose.depth.metrics import METRICS, RANKING
 from depthpose.depth.predictions import estimate_missing_depth, is_finished
+from depthpose.depth.protocols import PROTOCOLS, Protocol, has_truth
 from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.report import page
 from depthpose.report.depth import make_depth_section
@@ -271,7 +269,7 @@ def _show_frames(
     for role, k in page.choose_ranked(errors, max_count):
         row = rows_at_cap[k]
         index = index_of[row.frame or ""]
-        estimate, error = frame_result(dataset, index, folder, protocol, row.cap_m)
+        estimate, error = read_frame_result(dataset, index, folder, protocol, row.cap_m)
         value = row.metrics[metric.name]
         section = make_depth_section(
             f"{folder.name}: {row.frame}, {role}",
@@ -368,7 +366,7 @@ def measure_shards(
     name = PurePosixPath(predictions).stem
     settings = read_settings(predictions)
     index_of = {frame.name: index for index, frame in enumerate(dataset.frames)}
-    measured: dict[str, list[Measured] | str] = {}
+    measured: dict[str, list[FrameMetrics] | str] = {}
     for shard in tqdm(engine.read_records(predictions), name, disable=None, unit=" shards"):
         for frame, files in engine.read_shard(predictions, shard):
             if frame not in index_of:

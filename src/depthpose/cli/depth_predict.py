@@ -38,7 +38,7 @@ from depthpose.core.files.images import LISTED_SUFFIXES, refuse_among_inputs
 from depthpose.core.runner import Job, run_jobs
 from depthpose.depth.config import Answer, MatcherConfig, SGBMConfig
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.ground import MountFilter, scale_by_distance
+from depthpose.depth.mount import MountFilter, scale_by_distance
 from depthpose.depth.predictions import (
     CLOUD_M,
     ENDINGS,

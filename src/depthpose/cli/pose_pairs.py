@@ -14,7 +14,7 @@ from depthpose.core.files import image_size, read_map, write_map
 from depthpose.core.files.images import refuse_among_inputs
 from depthpose.core.run import claim_folder, find_rank, is_whole, note_result
 from depthpose.depth.config import MatcherConfig
-from depthpose.depth.disparity import depth_deviation
+from depthpose.depth.disparity import depth_std_from_confidence
 
 MATCHED = "matched"
 """Folder of the files that 'depth match' writes."""
@@ -107,7 +107,7 @@ def _write_sure_depth(name: str, rig: StereoRig, min_confidence: float, out: Pat
         file=sys.stderr,
     )
 
-    deviation_m = depth_deviation(depth_m, confidence, rig)
+    deviation_m = depth_std_from_confidence(depth_m, confidence, rig)
     sure_deviation_m = torch.where(is_sure, deviation_m, torch.nan)
     for folder, values_m in zip(folders, (sure_m, sure_deviation_m), strict=True):
         write_map(folder / f"{name}.npy", values_m)

@@ -56,7 +56,7 @@ def reproduce(
     from depthpose.cli.depth_evaluate import baseline_method, open_frames, open_training
     from depthpose.cli.depth_predict import DepthMethodSource
     from depthpose.cli.thesis_depth import reproduce_table
-    from depthpose.depth.evaluate import find_protocol
+    from depthpose.depth.protocols import find_protocol
     from depthpose.thesis.depth import TABLES
 
     # Refuse what cannot be compared before anything is read.

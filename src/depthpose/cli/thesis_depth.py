@@ -16,8 +16,8 @@ from depthpose.core.errors import InputError, suggest_name
 from depthpose.core.files import write_image
 from depthpose.core.run import claim_folder, describe_environment, find_rank
 from depthpose.depth.datasets import Dataset, Frame, has_lidar, lidar_truth
-from depthpose.depth.evaluate import find_protocol
 from depthpose.depth.predictions import has_prediction, read_estimate
+from depthpose.depth.protocols import find_protocol
 from depthpose.report import page
 from depthpose.report.page import Drawing, PictureFile, Section
 from depthpose.thesis.depth import (

@@ -139,7 +139,7 @@ def import_weights(
 
         import_resnet18(file, out)
     else:
-        from depthpose.depth.synthesis import import_encoder
+        from depthpose.depth.encoder import import_encoder
 
         import_encoder(file, out)
     return show_weights(str(out))
@@ -253,12 +253,12 @@ def export_depth(out: NewPath, weights: WeightsName = "default", what: str | Non
             where the weights have a generator, else pair.
     """
     from depthpose.core.checkpoint import find_weights
-    from depthpose.depth.export import depth_export
+    from depthpose.depth.export import describe_export
     from depthpose.depth.weights import read_depth_weights
 
     path = find_weights(weights)
     depth_weights = read_depth_weights(path)
-    make_export = partial(depth_export, depth_weights, what)
+    make_export = partial(describe_export, depth_weights, what)
     return _write_graph(out, weights, path, depth_weights.facts, make_export)
 
 

@@ -11,6 +11,11 @@ from torch import Tensor
 Image = Float[Tensor, "3 h w"]
 """RGB in [0, 1], float32: red first. OpenCV's images are BGR, blue first."""
 
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+"""Mean and standard deviation of red, green and blue in ImageNet, which networks are normalised by.
+"""
+
 
 def take_evenly(rows: Shaped[Tensor, "n ..."], count: int) -> Shaped[Tensor, "m ..."]:
     """Take ``count`` rows at even steps, beginning with the first; all where there are fewer."""

@@ -1,6 +1,6 @@
-"""Random changes of training pairs that stay rectified pairs, and degradations of single images.
+"""Augmentation of training pairs, which stay rectified, and degradation of single images.
 
-Degradations are the effects of camera, weather and files on a picture; truth does not change.
+Degradation imitates the effects of camera, weather and files on a picture; the truth stays.
 """
 
 import math
@@ -19,62 +19,95 @@ from depthpose.core.errors import InputError
 from depthpose.depth.config import AugmentConfig, DegradeConfig
 from depthpose.depth.types import View
 
+_HAZE_BRIGHTNESS = (0.5, 1.0)
+_HAZE_DENSITY = (0.0, 0.4)
+"""Ranges of the grey value of haze (white is 1), and of its share of each pixel."""
+_GLARE_TOP = (0.0, 0.6)
+_GLARE_LEFT = (0.0, 1.0)
+_GLARE_RADIUS = (0.2, 0.8)
+_GLARE_STRENGTH = (0.1, 0.6)
+"""Ranges of the place of a glare as shares of the height and of the width, of its standard
+deviation as a share of the height, and of what it adds to the colours at its place."""
+_MIN_BLUR_PX = 0.3
+"""Least standard deviation of a blur that can be seen."""
+_JPEG_QUALITY = (40.0, 95.0)
+
 
 def degrade(image: View, config: DegradeConfig, generator: torch.Generator) -> View:
-    """Change colours and sharpness of an image at random, but not where objects are.
+    """Degrade the colours and the sharpness of an image at random; objects stay in place.
 
     Args:
         image: RGB in [0, 1].
         config: ranges and probabilities of the changes.
         generator: generator of the random numbers.
+
+    Returns:
+        The degraded image, RGB in [0, 1].
     """
-
-    def between(low: float, high: float) -> float:
-        return low + (high - low) * float(torch.rand((), generator=generator))
-
-    def happens(share: float) -> bool:
-        return between(0.0, 1.0) < share
-
-    if happens(config.hue_share):
+    if _happens(config.hue_share, generator):
         image = image[torch.randperm(3, generator=generator)]
-
-    # Colours: every image.
-    low = 1 - config.colour
-    high = 1 + config.colour
-    exposure, contrast, saturation, gamma = (between(low, high) for _ in range(4))
-    third = config.colour / 3
-    tint = torch.tensor([between(1 - third, 1 + third) for _ in range(3)])
-    grey = grey_from_rgb(image)
-    image = grey + (image - grey) * saturation
-    mean = image.mean()
-    image = ((image - mean) * contrast + mean) * exposure * tint[:, None, None]
-    image = image.clamp(0, 1) ** gamma
-
-    if happens(config.haze_share):
-        haze = torch.full_like(image, between(0.5, 1.0))
-        image = torch.lerp(image, haze, between(0.0, 0.4))
-    if happens(config.glare_share):
-        # A low sun or a lamp, whose light fades with the distance from its place.
-        height, width = image.shape[1:]
-        y = torch.linspace(0, 1, height)[:, None] - between(0.0, 0.6)
-        x = (torch.linspace(0, 1, width) - between(0.0, 1.0)) * width / height
-        radius = between(0.2, 0.8)
-        image = image + between(0.1, 0.6) * torch.exp(-(x**2 + y**2) / (2 * radius**2))
-    if happens(config.blur_share):
-        image = _blur(image, between(0.3, config.blur_px))
-    if happens(config.noise_share):
+    image = _change_colours(image, config.colour, generator)
+    if _happens(config.haze_share, generator):
+        haze = torch.full_like(image, _draw_between(*_HAZE_BRIGHTNESS, generator))
+        image = torch.lerp(image, haze, _draw_between(*_HAZE_DENSITY, generator))
+    if _happens(config.glare_share, generator):
+        image = _add_glare(image, generator)
+    if _happens(config.blur_share, generator):
+        image = _blur(image, _draw_between(_MIN_BLUR_PX, config.blur_px, generator))
+    if _happens(config.noise_share, generator):
         noise = torch.randn(image.shape, generator=generator)
-        image = image + noise * between(0.0, config.noise)
+        image = image + noise * _draw_between(0.0, config.noise, generator)
     image = image.clamp(0, 1)
-    if happens(config.jpeg_share):
-        image = through_jpeg(image, int(between(40.0, 95.0)))
+    if _happens(config.jpeg_share, generator):
+        image = through_jpeg(image, int(_draw_between(*_JPEG_QUALITY, generator)))
     return image
 
 
-def _blur(image: View, deviation_px: float) -> View:
-    """Blur an image by a Gaussian of a standard deviation, cut off at 3 px."""
+def _draw_between(low: float, high: float, generator: torch.Generator) -> float:
+    """Draw a number between two limits, uniformly."""
+    return low + (high - low) * float(torch.rand((), generator=generator))
+
+
+def _happens(probability: float, generator: torch.Generator) -> bool:
+    """Draw whether something of a probability happens."""
+    return float(torch.rand((), generator=generator)) < probability
+
+
+def _change_colours(image: View, strength: float, generator: torch.Generator) -> View:
+    """Change exposure, contrast, saturation, gamma and tint of an image at random.
+
+    Each is scaled by a factor within 1 +- ``strength``, the tint within 1 +- a third of it.
+    """
+    low = 1 - strength
+    high = 1 + strength
+    exposure, contrast, saturation, gamma = (_draw_between(low, high, generator) for _ in range(4))
+    third = strength / 3
+    tint = torch.tensor([_draw_between(1 - third, 1 + third, generator) for _ in range(3)])
+
+    grey = grey_from_rgb(image)
+    image = grey + (image - grey) * saturation
+    mean = image.mean()
+    contrasted = (image - mean) * contrast + mean
+    exposed = contrasted * exposure * tint[:, None, None]
+    return exposed.clamp(0, 1) ** gamma
+
+
+def _add_glare(image: View, generator: torch.Generator) -> View:
+    """Add the light of a low sun or a lamp, a Gaussian about a random place."""
+    height, width = image.shape[1:]
+    # Distances from the place in heights of the image.
+    y = torch.linspace(0, 1, height)[:, None] - _draw_between(*_GLARE_TOP, generator)
+    x = torch.linspace(0, 1, width) - _draw_between(*_GLARE_LEFT, generator)
+    x = x * width / height
+    radius = _draw_between(*_GLARE_RADIUS, generator)
+    strength = _draw_between(*_GLARE_STRENGTH, generator)
+    return image + strength * torch.exp(-(x**2 + y**2) / (2 * radius**2))
+
+
+def _blur(image: View, std_px: float) -> View:
+    """Blur an image by a Gaussian of standard deviation ``std_px``, cut off at 3 px."""
     offsets = torch.arange(-3.0, 4.0)
-    kernel = torch.exp(-(offsets**2) / (2 * deviation_px**2))
+    kernel = torch.exp(-(offsets**2) / (2 * std_px**2))
     kernel = kernel / kernel.sum()
     padded = F.pad(image[:, None], (3, 3, 3, 3), mode="replicate")
     along_rows = F.conv2d(padded, kernel[None, None, None])
@@ -82,7 +115,10 @@ def _blur(image: View, deviation_px: float) -> View:
 
 
 def through_jpeg(image: View, quality: int) -> View:
-    """Compress an image as JPEG of ``quality`` (1 to 95), colours at full size, and decode it."""
+    """Compress an image as JPEG of ``quality`` (1 to 95), and decode it again.
+
+    Colours are not subsampled.
+    """
     pixels = (image.permute(1, 2, 0) * 255).round().byte().numpy()
     file = BytesIO()
     Image.fromarray(pixels).save(file, "JPEG", quality=quality, subsampling=0)
@@ -110,33 +146,39 @@ class TrainingPair(NamedTuple):
 
 
 def augment(pair: TrainingPair, config: AugmentConfig, generator: torch.Generator) -> TrainingPair:
-    """Scale, crop, perhaps mirror, and change the colours of a pair (thesis, 2.4.2).
+    """Augment a pair at random: scale, crop, perhaps mirror, change colours (thesis, 2.4.2).
 
-    A pair smaller than the crop is padded (:func:`pad_pair`), not enlarged, for that would change
-    its focal length.
+    Args:
+        pair: one pair, without a batch axis.
+        config: ranges and probabilities of the changes.
+        generator: generator of the random numbers.
+
+    Returns:
+        A pair of ``config.crop_px``. A smaller pair is padded to it (:func:`pad_pair`), not
+        enlarged, for that would change its focal length.
 
     Raises:
         InputError: the pair is smaller than half of the crop.
     """
     # A random scale, but at least the one that fills half of the crop, where the range allows it.
     low, high = config.scale
-    scale = low + (high - low) * float(torch.rand((), generator=generator))
+    random_scale = _draw_between(low, high, generator)
     sides = zip(config.crop_px, pair.left.shape[-2:], strict=True)
-    half_scale = max((crop + 1) / 2 / side for crop, side in sides)
-    scaled = scale_pair(pair, max(scale, min(half_scale, high)))
+    half_filling_scale = max((crop + 1) / 2 / side for crop, side in sides)
+    scaled = scale_pair(pair, max(random_scale, min(half_filling_scale, high)))
 
     height, width = scaled.left.shape[-2:]
     rows, columns = config.crop_px
     cropped = crop_pair(scaled, (min(height, rows), min(width, columns)), generator)
-    if float(torch.rand((), generator=generator)) < config.flip_share:
+    if _happens(config.flip_share, generator):
         cropped = flip_and_swap(cropped)
     coloured = jitter_colors(cropped, config.jitter, generator)
-    differing = set_apart(coloured, config, generator)
+    differing = make_views_differ(coloured, config, generator)
     return pad_pair(differing, config.crop_px)
 
 
 def flip_and_swap(pair: TrainingPair) -> TrainingPair:
-    """Mirror both views and swap them, which gives a rectified pair again.
+    """Mirror both views and swap them, which makes a rectified pair again.
 
     The truth of the new left view is the mirrored truth of the old right one.
     """
@@ -171,7 +213,7 @@ def scale_pair(pair: TrainingPair, scale: float) -> TrainingPair:
 def crop_pair(
     pair: TrainingPair, size_px: tuple[int, int], generator: torch.Generator
 ) -> TrainingPair:
-    """Cut the same random window out of both views and their truth, so that disparity stays.
+    """Crop a pair to a random window, the same in both views and their truth: disparity stays.
 
     ``size_px``: rows and columns of the window.
 
@@ -194,11 +236,11 @@ def crop_pair(
 
 
 def pad_pair(pair: TrainingPair, size_px: tuple[int, int]) -> TrainingPair:
-    """Pad a pair on the right and below with black that has no truth.
+    """Pad a pair on the right and below with black, whose disparity is unknown (NaN).
 
-    Rows and columns of the picture keep their numbers, so disparity and horizon stay where they
-    are. A reflected border would have the negative of every disparity. ``size_px``: rows and
-    columns that the result has at least.
+    Pixels keep their rows and columns, so disparity and horizon stay the same. The border is not
+    reflected, for a reflection has negative disparities. ``size_px``: least rows and columns of
+    the result.
 
     Raises:
         InputError: more than half of the rows or of the columns would be black.
@@ -220,30 +262,32 @@ def pad_pair(pair: TrainingPair, size_px: tuple[int, int]) -> TrainingPair:
 
 
 def jitter_colors(pair: TrainingPair, strength: float, generator: torch.Generator) -> TrainingPair:
-    """Scale brightness, contrast and saturation at random, by the same factors in both views.
+    """Change brightness, contrast and saturation at random, alike in both views.
 
-    The factors lie between 1 - ``strength`` and 1 + ``strength``.
+    Each is scaled by a factor between 1 - ``strength`` and 1 + ``strength``.
     """
     factors = 1 + strength * (2 * torch.rand(3, generator=generator) - 1)
     brightness, contrast, saturation = factors.tolist()
     left = pair.left * brightness
     right = pair.right * brightness
-    mean = (left.mean() + right.mean()) / 2  # of both, or the views would come to differ
-
-    def change(view: View) -> View:
+    # The mean of both views: contrast about the mean of each would make them differ.
+    mean = (left.mean() + right.mean()) / 2
+    jittered: list[View] = []
+    for view in (left, right):
         contrasted = (view - mean) * contrast + mean
         grey = grey_from_rgb(contrasted)
-        return (grey + (contrasted - grey) * saturation).clamp(0, 1)
+        saturated = grey + (contrasted - grey) * saturation
+        jittered.append(saturated.clamp(0, 1))
+    return pair._replace(left=jittered[0], right=jittered[1])
 
-    return pair._replace(left=change(left), right=change(right))
 
-
-def set_apart(
+def make_views_differ(
     pair: TrainingPair, config: AugmentConfig, generator: torch.Generator
 ) -> TrainingPair:
-    """Make the views differ at random, as those of two real cameras; disparity does not change.
+    """Change each view at random, so that they differ as those of two real cameras do.
 
-    Each view is degraded by itself; the right one is misaligned, and may lose a patch.
+    Each view is degraded by itself; the rows of the right one are shifted, and a patch of it may
+    be erased. Disparity does not change.
     """
     if config.per_view is not None:
         left, right = (
@@ -252,28 +296,33 @@ def set_apart(
         pair = pair._replace(left=left, right=right)
     if config.misaligned_px:
         shifts_px = config.misaligned_px * (2 * torch.rand(2, generator=generator) - 1)
-        pair = pair._replace(right=shift_rows(pair.right, *shifts_px.tolist()))
-    if float(torch.rand((), generator=generator)) < config.erased_share:
-        # A patch of a sixth to a third of each side gets the mean colour.
-        window: list[slice] = []
-        for side in pair.right.shape[1:]:
-            size = int(side * (1 + float(torch.rand((), generator=generator))) / 6)
-            first = int(torch.randint(side - size + 1, (), generator=generator))
-            window.append(slice(first, first + size))
-        rows, columns = window
-        erased = pair.right.clone()
-        erased[:, rows, columns] = pair.right.mean((1, 2))[:, None, None]
-        pair = pair._replace(right=erased)
+        pair = pair._replace(right=shift_up(pair.right, *shifts_px.tolist()))
+    if _happens(config.erased_share, generator):
+        pair = pair._replace(right=_erase_patch(pair.right, generator))
     return pair
 
 
-def shift_rows(image: View, left_px: float, right_px: float) -> View:
-    """Move an image up: by ``left_px`` at its left border, ``right_px`` at its right one.
+def _erase_patch(image: View, generator: torch.Generator) -> View:
+    """Fill a random patch, a sixth to a third of each side, with the image's mean colour."""
+    window: list[slice] = []
+    for side in image.shape[1:]:
+        size = int(side * _draw_between(1.0, 2.0, generator) / 6)
+        first = int(torch.randint(side - size + 1, (), generator=generator))
+        window.append(slice(first, first + size))
+    rows, columns = window
+    erased = image.clone()
+    erased[:, rows, columns] = image.mean((1, 2))[:, None, None]
+    return erased
 
-    The shift is linear between the borders. Columns stay, and so does disparity.
+
+def shift_up(image: View, at_left_border_px: float, at_right_border_px: float) -> View:
+    """Shift the columns of an image up, by amounts given at both borders and linear between them.
+
+    Sampling is bilinear, and the border repeats. Columns stay, and so does disparity.
     """
     height, width = image.shape[1:]
-    rows = torch.arange(height)[:, None] + torch.linspace(left_px, right_px, width)
+    shifts_px = torch.linspace(at_left_border_px, at_right_border_px, width)
+    rows = torch.arange(height)[:, None] + shifts_px
     columns = torch.arange(width).expand(height, width)
     # grid_sample's coordinates: -1 and 1 are the outer borders of the image.
     x = (2 * columns + 1) / width - 1

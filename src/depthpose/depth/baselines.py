@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float64, Shaped
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -26,9 +26,11 @@ _ROWS = 1443
 """Number of rows of that camera."""
 _NEAR_M = 1.0
 _FAR_M = 80.0
-_DEPTH_STEPS = 4096
-"""Range of the true depths that are learnt from, and steps of their histogram, equal in the
-logarithm of depth."""
+_DEPTH_BINS = 4096
+"""Range of the true depths that are learnt from, and bins of their histogram, of equal widths in
+the logarithm of depth."""
+_THUMBNAIL_SIZE = (8, 24)
+"""Rows and columns of the thumbnails that images are compared by."""
 
 Progress = Callable[[Sequence[int]], Iterable[int]]
 
@@ -37,11 +39,12 @@ Progress = Callable[[Sequence[int]], Iterable[int]]
 class RowDepthBaseline:
     """The best constant depth of each image row: it uses the camera and not the image.
 
-    A row is counted by its slope ``(v - cy) / fy``, not by its number: the road at one slope is
-    equally far in every camera of one mounting height, whatever its focal length or crop.
+    Rows of all cameras are converted to those of one canonical camera, by their slope
+    ``(v - cy) / fy``: the road at one slope is equally far in every camera of one mounting height,
+    whatever its focal length or crop.
     """
 
-    #: one depth a row of the canonical camera, the principal point in the middle
+    #: depth of each row of the canonical camera, the principal point in the middle
     depth_m: Float64[np.ndarray, " rows"]
 
     @classmethod
@@ -49,42 +52,36 @@ class RowDepthBaseline:
         """Find for each row the constant c that minimises the mean of ``|c - t| / t``.
 
         That is the median of the true depths t weighted by 1 / t. Each frame counts the same. The
-        depths are counted in a histogram with steps of 0.1 %, so that any number of frames fits in
-        memory. Rows without truth are interpolated in inverse depth, and beyond the outermost rows
-        with truth their values go on.
+        depths are counted in a histogram with bins of 0.1 %, so that any number of frames fits in
+        memory. Rows without truth are interpolated in inverse depth; beyond the outermost rows
+        with truth their values are repeated.
+
+        Args:
+            dataset: the frames of the training.
+            progress: wraps the sequence of frame indices to show the progress, as ``tqdm`` does.
 
         Raises:
             InputError: no frame has both truth and a rig.
         """
-        # A histogram of the depths of each row, weighted by 1 / t.
-        weight = np.zeros((_ROWS, _DEPTH_STEPS))
+        weight = np.zeros((_ROWS, _DEPTH_BINS))
         for index in progress(range(len(dataset))):
             true_map_m = read_true_depth(dataset, index)
             rig = dataset.read_rig(index)
-            if true_map_m is None or rig is None:
-                continue
-            true_m = true_map_m.double().numpy()
-            v, u = np.nonzero((true_m > _NEAR_M) & (true_m < _FAR_M))
-            true_m = true_m[v, u]
-            row = np.rint(_convert_to_canonical_rows(v, rig)).astype(np.int64).clip(0, _ROWS - 1)
-            step = np.log(true_m / _NEAR_M) / np.log(_FAR_M / _NEAR_M) * _DEPTH_STEPS
-            cell = row * _DEPTH_STEPS + step.astype(np.int64)
-            cell_weight = 1 / true_m / max(len(true_m), 1)
-            counted = np.bincount(cell, cell_weight, _ROWS * _DEPTH_STEPS)
-            weight += counted.reshape(_ROWS, _DEPTH_STEPS)
+            if true_map_m is not None and rig is not None:
+                weight += _weigh_depths(true_map_m.double().numpy(), rig)
         has_truth = weight.sum(1) > 0
         if not has_truth.any():
-            raise _nothing_to_learn(dataset)
+            raise _make_no_truth_error(dataset)
 
-        # The weighted median: the middle of the step where half of the weight is reached.
+        # The weighted median: the middle of the bin where half of the weight is reached.
         is_half_reached = weight.cumsum(1) >= weight.sum(1, keepdims=True) / 2
-        step_share = (is_half_reached.argmax(1) + 0.5) / _DEPTH_STEPS
-        median_m = _NEAR_M * (_FAR_M / _NEAR_M) ** step_share
+        median_bin = is_half_reached.argmax(1) + 0.5
+        median_m = _NEAR_M * (_FAR_M / _NEAR_M) ** (median_bin / _DEPTH_BINS)
         rows = np.arange(_ROWS)
         return cls(1 / np.interp(rows, rows[has_truth], 1 / median_m[has_truth]))
 
     def estimate_input(self, pair: StereoInput) -> DepthEstimate:
-        """Give every pixel the depth of its row.
+        """Estimate the depth of every pixel as that of its row.
 
         Raises:
             InputError: the input has no rig.
@@ -98,7 +95,26 @@ class RowDepthBaseline:
         return DepthEstimate(depth_m=depth_m, disparity_px=disparity_from_depth(depth_m, rig))
 
 
-def _convert_to_canonical_rows(rows: np.ndarray, rig: StereoRig) -> np.ndarray:
+def _weigh_depths(
+    true_depth_m: Float64[np.ndarray, "h w"], rig: StereoRig
+) -> Float64[np.ndarray, "rows bins"]:
+    """Compute the histogram of a frame's true depths t in each canonical row.
+
+    A pixel weighs 1 / t, divided by the number of the frame's pixels with truth.
+    """
+    v, u = np.nonzero((true_depth_m > _NEAR_M) & (true_depth_m < _FAR_M))
+    true_m = true_depth_m[v, u]
+    row = np.rint(_convert_to_canonical_rows(v, rig)).astype(np.int64).clip(0, _ROWS - 1)
+    depth_bin = np.log(true_m / _NEAR_M) / np.log(_FAR_M / _NEAR_M) * _DEPTH_BINS
+    flat_index = row * _DEPTH_BINS + depth_bin.astype(np.int64)
+    pixel_weight = 1 / true_m / max(len(true_m), 1)
+    histogram = np.bincount(flat_index, pixel_weight, _ROWS * _DEPTH_BINS)
+    return histogram.reshape(_ROWS, _DEPTH_BINS)
+
+
+def _convert_to_canonical_rows(
+    rows: Shaped[np.ndarray, " n"], rig: StereoRig
+) -> Float64[np.ndarray, " n"]:
     """Convert rows of a camera's image to fractional rows of the canonical camera."""
     slope = (rows - float(rig.K[1, 2])) / float(rig.K[1, 1])
     return slope * _CANONICAL_FOCAL_PX + _ROWS // 2
@@ -108,44 +124,51 @@ def _convert_to_canonical_rows(rows: np.ndarray, rig: StereoRig) -> np.ndarray:
 class NearestImageBaseline:
     """The depth of the most similar training image.
 
-    Images are compared as colour thumbnails of 24 x 8 cells, by correlation. The truth of the most
-    similar one is sparse and is filled in a pyramid: inverse depth is averaged over ever larger
-    cells, and a pixel without truth takes the smallest cell that has any. It is then brought to
-    the size of the input, and to its focal length: what looks alike through a lens twice as long
-    is twice as far.
+    Images are compared by the correlation of colour thumbnails. The truth of the most similar one
+    is sparse, and its holes are filled (:func:`fill_by_pyramid`). It is resized to the input, and
+    scaled by the ratio of the focal lengths: what looks alike through a lens twice as long is twice
+    as far.
     """
 
     dataset: Dataset  #: data set of the training
     indices: list[int]  #: indices of its frames that have truth and a rig
-    thumbnails: Float[Tensor, "n d"]  #: thumbnails of the left images of these frames
+    #: thumbnails of the left images of these frames, each with mean 0 and norm 1
+    thumbnails: Float[Tensor, "n d"]
 
     @classmethod
     def fit(cls, dataset: Dataset, progress: Progress = iter) -> "NearestImageBaseline":
         """Make the thumbnail of every training image that has truth and a rig.
 
+        Args:
+            dataset: the frames of the training.
+            progress: wraps the sequence of numbers of these images to show the progress.
+
         Raises:
             InputError: no image has both.
         """
         indices = [
-            i
-            for i, frame in enumerate(dataset.frames)
-            if frame.calibration and truth_kinds(frame) and dataset.read_rig(i) is not None
+            index
+            for index, frame in enumerate(dataset.frames)
+            if frame.calibration and truth_kinds(frame) and dataset.read_rig(index) is not None
         ]
         if not indices:
-            raise _nothing_to_learn(dataset)
-        lefts = [dataset.frames[i].left for i in indices]
-        thumbnails = [_make_thumbnail(read_image(lefts[k])) for k in progress(range(len(lefts)))]
+            raise _make_no_truth_error(dataset)
+        thumbnails: list[Tensor] = []
+        for number in progress(range(len(indices))):
+            left_path = dataset.frames[indices[number]].left
+            thumbnails.append(_make_thumbnail(read_image(left_path)))
         return cls(dataset, indices, torch.stack(thumbnails))
 
     def estimate_input(self, pair: StereoInput) -> DepthEstimate:
-        """Give the left image the depth of the most similar training image.
+        """Estimate the depth of the left image as that of the most similar training image.
 
         Raises:
             InputError: the input has no rig.
         """
         rig = _require_rig(pair)
         height, width = pair.left.shape[1:]
-        nearest = self.indices[int((self.thumbnails @ _make_thumbnail(pair.left)).argmax())]
+        correlations = self.thumbnails @ _make_thumbnail(pair.left)
+        nearest = self.indices[int(correlations.argmax())]
         nearest_true_m = read_true_depth(self.dataset, nearest)
         nearest_rig = self.dataset.read_rig(nearest)
         assert nearest_true_m is not None  # `fit` chose frames that have both
@@ -161,9 +184,9 @@ class NearestImageBaseline:
 
 
 def fill_by_pyramid(values: Map) -> Map:
-    """Fill NaN with the mean of the smallest cell (2, 4, 8, ... pixels) around it that has values.
+    """Fill each NaN with the mean of the smallest cell around it that has values.
 
-    All stays NaN where there is no value at all.
+    Cells are squares of 2, 4, 8, ... pixels. A map without any value stays NaN.
     """
     has_value = torch.isfinite(values)
     if bool(has_value.all()) or values.shape == (1, 1):
@@ -178,14 +201,18 @@ def fill_by_pyramid(values: Map) -> Map:
 
 
 def _make_thumbnail(image: View) -> Float[Tensor, " d"]:
-    """Shrink an image to 24 x 8 cells, with mean 0 and norm 1: dot products are correlations."""
-    cells = F.interpolate(image[None], (8, 24), mode="area").flatten()
+    """Shrink an image to a vector of mean 0 and norm 1: dot products are correlations."""
+    cells = F.interpolate(image[None], _THUMBNAIL_SIZE, mode="area").flatten()
     centred = cells - cells.mean()
     return centred / centred.norm().clamp(min=1e-9)
 
 
 def _require_rig(pair: StereoInput) -> StereoRig:
-    """Return the rig of a pair, which must have one."""
+    """Return the rig of a pair.
+
+    Raises:
+        InputError: it has none.
+    """
     if not isinstance(pair.camera, StereoRig):
         raise InputError(
             f"{pair.name}: has no rig, and a baseline is measured as disparity; give a camera with "
@@ -194,8 +221,8 @@ def _require_rig(pair: StereoInput) -> StereoRig:
     return pair.camera
 
 
-def _nothing_to_learn(dataset: Dataset) -> InputError:
-    """Make the error of a dataset to which no baseline can be fitted."""
+def _make_no_truth_error(dataset: Dataset) -> InputError:
+    """Make the error of a dataset without a frame that a baseline can be fitted to."""
     return InputError(
         f"{dataset.name}: none of its {len(dataset)} frames has both truth and calibration; give "
         "--train a folder with lidar_depth, disp_occ or LiDAR scans"

@@ -1,451 +1,47 @@
-"""Depth as one ONNX graph, the estimator's own steps included, and its comparison with PyTorch."""
+"""Exports of depth: ONNX graphs, each with the cases by which it is compared with PyTorch."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from depthpose.core.camera import Camera, StereoRig
-from depthpose.core.errors import InputError, refuse_unknown
-from depthpose.core.export import Case, Export, Graph, Limit, Value, convert_network
+from depthpose.core.errors import refuse_unknown
+from depthpose.core.export import Case, Export, Limit
 from depthpose.depth.config import MatcherConfig
-from depthpose.depth.disparity import LEAST_PX, SKY_M
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.stereo import LightStereo, NetworkMatcher, PSMNet, StereoNetwork
-from depthpose.depth.stereo.layers import interpolation_matrix, linear_taps
-from depthpose.depth.stereo.matcher import IMAGENET_MEAN, IMAGENET_STD
-from depthpose.depth.stereo.psmnet import WINDOW_PX
-from depthpose.depth.synthesis import (
-    COLUMNS_SHARE,
-    ROWS_SHARE,
-    Generator,
-    SelectionGenerator,
-    make_synthesiser,
-    read_logits,
-)
-from depthpose.depth.types import DepthEstimate, StereoInput, Views
+from depthpose.depth.generators import SelectionGenerator
+from depthpose.depth.graphs import image_graph, pair_graph
+from depthpose.depth.stereo import LightStereo, NetworkMatcher, StereoNetwork
+from depthpose.depth.synthesis import make_synthesiser
+from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.depth.weights import DepthWeights, make_matcher
-
-# float32 constants of graphs.
-_0 = np.float32(0)
-_1 = np.float32(1)
-_2 = np.float32(2)
-_HALF = np.float32(0.5)
-_NAN = np.float32(np.nan)
-
-
-def _side(size: Value, axis: int) -> Value:
-    """Give the number of rows (axis 0) or columns (1) of a size, as a list of one number."""
-    return size.slice([axis], [axis + 1], [0])
-
-
-def _resize_image(image: Value, size: Value) -> Value:
-    """Resize images to rows and columns, with antialiasing where they shrink; clip to [0, 1]."""
-    # As torch does, pixels beyond the border are left out and the other weights add up to 1; by
-    # default ONNX would repeat the pixels of the border.
-    resized = image.op(
-        "Resize", None, None, size, mode="linear", axes=[2, 3], antialias=1, exclude_outside=1
-    )
-    return resized.op("Clip", _0, _1)
-
-
-def _resize_map(values: Value, size: Value) -> Value:
-    """Resize maps (batch, height, width) to rows and columns, without antialiasing."""
-    with_channel = values.op("Unsqueeze", [1])
-    resized = with_channel.op("Resize", None, None, size, mode="linear", axes=[2, 3])
-    return resized.op("Squeeze", [1])
-
-
-def _width_ratio(size: Value, other: Value) -> Value:
-    """Give the width of a size as a multiple of another's, by which disparities scale."""
-    width = _side(size, 1).cast(np.float64)
-    other_width = _side(other, 1).cast(np.float64)
-    return (width / other_width).cast(np.float32)
-
-
-def _size_at_focal_length(size: Value, target_px: float, focal_px: Value | np.ndarray) -> Value:
-    """Give (rows, columns) at which images have a focal length, as ``size_at_focal_length`` does.
-
-    ``size``: (rows, columns) of the images; ``target_px``: that focal length; ``focal_px``: those
-    of the images in the same order, (fy, fx).
-    """
-    scaled = size.cast(np.float64) * target_px / focal_px
-    return scaled.op("Round").op("Max", 1.0).cast(np.int64)
-
-
-Maps = Float[Tensor, "b rows columns"]
-
-
-class DynamicPSMNet(nn.Module):
-    """PSMNet with its soft arg-min in eval mode, in operators that allow images of any size.
-
-    Disparities are few and fixed, so their interpolation is a matrix; rows and columns are resized.
-    """
-
-    matrix: Tensor
-
-    def __init__(self, network: PSMNet) -> None:
-        super().__init__()
-        self.network = network
-        config = network.config
-        self.bins = config.max_disparity_px // 4
-        taps = linear_taps(
-            self.bins, config.max_disparity_px, torch.zeros(1), align_corners=config.align_corners
-        )
-        self.register_buffer("matrix", interpolation_matrix(taps, self.bins)[..., None, None])
-
-    def forward(
-        self, left: Views, right: Views
-    ) -> tuple[Float[Tensor, "b h w"], Float[Tensor, "b h w"]]:
-        """Give disparity [px] and confidence of normalised images."""
-        config = self.network.config
-        left_features = self.network.features(left)
-        right_features = self.network.features(right)
-        volume = gathered_volume(left_features, right_features, self.bins)
-        cost = self.network.refine(self.network.aggregate(volume))[-1][:, 0]
-
-        # Costs at the size of the images and for each disparity.
-        resized = F.interpolate(
-            cost, left.shape[-2:], mode="bilinear", align_corners=config.align_corners
-        )
-        probability = F.conv2d(resized, self.matrix).softmax(1)
-
-        disparities_px = torch.arange(config.max_disparity_px).to(cost)[:, None, None]
-        disparity_px = (probability * disparities_px).sum(1)
-        is_near = (disparities_px - disparity_px[:, None]).abs() <= WINDOW_PX
-        return disparity_px, (probability * is_near).sum(1).clamp(0, 1)
-
-
-class _Dynamic(nn.Module):
-    """A module that computes what an export needs of a network."""
-
-    def __init__(self, network: Any) -> None:  # noqa: ANN401
-        super().__init__()
-        self.network = network
-
-
-class DynamicLightStereo(_Dynamic):
-    """The light network with its matcher's post-processing."""
-
-    def forward(self, left: Views, right: Views) -> tuple[Maps, ...]:
-        """Give disparity [px] and confidence of normalised images, then 1 in the sky.
-
-        The sky is left out where the network does not recognise it.
-        """
-        max_disparity_px = self.network.config.max_disparity_px
-        output = self.network.read(left, right, max_disparity_px, with_confidence=True)
-        assert output.confidence is not None
-        if output.sky is None:
-            return output.heads[-1], output.confidence
-        return output.heads[-1], output.confidence, (output.sky > 0.5).float()
-
-
-DYNAMIC_SHAPE_NETWORKS: dict[type[StereoNetwork], Callable[[Any], nn.Module]] = {
-    PSMNet: DynamicPSMNet,
-    LightStereo: DynamicLightStereo,
-}
-"""Modules that matcher networks are exported as, for any image size: a new kind is one entry."""
-
-
-class DynamicSelection(_Dynamic):
-    """The generator that selects with the post-processing of its logits, at half the image size."""
-
-    def forward(self, image: Views) -> tuple[Tensor, ...]:
-        """Give log of disparity, sky and confidence of the left view; the first two of the right.
-
-        Disparity is counted in pixels of the image's width. The probability of a street follows,
-        (b,), where the weights have a layer for it.
-        """
-        planes = self.network.planes
-        features = self.network.encoder(image)
-        left_logits, right_logits = self.network.decode(features)
-        left_log_px, left_sky, left_confidence = read_logits(left_logits, planes)
-        right_log_px, right_sky, _ = read_logits(right_logits, planes)
-        outputs = (left_log_px, left_sky, left_confidence, right_log_px, right_sky)
-        street_probability = self.network.street_probability(features[-1])
-        return outputs if street_probability is None else (*outputs, street_probability)
-
-
-def gathered_volume(
-    left: Float[Tensor, "b c h w"], right: Float[Tensor, "b c h w"], bins: int
-) -> Float[Tensor, "b c2 {bins} h w"]:
-    """Make ``concatenation_volume`` by one gather in place of a copy for each disparity."""
-    right_column = torch.arange(left.shape[-1]) - torch.arange(bins)[:, None]
-    is_inside = (right_column >= 0).to(left.dtype)
-    left_part = left[..., None, :] * is_inside
-    right_part = right[..., right_column.clamp(min=0)] * is_inside
-    return torch.cat([left_part, right_part], 1).transpose(2, 3)
-
-
-class _Maps(NamedTuple):
-    """Maps of left views in a graph."""
-
-    disparity_px: Value
-    confidence: Value
-    sky: Value | None = None  # 1 in the sky; None where the weights do not recognise it
-
-
-class _Generated(NamedTuple):
-    """Outputs of a generator for left views in a graph."""
-
-    right: Value
-    left_maps: _Maps | None = None  # None of a generator that estimates no disparity
-    street_probability: Value | None = None  # None where the weights do not give it
-
-
-def _generate(left: Value, generator: Generator) -> _Generated:
-    """Add a generator to a graph: ``draw_right``, and the left maps of ``select_views``."""
-    size = left.op("Shape", start=2, end=4)
-    multiple = generator.config.side_multiple_px
-
-    # The multiple that a side is close to, or the side itself.
-    sides = size.cast(np.float64)
-    nearest = (sides / float(multiple)).op("Round").op("Max", 1.0) * float(multiple)
-    limits = sides * np.array([ROWS_SHARE, COLUMNS_SHARE])
-    is_near = (nearest - sides).op("Abs").op("LessOrEqual", limits)
-    network_size = is_near.op("Where", nearest, sides).cast(np.int64)
-
-    if isinstance(generator, SelectionGenerator):
-        return _generate_by_selection(left, size, network_size, generator)
-    example = _example_image(multiple)
-    image = _resize_image(left, network_size) * _2 - _1
-    network = convert_network(generator, [example], multiple)
-    (output,) = left.graph.call(network, _pad_by_reflection(image, network_size, multiple))
-    right = (output + _1).slice([0, 0], network_size, [2, 3]) / _2
-    return _Generated(_resize_image(right, size))
-
-
-def _generate_by_selection(
-    left: Value, size: Value, network_size: Value, generator: SelectionGenerator
-) -> _Generated:
-    """Add a generator that selects to a graph.
-
-    ``size``: rows and columns of ``left``; ``network_size``: those to which the network's input is
-    resized before it is padded.
-    """
-    multiple = generator.config.side_multiple_px
-    even_size = (network_size / 2 * 2).op("Max", 2)  # logits stand for two rows and two columns
-    image = _pad_by_reflection(_resize_image(left, even_size), even_size, multiple)
-    network = convert_network(
-        DynamicSelection(generator).eval(), [_example_image(multiple)], multiple
-    )
-    outputs = left.graph.call(network, image)
-    log_px, sky, disparity_confidence, right_log_px, right_sky = (
-        _resize_map(output.slice([0, 0], even_size / 2, [1, 2]), size) for output in outputs[:5]
-    )
-    street_probability = outputs[5] if generator.config.with_street else None
-
-    # The left view.
-    scale = _width_ratio(size, even_size)
-    is_sky = sky.op("Greater", _HALF)
-    not_sky = sky * np.float32(-1) + _1
-    confidence = is_sky.op("Where", sky, disparity_confidence * not_sky)
-    left_maps = _Maps(log_px.op("Exp") * scale, confidence, is_sky.cast(np.float32))
-
-    # The right view; the sky is not shifted.
-    is_right_sky = right_sky.op("Greater", _HALF)
-    right_px = is_right_sky.op("Where", _0, right_log_px.op("Exp") * scale)
-    return _Generated(_warp_left_to_right(left, right_px, size), left_maps, street_probability)
-
-
-def _warp_left_to_right(left: Value, right_px: Value, size: Value) -> Value:
-    """Sample left views at ``x + disparity``; beyond the border the border repeats."""
-    graph = left.graph
-    row, column = (
-        graph.op("Range", 0, _side(size, axis).op("Squeeze", [0]), 1).cast(np.float32)
-        for axis in (0, 1)
-    )
-    # GridSample's coordinates: -1 and 1 are the outer borders of the image.
-    y, x = (
-        (values * _2 + _1) / _side(size, axis).cast(np.float32) - _1
-        for axis, values in enumerate((row.op("Unsqueeze", [1]), right_px + column))
-    )
-    shape = right_px.op("Shape")
-    coordinates = (values.op("Expand", shape).op("Unsqueeze", [-1]) for values in (x, y))
-    grid = graph.op("Concat", *coordinates, axis=-1)
-    return left.op("GridSample", grid, mode="bilinear", padding_mode="border", align_corners=0)
-
-
-def _example_image(multiple: int) -> Tensor:
-    """Make an image of sides that are multiples, by which a generator's network is traced."""
-    return torch.rand(2, 3, 2 * multiple, 3 * multiple)
-
-
-def _pad_by_reflection(image: Value, size: Value, multiple: int) -> Value:
-    """Pad images of a size at the right and below, until both sides are multiples."""
-    lacking = (size + (multiple - 1)) / multiple * multiple - size
-    none = [0, 0]
-    pads = image.graph.op("Concat", none, none, none, lacking, axis=0)
-    return image.op("Pad", pads, mode="reflect")
-
-
-_IMAGES_SHAPE = ("batch", 3, "height", "width")
-_MAPS_SHAPE = ("batch", "height", "width")
-
-
-def image_graph(weights: DepthWeights) -> Graph:
-    """Make the graph of depth from one image: ``FakestereoNet.estimate`` without a right view.
-
-    Inputs are ``image`` (batch, 3, height, width; RGB in [0, 1]) and ``K`` (3, 3; float64, of all
-    images). Outputs are ``depth_m``, ``disparity_px`` (of the imitated rig, in the image's pixels),
-    ``confidence`` (each batch, height, width) and ``right``, the synthesised view; with networks
-    that recognise the sky also ``is_sky`` (batch, height, width; bool), and with weights that
-    recognise streets ``image_confidence`` (batch), the probability of a street.
-
-    Raises:
-        InputError: the weights have no generator, or no matcher where they need one.
-    """
-    generator = weights.generator
-    if generator is None or (weights.matcher is None and generator.config.answer != "own"):
-        raise InputError(
-            f"depth from one image needs a generator and a matcher, and these weights lack the "
-            f"{'generator' if generator is None else 'matcher'}; 'depthpose weights pack' makes "
-            "one file of both."
-        )
-    rig = generator.config
-    graph = Graph()
-    image = graph.input("image", np.float32, _IMAGES_SHAPE)
-    K = graph.input("K", np.float64, (3, 3)).op("Reshape", [-1])
-
-    # The virtual rig: the right view, and maps of the left one.
-    size = image.op("Shape", start=2, end=4)
-    focal_px = K.op("Gather", [4, 0])  # fy, fx
-    virtual_size = _size_at_focal_length(size, float(rig.virtual_focal_px), focal_px)
-    left = _resize_image(image, virtual_size)
-    right, generator_maps, street_probability = _generate(left, generator)
-    maps = generator_maps
-    if rig.answer == "matched":
-        assert weights.matcher is not None, "checked before"
-        maps = _match(left, right, np.array([rig.virtual_focal_px] * 2), weights.matcher)
-        if generator_maps is not None:
-            maps = maps._replace(sky=generator_maps.sky)
-    assert maps is not None
-
-    # Depth at the size of the image.
-    disparity_px = _resize_map(maps.disparity_px, size) * _width_ratio(size, virtual_size)
-    focal_m_px = K.op("Gather", 0).cast(np.float32) * np.float32(rig.virtual_baseline_m)
-    is_positive = disparity_px.op("Greater", _0)
-    depth_m = is_positive.op("Where", focal_m_px / disparity_px, _NAN)
-    if maps.sky is not None:
-        is_sky = _resize_map(maps.sky, size).op("Greater", _HALF)
-        depth_m = is_sky.op("Where", _NAN, depth_m)
-        disparity_px = is_sky.op("Where", focal_m_px / np.float32(SKY_M), disparity_px)
-        graph.output("is_sky", is_sky, np.bool_, _MAPS_SHAPE)
-    graph.output("depth_m", depth_m, np.float32, _MAPS_SHAPE)
-    graph.output("disparity_px", disparity_px, np.float32, _MAPS_SHAPE)
-    graph.output("confidence", _resize_map(maps.confidence, size), np.float32, _MAPS_SHAPE)
-    graph.output("right", _resize_image(right, size), np.float32, _IMAGES_SHAPE)
-    if street_probability is not None:
-        graph.output("image_confidence", street_probability, np.float32, ("batch",))
-    return graph
-
-
-def pair_graph(weights: DepthWeights) -> Graph:
-    """Make the graph of disparity of a rectified pair: ``FakestereoNet.estimate`` with ``right=``.
-
-    Inputs are ``left`` and ``right`` (batch, 3, height, width; RGB in [0, 1]), and ``K`` (3, 3;
-    float64) where the weights were trained at one focal length. Outputs are ``disparity_px`` and
-    ``confidence`` (batch, height, width), and with a network that recognises the sky ``is_sky``
-    (the same; bool), where disparity is 0.01 px. Elsewhere depth is ``fx * baseline / disparity``.
-
-    Raises:
-        InputError: the weights have no matcher, or one of a kind that is not exported.
-    """
-    if weights.matcher is None:
-        raise InputError("these weights hold no matcher, only a generator; give a matcher's.")
-    graph = Graph()
-    left = graph.input("left", np.float32, _IMAGES_SHAPE)
-    right = graph.input("right", np.float32, _IMAGES_SHAPE)
-    focal_px = None
-    if getattr(weights.matcher.config, "work_focal_px", None) is not None:
-        K = graph.input("K", np.float64, (3, 3))
-        focal_px = K.op("Reshape", [-1]).op("Gather", [4, 0])  # fy, fx
-    disparity_px, confidence, sky = _match(left, right, focal_px, weights.matcher)
-    if sky is not None:
-        is_sky = sky.op("Greater", _HALF)
-        disparity_px = is_sky.op("Where", np.float32(LEAST_PX), disparity_px)
-        graph.output("is_sky", is_sky, np.bool_, _MAPS_SHAPE)
-    graph.output("disparity_px", disparity_px, np.float32, _MAPS_SHAPE)
-    graph.output("confidence", confidence, np.float32, _MAPS_SHAPE)
-    return graph
-
-
-def _match(
-    left: Value, right: Value, focal_px: Value | np.ndarray | None, matcher: StereoNetwork
-) -> _Maps:
-    """Add a matcher to a graph, at the focal length of its training; maps have the images' size.
-
-    ``focal_px``: focal lengths of the images along rows and columns, where the matcher needs them.
-    """
-    if type(matcher) not in DYNAMIC_SHAPE_NETWORKS:
-        kinds = ", ".join(kind.__name__ for kind in DYNAMIC_SHAPE_NETWORKS)
-        raise InputError(
-            f"the matcher is {type(matcher).__name__}, and no file is made of it; give weights of "
-            f"one of {kinds}."
-        )
-    network = DYNAMIC_SHAPE_NETWORKS[type(matcher)](matcher).eval()
-    config = matcher.config
-    graph = left.graph
-    size = left.op("Shape", start=2, end=4)
-    work_size = size
-    if config.work_focal_px is not None:
-        assert focal_px is not None
-        work_size = _size_at_focal_length(size, float(config.work_focal_px), focal_px)
-
-    # Normalised images, padded above and at the right to the sides that the network takes.
-    min_side = config.min_side_px
-    step = config.step_px
-    padded_size = ((work_size + (step - 1)) / step * step).op("Max", min_side)
-    padding = padded_size - work_size
-    rows_above = _side(padding, 0)
-    columns_right = _side(padding, 1)
-    pads = graph.op("Concat", [0, 0], rows_above, [0, 0, 0, 0], columns_right, axis=0)
-    mean = np.array(IMAGENET_MEAN, np.float32)[:, None, None]
-    deviation = np.array(IMAGENET_STD, np.float32)[:, None, None]
-    padded = [
-        ((_resize_image(view, work_size) - mean) / deviation).op("Pad", pads)
-        for view in (left, right)
-    ]
-
-    example = [torch.rand(2, 3, min_side + step, min_side + 2 * step) for _ in range(2)]
-    outputs = graph.call(convert_network(network, example, step), *padded)
-
-    # Maps without the padding, at the size of the images.
-    first = graph.op("Concat", rows_above, [0], axis=0)
-    last = graph.op("Concat", [1 << 62], _side(work_size, 1), axis=0)
-    disparity_px, confidence, *sky = (
-        _resize_map(output.slice(first, last, [1, 2]), size) for output in outputs
-    )
-    is_sky = [values.op("Greater", _HALF).cast(np.float32) for values in sky]
-    return _Maps(disparity_px * _width_ratio(size, work_size), confidence, *is_sky)
-
 
 _LIMITS = {
     "depth_m": Limit(value=0.01, is_relative=True),
     "disparity_px": Limit(value=0.05),
-    # A plane counts as near the disparity or not: where it lies on that border, confidence jumps.
+    # Its mean: single values jump where a plane lies at the border of those that count as near.
     "confidence": Limit(value=1e-3, of="mean"),
     "right": Limit(value=1e-3),
     "image_confidence": Limit(value=1e-3),
 }
-_FLIPPED_SHARE = 1e-3
-"""Share of pixels that may be sky in one of two results, with all that follows from it."""
-_FLIPPING_LIMITS = {
-    name: limit if limit.of == "mean" else replace(limit, flips=_FLIPPED_SHARE)
+_MAX_FLIPPED_SHARE = 1e-3
+"""Share of pixels that may be sky in one result and not in the other, and so differ in all maps."""
+_SELECTING_LIMITS = {
+    name: limit if limit.of == "mean" else replace(limit, flips=_MAX_FLIPPED_SHARE)
     for name, limit in _LIMITS.items()
-} | {"is_sky": Limit(value=_FLIPPED_SHARE, of="mean")}
+} | {"is_sky": Limit(value=_MAX_FLIPPED_SHARE, of="mean")}
 """Limits of networks that choose between candidates: where two scores tie, the last bit decides."""
-_FLIPPING: tuple[type[StereoNetwork], ...] = (LightStereo,)
+_SELECTING_MATCHERS: tuple[type[StereoNetwork], ...] = (LightStereo,)
 """Matchers that choose between candidates."""
 
 
 @dataclass(frozen=True)
-class _Size:
+class _CaseSize:
     """Size and number of the images of a case."""
 
     rows: int
@@ -454,14 +50,14 @@ class _Size:
     count: int = 1
 
 
-_SIZES = (
-    _Size(256, 512, 1.0),
-    _Size(375, 1242, 2.0),
-    _Size(190, 300, 0.8, count=2),
-    _Size(233, 401, 1.3),
+_CASE_SIZES = (
+    _CaseSize(256, 512, 1.0),
+    _CaseSize(375, 1242, 2.0),
+    _CaseSize(190, 300, 0.8, count=2),
+    _CaseSize(233, 401, 1.3),
 )
-"""Multiples of the sides that networks take; sides that are stretched to them; images that are
-enlarged; and sides that are padded."""
+"""Sides that networks take; sides that are stretched to such; images that are enlarged; and sides
+that are padded."""
 _SHIFT_PX = 6
 """Disparity of the scenes at the network's focal length."""
 _SKY_COLOR = (0.72, 0.82, 0.95)
@@ -469,26 +65,25 @@ _SKY_COLOR = (0.72, 0.82, 0.95)
 _QUICK = MatcherConfig(speed="quick")
 """Graphs match pairs at the focal length of the weights' training, as this speed does."""
 _MIN_COMPARED_PX = 1.0
-"""Disparity from which depths are compared: below it depth hangs on the last bit of disparity."""
+"""Disparity from which depths are compared: below it depth depends on the last bit of disparity."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Target:
     """A kind of graph that weights are exported as."""
 
-    fits: Callable[[DepthWeights], bool]  # whether weights may be exported so by default
-    export: Callable[
-        [DepthWeights, dict[str, Any]], Export
-    ]  # takes weights, and facts for its user
+    fits: Callable[[DepthWeights], bool]  #: whether it is the default for weights
+    #: describes the export of weights, with facts for the user of the file
+    export: Callable[[DepthWeights, dict[str, Any]], Export]
 
 
-def depth_export(weights: DepthWeights, what: str | None, facts: dict[str, Any]) -> Export:
-    """Describe the export of weights: the graph, and the cases that prove it.
+def describe_export(weights: DepthWeights, what: str | None, facts: dict[str, Any]) -> Export:
+    """Describe the export of weights: the graph, and the cases that compare it with PyTorch.
 
     Args:
         weights: the networks.
         what: a key of ``TARGETS``; None: the first that fits the weights.
-        facts: facts of the weights, for the user of the file.
+        facts: facts of the weights, for the user of the file, by name.
 
     Raises:
         InputError: there is no such target.
@@ -500,89 +95,83 @@ def depth_export(weights: DepthWeights, what: str | None, facts: dict[str, Any])
 
 
 def _describe_pair_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
-    """Describe the export of a matcher: its graph, and cases by which the graph is proven."""
-
-    def cases() -> Iterator[Case]:
-        """Match synthetic pairs of several sizes by PyTorch."""
-        assert weights.matcher is not None
-        matcher = make_matcher(weights.matcher, _QUICK)
-        if isinstance(matcher, NetworkMatcher):
-            matcher.finds_range = False  # as in a graph
-        net = FakestereoNet(matcher)
-        outputs = ["disparity_px", "confidence"]
-        has_sky = getattr(weights.matcher.config, "with_sky", False)
-        if has_sky:
-            outputs.append("is_sky")
-        work_focal_px = weights.matcher.config.work_focal_px
-        for size in _SIZES:
-            left, right, camera = _make_scenes(size, work_focal_px or 1.0, with_sky=has_sky)
-            inputs = {"left": left.numpy(), "right": right.numpy()}
-            rig = None
-            if work_focal_px is not None:
-                rig = StereoRig(
-                    width=camera.width, height=camera.height, K=camera.K, baseline_m=0.5
-                )
-                inputs["K"] = camera.K.numpy()
-            pairs = (
-                StereoInput(name="proof", left=left_view, right=right_view, camera=rig)
-                for left_view, right_view in zip(left, right, strict=True)
-            )
-            estimates = [net.estimate_input(pair, with_check=False) for pair in pairs]
-            yield _make_case(inputs, estimates, outputs)
-
+    """Describe the export of a matcher: its graph, and cases that compare it with PyTorch."""
     return Export(
         graph=lambda: pair_graph(weights),
-        cases=cases,
-        limits=_FLIPPING_LIMITS if isinstance(weights.matcher, _FLIPPING) else _LIMITS,
+        cases=lambda: _make_pair_cases(weights),
+        limits=_SELECTING_LIMITS if isinstance(weights.matcher, _SELECTING_MATCHERS) else _LIMITS,
         facts={**facts, "what": "rectified pair, RGB in [0, 1] -> disparity [px], ..."},
     )
 
 
-def _describe_image_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
-    """Describe the export of a generator: its graph, and cases by which the graph is proven."""
-
-    def cases() -> Iterator[Case]:
-        """Estimate synthetic images of several sizes by PyTorch."""
-        assert weights.generator is not None
-        matcher = None if weights.matcher is None else make_matcher(weights.matcher, _QUICK)
-        # The scenes of the proof need not be like the images that the weights were trained on.
-        synthesiser = make_synthesiser(weights.generator, speed=_QUICK.speed)
-        net = FakestereoNet(matcher, synthesiser, allow_ood=True)
-        outputs = ["depth_m", "disparity_px", "confidence", "right"]
-        matcher_config = None if weights.matcher is None else weights.matcher.config
-        has_sky = isinstance(weights.generator, SelectionGenerator) or getattr(
-            matcher_config, "with_sky", False
+def _make_pair_cases(weights: DepthWeights) -> Iterator[Case]:
+    """Make cases of synthetic pairs of several sizes, with PyTorch's estimates."""
+    assert weights.matcher is not None
+    matcher = make_matcher(weights.matcher, _QUICK)
+    if isinstance(matcher, NetworkMatcher):
+        matcher.finds_range = False  # as in a graph
+    net = FakestereoNet(matcher)
+    outputs = ["disparity_px", "confidence"]
+    has_sky = getattr(weights.matcher.config, "with_sky", False)
+    if has_sky:
+        outputs.append("is_sky")
+    work_focal_px = weights.matcher.config.work_focal_px
+    for size in _CASE_SIZES:
+        left, right, camera = _make_scenes(size, work_focal_px or 1.0, with_sky=has_sky)
+        inputs = {"left": left.numpy(), "right": right.numpy()}
+        rig = None
+        if work_focal_px is not None:
+            rig = StereoRig(width=camera.width, height=camera.height, K=camera.K, baseline_m=0.5)
+            inputs["K"] = camera.K.numpy()
+        pairs = (
+            StereoInput(name="case", left=left_view, right=right_view, camera=rig)
+            for left_view, right_view in zip(left, right, strict=True)
         )
-        if has_sky:
-            outputs.append("is_sky")
-        if getattr(weights.generator, "street", None):
-            outputs.append("image_confidence")
-        focal_px = weights.generator.config.virtual_focal_px
-        for size in _SIZES:
-            images, _, camera = _make_scenes(size, focal_px, with_sky=has_sky)
-            inputs = {"image": images.numpy(), "K": camera.K.numpy()}
-            views = (
-                StereoInput(name="proof", left=view, right=None, camera=camera) for view in images
-            )
-            estimates = [net.estimate_input(view) for view in views]
-            case = _make_case(inputs, estimates, outputs)
-            is_compared = case.expected["disparity_px"] >= _MIN_COMPARED_PX
-            if has_sky:
-                is_compared = is_compared | case.expected["is_sky"]
-            yield replace(case, where={"depth_m": is_compared})
+        estimates = [net.estimate_input(pair, with_check=False) for pair in pairs]
+        yield _make_case(inputs, estimates, outputs)
 
+
+def _make_image_cases(weights: DepthWeights) -> Iterator[Case]:
+    """Make cases of synthetic images of several sizes, with PyTorch's estimates."""
+    assert weights.generator is not None
+    matcher = None if weights.matcher is None else make_matcher(weights.matcher, _QUICK)
+    # The scenes need not be like the images that the weights were trained on.
+    synthesiser = make_synthesiser(weights.generator, speed=_QUICK.speed)
+    net = FakestereoNet(matcher, synthesiser, allow_ood=True)
+    outputs = ["depth_m", "disparity_px", "confidence", "right"]
+    matcher_config = None if weights.matcher is None else weights.matcher.config
+    is_selecting = isinstance(weights.generator, SelectionGenerator)
+    has_sky = is_selecting or getattr(matcher_config, "with_sky", False)
+    if has_sky:
+        outputs.append("is_sky")
+    if getattr(weights.generator, "street", None):
+        outputs.append("image_confidence")
+    focal_px = weights.generator.config.virtual_focal_px
+    for size in _CASE_SIZES:
+        images, _, camera = _make_scenes(size, focal_px, with_sky=has_sky)
+        inputs = {"image": images.numpy(), "K": camera.K.numpy()}
+        views = (StereoInput(name="case", left=view, right=None, camera=camera) for view in images)
+        estimates = [net.estimate_input(view) for view in views]
+        case = _make_case(inputs, estimates, outputs)
+        is_compared = case.expected["disparity_px"] >= _MIN_COMPARED_PX
+        if has_sky:
+            is_compared = is_compared | case.expected["is_sky"]
+        yield replace(case, where={"depth_m": is_compared})
+
+
+def _describe_image_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
+    """Describe the export of a generator: its graph, and cases that compare it with PyTorch."""
     generator = weights.generator
     rig_facts: dict[str, Any] = {}
     if generator is not None:
         names = ("virtual_focal_px", "virtual_baseline_m", "answer")
         rig_facts = {name: getattr(generator.config, name) for name in names}
-    is_flipping = isinstance(generator, SelectionGenerator) or isinstance(
-        weights.matcher, _FLIPPING
-    )
+    has_selecting_matcher = isinstance(weights.matcher, _SELECTING_MATCHERS)
+    is_selecting = isinstance(generator, SelectionGenerator) or has_selecting_matcher
     return Export(
         graph=lambda: image_graph(weights),
-        cases=cases,
-        limits=_FLIPPING_LIMITS if is_flipping else _LIMITS,
+        cases=lambda: _make_image_cases(weights),
+        limits=_SELECTING_LIMITS if is_selecting else _LIMITS,
         facts={**facts, **rig_facts, "what": "image, RGB in [0, 1], and K [px] -> depth [m], ..."},
     )
 
@@ -599,7 +188,7 @@ TARGETS = {
 def _make_case(
     inputs: dict[str, np.ndarray], estimates: list[DepthEstimate], outputs: Sequence[str]
 ) -> Case:
-    """Make a case of inputs and of the outputs that PyTorch estimates from them."""
+    """Make a case of inputs and of the fields ``outputs`` of PyTorch's estimates from them."""
     expected: dict[str, np.ndarray] = {}
     for output in outputs:
         values = [torch.as_tensor(getattr(estimate, output)) for estimate in estimates]
@@ -609,9 +198,12 @@ def _make_case(
 
 
 def _make_scenes(
-    size: _Size, network_focal_px: float, *, with_sky: bool
+    size: _CaseSize, network_focal_px: float, *, with_sky: bool
 ) -> tuple[Tensor, Tensor, Camera]:
-    """Make left and right views of smooth noise, shifted by one disparity, and their camera."""
+    """Make left and right views of smooth noise, shifted by one disparity, and their camera.
+
+    ``network_focal_px``: focal length at which the network sees images.
+    """
     rows = size.rows
     columns = size.columns
     focal_px = size.focal_share * network_focal_px
@@ -624,7 +216,8 @@ def _make_scenes(
     noise = torch.rand(size.count, 3, rows // 6, columns // 6, generator=random)
     scene = F.interpolate(noise, (rows, columns + shift), mode="bicubic").clamp(0, 1)
     if with_sky:  # bright and nearly without texture, over the upper two fifths
-        top = rows * 2 // 5
-        sky = torch.tensor(_SKY_COLOR)[:, None, None] * torch.linspace(0.9, 1.0, top)[:, None]
-        scene[:, :, :top] = torch.lerp(scene[:, :, :top], sky, 0.97)
+        sky_rows = rows * 2 // 5
+        brightness = torch.linspace(0.9, 1.0, sky_rows)[:, None]
+        sky = torch.tensor(_SKY_COLOR)[:, None, None] * brightness
+        scene[:, :, :sky_rows] = torch.lerp(scene[:, :, :sky_rows], sky, 0.97)
     return scene[..., :columns].contiguous(), scene[..., shift:].contiguous(), camera

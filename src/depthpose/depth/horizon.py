@@ -24,6 +24,8 @@ _MAX_PIXELS = 500_000
 """Larger images are halved until they have fewer: edges in a street are long."""
 _MIN_CONTRAST = 0.012
 """Least contrast of an edge: change of grey from pixel to pixel; white is 1."""
+_SMOOTHING_PX = 1.0
+"""Standard deviation of the Gaussian that an image is smoothed by before its gradient is taken."""
 _MIN_COS_ANGLE = math.cos(math.radians(20))
 """Cosine of the largest angle between the gradients of two neighbours on one segment."""
 _MIN_LENGTH_PX = 20.0
@@ -51,14 +53,15 @@ _TILT_STEPS = np.linspace(-3.0, 3.0, 25)
 _ROLL_STEPS = np.linspace(-2.4, 2.4, 7)
 """Grid of angles: pans in degrees; tilts and rolls in standard deviations from those expected."""
 
-Segments = Float[np.ndarray, "n 5"]  # column, row of the middle; direction (x, y); length [px]
+Segments = Float[np.ndarray, "n 5"]
+"""Straight edges, one a row: column and row of the middle, direction (x, y), length [px]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Angles:
     """Tilt and roll of a camera against the road, with standard deviations.
 
-    Signs are those of :class:`~depthpose.depth.types.Ground`.
+    The tilt is positive where the camera looks up, the roll where the horizon falls to the right.
     """
 
     tilt_deg: float
@@ -70,10 +73,9 @@ class Angles:
 def find_segments(grey: Float[np.ndarray, "h w"]) -> Segments:
     """Find straight edges: chains of edge pixels whose gradients have nearly one direction.
 
-    A line is fitted to each chain by its moments; curved chains are left out. The longest segments
-    come first. ``grey``: black is 0, white 1.
+    Curved chains are left out. The longest segments come first. ``grey``: black is 0, white 1.
     """
-    smooth = ndimage.gaussian_filter(grey.astype(np.float32), 1.0)
+    smooth = ndimage.gaussian_filter(grey.astype(np.float32), _SMOOTHING_PX)
     gradient_x = np.zeros_like(smooth)
     gradient_x[:, 1:-1] = (smooth[:, 2:] - smooth[:, :-2]) / 2
     gradient_y = np.zeros_like(smooth)
@@ -96,7 +98,7 @@ def find_segments(grey: Float[np.ndarray, "h w"]) -> Segments:
     direction_y = gradient_y[rows, columns] / strength[rows, columns]
     chain_count, chains = _connect_edges(rows, columns, direction_x, direction_y, grey.shape)
 
-    # The top of a parabola through three strengths is the edge's place between pixels.
+    # Across the edge its place is refined to a fraction of a pixel.
     is_along_x = is_along_x[rows, columns]
     x = columns + np.where(is_along_x, _peak_offset(strength, rows, columns, 0, 1), 0)
     y = rows + np.where(is_along_x, 0, _peak_offset(strength, rows, columns, 1, 0))
@@ -115,15 +117,15 @@ def _connect_edges(
     Args:
         rows: rows of the edge pixels.
         columns: columns of the edge pixels.
-        direction_x: unit vectors of their gradients.
-        direction_y: the same along the columns.
+        direction_x: x of the unit vectors of their gradients.
+        direction_y: y of these unit vectors.
         shape: rows and columns of the image.
 
     Returns:
-        The number of chains, and the chain of each edge pixel.
+        The number of chains, and for each edge pixel the number of its chain, from 0.
     """
     count = len(rows)
-    # The index of the edge pixel at each place, -1 where there is none; a border of one pixel.
+    # The index of the edge pixel at each place, -1 where there is none; with a border of one pixel.
     index_at = np.full((shape[0] + 2, shape[1] + 2), -1)
     index_at[rows + 1, columns + 1] = np.arange(count)
 
@@ -146,9 +148,10 @@ def _connect_edges(
 
 
 def _fit_segments(x: np.ndarray, y: np.ndarray, chains: np.ndarray, chain_count: int) -> Segments:
-    """Fit a line to the points of each chain by their moments; give straight ones, longest first.
+    """Fit a line segment to each chain by the moments of its points; curved chains are left out.
 
-    ``chains``: the number of each point's chain, below ``chain_count``.
+    ``x`` and ``y``: the points [px]; ``chains``: the number of each point's chain, below
+    ``chain_count``. The longest segments come first.
     """
     size = np.bincount(chains, minlength=chain_count).astype(float)
     middle_x = np.bincount(chains, x, chain_count) / size
@@ -161,31 +164,35 @@ def _fit_segments(x: np.ndarray, y: np.ndarray, chains: np.ndarray, chain_count:
     yy = np.bincount(chains, from_middle_y * from_middle_y, chain_count) / size
     xy = np.bincount(chains, from_middle_x * from_middle_y, chain_count) / size
 
-    # Its axes: the eigenvalues are mean_variance +- difference. Of a uniform distribution over a
-    # length the variance is a twelfth of its square.
+    # The eigenvalues of the covariance are the variances along and across the segment. A uniform
+    # distribution over a length has the variance length^2 / 12.
     angle = np.arctan2(2 * xy, xx - yy) / 2
     mean_variance = (xx + yy) / 2
-    difference = np.hypot((xx - yy) / 2, xy)
-    length = np.sqrt(12 * (mean_variance + difference))
-    width = np.sqrt(12 * np.clip(mean_variance - difference, 0, None))
+    half_difference = np.hypot((xx - yy) / 2, xy)
+    length = np.sqrt(12 * (mean_variance + half_difference))
+    width = np.sqrt(12 * np.clip(mean_variance - half_difference, 0, None))
 
     max_width = np.maximum(_MAX_WIDTH_SHARE * length, _MIN_WIDTH_LIMIT_PX)
     is_straight = (length > _MIN_LENGTH_PX) & (width < max_width)
-    segments = np.stack([middle_x, middle_y, np.cos(angle), np.sin(angle), length], 1)[is_straight]
-    return segments[np.argsort(-segments[:, 4], kind="stable")]
+    columns = (middle_x, middle_y, np.cos(angle), np.sin(angle), length)
+    segments = np.stack(columns, 1)[is_straight]
+    longest_first = np.argsort(-segments[:, 4], kind="stable")
+    return segments[longest_first]
 
 
 def _peak_offset(
     strength: np.ndarray, rows: np.ndarray, columns: np.ndarray, step_y: int, step_x: int
 ) -> np.ndarray:
-    """Give where between pixels a parabola through three strengths is largest, -0.5 to 0.5.
+    """Compute how far from a pixel's centre the gradient is strongest, -0.5 to 0.5 [px].
 
-    The three are those of each pixel and of its neighbours a step before and after it.
+    That is the top of the parabola through the strengths of the pixel and of its neighbours a step
+    before and after it, along one axis.
     """
     before = strength[rows - step_y, columns - step_x]
     after = strength[rows + step_y, columns + step_x]
-    bend = before - 2 * strength[rows, columns] + after
-    return np.clip((before - after) / 2 / np.minimum(bend, -1e-9), -0.5, 0.5)
+    # a x^2 + b x + c has its top at -b / (2 a), with b = (after - before) / 2 and 2 a = curvature.
+    curvature = before - 2 * strength[rows, columns] + after
+    return np.clip((before - after) / 2 / np.minimum(curvature, -1e-9), -0.5, 0.5)
 
 
 def find_angles(image: View, camera: Camera, expected: Angles) -> Angles:
@@ -197,26 +204,27 @@ def find_angles(image: View, camera: Camera, expected: Angles) -> Angles:
         expected: the prior: mean and standard deviation without the image.
 
     Returns:
-        Mean and standard deviation of the posterior; the prior where there is no edge.
+        Mean and standard deviation of the posterior; those of the prior where there is no edge.
     """
-    # Segments in a smaller copy of a large image.
-    halvings = max(math.ceil(math.log2(image.shape[1] * image.shape[2] / _MAX_PIXELS) / 2), 0)
+    # Segments in a copy of the image, whose sides are halved until it has few enough pixels.
+    pixel_count = image.shape[1] * image.shape[2]
+    halvings = max(math.ceil(math.log2(pixel_count / _MAX_PIXELS) / 2), 0)
     scale = 2**halvings
     grey = grey_from_rgb(image.detach().cpu().float())
     if halvings:
         grey = torch.nn.functional.avg_pool2d(grey[None, None], scale)[0, 0]
     segments = find_segments(grey.numpy())[:_MAX_SEGMENTS]
-    # In pixels of the image: a pixel of the copy lies at the middle of a square of them.
+    # To pixels of the image: a pixel of the copy lies at the middle of a square of them.
     segments[:, :2] = (segments[:, :2] + 0.5) * scale - 0.5
     segments[:, 4] *= scale
 
-    # A grid of angles.
+    # The grid of pan, tilt and roll over which the posterior is summed.
     tilt_axis = expected.tilt_deg + _TILT_STEPS * expected.tilt_std_deg
     roll_axis = expected.roll_deg + _ROLL_STEPS * expected.roll_std_deg
     grid = np.meshgrid(_PANS_DEG, tilt_axis, roll_axis, indexing="ij")
     pans, tilts, rolls = (angles.ravel() for angles in grid)
 
-    # Its posterior: how well edges run to their vanishing points, times the normal priors.
+    # The posterior: how well edges run to their vanishing points, times the normal priors.
     log_likelihood = _log_likelihood(segments, camera, pans, tilts, rolls, _END_STD_PX * scale)
     squared_deviation = (
         (pans / _PAN_STD_DEG) ** 2
@@ -245,34 +253,49 @@ def _log_likelihood(
     rolls_deg: np.ndarray,
     end_std_px: float,
 ) -> Float[np.ndarray, " angles"]:
-    """Give the log likelihood of the directions of all segments, for each triple of angles.
+    """Compute the log likelihood of the directions of all segments, for each triple of angles.
 
     ``end_std_px``: standard deviation of the ends of a segment, in pixels of the image.
     """
-    # The three directions of a street in camera coordinates (x right, y down, z forward).
+    forward, down, right = _street_directions(pans_deg, tilts_deg, rolls_deg)
+
+    # Standard deviations of the segments' directions [rad]: of a line fit, and of what is built.
+    x, y, along_x, along_y, length = segments.astype(np.float32).T
+    direction_std = np.hypot(math.sqrt(12) * end_std_px / length, _DIRECTION_STD_RAD)
+
+    # The density of the angle between a segment and the line to a vanishing point: a mixture of one
+    # normal distribution for each of the three directions and a uniform one for all other segments,
+    # relative to 1 / pi, the density of the uniform one.
+    other_share = 1 - _FORWARD_SHARE - _UPRIGHT_SHARE - _ACROSS_SHARE
+    density = np.full((len(pans_deg), len(segments)), other_share, np.float32)
+    K = camera.K.numpy()
+    directions = ((forward, _FORWARD_SHARE), (down, _UPRIGHT_SHARE), (right, _ACROSS_SHARE))
+    for direction, share in directions:
+        # Homogeneous, for a vanishing point may be at infinity.
+        vanishing_point = (direction @ K.T).astype(np.float32)
+        to_x = vanishing_point[:, :1] - x * vanishing_point[:, 2:]
+        to_y = vanishing_point[:, 1:2] - y * vanishing_point[:, 2:]
+        sine = (along_x * to_y - along_y * to_x) / (np.hypot(to_x, to_y) + 1e-6)
+        peak = share * math.pi / (math.sqrt(2 * math.pi) * direction_std)
+        density += peak * np.exp(-0.5 * (sine / direction_std) ** 2)
+    return np.log(density).sum(1)
+
+
+def _street_directions(
+    pans_deg: np.ndarray, tilts_deg: np.ndarray, rolls_deg: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Compute the directions of a street in the camera's frame (x right, y down, z forward).
+
+    Returns:
+        Unit vectors forward along the street, down, and right across the street, each (angles, 3).
+    """
     pan = np.radians(pans_deg)
     tilt = np.radians(tilts_deg)
     roll = np.radians(rolls_deg)
     down = np.stack([-np.tan(roll), np.ones_like(roll), -np.tan(tilt)], 1)
     down /= np.linalg.norm(down, axis=1, keepdims=True)
+    # Forward is the part of the panned axis that is perpendicular to down.
     ahead = np.stack([np.sin(pan), np.zeros_like(pan), np.cos(pan)], 1)
     forward = ahead - (ahead * down).sum(1, keepdims=True) * down
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
-    right = np.cross(down, forward)
-
-    # Densities of the angles between segments and the lines to the vanishing points, relative to
-    # 1 / pi, the density of segments of any direction.
-    x, y, along_x, along_y, length = segments.astype(np.float32).T
-    deviation = np.hypot(math.sqrt(12) * end_std_px / length, _DIRECTION_STD_RAD)
-    other_share = 1 - _FORWARD_SHARE - _UPRIGHT_SHARE - _ACROSS_SHARE
-    density = np.full((len(pan), len(segments)), other_share, np.float32)
-    K = camera.K.numpy()
-    directions = ((forward, _FORWARD_SHARE), (down, _UPRIGHT_SHARE), (right, _ACROSS_SHARE))
-    for direction, share in directions:
-        point = (direction @ K.T).astype(np.float32)  # homogeneous, so it may be at infinity
-        to_x = point[:, :1] - x * point[:, 2:]
-        to_y = point[:, 1:2] - y * point[:, 2:]
-        sine = (along_x * to_y - along_y * to_x) / (np.hypot(to_x, to_y) + 1e-6)
-        peak = share * math.pi / (math.sqrt(2 * math.pi) * deviation)
-        density += peak * np.exp(-0.5 * (sine / deviation) ** 2)
-    return np.log(density).sum(1)
+    return forward, down, np.cross(down, forward)

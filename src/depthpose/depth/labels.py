@@ -68,25 +68,13 @@ def label_pairs(
     sources = {frames[index].name: frames[index].seen_files() for index in usable}
     claim_names(folder, sources, is_finished=partial(_is_labelled, folder))
 
-    def fail(error: InputError) -> None:
-        if failures is None:
-            raise error
-        failures.append(error)
-
     # The rigs first: calib.txt names all of them before there is any label.
     rigs: dict[int, StereoRig] = {}
     for index in usable:
-        name = frames[index].name
-        if any("\ud800" <= letter <= "\udfff" for letter in name):  # bytes that are no UTF-8
-            fail(InputError(f"{name!r}: not a name in UTF-8, as calib.txt needs; rename the file"))
-            continue
         try:
-            rig = dataset.read_rig(index)
+            rigs[index] = _read_named_rig(dataset, index)
         except InputError as error:
-            fail(error)
-            continue
-        assert rig is not None
-        rigs[index] = rig
+            _keep_or_raise(error, failures)
     if failures and not rigs:
         raise failures[0]
     rigs_by_name = {frames[index].name: rig for index, rig in rigs.items()}
@@ -102,7 +90,7 @@ def label_pairs(
             refuse_unrectified(pair)
             labelled_px = label_pair(net, pair, config)
         except InputError as error:
-            fail(error)
+            _keep_or_raise(error, failures)
             continue
         assert pair.right is not None
         files = [folder / part / f"{name}.png" for part in ("left", "right", "disp_occ")]
@@ -113,15 +101,37 @@ def label_pairs(
         yield name, float(labelled_px.isfinite().float().mean())
 
 
+def _keep_or_raise(error: InputError, failures: list[InputError] | None) -> None:
+    """Append an error to ``failures``; raise it where that is None."""
+    if failures is None:
+        raise error
+    failures.append(error)
+
+
+def _read_named_rig(dataset: Dataset, index: int) -> StereoRig:
+    """Read the rig of a frame, whose name can stand in calib.txt.
+
+    Raises:
+        InputError: the name is not UTF-8, or the calibration cannot be read.
+    """
+    name = dataset.frames[index].name
+    if any("\ud800" <= letter <= "\udfff" for letter in name):  # bytes that are no UTF-8
+        raise InputError(f"{name!r}: not a name in UTF-8, as calib.txt needs; rename the file")
+    rig = dataset.read_rig(index)
+    assert rig is not None, "the frame has a calibration"
+    return rig
+
+
 def _is_labelled(folder: Path, name: str) -> bool:
     """Whether an earlier run wrote all files of a pair."""
     return is_whole(folder, name, [f"disp_occ/{name}.png"])
 
 
 def label_pair(net: FakestereoNet, pair: StereoInput, config: LabelConfig) -> Map:
-    """Match a pair from left to right and from right to left, and give the left disparity [px].
+    """Estimate the disparity of the left view [px] where it is sure enough to serve as truth.
 
-    NaN where the two disagree, in the sky, and where the confidence is too low.
+    The pair is matched from left to right and from right to left. NaN where the two disagree, in
+    the sky, and where the confidence is too low.
     """
     assert pair.right is not None
     mirrored = replace(pair, left=pair.right.flip(-1), right=pair.left.flip(-1))
@@ -141,7 +151,11 @@ def label_pair(net: FakestereoNet, pair: StereoInput, config: LabelConfig) -> Ma
 
 
 def _write_calibration(path: Path, rigs: Mapping[str, StereoRig]) -> None:
-    """Write the line of each pair by its name, and keep the lines of other pairs."""
+    """Write ``calib.txt``, one line for each pair, by name; lines of other pairs are kept.
+
+    A line holds name, width, height, fx, cx, cy, baseline [m], fy, and cx of the right camera less
+    that of the left one; all but name, width, height and baseline [px].
+    """
     try:
         existing_lines = read_text(path).splitlines() if path.is_file() else []
     except InputError:  # damaged: the lines of these pairs are made again

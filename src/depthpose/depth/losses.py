@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from depthpose.depth.types import Maps, Views
@@ -16,9 +16,12 @@ HEAD_WEIGHTS = (0.5, 0.7, 1.0)
 def adversarial_loss(
     logits: Float[Tensor, "b 1 rows columns"], mode: str, *, is_real: bool
 ) -> Float[Tensor, ""]:
-    """Compute the loss of a discriminator's logits for a label ``is_real`` (eq. 2.4 of the thesis).
+    """Compute the mean loss of a discriminator's logits for one label (eq. 2.4 of the thesis).
 
-    ``mode`` is a key of ``ADVERSARIAL_LOSSES``. The generator trains with ``is_real=True``.
+    Args:
+        logits: logits that a patch or pixel is real.
+        mode: a key of ``ADVERSARIAL_LOSSES``.
+        is_real: the label. The generator is trained with True for its own views.
     """
     return ADVERSARIAL_LOSSES[mode](logits, torch.full_like(logits, float(is_real)))
 
@@ -33,10 +36,16 @@ ADVERSARIAL_LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 def disparity_loss(
     predicted_px: Maps, truth_px: Maps, max_px: int, *, sky_weight: float = 0.0
 ) -> Float[Tensor, ""]:
-    """Compute smooth L1 over the pixels with truth below ``max_px`` (eq. 2.6 of the thesis).
+    """Compute the mean smooth L1 loss of disparity [px] (eq. 2.6 of the thesis).
 
-    The truth of the sky is 0 and such a pixel has the weight ``sky_weight``; NaN has no truth. The
-    loss is 0 where no pixel has truth.
+    Args:
+        predicted_px: predicted disparity.
+        truth_px: true disparity; 0 in the sky, NaN where it is unknown.
+        max_px: truth from here on does not count.
+        sky_weight: weight of a pixel of the sky; other pixels with truth have the weight 1.
+
+    Returns:
+        The weighted mean over the pixels with truth; 0 where there is none.
     """
     is_valid = (truth_px > 0) & (truth_px < max_px)
     weights = is_valid.float() + sky_weight * (truth_px == 0)
@@ -49,36 +58,49 @@ def disparity_loss(
 def heads_loss(
     heads_px: Sequence[Maps], truth_px: Maps, max_px: int, *, sky_weight: float = 0.0
 ) -> Float[Tensor, ""]:
-    """Sum :func:`disparity_loss` over up to three heads, weighted by the last ``HEAD_WEIGHTS``."""
+    """Sum :func:`disparity_loss` over up to three heads, weighted by ``HEAD_WEIGHTS``.
+
+    With fewer than three heads, the last weights count.
+    """
     losses = [disparity_loss(head, truth_px, max_px, sky_weight=sky_weight) for head in heads_px]
     weights = HEAD_WEIGHTS[-len(losses) :]
     weighted = [weight * loss for weight, loss in zip(weights, losses, strict=True)]
     return torch.stack(weighted).sum()
 
 
+_MIN_PROBABILITY = 1e-4
+"""Added to probabilities, so that gradients of their logarithms are finite where they are 0."""
+
+
 def sky_loss(probability: Maps, truth_px: Maps) -> Float[Tensor, ""]:
-    """Average the cross entropy of the sky's probability over the pixels with truth (0: sky)."""
+    """Compute the mean binary cross entropy of the sky over the pixels with truth.
+
+    ``probability``: that a pixel shows the sky; ``truth_px``: 0 in the sky, NaN where unknown.
+    """
     has_truth = truth_px >= 0
     is_sky = truth_px == 0
     true_probability = torch.where(is_sky, probability, 1 - probability)
-    # Gradients stay finite where a probability is 0 in float32.
-    losses = torch.where(has_truth, -(true_probability + 1e-4).log(), 0.0)
+    losses = torch.where(has_truth, -(true_probability + _MIN_PROBABILITY).log(), 0.0)
     return losses.sum() / has_truth.sum().clamp(min=1)
 
 
 def log_disparity_loss(
     predicted_log_px: Maps, truth_px: Maps, range_px: tuple[float, float]
 ) -> Float[Tensor, ""]:
-    """Average the absolute error of the log of disparity, which is a relative error of depth.
+    """Compute the mean absolute error of the log of disparity, which is a relative error of depth.
 
-    Each image with truth counts the same, however sparse its truth is. Truth is clamped to
-    ``range_px``; NaN and the sky (0) do not count.
+    Each image with truth counts the same, however sparse its truth is.
+
+    Args:
+        predicted_log_px: natural logarithm of the predicted disparity [px].
+        truth_px: true disparity; 0 in the sky and NaN where unknown, which do not count.
+        range_px: least and largest disparity, to which the truth is clamped.
     """
-    truth = truth_px.nan_to_num(1.0).clamp(*range_px).log()
-    return _mean_of_images((predicted_log_px - truth).abs(), truth_px > 0)
+    true_log_px = truth_px.nan_to_num(1.0).clamp(*range_px).log()
+    return _average_images((predicted_log_px - true_log_px).abs(), truth_px > 0)
 
 
-def _mean_of_images(error: Tensor, has_truth: Tensor) -> Tensor:
+def _average_images(error: Maps, has_truth: Bool[Tensor, "b h w"]) -> Float[Tensor, ""]:
     """Average over the pixels with truth of each image, then over the images that have any."""
     counts = has_truth.sum((1, 2))
     means = torch.where(has_truth, error, 0.0).sum((1, 2)) / counts.clamp(min=1)
@@ -97,15 +119,15 @@ def plane_loss(
     truth_px: Float[Tensor, "b rows columns"],
     planes: Float[Tensor, " planes"],
 ) -> Float[Tensor, ""]:
-    """Average the cross entropy of the classes sky (0) and planes (1, 2, ...).
+    """Compute the mean cross entropy of the classes: the sky (0), and planes of disparity (1, ...).
 
-    A disparity between two planes has its probability divided between both, linearly. Each image
-    with truth counts the same, however sparse its truth is.
+    A true disparity between two planes divides the target probability between both, linearly in its
+    logarithm. Each image with truth counts the same, however sparse its truth is.
 
     Args:
         logits: logits of the classes.
-        truth_px: 0 in the sky, NaN where it is unknown.
-        planes: disparities, evenly spaced in their logarithm.
+        truth_px: true disparity; 0 in the sky, NaN where it is unknown.
+        planes: disparities of the planes [px], evenly spaced in their logarithm.
     """
     # The fractional number of the plane at the true disparity.
     is_sky = truth_px == 0
@@ -119,14 +141,16 @@ def plane_loss(
     lower_class = torch.where(is_sky, 0, lower_plane.long() + 1)[:, None]
 
     log_probabilities = logits.float().log_softmax(1)
-    lower = log_probabilities.gather(1, lower_class)[:, 0]
-    upper = log_probabilities.gather(1, lower_class + 1)[:, 0]
-    return _mean_of_images(-(lower * (1 - upper_share) + upper * upper_share), truth_px >= 0)
+    lower_log = log_probabilities.gather(1, lower_class)[:, 0]
+    upper_log = log_probabilities.gather(1, lower_class + 1)[:, 0]
+    cross_entropy = -(lower_log * (1 - upper_share) + upper_log * upper_share)
+    return _average_images(cross_entropy, truth_px >= 0)
 
 
-def view_loss(drawn: Views, real: Views) -> Float[Tensor, " b"]:
-    """Add L1 of a synthesised view and L1 of its horizontal gradient, for each image."""
-    colour = (drawn - real).abs().mean((1, 2, 3))
-    drawn_gradient = drawn[..., 1:] - drawn[..., :-1]
+def view_loss(synthesised: Views, real: Views) -> Float[Tensor, " b"]:
+    """Compute L1 of each synthesised view plus L1 of its horizontal gradient."""
+    colour_loss = (synthesised - real).abs().mean((1, 2, 3))
+    synthesised_gradient = synthesised[..., 1:] - synthesised[..., :-1]
     real_gradient = real[..., 1:] - real[..., :-1]
-    return colour + (drawn_gradient - real_gradient).abs().mean((1, 2, 3))
+    gradient_loss = (synthesised_gradient - real_gradient).abs().mean((1, 2, 3))
+    return colour_loss + gradient_loss

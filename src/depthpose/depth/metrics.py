@@ -39,7 +39,7 @@ def measure(of: Quantity, predicted: Numbers, true: Numbers) -> dict[str, float]
     """Compute all metrics of one quantity, by name, in the order of ``METRICS``.
 
     Args:
-        of: the quantity.
+        of: the quantity that is compared.
         predicted: its predicted values, already clamped as the protocol says; depth is positive and
             finite.
         true: its true values; depth is positive and finite.
@@ -62,19 +62,21 @@ def measure(of: Quantity, predicted: Numbers, true: Numbers) -> dict[str, float]
 
 
 def _end_point_error(p: Tensor, t: Tensor) -> float:
-    """Compute the mean absolute error of disparity [px]."""
+    """Compute the mean absolute error of disparity [px], from predicted ``p`` and true ``t``."""
     return float((p - t).abs().mean())
 
 
 def _bad_share(p: Tensor, t: Tensor) -> float:
-    """Give the share of disparities wrong by more than 3 px and by more than 5 % (KITTI's D1)."""
-    error = (p - t).abs()
-    return float(((error > 3) & (error > 0.05 * t)).double().mean())
+    """Compute KITTI's D1: the share of disparities off by more than 3 px and more than 5 %."""
+    error_px = (p - t).abs()
+    is_bad = (error_px > 3) & (error_px > 0.05 * t)
+    return float(is_bad.double().mean())
 
 
 def _share_within(p: Tensor, t: Tensor, factor: float) -> float:
-    """Give the share of depths whose ratio to the truth is below a factor."""
-    return float((torch.maximum(p / t, t / p) < factor).double().mean())
+    """Compute the share of depths with max(p / t, t / p) below a factor."""
+    ratio = torch.maximum(p / t, t / p)
+    return float((ratio < factor).double().mean())
 
 
 _within = [partial(_share_within, factor=1.25**k) for k in (1, 2, 3)]
@@ -109,24 +111,33 @@ RANKING: dict[Quantity, str] = {"depth": "abs_rel", "disparity": "epe_px"}
 
 
 def garg_crop(height: int, width: int) -> Bool[Tensor, "height width"]:
-    """Give the mask of Garg et al. (2016): the part of a KITTI image that an evaluation counts.
+    """Make the mask of Garg et al. (2016): True in the part of a KITTI image that counts.
 
     Its borders are rounded down as in the published script.
     """
     mask = torch.zeros(height, width, dtype=torch.bool)
     top = int(0.40810811 * height)
     bottom = int(0.99189189 * height)
-    mask[top:bottom, int(0.03594771 * width) : int(0.96405229 * width)] = True
+    left = int(0.03594771 * width)
+    right = int(0.96405229 * width)
+    mask[top:bottom, left:right] = True
     return mask
 
 
 def sparsification_area(error: Numbers, confidence: Numbers, steps: int = 50) -> float:
     """Compute AUSE, the area under the sparsification error (Ilg et al. 2018).
 
-    Pixels are removed in ``steps`` steps (0 %, 2 %, ...), once those of least confidence first and
-    once those of largest error first (the oracle). The result is the area between both curves of
-    the mean remaining error, divided by the mean error of all pixels: 0 for an oracle; for a
-    constant confidence the area between the oracle's curve and 1.
+    Pixels are removed step by step, once those of least confidence first, and once those of largest
+    error first (the oracle). Either way the mean error of the remaining pixels is a curve.
+
+    Args:
+        error: error of each pixel, of any unit.
+        confidence: its confidence, of any scale; only the order counts.
+        steps: number of steps; by default 0 %, 2 %, ..., 98 % of the pixels are removed.
+
+    Returns:
+        The area between both curves, divided by the mean error of all pixels: 0 for an oracle; for
+        a constant confidence the area between the oracle's curve and 1.
 
     Raises:
         InputError: no pixel at all.
@@ -142,21 +153,21 @@ def sparsification_area(error: Numbers, confidence: Numbers, steps: int = 50) ->
 
 
 def _sparsification_curve(error: Numbers, score: Numbers, steps: int) -> Float[Tensor, " steps"]:
-    """Give the mean error of the pixels that remain after each step, the lowest scores removed."""
+    """Compute the mean error of the pixels that remain at each step, the lowest scores removed."""
     descending = torch.argsort(score, descending=True)
     counts = torch.arange(1, len(error) + 1)
-    mean_of_first = _mean_of_equal(error, score)[descending].cumsum(0) / counts
+    mean_of_first = _average_ties(error, score)[descending].cumsum(0) / counts
     remaining = len(error) * (1 - torch.arange(steps, dtype=error.dtype) / steps)
     return mean_of_first[remaining.ceil().long().clamp(min=1) - 1]
 
 
 def score_confidence(error: Numbers, confidence: Numbers) -> dict[str, float]:
-    """Compare a confidence with an oracle and with chance; see :func:`sparsification_area`.
+    """Measure how well a confidence ranks errors; see :func:`sparsification_area`.
 
     Returns:
-        ``ause`` of the confidence, ``ause_random`` of one that knows nothing, and their ratio
-        ``ause_share``: 0 an oracle, 1 no better than chance, above 1 misleading. Where all errors
-        are equal every order is as good as the oracle's, and the share is 0.
+        ``ause`` of the confidence; ``ause_random``, that of a constant confidence; and their ratio
+        ``ause_share``: 0 for an oracle, 1 for chance, above 1 for a misleading confidence. Where
+        all errors are equal every order is as good as the oracle's, and the share is 0.
     """
     ause = sparsification_area(error, confidence)
     ause_random = sparsification_area(error, torch.zeros_like(error))
@@ -165,17 +176,17 @@ def score_confidence(error: Numbers, confidence: Numbers) -> dict[str, float]:
 
 
 def error_by_decile(error: Numbers, confidence: Numbers) -> Float[Tensor, "10"]:
-    """Give the mean error of each tenth of the pixels, from the least confidence to the largest.
+    """Compute the mean error of each tenth of the pixels, from the least confidence to the largest.
 
     Pixels of equal confidence share their mean error. NaN for a tenth without a pixel.
     """
     ascending = torch.argsort(confidence)
-    tenths = _mean_of_equal(error.double(), confidence)[ascending].tensor_split(10)
-    return torch.stack([tenth.mean() for tenth in tenths])
+    sorted_error = _average_ties(error.double(), confidence)[ascending]
+    return torch.stack([tenth.mean() for tenth in sorted_error.tensor_split(10)])
 
 
-def _mean_of_equal(error: Numbers, score: Numbers) -> Numbers:
-    """Give each pixel the mean error of all pixels of its score, so that ties have no order."""
+def _average_ties(error: Numbers, score: Numbers) -> Numbers:
+    """Replace each error by the mean over all pixels of its score: ties then have no order."""
     values, group = score.unique(return_inverse=True)
     zeros = torch.zeros(len(values), dtype=error.dtype)
     counts = zeros.index_add(0, group, torch.ones_like(error))
@@ -183,7 +194,7 @@ def _mean_of_equal(error: Numbers, score: Numbers) -> Numbers:
     return (sums / counts)[group]
 
 
-def view_errors(drawn: View, real: View) -> dict[str, float]:
+def view_errors(synthesised: View, real: View) -> dict[str, float]:
     """Compare a synthesised right view with the real one, both RGB in [0, 1].
 
     Returns:
@@ -191,9 +202,9 @@ def view_errors(drawn: View, real: View) -> dict[str, float]:
         ``right_sharpness``: mean absolute gradient as a share of that of the real view: 1 is as
         sharp, less is blurred.
     """
-    difference = drawn.double() - real.double()
+    difference = synthesised.double() - real.double()
     mean_square = difference.square().mean().clamp(min=1e-12)
-    sharpness = _mean_gradient(drawn) / _mean_gradient(real).clamp(min=1e-12)
+    sharpness = _mean_gradient(synthesised) / _mean_gradient(real).clamp(min=1e-12)
     return {
         "right_l1": float(difference.abs().mean()),
         "right_psnr_db": float(-10 * torch.log10(mean_square)),
@@ -202,7 +213,7 @@ def view_errors(drawn: View, real: View) -> dict[str, float]:
 
 
 def _mean_gradient(image: View) -> Float[Tensor, ""]:
-    """Give the mean absolute difference of neighbours in a row plus that of those in a column."""
+    """Compute the mean absolute difference of neighbours in rows, plus that of those in columns."""
     along_rows = image.diff(dim=2).abs().double().mean()
     along_columns = image.diff(dim=1).abs().double().mean()
     return along_rows + along_columns

@@ -74,31 +74,31 @@ class _EstimateFile(NamedTuple):
 
 
 def _make_cloud(estimate: DepthEstimate, options: _FileOptions) -> files.PointCloud | None:
-    """Make the cloud of an estimate, if one is asked for."""
+    """Make the cloud of an estimate; None where none is to be written."""
     if options.cloud_m is None:
         return None
     return estimate.cloud(options.cloud_m, options.min_confidence)
 
 
 def _encode_warning(estimate: DepthEstimate, _: _FileOptions) -> bytes | None:
-    """Encode the warning of an estimate as a line of text."""
+    """Encode the warning of an estimate as a line of text; None where it has none."""
     return f"{estimate.warning}\n".encode() if estimate.warning else None
 
 
 def _round_ground(estimate: DepthEstimate, _: _FileOptions) -> dict[str, float] | None:
-    """Round the values of a road to the digits that are the same in every run."""
+    """Round the values of the road, by name, to digits that every run repeats; None without one."""
     if estimate.ground is None:
         return None
     return {name: round(value, _DECIMALS) for name, value in asdict(estimate.ground).items()}
 
 
 def _draw_sky(estimate: DepthEstimate, _: _FileOptions) -> View | None:
-    """Draw the sky white, and all else black."""
+    """Draw the sky white, and all else black; None where the sky is not recognised."""
     return None if estimate.is_sky is None else estimate.is_sky.float().expand(3, -1, -1)
 
 
 def _draw_colors(estimate: DepthEstimate, options: _FileOptions) -> View:
-    """Draw the depth of an estimate, or its disparity where it has no depth."""
+    """Draw the depth of an estimate in colours, or its disparity where it has no depth."""
     if estimate.depth_m is None:
         return draw_disparity(estimate.disparity_px, is_sky=estimate.is_sky)
     return draw_depth(estimate.depth_m, *options.range_m)
@@ -132,7 +132,7 @@ def write_estimate(
     cloud_m: float | None = None,
     min_confidence: float | None = None,
 ) -> list[Path]:
-    """Write the files of one estimate, and give their paths; the disparity comes last.
+    """Write the files of one estimate, and return their paths; the disparity comes last.
 
     They are called ``NAME.ENDING``, with the ``ENDINGS`` of what the estimate has.
 
@@ -177,7 +177,7 @@ def has_prediction(folder: Path, name: str, *, of_disparity: bool = False) -> bo
 def read_disparity(
     folder: Path, name: str, camera: Camera | None, *, with_disparity_png: bool = False
 ) -> Map:
-    """Read one predicted disparity, of ours or of another method [px at the map's own width].
+    """Read one predicted disparity, of ours or of another method [px of the map's own width].
 
     ``NAME.disparity_px.npy`` (or ``.pfm``) comes first; without it, the depth that
     :func:`read_depth` reads is converted by the rig. A pixel without a prediction is NaN. Depth of

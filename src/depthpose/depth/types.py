@@ -49,8 +49,8 @@ class StereoTruth:
 class StereoSample:
     """One sample of a dataset."""
 
-    input: StereoInput
-    truth: StereoTruth
+    input: StereoInput  #: what an estimator may use
+    truth: StereoTruth  #: what its estimate is compared with
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -85,7 +85,7 @@ class Match:
 class Ground:
     """The road as a plane below a camera: fitted to one depth map, or combined from all cues.
 
-    The latter is the camera's mount (``find_mount`` of ``depth/ground.py``).
+    The latter is the camera's mount (``find_mount`` of ``depth/mount.py``).
     """
 
     height_m: float  #: height of the camera above the plane
@@ -98,7 +98,7 @@ class Ground:
     tilt_std_deg: float  #: standard deviation of the tilt
 
     def __str__(self) -> str:
-        """Give height, tilt and roll in one line of text."""
+        """Return height, tilt and roll in one line of text."""
         return (
             f"road {self.height_m:.2f} +- {self.height_std_m:.2f} m below the camera, tilt "
             f"{self.tilt_deg:.1f} +- {self.tilt_std_deg:.1f} degrees, roll {self.roll_deg:.1f}"
@@ -131,7 +131,7 @@ class DepthEstimate:
     input: StereoInput | None = None
 
     def is_sure(self, min_confidence: float | None = None) -> Mask:
-        """Give the pixels that have depth of at least a confidence.
+        """Find the pixels that have depth, and a confidence that is high enough.
 
         Without depth those with disparity count. Without a confidence all of them are sure.
 
@@ -149,7 +149,7 @@ class DepthEstimate:
         return is_estimated & (self.confidence >= min_confidence)
 
     def cloud(self, far_m: float = 80.0, min_confidence: float | None = None) -> PointCloud:
-        """Give the coloured points nearer than ``far_m``, in metres in the left camera's frame.
+        """Back-project depth to coloured points [m] in the left camera's frame.
 
         Args:
             far_m: points farther than this are left out.
@@ -171,7 +171,7 @@ class DepthEstimate:
         return PointCloud(points=points_m[is_included].float(), color=color[is_included])
 
     def to_open3d(self, far_m: float = 80.0) -> Any:  # noqa: ANN401  Open3D carries no types
-        """Give :meth:`cloud` as ``open3d.geometry.PointCloud`` (extra ``open3d``).
+        """Convert :meth:`cloud` to an ``open3d.geometry.PointCloud`` (extra ``open3d``).
 
         Raises:
             InputError: as :meth:`cloud`.
@@ -180,7 +180,7 @@ class DepthEstimate:
         return self.cloud(far_m).to_open3d()
 
     def __repr__(self) -> str:
-        """Give size, range of depth, confidence and warning in one line of text."""
+        """Return size, range of depth, confidence and warning in one line of text."""
         height, width = self.disparity_px.shape
         if self.depth_m is not None:
             quantity = "depth"

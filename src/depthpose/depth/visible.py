@@ -36,11 +36,11 @@ _ROUNDING_STD = 0.5 / 255
 """Standard deviation of grey values that rounding to 8 bits can make: half a level."""
 
 
-def without_picture(image: Float[Tensor, "3 h w"]) -> Bool[Tensor, "h w"]:
-    """Find blank borders, which show nothing of the scene.
+def find_blank_borders(image: Float[Tensor, "3 h w"]) -> Bool[Tensor, "h w"]:
+    """Find blank borders, which show nothing of the scene; True where a pixel belongs to one.
 
     These are bars of one colour along whole sides (letterboxes), dark or at two opposite sides, and
-    black regions along the border, as rectification leaves them.
+    black regions along the border, as rectification leaves them. ``image``: RGB in [0, 1].
     """
     height, width = image.shape[1:]
     is_blank = torch.zeros(height, width, dtype=torch.bool, device=image.device)
@@ -57,37 +57,44 @@ def without_picture(image: Float[Tensor, "3 h w"]) -> Bool[Tensor, "h w"]:
     return is_blank if picture_share >= _MIN_PICTURE_SHARE else torch.zeros_like(is_blank)
 
 
-def _find_black_border(is_black: np.ndarray) -> np.ndarray:
+def _find_black_border(is_black: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Find the black regions that rectification leaves, but not dark objects at the border.
 
     The picture of a rectified image is bulged or cut straight: a black region beside it reaches a
     corner of the image or along half a side, and has no holes.
     """
     height, width = is_black.shape
-    sides = (is_black[0], is_black[-1], is_black[:, 0], is_black[:, -1])
-    if not any(side.any() for side in sides):
+    if not any(side.any() for side in _sides(is_black)):
         return np.zeros_like(is_black)
     # Pixels with nothing but black between them and a side of the image.
-    from_side = np.zeros_like(is_black)
+    is_black_to_side = np.zeros_like(is_black)
     for axis in (0, 1):
-        from_side |= np.logical_and.accumulate(is_black, axis)
-        from_side |= np.flip(np.logical_and.accumulate(np.flip(is_black, axis), axis), axis)
+        to_first = np.logical_and.accumulate(is_black, axis)
+        to_last = np.flip(np.logical_and.accumulate(np.flip(is_black, axis), axis), axis)
+        is_black_to_side |= to_first | to_last
 
-    regions, count = cast("tuple[np.ndarray, int]", ndimage.label(is_black))
-    corners = regions[[0, 0, -1, -1], [0, -1, 0, -1]]
-    area_px = np.bincount(regions.ravel(), minlength=count + 1)
-    filled_px = np.bincount(regions[from_side], minlength=count + 1)
-    reaches = np.isin(np.arange(count + 1), corners)
-    for side in (regions[0], regions[-1], regions[:, 0], regions[:, -1]):
-        reaches |= np.bincount(side, minlength=count + 1) > len(side) / 2
-    is_border = reaches & (area_px >= _MIN_REGION_SHARE * height * width)
+    # Label 0 is what is not black; the regions follow.
+    labels, region_count = cast("tuple[np.ndarray, int]", ndimage.label(is_black))
+    count = region_count + 1
+    corner_labels = labels[[0, 0, -1, -1], [0, -1, 0, -1]]
+    is_border = np.isin(np.arange(count), corner_labels)
+    for side in _sides(labels):
+        is_border |= np.bincount(side, minlength=count) > len(side) / 2
+    area_px = np.bincount(labels.ravel(), minlength=count)
+    filled_px = np.bincount(labels[is_black_to_side], minlength=count)
+    is_border &= area_px >= _MIN_REGION_SHARE * height * width
     is_border &= filled_px >= _MIN_FILLED_SHARE * area_px
-    is_border[0] = False  # label 0: not black
-    return ndimage.binary_dilation(is_border[regions], iterations=_MIXED_BORDER_PX)
+    is_border[0] = False
+    return ndimage.binary_dilation(is_border[labels], iterations=_MIXED_BORDER_PX)
+
+
+def _sides(values: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return the first and the last row, and the first and the last column, of an image."""
+    return values[0], values[-1], values[:, 0], values[:, -1]
 
 
 def _count_bar_rows(image: Float[Tensor, "3 _ _"]) -> tuple[int, int]:
-    """Count the rows of the bars at the top and the bottom, 0 where there is none.
+    """Count the rows of the bars at the top and the bottom; 0 where there is no bar.
 
     A bar has one colour, and ends at a row of several colours, which tells it from a ramp of
     brightness. A bar that is not dark counts only where there is one at the other end too.
@@ -106,26 +113,28 @@ def _count_bar_rows(image: Float[Tensor, "3 _ _"]) -> tuple[int, int]:
 
 
 def _count_first_rows(lowest: Float[Tensor, "3 rows"], highest: Float[Tensor, "3 rows"]) -> int:
-    """Count the first rows of one colour if they are a bar, else 0.
+    """Count the rows of a bar that begins at the first row; 0 if there is none.
 
-    ``lowest`` and ``highest``: the range of each channel in each row.
+    ``lowest`` and ``highest``: least and largest value of each channel in each row.
     """
     rows = lowest.shape[1]
-    is_same = (highest - lowest[:, :1] <= _MAX_VARIATION) & (
-        highest[:, :1] - lowest <= _MAX_VARIATION
-    )
-    count = int(is_same.all(0).long().cumprod(0).sum())
+    # Rows whose values differ little from all those of the first row.
+    is_below_limit = highest - lowest[:, :1] <= _MAX_VARIATION
+    is_above_limit = highest[:, :1] - lowest <= _MAX_VARIATION
+    is_like_first = (is_below_limit & is_above_limit).all(0)
+    count = int(is_like_first.long().cumprod(0).sum())
     if count == rows or count < max(2, _MIN_BAR_SHARE * rows):
         return 0
     has_colours_after = float((highest - lowest)[:, count].amax()) > _MAX_VARIATION
     return count if has_colours_after else 0
 
 
-def texture(image: Float[Tensor, "3 h w"]) -> Float[Tensor, "h w"]:
-    """Give how much texture there is around each pixel, by which it can be matched: 0 to 1.
+def measure_texture(image: Float[Tensor, "3 h w"]) -> Float[Tensor, "h w"]:
+    """Measure the texture around each pixel, by which it can be matched: 0 (none) to 1 (enough).
 
-    It is 0 where the patch around a pixel is plain, such as on a wall or where it is over-exposed,
-    and 1 where the standard deviation of its grey values is larger than rounding makes it.
+    The measure is the standard deviation of the grey values in the patch around a pixel, as a share
+    of what rounding to 8 bits makes of it, up to 1. It is 0 on plain walls and where the image is
+    over-exposed.
     """
     grey = grey_from_rgb(image).float()
     radius = max(_MIN_RADIUS_PX, round(_RADIUS_SHARE * grey.shape[1]))

@@ -22,7 +22,7 @@ from depthpose.depth.config import (
     PSMNetConfig,
     SelectionConfig,
 )
-from depthpose.depth.synthesis import Generator, SelectionGenerator, UNetGenerator
+from depthpose.depth.generators import Generator, SelectionGenerator, UNetGenerator
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +30,7 @@ class GeneratorKind:
     """Classes of one kind of network, by which its weights are read and written."""
 
     config: type  #: dataclass of the network's sizes and conventions, which its weights file holds
-    network: type  #: module that is made of a config, and has it as the attribute ``config``
+    network: type  #: module that is built from a config, and has it as the attribute ``config``
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,8 +62,11 @@ GENERATORS = {
 """Kinds of generators with weights."""
 
 
-def _list_kinds() -> dict[str, GeneratorKind]:
-    """List all kinds of networks, the generators first; users may have added to ``MATCHERS``."""
+def _all_kinds() -> dict[str, GeneratorKind]:
+    """Return all kinds of networks by name, generators first.
+
+    They are joined at each call, for users may add to ``MATCHERS``.
+    """
     return {**GENERATORS, **MATCHERS}
 
 
@@ -84,29 +87,29 @@ def read_depth_weights(
 
     Args:
         path: the file.
-        use: build only the networks that this takes, if the file holds both; None: all.
+        use: build only the networks that this use takes, if the file holds both; None: all.
         answer: where depth of one image is to come from, in place of what the weights say.
 
     Raises:
         InputError: not such weights, or weights that do not fit their own config.
     """
     checkpoint = checkpoints.read_checkpoint(path)
-    if checkpoint.kind not in (*_list_kinds(), BOTH):
+    if checkpoint.kind not in (*_all_kinds(), BOTH):
         raise InputError(
             f"{path}: holds weights of kind {checkpoint.kind!r}; depth takes "
-            f"{', '.join(map(repr, _list_kinds()))} or {BOTH!r}."
+            f"{', '.join(map(repr, _all_kinds()))} or {BOTH!r}."
         )
     is_both = checkpoint.kind == BOTH
     parts = _split(checkpoint, path) if is_both else {checkpoint.kind: checkpoint}
 
-    # Generators come first, for with one that answers depth itself single images need no matcher.
+    # Generators come first: with one that estimates disparity itself, images need no matcher.
     networks: dict[str, Any] = {}
     for kind, part in parts.items():
         is_generator = kind in GENERATORS
         if use == "pairs" and is_both and is_generator:
             continue
         config = _read_network_config(kind, part.config, str(path))
-        make = partial(_list_kinds()[kind].network, config)
+        make = partial(_all_kinds()[kind].network, config)
         networks[kind] = checkpoints.build_network(make, part, str(path)).eval()
         if use == "images" and is_generator and (answer or config.answer) == "own":
             break
@@ -120,7 +123,7 @@ def read_depth_weights(
 def _split(checkpoint: checkpoints.Checkpoint, path: Path) -> dict[str, checkpoints.Checkpoint]:
     """Split the checkpoint of two networks into one for each, by kind, the generator first."""
     parts: dict[str, checkpoints.Checkpoint] = {}
-    for kind in _list_kinds():
+    for kind in _all_kinds():
         if kind not in checkpoint.config:
             continue
         config = checkpoint.config[kind]
@@ -143,11 +146,11 @@ def _split(checkpoint: checkpoints.Checkpoint, path: Path) -> dict[str, checkpoi
 
 def _read_network_config(kind: str, settings: Mapping[str, Any], source: str) -> Any:  # noqa: ANN401
     """Make the config of a network from the metadata of its file; ``source`` is for errors."""
-    return config_from_dict(settings, _list_kinds()[kind].config, source=source)
+    return config_from_dict(settings, _all_kinds()[kind].config, source=source)
 
 
 def settings_of(checkpoint: checkpoints.Checkpoint, source: str) -> dict[str, Any]:
-    """Give the settings of a file's networks, by kind where there are two.
+    """Return the settings of a file's networks, by kind where there are two.
 
     Settings that the file does not hold are at their defaults. ``source``: the file, for errors.
 
@@ -204,7 +207,7 @@ def write_depth_weights(
         with_half: store 16-bit floats: half the size.
     """
     networks: dict[str, Any] = {}
-    for kind, classes in _list_kinds().items():
+    for kind, classes in _all_kinds().items():
         for network in (generator, matcher):
             if isinstance(network, classes.network):
                 networks[kind] = network

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int, Int64
 from scipy import ndimage
 from torch import Tensor, nn
 
-from depthpose.core.arrays import Image
+from depthpose.core.arrays import IMAGENET_MEAN, IMAGENET_STD, Image
 from depthpose.core.checkpoint import (
     Checkpoint,
     build_network,
@@ -35,10 +35,6 @@ ENCODER_KIND = "resnet18"
 WIDTHS = (64, 128, 256, 512)  #: channels of the four stages in the published network
 
 Widths = tuple[int, int, int, int]
-MEAN = (0.485, 0.456, 0.406)
-STD = (0.229, 0.224, 0.225)
-"""Mean and deviation of ImageNet's colours in [0, 1]: published weights expect images normalised by
-them."""
 
 
 class BasicBlock(nn.Module):
@@ -94,8 +90,8 @@ class ResNet18(nn.Module):
 
 def normalise_colors(image: Float[Tensor, "*b 3 h w"]) -> Float[Tensor, "*b 3 h w"]:
     """Subtract ImageNet's mean from RGB in [0, 1], and divide by its standard deviation."""
-    mean = image.new_tensor(MEAN)[:, None, None]
-    std = image.new_tensor(STD)[:, None, None]
+    mean = image.new_tensor(IMAGENET_MEAN)[:, None, None]
+    std = image.new_tensor(IMAGENET_STD)[:, None, None]
     return (image - mean) / std
 
 

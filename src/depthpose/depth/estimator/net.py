@@ -1,7 +1,7 @@
 """The estimator: one image, or a rectified pair, to depth in metres.
 
-What is computed of a pair :mod:`depthpose.depth.estimator.pair` says, and of one image
-:mod:`depthpose.depth.estimator.single_image`; here networks are loaded and inputs read.
+Here networks are loaded and inputs read. The estimates themselves are computed by
+:mod:`depthpose.depth.estimator.pair` and :mod:`depthpose.depth.estimator.single_image`.
 """
 
 import warnings
@@ -32,16 +32,13 @@ from depthpose.core.files import read_exif_focal, rgb_from_picture
 from depthpose.depth.config import Answer, MatcherConfig, SGBMConfig
 from depthpose.depth.estimator.pair import depth_from_pair
 from depthpose.depth.estimator.single_image import depth_from_images, virtual_sizes
-from depthpose.depth.ground import MountFilter, scale_by_distance
+from depthpose.depth.generators import Generator, SelectionGenerator
+from depthpose.depth.mount import MountFilter, scale_by_distance
 from depthpose.depth.stereo import (
     Matcher,
     SGBMMatcher,
 )
-from depthpose.depth.synthesis import (
-    SelectionGenerator,
-    Synthesiser,
-    make_synthesiser,
-)
+from depthpose.depth.synthesis import Synthesiser, make_synthesiser
 from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.depth.weights import DepthWeights, Use, make_matcher, read_depth_weights
 
@@ -53,7 +50,7 @@ def as_input(
 
     Args:
         image: a picture, as :meth:`FakestereoNet.estimate` takes it.
-        name: what to call it in errors.
+        name: its name in errors.
         camera: its camera, or its focal length [px]; None: not known.
         with_exif: read the focal length from the picture's EXIF where ``camera`` is None, with a
             notice.
@@ -77,7 +74,7 @@ def _choose_matcher(
     loaded_matcher: DepthWeights | None,
     config: MatcherConfig | SGBMConfig | None,
 ) -> Matcher | None:
-    """Choose the matcher of an estimator: OpenCV's, the caller's own, that of weights, or none.
+    """Choose the matcher of an estimator: OpenCV's, the caller's, that of weights, or none.
 
     Args:
         weights: what :meth:`FakestereoNet.load` was asked for.
@@ -87,7 +84,7 @@ def _choose_matcher(
         config: how the matcher runs.
 
     Returns:
-        None where the generator answers depth itself and no matcher was asked for.
+        None where the generator estimates disparity itself and no matcher was asked for.
 
     Raises:
         InputError: there is no matcher, or one that the other arguments do not fit.
@@ -98,7 +95,7 @@ def _choose_matcher(
             f"config is of SGBM, but matcher is {matcher!r}; give matcher='sgbm' or a MatcherConfig"
         )
 
-    # OpenCV's, or the caller's own.
+    # OpenCV's, or the caller's.
     if matcher == "sgbm":
         if loaded is not None and generator is None:
             raise InputError(
@@ -125,6 +122,21 @@ def _choose_matcher(
     )
 
 
+def _choose_answer(generator: Generator | None, answer: Answer) -> None:
+    """Set where depth of one image comes from, in a generator's config.
+
+    Raises:
+        InputError: the generator cannot give that answer, or there is none.
+    """
+    if isinstance(generator, SelectionGenerator):
+        generator.config = replace(generator.config, answer=answer)
+    elif generator is None or answer != generator.config.answer:
+        raise InputError(
+            f"answer is {answer!r}, which takes the weights of a generator that selects; omit "
+            "it: these have no generator, or a U-Net, which estimates no disparity."
+        )
+
+
 DEFAULT = "default"
 """Name of the weights that are loaded where none are named."""
 
@@ -139,8 +151,8 @@ class FakestereoNet:
         net.estimate("left.png", "rig.json", right="right.png").depth_m
 
     Args:
-        matcher: pair to disparity; None where the synthesiser answers depth itself (its
-            ``answer`` is own), for single images only.
+        matcher: pair to disparity; None where the synthesiser estimates disparity itself (its
+            ``answer`` is ``own``), for single images only.
         synthesiser: left view to right view; None: only real pairs are estimated.
         terms: licence terms of the weights that bind their user; "": none.
         weights: name of the weights, for ``repr``.
@@ -174,7 +186,7 @@ class FakestereoNet:
         self.weights = weights
 
     def __repr__(self) -> str:
-        """Give one line: generator and matcher, weights, device."""
+        """Return generator and matcher, weights, and device as one line of text."""
         parts = [part for part in (self.synthesiser, self.matcher) if part is not None]
         facts = [" + ".join(type(part).__name__ for part in parts)]
         if self.weights:
@@ -197,53 +209,50 @@ class FakestereoNet:
     ) -> "FakestereoNet":
         """Build an estimator from weights, by file, folder, name or ``hf://OWNER/NAME``.
 
-        Weights whose terms bind the user say so (:class:`LicenceNotice`).
+        A :class:`LicenceNotice` names terms of the weights that bind the user.
 
         Args:
             weights: weights of both networks, of the generator alone (pairs then need a
                 ``matcher``), or of a matcher alone (real pairs only). None: ``default``, or
                 ``matcher`` alone. What names weights: ``core.checkpoint.find_weights``.
-            matcher: ``sgbm`` (OpenCV's), weights with a matcher by file or name, or any matcher of
-                your own. None: that of ``weights``.
+            matcher: ``sgbm`` (OpenCV's), weights with a matcher by file or name, or any object that
+                is a matcher. None: that of ``weights``.
             config: how the matcher runs.
             answer: where depth of one image comes from, in place of what the weights say
                 (:class:`~depthpose.depth.config.SelectionConfig`).
-            allow_ood: answer images unlike what the weights know too, with a ``warning``.
-            use: ``images`` or ``pairs``: build what these take alone, which is quicker. None: all.
+            allow_ood: estimate images unlike what the weights know too, with a ``warning``.
+            use: ``images`` or ``pairs``: build only the networks that these take, which is quicker.
+                None: all.
 
         Raises:
             InputError: no such weights, no matcher in them, or an ``answer`` that they cannot give.
         """
+        # The weights that are named, as generator and matcher.
         if weights is None and matcher is None:
             weights = DEFAULT
         loaded = None
+        loaded_matcher = None
+        loaded_files: list[tuple[str, DepthWeights]] = []
         if weights is not None:
             loaded = read_depth_weights(find_weights(weights), use=use, answer=answer)
+            loaded_files.append((str(weights), loaded))
         # A Path has a method 'match', so it would pass for a matcher: it is recognised first.
-        loaded_matcher = None
         if isinstance(matcher, str | Path) and matcher != "sgbm":
             loaded_matcher = read_depth_weights(find_weights(matcher), use="pairs")
-        files = [(weights, loaded), (matcher, loaded_matcher)]
-        loaded_files = [(name, networks) for name, networks in files if networks is not None]
+            loaded_files.append((str(matcher), loaded_matcher))
         terms = join_terms(*(networks.facts for _, networks in loaded_files))
         warn_of_terms({"terms": terms})
 
-        # The generator, with the caller's choice of where depth comes from.
+        # The networks that run, in place of the defaults as the caller chose.
         generator = None if loaded is None else loaded.generator
-        if answer is not None and isinstance(generator, SelectionGenerator):
-            generator.config = replace(generator.config, answer=answer)
-        elif answer is not None and (generator is None or answer != generator.config.answer):
-            raise InputError(
-                f"answer is {answer!r}, which takes the weights of a generator that selects; omit "
-                "it: these have no generator, or a U-Net, which estimates no disparity."
-            )
-
+        if answer is not None:
+            _choose_answer(generator, answer)
         chosen_matcher = _choose_matcher(weights, loaded, matcher, loaded_matcher, config)
         synthesiser = None
         if generator is not None:
             run_config = config if isinstance(config, MatcherConfig) else MatcherConfig()
             synthesiser = make_synthesiser(generator, run_config.device, run_config.speed)
-        names = " + ".join(str(name) for name, _ in loaded_files)
+        names = " + ".join(name for name, _ in loaded_files)
         return cls(chosen_matcher, synthesiser, terms=terms, weights=names, allow_ood=allow_ood)
 
     from_pretrained = load
@@ -281,9 +290,9 @@ class FakestereoNet:
                 scale of one image.
             mount: the same for all frames of one camera on one vehicle, taken in order: holds its
                 height and smooths its tilt.
-            name: what to call the input in errors; the file's name by default.
-            with_check: look first whether both images show one scene, rectified and in the right
-                order; where that cannot be told, the estimate has a ``warning``.
+            name: name of the input in errors; by default that of the file.
+            with_check: check first that both images show one scene, rectified and in the right
+                order; where that is uncertain, the estimate has a ``warning``.
 
         Raises:
             InputError: a file that cannot be read, sizes that disagree, a camera without what is
@@ -314,8 +323,13 @@ class FakestereoNet:
     ) -> DepthEstimate:
         """Estimate depth of one input whose images are read already, as :meth:`estimate` does.
 
-        How is said by ``depth_from_pair`` of ``depth/estimator/pair.py`` and
-        ``depth_from_images`` of ``depth/estimator/single_image.py``.
+        Args:
+            depth_input: one image, or a pair.
+            with_check: of a pair, as for :meth:`estimate`.
+            mount: of one image, as for :meth:`estimate`.
+
+        Raises:
+            InputError: as :meth:`estimate`.
         """
         return self._estimate_in_groups([depth_input], with_check=with_check, mount=mount)[0]
 
@@ -462,7 +476,7 @@ class FakestereoNet:
         return depth_from_pair(self.matcher, pair, with_check=with_check)
 
     def virtual_sizes(self, image: StereoInput) -> list[tuple[int, int]]:
-        """Give the sizes (rows, columns) at which the generator sees one image.
+        """Compute the sizes (rows, columns) at which the generator sees one image.
 
         Raises:
             InputError: there is no generator, or what
@@ -477,7 +491,7 @@ class FakestereoNet:
 
 
 def _named_batches(images: Iterable[object], batch: int) -> Iterator[list[tuple[str, object]]]:
-    """Yield lists of up to ``batch`` images, each with its number as its name."""
+    """Yield lists of up to ``batch`` images, each image with a name made of its number."""
     named = ((f"image {number}", image) for number, image in enumerate(images))
     while chunk := list(islice(named, batch)):
         yield chunk

@@ -1,4 +1,4 @@
-"""A rectified pair to depth: check it, find the range of its disparities, match, give metres."""
+"""A rectified pair to depth: check it, measure the range of its disparities, match, triangulate."""
 
 import math
 from dataclasses import replace
@@ -33,9 +33,9 @@ def depth_from_pair(
     Args:
         matcher: pair to disparity. A network that finds the range measures the disparities of the
             pair first, and matches within their range; the estimate's ``warning`` names what lies
-            beyond it. Any other searches from 0 px upwards.
+            beyond it. Any other matcher searches from 0 px upwards.
         pair: the images, and their rig where it is known.
-        with_check: look first whether it is a pair, as :func:`refuse_unrectified` does.
+        with_check: as for :func:`refuse_unrectified`.
 
     Returns:
         Depth, disparity and confidence of the left view.
@@ -105,7 +105,7 @@ def refuse_unrectified(pair: StereoInput, *, with_check: bool = True) -> str:
 
 
 def _cx_difference_px(pair: StereoInput) -> float:
-    """Give cx of the right camera less that of the left one [px]; 0 where no rig is known.
+    """Return cx of the right camera less that of the left one [px]; 0 where no rig is known.
 
     Raises:
         InputError: the views share nothing that is far away.

@@ -1,4 +1,4 @@
-"""One image to depth: synthesise its right view, match both, give metres, correct by the mount.
+"""One image to depth: synthesise its right view, match both, correct depth by the mount.
 
 Images are brought to the virtual rig that the generator imitates: its focal length and baseline.
 Those of one size go through the networks together.
@@ -15,7 +15,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.files.images import check_image
 from depthpose.depth.config import SelectionConfig
 from depthpose.depth.disparity import estimate_from_virtual, resize_image, size_at_focal_length
-from depthpose.depth.ground import MountFilter, scale_by_mount
+from depthpose.depth.mount import MountFilter, scale_by_mount
 from depthpose.depth.stereo import CameraMatcher, Matcher
 from depthpose.depth.synthesis import SynthesisedViews, Synthesiser
 from depthpose.depth.types import DepthEstimate, Match, StereoInput, Views
@@ -34,7 +34,7 @@ def depth_from_images(
 
     Args:
         synthesiser: left view to right view.
-        matcher: pair to disparity; None where the synthesiser answers disparity itself.
+        matcher: pair to disparity; None where the synthesiser estimates disparity itself.
         images: without right views, all of the same virtual sizes.
         sizes: these sizes, by :func:`virtual_sizes`.
         mount: mount of one camera, whose successive frames the images then are.
@@ -66,7 +66,7 @@ def depth_before_mount(
 
     Args:
         synthesiser: left view to right view.
-        matcher: pair to disparity; None where the synthesiser answers disparity itself.
+        matcher: pair to disparity; None where the synthesiser estimates disparity itself.
         images: without right views, all of the same virtual sizes.
         sizes: these sizes, by :func:`virtual_sizes`.
         allow_ood: estimate images unlike what the weights know too, with a ``warning``.
@@ -101,7 +101,7 @@ def depth_before_mount(
 def virtual_sizes(
     synthesiser: Synthesiser, image: StereoInput, *, allow_ood: bool = False
 ) -> list[tuple[int, int]]:
-    """Give the sizes (rows, columns) at which the generator sees one image.
+    """Compute the sizes (rows, columns) at which the generator sees one image.
 
     The first is the image's size at the virtual focal length; larger ones follow only where the
     image itself is at least as large.
@@ -145,14 +145,14 @@ def _match_views(
 ) -> list[Match]:
     """Match images with their synthesised views, or take the synthesiser's own disparity."""
     if synthesiser.config.answer != "matched":
-        assert views.disparity_px is not None, "it has an answer of its own"
+        assert views.disparity_px is not None, "its answer is its own disparity"
         assert views.confidence is not None
         maps = zip(views.disparity_px, views.confidence, strict=True)
         return [
             Match(disparity_px=disparity_px, confidence=confidence)
             for disparity_px, confidence in maps
         ]
-    assert matcher is not None, "without an answer of the synthesiser's there is one"
+    assert matcher is not None, "FakestereoNet checked it"
     camera = camera_of(synthesiser.config.virtual_focal_px, (left.shape[3], left.shape[2]))
     pairs = list(zip(left, views.right, strict=True))
     if isinstance(matcher, CameraMatcher):
@@ -161,7 +161,7 @@ def _match_views(
 
 
 def _image_confidence(views: SynthesisedViews, index: int) -> float | None:
-    """Give the generator's confidence in an image as a whole, 0..1; None where it has none."""
+    """Return the generator's confidence in an image as a whole, 0..1; None where it has none."""
     if views.street_probability is not None:
         return float(views.street_probability[index])
     if views.confidence is not None:
@@ -177,7 +177,7 @@ def _refuse_ood(
     Args:
         synthesiser: the synthesiser, whose config has the limit.
         name: name of the image, for the error.
-        image_confidence: how sure the generator is of the image as a whole, 0..1.
+        image_confidence: the generator's confidence in the image as a whole, 0..1.
         allow_ood: warn, and do not refuse.
 
     Returns:

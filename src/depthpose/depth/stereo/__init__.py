@@ -5,13 +5,13 @@ from depthpose.depth.stereo.light import LightStereo as LightStereo
 from depthpose.depth.stereo.matcher import CallableMatcher as CallableMatcher
 from depthpose.depth.stereo.matcher import CameraMatcher as CameraMatcher
 from depthpose.depth.stereo.matcher import Matcher as Matcher
-from depthpose.depth.stereo.matcher import NetworkMatcher as NetworkMatcher
-from depthpose.depth.stereo.matcher import SearchRange as SearchRange
 from depthpose.depth.stereo.matcher import SGBMMatcher as SGBMMatcher
-from depthpose.depth.stereo.matcher import StereoNetwork as StereoNetwork
 from depthpose.depth.stereo.matcher import check_pair as check_pair
 from depthpose.depth.stereo.matcher import fill_holes as fill_holes
-from depthpose.depth.stereo.matcher import normalise as normalise
+from depthpose.depth.stereo.network_matcher import NetworkMatcher as NetworkMatcher
+from depthpose.depth.stereo.network_matcher import SearchRange as SearchRange
+from depthpose.depth.stereo.network_matcher import StereoNetwork as StereoNetwork
+from depthpose.depth.stereo.network_matcher import normalise as normalise
 from depthpose.depth.stereo.psmnet import PSMNet as PSMNet
 from depthpose.depth.stereo.psmnet import PSMNetMatcher as PSMNetMatcher
 from depthpose.depth.stereo.psmnet import import_psmnet as import_psmnet

@@ -1,42 +1,28 @@
-"""Matchers: a function of the user's, OpenCV's StereoSGBM, and a network with weights.
+"""Matchers without weights: a function of the user's, and OpenCV's StereoSGBM.
 
-What networks share: normalisation, padding, the working focal length, the left-right check.
+:class:`Matcher` and :class:`CameraMatcher` say what every matcher has.
 """
 
-import math
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from copy import deepcopy
-from dataclasses import dataclass, replace
-from operator import itemgetter
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from depthpose.core.camera import Camera
-from depthpose.core.devices import usable_device, usable_precision
 from depthpose.core.errors import InputError, import_opencv
 from depthpose.core.files.images import check_image
-from depthpose.depth import disparity
-from depthpose.depth.config import MatcherConfig, NetworkConfig, SGBMConfig
-from depthpose.depth.synthesis import LiteEncoder
-from depthpose.depth.types import Map, Maps, Match, View, Views
-
-STEP_PX = 4
-"""Between neighbouring disparities that have a score, of every network here: their volumes are of a
-quarter of the image's size."""
+from depthpose.depth.config import SGBMConfig
+from depthpose.depth.types import Map, Match, View
 
 
 @runtime_checkable
 class Matcher(Protocol):
-    """Anything that turns a rectified pair into the disparity of its left image.
+    """Anything that estimates the disparity of the left image of a rectified pair.
 
-    A matcher may be a :class:`CameraMatcher` too, which is given several pairs at once and what
-    camera took them.
+    One that is a :class:`CameraMatcher` too is given several pairs at once, with their camera.
     """
 
     def match(self, left: Tensor, right: Tensor) -> Match:
@@ -50,20 +36,6 @@ class Matcher(Protocol):
             InputError: the images are no such pair, or this matcher cannot take them.
         """
         ...
-
-
-@dataclass(frozen=True, kw_only=True)
-class SearchRange:
-    """The size at which a pair is matched, and the disparities that are searched there."""
-
-    scale: float  #: rows and columns are so many times those of the images
-    first_px: int  #: the least disparity, in pixels at that scale, a multiple of 4
-    span_px: int  #: how many disparities are searched from there on
-
-    @property
-    def last_in_images_px(self) -> float:
-        """The largest disparity, in pixels of the images."""
-        return (self.first_px + self.span_px) / self.scale
 
 
 @runtime_checkable
@@ -85,7 +57,7 @@ class CameraMatcher(Matcher, Protocol):
         ...
 
     def work_size(self, camera: Camera) -> tuple[int, int]:
-        """Give the rows and columns at which the images of a camera are matched [px]."""
+        """Compute the rows and columns at which the images of a camera are matched [px]."""
         ...
 
 
@@ -97,9 +69,9 @@ class CallableMatcher:
         matcher = CallableMatcher(lambda left, right: my_network(left[None], right[None])[0])
 
     Args:
-        function: takes the two images and answers disparity [px] of the left one, ``(H, W)``,
-            as a tensor or array; NaN where it has no answer.
-        with_numpy_images: give the function ``(H, W, 3)`` arrays instead of tensors.
+        function: from the two images to the disparity [px] of the left one, ``(H, W)``, as a tensor
+            or array; NaN where it is unknown.
+        with_numpy_images: call the function with ``(H, W, 3)`` arrays instead of tensors.
     """
 
     def __init__(
@@ -114,24 +86,24 @@ class CallableMatcher:
         """Call the function, and refuse a result that is no disparity map.
 
         Raises:
-            InputError: unusable images, or an answer of another type or size, infinite, negative,
-                or without a single value.
+            InputError: unusable images, or a result of another type or size, infinite, negative, or
+                NaN everywhere.
         """
         check_pair(left, right)
         views = (left, right)
         if self.with_numpy_images:
             views = tuple(view.permute(1, 2, 0).cpu().numpy() for view in views)
-        answer = self.function(*views)
+        result = self.function(*views)
 
         # Refuse what is no map of numbers of the images' size.
-        if isinstance(answer, np.ndarray) and answer.dtype.kind in "fiu":
-            answer = torch.from_numpy(np.ascontiguousarray(answer, dtype=np.float32))
-        if not isinstance(answer, Tensor) or answer.is_complex():
+        if isinstance(result, np.ndarray) and result.dtype.kind in "fiu":
+            result = torch.from_numpy(np.ascontiguousarray(result, dtype=np.float32))
+        if not isinstance(result, Tensor) or result.is_complex():
             raise InputError(
-                f"the wrapped matcher answered {type(answer).__name__}; let it answer a tensor or "
+                f"the wrapped matcher answered {type(result).__name__}; let it answer a tensor or "
                 f"array of disparities"
             )
-        disparity_px = answer.detach().to(torch.float32)
+        disparity_px = result.detach().to(torch.float32)
         size = tuple(left.shape[-2:])
         if tuple(disparity_px.shape) != size:
             raise InputError(
@@ -147,8 +119,8 @@ class CallableMatcher:
             f"negative disparity (least {least_px:.4g} px); is the pair swapped? NaN says no "
             "answer": least_px < 0,
         }
-        for fault, is_there in faults.items():
-            if is_there:
+        for fault, is_present in faults.items():
+            if is_present:
                 raise InputError(f"the wrapped matcher answered {fault}")
         return Match(disparity_px=disparity_px)
 
@@ -171,9 +143,9 @@ def check_pair(left: object, right: object) -> None:
 
 
 class SGBMMatcher:
-    """A matcher that needs no weights; holes are NaN unless it fills them.
+    """OpenCV's StereoSGBM, which needs no weights. Its holes are NaN, unless they are filled.
 
-    OpenCV has no answer in the leftmost ``num_disparities`` columns.
+    The leftmost ``num_disparities`` columns are a hole.
 
     Raises:
         MissingExtraError: OpenCV is not installed.
@@ -184,7 +156,9 @@ class SGBMMatcher:
         self._cv2 = import_opencv("matching with StereoSGBM")
 
     def match(self, left: Tensor, right: Tensor) -> Match:
-        """Match one pair. With filled holes the confidence is 0 there and 1 elsewhere; else None.
+        """Match one pair.
+
+        With filled holes the confidence is 0 there and 1 elsewhere; else it is None.
 
         Raises:
             InputError: unusable images, or images narrower than the disparity range.
@@ -208,11 +182,7 @@ class SGBMMatcher:
             speckleRange=2,  # ... where they step by more than this [px]
             mode=self._cv2.STEREO_SGBM_MODE_SGBM_3WAY,
         )
-        # The 8-bit BGR that OpenCV reads from a file.
-        images = ((view.detach().cpu().clamp(0, 1) * 255).round().byte() for view in (left, right))
-        fixed_point = matcher.compute(
-            *(np.ascontiguousarray(image.flip(0).permute(1, 2, 0).numpy()) for image in images)
-        )
+        fixed_point = matcher.compute(_convert_to_bgr(left), _convert_to_bgr(right))
         disparity_px = torch.from_numpy(fixed_point.astype(np.float32) / 16).to(left.device)
         disparity_px = disparity_px.where(disparity_px > 0, torch.nan)
         if not self.config.with_filled_holes:
@@ -221,319 +191,37 @@ class SGBMMatcher:
         return Match(disparity_px=fill_holes(disparity_px), confidence=confidence)
 
 
-def fill_holes(disparity_px: Tensor) -> Tensor:
+def _convert_to_bgr(image: View) -> np.ndarray:
+    """Convert RGB in [0, 1] to the 8-bit BGR (H, W, 3) that OpenCV reads from a file."""
+    rgb = (image.detach().cpu().clamp(0, 1) * 255).round().byte()
+    return np.ascontiguousarray(rgb.flip(0).permute(1, 2, 0).numpy())
+
+
+def fill_holes(disparity_px: Map) -> Map:
     """Fill NaN along rows as the KITTI devkit does.
 
-    A hole takes the smaller of its row's two valid neighbours, for a hole is mostly background;
-    at a border of the row it takes the one neighbour it has. A row without any value takes the
-    nearest row that has some.
-
-    Args:
-        disparity_px: ``(H, W)``.
+    A pixel of a hole takes the smaller of the two values that bound the hole in its row, for a hole
+    is mostly background; at a border of the image it takes the only one. A row without any value
+    takes the nearest row that has one.
 
     Raises:
         InputError: there is no value at all to fill from.
     """
-    valid = torch.isfinite(disparity_px)
-    if not bool(valid.any()):
+    is_valid = torch.isfinite(disparity_px)
+    if not bool(is_valid.any()):
         raise InputError("no pixel was matched, so no hole can be filled; is the pair rectified?")
-    values = disparity_px.where(valid, torch.inf)
-    column = torch.arange(values.shape[1], device=values.device).expand_as(values)
-    before = column.where(valid, -1).cummax(1).values
-    after = column.where(valid, values.shape[1]).flip(1).cummin(1).values.flip(1)
-    # An absent neighbour is infinite, so the smaller of the two is the one that is there.
-    padded = F.pad(values, (0, 1), value=torch.inf)
-    before = before.where(before >= 0, values.shape[1])
-    filled = torch.minimum(padded.gather(1, before), padded.gather(1, after))
-    rows = torch.arange(len(valid), device=valid.device)
-    filled_rows = rows[valid.any(1)]
-    return filled[filled_rows[(rows[:, None] - filled_rows).abs().argmin(1)]]
+    height, width = disparity_px.shape
 
+    # Columns of the last valid pixel before each pixel and the first one after it, or itself.
+    column = torch.arange(width, device=disparity_px.device).expand_as(disparity_px)
+    column_before = column.where(is_valid, -1).cummax(1).values
+    column_after = column.where(is_valid, width).flip(1).cummin(1).values.flip(1)
+    # Where there is none, an added column of infinite values, of which the other is the smaller.
+    column_before = column_before.where(column_before >= 0, width)
+    padded = F.pad(disparity_px.where(is_valid, torch.inf), (0, 1), value=torch.inf)
+    filled = torch.minimum(padded.gather(1, column_before), padded.gather(1, column_after))
 
-IMAGENET_MEAN = (0.485, 0.456, 0.406)
-IMAGENET_STD = (0.229, 0.224, 0.225)
-DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16}
-
-
-AGREEMENT_PX = 3.0
-"""Difference of left and right disparity at which their agreement is down to 1/e."""
-
-
-class StereoNetwork(nn.Module):
-    """A network from a normalised pair to disparity maps, the last of which is its output.
-
-    In training it gives at most three maps, the last of which weighs most; else one.
-    """
-
-    config: Any  #: its sizes and conventions, a :class:`~depthpose.depth.config.NetworkConfig`
-    #: the part that may begin with weights of ImageNet, which trains more slowly
-    encoder: LiteEncoder | None = None
-    sky: nn.Module | None = None  #: the class of the sky, which may be trained alone
-
-    def forward_with_sky(self, left: Views, right: Views) -> tuple[tuple[Maps, ...], Maps | None]:
-        """Give the disparity maps [px], and P(sky) where the network has that class."""
-        return self(left, right), None
-
-
-class NetworkMatcher(ABC):
-    """A network with pre- and post-processing: normalisation, padding, device, memory.
-
-    A kind of network adds :meth:`fold`, :meth:`run`, :meth:`activation_bytes` and ``fine_pixels``;
-    what ``fold`` gives has ``rows``, how many rows of a volume are computed at a time, or None. The
-    weights are copied: training ``network`` further does not change this matcher. Where the
-    processor has no bf16, ``config`` says fp32 in its place.
-
-    Raises:
-        InputError: the device does not exist on this machine; a largest disparity for a network
-            that searches those of its training alone.
-    """
-
-    fine_pixels: ClassVar[int]
-    """Pixels of a fine match at most."""
-    largest_upscale: ClassVar[float] = 1.0
-    """Times the size of the images at which a fine match may be."""
-    largest_span_factor: ClassVar[float] = 1.5
-    """Times the disparities of training that a fine match looks through at most."""
-    finds_range: bool = False
-    """Whether the disparities of a pair are measured first, and searched where they lie."""
-    activation_bytes: ClassVar[Callable[..., int]]
-    """Peak memory of a padded pair [bytes], by the network's config, height, width, type, rows."""
-
-    def __init__(self, network: StereoNetwork, config: MatcherConfig | None = None) -> None:
-        config = config or MatcherConfig()
-        if config.max_disparity_px is not None and not self.finds_range:
-            raise InputError(
-                f"max_disparity_px is {config.max_disparity_px:g}, but this network searches the "
-                f"{network.config.max_disparity_px} disparities that it was trained with; omit it "
-                "(--max-disparity), or take weights with a light matcher, as 'default'"
-            )
-        self.device = usable_device(config.device)
-        precision = usable_precision(config.precision, config.device)
-        self.config = replace(config, precision=precision)
-        self.dtype = DTYPES[precision]
-        self.network_config: NetworkConfig = network.config
-        example = torch.empty(0, dtype=self.dtype, device=self.device)
-        self._network = self.fold(deepcopy(network).eval().to(self.device), example)
-
-    @abstractmethod
-    def fold(self, network: Any, example: Tensor) -> Any:  # noqa: ANN401
-        """Fold batch norm into the convolutions; weights get the type of ``example``."""
-
-    @abstractmethod
-    def run(
-        self,
-        left: Views,
-        right: Views,
-        network_config: Any,  # noqa: ANN401
-        first_px: int = 0,
-    ) -> list[Match]:
-        """Match normalised pairs whose sides suit the network.
-
-        Args:
-            left: left views.
-            right: right views, the same size.
-            network_config: config of the network, perhaps of more disparities than in training.
-            first_px: the least disparity that is searched, a multiple of 4; other
-                than 0 for networks alone that find the range.
-        """
-
-    @torch.no_grad()
-    def match(self, left: Tensor, right: Tensor) -> Match:
-        """Match one pair of any size.
-
-        Raises:
-            InputError: unusable images, or a memory bound that is too small for them.
-        """
-        return self.match_many([(left, right)])[0]
-
-    @torch.no_grad()
-    def match_many(
-        self,
-        pairs: Sequence[tuple[Tensor, Tensor]],
-        camera: Camera | None = None,
-        search: SearchRange | None = None,
-    ) -> list[Match]:
-        """Match pairs: together if all become one size and memory is unbounded, else one by one.
-
-        Pairs of a known camera are matched at the size of :meth:`work_size`, or all at that of
-        ``search``. A processor is busy with one pair; it is a GPU that gains from several.
-
-        Raises:
-            InputError: as :meth:`match`.
-        """
-        for left, right in pairs:
-            check_pair(left, right)
-        views, network_config = self._resize_views(pairs, camera, search)
-        first_px = 0 if search is None else search.first_px
-        is_one_size = len({left.shape for left, _ in views}) == 1
-        is_together = is_one_size and self.config.max_memory_bytes is None
-        groups = [views] if is_together else [[pair] for pair in views]
-        matches = [
-            match
-            for group in groups
-            for match in self._match_group(group, network_config, first_px)
-        ]
-        # Back to the size and the device of the images.
-        home = pairs[0][0].device
-        return [
-            disparity.resize_match(
-                disparity.map_match(match, lambda values: values.to(home)), *left.shape[1:]
-            )
-            for match, (left, _) in zip(matches, pairs, strict=True)
-        ]
-
-    def _resize_views(
-        self,
-        pairs: Sequence[tuple[Tensor, Tensor]],
-        camera: Camera | None,
-        search: SearchRange | None,
-    ) -> tuple[Sequence[tuple[Tensor, ...]], Any]:
-        """Resize pairs to the size at which they are matched, with the settings for that size."""
-        trained = self.network_config
-        if search is not None:
-            sizes = [_scaled_size(left, search.scale, camera) for left, _ in pairs]
-            largest_px = search.span_px
-        elif camera is not None and trained.work_focal_px is not None:
-            sizes = [self.work_size(camera)] * len(pairs)
-            largest_px = self.work_disparities(camera)
-        else:
-            return pairs, trained
-        views = [
-            tuple(disparity.resize_image(view, *size) for view in pair)
-            for pair, size in zip(pairs, sizes, strict=True)
-        ]
-        return views, replace(trained, max_disparity_px=largest_px)
-
-    def _match_group(
-        self,
-        group: Sequence[tuple[Tensor, ...]],
-        network_config: Any,  # noqa: ANN401
-        first_px: int,
-    ) -> list[Match]:
-        """Match pairs of one size in one call of the network, or two with the left-right check."""
-        left, right = (
-            normalise(torch.stack(side).to(self.device, torch.float32))
-            for side in zip(*group, strict=True)
-        )
-        matches = self._match_padded(left, right, network_config, first_px)
-        if not self.config.with_left_right_check:
-            return matches
-        # Mirrored, the right view is a left one.
-        mirrored = self._match_padded(right.flip(-1), left.flip(-1), network_config, first_px)
-        right_px = (match.disparity_px.flip(-1) for match in mirrored)
-        return list(map(lower_where_disagreeing, matches, right_px))
-
-    def _match_padded(
-        self,
-        left: Views,
-        right: Views,
-        network_config: Any,  # noqa: ANN401
-        first_px: int,
-    ) -> list[Match]:
-        """Match pairs padded to sides that suit the network; give matches of their own size.
-
-        Raises:
-            InputError: the network needs more memory than the config allows.
-        """
-        height, width = left.shape[-2:]
-        padded_left = pad_top_right(left, network_config)
-        padded_right = pad_top_right(right, network_config)
-        self._refuse_memory(network_config, *padded_left.shape[-2:])
-        matches = self.run(padded_left, padded_right, network_config, first_px)
-        crop = itemgetter((slice(-height, None), slice(width)))  # values[-height:, :width]
-        return [disparity.map_match(match, crop) for match in matches]
-
-    def _refuse_memory(self, network_config: Any, height: int, width: int) -> None:  # noqa: ANN401
-        """Refuse images whose matching takes more memory than the config allows."""
-        limit_bytes = self.config.max_memory_bytes
-        if limit_bytes is None:
-            return
-        rows = self._network.rows or height // 4
-        needed_bytes = self.activation_bytes(network_config, height, width, self.dtype, rows)
-        if needed_bytes > limit_bytes:  # volumes are held whole
-            quick = "" if network_config.work_focal_px is None else " or speed='quick'"
-            raise InputError(
-                f"max_memory_bytes={limit_bytes} is too small for images of "
-                f"{height}x{width} (padded): this matcher takes {needed_bytes}; allow "
-                f"that, take precision='bf16'{quick}, or match the pair at a smaller size"
-            )
-
-    def work_size(self, camera: Camera) -> tuple[int, int]:
-        """Give the rows and columns at which images of a camera are matched [px]."""
-        if self.network_config.work_focal_px is None:
-            return camera.height, camera.width
-        return disparity.size_at_focal_length(camera, self.work_focal_px(camera))
-
-    def work_disparities(self, camera: Camera) -> int:
-        """Give the number of disparities that are searched at :meth:`work_size` [px]."""
-        trained = self.network_config
-        if trained.work_focal_px is None:
-            return trained.max_disparity_px
-        # A larger size needs more disparities; the same filters look through them.
-        larger = min(self.work_focal_px(camera) / trained.work_focal_px, self.largest_span_factor)
-        return self.whole_steps(trained.max_disparity_px * larger)
-
-    def whole_steps(self, disparity_px: float) -> int:
-        """Round a number of disparities [px] up to a multiple of the network's step."""
-        step_px = self.network_config.step_px
-        return max(1, math.ceil(round(disparity_px, 3) / step_px)) * step_px
-
-    def work_focal_px(self, camera: Camera) -> float:
-        """Give the focal length at which images of a camera are matched [px]."""
-        trained_px = self.network_config.work_focal_px
-        if trained_px is None:
-            return float(camera.K[0, 0])
-        if self.config.speed == "quick":
-            return trained_px
-        share = math.sqrt(self.fine_pixels / (camera.height * camera.width))
-        return max(trained_px, float(camera.K[0, 0]) * min(share, self.largest_upscale))
-
-
-def _scaled_size(left: View, scale: float, camera: Camera | None) -> tuple[int, int]:
-    """Give the rows and columns of a view that is scaled; with a camera, pixels become square."""
-    if camera is not None:
-        return disparity.size_at_focal_length(camera, scale * float(camera.K[0, 0]))
-    return max(1, round(left.shape[1] * scale)), max(1, round(left.shape[2] * scale))
-
-
-def normalise(image: Float[Tensor, "*batch 3 h w"]) -> Float[Tensor, "*batch 3 h w"]:
-    """Normalise RGB in [0, 1] by ImageNet's mean and deviation, as in the training."""
-    mean = image.new_tensor(IMAGENET_MEAN)[:, None, None]
-    return (image - mean) / image.new_tensor(IMAGENET_STD)[:, None, None]
-
-
-def pad_top_right(
-    image: Float[Tensor, "*batch 3 h w"], network: NetworkConfig
-) -> Float[Tensor, "*batch 3 h2 w2"]:
-    """Pad a normalised image with zeros, top and right, to a size that suits the network.
-
-    Top and right, as PSMNet's authors do: columns stay where they are, so disparity does too.
-    """
-    step = network.step_px
-    least = network.min_side_px
-    h, w = (max(least, -(-side // step) * step) for side in image.shape[-2:])
-    return F.pad(image, (0, w - image.shape[-1], h - image.shape[-2], 0))
-
-
-def lower_where_disagreeing(
-    match: Match, right_px: Map, tolerance_px: float = 0.0, falls_px: float = AGREEMENT_PX
-) -> Match:
-    """Lower the confidence where the right view's own disparity is another.
-
-    Halved where the matching point lies outside the right view, for nothing there can agree. The
-    sky keeps its confidence.
-
-    Args:
-        match: match of the left view.
-        right_px: disparity of the right view.
-        tolerance_px: a difference that says nothing.
-        falls_px: what is larger by so much takes the agreement down to 1/e.
-    """
-    # Small where both views agree, large at occlusions; NaN outside the right view.
-    there_px = disparity.warp_right_to_left(right_px[None], match.disparity_px)[0]
-    difference_px = ((match.disparity_px - there_px).abs() - tolerance_px).clamp(min=0)
-    agreement = torch.exp(-difference_px / falls_px).nan_to_num(0.0)
-    confidence = agreement if match.confidence is None else match.confidence * (1 + agreement) / 2
-    if match.confidence is not None and match.is_sky is not None:
-        confidence = torch.where(match.is_sky, match.confidence, confidence)
-    return replace(match, confidence=confidence)
+    rows = torch.arange(height, device=disparity_px.device)
+    valid_rows = rows[is_valid.any(1)]
+    nearest = (rows[:, None] - valid_rows).abs().argmin(1)
+    return filled[valid_rows[nearest]]

@@ -26,15 +26,15 @@ from depthpose.core.errors import InputError
 from depthpose.depth.config import PSMNetConfig
 from depthpose.depth.stereo import layers
 from depthpose.depth.stereo.layers import ConvNorm, Volume
-from depthpose.depth.stereo.matcher import NetworkMatcher, StereoNetwork
+from depthpose.depth.stereo.network_matcher import STEP_PX, NetworkMatcher, StereoNetwork
 from depthpose.depth.types import Map, Maps, Match, Views
 
 CHUNK_BYTES = 6 << 20
-"""Size of one piece of the soft arg-min; it fits the caches."""
-
+"""Size of the rows of which the soft arg-min is computed at a time; it fits the caches."""
 
 WINDOW_PX = 2.0
-"""Half width of the window whose probability is the confidence; ranks errors best (AUSE)."""
+"""The confidence is the probability of disparities within this distance of the estimated one; this
+width ranks errors best (AUSE)."""
 
 
 def expected_disparity(
@@ -45,36 +45,51 @@ def expected_disparity(
     chunk_bytes: int = CHUNK_BYTES,
     with_confidence: bool,
 ) -> tuple[Map, Map | None]:
-    """Enlarge the cost to ``size`` and take the expected disparity [px], some rows at a time.
+    """Compute the expected disparity of a cost enlarged to full size, some rows at a time.
 
-    Equals :func:`soft_argmin` of a cost in float32 or wider; ``size`` is disparities, rows and
-    columns. About four pieces of ``chunk_bytes`` are alive at a time. The confidence is the
-    probability within ``WINDOW_PX`` of the expectation.
+    Equals :func:`soft_argmin` of a cost in float32 or wider, in less memory: about four tensors of
+    ``chunk_bytes`` are alive at a time.
+
+    Args:
+        cost: cost of each disparity of each pixel, at quarter size; larger is likelier.
+        size: disparities, rows and columns at full size.
+        align_corners: how the cost is enlarged.
+        chunk_bytes: size of the rows that are computed at a time.
+        with_confidence: compute the confidence too.
+
+    Returns:
+        The disparity [px]; and the confidence, the probability within ``WINDOW_PX`` of it.
     """
     count, rows, columns = size
-    down, across, deep = (
+    row_taps, column_taps, disparity_taps = (
         layers.linear_taps(small, large, cost, align_corners=align_corners)
         for small, large in zip(cost.shape, (rows, columns, count), strict=True)
     )
-    matrix = layers.interpolation_matrix(deep, cost.shape[2]).T.contiguous()
-    bins = torch.arange(count, device=cost.device).to(cost)
+    disparity_matrix = layers.interpolation_matrix(disparity_taps, cost.shape[2]).T.contiguous()
+    disparities_px = torch.arange(count, device=cost.device).to(cost)
     disparity_px = cost.new_empty(rows, columns)
     confidence = torch.empty_like(disparity_px) if with_confidence else None
     step = max(1, chunk_bytes // (columns * count * cost.element_size()))
     for first in range(0, rows, step):
         y = slice(first, first + step)
-        wide = torch.lerp(cost[down.low[y]], cost[down.high[y]], down.share[y, None, None])
-        low, high = (wide.index_select(1, taps) for taps in (across.low, across.high))
-        probability = (torch.lerp(low, high, across.share[:, None]) @ matrix).softmax(-1)
-        torch.matmul(probability, bins, out=disparity_px[y])
+
+        # The cost of these rows, interpolated along rows, columns and disparities in turn.
+        row_share = row_taps.share[y, None, None]
+        of_rows = torch.lerp(cost[row_taps.low[y]], cost[row_taps.high[y]], row_share)
+        low = of_rows.index_select(1, column_taps.low)
+        high = of_rows.index_select(1, column_taps.high)
+        of_pixels = torch.lerp(low, high, column_taps.share[:, None])
+        probability = (of_pixels @ disparity_matrix).softmax(-1)
+
+        torch.matmul(probability, disparities_px, out=disparity_px[y])
         if confidence is not None:
-            near = (bins - disparity_px[y, :, None]).abs_() <= WINDOW_PX
-            torch.sum(probability.mul_(near), -1, out=confidence[y])
+            is_near = (disparities_px - disparity_px[y, :, None]).abs_() <= WINDOW_PX
+            torch.sum(probability.mul_(is_near), -1, out=confidence[y])
             confidence[y].clamp_(0, 1)
     return disparity_px, confidence
 
 
-class Block(nn.Module):
+class ResidualBlock(nn.Module):
     """Two convolutions and a shortcut; no ReLU after the sum, as in the paper's code."""
 
     def __init__(self, inputs: int, outputs: int, stride: int, dilation: int) -> None:
@@ -85,13 +100,13 @@ class Block(nn.Module):
         self.shortcut = None if keeps_size else ConvNorm(nn.Conv2d, inputs, outputs, 1, stride)
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b k h2 w2"]:
-        """Add what two convolutions see to the input."""
+        """Add the output of two convolutions to the input."""
         shortcut = x if self.shortcut is None else self.shortcut(x)
         return self.second(F.relu(self.first(x))) + shortcut
 
 
 class FeatureExtractor(nn.Module):
-    """One view to ``width`` features for each pixel of a quarter-size grid."""
+    """One view to ``config.width`` features for each pixel at quarter size."""
 
     def __init__(self, config: PSMNetConfig) -> None:
         super().__init__()
@@ -104,34 +119,39 @@ class FeatureExtractor(nn.Module):
             ConvNorm(nn.Conv2d, c, c),
         )
         self.stem = nn.ModuleList(stem)
-        # The first block of each stage changes the channels and the size.
-        kinds = ((c, c, 1, 1), (c, 2 * c, 2, 1), (2 * c, 4 * c, 1, 1), (4 * c, 4 * c, 1, 2))
+        # The first block of each stage changes the channels and the size: input and output
+        # channels, stride, dilation.
+        stages = ((c, c, 1, 1), (c, 2 * c, 2, 1), (2 * c, 4 * c, 1, 1), (4 * c, 4 * c, 1, 2))
         self.stages = nn.ModuleList()
-        for (inputs, outputs, stride, dilation), count in zip(kinds, config.blocks, strict=True):
-            rest = (Block(outputs, outputs, 1, dilation) for _ in range(count - 1))
-            self.stages.append(nn.Sequential(Block(inputs, outputs, stride, dilation), *rest))
+        for (inputs, outputs, stride, dilation), count in zip(stages, config.blocks, strict=True):
+            rest = (ResidualBlock(outputs, outputs, 1, dilation) for _ in range(count - 1))
+            self.stages.append(
+                nn.Sequential(ResidualBlock(inputs, outputs, stride, dilation), *rest)
+            )
         self.pyramid = nn.ModuleList([ConvNorm(nn.Conv2d, 4 * c, c, 1) for _ in config.pools])
         self.fuse = ConvNorm(nn.Conv2d, (6 + len(config.pools)) * c, 4 * c)
         self.project = nn.Conv2d(4 * c, c, 1, bias=False)
 
     def forward(self, image: Views) -> Float[Tensor, "b c h4 w4"]:
-        """Give features of each pixel with local and global context."""
+        """Compute features of normalised views, with local and global context."""
         x = image
         for layer in self.stem:
             x = F.relu(layer(x))
-        raw = self.stages[1](self.stages[0](x))
-        last = self.stages[3](self.stages[2](raw))
+        local = self.stages[1](self.stages[0](x))
+        deep = self.stages[3](self.stages[2](local))
+        # The spatial pyramid: means over ever larger windows.
         levels = []
         for layer, pool in zip(reversed(self.pyramid), reversed(self.pools), strict=True):
-            pooled = F.relu(layer(F.avg_pool2d(last, pool)))
-            size = last.shape[-2:]
+            pooled = F.relu(layer(F.avg_pool2d(deep, pool)))
+            size = deep.shape[-2:]
             align = self.align_corners
             levels.append(F.interpolate(pooled, size, mode="bilinear", align_corners=align))
-        return self.project(F.relu(self.fuse(torch.cat([raw, last, *levels], 1))))
+        fused = F.relu(self.fuse(torch.cat([local, deep, *levels], 1)))
+        return self.project(fused)
 
 
 class Hourglass(nn.Module):
-    """Down to a quarter of the volume and back, to let far evidence reach each voxel."""
+    """Down to a quarter of a volume's sides and back, so that far evidence reaches each voxel."""
 
     def __init__(self, c: int) -> None:
         super().__init__()
@@ -143,19 +163,22 @@ class Hourglass(nn.Module):
         self.up1 = ConvNorm(nn.ConvTranspose3d, 2 * c, c, stride=2)
 
     def forward(
-        self, x: Volume, first: Volume | None, before: Volume | None
+        self, x: Volume, first_down: Volume | None, last_up: Volume | None
     ) -> tuple[Volume, Volume]:
-        """Give the half-size volumes going down and coming up, between ``down1`` and ``up1``.
+        """Compute the volumes at half size, on the way down and on the way up.
+
+        ``down1`` is applied before, and ``up1`` after it, by :meth:`PSMNet.refine`.
 
         Args:
-            x: what ``down1`` made of the volume that the hourglass refines; it is overwritten.
-            first: half-size volume of the first hourglass going down; None in the first itself.
-            before: half-size volume of the hourglass before, coming up; None in the first.
+            x: the output of ``down1`` of this hourglass; it is overwritten.
+            first_down: volume of the first hourglass on its way down; None in the first itself.
+            last_up: volume of the hourglass before on its way up; None in the first.
         """
         down = self.same1(x.relu_())
-        down = (down if before is None else down.add_(before)).relu_()
-        up = self.up2(self.same2(self.down2(down).relu_()).relu_())
-        return down, up.add_(down if first is None else first).relu_()
+        down = (down if last_up is None else down.add_(last_up)).relu_()
+        quarter = self.same2(self.down2(down).relu_()).relu_()
+        up = self.up2(quarter)
+        return down, up.add_(down if first_down is None else first_down).relu_()
 
 
 class Head(nn.Sequential):
@@ -171,7 +194,7 @@ class Head(nn.Sequential):
 def concatenation_volume(
     left: Float[Tensor, "b c h w"], right: Float[Tensor, "b c h w"], bins: int
 ) -> Volume:
-    """Put left features beside the right ones that each disparity would match them with.
+    """Concatenate, for each disparity, left features and the right ones that they match.
 
     Voxel ``(d, y, x)`` holds ``left[y, x]`` and ``right[y, x - d]``, or zeros where the right
     pixel falls outside the image.
@@ -185,10 +208,10 @@ def concatenation_volume(
 
 
 def soft_argmin(cost: Volume, size: tuple[int, int, int], *, align_corners: bool) -> Maps:
-    """Enlarge the cost to ``size`` (disparities, rows, columns) and take the expected disparity.
+    """Compute the expected disparity [px] of a cost enlarged to ``size``.
 
-    ``sum_d d softmax(cost)_d`` [px], eq. 2.2 of the thesis; costs are likelihoods here, so no
-    sign stands before them.
+    It is ``sum_d d softmax(cost)_d``, eq. 2.2 of the thesis. A larger cost is likelier here, so the
+    softmax is that of the cost, not of its negative. ``size``: disparities, rows, columns.
     """
     if cost.dtype in (torch.bfloat16, torch.float16):
         cost = cost.float()  # 8 bits of mantissa would round the expectation to whole pixels
@@ -204,7 +227,7 @@ class PSMNet(StereoNetwork):
     at least ``config.min_side_px``. The default size has 5,224,768 parameters.
     """
 
-    #: at 1/4 size, that are computed at a time where something large would be held, with no
+    #: rows at 1/4 size that are computed at a time where a large volume would be held, with no
     #: gradient; None, as in training and in exported graphs: all
     rows: int | None = None
 
@@ -223,42 +246,39 @@ class PSMNet(StereoNetwork):
                 nn.init.normal_(module.weight, 0, (2 / (taps * module.out_channels)) ** 0.5)
 
     def forward(self, left: Views, right: Views) -> tuple[Maps, ...]:
-        """Match the pair.
+        """Estimate the disparity of the left view.
 
         Returns:
-            Disparity of the left view [px], after each of the three hourglasses while training,
-            after the last alone in eval mode. The last is always the answer.
+            Disparity [px] after each of the three hourglasses in training; after the last alone in
+            eval mode.
 
         Raises:
             InputError: the images' size does not suit the network.
         """
-        h, w = left.shape[-2:]
+        height, width = left.shape[-2:]
         least = self.config.min_side_px
-        if h % 16 or w % 16 or min(h, w) < least:
+        if height % 16 or width % 16 or min(height, width) < least:
             raise InputError(
                 f"PSMNet takes sides that are multiples of 16 and at least {least} px, got "
-                f"{h}x{w}; pad the pair, as PSMNetMatcher does"
+                f"{height}x{width}; pad the pair, as PSMNetMatcher does"
             )
-        size = (self.config.max_disparity_px, h, w)
+        size = (self.config.max_disparity_px, height, width)
         costs = self.costs(left, right)
+        used_costs = costs if self.training else costs[-1:]
         align = self.config.align_corners
-        return tuple(
-            soft_argmin(cost, size, align_corners=align)
-            for cost in (costs if self.training else costs[-1:])
-        )
+        return tuple(soft_argmin(cost, size, align_corners=align) for cost in used_costs)
 
     def costs(
         self, left: Views, right: Views, max_disparity_px: int | None = None
     ) -> tuple[Volume, Volume, Volume]:
-        """Give the quarter-size cost after each hourglass; each adds to the one before.
+        """Compute the cost at quarter size after each hourglass; each adds to the one before.
 
-        ``max_disparity_px`` takes the place of the network's own: the same filters look over all
-        disparities, so they can look farther than they did in training.
+        ``max_disparity_px``: number of disparities, in place of that of the training: the same
+        filters can search more.
         """
-        bins = (max_disparity_px or self.config.max_disparity_px) // 4
-
+        bins = (max_disparity_px or self.config.max_disparity_px) // STEP_PX
         volume = layers.by_rows(
-            lambda near, far: self.aggregate(concatenation_volume(near, far, bins)),
+            lambda left, right: self.aggregate(concatenation_volume(left, right, bins)),
             (self.features(left), self.features(right)),
             halo=4,  # four convolutions follow each other
             rows=self.rows,
@@ -266,26 +286,26 @@ class PSMNet(StereoNetwork):
         return self.refine(volume)
 
     def aggregate(self, volume: Volume) -> Volume:
-        """Give the volume that the hourglasses refine, of a concatenation volume."""
+        """Compute the volume that the hourglasses refine from a concatenation volume."""
         x = self.dres0[0](volume).relu_()
         del volume
         x = self.dres0[1](x).relu_()
         return self.dres1[1](self.dres1[0](x).relu_()).add_(x)
 
-    def refine(self, cost0: Volume) -> tuple[Volume, Volume, Volume]:
-        """Give the cost after each hourglass."""
-        x = cost0
-        first = None
+    def refine(self, volume: Volume) -> tuple[Volume, Volume, Volume]:
+        """Compute the cost after each hourglass, from the volume of :meth:`aggregate`."""
+        x = volume
+        first_down = None
         up = None
         costs = []
         for module, head in zip(self.hourglasses, self.heads, strict=True):
             hourglass = cast("Hourglass", module)
-            # Under the same name, so that one volume of the full size is held beside ``cost0``.
+            # Under the same name, so that one volume of the full size is held beside ``volume``.
             x = hourglass.down1(x)
-            down, up = hourglass(x, first, up)
-            first = down if first is None else first
+            down, up = hourglass(x, first_down, up)
+            first_down = down if first_down is None else first_down
             del down
-            x = hourglass.up1(up).add_(cost0)
+            x = hourglass.up1(up).add_(volume)
             cost = layers.by_rows(head, (x,), halo=2, rows=self.rows)
             costs.append(cost + costs[-1] if costs else cost)
         return cast("tuple[Volume, Volume, Volume]", tuple(costs))
@@ -298,32 +318,35 @@ ROWS = 32
 def psmnet_bytes(
     config: PSMNetConfig, height: int, width: int, dtype: torch.dtype, rows: int = ROWS
 ) -> int:
-    """Estimate the peak memory of a padded pair [bytes], with margin for the allocator.
+    """Estimate the peak memory of matching a padded pair [bytes], with margin for the allocator.
 
     Two volumes of the largest size are held whole; ``rows`` at quarter size are computed at a time.
     """
     h = height // 4
     w = width // 4
+    bins = config.max_disparity_px // STEP_PX
     row_bytes = config.width * w * dtype.itemsize
     map_bytes = row_bytes * h
-    bins = config.max_disparity_px // 4
     volume_bytes = map_bytes * bins
+    cost_bytes = 4 * bins * h * w  # float32, one channel
 
-    slab2_bytes, slab4_bytes = (min(rows + 2 * halo, h) * row_bytes * bins for halo in (2, 4))
+    # Volumes of some rows, with the halo of the head's convolutions and of the aggregation's.
+    head_slab_bytes = min(rows + 2 * 2, h) * row_bytes * bins
+    aggregation_slab_bytes = min(rows + 2 * 4, h) * row_bytes * bins
+    head_slabs = 2 if dtype.itemsize >= 4 else 4  # the head computes in float32
+
+    # Five half-size maps in the first stage; joined levels, twice, in the last.
     levels = 6 + len(config.pools)
-    cost_bytes = 4 * bins * h * w
-    # Costs are computed in float32.
-    head_slabs = 2 if dtype.itemsize >= 4 else 4
-    stages = (
-        # Five half-size maps in the first stage; joined levels, twice, in the last.
-        2 * map_bytes * max(5 * 4, 2 * levels + 12),
-        # ``cost0``; of some rows the concatenation, and what a convolution makes of it.
-        volume_bytes + 2 * map_bytes + 3 * slab4_bytes,
-        # ``cost0``, what is added to it, three half-size volumes; some rows in the head.
-        2 * volume_bytes + 3 * volume_bytes // 4 + head_slabs * slab2_bytes + 3 * cost_bytes,
-        4 * cost_bytes + 16 * height * width + 5 * CHUNK_BYTES,
-    )
-    return int(layers.MARGIN * max(stages)) + layers.OVERHEAD_BYTES
+    features_bytes = 2 * map_bytes * max(5 * 4, 2 * levels + 12)
+    # The volume; of some rows the concatenation, and what a convolution makes of it.
+    aggregation_bytes = volume_bytes + 2 * map_bytes + 3 * aggregation_slab_bytes
+    # The volume, what is added to it, three half-size volumes; some rows in the head.
+    hourglass_bytes = 2 * volume_bytes + 3 * volume_bytes // 4
+    head_bytes = head_slabs * head_slab_bytes + 3 * cost_bytes
+    # Costs, maps of the full size, and the rows of the soft arg-min.
+    argmin_bytes = 4 * cost_bytes + 16 * height * width + 5 * CHUNK_BYTES
+    peak_bytes = max(features_bytes, aggregation_bytes, hourglass_bytes + head_bytes, argmin_bytes)
+    return int(layers.MARGIN * peak_bytes) + layers.OVERHEAD_BYTES
 
 
 class PSMNetMatcher(NetworkMatcher):
@@ -338,8 +361,8 @@ class PSMNetMatcher(NetworkMatcher):
         for head in network.heads:
             # In float32 at least: 8 bits would round the expectation to whole pixels.
             cost = cast("nn.Conv3d", head.cost)
-            wide = torch.empty(0, device=self.device)
-            head.cost = layers.VolumeConv(cost, cost.weight, torch.zeros(1), wide)
+            in_float32 = torch.empty(0, device=self.device)
+            head.cost = layers.VolumeConv(cost, cost.weight, torch.zeros(1), in_float32)
         network.rows = ROWS
         return layers.fold(network, example)
 
@@ -348,24 +371,27 @@ class PSMNetMatcher(NetworkMatcher):
     ) -> list[Match]:
         """Match normalised pairs whose sides suit the network."""
         assert first_px == 0, "its volume begins at 0; the views are moved instead"
-        near, far = (v.to(self.dtype, memory_format=torch.channels_last) for v in (left, right))
-        costs = self._network.costs(near, far, network_config.max_disparity_px)[-1][:, 0]
         height, width = left.shape[-2:]
-        matches = [
-            expected_disparity(
+        size = (network_config.max_disparity_px, height, width)
+        left = left.to(self.dtype, memory_format=torch.channels_last)
+        right = right.to(self.dtype, memory_format=torch.channels_last)
+        last_costs = self._network.costs(left, right, network_config.max_disparity_px)[-1][:, 0]
+        matches: list[Match] = []
+        for cost in last_costs:
+            disparity_px, confidence = expected_disparity(
                 cost.permute(1, 2, 0).contiguous(),
-                (network_config.max_disparity_px, height, width),
+                size,
                 align_corners=network_config.align_corners,
                 with_confidence=self.config.with_confidence,
             )
-            for cost in costs
-        ]
-        return [Match(disparity_px=d, confidence=c) for d, c in matches]
+            matches.append(Match(disparity_px=disparity_px, confidence=confidence))
+        return matches
 
 
 _PARTS = {"0": "conv", "1": "norm"}
+"""Our names of the layers of a convolution with a norm, by the authors' numbers."""
 _HOURGLASS = ("down1", "same1", "down2", "same2", "up2", "up1")
-_PUBLISHED_NAMES = {
+_RENAMES = {
     "feature_extraction.": (
         (r"firstconv\.([024])\.([01])\.", lambda m: f"stem.{int(m[1]) // 2}.{_PARTS[m[2]]}."),
         (r"layer(\d)\.", lambda m: f"stages.{int(m[1]) - 1}."),
@@ -386,7 +412,7 @@ _PUBLISHED_NAMES = {
         (r"^classif(\d)\.2\.", lambda m: f"heads.{int(m[1]) - 1}.cost."),
     ),
 }
-"""Patterns of the authors' names, of the feature extractor and of the rest, and ours."""
+"""Patterns of the authors' names, each with our name: of the feature extractor, and of the rest."""
 
 
 def psmnet_from_published(state: Mapping[str, Tensor], *, align_corners: bool) -> PSMNet:
@@ -402,16 +428,20 @@ def psmnet_from_published(state: Mapping[str, Tensor], *, align_corners: bool) -
     """
     network = PSMNet(PSMNetConfig(align_corners=align_corners))
     renamed: dict[str, Tensor] = {}
-    for published, value in state.items():  # an unknown name stays as it is, and is refused
-        name = published.removeprefix("module.")
-        prefix = next(prefix for prefix in _PUBLISHED_NAMES if name.startswith(prefix))
+    for published_name, tensor in state.items():  # an unknown name stays as it is, and is refused
+        name = published_name.removeprefix("module.")
+        prefix = next(prefix for prefix in _RENAMES if name.startswith(prefix))
         name = name.removeprefix(prefix)
-        for pattern, ours in _PUBLISHED_NAMES[prefix]:
-            name = re.sub(pattern, ours, name)
-        renamed[f"features.{name}" if prefix else name] = value
-    # The count of batches steers nothing at inference; files older than 2018 do not hold it.
-    uncounted = {n: v for n, v in network.state_dict().items() if n.endswith("batches_tracked")}
-    checkpoint = Checkpoint(kind="psmnet", config={}, state={**uncounted, **renamed})
+        for pattern, our_name in _RENAMES[prefix]:
+            name = re.sub(pattern, our_name, name)
+        renamed[f"features.{name}" if prefix else name] = tensor
+    # The counts of batches have no effect at inference; files older than 2018 do not hold them.
+    counts = {
+        name: tensor
+        for name, tensor in network.state_dict().items()
+        if name.endswith("batches_tracked")
+    }
+    checkpoint = Checkpoint(kind="psmnet", config={}, state={**counts, **renamed})
     load_weights(
         network, checkpoint, "the checkpoint of the stacked-hourglass PSMNet ('state_dict')"
     )
@@ -419,10 +449,13 @@ def psmnet_from_published(state: Mapping[str, Tensor], *, align_corners: bool) -
 
 
 def import_psmnet(file: Path, out: Path, *, align_corners: bool) -> None:
-    """Turn the authors' checkpoint into a weights file of ours.
+    """Convert the authors' checkpoint to a weights file of ours.
 
-    Their ``.tar`` is a PyTorch file, not an archive to unpack, and read without its code.
-    ``align_corners`` (:func:`psmnet_from_published`) is recorded in ``out``.
+    Args:
+        file: their ``.tar``, a PyTorch file, not an archive to unpack. It is read without running
+            the code that it may hold.
+        out: the weights file.
+        align_corners: as for :func:`psmnet_from_published`; recorded in ``out``.
 
     Raises:
         InputError: not a checkpoint of the published network.

@@ -1,11 +1,10 @@
-"""Where the disparities of a pair lie, and at which size and from which one on they are searched.
+"""The range of a pair's disparities: measured in a narrow copy, and searched at a suitable size.
 
-A network looks through a fixed number of disparities, and gives wrong ones where the true ones lie
-beyond. So the pair is first matched in a copy so narrow that every disparity it can have is within
-reach. Where nothing is infinitely far away, the search begins at the least disparity that is found;
-where the usual number of disparities does not hold the largest one, the size is chosen so that the
-volume of the search is no larger than usual: twice the disparities at four fifths of the sides take
-the same time and memory.
+A network searches a fixed number of disparities, and its results are wrong where the true ones lie
+beyond. So the pair is first matched in a copy so narrow that every disparity is within reach. The
+search then begins at the least disparity of the copy. Where the usual number of disparities does
+not reach the largest one, more are searched at a smaller size, so that the volume is no larger:
+twice the disparities at four fifths of the sides take the same time and memory.
 """
 
 import math
@@ -17,34 +16,34 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from depthpose.core.camera import Camera
-from depthpose.depth.disparity import map_match, warp_right_to_left
-from depthpose.depth.stereo.matcher import (
+from depthpose.depth.disparity import apply_to_maps, warp_right_to_left
+from depthpose.depth.stereo.network_matcher import (
     STEP_PX,
     NetworkMatcher,
     SearchRange,
     lower_where_disagreeing,
 )
 from depthpose.depth.types import Map, Mask, Match
-from depthpose.depth.visible import without_picture
+from depthpose.depth.visible import find_blank_borders
 
 _TAIL = 0.001
 """Share of the copy's pixels that may lie beyond either end: single pixels at edges are wrong."""
-_SURE = 0.5
+_MIN_NEAR_CONFIDENCE = 0.5
 """Confidence from which a near place counts: it is more probable than not. Every far place counts,
 for its confidence is low by construction: few disparities are within 15 % of a small one."""
-_NAMED = 0.001
-"""Share of the image beyond the search from which it is named."""
+_MIN_WARNED_SHARE = 0.001
+"""Share of the image beyond the search from which a warning is given."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DisparityRange:
     """The range of a pair's disparities, in pixels of its images, and the match that found it."""
 
-    low_px: float  #: the least, or infinity's where that may be there
-    high_px: float  #: the largest
-    step_px: float  #: how exactly they are known, which both ends include
-    coarse: Match  #: the match of the copy, at the size of the images
-    right_px: Map  #: disparity of the right view in the copy, at the size of the images
+    low_px: float  #: the least disparity, at least that of what is infinitely far away
+    high_px: float  #: the largest disparity
+    step_px: float  #: error of both ends, by which they are set outwards
+    coarse: Match  #: the match of the narrow copy, at the size of the images
+    right_px: Map  #: disparity of the right view in the narrow copy, at the size of the images
 
 
 def move_views(left: Tensor, right: Tensor, first_px: int) -> tuple[Tensor, Tensor]:
@@ -79,7 +78,7 @@ def move_match_back(match: Match, first_px: int) -> Match:
     if first_px == 0:
         return match
     added = max(-first_px, 0)
-    moved = map_match(match, lambda values: values[:, added:])
+    moved = apply_to_maps(match, lambda values: values[:, added:])
     moved = replace(moved, disparity_px=moved.disparity_px + first_px)
     if moved.confidence is None:
         return moved
@@ -91,7 +90,7 @@ def move_match_back(match: Match, first_px: int) -> Match:
 def measure_disparity_range(
     matcher: NetworkMatcher, left: Tensor, right: Tensor, infinity_px: float
 ) -> DisparityRange:
-    """Measure where the disparities of a pair lie, in a narrow copy of it.
+    """Measure the range of a pair's disparities, in a narrow copy of it.
 
     Args:
         matcher: a network that matches pairs of any size.
@@ -123,7 +122,7 @@ def measure_disparity_range(
     columns = torch.arange(disparity_px.shape[1], device=disparity_px.device)
     counts_as_near = is_picture & (disparity_px <= columns)
     if confidence is not None:
-        counts_as_near &= confidence >= _SURE
+        counts_as_near &= confidence >= _MIN_NEAR_CONFIDENCE
 
     # The maps have the size of the images: one sample for each pixel of the narrow copy.
     stride = max(1, round(1 / search.scale))
@@ -148,7 +147,10 @@ def measure_disparity_range(
 
 
 def _search_of_narrow_copy(matcher: NetworkMatcher, width: int, infinity_px: float) -> SearchRange:
-    """Give the search of a copy in which every disparity of a pair is within reach of a network."""
+    """Compute the search in a copy so narrow that every disparity of a pair is within reach.
+
+    ``width``: of the images; ``infinity_px``: as for :func:`measure_disparity_range`.
+    """
     trained_px = matcher.network_config.max_disparity_px
     span_px = matcher.whole_steps(trained_px * matcher.largest_span_factor)
     scale = min(1.0, span_px / (width + abs(infinity_px)))
@@ -157,9 +159,9 @@ def _search_of_narrow_copy(matcher: NetworkMatcher, width: int, infinity_px: flo
 
 
 def _shows_picture(left: Tensor, right: Tensor, disparity_px: Map) -> Mask:
-    """Mark where neither a pixel nor what it is matched with lies in a border without a picture."""
-    left_blank = without_picture(left).to(disparity_px.device)
-    right_blank = without_picture(right).to(disparity_px)
+    """Find the left pixels of which neither they nor their matches lie in a blank border."""
+    left_blank = find_blank_borders(left).to(disparity_px.device)
+    right_blank = find_blank_borders(right).to(disparity_px)
     matched_blank = warp_right_to_left(right_blank[None], disparity_px)[0]
     return ~left_blank & ~(matched_blank > 0)
 
@@ -167,13 +169,14 @@ def _shows_picture(left: Tensor, right: Tensor, disparity_px: Map) -> Mask:
 def choose_search_range(
     matcher: NetworkMatcher, measured: DisparityRange, size: Sequence[int], camera: Camera | None
 ) -> SearchRange:
-    """Choose the disparities that are searched, so that those that were measured are among them.
+    """Choose the size and the disparities of a search, so that it holds the measured disparities.
 
     They are at least as many as the network was trained with.
 
     Args:
-        matcher: a network.
-        measured: where the disparities lie.
+        matcher: a network; its ``max_disparity_px``, where it has one, replaces the largest
+            measured disparity.
+        measured: the range of the disparities.
         size: rows and columns of the images.
         camera: camera of the left image, where it is known.
     """
@@ -181,8 +184,8 @@ def choose_search_range(
     high_px = measured.high_px
     if matcher.config.max_disparity_px is not None:
         high_px = matcher.config.max_disparity_px
-    # The volume has scale^2 H W pixels and scale span disparities: a wider span is searched at a
-    # smaller scale, in the same memory.
+    # The volume has scale^2 H W pixels and scale * span disparities: a wider span is searched at a
+    # smaller scale, so that scale^3 * span, and with it the memory, stays the same.
     span_px = max(high_px - measured.low_px, measured.step_px)
     if span_px * scale > usual_span_px:
         scale = (usual_span_px * scale**2 / span_px) ** (1 / 3)
@@ -195,11 +198,14 @@ def choose_search_range(
 def _usual_scale_and_span(
     matcher: NetworkMatcher, size: Sequence[int], camera: Camera | None
 ) -> tuple[float, int]:
-    """Give the scale and the span of a match, where the disparities need no wider span.
+    """Compute the scale and the span of a search, where the disparities need no wider span.
 
-    The scale is the size at which the images are matched relative to their own; the span is how
-    many disparities are searched [px at that size]. With a camera, the scale follows from the focal
-    length; without one, a fine match has a fixed number of pixels.
+    With a camera, the scale follows from the focal length; without one, a fine match has a fixed
+    number of pixels.
+
+    Returns:
+        The size at which the images are matched, as a multiple of their own; and how many
+        disparities are searched [px at that size].
     """
     trained = matcher.network_config
     if camera is not None and trained.work_focal_px is not None:
@@ -215,8 +221,8 @@ def _usual_scale_and_span(
 def doubt_hidden(match: Match, measured: DisparityRange) -> Match:
     """Lower the confidence where the narrow copy's right view disagrees: mostly hidden places.
 
-    A difference of up to a pixel of the copy is within its error. A check at full size would find
-    smaller differences too, in twice the time.
+    A difference of up to a pixel of the copy is within its error, and does not count. A check at
+    full size would find smaller differences too, in twice the time.
     """
     if match.confidence is None:
         return match
@@ -230,6 +236,11 @@ def doubt_outside(match: Match, measured: DisparityRange, search: SearchRange) -
     That is where the narrow copy has a larger disparity than was searched, and where the match is
     the last disparity of the search.
 
+    Args:
+        match: the match of the pair.
+        measured: the range of the disparities, with the match of the narrow copy.
+        search: the search of ``match``.
+
     Returns:
         The match; and a warning with the share of pixels beyond the search, counted where the copy
         is sure and the right view can show them; "" where the share is small.
@@ -239,27 +250,20 @@ def doubt_outside(match: Match, measured: DisparityRange, search: SearchRange) -
     coarse_px = measured.coarse.disparity_px
     coarse_confidence = measured.coarse.confidence
     last_px = search.last_in_images_px
-    # Within two pixels of the copy, its error, neighbours may lie beyond too.
+    # Neighbours within two pixels of the copy, its error, may lie beyond too.
     may_be_beyond = coarse_px > last_px - measured.step_px
     if bool(may_be_beyond.any()):
-        radius = round(2 * measured.step_px / STEP_PX)
-        wide = may_be_beyond.float()[None]
-        for kernel, padding in (
-            ((1, 2 * radius + 1), (0, radius)),
-            ((2 * radius + 1, 1), (radius, 0)),
-        ):
-            wide = F.max_pool2d(wide, kernel, 1, padding)
-        may_be_beyond = wide[0] > 0
+        may_be_beyond = _dilate(may_be_beyond, round(2 * measured.step_px / STEP_PX))
     is_last = match.disparity_px > last_px - STEP_PX / search.scale
     doubted = replace(match, confidence=match.confidence.masked_fill(may_be_beyond | is_last, 0.0))
 
-    # What is surely beyond is named.
+    # What is surely beyond is counted for the warning.
     is_beyond = coarse_px > last_px + measured.step_px
     is_beyond &= coarse_px <= torch.arange(coarse_px.shape[1], device=coarse_px.device)
     if coarse_confidence is not None:
-        is_beyond &= coarse_confidence >= _SURE
+        is_beyond &= coarse_confidence >= _MIN_NEAR_CONFIDENCE
     share = float(is_beyond.float().mean())
-    if share < _NAMED:
+    if share < _MIN_WARNED_SHARE:
         return doubted, ""
     return doubted, (
         f"{share:.1%} of the image have disparities beyond {last_px:.0f} px, the largest "
@@ -267,3 +271,12 @@ def doubt_outside(match: Match, measured: DisparityRange, search: SearchRange) -
         "is 0. Give a larger --max-disparity (in Python MatcherConfig(max_disparity_px=...)), or "
         "none, and it is measured"
     )
+
+
+def _dilate(mask: Mask, radius: int) -> Mask:
+    """Extend a mask to the square of ``radius`` pixels around each of its pixels."""
+    side = 2 * radius + 1
+    values = mask.float()[None]
+    along_rows = F.max_pool2d(values, (1, side), 1, (0, radius))
+    dilated = F.max_pool2d(along_rows, (side, 1), 1, (radius, 0))
+    return dilated[0] > 0

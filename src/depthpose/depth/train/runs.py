@@ -21,8 +21,9 @@ from depthpose.core.loop import Task, TrainingRun, format_held_out, releases_fol
 from depthpose.core.run import find_rank
 from depthpose.depth.config import GeneratorConfig, PairsConfig, SelectionConfig
 from depthpose.depth.datasets import Frame, refuse_common
+from depthpose.depth.encoder import load_encoder
+from depthpose.depth.generators import Generator, SelectionGenerator, UNetGenerator
 from depthpose.depth.stereo import StereoNetwork
-from depthpose.depth.synthesis import Generator, SelectionGenerator, UNetGenerator, load_encoder
 from depthpose.depth.train import stages
 from depthpose.depth.train.config import (
     FinetuneTraining,

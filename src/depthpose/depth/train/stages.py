@@ -15,13 +15,13 @@ from torch import Tensor, nn
 
 from depthpose.core.draw import draw_disparity
 from depthpose.core.loop import Update, ValidationResult, make_adam, make_sample_generator
-from depthpose.depth import losses, synthesis
+from depthpose.depth import generators, losses, synthesis
 from depthpose.depth.augment import TrainingPair, degrade
 from depthpose.depth.config import DegradeConfig
 from depthpose.depth.disparity import right_disparity_from_left
 from depthpose.depth.metrics import measure
 from depthpose.depth.stereo import StereoNetwork, normalise
-from depthpose.depth.stereo.matcher import pad_top_right
+from depthpose.depth.stereo.network_matcher import pad_top_right
 from depthpose.depth.train.config import (
     FinetuneTraining,
     SelectTraining,
@@ -127,7 +127,7 @@ def _end_point_error(
 
 @torch.no_grad()
 def validate_pairs(
-    matcher: StereoNetwork, held_out: TrainingPairs, generator: synthesis.Generator | None = None
+    matcher: StereoNetwork, held_out: TrainingPairs, generator: generators.Generator | None = None
 ) -> ValidationResult:
     """Measure a matcher in eval mode on held-out pairs.
 
@@ -149,7 +149,7 @@ def validate_pairs(
         pair = held_out.read(index)
         right = pair.right
         if generator is not None:
-            right = synthesis.draw_right(generator, pair.left[None].to(device))[0].cpu()
+            right = synthesis.synthesise_right(generator, pair.left[None].to(device))[0].cpu()
         predicted_px, is_sky = _match(matcher, pair.left, right)
         if is_sky is not None:
             predicted_px = torch.where(is_sky, 0.0, predicted_px)
@@ -192,7 +192,7 @@ class ViewTask:
 
     def __init__(
         self,
-        generator: synthesis.UNetGenerator,
+        generator: generators.UNetGenerator,
         config: ViewTraining,
         held_out: TrainingPairs | None,
     ) -> None:
@@ -203,7 +203,7 @@ class ViewTask:
         adam = config.generator_adam
         self.optimizers = {"generator": (make_adam(generator.parameters(), adam), adam)}
         if config.discriminator != "none":
-            discriminator = synthesis.Discriminator(
+            discriminator = generators.Discriminator(
                 config.discriminator, config.discriminator_width
             )
             self.modules["discriminator"] = discriminator.train()
@@ -249,7 +249,7 @@ class ViewTask:
         pictures: dict[str, Tensor] = {}
         for index in range(len(self.held_out)):
             pair = self.held_out.read(index)
-            drawn = synthesis.draw_right(self.generator, pair.left[None].to(device))[0].cpu()
+            drawn = synthesis.synthesise_right(self.generator, pair.left[None].to(device))[0].cpu()
             difference = drawn - pair.right
             l1.append(float(difference.abs().mean()))
             psnr_db.append(float(-10 * torch.log10(difference.square().mean())))
@@ -271,7 +271,7 @@ class FinetuneTask:
 
     def __init__(
         self,
-        generator: synthesis.Generator,
+        generator: generators.Generator,
         matcher: StereoNetwork,
         config: FinetuneTraining,
         held_out: TrainingPairs | None,
@@ -287,7 +287,7 @@ class FinetuneTask:
 
     def step(self, batch: TrainingPair) -> Iterator[Update]:
         """Synthesise right views and match them; give the one update of the generator."""
-        drawn = synthesis.draw_right(self.generator, batch.left)
+        drawn = synthesis.synthesise_right(self.generator, batch.left)
         (predicted_px,) = self.matcher(normalise(batch.left), normalise(drawn))
         predicted_px = predicted_px.float()
         max_disparity_px = self.matcher.config.max_disparity_px
@@ -385,7 +385,7 @@ class SelectTask:
 
     def __init__(
         self,
-        generator: synthesis.SelectionGenerator,
+        generator: generators.SelectionGenerator,
         config: SelectTraining,
         held_out: TrainingPairs | None,
     ) -> None:
