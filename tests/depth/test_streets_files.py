@@ -18,7 +18,7 @@ from depthpose.depth.datasets import (
     write_raw_frame,
 )
 from depthpose.depth.disparity import disparity_from_depth
-from depthpose.depth.synthetic import draw_street
+from depthpose.depth.synthetic import render_street
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +73,7 @@ def test_what_is_read_is_metric(synthetic: Path) -> None:
 
 def test_one_date_has_one_calibration(tmp_path: Path) -> None:
     drive = "2100_02_01_drive_0001_sync"
-    raw = draw_street(StreetsConfig(scale=0.05), 0)
+    raw = render_street(StreetsConfig(scale=0.05), 0)
     write_raw_frame(tmp_path, drive, 3, raw)
     other = replace(raw, rig=replace(raw.rig, baseline_m=0.6))
     with pytest.raises(InputError, match="another rig or scale"):

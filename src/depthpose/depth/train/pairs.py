@@ -13,7 +13,7 @@ from depthpose.depth.augment import TrainingPair, augment, scale_pair
 from depthpose.depth.config import PairsConfig, TruthKind
 from depthpose.depth.datasets import Dataset, Frame, lidar_truth, open_dataset, truth_kinds
 from depthpose.depth.disparity import disparity_from_depth, right_disparity_from_left
-from depthpose.depth.synthetic import Streets, kitti_rig
+from depthpose.depth.synthetic import KITTI_RIG_COUNT, Streets, kitti_rig
 from depthpose.depth.types import Map
 
 BASELINE_TOLERANCE = 0.02
@@ -110,7 +110,7 @@ class TrainingPairs:
             if isinstance(source, Dataset)
         }
         if self.config.streets is not None:  # perhaps millions of streets, but of five rigs
-            rigs |= {f"street with KITTI's rig {n}": kitti_rig(n) for n in range(5)}
+            rigs |= {f"street with KITTI's rig {n}": kitti_rig(n) for n in range(KITTI_RIG_COUNT)}
         for name, rig in rigs.items():
             if rig is None:
                 raise InputError(
