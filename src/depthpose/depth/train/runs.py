@@ -45,7 +45,7 @@ def refuse_frozen_random(config: SelectTraining | StereoTraining) -> None:
     """Refuse to freeze the first layers of an encoder that begins with random weights.
 
     Raises:
-        InputError: that is so.
+        InputError: ``with_frozen_stem`` is set, and neither ``encoder`` nor ``start``.
     """
     if config.with_frozen_stem and config.encoder is None and config.start is None:
         raise InputError(
@@ -77,7 +77,12 @@ def copy_start(network: Generator | StereoNetwork, loaded: nn.Module, source: st
 
 
 def make_matcher_network(config: StereoTraining) -> StereoNetwork:
-    """Make the matcher network that a config trains, with its initial weights."""
+    """Make the matcher network that a config trains, with its initial weights.
+
+    Raises:
+        InputError: the weights that the config names are of another network, or there is nothing
+            to begin with for an encoder whose first layers are frozen.
+    """
     kind = next(kind for kind in MATCHERS.values() if isinstance(config.network, kind.config))
     matcher = kind.network(config.network)
     if config.encoder is not None:
@@ -113,7 +118,7 @@ _VALIDATION_TEXTS = {
 
 @releases_folder
 def train_view(config: ViewTraining, run: Run) -> Path:
-    """Train the U-Net generator; give its weights file."""
+    """Train the U-Net generator; return the path of its weights."""
     torch.manual_seed(config.loop.seed)
     config = _at_virtual_focal(config, config.generator)
     baseline_m = config.generator.virtual_baseline_m
@@ -128,7 +133,7 @@ def train_view(config: ViewTraining, run: Run) -> Path:
 
 @releases_folder
 def train_select(config: SelectTraining, run: Run) -> Path:
-    """Train the generator that selects; give its weights file."""
+    """Train the generator that selects; return the path of its weights."""
     refuse_frozen_random(config)
     torch.manual_seed(config.loop.seed)
     rig = config.generator
@@ -155,7 +160,22 @@ def train_select(config: SelectTraining, run: Run) -> Path:
 
 @releases_folder
 def train_stereo(config: StereoTraining, run: Run) -> Path:
-    """Train the matcher; give its weights file."""
+    """Train the matcher; return the path of its weights."""
+    _refuse_wrong_gradients(config)
+    torch.manual_seed(config.loop.seed)
+    pairs = TrainingPairs(config.pairs, config.loop.seed, needs_truth=True)
+    held_out = config.held_out and TrainingPairs(config.held_out, 0, needs_truth=True)
+    matcher = make_matcher_network(config)
+    facts, seconds = _run_stage(stages.StereoTask(matcher, config, held_out), pairs, config, run)
+    return _write_weights(run, "stereo", facts, seconds, matcher=matcher)
+
+
+def _refuse_wrong_gradients(config: StereoTraining) -> None:
+    """Refuse settings by which torch computes wrong gradients on a CPU.
+
+    Raises:
+        InputError: the precision is of 16 bits, and the search two planes deep at its coarsest.
+    """
     # With torch 2.13, gradients of a 3x3x3 convolution over two planes in 16 bits are values near
     # 1e35 or NaN, while those over one, three or more planes agree with fp32 within 0.5 %.
     step_px = config.network.step_px
@@ -166,17 +186,11 @@ def train_stereo(config: StereoTraining, run: Run) -> Path:
             "two planes deep, and a CPU's 16-bit gradients of its convolutions are wrong. Take "
             f"max_disparity_px {3 * step_px}, or precision fp32."
         )
-    torch.manual_seed(config.loop.seed)
-    pairs = TrainingPairs(config.pairs, config.loop.seed, needs_truth=True)
-    held_out = config.held_out and TrainingPairs(config.held_out, 0, needs_truth=True)
-    matcher = make_matcher_network(config)
-    facts, seconds = _run_stage(stages.StereoTask(matcher, config, held_out), pairs, config, run)
-    return _write_weights(run, "stereo", facts, seconds, matcher=matcher)
 
 
 @releases_folder
 def train_finetune(config: FinetuneTraining, run: Run) -> Path:
-    """Fine-tune the generator through the frozen matcher; give the weights file of both."""
+    """Fine-tune the generator through the frozen matcher; return the path of both's weights."""
     torch.manual_seed(config.loop.seed)
     for setting in ("generator", "matcher"):
         if not getattr(config, setting):
@@ -214,34 +228,62 @@ def _run_stage(
     config: Any,  # noqa: ANN401
     run: Run,
 ) -> tuple[dict[str, str], float]:
-    """Claim the folder for this config, and train; give the facts of the card, and the seconds.
+    """Claim the folder for this config, and train.
+
+    Returns:
+        The facts of the weights' card, and how long the training took [s].
 
     Raises:
         InputError: the folder belongs to another training, or held-out pairs are trained on too.
     """
+    # Held-out pairs must not be trained on.
+    sources = samples.sources if isinstance(samples, stages.SelectionSamples) else [samples]
+    frames = [frame for source in sources for frame in source.frames]
+    held_out: TrainingPairs | None = getattr(task, "held_out", None)
+    if held_out is not None:
+        remedy = "give --held-out other pairs, or exclude these in the config"
+        refuse_common(frames, held_out.frames, "pairs held out", remedy)
+
     # What the folder is claimed for beside the config: the initial weights, truths and frames.
-    initial_weights: dict[str, str] = {}
-    for setting in _WEIGHTS_SETTINGS:
-        name = getattr(config, setting, None)
-        if isinstance(name, str):
-            initial_weights[setting] = name
+    initial_weights = _find_initial_weights(config)
     checksums: dict[str, Any] = {
         f"{setting}_sha256": file_sha256(find_weights(name))
         for setting, name in initial_weights.items()
     }
     if samples.truths:
         checksums["truth"] = list(samples.truths)
-    sources = samples.sources if isinstance(samples, stages.SelectionSamples) else [samples]
-    frames = [frame for source in sources for frame in source.frames]
     if frames:
         checksums["frames_sha256"] = _frames_sha256(frames)
 
-    held_out: TrainingPairs | None = getattr(task, "held_out", None)
-    if held_out is not None:
-        remedy = "give --held-out other pairs, or exclude these in the config"
-        refuse_common(frames, held_out.frames, "pairs held out", remedy)
+    facts = _describe_training(config, samples.truths, tuple(initial_weights.values()))
+    warn_of_terms(facts)
+    weights_files = ("generator", "matcher", "fakestereo")
+    run.claim(config, weights_files, checksums, ("held_out",))
+    return facts, run.train(task, samples, config.loop)
 
-    # The facts of the card.
+
+def _find_initial_weights(config: Any) -> dict[str, str]:  # noqa: ANN401
+    """Find the settings of a stage that name weights to begin with: setting to name."""
+    initial_weights: dict[str, str] = {}
+    for setting in _WEIGHTS_SETTINGS:
+        name = getattr(config, setting, None)
+        if isinstance(name, str):
+            initial_weights[setting] = name
+    return initial_weights
+
+
+def _describe_training(
+    config: Any,  # noqa: ANN401
+    truths: Sequence[str],
+    began_with: Sequence[str],
+) -> dict[str, str]:
+    """Describe a training for the card of its weights, with the terms that bind them.
+
+    Args:
+        config: config of the stage.
+        truths: the kinds of truth, as :class:`TrainingPairs` has them.
+        began_with: names of the weights that it begins with.
+    """
     pair_configs = [pairs for pairs in (config.pairs, getattr(config, "more", None)) if pairs]
     data = [Path(folder).name for pairs in pair_configs for folder in pairs.folders]
     if any(pairs.streets for pairs in pair_configs):
@@ -251,16 +293,11 @@ def _run_stage(
         "stage": type(config).__name__,
         "licence": "not stated; that of the training data binds",
     }
-    if samples.truths:
-        facts["truth"] = ", ".join(samples.truths)
-    began_with = tuple(initial_weights.values())
+    if truths:
+        facts["truth"] = ", ".join(truths)
     if began_with:
         facts["began_with"] = ", ".join(Path(name).stem for name in began_with)
-    facts = bound_facts(facts, began_with)
-    warn_of_terms(facts)
-
-    run.claim(config, ("generator", "matcher", "fakestereo"), checksums, ("held_out",))
-    return facts, run.train(task, samples, config.loop)
+    return bound_facts(facts, began_with)
 
 
 def _frames_sha256(frames: Sequence[Frame]) -> str:
@@ -281,7 +318,10 @@ def _write_weights(
     generator: Generator | None = None,
     matcher: StereoNetwork | None = None,
 ) -> Path:
-    """Write the weights and their card, by the process of rank 0; give the file of the weights."""
+    """Write the weights and their card, by the process of rank 0; return the weights' path.
+
+    They are called after what they hold: generator, matcher, or fakestereo for both.
+    """
     if generator is not None and matcher is not None:
         name = "fakestereo"
     else:
@@ -299,11 +339,11 @@ def _write_weights(
 def _at_virtual_focal(
     config: _GeneratorTraining, generator: GeneratorConfig | SelectionConfig
 ) -> _GeneratorTraining:
-    """Set the focal length of all pairs that leave it open to that of the generator's rig.
+    """Return the config with the focal length of the generator's rig for pairs without one.
 
     Raises:
-        InputError: pairs have a focal length of their own, or a scale, which the generator cannot
-            learn from.
+        InputError: pairs have a focal length of their own, or a scale, from which the generator
+            cannot learn.
     """
     focal_px = generator.virtual_focal_px
     pair_configs: dict[str, PairsConfig] = {}

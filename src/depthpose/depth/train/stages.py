@@ -32,17 +32,20 @@ from depthpose.depth.train.pairs import TrainingPairs
 from depthpose.depth.types import Map, Maps, Mask, View
 
 
-def _fix_norms(module: nn.Module) -> None:
-    """Let batch norms use their stored statistics in train mode too: small batches spoil them."""
+def _freeze_norm_statistics(module: nn.Module) -> None:
+    """Set batch norms to eval mode, so that small batches do not spoil their statistics."""
     for part in module.modules():
         if isinstance(part, nn.BatchNorm2d | nn.BatchNorm3d):
             part.eval()
 
 
-def _encoder_groups(
+def _group_parameters(
     network: nn.Module, encoder: nn.Module, encoder_rate: float
 ) -> list[dict[str, Any]]:
-    """Group parameters for the optimiser: the encoder has a share of the learning rate."""
+    """Group a network's parameters for the optimiser: those of its encoder, and the rest.
+
+    ``encoder_rate``: learning rate of the encoder, as a share of the rest's.
+    """
     encoder_parameters = set(encoder.parameters())
     rest = [p for p in network.parameters() if p not in encoder_parameters]
     trained = [p for p in encoder.parameters() if p.requires_grad]
@@ -60,13 +63,13 @@ class StereoTask:
         self.matcher = matcher
         self.modules: dict[str, nn.Module] = {"matcher": matcher}
 
-        # Parts that stay as they are: norms, the encoder's stem, or all but the head of the sky.
-        self._with_fixed_norms: list[nn.Module] = []
+        # Parts that stay as they are: the encoder's stem, norms, or all but the head of the sky.
+        self._with_frozen_norms: list[nn.Module] = []
         if config.with_frozen_stem and matcher.encoder is not None:
             matcher.encoder.freeze_early()
-            self._with_fixed_norms.append(matcher.encoder)
+            self._with_frozen_norms.append(matcher.encoder)
         if config.with_frozen_norms:
-            self._with_fixed_norms.append(matcher)
+            self._with_frozen_norms.append(matcher)
         self._only_trained = matcher.sky if config.sky_alone else None
         if self._only_trained is not None:
             matcher.requires_grad_(False)
@@ -75,7 +78,7 @@ class StereoTask:
 
         groups: list[dict[str, Any]]
         if self._only_trained is None and matcher.encoder is not None:
-            groups = _encoder_groups(matcher, matcher.encoder, config.encoder_rate)
+            groups = _group_parameters(matcher, matcher.encoder, config.encoder_rate)
         else:
             groups = [{"params": [p for p in matcher.parameters() if p.requires_grad]}]
         self.optimizers = {"matcher": (make_adam(groups, config.adam), config.adam)}
@@ -83,28 +86,28 @@ class StereoTask:
     def _set_train_mode(self) -> None:
         """Set the matcher to train mode, except for norms and parts that stay as they are."""
         self.matcher.train()
-        for module in self._with_fixed_norms:
-            _fix_norms(module)
+        for module in self._with_frozen_norms:
+            _freeze_norm_statistics(module)
         if self._only_trained is not None:
             for part in self.matcher.children():
                 part.train(part is self._only_trained)
 
     def step(self, batch: TrainingPair) -> Iterator[Update]:
-        """Match a batch, and give the one update of the matcher."""
+        """Match a batch, and yield the one update of the matcher, by ``losses.stereo_loss``."""
         max_disparity_px = self.matcher.config.max_disparity_px
-        sky_weight = self.config.sky_weight
-        views = normalise(batch.left), normalise(batch.right)
-        heads, sky = self.matcher.forward_with_sky(*views)
-        heads = tuple(head.float() for head in heads)
-        facts = {"epe": _end_point_error(heads[-1], batch.left_px, max_disparity_px)}
-        if sky is None:
-            loss = losses.heads_loss(heads, batch.left_px, max_disparity_px, sky_weight=sky_weight)
-        else:
-            sky_loss = losses.sky_loss(sky.float(), batch.left_px)
-            heads_loss = losses.heads_loss(heads, batch.left_px, max_disparity_px)
-            loss = heads_loss + sky_weight * sky_loss
-            facts["sky"] = sky_loss.detach()
-        yield Update("matcher", loss, facts)
+        left = normalise(batch.left)
+        right = normalise(batch.right)
+        heads_px, sky = self.matcher.forward_with_sky(left, right)
+        heads_px = tuple(head_px.float() for head_px in heads_px)
+        if sky is not None:
+            sky = sky.float()
+        loss = losses.stereo_loss(
+            heads_px, sky, batch.left_px, max_disparity_px, self.config.sky_weight
+        )
+        facts = {"epe": _end_point_error(heads_px[-1], batch.left_px, max_disparity_px)}
+        if loss.sky is not None:
+            facts["sky"] = loss.sky.detach()
+        yield Update("matcher", loss.total, facts)
 
     def validate(self) -> ValidationResult:
         """Match held-out pairs, and measure them by ``validate_pairs``."""
@@ -119,7 +122,10 @@ class StereoTask:
 def _end_point_error(
     predicted_px: Maps, truth_px: Maps, max_disparity_px: int
 ) -> Float[Tensor, ""]:
-    """Average the absolute error over pixels with truth, without a gradient; 0 if there is none."""
+    """Average the absolute error [px] over pixels with truth, without a gradient.
+
+    It is 0 where no pixel has truth. Truth from ``max_disparity_px`` on does not count.
+    """
     is_valid = (truth_px > 0) & (truth_px < max_disparity_px)
     error_px = (predicted_px.detach() - truth_px.nan_to_num(0.0)).abs()
     return error_px.where(is_valid, 0.0).sum() / is_valid.sum().clamp(min=1)
@@ -141,6 +147,7 @@ def validate_pairs(
         the sky, shares of the sky that is missed and of the rest that is taken for sky. Pixels
         taken for sky have a disparity of 0. The picture is of the first pair.
     """
+    # The metrics of each pair, by name; those of the sky may have none.
     errors: dict[str, list[float]] = {"epe_px": [], "d1": []}
     sky_shares: dict[str, list[float]] = {"sky_missed": [], "sky_false": []}
     pictures: dict[str, Tensor] = {}
@@ -167,9 +174,10 @@ def validate_pairs(
             metrics = measure("disparity", predicted_px[has_truth], pair.left_px[has_truth])
             errors["epe_px"].append(metrics["epe_px"])
             errors["d1"].append(metrics["d1_all"])
-    numbers = errors | {name: shares for name, shares in sky_shares.items() if shares}
+
+    values_of = errors | {name: shares for name, shares in sky_shares.items() if shares}
     means = {
-        f"held_out/{name}": sum(values) / max(len(values), 1) for name, values in numbers.items()
+        f"held_out/{name}": sum(values) / max(len(values), 1) for name, values in values_of.items()
     }
     return ValidationResult(numbers=means, pictures=pictures)
 
@@ -177,18 +185,19 @@ def validate_pairs(
 def _match(matcher: StereoNetwork, left: View, right: View) -> tuple[Map, Mask | None]:
     """Match one pair of any size: disparity of the left view [px], and its sky where recognised."""
     device = next(matcher.parameters()).device
-    views = [
-        pad_top_right(normalise(view.to(device)), matcher.config)[None] for view in (left, right)
-    ]
-    heads, sky = matcher.forward_with_sky(*views)
+    padded_left = pad_top_right(normalise(left.to(device)), matcher.config)
+    padded_right = pad_top_right(normalise(right.to(device)), matcher.config)
+    heads_px, sky = matcher.forward_with_sky(padded_left[None], padded_right[None])
+
+    # Without the padding, which is at the top and on the right.
     height, width = left.shape[-2:]
-    disparity_px = heads[-1][0, -height:, :width].float().cpu()
+    disparity_px = heads_px[-1][0, -height:, :width].float().cpu()
     is_sky = None if sky is None else sky[0, -height:, :width].cpu() > 0.5
     return disparity_px, is_sky
 
 
 class ViewTask:
-    """Trains the U-Net as pix2pix: cGAN + lambda L1 (eq. 2.3)."""
+    """Trains the U-Net generator as pix2pix does: adversarial loss + ``l1_weight`` L1 (eq. 2.3)."""
 
     def __init__(
         self,
@@ -212,11 +221,12 @@ class ViewTask:
             self.optimizers["discriminator"] = (optimizer, discriminator_adam)
 
     def step(self, batch: TrainingPair) -> Iterator[Update]:
-        """Synthesise right views; give the update of the discriminator, then of the generator.
+        """Synthesise right views; yield the update of the discriminator, then of the generator.
 
-        The discriminator scores the views anew after its update.
+        The discriminator scores the views anew after its update. Without one, the generator's is
+        the only update, by L1 alone.
         """
-        left = 2 * batch.left - 1
+        left = 2 * batch.left - 1  # from [0, 1] to [-1, 1]
         right = 2 * batch.right - 1
         drawn = self.generator(left)
         l1 = (drawn - right).abs().mean()  # eq. 2.5
@@ -286,7 +296,7 @@ class FinetuneTask:
         }
 
     def step(self, batch: TrainingPair) -> Iterator[Update]:
-        """Synthesise right views and match them; give the one update of the generator."""
+        """Synthesise right views and match them; yield the one update of the generator."""
         drawn = synthesis.draw_right(self.generator, batch.left)
         (predicted_px,) = self.matcher(normalise(batch.left), normalise(drawn))
         predicted_px = predicted_px.float()
@@ -309,7 +319,10 @@ class FinetuneTask:
 
 
 class SelectionSample(NamedTuple):
-    """A sample of the selecting generator's training; disparity is NaN if unknown, 0 in the sky."""
+    """A sample or batch of the selecting generator's training.
+
+    Disparity is NaN where it is unknown, and 0 in the sky.
+    """
 
     degraded: Float[Tensor, "*b 3 h w"]  # the degraded left image: the input
     left: Float[Tensor, "*b 3 h w"]  # the left image itself, which the right view is made of
@@ -325,8 +338,8 @@ class SelectionSamples:
     The first source sets the length of an epoch.
 
     Args:
-        sources: one or two.
-        more_share: share of the samples from the second source.
+        sources: one or two sources of pairs.
+        more_share: share of the samples from the second source, if there is one.
         config: degradation of the input.
         seed: seed of the random numbers.
 
@@ -372,8 +385,8 @@ class SelectionSamples:
         )
 
 
-_CAP_M = 80.0
-"""Truth beyond this does not count, and no estimate lies beyond it, as in Eigen's protocol."""
+_MAX_DEPTH_M = 80.0
+"""Truth beyond this does not count, and estimates are clamped to it, as in Eigen's protocol."""
 
 
 class SelectTask:
@@ -396,17 +409,17 @@ class SelectTask:
             generator.encoder.freeze_early()
         self.modules: dict[str, nn.Module] = {"generator": generator}
         self._set_train_mode()
-        groups = _encoder_groups(generator, generator.encoder, config.encoder_rate)
+        groups = _group_parameters(generator, generator.encoder, config.encoder_rate)
         self.optimizers = {"generator": (make_adam(groups, config.adam), config.adam)}
 
     def _set_train_mode(self) -> None:
         """Set the generator to train mode, except for the encoder's norms if its stem is frozen."""
         self.generator.train()
         if self.config.with_frozen_stem:
-            _fix_norms(self.generator.encoder)
+            _freeze_norm_statistics(self.generator.encoder)
 
     def step(self, batch: SelectionSample) -> Iterator[Update]:
-        """Estimate disparities and synthesise right views; give the one update of the generator."""
+        """Estimate disparities and synthesise right views; yield the generator's one update."""
         left_logits, right_logits = self.generator(batch.degraded)
         left_loss = self._disparity_loss(left_logits, batch.left_px)
         right_loss = self._disparity_loss(right_logits, batch.right_px)
@@ -429,12 +442,13 @@ class SelectTask:
         self, logits: Float[Tensor, "b k rows columns"], truth_px: Maps
     ) -> Float[Tensor, ""]:
         """Compute the loss of one view's disparity, and of its classes where they have a weight."""
+        # The disparity that the logits mean, at the size of the truth.
         planes = self.generator.planes
-        range_px = self.generator.config.disparity_px
-        log_px = synthesis.read_logits(logits, planes)[0][:, None]
-        log_px = F.interpolate(log_px, truth_px.shape[1:], mode="bilinear", align_corners=False)
+        half_log_px, _, _ = synthesis.read_logits(logits, planes)
+        size = truth_px.shape[1:]
+        log_px = F.interpolate(half_log_px[:, None], size, mode="bilinear", align_corners=False)
         disparity_loss = losses.GENERATOR_DISPARITY_LOSSES[self.config.disparity_loss]
-        loss = disparity_loss(log_px[:, 0], truth_px, range_px)
+        loss = disparity_loss(log_px[:, 0], truth_px, self.generator.config.disparity_px)
         if not self.config.plane_weight:
             return loss
 
@@ -450,10 +464,11 @@ class SelectTask:
             return ValidationResult()
         self.generator.eval()
         device = next(self.generator.parameters()).device
-        rig = self.generator.config
+        config = self.generator.config
         synthesiser = synthesis.SelectionSynthesiser(self.generator, device)
-        far_px = rig.virtual_focal_px * rig.virtual_baseline_m / _CAP_M
-        numbers: dict[str, list[float]] = {"abs_rel": [], "d1": [], "sky_missed": []}
+        far_px = config.virtual_focal_px * config.virtual_baseline_m / _MAX_DEPTH_M
+        # The metrics of each pair, by name.
+        values_of: dict[str, list[float]] = {"abs_rel": [], "d1": [], "sky_missed": []}
         pictures: dict[str, Tensor] = {}
         for index in range(len(self.held_out)):
             pair = self.held_out.read(index)
@@ -473,15 +488,15 @@ class SelectTask:
                     # 1 / disparity is depth in another unit, on which these metrics do not depend.
                     true_depth = 1 / pair.left_px[has_truth]
                     metrics = measure("depth", 1 / predicted_px[has_truth], true_depth)
-                numbers["abs_rel"].append(metrics["abs_rel"])
-                numbers["d1"].append(metrics["d1"])
+                values_of["abs_rel"].append(metrics["abs_rel"])
+                values_of["d1"].append(metrics["d1"])
             is_true_sky = pair.left_px == 0
             if bool(is_true_sky.any()):
-                numbers["sky_missed"].append(float((~is_sky[is_true_sky]).float().mean()))
+                values_of["sky_missed"].append(float((~is_sky[is_true_sky]).float().mean()))
         self._set_train_mode()
         means = {
             f"held_out/{name}": sum(values) / len(values)
-            for name, values in numbers.items()
+            for name, values in values_of.items()
             if values
         }
         return ValidationResult(numbers=means, pictures=pictures)
