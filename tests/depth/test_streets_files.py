@@ -13,8 +13,8 @@ from depthpose.depth.config import StreetsConfig
 from depthpose.depth.datasets import (
     has_calibration,
     has_raw_frame,
-    lidar_truth,
     open_dataset,
+    read_lidar_depth,
     write_raw_frame,
 )
 from depthpose.depth.disparity import disparity_from_depth
@@ -61,7 +61,7 @@ def test_what_is_read_is_metric(synthetic: Path) -> None:
     rig, truth = dataset.read_rig(0), dataset.read_truth(0)
     assert rig is not None
     assert truth.disparity_px is not None
-    scan_m = lidar_truth(frame, "camera_z")
+    scan_m = read_lidar_depth(frame, "camera_z")
     # KITTI's own protocol draws a point one pixel up and to the left.
     expected = disparity_from_depth(scan_m, rig).roll((1, 1), (0, 1))
     difference = (expected - truth.disparity_px).abs()

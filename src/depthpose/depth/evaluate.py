@@ -21,7 +21,13 @@ from depthpose.core.files import read_image
 from depthpose.core.frame import data_frame
 from depthpose.depth import disparity
 from depthpose.depth import predictions as files
-from depthpose.depth.datasets import Dataset, Frame, has_lidar, lidar_truth, read_disparity
+from depthpose.depth.datasets import (
+    Dataset,
+    FramePaths,
+    has_lidar,
+    read_disparity,
+    read_lidar_depth,
+)
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.metrics import (
     RANKING,
@@ -92,7 +98,7 @@ def find_protocol(name: str) -> Protocol:
     return PROTOCOLS[name]
 
 
-def has_truth(frame: Frame, rule: Protocol) -> bool:
+def has_truth(frame: FramePaths, rule: Protocol) -> bool:
     """Whether a frame has files of the truth that a protocol needs; none is read."""
     match rule.truth:
         case "disparity":
@@ -173,7 +179,7 @@ class Measured:
 class _PreparedFrame:
     """A frame's truth and prediction, at the size of the image."""
 
-    frame: Frame
+    frame: FramePaths
     truth: Map  # depth [m] or disparity [px], as the protocol says
     disparity_px: Map
     depth_m: Map | None  # where depth was predicted and no disparity
@@ -444,7 +450,7 @@ def _prepare_frame(
 
     # The truth.
     if rule.truth in ("velodyne_x", "camera_z"):
-        truth = lidar_truth(frame, rule.truth)
+        truth = read_lidar_depth(frame, rule.truth)
     else:
         stored_truth = dataset.read_truth(index)
         truth = stored_truth.disparity_px if rule.is_disparity else stored_truth.depth_m
@@ -494,7 +500,7 @@ def _prepare_frame(
     )
 
 
-def _measure_view(frame: Frame, predictions: Path) -> dict[str, float]:
+def _measure_view(frame: FramePaths, predictions: Path) -> dict[str, float]:
     """Compare the synthesised right view of a frame with the real one; {} where one is missing."""
     synthesised = files.read_part(predictions, frame.name, "right.png")
     if synthesised is None or frame.right is None:

@@ -11,7 +11,13 @@ from depthpose.core.errors import InputError, Notice
 from depthpose.core.loop import sample_generator, shuffled_index
 from depthpose.depth.augment import TrainingPair, augment, scale_pair
 from depthpose.depth.config import PairsConfig, TruthKind
-from depthpose.depth.datasets import Dataset, Frame, lidar_truth, open_dataset, truth_kinds
+from depthpose.depth.datasets import (
+    Dataset,
+    FramePaths,
+    list_truth_kinds,
+    open_dataset,
+    read_lidar_depth,
+)
 from depthpose.depth.disparity import disparity_from_depth, right_disparity_from_left
 from depthpose.depth.synthetic import KITTI_RIG_COUNT, Streets, kitti_rig
 from depthpose.depth.types import Map
@@ -68,7 +74,7 @@ class TrainingPairs:
             self._refs += _spread_evenly(refs, config.limit)
 
         # The frames on disk, and the truth of each source.
-        self.frames: list[Frame] = []
+        self.frames: list[FramePaths] = []
         truths: dict[str, None] = {}  # in order, each once
         for source, number, truth in self._refs:
             if isinstance(source, Dataset):
@@ -237,7 +243,7 @@ def _truth_of_frame(
         )
     depth_m = dataset.read_truth(number).depth_m
     if kind == "scan":
-        depth_m = lidar_truth(dataset.frames[number], "camera_z")
+        depth_m = read_lidar_depth(dataset.frames[number], "camera_z")
     assert depth_m is not None, "frames without truth were left out"
     return disparity_from_depth(depth_m, rig)
 
@@ -262,7 +268,7 @@ def _usable_pairs(
 
     # The kinds of truth of each frame that has the views.
     kinds_by_index = {
-        index: truth_kinds(frame)
+        index: list_truth_kinds(frame)
         for index, frame in enumerate(dataset.frames)
         if (frame.right is not None or is_mixed) and frame.name not in config.exclude
     }

@@ -20,7 +20,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.loop import Run, Task, held_out_text, releases_folder, write_card
 from depthpose.core.run import find_rank
 from depthpose.depth.config import GeneratorConfig, PairsConfig, SelectionConfig
-from depthpose.depth.datasets import Frame, refuse_common
+from depthpose.depth.datasets import FramePaths, refuse_shared_frames
 from depthpose.depth.stereo import StereoNetwork
 from depthpose.depth.synthesis import Generator, SelectionGenerator, UNetGenerator, load_encoder
 from depthpose.depth.train import stages
@@ -242,7 +242,7 @@ def _run_stage(
     held_out: TrainingPairs | None = getattr(task, "held_out", None)
     if held_out is not None:
         remedy = "give --held-out other pairs, or exclude these in the config"
-        refuse_common(frames, held_out.frames, "pairs held out", remedy)
+        refuse_shared_frames(frames, held_out.frames, "pairs held out", remedy)
 
     # What the folder is claimed for beside the config: the initial weights, truths and frames.
     initial_weights = _find_initial_weights(config)
@@ -300,7 +300,7 @@ def _describe_training(
     return bound_facts(facts, began_with)
 
 
-def _frames_sha256(frames: Sequence[Frame]) -> str:
+def _frames_sha256(frames: Sequence[FramePaths]) -> str:
     """Hash the names of frames and the sizes of their left images."""
     digest = sha256()
     for frame in frames:
