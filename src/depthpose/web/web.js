@@ -117,7 +117,7 @@ function show(answer, found) {
   const scene = made("div");
   const note = found.scene.note ? ` (${found.scene.note})` : "";
   answer.append(
-    made("p", { className: `said ${found.ok ? "" : "refused"}`, textContent: found.said }),
+    made("p", { className: `said ${found.ok ? "" : "refused"}`, textContent: found.sentence }),
     ...(found.terms ? [made("p", { className: "terms" },
       made("b", { textContent: "Terms of the weights: " }), found.terms)] : []),
     made("dl", { className: "facts" }, ...found.facts.flatMap(([name, value]) =>
