@@ -166,7 +166,7 @@ def add_part(
     builder: MeshBuilder, name: str, pose: Rigid, scale: float, *, is_textured: bool
 ) -> None:
     """Add a part to a scene that is enlarged by ``scale``."""
-    builder.object_id += 1
+    builder.begin_object()
     surface = Appearance("paint", (0.35, 0.35, 0.37), 10 * scale, 0)
     if is_textured:
         surface = Appearance("stone", (0.6, 0.55, 0.5), 0.06 * scale, builder.object_id)

@@ -41,7 +41,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
     builder = MeshBuilder(rng)
     wall = Appearance("brick", (0.5, 0.45, 0.4), 0.3, 1)
     builder.add_rectangle([-2, 1.5, 1.3], [4, 0, 0], [0, -3, 0], wall)
-    builder.object_id = 1
+    builder.begin_object()
     # Textured by its places in x and y of the camera: no seam matters to a matcher.
     builder.add_triangles(corners, corners[..., :2], Appearance("stone", (0.6, 0.6, 0.65), 0.08, 0))
     scene = SyntheticScene(

@@ -35,7 +35,8 @@ from depthpose.depth.stereo import StereoNetwork
 from depthpose.depth.synthesis import SelectionGenerator, UNetGenerator
 from depthpose.depth.train.config import FinetuneTraining, SelectTraining, StereoTraining
 from depthpose.depth.train.runs import train_finetune, train_stereo
-from depthpose.depth.train.stages import SelectionSample, SelectTask, StereoTask
+from depthpose.depth.train.selection_task import SelectionSample, SelectTask
+from depthpose.depth.train.stereo_task import StereoTask
 from depthpose.depth.types import Match
 from depthpose.depth.weights import (
     MATCHERS,

@@ -163,7 +163,7 @@ def _check_frame(frame: FramePaths, *, with_decoding: bool) -> Iterator[Problem]
     rig = None
     report = None
     if frame.right is not None and len(images) == 2 and images[0].shape == images[1].shape:
-        with suppress(InputError):  # _check_measurements reports it
+        with suppress(InputError):  # _check_calibration reports it
             rig = read_frame_camera(frame)
         cx_difference_px = rig.cx_right_minus_left_px if isinstance(rig, StereoRig) else 0.0
         report = check_rectified(images[0], images[1], cx_difference_px)
@@ -172,25 +172,23 @@ def _check_frame(frame: FramePaths, *, with_decoding: bool) -> Iterator[Problem]
             kind = "mismatch" if report.is_wrong else "note"
             yield Problem(path=frame.right, kind=kind, message=message)
 
-    yield from _check_measurements(frame)
+    yield from _check_calibration(frame)
+    if frame.velodyne is not None:
+        yield from _check_scan(frame.velodyne)
     for path in (frame.scan, frame.depth, frame.disparity, frame.disparity_noc):
         if path is not None and size is not None:
             is_depth = path in (frame.scan, frame.depth)
             yield from _check_truth(path, size, rig, report, is_depth=is_depth)
 
 
-def _check_measurements(frame: FramePaths) -> Iterator[Problem]:
-    """Yield the problems of a calibration or LiDAR scan: missing, unreadable or empty."""
-    if frame.calibration is None:
-        if frame.velodyne is None:
-            yield Problem(
-                path=frame.left,
-                kind="note",
-                message="has no calibration: disparity only, no metres",
-            )
-        else:
-            message = "has no calibration, so its scan cannot be projected"
-            yield Problem(path=frame.left, kind="missing", message=message)
+def _check_calibration(frame: FramePaths) -> Iterator[Problem]:
+    """Yield the problems of a frame's calibration: missing, unreadable, or without the LiDAR."""
+    if frame.calibration is None and frame.velodyne is None:
+        message = "has no calibration: disparity only, no metres"
+        yield Problem(path=frame.left, kind="note", message=message)
+    elif frame.calibration is None:
+        message = "has no calibration, so its scan cannot be projected"
+        yield Problem(path=frame.left, kind="missing", message=message)
     else:
         try:
             read_frame_camera(frame)
@@ -200,12 +198,14 @@ def _check_measurements(frame: FramePaths) -> Iterator[Problem]:
         except InputError as error:
             yield unreadable(frame.calibration, error)
 
-    if frame.velodyne is not None:
-        try:
-            if not len(read_points_bin(frame.velodyne)):
-                yield Problem(path=frame.velodyne, kind="empty", message="holds no LiDAR point")
-        except InputError as error:
-            yield unreadable(frame.velodyne, error)
+
+def _check_scan(path: Path) -> Iterator[Problem]:
+    """Yield the problem of a LiDAR scan that is unreadable or empty."""
+    try:
+        if not len(read_points_bin(path)):
+            yield Problem(path=path, kind="empty", message="holds no LiDAR point")
+    except InputError as error:
+        yield unreadable(path, error)
 
 
 def _check_truth(
@@ -258,9 +258,7 @@ def _check_agreement(path: Path, truth_px: Map, report: RectificationReport) -> 
     agreement = _measure_agreement(truth_px, report)
     if agreement is None or agreement.share >= _MIN_AGREEMENT:
         return
-    message = (
-        f"agrees with {agreement.share:.0%} of {agreement.count} matches between left and right"
-    )
+    message = f"agrees with {agreement.share:.0%} of {agreement.match_count} matches between left and right"
 
     # The change of the map that agrees best.
     changes = {f"{scale:g} times its disparities": truth_px * scale for scale in _TRUTH_SCALES}
@@ -280,7 +278,7 @@ class _Agreement(NamedTuple):
     """How well a map of disparity agrees with matches between the views."""
 
     share: float  # share of the matches that agree with it
-    count: int  # number of the matches that have truth near them
+    match_count: int  # number of the matches that have truth near them
 
 
 def _measure_agreement(disparity_px: Map, report: RectificationReport) -> _Agreement | None:

@@ -51,7 +51,7 @@ def add_house(builder: MeshBuilder, plot: Plot, *, with_details: bool) -> None:
     style = _draw_style(rng, with_details=with_details)
 
     # Four walls: the front, the near end, the far end and the back.
-    builder.object_id += 1
+    builder.begin_object()
     away = np.array([float(plot.side), 0, 0])
     length = plot.stop_m - plot.start_m
     back_m = plot.x_m + plot.side * plot.depth_m

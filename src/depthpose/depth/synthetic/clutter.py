@@ -47,7 +47,7 @@ def make_clutter(seed: tuple[int, ...]) -> SyntheticScene:
             _add_backdrop_ground(builder)
 
     for _ in range(int(rng.integers(12, 60))):
-        builder.object_id += 1
+        builder.begin_object()
         z = draw_log_uniform(rng, *_DEPTHS_M)
         centre = np.array([rng.uniform(-0.95, 0.95) * z, rng.uniform(-0.3, 0.3) * z, z])
         size_m = min(z, 25.0) * draw_log_uniform(rng, 0.03, 0.3)
@@ -64,7 +64,7 @@ def make_clutter(seed: tuple[int, ...]) -> SyntheticScene:
 
 def _add_sheet(builder: MeshBuilder, corner: Values, along: Values, up: Values) -> None:
     """Add a large rectangle as one object: a corner and its two sides, as vectors [m]."""
-    builder.object_id += 1
+    builder.begin_object()
     appearance = draw_appearance(builder.rng, builder.rng.uniform(0.5, 4))
     builder.add_rectangle(corner, along, up, appearance)
 

@@ -111,21 +111,25 @@ class _Box(NamedTuple):
 
 @dataclass(eq=False)
 class MeshBuilder:
-    """Builds a mesh; every method but ``finish`` adds triangles."""
+    """Builds a mesh: each ``add`` method adds triangles to the object that was begun last."""
 
     rng: np.random.Generator  # random numbers of all that is built
     object_id: int = 0  # number of the object to which added triangles belong
     _parts: list[Mesh] = field(default_factory=list)
     _boxes: list[_Box] = field(default_factory=list)
 
-    def add_model(self, mesh: Mesh) -> None:
-        """Add a placed model as one object, unless it is nearer than ``MIN_DISTANCE_M``."""
-        distance_m = np.hypot(mesh.corners[..., 0], mesh.corners[..., 2])
-        if len(mesh) and distance_m.min() < MIN_DISTANCE_M:
-            return
+    def begin_object(self) -> None:
+        """Begin an object, to which all triangles belong that are added from here on."""
         self.object_id += 1
-        object_ids = np.full(len(mesh), self.object_id, np.int32)
-        self._parts.append(replace(mesh, object_id=object_ids))
+
+    def add_model(self, model: Mesh) -> None:
+        """Add a placed model as one object, unless it is nearer than ``MIN_DISTANCE_M``."""
+        distance_m = np.hypot(model.corners[..., 0], model.corners[..., 2])
+        if len(model) and distance_m.min() < MIN_DISTANCE_M:
+            return
+        self.begin_object()
+        object_ids = np.full(len(model), self.object_id, np.int32)
+        self._parts.append(replace(model, object_id=object_ids))
 
     def add_triangles(
         self,

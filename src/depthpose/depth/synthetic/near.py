@@ -233,7 +233,7 @@ class _NearSceneBuilder:
 
     def _add_sheet(self, corner: Values, along: Values, up: Values) -> None:
         """Add a large rectangle to the backdrop, which may be nearer than objects."""
-        self.builder.object_id += 1
+        self.builder.begin_object()
         texture_m = self.near_m * draw_log_uniform(self.rng, 0.3, 3)
         appearance = draw_near_appearance(self.rng, texture_m, self.plain_share)
         if appearance.material in PLAIN_MATERIALS:  # one tile, so that nothing repeats
@@ -315,7 +315,7 @@ class _NearSceneBuilder:
         self._add_sheet(corner, 2 * half_side_m * right, 2 * half_side_m * ahead)
         height_m = half_side_m * rng.uniform(0.15, 0.6)
         if is_bin:
-            self.builder.object_id += 1
+            self.builder.begin_object()
             sides = ((right, ahead), (-right, ahead), (ahead, right), (-ahead, right))
             for outwards, along in sides:
                 corner = middle + half_side_m * (outwards - along)
@@ -376,7 +376,7 @@ class _NearSceneBuilder:
         middle = np.array([0, 0, front_m + depth_m / 2])
         levels = np.linspace(-half_y, half_y, int(rng.integers(2, 6)))
         columns = np.linspace(-half_x, half_x, int(rng.integers(2, 6)))
-        self.builder.object_id += 1
+        self.builder.begin_object()
         for y in levels:
             board = (2 * half_x, thick_m, depth_m)
             self.builder.add_box(middle + rotation @ [0, y, 0], board, appearance, rotation)

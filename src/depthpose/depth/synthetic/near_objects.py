@@ -35,7 +35,7 @@ def draw_near_appearance(
 
 def add_near_object(builder: MeshBuilder, kind: str, centre: np.ndarray, size_m: float) -> None:
     """Add an object of a kind about its centre (3,) [m], of random appearance and rotation."""
-    builder.object_id += 1
+    builder.begin_object()
 
     # Drawn for shapes of clutter too, which draw their own: a change would change earlier scenes.
     appearance = draw_near_appearance(builder.rng, size_m)
@@ -142,7 +142,7 @@ def _add_books(
     down = np.array([0.0, 1, 0])
     offset = np.zeros(3)
     for _book in range(int(builder.rng.integers(2, 9))):
-        builder.object_id += 1
+        builder.begin_object()
         thick = size_m * builder.rng.uniform(0.03, 0.15)
         width = size_m * builder.rng.uniform(0.4, 0.7)
         length = size_m * builder.rng.uniform(0.5, 0.9)

@@ -80,8 +80,9 @@ def make_cyclist(number: int) -> Mesh:
     for z in (-0.52, 0.52):
         _add_bicycle_wheel(builder, z, frame)
     for start, stop in _BICYCLE_TUBES:
-        ends = [(0.0, *_BICYCLE_JOINTS[joint]) for joint in (start, stop)]
-        builder.add_tube(*ends, 0.022, frame, 5)
+        start_point = (0.0, *_BICYCLE_JOINTS[start])
+        stop_point = (0.0, *_BICYCLE_JOINTS[stop])
+        builder.add_tube(start_point, stop_point, 0.022, frame, 5)
     builder.add_tube((-0.28, -1.06, 0.36), (0.28, -1.06, 0.36), 0.016, _RUBBER, 4)
     builder.add_box((0, -0.94, -0.22), (0.16, 0.06, 0.26), _RUBBER)
 

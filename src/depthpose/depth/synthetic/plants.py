@@ -216,7 +216,7 @@ def add_wood_edge(
     # Dark leaves between each two rows.
     along_m = np.arange(count) * _EDGE_STEP_M
     color = np.array(draw_leaf_color(rng))
-    builder.object_id += 1
+    builder.begin_object()
     dark = Appearance("leaf", tuple(0.3 * color), 3.0, int(rng.integers(3)))
     for lower, upper in pairwise(range(len(row_y))):
         uv_m = [np.stack([along_m, -y[row]], 1) for row in (lower, upper)]

@@ -232,7 +232,7 @@ def add_ground(builder: MeshBuilder, road: Road) -> None:
     colors = _draw_ground_colors(builder.rng, road.place)
 
     # The carriageway, in pieces that grow longer with distance.
-    builder.object_id += 1
+    builder.begin_object()
     near = np.arange(-BEHIND_M, 60, 4)
     middle = np.arange(60, 150, 10)
     far = np.arange(150, AHEAD_M + 1, 30)
@@ -244,7 +244,7 @@ def add_ground(builder: MeshBuilder, road: Road) -> None:
     for side in SIDES:
         edge = road.edge_m[side]
         for piece, is_street in _cut_at_side_streets(road, side, stations):
-            builder.object_id += 1
+            builder.begin_object()
             if is_street:
                 street = (edge, edge + side * _WIDE_M)
                 _add_strip(builder, street, (0.0, 0.0), colors.asphalt, piece)

@@ -285,7 +285,7 @@ class _Roadside:
         height = rng.uniform(6, 8)
         step = rng.uniform(22, 38)
         pole_s = np.arange(rng.uniform(-15, 10), 120, step)
-        self.builder.object_id += 1
+        self.builder.begin_object()
         for s in pole_s:
             self.builder.add_tube((x_m, 0.2, s), (x_m, -height, s), (0.12, 0.09), _WOOD, 8)
             self.builder.add_box((x_m, -height + 0.3, s), (1.4, 0.1, 0.1), _WOOD)

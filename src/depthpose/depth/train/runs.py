@@ -23,14 +23,16 @@ from depthpose.depth.config import GeneratorConfig, PairsConfig, SelectionConfig
 from depthpose.depth.datasets import FramePaths, refuse_shared_frames
 from depthpose.depth.stereo import StereoNetwork
 from depthpose.depth.synthesis import Generator, SelectionGenerator, UNetGenerator, load_encoder
-from depthpose.depth.train import stages
 from depthpose.depth.train.config import (
     FinetuneTraining,
     SelectTraining,
     StereoTraining,
     ViewTraining,
 )
+from depthpose.depth.train.generator_tasks import FinetuneTask, ViewTask
 from depthpose.depth.train.pairs import TrainingPairs
+from depthpose.depth.train.selection_task import SelectionSamples, SelectTask
+from depthpose.depth.train.stereo_task import StereoTask
 from depthpose.depth.weights import MATCHERS, read_generator, read_matcher, write_depth_weights
 
 _INDEPENDENT_OF_WEIGHTS = ("max_disparity_px", "with_street", "least_confidence")
@@ -127,7 +129,7 @@ def train_view(config: ViewTraining, run: Run) -> Path:
     generator = UNetGenerator(config.generator)
     if config.start is not None:
         copy_start(generator, read_generator(find_weights(config.start)), config.start)
-    facts, seconds = _run_stage(stages.ViewTask(generator, config, held_out), pairs, config, run)
+    facts, seconds = _run_stage(ViewTask(generator, config, held_out), pairs, config, run)
     return _write_weights(run, "view", facts, seconds, generator=generator)
 
 
@@ -146,14 +148,14 @@ def train_select(config: SelectTraining, run: Run) -> Path:
         for pairs in (config.pairs, config.more)
         if pairs is not None
     ]
-    samples = stages.SelectionSamples(sources, config.more_share, config.degrade, seed)
+    samples = SelectionSamples(sources, config.more_share, config.degrade, seed)
     generator = SelectionGenerator(rig)
     if config.encoder is not None:
         load_encoder(generator.encoder, find_weights(config.encoder))
     if config.start is not None:
         copy_start(generator, read_generator(find_weights(config.start)), config.start)
     held_out = config.held_out and TrainingPairs(config.held_out, 0, needs_truth=True)
-    task = stages.SelectTask(generator, config, held_out)
+    task = SelectTask(generator, config, held_out)
     facts, seconds = _run_stage(task, samples, config, run)
     return _write_weights(run, "select", facts, seconds, generator=generator)
 
@@ -166,7 +168,7 @@ def train_stereo(config: StereoTraining, run: Run) -> Path:
     pairs = TrainingPairs(config.pairs, config.loop.seed, needs_truth=True)
     held_out = config.held_out and TrainingPairs(config.held_out, 0, needs_truth=True)
     matcher = make_matcher_network(config)
-    facts, seconds = _run_stage(stages.StereoTask(matcher, config, held_out), pairs, config, run)
+    facts, seconds = _run_stage(StereoTask(matcher, config, held_out), pairs, config, run)
     return _write_weights(run, "stereo", facts, seconds, matcher=matcher)
 
 
@@ -208,7 +210,7 @@ def train_finetune(config: FinetuneTraining, run: Run) -> Path:
     baseline_m = generator.config.virtual_baseline_m
     pairs = TrainingPairs(config.pairs, config.loop.seed, needs_truth=True, baseline_m=baseline_m)
     held_out = config.held_out and TrainingPairs(config.held_out, 0, needs_truth=True)
-    task = stages.FinetuneTask(generator, matcher, config, held_out)
+    task = FinetuneTask(generator, matcher, config, held_out)
     facts, seconds = _run_stage(task, pairs, config, run)
     return _write_weights(run, "finetune", facts, seconds, generator=generator, matcher=matcher)
 
@@ -224,7 +226,7 @@ STAGES = {
 
 def _run_stage(
     task: Task,
-    samples: TrainingPairs | stages.SelectionSamples,
+    samples: TrainingPairs | SelectionSamples,
     config: Any,  # noqa: ANN401
     run: Run,
 ) -> tuple[dict[str, str], float]:
@@ -237,7 +239,7 @@ def _run_stage(
         InputError: the folder belongs to another training, or held-out pairs are trained on too.
     """
     # Held-out pairs must not be trained on.
-    sources = samples.sources if isinstance(samples, stages.SelectionSamples) else [samples]
+    sources = samples.sources if isinstance(samples, SelectionSamples) else [samples]
     frames = [frame for source in sources for frame in source.frames]
     held_out: TrainingPairs | None = getattr(task, "held_out", None)
     if held_out is not None:
