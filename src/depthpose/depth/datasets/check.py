@@ -258,7 +258,10 @@ def _check_agreement(path: Path, truth_px: Map, report: RectificationReport) -> 
     agreement = _measure_agreement(truth_px, report)
     if agreement is None or agreement.share >= _MIN_AGREEMENT:
         return
-    message = f"agrees with {agreement.share:.0%} of {agreement.match_count} matches between left and right"
+    message = (
+        f"agrees with {agreement.share:.0%} of {agreement.match_count} matches between left and "
+        "right"
+    )
 
     # The change of the map that agrees best.
     changes = {f"{scale:g} times its disparities": truth_px * scale for scale in _TRUTH_SCALES}

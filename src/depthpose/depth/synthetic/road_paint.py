@@ -81,17 +81,20 @@ def _marked_share(
     ``x`` and ``s``: coordinates on the road [m]; the rest as in :func:`paint_road`.
     """
     cover = torch.zeros_like(x)
-    for line_x, half, period, dash in markings.lines.tolist():
-        line = _covered_share(x - line_x, half, width_m)
-        if dash < period:
-            line = line * _covered_share(s % period - period / 2, dash / 2, length_m)
-        cover = torch.maximum(cover, line)
-    for bar_s, half, first, last, is_striped in markings.bars.tolist():
-        bar = _covered_share(s - bar_s, half, length_m)
-        bar = bar * _covered_share(x - (first + last) / 2, (last - first) / 2, width_m)
-        if is_striped:  # stripes of half a metre, one each metre
-            bar = bar * _covered_share(x % 1.0 - 0.5, 0.25, width_m)
-        cover = torch.maximum(cover, bar)
+    for line in markings.lines:
+        share = _covered_share(x - line.x_m, line.half_width_m, width_m)
+        if line.dash_m < line.period_m:
+            from_dash = s % line.period_m - line.period_m / 2
+            share = share * _covered_share(from_dash, line.dash_m / 2, length_m)
+        cover = torch.maximum(cover, share)
+    for bar in markings.bars:
+        middle_x = (bar.first_x_m + bar.last_x_m) / 2
+        half_x = (bar.last_x_m - bar.first_x_m) / 2
+        share = _covered_share(s - bar.s_m, bar.half_length_m, length_m)
+        share = share * _covered_share(x - middle_x, half_x, width_m)
+        if bar.is_striped:  # stripes of half a metre, one each metre
+            share = share * _covered_share(x % 1.0 - 0.5, 0.25, width_m)
+        cover = torch.maximum(cover, share)
     return cover
 
 

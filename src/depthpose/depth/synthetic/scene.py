@@ -64,22 +64,41 @@ def draw_weather(rng: np.random.Generator) -> Weather:
     )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True)
+class LaneLine:
+    """A line of paint along the road, solid or dashed."""
+
+    x_m: float
+    half_width_m: float
+    period_m: float  # distance from dash to dash
+    dash_m: float  # length of a dash; of a solid line the period
+
+
+@dataclass(frozen=True, kw_only=True)
+class CrossBar:
+    """A bar of paint across the road: a stop line, or with stripes a zebra crossing."""
+
+    s_m: float  # its middle along the road
+    half_length_m: float  # half of its extent along the road
+    first_x_m: float
+    last_x_m: float
+    is_striped: bool
+
+
+@dataclass(frozen=True, kw_only=True)
 class Markings:
     """Paint on the road, in road coordinates (x across, s along) [m]."""
 
-    # Along the road: x, half width, period and length of the dashes; both equal for a solid line.
-    lines: Float64[np.ndarray, "n 4"]
-    # Across the road: s, half length, first and last x, and 1 if it is striped, else 0.
-    bars: Float64[np.ndarray, "m 5"]
+    lines: tuple[LaneLine, ...]
+    bars: tuple[CrossBar, ...]
     brightness: float  # brightness of the paint
     first_lane_x_m: float  # x of the left edge of the left lane
     lane_m: float  # width of the lanes: wheels darken two tracks in each
 
 
 NO_MARKINGS = Markings(
-    lines=np.zeros((0, 4)),
-    bars=np.zeros((0, 5)),
+    lines=(),
+    bars=(),
     brightness=0.5,
     first_lane_x_m=0.0,
     lane_m=3.0,

@@ -14,7 +14,14 @@ from depthpose.depth.synthetic.materials import Appearance
 from depthpose.depth.synthetic.mesh import MeshBuilder, Rotation, join_meshes, quads_between
 from depthpose.depth.synthetic.randomness import Stream, make_rng
 from depthpose.depth.synthetic.roadside import add_roadside
-from depthpose.depth.synthetic.scene import Markings, SyntheticScene, Vector, draw_weather
+from depthpose.depth.synthetic.scene import (
+    CrossBar,
+    LaneLine,
+    Markings,
+    SyntheticScene,
+    Vector,
+    draw_weather,
+)
 from depthpose.depth.synthetic.traffic import Traffic
 
 _REACH_BEHIND_M = 12
@@ -110,15 +117,15 @@ def _add_hills(builder: MeshBuilder) -> None:
 def _draw_markings(rng: np.random.Generator, road: roads.Road) -> Markings:
     """Draw random markings: lines of the lanes; stop lines and zebra crossings at side streets."""
     is_marked = road.place in ("avenue", "rural", "forest") or rng.random() < 0.5
-    dash_m = rng.uniform(2, 6)
-    half_width_m = rng.uniform(0.05, 0.08)
-    period_m = dash_m * rng.uniform(2, 3)
+    dash_m = float(rng.uniform(2, 6))
+    half_width_m = float(rng.uniform(0.05, 0.08))
+    period_m = dash_m * float(rng.uniform(2, 3))
     left_m = road.edge_m[-1]
     right_m = road.edge_m[1]
     first_lane_x_m = left_m + road.parking_m[-1]
 
     # Lines along the lanes: solid at both edges, where a kerb often replaces them.
-    lines: list[tuple[float, ...]] = []
+    lines: list[LaneLine] = []
     for line in range(road.lanes + 1) if is_marked else ():
         is_edge = line in (0, road.lanes)
         is_solid = is_edge or (line == road.lanes // 2 and rng.random() < 0.3)
@@ -127,20 +134,39 @@ def _draw_markings(rng: np.random.Generator, road: roads.Road) -> Markings:
         inset_m = 0.0
         if is_edge:
             inset_m = 0.15 if line == 0 else -0.15
-        x = first_lane_x_m + line * road.lane_m + inset_m
-        lines.append((x, half_width_m, period_m, period_m if is_solid else dash_m))
+        marking = LaneLine(
+            x_m=float(first_lane_x_m + line * road.lane_m + inset_m),
+            half_width_m=half_width_m,
+            period_m=period_m,
+            dash_m=period_m if is_solid else dash_m,
+        )
+        lines.append(marking)
 
     # Zebra crossings, and stop lines of the right half, before side streets.
-    bars: list[tuple[float, ...]] = []
+    bars: list[CrossBar] = []
     for street in road.side_streets:
         start_m = street.s_m - street.half_m
         if rng.random() < 0.4:
-            bars.append((start_m - 3.5, 1.5, left_m, right_m, 1.0))
+            zebra = CrossBar(
+                s_m=float(start_m - 3.5),
+                half_length_m=1.5,
+                first_x_m=left_m,
+                last_x_m=right_m,
+                is_striped=True,
+            )
+            bars.append(zebra)
         if rng.random() < 0.4:
-            bars.append((start_m - 6, 0.2, (left_m + right_m) / 2, right_m, 0.0))
+            stop_line = CrossBar(
+                s_m=float(start_m - 6),
+                half_length_m=0.2,
+                first_x_m=(left_m + right_m) / 2,
+                last_x_m=right_m,
+                is_striped=False,
+            )
+            bars.append(stop_line)
     return Markings(
-        lines=np.array(lines, float).reshape(-1, 4),
-        bars=np.array(bars, float).reshape(-1, 5),
+        lines=tuple(lines),
+        bars=tuple(bars),
         brightness=rng.uniform(0.4, 0.75),
         first_lane_x_m=first_lane_x_m,
         lane_m=road.lane_m,

@@ -308,7 +308,7 @@ def _paint_metal(noise: _Noise, variant: int) -> GreyTexture:
     return 1 + 0.06 * noise.draw_fine() + (0.08 + 0.1 * variant) * noise.draw_broad()
 
 
-def _paint_paint(noise: _Noise, _: int) -> GreyTexture:
+def _paint_lacquer(noise: _Noise, _: int) -> GreyTexture:
     """Paint lacquer, which is almost even."""
     grey = np.ones((SIDE_PX, SIDE_PX), np.float32)
     grey = grey + 0.03 * noise.draw_broad()
@@ -449,7 +449,7 @@ _PAINTERS: dict[str, Callable[[_Noise, int], GreyTexture | ColorTexture]] = {
     "leaf": _paint_leaf,
     "wood": _paint_wood,
     "metal": _paint_metal,
-    "paint": _paint_paint,
+    "paint": _paint_lacquer,
     "side": _paint_side,
     "glass": _paint_glass,
     "pane": _paint_pane,
