@@ -125,16 +125,18 @@ def _add_shell(
         builder.add_triangles(triangles, triangles[..., :2], paint)
 
 
+_PANE_OFFSET_M = 0.006
+"""Distance of a pane from its frame, so that it covers it."""
+
+
 def _add_window(builder: MeshBuilder, face: Float[np.ndarray, "4 3"]) -> None:
-    """Add a pane in a dark frame, the four-cornered face of a body; it looks outwards."""
+    """Add a dark frame, a four-cornered face of a body [m], and a pane just outside it."""
     builder.add_quads([face], [UNIT_SQUARE], Appearance("tyre", (0.015, 0.015, 0.017)))
     middle = face.mean(0)
     outward = np.cross(face[1] - face[0], face[3] - face[0])
-    outward *= 0.006 / (np.linalg.norm(outward) + 1e-9)
+    outward *= _PANE_OFFSET_M / (np.linalg.norm(outward) + 1e-9)
 
-    # Towards the outside, by two rules of which the second has the last word: a pane looks up or
-    # away from the origin, and away from the middle of its body.
-    outward *= 1 if outward @ middle > 0 or outward[1] < 0 else -1
+    # A pane looks away from the middle of its body.
     body_middle = np.array([0, middle[1] * 0.5, 0])
     if outward @ (middle - body_middle) < 0:
         outward = -outward

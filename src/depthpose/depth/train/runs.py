@@ -118,6 +118,13 @@ _VALIDATION_TEXTS = {
 """What the numbers of each stage's validation are, for the card."""
 
 
+def _open_held_out(config: PairsConfig | None, *, needs_truth: bool) -> TrainingPairs | None:
+    """Open the pairs for validation, if there are any; all are measured, so the seed is any."""
+    if config is None:
+        return None
+    return TrainingPairs(config, 0, needs_truth=needs_truth)
+
+
 @releases_folder
 def train_view(config: ViewTraining, run: Run) -> Path:
     """Train the U-Net generator; return the path of its weights."""
@@ -125,7 +132,7 @@ def train_view(config: ViewTraining, run: Run) -> Path:
     config = _at_virtual_focal(config, config.generator)
     baseline_m = config.generator.virtual_baseline_m
     pairs = TrainingPairs(config.pairs, config.loop.seed, needs_truth=False, baseline_m=baseline_m)
-    held_out = config.held_out and TrainingPairs(config.held_out, 0, needs_truth=False)
+    held_out = _open_held_out(config.held_out, needs_truth=False)
     generator = UNetGenerator(config.generator)
     if config.start is not None:
         copy_start(generator, read_generator(find_weights(config.start)), config.start)
@@ -154,7 +161,7 @@ def train_select(config: SelectTraining, run: Run) -> Path:
         load_encoder(generator.encoder, find_weights(config.encoder))
     if config.start is not None:
         copy_start(generator, read_generator(find_weights(config.start)), config.start)
-    held_out = config.held_out and TrainingPairs(config.held_out, 0, needs_truth=True)
+    held_out = _open_held_out(config.held_out, needs_truth=True)
     task = SelectTask(generator, config, held_out)
     facts, seconds = _run_stage(task, samples, config, run)
     return _write_weights(run, "select", facts, seconds, generator=generator)
@@ -166,7 +173,7 @@ def train_stereo(config: StereoTraining, run: Run) -> Path:
     _refuse_wrong_gradients(config)
     torch.manual_seed(config.loop.seed)
     pairs = TrainingPairs(config.pairs, config.loop.seed, needs_truth=True)
-    held_out = config.held_out and TrainingPairs(config.held_out, 0, needs_truth=True)
+    held_out = _open_held_out(config.held_out, needs_truth=True)
     matcher = make_matcher_network(config)
     facts, seconds = _run_stage(StereoTask(matcher, config, held_out), pairs, config, run)
     return _write_weights(run, "stereo", facts, seconds, matcher=matcher)
@@ -209,7 +216,7 @@ def train_finetune(config: FinetuneTraining, run: Run) -> Path:
     config = _at_virtual_focal(config, generator.config)
     baseline_m = generator.config.virtual_baseline_m
     pairs = TrainingPairs(config.pairs, config.loop.seed, needs_truth=True, baseline_m=baseline_m)
-    held_out = config.held_out and TrainingPairs(config.held_out, 0, needs_truth=True)
+    held_out = _open_held_out(config.held_out, needs_truth=True)
     task = FinetuneTask(generator, matcher, config, held_out)
     facts, seconds = _run_stage(task, pairs, config, run)
     return _write_weights(run, "finetune", facts, seconds, generator=generator, matcher=matcher)
