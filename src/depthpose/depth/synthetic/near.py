@@ -6,7 +6,7 @@ where textures, shadows and lenses have their usual sizes, and is scaled to its 
 """
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -201,6 +201,20 @@ def _draw_border(rng: np.random.Generator, view: View) -> Mask:
     return is_black
 
 
+class _TablePlane(NamedTuple):
+    """The plane of a table, in the frame of the left camera."""
+
+    right: np.ndarray  # unit vector in the plane
+    ahead: np.ndarray  # unit vector in the plane, away from the camera
+    normal: np.ndarray  # unit vector up from the plane
+    distance_m: float  # camera z where the optical axis meets it
+
+    @property
+    def middle(self) -> np.ndarray:
+        """The point (3,) where the optical axis meets the plane [m]."""
+        return np.array([0, 0, self.distance_m])
+
+
 class _NearSceneBuilder:
     """Builds the surfaces of a near scene, within the camera's field of view.
 
@@ -295,58 +309,23 @@ class _NearSceneBuilder:
         A bin has four sides, and many objects of one kind.
         """
         rng = self.rng
-        right, ahead, normal = self._draw_table_axes(max_tilt_deg=35 if is_bin else 75)
-
-        # The plane passes through the axis so far away that its nearest visible corner is far
-        # enough; a ray (u, v, 1) meets it at z = distance * normal_z / (normal . ray).
-        rays = np.array([[u, v, 1.0] for u in (-1, 0, 1) for v in (-1, 0, 1)])
-        rays[:, :2] *= self.half_view
-        aligned = rays @ normal
-        nearest_share = (normal[2] / aligned[aligned < -0.03]).min()
-        distance_m = self.near_m * rng.uniform(1.05, 1.6) / nearest_share
-
-        # The wall behind, the plane, and the sides of a bin.
-        middle = np.array([0, 0, distance_m])
-        half_side_m = distance_m * draw_log_uniform(rng, 0.5, 4)
+        table = self._draw_table_plane(max_tilt_deg=35 if is_bin else 75)
+        half_side_m = table.distance_m * draw_log_uniform(rng, 0.5, 4)
         if is_bin:
-            half_side_m = distance_m * self.half_view[0] * rng.uniform(0.6, 1.2)
-        self.add_wall(distance_m * draw_log_uniform(rng, 1.3, 5))
-        corner = middle - half_side_m * (right + ahead)
-        self._add_sheet(corner, 2 * half_side_m * right, 2 * half_side_m * ahead)
+            half_side_m = table.distance_m * self.half_view[0] * rng.uniform(0.6, 1.2)
+        self.add_wall(table.distance_m * draw_log_uniform(rng, 1.3, 5))
+        corner = table.middle - half_side_m * (table.right + table.ahead)
+        self._add_sheet(corner, 2 * half_side_m * table.right, 2 * half_side_m * table.ahead)
         height_m = half_side_m * rng.uniform(0.15, 0.6)
         if is_bin:
-            self.builder.begin_object()
-            sides = ((right, ahead), (-right, ahead), (ahead, right), (-ahead, right))
-            for outwards, along in sides:
-                corner = middle + half_side_m * (outwards - along)
-                appearance = draw_near_appearance(rng, half_side_m)
-                side = 2 * half_side_m * along
-                self.builder.add_rectangle(corner, side, height_m * normal, appearance)
+            self._add_bin_sides(table, half_side_m, height_m)
+            self._fill_bin(table, height_m)
+        else:
+            self._cover_table(table)
+        self.far_m = table.distance_m
 
-        # Objects on it, where random rays meet the plane.
-        common_kind = draw_near_kind(rng) if is_bin else None
-        common_m = distance_m * self.half_view[0] * draw_log_uniform(rng, 0.1, 0.5)
-        object_count = int(rng.integers(20, 70) if is_bin else rng.integers(2, 30))
-        for _ in range(object_count):
-            ray = np.array([*(rng.uniform(-1, 1, 2) * self.half_view), 1.0])
-            normal_part = float(ray @ normal)
-            if normal_part > -0.05:  # it meets the plane far away or not at all
-                continue
-            z = distance_m * normal[2] / normal_part
-            if common_kind is not None:  # heaped up in the bin
-                size_m = common_m
-                lift_m = rng.uniform(0.1, 1.0) * height_m
-            else:  # half of it above the table
-                size_m = z * self.half_view[0] * draw_log_uniform(rng, 0.08, 0.7)
-                lift_m = rng.uniform(0.2, 0.6) * size_m
-            self._add_object(ray * z + lift_m * normal, size_m, common_kind)
-        self.far_m = distance_m
-
-    def _draw_table_axes(self, max_tilt_deg: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Draw the axes of a table: unit vectors to the right, ahead, and up from its plane.
-
-        A tilt of 0 faces the camera, one of 90 degrees is level.
-        """
+    def _draw_table_plane(self, max_tilt_deg: float) -> _TablePlane:
+        """Draw the plane of a table; a tilt of 0 faces the camera, one of 90 degrees is level."""
         tilt = np.deg2rad(self.rng.uniform(0, max_tilt_deg))
         roll = self.rng.normal(0, 0.15)
         normal = np.array([np.sin(roll), -np.sin(tilt), -np.cos(tilt) * np.cos(roll)])
@@ -356,7 +335,58 @@ class _NearSceneBuilder:
         faces_camera = tilt < 0.1
         right = np.cross(normal, [0.0, 1, 0]) if faces_camera else np.cross([0.0, 0, -1], normal)
         right /= np.linalg.norm(right)
-        return right, np.cross(right, normal), normal
+
+        # The plane passes through the axis so far away that its nearest visible corner is far
+        # enough; a ray (u, v, 1) meets it at z = distance * normal_z / (normal . ray).
+        rays = np.array([[u, v, 1.0] for u in (-1, 0, 1) for v in (-1, 0, 1)])
+        rays[:, :2] *= self.half_view
+        aligned = rays @ normal
+        nearest_share = (normal[2] / aligned[aligned < -0.03]).min()
+        distance_m = self.near_m * self.rng.uniform(1.05, 1.6) / nearest_share
+        return _TablePlane(right, np.cross(right, normal), normal, distance_m)
+
+    def _add_bin_sides(self, table: _TablePlane, half_side_m: float, height_m: float) -> None:
+        """Add the four sides of a bin, each of its own appearance."""
+        right, ahead = table.right, table.ahead
+        self.builder.begin_object()
+        for outwards, along in ((right, ahead), (-right, ahead), (ahead, right), (-ahead, right)):
+            corner = table.middle + half_side_m * (outwards - along)
+            appearance = draw_near_appearance(self.rng, half_side_m)
+            side = 2 * half_side_m * along
+            self.builder.add_rectangle(corner, side, height_m * table.normal, appearance)
+
+    def _fill_bin(self, table: _TablePlane, height_m: float) -> None:
+        """Add many objects of one kind and size, heaped up to the height of the bin."""
+        rng = self.rng
+        kind = draw_near_kind(rng)
+        size_m = table.distance_m * self.half_view[0] * draw_log_uniform(rng, 0.1, 0.5)
+        for _ in range(int(rng.integers(20, 70))):
+            point = self._draw_point_on(table)
+            if point is not None:
+                lift_m = rng.uniform(0.1, 1.0) * height_m
+                self._add_object(point + lift_m * table.normal, size_m, kind)
+
+    def _cover_table(self, table: _TablePlane) -> None:
+        """Add objects of random kinds and sizes, each about half above the table."""
+        rng = self.rng
+        draw_log_uniform(rng, 0.1, 0.5)  # unused: without it, earlier scenes would change
+        for _ in range(int(rng.integers(2, 30))):
+            point = self._draw_point_on(table)
+            if point is not None:
+                size_m = point[2] * self.half_view[0] * draw_log_uniform(rng, 0.08, 0.7)
+                lift_m = rng.uniform(0.2, 0.6) * size_m
+                self._add_object(point + lift_m * table.normal, size_m)
+
+    def _draw_point_on(self, table: _TablePlane) -> np.ndarray | None:
+        """Draw a visible point (3,) of a table [m], on a random ray of the camera.
+
+        None where the ray meets the plane very far away, or not at all.
+        """
+        ray = np.array([*(self.rng.uniform(-1, 1, 2) * self.half_view), 1.0])
+        normal_part = float(ray @ table.normal)
+        if normal_part > -0.05:
+            return None
+        return ray * (table.distance_m * table.normal[2] / normal_part)
 
     def add_shelf(self) -> None:
         """Add a shelf of boards and uprights before a wall, with objects on the boards."""
