@@ -154,37 +154,16 @@ def _shade(stage: Stage, hits: Hits, focal_px: float) -> Vectors:
     weather = stage.scene.weather
     rows = stage.attributes.index_select(0, hits.primitive)
     material = stage.material.index_select(0, hits.primitive)
-    layer = stage.layer.index_select(0, hits.primitive)
 
     # The normal of the triangle's plane, and the interpolated one; both face the camera.
     plane = rows[:, PLANE_NORMAL]
     facing = _dot(plane, hits.towards)
     plane = torch.where(facing[:, None] > 0, -plane, plane)
-    uv = _interpolate(rows[:, _UV], hits.barycentric)
     normal = _interpolate(rows[:, _NORMALS], hits.barycentric)
     normal = normal / _dot(normal, normal).sqrt()[:, None]
     normal = torch.where((_dot(normal, plane) < 0)[:, None], -normal, normal)
 
-    # The share of the light that the surface reflects, by its texture. The texture's level is a
-    # compromise between the width of a pixel's footprint and its length, which grows with the
-    # slant.
-    textures = make_textures()
-    footprint_m = hits.distance_m / focal_px
-    lengthening = facing.abs().clamp(min=0.03) ** -0.6
-    level = torch.log2(footprint_m * rows[:, _TEXELS_PER_M] * lengthening + 1e-9)
-    albedo = sample_texture(textures, layer, uv, level) * rows[:, TINT]
-
-    # Stains over metres hide that textures repeat: 0.021 tiles per metre along x and z.
-    u = hits.points[:, 0] * 0.021 + hits.points[:, 1] * 0.013 + weather.shift[0]
-    v = hits.points[:, 2] * 0.021 + weather.shift[1]
-    albedo *= (1 + 0.07 * look_up_noise(textures.stains, u, v))[:, None]
-
-    is_road = (material == MATERIAL_IDS["road"]).nonzero()[:, 0]
-    if len(is_road):
-        place_m = uv[is_road] * ROAD_TILE_M
-        width_m = footprint_m[is_road]
-        length_m = width_m / facing[is_road].abs().clamp(min=0.02)
-        albedo[is_road] = paint_road(stage.scene, albedo[is_road], place_m, width_m, length_m)
+    albedo = _compute_albedo(stage, hits, rows, facing.abs(), focal_px)
 
     # Light of the sun, where it is not in shadow; leaves let some through.
     sun_slant = normal @ stage.to_sun
@@ -203,6 +182,8 @@ def _shade(stage: Stage, hits: Hits, focal_px: float) -> Vectors:
     sky_color = torch.from_numpy(0.5 * (weather.zenith + weather.horizon)).float()
     ambient = ((0.09 + 0.26 * upward) * openness)[:, None] * sky_color
     bounced = ((1 - upward) * openness * 0.045)[:, None] * sun_color
+
+    # What the surface reflects, and the glow of lamps.
     color = albedo * ((sun * lit)[:, None] * sun_color + ambient + bounced)
     color += albedo * (2 * _GLOW[material])[:, None]
     _add_reflections(stage, hits.towards, normal, _SPECULAR[material], lit, color)
@@ -210,6 +191,49 @@ def _shade(stage: Stage, hits: Hits, focal_px: float) -> Vectors:
     haze_share = 1 - torch.exp(-hits.distance_m / weather.haze_m)
     haze_color = torch.from_numpy(weather.horizon).float() * 0.7
     return torch.lerp(color, haze_color.expand_as(color), haze_share[:, None])
+
+
+_STAIN_TILES_PER_M = 0.021
+"""Tiles of the field of stains per metre along x and z."""
+
+
+def _compute_albedo(
+    stage: Stage, hits: Hits, rows: Float[Tensor, "n 22"], facing: Numbers, focal_px: float
+) -> Vectors:
+    """Compute the share of the light that each surface reflects diffusely, by channel.
+
+    Args:
+        stage: the scene.
+        hits: the points.
+        rows: attributes of their triangles.
+        facing: cosines of the angles between the rays and the planes' normals, 0 to 1.
+        focal_px: focal length of the camera.
+    """
+    # The texture's level is a compromise between the width of a pixel's footprint and its length,
+    # which grows with the slant.
+    textures = make_textures()
+    layer = stage.layer.index_select(0, hits.primitive)
+    uv = _interpolate(rows[:, _UV], hits.barycentric)
+    footprint_m = hits.distance_m / focal_px
+    lengthening = facing.clamp(min=0.03) ** -0.6
+    level = torch.log2(footprint_m * rows[:, _TEXELS_PER_M] * lengthening + 1e-9)
+    albedo = sample_texture(textures, layer, uv, level) * rows[:, TINT]
+
+    # Stains over metres hide that textures repeat.
+    x, y, z = hits.points.unbind(1)
+    shift_u, shift_v = stage.scene.weather.shift
+    u = x * _STAIN_TILES_PER_M + y * 0.013 + shift_u
+    v = z * _STAIN_TILES_PER_M + shift_v
+    albedo *= (1 + 0.07 * look_up_noise(textures.stains, u, v))[:, None]
+
+    material = stage.material.index_select(0, hits.primitive)
+    on_road = (material == MATERIAL_IDS["road"]).nonzero()[:, 0]
+    if len(on_road):
+        place_m = uv[on_road] * ROAD_TILE_M
+        width_m = footprint_m[on_road]
+        length_m = width_m / facing[on_road].clamp(min=0.02)
+        albedo[on_road] = paint_road(stage.scene, albedo[on_road], place_m, width_m, length_m)
+    return albedo
 
 
 def _interpolate(values: Float[Tensor, "n 3*k"], shares: Vectors) -> Float[Tensor, "n k"]:
