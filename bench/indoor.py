@@ -37,7 +37,7 @@ from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.stereo import SGBMMatcher
 from depthpose.depth.stereo.network_matcher import NetworkMatcher
 from depthpose.depth.stereo.search_range import choose_search_range, measure_disparity_range
-from depthpose.depth.synthetic import draw_near
+from depthpose.depth.synthetic import render_near
 from depthpose.depth.types import DepthEstimate, StereoInput, StereoSample, StereoTruth
 from depthpose.report.page import format_markdown_table
 
@@ -223,7 +223,7 @@ def wide_samples(number: int, seed: int) -> Iterator[StereoSample]:
         width = WIDTHS_PX[index % len(WIDTHS_PX)]
         share = min(0.6, PIXEL_BANDS_PX[-1] / width)
         config = NearConfig(seed=seed, columns_px=(width, width), largest_share=share)
-        frame = draw_near(config, index)
+        frame = render_near(config, index)
         yield StereoSample(
             input=StereoInput(
                 name=f"{index} {width}x{frame.left.shape[1]}",

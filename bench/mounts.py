@@ -42,9 +42,10 @@ from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.estimator.single_image import depth_before_mount
 from depthpose.depth.ground import fit_ground
 from depthpose.depth.mount import MountFilter, scale_by_mount
-from depthpose.depth.synthetic.dataset import draw_light, draw_sensors, expose, view_from
-from depthpose.depth.synthetic.scene import make_scene
-from depthpose.depth.synthetic.shading import prepare
+from depthpose.depth.synthetic.sensor import draw_sensors, expose
+from depthpose.depth.synthetic.shading import prepare_stage
+from depthpose.depth.synthetic.street import make_street
+from depthpose.depth.synthetic.visibility import render_light, view_from
 from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.report.page import format_markdown_table, write_table
 
@@ -106,7 +107,7 @@ def draw_street(
     street: int, height_m: float, tilt_deg: int, roll_deg: int, fov_deg: int
 ) -> dict[str, Any]:
     """Draw one street from a mount: 8-bit picture and depth [m]."""
-    scene = make_scene((STREET_SEED, street), SCENE_HEIGHT_M)
+    scene = make_street((STREET_SEED, street), SCENE_HEIGHT_M)
     raised_m = np.array([0, height_m - SCENE_HEIGHT_M, 0])
     corners_in_world_m = scene.mesh.corners.astype(float) @ scene.camera_from_world + raised_m
     normals_in_world = scene.mesh.normals @ scene.camera_from_world.astype(np.float32)
@@ -116,10 +117,10 @@ def draw_street(
     normals = normals_in_world @ R.T.astype(np.float32)
     mesh = dataclasses.replace(scene.mesh, corners=corners_m, normals=normals)
     is_near = corners_m[:, :, 2].max(1) > -MAX_BEHIND_M
-    scene = dataclasses.replace(scene, mesh=mesh.part(is_near), camera_from_world=R)
-    stage = prepare(scene, WIDTH * HEIGHT)
+    scene = dataclasses.replace(scene, mesh=mesh.select(is_near), camera_from_world=R)
+    stage = prepare_stage(scene, WIDTH * HEIGHT)
     sight = view_from(stage, camera_of_fov(fov_deg).K, (HEIGHT, WIDTH), torch.zeros(3))
-    light = draw_light(stage, sight)
+    light = render_light(stage, sight)
     rng = np.random.default_rng([street, int(height_m * 100), 9 - tilt_deg, fov_deg])
     sensor, _ = draw_sensors(rng, light, 0.3)
     picture = (expose(light, sensor) * 255).round().byte().numpy()

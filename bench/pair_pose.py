@@ -31,10 +31,11 @@ from depthpose.core.rigid import Rigid
 from depthpose.depth.config import MatcherConfig, StreetsConfig
 from depthpose.depth.disparity import depth_std_from_confidence
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.synthetic import draw_scene
-from depthpose.depth.synthetic.dataset import Projector
-from depthpose.depth.synthetic.mesh import MeshBuilder, Surface
-from depthpose.depth.synthetic.scene import Markings, StreetScene, draw_weather
+from depthpose.depth.synthetic import render_scene
+from depthpose.depth.synthetic.materials import Appearance
+from depthpose.depth.synthetic.mesh import MeshBuilder
+from depthpose.depth.synthetic.projector import Projector
+from depthpose.depth.synthetic.scene import NO_MARKINGS, SyntheticScene, draw_weather
 from depthpose.depth.types import StereoInput
 from depthpose.pose.config import SyntheticSensorConfig
 from depthpose.pose.mesh import sample_surface
@@ -119,16 +120,14 @@ def draw_table(number: int, rig: Rig, look: str) -> TableScene:
     builder = MeshBuilder(rng)
     materials = ("wood", "stone", "concrete", "brick")
     material = materials[number % len(materials)]
-    table = Surface(material, (0.5, 0.45, 0.4), 0.4 * scale, number)
+    table = Appearance(material, (0.5, 0.45, 0.4), 0.4 * scale, number)
     corner = (origin - 3 * (right + ahead)) * scale
-    builder.rectangle(corner, 6 * scale * right, 6 * scale * ahead, table)
+    builder.add_rectangle(corner, 6 * scale * right, 6 * scale * ahead, table)
     for name, pose in poses.items():
         add_part(builder, name, pose, scale, is_textured=look == "textured")
-    scene = StreetScene(
+    scene = SyntheticScene(
         mesh=builder.finish(),
-        markings=Markings(
-            lines=np.zeros((0, 4)), bars=np.zeros((0, 5)), brightness=0.5, wheel_tracks=(0.0, 3.0)
-        ),
+        markings=NO_MARKINGS,
         weather=replace(draw_weather(rng), haze_m=1e5),
         camera_from_world=np.eye(3),
         place="clutter",
@@ -143,7 +142,7 @@ def draw_table(number: int, rig: Rig, look: str) -> TableScene:
             strength=1.0,
         )
     config = StreetsConfig(jpeg_share=0.0, rectification_error_px=0.1)
-    frame = draw_scene(scene, drawn, config, (57, number), projector)
+    frame = render_scene(scene, drawn, config, (57, number), projector)
     left, right = frame.left, frame.right
     if rig.is_infrared:
         left, right = grey(left), grey(right)
@@ -167,10 +166,10 @@ def add_part(
     builder: MeshBuilder, name: str, pose: Rigid, scale: float, *, is_textured: bool
 ) -> None:
     """Add a part to a scene that is enlarged by ``scale``."""
-    builder.thing += 1
-    surface = Surface("paint", (0.35, 0.35, 0.37), 10 * scale, 0)
+    builder.begin_object()
+    surface = Appearance("paint", (0.35, 0.35, 0.37), 10 * scale, 0)
     if is_textured:
-        surface = Surface("stone", (0.6, 0.55, 0.5), 0.06 * scale, builder.thing)
+        surface = Appearance("stone", (0.6, 0.55, 0.5), 0.06 * scale, builder.object_id)
     model = make_part(name)
     triangles_m = model.vertices_m.double().numpy()[model.faces.numpy()]
     corners = (triangles_m @ pose.R.numpy().T + pose.t_m.numpy()) * scale
@@ -180,7 +179,7 @@ def add_part(
     main_axis = np.abs(normals).argmax(1)
     other_axes = np.array([[1, 2], [0, 2], [0, 1]])[main_axis]
     uv = np.take_along_axis(triangles_m, other_axes[:, None, :].repeat(3, 1), 2) * scale
-    builder.triangles(corners, uv, surface)
+    builder.add_triangles(corners, uv, surface)
 
 
 def mask_of(name: str, pose: Rigid, K: Tensor, depth_m: Tensor) -> Tensor:

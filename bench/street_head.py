@@ -30,12 +30,12 @@ from torch.nn import functional as F
 
 from depthpose.core.checkpoint import find_weights
 from depthpose.depth.disparity import resize_image
-from depthpose.depth.generators import SelectionGenerator
-from depthpose.depth.synthesis import pad_to_multiple
-from depthpose.depth.synthetic.dataset import draw_light, draw_sensors, expose, view_from
-from depthpose.depth.synthetic.mesh import NUMBER
-from depthpose.depth.synthetic.scene import make_scene
-from depthpose.depth.synthetic.shading import prepare
+from depthpose.depth.synthesis import SelectionGenerator, pad_to_multiple
+from depthpose.depth.synthetic.materials import MATERIAL_IDS
+from depthpose.depth.synthetic.sensor import draw_sensors, expose
+from depthpose.depth.synthetic.shading import prepare_stage
+from depthpose.depth.synthetic.street import make_street
+from depthpose.depth.synthetic.visibility import render_light, view_from
 from depthpose.depth.types import StereoInput
 from depthpose.depth.weights import read_depth_weights, write_depth_weights
 from depthpose.report.page import format_markdown_table
@@ -59,10 +59,10 @@ def street_view(seed: int, index: int) -> StereoInput | None:
     cameras are near the mount of KITTI's cars. None if something stands right before the camera.
     """
     rng = np.random.default_rng([81, seed, index])
-    scene = make_scene((seed, index), 1.65)
+    scene = make_street((seed, index), 1.65)
     world_m = scene.mesh.corners.astype(float) @ scene.camera_from_world - [0, 1.65, 0]
     normals = scene.mesh.normals @ scene.camera_from_world.astype(np.float32)
-    road_m = world_m[scene.mesh.material == NUMBER["road"]].reshape(-1, 3)
+    road_m = world_m[scene.mesh.material == MATERIAL_IDS["road"]].reshape(-1, 3)
     z_m = rng.uniform(0, 60)
     road_here_m = road_m[np.argsort(np.abs(road_m[:, 2] - z_m))[:20]]
     f = float(np.exp(rng.uniform(math.log(360), math.log(600))))
@@ -79,13 +79,15 @@ def street_view(seed: int, index: int) -> StereoInput | None:
     corners = ((world_m - np.array([x_m, y_m, z_m])) @ R.T).astype(np.float32)
     mesh = dataclasses.replace(
         scene.mesh, corners=corners, normals=normals @ R.T.astype(np.float32)
-    ).part(corners[:, :, 2].max(1) > -12)
-    stage = prepare(dataclasses.replace(scene, mesh=mesh, camera_from_world=R), ROWS * COLUMNS)
+    ).select(corners[:, :, 2].max(1) > -12)
+    stage = prepare_stage(
+        dataclasses.replace(scene, mesh=mesh, camera_from_world=R), ROWS * COLUMNS
+    )
     K = torch.tensor([[f, 0, cx], [0, f, cy], [0, 0, 1]], dtype=torch.float64)
     sight = view_from(stage, K, (ROWS, COLUMNS), torch.zeros(3))
     if float((sight.raster.depth_m < 2).float().mean()) > 0.15:
         return None
-    light = draw_light(stage, sight)
+    light = render_light(stage, sight)
     sensor, _ = draw_sensors(rng, light, 0.3)
     return images.with_camera(f"{index}", expose(light, sensor), f)
 

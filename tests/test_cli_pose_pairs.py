@@ -17,9 +17,10 @@ from depthpose.core.checkpoint import SHIPPED
 from depthpose.core.files import read_map, write_image
 from depthpose.depth.config import StreetsConfig
 from depthpose.depth.disparity import depth_std_from_confidence
-from depthpose.depth.synthetic import draw_scene
-from depthpose.depth.synthetic.mesh import MeshBuilder, Surface
-from depthpose.depth.synthetic.scene import Markings, StreetScene, draw_weather
+from depthpose.depth.synthetic import render_scene
+from depthpose.depth.synthetic.materials import Appearance
+from depthpose.depth.synthetic.mesh import MeshBuilder
+from depthpose.depth.synthetic.scene import NO_MARKINGS, SyntheticScene, draw_weather
 from depthpose.pose.synthetic.parts import make_part_mesh
 
 pytestmark = pytest.mark.skipif(
@@ -38,23 +39,21 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
     corners = np.asarray(vertices_mm)[np.asarray(faces)] / 1000 @ turn.T + PLACE_M
     rng = np.random.default_rng(2)
     builder = MeshBuilder(rng)
-    wall = Surface("brick", (0.5, 0.45, 0.4), 0.3, 1)
-    builder.rectangle([-2, 1.5, 1.3], [4, 0, 0], [0, -3, 0], wall)
-    builder.thing = 1
+    wall = Appearance("brick", (0.5, 0.45, 0.4), 0.3, 1)
+    builder.add_rectangle([-2, 1.5, 1.3], [4, 0, 0], [0, -3, 0], wall)
+    builder.begin_object()
     # Textured by its places in x and y of the camera: no seam matters to a matcher.
-    builder.triangles(corners, corners[..., :2], Surface("stone", (0.6, 0.6, 0.65), 0.08, 0))
-    scene = StreetScene(
+    builder.add_triangles(corners, corners[..., :2], Appearance("stone", (0.6, 0.6, 0.65), 0.08, 0))
+    scene = SyntheticScene(
         mesh=builder.finish(),
-        markings=Markings(
-            lines=np.zeros((0, 4)), bars=np.zeros((0, 5)), brightness=0.5, wheel_tracks=(0.0, 3.0)
-        ),
+        markings=NO_MARKINGS,
         weather=draw_weather(rng),
         camera_from_world=np.eye(3),
         place="clutter",
     )
     K = intrinsics(700.0, 700.0, 319.5, 239.5)
     rig = StereoRig(width=640, height=480, K=K, baseline_m=0.08)
-    frame = draw_scene(scene, rig, StreetsConfig(jpeg_share=0.0, rectification_error_px=0.0))
+    frame = render_scene(scene, rig, StreetsConfig(jpeg_share=0.0, rectification_error_px=0.0))
     write_image(home / "left.png", frame.left)
     write_image(home / "right.png", frame.right)
     write_image(home / "mask.png", (frame.depth_m < 1.25).float().expand(3, -1, -1))

@@ -5,8 +5,8 @@ import sys
 import pytest
 
 from depthpose.cli import main
-from depthpose.web import Limits, address_and_hosts
-from depthpose.web.app import LOOPBACK
+from depthpose.web import Limits, find_address_and_hosts
+from depthpose.web.server import LOOPBACK
 
 
 def _has_ipv6() -> bool:
@@ -87,7 +87,7 @@ def test_what_counts_is_the_address_that_was_taken(bound: str, is_open: bool) ->
             return bound, 8000
 
     with Taken() as taken:
-        _, names = address_and_hosts("My-Robot", taken)
+        _, names = find_address_and_hosts("My-Robot", taken)
     assert names == (None if is_open else (*LOOPBACK, "my-robot", bound))
 
 

@@ -25,7 +25,7 @@ from depthpose.depth.config import (
     SelectionConfig,
 )
 from depthpose.depth.datasets import open_dataset
-from depthpose.depth.datasets.frames import Frame
+from depthpose.depth.datasets.frames import FramePaths
 from depthpose.depth.datasets.layouts import LAYOUTS, Layout
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.export import TARGETS, Target, describe_export
@@ -35,7 +35,8 @@ from depthpose.depth.metrics import METRICS, Metric
 from depthpose.depth.stereo import StereoNetwork
 from depthpose.depth.train.config import FinetuneTraining, SelectTraining, StereoTraining
 from depthpose.depth.train.runs import train_finetune, train_stereo
-from depthpose.depth.train.stages import SelectionSample, SelectTask, StereoTask
+from depthpose.depth.train.selection_task import SelectionSample, SelectTask
+from depthpose.depth.train.stereo_task import StereoTask
 from depthpose.depth.types import Match
 from depthpose.depth.weights import (
     MATCHERS,
@@ -171,11 +172,11 @@ def test_a_matcher_without_a_graph_is_not_exported(
 
 
 def test_extending_layouts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def find(folder: Path) -> Iterable[Frame]:
+    def find(folder: Path) -> Iterable[FramePaths]:
         for left in sorted(folder.glob("*-cam0.png")):
             name = left.stem.removesuffix("-cam0")
             right = folder / f"{name}-cam1.png"
-            yield Frame(name=name, left=left, right=right, calibration=None, style="plain")
+            yield FramePaths(name=name, left=left, right=right, calibration=None, style="plain")
 
     monkeypatch.setitem(LAYOUTS, "numbered", Layout(find=find, parts="NAME-cam0.png"))
     for side in (0, 1):

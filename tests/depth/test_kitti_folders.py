@@ -15,11 +15,11 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import write_depth_png, write_image, write_map
 from depthpose.depth.datasets import (
     check_dataset,
-    lidar_truth,
+    list_truth_kinds,
     open_dataset,
+    read_lidar_depth,
     read_split,
     read_true_depth,
-    truth_kinds,
 )
 from depthpose.depth.datasets.frames import read_object_calibration, read_plain_calibration
 
@@ -181,7 +181,7 @@ def test_raw_and_object_calibration_draw_the_same_scan(tmp_path: Path) -> None:
     make_raw(tmp_path / "raw")
     make_object(tmp_path / "object")
     drawn = [
-        lidar_truth(open_dataset(tmp_path / name).frames[0], "camera_z")
+        read_lidar_depth(open_dataset(tmp_path / name).frames[0], "camera_z")
         for name in ("raw", "object")
     ]
     assert torch.equal(drawn[0].nan_to_num(0.0), drawn[1].nan_to_num(0.0))
@@ -191,9 +191,9 @@ def test_raw_and_object_calibration_draw_the_same_scan(tmp_path: Path) -> None:
 def test_a_drawn_scan_serves_camera_z_only(tmp_path: Path) -> None:
     make_pairs(tmp_path)
     frame = open_dataset(tmp_path).frames[0]
-    assert lidar_truth(frame, "camera_z")[0, 0].item() == 9.0
+    assert read_lidar_depth(frame, "camera_z")[0, 0].item() == 9.0
     with pytest.raises(InputError, match="a: has no LiDAR scan of the kind velodyne_x"):
-        lidar_truth(frame, "velodyne_x")
+        read_lidar_depth(frame, "velodyne_x")
 
 
 def test_annotated_depth_is_found_beside_the_drives(tmp_path: Path) -> None:
@@ -229,17 +229,17 @@ def test_a_scan_of_the_depth_prediction_set_stands_in_for_one_of_points(
     drawn[3, 4] = 7.5
     write_depth_png(tmp_path / inside, drawn)
     frame, other = open_dataset(tmp_path).frames
-    assert truth_kinds(other) == ()
-    assert truth_kinds(frame) == ("scan",)
-    assert lidar_truth(frame, "camera_z").nan_to_num(0.0).sum().item() == 7.5
-    assert lidar_truth(frame, "camera_z")[3, 4].item() == 7.5
+    assert list_truth_kinds(other) == ()
+    assert list_truth_kinds(frame) == ("scan",)
+    assert read_lidar_depth(frame, "camera_z").nan_to_num(0.0).sum().item() == 7.5
+    assert read_lidar_depth(frame, "camera_z")[3, 4].item() == 7.5
     with pytest.raises(InputError, match="no LiDAR scan of the kind velodyne_x"):
-        lidar_truth(frame, "velodyne_x")
+        read_lidar_depth(frame, "velodyne_x")
     report = check_dataset(tmp_path)
     assert (report.counts["LiDAR scans"], report.problems) == (1, [])
     write_depth_png(tmp_path / inside, drawn[:, 1:])
     with pytest.raises(InputError, match="but its left image is"):
-        lidar_truth(frame, "camera_z")
+        read_lidar_depth(frame, "camera_z")
     assert "but its left image is" in check_dataset(tmp_path).problems[0].message
 
 
@@ -248,12 +248,12 @@ def test_points_come_before_a_drawn_scan(tmp_path: Path) -> None:
     make_raw(tmp_path)
     drive = tmp_path / "2011_09_26/2011_09_26_drive_0002_sync"
     frame = open_dataset(tmp_path).frames[0]
-    own = lidar_truth(frame, "camera_z")
+    own = read_lidar_depth(frame, "camera_z")
     inside = "proj_depth/velodyne_raw/image_02/0000000007.png"
     write_depth_png(drive / inside, torch.full((H, W), 50.0))
     frame = open_dataset(tmp_path).frames[0]
     assert frame.scan == drive / inside
-    torch.testing.assert_close(lidar_truth(frame, "camera_z"), own, equal_nan=True)
+    torch.testing.assert_close(read_lidar_depth(frame, "camera_z"), own, equal_nan=True)
 
 
 def test_one_line_a_pair_gives_each_its_own_camera(tmp_path: Path) -> None:
@@ -576,7 +576,7 @@ def test_a_grey_sequence_has_the_rig_and_scans_of_its_cameras(tmp_path: Path) ->
     assert dataset.frames[0].name == "000000"
     assert rig is not None
     assert rig.baseline_m == pytest.approx(350 / 700)
-    assert bool(lidar_truth(dataset.frames[0], "camera_z").isfinite().any())
+    assert bool(read_lidar_depth(dataset.frames[0], "camera_z").isfinite().any())
 
 
 def test_the_selection_of_frames_has_one_camera_and_both_truths(tmp_path: Path) -> None:
@@ -592,8 +592,8 @@ def test_the_selection_of_frames_has_one_camera_and_both_truths(tmp_path: Path) 
         assert check_dataset(folder).is_ok
         assert dataset.read_rig(0) is None
         assert dataset.read_input(0).camera is not None
-        assert truth_kinds(dataset.frames[0]) == ("scan", "annotated")
-        assert float(lidar_truth(dataset.frames[0], "camera_z").mean()) == 10
+        assert list_truth_kinds(dataset.frames[0]) == ("scan", "annotated")
+        assert float(read_lidar_depth(dataset.frames[0], "camera_z").mean()) == 10
 
 
 def test_drives_that_are_not_rectified_are_named(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import torch
 
 from depthpose.core.errors import Notice
 from depthpose.core.files import write_map
-from depthpose.depth.datasets import lidar_truth, open_dataset, project_lidar
+from depthpose.depth.datasets import open_dataset, project_lidar, read_lidar_depth
 from depthpose.depth.datasets.frames import LidarDepth
 from depthpose.depth.evaluate import evaluate
 
@@ -85,7 +85,7 @@ def test_every_reference_frame_is_equal_to_the_bit(
         reference = np.load(path)
         expected = np.full(tuple(reference["shape"]), np.nan, np.float32)
         expected[reference[keys[0]], reference[keys[1]]] = reference[keys[2]]
-        drawn = lidar_truth(frames[path.stem], depth)
+        drawn = read_lidar_depth(frames[path.stem], depth)
         assert drawn.dtype == torch.float32
         assert np.array_equal(drawn.numpy(), expected, equal_nan=True), path.stem
 

@@ -11,7 +11,7 @@ from tests.synthetic_street import make_street
 
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_depth_png, write_image, write_map
-from depthpose.depth.datasets import check_dataset, lidar_truth, open_dataset, read_split
+from depthpose.depth.datasets import check_dataset, open_dataset, read_lidar_depth, read_split
 from depthpose.depth.datasets.frames import read_object_calibration
 
 W, H = 20, 12
@@ -206,7 +206,7 @@ def test_a_scan_beyond_float32_draws_nothing_wrong(tmp_path: Path) -> None:
     put(tmp_path / "calib/0.txt", TEXT + LIDAR.replace("1", "1e200"))
     (tmp_path / "velodyne").mkdir()
     np.array([[10, 0, 0, 0]], np.float32).tofile(tmp_path / "velodyne/0.bin")
-    assert lidar_truth(open_dataset(tmp_path).frames[0], "camera_z").shape == (H, W)
+    assert read_lidar_depth(open_dataset(tmp_path).frames[0], "camera_z").shape == (H, W)
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from depthpose.depth.losses import (
     heads_loss,
     log_disparity_loss,
     plane_loss,
+    stereo_loss,
     view_loss,
 )
 from depthpose.depth.train import ViewTask
@@ -104,6 +105,19 @@ def test_the_last_of_fewer_heads_weighs_one_too() -> None:
     heads = [truth + 2.5, truth + 3.5]
     assert float(heads_loss(heads, truth, 96)) == pytest.approx(0.7 * 2 + 1.0 * 3)
     assert float(heads_loss(heads[1:], truth, 96)) == pytest.approx(1.0 * 3)
+
+
+def test_the_sky_weighs_as_a_disparity_or_as_a_class() -> None:
+    truth = torch.tensor([[[5.0, 0.0]]])
+    heads = [truth + 2.5]
+    without_class = stereo_loss(heads, None, truth, 96, 0.25)
+    assert without_class.sky is None
+    assert float(without_class.total) == pytest.approx(2.0)  # both pixels are 2.5 px off
+    with_class = stereo_loss(heads, torch.tensor([[[0.2, 0.7]]]), truth, 96, 0.25)
+    sky = -(math.log(0.8) + math.log(0.7)) / 2
+    assert with_class.sky is not None
+    assert float(with_class.sky) == pytest.approx(sky, abs=1e-3)
+    assert float(with_class.total) == pytest.approx(2.0 + 0.25 * sky, abs=1e-3)
 
 
 def test_unknown_truth_gives_no_gradient_and_no_nan() -> None:

@@ -10,7 +10,7 @@ from depthpose.core.errors import InputError
 from depthpose.depth.config import NearConfig
 from depthpose.depth.datasets import open_dataset, write_scene
 from depthpose.depth.disparity import disparity_from_depth, warp_right_to_left
-from depthpose.depth.synthetic import StreetFrame, draw_near, make_near
+from depthpose.depth.synthetic import SyntheticFrame, make_near, render_near
 from depthpose.depth.synthetic.near import NearScene
 
 SMALL = NearConfig(
@@ -20,9 +20,9 @@ SMALL = NearConfig(
 
 
 @cache
-def drawn(index: int) -> StreetFrame:
+def drawn(index: int) -> SyntheticFrame:
     """A frame of :data:`SMALL`, which no test changes."""
-    return draw_near(SMALL, index)
+    return render_near(SMALL, index)
 
 
 def test_scenes_are_near_and_of_all_kinds() -> None:
@@ -71,7 +71,7 @@ def test_dots_are_seen_by_both_cameras_at_the_same_place() -> None:
     plain = replace(infrared, dots_share=0.0)
     found = False
     for index in range(3):
-        with_dots, without = draw_near(infrared, index), draw_near(plain, index)
+        with_dots, without = render_near(infrared, index), render_near(plain, index)
         added = [
             a / a.mean() - b / b.mean()
             for a, b in ((with_dots.left, without.left), (with_dots.right, without.right))
@@ -88,7 +88,7 @@ def test_dots_are_seen_by_both_cameras_at_the_same_place() -> None:
 
 
 def test_black_borders_have_no_truth() -> None:
-    frame = draw_near(replace(SMALL, border_share=1.0), 3)
+    frame = render_near(replace(SMALL, border_share=1.0), 3)
     is_black = (frame.left == 0).all(0)
     whole = is_black.all(0) | is_black.all(1)[:, None]
     assert bool(whole.any())
@@ -122,6 +122,6 @@ def test_the_command_adds_what_is_missing(
 
 def test_unusable_numbers_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(InputError, match="index is -1"):
-        draw_near(SMALL, -1)
+        render_near(SMALL, -1)
     assert main(["data", "make", "near", "--out", str(tmp_path / "n"), "--number", "0"]) == 2
     assert "--number 0" in capsys.readouterr().err

@@ -20,9 +20,9 @@ from depthpose.core.errors import InputError
 from depthpose.depth.datasets import (
     Dataset,
     check_dataset,
-    lidar_truth,
     open_dataset,
     pack_frames,
+    read_lidar_depth,
 )
 
 CONFIG = """
@@ -69,7 +69,7 @@ def assert_same(one: Dataset, other: Dataset) -> None:
             if first is not None:
                 torch.testing.assert_close(first, second, rtol=0, atol=0, equal_nan=True)
         if frame.velodyne is not None:
-            found = [lidar_truth(f, "camera_z") for f in (frame, other.frames[index])]
+            found = [read_lidar_depth(f, "camera_z") for f in (frame, other.frames[index])]
             torch.testing.assert_close(*found, rtol=0, atol=0, equal_nan=True)
 
 

@@ -26,7 +26,7 @@ from depthpose.depth.stereo.network_matcher import lower_where_disagreeing
 from depthpose.depth.train import StereoTask
 from depthpose.depth.train.config import StereoTraining
 from depthpose.depth.train.pairs import TrainingPairs
-from depthpose.depth.train.stages import validate_pairs
+from depthpose.depth.train.stereo_task import validate_pairs
 from depthpose.depth.types import DepthEstimate, Match, StereoInput
 from depthpose.depth.weights import DepthWeights
 

@@ -15,18 +15,18 @@ from depthpose.depth.config import StreetsConfig
 from depthpose.depth.disparity import warp_right_to_left
 from depthpose.depth.synthetic import (
     CAMERA_FROM_VELODYNE,
-    StreetFrame,
     Streets,
-    draw_scene,
-    draw_street,
+    SyntheticFrame,
     kitti_rig,
     make_clutter,
-    make_scene,
-    models,
-    road,
+    make_street,
+    render_scene,
+    render_street,
+    roadside,
+    traffic,
 )
-from depthpose.depth.synthetic.dataset import draw_sensors
 from depthpose.depth.synthetic.road import draw_road
+from depthpose.depth.synthetic.sensor import draw_sensors
 
 PLAIN = StreetsConfig(scale=0.25, jpeg_share=0.0, rectification_error_px=0.0)
 
@@ -35,17 +35,17 @@ KITTI_EIGHTH = resize_camera(kitti_rig(), 155, 47)
 
 
 @pytest.fixture(scope="module")
-def frames() -> list[StreetFrame]:
+def frames() -> list[SyntheticFrame]:
     config = replace(PLAIN, with_lidar=True)
-    streets = [draw_street(config, index) for index in (0, 8)]
-    clutter = [draw_street(replace(config, clutter_share=1.0), index) for index in (0,)]
+    streets = [render_street(config, index) for index in (0, 8)]
+    clutter = [render_street(replace(config, clutter_share=1.0), index) for index in (0,)]
     return streets + clutter
 
 
 def test_a_frame_is_a_function_of_seed_and_index() -> None:
     config = StreetsConfig(scale=0.1)
     one = Streets(config)[5]
-    draw_street(config, 6)
+    render_street(config, 6)
     other = Streets(config)[5]
     assert torch.equal(one.input.left, other.input.left)
     assert one.input.right is not None
@@ -63,10 +63,10 @@ def test_a_frame_is_a_function_of_seed_and_index() -> None:
 def test_clutter_takes_its_share_and_leaves_the_streets_as_they_are() -> None:
     config = StreetsConfig(scale=0.05)
     half = replace(config, clutter_share=0.5)
-    streets = [bool(draw_street(half, i).is_road.any()) for i in range(6)]
+    streets = [bool(render_street(half, i).is_road.any()) for i in range(6)]
     assert 1 <= sum(streets) <= 5
     first = streets.index(True)
-    assert torch.equal(draw_street(half, first).left, draw_street(config, first).left)
+    assert torch.equal(render_street(half, first).left, render_street(config, first).left)
 
 
 def test_clutter_is_within_reach_of_a_matcher_and_of_all_kinds() -> None:
@@ -74,7 +74,7 @@ def test_clutter_is_within_reach_of_a_matcher_and_of_all_kinds() -> None:
     materials = {int(m) for scene in scenes for m in np.unique(scene.mesh.material)}
     assert len(materials) >= 20
     for scene in scenes[:3]:
-        disparity_px = 8 * draw_scene(scene, KITTI_EIGHTH, PLAIN).disparity_px.nan_to_num(0)
+        disparity_px = 8 * render_scene(scene, KITTI_EIGHTH, PLAIN).disparity_px.nan_to_num(0)
         assert float(disparity_px.quantile(0.95)) < 128
         assert float(disparity_px.std()) > 5
 
@@ -86,21 +86,39 @@ def test_streets_vary_in_what_stands_there_and_how(monkeypatch: pytest.MonkeyPat
         make = getattr(module, name)
 
         def note(*words: Any, **more: Any) -> Any:  # noqa: ANN401
-            drawn[f"vehicle {words[0]}" if name == "vehicle" else name] += 1
+            drawn[f"vehicle {words[0]}" if name == "make_vehicle" else name] += 1
             return make(*words, **more)
 
         monkeypatch.setattr(module, name, note)
 
     for module, names in {
-        models: ("walker", "rider", "vehicle", "tree", "bush", "hedge", "lamp", "sign", "fence"),
-        road: ("add_house",),
+        traffic: ("make_pedestrian", "make_cyclist", "make_vehicle"),
+        roadside: (
+            "make_tree",
+            "make_bush",
+            "make_hedge",
+            "make_lamp",
+            "make_sign",
+            "make_fence",
+            "add_house",
+        ),
     }.items():
         for name in names:
             counted(module, name)
-    scenes = [make_scene((0, index)) for index in range(10)]
+    scenes = [make_street((0, index)) for index in range(10)]
     assert len({scene.place for scene in scenes}) >= 3
     assert sum(kind.startswith("vehicle") for kind in drawn) >= 3
-    for what in ("walker", "rider", "tree", "bush", "hedge", "add_house", "lamp", "sign", "fence"):
+    for what in (
+        "make_pedestrian",
+        "make_cyclist",
+        "make_tree",
+        "make_bush",
+        "make_hedge",
+        "make_lamp",
+        "make_sign",
+        "make_fence",
+        "add_house",
+    ):
         assert drawn[what] > 0, what
     assert {scene.weather.is_overcast for scene in scenes} == {True, False}
     assert any(scene.weather.haze_m < 600 for scene in scenes)
@@ -110,8 +128,8 @@ def test_streets_vary_in_what_stands_there_and_how(monkeypatch: pytest.MonkeyPat
 
 def test_roads_bend_climb_and_cross() -> None:
     roads = [draw_road(np.random.default_rng(seed)) for seed in range(40)]
-    heights = np.array([np.ptp(road.centre[:, 2]) for road in roads])
-    headings = np.rad2deg([np.ptp(road.centre[:, 4]) for road in roads])
+    heights = np.array([np.ptp(road.centre.y_m) for road in roads])
+    headings = np.rad2deg([np.ptp(road.centre.heading_rad) for road in roads])
     assert (heights > 1).any()
     assert (heights < 0.5).any()
     assert (headings > 10).any()
@@ -129,20 +147,20 @@ def test_cameras_differ_in_light_noise_and_compression() -> None:
         assert len({str(getattr(sensor, field.name)) for sensor in left}) > 1, field.name
 
 
-def photometric_error(frame: StreetFrame, shift_px: float) -> float:
+def photometric_error(frame: SyntheticFrame, shift_px: float) -> float:
     warped = warp_right_to_left(frame.right, frame.disparity_px + shift_px)
     seen = ~frame.occluded & ~frame.is_sky
     return float((warped - frame.left).abs().mean(0)[seen].nanmean())
 
 
-def test_the_right_view_warped_by_the_disparity_is_the_left(frames: list[StreetFrame]) -> None:
+def test_the_right_view_warped_by_the_disparity_is_the_left(frames: list[SyntheticFrame]) -> None:
     for frame in frames:
         exact = photometric_error(frame, 0.0)
         assert exact < 0.04
         assert exact < 0.75 * min(photometric_error(frame, 2.0), photometric_error(frame, -2.0))
 
 
-def test_disparity_and_depth_are_one(frames: list[StreetFrame]) -> None:
+def test_disparity_and_depth_are_one(frames: list[SyntheticFrame]) -> None:
     for frame in frames:
         expected = float(frame.rig.K[0, 0]) * frame.rig.baseline_m / frame.depth_m
         assert torch.equal(frame.is_sky, frame.disparity_px.isnan())
@@ -150,7 +168,7 @@ def test_disparity_and_depth_are_one(frames: list[StreetFrame]) -> None:
         assert float(frame.depth_m.nan_to_num(9).min()) > 1
 
 
-def test_occlusion_agrees_with_the_right_disparity(frames: list[StreetFrame]) -> None:
+def test_occlusion_agrees_with_the_right_disparity(frames: list[SyntheticFrame]) -> None:
     for frame in frames:
         height, width = frame.occluded.shape
         columns = (torch.arange(width) - frame.disparity_px).round()
@@ -182,7 +200,7 @@ def sparse_depth(points: Tensor, rig: StereoRig) -> Tensor:
     return torch.where(depth_m.isinf(), torch.nan, depth_m).reshape(rig.height, rig.width)
 
 
-def test_the_lidar_agrees_with_the_depth(frames: list[StreetFrame]) -> None:
+def test_the_lidar_agrees_with_the_depth(frames: list[SyntheticFrame]) -> None:
     for frame in frames:
         assert frame.lidar_points is not None
         assert len(frame.lidar_points) > 10_000
@@ -195,11 +213,11 @@ def test_the_lidar_agrees_with_the_depth(frames: list[StreetFrame]) -> None:
 
 
 def test_one_scene_has_the_same_metres_at_two_focal_lengths() -> None:
-    scene = make_scene((4, 2))
+    scene = make_street((4, 2))
     rig = resize_camera(kitti_rig(), 240, 72)
     K = torch.diag(torch.tensor([2.0, 2.0, 1.0], dtype=torch.float64)) @ rig.K
     large = StereoRig(width=470, height=140, K=K, baseline_m=0.3)
-    small_frame, large_frame = (draw_scene(scene, one, PLAIN) for one in (rig, large))
+    small_frame, large_frame = (render_scene(scene, one, PLAIN) for one in (rig, large))
     # Pixel (u, v) of the small picture looks along the ray of (2 u, 2 v) of the large one.
     at_large = large_frame.depth_m[::2, ::2]
     at_small = small_frame.depth_m[: at_large.shape[0], : at_large.shape[1]]
@@ -208,7 +226,7 @@ def test_one_scene_has_the_same_metres_at_two_focal_lengths() -> None:
     assert float((ratio - rig.baseline_m / 0.6).nan_to_num(0.0).abs().max()) < 1e-4
 
 
-def test_frames_are_pictures(frames: list[StreetFrame]) -> None:
+def test_frames_are_pictures(frames: list[SyntheticFrame]) -> None:
     for frame in frames:
         for image in (frame.left, frame.right):
             assert image.dtype == torch.float32
@@ -230,7 +248,7 @@ def test_what_cannot_be_drawn_is_refused() -> None:
     with pytest.raises(InputError, match="rectification_error_px"):
         StreetsConfig(rectification_error_px=-1.0)
     with pytest.raises(InputError, match="index is -1"):
-        draw_street(PLAIN, -1)
+        render_street(PLAIN, -1)
     with pytest.raises(IndexError):
         Streets(StreetsConfig(frames=3))[3]
     assert len(Streets(StreetsConfig(frames=3))) == 3

@@ -13,12 +13,12 @@ from depthpose.depth.config import StreetsConfig
 from depthpose.depth.datasets import (
     has_calibration,
     has_raw_frame,
-    lidar_truth,
     open_dataset,
+    read_lidar_depth,
     write_raw_frame,
 )
 from depthpose.depth.disparity import disparity_from_depth
-from depthpose.depth.synthetic import draw_street
+from depthpose.depth.synthetic import render_street
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +61,7 @@ def test_what_is_read_is_metric(synthetic: Path) -> None:
     rig, truth = dataset.read_rig(0), dataset.read_truth(0)
     assert rig is not None
     assert truth.disparity_px is not None
-    scan_m = lidar_truth(frame, "camera_z")
+    scan_m = read_lidar_depth(frame, "camera_z")
     # KITTI's own protocol draws a point one pixel up and to the left.
     expected = disparity_from_depth(scan_m, rig).roll((1, 1), (0, 1))
     difference = (expected - truth.disparity_px).abs()
@@ -73,7 +73,7 @@ def test_what_is_read_is_metric(synthetic: Path) -> None:
 
 def test_one_date_has_one_calibration(tmp_path: Path) -> None:
     drive = "2100_02_01_drive_0001_sync"
-    raw = draw_street(StreetsConfig(scale=0.05), 0)
+    raw = render_street(StreetsConfig(scale=0.05), 0)
     write_raw_frame(tmp_path, drive, 3, raw)
     other = replace(raw, rig=replace(raw.rig, baseline_m=0.6))
     with pytest.raises(InputError, match="another rig or scale"):

@@ -31,7 +31,7 @@ from depthpose.depth.train import (
     train_select,
 )
 from depthpose.depth.train.config import FinetuneTraining, SelectTraining
-from depthpose.depth.train.stages import SelectionSample, SelectionSamples
+from depthpose.depth.train.selection_task import SelectionSample, SelectionSamples
 from depthpose.depth.weights import read_depth_weights, read_generator, write_depth_weights
 
 __all__ = ["folder", "held_folder", "pairs"]  # fixtures

@@ -11,7 +11,7 @@ from depthpose.core.checkpoint import SHIPPED
 from depthpose.depth.config import StreetsConfig
 from depthpose.depth.disparity import resize_image
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.synthetic import draw_scene, kitti_rig, make_scene
+from depthpose.depth.synthetic import kitti_rig, make_street, render_scene
 from depthpose.depth.types import StereoInput
 
 ALLOWED = 0.05
@@ -30,7 +30,7 @@ def rig(focal_px: float, width: int, height: int) -> StereoRig:
 
 def depth_m(net: FakestereoNet, camera: StereoRig) -> Tensor:
     config = StreetsConfig(seed=9, jpeg_share=0.0, rectification_error_px=0.0)
-    frame = draw_scene(make_scene((9, 2)), camera, config, (9, 2))
+    frame = render_scene(make_street((9, 2)), camera, config, (9, 2))
     estimate = net.estimate_input(
         StereoInput(name="street", left=frame.left, right=None, camera=camera)
     )

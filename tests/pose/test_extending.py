@@ -26,7 +26,7 @@ from depthpose.pose.losses import POINT_LOSSES, direction_loss
 from depthpose.pose.mesh import MESH_READERS, read_model
 from depthpose.pose.predictions import write_bop_results
 from depthpose.pose.train import PoseTraining
-from depthpose.web.answer import KINDS
+from depthpose.web.answer import FILE_FIELDS
 
 
 def read_json_points(path: AnyPath) -> PointCloud:
@@ -137,5 +137,5 @@ def test_extending_losses(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_page_takes_every_cloud_and_mesh() -> None:
-    assert KINDS["cloud"][1] == tuple(CLOUD_READERS)
-    assert KINDS["cad"][1] == tuple(MESH_READERS)
+    assert FILE_FIELDS["cloud"][1] == tuple(CLOUD_READERS)
+    assert FILE_FIELDS["cad"][1] == tuple(MESH_READERS)

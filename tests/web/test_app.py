@@ -121,7 +121,7 @@ def test_a_guess_is_not_coloured_as_a_good_answer(
     with TestClient(make_app(guessing, nets[1]), base_url=URL) as client:
         found = ask(client, "depth", tmp_path, {"image": "noise.png"}, focal_px="180").json()
     assert not found["ok"]
-    assert found["said"].startswith("Careful: out of distribution")
+    assert found["sentence"].startswith("Careful: out of distribution")
     assert "warning" not in dict(found["facts"])
 
 
@@ -224,7 +224,7 @@ def test_a_damaged_file_is_named_and_nothing_of_ours_is_shown(
 def test_a_focal_length_that_asks_for_a_huge_picture_is_refused(
     page: TestClient, samples: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("depthpose.web.depth._MOST_WORK_PIXELS", 1000)
+    monkeypatch.setattr("depthpose.web.depth._MAX_NETWORK_PIXELS", 1000)
     status, text = refusal(ask(page, "depth", samples, {"image": "left.png"}))
     assert (status, "more than this page computes" in text) == (400, True)
 
@@ -235,7 +235,7 @@ def test_weights_that_match_pairs_as_they_are_have_a_limit_too(
     def never(*_: torch.Tensor) -> torch.Tensor:
         raise AssertionError("the work began")
 
-    monkeypatch.setattr("depthpose.web.depth._MOST_WORK_PIXELS", 20_000)
+    monkeypatch.setattr("depthpose.web.depth._MAX_NETWORK_PIXELS", 20_000)
     app = make_app(FakestereoNet(CallableMatcher(never)), nets[1])
     files = {**PAIR, "camera": "camera.json"}
     status, text = refusal(ask(TestClient(app, base_url=URL), "depth", samples, files))
@@ -274,7 +274,7 @@ def test_weights_without_a_matcher_answer_one_image_and_refuse_a_pair(
     assert 'name="right"' in page.get("/").text
     one = {"image": "left.png", "camera": "camera.json"}
     found = ask(client, "depth", samples, one).json()
-    assert found["said"].endswith(" m. 0% are sky.")
+    assert found["sentence"].endswith(" m. 0% are sky.")
     picture, depth = found["pictures"][:2]
     assert picture["caption"] == "the image"
     assert picture["size"] == depth["size"]
@@ -294,7 +294,7 @@ def test_examples_are_what_the_forms_take(page: TestClient, tmp_path: Path) -> N
             (tmp_path / one["name"]).write_bytes(b64decode(one["data"]))
         files = {one["field"]: one["name"] for one in found["files"]}
         answer = ask(page, kind, tmp_path, files, **found["fields"]).json()
-        assert answer["ok"], answer["said"]
+        assert answer["ok"], answer["sentence"]
     assert page.get("/examples/kitchen").status_code == 404
 
 
@@ -303,7 +303,7 @@ def test_a_picture_of_the_sky_alone_is_said_to_be_one(
 ) -> None:
     files = {"image": "left.png", "camera": "camera.json"}
     found = ask(page_without_matcher(0, nets), "depth", samples, files).json()
-    assert found["said"] == (
+    assert found["sentence"] == (
         "No pixel got a depth from one image; 100% of the image is taken for sky."
     )
     assert found["scene"]["layers"][0]["count"] == 0
@@ -350,7 +350,7 @@ def test_the_network_is_asked_once(
 def test_a_picture_of_too_many_pixels_is_refused(
     page: TestClient, samples: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("depthpose.web.answer.MOST_PIXELS", 1000)
+    monkeypatch.setattr("depthpose.web.answer.MAX_PIXELS", 1000)
     assert "scale it down" in refusal(ask(page, "depth", samples, {"image": "left.png"}))[1]
 
 
@@ -358,7 +358,7 @@ def test_a_picture_of_too_many_pixels_is_refused(
 def test_a_depth_map_of_floats_has_the_limit_of_a_picture(
     page: TestClient, tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("depthpose.web.answer.MOST_PIXELS", 1000)
+    monkeypatch.setattr("depthpose.web.answer.MAX_PIXELS", 1000)
     name = f"d.{suffix}"
     for columns, said in ((50, "focal length: without it"), (51, f"{name} has 51x20 pixels")):
         write_map(tmp_path / name, torch.ones(20, columns))
@@ -367,7 +367,7 @@ def test_a_depth_map_of_floats_has_the_limit_of_a_picture(
 
 
 def assert_right(page: TestClient, found: dict[str, Any], truth: Rigid, name: str) -> None:
-    assert found["ok"], found["said"]
+    assert found["ok"], found["sentence"]
     (row,) = json.loads(page.get("/" + found["folder"] + "poses.json").content)
     T = torch.tensor(row["camera_from_model"])
     model = make_part(PART)
@@ -446,7 +446,7 @@ def test_a_cloud_in_millimetres_is_posed_by_a_cad_file_that_the_weights_know(
 def test_another_object_is_refused_in_words(page: TestClient, samples: Path, truth: Rigid) -> None:
     found = ask(page, "pose", samples, VIEW, object="spool").json()
     assert not found["ok"]
-    assert found["said"].startswith("Refused (")
+    assert found["sentence"].startswith("Refused (")
     assert found["tables"] == {}
     assert [file["name"] for file in found["files"]] == [
         "depth.pose.ply",
@@ -531,11 +531,11 @@ def test_a_cad_file_that_no_weights_know_is_registered(
     page: TestClient,
     files: dict[str, str],
 ) -> None:
-    monkeypatch.setattr(pose_tab, "_SAME_SHAPE", -1.0)
+    monkeypatch.setattr(pose_tab, "_MAX_SHAPE_DIFFERENCE", -1.0)
     cad = {"cad": f"{PART}.stl"}
     found = ask(page, "pose", samples, files | cad, object="cad", cad_unit="mm").json()
     assert dict(found["facts"])["by"].startswith("the CAD file alone")
-    assert found["ok"], found["said"]
+    assert found["ok"], found["sentence"]
     assert found["terms"] == ""
     (row,) = json.loads(page.get("/" + found["folder"] + "poses.json").content)
     T = torch.tensor(row["camera_from_model"])
@@ -552,7 +552,7 @@ def test_another_part_than_the_cad_file_is_refused(
     files = VIEW | {"cad": "rod.obj"}
     found = ask(page, "pose", samples, files, object="cad", cad_unit="m").json()
     assert not found["ok"]
-    assert found["said"].startswith("Refused")
+    assert found["sentence"].startswith("Refused")
 
 
 def test_what_is_too_large_is_refused_before_it_is_read(

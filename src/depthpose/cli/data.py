@@ -58,7 +58,7 @@ def make_streets(
     from depthpose.core.run import claim_folder
     from depthpose.depth.config import StreetsConfig
     from depthpose.depth.datasets import has_calibration, has_raw_frame, write_raw_frame
-    from depthpose.depth.synthetic import draw_street, rig_number
+    from depthpose.depth.synthetic import draw_rig_number, render_street
 
     if number < 1 or first < 0 or not 0 <= seed <= 9999:
         raise InputError(
@@ -76,7 +76,7 @@ def make_streets(
     settings = {key: value for key, value in asdict(config).items() if key != "seed"}
     claim_folder(out, settings, dates)
     indices = range(first, first + number)
-    date_of = {index: dates[rig_number(config, index)] for index in indices}
+    date_of = {index: dates[draw_rig_number(config, index)] for index in indices}
     drive_of = {index: f"{date}_drive_{seed:04d}_sync" for index, date in date_of.items()}
 
     # A frame is missing if it is not there, or if it is to bring the calibration of its date.
@@ -88,7 +88,7 @@ def make_streets(
         if index in uncalibrated or not has_raw_frame(out, drive_of[index], index)
     ]
     for index in tqdm(missing, unit=" frames", leave=False, disable=None):
-        write_raw_frame(out, drive_of[index], index, draw_street(config, index))
+        write_raw_frame(out, drive_of[index], index, render_street(config, index))
     print(f"{out}: {len(missing)} frames made, {number - len(missing)} were there")
     return 0
 
@@ -117,7 +117,7 @@ def make_near(
     from depthpose.core.run import claim_folder
     from depthpose.depth.config import NearConfig
     from depthpose.depth.datasets import has_scene, write_scene
-    from depthpose.depth.synthetic import draw_near
+    from depthpose.depth.synthetic import render_near
 
     if number < 1 or first < 0 or not 0 <= seed <= 9999:
         raise InputError(
@@ -130,7 +130,7 @@ def make_near(
     claim_folder(out, settings, list(names.values()))
     missing = [index for index, name in names.items() if not has_scene(out, name)]
     for index in tqdm(missing, unit=" scenes", leave=False, disable=None):
-        write_scene(out, names[index], draw_near(config, index))
+        write_scene(out, names[index], render_near(config, index))
     print(f"{out}: {len(missing)} scenes made, {number - len(missing)} were there")
     return 0
 

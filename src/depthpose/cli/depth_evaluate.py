@@ -19,7 +19,7 @@ from depthpose.core.run import describe_environment, find_rank, read_settings, w
 from depthpose.core.runner import Job
 from depthpose.depth.baselines import NearestImageBaseline, RowDepthBaseline
 from depthpose.depth.config import Answer, BaselineName, MatcherConfig, Speed
-from depthpose.depth.datasets import Dataset, join_datasets, open_dataset, refuse_common
+from depthpose.depth.datasets import Dataset, join_datasets, open_dataset, refuse_shared_frames
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.evaluate import (
     Evaluation,
@@ -72,7 +72,7 @@ def predict_depth_of_dataset(
 
     share = process.share_of(usable)
     jobs = [Job(name=frame.name, read=partial(read, i)) for i, frame in share]
-    sources = {f.name: f.seen_files(with_right=method.with_right) for _, f in usable}
+    sources = {f.name: f.list_input_files(with_right=method.with_right) for _, f in usable}
     net = _UncheckedNet(method.net) if isinstance(method.net, FakestereoNet) else method.net
     written = estimate_missing_depth(net, jobs, home, method.settings, sources)
     for _ in tqdm(written, method.name, total=len(jobs), disable=None, unit=" frames"):
@@ -174,7 +174,7 @@ def open_training(folders: Sequence[Path], without: Sequence[str], measured: Dat
         )
     training = join_datasets([open_dataset(folder) for folder in folders], without)
     remedy = "give --train other folders, or name these in --train-without"
-    refuse_common(training.frames, measured.frames, "frames to measure", remedy)
+    refuse_shared_frames(training.frames, measured.frames, "frames to measure", remedy)
     return training
 
 

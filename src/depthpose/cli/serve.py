@@ -32,7 +32,7 @@ def serve(
         max_seconds: of one computation; a longer one is stopped, as others wait for it.
     """
     try:
-        from depthpose.web import Limits, address_and_hosts, make_app, open_socket, run
+        from depthpose.web import Limits, find_address_and_hosts, make_app, open_socket, run
     except ModuleNotFoundError as error:
         package = (error.name or "starlette").partition(".")[0]
         raise MissingExtraError(package, "serve", "the page in the browser") from error
@@ -44,7 +44,7 @@ def serve(
     if max_seconds < 1:
         raise InputError(f"--max-seconds {max_seconds}: take 1 at least; 120 is usual")
     listener = open_socket(host, port)  # a port in use is refused before weights are loaded
-    address, hosts = address_and_hosts(host, listener)
+    address, hosts = find_address_and_hosts(host, listener)
     limits = Limits(upload_bytes=max_upload_mb * 10**6, compute_s=max_seconds, hosts=hosts)
     depth = FakestereoNet.load(weights, allow_ood=True)
     app = make_app(depth, GeoPoseNet.load(pose_weights), limits)

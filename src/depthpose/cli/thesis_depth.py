@@ -15,7 +15,7 @@ from depthpose.cli.depth_predict import DepthMethod
 from depthpose.core.errors import InputError, suggest_name
 from depthpose.core.files import write_image
 from depthpose.core.run import claim_folder, describe_environment, find_rank
-from depthpose.depth.datasets import Dataset, Frame, has_lidar, lidar_truth
+from depthpose.depth.datasets import Dataset, FramePaths, has_lidar, read_lidar_depth
 from depthpose.depth.predictions import has_prediction, read_estimate
 from depthpose.depth.protocols import find_protocol
 from depthpose.report import page
@@ -103,7 +103,7 @@ def reproduce_table(
     return 0
 
 
-def _frames_sha256(frames: Sequence[Frame]) -> str:
+def _frames_sha256(frames: Sequence[FramePaths]) -> str:
     """Give the SHA-256 of the paths of the left images."""
     paths = "".join(f"{frame.left.resolve()}\n" for frame in frames)
     return hashlib.sha256(paths.encode()).hexdigest()
@@ -145,9 +145,9 @@ def _make_figure_sections(
     return sections
 
 
-def _read_lidar(frame: Frame) -> Float[Tensor, "h w"] | None:
+def _read_lidar(frame: FramePaths) -> Float[Tensor, "h w"] | None:
     """Read the LiDAR depth (camera z) of a frame; None where it has none."""
-    return lidar_truth(frame, "camera_z") if has_lidar(frame, "camera_z") else None
+    return read_lidar_depth(frame, "camera_z") if has_lidar(frame, "camera_z") else None
 
 
 def write_report(title: str, sections: Sequence[Section], out: Path) -> None:

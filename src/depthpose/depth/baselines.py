@@ -16,7 +16,7 @@ from torch.nn import functional as F
 from depthpose.core.camera import StereoRig
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image
-from depthpose.depth.datasets import Dataset, read_true_depth, truth_kinds
+from depthpose.depth.datasets import Dataset, list_truth_kinds, read_true_depth
 from depthpose.depth.disparity import disparity_from_depth
 from depthpose.depth.types import DepthEstimate, Map, StereoInput, View
 
@@ -147,9 +147,9 @@ class NearestImageBaseline:
             InputError: no image has both.
         """
         indices = [
-            index
-            for index, frame in enumerate(dataset.frames)
-            if frame.calibration and truth_kinds(frame) and dataset.read_rig(index) is not None
+            i
+            for i, frame in enumerate(dataset.frames)
+            if frame.calibration and list_truth_kinds(frame) and dataset.read_rig(i) is not None
         ]
         if not indices:
             raise _make_no_truth_error(dataset)

@@ -65,7 +65,7 @@ def label_pairs(
     if not usable:
         raise InputError(f"{dataset.name}: no frame has a right view and a calibration to match by")
     claim_folder(folder, settings, ("left", "right", "disp_occ", "calib.txt"))
-    sources = {frames[index].name: frames[index].seen_files() for index in usable}
+    sources = {frames[index].name: frames[index].list_input_files() for index in usable}
     claim_names(folder, sources, is_finished=partial(_is_labelled, folder))
 
     # The rigs first: calib.txt names all of them before there is any label.

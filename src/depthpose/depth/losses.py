@@ -1,6 +1,7 @@
 """Losses of the depth networks."""
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -70,6 +71,36 @@ def heads_loss(
 
 _MIN_PROBABILITY = 1e-4
 """Added to probabilities, so that gradients of their logarithms are finite where they are 0."""
+
+
+class StereoLoss(NamedTuple):
+    """The loss of a stereo network, and the part of it that is for the sky."""
+
+    total: Float[Tensor, ""]
+    sky: Float[Tensor, ""] | None  # before its weight; None of a network without a class of the sky
+
+
+def stereo_loss(
+    heads_px: Sequence[Maps],
+    sky_probability: Maps | None,
+    truth_px: Maps,
+    max_px: int,
+    sky_weight: float,
+) -> StereoLoss:
+    """Compute the loss by which all stereo networks are trained; another one takes its place here.
+
+    Args:
+        heads_px: disparities of the network's heads, the final one last.
+        sky_probability: probability of the sky, of a network that has a class for it.
+        truth_px: true disparity; 0 in the sky, NaN where it is unknown.
+        max_px: truth from here on does not count.
+        sky_weight: weight of the sky: of the cross entropy of its class, or without such a class of
+            its pixels, which are taught a disparity of 0.
+    """
+    if sky_probability is None:
+        return StereoLoss(heads_loss(heads_px, truth_px, max_px, sky_weight=sky_weight), None)
+    sky = sky_loss(sky_probability, truth_px)
+    return StereoLoss(heads_loss(heads_px, truth_px, max_px) + sky_weight * sky, sky)
 
 
 def sky_loss(probability: Maps, truth_px: Maps) -> Float[Tensor, ""]:

@@ -18,7 +18,7 @@ from depthpose.core.errors import InputError, Notice, suggest_name
 from depthpose.core.files import read_image
 from depthpose.depth import disparity
 from depthpose.depth import predictions as files
-from depthpose.depth.datasets import Dataset, Frame, has_lidar, lidar_truth
+from depthpose.depth.datasets import Dataset, FramePaths, has_lidar, read_lidar_depth
 from depthpose.depth.metrics import SMALLEST_DEPTH_M, garg_crop, view_errors
 from depthpose.depth.types import Map
 
@@ -81,7 +81,7 @@ def find_protocol(name: str) -> Protocol:
     return PROTOCOLS[name]
 
 
-def has_truth(frame: Frame, protocol: Protocol) -> bool:
+def has_truth(frame: FramePaths, protocol: Protocol) -> bool:
     """Whether a frame has files of the truth that a protocol needs; none is read."""
     match protocol.truth:
         case "disparity":
@@ -96,7 +96,7 @@ def has_truth(frame: Frame, protocol: Protocol) -> bool:
 class PreparedFrame:
     """A frame's truth and prediction, at the size of the truth."""
 
-    frame: Frame  #: the frame
+    frame: FramePaths  #: the frame
     truth: Map  #: depth [m] or disparity [px], as the protocol says
     disparity_px: Map  #: predicted disparity
     depth_m: Map | None  #: predicted depth, where depth was predicted and no disparity
@@ -190,7 +190,7 @@ def prepare_frame(
 def _read_truth(dataset: Dataset, index: int, protocol: Protocol) -> Map:
     """Read the truth of a frame that has the files of it: depth [m] or disparity [px]."""
     if protocol.truth in ("velodyne_x", "camera_z"):
-        return lidar_truth(dataset.frames[index], protocol.truth)
+        return read_lidar_depth(dataset.frames[index], protocol.truth)
     stored_truth = dataset.read_truth(index)
     truth = stored_truth.disparity_px if protocol.is_disparity else stored_truth.depth_m
     assert truth is not None, "has_truth said so"
@@ -207,7 +207,7 @@ def _make_stand_in_rig(truth_m: Map) -> StereoRig:
     return StereoRig(width=width, height=height, K=K, baseline_m=1.0)
 
 
-def _measure_view(frame: Frame, predictions: Path) -> dict[str, float]:
+def _measure_view(frame: FramePaths, predictions: Path) -> dict[str, float]:
     """Measure the synthesised right view of a frame by the real one; {} where one is missing."""
     synthesised = files.read_part(predictions, frame.name, "right.png")
     if synthesised is None or frame.right is None:

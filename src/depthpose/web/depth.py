@@ -22,22 +22,28 @@ from depthpose.web.answer import (
     EXAMPLE_SEED,
     Answer,
     Form,
-    Shown,
-    example_form,
+    ShownPicture,
+    encode_example,
     refuse_large,
 )
 
-_MOST_WORK_PIXELS = 8_000_000
+_MAX_NETWORK_PIXELS = 8_000_000
 """Most pixels of the image as networks get it, resized to their focal length."""
 _PHONE_FOCAL_WIDTHS = 0.75
 """Focal length of a phone's main camera, in widths of the image."""
-_GUESSED = f" (guessed as {_PHONE_FOCAL_WIDTHS} widths: the metres are as wrong as the guess)"
-_MOSTLY_SKY = 0.5
+_GUESSED_ORIGIN = (
+    f" (guessed as {_PHONE_FOCAL_WIDTHS} widths: the metres are as wrong as the guess)"
+)
+_MIN_SKY_SHARE = 0.5
 """Share of the sky from which a pair without a depth is not taken for a wrong one."""
 
 
 def answer_depth(form: Form, net: FakestereoNet) -> Answer:
-    """Estimate depth for a form."""
+    """Estimate depth for a form: what the page shows, with files to download.
+
+    Raises:
+        InputError: a field or file is missing, wrong or too large.
+    """
     start = time.perf_counter()
     pair, focal_origin = _read_input(form)
 
@@ -48,7 +54,7 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
             "the weights of this page take one image alone: remove the right image, or start "
             "'depthpose serve' with --weights that have a matcher"
         )
-    _refuse_large_work(pair, net)
+    _refuse_large_inputs(pair, net)
 
     estimate = net.estimate_input(pair)
     seconds = time.perf_counter() - start
@@ -77,9 +83,9 @@ def answer_depth(form: Form, net: FakestereoNet) -> Answer:
 
 
 def _read_range(form: Form) -> tuple[float, float]:
-    """Read the depth [m] of the brightest and of the darkest colour."""
-    near_m = form.number("near_m")
-    far_m = form.number("far_m")
+    """Read the range of depth that the colours show [m]: of the brightest and the darkest one."""
+    near_m = form.read_number("near_m")
+    far_m = form.read_number("far_m")
     near_m = COLOR_RANGE_M[0] if near_m is None else near_m
     far_m = COLOR_RANGE_M[1] if far_m is None else far_m
     if not 0 < near_m < far_m:
@@ -90,7 +96,7 @@ def _read_range(form: Form) -> tuple[float, float]:
     return near_m, far_m
 
 
-def _refuse_large_work(pair: StereoInput, net: FakestereoNet) -> None:
+def _refuse_large_inputs(pair: StereoInput, net: FakestereoNet) -> None:
     """Refuse images that the networks would take in too large a size.
 
     The size follows from the focal length: networks resize images to the one they know.
@@ -116,13 +122,13 @@ def _refuse_large_work(pair: StereoInput, net: FakestereoNet) -> None:
         sizes.append((camera.height, camera.width))
 
     rows, columns = max(sizes, key=math.prod)
-    if (rows, columns) == (height, width) and rows * columns > _MOST_WORK_PIXELS:
+    if (rows, columns) == (height, width) and rows * columns > _MAX_NETWORK_PIXELS:
         raise InputError(
             f"{pair.name} has {width}x{height} pixels; these weights match pairs as "
-            f"they are, and this page computes {_MOST_WORK_PIXELS / 1e6:g} million at most; scale "
-            "both images down, and the focal length with them, or use the command line"
+            f"they are, and this page computes {_MAX_NETWORK_PIXELS / 1e6:g} million at most; "
+            "scale both images down, and the focal length with them, or use the command line"
         )
-    if rows * columns > _MOST_WORK_PIXELS:
+    if rows * columns > _MAX_NETWORK_PIXELS:
         raise InputError(
             f"a focal length of {focal_px:g} px for {width}x{height} pixels "
             f"would be resized to {columns}x{rows}, more than this page computes; is it in "
@@ -131,16 +137,18 @@ def _refuse_large_work(pair: StereoInput, net: FakestereoNet) -> None:
 
 
 def _read_input(form: Form) -> tuple[StereoInput, str]:
-    """Read the picture or pair with its camera, and say where its focal length is from.
+    """Read the picture or pair with its camera.
 
-    The origin is words for the page; empty where the user gave the focal length.
+    Returns:
+        The pair, and words for the page on where its focal length is from; empty where the user
+        gave it.
     """
-    path = form.file("image")
+    path = form.require_file("image")
     width, height = image_size(path)
     refuse_large(path.name, width, height)
     has_right = "right" in form.files
-    focal_px = form.number("focal_px")
-    baseline_m = form.number("baseline_m")
+    focal_px = form.read_number("focal_px")
+    baseline_m = form.read_number("baseline_m")
     if has_right and baseline_m is None and "camera" not in form.files:
         raise InputError(
             "baseline: the depth of a pair needs the distance of its two cameras; fill in the "
@@ -152,18 +160,22 @@ def _read_input(form: Form) -> tuple[StereoInput, str]:
     origin = ""
     if focal_px is None and "camera" not in form.files:
         exif = None if has_right else read_exif_focal(path)
-        focal_px, tags = (_PHONE_FOCAL_WIDTHS * width, "") if exif is None else exif
-        origin = f" (EXIF: {tags})" if tags else _GUESSED
+        if exif is None:
+            focal_px = _PHONE_FOCAL_WIDTHS * width
+            origin = _GUESSED_ORIGIN
+        else:
+            focal_px, tags = exif
+            origin = f" (EXIF: {tags})" if tags else _GUESSED_ORIGIN
 
     # The camera, by its file or by the fields.
-    doffs_px = form.number("cx_right_minus_left_px")
-    keys = form.pinhole_keys((width, height), focal_px) | {
+    doffs_px = form.read_number("cx_right_minus_left_px")
+    keys = form.make_pinhole_keys((width, height), focal_px) | {
         "baseline_m": baseline_m,
         "cx_right_minus_left_px": None if baseline_m is None else doffs_px,
-        "mount_height_m": form.number("mount_height_m"),
-        "tilt_deg": form.number("tilt_deg"),
+        "mount_height_m": form.read_number("mount_height_m"),
+        "tilt_deg": form.read_number("tilt_deg"),
     }
-    camera = form.camera(keys, (width, height))
+    camera = form.make_camera(keys, (width, height))
     if baseline_m is not None and not isinstance(camera, StereoRig):  # of a file without one
         camera = StereoRig(
             width=camera.width,
@@ -175,7 +187,7 @@ def _read_input(form: Form) -> tuple[StereoInput, str]:
 
     right = None
     if has_right:
-        right_path = form.file("right")
+        right_path = form.require_file("right")
         refuse_large(right_path.name, *image_size(right_path))
         right = read_image(right_path)
     pair = StereoInput(name=path.stem, left=read_image(path), right=right, camera=camera)
@@ -184,24 +196,24 @@ def _read_input(form: Form) -> tuple[StereoInput, str]:
 
 def _list_pictures(
     pair: StereoInput, estimate: DepthEstimate, range_m: tuple[float, float]
-) -> list[Shown]:
+) -> list[ShownPicture]:
     """List the pictures that the page shows of an estimate."""
     name = pair.name
     near_m, far_m = range_m
     grey = "grey: none" if estimate.is_sky is None else "grey: sky or no answer"
     colours = f"near bright and far dark, {near_m:g} m to {far_m:g} m by the logarithm"
-    depth = Shown(
+    depth = ShownPicture(
         file=f"{name}.color.png",
         caption=f"depth: {colours}; {grey}",
         values=f"{name}.depth_m.npy",
         unit="m",
         scale=make_depth_color_bar(*range_m),
     )
-    pictures = [Shown(file=f"{name}.input.jpg", caption="the image"), depth]
+    pictures = [ShownPicture(file=f"{name}.input.jpg", caption="the image"), depth]
     if estimate.right is not None:
-        pictures.append(Shown(file=f"{name}.right.png", caption="right view, synthesised"))
+        pictures.append(ShownPicture(file=f"{name}.right.png", caption="right view, synthesised"))
     if estimate.confidence is not None:
-        confidence = Shown(
+        confidence = ShownPicture(
             file=f"{name}.confidence.png",
             caption="confidence: bright is high, dark low",
             values=f"{name}.confidence.npy",
@@ -214,27 +226,27 @@ def _list_pictures(
 def _describe_depth(pair: StereoInput, estimate: DepthEstimate) -> str:
     """Describe in a sentence how much of the image has a depth, and how far half of it is."""
     assert estimate.depth_m is not None
-    known_m = estimate.depth_m[estimate.depth_m.isfinite()]
+    finite_m = estimate.depth_m[estimate.depth_m.isfinite()]
     images = "one image" if pair.right is None else "both images"
     is_sky = estimate.is_sky
-    sky = 0.0 if is_sky is None else float(is_sky.float().mean())
+    sky_share = 0.0 if is_sky is None else float(is_sky.float().mean())
     warning = f"Careful: {estimate.warning}. " if estimate.warning else ""
-    if len(known_m) == 0:
-        doubt = f"; {sky:.0%} of the image is taken for sky." if is_sky is not None else "."
-        if pair.right is not None and sky < _MOSTLY_SKY:
+    if len(finite_m) == 0:
+        doubt = f"; {sky_share:.0%} of the image is taken for sky." if is_sky is not None else "."
+        if pair.right is not None and sky_share < _MIN_SKY_SHARE:
             doubt = ": is the pair rectified, and are left and right as they should be?"
         return f"{warning}No pixel got a depth from {images}{doubt}"
-    share = len(known_m) / estimate.depth_m.numel()
-    median_m = float(known_m.median())
-    sky_text = f" {sky:.0%} are sky." if is_sky is not None else ""
+    share = len(finite_m) / estimate.depth_m.numel()
+    median_m = float(finite_m.median())
+    sky_text = f" {sky_share:.0%} are sky." if is_sky is not None else ""
     return (
         f"{warning}Depth from {images} for {share:.0%} of the pixels; half of these are nearer "
         f"than {median_m:.2f} m.{sky_text}"
     )
 
 
-def depth_example() -> dict[str, Any]:
-    """Render a street of half KITTI's size: left and right image, and their rig."""
+def make_depth_example() -> dict[str, Any]:
+    """Render the example of the tab, as JSON: a street of half KITTI's size, and its rig."""
     pair = Streets(StreetsConfig(seed=EXAMPLE_SEED, scale=0.5))[1].input
     assert pair.right is not None
     assert pair.camera is not None
@@ -243,4 +255,4 @@ def depth_example() -> dict[str, Any]:
         write_image(folder / "image.png", pair.left)
         write_image(folder / "right.png", pair.right)
         write_camera(folder / "camera.json", pair.camera)
-        return example_form(folder, {})
+        return encode_example(folder, {})

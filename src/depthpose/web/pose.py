@@ -30,14 +30,14 @@ from depthpose.web.answer import (
     EXAMPLE_SEED,
     Answer,
     Form,
-    Shown,
-    example_form,
+    ShownPicture,
+    encode_example,
     refuse_large,
 )
 
-OWN_CAD = "cad"
+CAD_FILE = "cad"
 """Value of the field ``object`` that means the CAD file."""
-_SAME_SHAPE = 0.02
+_MAX_SHAPE_DIFFERENCE = 0.02
 """Largest difference [diameters] of size and surface of a CAD file and the weights' own object."""
 _SURFACE_POINTS = 500
 """Number of points of a CAD file whose distance to that object is measured."""
@@ -54,18 +54,22 @@ class _Target:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _ShownPose:
-    """A pose and its input: of a searched image, with the mask of the pixels that it explains."""
+    """An estimate that the page shows, and its input."""
 
-    input: CloudInput | ViewInput
+    input: CloudInput | ViewInput  #: of a searched image, with the mask of the pixels it explains
     estimate: PoseEstimate
 
 
 def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
-    """Estimate poses for a form."""
+    """Estimate poses for a form: what the page shows, with files to download.
+
+    Raises:
+        InputError: a field or file is missing, wrong or too large.
+    """
     target = _find_target(form, net)
     pose_input = _read_input(form, target.model)
     shown_poses, votes = _estimate(form, target, pose_input)
-    min_certainty = form.number("min_certainty")
+    min_certainty = form.read_number("min_certainty")
     if min_certainty is not None:
         limit = EstimateConfig(min_certainty=min_certainty).min_certainty  # refuses what is none
         shown_poses = [
@@ -100,9 +104,12 @@ def answer_pose(form: Form, net: GeoPoseNet) -> Answer:
 def _estimate(
     form: Form, target: _Target, pose_input: CloudInput | ViewInput
 ) -> tuple[list[_ShownPose], VotingDirections | None]:
-    """Estimate what a form asks for, the surest first; give the votes of a single one, if any.
+    """Estimate what a form asks for.
 
     Boxes are searched, one pose in each; a depth image without a mask is searched as a whole.
+
+    Returns:
+        The estimates, the surest first; and of a single one by a network its votes, else None.
     """
     views = _make_box_views(form, pose_input)
     if views:
@@ -125,7 +132,7 @@ def _estimate(
 
 
 def _search(target: _Target, view: ViewInput) -> list[_ShownPose]:
-    """Search a whole depth image for the object."""
+    """Search a whole depth image for the object: an estimate for each copy that is found."""
     surface = prepare_surface(target.model)
     shown_poses: list[_ShownPose] = []
     for estimate in target.net.find_in(view, [target.model.name]):
@@ -156,7 +163,11 @@ def _make_scene(
 
 
 def _make_box_views(form: Form, pose_input: CloudInput | ViewInput) -> list[ViewInput]:
-    """Make a view for each box in the form: NAME, or of several NAME_1, NAME_2, ..."""
+    """Make a view for each box in the form, [] without one: NAME, or NAME_1, NAME_2 of several.
+
+    Raises:
+        InputError: a box is no box, or there is a mask or cloud beside it.
+    """
     words = form.fields.get("box", "").split()
     if words and ("mask" in form.files or not isinstance(pose_input, ViewInput)):
         raise InputError(
@@ -184,10 +195,11 @@ def _format_row(estimate: PoseEstimate) -> list[str]:
 
 def _write_results(
     folder: Path, name: str, shown_poses: list[_ShownPose], model: ObjectModel
-) -> list[Shown]:
+) -> list[ShownPicture]:
     """Write ``poses.json``, a cloud with each posed model, and a picture of all of them.
 
-    Gives the picture, if the input is a depth image.
+    Returns:
+        The picture, if the input is a depth image; else [].
     """
     predictions = [Prediction(estimate=shown_pose.estimate) for shown_pose in shown_poses]
     write_predictions(folder, predictions)
@@ -214,7 +226,7 @@ def _write_results(
     if pose_input.is_region:
         caption += ", boxes yellow"
     files.write_image(folder / f"{name}.{PICTURE}", picture)
-    return [Shown(file=f"{name}.{PICTURE}", caption=caption)]
+    return [ShownPicture(file=f"{name}.{PICTURE}", caption=caption)]
 
 
 def _find_target(form: Form, net: GeoPoseNet) -> _Target:
@@ -224,7 +236,7 @@ def _find_target(form: Form, net: GeoPoseNet) -> _Target:
     """
     name = form.fields.get("object", "")
     models = net.weights.models
-    if name != OWN_CAD:
+    if name != CAD_FILE:
         if "cad" in form.files:
             raise InputError(
                 f"object {name!r} and the CAD file {form.files['cad'].name} are both given; choose "
@@ -234,7 +246,7 @@ def _find_target(form: Form, net: GeoPoseNet) -> _Target:
         if model is None:
             raise InputError(f"object {name!r}: the weights know {', '.join(net.objects)}")
         return _Target(model=model, net=net, method="network, by the weights' own model")
-    cad = form.file("cad")
+    cad = form.require_file("cad")
     unit = mesh.FIXED_UNITS.get(cad.suffix.lower()) or form.fields.get("cad_unit", "")
     refuse_unknown("cad_unit", unit, METRES)
     cad_model = mesh.read_model(cad, cast(Unit, unit))
@@ -249,7 +261,7 @@ def _find_target(form: Form, net: GeoPoseNet) -> _Target:
 
 def _is_same_shape(cad_model: ObjectModel, model: ObjectModel) -> bool:
     """Whether a CAD file is an object of the weights, in the same frame: size and surface agree."""
-    if abs(cad_model.diameter_m / model.diameter_m - 1) > _SAME_SHAPE:
+    if abs(cad_model.diameter_m / model.diameter_m - 1) > _MAX_SHAPE_DIFFERENCE:
         return False
     # Points of the whole CAD surface must lie on the model: the file has no part that the model
     # lacks. Of the model the keypoints suffice: they lie far apart, so one is off a CAD file that
@@ -257,20 +269,24 @@ def _is_same_shape(cad_model: ObjectModel, model: ObjectModel) -> bool:
     cad_points_m = mesh.sample_surface(cad_model, _SURFACE_POINTS)[0]
     to_cad_m = mesh.gap_to_surface_m(model.keypoints_m, cad_model)
     from_cad_m = mesh.gap_to_surface_m(cad_points_m, model)
-    return max(to_cad_m, from_cad_m) < _SAME_SHAPE * model.diameter_m
+    return max(to_cad_m, from_cad_m) < _MAX_SHAPE_DIFFERENCE * model.diameter_m
 
 
 def _read_input(form: Form, model: ObjectModel) -> CloudInput | ViewInput:
-    """Read the cloud, or the depth image with its mask and camera, of a form."""
+    """Read the cloud of a form, or its depth image with mask and camera.
+
+    Raises:
+        InputError: one of them is missing, wrong or too large, or both are there.
+    """
     if "cloud" in form.files:
         if "depth" in form.files or "mask" in form.files:
             raise InputError("a cloud and a depth image are both given; choose one of the two")
-        path = form.file("cloud")
+        path = form.require_file("cloud")
         unit = form.fields.get("cloud_unit", "")
         refuse_unknown("cloud_unit", unit, METRES)
         return cloud_input(path, cast(Unit, unit), model.name, path.stem)
-    depth = form.file("depth")
-    mask = form.file("mask") if "mask" in form.files else None
+    depth = form.require_file("depth")
+    mask = form.require_file("mask") if "mask" in form.files else None
     if mask is not None:
         refuse_large(mask.name, *files.image_size(mask))
 
@@ -284,26 +300,30 @@ def _read_input(form: Form, model: ObjectModel) -> CloudInput | ViewInput:
 
     keys: dict[str, Any] = {}
     if "camera" not in form.files:
-        focal_px = form.number("focal_px")
+        focal_px = form.read_number("focal_px")
         if focal_px is None:
             raise InputError(
                 "focal length: without it a depth image has no size; fill in that of the depth "
                 "sensor (its driver has it), or choose a camera file"
             )
-        keys = form.pinhole_keys(size, focal_px) | {"depth_unit_m": form.number("depth_unit_m")}
-    camera = form.camera(keys, size)
+        keys = form.make_pinhole_keys(size, focal_px)
+        keys["depth_unit_m"] = form.read_number("depth_unit_m")
+    camera = form.make_camera(keys, size)
     if camera.depth_unit_m is None:
         # Files of ROS, OpenCV and KITTI do not have it.
-        camera = replace(camera, depth_unit_m=form.number("depth_unit_m"))
+        camera = replace(camera, depth_unit_m=form.read_number("depth_unit_m"))
     return view_input(depth, mask, camera, model.name, depth.stem)
 
 
-_UNIT_M = 0.0001
+_EXAMPLE_UNIT_M = 0.0001
 """Unit of the depth image of the example."""
 
 
-def pose_example(net: GeoPoseNet) -> dict[str, Any]:
-    """Render a frame of the first object that the weights know, on a table: depth, mask, camera."""
+def make_pose_example(net: GeoPoseNet) -> dict[str, Any]:
+    """Render the example of the tab, as JSON: the weights' first object on a table.
+
+    It has a depth image, a mask and a camera.
+    """
     model = net.weights.models[0]
     near_m = 4 * model.diameter_m
     config = ObjectsConfig(
@@ -314,10 +334,10 @@ def pose_example(net: GeoPoseNet) -> dict[str, Any]:
     )
     frame = next(make_frames((model,), config, 1))
     height, width = frame.depth_m.shape
-    camera = Camera(width=width, height=height, K=frame.K.double(), depth_unit_m=_UNIT_M)
+    camera = Camera(width=width, height=height, K=frame.K.double(), depth_unit_m=_EXAMPLE_UNIT_M)
     with TemporaryDirectory(prefix="depthpose-") as name:
         folder = Path(name)
-        files.write_depth_png(folder / "depth.png", frame.depth_m, _UNIT_M)
+        files.write_depth_png(folder / "depth.png", frame.depth_m, _EXAMPLE_UNIT_M)
         write_mask(folder / "mask.png", frame.objects[0].visible)
         write_camera(folder / "camera.json", camera)
-        return example_form(folder, {"object": model.name})
+        return encode_example(folder, {"object": model.name})

@@ -1,5 +1,5 @@
 // The page of depthpose serve: tabs, drop zones, answers. No library, and no other server.
-const made = (name, facts = {}, ...children) => {
+const makeElement = (name, facts = {}, ...children) => {
   const element = Object.assign(document.createElement(name), facts);
   element.append(...children);
   return element;
@@ -7,17 +7,17 @@ const made = (name, facts = {}, ...children) => {
 
 // Tabs: the address ends in #depth or #pose, arrow keys go from one to the other.
 const tabs = [...document.querySelectorAll("[role=tab]")];
-function choose(tab) {
-  for (const one of tabs) {
-    const isChosen = one === tab;
-    one.setAttribute("aria-selected", isChosen);
-    one.tabIndex = isChosen ? 0 : -1;
-    document.getElementById(one.getAttribute("aria-controls")).hidden = !isChosen;
+function chooseTab(tab) {
+  for (const candidate of tabs) {
+    const isChosen = candidate === tab;
+    candidate.setAttribute("aria-selected", isChosen);
+    candidate.tabIndex = isChosen ? 0 : -1;
+    document.getElementById(candidate.getAttribute("aria-controls")).hidden = !isChosen;
   }
 }
 const address = tab => `#${tab.getAttribute("aria-controls")}`;
 for (const tab of tabs) {
-  tab.addEventListener("click", () => { choose(tab); history.replaceState(null, "", address(tab)); });
+  tab.addEventListener("click", () => { chooseTab(tab); history.replaceState(null, "", address(tab)); });
   tab.addEventListener("keydown", event => {
     if (event.key !== "ArrowLeft" && event.key !== "ArrowRight") return;
     const other = tabs[1 - tabs.indexOf(tab)];
@@ -25,21 +25,21 @@ for (const tab of tabs) {
     other.focus();
   });
 }
-choose(tabs.find(tab => address(tab) === location.hash) || tabs[0]);
+chooseTab(tabs.find(tab => address(tab) === location.hash) || tabs[0]);
 // An address that ends in #pose names the tab; the browser would scroll past the tabs to it.
 addEventListener("load", () => scrollTo(0, 0));
 
 // Drop zones show the chosen file, with a button to remove it.
 for (const zone of document.querySelectorAll(".drop")) {
-  const input = zone.querySelector("input"), said = zone.querySelector("output");
+  const input = zone.querySelector("input"), label = zone.querySelector("output");
   const show = () => {
     const file = input.files[0];
-    said.textContent = file ? `${file.name}, ${sized(file.size)}` : "";
+    label.textContent = file ? `${file.name}, ${formatSize(file.size)}` : "";
     zone.classList.toggle("has", Boolean(file));
     if (file && input.name === "cad") input.form.elements.object.value = "cad";
   };
   input.addEventListener("change", show);
-  const drop = made("button", { type: "button", className: "drop-it", textContent: "\u00d7", title: "take the file out" });
+  const drop = makeElement("button", { type: "button", className: "drop-it", textContent: "\u00d7", title: "take the file out" });
   drop.addEventListener("click", event => { event.preventDefault(); input.value = ""; show(); });
   zone.append(drop);
   for (const name of ["dragenter", "dragover"]) zone.addEventListener(name, () => zone.classList.add("over"));
@@ -50,7 +50,7 @@ for (const name of ["dragover", "drop"]) addEventListener(name, event => {
   if (!event.target.closest?.(".drop")) event.preventDefault();
 });
 
-function sized(bytes) {
+function formatSize(bytes) {
   return bytes < 1e6 ? `${Math.ceil(bytes / 1e3)} kB` : `${(bytes / 1e6).toFixed(1)} MB`;
 }
 
@@ -59,21 +59,21 @@ for (const button of document.querySelectorAll(".try")) button.addEventListener(
   const form = button.form;
   button.disabled = true;
   const response = await fetch(`examples/${form.dataset.kind}`).catch(() => null);
-  const found = await response?.json().catch(() => null);
+  const example = await response?.json().catch(() => null);
   button.disabled = false;
-  if (!found?.files) {
-    const textContent = found?.error || "the server does not answer; is 'depthpose serve' still running?";
-    form.parentElement.querySelector(".answer").replaceChildren(made("p", { className: "said failed", role: "alert", textContent }));
+  if (!example?.files) {
+    const textContent = example?.error || "the server does not answer; is 'depthpose serve' still running?";
+    form.parentElement.querySelector(".answer").replaceChildren(makeElement("p", { className: "said failed", role: "alert", textContent }));
     return;
   }
   form.reset();
   for (const input of form.querySelectorAll("input[type=file]")) {
-    const file = found.files.find(one => one.field === input.name), held = new DataTransfer();
-    if (file) held.items.add(new File([Uint8Array.from(atob(file.data), c => c.charCodeAt(0))], file.name));
-    input.files = held.files;
+    const file = example.files.find(candidate => candidate.field === input.name), transfer = new DataTransfer();
+    if (file) transfer.items.add(new File([Uint8Array.from(atob(file.data), c => c.charCodeAt(0))], file.name));
+    input.files = transfer.files;
     input.dispatchEvent(new Event("change"));
   }
-  for (const [name, value] of Object.entries(found.fields)) form.elements[name].value = value;
+  for (const [name, value] of Object.entries(example.fields)) form.elements[name].value = value;
   form.requestSubmit(form.querySelector(".go"));
 });
 
@@ -93,14 +93,14 @@ for (const form of document.forms) form.addEventListener("submit", async event =
   }, 1000);
   button.disabled = true;
   answer.setAttribute("aria-busy", "true");
-  let found;
+  let result;
   try {
     const response = await fetch(`estimate/${form.dataset.kind}`, {
       method: "POST", body: new FormData(form), headers: { "X-Ticket": ticket },
     });
-    found = await response.json();
+    result = await response.json();
   } catch {
-    found = { error: "the server does not answer; is 'depthpose serve' still running?" };
+    result = { error: "the server does not answer; is 'depthpose serve' still running?" };
   }
   clearInterval(tick);
   clearInterval(ask);
@@ -109,44 +109,44 @@ for (const form of document.forms) form.addEventListener("submit", async event =
   answer.removeAttribute("aria-busy");
   answer.querySelector(".scene")?.stopScene?.();
   answer.replaceChildren();
-  if (found.error) answer.append(made("p", { className: "said failed", role: "alert", textContent: found.error }));
-  else show(answer, found);
+  if (result.error) answer.append(makeElement("p", { className: "said failed", role: "alert", textContent: result.error }));
+  else showAnswer(answer, result);
 });
 
-function show(answer, found) {
-  const scene = made("div");
-  const note = found.scene.note ? ` (${found.scene.note})` : "";
+function showAnswer(answer, result) {
+  const scene = makeElement("div");
+  const note = result.scene.note ? ` (${result.scene.note})` : "";
   answer.append(
-    made("p", { className: `said ${found.ok ? "" : "refused"}`, textContent: found.said }),
-    ...(found.terms ? [made("p", { className: "terms" },
-      made("b", { textContent: "Terms of the weights: " }), found.terms)] : []),
-    made("dl", { className: "facts" }, ...found.facts.flatMap(([name, value]) =>
-      [made("dt", { textContent: name }), made("dd", { textContent: value })])),
-    made("figure", { className: "space" }, scene,
-      made("figcaption", { textContent: found.scene.caption + note })),
-    made("div", { className: "pictures" }, ...found.pictures.map(picture => shown(picture, found.folder))),
-    ...Object.entries(found.tables).flatMap(([title, rows]) => [made("h3", { textContent: title }), table(rows)]),
-    made("h3", { textContent: "Downloads" }),
-    made("ul", { className: "downloads" }, ...[...found.files, { name: "all.zip" }].map(({ name, bytes }) =>
-      made("li", {}, made("a", { href: found.folder + encodeURIComponent(name), download: name,
-        textContent: bytes === undefined ? name : `${name}, ${sized(bytes)}` })))),
+    makeElement("p", { className: `said ${result.ok ? "" : "refused"}`, textContent: result.sentence }),
+    ...(result.terms ? [makeElement("p", { className: "terms" },
+      makeElement("b", { textContent: "Terms of the weights: " }), result.terms)] : []),
+    makeElement("dl", { className: "facts" }, ...result.facts.flatMap(([name, value]) =>
+      [makeElement("dt", { textContent: name }), makeElement("dd", { textContent: value })])),
+    makeElement("figure", { className: "space" }, scene,
+      makeElement("figcaption", { textContent: result.scene.caption + note })),
+    makeElement("div", { className: "pictures" }, ...result.pictures.map(picture => makeFigure(picture, result.folder))),
+    ...Object.entries(result.tables).flatMap(([title, rows]) => [makeElement("h3", { textContent: title }), makeTable(rows)]),
+    makeElement("h3", { textContent: "Downloads" }),
+    makeElement("ul", { className: "downloads" }, ...[...result.files, { name: "all.zip" }].map(({ name, bytes }) =>
+      makeElement("li", {}, makeElement("a", { href: result.folder + encodeURIComponent(name), download: name,
+        textContent: bytes === undefined ? name : `${name}, ${formatSize(bytes)}` })))),
   );
-  showScene(scene, found.scene);
+  showScene(scene, result.scene);
 }
 
-function table(rows) {
+function makeTable(rows) {
   const cells = row => row.map((text, k) =>
-    made("td", { textContent: text, className: k === 0 && isNaN(text) ? "head" : "" }));
-  return made("div", { className: "table" }, made("table", {}, ...rows.map(row => made("tr", {}, ...cells(row)))));
+    makeElement("td", { textContent: text, className: k === 0 && isNaN(text) ? "head" : "" }));
+  return makeElement("div", { className: "table" }, makeElement("table", {}, ...rows.map(row => makeElement("tr", {}, ...cells(row)))));
 }
 
 // A picture; where there are numbers behind it, the one under the pointer is read out.
-function shown(picture, folder) {
+function makeFigure(picture, folder) {
   const [width, height] = picture.size;
-  const image = made("img", { src: folder + encodeURIComponent(picture.file), alt: picture.caption, width, height });
-  const read = made("span", { className: "read" });
-  const bar = picture.scale ? [scaled(picture.scale)] : [];
-  const figure = made("figure", {}, image, ...bar, made("figcaption", {}, picture.caption, read));
+  const image = makeElement("img", { src: folder + encodeURIComponent(picture.file), alt: picture.caption, width, height });
+  const read = makeElement("span", { className: "read" });
+  const bar = picture.scale ? [makeColorBar(picture.scale)] : [];
+  const figure = makeElement("figure", {}, image, ...bar, makeElement("figcaption", {}, picture.caption, read));
   if (!picture.values) return figure;
   let map;
   image.addEventListener("pointerenter", async () => {
@@ -165,16 +165,16 @@ function shown(picture, folder) {
 }
 
 // The bar of a picture's colours, with its numbers.
-function scaled({ title, colors, marks }) {
-  const bar = made("div", { className: "bar" }), rgb = colors.map(c => `rgb(${c.map(v => Math.round(255 * v))})`);
+function makeColorBar({ title, colors, marks }) {
+  const bar = makeElement("div", { className: "bar" }), rgb = colors.map(c => `rgb(${c.map(v => Math.round(255 * v))})`);
   bar.style.background = `linear-gradient(to right, ${rgb})`;
   const numbers = marks.map(([place, textContent]) => {
-    const mark = made("span", { textContent });
+    const mark = makeElement("span", { textContent });
     mark.style.left = `${100 * place}%`;
     return mark;
   });
-  return made("div", { className: "scale" }, bar, made("div", { className: "marks" }, ...numbers),
-    made("div", { className: "of", textContent: title }));
+  return makeElement("div", { className: "scale" }, bar, makeElement("div", { className: "marks" }, ...numbers),
+    makeElement("div", { className: "of", textContent: title }));
 }
 
 // NPY, version 1, float32, row by row: what the server writes.

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,7 +16,12 @@ from depthpose.core.files.disk import normalise_stem
 from depthpose.core.files.images import LISTED_SUFFIXES
 from depthpose.core.findings import CheckReport, Problem, make_report, make_unreadable
 from depthpose.depth.datasets.dataset import read_split
-from depthpose.depth.datasets.frames import Frame, frame_camera, kitti_calibration, read_depth
+from depthpose.depth.datasets.frames import (
+    FramePaths,
+    read_depth,
+    read_frame_camera,
+    read_kitti_calibration,
+)
 from depthpose.depth.datasets.layouts import find_frames
 from depthpose.depth.disparity import disparity_from_depth
 from depthpose.depth.types import Map
@@ -60,18 +66,20 @@ def check_dataset(
     if split is not None:
         chosen_split = read_split(split)
         frame_of = {frame.name: frame for frame in frames}
-        problems += [
-            Problem(path=folder, kind="missing", message=f"frame {name} of {chosen_split.name}")
-            for name in chosen_split.names
-            if name not in frame_of
-        ]
-        frames = [frame_of[name] for name in chosen_split.names if name in frame_of]
+        frames = []
+        for name in chosen_split.names:
+            if name in frame_of:
+                frames.append(frame_of[name])
+            else:
+                message = f"frame {name} of {chosen_split.name}"
+                problems.append(Problem(path=folder, kind="missing", message=message))
     problems += _check_folder(folder, frames)
     for done, frame in enumerate(frames, 1):
         problems += _check_frame(frame, with_decoding=with_decoding)
         if progress is not None:
             progress(done, len(frames))
 
+    # How many frames have a file of each part, by the fields of such files.
     fields_of_parts = {
         "right views": ("right",),
         "calibrations": ("calibration",),
@@ -85,8 +93,8 @@ def check_dataset(
     return make_report(layout, counts, problems)
 
 
-def _check_folder(folder: Path, frames: list[Frame]) -> Iterator[Problem]:
-    """Report duplicate names, mixed formats, single right views, and maps without an image."""
+def _check_folder(folder: Path, frames: list[FramePaths]) -> Iterator[Problem]:
+    """Yield duplicate names, mixed formats, single right views, and folders without use."""
     path_of: dict[str, Path] = {}
     for frame in frames:
         if frame.name in path_of:
@@ -125,8 +133,8 @@ def _check_folder(folder: Path, frames: list[Frame]) -> Iterator[Problem]:
             yield Problem(path=folder / name, kind="missing", message=message)
 
 
-def _check_frame(frame: Frame, *, with_decoding: bool) -> Iterator[Problem]:
-    """Report problems of a frame's views, calibration, LiDAR scan and truth.
+def _check_frame(frame: FramePaths, *, with_decoding: bool) -> Iterator[Problem]:
+    """Yield the problems of a frame's views, calibration, LiDAR scan and truth.
 
     ``with_decoding``: decode the images and compare both views; else check their sizes alone.
     """
@@ -155,8 +163,8 @@ def _check_frame(frame: Frame, *, with_decoding: bool) -> Iterator[Problem]:
     rig = None
     report = None
     if frame.right is not None and len(images) == 2 and images[0].shape == images[1].shape:
-        with suppress(InputError):  # _check_measurements reports it
-            rig = frame_camera(frame)
+        with suppress(InputError):  # _check_calibration reports it
+            rig = read_frame_camera(frame)
         cx_difference_px = rig.cx_right_minus_left_px if isinstance(rig, StereoRig) else 0.0
         report = check_rectified(images[0], images[1], cx_difference_px)
         if report.is_wrong or report.is_rectified is None:
@@ -164,40 +172,40 @@ def _check_frame(frame: Frame, *, with_decoding: bool) -> Iterator[Problem]:
             kind = "mismatch" if report.is_wrong else "note"
             yield Problem(path=frame.right, kind=kind, message=message)
 
-    yield from _check_measurements(frame)
+    yield from _check_calibration(frame)
+    if frame.velodyne is not None:
+        yield from _check_scan(frame.velodyne)
     for path in (frame.scan, frame.depth, frame.disparity, frame.disparity_noc):
         if path is not None and size is not None:
             is_depth = path in (frame.scan, frame.depth)
             yield from _check_truth(path, size, rig, report, is_depth=is_depth)
 
 
-def _check_measurements(frame: Frame) -> Iterator[Problem]:
-    """Report a calibration or LiDAR scan that is missing, unreadable or empty."""
-    if frame.calibration is None:
-        if frame.velodyne is None:
-            yield Problem(
-                path=frame.left,
-                kind="note",
-                message="has no calibration: disparity only, no metres",
-            )
-        else:
-            message = "has no calibration, so its scan cannot be projected"
-            yield Problem(path=frame.left, kind="missing", message=message)
+def _check_calibration(frame: FramePaths) -> Iterator[Problem]:
+    """Yield the problems of a frame's calibration: missing, unreadable, or without the LiDAR."""
+    if frame.calibration is None and frame.velodyne is None:
+        message = "has no calibration: disparity only, no metres"
+        yield Problem(path=frame.left, kind="note", message=message)
+    elif frame.calibration is None:
+        message = "has no calibration, so its scan cannot be projected"
+        yield Problem(path=frame.left, kind="missing", message=message)
     else:
         try:
-            frame_camera(frame)
-            if frame.velodyne and kitti_calibration(frame).pixels_from_velodyne is None:
+            read_frame_camera(frame)
+            if frame.velodyne and read_kitti_calibration(frame).pixels_from_velodyne is None:
                 message = f"says nothing of the LiDAR, and {frame.velodyne.name} is there"
                 yield Problem(path=frame.calibration, kind="missing", message=message)
         except InputError as error:
             yield make_unreadable(frame.calibration, error)
 
-    if frame.velodyne is not None:
-        try:
-            if not len(read_points_bin(frame.velodyne)):
-                yield Problem(path=frame.velodyne, kind="empty", message="holds no LiDAR point")
-        except InputError as error:
-            yield make_unreadable(frame.velodyne, error)
+
+def _check_scan(path: Path) -> Iterator[Problem]:
+    """Yield the problem of a LiDAR scan that is unreadable or empty."""
+    try:
+        if not len(read_points_bin(path)):
+            yield Problem(path=path, kind="empty", message="holds no LiDAR point")
+    except InputError as error:
+        yield make_unreadable(path, error)
 
 
 def _check_truth(
@@ -208,7 +216,7 @@ def _check_truth(
     *,
     is_depth: bool,
 ) -> Iterator[Problem]:
-    """Report a map of depth or disparity whose size, range or values do not fit its pair.
+    """Yield the problems of a map of depth or disparity: size, range or values do not fit its pair.
 
     Args:
         path: path of the map.
@@ -243,33 +251,43 @@ def _check_truth(
 
 
 def _check_agreement(path: Path, truth_px: Map, report: RectificationReport) -> Iterator[Problem]:
-    """Report a true map that few matches between the views agree with, and a change that helps."""
+    """Yield a problem if few matches between the views agree with a true map of disparity.
+
+    Its message names the change of the map that would agree, such as another unit.
+    """
     agreement = _measure_agreement(truth_px, report)
-    if agreement is None:
+    if agreement is None or agreement.share >= _MIN_AGREEMENT:
         return
-    share, count = agreement
-    if share >= _MIN_AGREEMENT:
-        return
-    message = f"agrees with {share:.0%} of {count} matches between left and right"
+    message = (
+        f"agrees with {agreement.share:.0%} of {agreement.match_count} matches between left and "
+        "right"
+    )
 
     # The change of the map that agrees best.
     changes = {f"{scale:g} times its disparities": truth_px * scale for scale in _TRUTH_SCALES}
     changes |= {"mirrored": truth_px.flip(1), "upside down": truth_px.flip(0)}
-    best_share = max(_MIN_AGREEMENT, share)
+    best_share = max(_MIN_AGREEMENT, agreement.share)
     hint = ""
     for change, changed_px in changes.items():
-        changed_agreement = _measure_agreement(changed_px, report)
-        if changed_agreement is not None and changed_agreement[0] >= best_share:
-            best_share = changed_agreement[0]
+        changed = _measure_agreement(changed_px, report)
+        if changed is not None and changed.share >= best_share:
+            best_share = changed.share
             hint = f"; {change} it agrees with {best_share:.0%}"
     message = f"{message}{hint}: is it of this pair, and in which unit?"
     yield Problem(path=path, kind="mismatch", message=message)
 
 
-def _measure_agreement(disparity_px: Map, report: RectificationReport) -> tuple[float, int] | None:
-    """Measure the share of matches that agree with a map, of those with truth near them.
+class _Agreement(NamedTuple):
+    """How well a map of disparity agrees with matches between the views."""
 
-    Gives the number of the latter too; None where they are too few.
+    share: float  # share of the matches that agree with it
+    match_count: int  # number of the matches that have truth near them
+
+
+def _measure_agreement(disparity_px: Map, report: RectificationReport) -> _Agreement | None:
+    """Measure how many matches agree with a map, of those with truth near them.
+
+    None where these are too few.
     """
     # Matched corners lie at edges, so each value in a window may be that of the match.
     side = 2 * _TRUTH_RADIUS_PX + 1
@@ -278,6 +296,8 @@ def _measure_agreement(disparity_px: Map, report: RectificationReport) -> tuple[
     column, row = report.places_px.round().long().unbind(-1)
     height, width = disparity_px.shape
     near_px = windows[row.clamp(0, height - 1), column.clamp(0, width - 1)].flatten(1)
+
+    # The matches that any value in their window is close enough to.
     matched_px = report.disparities_px[:, None]
     tolerance_px = _TRUTH_TOLERANCE_PX + _TRUTH_TOLERANCE_SHARE * matched_px.abs()
     has_truth = torch.isfinite(near_px).any(1)
@@ -285,4 +305,4 @@ def _measure_agreement(disparity_px: Map, report: RectificationReport) -> tuple[
     count = int(has_truth.sum())
     if count < _MIN_MATCHES:
         return None
-    return float(agrees[has_truth].float().mean()), count
+    return _Agreement(float(agrees[has_truth].float().mean()), count)

@@ -12,23 +12,24 @@ from depthpose.core.camera import StereoRig
 from depthpose.core.errors import InputError, suggest_name
 from depthpose.core.files import image_size, read_image, read_text
 from depthpose.depth.datasets.frames import (
-    Frame,
+    FramePaths,
     check_map_size,
-    frame_camera,
     has_lidar,
-    lidar_truth,
     read_depth,
     read_disparity,
+    read_frame_camera,
+    read_lidar_depth,
 )
-from depthpose.depth.datasets.layouts import find_frames, local_folder
+from depthpose.depth.datasets.layouts import find_frames
+from depthpose.depth.datasets.packed import resolve_folder
 from depthpose.depth.disparity import depth_from_disparity
 from depthpose.depth.types import Map, StereoInput, StereoSample, StereoTruth
 
-_SHIPPED = ("eigen-train", "eigen-val", "eigen-test", "eigen-benchmark")
+_SHIPPED_SPLITS = ("eigen-train", "eigen-val", "eigen-test", "eigen-benchmark")
 """Splits that come as files: a line for each drive, with its frame numbers as ranges."""
-# Splits that consist of others; the thesis trains on this one (2.4.1).
-_JOINED = {"eigen-train-val": ("eigen-train", "eigen-val")}
-SPLIT_NAMES = (*_SHIPPED, *_JOINED)
+_JOINED_SPLITS = {"eigen-train-val": ("eigen-train", "eigen-val")}
+"""Splits that consist of others; the thesis trains on this one (2.4.1)."""
+SPLIT_NAMES = (*_SHIPPED_SPLITS, *_JOINED_SPLITS)
 
 _MAX_BYTES = 2**24
 """Largest file of a split: twenty times that of all frames of KITTI."""
@@ -44,12 +45,12 @@ class Split:
 
     @property
     def names(self) -> list[str]:
-        """The names of the frames, as those of :class:`Frame`, sorted."""
+        """The names of the frames, as those of :class:`FramePaths`, sorted."""
         return [f"{drive}_{frame:010d}" for drive, frame in self.frames]
 
 
 def read_split(name: str | Path) -> Split:
-    """Give a split by name, or read a file in monodepth's or monodepth2's format.
+    """Read a split by its name, or a file in monodepth's or monodepth2's format.
 
     A file with the same set of frames as a split of ``SPLIT_NAMES`` gets that split's name. Of
     monodepth2's lists the lines of the left camera (``l``) count.
@@ -58,7 +59,7 @@ def read_split(name: str | Path) -> Split:
         InputError: neither a name nor a file, or a line that cannot be parsed.
     """
     if str(name) in SPLIT_NAMES:
-        return _shipped_split(str(name))
+        return _read_shipped_split(str(name))
     path = Path(name)
     try:
         is_file = path.is_file()
@@ -82,7 +83,7 @@ def read_split(name: str | Path) -> Split:
 
     # A file with the frames of a known split is called by its name.
     listed = tuple(sorted(frames))
-    equal_splits = [key for key in SPLIT_NAMES if _shipped_split(key).frames == listed]
+    equal_splits = [key for key in SPLIT_NAMES if _read_shipped_split(key).frames == listed]
     return Split(name=equal_splits[0] if equal_splits else path.name, frames=listed)
 
 
@@ -109,10 +110,12 @@ def _parse_split_line(line: str, context: str) -> tuple[str, int] | None:
 
 
 @cache
-def _shipped_split(name: str) -> Split:
+def _read_shipped_split(name: str) -> Split:
     """Read a split of ``SPLIT_NAMES``, or join those that it consists of."""
-    if name in _JOINED:
-        joined = {frame for part in _JOINED[name] for frame in _shipped_split(part).frames}
+    if name in _JOINED_SPLITS:
+        joined: set[tuple[str, int]] = set()
+        for part in _JOINED_SPLITS[name]:
+            joined.update(_read_shipped_split(part).frames)
         return Split(name=name, frames=tuple(sorted(joined)))
     text = resources.files("depthpose.depth.datasets").joinpath(f"lists/{name}.txt").read_text()
     frames: list[tuple[str, int]] = []
@@ -130,7 +133,7 @@ class Dataset:
 
     name: str  #: the name of the folder, followed by that of the split
     layout: str  #: name of the layout that was recognised
-    frames: list[Frame]  #: paths of each frame
+    frames: list[FramePaths]  #: paths of each frame
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -146,10 +149,10 @@ class Dataset:
         right = None if frame.right is None else read_image(frame.right)
         if frame.right is not None and right is not None:
             check_map_size(frame.right, right, (left.shape[2], left.shape[1]))
-        return StereoInput(name=frame.name, left=left, right=right, camera=frame_camera(frame))
+        return StereoInput(name=frame.name, left=left, right=right, camera=read_frame_camera(frame))
 
     def read_truth(self, index: int) -> StereoTruth:
-        """Read the true maps of a frame; :func:`lidar_truth` draws one of a LiDAR scan."""
+        """Read the true maps of a frame; :func:`read_lidar_depth` draws one of a LiDAR scan."""
         frame = self.frames[index]
         depth_m = None if frame.depth is None else read_depth(frame.depth)
         disparity_px = None if frame.disparity is None else read_disparity(frame.disparity)
@@ -162,7 +165,7 @@ class Dataset:
 
     def read_rig(self, index: int) -> StereoRig | None:
         """Read the calibration of a frame; None where it has none, or one of a single camera."""
-        camera = frame_camera(self.frames[index])
+        camera = read_frame_camera(self.frames[index])
         return camera if isinstance(camera, StereoRig) else None
 
 
@@ -178,7 +181,7 @@ def open_dataset(folder: Path | str, split: str | Path | None = None) -> Dataset
         InputError: no such folder or layout, two images of one name, or frames of the split are
             missing.
     """
-    folder = local_folder(folder)
+    folder = resolve_folder(folder)
     layout, frames = find_frames(folder)
     for frame, after in pairwise(frames):
         if frame.name == after.name:
@@ -220,12 +223,16 @@ def join_datasets(datasets: Sequence[Dataset], without: Sequence[str] = ()) -> D
     )
 
 
-def refuse_common(
-    trained: Iterable[Frame], measured: Iterable[Frame], what: str, remedy: str
+def refuse_shared_frames(
+    trained: Iterable[FramePaths], measured: Iterable[FramePaths], noun: str, remedy: str
 ) -> None:
     """Refuse frames that are both trained on and measured.
 
-    The error calls the measured frames ``what``, and ends with the ``remedy``.
+    Args:
+        trained: frames that are trained on.
+        measured: frames on which an error is measured.
+        noun: what the error calls the latter.
+        remedy: how the error ends.
 
     Raises:
         InputError: a left image is in both.
@@ -234,7 +241,7 @@ def refuse_common(
     common = [frame.name for frame in measured if frame.left.resolve() in trained_files]
     if common:
         raise InputError(
-            f"{len(common)} of the {what} are trained on too, {common[0]} first, so their error "
+            f"{len(common)} of the {noun} are trained on too, {common[0]} first, so their error "
             f"would be too good; {remedy}"
         )
 
@@ -246,7 +253,7 @@ def read_true_depth(dataset: Dataset, index: int) -> Map | None:
     """
     frame = dataset.frames[index]
     if has_lidar(frame, "camera_z"):
-        return lidar_truth(frame, "camera_z")
+        return read_lidar_depth(frame, "camera_z")
     truth = dataset.read_truth(index)
     if truth.depth_m is not None or truth.disparity_px is None:
         return truth.depth_m

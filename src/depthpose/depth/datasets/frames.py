@@ -78,7 +78,7 @@ def read_object_calibration(
     """
     keys = files.read_key_values(path)
     pair = choose_kitti_pair(keys, KITTI_GREY if is_grey else KITTI_COLOR)
-    rig, left = _projected_rig(path, keys, pair, (width, height))
+    rig, left = _rig_from_projections(path, keys, pair, (width, height))
 
     # The LiDAR.
     if "Tr_velo_to_cam" in keys:
@@ -140,7 +140,7 @@ def read_plain_calibration(path: Path, name: str, width: int, height: int) -> St
 
 
 def _leading_numbers(line: str) -> list[float]:
-    """Give the numbers with which a line begins, up to the first word that is none."""
+    """Return the numbers with which a line begins, up to the first word that is none."""
     numbers: list[float] = []
     for word in line.split():
         try:
@@ -158,12 +158,19 @@ def _make_rig(path: Path, facts: CameraFacts, size: Size | None) -> StereoRig:
     return rig
 
 
-def _projected_rig(
+def _rig_from_projections(
     path: Path, keys: Mapping[str, list[float]], pair: KittiPair, size: Size
 ) -> tuple[StereoRig, Matrix]:
-    """Make the rig of a calibration's two projections; give the left projection too.
+    """Make the rig of a calibration's two projections, and return it with the left projection.
 
-    ``pair``: the keys of both cameras; ``size``: width and height of the images.
+    Args:
+        path: the file, for errors.
+        keys: what it holds.
+        pair: which keys are those of both cameras.
+        size: width and height of the images.
+
+    Raises:
+        InputError: a projection is missing or damaged, or of images of another size.
     """
     left, right = (read_kitti_matrix(path, keys, name, (3, 4)) for name in (pair.left, pair.right))
     stated_size = read_kitti_size(keys, pair) or size
@@ -184,9 +191,16 @@ def _compose_projection(
     rectify: Float64[np.ndarray, "3 3"],
     camera_from_velodyne: Float64[np.ndarray, "3 4"],
 ) -> Float64[np.ndarray, "3 4"]:
-    """Multiply the projection of LiDAR points to pixels of the left camera.
+    """Multiply three matrices to the projection of LiDAR points to pixels of the left camera.
 
-    ``left`` projects rectified camera coordinates, ``rectify`` rotates the camera's into them.
+    Args:
+        path: the file that they are of, for errors.
+        left: projection of rectified camera coordinates to pixels.
+        rectify: rotation of camera coordinates to rectified ones.
+        camera_from_velodyne: transform of LiDAR coordinates to camera coordinates.
+
+    Raises:
+        InputError: the product is not finite.
     """
     rectified_from_camera = np.eye(4)
     rectified_from_camera[:3, :3] = rectify
@@ -200,6 +214,7 @@ def _compose_projection(
 
 
 LidarDepth = Literal["velodyne_x", "camera_z"]
+"""Which coordinate of a LiDAR point is its depth: x of the scanner, or z of the camera."""
 
 
 def project_lidar(
@@ -263,7 +278,7 @@ CalibrationStyle = Literal["raw", "object", "grey", "middlebury", "plain", "came
 
 
 @dataclass(frozen=True, kw_only=True)
-class Frame:
+class FramePaths:
     """Paths of one frame; None where the dataset has no such file."""
 
     name: str  #: unique in its dataset and usable as a file name
@@ -282,7 +297,7 @@ class Frame:
     disparity_noc: Path | None = None  #: disparity of those pixels alone that both views show
     sky: Path | None = None  #: 8-bit PNG of the left image, not 0 where it shows the sky
 
-    def seen_files(self, *, with_right: bool = True) -> list[Path]:
+    def list_input_files(self, *, with_right: bool = True) -> list[Path]:
         """List the files an estimate depends on: left image, right image, calibration."""
         paths = [self.left]
         if with_right and self.right is not None:
@@ -294,7 +309,7 @@ class Frame:
         return paths
 
 
-def frame_camera(frame: Frame) -> Camera | None:
+def read_frame_camera(frame: FramePaths) -> Camera | None:
     """Read the camera of a frame, for a pair its rig; None where it has no calibration.
 
     Raises:
@@ -306,7 +321,7 @@ def frame_camera(frame: Frame) -> Camera | None:
     size = files.image_size(frame.left)
     match frame.style:
         case "raw" | "object" | "grey":
-            camera = kitti_calibration(frame).rig
+            camera = read_kitti_calibration(frame).rig
         case "middlebury":
             camera = read_rig(path)
         case "camera":
@@ -317,7 +332,7 @@ def frame_camera(frame: Frame) -> Camera | None:
     return camera
 
 
-def kitti_calibration(frame: Frame) -> KittiCalibration:
+def read_kitti_calibration(frame: FramePaths) -> KittiCalibration:
     """Read rig and LiDAR projection of a frame in KITTI's raw or object layout.
 
     Raises:
@@ -331,13 +346,22 @@ def kitti_calibration(frame: Frame) -> KittiCalibration:
     size = files.image_size(frame.left)
     if frame.style != "raw":
         return read_object_calibration(frame.calibration, *size, is_grey=frame.style == "grey")
+    return _read_raw_calibration(frame.calibration, size)
 
-    # The raw layout: two files in the folder of the date, that of the LiDAR may be missing.
-    camera_file = frame.calibration / "calib_cam_to_cam.txt"
-    lidar_file = frame.calibration / "calib_velo_to_cam.txt"
+
+def _read_raw_calibration(folder: Path, size: Size) -> KittiCalibration:
+    """Read a calibration of the raw layout: two files in the folder of a date.
+
+    That of the LiDAR may be missing. ``size``: width and height of the images.
+
+    Raises:
+        InputError: a matrix is missing or damaged, or the files are of images of another size.
+    """
+    camera_file = folder / "calib_cam_to_cam.txt"
+    lidar_file = folder / "calib_velo_to_cam.txt"
     camera_keys = files.read_key_values(camera_file)
     raw_pair = KITTI_COLOR[1]
-    rig, left = _projected_rig(camera_file, camera_keys, raw_pair, size)
+    rig, left = _rig_from_projections(camera_file, camera_keys, raw_pair, size)
     if not lidar_file.is_file():
         return KittiCalibration(rig=rig, pixels_from_velodyne=None)
     rectify = read_kitti_matrix(camera_file, camera_keys, "R_rect_00", (3, 3))
@@ -348,8 +372,8 @@ def kitti_calibration(frame: Frame) -> KittiCalibration:
     return KittiCalibration(rig=rig, pixels_from_velodyne=pixels_from_velodyne)
 
 
-def truth_kinds(frame: Frame) -> tuple[TruthKind, ...]:
-    """List the kinds of truth that a frame has files of."""
+def list_truth_kinds(frame: FramePaths) -> tuple[TruthKind, ...]:
+    """List the kinds of truth that a frame has files of; ``annotated`` is a map of depth."""
     kinds: dict[TruthKind, bool] = {
         "scan": has_lidar(frame, "camera_z"),
         "annotated": frame.depth is not None and frame.depth != _find_scan_map(frame),
@@ -358,13 +382,13 @@ def truth_kinds(frame: Frame) -> tuple[TruthKind, ...]:
     return tuple(kind for kind, has_kind in kinds.items() if has_kind)
 
 
-def has_lidar(frame: Frame, depth: LidarDepth) -> bool:
-    """Whether a frame has a LiDAR scan, or a map of one, for :func:`lidar_truth`."""
+def has_lidar(frame: FramePaths, depth: LidarDepth) -> bool:
+    """Whether a frame has a LiDAR scan, or a map of one, for :func:`read_lidar_depth`."""
     return frame.velodyne is not None or (depth == "camera_z" and _find_scan_map(frame) is not None)
 
 
-def lidar_truth(frame: Frame, depth: LidarDepth) -> Map:
-    """Give the depth map of a frame's LiDAR scan [m]; NaN where no point falls.
+def read_lidar_depth(frame: FramePaths, depth: LidarDepth) -> Map:
+    """Read the depth map of a frame's LiDAR scan [m]; NaN where no point falls.
 
     Of a frame without a scan, but with a map of one (``lidar_depth/`` of a plain folder,
     ``velodyne_raw`` of KITTI's depth-prediction set), that map is read for ``camera_z``.
@@ -379,7 +403,7 @@ def lidar_truth(frame: Frame, depth: LidarDepth) -> Map:
         return depth_m
     if frame.velodyne is None:
         raise InputError(f"{frame.name}: has no LiDAR scan of the kind {depth}.")
-    pixels_from_velodyne = kitti_calibration(frame).pixels_from_velodyne
+    pixels_from_velodyne = read_kitti_calibration(frame).pixels_from_velodyne
     if pixels_from_velodyne is None:
         raise InputError(
             f"{frame.name}: its calibration says nothing of the LiDAR; calib_velo_to_cam.txt (or "
@@ -390,14 +414,18 @@ def lidar_truth(frame: Frame, depth: LidarDepth) -> Map:
     return project_lidar(points, pixels_from_velodyne, (height, width), depth)
 
 
-def _find_scan_map(frame: Frame) -> Path | None:
+def _find_scan_map(frame: FramePaths) -> Path | None:
     """Find the depth map of a LiDAR scan, if there is one; the depth of a plain folder is such."""
     is_plain = frame.style in ("plain", "camera") and frame.scan is None
     return frame.depth if is_plain else frame.scan
 
 
 def check_map_size(path: Path, values: Shaped[Tensor, "*any h w"], size: tuple[int, int]) -> None:
-    """Refuse a map whose size is not that of its left image, (width, height)."""
+    """Refuse a map whose size is not ``size``, width and height of its left image.
+
+    Raises:
+        InputError: it has another size; ``path`` names it.
+    """
     height, width = values.shape[-2:]
     if (width, height) != size:
         raise InputError(

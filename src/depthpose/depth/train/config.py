@@ -59,7 +59,7 @@ class ViewTraining(Settings):
     """Pairs for validation."""
 
     loop: LoopConfig = field(default_factory=lambda: LoopConfig(epochs=200.0))
-    """How long."""
+    """Length, batches, seed and precision of the training."""
 
     def __post_init__(self) -> None:
         refuse_unknown("gan_mode", self.gan_mode, ADVERSARIAL_LOSSES)
@@ -123,14 +123,16 @@ class SelectTraining(Settings):
     loop: LoopConfig = field(
         default_factory=lambda: LoopConfig(steps=20_000, batch_size=8, clip_norm=5.0)
     )
-    """How long."""
+    """Length, batches, seed and precision of the training."""
 
     def __post_init__(self) -> None:
         refuse_unknown("disparity_loss", self.disparity_loss, GENERATOR_DISPARITY_LOSSES)
         super().__post_init__()
         for pairs in (self.pairs, self.more):
-            augment = None if pairs is None else pairs.augment
-            if augment and (augment.per_view or augment.erased_share or augment.misaligned_px):
+            if pairs is None:
+                continue
+            augment = pairs.augment
+            if augment.per_view or augment.erased_share or augment.misaligned_px:
                 raise InputError(
                     "pairs.augment changes each view on its own (per_view, erased_share or "
                     "misaligned_px), and this training compares them; omit these"
@@ -187,20 +189,32 @@ class StereoTraining(Settings):
     """Pairs for validation."""
 
     loop: LoopConfig = field(default_factory=lambda: LoopConfig(epochs=20.0))
-    """How long."""
+    """Length, batches, seed and precision of the training."""
 
     def __post_init__(self) -> None:
+        self._refuse_several_networks()
+        for kind in self.other:
+            refuse_unknown("other", kind, MATCHERS)
+        super().__post_init__()
+        self._refuse_missing_encoder()
+        self._refuse_unlearnt_sky()
+
+    def _refuse_several_networks(self) -> None:
+        """Refuse settings of more than one network."""
+        networks: list[str] = []
         # A config that a run has written holds the defaults of ``matcher`` beside the others.
-        networks = ["matcher"] if self.matcher != PSMNetConfig() else []
-        networks += [*(["light"] if self.light is not None else []), *self.other]
+        if self.matcher != PSMNetConfig():
+            networks.append("matcher")
+        if self.light is not None:
+            networks.append("light")
+        networks += self.other
         if len(networks) > 1:
             raise InputError(
                 f"{' and '.join(networks)} are given, and one network is trained; keep one"
             )
-        for kind in self.other:
-            refuse_unknown("other", kind, MATCHERS)
-        super().__post_init__()
 
+    def _refuse_missing_encoder(self) -> None:
+        """Refuse settings of an encoder for a network that has none."""
         is_psmnet = self.light is None and not self.other
         if is_psmnet and (self.encoder_rate != 0.3 or not self.with_frozen_stem):
             raise InputError(
@@ -208,12 +222,14 @@ class StereoTraining(Settings):
                 "PSMNet does not have; leave them out, or give light"
             )
 
-        if self.light is not None and self.light.with_sky and self.sky_weight == 0:
+    def _refuse_unlearnt_sky(self) -> None:
+        """Refuse a class of the sky without weight, and training one that is not there."""
+        has_sky = self.light is not None and self.light.with_sky
+        if has_sky and self.sky_weight == 0:
             raise InputError(
                 "light.with_sky is true and sky_weight 0, so the sky would not be learnt; set "
                 "sky_weight to 0.5, or leave with_sky out"
             )
-        has_sky = self.light is not None and self.light.with_sky
         if self.sky_alone and (self.start is None or not has_sky):
             raise InputError(
                 "sky_alone trains a class of the sky for a matcher that is there: it takes start "
@@ -251,4 +267,4 @@ class FinetuneTraining(Settings):
     """Pairs for validation."""
 
     loop: LoopConfig = field(default_factory=lambda: LoopConfig(epochs=60.0))
-    """How long."""
+    """Length, batches, seed and precision of the training."""

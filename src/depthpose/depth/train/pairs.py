@@ -11,9 +11,15 @@ from depthpose.core.errors import InputError, Notice
 from depthpose.core.loop import make_sample_generator, shuffle_index
 from depthpose.depth.augment import TrainingPair, augment, scale_pair
 from depthpose.depth.config import PairsConfig, TruthKind
-from depthpose.depth.datasets import Dataset, Frame, lidar_truth, open_dataset, truth_kinds
+from depthpose.depth.datasets import (
+    Dataset,
+    FramePaths,
+    list_truth_kinds,
+    open_dataset,
+    read_lidar_depth,
+)
 from depthpose.depth.disparity import disparity_from_depth, right_disparity_from_left
-from depthpose.depth.synthetic import Streets, kitti_rig
+from depthpose.depth.synthetic import KITTI_RIG_COUNT, Streets, kitti_rig
 from depthpose.depth.types import Map
 
 BASELINE_TOLERANCE = 0.02
@@ -21,11 +27,11 @@ BASELINE_TOLERANCE = 0.02
 
 
 class _PairRef(NamedTuple):
-    """Reference to a pair: its source, its number there, and the kind of truth that is read."""
+    """Where a pair is, and what is read of it."""
 
     source: Dataset | Streets
-    number: int
-    truth: TruthKind | None
+    number: int  # index of the pair in its source
+    truth: TruthKind | None  # the kind of truth that is read; None: none
 
 
 class TrainingPairs:
@@ -63,33 +69,12 @@ class TrainingPairs:
         if not config.folders and config.streets is None:
             raise InputError("there is nothing to train on: name a folder of pairs (--data PATH).")
 
-        # The pairs of each source: rendered streets, and folders.
-        sources: list[list[_PairRef]] = []
-        if config.streets is not None:
-            streets = Streets(config.streets)
-            exact: TruthKind | None = "disparity" if needs_truth else None
-            sources.append([_PairRef(streets, number, exact) for number in range(len(streets))])
-        excluded = set(config.exclude)
-        for folder_number, folder in enumerate(config.folders):
-            dataset = open_dataset(folder, config.split if folder_number == 0 else None)
-            excluded -= {frame.name for frame in dataset.frames}
-            usable = _usable_pairs(dataset, config, needs_truth=needs_truth, is_mixed=is_mixed)
-            sources.append(usable)
-        if excluded:
-            raise InputError(
-                f"exclude names {sorted(excluded)}, which no folder holds; a misspelt name would "
-                "train on what should be left out"
-            )
-
-        # At most ``limit`` pairs of each source, evenly spread: neighbours in a drive look alike.
         self._refs: list[_PairRef] = []
-        for refs in sources:
-            count = len(refs) if config.limit is None else min(config.limit, len(refs))
-            last = len(refs) - 1
-            self._refs += [refs[round(k * last / max(count - 1, 1))] for k in range(count)]
+        for refs in _list_pairs(config, needs_truth=needs_truth, is_mixed=is_mixed):
+            self._refs += _spread_evenly(refs, config.limit)
 
         # The frames on disk, and the truth of each source.
-        self.frames: list[Frame] = []
+        self.frames: list[FramePaths] = []
         truths: dict[str, None] = {}  # in order, each once
         for source, number, truth in self._refs:
             if isinstance(source, Dataset):
@@ -103,14 +88,18 @@ class TrainingPairs:
             self._refuse_other_rigs(baseline_m)
 
     def _refuse_other_rigs(self, baseline_m: float) -> None:
-        """Refuse pairs of another baseline, which would change the metric scale."""
+        """Refuse pairs of another baseline, which would change the metric scale.
+
+        Raises:
+            InputError: a pair has another baseline, or no calibration.
+        """
         rigs = {
             source.frames[number].name: source.read_rig(number)
             for source, number, _ in self._refs
             if isinstance(source, Dataset)
         }
         if self.config.streets is not None:  # perhaps millions of streets, but of five rigs
-            rigs |= {f"street with KITTI's rig {n}": kitti_rig(n) for n in range(5)}
+            rigs |= {f"street with KITTI's rig {n}": kitti_rig(n) for n in range(KITTI_RIG_COUNT)}
         for name, rig in rigs.items():
             if rig is None:
                 raise InputError(
@@ -128,24 +117,33 @@ class TrainingPairs:
         return len(self._refs)
 
     def __getitem__(self, sample_index: int) -> TrainingPair:
-        """Make a sample: a random pair, randomly changed."""
+        """Make a sample: the pair at a place of the shuffled order, randomly changed."""
         index = shuffle_index(sample_index, len(self), self.seed)
         generator = make_sample_generator(sample_index, self.seed)
         return augment(self.read(index), self.config.augment, generator)
 
     def read(self, index: int) -> TrainingPair:
-        """Read one whole pair at the config's focal length, unchanged otherwise."""
+        """Read one whole pair at the config's focal length, unchanged otherwise.
+
+        Raises:
+            InputError: a file is damaged, or the pair has no calibration where one is needed.
+        """
         if not self.config.with_cache:
             return self._read(index)
-        if index not in self._cache:
+        if index not in self._cache:  # views are cached in 8 bits, a quarter of the memory
             pair = self._read(index)
-            views = [(view * 255).round().to(torch.uint8) for view in (pair.left, pair.right)]
-            self._cache[index] = pair._replace(left=views[0], right=views[1])
+            left = (pair.left * 255).round().to(torch.uint8)
+            right = (pair.right * 255).round().to(torch.uint8)
+            self._cache[index] = pair._replace(left=left, right=right)
         cached = self._cache[index]
         return cached._replace(left=cached.left.float() / 255, right=cached.right.float() / 255)
 
     def _read(self, index: int) -> TrainingPair:
-        """Read a pair and its truth, if that is needed; disparity is 0 in the sky where known."""
+        """Read a pair, and its truth if that is needed: disparity, 0 in a sky that is labelled.
+
+        NaN is unknown: all of it, where no truth is needed.
+        """
+        # Views, rig and truth of a folder's frame or of a rendered street.
         source, number, kind = self._refs[index]
         if isinstance(source, Dataset):
             name = source.frames[number].name
@@ -161,6 +159,7 @@ class TrainingPairs:
             left_px = _with_sky_at_zero(sample.truth.disparity_px, kind)
             right_px = _with_sky_at_zero(sample.truth.right_disparity_px, kind)
 
+        # What is missing: truth, and the right view or its truth.
         if left_px is None:
             left_px = torch.full_like(views.left[0], torch.nan)
         right = views.right
@@ -172,6 +171,7 @@ class TrainingPairs:
         focal_px = torch.tensor(torch.nan if rig is None else float(rig.K[0, 0]))
         pair = TrainingPair(views.left, right, left_px, right_px, focal_px)
 
+        # The config's focal length, by another size.
         target_focal_px = self.config.focal_px
         if target_focal_px is None:
             return pair
@@ -181,6 +181,41 @@ class TrainingPairs:
                 f"focal length of {target_focal_px} px; add one, exclude it, or leave focal_px out"
             )
         return scale_pair(pair, target_focal_px / float(focal_px))
+
+
+def _list_pairs(config: PairsConfig, *, needs_truth: bool, is_mixed: bool) -> list[list[_PairRef]]:
+    """List the usable pairs of each source: the rendered streets, and each folder.
+
+    The arguments are those of :class:`TrainingPairs`.
+
+    Raises:
+        InputError: a folder is of no use, or an excluded frame is in none.
+    """
+    sources: list[list[_PairRef]] = []
+    if config.streets is not None:
+        streets = Streets(config.streets)
+        kind: TruthKind | None = "disparity" if needs_truth else None
+        sources.append([_PairRef(streets, number, kind) for number in range(len(streets))])
+
+    missing = set(config.exclude)
+    for folder_number, folder in enumerate(config.folders):
+        dataset = open_dataset(folder, config.split if folder_number == 0 else None)
+        missing -= {frame.name for frame in dataset.frames}
+        usable = _usable_pairs(dataset, config, needs_truth=needs_truth, is_mixed=is_mixed)
+        sources.append(usable)
+    if missing:
+        raise InputError(
+            f"exclude names {sorted(missing)}, which no folder holds; a misspelt name would "
+            "train on what should be left out"
+        )
+    return sources
+
+
+def _spread_evenly(refs: list[_PairRef], limit: int | None) -> list[_PairRef]:
+    """Choose at most ``limit`` pairs, evenly spread: neighbours in a drive look alike."""
+    count = len(refs) if limit is None else min(limit, len(refs))
+    last = len(refs) - 1
+    return [refs[round(k * last / max(count - 1, 1))] for k in range(count)]
 
 
 def _truth_of_frame(
@@ -208,7 +243,7 @@ def _truth_of_frame(
         )
     depth_m = dataset.read_truth(number).depth_m
     if kind == "scan":
-        depth_m = lidar_truth(dataset.frames[number], "camera_z")
+        depth_m = read_lidar_depth(dataset.frames[number], "camera_z")
     assert depth_m is not None, "frames without truth were left out"
     return disparity_from_depth(depth_m, rig)
 
@@ -233,7 +268,7 @@ def _usable_pairs(
 
     # The kinds of truth of each frame that has the views.
     kinds_by_index = {
-        index: truth_kinds(frame)
+        index: list_truth_kinds(frame)
         for index, frame in enumerate(dataset.frames)
         if (frame.right is not None or is_mixed) and frame.name not in config.exclude
     }

@@ -20,18 +20,20 @@ from depthpose.core.errors import InputError
 from depthpose.core.loop import Task, TrainingRun, format_held_out, releases_folder, write_card
 from depthpose.core.run import find_rank
 from depthpose.depth.config import GeneratorConfig, PairsConfig, SelectionConfig
-from depthpose.depth.datasets import Frame, refuse_common
+from depthpose.depth.datasets import FramePaths, refuse_shared_frames
+from depthpose.depth.stereo import StereoNetwork
 from depthpose.depth.encoder import load_encoder
 from depthpose.depth.generators import Generator, SelectionGenerator, UNetGenerator
-from depthpose.depth.stereo import StereoNetwork
-from depthpose.depth.train import stages
 from depthpose.depth.train.config import (
     FinetuneTraining,
     SelectTraining,
     StereoTraining,
     ViewTraining,
 )
+from depthpose.depth.train.generator_tasks import FinetuneTask, ViewTask
 from depthpose.depth.train.pairs import TrainingPairs
+from depthpose.depth.train.selection_task import SelectionSamples, SelectTask
+from depthpose.depth.train.stereo_task import StereoTask
 from depthpose.depth.weights import MATCHERS, read_generator, read_matcher, write_depth_weights
 
 _INDEPENDENT_OF_WEIGHTS = ("max_disparity_px", "with_street", "least_confidence")
@@ -46,7 +48,7 @@ def refuse_frozen_random(config: SelectTraining | StereoTraining) -> None:
     """Refuse to freeze the first layers of an encoder that begins with random weights.
 
     Raises:
-        InputError: that is so.
+        InputError: ``with_frozen_stem`` is set, and neither ``encoder`` nor ``start``.
     """
     if config.with_frozen_stem and config.encoder is None and config.start is None:
         raise InputError(
@@ -78,7 +80,12 @@ def copy_start(network: Generator | StereoNetwork, loaded: nn.Module, source: st
 
 
 def make_matcher_network(config: StereoTraining) -> StereoNetwork:
-    """Make the matcher network that a config trains, with its initial weights."""
+    """Make the matcher network that a config trains, with its initial weights.
+
+    Raises:
+        InputError: the weights that the config names are of another network, or there is nothing
+            to begin with for an encoder whose first layers are frozen.
+    """
     kind = next(kind for kind in MATCHERS.values() if isinstance(config.network, kind.config))
     matcher = kind.network(config.network)
     if config.encoder is not None:
@@ -112,24 +119,31 @@ _VALIDATION_TEXTS = {
 """What the numbers of each stage's validation are, for the card."""
 
 
+def _open_held_out(config: PairsConfig | None, *, needs_truth: bool) -> TrainingPairs | None:
+    """Open the pairs for validation, if there are any; all are measured, so the seed is any."""
+    if config is None:
+        return None
+    return TrainingPairs(config, 0, needs_truth=needs_truth)
+
+
 @releases_folder
 def train_view(config: ViewTraining, run: TrainingRun) -> Path:
-    """Train the U-Net generator; give its weights file."""
+    """Train the U-Net generator; return the path of its weights."""
     torch.manual_seed(config.loop.seed)
     config = _at_virtual_focal(config, config.generator)
     baseline_m = config.generator.virtual_baseline_m
     pairs = TrainingPairs(config.pairs, config.loop.seed, needs_truth=False, baseline_m=baseline_m)
-    held_out = config.held_out and TrainingPairs(config.held_out, 0, needs_truth=False)
+    held_out = _open_held_out(config.held_out, needs_truth=False)
     generator = UNetGenerator(config.generator)
     if config.start is not None:
         copy_start(generator, read_generator(find_weights(config.start)), config.start)
-    facts, seconds = _run_stage(stages.ViewTask(generator, config, held_out), pairs, config, run)
+    facts, seconds = _run_stage(ViewTask(generator, config, held_out), pairs, config, run)
     return _write_weights(run, "view", facts, seconds, generator=generator)
 
 
 @releases_folder
 def train_select(config: SelectTraining, run: TrainingRun) -> Path:
-    """Train the generator that selects; give its weights file."""
+    """Train the generator that selects; return the path of its weights."""
     refuse_frozen_random(config)
     torch.manual_seed(config.loop.seed)
     rig = config.generator
@@ -142,21 +156,36 @@ def train_select(config: SelectTraining, run: TrainingRun) -> Path:
         for pairs in (config.pairs, config.more)
         if pairs is not None
     ]
-    samples = stages.SelectionSamples(sources, config.more_share, config.degrade, seed)
+    samples = SelectionSamples(sources, config.more_share, config.degrade, seed)
     generator = SelectionGenerator(rig)
     if config.encoder is not None:
         load_encoder(generator.encoder, find_weights(config.encoder))
     if config.start is not None:
         copy_start(generator, read_generator(find_weights(config.start)), config.start)
-    held_out = config.held_out and TrainingPairs(config.held_out, 0, needs_truth=True)
-    task = stages.SelectTask(generator, config, held_out)
+    held_out = _open_held_out(config.held_out, needs_truth=True)
+    task = SelectTask(generator, config, held_out)
     facts, seconds = _run_stage(task, samples, config, run)
     return _write_weights(run, "select", facts, seconds, generator=generator)
 
 
 @releases_folder
 def train_stereo(config: StereoTraining, run: TrainingRun) -> Path:
-    """Train the matcher; give its weights file."""
+    """Train the matcher; return the path of its weights."""
+    _refuse_wrong_gradients(config)
+    torch.manual_seed(config.loop.seed)
+    pairs = TrainingPairs(config.pairs, config.loop.seed, needs_truth=True)
+    held_out = _open_held_out(config.held_out, needs_truth=True)
+    matcher = make_matcher_network(config)
+    facts, seconds = _run_stage(StereoTask(matcher, config, held_out), pairs, config, run)
+    return _write_weights(run, "stereo", facts, seconds, matcher=matcher)
+
+
+def _refuse_wrong_gradients(config: StereoTraining) -> None:
+    """Refuse settings by which torch computes wrong gradients on a CPU.
+
+    Raises:
+        InputError: the precision is of 16 bits, and the search two planes deep at its coarsest.
+    """
     # With torch 2.13, gradients of a 3x3x3 convolution over two planes in 16 bits are values near
     # 1e35 or NaN, while those over one, three or more planes agree with fp32 within 0.5 %.
     step_px = config.network.step_px
@@ -167,17 +196,11 @@ def train_stereo(config: StereoTraining, run: TrainingRun) -> Path:
             "two planes deep, and a CPU's 16-bit gradients of its convolutions are wrong. Take "
             f"max_disparity_px {3 * step_px}, or precision fp32."
         )
-    torch.manual_seed(config.loop.seed)
-    pairs = TrainingPairs(config.pairs, config.loop.seed, needs_truth=True)
-    held_out = config.held_out and TrainingPairs(config.held_out, 0, needs_truth=True)
-    matcher = make_matcher_network(config)
-    facts, seconds = _run_stage(stages.StereoTask(matcher, config, held_out), pairs, config, run)
-    return _write_weights(run, "stereo", facts, seconds, matcher=matcher)
 
 
 @releases_folder
 def train_finetune(config: FinetuneTraining, run: TrainingRun) -> Path:
-    """Fine-tune the generator through the frozen matcher; give the weights file of both."""
+    """Fine-tune the generator through the frozen matcher; return the path of both's weights."""
     torch.manual_seed(config.loop.seed)
     for setting in ("generator", "matcher"):
         if not getattr(config, setting):
@@ -194,8 +217,8 @@ def train_finetune(config: FinetuneTraining, run: TrainingRun) -> Path:
     config = _at_virtual_focal(config, generator.config)
     baseline_m = generator.config.virtual_baseline_m
     pairs = TrainingPairs(config.pairs, config.loop.seed, needs_truth=True, baseline_m=baseline_m)
-    held_out = config.held_out and TrainingPairs(config.held_out, 0, needs_truth=True)
-    task = stages.FinetuneTask(generator, matcher, config, held_out)
+    held_out = _open_held_out(config.held_out, needs_truth=True)
+    task = FinetuneTask(generator, matcher, config, held_out)
     facts, seconds = _run_stage(task, pairs, config, run)
     return _write_weights(run, "finetune", facts, seconds, generator=generator, matcher=matcher)
 
@@ -211,38 +234,66 @@ STAGES = {
 
 def _run_stage(
     task: Task,
-    samples: TrainingPairs | stages.SelectionSamples,
+    samples: TrainingPairs | SelectionSamples,
     config: Any,  # noqa: ANN401
     run: TrainingRun,
 ) -> tuple[dict[str, str], float]:
-    """Claim the folder for this config, and train; give the facts of the card, and the seconds.
+    """Claim the folder for this config, and train.
+
+    Returns:
+        The facts of the weights' card, and how long the training took [s].
 
     Raises:
         InputError: the folder belongs to another training, or held-out pairs are trained on too.
     """
+    # Held-out pairs must not be trained on.
+    sources = samples.sources if isinstance(samples, SelectionSamples) else [samples]
+    frames = [frame for source in sources for frame in source.frames]
+    held_out: TrainingPairs | None = getattr(task, "held_out", None)
+    if held_out is not None:
+        remedy = "give --held-out other pairs, or exclude these in the config"
+        refuse_shared_frames(frames, held_out.frames, "pairs held out", remedy)
+
     # What the folder is claimed for beside the config: the initial weights, truths and frames.
-    initial_weights: dict[str, str] = {}
-    for setting in _WEIGHTS_SETTINGS:
-        name = getattr(config, setting, None)
-        if isinstance(name, str):
-            initial_weights[setting] = name
+    initial_weights = _find_initial_weights(config)
     checksums: dict[str, Any] = {
         f"{setting}_sha256": file_sha256(find_weights(name))
         for setting, name in initial_weights.items()
     }
     if samples.truths:
         checksums["truth"] = list(samples.truths)
-    sources = samples.sources if isinstance(samples, stages.SelectionSamples) else [samples]
-    frames = [frame for source in sources for frame in source.frames]
     if frames:
         checksums["frames_sha256"] = _frames_sha256(frames)
 
-    held_out: TrainingPairs | None = getattr(task, "held_out", None)
-    if held_out is not None:
-        remedy = "give --held-out other pairs, or exclude these in the config"
-        refuse_common(frames, held_out.frames, "pairs held out", remedy)
+    facts = _describe_training(config, samples.truths, tuple(initial_weights.values()))
+    warn_of_terms(facts)
+    weights_files = ("generator", "matcher", "fakestereo")
+    run.claim(config, weights_files, checksums, ("held_out",))
+    return facts, run.train(task, samples, config.loop)
 
-    # The facts of the card.
+
+def _find_initial_weights(config: Any) -> dict[str, str]:  # noqa: ANN401
+    """Find the settings of a stage that name weights to begin with: setting to name."""
+    initial_weights: dict[str, str] = {}
+    for setting in _WEIGHTS_SETTINGS:
+        name = getattr(config, setting, None)
+        if isinstance(name, str):
+            initial_weights[setting] = name
+    return initial_weights
+
+
+def _describe_training(
+    config: Any,  # noqa: ANN401
+    truths: Sequence[str],
+    began_with: Sequence[str],
+) -> dict[str, str]:
+    """Describe a training for the card of its weights, with the terms that bind them.
+
+    Args:
+        config: config of the stage.
+        truths: the kinds of truth, as :class:`TrainingPairs` has them.
+        began_with: names of the weights that it begins with.
+    """
     pair_configs = [pairs for pairs in (config.pairs, getattr(config, "more", None)) if pairs]
     data = [Path(folder).name for pairs in pair_configs for folder in pairs.folders]
     if any(pairs.streets for pairs in pair_configs):
@@ -252,19 +303,14 @@ def _run_stage(
         "stage": type(config).__name__,
         "licence": "not stated; that of the training data binds",
     }
-    if samples.truths:
-        facts["truth"] = ", ".join(samples.truths)
-    began_with = tuple(initial_weights.values())
+    if truths:
+        facts["truth"] = ", ".join(truths)
     if began_with:
         facts["began_with"] = ", ".join(Path(name).stem for name in began_with)
-    facts = add_terms(facts, began_with)
-    warn_of_terms(facts)
-
-    run.claim(config, ("generator", "matcher", "fakestereo"), checksums, ("held_out",))
-    return facts, run.train(task, samples, config.loop)
+    return add_terms(facts, began_with)
 
 
-def _frames_sha256(frames: Sequence[Frame]) -> str:
+def _frames_sha256(frames: Sequence[FramePaths]) -> str:
     """Hash the names of frames and the sizes of their left images."""
     digest = sha256()
     for frame in frames:
@@ -282,7 +328,10 @@ def _write_weights(
     generator: Generator | None = None,
     matcher: StereoNetwork | None = None,
 ) -> Path:
-    """Write the weights and their card, by the process of rank 0; give the file of the weights."""
+    """Write the weights and their card, by the process of rank 0; return the weights' path.
+
+    They are called after what they hold: generator, matcher, or fakestereo for both.
+    """
     if generator is not None and matcher is not None:
         name = "fakestereo"
     else:
@@ -300,11 +349,11 @@ def _write_weights(
 def _at_virtual_focal(
     config: _GeneratorTraining, generator: GeneratorConfig | SelectionConfig
 ) -> _GeneratorTraining:
-    """Set the focal length of all pairs that leave it open to that of the generator's rig.
+    """Return the config with the focal length of the generator's rig for pairs without one.
 
     Raises:
-        InputError: pairs have a focal length of their own, or a scale, which the generator cannot
-            learn from.
+        InputError: pairs have a focal length of their own, or a scale, from which the generator
+            cannot learn.
     """
     focal_px = generator.virtual_focal_px
     pair_configs: dict[str, PairsConfig] = {}
