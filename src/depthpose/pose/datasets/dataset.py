@@ -44,7 +44,7 @@ from depthpose.pose.datasets.layouts import (
 )
 from depthpose.pose.datasets.masks import mask_box, read_mask
 from depthpose.pose.mesh import (
-    exact_diameter,
+    measure_diameter,
     read_model,
     sample_surface,
     symmetries_from_bop,
@@ -272,7 +272,7 @@ def _check_models(
 
         # Is it as large as the data set says?
         declared_mm = infos.get(number, {}).get("diameter")
-        measured_mm = 1000 * exact_diameter(models[number].vertices_m)
+        measured_mm = 1000 * measure_diameter(models[number].vertices_m)
         if not isinstance(declared_mm, int | float):
             message = "has no declared diameter; that of the mesh is taken"
             problems.append(Problem(path=path, kind="note", message=message))

@@ -13,19 +13,27 @@ from depthpose.pose.types import ObjectModel
 
 
 @lru_cache(maxsize=64)
-def cached(model: ObjectModel, compute: Callable[..., Any], name: str, *settings: float) -> Any:  # noqa: ANN401
-    """Compute ``compute(model, *settings)``, JSON values that take long, or read them from a cache.
+def read_or_compute(
+    model: ObjectModel,
+    compute: Callable[..., Any],
+    name: str,
+    *settings: float,
+) -> Any:  # noqa: ANN401
+    """Read ``compute(model, *settings)`` from the cache, or compute it and write it there.
 
-    The cache is ``$DEPTHPOSE_CACHE``, where that can be written to. Its key is made of the bytes of
-    the shape and its symmetries, and of the code that computes.
+    The cache is ``$DEPTHPOSE_CACHE``, where that can be written to. A file is named by the bytes of
+    the shape, of its symmetries and of the code that computes.
 
     Args:
         model: the object.
-        compute: the function.
+        compute: a function that returns JSON values, and takes long.
         name: of the folder of its values in the cache.
-        settings: further arguments.
+        settings: further arguments of the function.
+
+    Returns:
+        What the function returns; as JSON holds it, a list for a tuple, where it was read.
     """
-    # What the values depend on.
+    # The digest of all that the values depend on.
     symmetries = model.symmetries
     tensors = [model.vertices_m, model.faces]
     if symmetries.discrete is not None:
@@ -38,7 +46,6 @@ def cached(model: ObjectModel, compute: Callable[..., Any], name: str, *settings
     for tensor in tensors:
         digest.update(tensor.contiguous().numpy().tobytes())
 
-    # Read, or computed and written.
     folder = "_".join(map(str, (name, *settings)))
     path = cache_folder() / folder / f"{digest.hexdigest()}.json"
     try:

@@ -2,29 +2,38 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
 
 from depthpose.core.rigid import Rigid, geodesic_rad
+from depthpose.pose.mesh.cache import read_or_compute
+from depthpose.pose.mesh.deviation import (
+    EXACT_SHARE,
+    SurfaceDeviation,
+    refine_motion,
+    sample_deviation,
+)
+from depthpose.pose.mesh.models import symmetry_transforms
+from depthpose.pose.mesh.symmetry import find_rough_symmetries, rotations_about
 from depthpose.pose.types import ObjectModel, Symmetries
 
-ALIKE = 0.004
+EXACT_DEVIATION = 0.004
 """Deviation in diameters up to which a symmetry that was found in a shape is exact: as much as a
 cylinder of 25 facets deviates. A copy that deviates by more, as a scan's dents or a keyway do, is
 another pose, though a view may not tell which."""
-ALMOST_ALL = 0.998
-"""Share of the surface within ``ALIKE``; a key or a notch is a few percent of it."""
 _NEAR_TOLERANCE = 0.05
 """Deviation in diameters at which a sensor's noise begins to mask the difference of two poses: real
 points of LineMOD and YCB lie 1.4 to 2.6 % of the diameter off the posed surface. Twice as much is
 tried."""
 _NEAR_SUPPRESSION_RAD = math.radians(35)  # rotations nearer to each other are the same to ICP
 _AXIS_STEP_RAD = math.pi / 8  # an axis that nearly is one of revolution counts as eight rotations
-_FINE_AXIS_STEP_RAD = math.pi / 36
-_MOST_NEAR = 24  # near-symmetries that are given
-_NEAR_STARTS = 24  # rotations that ICP refines
+_FINE_AXIS_STEP_RAD = math.pi / 36  # half the step of copies from which others must be far
+_MOST_NEAR = 24  # near-symmetries that are kept
+_STARTS = 24  # rotations that ICP refines
+_SECOND_FACTORS = 3  # best motions that the best _STARTS are multiplied by
+_CIRCLE_RAD = torch.arange(1, 8, dtype=torch.float64) * (math.pi / 4)  # by which an axis is tested
+_EYE = torch.eye(3, dtype=torch.float64)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -37,125 +46,142 @@ class NearSymmetry:
     deviation: float
 
 
+class _Exactness(NamedTuple):
+    """Which symmetries of a model the surface has exactly."""
+
+    discrete: list[bool]  #: whether each discrete symmetry is exact
+    continuous: list[bool]  #: whether each axis is
+
+
+class _Candidate(NamedTuple):
+    """A motion that may be a near-symmetry."""
+
+    deviation: float  #: of the moved surface from itself, in diameters
+    motion: Rigid  #: about the surface's centre, its translation in diameters
+
+
 def near_symmetries(model: ObjectModel) -> tuple[NearSymmetry, ...]:
     """Find the motions that leave a model nearly as it is, those of the least deviation first.
 
-    Those of :func:`true_symmetries`, which make no other pose, are not among them. They are
-    searched once for each shape, in a few seconds, and kept in ``$DEPTHPOSE_CACHE``.
+    Those of :func:`true_symmetries`, which make no other pose, are not among them. The search takes
+    a few seconds for a new shape, whose motions are then kept in ``$DEPTHPOSE_CACHE``.
     """
+    values = read_or_compute(model, _search_near_symmetries, "near_symmetries")
     near: list[NearSymmetry] = []
-    for rows, deviation in cached(model, _search_near_symmetries, "near_symmetries")["near"]:
+    for rows, deviation in values["near"]:
         matrix = torch.tensor(rows, dtype=torch.float64)
         motion = Rigid(matrix[:3, :3], matrix[:3, 3])
         near.append(NearSymmetry(model_from_model=motion, deviation=deviation))
     return tuple(near)
 
 
-def true_symmetries(
-    model: ObjectModel, alike: tuple[list[bool], list[bool]] | None = None
-) -> Symmetries:
-    """Select the symmetries whose copies count as one pose.
+def true_symmetries(model: ObjectModel) -> Symmetries:
+    """Select the symmetries of a model whose copies count as one pose.
 
     These are all that were declared. Of those that were found in the geometry, near-symmetries,
-    whose copies deviate by more than ``ALIKE``, are left out.
-
-    Args:
-        model: the object.
-        alike: which discrete symmetries and which axes deviate by less; None: it is searched.
+    whose copies deviate by more than ``EXACT_DEVIATION``, are left out.
     """
-    symmetries = model.symmetries
+    if not model.symmetries.is_found:
+        return model.symmetries
+    values = read_or_compute(model, _search_near_symmetries, "near_symmetries")
+    return _select_exact(model.symmetries, _Exactness(*values["exact"]))
+
+
+def _select_exact(symmetries: Symmetries, exactness: _Exactness) -> Symmetries:
+    """Select those of found symmetries that are exact; declared ones are all kept."""
     if not symmetries.is_found:
         return symmetries
-    if alike is None:
-        cached_values = cached(model, _search_near_symmetries, "near_symmetries")
-        are_turns_alike, are_axes_alike = cached_values["alike"]
-    else:
-        are_turns_alike, are_axes_alike = alike
     discrete = symmetries.discrete
     if discrete is not None:
-        discrete = discrete[torch.tensor(are_turns_alike)] if any(are_turns_alike) else None
-    pairs = zip(symmetries.continuous, are_axes_alike, strict=True)
-    continuous = tuple(axis for axis, is_alike in pairs if is_alike)
+        is_exact = torch.tensor(exactness.discrete)
+        discrete = discrete[is_exact] if any(exactness.discrete) else None
+    pairs = zip(symmetries.continuous, exactness.continuous, strict=True)
+    continuous = tuple(axis for axis, is_exact in pairs if is_exact)
     return Symmetries(discrete=discrete, continuous=continuous, is_found=True)
 
 
 def _search_near_symmetries(model: ObjectModel) -> dict[str, Any]:
     """Search near-symmetries of a model, and which of its symmetries the surface has exactly.
 
-    Gives JSON values, which are cached: ``near``, transforms with their deviations, the best first;
-    and ``alike``, flags of the discrete and the continuous symmetries.
+    Returns:
+        JSON values: ``near``, pairs of a 4x4 matrix ``model_from_model`` in metres and its
+        deviation, the best first; and ``exact``, the flags of :class:`_Exactness`.
     """
     # Symmetries that were found, and rotations that nearly are some.
-    surface = _prepare_surface(model)
-    alike = _find_alike(model.symmetries, surface)
-    measured = _measure_deviations(_propose_near_symmetries(model.symmetries, surface), surface)
+    surface = sample_deviation(model)
+    exactness = _measure_exactness(model.symmetries, surface)
+    candidates = _measure_deviations(_propose_motions(model.symmetries, surface), surface)
 
     # Products of the best candidates are candidates too: a can upside down, then about its axis.
-    by_deviation = sorted(measured, key=lambda pair: pair[0])
-    good = [motion for deviation, motion in by_deviation if deviation <= _NEAR_TOLERANCE]
-    products = [first @ second for first in good[:_NEAR_STARTS] for second in good[:3]]
-    measured += _measure_deviations(products, surface)
+    by_deviation = sorted(candidates, key=lambda candidate: candidate.deviation)
+    good = [c.motion for c in by_deviation if c.deviation <= _NEAR_TOLERANCE]
+    products = [first @ second for first in good[:_STARTS] for second in good[:_SECOND_FACTORS]]
+    candidates += _measure_deviations(products, surface)
 
     # The best, each far from better ones and from all copies of these that look alike.
-    same = symmetry_transforms(true_symmetries(model, alike), _FINE_AXIS_STEP_RAD).R.double()
-    near: list[tuple[Rigid, float]] = []
-    for deviation, motion in sorted(measured, key=lambda pair: pair[0]):
+    exact = _select_exact(model.symmetries, exactness)
+    exact_R = symmetry_transforms(exact, _FINE_AXIS_STEP_RAD).R.double()
+    better_R = _EYE @ exact_R
+    near: list[tuple[list[list[float]], float]] = []
+    for deviation, motion in sorted(candidates, key=lambda candidate: candidate.deviation):
         if len(near) == _MOST_NEAR or deviation > 2 * _NEAR_TOLERANCE:
             break
-        better = torch.cat([R @ same for R in (_EYE, *(chosen.R for chosen, _ in near))])
-        apart_rad = float(geodesic_rad(motion.R.expand_as(better), better).min())
+        apart_rad = float(geodesic_rad(motion.R.expand_as(better_R), better_R).min())
         if apart_rad > _NEAR_SUPPRESSION_RAD:
+            better_R = torch.cat([better_R, motion.R @ exact_R])
             # From the surface's centre and unit to the model's.
             shift_m = surface.centre_m - motion.R @ surface.centre_m + motion.t_m * model.diameter_m
-            near.append((Rigid(motion.R, shift_m), deviation))
-    rows = [(motion.matrix().tolist(), deviation) for motion, deviation in near]
-    return {"near": rows, "alike": alike}
+            near.append((Rigid(motion.R, shift_m).matrix().tolist(), deviation))
+    return {"near": near, "exact": exactness}
 
 
-def _find_alike(symmetries: Symmetries, surface: SurfaceDeviation) -> tuple[list[bool], list[bool]]:
-    """Find which discrete symmetries, and which axes, have copies that lie on the surface."""
+def _measure_exactness(symmetries: Symmetries, surface: SurfaceDeviation) -> _Exactness:
+    """Measure which discrete symmetries, and which axes, have copies that lie on the surface."""
     discrete: list[bool] = []
     if symmetries.discrete is not None:
         R = symmetries.discrete.R.double()
-        discrete = (surface.deviation(R, share=ALMOST_ALL) <= ALIKE).tolist()
-    circle = torch.arange(1, 8, dtype=torch.float64) * (math.pi / 4)
+        discrete = (surface.deviation(R, share=EXACT_SHARE) <= EXACT_DEVIATION).tolist()
     continuous: list[bool] = []
     for axis in symmetries.continuous:
-        R = _rotate_about(axis.direction.double(), circle)
-        continuous.append(float(surface.deviation(R, share=ALMOST_ALL).max()) <= ALIKE)
-    return discrete, continuous
+        R = rotations_about(axis.direction.double(), _CIRCLE_RAD)
+        worst = float(surface.deviation(R, share=EXACT_SHARE).max())
+        continuous.append(worst <= EXACT_DEVIATION)
+    return _Exactness(discrete, continuous)
 
 
-def _propose_near_symmetries(symmetries: Symmetries, surface: SurfaceDeviation) -> list[Rigid]:
+def _propose_motions(symmetries: Symmetries, surface: SurfaceDeviation) -> list[Rigid]:
     """Propose motions as near-symmetries: symmetries that were found, and refined rotations.
 
     Refinement may shift the surface too: a scan whose points are denser on one side has its centre
     where no symmetry has it.
     """
     # Symmetries that were found.
-    candidates: list[Rigid] = []
+    proposals: list[Rigid] = []
     if symmetries.is_found:
         copies = symmetry_transforms(symmetries, _AXIS_STEP_RAD).R.double()[1:]
-        candidates = [Rigid(R, torch.zeros(3).double()) for R in copies]
+        proposals = [Rigid(R, torch.zeros(3).double()) for R in copies]
 
-    # Refined from quarter turns about the principal axes, and the best of many other rotations.
+    # Quarter turns about the principal axes, and the best of many other rotations.
     quarters = torch.arange(1, 4).double() * (math.pi / 2)
-    starts = [R for axis in surface.axes for R in _rotate_about(axis, quarters)]
-    for R in _find_promising_turns(surface):
-        if len(starts) >= _NEAR_STARTS:
+    starts = [R for axis in surface.axes for R in rotations_about(axis, quarters)]
+    for R in find_rough_symmetries(surface):
+        if len(starts) >= _STARTS:
             break
         apart_rad = [float(geodesic_rad(R, start)) for start in (_EYE, *starts)]
         if min(apart_rad) > _NEAR_SUPPRESSION_RAD:
             starts.append(R)
-    return candidates + [refine_turn(surface, R) for R in starts]
+
+    # Refined, from rotations about the middle of the box.
+    for R in starts:
+        start = Rigid(R, surface.middle - R @ surface.middle)
+        proposals.append(refine_motion(surface, surface.compared_points, start))
+    return proposals
 
 
-def _measure_deviations(
-    motions: list[Rigid], surface: SurfaceDeviation
-) -> list[tuple[float, Rigid]]:
-    """Pair each motion with how far it moves the surface off itself, in diameters."""
+def _measure_deviations(motions: list[Rigid], surface: SurfaceDeviation) -> list[_Candidate]:
+    """Measure how far each motion moves the surface off itself."""
     if not motions:
         return []
-    R = torch.stack([motion.R for motion in motions])
-    shift = torch.stack([motion.t_m for motion in motions])
-    return list(zip(surface.deviation(R, shift).tolist(), motions, strict=True))
+    stacked = Rigid.stack(motions)
+    deviations = surface.deviation(stacked.R, stacked.t_m).tolist()
+    return [_Candidate(d, motion) for d, motion in zip(deviations, motions, strict=True)]

@@ -20,7 +20,7 @@ from depthpose.pose.datasets import open_bop
 from depthpose.pose.datasets.layouts import read_bop_models, read_models_info
 from depthpose.pose.mesh import (
     read_model,
-    refuse_one_name,
+    refuse_equal_names,
     sample_surface,
     symmetry_transforms,
     with_found_symmetries,
@@ -241,7 +241,7 @@ def read_models(
             read_model(path, config.unit, number=number, config=config.mesh)
             for number, path in enumerate(config.cad, start=1)
         )
-        refuse_one_name(models)
+        refuse_equal_names(models)
 
     # With the symmetries of their shapes, where these are wanted.
     return tuple(
