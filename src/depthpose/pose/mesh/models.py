@@ -76,9 +76,8 @@ def symmetry_transforms(symmetries: Symmetries, max_step: float = BOP_STEP) -> R
     discrete = symmetries.discrete
     copies = identity
     if discrete is not None:
-        copies = Rigid.cat(
-            [Rigid(identity.R.to(discrete.R), identity.t_m.to(discrete.t_m)), discrete]
-        )
+        identity = Rigid(identity.R.to(discrete.R), identity.t_m.to(discrete.t_m))
+        copies = Rigid.cat([identity, discrete])
 
     # Each of them followed by rotations.
     steps = math.ceil(math.pi / max_step)
