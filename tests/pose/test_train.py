@@ -23,7 +23,7 @@ from depthpose.pose.config import CloudConfig, MeshConfig, ObjectsConfig, Synthe
 from depthpose.pose.datasets import write_bop_models, write_bop_scene
 from depthpose.pose.network import ResUNet, ResUNetConfig, fold_norms
 from depthpose.pose.sparse import Voxels
-from depthpose.pose.synthetic import Objects, make_frames
+from depthpose.pose.synthetic import SyntheticViews, make_frames
 from depthpose.pose.train import (
     STAGES,
     FramesConfig,
@@ -206,7 +206,7 @@ def test_frames_and_synthetic_views_mix_and_frames_stay_true(tmp_path: Path) -> 
         0,
     )
     assert len(clouds) == 2 * len(real)
-    made = Objects(models, _VIEWS, _CLOUD)
+    made = SyntheticViews(models, _VIEWS, _CLOUD)
     is_made = [
         torch.allclose(clouds[i].t_m.norm(), made.view(i).truth.camera_from_model.t_m.norm())
         for i in range(30)

@@ -27,7 +27,7 @@ from depthpose.pose.mesh import (
 )
 from depthpose.pose.metrics import SUCCESS_SHARE, add_of_nearest_m
 from depthpose.pose.network_pose import DepthImageRegressor, GeoPoseNet
-from depthpose.pose.synthetic import Objects, make_part
+from depthpose.pose.synthetic import SyntheticViews, make_part
 from depthpose.pose.train.config import HeldOutConfig, ModelsConfig, PoseTraining, ViewsTraining
 from depthpose.pose.types import (
     CloudSample,
@@ -87,7 +87,7 @@ class TrainingViews(Generic[Config]):
         self.models = models
         self.config = config
         self.seed = seed
-        self.synthetic = Objects(models, config.objects, config.cloud)
+        self.synthetic = SyntheticViews(models, config.objects, config.cloud)
         self._class_of = {model.name: k for k, model in enumerate(models)}
         self._frames = config.frames
         self._real = None
@@ -325,7 +325,7 @@ def make_held_out_objects(
     cloud: CloudConfig,
     config: HeldOutConfig,
     occlusion: float,
-) -> Objects:
+) -> SyntheticViews:
     """Make views that no training uses, all of one occlusion.
 
     Args:
@@ -344,7 +344,7 @@ def make_held_out_objects(
         occluded_share=1.0,
         occlusion=(occlusion, occlusion),
     )
-    return Objects(models, held_out_config, cloud)
+    return SyntheticViews(models, held_out_config, cloud)
 
 
 def measure_add(estimated: Rigid | None, truth: Rigid, model: ObjectModel) -> float:
@@ -409,7 +409,7 @@ def format_table(table: Table) -> str:
 
 
 def _estimate_views(
-    weights: PoseWeights, objects: Objects
+    weights: PoseWeights, objects: SyntheticViews
 ) -> tuple[list[PoseEstimate], list[float]]:
     """Estimate views of objects; give the estimates and their errors by ADD [diameters]."""
     is_regressed = isinstance(weights.network, DepthImageNet)

@@ -39,7 +39,7 @@ from depthpose.pose.segmentation import (
     predict_probabilities,
     write_segmentation,
 )
-from depthpose.pose.synthetic.views import random_index, uniform
+from depthpose.pose.synthetic.random_numbers import random_index, uniform
 from depthpose.pose.train.config import ImageAugmentConfig, ImagesConfig, SegmentationTraining
 from depthpose.pose.train.poses import add_origin, claim_run
 

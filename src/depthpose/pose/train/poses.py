@@ -321,7 +321,7 @@ def _build_training(
         return "depth-image", DepthImageTask(DepthImageNet(config.network), models, config), crops
     clouds = TrainingClouds(models, config, config.loop.seed)
     if config.loop.workers > 1 and (config.frames is None or config.frames.share < 1):
-        clouds.synthetic.draw_stored(config.loop.workers)
+        clouds.synthetic.render_stored(config.loop.workers)
     if isinstance(config.network, PointNetConfig):
         return "pointnet", PoseTask(PointNet(config.network), models, config), clouds
     return "pose", PoseTask(ResUNet(config.network), models, config), clouds
