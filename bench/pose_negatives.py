@@ -33,7 +33,7 @@ from depthpose.pose.mesh import MIRROR_ALIKE, mirror_deviation
 from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.pose.registration import Registration
 from depthpose.pose.synthetic import SyntheticViews
-from depthpose.pose.train.clouds import measure_add
+from depthpose.pose.train.held_out import measure_add
 from depthpose.pose.types import CloudSample, ObjectModel, ViewSample
 from depthpose.report.page import markdown_table
 

@@ -47,7 +47,7 @@ from depthpose.depth.train import STAGES as DEPTH_STAGES
 from depthpose.depth.types import RawFrame
 from depthpose.depth.weights import read_depth_weights, write_depth_weights
 from depthpose.pose.datasets import open_bop, read_detections, read_mask
-from depthpose.pose.datasets.layouts import read_mapping
+from depthpose.pose.datasets.entries import read_mapping
 from depthpose.pose.mesh import read_model
 from depthpose.pose.predictions import read_bop_results, read_predictions
 from depthpose.pose.train import STAGES as POSE_STAGES

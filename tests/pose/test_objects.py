@@ -14,7 +14,7 @@ from depthpose.pose.config import ObjectsConfig, SyntheticSensorConfig
 from depthpose.pose.datasets import check_bop, open_bop, write_bop_models, write_bop_scene
 from depthpose.pose.mesh import drawn_triangles, make_model
 from depthpose.pose.mesh.models import triangulate_points
-from depthpose.pose.synthetic import SyntheticViews, make_frames, views
+from depthpose.pose.synthetic import SyntheticViews, depth_sensors, make_frames
 from depthpose.pose.synthetic.random_numbers import random_rotation
 from depthpose.pose.synthetic.views import aim_camera, make_shape, render_view, turn_view
 from depthpose.pose.types import ObjectModel, ViewSample
@@ -173,7 +173,7 @@ def test_the_object_lies_whole_in_the_image() -> None:
         view = objects.view(index)
         pose = view.truth.camera_from_model
         points = pose.apply(objects.models[0].vertices_m).double()
-        K = objects.intrinsics()
+        K = objects.make_intrinsics()
         pixels = (points @ K.mT)[:, :2] / points[:, 2:]
         assert float(pixels.min()) > 0
         assert bool((pixels.amax(0) < torch.tensor([640, 480])).all())
@@ -340,7 +340,7 @@ def test_the_projector_throws_the_shadow_of_a_thing_onto_what_lies_behind_it() -
     """To one side alone, as wide as its disparities differ."""
     depth_m = torch.full((3, 60), 2.0)
     depth_m[:, 20:30] = 1.0
-    is_shadowed = views._mark_shadow(depth_m, focal_px=100.0, baseline_m=0.2)
+    is_shadowed = depth_sensors._mark_shadow(depth_m, focal_px=100.0, baseline_m=0.2)
     columns = is_shadowed[0].nonzero().flatten().tolist()
     wide_px = 100 * 0.2 * (1 / 1.0 - 1 / 2.0)
     # Half a pixel more than one is tolerated at its end.

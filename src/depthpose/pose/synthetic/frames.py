@@ -275,7 +275,7 @@ def _make_frame(
 
 
 def _draw_table(generator: torch.Generator) -> Solid:
-    """Draw the top of a table: a square about the origin at height 0, of random size and pattern."""
+    """Draw the top of a table: a square about the origin, at height 0, of random size."""
     half_m = 0.5 * uniform(generator, 0.8, 3.0)
     first = [[-half_m, -half_m, 0.0], [half_m, -half_m, 0.0], [half_m, half_m, 0.0]]
     second = [[-half_m, -half_m, 0.0], [half_m, half_m, 0.0], [-half_m, half_m, 0.0]]

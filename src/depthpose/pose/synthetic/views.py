@@ -315,7 +315,7 @@ class SyntheticViews:
         views = self.config.views
         if views is not None:
             stored = self._find_stored(number, random_index(generator, views))
-            K = self._scale_intrinsics(float(stored.K[0, 0]) / self.config.focal_px[0])
+            K = self.make_intrinsics(float(stored.K[0, 0]) / self.config.focal_px[0])
             turn = self._draw_gaze(number, stored.distance_m, K, generator)
             return turn_view(stored.restore(), turn, shape, K)
 
@@ -323,7 +323,7 @@ class SyntheticViews:
         # the image. Its middle, (0, 0, distance), is turned too.
         R = random_rotation(generator)
         distance_m = uniform(generator, *self.config.distance_m)
-        K = self._scale_intrinsics(uniform(generator, *self.config.resolution))
+        K = self.make_intrinsics(uniform(generator, *self.config.resolution))
         turn = self._draw_gaze(number, distance_m, K, generator)
         R = turn @ R
         middle_m = turn[:, 2] * distance_m
@@ -339,7 +339,7 @@ class SyntheticViews:
             shape = self._shapes[number]
             R = random_rotation(generator)
             distance_m = uniform(generator, *self.config.distance_m)
-            K = self._scale_intrinsics(uniform(generator, *self.config.resolution))
+            K = self.make_intrinsics(uniform(generator, *self.config.resolution))
             middle_m = torch.tensor([0.0, 0.0, distance_m], dtype=torch.float64)
             pose = Rigid(R, middle_m - R @ shape.middle_m)
             view = render_view(shape, pose, K)
@@ -351,7 +351,7 @@ class SyntheticViews:
             )
         return self._stored[key]
 
-    def _scale_intrinsics(self, scale: float) -> Float[Tensor, "3 3"]:
+    def make_intrinsics(self, scale: float = 1.0) -> Float[Tensor, "3 3"]:
         """Make the intrinsic matrix of the sensor's image, enlarged by ``scale``."""
         assert self.config.centre_px is not None, "the config computes a centre left out"
         fx, fy = self.config.focal_px
