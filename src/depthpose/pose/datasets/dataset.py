@@ -1,4 +1,4 @@
-"""A data set of any known layout as samples, its check before hours of work, and writing BOP's."""
+"""Data sets of poses: samples of any known layout, the check of all files, and writing BOP's."""
 
 import hashlib
 from collections import Counter
@@ -289,15 +289,7 @@ def _check_models(
             problems.append(unreadable(path, error))
             continue
 
-        # Is it as large as the data set says?
-        declared_mm = infos.get(number, {}).get("diameter")
-        measured_mm = 1000 * measure_diameter(models[number].vertices_m)
-        if not isinstance(declared_mm, int | float):
-            message = "has no declared diameter; that of the mesh is taken"
-            problems.append(Problem(path=path, kind="note", message=message))
-        elif abs(measured_mm - declared_mm) > _DIAMETER_SLACK * declared_mm:
-            message = f"is {measured_mm:.1f} mm across, but models_info says {declared_mm:.1f} mm"
-            problems.append(Problem(path=path, kind="mismatch", message=message))
+        problems += _check_diameter(path, models[number], infos.get(number, {}).get("diameter"))
 
     # Estimators know objects by name, and refuse two of one.
     names = read_object_names(folder, numbers)
@@ -307,6 +299,17 @@ def _check_models(
             message = f"calls objects {of_name} {name!r}; rename all but one in models_info"
             problems.append(Problem(path=models_folder, kind="mismatch", message=message))
     return models
+
+
+def _check_diameter(path: Path, model: ObjectModel, declared_mm: object) -> Iterator[Problem]:
+    """Compare the diameter of a mesh with that which the data set declares, if it does."""
+    measured_mm = 1000 * measure_diameter(model.vertices_m)
+    if not isinstance(declared_mm, int | float):
+        message = "has no declared diameter; that of the mesh is taken"
+        yield Problem(path=path, kind="note", message=message)
+    elif abs(measured_mm - declared_mm) > _DIAMETER_SLACK * declared_mm:
+        message = f"is {measured_mm:.1f} mm across, but models_info says {declared_mm:.1f} mm"
+        yield Problem(path=path, kind="mismatch", message=message)
 
 
 def _check_instance(instance: Instance, model: ObjectModel | None) -> Iterator[Problem]:
@@ -338,24 +341,30 @@ def _check_instance(instance: Instance, model: ObjectModel | None) -> Iterator[P
             message = f"is {size[0]}x{size[1]}, but its depth image is {width}x{height}"
             yield Problem(path=path, kind="mismatch", message=message)
             return
-    if instance.mask is None or model is None:
-        return
+    if instance.mask is not None and model is not None:
+        yield from _compare_with_model(instance, instance.mask, model)
 
+
+def _compare_with_model(
+    instance: Instance, mask_path: Path, model: ObjectModel
+) -> Iterator[Problem]:
+    """Compare what an instance's depth image and mask show with its model at the annotated pose."""
     # Does the mask show enough points?
-    mask = read_instance_mask(instance)
+    mask = read_mask(mask_path)
     depth_m = read_depth_png(instance.depth, instance.depth_unit_m)
     cloud = cloud_from_depth(depth_m, mask, instance.K)
     too_few = why_too_few(cloud)
     if too_few is not None:
         # Instances that are fully occluded are annotated too: no fault, but no test either.
-        yield Problem(path=instance.mask, kind="note", message=too_few)
+        yield Problem(path=mask_path, kind="note", message=too_few)
         return
 
     # Do they lie at the annotated pose? And if so, does the posed model lie in the mask?
     centre_m = instance.camera_from_model.apply(model.vertices_m.double()).mean(0)
     away_m = float((cloud.double().median(0).values - centre_m).norm())
     if away_m > _FAR_DIAMETERS * model.diameter_m:
-        advice = advise_unit(model.diameter_m, cloud[cloud[:, 2] < 3 * cloud[:, 2].median()])
+        near_cloud = cloud[cloud[:, 2] < 3 * cloud[:, 2].median()]
+        advice = advise_unit(model.diameter_m, near_cloud)
         message = (
             f"the cloud lies {away_m:.2f} m from the annotated pose; are depth_scale and "
             "cam_t_m2c both for millimetres?"
@@ -367,7 +376,7 @@ def _check_instance(instance: Instance, model: ObjectModel | None) -> Iterator[P
     is_visible = instance.visible_fraction is None or instance.visible_fraction >= _FEW_IN_MASK
     if is_visible and _measure_share_in_mask(instance, model, mask) < _FEW_IN_MASK:
         message = f"{instance.name}: the posed model does not lie on its mask; is it another's?"
-        yield Problem(path=instance.mask, kind="mismatch", message=message)
+        yield Problem(path=mask_path, kind="mismatch", message=message)
 
 
 def _measure_share_in_mask(

@@ -45,7 +45,7 @@ class Instance:
     mask: Path | None  #: of the visible part; None where there is no such file
     rgb: Path | None  #: the picture, where there is one
     camera_from_model: Rigid  #: the annotated pose
-    visible_fraction: float | None = None  #: share of the silhouette that is seen, where given
+    visible_fraction: float | None = None  #: share of the silhouette that is seen, where annotated
     is_measured: bool = True  #: whether the pose was annotated, not itself fitted to the same depth
 
     @property
@@ -151,32 +151,54 @@ def read_bop_instances(scene: Path, suffix: str = "") -> Iterator[Instance]:
             raise InputError(f"{source}: is no list of annotations")
         if not annotations:
             continue
-        depth, rgb = _find_bop_images(scene, suffix, int(key))
         K, unit_m = read_bop_camera(cameras[key], f"{camera_path}: image {int(key)}")
+        depth, rgb = _find_bop_images(scene, suffix, int(key))
         for index, annotation in enumerate(annotations):
             info = image_infos[index] if index < len(image_infos) else {}
-            info = info if isinstance(info, dict) else {}
             mask = scene / f"mask_visib{suffix}" / f"{int(key):06d}_{index:06d}.png"
-            place = f"{source}, annotation {index}"
-            visible_fraction = read_number(info, "visib_fract", -1.0, place)  # negative: not known
+            truth = _read_bop_truth(annotation, info, f"{source}, annotation {index}")
             yield Instance(
                 scene_id=int(scene.name),
                 image_id=int(key),
                 index=index,
-                object_id=read_integer(annotation, "obj_id", place),
+                object_id=truth.object_id,
                 K=K,
                 depth=depth,
                 depth_unit_m=unit_m,
                 mask=mask if mask.is_file() else None,
                 rgb=rgb,
-                camera_from_model=make_pose(
-                    read_numbers(annotation, "cam_R_m2c", 9, place),
-                    read_numbers(annotation, "cam_t_m2c", 3, place),
-                    place,
-                ),
-                visible_fraction=visible_fraction if visible_fraction >= 0 else None,
-                is_measured=not str(info.get("pose_source", "")).startswith("pseudo"),
+                camera_from_model=truth.camera_from_model,
+                visible_fraction=truth.visible_fraction,
+                is_measured=truth.is_measured,
             )
+
+
+class _BopTruth(NamedTuple):
+    """What is annotated of an instance; as in :class:`Instance`."""
+
+    object_id: int
+    camera_from_model: Rigid
+    visible_fraction: float | None
+    is_measured: bool
+
+
+def _read_bop_truth(annotation: object, info: object, source: str) -> _BopTruth:
+    """Read an entry of ``scene_gt.json``, and the one beside it in ``scene_gt_info.json``, if any.
+
+    ``source`` names it in errors.
+    """
+    fields = info if isinstance(info, dict) else {}
+    visible_fraction = read_number(fields, "visib_fract", -1.0, source)  # negative: not known
+    return _BopTruth(
+        object_id=read_integer(annotation, "obj_id", source),
+        camera_from_model=make_pose(
+            read_numbers(annotation, "cam_R_m2c", 9, source),
+            read_numbers(annotation, "cam_t_m2c", 3, source),
+            source,
+        ),
+        visible_fraction=visible_fraction if visible_fraction >= 0 else None,
+        is_measured=not str(fields.get("pose_source", "")).startswith("pseudo"),
+    )
 
 
 def _find_bop_images(scene: Path, suffix: str, image_id: int) -> tuple[Path, Path | None]:
@@ -256,41 +278,61 @@ def read_linemod_instances(folder: Path, split: str) -> Iterator[Instance]:
             if parse_entry_number(line) is None:
                 raise InputError(f"{listed}: {line[:40]!r} is no number of an image")
 
-            # The one annotation of the folder's own object.
-            image = int(line)
-            number = int(scene.name)
-            source = f"{scene / 'gt.yml'}: image {image}"
-            entries = truths.get(image)
-            if not isinstance(entries, list):
-                raise InputError(f"{source} has no annotation; is the list of another download?")
-            of_object = [e for e in entries if read_integer(e, "obj_id", source) == number]
-            if len(of_object) != 1:
-                raise InputError(
-                    f"{source} annotates object {number} {len(of_object)} times, where once belongs"
-                )
+            yield _read_linemod_instance(scene, int(line), truths, infos)
 
-            # Its camera and its images.
-            camera_source = f"{scene / 'info.yml'}: image {image}"
-            K, unit_m = read_bop_camera(infos.get(image), camera_source)
-            depth = scene / "depth" / f"{image:04d}.png"
-            mask = scene / "mask" / f"{image:04d}.png"
-            rgb = scene / "rgb" / f"{image:04d}.png"
-            yield Instance(
-                scene_id=number,
-                image_id=image,
-                index=entries.index(of_object[0]),
-                object_id=number,
-                K=K,
-                depth=depth,
-                depth_unit_m=unit_m,
-                mask=mask if mask.is_file() else None,
-                rgb=rgb if rgb.is_file() else None,
-                camera_from_model=make_pose(
-                    read_numbers(of_object[0], "cam_R_m2c", 9, source),
-                    read_numbers(of_object[0], "cam_t_m2c", 3, source),
-                    source,
-                ),
-            )
+
+def _read_linemod_instance(
+    scene: Path, image_id: int, truths: Mapping[Any, Any], infos: Mapping[Any, Any]
+) -> Instance:
+    """Read the annotation of the object of a folder in one of its images.
+
+    Args:
+        scene: the folder.
+        image_id: number of the image.
+        truths: annotations by image, of ``gt.yml``.
+        infos: cameras by image, of ``info.yml``.
+
+    Raises:
+        InputError: an entry is missing or damaged.
+    """
+    # The one annotation of the folder's own object.
+    number = int(scene.name)
+    source = f"{scene / 'gt.yml'}: image {image_id}"
+    annotations = truths.get(image_id)
+    if not isinstance(annotations, list):
+        raise InputError(f"{source} has no annotation; is the list of another download?")
+    of_object = [
+        index
+        for index, annotation in enumerate(annotations)
+        if read_integer(annotation, "obj_id", source) == number
+    ]
+    if len(of_object) != 1:
+        raise InputError(
+            f"{source} annotates object {number} {len(of_object)} times, where once belongs"
+        )
+    index = of_object[0]
+
+    # Its camera and its images.
+    K, unit_m = read_bop_camera(infos.get(image_id), f"{scene / 'info.yml'}: image {image_id}")
+    file_name = f"{image_id:04d}.png"
+    mask = scene / "mask" / file_name
+    rgb = scene / "rgb" / file_name
+    return Instance(
+        scene_id=number,
+        image_id=image_id,
+        index=index,
+        object_id=number,
+        K=K,
+        depth=scene / "depth" / file_name,
+        depth_unit_m=unit_m,
+        mask=mask if mask.is_file() else None,
+        rgb=rgb if rgb.is_file() else None,
+        camera_from_model=make_pose(
+            read_numbers(annotations[index], "cam_R_m2c", 9, source),
+            read_numbers(annotations[index], "cam_t_m2c", 3, source),
+            source,
+        ),
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -359,8 +401,10 @@ def read_models_info(folder: Path) -> tuple[Path, dict[int, dict[str, Any]]]:
 
 def find_model_file(models_folder: Path, number: int) -> Path | None:
     """Find the mesh of an object in a folder of models; None where there is none."""
-    names = (f"obj_{number:06d}.ply", f"obj_{number:02d}.ply")
-    return next((models_folder / name for name in names if (models_folder / name).is_file()), None)
+    for name in (f"obj_{number:06d}.ply", f"obj_{number:02d}.ply"):
+        if (models_folder / name).is_file():
+            return models_folder / name
+    return None
 
 
 def read_bop_models(
@@ -417,15 +461,14 @@ def read_bop_models(
 
 
 def read_object_names(folder: Path, numbers: Iterable[int] | None = None) -> dict[int, str]:
-    """Read the names of objects by number; of all in ``models_info`` where none are given.
+    """Read the names of objects by number; None: of all in ``models_info``.
 
     Raises:
         InputError: there is no folder of models, or the file is damaged.
     """
     _, infos = read_models_info(folder)
-    return {
-        number: _name_object(number, infos) for number in (infos if numbers is None else numbers)
-    }
+    numbers = infos if numbers is None else numbers
+    return {number: _name_object(number, infos) for number in numbers}
 
 
 def _name_object(number: int, infos: Mapping[int, Mapping[str, Any]]) -> str:

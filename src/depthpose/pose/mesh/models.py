@@ -49,9 +49,11 @@ def axis_of_turn(turn: Rigid) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
         The unit vector of the line (3,), by the right-hand rule, and its point nearest to the
         origin (3,) [m].
     """
-    twist = turn.R - turn.R.T
-    direction = torch.stack([twist[2, 1], twist[0, 2], twist[1, 0]])
+    # R - R^T is the skew matrix of the direction, times twice the sine of the angle.
+    skew = turn.R - turn.R.T
+    direction = torch.stack([skew[2, 1], skew[0, 2], skew[1, 0]])
     # The points of the line stay where they are: p = R p + t.
+    # Solved without the direction of the line, whose singular value is 0.
     change = torch.eye(3).to(turn.R) - turn.R
     point_m = torch.linalg.pinv(change, rtol=1e-3) @ turn.t_m
     return direction / direction.norm(), point_m
@@ -360,7 +362,20 @@ def read_model(
     unit_m = metres_of(unit)
     vertices, faces = read_geometry(path)
     vertices_m = torch.from_numpy(vertices) * unit_m
-    extent_m = float((vertices_m.amax(0) - vertices_m.amin(0)).max())
+    _refuse_other_unit(path, unit, float((vertices_m.amax(0) - vertices_m.amin(0)).max()))
+    model = make_model(
+        vertices_m,
+        torch.from_numpy(faces),
+        name=name,
+        number=number,
+        symmetries=symmetries,
+        config=config,
+    )
+    return replace(model, colors=read_colors(path, unit_m, model)) if is_file else model
+
+
+def _refuse_other_unit(path: AnyModel, unit: Unit, extent_m: float) -> None:
+    """Refuse a model that is so long or short [m] in its unit that another must be meant."""
     if extent_m > _LARGEST_M and unit == "m":
         raise InputError(
             f"{path}: the model is {extent_m:g} m long, and no sensor sees it whole; is it in mm? "
@@ -371,15 +386,6 @@ def read_model(
             f"{path}: the model is {extent_m * 1000:g} mm long, below what a sensor resolves; is "
             "it in metres? Then say unit m; of BOP, whose models are in mm, multiply it by 1000."
         )
-    model = make_model(
-        vertices_m,
-        torch.from_numpy(faces),
-        name=name,
-        number=number,
-        symmetries=symmetries,
-        config=config,
-    )
-    return replace(model, colors=read_colors(path, unit_m, model)) if is_file else model
 
 
 def make_model(

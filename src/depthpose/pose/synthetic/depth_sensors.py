@@ -24,6 +24,7 @@ _STEREO_CORRELATION_PX = (3.0, 6.0)  # range of the width of its noise
 _STEREO_WINDOW_PX = 2  # by which active stereo displaces an edge at most
 _DISPLACEMENT_PX = 1.2  # standard deviation of that displacement
 _DISPLACEMENT_WIDTH_PX = 3.0  # distance over which neighbours are displaced alike
+_LASER_NOISE_M = 0.0005  # standard deviation
 _SHADOW_PX = 1.5  # by which a column of the projector lies before another that hides it
 _PATCH_PX = 12  # width of a patch of missing pixels
 _STEEPEST = math.tan(math.radians(80))
@@ -70,31 +71,59 @@ def simulate_depth(
         (depth_m.shape[0], depth_m.shape[1]), width_px, generator
     )
 
-    # What each kind of sensor reads. A standard deviation is a formula in metres.
+    # What each kind of sensor reads.
     if kind == "structured light":
         is_lost |= _mark_shadow(depth_m, window_focal_px)
-        read_m = _swap_neighbours(depth_m, generator)
-        # Nguyen, Izadi and Lovell 2012: sigma_z = 0.0012 + 0.0019 (z - 0.4)^2 [m].
-        read_m = read_m + unit_noise * (0.0012 + 0.0019 * (read_m - 0.4).square())
-        scale_px_m = _KINECT_STEPS_PER_PX * image_focal_px * _KINECT_BASELINE_M
-        read_m = _round_disparity(read_m, scale_px_m)
+        read_m = _read_structured_light(depth_m, unit_noise, image_focal_px, generator)
     elif kind == "active stereo":
         # Its second camera is on the other side: the shadow falls to the other side too.
         is_lost |= _mark_shadow(depth_m.flip(1), window_focal_px, _STEREO_BASELINE_M).flip(1)
-        first, second = (_displace(depth_m, scale, generator) for _ in range(2))
-        read_m = torch.lerp(first, second, torch.rand(depth_m.shape, generator=generator))
-        read_m = read_m + unit_noise * 0.003 * read_m.square()
-        scale_px_m = _STEREO_STEPS_PER_PX * image_focal_px * _STEREO_BASELINE_M
-        read_m = _round_disparity(read_m, scale_px_m)
+        read_m = _read_active_stereo(depth_m, unit_noise, focal_px, generator)
     elif kind == "time of flight":
-        read_m = _mix_at_jumps(depth_m, generator)
-        read_m = read_m + unit_noise * (0.001 + 0.002 * read_m.square())
+        read_m = _read_time_of_flight(depth_m, unit_noise, generator)
     else:  # a laser
-        read_m = depth_m + 0.0005 * unit_noise
+        read_m = depth_m + _LASER_NOISE_M * unit_noise
 
     # All readings are off alike.
     read_m = read_m + uniform(generator, *config.offset_m)
     return torch.where(is_lost, torch.nan, read_m)
+
+
+def _read_structured_light(
+    depth_m: Depth, unit_noise: Depth, image_focal_px: float, generator: torch.Generator
+) -> Depth:
+    """Read depth as a Kinect does: blurred edges, noise, and steps of disparity."""
+    read_m = _swap_neighbours(depth_m, generator)
+    # Nguyen, Izadi and Lovell 2012: sigma_z = 0.0012 + 0.0019 (z - 0.4)^2 [m].
+    read_m = read_m + unit_noise * (0.0012 + 0.0019 * (read_m - 0.4).square())
+    scale_px_m = _KINECT_STEPS_PER_PX * image_focal_px * _KINECT_BASELINE_M
+    return _round_disparity(read_m, scale_px_m)
+
+
+def _read_active_stereo(
+    depth_m: Depth, unit_noise: Depth, focal_px: tuple[float, float], generator: torch.Generator
+) -> Depth:
+    """Read depth as a stereo pair with a projector does: wandering edges, noise, and steps.
+
+    ``focal_px``: as of :func:`simulate_depth`.
+    """
+    # At an edge the depths of two displaced places are mixed.
+    window_focal_px, image_focal_px = focal_px
+    scale = window_focal_px / image_focal_px
+    first, second = (_displace(depth_m, scale, generator) for _ in range(2))
+    read_m = torch.lerp(first, second, torch.rand(depth_m.shape, generator=generator))
+
+    # sigma_z = 0.003 z^2 [m].
+    read_m = read_m + unit_noise * 0.003 * read_m.square()
+    scale_px_m = _STEREO_STEPS_PER_PX * image_focal_px * _STEREO_BASELINE_M
+    return _round_disparity(read_m, scale_px_m)
+
+
+def _read_time_of_flight(depth_m: Depth, unit_noise: Depth, generator: torch.Generator) -> Depth:
+    """Read depth by time of flight: mixed pixels at edges, and noise."""
+    read_m = _mix_at_jumps(depth_m, generator)
+    # sigma_z = 0.001 + 0.002 z^2 [m].
+    return read_m + unit_noise * (0.001 + 0.002 * read_m.square())
 
 
 def _mark_steep(depth_m: Depth, focal_px: float, *, is_laser: bool) -> Mask:

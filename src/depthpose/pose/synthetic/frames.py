@@ -253,7 +253,7 @@ def _make_frame(
     image[:, raster.primitive >= 0] = _shade(placed, raster, K, light).mT
     rgb = _photograph(image, generator)
 
-    # Depth, and the objects that are annotated.
+    # Depth, and the objects that are annotated, by what each would show alone.
     focal_px = (config.focal_px[0], config.focal_px[0])  # the window is the whole image
     depth_m = simulate_depth(raster.depth_m, focal_px, config.sensor, generator)
     shown: list[BopObject] = []
