@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Bool, Float, Float64
 from scipy.spatial import KDTree
 from torch import Tensor
 
@@ -71,10 +71,7 @@ def read_colors(path: AnyPath, unit_m: float, model: ObjectModel) -> SurfaceColo
 
     # Those of the shape alone. The shape is read by another reader, which leaves stray bodies out.
     points_m = unit_m * samples.points
-    low_m = model.vertices_m.amin(0).double()
-    high_m = model.vertices_m.amax(0).double()
-    slack_m = _SAME_BOX * float((high_m - low_m).max())
-    is_inside = ((points_m > low_m - slack_m) & (points_m < high_m + slack_m)).all(-1)
+    is_inside = _mark_inside_box(points_m, model)
     if float(is_inside.double().mean()) < _LEAST_INSIDE:
         warnings.warn(
             f"{path}: its colours lie beside its shape, so they are left out; export it as GLB",
@@ -83,6 +80,14 @@ def read_colors(path: AnyPath, unit_m: float, model: ObjectModel) -> SurfaceColo
         )
         return None
     return average_colors(points_m[is_inside], samples.normals[is_inside], samples.rgb[is_inside])
+
+
+def _mark_inside_box(points_m: Float64[Tensor, "n 3"], model: ObjectModel) -> Bool[Tensor, " n"]:
+    """Mark the points that lie in the box about a model."""
+    low_m = model.vertices_m.amin(0).double()
+    high_m = model.vertices_m.amax(0).double()
+    slack_m = _SAME_BOX * float((high_m - low_m).max())
+    return ((points_m > low_m - slack_m) & (points_m < high_m + slack_m)).all(-1)
 
 
 def average_colors(

@@ -17,7 +17,7 @@ from depthpose.pose.types import ObjectModel
 EXACT_SHARE = 0.998
 """Share of the surface within ``EXACT_DEVIATION``; a key or a notch is a few percent of it."""
 _USUAL_SHARE = 0.98  # of the points: the farthest of a scan are stray
-_SAMPLES = 20_000
+_SAMPLES = 20_000  # of the surface: spaced by about a hundredth of the diameter
 _NEAREST_SAMPLES = 4  # of the surface, that are compared with a point in an exact measure
 _ICP_STEPS = 20
 _ICP_SHARE = 0.9  # points that count in each step of ICP
@@ -44,7 +44,7 @@ class SurfaceDeviation:
         self._dense_points = take_evenly(self.points, 5000)  # for exact measures
         self._normals = normals.double().numpy()
         self._tree = KDTree(self.points.numpy())
-        self._rough_tree = KDTree(take_evenly(self.points, 2500).numpy())
+        self._rough_tree = KDTree(take_evenly(self.points, 2500).numpy())  # a fast, coarse one
 
     def find_nearest(self, moved: Float[Tensor, "*batch m 3"]) -> tuple[np.ndarray, np.ndarray]:
         """Find the sample nearest to each point: its distance [diameters] and its index."""

@@ -30,6 +30,7 @@ _STL_HEADER_BYTES = 84  # of a binary STL: 80 of any text, and the number of its
 _STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", 9), ("attribute", "<u2")])
 _NO_AREA = 1e-12  # of the square of the extent: a face of no more is a line or a point
 _LEAST_AREA = 1e-6  # of the squared extent: faces of less in all are no surface; a wire has 0.003
+_FEWEST_POINTS = 4  # of a model: of a tetrahedron
 _FARTHEST = 1e9  # no model has a larger coordinate, in whatever unit; it overflows in float32
 
 
@@ -37,26 +38,29 @@ AnyModel = AnyPath | object  #: a model file, or a mesh of trimesh or Open3D
 FIXED_UNITS: dict[str, Unit] = {".glb": "m"}  #: of formats that fix theirs
 
 
-def unit_of(path: AnyModel, unit: Unit | None) -> Unit:
+def unit_of(model: AnyModel, unit: Unit | None) -> Unit:
     """Find the unit of a model: ``unit``, else that of its format or of the mesh in memory.
 
     Raises:
         InputError: there is none.
     """
-    if isinstance(path, str | Path):
-        declared = unit or FIXED_UNITS.get(Path(path).suffix.lower())
+    if isinstance(model, str | Path):
+        declared = unit or FIXED_UNITS.get(Path(model).suffix.lower())
     else:
-        declared = unit or shape_unit(path)
+        declared = unit or shape_unit(model)
     if declared is None:
         raise InputError(
-            f"{path}: no unit is given, and such a file does not say its own; give --unit mm, "
+            f"{model}: no unit is given, and such a file does not say its own; give --unit mm, "
             "where depth or a cloud is given too --cad-unit mm, or unit: mm in a config"
         )
     return declared
 
 
-def read_geometry(path: AnyModel) -> tuple[np.ndarray, np.ndarray]:
-    """Read points (n, 3) and triangles (m, 3) of a model in its own unit; bare points have none.
+def read_geometry(model: AnyModel) -> tuple[np.ndarray, np.ndarray]:
+    """Read points and triangles of a model, in its own unit.
+
+    Returns:
+        Points (n, 3), and triangles as their indices (m, 3); bare points have no triangles.
 
     Raises:
         InputError: the file is missing, damaged or of another format, has no surface, or bodies far
@@ -65,28 +69,27 @@ def read_geometry(path: AnyModel) -> tuple[np.ndarray, np.ndarray]:
     Warns:
         Notice: a small body far from the rest is left out.
     """
-    # By the reader of its suffix. Bare points need nothing more.
-    if not isinstance(path, str | Path):
-        vertices, faces = shape_geometry(path)
+    # From memory, or by the reader of the file's suffix. Bare points need nothing more.
+    if not isinstance(model, str | Path):
+        vertices, faces = shape_geometry(model)
+    elif (suffix := Path(model).suffix.lower()) in MESH_READERS:
+        vertices, faces = MESH_READERS[suffix](model)
+    elif suffix in CLOUD_READERS:
+        return read_cloud(model).points.double().numpy(), np.empty((0, 3), np.int64)
     else:
-        suffix = Path(path).suffix.lower()
-        if suffix not in MESH_READERS:
-            if suffix not in CLOUD_READERS:
-                suffixes = dict.fromkeys((*MESH_READERS, *CLOUD_READERS))
-                raise refused_suffix(path, "model", tuple(suffixes))
-            return read_cloud(path).points.double().numpy(), np.empty((0, 3), np.int64)
-        vertices, faces = MESH_READERS[suffix](path)
-    if len(vertices) < 4 or not (np.abs(vertices) < _FARTHEST).all():
+        suffixes = dict.fromkeys((*MESH_READERS, *CLOUD_READERS))
+        raise refused_suffix(model, "model", tuple(suffixes))
+    if len(vertices) < _FEWEST_POINTS or not (np.abs(vertices) < _FARTHEST).all():
         raise InputError(
-            f"{path}: holds {len(vertices)} points, or one that is not finite or beyond "
-            f"{_FARTHEST:g}; a model needs 4 and more. Export it again."
+            f"{model}: holds {len(vertices)} points, or one that is not finite or beyond "
+            f"{_FARTHEST:g}; a model needs {_FEWEST_POINTS} and more. Export it again."
         )
 
     # Polygons become triangles, of which those of the part stay.
-    triangles = _convert_to_triangles(str(path), vertices, faces)
+    triangles = _convert_to_triangles(str(model), vertices, faces)
     if len(triangles) == 0:
         return vertices, triangles
-    return _clean_surface(str(path), vertices, triangles)
+    return _clean_surface(str(model), vertices, triangles)
 
 
 def _convert_to_triangles(
@@ -111,8 +114,8 @@ def _clean_surface(
     normals. Holes are no flaw.
 
     Returns:
-        Vertices and faces. Where no body is dropped, the vertices are all those given, unused ones
-        too; else they are those of the remaining faces alone, numbered anew.
+        Vertices and faces. Where no body is dropped, the vertices are the same, unused ones too;
+        else they are those of the remaining faces alone, numbered anew.
 
     Raises:
         InputError: the faces have no area, or bodies lie far from each other.
@@ -130,8 +133,13 @@ def _clean_surface(
     # Points are compared by place, not by index: STL repeats the points of every face.
     unique_points, index_of_vertex = np.unique(vertices, axis=0, return_inverse=True)
     merged = index_of_vertex.reshape(-1)[faces]
-    _, first = np.unique(np.sort(merged, axis=-1), axis=0, return_index=True)
-    is_kept = np.isin(np.arange(len(faces)), first) & (area > _NO_AREA * extent_squared)
+
+    # The first face on its three points, if it has an area.
+    _, first_faces = np.unique(np.sort(merged, axis=-1), axis=0, return_index=True)
+    is_first = np.isin(np.arange(len(faces)), first_faces)
+    is_kept = is_first & (area > _NO_AREA * extent_squared)
+
+    # The part among the bodies of these faces.
     faces = faces[is_kept]
     is_part = mark_part(path, unique_points, merged[is_kept], area[is_kept])
     if is_part.all():
@@ -150,7 +158,7 @@ def _read_ply(path: AnyPath) -> tuple[np.ndarray, Ragged]:
     with np.errstate(invalid="ignore"):  # a signalling NaN is a NaN, and refused as such
         vertices = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], -1)
 
-    # The list of a face has one of several names: vertex_indices, vertex_index, ...
+    # The list of a face's corners has one of several names: vertex_indices, vertex_index, ...
     face_lists = [name for name in lists if name.split()[0] in ("face", "tristrips")]
     index_lists = [name for name in face_lists if name.startswith("face ") and "ind" in name]
     vertex_lists = [name for name in index_lists if "vert" in name] or index_lists
