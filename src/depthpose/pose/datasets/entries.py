@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import torch
 from jaxtyping import Float64
@@ -70,7 +70,17 @@ def check_rows(content: object, source: str) -> list[dict[str, Any]]:
 
 
 def read_numbers(entry: object, key: str, count: int, source: str) -> list[float]:
-    """Read a list of ``count`` finite numbers from an entry; ``source`` names it in errors."""
+    """Read a list of finite numbers from an entry.
+
+    Args:
+        entry: of a file, a mapping.
+        key: of the list in it.
+        count: how many numbers belong there.
+        source: of the entry, in errors.
+
+    Raises:
+        InputError: there is no such list.
+    """
     values = entry.get(key) if isinstance(entry, Mapping) else None
     if not isinstance(values, list) or len(values) != count or not all(map(_is_finite, values)):
         raise InputError(f"{source}: {key} is {_shorten(values)}, where {count} numbers belong")
@@ -78,7 +88,16 @@ def read_numbers(entry: object, key: str, count: int, source: str) -> list[float
 
 
 def read_integer(entry: object, key: str, source: str) -> int:
-    """Read a whole number of 0 or more from an entry; ``source`` names it in errors."""
+    """Read a whole number from 0 to ``LARGEST_ID`` from an entry.
+
+    Args:
+        entry: of a file, a mapping.
+        key: of the number in it.
+        source: of the entry, in errors.
+
+    Raises:
+        InputError: there is no such number.
+    """
     value = entry.get(key) if isinstance(entry, Mapping) else None
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= LARGEST_ID:
         raise InputError(
@@ -88,23 +107,37 @@ def read_integer(entry: object, key: str, source: str) -> int:
 
 
 def read_number(entry: object, key: str, default: float | None, source: str) -> float:
-    """Read a finite number from an entry; ``default``, if any, where the key is missing."""
+    """Read a finite number from an entry.
+
+    Args:
+        entry: of a file, a mapping.
+        key: of the number in it.
+        default: is returned where the key is missing; None: it must be there.
+        source: of the entry, in errors.
+
+    Raises:
+        InputError: there is no such number.
+    """
     value = entry.get(key, default) if isinstance(entry, Mapping) else None
     if not _is_finite(value):
         raise InputError(f"{source}: {key} is {_shorten(value)}, where a number belongs")
     return float(value)
 
 
-def _is_finite(value: Any) -> bool:  # noqa: ANN401  JSON
+def _is_finite(value: Any) -> TypeGuard[float]:  # noqa: ANN401  JSON
     """Whether a value of JSON is a number that is finite as a float; true and false are none."""
     return type(value) in (int, float) and abs(value) < _LARGEST_NUMBER
 
 
 def make_pose(R: list[float], t_mm: list[float], source: str) -> Rigid:
-    """Make a pose of a rotation matrix, row by row, and a translation in mm.
+    """Make a pose of the numbers that a file holds.
 
     The rotation is replaced by the nearest exact one, for published numbers are rounded.
-    ``source`` names the numbers in errors.
+
+    Args:
+        R: nine numbers of the rotation matrix, row by row.
+        t_mm: three of the translation.
+        source: of the numbers, in errors.
 
     Raises:
         InputError: the matrix is no rotation, and is not one that was rounded.

@@ -221,12 +221,12 @@ def read_runs(entry: object, source: str) -> RunLengths:
 
     # Their size.
     size = entry.get("size")
-    is_pair = isinstance(size, list) and len(size) == 2
-    if not is_pair or not all(type(side) is int and side > 0 for side in size):
+    sides = size if isinstance(size, list) else []
+    if len(sides) != 2 or not all(type(side) is int and side > 0 for side in sides):
         raise InputError(f"{what}: its size is {size!r}, where [height, width] belongs")
 
     # Numbers that add up to it.
-    height, width = size
+    height, width = sides
     counts: Any = entry["counts"]
     if isinstance(counts, bytes):
         counts = counts.decode("latin-1")

@@ -22,7 +22,7 @@ def read_or_compute(
     """Read ``compute(model, *settings)`` from the cache, or compute it and write it there.
 
     The cache is ``$DEPTHPOSE_CACHE``, where that can be written to. A file is named by the bytes of
-    the shape, of its symmetries and of the code that computes.
+    the shape, of its symmetries and of the code in the folders of the function and of the meshes.
 
     Args:
         model: the object.
@@ -40,14 +40,15 @@ def read_or_compute(
         tensors.append(symmetries.discrete.R)
     tensors += [axis.direction for axis in symmetries.continuous]
     digest = sha256(f"{symmetries.is_found}".encode())
-    code = {*Path(__file__).parent.glob("*.py"), Path(compute.__code__.co_filename)}
-    for path in sorted(code):
-        digest.update(path.read_bytes())
+    folders = {Path(__file__).parent, Path(compute.__code__.co_filename).parent}
+    for folder in sorted(folders):
+        for path in sorted(folder.glob("*.py")):
+            digest.update(path.read_bytes())
     for tensor in tensors:
         digest.update(tensor.contiguous().numpy().tobytes())
 
-    folder = "_".join(map(str, (name, *settings)))
-    path = cache_folder() / folder / f"{digest.hexdigest()}.json"
+    name_with_settings = "_".join(map(str, (name, *settings)))
+    path = cache_folder() / name_with_settings / f"{digest.hexdigest()}.json"
     try:
         return read_json(path)
     except (InputError, OSError):

@@ -89,15 +89,16 @@ class SurfaceDeviation:
         is_exact = share >= EXACT_SHARE
         points = self._dense_points if is_exact else self.compared_points
         count = _NEAREST_SAMPLES if is_exact else 1
-        spacing = 2.0 / math.sqrt(len(self.points))
-        moved = motion.apply(points)
-        nearest = self._tree.query(moved.numpy(), k=count, workers=torch.get_num_threads())
-        distance, index = (np.reshape(part, (*moved.shape[:-1], count)) for part in nearest)
+        moved = motion.apply(points).numpy()
+        distance, index = self._tree.query(moved, k=count, workers=torch.get_num_threads())
+        distance = np.reshape(distance, (*moved.shape[:-1], count))
+        index = np.reshape(index, distance.shape)
 
         # Between samples the distance is that to the tangent plane, beside an edge that to the
         # sample. The least of several samples counts, since the nearest one may lie on the other
         # side of an edge.
-        gap = moved.numpy()[..., None, :] - self.points.numpy()[index]
+        spacing = 2.0 / math.sqrt(len(self.points))  # about the largest of samples, in diameters
+        gap = moved[..., None, :] - self.points.numpy()[index]
         height = np.abs((gap * self._normals[index]).sum(-1))
         beside = np.maximum(distance - spacing, 0)
         distance_to_surface = np.maximum(height, beside).min(-1)

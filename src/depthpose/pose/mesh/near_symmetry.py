@@ -121,7 +121,7 @@ def _search_near_symmetries(model: ObjectModel) -> dict[str, Any]:
     # The best, each far from better ones and from all copies of these that look alike.
     exact = _select_exact(model.symmetries, exactness)
     exact_R = symmetry_transforms(exact, _FINE_AXIS_STEP_RAD).R.double()
-    better_R = _EYE @ exact_R
+    better_R = exact_R
     near: list[tuple[list[list[float]], float]] = []
     for deviation, motion in sorted(candidates, key=lambda candidate: candidate.deviation):
         if len(near) == _MOST_NEAR or deviation > 2 * _NEAR_TOLERANCE:

@@ -107,7 +107,7 @@ def propose_in_frame(
     for stage in _STAGES:
         poses = refine_projectively(frame, poses, surface, stage)
         score = score_by_image(frame, poses, surface, stage)
-        best = _best_distinct(poses, score, surface, stage.most)
+        best = _choose_distinct(poses, score, surface, stage.most)
         poses = poses[best]
         score = score[best]
     is_good = score >= _LEAST_SCORE
@@ -159,7 +159,7 @@ def _scene_points(
     return mean_m[is_one_surface], normalize(mean_normal[is_one_surface], dim=-1)
 
 
-def _best_distinct(
+def _choose_distinct(
     poses: Rigid, score: Float64[Tensor, " b"], surface: Surface, most: int
 ) -> Int64[Tensor, " c"]:
     """Choose the best poses, ``most`` of them, without any near a better one; as indices."""

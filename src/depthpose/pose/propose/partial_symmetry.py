@@ -24,9 +24,9 @@ _SELF_PEAKS = 48
 _SELF_COMPARED = 250
 """Points of the surface by which motions are compared."""
 _LEAST_SHARE = 0.25
-"""Least share of the surface that a motion must move onto the surface."""
+"""Share of the surface that a motion must move onto the surface, at least."""
 _LEAST_OF_BEST = 0.85
-"""Least ratio of that share to the share of the best motion."""
+"""That share over the share of the best motion, at least."""
 _NEAR_SYMMETRY = 0.8
 """Share from which a motion is a near-symmetry, and may differ little from another motion."""
 _MIN_COSINE = 0.7
@@ -82,7 +82,7 @@ class _Choice(NamedTuple):
 
 
 def _choose_distinct(motions: Rigid, surface: Surface) -> _Choice:
-    """Choose the motions after which most of a surface lies on itself.
+    """Choose the motions that move the largest share of a surface onto itself.
 
     None is within 12 degrees of a better one, of a symmetry, or of a product of these; one that is
     no near-symmetry is not within 60 degrees, since any small motion leaves the surface near
@@ -92,8 +92,9 @@ def _choose_distinct(motions: Rigid, surface: Surface) -> _Choice:
     chosen: list[int] = []
     excluded_R = surface.symmetries.R  # of symmetries, and of chosen motions after them
     for k in share.argsort(descending=True).tolist():
-        least = _LEAST_OF_BEST * float(share[chosen[0]]) if chosen else _LEAST_SHARE
-        if share[k] < max(least, _LEAST_SHARE) or len(chosen) == _MOST_MOTIONS:
+        best_share = float(share[chosen[0]]) if chosen else 0.0
+        least_share = max(_LEAST_OF_BEST * best_share, _LEAST_SHARE)
+        if share[k] < least_share or len(chosen) == _MOST_MOTIONS:
             break
         limit_rad = _APART_RAD if share[k] >= _NEAR_SYMMETRY else _FAR_APART_RAD
         R = motions.R[k]

@@ -194,10 +194,12 @@ def _mix_at_jumps(depth_m: Depth, generator: torch.Generator) -> Depth:
 
 
 def draw_smooth_noise(size: tuple[int, int], width_px: float, generator: torch.Generator) -> Depth:
-    """Draw normal noise of deviation 1, correlated between neighbours.
+    """Draw normal noise of standard deviation 1, which neighbours share.
 
-    It is white noise convolved with a Gaussian of deviation ``width_px``, 0 for white noise;
-    ``size`` is rows and columns.
+    Args:
+        size: rows and columns.
+        width_px: standard deviation of the Gaussian by which white noise is smoothed; 0: it is not.
+        generator: of random numbers.
     """
     # White noise, with a margin for the Gaussian.
     radius = math.ceil(3 * width_px)

@@ -169,7 +169,13 @@ def _make_plate(
 
 
 def make_ring(outer: np.ndarray, inner: np.ndarray, height: float) -> Mesh:
-    """Extrude the area between two outlines of equally many corners, from -height/2 to height/2."""
+    """Extrude the area between two outlines of equally many corners along z.
+
+    Args:
+        outer: corners in x and y, counter-clockwise (n, 2).
+        inner: those of the hole (n, 2).
+        height: the ring reaches from -height/2 to height/2.
+    """
     low = np.full((len(outer), 1), -height / 2)
     high = np.full((len(outer), 1), height / 2)
     loops = [

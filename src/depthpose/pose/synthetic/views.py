@@ -104,6 +104,11 @@ def find_window(
 ) -> tuple[Float[Tensor, "3 3"], int, int]:
     """Find the window of an image in which an object lies, with a margin.
 
+    Args:
+        shape: of the object.
+        pose: ``camera_from_model``.
+        K: intrinsic matrix of the image.
+
     Returns:
         The intrinsic matrix of the window, its width and its height.
     """
@@ -116,7 +121,7 @@ def find_window(
 
 
 def render_view(shape: Shape, pose: Rigid, K: Float[Tensor, "3 3"]) -> CleanView:
-    """Render an object at the pose ``camera_from_model``, in the window of the image around it."""
+    """Render an object in the window around it; the arguments are those of :func:`find_window`."""
     window_K, width, height = find_window(shape, pose, K)
     # float64 poses: the corners are rounded once.
     triangles = (shape.triangles_m.double() @ pose.R.mT + pose.t_m).float()

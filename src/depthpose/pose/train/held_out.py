@@ -105,7 +105,13 @@ def make_held_out_views(
 
 
 def measure_add(estimated: Rigid | None, truth: Rigid, model: ObjectModel) -> float:
-    """Measure ADD to the nearest symmetric pose, in diameters; infinite without an estimate."""
+    """Measure the ADD of a pose to the nearest symmetric copy of the truth, in diameters.
+
+    Args:
+        estimated: ``camera_from_model``; None: there is no estimate, and the error is infinite.
+        truth: the true pose.
+        model: of the object.
+    """
     if estimated is None:
         return math.inf
     points_m, _ = sample_surface(model, _SURFACE_POINTS)
