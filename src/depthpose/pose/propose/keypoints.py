@@ -288,7 +288,8 @@ def _cross_pairs(
     x1, n1 = _select_lines(lines, first)
     x2, n2 = _select_lines(lines, second)
 
-    # The points of the perpendicular on both lines.
+    # The feet of the perpendicular: with gap = x1 - x2, c = n1 . n2, d = n1 . gap, e = n2 . gap
+    # they are x1 + n1 (c e - d) / (1 - c^2) and x2 + n2 (e - c d) / (1 - c^2).
     gap = x1 - x2
     cosine = (n1 * n2).sum(-2, keepdim=True)
     d = (n1 * gap).sum(-2, keepdim=True)

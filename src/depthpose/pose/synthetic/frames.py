@@ -381,8 +381,7 @@ _PILE_POINTS = 20_000  # of a body's surface, which land on the height map
 class _Drop(NamedTuple):
     """A body that was dropped on a pile."""
 
-    height_m: float  #: of its middle
-    pose: Rigid  #: in the table's frame
+    pose: Rigid  #: of the body about its middle, in the table's frame
     cell: Int64[Tensor, " n"]  #: of the height map, of each of its points
     top_m: Float[Tensor, " n"]  #: height of each of its points
 
@@ -397,38 +396,56 @@ def _drop_pile(
 
     Of several drops of each copy the one is taken by which its middle comes to lie lowest.
     """
-    # One of the objects, and a map of the pile's height.
+    # One of the objects, about the middle of its box.
     chosen = random_index(generator, len(solids))
-    points, _ = sample_surface(models[chosen], _PILE_POINTS)
-    middle = (points.amin(0) + points.amax(0)) / 2
-    points = points - middle
-    radius_m = float(points.norm(dim=1).max())
-    reach_m = 0.6 * radius_m * math.sqrt(config.frame_pile)
-    cells = math.ceil((reach_m + radius_m) / _CELL_M)
-    side = 2 * cells + 1
-    height_m = torch.zeros(side**2)
+    points_m, _ = sample_surface(models[chosen], _PILE_POINTS)
+    middle_m = (points_m.amin(0) + points_m.amax(0)) / 2
+    points_m = points_m - middle_m
 
+    # A map of the pile's height, about the middle of the table.
+    radius_m = float(points_m.norm(dim=1).max())
+    reach_m = 0.6 * radius_m * math.sqrt(config.frame_pile)
+    cells = math.ceil((reach_m + radius_m) / _CELL_M)  # from the middle to each side
+    height_m = torch.zeros((2 * cells + 1) ** 2)
+
+    # Of several drops the lowest is taken, and the pile grows by it.
     placed: list[PlacedSolid] = []
     for _ in range(config.frame_pile):
-        # Several drops: turned and shifted at random, and as low as the pile lets them.
-        drops: list[_Drop] = []
-        for _ in range(_DROPS):
-            R = random_rotation(generator).float()
-            x, y = (uniform(generator, -reach_m, reach_m) for _ in range(2))
-            moved = points @ R.mT + torch.tensor([x, y, 0.0])
-            column, row = ((moved[:, :2] / _CELL_M).round().long() + cells).unbind(1)
-            cell = row * side + column
-            bottom = torch.full_like(height_m, math.inf)
-            bottom = bottom.scatter_reduce(0, cell, moved[:, 2], "amin")
-            z = float((height_m - bottom)[bottom.isfinite()].max())
-            pose = Rigid(R, torch.tensor([x, y, z]) - R @ middle)
-            drops.append(_Drop(z, pose, cell, moved[:, 2] + z))
-
-        # The lowest is taken, and the pile grows by it.
-        lowest = min(drops, key=lambda drop: drop.height_m)
+        drops = [_drop_body(points_m, height_m, cells, reach_m, generator) for _ in range(_DROPS)]
+        lowest = min(drops, key=lambda drop: float(drop.pose.t_m[2]))
         height_m = height_m.scatter_reduce(0, lowest.cell, lowest.top_m, "amax")
-        placed.append(PlacedSolid(solids[chosen], lowest.pose))
+        pose = Rigid(lowest.pose.R, lowest.pose.t_m - lowest.pose.R @ middle_m)
+        placed.append(PlacedSolid(solids[chosen], pose))
     return placed
+
+
+def _drop_body(
+    points_m: Float[Tensor, "n 3"],
+    height_m: Float[Tensor, " cells"],
+    cells: int,
+    reach_m: float,
+    generator: torch.Generator,
+) -> _Drop:
+    """Drop a body on a pile: rotated and shifted at random, and as low as the pile lets it.
+
+    Args:
+        points_m: of its surface, about its middle.
+        height_m: of the pile in each cell, row after row.
+        cells: from the middle of the table to each side of the map.
+        reach_m: largest shift along x and y.
+        generator: of random numbers.
+    """
+    R = random_rotation(generator).float()
+    x, y = (uniform(generator, -reach_m, reach_m) for _ in range(2))
+    moved_m = points_m @ R.mT + torch.tensor([x, y, 0.0])
+    column, row = ((moved_m[:, :2] / _CELL_M).round().long() + cells).unbind(1)
+    cell = row * (2 * cells + 1) + column
+
+    # The body rises until its lowest point in each cell is above the pile.
+    bottom_m = torch.full_like(height_m, math.inf)
+    bottom_m = bottom_m.scatter_reduce(0, cell, moved_m[:, 2], "amin")
+    z = float((height_m - bottom_m)[bottom_m.isfinite()].max())
+    return _Drop(pose=Rigid(R, torch.tensor([x, y, z])), cell=cell, top_m=moved_m[:, 2] + z)
 
 
 def _draw_viewpoint(config: ObjectsConfig, generator: torch.Generator) -> Rigid:
@@ -440,9 +457,13 @@ def _draw_viewpoint(config: ObjectsConfig, generator: torch.Generator) -> Rigid:
     elevation = math.radians(uniform(generator, 25.0, 85.0))
     azimuth = uniform(generator, 0.0, 2 * math.pi)
     distance_m = uniform(generator, *config.distance_m)
-    flat = math.cos(elevation)
-    eye = [flat * math.cos(azimuth), flat * math.sin(azimuth), math.sin(elevation)]
-    forward = -torch.tensor(eye)
+    along_table = math.cos(elevation)
+    toward_camera = [
+        along_table * math.cos(azimuth),
+        along_table * math.sin(azimuth),
+        math.sin(elevation),
+    ]
+    forward = -torch.tensor(toward_camera)
     right = F.normalize(torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0])), dim=0)
     R = torch.stack([right, torch.linalg.cross(forward, right), forward])
 
@@ -452,4 +473,4 @@ def _draw_viewpoint(config: ObjectsConfig, generator: torch.Generator) -> Rigid:
     sine = math.sin(roll)
     R = torch.tensor([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]]) @ R
     target = torch.tensor([uniform(generator, -0.05, 0.05), uniform(generator, -0.05, 0.05), 0.03])
-    return Rigid(R, -R @ (target + distance_m * torch.tensor(eye)))
+    return Rigid(R, -R @ (target + distance_m * torch.tensor(toward_camera)))
