@@ -119,7 +119,10 @@ class BopDataset:
         )
 
     def of_objects(self, *objects: int | str) -> "BopDataset":
-        """Keep the instances of some objects, by number or name; digits are a number too.
+        """Select the instances of some objects, as a data set of these alone.
+
+        Args:
+            objects: their numbers or names; digits are a number too.
 
         Raises:
             InputError: none is left.

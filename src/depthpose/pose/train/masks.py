@@ -51,6 +51,13 @@ class LabelledImage(NamedTuple):
     labels: Int[Tensor, "*b h w"]  #: 0 is the background, ``1 + i`` object i
 
 
+class _StoredImage(NamedTuple):
+    """A labelled image in less memory."""
+
+    rgb: UInt8[Tensor, "3 h w"]  #: 0 to 255
+    labels: UInt8[Tensor, "h w"]  #: class of each pixel
+
+
 _ABOUT_OBJECT_SHARE = 0.5  # of the windows: most of an image is background
 
 
@@ -80,7 +87,8 @@ class AnnotatedImages:
 
         # The objects that are classes: ``objects``, or those that the config wants and images show.
         if objects is None:
-            shown_numbers = sorted({i.object_id for shown in images.values() for i in shown})
+            shown = [instance for instances in images.values() for instance in instances]
+            shown_numbers = sorted({instance.object_id for instance in shown})
             wanted = [n for n in shown_numbers if not config.objects or n in config.objects]
             if not wanted:
                 raise InputError(
@@ -91,7 +99,7 @@ class AnnotatedImages:
         self.objects = objects  # names by number, in the order of the classes
         self._class_of = {number: k for k, number in enumerate(objects, 1)}
         self._images = list(images.values())
-        self._cache: dict[int, tuple[UInt8[Tensor, "3 h w"], UInt8[Tensor, "h w"]]] = {}
+        self._cache: dict[int, _StoredImage] = {}
         self._with_cache = config.with_cache
 
     def __len__(self) -> int:
@@ -104,17 +112,10 @@ class AnnotatedImages:
             stored = self._read(self._images[index])
             if self._with_cache:
                 self._cache[index] = stored
-        image, labels = stored
-        return LabelledImage(image.float() / 255, labels.long())
+        return LabelledImage(stored.rgb.float() / 255, stored.labels.long())
 
-    def _read(
-        self, instances: list[Instance]
-    ) -> tuple[UInt8[Tensor, "3 h w"], UInt8[Tensor, "h w"]]:
-        """Read the image that shows some instances, and label the pixels of their masks.
-
-        Returns:
-            RGB from 0 to 255, and the class of each pixel.
-        """
+    def _read(self, instances: list[Instance]) -> _StoredImage:
+        """Read the image that shows some instances, and label the pixels of their masks."""
         path = instances[0].rgb
         assert path is not None
         image = read_image(path)
@@ -130,7 +131,7 @@ class AnnotatedImages:
                     f"picture {labels.shape[1]}x{labels.shape[0]}; one of them is another's"
                 )
             labels[mask] = number
-        return (image * 255).round().to(torch.uint8), labels
+        return _StoredImage((image * 255).round().to(torch.uint8), labels)
 
 
 @dataclass(frozen=True, eq=False)
