@@ -209,20 +209,15 @@ def _parse_coco_entry(
     elif "file_name" not in row:
         image_file = row.get("image_id")
 
-    # The mask, or the box; and the time, which is negative where it is not known.
+    # The time is negative where it is not known.
     seconds = read_number(row, "time", -1.0, source)
     segmentation = row.get("segmentation")
-    box = None
-    if row.get("bbox") is not None and not segmentation:
-        left, top, width, height = read_numbers(row, "bbox", 4, source)
-        if [left, top, width, height] != _NO_BOX:
-            box = (left, top, left + width, top + height)
     try:
         return Detection(
             object=None if name is None else str(name),
             object_id=object_id,
             score=read_number(row, "score", 1.0, source),
-            box=box,
+            box=None if segmentation else _read_coco_box(row, source),
             segmentation=read_runs(segmentation, source) if segmentation else None,
             scene_id=read_integer(row, "scene_id", source) if "scene_id" in row else None,
             image_id=image_id,
@@ -232,6 +227,16 @@ def _parse_coco_entry(
     except InputError as error:
         reason = str(error)
         raise InputError(reason if source in reason else f"{source}: {reason}") from error
+
+
+def _read_coco_box(row: dict[str, Any], source: str) -> Box | None:
+    """Read left, top, width and height of an entry as a box; None where it has none."""
+    if row.get("bbox") is None:
+        return None
+    left, top, width, height = read_numbers(row, "bbox", 4, source)
+    if [left, top, width, height] == _NO_BOX:
+        return None
+    return left, top, left + width, top + height
 
 
 def _read_yolo(path: Path, size: tuple[int, int] | None) -> list[Detection]:
