@@ -367,14 +367,13 @@ def _write_pose_card(
     # The objects, and the rotations that no view of them may tell apart.
     objects = ", ".join(f"{m.name} ({1000 * m.diameter_m:.0f} mm)" for m in weights.models)
     facts = {"objects": objects}
-    rotations = {
-        model.name: near_symmetry_lines(model)[:_ROTATIONS_ON_CARD] for model in weights.models
-    }
-    near_symmetries = "; ".join(
-        f"{name}: {', '.join(lines)}" for name, lines in rotations.items() if lines
-    )
+    near_symmetries: list[str] = []
+    for model in weights.models:
+        rotations = near_symmetry_lines(model)[:_ROTATIONS_ON_CARD]
+        if rotations:
+            near_symmetries.append(f"{model.name}: {', '.join(rotations)}")
     if near_symmetries:
-        facts["nearly_alike"] = near_symmetries
+        facts["nearly_alike"] = "; ".join(near_symmetries)
     write_card(path, command, seconds, facts | dict(weights.facts), held_out)
 
 
@@ -392,22 +391,20 @@ def _copy_start(network: AnyNetwork, start: str, samples: TrainingViews[Any]) ->
     Raises:
         InputError: the file is of another network, or of other settings.
     """
-    # The two networks may differ in some settings.
+    # A network with batch norm takes up the biases that written weights have in place of norms.
     path = find_weights(start)
     loaded = build_pose_network(read_checkpoint(path), str(path))
-    has_norms = isinstance(network, ResUNet) and network.config.norm == "batch"
-    independent = () if isinstance(network, DepthImageNet) else ("classes",)
-    if has_norms:
-        independent = ("classes", "norm", "with_bias")
-    refuse_other_network(network, loaded, start, independent)
-
-    # Written weights are folded: they have biases in place of norms, which a network with batch
-    # norm has to take up.
-    if has_norms and isinstance(network, ResUNet) and isinstance(loaded, ResUNet):
+    if isinstance(network, ResUNet) and network.config.norm == "batch":
+        refuse_other_network(network, loaded, start, ("classes", "norm", "with_bias"))
+        assert isinstance(loaded, ResUNet)
         assert isinstance(samples, TrainingClouds)
         batch = samples.collate([samples[index] for index in range(_STATISTICS_CLOUDS)])
         unfold_norms(loaded, network, Voxels.from_points(batch.coordinates, batch.features))
         return
+
+    # Others are copied, but for the last layer of other objects.
+    may_differ = () if isinstance(network, DepthImageNet) else ("classes",)
+    refuse_other_network(network, loaded, start, may_differ)
     state = loaded.state_dict()
     if loaded.config.classes != network.config.classes:
         initial = network.state_dict()
