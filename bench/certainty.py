@@ -23,7 +23,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.config import ObjectsConfig, SyntheticSensorConfig
 from depthpose.pose.copies import SymmetricCopies, find_copies
 from depthpose.pose.network_pose import GeoPoseNet
-from depthpose.pose.synthetic import Objects
+from depthpose.pose.synthetic import SyntheticViews
 from depthpose.pose.weights import read_pose_weights
 from depthpose.report.page import format_markdown_table, write_table
 
@@ -56,7 +56,7 @@ def answers_of(name: str, number: int) -> Iterator[Answer | None]:
             number=count, seed=SEED + third, views=None, resolution=(1.0, 1.0), occluded_share=0.7,
             occlusion=(0.0, 0.6), sensor=SyntheticSensorConfig(noise=(0.5 * noise, 1.5 * noise)),
         )  # fmt: skip
-        views = Objects(weights.models, config, weights.cloud)
+        views = SyntheticViews(weights.models, config, weights.cloud)
         for index in range(count):
             view = views[index]
             estimate = net.estimate_many([view.input])[0]

@@ -30,7 +30,8 @@ from depthpose.pose.config import IcpConfig, SensorKind, SyntheticSensorConfig
 from depthpose.pose.icp import refine_pose
 from depthpose.pose.mesh import drawn_triangles
 from depthpose.pose.surface import prepare_surface
-from depthpose.pose.synthetic.views import random_rotation, simulate_depth
+from depthpose.pose.synthetic.depth_sensors import simulate_depth
+from depthpose.pose.synthetic.random_numbers import random_rotation
 from depthpose.report.page import format_markdown_table
 
 KINDS: tuple[SensorKind, ...] = ("structured light", "active stereo", "time of flight", "laser")

@@ -23,7 +23,7 @@ from depthpose.pose.synthetic.parts import (
     revolve,
     rotate,
 )
-from depthpose.pose.synthetic.views import random_index, random_rotation, uniform
+from depthpose.pose.synthetic.random_numbers import random_index, random_rotation, uniform
 from depthpose.pose.types import ObjectModel
 
 NegativeKind = Literal[

@@ -23,8 +23,8 @@ from depthpose.pose.config import EstimateConfig
 from depthpose.pose.metrics import SUCCESS_SHARE
 from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.pose.registration import Registration
-from depthpose.pose.train.clouds import make_held_out_objects, measure_add
 from depthpose.pose.train.config import PoseTraining
+from depthpose.pose.train.held_out import make_held_out_views, measure_add
 from depthpose.pose.weights import PoseWeights, read_pose_weights
 from depthpose.report.page import format_markdown_table
 
@@ -69,9 +69,7 @@ def measure(weights: PoseWeights, number: int) -> list[dict[str, Any]]:
     rows = []
     for share in (0.0, 0.3):
         held_out = dataclasses.replace(config.held_out, number=number)
-        views = make_held_out_objects(
-            weights.models, config.objects, weights.cloud, held_out, share
-        )
+        views = make_held_out_views(weights.models, config.objects, weights.cloud, held_out, share)
         samples = [views.view(index) for index in range(len(views))]
         for name, method in methods.items():
             estimates = method.estimate_many([sample.input for sample in samples])

@@ -41,8 +41,10 @@ from depthpose.pose.config import SyntheticSensorConfig
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.metrics import SUCCESS_SHARE, adds_m
 from depthpose.pose.registration import Registration
+from depthpose.pose.synthetic.depth_sensors import simulate_depth
 from depthpose.pose.synthetic.parts import PARTS, make_part
-from depthpose.pose.synthetic.views import draw_view, make_shape, random_rotation, simulate_depth
+from depthpose.pose.synthetic.random_numbers import random_rotation
+from depthpose.pose.synthetic.views import make_shape, render_view
 from depthpose.pose.types import ViewInput
 from depthpose.report.page import format_markdown_table
 
@@ -184,7 +186,7 @@ def add_part(
 
 def mask_of(name: str, pose: Rigid, K: Tensor, depth_m: Tensor) -> Tensor:
     """Compute the pixels in which a part is visible."""
-    part = draw_view(make_shape(make_part(name)), pose, K.double())
+    part = render_view(make_shape(make_part(name)), pose, K.double())
     left, top = (K.double()[:2, 2] - part.K[:2, 2]).round().long().tolist()
     height, width = part.depth_m.shape
     rows = slice(max(top, 0), min(top + height, depth_m.shape[0]))

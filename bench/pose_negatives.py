@@ -32,8 +32,8 @@ from depthpose.pose.estimator import PoseEstimator
 from depthpose.pose.mesh import MIRROR_ALIKE, mirror_deviation
 from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.pose.registration import Registration
-from depthpose.pose.synthetic import Objects
-from depthpose.pose.train.clouds import measure_add
+from depthpose.pose.synthetic import SyntheticViews
+from depthpose.pose.train.held_out import measure_add
 from depthpose.pose.types import CloudSample, ObjectModel, ViewSample
 from depthpose.report.page import format_markdown_table
 
@@ -53,7 +53,7 @@ def render_views(
         number=len(models), seed=seed, views=None, resolution=(1.0, 1.0), occluded_share=0.5,
         occlusion=(0.0, 0.5),
     )  # fmt: skip
-    objects = Objects(models, config)
+    objects = SyntheticViews(models, config)
     return (objects.view(k) if with_scene else objects[k] for k in range(len(models)))
 
 

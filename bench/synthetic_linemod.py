@@ -37,7 +37,7 @@ from depthpose.pose.mesh import sample_surface
 from depthpose.pose.metrics import add_m, adds_m
 from depthpose.pose.network_pose import DepthImageRegressor, GeoPoseNet
 from depthpose.pose.registration import Registration
-from depthpose.pose.synthetic import PARTS, Objects, make_part
+from depthpose.pose.synthetic import PARTS, SyntheticViews, make_part
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput, ViewSample
 from depthpose.pose.weights import read_pose_weights
 from depthpose.report.page import format_markdown_table, write_table
@@ -71,7 +71,9 @@ class Method(NamedTuple):
     limit: int
 
 
-def synthetic_views(models: Sequence[ObjectModel], condition: Condition, number: int) -> Objects:
+def synthetic_views(
+    models: Sequence[ObjectModel], condition: Condition, number: int
+) -> SyntheticViews:
     """Render ``number`` views of each object under a condition."""
     config = ObjectsConfig(
         number=number * len(models), seed=SEED, views=None,
@@ -82,7 +84,7 @@ def synthetic_views(models: Sequence[ObjectModel], condition: Condition, number:
             kinds=(condition.sensor,), noise=(condition.noise, condition.noise)
         ),
     )  # fmt: skip
-    return Objects(models, config)
+    return SyntheticViews(models, config)
 
 
 def trained_methods(

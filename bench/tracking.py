@@ -37,7 +37,8 @@ from depthpose.pose.config import SyntheticSensorConfig
 from depthpose.pose.mesh import drawn_triangles, sample_surface
 from depthpose.pose.metrics import add_m, adds_m
 from depthpose.pose.network_pose import GeoPoseNet
-from depthpose.pose.synthetic.views import random_rotation, simulate_depth
+from depthpose.pose.synthetic.depth_sensors import simulate_depth
+from depthpose.pose.synthetic.random_numbers import random_rotation
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 from depthpose.report.page import format_markdown_table
 

@@ -20,6 +20,7 @@ from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import SensorKind, SyntheticSensorConfig
 from depthpose.pose.mesh import drawn_triangles
+from depthpose.pose.synthetic.depth_sensors import simulate_depth
 from depthpose.pose.synthetic.parts import (
     Mesh,
     join,
@@ -30,7 +31,7 @@ from depthpose.pose.synthetic.parts import (
     revolve,
     rotate,
 )
-from depthpose.pose.synthetic.views import random_rotation, simulate_depth, uniform
+from depthpose.pose.synthetic.random_numbers import random_rotation, uniform
 from depthpose.pose.types import ObjectModel
 
 FOCAL_PX = 570.0

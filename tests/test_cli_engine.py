@@ -39,7 +39,7 @@ from depthpose.core.files import (
     write_image,
 )
 from depthpose.pose.config import ObjectsConfig
-from depthpose.pose.synthetic import Objects, make_part
+from depthpose.pose.synthetic import SyntheticViews, make_part
 from depthpose.pose.weights import write_pose_weights
 
 RIG = {"width": 64, "height": 48, "K": [[70, 0, 31.5], [0, 70, 23.5], [0, 0, 1]], "baseline_m": 0.5}
@@ -293,7 +293,9 @@ def test_a_cad_file_alone_is_registered_by_workers_too(
     tmp_path: Path, double: InProcessEngine
 ) -> None:
     write_part("connector", tmp_path)
-    views = Objects([make_part("connector")], ObjectsConfig(views=None, occluded_share=0.0, seed=5))
+    views = SyntheticViews(
+        [make_part("connector")], ObjectsConfig(views=None, occluded_share=0.0, seed=5)
+    )
     write_cloud(tmp_path / "in" / "0.ply", PointCloud(points=1000 * views[0].input.points_m))
     words = ["pose", "predict", "--method", "register", "--cad", str(tmp_path / "connector.stl"),
              "--unit", "mm", "--cloud", str(tmp_path / "in"), "--out"]  # fmt: skip

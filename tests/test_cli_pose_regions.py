@@ -23,7 +23,7 @@ from depthpose.cli import main, pose_methods
 from depthpose.core.camera import Camera, write_camera
 from depthpose.core.files import read_image, write_depth_png
 from depthpose.pose.datasets import encode_rle
-from depthpose.pose.datasets.masks import mask_box
+from depthpose.pose.datasets.masks import find_mask_box
 from depthpose.pose.search import nothing_found
 from depthpose.pose.types import PoseEstimate, ViewInput
 from depthpose.pose.weights import write_pose_weights
@@ -64,7 +64,7 @@ def assert_right(rows: dict[str, dict], expected: dict[str, str]) -> None:
 
 
 def edges(mask: torch.Tensor, more: int = 2) -> list[int]:
-    left, top, width, height = mask_box(mask)
+    left, top, width, height = find_mask_box(mask)
     return [left - more, top - more, left + width + more, top + height + more]
 
 

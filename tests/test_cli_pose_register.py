@@ -20,7 +20,7 @@ from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.datasets import write_bop_models, write_bop_scene
 from depthpose.pose.inputs import rigid_input
 from depthpose.pose.metrics import add_m
-from depthpose.pose.synthetic import Objects, make_part
+from depthpose.pose.synthetic import SyntheticViews, make_part
 
 
 @pytest.fixture
@@ -36,7 +36,7 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("part")
     write_part("bracket", folder)
     config = ObjectsConfig(views=None, resolution=(1.0, 1.0), occluded_share=0.0, seed=5)
-    views = Objects([make_part("bracket")], config)
+    views = SyntheticViews([make_part("bracket")], config)
     write_cloud(folder / "scan.ply", PointCloud(points=1000 * views[0].input.points_m))
     window = views.view(0).input
     centre_px = torch.tensor(config.centre_px)

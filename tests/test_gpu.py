@@ -10,7 +10,7 @@ from depthpose import FakestereoNet, GeoPoseNet
 from depthpose.core.rigid import geodesic_rad
 from depthpose.depth.config import MatcherConfig
 from depthpose.pose.config import EstimateConfig, ObjectsConfig
-from depthpose.pose.synthetic import Objects
+from depthpose.pose.synthetic import SyntheticViews
 
 pytestmark = [
     pytest.mark.gpu,
@@ -21,7 +21,7 @@ pytestmark = [
 def test_poses_are_those_of_the_cpu() -> None:
     on_cpu = GeoPoseNet.load("parts")
     on_gpu = GeoPoseNet.load("parts", config=EstimateConfig(device="cuda"))
-    views = Objects(
+    views = SyntheticViews(
         on_cpu.weights.models, ObjectsConfig(number=20, views=None), on_cpu.weights.cloud
     )
     inputs = [views.view(index).input for index in range(len(views))]

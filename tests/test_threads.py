@@ -10,7 +10,7 @@ from depthpose import FakestereoNet, GeoPoseNet, Registration
 from depthpose.core.devices import map_in_threads
 from depthpose.core.errors import InputError
 from depthpose.pose.config import ObjectsConfig
-from depthpose.pose.synthetic import Objects, make_part
+from depthpose.pose.synthetic import SyntheticViews, make_part
 from depthpose.pose.types import CloudInput, PoseEstimate
 
 Estimate = Callable[[int], list[torch.Tensor]]
@@ -28,7 +28,7 @@ def _depth() -> Estimate:
 
 
 def _poses(net: GeoPoseNet | Registration) -> Estimate:
-    views = Objects([make_part("connector")], ObjectsConfig(views=None, seed=5))
+    views = SyntheticViews([make_part("connector")], ObjectsConfig(views=None, seed=5))
     given = [views[k].input for k in range(3)]
     inputs = [CloudInput(name=g.name, points_m=g.points_m, object="connector") for g in given]
     return lambda k: _pose_numbers(net.estimate_many([inputs[k % 3]])[0])

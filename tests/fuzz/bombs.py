@@ -41,7 +41,7 @@ from depthpose.depth.datasets.frames import read_plain_calibration
 from depthpose.depth.train import STAGES
 from depthpose.depth.weights import read_depth_weights
 from depthpose.pose.datasets import read_detections, read_mask
-from depthpose.pose.datasets.layouts import read_mapping
+from depthpose.pose.datasets.entries import read_mapping
 from depthpose.pose.mesh import read_model
 from depthpose.pose.predictions import read_bop_results
 

@@ -47,7 +47,8 @@ from depthpose.depth.train import STAGES as DEPTH_STAGES
 from depthpose.depth.types import RawFrame
 from depthpose.depth.weights import read_depth_weights, write_depth_weights
 from depthpose.pose.datasets import open_bop, read_detections, read_mask
-from depthpose.pose.datasets.layouts import read_mapping
+from depthpose.pose.datasets.entries import read_mapping
+from depthpose.pose.datasets.masks import RunLengths
 from depthpose.pose.mesh import read_model
 from depthpose.pose.predictions import read_bop_results, read_predictions
 from depthpose.pose.train import STAGES as POSE_STAGES
@@ -399,7 +400,7 @@ def open_bop_results(home: Path) -> dict[str, Kind]:
 
     pose = pose_in_frame(0.1, 3)
     detection = Detection(scene_id=0, image_id=1, object_id=7, score=0.5,
-                          segmentation=((3, 4, 13), 4, 5))  # fmt: skip
+                          segmentation=RunLengths((3, 4, 13), 4, 5))  # fmt: skip
     write_detections(home / "d.json", [detection] * 2)
     from depthpose.pose.types import PoseEstimate
 

@@ -35,7 +35,9 @@ from depthpose.pose.icp import RefinedPose, refine_pose
 from depthpose.pose.mesh import (
     NearSymmetry,
     SymmetryProposal,
+    cache,
     near_symmetries,
+    near_symmetry,
     symmetries_from_proposals,
     symmetry,
     true_symmetries,
@@ -244,7 +246,7 @@ def test_proposals_of_a_shape_are_cached_to_the_bit(
     monkeypatch.setattr(symmetry, "propose_symmetries", search)
     wanted = symmetries_from_proposals(given)
     for tolerance in (0.02, 0.02, 0.03):
-        symmetry.cached.cache_clear()
+        cache.read_or_compute.cache_clear()
         model = with_found_symmetries(bar(), None, is_taken=True, tolerance=tolerance)
         found, (own,) = model.symmetries, wanted.continuous
         assert found.discrete is not None
@@ -259,23 +261,23 @@ def test_what_was_found_is_kept_for_the_next_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("DEPTHPOSE_CACHE", str(tmp_path))
-    symmetry.cached.cache_clear()
+    cache.read_or_compute.cache_clear()
     model = replace(bar(), symmetries=Symmetries(is_found=True))
-    true = symmetry._search_near_symmetries(model)
+    true = near_symmetry._search_near_symmetries(model)
     searches: list[ObjectModel] = []
 
     def counted(model: ObjectModel) -> Any:  # noqa: ANN401
         searches.append(model)
         return true
 
-    monkeypatch.setattr(symmetry, "_search_near_symmetries", counted)
+    monkeypatch.setattr(near_symmetry, "_search_near_symmetries", counted)
     found = near_symmetries(model)
     assert found
     (path,) = tmp_path.glob("near_symmetries/*.json")
     searches.clear()
 
     def again() -> tuple[NearSymmetry, ...]:
-        symmetry.cached.cache_clear()
+        cache.read_or_compute.cache_clear()
         return near_symmetries(model)
 
     assert all(

@@ -10,14 +10,10 @@ import torch
 from depthpose.core.config import config_to_dict, read_config, write_config
 from depthpose.core.errors import InputError
 from depthpose.pose.config import ObjectsConfig, SyntheticSensorConfig
-from depthpose.pose.synthetic.views import (
-    draw_levels,
-    grow_mask,
-    occlude,
-    random_index,
-    random_rotation,
-    simulate_depth,
-)
+from depthpose.pose.synthetic.depth_sensors import simulate_depth
+from depthpose.pose.synthetic.occluders import draw_levels, occlude
+from depthpose.pose.synthetic.random_numbers import random_index, random_rotation
+from depthpose.pose.synthetic.views import grow_mask
 from depthpose.pose.train import PoseTraining
 
 

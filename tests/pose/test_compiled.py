@@ -25,15 +25,8 @@ from depthpose.pose.icp import (
 )
 from depthpose.pose.identity import _linearise_growth
 from depthpose.pose.kdtree import build_tree, find_nearest_points
-from depthpose.pose.propose.point_pairs import (
-    ANGLES,
-    DISTANCES,
-    STEP,
-    TURNS,
-    PairTable,
-    prepare_pairs,
-    vote_poses,
-)
+from depthpose.pose.propose.pair_votes import ANGLES, DISTANCES, TURNS
+from depthpose.pose.propose.point_pairs import STEP, PairTable, prepare_pairs, vote_poses
 from depthpose.pose.surface import Surface, look_along_rays, match, prepare_surface
 from depthpose.pose.synthetic.parts import make_part
 
@@ -225,17 +218,17 @@ def test_rays(surface: Surface) -> None:
     assert float(violation[4]) == float(unobserved[4]) == 1
 
 
-def feature_of(points: np.ndarray, frames: np.ndarray, i: int, j: int) -> tuple[np.ndarray, float]:
+def feature_of(points: np.ndarray, bases: np.ndarray, i: int, j: int) -> tuple[np.ndarray, float]:
     """The feature of a pair, distance in metres and angles in bins, and its turn."""
     way = points[j] - points[i]
     along = way / max(float(np.linalg.norm(way)), 1e-12)  # both sides of a sheet are at one place
-    n, m = frames[i, :, 0], frames[j, :, 0]
+    n, m = bases[i, :, 0], bases[j, :, 0]
     angles = np.arccos(np.clip([along @ n, along @ m, n @ m], -1, 1)) * ANGLES / np.pi
-    turn = np.arctan2(way @ frames[i, :, 2], way @ frames[i, :, 1])
+    turn = np.arctan2(way @ bases[i, :, 2], way @ bases[i, :, 1])
     return np.array([np.linalg.norm(way), *angles]), turn
 
 
-def votes_by_hand(points: np.ndarray, frames: np.ndarray, i: int, table: PairTable) -> np.ndarray:
+def votes_by_hand(points: np.ndarray, bases: np.ndarray, i: int, table: PairTable) -> np.ndarray:
     """The votes of one reference, by dictionaries: (model points, turns)."""
     step = STEP * table.surface.diameter_m
     bounds = table.bounds.numpy()
@@ -246,7 +239,7 @@ def votes_by_hand(points: np.ndarray, frames: np.ndarray, i: int, table: PairTab
         distance = np.linalg.norm(points[j] - points[i])
         if not step < distance < DISTANCES * step:
             continue
-        feature, turn = feature_of(points, frames, i, j)
+        feature, turn = feature_of(points, bases, i, j)
         feature[0] /= step
         own = np.floor(feature)
         beside = own + np.where(feature - own < 0.5, -1, 1) * np.eye(4)
@@ -277,9 +270,9 @@ def test_votes_of_point_pairs() -> None:
     assert found.R.shape == (12, 3, 3)
     least = torch.eye(3).double()[normals.abs().argmin(-1)]
     first = torch.nn.functional.normalize(torch.linalg.cross(normals, least), dim=-1)
-    frames = torch.stack([normals, first, torch.linalg.cross(normals, first)], -1).numpy()
+    bases = torch.stack([normals, first, torch.linalg.cross(normals, first)], -1).numpy()
     for r in range(3):
-        by_hand = votes_by_hand(points_m.numpy(), frames, r, table)
+        by_hand = votes_by_hand(points_m.numpy(), bases, r, table)
         best = np.sort(by_hand.max(1))[::-1][:4]
         assert np.allclose(votes[4 * r : 4 * r + 4].numpy(), best, rtol=1e-4)
     # Each pose puts a point of the model on its reference, with its normal.
@@ -291,7 +284,7 @@ def test_votes_of_point_pairs() -> None:
 
 def test_pairs_of_a_model_are_sorted_by_their_features() -> None:
     table = prepare_pairs(prepare_surface(make_part("bracket"), 4000))
-    points, frames = table.points_m.numpy(), table.frames.numpy()
+    points, bases = table.points_m.numpy(), table.bases.numpy()
     bounds, generator = table.bounds.numpy(), np.random.default_rng(0)
     assert bounds[-1] == len(table.first) == len(points) * (len(points) - 1)
     step = STEP * table.surface.diameter_m
@@ -302,7 +295,7 @@ def test_pairs_of_a_model_are_sorted_by_their_features() -> None:
         for j in range(len(points)):
             if j == i:
                 continue
-            feature, turn = feature_of(points, frames, i, j)
+            feature, turn = feature_of(points, bases, i, j)
             feature[0] /= step
             own = np.clip(feature.astype(int), 0, [DISTANCES, *[ANGLES - 1] * 3])
             if int(own @ [ANGLES**3, ANGLES**2, ANGLES, 1]) == key:

@@ -11,9 +11,9 @@ from PIL import Image
 from depthpose.core.errors import InputError
 from depthpose.pose.datasets import (
     Detection,
-    box_mask,
     encode_rle,
     group_by_image,
+    mask_from_box,
     name_objects,
     parse_box,
     parse_labels,
@@ -31,11 +31,11 @@ def written(path: Path, content: object) -> Path:
 
 
 def test_a_box_is_all_pixels_that_it_touches() -> None:
-    mask = box_mask(parse_box("1.5,0,3,2"), 4, 5)
+    mask = mask_from_box(parse_box("1.5,0,3,2"), 4, 5)
     assert mask.nonzero().tolist() == [[0, 1], [0, 2], [1, 1], [1, 2]]
-    assert bool(box_mask((0, 0, 5, 4), 4, 5).all())
+    assert bool(mask_from_box((0, 0, 5, 4), 4, 5).all())
     # A part that reaches out of the image has a box that does.
-    assert box_mask((-4.0, 2.0, 6.0, 9.0), 6, 5)[2:].all()
+    assert mask_from_box((-4.0, 2.0, 6.0, 9.0), 6, 5)[2:].all()
 
 
 @pytest.mark.parametrize(
@@ -55,7 +55,7 @@ def test_a_box_that_is_none_is_refused(text: str, reason: str) -> None:
 
 def test_a_box_of_a_larger_image_is_refused() -> None:
     with pytest.raises(InputError, match="its centre lies outside of the image of 640x480 pixels"):
-        box_mask((700, 100, 900, 200), 480, 640)
+        mask_from_box((700, 100, 900, 200), 480, 640)
 
 
 def test_results_of_coco_are_read(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from depthpose.core.errors import InputError, Notice
 from depthpose.core.rigid import rotation_by
 from depthpose.pose.cloud import advise_unit
 from depthpose.pose.mesh import read_geometry, read_model
-from depthpose.pose.mesh.files import cut_polygons
+from depthpose.pose.mesh.polygons import cut_polygons
 from depthpose.pose.registration import Registration
 
 # An L of 30 x 20 x 10 (mm), its caps concave: volume 4000, area 2 * 400 + 100 * 10.

@@ -14,14 +14,9 @@ from depthpose.pose.config import ObjectsConfig, SyntheticSensorConfig
 from depthpose.pose.datasets import check_bop, open_bop, write_bop_models, write_bop_scene
 from depthpose.pose.mesh import drawn_triangles, make_model
 from depthpose.pose.mesh.models import triangulate_points
-from depthpose.pose.synthetic import Objects, make_frames, views
-from depthpose.pose.synthetic.views import (
-    aim_camera,
-    draw_view,
-    make_shape,
-    random_rotation,
-    turn_view,
-)
+from depthpose.pose.synthetic import SyntheticViews, depth_sensors, make_frames
+from depthpose.pose.synthetic.random_numbers import random_rotation
+from depthpose.pose.synthetic.views import aim_camera, make_shape, render_view, turn_view
 from depthpose.pose.types import ObjectModel, ViewSample
 
 _K = torch.tensor([[572.4, 0, 325.3], [0, 573.6, 242.0], [0, 0, 1]], dtype=torch.float64)
@@ -54,7 +49,7 @@ def _drawn_again(view: ViewSample, model: ObjectModel) -> torch.Tensor:
 @pytest.mark.parametrize("views", [None, 3])
 def test_a_clean_view_is_what_its_truth_looks_like(views: int | None) -> None:
     model = _model(shift_m=0.1)
-    objects = Objects([model], ObjectsConfig(views=views, **_CLEAN))
+    objects = SyntheticViews([model], ObjectsConfig(views=views, **_CLEAN))
     for index in range(6):
         view = objects.view(index)
         again_m = _drawn_again(view, model)
@@ -77,8 +72,8 @@ def test_a_turned_view_of_a_plane_is_exact_to_rounding() -> None:
     middle_m = torch.tensor([0.0, 0.0, 0.8], dtype=torch.float64)
     pose = Rigid(tilt, middle_m - tilt @ shape.middle_m)
     turn = aim_camera(torch.tensor([-0.2, 0.3, 1.0], dtype=torch.float64), 2.0)
-    turned = turn_view(draw_view(shape, pose, _K), turn, shape, _K)
-    error_m = (turned.depth_m - draw_view(shape, turned.camera_from_model, _K).depth_m).abs()
+    turned = turn_view(render_view(shape, pose, _K), turn, shape, _K)
+    error_m = (turned.depth_m - render_view(shape, turned.camera_from_model, _K).depth_m).abs()
     inside = error_m[error_m.isfinite()]
     assert len(inside) > 10000
     # Beside the rim the nearest pixel is taken.
@@ -99,7 +94,7 @@ def test_a_clean_cloud_lies_on_the_surface() -> None:
     tree = trimesh.proximity.ProximityQuery(
         trimesh.Trimesh(model.vertices_m.numpy(), model.faces.numpy(), process=False)
     )
-    objects = Objects([model], ObjectsConfig(views=None, **_CLEAN))
+    objects = SyntheticViews([model], ObjectsConfig(views=None, **_CLEAN))
     sample = objects[0]
     on_model = sample.truth.camera_from_model.inverse().apply(sample.input.points_m)
     near = trimesh.points.PointCloud(on_model.numpy()[::20])
@@ -110,7 +105,7 @@ def test_a_clean_cloud_lies_on_the_surface() -> None:
 def test_a_sample_depends_on_seed_and_index_alone() -> None:
     models = [_model("first"), _model("second", 0.03)]
     config = ObjectsConfig(views=2, number=20)
-    ahead, alone = Objects(models, config), Objects(models, config)
+    ahead, alone = SyntheticViews(models, config), SyntheticViews(models, config)
     for index in range(12):
         ahead.view(index)
     first, second = ahead.view(7), alone.view(7)
@@ -118,28 +113,28 @@ def test_a_sample_depends_on_seed_and_index_alone() -> None:
     assert torch.equal(first.input.depth_m.nan_to_num(), second.input.depth_m.nan_to_num())
     assert first.input.name == "second_0_000007"
     assert first.input.object == "second"
-    other = Objects(models, dataclasses.replace(config, seed=1)).view(7)
+    other = SyntheticViews(models, dataclasses.replace(config, seed=1)).view(7)
     assert not torch.equal(first.truth.camera_from_model.R, other.truth.camera_from_model.R)
     assert torch.equal(alone[7].input.points_m, ahead[7].input.points_m)
 
 
 def test_views_drawn_ahead_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     models = [_model("first"), _model("second", 0.03)]
-    ahead, alone = (Objects(models, ObjectsConfig(views=3, number=20)) for _ in range(2))
-    ahead.draw_stored(workers=2)
+    ahead, alone = (SyntheticViews(models, ObjectsConfig(views=3, number=20)) for _ in range(2))
+    ahead.render_stored(workers=2)
     expected = [alone.view(index).input.depth_m.nan_to_num() for index in range(12)]
 
     def draw(*_: object) -> None:
         raise AssertionError("every stored view is drawn already")
 
-    monkeypatch.setattr("depthpose.pose.synthetic.views.draw_view", draw)
+    monkeypatch.setattr("depthpose.pose.synthetic.views.render_view", draw)
     found = [ahead.view(index).input.depth_m for index in range(12)]
     for mine, theirs in zip(found, expected, strict=True):
         assert torch.equal(mine.nan_to_num(), theirs)
 
 
 def test_the_number_of_samples_is_kept() -> None:
-    objects = Objects([_model()], ObjectsConfig(number=2, views=1))
+    objects = SyntheticViews([_model()], ObjectsConfig(number=2, views=1))
     assert len(objects) == 2
     with pytest.raises(IndexError, match="sample 2 of 2"):
         objects[2]
@@ -148,7 +143,7 @@ def test_the_number_of_samples_is_kept() -> None:
 
 def test_visible_fractions_fill_their_range() -> None:
     config = ObjectsConfig(views=4, occluded_share=1.0, occlusion=(0.2, 0.5))
-    objects = Objects([_model()], config)
+    objects = SyntheticViews([_model()], config)
     found = [objects.view(i).truth.visible_fraction for i in range(30)]
     given = [share for share in found if share is not None]
     assert len(given) == 30
@@ -159,7 +154,7 @@ def test_visible_fractions_fill_their_range() -> None:
 def test_grown_masks_hold_what_is_behind() -> None:
     values = {**_CLEAN, "with_background": True, "mask_error_px": 3, "resolution": (1.0, 1.0)}
     model = _model()
-    objects = Objects([model], ObjectsConfig(views=None, **values))
+    objects = SyntheticViews([model], ObjectsConfig(views=None, **values))
     grown = 0
     for index in range(12):
         view = objects.view(index)
@@ -173,12 +168,12 @@ def test_grown_masks_hold_what_is_behind() -> None:
 
 def test_the_object_lies_whole_in_the_image() -> None:
     config = ObjectsConfig(views=2, resolution=(1.0, 1.0))
-    objects = Objects([_model()], config)
+    objects = SyntheticViews([_model()], config)
     for index in range(10):
         view = objects.view(index)
         pose = view.truth.camera_from_model
         points = pose.apply(objects.models[0].vertices_m).double()
-        K = objects.intrinsics()
+        K = objects.make_intrinsics()
         pixels = (points @ K.mT)[:, :2] / points[:, 2:]
         assert float(pixels.min()) > 0
         assert bool((pixels.amax(0) < torch.tensor([640, 480])).all())
@@ -236,11 +231,11 @@ def test_points_that_are_no_body_are_joined_where_they_are_a_surface(
 
 def test_errors_say_what_to_do() -> None:
     with pytest.raises(InputError, match="there is no object to show; give one model at least"):
-        Objects([])
+        SyntheticViews([])
     with pytest.raises(
         InputError, match=r"the camera would stand in it\. Begin at 0\.[0-9]+ or farther"
     ):
-        Objects([_model()], ObjectsConfig(distance_m=(0.06, 1.0)))
+        SyntheticViews([_model()], ObjectsConfig(distance_m=(0.06, 1.0)))
 
 
 def _numbered(number: int) -> ObjectModel:
@@ -345,7 +340,7 @@ def test_the_projector_throws_the_shadow_of_a_thing_onto_what_lies_behind_it() -
     """To one side alone, as wide as its disparities differ."""
     depth_m = torch.full((3, 60), 2.0)
     depth_m[:, 20:30] = 1.0
-    is_shadowed = views._mark_shadow(depth_m, focal_px=100.0, baseline_m=0.2)
+    is_shadowed = depth_sensors._mark_shadow(depth_m, focal_px=100.0, baseline_m=0.2)
     columns = is_shadowed[0].nonzero().flatten().tolist()
     wide_px = 100 * 0.2 * (1 / 1.0 - 1 / 2.0)
     # Half a pixel more than one is tolerated at its end.

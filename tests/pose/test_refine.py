@@ -21,7 +21,7 @@ from depthpose.pose.mesh import drawn_triangles, make_model, sample_surface
 from depthpose.pose.mesh.models import turn_about
 from depthpose.pose.metrics import add_m
 from depthpose.pose.surface import Surface, prepare_surface
-from depthpose.pose.synthetic.views import simulate_depth
+from depthpose.pose.synthetic.depth_sensors import simulate_depth
 from depthpose.pose.types import ObjectModel, Symmetries
 from depthpose.report.pose import select_object_points
 

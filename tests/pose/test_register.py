@@ -19,7 +19,7 @@ from depthpose.pose.mesh import make_model, sample_surface
 from depthpose.pose.metrics import add_m
 from depthpose.pose.propose.point_pairs import prepare_pairs, propose_poses
 from depthpose.pose.surface import prepare_surface
-from depthpose.pose.synthetic import Objects, make_part
+from depthpose.pose.synthetic import SyntheticViews, make_part
 from depthpose.pose.types import CloudSample, ObjectModel
 from depthpose.pose.weights import read_pose_weights
 
@@ -36,7 +36,7 @@ def registration() -> Registration:
 
 def view(model: ObjectModel, index: int, seed: int = 5) -> CloudSample:
     config = ObjectsConfig(views=None, resolution=(1.0, 1.0), occluded_share=0.0, seed=seed)
-    return Objects([model], config)[index]
+    return SyntheticViews([model], config)[index]
 
 
 def test_poses_of_a_part_that_no_training_saw_are_right_or_refused() -> None:

@@ -11,7 +11,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.config import CloudConfig
 from depthpose.pose.evaluate import Conditions, ObjectRow, Origin
 from depthpose.pose.network_pose import GeoPoseNet
-from depthpose.pose.synthetic import Objects
+from depthpose.pose.synthetic import SyntheticViews
 from depthpose.thesis.pose_tables import (
     LINEMOD,
     LINEMOD_DIAMETERS_M,
@@ -166,7 +166,7 @@ def test_every_way_of_voting_sees_the_same_and_fails_alike() -> None:
 def test_votes_stand_at_the_points_of_the_view() -> None:
     model = bracket()
     net = GeoPoseNet(tiny_weights(model))
-    views = [Objects([model]).view(i) for i in range(2)]
+    views = [SyntheticViews([model]).view(i) for i in range(2)]
     empty = replace(views[0].input, mask=torch.zeros_like(views[0].input.mask))
     cases = list(collect_votes(net, [*views, replace(views[0], input=empty)], 50))
     assert cases[2] is None
@@ -183,7 +183,7 @@ def test_votes_are_those_of_the_estimator() -> None:
     model = bracket()
     weights = replace(tiny_weights(model), cloud=CloudConfig(max_points=None))
     net = GeoPoseNet(weights)
-    view = Objects([model]).view(1)
+    view = SyntheticViews([model]).view(1)
     _, voted = net.estimate_with_votes(view.input)
     assert voted is not None
     case = next(collect_votes(net, [view], 100_000))

@@ -23,7 +23,7 @@ from depthpose.pose.config import CloudConfig, MeshConfig, ObjectsConfig, Synthe
 from depthpose.pose.datasets import write_bop_models, write_bop_scene
 from depthpose.pose.network import ResUNet, ResUNetConfig, fold_norms
 from depthpose.pose.sparse import Voxels
-from depthpose.pose.synthetic import Objects, make_frames
+from depthpose.pose.synthetic import SyntheticViews, make_frames
 from depthpose.pose.train import (
     STAGES,
     FramesConfig,
@@ -35,14 +35,14 @@ from depthpose.pose.train import (
     read_models,
     train_pose_network,
 )
-from depthpose.pose.train.clouds import (
+from depthpose.pose.train.clouds import TrainingViews
+from depthpose.pose.train.held_out import (
     HELD_OUT_SEED,
-    TrainingViews,
-    format_table,
-    make_held_out_objects,
+    format_held_out,
+    make_held_out_views,
     score_held_out,
 )
-from depthpose.pose.train.poses import pack_weights
+from depthpose.pose.train.poses import make_pose_weights
 from depthpose.pose.types import ObjectModel, PoseEstimate, Symmetries, VotingPoints
 from depthpose.pose.weights import (
     PoseWeights,
@@ -208,7 +208,7 @@ def test_frames_and_synthetic_views_mix_and_frames_stay_true(tmp_path: Path) -> 
         0,
     )
     assert len(clouds) == 2 * len(real)
-    made = Objects(models, _VIEWS, _CLOUD)
+    made = SyntheticViews(models, _VIEWS, _CLOUD)
     is_made = [
         torch.allclose(clouds[i].t_m.norm(), made.view(i).truth.camera_from_model.t_m.norm())
         for i in range(30)
@@ -258,7 +258,7 @@ def test_held_out_views_are_not_those_that_are_trained_on() -> None:
 def test_a_held_out_view_of_too_few_points_is_a_failure() -> None:
     held_out = HeldOutConfig(number=3, occlusions=(0.0,))
     network = ResUNet(_SMALL).eval()
-    made = make_held_out_objects(_models(), _VIEWS, _CLOUD, held_out, 0.0)
+    made = make_held_out_views(_models(), _VIEWS, _CLOUD, held_out, 0.0)
     seen = [len(made[i].input.points_m) for i in range(6)]
     cloud = dataclasses.replace(_CLOUD, max_points=None, min_points=sorted(seen)[4])
     task = PoseTask(network, _models(), _training(held_out=held_out, cloud=cloud))
@@ -349,7 +349,7 @@ def test_a_training_without_norms_begins_with_weights_that_have_its_biases(tmp_p
     path = tmp_path / "folded.safetensors"
     config = _training()
     network = fold_norms(ResUNet(dataclasses.replace(_SMALL, classes=1)))
-    write_pose_weights(path, pack_weights(network, read_models(config.models), config))
+    write_pose_weights(path, make_pose_weights(network, read_models(config.models), config))
     plain = dataclasses.replace(_SMALL, norm="none")
     with pytest.raises(InputError) as error:
         train_pose_network(
@@ -408,14 +408,16 @@ def test_held_out_views_are_right_ambiguous_wrong_or_refused(
     none = PoseEstimate(name="", object="", status="doubtful", reason="so")
     rows = [(sure, 0.02)] * 5 + [(sure, 0.4), (unsure, 0.01), (unsure, 0.5), (none, math.inf)] * 1
     answers = ([one for one, _ in rows], [error for _, error in rows])
-    monkeypatch.setattr("depthpose.pose.train.clouds._estimate_views", lambda *_: answers)
+    monkeypatch.setattr("depthpose.pose.train.held_out._estimate_views", lambda *_: answers)
     held_out = HeldOutConfig(number=4, occlusions=(0.0,))
     table = score_held_out(tiny_weights(*_models()), _VIEWS, held_out)
     shares = {"right": 5 / 9, "ambiguous": 2 / 9, "wrong": 1 / 9, "refused": 1 / 9, "median": 0.02}
     assert table["0"] == pytest.approx(shares)
-    assert "| occluded % | right % | ambiguous % | wrong % | refused %" in format_table(table)
+    assert "| occluded % | right % | ambiguous % | wrong % | refused %" in format_held_out(table)
     assert (
-        format_table(table).splitlines()[-1].startswith("| 0 | 55.6 | 22.2 | 11.1 | 11.1 | 2.0 |")
+        format_held_out(table)
+        .splitlines()[-1]
+        .startswith("| 0 | 55.6 | 22.2 | 11.1 | 11.1 | 2.0 |")
     )
 
 

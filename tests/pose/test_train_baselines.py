@@ -33,8 +33,8 @@ from depthpose.pose.config import CloudConfig, ObjectsConfig
 from depthpose.pose.datasets import BopFrame, BopObject, write_bop_models, write_bop_scene
 from depthpose.pose.network_pose import DepthImageRegressor, GeoPoseNet
 from depthpose.pose.segmentation import ResNet18, SegmentationConfig, Segmenter
-from depthpose.pose.synthetic import Objects
-from depthpose.pose.synthetic.views import uniform
+from depthpose.pose.synthetic import SyntheticViews
+from depthpose.pose.synthetic.random_numbers import uniform
 from depthpose.pose.train import (
     STAGES,
     DepthImageTraining,
@@ -91,7 +91,7 @@ def test_the_pointnet_trains_and_its_file_is_an_estimators(
     assert "held_out/occluded_0/ransac_add_10" in rows[-1]
     net = GeoPoseNet.load(path)
     assert net.objects == ("bracket",)
-    (found,) = net.estimate_many([Objects([bracket()], VIEWS)[0].input])
+    (found,) = net.estimate_many([SyntheticViews([bracket()], VIEWS)[0].input])
     assert found.is_ok or found.reason
 
 
@@ -119,7 +119,7 @@ def test_the_depth_image_trains_and_its_file_is_a_regressors(
     with pytest.warns(LicenceNotice, match="For research alone"):
         warn_of_terms(weights.facts)
     regressor = DepthImageRegressor(weights)
-    view = Objects([bracket()], VIEWS).view(0).input
+    view = SyntheticViews([bracket()], VIEWS).view(0).input
     found, refused = regressor.estimate_many(
         [view, dataclasses.replace(view, mask=view.mask & False)]
     )
@@ -167,7 +167,7 @@ def test_the_loss_of_a_depth_image_falls(models_folder: Path, tmp_path: Path) ->
 def test_crops_carry_the_truth_of_their_view() -> None:
     config = DepthImageTraining(objects=VIEWS, network=DepthImageConfig(crop_px=32))
     crops = TrainingCrops([bracket(), bottle()], config, 0)
-    sample, view = crops[3], Objects([bracket(), bottle()], VIEWS).view(3)
+    sample, view = crops[3], SyntheticViews([bracket(), bottle()], VIEWS).view(3)
     assert int(sample.class_of) == 1
     torch.testing.assert_close(sample.R, view.truth.camera_from_model.R.float())
     assert len(crops) == 8

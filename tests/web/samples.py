@@ -14,7 +14,7 @@ from depthpose.depth.synthetic import Streets
 from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.datasets.dataset import write_mask
-from depthpose.pose.synthetic import Objects, make_part
+from depthpose.pose.synthetic import SyntheticViews, make_part
 
 PART = "flange"
 
@@ -33,7 +33,7 @@ def write_street(folder: Path, scale: float = 0.25) -> Path:
 def write_view(folder: Path) -> Rigid:
     """Write ``depth.png``, ``mask.png``, ``view.json``, ``cloud.ply`` and STLs; give the pose."""
     config = ObjectsConfig(seed=4, number=1, occluded_share=0.0, views=None, resolution=(1.0, 1.0))
-    sample = Objects((make_part(PART),), config).view(0)
+    sample = SyntheticViews((make_part(PART),), config).view(0)
     window = sample.input
     # The window of the object leaves the principal point out: a margin takes it in.
     margin = 8

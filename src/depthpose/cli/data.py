@@ -174,7 +174,7 @@ def make_objects(
     from depthpose.core.run import claim_folder, note_result
     from depthpose.pose.config import ObjectsConfig, SyntheticSensorConfig
     from depthpose.pose.datasets import write_bop_models, write_bop_scene
-    from depthpose.pose.mesh import read_model, refuse_one_name, with_found_symmetries
+    from depthpose.pose.mesh import read_model, refuse_equal_names, with_found_symmetries
     from depthpose.pose.synthetic import make_frames
 
     if number < 1:
@@ -206,7 +206,7 @@ def make_objects(
         for k, path in numbered_files
     }
     models = [read_model(path, unit, number=k) for k, path in numbered_files]
-    refuse_one_name(models)
+    refuse_equal_names(models)
     models = [
         with_found_symmetries(model, on_message=tqdm.write, is_taken=symmetries == "found")
         for model in models

@@ -139,11 +139,13 @@ def _try_pose() -> str:
     from depthpose.pose.config import ObjectsConfig
     from depthpose.pose.metrics import adds_m
     from depthpose.pose.network_pose import GeoPoseNet
-    from depthpose.pose.synthetic import Objects
+    from depthpose.pose.synthetic import SyntheticViews
 
     net = GeoPoseNet.load("parts")
     flange = next(model for model in net.weights.models if model.name == "flange")
-    view = Objects((flange,), ObjectsConfig(number=1, occluded_share=0.0, views=None)).view(0)
+    view = SyntheticViews((flange,), ObjectsConfig(number=1, occluded_share=0.0, views=None)).view(
+        0
+    )
     (estimate,) = net.estimate_many([view.input])
     if estimate.camera_from_model is None:
         raise RuntimeError(f"a synthetic view of a flange was refused: {estimate.reason}")

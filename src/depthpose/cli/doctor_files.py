@@ -18,7 +18,7 @@ from depthpose.core.rigid import geodesic_rad
 from depthpose.pose.cloud import advise_frame, advise_unit
 from depthpose.pose.datasets import decode_rle
 from depthpose.pose.datasets.masks import read_runs
-from depthpose.pose.mesh import MESH_READERS, exact_diameter, read_geometry
+from depthpose.pose.mesh import MESH_READERS, measure_diameter, read_geometry
 
 Size = tuple[int, int]
 
@@ -128,7 +128,7 @@ def _describe_mesh(path: Path) -> FileFacts:
     points = torch.from_numpy(vertices)
     if not len(faces):
         return _describe_points(path, points)
-    diameter = exact_diameter(points)
+    diameter = measure_diameter(points)
     if diameter > _MAX_LENGTH_M:
         unit = "millimetres (--unit mm)"
     elif diameter < _MIN_LENGTH_MM:
@@ -344,6 +344,6 @@ def _list_contradictions(facts: FileFacts, all_facts: Sequence[FileFacts]) -> It
         if facts.mask is not None and is_depth and other.size != facts.size:
             yield f"it is not of the size of {other.path.name}; give the mask of this very image"
         if facts.model is not None and other.cloud is not None:
-            advice = advise_unit(exact_diameter(facts.model), other.cloud)
+            advice = advise_unit(measure_diameter(facts.model), other.cloud)
             if advice is not None:
                 yield f"beside {other.path.name}: {advice.message}"

@@ -18,7 +18,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import read_image, write_json
 from depthpose.core.run import claim_folder
 from depthpose.pose import datasets, predictions
-from depthpose.pose.datasets.layouts import read_integer, read_rows
+from depthpose.pose.datasets.entries import read_integer, read_rows
 from depthpose.pose.segmentation import Segmenter
 from depthpose.pose.types import ViewInput
 

@@ -9,7 +9,7 @@ import torch
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose import predictions
-from depthpose.pose.datasets.layouts import read_rows
+from depthpose.pose.datasets.entries import read_rows
 from depthpose.pose.inputs import rigid_input
 
 _FARTHEST_BASE_M = 50.0

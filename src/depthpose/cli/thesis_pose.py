@@ -27,7 +27,7 @@ from depthpose.pose.evaluate import hash_frames
 from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.pose.predictions import read_predictions
 from depthpose.pose.propose import vote_ransac
-from depthpose.pose.synthetic import Objects
+from depthpose.pose.synthetic import SyntheticViews
 from depthpose.pose.types import ViewSample
 from depthpose.report import page
 from depthpose.report.page import Drawing, PictureFile, Section
@@ -80,7 +80,7 @@ def open_views(net: GeoPoseNet, data: PoseDataOptions, number: int | None, synth
     """
     if data.folder is None:
         config = ObjectsConfig(number=synthetic, seed=_SYNTHETIC_SEED)
-        objects = Objects(net.weights.models, config, net.weights.cloud)
+        objects = SyntheticViews(net.weights.models, config, net.weights.cloud)
         return Views(
             samples=[objects.view(i) for i in range(synthetic)],
             instances=[None] * synthetic,

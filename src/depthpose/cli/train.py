@@ -327,12 +327,12 @@ def pose_train(
         workers: processes that render views beside the one that trains.
     """
     from depthpose.pose.train import STAGES
-    from depthpose.pose.train.config import own_part
+    from depthpose.pose.train.config import configure_own_part
 
     # A CAD file without a config has the defaults of a training from trained weights.
     kind, run_stage = STAGES[what]
     is_fine_tuned = what == "pose" and bool(cad) and start != _NO_START
-    default = own_part(_START) if is_fine_tuned else kind()
+    default = configure_own_part(_START) if is_fine_tuned else kind()
     settings = training.read(config, kind, default=default, workers=workers)
 
     # Options take the place of what the config says.

@@ -13,14 +13,15 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, geodesic_rad
 from depthpose.pose.mesh import (
     axis_of_turn,
-    cached,
     mirror_deviation,
     near_symmetries,
+    read_or_compute,
     sample_surface,
     symmetry_transforms,
     true_symmetries,
 )
-from depthpose.pose.propose.point_pairs import PairTable, find_turns, prepare_pairs
+from depthpose.pose.propose.partial_symmetry import find_partial_symmetries
+from depthpose.pose.propose.point_pairs import PairTable, prepare_pairs
 from depthpose.pose.surface import Surface
 from depthpose.pose.types import Axis, ObjectModel
 
@@ -214,7 +215,7 @@ def _propose_motions(
 
     # Motions of a part of the surface, by the share that they move onto it: from 80 % on they are
     # near-symmetries, which come first, from 25 % on look-alikes. A mug without its handle.
-    by_pairs = cached(model, find_turns, "turns")
+    by_pairs = read_or_compute(model, find_partial_symmetries, "turns")
     matrices = torch.tensor(by_pairs["turns"], dtype=torch.float64).reshape(-1, 4, 4)
     partial_motions = Rigid(matrices[:, :3, :3], matrices[:, :3, 3])
     near_count = by_pairs["near"]

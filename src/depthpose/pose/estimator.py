@@ -19,7 +19,7 @@ from depthpose.pose.background import AnyBackground, with_background
 from depthpose.pose.color_inputs import with_color
 from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.copies import PreparedObject
-from depthpose.pose.datasets.detections import Box, box_mask
+from depthpose.pose.datasets.detections import Box, mask_from_box
 from depthpose.pose.decide import choose_object, refused, seconds_of_all, with_status
 from depthpose.pose.inputs import (
     AnyArray,
@@ -220,7 +220,7 @@ class PoseEstimator:
                 )
             pose_input = view_input(depth, mask, lens, which, _NAME, unit)
             if box is not None:
-                pixels = box_mask(box, *pose_input.depth_m.shape)
+                pixels = mask_from_box(box, *pose_input.depth_m.shape)
                 pose_input = replace(pose_input, mask=pixels, is_region=True)
             pose_input = with_background(pose_input, background, lens, unit)
             models = self.models if object is None else [self._find_object(object).model]

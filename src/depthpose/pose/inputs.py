@@ -23,7 +23,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import read_cloud, read_stored_depth
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit, metres_of
-from depthpose.pose.datasets import decode_rle, number_objects, one_mask, read_labels
+from depthpose.pose.datasets import decode_rle, mask_from_labels, number_objects, read_labels
 from depthpose.pose.datasets.masks import read_runs
 from depthpose.pose.mesh.shapes import is_shape, shape_geometry
 from depthpose.pose.rays import warn_of_rays
@@ -130,7 +130,7 @@ def view_input(
     pixels = torch.ones(height, width).bool()
     if mask is not None:
         mask_name = str(mask) if isinstance(mask, str | Path) else name
-        pixels = one_mask(labels_input(mask, name), mask_name)
+        pixels = mask_from_labels(labels_input(mask, name), mask_name)
     if tuple(pixels.shape) != (height, width):
         raise InputError(
             f"{name}: the mask is of shape {tuple(pixels.shape)}, but the depth image of "

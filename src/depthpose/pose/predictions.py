@@ -24,7 +24,13 @@ from depthpose.core.rigid import Rigid
 from depthpose.core.run import claim_folder
 from depthpose.core.runner import Job, Results, run_jobs
 from depthpose.pose.datasets import BopDataset, Detection, Instance, read_mask
-from depthpose.pose.datasets.layouts import MOST, make_pose, read_integer, read_number, read_rows
+from depthpose.pose.datasets.entries import (
+    LARGEST_ID,
+    make_pose,
+    read_integer,
+    read_number,
+    read_rows,
+)
 from depthpose.pose.types import (
     POSED,
     Alternative,
@@ -631,8 +637,8 @@ def _parse_bop_row(
         ) from error
 
     # Are they possible?
-    if not all(0 <= value <= MOST for value in place):
-        raise InputError(f"{source}: scene, image and object are numbers from 0 to {MOST}")
+    if not all(0 <= value <= LARGEST_ID for value in place):
+        raise InputError(f"{source}: scene, image and object are numbers from 0 to {LARGEST_ID}")
     if len(R) != 9 or len(t_mm) != 3 or not all(map(math.isfinite, [score, time_s, *R, *t_mm])):
         raise InputError(f"{source}: {len(R)} numbers of R and {len(t_mm)} of t, where 9 and 3 "
                          "finite ones belong")  # fmt: skip

@@ -18,7 +18,7 @@ from depthpose.pose.mesh import (
     assign_symmetries,
     declare_symmetry,
     read_model,
-    refuse_one_name,
+    refuse_equal_names,
     with_found_symmetries,
 )
 from depthpose.pose.types import ObjectModel, PoseEstimate
@@ -57,7 +57,7 @@ class Registration(PoseEstimator):
             raise InputError(
                 "registration looks for CAD files and none is given; name one: STL, PLY, OBJ or GLB"
             )
-        refuse_one_name(models)
+        refuse_equal_names(models)
         for model in models:
             require_surface(model)
         if config is not None and not config.with_icp:

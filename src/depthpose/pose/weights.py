@@ -26,7 +26,7 @@ from depthpose.pose.baselines import DepthImageConfig, DepthImageNet, PointNet, 
 from depthpose.pose.config import SHAPE_FEATURES, CloudConfig, RefusalConfig
 from depthpose.pose.mesh import (
     gap_to_surface_m,
-    refuse_one_name,
+    refuse_equal_names,
     symmetries_from_bop,
     symmetries_to_bop,
 )
@@ -83,7 +83,7 @@ class PoseWeights:
                     f"the network points at {keypoints} keypoints, but object {model.name!r} has "
                     f"{len(model.keypoints_m)}. Make the model with as many."
                 )
-        refuse_one_name(self.models)
+        refuse_equal_names(self.models)
 
 
 def write_pose_weights(

@@ -12,7 +12,7 @@ from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.core.units import METRES, Unit
 from depthpose.pose import mesh
 from depthpose.pose.config import EstimateConfig, ObjectsConfig
-from depthpose.pose.datasets import box_mask, parse_box
+from depthpose.pose.datasets import mask_from_box, parse_box
 from depthpose.pose.datasets.dataset import write_mask
 from depthpose.pose.decide import with_status
 from depthpose.pose.footprint import explained_mask
@@ -177,7 +177,7 @@ def _make_box_views(form: Form, pose_input: CloudInput | ViewInput) -> list[View
     views: list[ViewInput] = []
     for number, word in enumerate(words, 1):
         assert isinstance(pose_input, ViewInput)
-        mask = box_mask(parse_box(word), *pose_input.depth_m.shape)
+        mask = mask_from_box(parse_box(word), *pose_input.depth_m.shape)
         name = pose_input.name + (f"_{number}" if len(words) > 1 else "")
         views.append(replace(pose_input, name=name, mask=mask, is_region=True))
     return views

@@ -9,8 +9,8 @@ from depthpose.pose.datasets.dataset import write_bop_models as write_bop_models
 from depthpose.pose.datasets.dataset import write_bop_scene as write_bop_scene
 from depthpose.pose.datasets.detections import Box as Box
 from depthpose.pose.datasets.detections import Detection as Detection
-from depthpose.pose.datasets.detections import box_mask as box_mask
 from depthpose.pose.datasets.detections import group_by_image as group_by_image
+from depthpose.pose.datasets.detections import mask_from_box as mask_from_box
 from depthpose.pose.datasets.detections import name_objects as name_objects
 from depthpose.pose.datasets.detections import parse_box as parse_box
 from depthpose.pose.datasets.detections import parse_labels as parse_labels
@@ -24,7 +24,7 @@ from depthpose.pose.datasets.layouts import read_object_names as read_object_nam
 from depthpose.pose.datasets.layouts import read_targets as read_targets
 from depthpose.pose.datasets.masks import decode_rle as decode_rle
 from depthpose.pose.datasets.masks import encode_rle as encode_rle
+from depthpose.pose.datasets.masks import mask_from_labels as mask_from_labels
 from depthpose.pose.datasets.masks import number_objects as number_objects
-from depthpose.pose.datasets.masks import one_mask as one_mask
 from depthpose.pose.datasets.masks import read_labels as read_labels
 from depthpose.pose.datasets.masks import read_mask as read_mask

@@ -1,4 +1,4 @@
-"""A data set of any known layout as samples, its check before hours of work, and writing BOP's."""
+"""Data sets of poses: samples of any known layout, the check of all files, and writing BOP's."""
 
 import hashlib
 from collections import Counter
@@ -37,14 +37,15 @@ from depthpose.pose.cloud import (
 from depthpose.pose.datasets.layouts import (
     Instance,
     find_layout,
+    find_model_file,
     list_bop_splits,
     read_bop_models,
     read_models_info,
     read_object_names,
 )
-from depthpose.pose.datasets.masks import mask_box, read_mask
+from depthpose.pose.datasets.masks import find_mask_box, read_mask
 from depthpose.pose.mesh import (
-    exact_diameter,
+    measure_diameter,
     read_model,
     sample_surface,
     symmetries_from_bop,
@@ -55,7 +56,7 @@ from depthpose.pose.types import ObjectModel, PoseTruth, ViewInput, ViewSample
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BopDataset:
-    """Instances of one split, each a sample when it is asked for."""
+    """The instances of a split, whose files are read when a sample is asked for."""
 
     folder: Path  #: of the data set
     split: str  #: its name, with that of the sensor where there are several
@@ -70,10 +71,10 @@ class BopDataset:
     def folder_of_split(self) -> str:
         """The folder of the split: its name without that of the sensor."""
         splits = list_bop_splits(self.folder) if self.layout == "BOP" else {}
-        return splits[self.split][0] if self.split in splits else self.split
+        return splits[self.split].folder if self.split in splits else self.split
 
     def __getitem__(self, index: int) -> ViewSample:
-        """Give a view with the annotated mask; see :meth:`view`."""
+        """Read the view of an instance, with the annotated mask; see :meth:`view`."""
         return self.view(self.instances[index])
 
     @cached_property
@@ -89,7 +90,11 @@ class BopDataset:
     def view(
         self, instance: Instance, mask: Bool[Tensor, "mask_h mask_w"] | None = None
     ) -> ViewSample:
-        """Read the whole depth image of an instance, with a predicted mask or the annotated one.
+        """Read the whole depth image of an instance, and its true pose.
+
+        Args:
+            instance: of this data set.
+            mask: a predicted one; None: the annotated one.
 
         Raises:
             InputError: a file is missing or damaged, or the mask does not fit the depth.
@@ -114,12 +119,15 @@ class BopDataset:
         )
 
     def of_objects(self, *objects: int | str) -> "BopDataset":
-        """Keep the instances of some objects, by number or name; digits are a number too.
+        """Select the instances of some objects, as a data set of these alone.
+
+        Args:
+            objects: their numbers or names; digits are a number too.
 
         Raises:
             InputError: none is left.
         """
-        # The objects that occur, and those of them that are asked for: digits may be a name.
+        # The objects that occur, and those that are asked for: digits are a number, or a name.
         present = sorted({instance.object_id for instance in self.instances})
         names = read_object_names(self.folder, present)
         digits = (o for o in objects if isinstance(o, str) and o.isdecimal())
@@ -179,9 +187,12 @@ def read_instance_mask(instance: Instance) -> Bool[Tensor, "mask_h mask_w"]:
     return read_mask(instance.mask)
 
 
-_DIAMETER_SLACK = 0.01
-_FAR_DIAMETERS = 1.0
-_FEW_IN_MASK = 0.5
+_DIAMETER_SLACK = 0.01  # share by which the declared diameter may differ from the mesh's
+_FAR_DIAMETERS = 1.0  # of a cloud from the annotated pose, from which units are suspected
+_FEW_IN_MASK = 0.5  # share of a posed model in its mask, below which the mask is another's
+_CHECKED_POINTS = 500  # of a model, by which that share is measured
+_MASK_MARGIN_PX = 2  # by which a mask may be too small
+_NOWHERE_PX = -9  # pixel of a point that has none
 
 
 def check_bop(
@@ -227,14 +238,11 @@ def check_bop(
         try:
             problems += _check_instance(instance, model)
         except InputError as error:
-            # Of which file, by the error's words: the depth image where it names no other.
-            paths = (p for p in (instance.mask, instance.rgb) if p and str(p) in str(error))
-            problem = make_unreadable(next(paths, instance.depth), error)
-            if not problem.path.is_file():
-                problem = replace(problem, kind="missing")
-            problems.append(problem)
+            problems.append(_describe_unreadable(instance, error))
         if progress is not None:
             progress(done, len(instances))
+
+    # The report.
     counts = {
         "images": len({(i.depth.parent, i.image_id) for i in instances}),
         "instances": len(instances),
@@ -245,23 +253,37 @@ def check_bop(
     return make_report(name, counts, problems)
 
 
+def _describe_unreadable(instance: Instance, error: InputError) -> Problem:
+    """Describe an error in reading an instance's files as a problem of one of these.
+
+    It is the file that the error names, or else the depth image.
+    """
+    files = (instance.mask, instance.rgb)
+    named = (path for path in files if path is not None and str(path) in str(error))
+    problem = make_unreadable(next(named, instance.depth), error)
+    return problem if problem.path.is_file() else replace(problem, kind="missing")
+
+
 def _check_models(
     folder: Path, numbers: set[int], problems: list[Problem]
 ) -> dict[int, ObjectModel]:
-    """Read the models that can be read; what is wrong with them goes to ``problems``."""
+    """Read the models that can be read; what is wrong with them is added to ``problems``.
+
+    Returns:
+        The models by number.
+    """
     models: dict[int, ObjectModel] = {}
     try:
-        home, infos = read_models_info(folder)
+        models_folder, infos = read_models_info(folder)
     except InputError as error:
         problems.append(Problem(path=folder, kind="missing", message=str(error)))
         return models
     for number in sorted(numbers):
         # Is there a mesh, and can it be read?
-        candidates = (home / f"obj_{number:06d}.ply", home / f"obj_{number:02d}.ply")
-        path = next((path for path in candidates if path.is_file()), None)
+        path = find_model_file(models_folder, number)
         if path is None:
             message = f"has no mesh of object {number}, which is annotated"
-            problems.append(Problem(path=home, kind="missing", message=message))
+            problems.append(Problem(path=models_folder, kind="missing", message=message))
             continue
         try:
             symmetries_from_bop(infos.get(number, {}), source=f"object {number}")
@@ -270,15 +292,7 @@ def _check_models(
             problems.append(make_unreadable(path, error))
             continue
 
-        # Is it as large as the data set says?
-        declared_mm = infos.get(number, {}).get("diameter")
-        measured_mm = 1000 * exact_diameter(models[number].vertices_m)
-        if not isinstance(declared_mm, int | float):
-            message = "has no declared diameter; that of the mesh is taken"
-            problems.append(Problem(path=path, kind="note", message=message))
-        elif abs(measured_mm - declared_mm) > _DIAMETER_SLACK * declared_mm:
-            message = f"is {measured_mm:.1f} mm across, but models_info says {declared_mm:.1f} mm"
-            problems.append(Problem(path=path, kind="mismatch", message=message))
+        problems += _check_diameter(path, models[number], infos.get(number, {}).get("diameter"))
 
     # Estimators know objects by name, and refuse two of one.
     names = read_object_names(folder, numbers)
@@ -286,12 +300,34 @@ def _check_models(
         if count > 1:
             of_name = " and ".join(str(n) for n in sorted(names) if names[n] == name)
             message = f"calls objects {of_name} {name!r}; rename all but one in models_info"
-            problems.append(Problem(path=home, kind="mismatch", message=message))
+            problems.append(Problem(path=models_folder, kind="mismatch", message=message))
     return models
 
 
+def _check_diameter(path: Path, model: ObjectModel, declared_mm: object) -> Iterator[Problem]:
+    """Compare the diameter of a mesh with that which the data set declares, if it does."""
+    measured_mm = 1000 * measure_diameter(model.vertices_m)
+    if not isinstance(declared_mm, int | float):
+        message = "has no declared diameter; that of the mesh is taken"
+        yield Problem(path=path, kind="note", message=message)
+    elif abs(measured_mm - declared_mm) > _DIAMETER_SLACK * declared_mm:
+        message = f"is {measured_mm:.1f} mm across, but models_info says {declared_mm:.1f} mm"
+        yield Problem(path=path, kind="mismatch", message=message)
+
+
 def _check_instance(instance: Instance, model: ObjectModel | None) -> Iterator[Problem]:
-    """Compare the sizes of an instance's files, and with a model what they show with its pose."""
+    """Compare the sizes of an instance's files, and what they show with the model at its pose.
+
+    Args:
+        instance: the annotation and its files.
+        model: of its object; None: sizes are compared alone.
+
+    Yields:
+        What does not agree, and notes.
+
+    Raises:
+        InputError: a file is missing or damaged.
+    """
     # What is noted of the annotation.
     if instance.mask is None:
         message = f"has no mask_visib of annotation {instance.index}"
@@ -308,24 +344,30 @@ def _check_instance(instance: Instance, model: ObjectModel | None) -> Iterator[P
             message = f"is {size[0]}x{size[1]}, but its depth image is {width}x{height}"
             yield Problem(path=path, kind="mismatch", message=message)
             return
-    if instance.mask is None or model is None:
-        return
+    if instance.mask is not None and model is not None:
+        yield from _compare_with_model(instance, instance.mask, model)
 
+
+def _compare_with_model(
+    instance: Instance, mask_path: Path, model: ObjectModel
+) -> Iterator[Problem]:
+    """Compare what an instance's depth image and mask show with its model at the annotated pose."""
     # Does the mask show enough points?
-    mask = read_instance_mask(instance)
+    mask = read_mask(mask_path)
     depth_m = read_depth_png(instance.depth, instance.depth_unit_m)
     cloud = cloud_from_depth(depth_m, mask, instance.K)
     too_few = why_too_few(cloud)
     if too_few is not None:
         # Instances that are fully occluded are annotated too: no fault, but no test either.
-        yield Problem(path=instance.mask, kind="note", message=too_few)
+        yield Problem(path=mask_path, kind="note", message=too_few)
         return
 
     # Do they lie at the annotated pose? And if so, does the posed model lie in the mask?
     centre_m = instance.camera_from_model.apply(model.vertices_m.double()).mean(0)
     away_m = float((cloud.double().median(0).values - centre_m).norm())
     if away_m > _FAR_DIAMETERS * model.diameter_m:
-        advice = advise_unit(model.diameter_m, cloud[cloud[:, 2] < 3 * cloud[:, 2].median()])
+        near_cloud = cloud[cloud[:, 2] < 3 * cloud[:, 2].median()]
+        advice = advise_unit(model.diameter_m, near_cloud)
         message = (
             f"the cloud lies {away_m:.2f} m from the annotated pose; are depth_scale and "
             "cam_t_m2c both for millimetres?"
@@ -337,19 +379,20 @@ def _check_instance(instance: Instance, model: ObjectModel | None) -> Iterator[P
     is_visible = instance.visible_fraction is None or instance.visible_fraction >= _FEW_IN_MASK
     if is_visible and _measure_share_in_mask(instance, model, mask) < _FEW_IN_MASK:
         message = f"{instance.name}: the posed model does not lie on its mask; is it another's?"
-        yield Problem(path=instance.mask, kind="mismatch", message=message)
+        yield Problem(path=mask_path, kind="mismatch", message=message)
 
 
 def _measure_share_in_mask(
     instance: Instance, model: ObjectModel, mask: Bool[Tensor, "h w"]
 ) -> float:
-    """Measure the share of a posed model's points whose pixel is in the mask, or two beside it."""
+    """Measure the share of a posed model's points whose pixel is in the mask, or near it."""
     height, width = mask.shape
-    surface_m, _ = sample_surface(model, 500)
+    surface_m, _ = sample_surface(model, _CHECKED_POINTS)
     points_m = instance.camera_from_model.apply(surface_m.double())
-    u, v = project(points_m, instance.K).nan_to_num(-9).round().long().unbind(1)
+    pixels = project(points_m, instance.K).nan_to_num(_NOWHERE_PX).round().long()
+    u, v = pixels.unbind(1)
     is_inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
-    grown = grow_mask(mask, 2)
+    grown = grow_mask(mask, _MASK_MARGIN_PX)
     is_hit = grown[v.clamp(0, height - 1), u.clamp(0, width - 1)] & is_inside
     return float(is_hit.double().mean())
 
@@ -359,7 +402,7 @@ _DEPTH_UNIT_M = 0.0001  # tenths of a millimetre reach 6.5 m, and no imitated se
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BopObject:
-    """One object of a frame."""
+    """An annotated object of a frame."""
 
     number: int  #: its ``obj_id``
     camera_from_model: Rigid  #: its pose
@@ -369,7 +412,7 @@ class BopObject:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BopFrame:
-    """One image of a scene."""
+    """An image of a scene, with its annotations."""
 
     number: int  #: its ``im_id``
     K: Float[Tensor, "3 3"]  #: intrinsic matrix
@@ -381,7 +424,7 @@ class BopFrame:
 def write_bop_scene(
     folder: Path, split: str, scene_id: int, frames: Sequence[BopFrame]
 ) -> Path:  # fmt: skip
-    """Write a scene whole: images and masks first, so that its JSON never names what is missing.
+    """Write a scene in BOP's layout, its images and masks before the JSON that names them.
 
     Args:
         folder: of the data set.
@@ -408,7 +451,7 @@ def write_bop_scene(
             write_mask(scene / "mask_visib" / f"{name}_{index:06d}.png", shown.visible)
             write_mask(scene / "mask" / f"{name}_{index:06d}.png", shown.silhouette)
 
-        # What is known of its objects.
+        # The annotations of its objects.
         truths[str(frame.number)] = [_describe_pose(shown) for shown in frame.objects]
         infos[str(frame.number)] = [_describe_visible(shown, frame) for shown in frame.objects]
     scale_mm = 1000 * _DEPTH_UNIT_M
@@ -436,8 +479,8 @@ def _describe_visible(shown: BopObject, frame: BopFrame) -> dict[str, Any]:
     silhouette_px = int(shown.silhouette.sum())
     visible_px = int(shown.visible.sum())
     return {
-        "bbox_obj": mask_box(shown.silhouette),
-        "bbox_visib": mask_box(shown.visible),
+        "bbox_obj": find_mask_box(shown.silhouette),
+        "bbox_visib": find_mask_box(shown.visible),
         "px_count_all": silhouette_px,
         "px_count_valid": int((shown.silhouette & frame.depth_m.isfinite()).sum()),
         "px_count_visib": visible_px,
@@ -446,36 +489,36 @@ def _describe_visible(shown: BopObject, frame: BopFrame) -> dict[str, Any]:
 
 
 def write_bop_models(folder: Path, models: Sequence[ObjectModel]) -> Path:
-    """Write ``models/obj_NNNNNN.ply`` in mm, and ``models_info.json`` with symmetries.
+    """Write models in BOP's layout: ``models/obj_NNNNNN.ply`` in mm, and ``models_info.json``.
 
     Returns:
-        The folder of models.
+        The folder of the models.
 
     Raises:
         InputError: the disk refuses.
     """
     import trimesh
 
-    home = folder / "models"
+    models_folder = folder / "models"
     info: dict[str, Any] = {}
     for model in models:
         # Its mesh, or its points.
-        vertices = 1000 * model.vertices_m.double().numpy()
-        mesh = trimesh.Trimesh(vertices, model.faces.numpy(), process=False)
-        shape = mesh if len(model.faces) else trimesh.PointCloud(vertices)
+        vertices_mm = 1000 * model.vertices_m.double().numpy()
+        mesh = trimesh.Trimesh(vertices_mm, model.faces.numpy(), process=False)
+        shape = mesh if len(model.faces) else trimesh.PointCloud(vertices_mm)
         data = shape.export(file_type="ply")
         assert isinstance(data, bytes)
-        write_bytes(home / f"obj_{model.number:06d}.ply", data)
+        write_bytes(models_folder / f"obj_{model.number:06d}.ply", data)
 
         # Its entry: diameter, name, box and symmetries.
-        low = vertices.min(0)
-        size = np.ptp(vertices, axis=0)
+        low = vertices_mm.min(0)
+        size = np.ptp(vertices_mm, axis=0)
         entry: dict[str, Any] = {"diameter": 1000 * model.diameter_m, "name": model.name}
         entry |= {f"min_{axis}": float(low[i]) for i, axis in enumerate("xyz")}
         entry |= {f"size_{axis}": float(size[i]) for i, axis in enumerate("xyz")}
         info[str(model.number)] = entry | symmetries_to_bop(model.symmetries)
-    write_json(home / "models_info.json", info)
-    return home
+    write_json(models_folder / "models_info.json", info)
+    return models_folder
 
 
 def write_mask(path: Path, mask: Bool[Tensor, "h w"]) -> None:

@@ -13,18 +13,24 @@ from torch import Tensor
 from depthpose.core.errors import InputError, suggest_name
 from depthpose.core.files import read_json, read_text, write_json
 from depthpose.core.files.disk import make_suffix_error
-from depthpose.pose.datasets.layouts import MOST, read_integer, read_number, read_numbers
-from depthpose.pose.datasets.masks import Runs, decode_rle, mask_box, read_runs
+from depthpose.pose.datasets.entries import (
+    LARGEST_ID,
+    check_rows,
+    read_integer,
+    read_number,
+    read_numbers,
+)
+from depthpose.pose.datasets.masks import RunLengths, decode_rle, find_mask_box, read_runs
 
 Box = tuple[float, float, float, float]
 """Left, top, right and bottom edge [px]: the first pixel reaches from 0 to 1, as COCO counts."""
 _NO_BOX = [-1.0] * 4  # as BOP writes the box of an empty mask
-_YOLO = "class cx cy w h [confidence]"
+_YOLO_FORM = "class cx cy w h [confidence]"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Detection:
-    """One object that a detector found in an image: a mask, or a box about it.
+    """An object that a detector found in an image: its mask, or a box about it.
 
     Raises:
         InputError: it has neither or both, or a box whose edges are not in order.
@@ -35,7 +41,7 @@ class Detection:
     object_id: int | None = None  #: number of its class (``category_id``)
     score: float = 1.0  #: confidence; 1 where the file gives none
     box: Box | None = None  #: edges; may reach beyond the image
-    segmentation: Runs | None = None  #: run lengths as in the file, checked
+    segmentation: RunLengths | None = None  #: its mask
     scene_id: int | None = None  #: number of the scene, of BOP's data sets
     image_id: int | None = None  #: number of the image
     image: str | None = None  #: name of the image's file without its ending
@@ -57,21 +63,22 @@ class Detection:
         return str(self.object_id) if self.object is None else self.object
 
     def mask(self, height: int, width: int) -> Bool[Tensor, "height width"]:
-        """Mark its pixels: those of the mask, or all that the box touches.
+        """Mark the object's pixels in the image: those of the mask, or all that the box touches.
 
         Raises:
             InputError: the mask is of an image of another size, or the box lies outside of this.
         """
         if self.segmentation is None:
             assert self.box is not None
-            return box_mask(self.box, height, width)
-        if self.segmentation[1:] != (height, width):
-            rows, columns = self.segmentation[1:]
+            return mask_from_box(self.box, height, width)
+        runs = self.segmentation
+        if (runs.height, runs.width) != (height, width):
             raise InputError(
-                f"the mask of a detection is {columns}x{rows}, but the image {width}x{height}; "
+                f"the mask of a detection is {runs.width}x{runs.height}, but the image "
+                f"{width}x{height}; "
                 "detect in this very image, or resize the masks to its size"
             )
-        return decode_rle(*self.segmentation)
+        return decode_rle(*runs)
 
 
 def parse_box(text: str) -> Box:
@@ -106,7 +113,7 @@ def check_box(box: Box) -> None:
         )
 
 
-def box_mask(box: Box, height: int, width: int) -> Bool[Tensor, "height width"]:
+def mask_from_box(box: Box, height: int, width: int) -> Bool[Tensor, "height width"]:
     """Mark all pixels of an image that a box touches; the box may reach beyond the image.
 
     Raises:
@@ -153,31 +160,31 @@ def read_detections(path: str | Path, size: tuple[int, int] | None = None) -> li
 
 
 def _read_coco(path: Path) -> list[Detection]:
-    """Read entries of BOP or COCO."""
+    """Read a JSON file of detections as BOP or COCO share them."""
     # The names of classes and images, which COCO lists apart.
     content = read_json(path)
     class_names: dict[int, str] = {}
     image_files: dict[int, str] = {}
     if isinstance(content, dict) and "annotations" in content:
-        for category in _check_entries(content.get("categories", []), f"{path}: categories"):
-            class_names[read_integer(category, "id", f"{path}: categories")] = str(
-                category.get("name")
-            )
-        for image in _check_entries(content.get("images", []), f"{path}: images"):
-            image_files[read_integer(image, "id", f"{path}: images")] = str(image.get("file_name"))
+        source = f"{path}: categories"
+        for category in check_rows(content.get("categories", []), source):
+            class_names[read_integer(category, "id", source)] = str(category.get("name"))
+        source = f"{path}: images"
+        for image in check_rows(content.get("images", []), source):
+            image_files[read_integer(image, "id", source)] = str(image.get("file_name"))
         content = content["annotations"]
 
     # The detections.
     return [
         _parse_coco_entry(row, class_names, image_files, f"{path}: entry {place}")
-        for place, row in enumerate(_check_entries(content, str(path)))
+        for place, row in enumerate(check_rows(content, str(path)))
     ]
 
 
 def _parse_coco_entry(
     row: dict[str, Any], class_names: dict[int, str], image_files: dict[int, str], source: str
 ) -> Detection:
-    """Read one entry of BOP or COCO; where it has a mask, its box is ignored.
+    """Make a detection of an entry of BOP or COCO; where it has a mask, its box is ignored.
 
     Args:
         row: the entry.
@@ -194,29 +201,27 @@ def _parse_coco_entry(
         name = class_names.get(object_id)
 
     # The image, by number or by the name of its file.
-    image_id = read_integer(row, "image_id", source) if _is_number(row, "image_id") else None
-    file = row.get("file_name", row.get("image_id") if image_id is None else None)
-    if file is None and image_id is not None:
-        file = image_files.get(image_id)
+    image_id = None
+    image_file = row.get("file_name")
+    if _has_integer(row, "image_id"):
+        image_id = read_integer(row, "image_id", source)
+        image_file = image_files.get(image_id) if image_file is None else image_file
+    elif "file_name" not in row:
+        image_file = row.get("image_id")
 
-    # The mask, or the box; and the time, which is negative where it is not known.
+    # The time is negative where it is not known.
     seconds = read_number(row, "time", -1.0, source)
     segmentation = row.get("segmentation")
-    box = None
-    if row.get("bbox") is not None and not segmentation:
-        left, top, width, height = read_numbers(row, "bbox", 4, source)
-        if [left, top, width, height] != _NO_BOX:
-            box = (left, top, left + width, top + height)
     try:
         return Detection(
             object=None if name is None else str(name),
             object_id=object_id,
             score=read_number(row, "score", 1.0, source),
-            box=box,
+            box=None if segmentation else _read_coco_box(row, source),
             segmentation=read_runs(segmentation, source) if segmentation else None,
             scene_id=read_integer(row, "scene_id", source) if "scene_id" in row else None,
             image_id=image_id,
-            image=None if file is None else PurePosixPath(str(file)).stem,
+            image=None if image_file is None else PurePosixPath(str(image_file)).stem,
             seconds=seconds if seconds >= 0 else None,
         )
     except InputError as error:
@@ -224,49 +229,69 @@ def _parse_coco_entry(
         raise InputError(reason if source in reason else f"{source}: {reason}") from error
 
 
+def _read_coco_box(row: dict[str, Any], source: str) -> Box | None:
+    """Read left, top, width and height of an entry as a box; None where it has none."""
+    if row.get("bbox") is None:
+        return None
+    left, top, width, height = read_numbers(row, "bbox", 4, source)
+    if [left, top, width, height] == _NO_BOX:
+        return None
+    return left, top, left + width, top + height
+
+
 def _read_yolo(path: Path, size: tuple[int, int] | None) -> list[Detection]:
-    """Read boxes of YOLO: in each line class, centre and size (shares of the image), and score."""
+    """Read a text file of YOLO's boxes in an image of some size (width, height)."""
     if size is None:
         raise InputError(
             f"{path}: its boxes are shares of an image whose size is not known here; give JSON, or "
             "name it by --detections beside --depth"
         )
-    detections: list[Detection] = []
-    for line, text in enumerate(read_text(path).splitlines(), 1):
-        words = text.split()
-        source = f"{path}: line {line}"
-        if not words:
-            continue
-        if len(words) not in (5, 6):
-            raise InputError(
-                f"{source}: {len(words)} numbers, where {_YOLO} belong; polygons are to be turned "
-                "into boxes, or masks given by --mask"
-            )
-        try:
-            object_id = int(words[0])
-            shares = [float(word) for word in words[1:]]
-        except ValueError as error:
-            raise InputError(f"{source}: {error}; write {_YOLO}") from error
+    lines = enumerate(read_text(path).splitlines(), 1)
+    return [
+        _parse_yolo_line(text, size, path.stem, f"{path}: line {line}")
+        for line, text in lines
+        if text.split()
+    ]
 
-        # Are these a class and shares of the image?
-        cx, cy, w, h = shares[:4]
-        is_share = all(0 <= share <= 1 for share in shares)
-        if not is_share or not w * h > 0 or not 0 <= object_id <= MOST:
-            raise InputError(
-                f"{source}: {text.strip()[:80]!r} is not {_YOLO}, a class of 0 or more, and shares "
-                "of the image from 0 to 1; boxes in pixels go into JSON as COCO's bbox"
-            )
 
-        # To edges in pixels.
-        width, height = size
-        left = (cx - w / 2) * width
-        right = (cx + w / 2) * width
-        top = (cy - h / 2) * height
-        bottom = (cy + h / 2) * height
-        box = (left, top, right, bottom)
-        score = shares[4] if len(shares) == 5 else 1.0
-        detections.append(Detection(object_id=object_id, score=score, box=box, image=path.stem))
-    return detections
+def _parse_yolo_line(text: str, size: tuple[int, int], image: str, source: str) -> Detection:
+    """Make a detection of a line: class, centre and size (shares of the image), and confidence.
+
+    Args:
+        text: the line.
+        size: width and height of the image.
+        image: its name.
+        source: of the line, for errors.
+    """
+    words = text.split()
+    if len(words) not in (5, 6):
+        raise InputError(
+            f"{source}: {len(words)} numbers, where {_YOLO_FORM} belong; polygons are to be turned "
+            "into boxes, or masks given by --mask"
+        )
+    try:
+        object_id = int(words[0])
+        shares = [float(word) for word in words[1:]]
+    except ValueError as error:
+        raise InputError(f"{source}: {error}; write {_YOLO_FORM}") from error
+
+    # Are these a class and shares of the image?
+    cx, cy, w, h = shares[:4]
+    is_share = all(0 <= share <= 1 for share in shares)
+    if not is_share or not w * h > 0 or not 0 <= object_id <= LARGEST_ID:
+        raise InputError(
+            f"{source}: {text.strip()[:80]!r} is not {_YOLO_FORM}, a class of 0 or more, and "
+            "shares of the image from 0 to 1; boxes in pixels go into JSON as COCO's bbox"
+        )
+
+    # To edges in pixels.
+    width, height = size
+    left = (cx - w / 2) * width
+    right = (cx + w / 2) * width
+    top = (cy - h / 2) * height
+    bottom = (cy + h / 2) * height
+    score = shares[4] if len(shares) == 5 else 1.0
+    return Detection(object_id=object_id, score=score, box=(left, top, right, bottom), image=image)
 
 
 def write_detections(path: str | Path, detections: Sequence[Detection]) -> None:
@@ -290,23 +315,29 @@ def write_detections(path: str | Path, detections: Sequence[Detection]) -> None:
 
         # The score, and the mask or the box.
         row["score"] = detection.score
-        if detection.segmentation is not None:
-            counts, height, width = detection.segmentation
-            row["segmentation"] = {"size": [height, width], "counts": list(counts)}
         if detection.box is not None:
             x0, y0, x1, y1 = detection.box
             row["bbox"] = [x0, y0, x1 - x0, y1 - y0]
         else:
-            assert detection.segmentation is not None
-            row["bbox"] = mask_box(decode_rle(*detection.segmentation))
+            runs = detection.segmentation
+            assert runs is not None
+            row["segmentation"] = {"size": [runs.height, runs.width], "counts": list(runs.counts)}
+            row["bbox"] = find_mask_box(decode_rle(*runs))
         rows.append(row | {"time": -1.0 if detection.seconds is None else detection.seconds})
     write_json(Path(path), rows)
 
 
 def parse_labels(text: str, objects: Sequence[str]) -> dict[str, str]:
-    """Read ``1=bracket,2=gear``: the object of each class, which is given by number or name.
+    """Parse ``1=bracket,2=gear``: the object of each class.
 
     ``3=`` leaves class 3 out: the name of its object is empty.
+
+    Args:
+        text: classes, by number or name, and their objects.
+        objects: names of the known objects.
+
+    Returns:
+        The names of objects by class.
 
     Raises:
         InputError: the text is not of this form, names a class twice, or an unknown object.
@@ -336,7 +367,7 @@ def name_objects(
     wanted: str | None,
     source: str,
 ) -> list[Detection]:
-    """Give each detection the name of its object, and leave out those of other objects.
+    """Name the object of each detection, and leave out detections of other objects.
 
     Args:
         detections: of any classes.
@@ -345,6 +376,9 @@ def name_objects(
         wanted: the only object to keep, if any; where all detections are of one class without a
             name, it is this object.
         source: of the detections, in errors.
+
+    Returns:
+        The detections that are kept, with the names of their objects.
 
     Raises:
         InputError: a class is no known object.
@@ -375,10 +409,18 @@ def name_objects(
 def group_by_image(
     detections: Sequence[Detection], images: Sequence[str], source: str
 ) -> dict[str, list[Detection]]:
-    """Group detections by image, which are given by the names of their files without endings.
+    """Group detections by image.
 
-    A detection belongs to the image named ``image``, or to that whose name is the number
-    ``image_id``. Where one image is given, and all detections are of one image, it is that.
+    A detection belongs to the image that its ``image`` names, or else to that whose name is its
+    ``image_id``. Where there is one image, and all detections are of one image, it is that.
+
+    Args:
+        detections: of any images.
+        images: names of their files without endings.
+        source: of the detections, in errors.
+
+    Returns:
+        The detections of each image, by its name.
 
     Raises:
         InputError: a detection names no image, or no detection is of a given image.
@@ -421,14 +463,7 @@ def group_by_image(
     return groups
 
 
-def _check_entries(content: object, source: str) -> list[dict[str, Any]]:
-    """Check that content of a file is a list of entries; ``source`` names it in errors."""
-    if not isinstance(content, list) or not all(isinstance(row, dict) for row in content):
-        raise InputError(f"{source}: is no list of objects, one an entry")
-    return content
-
-
-def _is_number(row: Mapping[str, Any], key: str) -> bool:
+def _has_integer(row: Mapping[str, Any], key: str) -> bool:
     """Whether an entry has a whole number under a key."""
     return isinstance(row.get(key), int) and not isinstance(row[key], bool)
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -13,11 +13,18 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import read_json
 from depthpose.core.files.images import MAX_PIXELS, open_image
 
-Runs = tuple[tuple[int, ...], int, int]  #: run lengths, height and width
 _MOST_LABELS = 64  # different values of an image of labels; one of more is a picture
 _HALF = 127  # of 255: values above it are the object, in masks with soft edges
 _SOFT = 32  # of 255: values farther than this from black and white are grey
 _MOST_BITS = 40  # of a run length in text: no image has as many pixels
+
+
+class RunLengths(NamedTuple):
+    """A mask as COCO holds it: lengths of runs of equal pixels, column by column."""
+
+    counts: tuple[int, ...]  #: the first of the background, which may be 0
+    height: int
+    width: int
 
 
 def read_mask(path: Path) -> Bool[Tensor, "mask_h mask_w"]:
@@ -26,13 +33,13 @@ def read_mask(path: Path) -> Bool[Tensor, "mask_h mask_w"]:
     Raises:
         InputError: it is missing, no picture, or shows several objects.
     """
-    return one_mask(read_labels(path), str(path))
+    return mask_from_labels(read_labels(path), str(path))
 
 
 def read_labels(
     path: Path, labels: Collection[int] | None = None
 ) -> Int64[Tensor, "mask_h mask_w"]:
-    """Read a mask image of any kind: 0 where it is black or transparent, a number for each object.
+    """Read a mask file of any kind: 0 where it is black or transparent, a number for each object.
 
     Of a picture in colour they are 1, 2, ... in the order of the colours. In a photograph, or a
     picture of one colour, with an alpha channel the opaque pixels are the object. A ``.json`` file
@@ -61,15 +68,16 @@ def read_labels(
                 f"{path}: holds {len(entries)} masks, where one is needed; leave one there, or "
                 "name a list of BOP detections by --masks, beside --bop"
             )
-        return decode_rle(*read_runs(entries[0], str(path))).long()
+        runs = read_runs(entries[0], str(path))
+        return decode_rle(*runs).long()
     pixels = _read_pixels(path, with_palette=labels is None)
 
     # Each colour becomes a number.
     values = pixels[..., 0]
     if pixels.shape[2] > 1 and (pixels[..., :3] != values[..., None]).any():
         colour = values.astype(np.int32)
-        for part in (pixels[..., 1], pixels[..., 2]):
-            colour = colour * 2**8 + part
+        for channel in (pixels[..., 1], pixels[..., 2]):
+            colour = colour * 2**8 + channel
         colours = np.unique(colour)
         # Not by the inverse of np.unique, which takes five times the memory.
         values = np.searchsorted(colours, colour).astype(np.int32) + (colours[0] != 0)
@@ -114,7 +122,7 @@ def _read_pixels(path: Path, *, with_palette: bool) -> np.ndarray:
 def _keep_labels(
     values: np.ndarray, labels: Collection[int], path: Path
 ) -> Int64[Tensor, "mask_h mask_w"]:
-    """Set pixels of no label to 0.
+    """Keep the numbers of a mask that are labels, and set other pixels to 0.
 
     Raises:
         InputError: another number fills a square of three by three pixels somewhere.
@@ -139,7 +147,7 @@ def _find_solid_numbers(values: np.ndarray) -> set[int]:
 
 
 def number_objects(values: np.ndarray) -> Int64[Tensor, "h w"]:
-    """Label the objects of a mask (h, w) of whole numbers by these; one object gets the number 1.
+    """Keep the numbers of a mask (h, w) that are objects, 0 elsewhere; a single object becomes 1.
 
     A number is an object where it fills a square of three by three pixels; the values at the soft
     borders of a mask do not. A mask of more than 64 numbers is one object.
@@ -153,8 +161,8 @@ def number_objects(values: np.ndarray) -> Int64[Tensor, "h w"]:
     return torch.from_numpy(np.where(np.isin(values, list(numbers)), values, 0)).long()
 
 
-def one_mask(labels: Int64[Tensor, "h w"], name: str) -> Bool[Tensor, "h w"]:
-    """Turn labels into the mask of their only object.
+def mask_from_labels(labels: Int64[Tensor, "h w"], name: str) -> Bool[Tensor, "h w"]:
+    """Convert labels to the mask of their only object; ``name`` is that of the mask, in errors.
 
     Raises:
         InputError: there are several objects.
@@ -172,33 +180,29 @@ def one_mask(labels: Int64[Tensor, "h w"], name: str) -> Bool[Tensor, "h w"]:
 
 
 def decode_rle(counts: tuple[int, ...], height: int, width: int) -> Bool[Tensor, "h w"]:
-    """Turn run lengths, column by column and beginning with the background, into a mask.
-
-    Args:
-        counts: the run lengths.
-        height: rows of the mask.
-        width: its columns.
-    """
-    values = np.arange(len(counts)) % 2 == 1
-    flat = np.repeat(values, counts)
+    """Convert run lengths to a mask; the arguments are those of :class:`RunLengths`."""
+    is_object = np.arange(len(counts)) % 2 == 1  # every other run
+    flat = np.repeat(is_object, counts)
     return torch.from_numpy(flat.reshape(width, height).T.copy())
 
 
-def encode_rle(mask: Bool[Tensor, "h w"]) -> Runs:
-    """Turn a mask into run lengths and its size."""
+def encode_rle(mask: Bool[Tensor, "h w"]) -> RunLengths:
+    """Convert a mask to run lengths."""
     # A run ends where the next pixel of a column differs.
     flat = mask.cpu().numpy().T.reshape(-1)
     ends = np.flatnonzero(np.diff(flat)) + 1
     runs = np.diff(np.concatenate([[0], ends, [flat.size]])).tolist()
     # The first run is of the background: of no pixel, where the mask starts on the object.
     starts_on_object = flat.size > 0 and bool(flat[0])
-    return tuple([0, *runs] if starts_on_object else runs), mask.shape[0], mask.shape[1]
+    counts = tuple([0, *runs] if starts_on_object else runs)
+    return RunLengths(counts, height=mask.shape[0], width=mask.shape[1])
 
 
-def read_runs(entry: object, source: str) -> Runs:
-    """Read and check COCO's run lengths, compressed (text) or not, and their size.
+def read_runs(entry: object, source: str) -> RunLengths:
+    """Read and check COCO's run lengths, compressed (text) or not.
 
-    The entry may also be one that holds them as its ``segmentation``.
+    The entry may also be one that holds them as its ``segmentation``. ``source`` names it in
+    errors.
 
     Raises:
         InputError: there are none, or they do not add up to their size.
@@ -217,34 +221,34 @@ def read_runs(entry: object, source: str) -> Runs:
 
     # Their size.
     size = entry.get("size")
-    counts = entry["counts"]
-    if (
-        not isinstance(size, list)
-        or len(size) != 2
-        or not all(type(v) is int and v > 0 for v in size)
-    ):
+    sides = size if isinstance(size, list) else []
+    if len(sides) != 2 or not all(type(side) is int and side > 0 for side in sides):
         raise InputError(f"{what}: its size is {size!r}, where [height, width] belongs")
 
     # Numbers that add up to it.
-    height, width = size
-    text = counts.decode("latin-1") if isinstance(counts, bytes) else counts
-    runs: Any = _decompress_runs(text, what) if isinstance(text, str) else text
-    is_list = isinstance(runs, list) and all(type(v) is int and v >= 0 for v in runs)
-    if not is_list or sum(runs) != height * width or height * width > MAX_PIXELS:
+    height, width = sides
+    counts: Any = entry["counts"]
+    if isinstance(counts, bytes):
+        counts = counts.decode("latin-1")
+    if isinstance(counts, str):
+        counts = _decompress_counts(counts, what)
+    is_list = isinstance(counts, list) and all(type(n) is int and n >= 0 for n in counts)
+    if not is_list or sum(counts) != height * width or height * width > MAX_PIXELS:
         raise InputError(f"{what} of {height}x{width} pixels: they do not add up to it")
-    return tuple(runs), height, width
+    return RunLengths(tuple(counts), height=height, width=width)
 
 
-def _decompress_runs(text: str, what: str) -> list[int]:
-    """Read COCO's compressed run lengths; ``what`` names them in errors.
+def _decompress_counts(text: str, what: str) -> list[int]:
+    """Decode COCO's compressed run lengths; ``what`` begins an error.
 
     A character holds five bits of a number, the lowest first, and a bit that says whether more
     follow. From the fourth run on the numbers are differences from the last run but one.
     """
-    runs: list[int] = []
+    counts: list[int] = []
     value = 0
     shift = 0
-    for bits in (ord(character) - 48 for character in text):
+    for character in text:
+        bits = ord(character) - ord("0")
         value |= (bits & 0x1F) << shift
         shift += 5
         if shift > _MOST_BITS:
@@ -257,14 +261,14 @@ def _decompress_runs(text: str, what: str) -> list[int]:
         is_negative = bits & 0x10
         if is_negative:
             value -= 1 << shift
-        runs.append(value + (runs[-2] if len(runs) > 2 else 0))
+        counts.append(value + (counts[-2] if len(counts) > 2 else 0))
         value = 0
         shift = 0
-    return runs
+    return counts
 
 
-def mask_box(mask: Bool[Tensor, "h w"]) -> list[int]:
-    """Give left, top, width and height of a mask [px]; -1 four times, as BOP, for an empty one."""
+def find_mask_box(mask: Bool[Tensor, "h w"]) -> list[int]:
+    """Find the box about a mask: left, top, width and height [px]; -1 four times if it is empty."""
     rows, columns = mask.nonzero(as_tuple=True)
     if len(rows) == 0:
         return [-1] * 4

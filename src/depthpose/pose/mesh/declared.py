@@ -15,8 +15,8 @@ from torch import Tensor
 from depthpose.core.errors import InputError, Notice, suggest_name
 from depthpose.core.files import read_json
 from depthpose.core.rigid import Rigid, geodesic_rad
+from depthpose.pose.mesh.deviation import SurfaceDeviation
 from depthpose.pose.mesh.models import symmetries_from_bop, symmetry_transforms, turn_about
-from depthpose.pose.mesh.symmetry import SurfaceDeviation
 from depthpose.pose.types import Axis, ObjectModel, Symmetries
 
 AnySymmetry = str | Path | Mapping[str, Any] | Symmetries
@@ -29,6 +29,7 @@ _FORM = (
     "several are joined by + (z,6+x,2). Or give a JSON file with BOP's symmetries_discrete and "
     "symmetries_continuous"
 )
+_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 _MOST_TURNS = 360  # of one axis: more is a body of revolution
 _MOST_COPIES = 720  # of all axes together
 _SAME_RAD = 0.005  # angle up to which two rotations are the same
@@ -47,7 +48,7 @@ class DeclaredTurns:
 
     @property
     def angles_rad(self) -> Float64[Tensor, " a"]:
-        """Angles of all rotations but that by 0; of a free axis some, by which it is measured."""
+        """Angles of all rotations but that by 0; of a free axis eleven, by which it is measured."""
         count = self.turns or _CHECKED
         return torch.arange(1, count, dtype=torch.float64) * (2 * math.pi / count)
 
@@ -55,46 +56,57 @@ class DeclaredTurns:
 def read_symmetry(text: str) -> tuple[DeclaredTurns, ...]:
     """Read a symmetry in words: ``z,18``, ``z,free``, ``z,6+x,2``.
 
+    Returns:
+        The rotations about each axis, in the order of the words.
+
     Raises:
-        InputError: it is none.
+        InputError: a part of it is no axis with a number of turns.
     """
     declared: list[DeclaredTurns] = []
     for part in text.split("+"):
-        # An axis and how many turns about it; a length of 0 where it is none.
-        axis, _, count = (word.strip().lower() for word in part.rpartition(","))
-        try:
-            directions = {"x": (1.0, 0, 0), "y": (0, 1.0, 0), "z": (0, 0, 1.0)}
-            numbers = directions.get(axis) or [float(word) for word in axis.split()]
-            direction = torch.tensor(numbers, dtype=torch.float64).reshape(3)
-            length = float(direction.norm())
-            turns = None if count == "free" else int(count)
-        except (ValueError, RuntimeError):
-            length = 0.0
-            turns = 0
-            direction = torch.zeros(3)
-        if not 0 < length < math.inf or not (turns is None or 2 <= turns <= _MOST_TURNS):
+        turns = _parse_turns(part)
+        if turns is None:
             raise InputError(
                 f"symmetry {text!r}: {part.strip()!r} is no axis with 2 to {_MOST_TURNS} turns; "
                 f"{_FORM}"
             )
-        declared.append(DeclaredTurns(direction=direction / length, turns=turns))
+        declared.append(turns)
     return tuple(declared)
 
 
+def _parse_turns(text: str) -> DeclaredTurns | None:
+    """Parse an axis and how many turns about it, ``z,18`` or ``0 1 1,free``; None: it is none."""
+    axis, _, count = (word.strip().lower() for word in text.rpartition(","))
+    try:
+        components = _AXES.get(axis) or [float(word) for word in axis.split()]
+        direction = torch.tensor(components, dtype=torch.float64).reshape(3)
+        turns = None if count == "free" else int(count)
+    except (ValueError, RuntimeError):
+        return None
+    length = float(direction.norm())
+    is_in_range = turns is None or 2 <= turns <= _MOST_TURNS
+    if not 0 < length < math.inf or not is_in_range:
+        return None
+    return DeclaredTurns(direction=direction / length, turns=turns)
+
+
 def declare_symmetry(model: ObjectModel, symmetry: AnySymmetry) -> ObjectModel:
-    """Declare the symmetry of a model: its copies are one answer.
+    """Declare the symmetry of a model: its copies count as one pose.
 
     An axis in words is placed where the surface rotated about it fits best, not through the file's
     origin. A notice is given where the rotated surface lies more than 2 % of the diameter off.
 
     Args:
         model: the object.
-        symmetry: in words, BOP's form, or as it is.
+        symmetry: in words, as BOP's entry of an object or a JSON file of it, or ``Symmetries``.
+
+    Returns:
+        The model with the symmetry in place of its own.
 
     Raises:
         InputError: it is no symmetry, or a file of none.
     """
-    # In whatever form it is given.
+    # From each of its forms.
     surface = SurfaceDeviation(model)
     if isinstance(symmetry, str) and not symmetry.lower().endswith(".json"):
         declared = _place_axes(read_symmetry(symmetry), surface, model)
@@ -124,32 +136,35 @@ def declare_symmetry(model: ObjectModel, symmetry: AnySymmetry) -> ObjectModel:
 
 
 def assign_symmetries(
-    given: AnySymmetry | Mapping[str, AnySymmetry] | Sequence[str] | None, names: Sequence[str]
+    declared: AnySymmetry | Mapping[str, AnySymmetry] | Sequence[str] | None, names: Sequence[str]
 ) -> dict[str, AnySymmetry]:
-    """Assign declared symmetries to the objects that have one.
+    """Find for each declared symmetry the object that has it.
 
     Args:
-        given: one, where one object is known; a mapping from names; or words that begin by a name
-            where there are several (``gear:z,18``).
+        declared: one, where there is one object; a mapping from names; or words that begin by a
+            name where there are several objects (``gear:z,18``).
         names: of the objects.
+
+    Returns:
+        The symmetries by the names of their objects.
 
     Raises:
         InputError: no object, or several, could be meant.
     """
-    if given is None:
+    if declared is None:
         return {}
 
     # A mapping from names.
-    is_bop = isinstance(given, Mapping) and any(key.startswith("symmetries_") for key in given)
-    if isinstance(given, Mapping) and not is_bop:
-        for name in given:
+    is_bop = isinstance(declared, Mapping) and any(k.startswith("symmetries_") for k in declared)
+    if isinstance(declared, Mapping) and not is_bop:
+        for name in declared:
             _refuse_unknown_name(name, names, f"symmetry of {name!r}")
-        return dict(given)
+        return dict(declared)
 
     # One symmetry or several, which may begin by the name of their object.
-    is_single = isinstance(given, str | Path | Mapping | Symmetries)
-    declarations: Sequence[AnySymmetry] = [given] if is_single else list(given)
-    declared: dict[str, AnySymmetry] = {}
+    is_single = isinstance(declared, str | Path | Mapping | Symmetries)
+    declarations: Sequence[AnySymmetry] = [declared] if is_single else list(declared)
+    of_objects: dict[str, AnySymmetry] = {}
     for declaration in declarations:
         name = colon = rest = ""
         if isinstance(declaration, str):
@@ -165,10 +180,10 @@ def assign_symmetries(
                 f"symmetry {declaration!r}: {len(names)} objects are known ({', '.join(names)}); "
                 f"say whose it is: {names[0]}:z,18, in Python symmetry={{{names[0]!r}: 'z,18'}}"
             )
-        if name in declared:
+        if name in of_objects:
             raise InputError(f"symmetry of {name!r} is given twice; join the two by +: z,6+x,2")
-        declared[name] = symmetry
-    return declared
+        of_objects[name] = symmetry
+    return of_objects
 
 
 def _refuse_unknown_name(name: str, names: Sequence[str], message: str) -> None:
@@ -193,36 +208,34 @@ def _read_entry(path: Path, model: ObjectModel) -> Mapping[str, Any]:
 
 
 def _place_axes(
-    terms: Sequence[DeclaredTurns], surface: SurfaceDeviation, model: ObjectModel
+    declared: Sequence[DeclaredTurns], surface: SurfaceDeviation, model: ObjectModel
 ) -> Symmetries:
-    """Place the axes by the surface, and complete their rotations to a group.
+    """Place axes by the surface, and complete their rotations to a group.
 
     Args:
-        terms: of the symmetry in words.
+        declared: rotations about each axis.
         surface: of the model.
         model: the object.
 
     Raises:
         InputError: the rotations make more copies than a symmetry has.
     """
-    axes = [
-        Axis(direction=term.direction, point_m=_find_point_on_axis(term, surface, model))
-        for term in terms
-    ]
-    pairs = list(zip(terms, axes, strict=True))
-    free = tuple(axis for term, axis in pairs if term.turns is None)
-    generators = [
-        turn_about(axis.direction, axis.point_m, term.angles_rad[0])
-        for term, axis in pairs
-        if term.turns is not None
-    ]
+    # Free axes, and the smallest rotation about each of the others.
+    free: list[Axis] = []
+    generators: list[Rigid] = []
+    for turns in declared:
+        point_m = _find_point_on_axis(turns, surface, model)
+        if turns.turns is None:
+            free.append(Axis(direction=turns.direction, point_m=point_m))
+        else:
+            generators.append(turn_about(turns.direction, point_m, turns.angles_rad[0]))
 
     # Products are added until there is no new one: the list grows while it is read.
     copies = [Rigid(torch.eye(3).double(), torch.zeros(3).double())]
-    for first in copies:
+    for copy in copies:
         for turn in generators:
-            product = turn @ first
-            copies_R = torch.stack([copy.R for copy in copies])
+            product = turn @ copy
+            copies_R = Rigid.stack(copies).R
             apart_rad = geodesic_rad(product.R.expand_as(copies_R), copies_R)
             if float(apart_rad.min()) > _SAME_RAD:
                 copies.append(product)
@@ -231,56 +244,68 @@ def _place_axes(
                 f"symmetry of {model.name}: its turns make more than {_MOST_COPIES} copies, so "
                 "their axes are no symmetry together; correct them"
             )
-    return Symmetries(discrete=Rigid.stack(copies[1:]) if copies[1:] else None, continuous=free)
+    discrete = Rigid.stack(copies[1:]) if len(copies) > 1 else None
+    return Symmetries(discrete=discrete, continuous=tuple(free))
 
 
-_FOLLOW_STEPS = 20  # by which an axis is placed
-_NEAREST = 0.9  # share of the points that place an axis: a keyway, without a counterpart, does not
+_AXIS_STEPS = 20  # by which an axis is placed
+_NEAREST_SHARE = (
+    0.9  # of the points, which place an axis: a keyway, without a counterpart, does not
+)
+_COMPARED_TURNS = 6  # rotations, about so many, by which places of an axis are compared
 
 
 def _find_point_on_axis(
-    term: DeclaredTurns, surface: SurfaceDeviation, model: ObjectModel
+    turns: DeclaredTurns, surface: SurfaceDeviation, model: ObjectModel
 ) -> Float64[Tensor, "3"]:
-    """Find a point on an axis of given direction, such that the surface rotated about it fits best.
+    """Find a point on an axis of some direction, such that the surface rotated about it fits best.
 
-    Starts are the centroid, the middle of the box and the file's origin. In each step the surface
-    is rotated by about a half turn, and the axis moves to where the rotated points would lie on
-    the surface.
+    Returns:
+        The point (3,) in the model frame [m].
     """
-    # The rotation that is tried, and where the axis may be to begin with.
-    axis = term.direction
-    across = torch.linalg.svd(axis[None]).Vh[1:]  # two axes across it
-    half = (term.turns or 2) // 2
-    angle_rad = torch.tensor(2 * math.pi * half / (term.turns or 2), dtype=torch.float64)
-    low = surface.points.amin(0)
-    high = surface.points.amax(0)
-    origin = -surface.centre_m / model.diameter_m
-    candidates: list[tuple[float, Tensor]] = []
-    for start in (torch.zeros(3).double(), (low + high) / 2, origin):
-        # Moved until the rotated surface lies on itself.
-        point = start
-        for _ in range(_FOLLOW_STEPS):
-            turn = turn_about(axis, point, angle_rad)
-            moved = turn.apply(surface.many)
-            distance, index = surface.nearest(moved)
-            is_near = torch.from_numpy(distance <= np.quantile(distance, _NEAREST))
-            gap = (surface.points[torch.from_numpy(index)] - moved)[is_near].mean(0)
-            # Moving the axis by p shifts the rotated points by (1 - R) p, solved across the axis.
-            lever = across @ (torch.eye(3).double() - turn.R) @ across.T
-            point = point + across.T @ torch.linalg.solve(lever, across @ gap)
+    step = max(1, len(turns.angles_rad) // _COMPARED_TURNS)
+    origin = -surface.centre_m / model.diameter_m  # of the file
+    best_deviation = math.inf
+    best_point = origin
+    for start in (torch.zeros(3).double(), surface.middle, origin):
+        point = _shift_axis(start, turns, surface)
+        rotations = turn_about(turns.direction, point, turns.angles_rad[::step])
+        deviation = float(surface.deviation(rotations.R, rotations.t_m).max())
+        if deviation < best_deviation:
+            best_deviation = deviation
+            best_point = point
+    return best_point * model.diameter_m + surface.centre_m
 
-        # How well that fits, by some of the rotations.
-        turns = turn_about(axis, point, term.angles_rad[:: max(1, len(term.angles_rad) // 6)])
-        candidates.append((float(surface.deviation(turns.R, turns.t_m).max()), point))
-    _, best = min(candidates, key=lambda pair: pair[0])
-    return best * model.diameter_m + surface.centre_m
+
+def _shift_axis(
+    start: Float64[Tensor, "3"], turns: DeclaredTurns, surface: SurfaceDeviation
+) -> Float64[Tensor, "3"]:
+    """Shift an axis through a point until the surface rotated about it lies on itself.
+
+    In each step the surface is rotated by about a half turn, and the axis moves to where the
+    rotated points would lie on the surface. Points are those of the surface's frame, in diameters.
+    """
+    count = turns.turns or 2
+    half_turn_rad = torch.tensor(2 * math.pi * (count // 2) / count, dtype=torch.float64)
+    across = torch.linalg.svd(turns.direction[None]).Vh[1:]  # two directions across the axis
+    point = start
+    for _ in range(_AXIS_STEPS):
+        turn = turn_about(turns.direction, point, half_turn_rad)
+        moved = turn.apply(surface.compared_points)
+        distance, index = surface.find_nearest(moved)
+        is_near = torch.from_numpy(distance <= np.quantile(distance, _NEAREST_SHARE))
+        gap = (surface.points[torch.from_numpy(index)] - moved)[is_near].mean(0)
+        # Moving the axis by p shifts the rotated points by (I - R) p, solved across the axis.
+        lever = across @ (torch.eye(3).double() - turn.R) @ across.T
+        point = point + across.T @ torch.linalg.solve(lever, across @ gap)
+    return point
 
 
 def _measure_deviation(
     declared: Symmetries, surface: SurfaceDeviation, model: ObjectModel
 ) -> float:
-    """Measure how far the surface lies off itself after any of the rotations, in diameters."""
-    # Not all of many rotations are measured.
+    """Measure how far the surface lies off itself after the worst rotation, in diameters."""
+    # Of many rotations some are measured.
     turns = symmetry_transforms(declared, 2 * math.pi / _CHECKED / 2).double()[1:]
     turns = turns[:: max(1, len(turns.R) // (2 * _CHECKED))]
 

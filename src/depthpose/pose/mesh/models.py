@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Float64, Int64
 from scipy.spatial import ConvexHull, Delaunay, KDTree, QhullError
 from torch import Tensor
 
@@ -20,7 +20,7 @@ from depthpose.core.units import Unit, metres_of
 from depthpose.pose.config import MeshConfig
 from depthpose.pose.mesh.colors import read_colors
 from depthpose.pose.mesh.files import AnyModel, read_geometry, unit_of
-from depthpose.pose.mesh.sampling import surface_places
+from depthpose.pose.mesh.sampling import spread_over_triangles
 from depthpose.pose.mesh.shapes import is_shape, shape_name
 from depthpose.pose.types import Axis, ObjectModel, Symmetries
 
@@ -31,13 +31,16 @@ BOP_STEP = 0.01
 def turn_about(
     direction: Float[Tensor, "3"], point_m: Float[Tensor, "3"], angle_rad: Float[Tensor, "*batch"]
 ) -> Rigid:
-    """Make the rotation about a line through ``point_m``, by the right-hand rule."""
+    """Make the rotation by an angle about a line through ``point_m``, by the right-hand rule.
+
+    ``direction`` is that of the line, of any length; the other two arguments may be batches.
+    """
     R = rotation_by(angle_rad[..., None].to(direction) * direction / direction.norm())
     return Rigid(R, point_m - (R @ point_m[..., None]).squeeze(-1))
 
 
 def axis_of_turn(turn: Rigid) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """Give the line about which a motion rotates, the inverse of :func:`turn_about`.
+    """Find the line about which a motion rotates, the inverse of :func:`turn_about`.
 
     Args:
         turn: rotation about a line by more than 0 and less than 180 degrees.
@@ -46,9 +49,11 @@ def axis_of_turn(turn: Rigid) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
         The unit vector of the line (3,), by the right-hand rule, and its point nearest to the
         origin (3,) [m].
     """
-    twist = turn.R - turn.R.T
-    direction = torch.stack([twist[2, 1], twist[0, 2], twist[1, 0]])
+    # R - R^T is the skew matrix of the direction, times twice the sine of the angle.
+    skew = turn.R - turn.R.T
+    direction = torch.stack([skew[2, 1], skew[0, 2], skew[1, 0]])
     # The points of the line stay where they are: p = R p + t.
+    # Solved without the direction of the line, whose singular value is 0.
     change = torch.eye(3).to(turn.R) - turn.R
     point_m = torch.linalg.pinv(change, rtol=1e-3) @ turn.t_m
     return direction / direction.norm(), point_m
@@ -58,34 +63,44 @@ def symmetry_transforms(symmetries: Symmetries, max_step: float = BOP_STEP) -> R
     """List the transforms ``model_from_model`` that leave the object as it is.
 
     They are the identity, the discrete ones, and each of them followed by rotations about each
-    continuous axis (BOP: ``ceil(pi / max_step)`` equal steps of the full circle). BOP's toolkit
-    leaves out the rotation by 0 where there is an axis; here an exact estimate has no error.
+    continuous axis, in equal steps of the full circle. BOP's toolkit leaves out the rotation by 0
+    where there is an axis; with it, an exact estimate has no error.
+
+    Args:
+        symmetries: of the object.
+        max_step: half of the largest step of a rotation about an axis [rad], as BOP counts.
 
     Returns:
         A batch, the identity first.
     """
-    base = Rigid(torch.eye(3)[None], torch.zeros(1, 3))
+    # The identity and the discrete ones.
+    identity = Rigid(torch.eye(3)[None], torch.zeros(1, 3))
     discrete = symmetries.discrete
+    copies = identity
     if discrete is not None:
-        base = Rigid(torch.cat([base.R.to(discrete.R), discrete.R]),
-                     torch.cat([base.t_m.to(discrete.t_m), discrete.t_m]))  # fmt: skip
-    if not symmetries.continuous:
-        return base
+        identity = Rigid(identity.R.to(discrete.R), identity.t_m.to(discrete.t_m))
+        copies = Rigid.cat([identity, discrete])
+
+    # Each of them followed by rotations.
     steps = math.ceil(math.pi / max_step)
     angles = torch.arange(steps, dtype=torch.float64) * (2 * math.pi / steps)
-    transforms = [base]
+    transforms = [copies]
     for axis in symmetries.continuous:
-        rotations = turn_about(axis.direction.to(base.R), axis.point_m.to(base.R), angles[1:])
-        products = rotations[:, None] @ base[None]
+        rotations = turn_about(axis.direction.to(copies.R), axis.point_m.to(copies.R), angles[1:])
+        products = rotations[:, None] @ copies[None]
         transforms.append(Rigid(products.R.flatten(0, 1), products.t_m.flatten(0, 1)))
     return Rigid.cat(transforms)
 
 
 def symmetries_from_bop(info: Mapping[str, Any], *, source: str) -> Symmetries:
-    """Read ``symmetries_discrete`` (4x4, row by row) and ``symmetries_continuous``; both in mm.
+    """Read the symmetries of an object from its entry in BOP's ``models_info.json``.
 
-    ``symmetries_found`` is ours: true where they were found in the geometry. ``info`` is the entry
-    of an object in ``models_info.json``, in errors called ``source``.
+    The entry has ``symmetries_discrete`` (4x4, row by row) and ``symmetries_continuous``, both in
+    mm. ``symmetries_found`` is ours: true where they were found in the geometry.
+
+    Args:
+        info: the entry.
+        source: what errors call it.
 
     Raises:
         InputError: an entry is no rigid transform or no axis.
@@ -124,30 +139,34 @@ def _motion_from_bop(row: object, source: str) -> Rigid:
 
 def _axis_from_bop(entry: object, source: str) -> Axis:
     """Read an entry of ``symmetries_continuous``: an axis, and a point on it in mm."""
-    try:
-        assert isinstance(entry, Mapping)
-        direction = torch.tensor(entry["axis"], dtype=torch.float64).reshape(3)
-        offset_mm = torch.tensor(entry.get("offset", [0, 0, 0]), dtype=torch.float64).reshape(3)
-        length = float(direction.norm())
-        assert 0 < length < math.inf
-    except (
-        AssertionError, KeyError, TypeError, ValueError, RuntimeError, OverflowError
-    ) as error:  # fmt: skip
+    fields = entry if isinstance(entry, Mapping) else {}
+    direction = _parse_vector(fields.get("axis"))
+    offset_mm = _parse_vector(fields.get("offset", [0, 0, 0]))
+    length = 0.0 if direction is None else float(direction.norm())
+    if direction is None or offset_mm is None or not 0 < length < math.inf:
         raise InputError(
             f'{source}: the continuous symmetry {repr(entry)[:80]} is not {{"axis": [x, y, z], '
             '"offset": [x, y, z]} with an axis of some length'
-        ) from error
+        )
     return Axis(direction=direction / length, point_m=0.001 * offset_mm)
 
 
+def _parse_vector(values: object) -> Float64[Tensor, "3"] | None:
+    """Parse a list of three numbers as a vector; None where it is none."""
+    try:
+        return torch.tensor(values, dtype=torch.float64).reshape(3)
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        return None
+
+
 def symmetries_to_bop(symmetries: Symmetries) -> dict[str, Any]:
-    """Give symmetries as an entry of ``models_info.json`` holds them; empty lists are left out."""
+    """Convert symmetries to entries of ``models_info.json``; empty lists are left out."""
     info: dict[str, Any] = {}
     if symmetries.discrete is not None:
         R = symmetries.discrete.R
         t_mm = 1000 * symmetries.discrete.t_m
-        top = torch.cat([R, t_mm[..., None]], -1).flatten(1).tolist()
-        info["symmetries_discrete"] = [[*row, 0.0, 0.0, 0.0, 1.0] for row in top]
+        upper_rows = torch.cat([R, t_mm[..., None]], -1).flatten(1).tolist()
+        info["symmetries_discrete"] = [[*rows, 0.0, 0.0, 0.0, 1.0] for rows in upper_rows]
     if symmetries.continuous:
         info["symmetries_continuous"] = [
             {"axis": axis.direction.tolist(), "offset": (1000 * axis.point_m).tolist()}
@@ -159,55 +178,62 @@ def symmetries_to_bop(symmetries: Symmetries) -> dict[str, Any]:
 
 
 _NORMAL_NEIGHBOURS = 16  # to which the plane at a bare point is fitted
-_DENSE = 20_000  # points of a surface between its vertices
+_GAP_POINTS = 20_000  # of a surface between its vertices, by which a gap to it is measured
 
 
 def farthest_points(points_m: Float[Tensor, "n 3"], count: int) -> Int64[Tensor, " count"]:
-    """Choose points each of which is farthest from all before it; give their indices.
+    """Choose points each of which is farthest from all before it.
 
     The first is farthest from the centre of the bounding box, which does not depend on how densely
-    a part is meshed (as PVNet). Of equals the earliest in the file is taken, so that a mesh always
-    has the same points.
+    a part is meshed (as PVNet). Of equals the earliest is taken, so that a mesh always has the same
+    points.
+
+    Returns:
+        Their indices, in the order in which they were chosen.
 
     Raises:
         InputError: there are fewer different points than wanted.
     """
     points = points_m.double().cpu().numpy()
     centre = (points.min(0) + points.max(0)) / 2
-    nearest = ((points - centre) ** 2).sum(-1)
+    gap_squared = ((points - centre) ** 2).sum(-1)  # of each point to the nearest chosen one
     chosen = []
     for _ in range(count):
-        farthest = int(nearest.argmax())
-        if nearest[farthest] == 0 and chosen:
+        farthest = int(gap_squared.argmax())
+        if gap_squared[farthest] == 0 and chosen:
             raise InputError(
                 f"the model has only {len(chosen)} different points, and {count} keypoints are to "
                 "be chosen among them; give a mesh with triangles, or more points"
             )
         chosen.append(farthest)
-        distance = ((points - points[farthest]) ** 2).sum(-1)
-        # Distances are to the chosen points: the centre counts for the first one alone.
-        nearest = distance if len(chosen) == 1 else np.minimum(nearest, distance)
+        distance_squared = ((points - points[farthest]) ** 2).sum(-1)
+        # The centre counts for the choice of the first point alone.
+        is_first = len(chosen) == 1
+        gap_squared = distance_squared if is_first else np.minimum(gap_squared, distance_squared)
     return torch.tensor(chosen)
 
 
 def sample_surface(
     model: ObjectModel, count: int
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
-    """Spread points evenly over the surface, always the same ones; give them and outward normals.
+    """Spread points evenly over the surface of a model, always the same ones.
 
     Of a model of points some of its own are taken, evenly by their order.
 
     Args:
         model: the object.
         count: how many points; a model of points may have fewer.
+
+    Returns:
+        The points [m] and their outward normals, in the model frame.
     """
     if len(model.faces) == 0:
         # Farthest points would be more even, but take quadratic time.
         return take_evenly(model.vertices_m, count), take_evenly(model.normals, count)
     corners = model.vertices_m[model.faces].double()
-    face, share = surface_places(corners, count)
+    face, barycentric = spread_over_triangles(corners, count)
     doubled = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    points = (corners[face] * share[..., None]).sum(-2)
+    points = (corners[face] * barycentric[..., None]).sum(-2)
     normals = doubled[face] / doubled[face].norm(dim=-1, keepdim=True).clamp(min=1e-300)
     return points.to(model.vertices_m), normals.to(model.vertices_m)
 
@@ -218,12 +244,12 @@ _NEIGHBOURS = 12
 """A triangle's circumcircle is no larger than the distance of a corner to its twelfth neighbour:
 where points are random a circle without any is seldom so large."""
 _LEAST_ALONG = 0.5
-"""Least cosine between a triangle and the normals of its points, in the mean of the three: one that
-bridges a hole or a thin wall is across its points' normals."""
+"""Least cosine between the normals of a triangle and of its points, in the mean of the three: a
+triangle that bridges a hole or a thin wall stands across the surface."""
 
 
 def drawn_triangles(model: ObjectModel) -> Float[Tensor, "n 3 3"]:
-    """Give the faces of a model, or the triangles between the points of one that has no faces."""
+    """Make the triangles by which a model is drawn: its faces, or triangles between bare points."""
     if len(model.faces):
         return model.vertices_m[model.faces]
     return triangulate_points(*sample_surface(model, _MOST_POINTS))
@@ -232,7 +258,7 @@ def drawn_triangles(model: ObjectModel) -> Float[Tensor, "n 3 3"]:
 def triangulate_points(
     points_m: Float[Tensor, "p 3"], normals: Float[Tensor, "p 3"]
 ) -> Float[Tensor, "n 3 3"]:
-    """Join neighbouring points of a surface by triangles.
+    """Join neighbouring points of a surface by triangles, whose corners are returned.
 
     As an alpha shape (Edelsbrunner and Mücke 1994): triangles of the Delaunay tetrahedra whose
     circumcircle is small, here beside the distances of neighbouring points, and that lie along the
@@ -241,10 +267,11 @@ def triangulate_points(
     points = points_m.double().numpy()
     if len(points) <= 4:  # a tetrahedron is no surface
         return points_m.new_zeros(0, 3, 3)
-    tree = KDTree(points)
+
+    # The largest circumcircle at each point, by the distance of its neighbours.
     count = min(_NEIGHBOURS + 1, len(points))  # the nearest is the point itself
-    distance_m, _ = tree.query(points, count, workers=1)
-    largest_m = distance_m[:, -1]
+    distance_m, _ = KDTree(points).query(points, count, workers=1)
+    largest_radius_m = distance_m[:, -1]
 
     # Each triangle of each tetrahedron, once. Joggled (QJ), points of one plane have some as well.
     tetrahedra = Delaunay(points, qhull_options="QJ").simplices
@@ -256,22 +283,25 @@ def triangulate_points(
     sides = corners - np.roll(corners, 1, axis=1)
     across = np.cross(sides[:, 0], sides[:, 1])
     doubled_area = np.maximum(np.linalg.norm(across, axis=1), 1e-300)
-    radius = np.linalg.norm(sides, axis=2).prod(1) / (2 * doubled_area)
-    is_small = radius < largest_m[triangles].max(1)
+    radius_m = np.linalg.norm(sides, axis=2).prod(1) / (2 * doubled_area)
+    is_small = radius_m < largest_radius_m[triangles].max(1)
 
-    direction = across / doubled_area[:, None]
-    cosine = np.abs(np.einsum("tci,ti->tc", normals.double().numpy()[triangles], direction))
+    # Does the triangle's normal agree with those of its corners?
+    triangle_normals = across / doubled_area[:, None]
+    corner_normals = normals.double().numpy()[triangles]
+    cosine = np.abs(np.einsum("tci,ti->tc", corner_normals, triangle_normals))
     is_along = cosine.mean(1) > _LEAST_ALONG
     return torch.from_numpy(corners[is_small & is_along]).to(points_m)
 
 
 def gap_to_surface_m(points_m: Float[Tensor, "n 3"], model: ObjectModel) -> float:
-    """Give the largest distance of some points from a model's surface [m].
+    """Measure the largest distance of some points from a model's surface [m].
 
     The surface is represented by its vertices and 20,000 points between them, a hundredth of the
     diameter apart.
     """
-    surface_m = torch.cat([model.vertices_m, sample_surface(model, _DENSE)[0]])
+    samples_m, _ = sample_surface(model, _GAP_POINTS)
+    surface_m = torch.cat([model.vertices_m, samples_m])
     return float(torch.cdist(points_m, surface_m).amin(1).max())
 
 
@@ -279,7 +309,8 @@ def fibonacci_directions(count: int) -> Float[Tensor, "count 3"]:
     """Spread unit vectors evenly over the half of the sphere with z > 0, by a Fibonacci lattice."""
     i = torch.arange(count, dtype=torch.float64) + 0.5
     z = 1 - i / count
-    angle = math.pi * (1 + 5**0.5) * i
+    golden_ratio = (1 + 5**0.5) / 2
+    angle = 2 * math.pi * golden_ratio * i
     radius = (1 - z * z).sqrt()
     return torch.stack([radius * angle.cos(), radius * angle.sin(), z], -1)
 
@@ -304,8 +335,8 @@ def read_model(
     Args:
         path: mesh (PLY, STL, OBJ, GLB) or bare points (PLY, PCD, NPY, text), whose colours are
             read where it has some; or a mesh or cloud of trimesh or Open3D.
-        unit: unit of the numbers in the file; None: a GLB, whose are metres, or a mesh that says
-            its own.
+        unit: unit of the numbers in the file; None where it is fixed (a GLB is in metres), or the
+            mesh in memory says its own.
         name: what samples call the object; None: the file's name, or that of a mesh
             (``metadata["name"]`` of trimesh), or object_NUMBER.
         number: BOP's ``obj_id``.
@@ -316,6 +347,7 @@ def read_model(
         InputError: the file is missing, damaged or of another format, holds no extent or faces
             without area, has no unit, or is so large or small that the unit must be another.
     """
+    # What it is called.
     is_file = isinstance(path, str | Path)
     if not is_file and not is_shape(path):
         raise InputError(
@@ -324,11 +356,26 @@ def read_model(
         )
     if name is None:
         name = Path(path).stem if is_file else shape_name(path, number)
+
+    # Its points, of a size that a sensor sees.
     unit = unit_of(path, unit)
-    scale = metres_of(unit)
+    unit_m = metres_of(unit)
     vertices, faces = read_geometry(path)
-    vertices_m = torch.from_numpy(vertices) * scale
-    extent_m = float((vertices_m.amax(0) - vertices_m.amin(0)).max())
+    vertices_m = torch.from_numpy(vertices) * unit_m
+    _refuse_other_unit(path, unit, float((vertices_m.amax(0) - vertices_m.amin(0)).max()))
+    model = make_model(
+        vertices_m,
+        torch.from_numpy(faces),
+        name=name,
+        number=number,
+        symmetries=symmetries,
+        config=config,
+    )
+    return replace(model, colors=read_colors(path, unit_m, model)) if is_file else model
+
+
+def _refuse_other_unit(path: AnyModel, unit: Unit, extent_m: float) -> None:
+    """Refuse a model that is so long or short [m] in its unit that another must be meant."""
     if extent_m > _LARGEST_M and unit == "m":
         raise InputError(
             f"{path}: the model is {extent_m:g} m long, and no sensor sees it whole; is it in mm? "
@@ -339,15 +386,6 @@ def read_model(
             f"{path}: the model is {extent_m * 1000:g} mm long, below what a sensor resolves; is "
             "it in metres? Then say unit m; of BOP, whose models are in mm, multiply it by 1000."
         )
-    model = make_model(
-        vertices_m,
-        torch.from_numpy(faces),
-        name=name,
-        number=number,
-        symmetries=symmetries,
-        config=config,
-    )
-    return replace(model, colors=read_colors(path, scale, model)) if is_file else model
 
 
 def make_model(
@@ -359,7 +397,15 @@ def make_model(
     symmetries: Symmetries | None = None,
     config: MeshConfig | None = None,
 ) -> ObjectModel:
-    """Make a model of points and faces that are in memory; the rest is computed.
+    """Make a model of points and faces in memory; normals, diameter and keypoints are computed.
+
+    Args:
+        vertices_m: points of the model frame.
+        faces: (f, 3), indices of their corners; of bare points none.
+        name: what samples call the object.
+        number: BOP's ``obj_id``.
+        symmetries: as declared; None: none.
+        config: how many keypoints.
 
     Raises:
         InputError: all points are one, or fewer of them differ than keypoints are wanted.
@@ -377,10 +423,12 @@ def make_model(
         vertices_m=vertices_m,
         faces=faces.long().reshape(-1, 3),
         normals=normals,
-        diameter_m=exact_diameter(vertices_m),
+        diameter_m=measure_diameter(vertices_m),
         keypoints_m=vertices_m[:0],
         symmetries=Symmetries() if symmetries is None else symmetries,
     )
+
+    # Keypoints, among the vertices and, of a coarse mesh, points inside its faces.
     candidates = vertices_m
     if len(faces) and len(candidates) < _COARSE_MESH:
         inside_m, _ = sample_surface(model, _KEYPOINT_CANDIDATES)
@@ -389,7 +437,7 @@ def make_model(
 
 
 def _vertex_normals(vertices_m: Float[Tensor, "v 3"], faces: Tensor) -> Float[Tensor, "v 3"]:
-    """Average at each vertex the normals of its faces, weighted by their areas."""
+    """Average at each vertex the normals of its faces, weighted by their areas, to unit vectors."""
     corners = vertices_m.double()[faces]
     sides = corners[:, 1:] - corners[:, :1]
     doubled = torch.linalg.cross(sides[:, 0], sides[:, 1])  # normals, twice as long as the area
@@ -400,25 +448,26 @@ def _vertex_normals(vertices_m: Float[Tensor, "v 3"], faces: Tensor) -> Float[Te
 
 
 def _point_normals(points_m: Float[Tensor, "v 3"]) -> Float[Tensor, "v 3"]:
-    """Fit a plane to the nearest 16 points of each; its normal points away from their mean.
+    """Fit a plane to the nearest 16 points of each point, and compute its unit normal.
 
-    That is the outer side of convex parts alone. Point-to-plane distances need no side.
+    It points away from the mean of all points: to the outer side of convex parts alone.
+    Point-to-plane distances need no side.
     """
     points = points_m.double().cpu().numpy()
     _, index = KDTree(points).query(points, k=min(_NORMAL_NEIGHBOURS, len(points)))
     near = points[index.reshape(len(points), -1)]
     near = near - near.mean(1, keepdims=True)
     _, axes = np.linalg.eigh(near.transpose(0, 2, 1) @ near)
-    outward = axes[:, :, 0]
+    outward = axes[:, :, 0]  # of the least extent
     outward[((points - points.mean(0)) * outward).sum(-1) < 0] *= -1
     return torch.from_numpy(outward).to(points_m)
 
 
-def refuse_one_name(models: Sequence[ObjectModel]) -> None:
-    """Refuse models of one name: an object is known by its name.
+def refuse_equal_names(models: Sequence[ObjectModel]) -> None:
+    """Refuse models two of which have the same name, by which an object is known.
 
     Raises:
-        InputError: the name, and the numbers of the models that have it.
+        InputError: with the name, and the numbers of the models that have it.
     """
     names = [model.name for model in models]
     twice = sorted({name for name in names if names.count(name) > 1})
@@ -432,10 +481,13 @@ def refuse_one_name(models: Sequence[ObjectModel]) -> None:
 
 _MOST_HULL_CORNERS = 8000  # of which all pairs are compared; more take seconds
 _HULL_DIRECTIONS = 4096  # no direction is farther than 0.03 rad from one of these: cosine 0.9995
+_DIRECTIONS_AT_ONCE = 256  # for memory
+_CORNERS_AT_ONCE = 1024
+_EXACT_DISTANCES = "donot_use_mm_for_euclid_dist"  # not by a matrix product, which cancels digits
 
 
-def exact_diameter(points_m: Float[Tensor, "n 3"]) -> float:
-    """Give the largest distance of two points [m], which are corners of the convex hull.
+def measure_diameter(points_m: Float[Tensor, "n 3"]) -> float:
+    """Measure the largest distance of two points [m], which are corners of the convex hull.
 
     Of a hull of more than 8,000 corners those farthest in many directions are compared: the result
     is less than 0.05 % too short.
@@ -447,10 +499,13 @@ def exact_diameter(points_m: Float[Tensor, "n 3"]) -> float:
     corners = torch.from_numpy(points)
     if len(corners) > _MOST_HULL_CORNERS:
         farthest = []
-        for directions in fibonacci_directions(_HULL_DIRECTIONS).T.split(256, dim=1):
+        all_directions = fibonacci_directions(_HULL_DIRECTIONS).T
+        for directions in all_directions.split(_DIRECTIONS_AT_ONCE, dim=1):
             along = corners @ directions
             farthest += [along.argmax(0), along.argmin(0)]
         corners = corners[torch.cat(farthest).unique()]
-    exactly = "donot_use_mm_for_euclid_dist"
-    distances = (torch.cdist(part, corners, compute_mode=exactly) for part in corners.split(1024))
-    return max(float(part.max()) for part in distances)
+    longest_m = 0.0
+    for some_corners in corners.split(_CORNERS_AT_ONCE):
+        distance_m = torch.cdist(some_corners, corners, compute_mode=_EXACT_DISTANCES)
+        longest_m = max(longest_m, float(distance_m.max()))
+    return longest_m

@@ -22,10 +22,10 @@ def is_shape(value: object) -> bool:
 
 
 def shape_geometry(shape: Any) -> tuple[np.ndarray, np.ndarray]:  # noqa: ANN401  no types of theirs
-    """Take points (n, 3) and triangles (m, 3) of a shape; a cloud has no triangles.
+    """Read points (n, 3) and triangles (m, 3) of a shape in memory; a cloud has no triangles.
 
-    Takes ``trimesh.Trimesh``, ``Scene`` and ``PointCloud``, and Open3D's ``TriangleMesh`` and
-    ``PointCloud``, of its tensors too.
+    A shape is a ``Trimesh``, ``Scene`` or ``PointCloud`` of trimesh, or a ``TriangleMesh`` or
+    ``PointCloud`` of Open3D, of its tensors too.
 
     Raises:
         InputError: the shape is something else, or has no points.
@@ -51,12 +51,12 @@ def shape_geometry(shape: Any) -> tuple[np.ndarray, np.ndarray]:  # noqa: ANN401
 
 
 def shape_unit(shape: Any) -> Unit | None:  # noqa: ANN401
-    """Give the unit that a shape declares; None where it declares none."""
+    """Read the unit that a shape declares; None where it declares none that is known."""
     return _UNITS.get(str(getattr(shape, "units", None)).lower())
 
 
 def shape_name(shape: Any, number: int) -> str:  # noqa: ANN401
-    """Give the name of a shape: its own, that of its file, or ``object_NUMBER``."""
+    """Find the name of a shape: its own, that of its file, or ``object_NUMBER``."""
     metadata = getattr(shape, "metadata", None) or {}
     file = getattr(getattr(shape, "source", None), "file_name", None)
     name = metadata.get("name") or file or metadata.get("file_name")

@@ -29,6 +29,8 @@ _FEWEST_REFERENCES = 200
 _LEAST_POINTS = 30
 """Of a scene: with fewer nothing is proposed."""
 _MOST_POINTS = 20_000
+_ORDER_SEED = 0
+"""Of the order of a scene's points, so that an image always has the same proposals."""
 _PEAKS = 3
 """Poses that each reference point proposes."""
 _LEAST_SCORE = 0.25
@@ -43,16 +45,16 @@ _MIN_COSINE = 0.7
 _MIN_COSINE_ICP = 0.5
 """The same in ICP, whose poses are rough."""
 _DAMPING = 0.02
-"""Of ICP: a motion that moves the readings across the surface by less is nearly suppressed."""
+"""Of ICP, in weights of all readings: a motion that few readings constrain is suppressed."""
 
 # The score of a pose.
 _DEVIATIONS = 2.0
-"""Of the error that neighbouring readings share, by which a reading may lie farther off the surface
-than the stage's limit."""
+"""Standard deviations of the error that neighbouring readings share, by which a reading may lie
+farther off the surface than the stage's limit."""
 _LEAST_READ = 0.5
 """Least share of the visible surface by which a score is divided, though less of it is read."""
-
-Points = Float64[Tensor, "b n 3"]
+_MORE_THAN_KEPT = 5
+"""Times as many poses as are kept are searched for distinct ones."""
 
 
 class _Stage(NamedTuple):
@@ -90,29 +92,33 @@ def propose_in_frame(
         models: number of models that are searched in the image.
 
     Returns:
-        Poses, roughly refined, the best first, and the score of each (:func:`score_by_image`).
+        Poses ``camera_from_model``, roughly refined, the best first, and the score of each
+        (:func:`score_by_image`).
     """
     # Votes.
     surface = table.surface
     points_m, normals = _scene_points(frame, is_unclaimed, surface)
-    generator = torch.Generator().manual_seed(0)
+    generator = torch.Generator().manual_seed(_ORDER_SEED)
     order = torch.randperm(len(points_m), generator=generator)[:_MOST_POINTS]
-    references = torch.arange(_number_of_references(len(order), models))
+    references = torch.arange(_choose_number_of_references(len(order), models))
     poses, score = vote_poses(points_m[order], normals[order], references, table, _PEAKS)
 
     # Fewer and fewer poses are refined and compared, more and more closely.
     for stage in _STAGES:
         poses = refine_projectively(frame, poses, surface, stage)
         score = score_by_image(frame, poses, surface, stage)
-        best = _best_distinct(poses, score, surface, stage.most)
+        best = _choose_distinct(poses, score, surface, stage.most)
         poses = poses[best]
         score = score[best]
     is_good = score >= _LEAST_SCORE
     return poses[is_good], score[is_good]
 
 
-def _number_of_references(points: int, models: int) -> int:
-    """Say how many points of a scene vote with each of the others, in a search of some models."""
+def _choose_number_of_references(points: int, models: int) -> int:
+    """Choose how many of a scene's points vote with each of the others, in a search of models.
+
+    ``points`` and ``models`` are their numbers.
+    """
     if points < _LEAST_POINTS:
         return 0
     wanted = max(_WANTED_REFERENCES, points // _REFERENCE_EVERY)
@@ -123,9 +129,12 @@ def _number_of_references(points: int, models: int) -> int:
 def _scene_points(
     frame: Frame, is_unclaimed: Bool[Tensor, "h w"], surface: Surface
 ) -> tuple[Float64[Tensor, "n 3"], Float64[Tensor, "n 3"]]:
-    """Average the points and normals of a frame that may be of an object, in cells.
+    """Average the points that may be of an object in cells, and their normals.
 
-    Left out are its background, and readings too far away to show a shape.
+    Left out are the frame's background, and readings too far away to show a shape.
+
+    Returns:
+        One point and its unit normal for each cell, in the camera frame.
     """
     is_used = frame.is_smooth & is_unclaimed & frame.may_show(surface.diameter_m)
     # Where the noise is as large as the limit of nearness, no shape is visible.
@@ -135,23 +144,26 @@ def _scene_points(
     if len(points_m) == 0:
         return points_m, normals
 
+    # The cell of each point.
+    place = (points_m / (STEP * surface.diameter_m)).floor().long()
+    place -= place.amin(0)
+    size = place.amax(0) + 1
+    key = (place[:, 0] * size[1] + place[:, 1]) * size[2] + place[:, 2]
+    _, cell, count = key.unique(return_inverse=True, return_counts=True)
+
     # Means of each cell; where normals differ much it holds several surfaces.
-    cell = (points_m / (STEP * surface.diameter_m)).floor().long()
-    cell -= cell.amin(0)
-    size = cell.amax(0) + 1
-    key = (cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2]
-    _, place, count = key.unique(return_inverse=True, return_counts=True)
     sums = points_m.new_zeros(len(count), 6)
-    means = sums.index_add_(0, place, torch.cat([points_m, normals], 1)) / count[:, None]
-    is_one_surface = means[:, 3:].norm(dim=-1) > _MIN_COSINE
-    return means[is_one_surface, :3], normalize(means[is_one_surface, 3:], dim=-1)
+    sums.index_add_(0, cell, torch.cat([points_m, normals], 1))
+    mean_m, mean_normal = (sums / count[:, None]).split(3, dim=1)
+    is_one_surface = mean_normal.norm(dim=-1) > _MIN_COSINE
+    return mean_m[is_one_surface], normalize(mean_normal[is_one_surface], dim=-1)
 
 
-def _best_distinct(
+def _choose_distinct(
     poses: Rigid, score: Float64[Tensor, " b"], surface: Surface, most: int
 ) -> Int64[Tensor, " c"]:
-    """Give the indices of the best poses, ``most`` of them, without any near a better one."""
-    order = score.argsort(descending=True, stable=True)[: 5 * most]
+    """Choose the best poses, ``most`` of them, without any near a better one; as indices."""
+    order = score.argsort(descending=True, stable=True)[: _MORE_THAN_KEPT * most]
     middles_m = poses[order].apply(surface.middle_m[None])[:, 0]
     rotations = poses.R[order].flatten(1)
     is_same = torch.cdist(middles_m, middles_m) < _SAME_DIAMETERS * surface.diameter_m
@@ -177,37 +189,54 @@ def refine_projectively(frame: Frame, poses: Rigid, surface: Surface, stage: _St
         poses: a batch, ``camera_from_model``.
         surface: of the model.
         stage: how many points are used, and the limit of each step.
+
+    Returns:
+        The refined poses, in the same order.
     """
     is_usable = (frame.is_smooth & frame.may_show(surface.diameter_m)).flatten()
-    radius_m = surface.diameter_m / 2
-    damping = _DAMPING * torch.diag(
-        torch.tensor([radius_m**2] * 3 + [1.0] * 3, dtype=torch.float64)
-    )
-    for share in stage.icp_limits:
+    for limit in stage.icp_limits:
         # Each visible point of the surface, and the reading in its direction.
-        visible = _visible_points(poses, surface, stage.every)
+        visible = _find_visible_points(poses, surface, stage.every)
         readings = readings_toward(frame, visible.points_m)
         normal = frame.normals.flatten(0, 1)[readings.pixel]
         gap_m = frame.points_m.flatten(0, 1)[readings.pixel] - visible.points_m
         is_alike = (normal * visible.normals).sum(-1).abs() > _MIN_COSINE_ICP
         is_used = readings.is_read & is_usable[readings.pixel] & is_alike
 
-        # One step of Gauss-Newton about the middle of the object, weighted by Tukey's function.
-        limit_m = share * surface.diameter_m
+        # One step, weighted by Tukey's function of the gap.
+        limit_m = limit * surface.diameter_m
         weight = torch.from_numpy(tukey_weight(gap_m.square().sum(-1).numpy(), limit_m))
         weight = torch.where(is_used, weight, 0.0)
+        distance_m = torch.where(is_used, (gap_m * normal).sum(-1), 0.0)
         middle_m = poses.apply(surface.middle_m[None])
         arm_m = visible.points_m - middle_m
         J = torch.cat([torch.linalg.cross(arm_m, normal), normal], -1)
         J = torch.where(is_used[..., None], J, 0.0)
-        weighted = J.mT * weight[:, None]
-        # Damped, so that a motion that few readings constrain stays where it was voted for.
-        H = weighted @ J + weight.sum(-1)[:, None, None].clamp(min=1.0) * damping
-        distance_m = torch.where(is_used, (gap_m * normal).sum(-1), 0.0)
-        motion = torch.linalg.solve(H, weighted @ distance_m[..., None])[..., 0]
+        motion = _solve_damped(J, distance_m, weight, surface.diameter_m / 2)
+
+        # The motion is about the middle of the object.
         moved = perturb(Rigid(poses.R, poses.t_m - middle_m[:, 0]), motion)
         poses = Rigid(moved.R, moved.t_m + middle_m[:, 0])
     return poses
+
+
+def _solve_damped(
+    J: Float64[Tensor, "b n 6"],
+    distance_m: Float64[Tensor, "b n"],
+    weight: Float64[Tensor, "b n"],
+    radius_m: float,
+) -> Float64[Tensor, "b 6"]:
+    """Compute the motions of a step of Gauss-Newton: ``(J^T W J + D) motion = J^T W distance``.
+
+    The damping D keeps a motion that few readings constrain where it was voted for. ``radius_m``,
+    of the object, converts a rotation to the distance by which it moves the surface.
+    """
+    squared_arms = torch.tensor([radius_m**2] * 3 + [1.0] * 3, dtype=torch.float64)
+    damping = _DAMPING * torch.diag(squared_arms)
+    weighted = J.mT * weight[:, None]
+    total_weight = weight.sum(-1)[:, None, None].clamp(min=1.0)
+    H = weighted @ J + total_weight * damping
+    return torch.linalg.solve(H, weighted @ distance_m[..., None])[..., 0]
 
 
 def score_by_image(
@@ -215,13 +244,19 @@ def score_by_image(
 ) -> Float64[Tensor, " b"]:
     """Score posed surfaces by the readings in the directions of their points, to rank proposals.
 
+    Args:
+        frame: the image.
+        poses: a batch, ``camera_from_model``.
+        surface: of the model.
+        stage: how many points are compared, and how closely.
+
     Returns:
         The share of the surface with a reading at its depth and with its normal, less the share
         with a reading there of another normal, that the camera saw through, or that a background
         hides; at most 1.
     """
-    # The reading in the direction of each visible point, and how far behind it.
-    visible = _visible_points(poses, surface, stage.every)
+    # The reading in the direction of each visible point, and how far behind the point it is.
+    visible = _find_visible_points(poses, surface, stage.every)
     depth_m = visible.points_m[..., 2]
     readings = readings_toward(frame, visible.points_m)
     gap_m = readings.depth_m - depth_m
@@ -243,23 +278,24 @@ def score_by_image(
     is_cut = is_through & ~visible.is_inner
     contradicts = (is_at_depth & has_other_normal) | is_hidden | (is_through & visible.is_inner)
 
+    # As shares of the points that are read, or of half of all points where less of them is read.
     count = depth_m.isfinite().sum(1).clamp(min=1)
     read = (readings.is_read & ~is_cut).sum(1).maximum(_LEAST_READ * count).double()
     return (supports.sum(1) - contradicts.sum(1)) / read
 
 
 class _Visible(NamedTuple):
-    """The visible points of posed surfaces, in the camera frame; parts of ``surface.Views``."""
+    """The visible points of posed surfaces, in the camera frame."""
 
-    points_m: Points
-    normals: Points
-    is_inner: Bool[Tensor, "b n"]
+    points_m: Float64[Tensor, "b n 3"]  #: NaN where a view has fewer points
+    normals: Float64[Tensor, "b n 3"]  #: of these points
+    is_inner: Bool[Tensor, "b n"]  #: whether a point is of no rim or edge, which sensors cut
 
 
-def _visible_points(poses: Rigid, surface: Surface, every: int) -> _Visible:
-    """Give the points of each posed surface that are visible from the view nearest to the camera's.
+def _find_visible_points(poses: Rigid, surface: Surface, every: int) -> _Visible:
+    """Find the points of each posed surface that are visible in the stored view nearest to it.
 
-    ``every``: of so many of them one is given.
+    ``every``: of so many of them one is taken.
     """
     views = surface.views
     camera_m = -(poses.t_m[:, None] @ poses.R)[:, 0]  # in the model frame

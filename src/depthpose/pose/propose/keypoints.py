@@ -13,16 +13,24 @@ from depthpose.core.rigid import Rigid, cross_matrix, fit_rigid, rotation_by
 from depthpose.pose.config import EstimateConfig, VotingConfig
 from depthpose.pose.types import ObjectModel, PoseFit, Refusal, Vote
 
-_SMALLEST = 1e-12
+_SMALLEST = 1e-12  # length by which a vector is divided, or that a direction has
 _NEAREST = 0.1
 """Share of the mean distance to a keypoint: nearer points weigh no more than at this distance. A
 point on the keypoint would outweigh all others, and its direction means nothing."""
+_LEAST_COSINE = 0.5
+"""Between a direction and the way to the keypoint, in the information of a vote: outliers would
+make its matrix indefinite."""
+_DAMPING = 1e-12
+"""Share of the trace that is added to a matrix of lines, so that parallel ones have a solution."""
 _EIGENVALUE_ROUNDING = 1e-7
 """Of a matrix of trace 2, sums in float32: a smaller eigenvalue is that of parallel lines."""
 
 
-class Lines(NamedTuple):
-    """Lines through points; coordinates are about the mean of the points, and come before them."""
+class VoteLines(NamedTuple):
+    """Lines of votes, from n points to each of k keypoints; the points are the last axis.
+
+    Coordinates are about the mean of the points.
+    """
 
     points: Float[Tensor, "*batch 1 3 n"]  #: one on each line
     directions: Float[Tensor, "*batch k 3 n"]  #: unit vectors
@@ -54,6 +62,9 @@ def meet_lines(
         weight: 0 leaves a vote out (padding, outliers); None counts all alike.
         refinements: steps after the nearest point.
 
+    Returns:
+        The keypoints in the frame of the points, and how well the lines fix them.
+
     Raises:
         InputError: fewer than two lines of a keypoint have weight.
     """
@@ -65,8 +76,8 @@ def _make_lines(
     points_m: Float[Tensor, "*batch n 3"],
     directions: Float[Tensor, "*batch n k 3"],
     weight: Float[Tensor, "*batch n k"] | None,
-) -> tuple[Lines, Float[Tensor, "*batch 1 3"]]:
-    """Make lines of points and directions; give them, and the points' mean.
+) -> tuple[VoteLines, Float[Tensor, "*batch 1 3"]]:
+    """Make lines of points and directions; return them, and the mean of the points.
 
     Raises:
         InputError: fewer than two lines of a keypoint have weight.
@@ -87,52 +98,21 @@ def _make_lines(
             f"voting: {least} directions of some keypoint carry weight, but two lines at least "
             "fix a point. Give more points or a positive weight to more of them."
         )
-    return Lines(local, n, w), centre_m
+    return VoteLines(points=local, directions=n, weights=w), centre_m
 
 
-def _meet(lines: Lines, centre_m: Float[Tensor, "*batch 1 3"], refinements: int) -> Vote:
+def _meet(lines: VoteLines, centre_m: Float[Tensor, "*batch 1 3"], refinements: int) -> Vote:
     """Find where lines meet best, as :func:`meet_lines`; ``centre_m`` is added to the points."""
-    local, n, w = lines  # points, unit directions n and weights w, as in the formulas
-    eye = torch.eye(3, dtype=torch.float64, device=n.device)
+    local, n, w = lines  # points x, unit directions n and weights w, as in the formulas
+    p, A = _find_nearest_point(lines)
+    condition = _measure_condition(A)
 
-    # The point nearest to all lines. Divided by the sum of weights, A has a trace of 2.
-    along = (n * local).sum(-2, keepdim=True)
-    total = w.sum(-1).double()[..., None, None]
-    wn = n * w[..., None, :]
-    A = (total * eye - (wn @ n.mT).double()) / total
-    b = (local @ w[..., None] - wn @ along.mT).double() / total
-    p = torch.linalg.solve(_damp(A), b).squeeze(-1)
-
-    # How well they fix it, and the gradient of each line there.
-    values = torch.linalg.eigvalsh(A)
-    least = values[..., 0].clamp(min=_EIGENVALUE_ROUNDING)
-    is_crossing = values[..., 0] > _EIGENVALUE_ROUNDING
-    condition = torch.where(is_crossing, values[..., 2] / least, torch.inf)
+    # The gradient of each line there, in case that there is no refinement.
     offset = p.to(n)[..., None] - local
     gradient = offset - n * (n * offset).sum(-2, keepdim=True)
     gradient = gradient * (w / w.sum(-1, keepdim=True))[..., None, :]
-
     for _ in range(refinements):
-        # The gradient of each line, and the information matrix, over the sum of weights.
-        offset = p.to(n)[..., None] - local
-        distance = offset.square().sum(-2).sqrt_()
-        scale = distance.mean(-1, keepdim=True).clamp(min=_SMALLEST)
-        q = offset / distance.clamp(min=_SMALLEST)[..., None, :]
-        distance = torch.maximum(distance, _NEAREST * scale)
-        cosine = (n * q).sum(-2)
-        pull = w / distance / w.sum(-1, keepdim=True)
-        gradient = (n - q * cosine[..., None, :]) * pull[..., None, :]
-        # A cosine of one half at least: outliers would make the matrix indefinite.
-        amount = pull / distance * cosine.clamp(min=0.5)
-        outer = ((q * amount[..., None, :]) @ q.mT).double()
-        A = amount.sum(-1).double()[..., None, None] * eye - outer
-        step = torch.linalg.solve(_damp(A), gradient.sum(-1).double()[..., None]).squeeze(-1)
-
-        # No step is longer than the root mean square distance of the keypoint to the points.
-        spread = local.square().sum(-2).mean(-1).double()
-        limit = (p.square().sum(-1) + spread).sqrt()
-        shortening = (limit / step.norm(dim=-1).clamp(min=_SMALLEST)).clamp(max=1.0)
-        p = p + step * shortening[..., None]
+        p, A, gradient = _step_to_likeliest(lines, p)
 
     # Each line gives 2 equations for 3 unknowns: the correction for the degrees of freedom.
     inverse = torch.linalg.inv(_damp(A))
@@ -147,10 +127,68 @@ def _meet(lines: Lines, centre_m: Float[Tensor, "*batch 1 3"], refinements: int)
     )
 
 
+def _find_nearest_point(
+    lines: VoteLines,
+) -> tuple[Float64[Tensor, "*b k 3"], Float64[Tensor, "*b k 3 3"]]:
+    """Find the points nearest to all lines, ``A p = b``; return p and A.
+
+    ``A = sum w (I - n n^T) / sum w``, of a trace of 2, and ``b = sum w (I - n n^T) x / sum w``.
+    """
+    local, n, w = lines
+    eye = torch.eye(3, dtype=torch.float64, device=n.device)
+    along = (n * local).sum(-2, keepdim=True)
+    total = w.sum(-1).double()[..., None, None]
+    wn = n * w[..., None, :]
+    A = (total * eye - (wn @ n.mT).double()) / total
+    b = (local @ w[..., None] - wn @ along.mT).double() / total
+    return torch.linalg.solve(_damp(A), b).squeeze(-1), A
+
+
+def _measure_condition(A: Float64[Tensor, "*b k 3 3"]) -> Float64[Tensor, "*b k"]:
+    """Measure the ratio of the largest to the least eigenvalue; infinite for parallel lines."""
+    eigenvalues = torch.linalg.eigvalsh(A)  # ascending
+    least = eigenvalues[..., 0]
+    ratio = eigenvalues[..., 2] / least.clamp(min=_EIGENVALUE_ROUNDING)
+    return torch.where(least > _EIGENVALUE_ROUNDING, ratio, torch.inf)
+
+
+def _step_to_likeliest(
+    lines: VoteLines, p: Float64[Tensor, "*b k 3"]
+) -> tuple[Float64[Tensor, "*b k 3"], Float64[Tensor, "*b k 3 3"], Float[Tensor, "*b k 3 n"]]:
+    """Make a step of Fisher scoring from points p to the largest ``sum w n . q / sum w``.
+
+    Returns:
+        The next points; the information matrix; and the gradient of each line, both at p.
+    """
+    # The unit vector q from each line's point to p. Near points weigh no more than others.
+    local, n, w = lines
+    offset = p.to(n)[..., None] - local
+    distance = offset.square().sum(-2).sqrt_()
+    scale = distance.mean(-1, keepdim=True).clamp(min=_SMALLEST)
+    q = offset / distance.clamp(min=_SMALLEST)[..., None, :]
+    distance = torch.maximum(distance, _NEAREST * scale)
+
+    # The gradient, (n - q cos) / distance, and the information, (I - q q^T) cos / distance^2.
+    cosine = (n * q).sum(-2)
+    pull = w / distance / w.sum(-1, keepdim=True)
+    gradient = (n - q * cosine[..., None, :]) * pull[..., None, :]
+    amount = pull / distance * cosine.clamp(min=_LEAST_COSINE)
+    outer = ((q * amount[..., None, :]) @ q.mT).double()
+    eye = torch.eye(3, dtype=torch.float64, device=n.device)
+    A = amount.sum(-1).double()[..., None, None] * eye - outer
+    step = torch.linalg.solve(_damp(A), gradient.sum(-1).double()[..., None]).squeeze(-1)
+
+    # No step is longer than the root mean square distance of the keypoint to the points.
+    spread = local.square().sum(-2).mean(-1).double()
+    limit = (p.square().sum(-1) + spread).sqrt()
+    shortening = (limit / step.norm(dim=-1).clamp(min=_SMALLEST)).clamp(max=1.0)
+    return p + step * shortening[..., None], A, gradient
+
+
 def _damp(A: Float64[Tensor, "*b k 3 3"]) -> Float64[Tensor, "*b k 3 3"]:
     """Add a little to the diagonal: parallel lines then meet near the mean of the points."""
-    size = A.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None].clamp(min=1e-300)
-    return A + 1e-12 * size * torch.eye(3, dtype=A.dtype, device=A.device)
+    trace = A.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None].clamp(min=1e-300)
+    return A + _DAMPING * trace * torch.eye(3, dtype=A.dtype, device=A.device)
 
 
 _PARALLEL = 1e-6  # square of the sine of the angle of two lines, below which they do not cross
@@ -180,6 +218,9 @@ def vote_ransac(
         weight: 0 leaves a vote out; None counts all alike.
         config: number of hypotheses, test for inliers, seed.
 
+    Returns:
+        The keypoints in the frame of the points, and how well their inliers fix them.
+
     Raises:
         InputError: fewer than two directions of a keypoint carry weight.
     """
@@ -189,15 +230,15 @@ def vote_ransac(
     hypotheses, is_crossing = _cross_pairs(lines, first, second)
 
     # The best hypothesis. Parallel pairs score 0, as the least of all, so that one always wins.
-    inlier_test = InlierTest(lines, config)
-    scores = torch.where(is_crossing, inlier_test.score(hypotheses), 0)
+    scorer = InlierScorer(lines, config)
+    scores = torch.where(is_crossing, scorer.score(hypotheses), 0)
     best = scores.argmax(-1)[..., None, None]
     keypoint = hypotheses.gather(-2, best.expand(*best.shape[:-1], 3))
 
     # Refitted to its inliers, then to those of the refitted point.
     w = lines.weights
     for steps in (min(config.refinements, 1), config.refinements):
-        inlier_weight = inlier_test.agree(keypoint).squeeze(-2) * w
+        inlier_weight = scorer.mark_inliers(keypoint).squeeze(-2) * w
         is_enough = (inlier_weight > 0).sum(-1, keepdim=True) >= _LEAST_INLIERS
         # Where there are too few inliers all votes are used, and the share is 0.
         share = torch.where(is_enough, inlier_weight, 0).sum(-1) / w.sum(-1)
@@ -210,9 +251,10 @@ def vote_ransac(
 def _draw_pairs(
     weights: Float[Tensor, "*batch k n"], config: VotingConfig
 ) -> tuple[Int64[Tensor, "*batch k h"], Int64[Tensor, "*batch k h"]]:
-    """Draw pairs of two different votes of positive weight for each keypoint, on any device alike.
+    """Draw pairs of two different votes of positive weight, on any device alike.
 
-    Gives the indices of the first and the second vote of each hypothesis.
+    Returns:
+        The indices of the first and of the second vote of each keypoint's hypotheses.
     """
     # Two different numbers below the count of votes with weight.
     counts = (weights > 0).sum(-1, keepdim=True)
@@ -231,18 +273,23 @@ def _draw_pairs(
 
 
 def _cross_pairs(
-    lines: Lines, first: Int64[Tensor, "*batch k h"], second: Int64[Tensor, "*batch k h"]
+    lines: VoteLines, first: Int64[Tensor, "*batch k h"], second: Int64[Tensor, "*batch k h"]
 ) -> tuple[Float[Tensor, "*batch k h 3"], Bool[Tensor, "*batch k h"]]:
-    """Find the middle of the common perpendicular of pairs of lines, and which are not parallel."""
-    # A point and a direction of each line.
-    wide = (*first.shape[:-1], 3, first.shape[-1])
-    x1, x2, n1, n2 = (
-        values.expand_as(lines.directions).gather(-1, index[..., None, :].expand(wide))
-        for values in (lines.points, lines.directions)
-        for index in (first, second)
-    )
+    """Find where pairs of lines nearly cross: the middle of their common perpendicular.
 
-    # The points of the perpendicular on both lines.
+    Args:
+        lines: of the votes.
+        first: index of the first line of each pair.
+        second: index of the second.
+
+    Returns:
+        The middles, and whether the lines cross: parallel ones do not.
+    """
+    x1, n1 = _select_lines(lines, first)
+    x2, n2 = _select_lines(lines, second)
+
+    # The feet of the perpendicular: with gap = x1 - x2, c = n1 . n2, d = n1 . gap, e = n2 . gap
+    # they are x1 + n1 (c e - d) / (1 - c^2) and x2 + n2 (e - c d) / (1 - c^2).
     gap = x1 - x2
     cosine = (n1 * n2).sum(-2, keepdim=True)
     d = (n1 * gap).sum(-2, keepdim=True)
@@ -255,7 +302,16 @@ def _cross_pairs(
     return ((on_first + on_second) / 2).mT, is_crossing.squeeze(-2)
 
 
-class InlierTest:
+def _select_lines(
+    lines: VoteLines, index: Int64[Tensor, "*batch k h"]
+) -> tuple[Float[Tensor, "*batch k 3 h"], Float[Tensor, "*batch k 3 h"]]:
+    """Select lines by index: a point on each, and its direction."""
+    index = index[..., None, :].expand(*index.shape[:-1], 3, index.shape[-1])
+    points = lines.points.expand_as(lines.directions)
+    return points.gather(-1, index), lines.directions.gather(-1, index)
+
+
+class InlierScorer:
     """Tests which lines agree with which hypotheses, by angle or by distance.
 
     Both tests compare polynomials in the hypothesis h, and so are two products of matrices:
@@ -264,8 +320,8 @@ class InlierTest:
     along^2 < limit^2``, whatever the sense of the vote (published practice).
     """
 
-    def __init__(self, lines: Lines, config: VotingConfig) -> None:
-        # The polynomials' coefficients of each line.
+    def __init__(self, lines: VoteLines, config: VotingConfig) -> None:
+        # The polynomials' coefficients of each line, of [h, 1] and of [h, |h|^2, 1].
         local, n, w = lines
         self._limit = config.max_distance_m**2 if config.inlier_test == "distance" else None
         along = torch.cat([n, -(n * local).sum(-2, keepdim=True)], -2)
@@ -291,20 +347,20 @@ class InlierTest:
         memory = hypotheses.new_empty(2, keypoints * rows * votes)
         scores = hypotheses.new_empty(flat.shape[:-1])
         for start in range(0, flat.shape[1], rows):
-            agreed = self.agree(flat[:, start : start + rows], memory)
+            agreed = self.mark_inliers(flat[:, start : start + rows], memory)
             agreed = agreed.mul_(self._w) if self._is_weighted else agreed
             scores[:, start : start + rows] = agreed.sum(-1)
         return scores.view(hypotheses.shape[:-1])
 
     @torch.no_grad()
-    def agree(
+    def mark_inliers(
         self, hypotheses: Float[Tensor, "*batch k h 3"], memory: Tensor | None = None
     ) -> Float[Tensor, "*batch k h n"]:
-        """Test each line against each hypothesis: 1 where they agree, else 0.
+        """Mark the lines that agree with each hypothesis by 1, the others by 0.
 
         Args:
             hypotheses: points.
-            memory: two rows, each for as many numbers as there are answers, into one of which these
+            memory: two rows, each for as many numbers as there are marks, into one of which these
                 are written; None: it is made.
         """
         # Both polynomials, as products of matrices.
@@ -328,10 +384,18 @@ class InlierTest:
 
 _LEAST_KEYPOINTS = 4  # that must agree: three fix a pose with nothing left to contradict it
 _STEPS = 4  # Gauss-Newton from Kabsch: the fourth step is below float64's noise
+_EXACT = 1e-12  # of the squared extent: no keypoint has a smaller variance, a millionth of the size
+_MOST_WEIGHT = 100  # times the median weight, in Kabsch's fit
+_MOST_SEVERITY = 100.0  # tolerances, of an error that decides which keypoint is removed
 
 
 def fit_poses(vote: Vote, model: ObjectModel, config: EstimateConfig) -> PoseFit | Refusal:
     """Fit a pose to the keypoints that are consistent; where ICP follows, also to all of them.
+
+    Args:
+        vote: observed keypoints of one object.
+        model: the object.
+        config: what keypoints must fulfil, and whether ICP follows.
 
     Returns:
         A batch of one or two fits; or why there is none.
@@ -397,33 +461,34 @@ def fit_pose(
     Raises:
         InputError: fewer than three keypoints are used.
     """
+    # Observed keypoints, those of the model, and which are used.
     observed_m = keypoints_m.double()
     model_m = model_keypoints_m.double().expand_as(observed_m)
     used = torch.ones_like(observed_m[..., 0], dtype=torch.bool) if is_used is None else is_used
 
     # Information of each keypoint; none is known better than a millionth of the object.
     spread_m2 = (model_m - model_m.mean(-2, keepdim=True)).square().sum(-1).mean(-1)
-    floor_m2 = (1e-12 * spread_m2)[..., None, None, None] * torch.eye(3).to(model_m)
+    floor_m2 = (_EXACT * spread_m2)[..., None, None, None] * torch.eye(3).to(model_m)
     information = torch.linalg.inv(covariance_m2.double() + floor_m2) * used[..., None, None]
 
     # Kabsch. One keypoint that looks exact must not decide alone, since a rotation takes three: no
     # weight is above a hundred times the median of those used.
     trace = information.diagonal(dim1=-2, dim2=-1).sum(-1)
-    usual = trace.masked_fill(~used, torch.nan).nanmedian(-1, keepdim=True).values
-    most = 100 * usual.clamp(min=1e-300)
+    median = trace.masked_fill(~used, torch.nan).nanmedian(-1, keepdim=True).values
+    most = _MOST_WEIGHT * median.clamp(min=1e-300)
     pose = fit_rigid(model_m, observed_m, trace.clamp(max=most))
 
     # Gauss-Newton from there.
     for _ in range(_STEPS):
         moved_m = pose.apply(model_m)
-        weighted, H = _weigh_motion(moved_m, information)
+        weighted, H = _linearise_motion(moved_m, information)
         gradient = (weighted @ (observed_m - moved_m)[..., None]).sum(-3).squeeze(-1)
         motion = torch.linalg.solve(H, gradient)
         pose = Rigid(rotation_by(motion[..., :3]), motion[..., 3:]) @ pose
 
-    # Covariance and residual of what it comes to.
+    # Covariance and residual of the last pose.
     moved_m = pose.apply(model_m)
-    _, H = _weigh_motion(moved_m, information)
+    _, H = _linearise_motion(moved_m, information)
     error_m = moved_m - observed_m
     mean_square_m2 = (error_m.square().sum(-1) * used).sum(-1) / used.sum(-1)
     return PoseFit(
@@ -433,7 +498,7 @@ def fit_pose(
     )
 
 
-def _weigh_motion(
+def _linearise_motion(
     moved_m: Float64[Tensor, "*batch k 3"], information: Float64[Tensor, "*batch k 3 3"]
 ) -> tuple[Float64[Tensor, "*batch k 6 3"], Float64[Tensor, "*batch 6 6"]]:
     """Compute ``J^T C^-1`` of each keypoint, and ``sum J^T C^-1 J``, by left perturbations.
@@ -452,7 +517,7 @@ def find_consistent_keypoints(
     keypoints_m: Float[Tensor, "*batch k 3"],
     model_keypoints_m: Float[Tensor, "k 3"],
     tolerance_m: float,
-    is_found: Bool[Tensor, "*batch k"] | None = None,
+    is_considered: Bool[Tensor, "*batch k"] | None = None,
 ) -> Bool[Tensor, "*batch k"]:
     """Remove keypoints until all pairs that remain have the distance of the model.
 
@@ -464,10 +529,10 @@ def find_consistent_keypoints(
         keypoints_m: observed.
         model_keypoints_m: in any frame, for distances alone count.
         tolerance_m: largest difference of a distance.
-        is_found: keypoints to begin with; None: all.
+        is_considered: keypoints to begin with; None: all.
 
     Returns:
-        Those that remain; three or more of them fix a pose.
+        Whether each keypoint remains; three or more fix a pose.
     """
     # By how much the distance of each pair is off.
     distance_m = _measure_pairs(keypoints_m)
@@ -475,9 +540,10 @@ def find_consistent_keypoints(
     errors_m = (distance_m - model_distance_m).abs()
     count = keypoints_m.shape[-2]
     remains = torch.ones(keypoints_m.shape[:-1], dtype=torch.bool, device=keypoints_m.device)
-    remains = remains if is_found is None else is_found.clone()
-    # Errors decide ties: they are capped, so that together they weigh less than one pair.
-    severity = (errors_m / tolerance_m).clamp(max=100.0) / (200.0 * count)
+    remains = remains if is_considered is None else is_considered.clone()
+
+    # Errors decide ties: they are capped, so that all of a keypoint weigh less than one pair.
+    severity = (errors_m / tolerance_m).clamp(max=_MOST_SEVERITY) / (2 * _MOST_SEVERITY * count)
     for _ in range(count):
         is_pair = remains[..., :, None] & remains[..., None, :]
         is_inconsistent = is_pair & (errors_m > tolerance_m)

@@ -1,12 +1,16 @@
-"""Whole frames: several objects on a table, as picture, depth and masks; light is linear RGB."""
+"""Whole frames: several objects on a table, as picture, depth and masks.
+
+Light is linear RGB until the camera encodes it as sRGB.
+"""
 
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from depthpose.core.camera import back_project
@@ -17,16 +21,20 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.datasets import BopFrame, BopObject
 from depthpose.pose.mesh import drawn_triangles, sample_surface
-from depthpose.pose.synthetic.views import random_index, random_rotation, simulate_depth, uniform
+from depthpose.pose.synthetic.depth_sensors import simulate_depth
+from depthpose.pose.synthetic.random_numbers import random_index, random_rotation, uniform
 from depthpose.pose.types import ObjectModel
 
 _WAVES = 6  # of a pattern
-_COLOUR_SEED = 0xC0102
+_COLOUR_SEED = 0xC0102  # of the colours of objects, which are the same in every data set
+_DISTINCT_HUE = (0.7, 1.0)  # shares of a hue by which objects are told apart
+_HIGHLIGHT_POWER = 1 / math.radians(2)  # of Blinn's cosine: the larger, the smaller a highlight
+_GAMMA = 2.2  # about that of sRGB
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Pattern:
-    """The colour of a surface by place: a base colour that waves in space change."""
+    """The colour of a surface by place: a base colour, changed by waves in space."""
 
     base: Float[Tensor, "3"]  #: linear RGB
     waves: Float[Tensor, "w 3"]  #: amplitude of each wave in RGB, a share of the base
@@ -45,18 +53,36 @@ class Solid:
     number: int | None  #: ``obj_id``; None for clutter
 
 
-def draw_pattern(
-    generator: torch.Generator, size_m: float, colourful: tuple[float, float] = (0.0, 0.8)
-) -> Pattern:
-    """Draw a pattern whose features are about a third of a size.
+class PlacedSolid(NamedTuple):
+    """A body at its place."""
 
-    ``colourful`` is the range of the share of a hue, against grey.
+    solid: Solid
+    pose: Rigid  #: from the body's frame to that of the table or the camera
+
+
+class _Light(NamedTuple):
+    """A lamp far away, and light from everywhere."""
+
+    towards: Float[Tensor, "3"]  #: unit vector to the lamp, in the camera frame
+    lamp: Float[Tensor, "3"]  #: colour of its light
+    ambient: Float[Tensor, "3"]  #: colour of the light from everywhere
+
+
+def draw_pattern(
+    generator: torch.Generator, size_m: float, hue_share: tuple[float, float] = (0.0, 0.8)
+) -> Pattern:
+    """Draw a random pattern.
+
+    Args:
+        generator: of random numbers.
+        size_m: of the surface; features are about a third of it.
+        hue_share: range of the share of a hue, against grey.
     """
     strength = uniform(generator, 0.0, 0.25)
     directions = torch.randn(_WAVES, 3, generator=generator)
     grey = uniform(generator, 0.1, 0.8)
     hue = torch.rand(3, generator=generator)
-    share = uniform(generator, *colourful)
+    share = uniform(generator, *hue_share)
     common = torch.randn(_WAVES, 1, generator=generator)
     waves = 0.5 * torch.randn(_WAVES, 3, generator=generator)
     return Pattern(
@@ -69,7 +95,7 @@ def draw_pattern(
 
 
 def draw_clutter(generator: torch.Generator) -> Solid:
-    """Draw clutter: a box, a ball or a can."""
+    """Draw a random body of clutter: a box, a ball or a can."""
     import trimesh
 
     size_m = uniform(generator, 0.04, 0.15)
@@ -89,69 +115,64 @@ def draw_clutter(generator: torch.Generator) -> Solid:
     )
 
 
-def shade(
-    placed: Sequence[tuple[Solid, Rigid]],
-    raster: Raster,
-    K: Float[Tensor, "3 3"],
-    towards: Float[Tensor, "3"],
-    lamp: Float[Tensor, "3"],
-    ambient: Float[Tensor, "3"],
+def _shade(
+    placed: Sequence[PlacedSolid], raster: Raster, K: Float[Tensor, "3 3"], light: _Light
 ) -> Float[Tensor, "n 3"]:
-    """Shade the pixels of a raster that show a surface, in the order of the image's rows.
+    """Compute the colours of the pixels that show a surface, in the order of the image's rows.
 
     By Lambert's law and a mirrored lamp (Blinn 1977); no shadow is cast.
 
     Args:
-        placed: bodies and their poses ``camera_from_body``, in the order of the raster's triangles.
+        placed: bodies in the camera frame, in the order of the raster's triangles.
         raster: of all of them.
         K: intrinsic matrix.
-        towards: unit vector to the lamp, which is far away, in the camera frame.
-        lamp: colour of its light, linear RGB.
-        ambient: colour of the light from everywhere.
+        light: on them.
     """
     assert raster.barycentric is not None
     is_seen = raster.primitive >= 0
-    points = back_project(raster.depth_m, K)[is_seen]
-    share = raster.barycentric[is_seen]
+    points_m = back_project(raster.depth_m, K)[is_seen]
+    barycentric = raster.barycentric[is_seen]
     primitive = raster.primitive[is_seen]
-    colour = torch.zeros_like(points)
+    colour = torch.zeros_like(points_m)
     start = 0
     for solid, pose in placed:
         stop = start + len(solid.triangles_m)
         of_solid = ((primitive >= start) & (primitive < stop)).nonzero()[:, 0]
 
         # Normals, toward the camera: both sides of a thin part are visible.
-        corners = solid.normals[primitive[of_solid] - start]
-        normal = (corners * share[of_solid, :, None]).sum(1) @ pose.R.mT
+        corner_normals = solid.normals[primitive[of_solid] - start]
+        normal = (corner_normals * barycentric[of_solid, :, None]).sum(1) @ pose.R.mT
         normal = F.normalize(normal, dim=-1)
-        sight = F.normalize(-points[of_solid], dim=-1)
+        sight = F.normalize(-points_m[of_solid], dim=-1)
         normal = normal * torch.where((normal * sight).sum(-1, keepdim=True) < 0, -1.0, 1.0)
 
         # Light: from the lamp, directly and mirrored, and ambient, half as much from below.
-        facing = (normal @ towards).clamp(min=0)[:, None]
-        half = F.normalize(sight + towards, dim=-1)
-        shine = (normal * half).sum(-1, keepdim=True).clamp(min=0) ** (1 / math.radians(2))
-        open_sky = 0.75 + 0.25 * (normal @ towards)[:, None]
-        diffuse = ambient * open_sky + lamp * facing
-
-        # The colour of the surface.
-        pattern = solid.pattern
-        local_m = pose.inverse().apply(points[of_solid])
-        waves = torch.tanh(2 * (local_m @ pattern.frequencies.mT + pattern.phases).sin())
-        albedo = (pattern.base * (1 + waves @ pattern.waves)).clamp(0.01, 1)
-        colour[of_solid] = albedo * diffuse + pattern.gloss * shine * lamp
+        facing = (normal @ light.towards).clamp(min=0)[:, None]
+        half = F.normalize(sight + light.towards, dim=-1)
+        shine = (normal * half).sum(-1, keepdim=True).clamp(min=0) ** _HIGHLIGHT_POWER
+        open_sky = 0.75 + 0.25 * (normal @ light.towards)[:, None]
+        diffuse = light.ambient * open_sky + light.lamp * facing
+        albedo = _find_albedo(solid.pattern, pose.inverse().apply(points_m[of_solid]))
+        colour[of_solid] = albedo * diffuse + solid.pattern.gloss * shine * light.lamp
         start = stop
     return colour
 
 
+def _find_albedo(pattern: Pattern, points_m: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    """Compute the share of the light that a surface reflects at its points, in RGB."""
+    phase = points_m @ pattern.frequencies.mT + pattern.phases
+    waves = torch.tanh(2 * phase.sin())
+    return (pattern.base * (1 + waves @ pattern.waves)).clamp(0.01, 1)
+
+
 _TRIES = 30  # places that are tried for a body on the table
-_FRAMES_SEED = 0xF4A3E5
+_FRAMES_SEED = 0xF4A3E5  # added to the seed, so that frames share no random numbers with views
 
 
 def make_frames(
     models: Sequence[ObjectModel], config: ObjectsConfig, number: int, first: int = 0
 ) -> Iterator[BopFrame]:
-    """Make frames of several objects on a table, as BOP lays them out.
+    """Make frames of several objects on a table, one after the other, for a data set of BOP.
 
     Frame i depends on the seed and i alone. A frame shows each object once at most, or a pile of
     one of them (``frame_pile``). Poses are exact; the depth has a sensor's errors.
@@ -184,8 +205,8 @@ def make_frames(
 
 def _make_solid(model: ObjectModel) -> Solid:
     """Make the body of an object, which looks alike in every frame of every data set."""
-    random = make_sample_generator(model.number, _COLOUR_SEED)
-    pattern = draw_pattern(random, model.diameter_m, (0.7, 1.0))
+    generator = make_sample_generator(model.number, _COLOUR_SEED)
+    pattern = draw_pattern(generator, model.diameter_m, _DISTINCT_HUE)
     corners = drawn_triangles(model)
     normals = model.normals[model.faces]
     if not len(model.faces):  # each point is a disc of several triangles
@@ -204,9 +225,10 @@ def _make_frame(
         scene = _drop_pile(models, solids, config, generator)
     else:
         scene = _arrange(solids, config, generator)
-    scene.append((_draw_table(generator), Rigid(torch.eye(3), torch.zeros(3))))
+    at_origin = Rigid(torch.eye(3), torch.zeros(3))
+    scene.append(PlacedSolid(_draw_table(generator), at_origin))
     camera_from_table = _draw_viewpoint(config, generator)
-    placed = [(solid, camera_from_table @ pose) for solid, pose in scene]
+    placed = [PlacedSolid(solid, camera_from_table @ pose) for solid, pose in scene]
 
     # The intrinsic matrix.
     assert config.centre_px is not None, "the config computes a centre left out"
@@ -216,33 +238,36 @@ def _make_frame(
 
     # What each pixel shows: the index of a body, or -1.
     width, height = config.image_px
-    corners = [pose.apply(solid.triangles_m) for solid, pose in placed]
-    raster = rasterize(torch.cat(corners), K, width, height)
-    owner = torch.cat([torch.full((len(c),), i) for i, c in enumerate(corners)])
-    visible = torch.where(raster.primitive >= 0, owner[raster.primitive.clamp(min=0)], -1)
+    triangles_m = [pose.apply(solid.triangles_m) for solid, pose in placed]
+    raster = rasterize(torch.cat(triangles_m), K, width, height)
+    body_of_triangle = torch.cat([
+        torch.full((len(triangles),), i) for i, triangles in enumerate(triangles_m)
+    ])  # fmt: skip
+    body = body_of_triangle[raster.primitive.clamp(min=0)]
+    visible_body = torch.where(raster.primitive >= 0, body, -1)
 
     # The picture: a background, lit bodies before it, and a camera's errors.
     image = _draw_background(height, width, generator)
     up = camera_from_table.R[:, 2]
-    towards, lamp, ambient = _draw_light(up, generator)
-    image[:, raster.primitive >= 0] = shade(placed, raster, K, towards, lamp, ambient).mT
+    light = _draw_light(up, generator)
+    image[:, raster.primitive >= 0] = _shade(placed, raster, K, light).mT
     rgb = _photograph(image, generator)
 
-    # Depth, and the bodies that are annotated.
-    focal_px = (config.focal_px[0], config.focal_px[0])
+    # Depth, and the objects that are annotated, by what each would show alone.
+    focal_px = (config.focal_px[0], config.focal_px[0])  # the window is the whole image
     depth_m = simulate_depth(raster.depth_m, focal_px, config.sensor, generator)
     shown: list[BopObject] = []
     for i, (solid, pose) in enumerate(placed):
         if solid.number is None:
             continue
-        alone = rasterize(corners[i], K, width, height, with_barycentric=False)
+        alone = rasterize(triangles_m[i], K, width, height, with_barycentric=False)
         silhouette = alone.depth_m.isfinite()
         if bool(silhouette.any()):
             shown.append(
                 BopObject(
                     number=solid.number,
                     camera_from_model=pose,
-                    visible=visible == i,
+                    visible=visible_body == i,
                     silhouette=silhouette,
                 )
             )
@@ -250,10 +275,10 @@ def _make_frame(
 
 
 def _draw_table(generator: torch.Generator) -> Solid:
-    """Draw the top of a table, at height 0."""
-    h = 0.5 * uniform(generator, 0.8, 3.0)
-    first = [[-h, -h, 0.0], [h, -h, 0.0], [h, h, 0.0]]
-    second = [[-h, -h, 0.0], [h, h, 0.0], [-h, h, 0.0]]
+    """Draw the top of a table: a square about the origin, at height 0, of random size."""
+    half_m = 0.5 * uniform(generator, 0.8, 3.0)
+    first = [[-half_m, -half_m, 0.0], [half_m, -half_m, 0.0], [half_m, half_m, 0.0]]
+    second = [[-half_m, -half_m, 0.0], [half_m, half_m, 0.0], [-half_m, half_m, 0.0]]
     return Solid(
         triangles_m=torch.tensor([first, second]),
         normals=torch.tensor([0.0, 0.0, 1.0]).expand(2, 3, 3),
@@ -265,7 +290,7 @@ def _draw_table(generator: torch.Generator) -> Solid:
 def _draw_background(
     height: int, width: int, generator: torch.Generator
 ) -> Float[Tensor, "3 {height} {width}"]:
-    """Draw a background out of focus: blots of several sizes over a colour."""
+    """Draw a random background out of focus: blots of several sizes over a colour."""
     image = torch.rand(3, 1, 1, generator=generator) * torch.ones(1, height, width)
     for cells in (3, 8, 24):
         blots = torch.randn(1, 3, cells, cells, generator=generator)
@@ -274,16 +299,14 @@ def _draw_background(
     return image.clamp(0, 1)
 
 
-def _draw_light(
-    up: Float[Tensor, "3"], generator: torch.Generator
-) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """Draw a lamp above a table: the direction to it, its colour, and that of ambient light."""
+def _draw_light(up: Float[Tensor, "3"], generator: torch.Generator) -> _Light:
+    """Draw a lamp above a table, and ambient light; ``up`` is the table's z in the camera frame."""
     towards = F.normalize(1.2 * up + 0.8 * torch.randn(3, generator=generator), dim=0)
     strength = uniform(generator, 0.3, 0.9)
     warmth = uniform(generator, -0.15, 0.15)
     colour = torch.tensor([1 + warmth, 1.0, 1 - warmth])
-    ambient = uniform(generator, 0.2, 0.6) * (2 - colour)
-    return towards, strength * colour, ambient
+    ambient = uniform(generator, 0.2, 0.6) * (2 - colour)  # the colder, the warmer the lamp
+    return _Light(towards=towards, lamp=strength * colour, ambient=ambient)
 
 
 def _photograph(
@@ -299,26 +322,26 @@ def _photograph(
     tint = 1 + 0.15 * (2 * torch.rand(3, 1, 1, generator=generator) - 1)
     gain = math.exp(uniform(generator, -0.8, 0.2))
     noise = uniform(generator, 0.0, 0.02) * torch.randn(image.shape, generator=generator)
-    return (gain * tint * image + noise).clamp(1e-6, 1) ** (1 / 2.2)
+    return (gain * tint * image + noise).clamp(1e-6, 1) ** (1 / _GAMMA)
 
 
 def _arrange(
     solids: Sequence[Solid], config: ObjectsConfig, generator: torch.Generator
-) -> list[tuple[Solid, Rigid]]:
-    """Lay bodies on the table, none in another; give their poses in its frame (z up)."""
+) -> list[PlacedSolid]:
+    """Lay random bodies on the table, none in another; their poses are in its frame (z up)."""
     # Some of the objects, and clutter.
-    low, high = (min(n, len(solids)) for n in config.frame_objects)
+    fewest, most = (min(count, len(solids)) for count in config.frame_objects)
     order = torch.randperm(len(solids), generator=generator)
-    objects = low + random_index(generator, high - low + 1)
+    objects = fewest + random_index(generator, most - fewest + 1)
     chosen = [solids[i] for i in order[:objects].tolist()]
-    low, high = config.frame_clutter
-    clutter = low + random_index(generator, high - low + 1)
+    fewest, most = config.frame_clutter
+    clutter = fewest + random_index(generator, most - fewest + 1)
     chosen += [draw_clutter(generator) for _ in range(clutter)]
 
     # Each is tried at places farther and farther from the middle until its circle is free; one that
     # never finds a free place is left out.
-    placed: list[tuple[Solid, Rigid]] = []
-    circles: list[tuple[float, float, float]] = []
+    placed: list[PlacedSolid] = []
+    circles: list[_Circle] = []
     for solid in chosen:
         R = random_rotation(generator).float()
         corners = solid.triangles_m.reshape(-1, 3) @ R.mT
@@ -327,17 +350,40 @@ def _arrange(
         for attempt in range(_TRIES):
             reach_m = 0.08 + 0.015 * attempt + 0.03 * len(circles)
             x, y = (uniform(generator, -reach_m, reach_m) for _ in range(2))
-            if all(math.hypot(x - a, y - b) > radius_m + r for a, b, r in circles):
+            circle = _Circle(x, y, radius_m)
+            if all(circle.is_apart(other) for other in circles):
                 height_m = -float(corners[:, 2].min())  # at which the body stands on the table
                 shift_m = [x - float(middle[0]), y - float(middle[1]), height_m]
-                placed.append((solid, Rigid(R, torch.tensor(shift_m))))
-                circles.append((x, y, radius_m))
+                placed.append(PlacedSolid(solid, Rigid(R, torch.tensor(shift_m))))
+                circles.append(circle)
                 break
     return placed
 
 
+class _Circle(NamedTuple):
+    """The circle about a body on the table."""
+
+    x_m: float
+    y_m: float
+    radius_m: float
+
+    def is_apart(self, other: "_Circle") -> bool:
+        """Whether two circles do not touch."""
+        distance_m = math.hypot(self.x_m - other.x_m, self.y_m - other.y_m)
+        return distance_m > self.radius_m + other.radius_m
+
+
 _CELL_M = 0.004  # side of a cell of the height map of a pile
 _DROPS = 10  # places that are tried for each body of a pile
+_PILE_POINTS = 20_000  # of a body's surface, which land on the height map
+
+
+class _Drop(NamedTuple):
+    """A body that was dropped on a pile."""
+
+    pose: Rigid  #: of the body about its middle, in the table's frame
+    cell: Int64[Tensor, " n"]  #: of the height map, of each of its points
+    top_m: Float[Tensor, " n"]  #: height of each of its points
 
 
 def _drop_pile(
@@ -345,46 +391,65 @@ def _drop_pile(
     solids: Sequence[Solid],
     config: ObjectsConfig,
     generator: torch.Generator,
-) -> list[tuple[Solid, Rigid]]:
+) -> list[PlacedSolid]:
     """Drop copies of one object straight down until they touch; poses in the table's frame (z up).
 
     Of several drops of each copy the one is taken by which its middle comes to lie lowest.
     """
-    # One of the objects, and a map of the pile's height.
+    # One of the objects, about the middle of its box.
     chosen = random_index(generator, len(solids))
-    points, _ = sample_surface(models[chosen], 20000)
-    middle = (points.amin(0) + points.amax(0)) / 2
-    points = points - middle
-    radius_m = float(points.norm(dim=1).max())
+    points_m, _ = sample_surface(models[chosen], _PILE_POINTS)
+    middle_m = (points_m.amin(0) + points_m.amax(0)) / 2
+    points_m = points_m - middle_m
+
+    # A map of the pile's height, about the middle of the table.
+    radius_m = float(points_m.norm(dim=1).max())
     reach_m = 0.6 * radius_m * math.sqrt(config.frame_pile)
-    cells = math.ceil((reach_m + radius_m) / _CELL_M)
+    cells = math.ceil((reach_m + radius_m) / _CELL_M)  # from the middle to each side
     height_m = torch.zeros((2 * cells + 1) ** 2)
 
-    placed: list[tuple[Solid, Rigid]] = []
+    # Of several drops the lowest is taken, and the pile grows by it.
+    placed: list[PlacedSolid] = []
     for _ in range(config.frame_pile):
-        # Several drops: turned and shifted at random, and as low as the pile lets them.
-        drops: list[tuple[float, Rigid, Tensor, Tensor]] = []
-        for _ in range(_DROPS):
-            R = random_rotation(generator).float()
-            x, y = (uniform(generator, -reach_m, reach_m) for _ in range(2))
-            moved = points @ R.mT + torch.tensor([x, y, 0.0])
-            column, row = ((moved[:, :2] / _CELL_M).round().long() + cells).unbind(1)
-            cell = row * (2 * cells + 1) + column
-            bottom = torch.full_like(height_m, math.inf)
-            bottom = bottom.scatter_reduce(0, cell, moved[:, 2], "amin")
-            z = float((height_m - bottom)[bottom.isfinite()].max())
-            t = torch.tensor([x, y, z]) - R @ middle
-            drops.append((z, Rigid(R, t), cell, moved[:, 2] + z))
-
-        # The lowest is taken, and the pile grows by it.
-        _, pose, cell, top = min(drops, key=lambda drop: drop[0])
-        height_m = height_m.scatter_reduce(0, cell, top, "amax")
-        placed.append((solids[chosen], pose))
+        drops = [_drop_body(points_m, height_m, cells, reach_m, generator) for _ in range(_DROPS)]
+        lowest = min(drops, key=lambda drop: float(drop.pose.t_m[2]))
+        height_m = height_m.scatter_reduce(0, lowest.cell, lowest.top_m, "amax")
+        pose = Rigid(lowest.pose.R, lowest.pose.t_m - lowest.pose.R @ middle_m)
+        placed.append(PlacedSolid(solids[chosen], pose))
     return placed
 
 
+def _drop_body(
+    points_m: Float[Tensor, "n 3"],
+    height_m: Float[Tensor, " cells"],
+    cells: int,
+    reach_m: float,
+    generator: torch.Generator,
+) -> _Drop:
+    """Drop a body on a pile: rotated and shifted at random, and as low as the pile lets it.
+
+    Args:
+        points_m: of its surface, about its middle.
+        height_m: of the pile in each cell, row after row.
+        cells: from the middle of the table to each side of the map.
+        reach_m: largest shift along x and y.
+        generator: of random numbers.
+    """
+    R = random_rotation(generator).float()
+    x, y = (uniform(generator, -reach_m, reach_m) for _ in range(2))
+    moved_m = points_m @ R.mT + torch.tensor([x, y, 0.0])
+    column, row = ((moved_m[:, :2] / _CELL_M).round().long() + cells).unbind(1)
+    cell = row * (2 * cells + 1) + column
+
+    # The body rises until its lowest point in each cell is above the pile.
+    bottom_m = torch.full_like(height_m, math.inf)
+    bottom_m = bottom_m.scatter_reduce(0, cell, moved_m[:, 2], "amin")
+    z = float((height_m - bottom_m)[bottom_m.isfinite()].max())
+    return _Drop(pose=Rigid(R, torch.tensor([x, y, z])), cell=cell, top_m=moved_m[:, 2] + z)
+
+
 def _draw_viewpoint(config: ObjectsConfig, generator: torch.Generator) -> Rigid:
-    """Draw a camera that looks down at about the middle of the table; ``camera_from_table``.
+    """Draw the pose ``camera_from_table`` of a camera that looks down at about the table's middle.
 
     It is 25 to 85 degrees above the table.
     """
@@ -392,16 +457,20 @@ def _draw_viewpoint(config: ObjectsConfig, generator: torch.Generator) -> Rigid:
     elevation = math.radians(uniform(generator, 25.0, 85.0))
     azimuth = uniform(generator, 0.0, 2 * math.pi)
     distance_m = uniform(generator, *config.distance_m)
-    flat = math.cos(elevation)
-    eye = [flat * math.cos(azimuth), flat * math.sin(azimuth), math.sin(elevation)]
-    forward = -torch.tensor(eye)
+    along_table = math.cos(elevation)
+    toward_camera = [
+        along_table * math.cos(azimuth),
+        along_table * math.sin(azimuth),
+        math.sin(elevation),
+    ]
+    forward = -torch.tensor(toward_camera)
     right = F.normalize(torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0])), dim=0)
     R = torch.stack([right, torch.linalg.cross(forward, right), forward])
 
-    # Rolled a little, and about a point near the middle.
+    # Rolled a little, and aimed at a point near the middle.
     roll = uniform(generator, -0.3, 0.3)
-    c = math.cos(roll)
-    s = math.sin(roll)
-    R = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ R
+    cosine = math.cos(roll)
+    sine = math.sin(roll)
+    R = torch.tensor([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]]) @ R
     target = torch.tensor([uniform(generator, -0.05, 0.05), uniform(generator, -0.05, 0.05), 0.03])
-    return Rigid(R, -R @ (target + distance_m * torch.tensor(eye)))
+    return Rigid(R, -R @ (target + distance_m * torch.tensor(toward_camera)))

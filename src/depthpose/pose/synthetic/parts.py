@@ -1,4 +1,4 @@
-"""Synthetic CAD parts, made by formula: for the demo, the default weights, and tests.
+"""Synthetic CAD parts, made by formula: for the demo, the weights ``parts``, and tests.
 
 Each is a few closed surfaces that run into one another, as assemblies are exported; the sizes are
 in millimetres, as CAD files are.
@@ -20,7 +20,7 @@ Mesh = tuple[np.ndarray, np.ndarray]  #: corners (n, 3) [mm]; outward faces (m, 
 _CIRCLE_CORNERS = 96
 _TEETH = 6  # of the flange
 _Y = (0.0, 1.0, 0.0)
-
+_NO_AREA = 1e-9  # [mm^2] of a triangle at an end that is one point
 
 PARTS = ("bracket", "flange", "mug", "connector", "spool")
 """Names of the parts."""
@@ -52,7 +52,7 @@ def make_part(name: str, number: int = 0, config: MeshConfig | None = None) -> O
 
 
 def make_part_mesh(name: str) -> Mesh:
-    """Make the mesh of a part.
+    """Make the mesh of a part, named as in ``PARTS``.
 
     Raises:
         InputError: there is no such part.
@@ -136,20 +136,20 @@ def _make_spool() -> Mesh:
 
 
 def make_circle(radius: float) -> np.ndarray:
-    """Give the corners of a circle about the origin, counter-clockwise (n, 2)."""
+    """Make the corners of a circle about the origin, counter-clockwise (n, 2)."""
     angle = np.arange(_CIRCLE_CORNERS) * (2 * math.pi / _CIRCLE_CORNERS)
     return radius * np.stack([np.cos(angle), np.sin(angle)], 1)
 
 
 def _make_plate(
-    size: tuple[float, float, float], hole_at: tuple[float, float], hole: float
+    size: tuple[float, float, float], hole_at: tuple[float, float], hole_diameter: float
 ) -> Mesh:
-    """Make a plate about the origin with a round hole.
+    """Make a plate about the origin with a round hole along z.
 
     Args:
         size: in x, y and z.
         hole_at: x and y of the middle of the hole.
-        hole: its diameter.
+        hole_diameter: of the hole.
     """
     # The outline about the middle of the hole: where rays from it at equal angles meet the border.
     unit = make_circle(1.0)
@@ -163,12 +163,19 @@ def _make_plate(
     outline = unit * extent[:, None]
     # The ray nearest to each corner goes to the corner itself, or the plate would lack its corners.
     for corner in corners:
-        outline[np.argmax(unit @ (corner / np.linalg.norm(corner)))] = corner
-    return move(make_ring(outline, make_circle(hole / 2), size[2]), (*hole_at, 0.0))
+        nearest_ray = np.argmax(unit @ (corner / np.linalg.norm(corner)))
+        outline[nearest_ray] = corner
+    return move(make_ring(outline, make_circle(hole_diameter / 2), size[2]), (*hole_at, 0.0))
 
 
 def make_ring(outer: np.ndarray, inner: np.ndarray, height: float) -> Mesh:
-    """Extrude the area between two outlines of equally many corners, from -height/2 to height/2."""
+    """Extrude the area between two outlines of equally many corners along z.
+
+    Args:
+        outer: corners in x and y, counter-clockwise (n, 2).
+        inner: those of the hole (n, 2).
+        height: the ring reaches from -height/2 to height/2.
+    """
     low = np.full((len(outer), 1), -height / 2)
     high = np.full((len(outer), 1), height / 2)
     loops = [
@@ -205,7 +212,7 @@ def _make_hose(path: np.ndarray, radius: float) -> Mesh:
     """Make a round hose along a path in a plane y = constant, closed at its ends."""
     along = np.gradient(path, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
-    side = np.array([0.0, 1.0, 0.0])
+    side = np.array(_Y)
     outline = make_circle(radius)
     loops = []
     for point, direction in zip(path, along, strict=True):
@@ -222,24 +229,26 @@ def _make_skin(loops: list[np.ndarray]) -> Mesh:
 
     Corners run counter-clockwise, as seen against the order of the loops.
     """
-    # Two triangles between each pair of successive corners of two loops.
+    # Two triangles between each pair of successive corners of a loop and those of the next loop.
     count = len(loops[0])
     vertices = np.concatenate(loops)
-    i, j = np.meshgrid(np.arange(len(loops) - 1), np.arange(count), indexing="ij")
-    a = i * count + j
-    b = i * count + (j + 1) % count
-    quads = np.stack([a, b, b + count, a, b + count, a + count], -1).reshape(-1, 3)
+    loop, corner = np.meshgrid(np.arange(len(loops) - 1), np.arange(count), indexing="ij")
+    a = loop * count + corner
+    b = loop * count + (corner + 1) % count
+    next_a = a + count
+    next_b = b + count
+    triangles = np.stack([a, b, next_b, a, next_b, next_a], -1).reshape(-1, 3)
 
     # Those at an end that is one point have no area, and are left out.
-    corners = vertices[quads]
+    corners = vertices[triangles]
     first_side = corners[:, 1] - corners[:, 0]
     second_side = corners[:, 2] - corners[:, 0]
     doubled_area = np.linalg.norm(np.cross(first_side, second_side), axis=1)
-    return vertices, quads[doubled_area > 1e-9]
+    return vertices, triangles[doubled_area > _NO_AREA]
 
 
 def move(mesh: Mesh, shift: tuple[float, ...]) -> Mesh:
-    """Shift a mesh by a vector."""
+    """Shift a mesh by a vector (x, y, z)."""
     vertices, faces = mesh
     return vertices + np.array(shift), faces
 

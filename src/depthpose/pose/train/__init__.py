@@ -1,7 +1,7 @@
 """Training of the direction network in the one loop: synthetic views, real frames, or both."""
 
-from depthpose.pose.train.clouds import Cloud as Cloud
 from depthpose.pose.train.clouds import CloudBatch as CloudBatch
+from depthpose.pose.train.clouds import TrainingCloud as TrainingCloud
 from depthpose.pose.train.clouds import TrainingClouds as TrainingClouds
 from depthpose.pose.train.clouds import read_models as read_models
 from depthpose.pose.train.config import DepthImageTraining as DepthImageTraining

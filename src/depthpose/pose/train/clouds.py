@@ -1,51 +1,47 @@
-"""The objects of a training, its samples of synthetic views or real frames, and held-out views."""
+"""The objects of a training, and its samples of synthetic views or real frames."""
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import ClassVar, Generic, NamedTuple, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 
 from depthpose.core.errors import InputError
-from depthpose.core.loop import ValidationResult, make_adam, make_sample_generator, shuffle_index
+from depthpose.core.loop import make_sample_generator, shuffle_index
 from depthpose.core.rigid import Rigid
-from depthpose.pose.baselines import DepthImageNet
 from depthpose.pose.cloud import lift_sample, sample_points, voxelise, why_too_few
-from depthpose.pose.config import CloudConfig, ObjectsConfig
-from depthpose.pose.datasets import open_bop
+from depthpose.pose.config import CloudConfig
+from depthpose.pose.datasets import BopDataset, open_bop
 from depthpose.pose.datasets.layouts import read_bop_models, read_models_info
 from depthpose.pose.mesh import (
     read_model,
-    refuse_one_name,
-    sample_surface,
-    symmetry_transforms,
+    refuse_equal_names,
     with_found_symmetries,
 )
-from depthpose.pose.metrics import SUCCESS_SHARE, add_of_nearest_m
-from depthpose.pose.network_pose import DepthImageRegressor, GeoPoseNet
-from depthpose.pose.synthetic import Objects, make_part
-from depthpose.pose.train.config import HeldOutConfig, ModelsConfig, PoseTraining, ViewsTraining
+from depthpose.pose.synthetic import SyntheticViews, make_part
+from depthpose.pose.train.config import FramesConfig, ModelsConfig, PoseTraining, ViewsTraining
 from depthpose.pose.types import (
     CloudSample,
     ObjectModel,
-    PoseEstimate,
     ViewSample,
     VotingPoints,
 )
-from depthpose.pose.weights import PoseWeights
 
 TRIES = 20  #: samples in a row that may show too few points
 BEYOND_TRAINING = 2**32  #: samples of each object: no training has so many
 
 
-class Cloud(NamedTuple):
-    """One training sample: the point of each voxel, and the true pose, in the axes of the grid."""
+class TrainingCloud(NamedTuple):
+    """One training sample: the point of each voxel, and the true pose.
 
-    points_m: Float[Tensor, "n 3"]  #: in the axes of the grid about its camera
+    Both are in the axes of the voxel grid about the camera.
+    """
+
+    points_m: Float[Tensor, "n 3"]  #: one of each voxel
     coordinates: Int[Tensor, "n 3"]  #: (x, y, z) of their voxels
     features: Float[Tensor, "n c"]  #: of their voxels
     class_number: int  #: of the object
@@ -80,28 +76,23 @@ Config = TypeVar("Config", bound=ViewsTraining)
 class TrainingViews(Generic[Config]):
     """The views of a training by sample index: synthetic ones, real frames, or both.
 
-    ``seed`` determines the order of frames and the choice of points.
+    Args:
+        models: of the objects.
+        config: of the views.
+        seed: of the order of frames and the choice of points.
+
+    Raises:
+        InputError: there are no such frames, or their objects have other names than the models.
     """
 
     def __init__(self, models: Sequence[ObjectModel], config: Config, seed: int) -> None:
         self.models = models
         self.config = config
         self.seed = seed
-        self.synthetic = Objects(models, config.objects, config.cloud)
+        self.synthetic = SyntheticViews(models, config.objects, config.cloud)
         self._class_of = {model.name: k for k, model in enumerate(models)}
         self._frames = config.frames
-        self._real = None
-        frames = config.frames
-        if frames is not None:
-            dataset = open_bop(frames.folder, frames.split)
-            self._real = dataset.of_objects(*(model.number for model in models))
-            names = {model.number: model.name for model in models}
-            for number, instances in self._real.objects.items():
-                if names[number] != instances.name:
-                    raise InputError(
-                        f"{frames.folder}: object {number} is called {instances.name!r} there, and "
-                        f"{names[number]!r} here; take the models from this folder (models: bop)"
-                    )
+        self._real = None if config.frames is None else _open_frames(config.frames, models)
 
     def __len__(self) -> int:
         if self._frames is None or self._real is None:
@@ -109,9 +100,10 @@ class TrainingViews(Generic[Config]):
         return max(1, round(len(self._real) / self._frames.share))
 
     def _choose_view(self, place: int, generator: torch.Generator) -> tuple[ViewSample, bool]:
-        """Choose a frame, with the probability of their share, or a synthetic view.
+        """Choose a frame, with the probability of their share, or synthetic view ``place``.
 
-        The second value is whether it is a frame.
+        Returns:
+            The view, and whether it is a frame.
         """
         share = 0.0 if self._frames is None else self._frames.share
         if self._real is not None and float(torch.rand((), generator=generator)) < share:
@@ -119,10 +111,28 @@ class TrainingViews(Generic[Config]):
         return self.synthetic.view(place), False
 
 
-class TrainingClouds(TrainingViews[PoseTraining]):
-    """A cloud by sample index, synthetic or of a frame."""
+def _open_frames(config: FramesConfig, models: Sequence[ObjectModel]) -> BopDataset:
+    """Open the real frames of a training, of its objects alone.
 
-    def __getitem__(self, index: int) -> Cloud:
+    Raises:
+        InputError: there are none, or an object has another name there.
+    """
+    frames = open_bop(config.folder, config.split)
+    frames = frames.of_objects(*(model.number for model in models))
+    names = {model.number: model.name for model in models}
+    for number, model in frames.objects.items():
+        if names[number] != model.name:
+            raise InputError(
+                f"{config.folder}: object {number} is called {model.name!r} there, and "
+                f"{names[number]!r} here; take the models from this folder (models: bop)"
+            )
+    return frames
+
+
+class TrainingClouds(TrainingViews[PoseTraining]):
+    """Clouds to learn directions from, by sample index: of synthetic views or frames."""
+
+    def __getitem__(self, index: int) -> TrainingCloud:
         """Make the sample of an index; one with too few points is replaced by another.
 
         Raises:
@@ -139,7 +149,7 @@ class TrainingClouds(TrainingViews[PoseTraining]):
             if place < self.config.first_alone:
                 place *= objects
 
-            # Its cloud; that of a frame as a rolled camera sees it.
+            # Its cloud; that of a frame as a camera sees it that is rolled at random.
             view, is_frame = self._choose_view(place, generator)
             number = self._class_of[view.input.object]
             sample = lift_sample(view, self.models[number].diameter_m, cloud_config)
@@ -156,12 +166,12 @@ class TrainingClouds(TrainingViews[PoseTraining]):
         )
 
     @staticmethod
-    def collate(clouds: Sequence[Cloud]) -> CloudBatch:
+    def collate(clouds: Sequence[TrainingCloud]) -> CloudBatch:
         """Make a batch of clouds, one after the other."""
         coordinates: list[Tensor] = []
         for number, cloud in enumerate(clouds):
-            numbers = torch.full((len(cloud.points_m), 1), number)
-            coordinates.append(torch.cat([numbers, cloud.coordinates], 1))
+            cloud_numbers = torch.full((len(cloud.points_m), 1), number)
+            coordinates.append(torch.cat([cloud_numbers, cloud.coordinates], 1))
         return CloudBatch(
             points_m=torch.cat([c.points_m for c in clouds]),
             coordinates=torch.cat(coordinates),
@@ -174,9 +184,9 @@ class TrainingClouds(TrainingViews[PoseTraining]):
 
 def _roll_camera(sample: CloudSample, angle_rad: float) -> CloudSample:
     """Roll the camera of a sample about its optical axis: its cloud and pose rotate."""
-    c = math.cos(angle_rad)
-    s = math.sin(angle_rad)
-    roll = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    cosine = math.cos(angle_rad)
+    sine = math.sin(angle_rad)
+    roll = torch.tensor([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
     pose = sample.truth.camera_from_model
     rolled = Rigid(roll @ pose.R.float(), roll @ pose.t_m.float())
     points_m = sample.input.points_m.float() @ roll.mT
@@ -188,7 +198,7 @@ def _roll_camera(sample: CloudSample, angle_rad: float) -> CloudSample:
 
 def voxelise_sample(
     sample: CloudSample, class_number: int, config: CloudConfig, generator: torch.Generator
-) -> Cloud:
+) -> TrainingCloud:
     """Choose points of a sample and voxelise them, as an estimate does.
 
     Cloud and true pose are rotated to the axes of the grid.
@@ -203,7 +213,7 @@ def voxelise_sample(
     voxels = voxelise(points, config)
     grid_from_camera = voxels.grid_from_camera.float()
     pose = sample.truth.camera_from_model
-    return Cloud(
+    return TrainingCloud(
         points_m=voxels.points_m.float() @ grid_from_camera.mT,
         coordinates=voxels.coordinates,
         features=voxels.features,
@@ -216,9 +226,11 @@ def voxelise_sample(
 def read_models(
     config: ModelsConfig, on_message: Callable[[str], None] | None = None
 ) -> tuple[ObjectModel, ...]:
-    """Read the models that a training names.
+    """Read the models of the objects that a training learns.
 
-    ``on_message`` is called with a sentence on symmetries that were found in a model.
+    Args:
+        config: where they are, and whether symmetries of their shapes are searched.
+        on_message: called with a sentence on symmetries that were found in a model.
 
     Raises:
         InputError: no model is named, or models of two kinds, CAD files without their unit, two of
@@ -241,7 +253,7 @@ def read_models(
             read_model(path, config.unit, number=number, config=config.mesh)
             for number, path in enumerate(config.cad, start=1)
         )
-        refuse_one_name(models)
+        refuse_equal_names(models)
 
     # With the symmetries of their shapes, where these are wanted.
     return tuple(
@@ -267,162 +279,3 @@ def _list_model_numbers(folder: Path) -> tuple[int, ...]:
     if not numbers:
         raise InputError(f"{home}: holds no obj_NNNNNN.ply; put the models there")
     return tuple(sorted(numbers))
-
-
-HELD_OUT_SEED = 0x4E1D  #: added to the seed of the views that are trained on
-_SURFACE_POINTS = 1000  # by which ADD is measured
-
-
-class ViewsTask:
-    """Base of the tasks that train one network which poses, and validate it on held-out views.
-
-    The views are rendered at the full resolution, equally many of each object at each occlusion.
-    ``method`` says in the names of numbers how the network poses.
-    """
-
-    method: ClassVar[str]
-
-    def __init__(
-        self, network: nn.Module, models: Sequence[ObjectModel], config: ViewsTraining
-    ) -> None:
-        self.models = tuple(models)
-        self.training = config
-        self.modules: dict[str, nn.Module] = {"network": network.train()}
-        self.optimizers = {"network": (make_adam(network.parameters(), config.adam), config.adam)}
-        self._held_out: dict[float, list[ViewSample]] = {}
-
-    def measure_held_out(self, view: ViewSample, index: int) -> float:
-        """Pose a held-out view without ICP and refusal, and measure ADD by ``measure_add``."""
-        raise NotImplementedError
-
-    @torch.no_grad()
-    def validate(self) -> ValidationResult:
-        """Measure ADD by occlusion: the share below a tenth of the diameter, and the median."""
-        numbers: dict[str, float] = {}
-        self.modules["network"].eval()
-        config = self.training
-        for occlusion in config.held_out.occlusions:
-            # Views are drawn once.
-            if occlusion not in self._held_out:
-                objects = make_held_out_objects(
-                    self.models, config.objects, config.cloud, config.held_out, occlusion
-                )
-                self._held_out[occlusion] = [objects.view(k) for k in range(len(objects))]
-
-            # The error of each, and what the numbers of all are.
-            views = self._held_out[occlusion]
-            errors = torch.tensor([self.measure_held_out(view, k) for k, view in enumerate(views)])
-            place = f"held_out/occluded_{round(100 * occlusion)}/{self.method}"
-            numbers[f"{place}_add_10"] = float((errors < SUCCESS_SHARE).float().mean())
-            numbers[f"{place}_median"] = float(errors.median())
-        self.modules["network"].train()
-        return ValidationResult(numbers=numbers)
-
-
-def make_held_out_objects(
-    models: Sequence[ObjectModel],
-    synthetic: ObjectsConfig,
-    cloud: CloudConfig,
-    config: HeldOutConfig,
-    occlusion: float,
-) -> Objects:
-    """Make views that no training uses, all of one occlusion.
-
-    Args:
-        models: of the objects.
-        synthetic: the views of the training, of which these differ by seed and resolution.
-        cloud: how they are lifted to clouds.
-        config: how many views of each object.
-        occlusion: occluded share of the silhouette.
-    """
-    held_out_config = dataclasses.replace(
-        synthetic,
-        number=config.number * len(models),
-        seed=synthetic.seed + HELD_OUT_SEED,
-        views=None,
-        resolution=(1.0, 1.0),
-        occluded_share=1.0,
-        occlusion=(occlusion, occlusion),
-    )
-    return Objects(models, held_out_config, cloud)
-
-
-def measure_add(estimated: Rigid | None, truth: Rigid, model: ObjectModel) -> float:
-    """Measure ADD to the nearest symmetric pose, in diameters; infinite without an estimate."""
-    if estimated is None:
-        return math.inf
-    points_m, _ = sample_surface(model, _SURFACE_POINTS)
-    copies = symmetry_transforms(model.symmetries)
-    return float(add_of_nearest_m(estimated, truth, points_m, copies)) / model.diameter_m
-
-
-_CLOUDS_AT_ONCE = 32
-
-Table = Mapping[str, Mapping[str, float | None]]
-"""By occlusion in percent: the shares ``right``, ``ambiguous``, ``wrong`` and ``refused``, and the
-``median`` error of all poses in diameters, None where there is none."""
-
-
-def score_held_out(weights: PoseWeights, synthetic: ObjectsConfig, config: HeldOutConfig) -> Table:
-    """Measure the shares of right, ambiguous, wrong and refused estimates, by occlusion.
-
-    A pose of too low a certainty is ambiguous, whether right or not.
-
-    Args:
-        weights: the network and its objects.
-        synthetic: the views, but for their occlusion.
-        config: occlusions, and views of each object at each.
-    """
-    table: dict[str, dict[str, float | None]] = {}
-    for occlusion in config.occlusions:
-        objects = make_held_out_objects(weights.models, synthetic, weights.cloud, config, occlusion)
-        estimates, errors = _estimate_views(weights, objects)
-        answered = [e for e, estimate in zip(errors, estimates, strict=True) if estimate.is_ok]
-        posed = sorted(e for e in errors if e < math.inf)
-        right = sum(e < SUCCESS_SHARE for e in answered)
-        table[f"{round(100 * occlusion)}"] = {
-            "right": right / len(errors),
-            "ambiguous": (len(posed) - len(answered)) / len(errors),
-            "wrong": (len(answered) - right) / len(errors),
-            "refused": 1 - len(posed) / len(errors),
-            "median": posed[len(posed) // 2] if posed else None,
-        }
-    return table
-
-
-def format_table(table: Table) -> str:
-    """Format a table as Markdown."""
-    lines = [
-        "Synthetic views that no training saw, posed with ICP and refusal; right is an "
-        "ADD, to the nearest symmetric pose, below a tenth of the diameter.",
-        "",
-        "| occluded % | right % | ambiguous % | wrong % | refused % | median error, % of size |",
-        "| --- | --- | --- | --- | --- | --- |",
-    ]
-    for occlusion, row in table.items():
-        cells: list[str] = []
-        for column in ("right", "ambiguous", "wrong", "refused", "median"):
-            value = row[column]
-            cells.append("-" if value is None else f"{100 * value:.1f}")
-        lines.append(f"| {occlusion} | {' | '.join(cells)} |")
-    return "\n".join(lines)
-
-
-def _estimate_views(
-    weights: PoseWeights, objects: Objects
-) -> tuple[list[PoseEstimate], list[float]]:
-    """Estimate views of objects; give the estimates and their errors by ADD [diameters]."""
-    is_regressed = isinstance(weights.network, DepthImageNet)
-    net = DepthImageRegressor(weights) if is_regressed else GeoPoseNet(weights)
-    estimates: list[PoseEstimate] = []
-    errors: list[float] = []
-    for start in range(0, len(objects), _CLOUDS_AT_ONCE):
-        places = range(start, min(start + _CLOUDS_AT_ONCE, len(objects)))
-        samples = [objects.view(place) for place in places]
-        posed = net.estimate_many([sample.input for sample in samples])
-        estimates += posed
-        for place, estimate, sample in zip(places, posed, samples, strict=True):
-            model = weights.models[place % len(weights.models)]
-            pose = estimate.camera_from_model
-            errors.append(measure_add(pose, sample.truth.camera_from_model, model))
-    return estimates, errors

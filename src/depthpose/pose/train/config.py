@@ -150,8 +150,8 @@ class PoseTraining(ViewsTraining):
         super().__post_init__()
 
 
-def own_part(start: str) -> PoseTraining:
-    """Give the settings to train one part from a trained backbone, as in own-part.yaml.
+def configure_own_part(start: str) -> PoseTraining:
+    """Make the settings to train one part from a trained backbone, as in own-part.yaml.
 
     The backbone learns on as it ships, with batch norm folded into its convolutions, at a third of
     the rate: new norms would take the place of statistics that it learnt with, and after 600 steps

@@ -10,12 +10,10 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 
-from depthpose.core.camera.rectified import grey_from_rgb
 from depthpose.core.checkpoint import Checkpoint, find_weights, load_weights, read_checkpoint
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image
 from depthpose.core.loop import (
-    TrainingRun,
     Update,
     ValidationResult,
     format_held_out,
@@ -39,7 +37,7 @@ from depthpose.pose.segmentation import (
     predict_probabilities,
     write_segmentation,
 )
-from depthpose.pose.synthetic.views import random_index, uniform
+from depthpose.pose.synthetic.random_numbers import random_index, uniform
 from depthpose.pose.train.config import ImageAugmentConfig, ImagesConfig, SegmentationTraining
 from depthpose.pose.train.poses import add_origin, claim_run
 
@@ -51,8 +49,26 @@ class LabelledImage(NamedTuple):
     labels: Int[Tensor, "*b h w"]  #: 0 is the background, ``1 + i`` object i
 
 
+class _StoredImage(NamedTuple):
+    """A labelled image in less memory."""
+
+    rgb: UInt8[Tensor, "3 h w"]  #: 0 to 255
+    labels: UInt8[Tensor, "h w"]  #: class of each pixel
+
+
+_ABOUT_OBJECT_SHARE = 0.5  # of the windows: most of an image is background
+
+
 class AnnotatedImages:
-    """Images of a data set with their labels."""
+    """Images of a data set with their labels, by index.
+
+    Args:
+        config: the data set.
+        objects: names of the classes by number of the object; None: those of the config.
+
+    Raises:
+        InputError: there is no picture, or none of the objects.
+    """
 
     def __init__(self, config: ImagesConfig, objects: Mapping[int, str] | None = None) -> None:
         if not config.folder:
@@ -67,9 +83,10 @@ class AnnotatedImages:
         if not images:
             raise InputError(f"{config.folder}: split {config.split!r} has no picture (rgb)")
 
-        # The objects that are classes: those given, or those that are wanted and shown.
+        # The objects that are classes: ``objects``, or those that the config wants and images show.
         if objects is None:
-            shown_numbers = sorted({i.object_id for shown in images.values() for i in shown})
+            shown = [instance for instances in images.values() for instance in instances]
+            shown_numbers = sorted({instance.object_id for instance in shown})
             wanted = [n for n in shown_numbers if not config.objects or n in config.objects]
             if not wanted:
                 raise InputError(
@@ -80,7 +97,7 @@ class AnnotatedImages:
         self.objects = objects  # names by number, in the order of the classes
         self._class_of = {number: k for k, number in enumerate(objects, 1)}
         self._images = list(images.values())
-        self._cache: dict[int, tuple[UInt8[Tensor, "3 h w"], UInt8[Tensor, "h w"]]] = {}
+        self._cache: dict[int, _StoredImage] = {}
         self._with_cache = config.with_cache
 
     def __len__(self) -> int:
@@ -93,12 +110,9 @@ class AnnotatedImages:
             stored = self._read(self._images[index])
             if self._with_cache:
                 self._cache[index] = stored
-        image, labels = stored
-        return LabelledImage(image.float() / 255, labels.long())
+        return LabelledImage(stored.rgb.float() / 255, stored.labels.long())
 
-    def _read(
-        self, instances: list[Instance]
-    ) -> tuple[UInt8[Tensor, "3 h w"], UInt8[Tensor, "h w"]]:
+    def _read(self, instances: list[Instance]) -> _StoredImage:
         """Read the image that shows some instances, and label the pixels of their masks."""
         path = instances[0].rgb
         assert path is not None
@@ -115,7 +129,7 @@ class AnnotatedImages:
                     f"picture {labels.shape[1]}x{labels.shape[0]}; one of them is another's"
                 )
             labels[mask] = number
-        return (image * 255).round().to(torch.uint8), labels
+        return _StoredImage((image * 255).round().to(torch.uint8), labels)
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,21 +153,27 @@ class TrainingImages:
         scale *= uniform(generator, *self.config.scale)
         window = cut_window(labelled, scale, self.config.crop_px, generator)
 
-        # Brightness, contrast and saturation change by the jitter at most, each color by a third.
-        changes = 1 + self.config.jitter * (2 * torch.rand(6, generator=generator) - 1)
-        brightness, contrast, saturation = changes[:3].tolist()
-        balance = 1 + (changes[3:, None, None] - 1) / 3
-        bright = window.image * brightness * balance
-        bright = (bright - bright.mean()) * contrast + bright.mean()
-        grey = grey_from_rgb(bright)
-        image = (grey + (bright - grey) * saturation).clamp(0, 1)
+        image = _jitter_colors(window.image, self.config.jitter, generator)
         return LabelledImage(image, window.labels)
+
+
+def _jitter_colors(
+    image: Float[Tensor, "3 h w"], jitter: float, generator: torch.Generator
+) -> Float[Tensor, "3 h w"]:
+    """Change brightness, contrast and saturation by the jitter at most, each color by a third."""
+    changes = 1 + jitter * (2 * torch.rand(6, generator=generator) - 1)
+    brightness, contrast, saturation = changes[:3].tolist()
+    balance = 1 + (changes[3:, None, None] - 1) / 3
+    image = image * brightness * balance
+    image = (image - image.mean()) * contrast + image.mean()
+    grey = grey_from_rgb(image)
+    return (grey + (image - grey) * saturation).clamp(0, 1)
 
 
 def cut_window(
     labelled: LabelledImage, scale: float, size: tuple[int, int], generator: torch.Generator
 ) -> LabelledImage:
-    """Scale an image and crop it to a window; pixels beside a small image are background.
+    """Scale an image and crop it to a random window; pixels beside a small image are background.
 
     Half of the windows show the middle of an object, since most of an image is background.
 
@@ -162,8 +182,12 @@ def cut_window(
         scale: of both.
         size: rows and columns of the window [px].
         generator: chooses the window.
+
+    Returns:
+        The window of the image and of its labels.
     """
     # Scale.
+    height, width = size
     rows, columns = (max(1, round(side * scale)) for side in labelled.image.shape[-2:])
     image = F.interpolate(
         labelled.image[None], (rows, columns), mode="bilinear", antialias=scale < 1
@@ -174,25 +198,25 @@ def cut_window(
     labels = labels[0, 0].long()
 
     # Pad what is smaller than the window.
-    bottom = max(0, size[0] - rows)
-    right = max(0, size[1] - columns)
+    bottom = max(0, height - rows)
+    right = max(0, width - columns)
     image = F.pad(image[None], (0, right, 0, bottom), mode="replicate")[0]
     labels = F.pad(labels, (0, right, 0, bottom))
 
     # The window: about the middle of an object, or anywhere.
-    last_top = labels.shape[0] - size[0]
-    last_left = labels.shape[1] - size[1]
-    is_about_object = uniform(generator, 0.0, 1.0) < 0.5
+    last_top = labels.shape[0] - height
+    last_left = labels.shape[1] - width
+    is_about_object = uniform(generator, 0.0, 1.0) < _ABOUT_OBJECT_SHARE
     classes = labels[labels > 0].unique()
     if is_about_object and len(classes):
         chosen = labels == classes[random_index(generator, len(classes))]
         row, column = chosen.nonzero().float().mean(0).tolist()
-        top = min(max(round(row - size[0] / 2), 0), last_top)
-        left = min(max(round(column - size[1] / 2), 0), last_left)
+        top = min(max(round(row - height / 2), 0), last_top)
+        left = min(max(round(column - width / 2), 0), last_left)
     else:
         top = random_index(generator, last_top + 1)
         left = random_index(generator, last_left + 1)
-    window = (slice(top, top + size[0]), slice(left, left + size[1]))
+    window = (slice(top, top + height), slice(left, left + width))
     return LabelledImage(image[:, *window], labels[window])
 
 
@@ -225,7 +249,7 @@ class SegmentationTask:
         yield Update("network", loss, {"iou": iou})
 
     def validate(self) -> ValidationResult:
-        """Measure intersection over union on held-out images; give the first one as a picture."""
+        """Measure intersection over union on held-out images; the first one becomes a picture."""
         if self._held_out is None:
             return ValidationResult()
 
@@ -267,7 +291,14 @@ def _tint_objects(
 
 @releases_folder
 def train_segmentation(config: SegmentationTraining, run: TrainingRun) -> Path:
-    """Train FCN; give the path of its weights."""
+    """Train FCN, and write its weights and their card.
+
+    Returns:
+        The path of the weights.
+
+    Raises:
+        InputError: settings, images or an encoder to begin with that do not fit.
+    """
     # What is learnt from, and the network, perhaps with a trained encoder.
     torch.manual_seed(config.loop.seed)
     images = AnnotatedImages(config.images)

@@ -22,7 +22,6 @@ from depthpose.core.checkpoint import (
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_json
 from depthpose.core.loop import (
-    TrainingRun,
     Update,
     make_sample_generator,
     releases_folder,
@@ -48,19 +47,21 @@ from depthpose.pose.propose import fit_pose, vote_ransac
 from depthpose.pose.sparse import Voxels
 from depthpose.pose.train.clouds import (
     BEYOND_TRAINING,
-    HELD_OUT_SEED,
     TRIES,
     CloudBatch,
     TrainingClouds,
     TrainingViews,
-    ViewsTask,
-    format_table,
-    measure_add,
     read_models,
-    score_held_out,
     voxelise_sample,
 )
 from depthpose.pose.train.config import DepthImageTraining, PoseTraining, ViewsTraining
+from depthpose.pose.train.held_out import (
+    HELD_OUT_SEED,
+    ViewsTask,
+    format_held_out,
+    measure_add,
+    score_held_out,
+)
 from depthpose.pose.types import ObjectModel, ViewSample
 from depthpose.pose.weights import (
     AnyNetwork,
@@ -71,7 +72,7 @@ from depthpose.pose.weights import (
     write_pose_weights,
 )
 
-_SYMMETRY_STEP = 0.05  # half the step about an axis of revolution [rad]; votes err by more
+_SYMMETRY_STEP_RAD = 0.05  # half the step about an axis of revolution; votes err by more
 
 
 class PoseTask(ViewsTask):
@@ -89,17 +90,20 @@ class PoseTask(ViewsTask):
         self.network = network
         self.config = config
         # Keypoints of each object under each of its symmetries (classes, copies, k, 3).
-        copies = stack_symmetries(models, _SYMMETRY_STEP)
+        copies = stack_symmetries(models, _SYMMETRY_STEP_RAD)
         keypoints_m = torch.stack([model.keypoints_m.double() for model in models])
         self._copies_m = (keypoints_m[:, None] @ copies.R.mT + copies.t_m[:, :, None]).float()
 
     def step(self, batch: CloudBatch) -> Iterator[Update]:
         """Make one update: the loss of all clouds at once."""
         directions = self.network.directions(batch.network_input).float()
-        copies = self._copies_m.to(batch.R)[batch.class_of]
-        copies_m = copies @ batch.R.mT[:, None] + batch.t_m[:, None, None]
-        instance = batch.coordinates[:, 0].long()
-        loss = direction_loss(directions, batch.points_m, copies_m, instance, self.config.loss)
+        # The true keypoints of each cloud, in all copies (clouds, copies, k, 3).
+        copies_m = self._copies_m.to(batch.R)[batch.class_of]
+        copies_m = copies_m @ batch.R.mT[:, None] + batch.t_m[:, None, None]
+        cloud_of_point = batch.coordinates[:, 0].long()
+        loss = direction_loss(
+            directions, batch.points_m, copies_m, cloud_of_point, self.config.loss
+        )
         yield Update("network", loss, {"directions": loss.detach()})
 
     def measure_held_out(self, view: ViewSample, index: int) -> float:
@@ -124,9 +128,10 @@ class PoseTask(ViewsTask):
 
 
 def stack_symmetries(models: Sequence[ObjectModel], step_rad: float) -> Rigid:
-    """Stack the symmetries of all objects, ``model_from_model`` (classes, copies).
+    """Stack the symmetries of all objects as a batch ``model_from_model`` (classes, copies).
 
-    Objects with fewer are filled up with the identity.
+    Objects with fewer are filled up with the identity. ``step_rad`` is half the step between
+    rotations about an axis of revolution.
     """
     of_models = [symmetry_transforms(model.symmetries, step_rad).double() for model in models]
     most = max(len(copies.R) for copies in of_models)
@@ -142,7 +147,10 @@ _ROTATIONS_ON_CARD = 3  # rotations by which an object looks nearly alike, on a 
 
 
 def claim_run(config: Any, run: TrainingRun, files: Sequence[str] = ()) -> None:  # noqa: ANN401
-    """Claim the folder of a run for a config, with the checksums of ``files`` and of its start."""
+    """Claim the folder of a run for a config, with the checksums of ``files`` and of start weights.
+
+    Of start weights with terms of their own, these are told.
+    """
     checksums: dict[str, Any] = {"sha256": [file_sha256(Path(path)) for path in files]}
     if config.start is not None:
         checksums["start_sha256"] = file_sha256(find_weights(config.start))
@@ -151,10 +159,10 @@ def claim_run(config: Any, run: TrainingRun, files: Sequence[str] = ()) -> None:
     run.claim(config, weights, checksums, without=("held_out",))
 
 
-def pack_weights(
+def make_pose_weights(
     network: AnyNetwork, models: tuple[ObjectModel, ...], config: ViewsTraining
 ) -> PoseWeights:
-    """Make weights of a trained network and its objects, with the facts for their card."""
+    """Make the weights of a trained network and its objects, with the facts for their card."""
     frames = "" if config.frames is None else f"{Path(config.frames.folder).name} and "
     names = ", ".join(model.name for model in models)
     facts = {"trained_on": f"{frames}synthetic views of {names}", "licence": config.models.licence}
@@ -170,16 +178,16 @@ def pack_weights(
 
 
 def add_origin(facts: Mapping[str, str], config: Any) -> dict[str, str]:  # noqa: ANN401
-    """Add to facts the stage and the start weights, whose terms bind the new ones too."""
+    """Add to the facts of a card the stage and the start weights, whose terms bind the new ones."""
     origin = {**facts, "stage": type(config).__name__}
     if config.start is None:
         return origin
     return add_terms({**origin, "began_with": Path(config.start).stem}, [config.start])
 
 
-_IMAGE_SYMMETRY_STEP = 0.2
-"""Half the step between rotations about a continuous axis [rad]: 11 degrees, far below the error
-that remains after training."""
+_IMAGE_SYMMETRY_STEP_RAD = 0.2
+"""Half the step between rotations about a continuous axis: 11 degrees, far below the error that
+remains after training."""
 
 
 class CropSample(NamedTuple):
@@ -192,10 +200,14 @@ class CropSample(NamedTuple):
 
 
 class TrainingCrops(TrainingViews[DepthImageTraining]):
-    """A crop of a view, synthetic or of a frame, by sample index."""
+    """Crops of views to regress poses from, by sample index: of synthetic views or frames."""
 
     def __getitem__(self, index: int) -> CropSample:
-        """Make the sample of an index; one with too few pixels is replaced by another."""
+        """Make the sample of an index; one with too few pixels is replaced by another.
+
+        Raises:
+            InputError: 20 in a row have too few pixels, so that the config must be wrong.
+        """
         for attempt in range(TRIES):
             # A further attempt takes an index beyond any training, of the same object.
             place = index + attempt * len(self.models) * BEYOND_TRAINING
@@ -212,7 +224,7 @@ class TrainingCrops(TrainingViews[DepthImageTraining]):
 
 
 class DepthImageTask(ViewsTask):
-    """Trains a regressed pose, by its ADD to the nearest symmetric copy of the truth."""
+    """Trains a network that regresses poses, by their ADD to the nearest symmetric truth."""
 
     method = "regressed"
 
@@ -228,7 +240,7 @@ class DepthImageTask(ViewsTask):
         self._points_m = torch.stack([
             points_m[torch.arange(count) % len(points_m)] for points_m in surfaces_m
         ])  # fmt: skip
-        self._copies = stack_symmetries(models, _IMAGE_SYMMETRY_STEP).float()
+        self._copies = stack_symmetries(models, _IMAGE_SYMMETRY_STEP_RAD).float()
         self._diameter_m = torch.tensor([model.diameter_m for model in models])
 
     def step(self, batch: CropSample) -> Iterator[Update]:
@@ -236,10 +248,10 @@ class DepthImageTask(ViewsTask):
         class_of = batch.class_of
         device = batch.R.device
         outputs = self.network(batch.crop.image, class_of).float()
+        poses = make_poses(outputs, batch.crop)
         copies = Rigid(self._copies.R.to(device)[class_of], self._copies.t_m.to(device)[class_of])
         points_m = self._points_m.to(device)[class_of]
-        truth = Rigid(batch.R, batch.t_m)
-        error_m = model_point_loss(make_poses(outputs, batch.crop), truth, points_m, copies)
+        error_m = model_point_loss(poses, Rigid(batch.R, batch.t_m), points_m, copies)
         diameter_m = self._diameter_m.to(device)[class_of]
         yield Update("network", (error_m / diameter_m).mean(), {})
 
@@ -252,33 +264,39 @@ class DepthImageTask(ViewsTask):
         if crop is None:
             return math.inf
         batch = DepthCrop(*(part[None].to(device) for part in crop))
-        poses = make_poses(self.network(batch.image, torch.tensor([number], device=device)), batch)
-        return measure_add(
-            Rigid(poses.R[0].cpu(), poses.t_m[0].cpu()), view.truth.camera_from_model, model
-        )
+        outputs = self.network(batch.image, torch.tensor([number], device=device))
+        poses = make_poses(outputs, batch)
+        pose = Rigid(poses.R[0].cpu(), poses.t_m[0].cpu())
+        return measure_add(pose, view.truth.camera_from_model, model)
 
 
 _STATISTICS_CLOUDS = 64  # from which statistics of batch norm, lost by folding, are computed anew
+_KINDS = {DepthImageNet: "depth-image", PointNet: "pointnet", ResUNet: "pose"}
+"""Name of each network's weights file."""
 
 
 @releases_folder
 def train_pose_network(config: PoseTraining | DepthImageTraining, run: TrainingRun) -> Path:
-    """Train the network that a config has, ours or a baseline; give its weights file.
+    """Train the network that a config has, ours or a baseline.
+
+    Returns:
+        The path of its weights.
 
     Raises:
         InputError: settings, models or weights to begin with that do not fit.
     """
+    # The objects, and the network, perhaps with weights to begin with.
     torch.manual_seed(config.loop.seed)
     models = read_models(config.models, run.on_message)
     config = _set_network_sizes(config, models)
-    kind, task, samples = _build_training(config, models)
+    task, samples = _build_training(config, models)
     if config.start is not None:
         _copy_start(task.network, config.start, samples)
 
     # The folder is claimed only now: until here a setting may be refused.
     claim_run(config, run, config.models.cad)
     seconds = run.train(task, samples, config.loop)
-    path = run.folder / f"{kind}.safetensors"
+    path = run.folder / f"{_KINDS[type(task.network)]}.safetensors"
     if run.on_message is not None:
         run.on_message("trained; now it is measured on synthetic views: a minute or more")
     if find_rank().rank:
@@ -287,21 +305,24 @@ def train_pose_network(config: PoseTraining | DepthImageTraining, run: TrainingR
     # Weights, with norms folded into their convolutions.
     network = task.network
     inference_network = fold_norms(network) if isinstance(network, ResUNet) else network
-    packed_weights = pack_weights(inference_network, models, config)
-    write_pose_weights(path, packed_weights, with_half=config.with_half)
+    trained_weights = make_pose_weights(inference_network, models, config)
+    write_pose_weights(path, trained_weights, with_half=config.with_half)
 
     # Their card, measured with the weights as the file holds them: 16 bits round them.
     weights = read_pose_weights(path)
     held_out_rows = score_held_out(weights, config.objects, config.held_out)
     write_json(path.with_suffix(".json"), {"held_out": held_out_rows})
-    _write_pose_card(path, weights, config, seconds, format_table(held_out_rows))
+    _write_pose_card(path, weights, config, seconds, format_held_out(held_out_rows))
     return path
 
 
 def _set_network_sizes(
     config: PoseTraining | DepthImageTraining, models: Sequence[ObjectModel]
 ) -> PoseTraining | DepthImageTraining:
-    """Set the network's classes and keypoints by the objects, and its inputs by the cloud."""
+    """Set the network's classes and keypoints by the objects, and its inputs by the cloud.
+
+    Of these a network has those that its config names.
+    """
     sizes = {
         "classes": len(models),
         "keypoints": len(models[0].keypoints_m),
@@ -314,17 +335,18 @@ def _set_network_sizes(
 
 def _build_training(
     config: PoseTraining | DepthImageTraining, models: tuple[ObjectModel, ...]
-) -> tuple[str, PoseTask | DepthImageTask, TrainingClouds | TrainingCrops]:
-    """Build what a config trains: the kind of its weights, its task with a new network, samples."""
+) -> tuple[PoseTask | DepthImageTask, TrainingClouds | TrainingCrops]:
+    """Build what a config trains: its task with a new network, and its samples."""
     if isinstance(config, DepthImageTraining):
         crops = TrainingCrops(models, config, config.loop.seed)
-        return "depth-image", DepthImageTask(DepthImageNet(config.network), models, config), crops
+        return DepthImageTask(DepthImageNet(config.network), models, config), crops
     clouds = TrainingClouds(models, config, config.loop.seed)
-    if config.loop.workers > 1 and (config.frames is None or config.frames.share < 1):
-        clouds.synthetic.draw_stored(config.loop.workers)
+    has_synthetic = config.frames is None or config.frames.share < 1
+    if config.loop.workers > 1 and has_synthetic:
+        clouds.synthetic.render_stored(config.loop.workers)
     if isinstance(config.network, PointNetConfig):
-        return "pointnet", PoseTask(PointNet(config.network), models, config), clouds
-    return "pose", PoseTask(ResUNet(config.network), models, config), clouds
+        return PoseTask(PointNet(config.network), models, config), clouds
+    return PoseTask(ResUNet(config.network), models, config), clouds
 
 
 def _write_pose_card(
@@ -334,8 +356,8 @@ def _write_pose_card(
     seconds: float,
     held_out: str,
 ) -> None:
-    """Write the card beside weights: the command, the objects, and what was measured of them."""
-    # The command, as far as options say it.
+    """Write the card beside weights: the command, the objects, and the table of held-out views."""
+    # The command, as far as its options are known here.
     cad_options = [word for file in config.models.cad for word in ("--cad", file)]
     if cad_options and config.models.unit:
         cad_options += ["--unit", config.models.unit]
@@ -344,14 +366,13 @@ def _write_pose_card(
     # The objects, and the rotations that no view of them may tell apart.
     objects = ", ".join(f"{m.name} ({1000 * m.diameter_m:.0f} mm)" for m in weights.models)
     facts = {"objects": objects}
-    rotations = {
-        model.name: near_symmetry_lines(model)[:_ROTATIONS_ON_CARD] for model in weights.models
-    }
-    near_symmetries = "; ".join(
-        f"{name}: {', '.join(lines)}" for name, lines in rotations.items() if lines
-    )
+    near_symmetries: list[str] = []
+    for model in weights.models:
+        rotations = near_symmetry_lines(model)[:_ROTATIONS_ON_CARD]
+        if rotations:
+            near_symmetries.append(f"{model.name}: {', '.join(rotations)}")
     if near_symmetries:
-        facts["nearly_alike"] = near_symmetries
+        facts["nearly_alike"] = "; ".join(near_symmetries)
     write_card(path, command, seconds, facts | dict(weights.facts), held_out)
 
 
@@ -361,24 +382,28 @@ def _copy_start(network: AnyNetwork, start: str, samples: TrainingViews[Any]) ->
     Where the numbers of objects differ the last layer, which is theirs, stays as it is; a network
     on depth images takes weights of the same number alone.
 
+    Args:
+        network: is changed.
+        start: name or file of the weights.
+        samples: from which statistics of batch norm are computed.
+
     Raises:
         InputError: the file is of another network, or of other settings.
     """
-    # What may differ between the two networks.
+    # A network with batch norm takes up the biases that written weights have in place of norms.
     path = find_weights(start)
     loaded = build_pose_network(read_checkpoint(path), str(path))
-    has_norms = isinstance(network, ResUNet) and network.config.norm == "batch"
-    independent = () if isinstance(network, DepthImageNet) else ("classes",)
-    if has_norms:
-        independent = ("classes", "norm", "with_bias")
-    refuse_other_network(network, loaded, start, independent)
-
-    # Written weights are folded: they have no norms, but biases; batch norm takes both up.
-    if has_norms and isinstance(network, ResUNet) and isinstance(loaded, ResUNet):
+    if isinstance(network, ResUNet) and network.config.norm == "batch":
+        refuse_other_network(network, loaded, start, ("classes", "norm", "with_bias"))
+        assert isinstance(loaded, ResUNet)
         assert isinstance(samples, TrainingClouds)
         batch = samples.collate([samples[index] for index in range(_STATISTICS_CLOUDS)])
         unfold_norms(loaded, network, Voxels.from_points(batch.coordinates, batch.features))
         return
+
+    # Others are copied, but for the last layer of other objects.
+    may_differ = () if isinstance(network, DepthImageNet) else ("classes",)
+    refuse_other_network(network, loaded, start, may_differ)
     state = loaded.state_dict()
     if loaded.config.classes != network.config.classes:
         initial = network.state_dict()
