@@ -16,9 +16,9 @@ from torch.nn.functional import normalize
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid, geodesic_rad, rotation_by
-from depthpose.pose.cloud import thin
 from depthpose.pose.compiled import array_of, compiled
 from depthpose.pose.config import IcpConfig
+from depthpose.pose.grid import thin_cloud
 from depthpose.pose.icp import refine_roughly
 from depthpose.pose.mesh import true_symmetries
 from depthpose.pose.mesh.models import fibonacci_directions
@@ -171,10 +171,10 @@ def prepare_pairs(surface: Surface) -> PairTable:
     # Points of the visible surface, few enough.
     points_m, normals = _find_visible_points(surface)
     step_m = STEP * surface.diameter_m
-    chosen = thin(points_m, normals, step_m)
+    chosen = thin_cloud(points_m, normals, step_m)
     while len(chosen) > _MODEL_POINTS:
         step_m *= _COARSER
-        chosen = thin(points_m, normals, step_m)
+        chosen = thin_cloud(points_m, normals, step_m)
     points_m = points_m[chosen]
     frames = _make_frames(normals[chosen])
 

@@ -14,10 +14,11 @@ from depthpose.core.errors import InputError
 from depthpose.core.loop import ValidationResult, make_adam, sample_generator, shuffled_index
 from depthpose.core.rigid import Rigid
 from depthpose.pose.baselines import DepthImageNet
-from depthpose.pose.cloud import lift_sample, sample_points, voxelise, why_too_few
+from depthpose.pose.cloud import lift_sample, why_too_few
 from depthpose.pose.config import CloudConfig, ObjectsConfig
 from depthpose.pose.datasets import open_bop
 from depthpose.pose.datasets.layouts import read_bop_models, read_models_info
+from depthpose.pose.grid import sample_points, voxelise
 from depthpose.pose.mesh import (
     read_model,
     refuse_one_name,
