@@ -16,7 +16,7 @@ from depthpose.pose.inputs import AnyArray, rigid_input
 from depthpose.pose.types import ColorImage, ObjectModel, ViewInput
 
 
-def with_color(
+def add_color(
     view: ViewInput,
     models: Sequence[ObjectModel],
     color: Picture | None,
@@ -68,7 +68,7 @@ def color_input(
 
     With a camera of its own it may be of any size and place. Without one it has the pixels and the
     intrinsic matrix of the depth image, and no transform. Arguments and errors are those of
-    :func:`with_color`.
+    :func:`add_color`.
     """
     rgb = as_tensor(color, f"{view.name}: the colour image")
     height, width = rgb.shape[1:]

@@ -13,7 +13,7 @@ _HIDDEN_SHARE = 0.02
 """Of a silhouette: where another object lies before more of it, that one is picked first."""
 
 
-def with_pick_ranks(
+def rank_picks(
     estimates: Sequence[PoseEstimate], view: ViewInput, surfaces: Mapping[str, Surface]
 ) -> list[PoseEstimate]:
     """Rank the poses of one image by the order in which to pick the objects, 1 the first.
