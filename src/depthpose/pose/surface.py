@@ -17,7 +17,7 @@ from depthpose.pose.compiled import Vector, array_of, compiled, dot, vector
 from depthpose.pose.kdtree import (
     Tree,
     build_tree,
-    faces,
+    faces_camera,
     find_nearest_facing,
     find_nearest_points,
     square_distance,
@@ -123,7 +123,7 @@ def match(
         points: in the model frame.
         target: the samples.
         eye: the camera in the model frame; samples count that show it their outer side.
-        least: how nearly they do (:func:`~depthpose.pose.kdtree.faces`).
+        least: how nearly they do (:func:`~depthpose.pose.kdtree.faces_camera`).
         limit: distance of the farthest sample, of exact matches.
         is_exact: whether the nearest sample is searched, not looked up in the table, and of two
             sides of a wall the one that faces the camera.
@@ -145,9 +145,9 @@ def match(
         # The match before or the sample of the box, if it faces the camera; else none.
         if not is_exact or place < 0:
             place = np.int64(table[_find_box(point, low, side, counts)])
-            if not faces(samples, outward, place, eye, least):
+            if not faces_camera(samples, outward, place, eye, least):
                 place = np.int64(across[place])
-        if place >= 0 and not faces(samples, outward, place, eye, least):
+        if place >= 0 and not faces_camera(samples, outward, place, eye, least):
             place = -1
 
         # From there the nearest one is searched.
