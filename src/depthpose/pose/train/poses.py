@@ -40,7 +40,7 @@ from depthpose.pose.baselines import (
 )
 from depthpose.pose.cloud import lift_sample, why_too_few
 from depthpose.pose.config import SHAPE_FEATURES, RefusalConfig
-from depthpose.pose.copies import near_symmetry_lines
+from depthpose.pose.copies import describe_near_symmetries
 from depthpose.pose.losses import direction_loss, model_point_loss
 from depthpose.pose.mesh import sample_surface, symmetry_transforms
 from depthpose.pose.network import ResUNet, fold_norms, unfold_norms
@@ -345,7 +345,7 @@ def _write_pose_card(
     objects = ", ".join(f"{m.name} ({1000 * m.diameter_m:.0f} mm)" for m in weights.models)
     facts = {"objects": objects}
     rotations = {
-        model.name: near_symmetry_lines(model)[:_ROTATIONS_ON_CARD] for model in weights.models
+        model.name: describe_near_symmetries(model)[:_ROTATIONS_ON_CARD] for model in weights.models
     }
     near_symmetries = "; ".join(
         f"{name}: {', '.join(lines)}" for name, lines in rotations.items() if lines
