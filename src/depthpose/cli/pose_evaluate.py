@@ -27,7 +27,7 @@ from depthpose.pose.evaluate import (
     evaluate,
     find_nearest_copy,
     match_instances,
-    read_any,
+    read_any_predictions,
     select_targets,
 )
 from depthpose.pose.mesh import symmetry_transforms
@@ -106,7 +106,7 @@ def measure_each(
     show = partial(tqdm, unit=" instances", disable=None)
     for path, origin in zip(predictions, find_origins(predictions), strict=True):
         _refuse_other_dataset(path, dataset)
-        evaluation = evaluate(dataset, read_any(path), config, show, origin)
+        evaluation = evaluate(dataset, read_any_predictions(path), config, show, origin)
         if evaluation.advice is not None:
             print(f"{path}: {evaluation.advice}", file=sys.stderr)
         evaluations.append(evaluation)
@@ -218,7 +218,9 @@ def _show_instances(
 ) -> list[Section]:
     """Show some instances of a folder or file of predictions, ``max_count`` at most, with truth."""
     instances = {instance.name: instance for instance in dataset.instances}
-    estimates = match_instances(dataset.instances, read_any(predictions), dataset.objects)
+    estimates = match_instances(
+        dataset.instances, read_any_predictions(predictions), dataset.objects
+    )
     sections: list[Section] = []
     for role, row in _choose_instances(rows, max_count):
         instance = instances[row.instance]
