@@ -15,7 +15,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.frame import data_frame
 from depthpose.pose.config import EvaluationConfig
 from depthpose.pose.datasets import BopDataset, BopTarget, Instance
-from depthpose.pose.evaluate.detection import score_detections
+from depthpose.pose.evaluate.detection import average_measured, score_detections
 from depthpose.pose.evaluate.errors import (
     METRICS,
     ErrorContext,
@@ -179,7 +179,7 @@ def summarise_instances(name: str, rows: Sequence[InstanceRow]) -> ObjectRow:
         wrong=coverage - success,
         coverage=coverage,
         scores=_summarise_errors(rows),
-        ms={stage: _average([row.ms[stage] for row in rows]) for stage in rows[0].ms},
+        ms={stage: average_measured([row.ms[stage] for row in rows]) for stage in rows[0].ms},
     )
 
 
@@ -193,7 +193,7 @@ def average_objects(rows: Sequence[ObjectRow]) -> ObjectRow:
         # those of which too little is visible.
         is_partial_allowed = name in _PRECISIONS or name.endswith("_median")
         is_averaged = is_partial_allowed or None not in values
-        scores[name] = _average(values) if is_averaged else None
+        scores[name] = average_measured(values) if is_averaged else None
     return ObjectRow(
         object="mean",
         instances=sum(row.instances for row in rows),
@@ -203,7 +203,7 @@ def average_objects(rows: Sequence[ObjectRow]) -> ObjectRow:
         wrong=sum(row.wrong for row in rows) / count,
         coverage=sum(row.coverage for row in rows) / count,
         scores=scores,
-        ms={stage: _average([row.ms[stage] for row in rows]) for stage in rows[0].ms},
+        ms={stage: average_measured([row.ms[stage] for row in rows]) for stage in rows[0].ms},
     )
 
 
@@ -259,12 +259,6 @@ def _summarise_errors(rows: Sequence[InstanceRow]) -> dict[str, float | None]:
             errors = [float(row.errors[name].mean()) for row in posed if name in row.errors]
             scores[f"{name}_median"] = statistics.median(errors) if errors else None
     return scores
-
-
-def _average(values: Sequence[float | None]) -> float | None:
-    """Average the values that are not None; None where there are none."""
-    numbers = [value for value in values if value is not None]
-    return sum(numbers) / len(numbers) if numbers else None
 
 
 def hash_frames(instances: Sequence[Instance]) -> str:
