@@ -13,7 +13,7 @@ from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.core.export import Case, Export, Graph, Limit, Value
 from depthpose.pose.mesh.models import sample_surface
-from depthpose.pose.network import Block, ConvNorm, ResUNet, fold_norms
+from depthpose.pose.network import ConvNorm, ResidualBlock, ResUNet, fold_norms
 from depthpose.pose.sparse import SparseConv, Voxels, kernel_offsets
 from depthpose.pose.weights import PoseWeights
 
@@ -124,7 +124,7 @@ def build_direction_graph(network: ResUNet) -> Graph:
     # Down: each level convolves the finer one, and a residual block follows.
     downs = zip(net.down, net.down_blocks, strict=True)
     skips: list[Value] = []
-    for level, (down, block) in enumerate(cast("Iterator[tuple[ConvNorm, Block]]", downs)):
+    for level, (down, block) in enumerate(cast("Iterator[tuple[ConvNorm, ResidualBlock]]", downs)):
         x = convolve(down, x, max(level - 1, 0), level)
         branch = convolve(block.first, x, level, level).op("Relu")
         x = (convolve(block.second, branch, level, level) + x).op("Relu")
@@ -133,7 +133,7 @@ def build_direction_graph(network: ResUNet) -> Graph:
     # Up: the same, and the features of the way down are added as channels.
     x = skips.pop()
     ups = zip(net.up, net.up_blocks, strict=True)
-    for up, block in cast("Iterator[tuple[ConvNorm, Block]]", ups):
+    for up, block in cast("Iterator[tuple[ConvNorm, ResidualBlock]]", ups):
         level = len(skips) - 1
         x = convolve(up, x, level + 1, level)
         branch = convolve(block.first, x, level, level).op("Relu")
