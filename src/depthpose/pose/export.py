@@ -12,9 +12,10 @@ from torch import Tensor
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.core.export import Case, Export, Graph, Limit, Value
+from depthpose.pose.kernel_map import list_offsets
 from depthpose.pose.mesh.models import sample_surface
 from depthpose.pose.network import ConvNorm, ResidualBlock, ResUNet, fold_norms
-from depthpose.pose.sparse import SparseConv, Voxels, kernel_offsets
+from depthpose.pose.sparse import SparseConv, Voxels
 from depthpose.pose.weights import PoseWeights
 
 LEVELS = 4  #: of the network; a voxel of level ``l`` is ``2**l`` cells wide
@@ -101,7 +102,7 @@ class GraphConvolutions:
         if key not in self._read_rows:
             step = 1 << min(level_in, level_out)
             sign = -1 if level_out < level_in else 1
-            offsets = np.array([(0, *offset) for offset in kernel_offsets(kernel)]) * sign * step
+            offsets = np.array([(0, *offset) for offset in list_offsets(kernel)]) * sign * step
             cell_offsets = self._graph.op("MatMul", offsets, self._strides)  # (kernel^3,)
             cells = self._level_cells[level_out].op("Unsqueeze", [1]) + cell_offsets
             self._read_rows[key] = self._row_of_cell[level_in].op("Gather", cells)
