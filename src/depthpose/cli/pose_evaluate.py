@@ -33,8 +33,8 @@ from depthpose.pose.evaluate import (
 from depthpose.pose.mesh import symmetry_transforms
 from depthpose.pose.predictions import (
     estimate_missing_poses,
+    name_bop_results,
     read_predictions,
-    results_name,
     write_bop_results,
 )
 from depthpose.report import page
@@ -90,7 +90,7 @@ def predict_instances(
     label = f"{method.name}, {masks.name} masks"
     for _ in tqdm(written, label, total=len(jobs), disable=None, unit=" instances"):
         pass
-    write_bop_results(home / results_name(dataset), read_predictions(home))
+    write_bop_results(home / name_bop_results(dataset), read_predictions(home))
     return home
 
 
