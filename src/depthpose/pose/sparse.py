@@ -254,7 +254,7 @@ class RowNorm(nn.BatchNorm1d):
 class SparseConv(nn.Module):
     """Convolution on voxels; with a stride it writes the coarser level.
 
-    ``weight`` is (kernel^3, inputs, outputs), its rows in the order of ``kernel_offsets``.
+    ``weight`` is (kernel^3, inputs, outputs), its rows in the order of ``list_offsets``.
     """
 
     is_transposed = False
