@@ -24,7 +24,7 @@ from depthpose.depth.generators import Discriminator, UNetGenerator
 from depthpose.depth.losses import disparity_loss
 from depthpose.depth.stereo import PSMNet
 from depthpose.depth.train.config import StereoTraining, ViewTraining
-from depthpose.pose.cloud import voxelise
+from depthpose.pose.grid import voxelise
 from depthpose.pose.network import ResUNet
 from depthpose.pose.propose import meet_lines, vote_ransac
 from depthpose.pose.segmentation import FCN

@@ -172,7 +172,7 @@ class Oracle(GeoPoseNet):
         self.wrong = changes.get("wrong", 0.0)
         self.calls: list[int] = []
 
-    def _ask_network(self, group: Sequence[CloudToPose | PoseEstimate]) -> None:
+    def _run_network(self, group: Sequence[CloudToPose | PoseEstimate]) -> None:
         ready = [one for one in group if isinstance(one, CloudToPose)]
         self.calls += [len(ready)] if ready else []
         for one in ready:

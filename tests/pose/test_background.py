@@ -17,7 +17,7 @@ from tests.pose.synthetic_objects import (
 
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
-from depthpose.pose.background import PosedBin, with_background
+from depthpose.pose.background import PosedBin, add_background
 from depthpose.pose.cloud import cloud_from_depth, grow_mask
 from depthpose.pose.evidence import compare, observe
 from depthpose.pose.footprint import why_background_excludes
@@ -107,7 +107,7 @@ def test_an_empty_bin_holds_nothing(net: Registration) -> None:
 
 
 def test_readings_on_the_bin_are_background_and_those_of_the_part_are_not() -> None:
-    view = with_background(view_input(full_frame(), None, CAMERA, "bracket", "x"), posed_bin())
+    view = add_background(view_input(full_frame(), None, CAMERA, "bracket", "x"), posed_bin())
     assert view.background is not None
     _, mask = view_of(bracket(), TRUTH)
     is_near_part = grow_mask(mask, 2)
@@ -126,7 +126,7 @@ def test_a_pose_in_a_wave_of_the_floor_is_no_place() -> None:
     assert why_background_excludes(
         prepare_frame(plain.depth_m, plain.K), sunk, surface
     ) == ""  # fmt: skip
-    view = with_background(plain, posed_bin())
+    view = add_background(plain, posed_bin())
     frame = prepare_frame(view.depth_m, view.K, None, view.background)
     assert "would lie in" in why_background_excludes(frame, sunk, surface)
     before = Rigid(TRUTH.R, TRUTH.t_m).double()
@@ -139,7 +139,7 @@ def test_a_plane_through_the_tops_of_parts_is_no_background_before_a_known_bin()
     depth_m = wall_m.clone()
     depth_m[40:200, 40:280] = 0.9 + noise(2)[40:200, 40:280]
     view = view_input(depth_m, None, CAMERA, "bracket", "x")
-    known = with_background(view, wall_m).background
+    known = add_background(view, wall_m).background
     tops = prepare_frame(view.depth_m, view.K).background_limit_m[44:196, 44:276]
     assert bool((tops > 0.15).all()), "of smaller parts it is taken for a table"
     frame = prepare_frame(view.depth_m, view.K, None, known)
@@ -177,7 +177,7 @@ def test_a_plate_that_lies_flush_in_its_tray_is_not_cut_out_of_it() -> None:
     empty_m = torch.where(grow_mask(mask, 1), level_m + 0.012, level_m)
     depth_m = torch.where(mask, seen.float(), empty_m) + noise(2)
     plain = view_input(depth_m, mask, CAMERA, "plate", "x")
-    known = with_background(plain, empty_m + noise(1))
+    known = add_background(plain, empty_m + noise(1))
     surface = prepare_surface(plate)
     cloud_m = cloud_from_depth(depth_m, mask, K)
 
@@ -207,7 +207,7 @@ def test_backgrounds_that_cannot_be_are_refused() -> None:
         (empty_frame() + 0.1, "of the readings lie on the empty frame, as if it were not there"),
     ):
         with pytest.raises(InputError, match=reason):
-            with_background(view, background)
+            add_background(view, background)
 
 
 def test_a_cloud_has_no_background(net: Registration) -> None:

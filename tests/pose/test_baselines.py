@@ -21,7 +21,7 @@ from depthpose.pose.baselines import (
     cut_depth,
     make_poses,
 )
-from depthpose.pose.cloud import turn_axis_to
+from depthpose.pose.grid import rotation_from_z_to
 from depthpose.pose.losses import model_point_loss
 from depthpose.pose.mesh import drawn_triangles, sample_surface
 from depthpose.pose.types import ViewInput, VotingPoints
@@ -76,7 +76,7 @@ def test_an_object_looks_alike_wherever_in_the_image_it_is() -> None:
     """The camera turns about its centre: the crop hardly changes, nor the pose in its frame."""
     pose = Rigid(turned(1), torch.tensor([0.0, 0.0, 0.9]))
     wide = replace(SMALL, crop_px=64, contrast=0.2)
-    turn = turn_axis_to(torch.tensor([0.2, 0.1, 1.0])).float()
+    turn = rotation_from_z_to(torch.tensor([0.2, 0.1, 1.0])).float()
     there = Rigid(turn @ pose.R, turn @ pose.t_m)
     one, two = (cut_depth(view_of(p), wide) for p in (pose, there))
     assert one is not None

@@ -14,7 +14,7 @@ from depthpose.pose.config import EvaluationConfig
 from depthpose.pose.datasets import BopDataset, Instance, check_bop, open_bop, read_targets
 from depthpose.pose.evaluate import evaluate, select_targets
 from depthpose.pose.metrics import average_precision
-from depthpose.pose.predictions import Prediction, place_of, results_name
+from depthpose.pose.predictions import Prediction, name_bop_results, place_of
 
 WITHOUT_VSD = EvaluationConfig(with_vsd=False)
 
@@ -158,7 +158,7 @@ def test_data_sets_of_several_sensors_are_read(tmp_path: Path) -> None:
     assert rgb is not None
     assert rgb.parent.name == "gray_photoneo"
     # BOP's toolkit knows the split by its folder.
-    assert results_name(dataset) == "depthpose_ipd-test.csv"
+    assert name_bop_results(dataset) == "depthpose_ipd-test.csv"
     assert check_bop(folder, "test_photoneo").problems == []
 
 

@@ -8,15 +8,9 @@ from depthpose.core.camera import project
 from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_depth_png, read_image
-from depthpose.pose.cloud import (
-    cloud_from_depth,
-    is_reading,
-    sample_points,
-    turn_axis_to,
-    voxelise,
-    why_too_few,
-)
+from depthpose.pose.cloud import cloud_from_depth, is_reading, why_too_few
 from depthpose.pose.config import SHAPE_FEATURES, CloudConfig
+from depthpose.pose.grid import rotation_from_z_to, sample_points, voxelise
 from depthpose.pose.types import CloudInput
 from depthpose.report.pose import select_object_points
 
@@ -166,7 +160,7 @@ def test_a_cloud_at_the_side_has_the_grid_of_one_straight_ahead() -> None:
     generator = torch.Generator().manual_seed(2)
     ahead = torch.rand(500, 3, generator=generator) * 0.1
     ahead = ahead - ahead.mean(0) + torch.tensor([0.0, 0.0, 0.8])
-    away = turn_axis_to(torch.tensor([0.5, -0.3, 1.0])).float()
+    away = rotation_from_z_to(torch.tensor([0.5, -0.3, 1.0])).float()
     side = ahead @ away.mT
     first = voxelise(ahead, CloudConfig(voxel_m=0.01))
     second = voxelise(side, CloudConfig(voxel_m=0.01))
@@ -201,7 +195,7 @@ def test_the_shape_of_a_voxel_is_what_a_plain_loop_gives() -> None:
 def test_a_plane_has_its_normal_toward_the_camera_and_a_ball_is_bent() -> None:
     generator = torch.Generator().manual_seed(3)
     flat = torch.rand(600, 3, generator=generator) * torch.tensor([0.1, 0.1, 0.0])
-    tilt = turn_axis_to(torch.tensor([0.3, 0.2, -1.0]))
+    tilt = rotation_from_z_to(torch.tensor([0.3, 0.2, -1.0]))
     plane = (flat.double() @ tilt.mT + torch.tensor([0.1, -0.2, 0.9])).float()
     features = shape_of(plane)
     turn = voxelise(plane, CloudConfig()).grid_from_camera
@@ -218,7 +212,7 @@ def test_the_shape_turns_with_the_camera() -> None:
     generator = torch.Generator().manual_seed(4)
     ahead = torch.rand(500, 3, generator=generator).double() * 0.1 + torch.tensor([0.0, 0.0, 0.8])
     ahead -= torch.tensor([*ahead.mean(0)[:2], 0.0])
-    away = turn_axis_to(torch.tensor([0.5, -0.3, 1.0])).double()
+    away = rotation_from_z_to(torch.tensor([0.5, -0.3, 1.0])).double()
     here, there = shape_of(ahead), shape_of(ahead @ away.mT)
     if len(here) == len(there):
         near = (here - there).abs().amax(1) < 1e-3
@@ -238,7 +232,7 @@ def test_three_points_have_a_shape_too() -> None:
 @pytest.mark.parametrize("direction", [(0, 0, 1), (0, 0, -1), (0.3, -2, 0.1)])
 def test_the_axis_turns_to_a_direction_the_shortest_way(direction: tuple[float, ...]) -> None:
     towards = torch.tensor(direction, dtype=torch.float64)
-    R = turn_axis_to(towards)
+    R = rotation_from_z_to(towards)
     assert torch.allclose(R[:, 2], towards / towards.norm(), atol=1e-9)
     assert torch.allclose(R @ R.mT, torch.eye(3).double(), atol=1e-9)
     assert float(torch.linalg.det(R)) > 0

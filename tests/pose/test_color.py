@@ -23,12 +23,9 @@ from tests.pose.textured_objects import (
 from torch import Tensor
 
 from depthpose.core.rigid import Rigid, geodesic_rad, rotation_by
-from depthpose.pose.color import (
-    color_agreement,
-    color_copies,
-    copies_about_axis,
-    settle_spin,
-)
+from depthpose.pose import color_copies
+from depthpose.pose.color import measure_color_agreement
+from depthpose.pose.color_copies import align_print, propose_color_copies, rotate_to_print
 from depthpose.pose.mesh import read_model, with_found_symmetries
 from depthpose.pose.registration import Registration
 from depthpose.pose.types import Axis, ColorImage, ObjectModel, Symmetries
@@ -77,7 +74,9 @@ def test_the_right_half_turn_of_a_box_is_chosen(seed: int) -> None:
         seed=seed,
     )
     view = drawn_view(textured_box(seed), pose, light)
-    agreement = color_agreement(moved(half_turns(pose), seed, 0.01, model.diameter_m), model, view)
+    agreement = measure_color_agreement(
+        moved(half_turns(pose), seed, 0.01, model.diameter_m), model, view
+    )
     likelihood = agreement.log_likelihood
     assert int(likelihood.argmax()) == 0
     assert float(likelihood[0] - likelihood[1:].max()) > math.log(1000)
@@ -91,7 +90,7 @@ def test_wrong_prints_are_as_likely_as_chance_lets_them_be() -> None:
     for seed in range(6):
         model, pose = box(seed), random_pose(seed)
         view = drawn_view(textured_box(seed), pose)
-        wrong.append(color_agreement(half_turns(pose), model, view).log_likelihood[1:])
+        wrong.append(measure_color_agreement(half_turns(pose), model, view).log_likelihood[1:])
     every = torch.cat(wrong)
     assert float(every.mean()) < 2.0  # 0.75 were it exact
     assert float((every > math.log(100)).double().mean()) < 0.1
@@ -104,9 +103,9 @@ def test_exposure_white_balance_and_gamma_change_little() -> None:
     assert plain.color is not None
     dim = drawn_view(textured_box(), pose, Light(gains=(0.5, 0.35, 0.25), noise=0.005))
     contrast = replace(plain, color=replace(plain.color, rgb=plain.color.rgb**1.4))
-    first = color_agreement(half_turns(pose), model, plain).correlation
+    first = measure_color_agreement(half_turns(pose), model, plain).correlation
     for view in (dim, contrast):
-        other = color_agreement(half_turns(pose), model, view).correlation
+        other = measure_color_agreement(half_turns(pose), model, view).correlation
         assert torch.allclose(first, other, atol=0.08)
 
 
@@ -122,7 +121,7 @@ def test_light_from_one_side_is_no_print() -> None:
         rotation_by(torch.linspace(0, 6, 20).double()[:, None] * Z.direction.double()),
         torch.zeros(20, 3).double(),
     )
-    assert float(color_agreement(spins, model, view).log_likelihood.max()) < math.log(100)
+    assert float(measure_color_agreement(spins, model, view).log_likelihood.max()) < math.log(100)
 
 
 def test_colour_is_mute_without_print_or_image() -> None:
@@ -141,15 +140,15 @@ def test_colour_is_mute_without_print_or_image() -> None:
         (model, nothing),
     ]
     for one, seen in cases:
-        agreement = color_agreement(half_turns(pose), one, seen)
+        agreement = measure_color_agreement(half_turns(pose), one, seen)
         assert agreement.log_likelihood.tolist() == [0.0] * 4
-        assert agreement.score.tolist() == [0.0] * 4
+        assert agreement.correlation.tolist() == [[0.0] * 3] * 4
 
 
 def test_colour_of_clipped_pixels_is_not_compared() -> None:
     model, pose = box(), random_pose(2)
     bright = drawn_view(textured_box(), pose, Light(gains=(2.5, 2.5, 2.5)))
-    agreement = color_agreement(half_turns(pose), model, bright)
+    agreement = measure_color_agreement(half_turns(pose), model, bright)
     assert int(agreement.log_likelihood.argmax()) == 0
     assert float(agreement.correlation[0, 1:].min()) > 0.6
 
@@ -165,12 +164,12 @@ def test_a_colour_camera_beside_the_depth_camera() -> None:
         textured_box(), pose, color_from_depth=beside, color_K=color_K, size=(640, 480)
     )
     assert view.color is not None
-    agreement = color_agreement(half_turns(pose), model, view)
+    agreement = measure_color_agreement(half_turns(pose), model, view)
     assert float(agreement.correlation[0].min()) > 0.8
     assert float(agreement.log_likelihood[0] - agreement.log_likelihood[1:].max()) > 10
     # The same image taken for one of the depth camera's own frame has the print elsewhere.
     wrong = replace(view, color=replace(view.color, color_from_depth=None))
-    apart = color_agreement(half_turns(pose), model, wrong)
+    apart = measure_color_agreement(half_turns(pose), model, wrong)
     assert float(apart.correlation[0].max()) < 0.7
 
 
@@ -185,8 +184,10 @@ def test_what_is_hidden_is_not_compared() -> None:
     random = torch.Generator().manual_seed(0)
     rgb[:, :, :middle] = torch.rand(rgb[:, :, :middle].shape, generator=random)
     hidden = replace(view, depth_m=depth_m, color=replace(view.color, rgb=rgb))
-    whole, half = (color_agreement(half_turns(pose), model, seen) for seen in (view, hidden))
-    assert 0.3 < float(half.visible[0] / whole.visible[0]) < 0.7
+    whole, half = (
+        measure_color_agreement(half_turns(pose), model, seen) for seen in (view, hidden)
+    )
+    assert 0.3 < float(half.visible_count[0] / whole.visible_count[0]) < 0.7
     assert float(half.correlation[0].min()) > 0.8
     assert int(half.log_likelihood.argmax()) == 0
 
@@ -195,7 +196,7 @@ def test_colour_tells_twins_apart() -> None:
     model, twin, pose = box(0), box(1), random_pose(6)
     view = drawn_view(textured_box(1), pose)
     one, other = (
-        float(color_agreement(half_turns(pose), m, view).log_likelihood.max())
+        float(measure_color_agreement(half_turns(pose), m, view).log_likelihood.max())
         for m in (model, twin)
     )
     assert other - one > 10
@@ -206,20 +207,20 @@ def test_the_spin_of_a_can_is_found(seed: int) -> None:
     model, pose = can(seed), random_pose(seed, 0.5)
     view = drawn_view(textured_can(seed), pose, Light(noise=0.03, seed=seed))
     spun = Rigid(pose.R @ rotation_by(torch.tensor([0, 0, 1.0 + seed]).double()), pose.t_m)
-    found = copies_about_axis(moved(spun[None], seed, 0.01, model.diameter_m)[0], Z, model, view)
+    found = rotate_to_print(moved(spun[None], seed, 0.01, model.diameter_m)[0], Z, model, view)
     assert len(found.R) <= 3
     # The pose is off by 1.2 mm, which is two degrees of the can's circumference.
     assert math.degrees(float(geodesic_rad(found.R[0], pose.R))) < 5
-    likelihood = color_agreement(found, model, view).log_likelihood
+    likelihood = measure_color_agreement(found, model, view).log_likelihood
     assert int(likelihood.argmax()) == 0
 
 
 def test_a_spin_without_colour_stays() -> None:
     model, pose = can(), random_pose(0, 0.5)
     view = replace(drawn_view(textured_can(), pose), color=None)
-    found = copies_about_axis(pose, Z, model, view)
+    found = rotate_to_print(pose, Z, model, view)
     assert torch.equal(found.R, pose.R[None])
-    assert torch.equal(color_copies(pose, model, view).R, pose.R[None])
+    assert torch.equal(propose_color_copies(pose, model, view).R, pose.R[None])
 
 
 def test_copies_of_a_can_hold_the_right_one() -> None:
@@ -229,16 +230,16 @@ def test_copies_of_a_can_hold_the_right_one() -> None:
     pose = random_pose(1, 0.5)
     view = drawn_view(textured_can(), pose)
     wrong = Rigid(pose.R @ rotation_by(torch.tensor([0, 0, 2.0]).double()), pose.t_m) @ flip[0]
-    copies = color_copies(wrong, model, view)
+    copies = propose_color_copies(wrong, model, view)
     assert torch.equal(copies.R[0], wrong.R)
-    best = copies[int(color_agreement(copies, model, view).log_likelihood.argmax())]
+    best = copies[int(measure_color_agreement(copies, model, view).log_likelihood.argmax())]
     assert math.degrees(float(geodesic_rad(best.R, pose.R))) < 3
     # What the user declares alike is one answer, and no copy is proposed.
     declared = replace(model, symmetries=replace(model.symmetries, is_found=False))
-    assert len(color_copies(wrong, declared, view).R) < len(copies.R)
+    assert len(propose_color_copies(wrong, declared, view).R) < len(copies.R)
 
 
-def test_an_axis_of_many_turns_is_swept() -> None:
+def test_an_axis_of_many_turns_is_swept(monkeypatch: pytest.MonkeyPatch) -> None:
     # A can whose shape was found to be alike after turns by 30 degrees, upside down too.
     angles = torch.arange(1, 12).double() * (math.pi / 6)
     spins = rotation_by(angles[:, None] * Z.direction.double())
@@ -251,11 +252,12 @@ def test_an_axis_of_many_turns_is_swept() -> None:
     view = drawn_view(textured_can(), pose)
     wrong = Rigid(pose.R @ rotation_by(torch.tensor([0, 0, 2.2]).double()), pose.t_m)
     for start in (wrong, Rigid(wrong.R @ flip[0], wrong.t_m)):
-        copies = color_copies(start, model, view)
+        copies = propose_color_copies(start, model, view)
         assert 2 <= len(copies.R) <= 9
         # Between the turns that were found, and the first of those that are proposed.
         assert math.degrees(float(geodesic_rad(copies.R[1], pose.R))) < 4
-    assert len(color_copies(wrong, model, view, most=1).R) == 2
+    monkeypatch.setattr(color_copies, "_MOST_COPIES", 1)
+    assert len(propose_color_copies(wrong, model, view).R) == 2
 
 
 @pytest.mark.parametrize("off_deg", [-13.0, 4.0, 18.0])
@@ -265,21 +267,23 @@ def test_a_spin_that_depth_does_not_fix_is_settled(off_deg: float) -> None:
     view = drawn_view(textured_can(), pose)
     turn = rotation_by(math.radians(off_deg) * Z.direction.double())
     drifted = Rigid(pose.R @ turn, pose.t_m)
-    settled = settle_spin(drifted, model, view)
+    settled = align_print(drifted, model, view)
     assert math.degrees(float(geodesic_rad(settled.R, pose.R))) < 2
-    mute = settle_spin(drifted, model, replace(view, color=None))
+    mute = align_print(drifted, model, replace(view, color=None))
     assert torch.equal(mute.R, drifted.R)
     declared = replace(model, symmetries=replace(model.symmetries, is_found=False))
-    assert torch.equal(settle_spin(drifted, declared, view).R, drifted.R)
+    assert torch.equal(align_print(drifted, declared, view).R, drifted.R)
 
 
 def test_half_turns_of_a_box_are_proposed() -> None:
     model, pose = box(), random_pose(6)
     view = drawn_view(textured_box(), pose)
     for wrong in half_turns(pose)[1:].R:
-        copies = color_copies(Rigid(wrong, pose.t_m), model, view)
+        copies = propose_color_copies(Rigid(wrong, pose.t_m), model, view)
         assert math.degrees(float(geodesic_rad(copies.R[1], pose.R))) < 1
-        alone = color_copies(Rigid(wrong, pose.t_m), model, view, turns=half_turns(pose)[:0])
+        alone = propose_color_copies(
+            Rigid(wrong, pose.t_m), model, view, motions=half_turns(pose)[:0]
+        )
         assert torch.equal(alone.R, wrong[None])
 
 
@@ -292,7 +296,7 @@ def test_a_window_of_the_depth_image_changes_nothing() -> None:
     shifted[:2, 2] -= torch.tensor([float(left), float(top)])
     depth_m, mask = view.depth_m[top:, left:], view.mask[top:, left:]
     window = replace(view, depth_m=depth_m, mask=mask, K=shifted)
-    one, other = (color_agreement(half_turns(pose), model, seen) for seen in (view, window))
+    one, other = (measure_color_agreement(half_turns(pose), model, seen) for seen in (view, window))
     assert torch.allclose(one.correlation, other.correlation, atol=1e-6)
 
 

@@ -13,7 +13,7 @@ from tests.pose.synthetic_objects import bracket
 from depthpose.core.camera import Camera
 from depthpose.core.errors import InputError, Notice
 from depthpose.core.rigid import Rigid, rotation_by
-from depthpose.pose.color_inputs import with_color
+from depthpose.pose.color_inputs import add_color
 from depthpose.pose.types import ObjectModel, SurfaceColors, ViewInput
 
 K = torch.tensor([[50.0, 0, 8], [0, 50, 6], [0, 0, 1]])
@@ -45,7 +45,7 @@ def test_every_form_of_a_picture_is_the_same_image(tmp_path: Path) -> None:
         str(tmp_path / "rgb.png"),
     ]
     for picture in given:
-        view = with_color(VIEW, [colored()], picture)
+        view = add_color(VIEW, [colored()], picture)
         assert view.color is not None
         assert torch.allclose(view.color.rgb, torch.from_numpy(RGB).permute(2, 0, 1) / 255)
         assert view.color.K is VIEW.K
@@ -54,7 +54,7 @@ def test_every_form_of_a_picture_is_the_same_image(tmp_path: Path) -> None:
 
 
 def test_without_a_picture_the_view_is_as_it_was() -> None:
-    assert with_color(VIEW, [bracket()], None) is VIEW
+    assert add_color(VIEW, [bracket()], None) is VIEW
 
 
 def test_a_camera_of_its_own() -> None:
@@ -65,7 +65,7 @@ def test_a_camera_of_its_own() -> None:
     moved[:3, :3] = rotation_by(torch.tensor([0, 0, math.pi / 2]))
     cameras = (own, own.tolist(), Camera(width=32, height=24, K=own), {"K": own.tolist()}, 100.0)
     for camera in cameras:
-        view = with_color(VIEW, [colored()], wide, camera, moved)
+        view = add_color(VIEW, [colored()], wide, camera, moved)
         assert view.color is not None
         assert float(view.color.K[0, 0]) == 100
         beside = view.color.color_from_depth
@@ -92,10 +92,10 @@ def test_what_does_not_fit_is_refused(
     color: np.ndarray | None, camera: Camera | float | None, moved: np.ndarray | None, said: str
 ) -> None:
     with pytest.raises(InputError, match=said):
-        with_color(VIEW, [colored()], color, camera, moved)
+        add_color(VIEW, [colored()], color, camera, moved)
 
 
 def test_a_model_without_colours_is_named() -> None:
     with pytest.warns(Notice, match=r"model file of bracket has no colours .*; give a PLY"):
-        view = with_color(VIEW, [bracket(), colored()], RGB)
+        view = add_color(VIEW, [bracket(), colored()], RGB)
     assert view.color is not None

@@ -12,7 +12,12 @@ import trimesh as _trimesh
 from tests.pose.synthetic_objects import bar, bottle, box_faces, boxes, bracket, gear, pose_at
 
 from depthpose.core.rigid import Rigid, geodesic_rad
-from depthpose.pose.copies import SymmetricCopies, difference_of, find_copies, near_symmetry_lines
+from depthpose.pose.copies import (
+    SymmetricCopies,
+    describe_difference,
+    describe_near_symmetries,
+    find_copies,
+)
 from depthpose.pose.mesh import make_model, turn_about, with_found_symmetries
 from depthpose.pose.synthetic.parts import make_part
 
@@ -60,7 +65,7 @@ def test_a_keyway_makes_the_steps_of_a_gear_other_poses() -> None:
 
 
 def test_a_gear_says_how_much_its_keyway_deviates() -> None:
-    lines = near_symmetry_lines(with_found_symmetries(gear(12, 1.0), None, is_taken=True))
+    lines = describe_near_symmetries(with_found_symmetries(gear(12, 1.0), None, is_taken=True))
     assert lines
     for line in lines:
         assert re.fullmatch(r"rotated by \d+ degrees about .* \(\d+\.\d%\)", line), line
@@ -148,13 +153,15 @@ def test_half_turns_about_the_principal_axes_are_look_alikes() -> None:
 def test_words_tell_the_axis_and_the_shift() -> None:
     copies, first = find_copies(bar()), pose_at(seed=1).double()
     turned = first @ rotation([0.0, 0, 1.0], 180)
-    assert difference_of(turned, first, copies) == "rotated by 180 degrees about the short axis"
+    assert (
+        describe_difference(turned, first, copies) == "rotated by 180 degrees about the short axis"
+    )
     moved = Rigid(turned.R, turned.t_m + torch.tensor([0.03, 0, 0]))
     words = "rotated by 180 degrees about the short axis and shifted by 30 mm"
-    assert difference_of(moved, first, copies) == words
+    assert describe_difference(moved, first, copies) == words
     oblique = first @ rotation([1.0, 1.0, 0], 90)
     words = "rotated by 90 degrees about the model's axis (0.71, 0.71, 0.00)"
-    assert difference_of(oblique, first, copies) == words
+    assert describe_difference(oblique, first, copies) == words
 
 
 def test_an_axis_that_is_hardly_longer_than_the_next_is_named_by_its_direction() -> None:
@@ -162,6 +169,6 @@ def test_an_axis_that_is_hardly_longer_than_the_next_is_named_by_its_direction()
     copies = replace(of_bar, lengths_m=torch.tensor([0.21, 0.2, 0.03]).double())
     turned = first @ rotation([1.0, 0, 0], 90)
     words = "rotated by 90 degrees about the model's axis (1.00, 0.00, 0.00)"
-    assert difference_of(turned, first, copies) == words
+    assert describe_difference(turned, first, copies) == words
     flat = first @ rotation([0, 0, 1.0], 90)
-    assert difference_of(flat, first, copies) == "rotated by 90 degrees about the short axis"
+    assert describe_difference(flat, first, copies) == "rotated by 90 degrees about the short axis"

@@ -60,8 +60,8 @@ class _Noisy(Oracle):
 
     generator = torch.Generator().manual_seed(0)
 
-    def _ask_network(self, group: Sequence[CloudToPose | PoseEstimate]) -> None:
-        super()._ask_network(group)
+    def _run_network(self, group: Sequence[CloudToPose | PoseEstimate]) -> None:
+        super()._run_network(group)
         for one in group:
             assert isinstance(one, CloudToPose)
             noise = torch.randn(one.directions.shape, generator=self.generator)

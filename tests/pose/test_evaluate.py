@@ -29,7 +29,7 @@ from depthpose.pose.evaluate import (
     find_nearest_copy,
     hash_frames,
     prepare_errors,
-    read_any,
+    read_any_predictions,
     select_targets,
 )
 from depthpose.pose.mesh import symmetry_transforms, turn_about
@@ -167,8 +167,8 @@ def test_files_are_measured_alike(synthetic: BopDataset, tmp_path: Path) -> None
     every = predictions_of(synthetic, lambda i: moved(i, [0.1, 0.0, 0.0, 0.0, 0.0, 0.01]))
     write_predictions(tmp_path, every)
     write_bop_results(tmp_path / "ours_made-test.csv", every)
-    ours = columns(evaluate(synthetic, read_any(tmp_path)).rows)
-    csv = columns(evaluate(synthetic, read_any(tmp_path / "ours_made-test.csv")).rows)
+    ours = columns(evaluate(synthetic, read_any_predictions(tmp_path)).rows)
+    csv = columns(evaluate(synthetic, read_any_predictions(tmp_path / "ours_made-test.csv")).rows)
     for one, other in zip(ours, csv, strict=True):
         for name in ("success", "auc", "ar", "rotation_deg_median", "ms_total"):
             assert one[name] == pytest.approx(other[name]), name
@@ -366,4 +366,4 @@ def test_poses_numbered_from_another_first_are_named(
 def test_a_csv_of_a_header_alone_is_refused(tmp_path: Path) -> None:
     (tmp_path / "none.csv").write_text("scene_id,im_id,obj_id,score,R,t,time\n")
     with pytest.raises(InputError, match=r"none\.csv: holds no pose, so there is nothing to meas"):
-        read_any(tmp_path / "none.csv")
+        read_any_predictions(tmp_path / "none.csv")

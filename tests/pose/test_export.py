@@ -13,7 +13,7 @@ from torch import Tensor
 from depthpose.cli import main
 from depthpose.core.errors import InputError
 from depthpose.pose.baselines import PointNet, PointNetConfig
-from depthpose.pose.export import direction_graph, pose_export
+from depthpose.pose.export import build_direction_graph, pose_export
 from depthpose.pose.network import ResUNet, ResUNetConfig
 from depthpose.pose.sparse import Voxels
 from depthpose.pose.weights import write_pose_weights
@@ -52,7 +52,9 @@ def network(request: pytest.FixtureRequest) -> ResUNet:
 
 @pytest.fixture(scope="module")
 def session(network: ResUNet) -> Iterator[object]:
-    return onnxruntime.InferenceSession(direction_graph(network).model({}).SerializeToString())
+    return onnxruntime.InferenceSession(
+        build_direction_graph(network).model({}).SerializeToString()
+    )
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,9 @@ from torch import Tensor
 
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, cross_matrix, perturb
-from depthpose.pose.cloud import voxelise
 from depthpose.pose.config import CloudConfig
 from depthpose.pose.datasets import open_bop
+from depthpose.pose.grid import voxelise
 from depthpose.pose.icp import refine_pose
 from depthpose.pose.metrics import add_m
 from depthpose.pose.observability import free_motions

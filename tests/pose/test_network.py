@@ -10,13 +10,14 @@ import torch
 from torch import Tensor, nn
 
 from depthpose.core.errors import InputError
+from depthpose.pose.kernel_map import unpack
 from depthpose.pose.network import (
     ResUNet,
     ResUNetConfig,
     fold_norms,
     unfold_norms,
 )
-from depthpose.pose.sparse import Voxels, unpack
+from depthpose.pose.sparse import Voxels
 from depthpose.pose.types import VotingPoints
 
 TINY = ResUNetConfig(

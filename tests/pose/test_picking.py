@@ -14,7 +14,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.config import ObjectsConfig, SyntheticSensorConfig
 from depthpose.pose.datasets import BopFrame
 from depthpose.pose.mesh import drawn_triangles
-from depthpose.pose.picking import with_pick_ranks
+from depthpose.pose.picking import rank_picks
 from depthpose.pose.registration import Registration
 from depthpose.pose.surface import Surface, prepare_surface
 from depthpose.pose.synthetic import make_frames
@@ -46,7 +46,7 @@ def ranks(*estimates: PoseEstimate) -> list[int | None]:
     depth_m = torch.full((240, 320), 2.0)
     view = ViewInput(name="x", depth_m=depth_m, mask=depth_m > 0, K=K, object="bracket")
     surfaces = {"bracket": surface()}
-    return [estimate.pick_rank for estimate in with_pick_ranks(estimates, view, surfaces)]
+    return [estimate.pick_rank for estimate in rank_picks(estimates, view, surfaces)]
 
 
 def test_what_lies_before_another_goes_first_however_unsure_it_is() -> None:
@@ -113,7 +113,7 @@ def test_a_pile_is_picked_from_the_top() -> None:
         view = ViewInput(
             name="x", depth_m=frame.depth_m, mask=frame.depth_m > 0, K=frame.K, object="connector"
         )
-        ranked = with_pick_ranks(estimates, view, surfaces)
+        ranked = rank_picks(estimates, view, surfaces)
         order = [estimate.pick_rank or 0 for estimate in ranked]
         assert sorted(order) == list(range(1, len(order) + 1))
         pairs = hiding_pairs(frame)

@@ -66,7 +66,7 @@ def test_what_is_no_plane_or_too_small_a_one_is_no_answer() -> None:
 def test_a_view_of_distances_is_told_of_once_with_the_remedy(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("depthpose.pose.rays._told", set())
+    monkeypatch.setattr("depthpose.pose.rays._warned", set())
     depth_m = plane(NORMALS["table"]).float()
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -527,7 +527,7 @@ def test_what_is_there_twice_is_searched_for_again(monkeypatch: pytest.MonkeyPat
         return []
 
     monkeypatch.setattr(search, "_propose", propose)
-    monkeypatch.setattr(search, "with_pick_ranks", lambda estimates, *_: estimates)
+    monkeypatch.setattr(search, "rank_picks", lambda estimates, *_: estimates)
     monkeypatch.setattr(search, "_judge", lambda *_: (rounds[len(searched) - 1], []))
     targets = replace(TARGETS, objects={"a": PREPARED, "b": PREPARED})
     found = find_objects(view, targets)

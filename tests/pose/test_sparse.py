@@ -10,18 +10,15 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from depthpose.core.errors import InputError
-from depthpose.pose.sparse import (
+from depthpose.pose.kernel_map import (
     CLOUD_LIMIT,
     COORDINATE_LIMIT,
     CoordinateCache,
-    SparseConv,
-    SparseConvTranspose,
-    Voxels,
-    conv,
-    kernel_offsets,
+    list_offsets,
     pack,
     unpack,
 )
+from depthpose.pose.sparse import SparseConv, SparseConvTranspose, Voxels, convolve
 
 CONV = import_module("depthpose.pose.sparse")
 SIDE = 8
@@ -109,7 +106,9 @@ def test_equals_the_dense_convolution(
     cache = points.cache
     x = features_of(unpack(cache.keys(start)), inputs).requires_grad_()
     weight = weight_of(kernel, inputs, 5).requires_grad_()
-    found = conv(x, weight, cache.kernel_map(start, kernel, stride, is_transposed=is_transposed))
+    found = convolve(
+        x, weight, cache.kernel_map(start, kernel, stride, is_transposed=is_transposed)
+    )
 
     grid = scatter(x, unpack(cache.keys(start)), 2**start)
     answer = dense_conv(grid, weight, stride, is_transposed=is_transposed)
@@ -146,7 +145,7 @@ def test_pairs_of_a_small_case_by_hand() -> None:
     kernel_map = cache.kernel_map(0, 3)
     pairs = kernel_map.neighbours.pairs
     met = set(zip(*(t.tolist() for t in (pairs.slot // 2, pairs.fine, pairs.coarse)), strict=True))
-    offsets = kernel_offsets(3)
+    offsets = list_offsets(3)
     left, right = offsets.index((-1, 0, 0)), offsets.index((1, 0, 0))
     assert met == {(left, 0, 1), (left, 1, 2), (right, 1, 0), (right, 2, 1)}
     pairs = kernel_map.neighbours.pairs
@@ -157,7 +156,7 @@ def test_pairs_of_a_small_case_by_hand() -> None:
 def test_a_table_and_a_binary_search_find_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     cloud_keys = Voxels.from_points(cloud()).cache
     by_table = [cloud_keys.kernel_map(*a).neighbours.table for a in ((0, 5), (0, 3, 2), (1, 3))]
-    monkeypatch.setattr("depthpose.pose.sparse.MAX_CELLS", 0)
+    monkeypatch.setattr("depthpose.pose.kernel_map.MAX_CELLS", 0)
     cloud_keys = CoordinateCache(cloud_keys.keys(0))
     by_search = [cloud_keys.kernel_map(*a).neighbours.table for a in ((0, 5), (0, 3, 2), (1, 3))]
     assert all(map(torch.equal, by_table, by_search))
@@ -172,7 +171,7 @@ def test_no_look_leaves_the_table(
     xyz = torch.cartesian_prod(*[torch.arange(5) - shift] * 3)
     keys = pack(F.pad(xyz, (1, 0)))
     found = CoordinateCache(keys.sort().values).kernel_map(0, kernel, stride).neighbours.table
-    monkeypatch.setattr("depthpose.pose.sparse.MAX_CELLS", 0)
+    monkeypatch.setattr("depthpose.pose.kernel_map.MAX_CELLS", 0)
     wanted = CoordinateCache(keys.sort().values).kernel_map(0, kernel, stride).neighbours.table
     assert torch.equal(found, wanted)
 
@@ -192,8 +191,8 @@ def test_voxels_far_apart_need_no_table_of_the_air_between() -> None:
 
 
 def test_offsets_run_with_x_fastest() -> None:
-    assert kernel_offsets(3)[:4] == ((-1, -1, -1), (0, -1, -1), (1, -1, -1), (-1, 0, -1))
-    assert kernel_offsets(2)[:3] == ((0, 0, 0), (1, 0, 0), (0, 1, 0))
+    assert list_offsets(3)[:4] == ((-1, -1, -1), (0, -1, -1), (1, -1, -1), (-1, 0, -1))
+    assert list_offsets(2)[:3] == ((0, 0, 0), (1, 0, 0), (0, 1, 0))
 
 
 def test_gradients_by_differences() -> None:
@@ -201,7 +200,7 @@ def test_gradients_by_differences() -> None:
     x = features_of(unpack(cache.keys(0)), 5).requires_grad_()
     weight = weight_of(3, 5, 2).requires_grad_()
     for kernel_map in (cache.kernel_map(0, 3), cache.kernel_map(0, 3, 2)):
-        assert torch.autograd.gradcheck(lambda a, w, m=kernel_map: conv(a, w, m), (x, weight))
+        assert torch.autograd.gradcheck(lambda a, w, m=kernel_map: convolve(a, w, m), (x, weight))
 
 
 @settings(deadline=None, max_examples=25)
@@ -238,8 +237,12 @@ def test_linear_in_features_and_in_weight(seed: int, a: float, b: float) -> None
     m = Voxels.from_points(coordinates).cache.kernel_map(0, 3)
     x, y = (features_of(coordinates, 6, seed=s) for s in (3, 4))
     v, w = weight_of(3, 6, 3), weight_of(3, 6, 3).flip(0)
-    torch.testing.assert_close(conv(a * x + b * y, w, m), a * conv(x, w, m) + b * conv(y, w, m))
-    torch.testing.assert_close(conv(x, a * v + b * w, m), a * conv(x, v, m) + b * conv(x, w, m))
+    torch.testing.assert_close(
+        convolve(a * x + b * y, w, m), a * convolve(x, w, m) + b * convolve(y, w, m)
+    )
+    torch.testing.assert_close(
+        convolve(x, a * v + b * w, m), a * convolve(x, v, m) + b * convolve(x, w, m)
+    )
 
 
 def test_clouds_of_a_batch_do_not_meet() -> None:
@@ -293,7 +296,7 @@ def test_the_gathered_rows_are_not_kept() -> None:
 
     weight = weight_of(3, 6, 5).requires_grad_()
     with torch.autograd.graph.saved_tensors_hooks(note, lambda tensor: tensor):
-        conv(x, weight, m)
+        convolve(x, weight, m)
     assert sorted(kept) == sorted([x.numel(), weight.numel()])
 
 
@@ -302,9 +305,9 @@ def test_autocast_is_followed() -> None:
     m = Voxels.from_points(coordinates).cache.kernel_map(0, 3)
     x, weight = features_of(coordinates, 6).float(), weight_of(3, 6, 5).float().requires_grad_()
     with torch.autocast("cpu", torch.bfloat16):
-        half = conv(x, weight, m)
+        half = convolve(x, weight, m)
     assert half.dtype == torch.bfloat16
-    torch.testing.assert_close(half.float(), conv(x, weight, m), rtol=0.05, atol=0.3)
+    torch.testing.assert_close(half.float(), convolve(x, weight, m), rtol=0.05, atol=0.3)
     half.float().sum().backward()
     assert weight.grad is not None
 
@@ -345,11 +348,11 @@ def test_cuda_answers_as_the_cpu_does_and_the_same_each_time() -> None:
         pytest.skip("no CUDA device")
     coordinates = cloud(900)
     x, weight = features_of(coordinates, 6), weight_of(3, 6, 5)
-    expected = conv(x, weight, Voxels.from_points(coordinates).cache.kernel_map(0, 3))
+    expected = convolve(x, weight, Voxels.from_points(coordinates).cache.kernel_map(0, 3))
     there = Voxels.from_points(coordinates.cuda()).cache.kernel_map(0, 3)
     torch.use_deterministic_algorithms(True)
     try:
-        found = [conv(x.cuda(), weight.cuda(), there) for _ in range(5)]
+        found = [convolve(x.cuda(), weight.cuda(), there) for _ in range(5)]
     finally:
         torch.use_deterministic_algorithms(False)
     torch.testing.assert_close(found[0].cpu(), expected, rtol=1e-12, atol=1e-12)

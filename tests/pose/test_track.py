@@ -111,7 +111,7 @@ def test_a_track_that_its_history_ends_does_not_blame_the_frame() -> None:
         config=EstimateConfig(),
         search=lambda _: pytest.fail("not looked for anew"),
     )
-    doubted = track_module._Track(pose=pose.double(), motion=None, log_odds=-9.0, origin=None)
+    doubted = track_module._Track(pose=pose.double(), motion=None, log_odds=-9.0, first=None)
     depth_m = frame(pose)
     everywhere = torch.ones_like(depth_m, dtype=torch.bool)
     view = ViewInput(name="a", depth_m=depth_m, mask=everywhere, K=K.float(), object="bracket")

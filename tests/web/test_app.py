@@ -335,13 +335,13 @@ def test_the_network_is_asked_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     asked: list[int] = []
-    ask_network = nets[1]._ask_network
+    run_network = nets[1]._run_network
 
     def counted(*words: Any) -> Any:  # noqa: ANN401
         asked.append(1)
-        return ask_network(*words)
+        return run_network(*words)
 
-    monkeypatch.setattr(nets[1], "_ask_network", counted)
+    monkeypatch.setattr(nets[1], "_run_network", counted)
     found = ask(page, "pose", samples, VIEW, object=PART).json()
     assert "votes" in [layer["name"] for layer in found["scene"]["layers"]]
     assert asked == [1]

@@ -27,14 +27,14 @@ from depthpose.pose.evaluate import (
     evaluate,
     find_nearest_copy,
     match_instances,
-    read_any,
+    read_any_predictions,
     select_targets,
 )
 from depthpose.pose.mesh import symmetry_transforms
 from depthpose.pose.predictions import (
     estimate_missing_poses,
+    name_bop_results,
     read_predictions,
-    results_name,
     write_bop_results,
 )
 from depthpose.report import page
@@ -90,7 +90,7 @@ def predict_instances(
     label = f"{method.name}, {masks.name} masks"
     for _ in tqdm(written, label, total=len(jobs), disable=None, unit=" instances"):
         pass
-    write_bop_results(home / results_name(dataset), read_predictions(home))
+    write_bop_results(home / name_bop_results(dataset), read_predictions(home))
     return home
 
 
@@ -106,7 +106,7 @@ def measure_each(
     show = partial(tqdm, unit=" instances", disable=None)
     for path, origin in zip(predictions, find_origins(predictions), strict=True):
         _refuse_other_dataset(path, dataset)
-        evaluation = evaluate(dataset, read_any(path), config, show, origin)
+        evaluation = evaluate(dataset, read_any_predictions(path), config, show, origin)
         if evaluation.advice is not None:
             print(f"{path}: {evaluation.advice}", file=sys.stderr)
         evaluations.append(evaluation)
@@ -218,7 +218,9 @@ def _show_instances(
 ) -> list[Section]:
     """Show some instances of a folder or file of predictions, ``max_count`` at most, with truth."""
     instances = {instance.name: instance for instance in dataset.instances}
-    estimates = match_instances(dataset.instances, read_any(predictions), dataset.objects)
+    estimates = match_instances(
+        dataset.instances, read_any_predictions(predictions), dataset.objects
+    )
     sections: list[Section] = []
     for role, row in _choose_instances(rows, max_count):
         instance = instances[row.instance]

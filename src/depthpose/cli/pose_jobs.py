@@ -21,8 +21,8 @@ from depthpose.core.files.disk import natural_sort_key, refuse_equal_stems
 from depthpose.core.files.images import refuse_among_inputs
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
-from depthpose.pose.background import AnyBackground, PosedBin, with_background
-from depthpose.pose.color_inputs import with_color
+from depthpose.pose.background import AnyBackground, PosedBin, add_background
+from depthpose.pose.color_inputs import add_color
 from depthpose.pose.datasets import (
     Detection,
     encode_rle,
@@ -503,7 +503,7 @@ def _read_with_background(
     unit: Unit | None,
 ) -> ViewInput:
     """Read a depth image together with its background."""
-    return with_background(read(), background, camera, unit)
+    return add_background(read(), background, camera, unit)
 
 
 def _with_color(
@@ -555,7 +555,7 @@ def _read_colored(
     color_from_depth: Rigid | None,
 ) -> ViewInput:
     """Read a depth image together with its colour picture."""
-    return with_color(read(), models, picture, camera, color_from_depth)
+    return add_color(read(), models, picture, camera, color_from_depth)
 
 
 def _list_depths(depth: Path) -> list[Path]:

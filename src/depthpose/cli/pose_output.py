@@ -23,8 +23,8 @@ from depthpose.pose.predictions import (
     POSES,
     PoseJob,
     Prediction,
+    name_bop_results,
     read_earlier_predictions,
-    results_name,
     write_bop_results,
 )
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
@@ -102,7 +102,7 @@ def claim_for_dataset(out: Path, settings: dict[str, Any], dataset: BopDataset) 
     """Claim a folder for the poses of a data set, with its tables and pictures."""
     images = sorted({(i.scene_id, i.image_id) for i in dataset.instances})
     pictures = [f"{scene:06d}_{image:06d}.{PICTURE}" for scene, image in images]
-    tables = [results_name(dataset), results_name(dataset, _WITH_ALTERNATIVES)]
+    tables = [name_bop_results(dataset), name_bop_results(dataset, _WITH_ALTERNATIVES)]
     run.claim_folder(out, settings, [POSES, _PAGE, *tables, *pictures])
 
 
@@ -139,9 +139,9 @@ def _write_dataset_files(
     models: Mapping[str, ObjectModel],
 ) -> None:
     """Write BOP's csv of a data set's poses, and a picture of each image with its poses."""
-    write_bop_results(out / results_name(dataset), predictions)
+    write_bop_results(out / name_bop_results(dataset), predictions)
     if any(p.estimate.alternatives for p in predictions):
-        table = out / results_name(dataset, _WITH_ALTERNATIVES)
+        table = out / name_bop_results(dataset, _WITH_ALTERNATIVES)
         write_bop_results(table, predictions, with_alternatives=True)
 
     image_of = {(i.scene_id, i.image_id): i for i in dataset.instances}

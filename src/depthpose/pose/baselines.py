@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from depthpose.core.config import Settings
 from depthpose.core.rigid import Rigid
-from depthpose.pose.cloud import turn_axis_to
+from depthpose.pose.grid import rotation_from_z_to
 from depthpose.pose.segmentation import ResNet18
 from depthpose.pose.sparse import RowNorm
 from depthpose.pose.types import ViewInput, VotingPoints
@@ -29,10 +29,10 @@ class DepthImageConfig(Settings):
     """Side of the crop that the network sees."""
 
     margin: Annotated[float, "[1, inf)"] = 1.1
-    """The crop is so many times as wide as the object's box."""
+    """Width of the crop over that of the object's bounding square."""
 
     contrast: Annotated[float, "(0, inf)"] = 0.1
-    """The crop is divided by its mean depth; this much more or less than the mean is 1 or -1."""
+    """A depth that differs by this share from the mean depth of the crop is 1 or -1."""
 
     widths: Annotated[tuple[int, int, int, int], "[1, inf)"] = (64, 128, 256, 512)
     """Channels of the encoder's stages: those of ResNet-18."""
@@ -64,13 +64,13 @@ class PointNetConfig(Settings):
     """Channels of a point beside that maximum."""
 
 
-EMPTY = -2.0  #: of a pixel without the object: below all that a depth can be, -1 to 1
+EMPTY = -2.0  #: value of a pixel without the object; those of the object are -1 to 1
 
 
 class DepthCrop(NamedTuple):
     """A crop of a depth image and its place; leading axes are of a batch."""
 
-    #: depth over its mean, less one, over the contrast; ``EMPTY`` beside the object.
+    #: ``(depth / mean depth - 1) / contrast``; ``EMPTY`` beside the object.
     image: Float[Tensor, "*b 1 size size"]
     #: ``camera_from_crop``: rotates the optical axis to the ray through the crop's middle. In this
     #: frame the rotation of an object does not depend on where in the image it is.
@@ -82,9 +82,13 @@ class DepthCrop(NamedTuple):
 def cut_depth(
     view: ViewInput, config: DepthImageConfig, diameter_m: float | None = None
 ) -> DepthCrop | None:
-    """Crop a view to its object; None where fewer pixels than ``min_points`` have a depth.
+    """Crop a view to its object; None where fewer than ``config.min_points`` pixels have a depth.
 
-    Pixels farther than the diameter from the median depth are left out; with None all are kept.
+    Args:
+        view: depth image and mask of the object.
+        config: size, margin and contrast of the crop.
+        diameter_m: of the object. Masked pixels whose depth differs by more from the median are
+            left out; None: all are kept.
     """
     # The pixels of the object.
     depth_m = torch.where(view.mask, view.depth_m, torch.nan)
@@ -96,18 +100,18 @@ def cut_depth(
 
     # A square about them, and their depth about its mean.
     rows, columns = is_seen.nonzero(as_tuple=True)
-    low = torch.stack([columns.min(), rows.min()]).float() - 0.5
-    high = torch.stack([columns.max(), rows.max()]).float() + 0.5
-    middle_px = (low + high) / 2
-    side_px = config.margin * float((high - low).max())
+    low_px = torch.stack([columns.min(), rows.min()]).float() - 0.5
+    high_px = torch.stack([columns.max(), rows.max()]).float() + 0.5
+    middle_px = (low_px + high_px) / 2
+    side_px = config.margin * float((high_px - low_px).max())
     mean_m = depth_m[is_seen].mean()
     relief = ((depth_m / mean_m - 1) / config.contrast).clamp(-1, 1)
     relief = torch.where(is_seen, relief, EMPTY)
 
     # Resized by nearest neighbour, so that depth is not mixed across edges.
-    steps = (torch.arange(config.crop_px) + 0.5) / config.crop_px - 0.5
-    column = (middle_px[0] + side_px * steps).round().long()
-    row = (middle_px[1] + side_px * steps).round().long()
+    offsets = (torch.arange(config.crop_px) + 0.5) / config.crop_px - 0.5  # in sides of the crop
+    column = (middle_px[0] + side_px * offsets).round().long()
+    row = (middle_px[1] + side_px * offsets).round().long()
     height, width = relief.shape
     is_inside = ((row >= 0) & (row < height))[:, None] & ((column >= 0) & (column < width))
     image = relief[row.clamp(0, height - 1)[:, None], column.clamp(0, width - 1)]
@@ -117,55 +121,60 @@ def cut_depth(
     ray = torch.linalg.solve(K, torch.cat([middle_px, torch.ones(1)]))
     return DepthCrop(
         image=torch.where(is_inside, image, EMPTY)[None],
-        R=turn_axis_to(ray).to(ray),
+        R=rotation_from_z_to(ray).to(ray),
         middle_m=ray * mean_m,
         side_m=side_px * mean_m / K[0, 0],
     )
 
 
-_NUMBERS = 9  # outputs for a class: two columns of a rotation, and an offset in crop widths
+_OUTPUTS = 9  # of a class: two columns of a rotation, and an offset in widths of the crop
 
 
 class DepthImageNet(nn.Module):
-    """A network from a crop to nine numbers of each class: two columns of a rotation, an offset.
+    """A network from a depth crop to nine outputs of each class (:func:`make_poses`).
 
-    The encoder of ResNet-18 with one channel in, its mean over the crop, and a linear layer.
+    The encoder of ResNet-18 with one input channel, the mean of its features over the crop, and a
+    linear layer.
     """
 
     def __init__(self, config: DepthImageConfig | None = None) -> None:
         super().__init__()
         self.config = config = config or DepthImageConfig()
         self.encoder = ResNet18(inputs=1, widths=config.widths)
-        self.heads = nn.Linear(config.widths[3], config.classes * _NUMBERS)
-        with torch.no_grad():  # begin at the identity, in the middle of the crop
+        self.heads = nn.Linear(config.widths[3], config.classes * _OUTPUTS)
+        # Training begins near the identity, in the middle of the crop.
+        with torch.no_grad():
             self.heads.weight.mul_(0.1)
             start = torch.tensor([1.0, 0, 0, 0, 1, 0, 0, 0, 0])
             self.heads.bias.copy_(start.repeat(config.classes))
 
     def forward(
-        self, image: Float[Tensor, "b 1 h w"], number: Int[Tensor, " b"]
+        self, image: Float[Tensor, "b 1 h w"], class_of_image: Int[Tensor, " b"]
     ) -> Float[Tensor, "b 9"]:
-        """Give the numbers of each crop for its own class, whose ``number`` is given."""
+        """Compute the outputs of each crop for its own class."""
         features = self.encoder(image)[-1].mean((-2, -1))
-        outputs = self.heads(features).view(len(image), self.config.classes, _NUMBERS)
-        return outputs[torch.arange(len(image), device=image.device), number]
+        outputs = self.heads(features).view(len(image), self.config.classes, _OUTPUTS)
+        return outputs[torch.arange(len(image), device=image.device), class_of_image]
 
 
 def make_poses(outputs: Float[Tensor, "b 9"], crop: DepthCrop) -> Rigid:
     """Convert outputs of the network to poses ``camera_from_model``.
 
-    The first six numbers are two columns of a rotation, which Gram and Schmidt's method makes
+    The first six outputs are two columns of a rotation, which the Gram-Schmidt process makes
     orthonormal: a continuous representation, which none of three or four numbers is (Zhou et al.,
     CVPR 2019). It is undefined where the columns are parallel or zero. The last three are the
     offset of the object's origin from the middle of the crop, in widths of the crop (``side_m``).
     """
     first = F.normalize(outputs[:, :3], dim=-1)
     second = outputs[:, 3:6]
-    second = F.normalize(second - (first * second).sum(-1, keepdim=True) * first, dim=-1)
-    R = torch.stack([first, second, torch.linalg.cross(first, second)], -1)
-    shift = crop.side_m[:, None] * outputs[:, 6:]
-    t_m = crop.middle_m + (crop.R @ shift[..., None]).squeeze(-1)
-    return Rigid(crop.R @ R, t_m)
+    along_first = (first * second).sum(-1, keepdim=True) * first
+    second = F.normalize(second - along_first, dim=-1)
+    crop_R_model = torch.stack([first, second, torch.linalg.cross(first, second)], -1)
+
+    # From the frame of the crop to that of the camera.
+    offset_m = crop.side_m[:, None] * outputs[:, 6:]
+    t_m = crop.middle_m + (crop.R @ offset_m[..., None]).squeeze(-1)
+    return Rigid(crop.R @ crop_R_model, t_m)
 
 
 _TRANSFORM_POOLED = (64, 128, 1024)  # widths of the layers before the maximum over points
@@ -173,59 +182,66 @@ _TRANSFORM_HEAD = (512, 256)  # and after it
 
 
 class PointNet(nn.Module):
-    """A network from points to raw directions, by each point and the maximum over its cloud.
+    """A network from points to raw directions: PointNet for segmentation (Qi et al., CVPR 2017).
 
-    The network for segmentation of Qi et al. (CVPR 2017). Clouds of any size are rows one after the
-    other. Outputs have the form of those of the sparse network, so that the same voting follows.
+    A direction depends on the features of its point and on their maximum over the cloud. Clouds of
+    any size are rows one after the other. Outputs have the shape of those of the sparse network, so
+    that the same voting follows.
     """
 
     def __init__(self, config: PointNetConfig | None = None) -> None:
         super().__init__()
         self.config = config = config or PointNetConfig()
-        c = config
-        self.turn_points = _Transform(3)
-        self.local = _make_layers((3, *c.local))
-        self.turn_features = _Transform(c.local[1])
-        self.pooled = _make_layers((c.local[1], *c.pooled))
-        self.head = _make_layers((c.local[1] + c.pooled[2], *c.head))
-        self.final = nn.Linear(c.head[2], c.classes * c.keypoints * 3)
+        local_width = config.local[-1]
+        self.turn_points = _TNet(3)
+        self.local = _make_layers((3, *config.local))
+        self.turn_features = _TNet(local_width)
+        self.pooled = _make_layers((local_width, *config.pooled))
+        self.head = _make_layers((local_width + config.pooled[-1], *config.head))
+        self.final = nn.Linear(config.head[-1], config.classes * config.keypoints * 3)
 
     def forward(
         self, points_m: Float[Tensor, "points 3"], cloud: Int[Tensor, " points"]
     ) -> Float[Tensor, "points classes keypoints 3"]:
-        """Give the raw directions of each point to the keypoints of every class.
+        """Compute the raw directions of each point to the keypoints of every class.
 
         Args:
             points_m: about the mean of their cloud.
             cloud: which cloud each belongs to, 0, 1, ..., ascending.
         """
-        # Each point by itself, with coordinates and then features turned as its cloud demands.
+        # Each point by itself; the coordinates and then the features are multiplied by a matrix
+        # that is predicted for the cloud.
         x = points_m / self.config.unit_m
         sizes = torch.bincount(cloud).tolist()
-        turns = self.turn_points(x, sizes)
-        x = torch.cat([part @ T for part, T in zip(x.split(sizes), turns, strict=True)])
+        x = _multiply_by_cloud(x, self.turn_points(x, sizes), sizes)
         x = self.local(x)
-        turns = self.turn_features(x, sizes)
-        x = torch.cat([part @ T for part, T in zip(x.split(sizes), turns, strict=True)])
+        x = _multiply_by_cloud(x, self.turn_features(x, sizes), sizes)
 
         # Each point beside the maximum over its cloud.
-        whole = torch.stack([part.amax(0) for part in self.pooled(x).split(sizes)])
-        outputs = self.final(self.head(torch.cat([x, whole[cloud]], 1)))
+        maximum = _take_maximum_by_cloud(self.pooled(x), sizes)
+        outputs = self.final(self.head(torch.cat([x, maximum[cloud]], 1)))
         return outputs.view(len(outputs), self.config.classes, self.config.keypoints, 3)
 
     def directions(self, points: VotingPoints) -> Float[Tensor, "points keypoints 3"]:
-        """Give the directions of each point for its own class, as all networks that vote do."""
+        """Compute the raw directions of each point to the keypoints of its own class.
+
+        The networks that vote share this method.
+        """
+        # The points about the mean of their cloud.
         points_m = points.points_m
         cloud = points.coordinates[:, 0].long()
         sizes = torch.bincount(cloud)
         sums_m = points_m.new_zeros(len(sizes), 3).index_add(0, cloud, points_m)
-        local_m = points_m - (sums_m / sizes[:, None])[cloud]
+        means_m = sums_m / sizes[:, None]
+        centred_m = points_m - means_m[cloud]
+
+        of_every_class = self(centred_m, cloud)
         rows = torch.arange(len(points_m), device=points_m.device)
-        return self(local_m, cloud)[rows, points.class_of_point]
+        return of_every_class[rows, points.class_of_point]
 
 
-class _Transform(nn.Module):
-    """T-Net: a matrix for each cloud, which begins as the identity."""
+class _TNet(nn.Module):
+    """PointNet's T-Net: predicts a square matrix for each cloud, the identity before training."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -239,14 +255,29 @@ class _Transform(nn.Module):
     def forward(
         self, x: Float[Tensor, "points c"], sizes: Sequence[int]
     ) -> Float[Tensor, "clouds c c"]:
-        """Give the matrix of each cloud; ``sizes`` are the points of each, one after the other."""
-        whole = torch.stack([part.amax(0) for part in self.pooled(x).split(list(sizes))])
+        """Predict the matrix of each cloud; clouds of ``sizes`` points are one after the other."""
+        maximum = _take_maximum_by_cloud(self.pooled(x), sizes)
         eye = torch.eye(self.width, device=x.device, dtype=x.dtype)
-        return self.final(self.head(whole)).view(len(sizes), self.width, self.width) + eye
+        return self.final(self.head(maximum)).view(len(sizes), self.width, self.width) + eye
+
+
+def _multiply_by_cloud(
+    x: Float[Tensor, "points c"], matrices: Float[Tensor, "clouds c c"], sizes: Sequence[int]
+) -> Float[Tensor, "points c"]:
+    """Multiply the rows of each cloud, of ``sizes`` rows, by the matrix of the cloud."""
+    clouds = x.split(list(sizes))
+    return torch.cat([rows @ matrix for rows, matrix in zip(clouds, matrices, strict=True)])
+
+
+def _take_maximum_by_cloud(
+    x: Float[Tensor, "points c"], sizes: Sequence[int]
+) -> Float[Tensor, "clouds c"]:
+    """Take the maximum of each channel over each cloud, of ``sizes`` rows."""
+    return torch.stack([rows.amax(0) for rows in x.split(list(sizes))])
 
 
 def _make_layers(widths: Sequence[int]) -> nn.Sequential:
-    """Make linear layers between successive widths, each with its norm and ReLU."""
+    """Build linear layers between successive widths, each followed by batch norm and ReLU."""
     layers: list[nn.Module] = []
     for inputs, outputs in pairwise(widths):
         layers += [nn.Linear(inputs, outputs, bias=False), RowNorm(outputs), nn.ReLU()]

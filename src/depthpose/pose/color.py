@@ -1,9 +1,10 @@
 """Colour as evidence: which of the poses that depth cannot tell apart shows the right print?
 
-At each pose the colours of the visible surface are compared with the image: brightness, red over
-green and blue over green, all as logarithms. Exposure, white balance and a screen's gamma are then
-constants and factors, to which a correlation is blind. Shading, the part of the brightness that is
-linear in the normal (Lambert), is removed from both by regression.
+The print is the pattern of colours on the surface. At each pose the colours of the visible surface
+are compared with the image: brightness, red over green and blue over green, all as logarithms.
+Exposure, white balance and a screen's gamma are then constants and factors, to which a correlation
+is blind. Shading, the part of the brightness that is linear in the normal (Lambert), is removed
+from both by regression.
 
 A correlation ``r`` of ``n`` independent points tells how much of the image a pose explains: its log
 likelihood above that of a pose whose print has nothing to do with the image is
@@ -14,27 +15,25 @@ print for much.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Float64, Int64
+from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
-from depthpose.core.rigid import Rigid, geodesic_rad
-from depthpose.pose.mesh import near_symmetries, turn_about
-from depthpose.pose.types import Axis, ColorImage, ObjectModel, SurfaceColors, ViewInput
+from depthpose.core.rigid import Rigid
+from depthpose.pose.types import ColorImage, ObjectModel, SurfaceColors, ViewInput
 
-_SAMPLES = 4000  # coloured points of a model that are compared, about a third of them visible
-_SWEEP_SAMPLES = 1500  # coloured points that are compared in a sweep about an axis
+MOST_SAMPLES = 4000  #: coloured points of a model that are compared; about a third are visible
 _LEAST_COSINE = 0.3  # least cosine between ray and normal: more slanted print is blurred
-_NEAR = 0.05  # diameters: a reading farther from the surface is of another object
+_NEAR_DIAMETERS = 0.05  # a reading farther from the surface is of another object
 _LEAST_VISIBLE = 40  # fewer visible points are not compared
 _BLUR = 1.0  # standard deviation of the image's blur, in spacings of the model's coloured points
+_PROJECTED = 300  # points of a model by which the part of the image about it is found
 _BLACK = 0.05  # value, 0 to 1, that noise and stray light give to black
 _SATURATED = 0.98  # a channel above this value is clipped, so the colour is false
 _DARK = 0.06  # where no channel is above this value, the colour is noise
@@ -48,76 +47,85 @@ _POINTS_AT_ONCE = 1_000_000  # points of all poses that are compared at a time, 
 class ColorAgreement:
     """How the colours of a posed model and an image agree, for a batch of poses."""
 
-    #: of brightness, red against green, blue against green; 0 where model or image are plain.
+    #: of brightness, red over green, blue over green; 0 where model or image show no print.
     correlation: Float64[Tensor, "b 3"]
-    independent: Float64[Tensor, "b 3"]  #: effective number of independent points of each
-    visible: Int64[Tensor, " b"]  #: coloured points that were compared
-
-    @property
-    def score(self) -> Float64[Tensor, " b"]:
-        """The mean of the three correlations, -1 to 1."""
-        return self.correlation.mean(-1)
+    independent_count: Float64[Tensor, "b 3"]  #: effective number of independent points of each
+    visible_count: Int64[Tensor, " b"]  #: coloured points that were compared
 
     @property
     def log_likelihood(self) -> Float64[Tensor, " b"]:
         """Log likelihood of the image above that of a print that has nothing to do with it.
 
         Differences are log odds between poses, and between objects at one place. It is 0 where
-        colour says nothing: a grey model, too few points, or a print that runs the other way.
+        colour says nothing: a grey model, too few points, or a negative correlation.
         """
         explained = self.correlation.clamp(0, _MOST_CORRELATION).square()
-        freedom = (self.independent - _FITTED).clamp(min=0)
+        freedom = (self.independent_count - _FITTED).clamp(min=0)
         return (-freedom / 2 * torch.log1p(-explained)).sum(-1)
 
 
-def color_agreement(
-    poses: Rigid, model: ObjectModel, view: ViewInput, *, samples: int = _SAMPLES
-) -> ColorAgreement:
-    """Compare the colours of a posed model with an image, for each of a batch of poses.
+def measure_color_agreement(poses: Rigid, model: ObjectModel, view: ViewInput) -> ColorAgreement:
+    """Correlate the colours of a posed model with an image, for each of a batch of poses.
 
     Args:
         poses: ``camera_from_model`` of the depth camera.
         model: the object; without ``colors`` colour says nothing.
         view: depth and colour; without ``color`` colour says nothing. Its mask limits where the
             object is.
-        samples: how many coloured points of the model are compared at most.
     """
     if model.colors is None or view.color is None:
-        nothing = torch.zeros(len(poses.R), 3, dtype=torch.float64)
+        zeros = torch.zeros(len(poses.R), 3, dtype=torch.float64)
         return ColorAgreement(
-            correlation=nothing, independent=nothing, visible=nothing[:, 0].long()
+            correlation=zeros, independent_count=zeros, visible_count=zeros[:, 0].long()
         )
-
-    # So many poses at a time as fit in memory.
-    surface = _take_samples(model.colors, samples)
-    image = _blur_image(view.color, poses, surface)
-    parts: list[ColorAgreement] = []
-    at_once = max(1, _POINTS_AT_ONCE // len(surface.points_m))
-    for first in range(0, len(poses.R), at_once):
-        chunk = poses[first : first + at_once].double()
-        compared = _compare_features(chunk, surface, view, image, _NEAR * model.diameter_m)
-        correlation = _correlate(compared)
+    surface = _take_samples(model.colors, MOST_SAMPLES)
+    correlations: list[Tensor] = []
+    independent_counts: list[Tensor] = []
+    visible_counts: list[Tensor] = []
+    for features in _sample_in_chunks(poses, surface, view, model.diameter_m):
+        correlation = _correlate(features)
+        independent_count = _count_independent_points(features, surface)
+        correlations.append(correlation)
         # Colour that explains nothing has no independent points.
-        independent = torch.where(
-            correlation != 0, _count_independent_points(compared, surface), 0.0
-        )
-        visible = compared.weight[..., 0].sum(-1).long()
-        parts.append(
-            ColorAgreement(correlation=correlation, independent=independent, visible=visible)
-        )
+        independent_counts.append(torch.where(correlation != 0, independent_count, 0.0))
+        visible_counts.append(features.weight[..., 0].sum(-1).long())
     return ColorAgreement(
-        correlation=torch.cat([part.correlation for part in parts]),
-        independent=torch.cat([part.independent for part in parts]),
-        visible=torch.cat([part.visible for part in parts]),
+        correlation=torch.cat(correlations),
+        independent_count=torch.cat(independent_counts),
+        visible_count=torch.cat(visible_counts),
     )
 
 
-def _take_samples(colors: SurfaceColors, samples: int) -> SurfaceColors:
-    """Take at most ``samples`` of the coloured points, evenly."""
+def score_by_color(
+    poses: Rigid, model: ObjectModel, view: ViewInput, most_samples: int = MOST_SAMPLES
+) -> Float64[Tensor, " b"]:
+    """Score poses by how much of the colours they explain, fast enough for sweeps of many poses.
+
+    Twice :attr:`ColorAgreement.log_likelihood`, but with every visible point counted as
+    independent.
+
+    Args:
+        poses: a batch, ``camera_from_model`` of the depth camera.
+        model: the object, with colours.
+        view: depth and colour.
+        most_samples: largest number of coloured points that are compared.
+    """
+    assert model.colors is not None
+    surface = _take_samples(model.colors, most_samples)
+    scores: list[Tensor] = []
+    for features in _sample_in_chunks(poses, surface, view, model.diameter_m):
+        explained = _correlate(features).clamp(0, _MOST_CORRELATION).square()
+        visible_count = features.weight.sum(1)
+        scores.append((-visible_count * torch.log1p(-explained)).sum(-1))
+    return torch.cat(scores)
+
+
+def _take_samples(colors: SurfaceColors, most: int) -> SurfaceColors:
+    """Take at most so many of the coloured points, evenly."""
     return SurfaceColors(
-        points_m=take_evenly(colors.points_m, samples),
-        normals=take_evenly(colors.normals, samples),
-        rgb=take_evenly(colors.rgb, samples),
+        points_m=take_evenly(colors.points_m, most),
+        normals=take_evenly(colors.normals, most),
+        rgb=take_evenly(colors.rgb, most),
         spacing_m=colors.spacing_m,  # over which each colour is a mean, not where the next one is
     )
 
@@ -127,7 +135,7 @@ class _BlurredImage(NamedTuple):
 
     rgb: Float[Tensor, "3 h w"]  #: 0..1
     left: int  #: first column of the part
-    top: int  #: and its first row
+    top: int  #: first row of the part
 
 
 def _project_to_color(
@@ -142,19 +150,21 @@ def _project_to_color(
 
 
 def _blur_image(color: ColorImage, poses: Rigid, surface: SurfaceColors) -> _BlurredImage:
-    """Blur an image, where the posed models lie, by the spacing of the model's colours."""
-    # The blur in pixels, where the models lie.
-    few_m = take_evenly(surface.points_m, 300).double()
+    """Blur the part of an image about the posed models by the spacing of the model's colours."""
+    few_m = take_evenly(surface.points_m, _PROJECTED).double()
     pixels, depth_m = _project_to_color(poses.double().apply(few_m), color)
     is_front = depth_m > 0
     height, width = color.rgb.shape[1:]
     if not bool(is_front.any()):
         return _BlurredImage(color.rgb, 0, 0)
-    sigma = _BLUR * surface.spacing_m * float(color.K[0, 0] / depth_m[is_front].median())
-    sigma = min(max(sigma, 1.0), max(height, width) / 8)
-    reach = math.ceil(3 * sigma)
 
-    # The part about the poses.
+    # The spacing in pixels, at the depth of the models; a pixel at least.
+    px_per_m = float(color.K[0, 0] / depth_m[is_front].median())
+    sigma_px = _BLUR * surface.spacing_m * px_per_m
+    sigma_px = min(max(sigma_px, 1.0), max(height, width) / 8)
+    reach = math.ceil(3 * sigma_px)
+
+    # The part about the models, with a margin for the blur.
     low = pixels[is_front].amin(0) - 2 * reach
     high = pixels[is_front].amax(0) + 2 * reach
     left = int(low[0].clamp(0, width - 1))
@@ -164,7 +174,7 @@ def _blur_image(color: ColorImage, poses: Rigid, surface: SurfaceColors) -> _Blu
 
     # A Gaussian, one axis after the other.
     steps = torch.arange(-reach, reach + 1, dtype=torch.float32)
-    kernel = torch.exp(-(steps**2) / (2 * sigma**2))
+    kernel = torch.exp(-(steps**2) / (2 * sigma_px**2))
     kernel /= kernel.sum()
     part = color.rgb[:, None, top:bottom, left:right].float()
     part = F.conv2d(F.pad(part, (reach, reach, 0, 0), "replicate"), kernel[None, None, None])
@@ -172,12 +182,12 @@ def _blur_image(color: ColorImage, poses: Rigid, surface: SurfaceColors) -> _Blu
     return _BlurredImage(part[:, 0], left, top)
 
 
-class _Compared(NamedTuple):
+class _ColorFeatures(NamedTuple):
     """Colour features of a model and of an image at the same points, less mean and shading."""
 
     weight: Float64[Tensor, "b n 3"]  #: 1 where a feature is compared, else 0
-    of_model: Float64[Tensor, "b n 3"]  #: features of the model
-    of_image: Float64[Tensor, "b n 3"]  #: features of the image
+    of_model: Float64[Tensor, "b n 3"]  #: of brightness, red over green, blue over green
+    of_image: Float64[Tensor, "b n 3"]  #: the same of the image
 
 
 def _take_logarithms(rgb: Float64[Tensor, "*b 3"]) -> Float64[Tensor, "*b 3"]:
@@ -187,55 +197,103 @@ def _take_logarithms(rgb: Float64[Tensor, "*b 3"]) -> Float64[Tensor, "*b 3"]:
     return torch.stack([brightness, red - green, blue - green], -1)
 
 
-def _compare_features(
+def _sample_in_chunks(
+    poses: Rigid, surface: SurfaceColors, view: ViewInput, diameter_m: float
+) -> Iterator[_ColorFeatures]:
+    """Yield the colour features of as many poses at a time as fit in memory.
+
+    Args:
+        poses: a batch, ``camera_from_model`` of the depth camera.
+        surface: coloured points of the model.
+        view: depth, mask and colour image.
+        diameter_m: of the model.
+    """
+    assert view.color is not None
+    image = _blur_image(view.color, poses, surface)
+    at_once = max(1, _POINTS_AT_ONCE // len(surface.points_m))
+    for first in range(0, len(poses.R), at_once):
+        chunk = poses[first : first + at_once].double()
+        yield _sample_features(chunk, surface, view, image, _NEAR_DIAMETERS * diameter_m)
+
+
+def _sample_features(
     poses: Rigid, surface: SurfaceColors, view: ViewInput, image: _BlurredImage, near_m: float
-) -> _Compared:
-    """Compare the colours of posed surfaces and of the image, where both cameras see them.
+) -> _ColorFeatures:
+    """Sample the colours of posed surfaces and of the image where both cameras see the surface.
 
     Args:
         poses: a batch, ``camera_from_model`` of the depth camera.
         surface: coloured points of the model.
         view: depth, mask and colour image.
         image: the colour image, blurred.
-        near_m: largest distance of a point to the depth reading in its direction.
+        near_m: largest distance of a visible point to the depth reading in its direction.
     """
     assert view.color is not None
     points_m = poses.apply(surface.points_m.double())
     normals = surface.normals.double() @ poses.R.mT
-    distance_m = points_m.norm(dim=-1)
-    cosine = -(normals * points_m).sum(-1) / distance_m.clamp(min=1e-9)
-
-    # Visible to the depth camera: facing it, with a reading there.
-    pixels = (points_m @ view.K.double().mT)[..., :2] / points_m[..., 2:].clamp(min=1e-6)
-    height, width = view.depth_m.shape
-    column, row = pixels.round().long().unbind(-1)
-    is_visible = (cosine > _LEAST_COSINE) & (points_m[..., 2] > 0)
-    is_visible &= (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    place = row.clamp(0, height - 1) * width + column.clamp(0, width - 1)
-    read_m = view.depth_m.flatten()[place].double()
-    is_visible &= ((read_m - points_m[..., 2]).abs() < near_m) & view.mask.flatten()[place]
-
-    # The colour camera's image there, between pixels.
-    color_pixels, depth_m = _project_to_color(points_m, view.color)
-    rows, columns = view.color.rgb.shape[1:]
-    u, v = color_pixels.unbind(-1)
-    is_visible &= (depth_m > 0) & (u >= 0) & (u <= columns - 1) & (v >= 0) & (v <= rows - 1)
-    side = torch.tensor(image.rgb.shape[:0:-1]).double().sub(1).clamp(min=1)
-    corner = torch.tensor([image.left, image.top]).double()
-    grid = (2 * (color_pixels - corner) / side - 1).float()  # -1 to 1 within the part
-    rgb = F.grid_sample(image.rgb[None], grid[None], align_corners=True)[0].double()
-    rgb = rgb.permute(1, 2, 0)
+    rgb, is_within = _sample_image(points_m, view.color, image)
+    is_visible = _mark_visible(points_m, normals, view, near_m) & is_within
 
     # Colour is false where a channel is clipped, and noise where all are dark.
-    has_color = (rgb.amax(-1) < _SATURATED) & (rgb.amax(-1) > _DARK)
-    with_color = is_visible & has_color
-    weight = torch.stack([is_visible, with_color, with_color], -1).double()
+    brightest = rgb.amax(-1)
+    has_hue = is_visible & (brightest < _SATURATED) & (brightest > _DARK)
+    weight = torch.stack([is_visible, has_hue, has_hue], -1).double()
     of_model = _take_logarithms(surface.rgb.double()).expand(len(points_m), -1, -1)
-    return _Compared(
+    return _ColorFeatures(
         weight=weight,
         of_model=_remove_shading(of_model, normals, weight),
         of_image=_remove_shading(_take_logarithms(rgb), normals, weight),
     )
+
+
+def _mark_visible(
+    points_m: Float64[Tensor, "b n 3"],
+    normals: Float64[Tensor, "b n 3"],
+    view: ViewInput,
+    near_m: float,
+) -> Bool[Tensor, "b n"]:
+    """Mark the surface points that the depth camera sees: they face it, with a reading near them.
+
+    Args:
+        points_m: of the surface, in the frame of the depth camera.
+        normals: outward normals of these points.
+        view: depth and mask.
+        near_m: largest distance along the optical axis between a point and its reading.
+    """
+    distance_m = points_m.norm(dim=-1)
+    cosine = -(normals * points_m).sum(-1) / distance_m.clamp(min=1e-9)
+    is_visible = (cosine > _LEAST_COSINE) & (points_m[..., 2] > 0)
+
+    pixels = (points_m @ view.K.double().mT)[..., :2] / points_m[..., 2:].clamp(min=1e-6)
+    height, width = view.depth_m.shape
+    column, row = pixels.round().long().unbind(-1)
+    is_visible &= (column >= 0) & (column < width) & (row >= 0) & (row < height)
+
+    place = row.clamp(0, height - 1) * width + column.clamp(0, width - 1)
+    read_m = view.depth_m.flatten()[place].double()
+    is_near = (read_m - points_m[..., 2]).abs() < near_m
+    return is_visible & is_near & view.mask.flatten()[place]
+
+
+def _sample_image(
+    points_m: Float64[Tensor, "b n 3"], color: ColorImage, image: _BlurredImage
+) -> tuple[Float64[Tensor, "b n 3"], Bool[Tensor, "b n"]]:
+    """Sample a blurred colour image at points of the depth camera's frame, between pixels.
+
+    Returns:
+        The colours, 0..1; and whether a point is projected into the image.
+    """
+    pixels, depth_m = _project_to_color(points_m, color)
+    u, v = pixels.unbind(-1)
+    rows, columns = color.rgb.shape[1:]
+    is_within = (depth_m > 0) & (u >= 0) & (u <= columns - 1) & (v >= 0) & (v <= rows - 1)
+
+    height, width = image.rgb.shape[1:]
+    last_pixel = torch.tensor([width - 1, height - 1]).double().clamp(min=1)
+    corner = torch.tensor([image.left, image.top]).double()
+    grid = (2 * (pixels - corner) / last_pixel - 1).float()  # -1 to 1 within the part
+    rgb = F.grid_sample(image.rgb[None], grid[None], align_corners=True)[0].double()
+    return rgb.permute(1, 2, 0), is_within
 
 
 _RIDGE = 1e-4  # added to the normals' second moments: a plane has no second direction
@@ -246,28 +304,39 @@ def _remove_shading(
     normals: Float64[Tensor, "b n 3"],
     weight: Float64[Tensor, "b n 3"],
 ) -> Float64[Tensor, "b n 3"]:
-    """Subtract from features their means, and from brightness its shading (Lambert)."""
-    total = weight.sum(1, keepdim=True).clamp(min=1)
-    features = (features - (weight * features).sum(1, keepdim=True) / total) * weight
+    """Subtract from features their means, and from brightness its shading (Lambert).
 
-    # Regression of brightness on the normals.
+    Args:
+        features: brightness, red over green, blue over green.
+        normals: of the points.
+        weight: 1 where a feature is compared, else 0; there the result is 0 too.
+    """
+    count = weight.sum(1, keepdim=True).clamp(min=1)
+    mean = (weight * features).sum(1, keepdim=True) / count
+    features = (features - mean) * weight
+
+    # Regression of brightness on the normals about their mean N: N (N^T N + ridge)^-1 N^T b.
     brightness = features[..., :1]
-    used = weight[..., :1]
-    centred = (normals - (used * normals).sum(1, keepdim=True) / total[..., :1]) * used
-    moments = centred.mT @ centred + _RIDGE * total[..., :1] * torch.eye(3, dtype=torch.float64)
+    is_compared = weight[..., :1]
+    visible_count = count[..., :1]
+    mean_normal = (is_compared * normals).sum(1, keepdim=True) / visible_count
+    centred = (normals - mean_normal) * is_compared
+    ridge = _RIDGE * visible_count * torch.eye(3, dtype=torch.float64)
+    moments = centred.mT @ centred + ridge
     shading = centred @ torch.linalg.solve(moments, centred.mT @ brightness)
     return torch.cat([brightness - shading, features[..., 1:]], -1)
 
 
-def _correlate(compared: _Compared) -> Float64[Tensor, "b 3"]:
+def _correlate(features: _ColorFeatures) -> Float64[Tensor, "b 3"]:
     """Correlate model and image; 0 where few points are visible, or either has no print."""
-    total = compared.weight.sum(1)
-    of_model = compared.of_model.square().sum(1)
-    of_image = compared.of_image.square().sum(1)
-    both = (compared.of_model * compared.of_image).sum(1)
-    least = _PLAIN**2 * total
-    is_printed = (of_model > least) & (of_image > least) & (total >= _LEAST_VISIBLE)
-    return torch.where(is_printed, both / (of_model * of_image).clamp(min=1e-12).sqrt(), 0.0)
+    count = features.weight.sum(1)
+    model_square = features.of_model.square().sum(1)
+    image_square = features.of_image.square().sum(1)
+    product = (features.of_model * features.of_image).sum(1)
+    correlation = product / (model_square * image_square).clamp(min=1e-12).sqrt()
+    least = _PLAIN**2 * count
+    has_print = (model_square > least) & (image_square > least) & (count >= _LEAST_VISIBLE)
+    return torch.where(has_print, correlation, 0.0)
 
 
 _PAIRED = 250  # visible points whose pairs give the autocorrelations
@@ -276,47 +345,84 @@ _POSES_AT_ONCE = 16  # poses whose pairs are counted at a time, for the memory
 
 
 def _count_independent_points(
-    compared: _Compared, surface: SurfaceColors
+    features: _ColorFeatures, surface: SurfaceColors
 ) -> Float64[Tensor, "b 3"]:
     """Count the independent points of each correlation: their effective number.
 
     The variance of the correlation of two unrelated fields is the mean product of their
-    autocorrelations over all pairs of points (Dutilleul 1993), and the number its inverse. Products
-    below 0, which come from chance, are left out, so that the number is rather too small.
+    autocorrelations over all pairs of points (Dutilleul 1993), and the number its inverse.
     """
-    generator = torch.Generator().manual_seed(0)
-    key = torch.rand(compared.weight.shape[1], generator=generator, dtype=torch.float64)
-    count = min(_PAIRED, compared.weight.shape[1])
+    point_count = features.weight.shape[1]
+    generator = torch.Generator().manual_seed(0)  # any seed: which points is of no account
+    key = torch.rand(point_count, generator=generator, dtype=torch.float64)
+    points_m = surface.points_m.double()
     reach_m = float((surface.points_m.amax(0) - surface.points_m.amin(0)).norm())
-    numbers: list[Tensor] = []
-    for first in range(0, len(compared.weight), _POSES_AT_ONCE):
-        # Visible points of each pose, chosen at random, and the bin of the distance of each pair.
-        chunk = slice(first, first + _POSES_AT_ONCE)
-        chosen = (compared.weight[chunk, :, 0] * (1 + key)).topk(count, dim=1).indices
-        points_m = surface.points_m.double()[chosen]
-        distance = torch.cdist(points_m, points_m) / reach_m
+    counts: list[Tensor] = []
+    for first in range(0, len(features.weight), _POSES_AT_ONCE):
+        weight, of_model, of_image = (part[first : first + _POSES_AT_ONCE] for part in features)
+
+        # Some points of each pose, chosen at random, visible ones before others.
+        priority = weight[..., 0] * (1 + key)
+        chosen = priority.topk(min(_PAIRED, point_count), dim=1).indices
+        index = chosen[..., None].expand(-1, -1, 3)
+        sample = _ColorFeatures(
+            weight.gather(1, index), of_model.gather(1, index), of_image.gather(1, index)
+        )
+
+        # The bin of the distance of each pair; each pose has bins of its own.
+        chosen_m = points_m[chosen]
+        distance = torch.cdist(chosen_m, chosen_m) / reach_m
         bins = (distance.sqrt() * _BINS).long().clamp(max=_BINS - 1)
         bins += _BINS * torch.arange(len(chosen))[:, None, None]
+        counts.append(_count_by_autocorrelation(sample, bins))
+    return torch.cat(counts)
 
-        # Autocorrelations of the model and of the image, by distance.
-        index = chosen[..., None].expand(-1, -1, 3)
-        weight, *fields = (values[chunk].gather(1, index) for values in compared)
-        pairs = _sum_by_bin(torch.einsum("bif,bjf->fbij", weight, weight), bins)
-        autocorrelations: list[Tensor] = []
-        for values in fields:
-            products = _sum_by_bin(torch.einsum("bif,bjf->fbij", values, values), bins)
-            variance = values.square().sum(1).mT / weight.sum(1).mT.clamp(min=1)
-            mean = products / pairs.clamp(min=1)
-            autocorrelations.append(mean / variance.clamp(min=1e-12)[..., None])
 
-        # The mean of their product over all pairs; that of a place with itself is 1.
-        product = (autocorrelations[0] * autocorrelations[1]).clamp(min=0)
-        sums = pairs * product
-        visible = weight.square().sum(1).mT
-        sums[..., 0] -= visible * product[..., 0]
-        variance = (sums.sum(-1) + visible) / visible.square().clamp(min=1)
-        numbers.append((1 / variance.clamp(min=1 / count)).mT)
-    return torch.cat(numbers)
+def _count_by_autocorrelation(
+    sample: _ColorFeatures, bins: Int64[Tensor, "b m m"]
+) -> Float64[Tensor, "b 3"]:
+    """Compute the effective number of independent points from the pairs of some points.
+
+    Products of autocorrelations below 0, which come from chance, count as 0, so that the number is
+    rather too small.
+
+    Args:
+        sample: features at some points of each pose.
+        bins: bin of the distance of each pair of these points.
+    """
+    weight = sample.weight
+    pair_count = _sum_by_bin(torch.einsum("bif,bjf->fbij", weight, weight), bins)
+    model_autocorrelation = _autocorrelate(sample.of_model, weight, pair_count, bins)
+    image_autocorrelation = _autocorrelate(sample.of_image, weight, pair_count, bins)
+
+    # Summed over all pairs. Those of a point with itself are in the first bin, and have a product
+    # of 1 in place of that of the bin.
+    product = (model_autocorrelation * image_autocorrelation).clamp(min=0)
+    sums = pair_count * product
+    visible_count = weight.square().sum(1).mT
+    sums[..., 0] -= visible_count * product[..., 0]
+    variance = (sums.sum(-1) + visible_count) / visible_count.square().clamp(min=1)
+    return (1 / variance.clamp(min=1 / weight.shape[1])).mT
+
+
+def _autocorrelate(
+    values: Float64[Tensor, "b m f"],
+    weight: Float64[Tensor, "b m f"],
+    pair_count: Float64[Tensor, "f b bins"],
+    bins: Int64[Tensor, "b m m"],
+) -> Float64[Tensor, "f b bins"]:
+    """Compute the autocorrelation of a field of mean 0 in each bin of distances.
+
+    Args:
+        values: of the field at points, 0 where they are not compared.
+        weight: 1 where a point is compared, else 0.
+        pair_count: pairs of compared points in each bin.
+        bins: bin of the distance of each pair of points.
+    """
+    products = _sum_by_bin(torch.einsum("bif,bjf->fbij", values, values), bins)
+    variance = values.square().sum(1).mT / weight.sum(1).mT.clamp(min=1)
+    mean_product = products / pair_count.clamp(min=1)
+    return mean_product / variance.clamp(min=1e-12)[..., None]
 
 
 def _sum_by_bin(
@@ -326,247 +432,3 @@ def _sum_by_bin(
     flat = values.flatten(1)
     sums = flat.new_zeros(len(flat), len(bins) * _BINS)
     return sums.index_add_(1, bins.flatten(), flat).unflatten(1, (len(bins), _BINS))
-
-
-_STEP_DEG = 5.0  # step of a sweep about an axis
-_FINE_STEPS = 5  # fine steps in each step of a sweep
-_MOST_PEAKS = 3  # largest number of poses that a sweep about one axis returns
-
-
-def copies_about_axis(
-    pose: Rigid, axis: Axis, model: ObjectModel, view: ViewInput, *, step_deg: float = _STEP_DEG
-) -> Rigid:
-    """Rotate a pose about an axis of the model to where its print agrees with the image.
-
-    A sweep of the full circle finds the largest agreements; each is refined by finer steps and by
-    the parabola through the best three of them.
-
-    Args:
-        pose: ``camera_from_model``, one.
-        axis: of revolution, of the model's shape, or nearly so.
-        model: the object, with colours.
-        view: depth and colour.
-        step_deg: of the sweep; print narrower than it along the circumference is stepped over.
-
-    Returns:
-        Poses at the largest agreements, at most three, the best first; ``pose`` alone where colour
-        says nothing.
-    """
-    if model.colors is None or view.color is None:
-        return pose.double()[None]
-
-    # The largest agreements of a sweep.
-    steps = max(3, math.ceil(360 / step_deg))
-    step_rad = 2 * math.pi / steps
-    sweep_rad = torch.arange(steps, dtype=torch.float64) * step_rad
-    rough = _score_sweep(_rotate_about(pose, axis, sweep_rad), model, view, _SWEEP_SAMPLES)
-    is_peak = (rough >= rough.roll(1)) & (rough > rough.roll(-1)) & (rough > 0)
-    peaks = is_peak.nonzero()[:, 0]
-    peaks = peaks[rough[peaks].argsort(descending=True)][:_MOST_PEAKS]
-    if len(peaks) == 0:
-        return pose.double()[None]
-
-    # Finer steps about each, and a parabola through the best three.
-    fine_rad = step_rad / _FINE_STEPS
-    offsets_rad = torch.arange(-_FINE_STEPS, _FINE_STEPS + 1, dtype=torch.float64) * fine_rad
-    angles_rad = sweep_rad[peaks, None] + offsets_rad
-    fine = _score_sweep(_rotate_about(pose, axis, angles_rad.flatten()), model, view, _SAMPLES)
-    fine = fine.reshape(angles_rad.shape)
-    best = fine.argmax(1).clamp(1, 2 * _FINE_STEPS - 1)
-    three = fine.gather(1, best[:, None] + torch.tensor([-1, 0, 1]))
-    middle_rad = angles_rad.gather(1, best[:, None])[:, 0]
-    best_rad = middle_rad + _find_parabola_peak(three) * step_rad / _FINE_STEPS
-    order = three[:, 1].argsort(descending=True)
-    return _rotate_about(pose, axis, best_rad[order])
-
-
-def _rotate_about(pose: Rigid, axis: Axis, angles_rad: Float64[Tensor, " a"]) -> Rigid:
-    """Rotate the model at a pose about one of its axes by each angle."""
-    turns = turn_about(axis.direction.double(), axis.point_m.double(), angles_rad)
-    return pose.double()[None] @ turns
-
-
-def _score_sweep(
-    poses: Rigid, model: ObjectModel, view: ViewInput, samples: int
-) -> Float64[Tensor, " b"]:
-    """Score poses by how much of the colours they explain, fast enough for sweeps of many poses.
-
-    As :attr:`ColorAgreement.log_likelihood`, but with every visible point counted as independent.
-    """
-    assert model.colors is not None
-    assert view.color is not None
-    surface = _take_samples(model.colors, samples)
-    image = _blur_image(view.color, poses, surface)
-    scores: list[Tensor] = []
-    at_once = max(1, _POINTS_AT_ONCE // len(surface.points_m))
-    for first in range(0, len(poses.R), at_once):
-        chunk = poses[first : first + at_once]
-        compared = _compare_features(chunk, surface, view, image, _NEAR * model.diameter_m)
-        explained = _correlate(compared).clamp(0, _MOST_CORRELATION).square()
-        scores.append((-compared.weight.sum(1) * torch.log1p(-explained)).sum(-1))
-    return torch.cat(scores)
-
-
-_SAME_RAD = math.radians(3)  # angle up to which two proposed copies are the same
-_MOST_COPIES = 8  # largest number of copies that are proposed beside a pose
-_SAME_TURN_RAD = math.radians(10)  # angle up to which two rotations that are tried are the same
-_MANY_TURNS = 6  # rotations about one line that make a shape nearly a body of revolution
-_PARALLEL_COSINE = math.cos(math.radians(8))  # least cosine of two directions that are the same
-_SETTLE_STEP_RAD = math.radians(2)  # step of the small sweep about a pose
-_SETTLE_STEPS = 10  # steps of it to each side
-
-
-def color_copies(
-    pose: Rigid,
-    model: ObjectModel,
-    view: ViewInput,
-    *,
-    turns: Rigid | None = None,
-    most: int = _MOST_COPIES,
-) -> Rigid:
-    """Propose poses that depth cannot tell from a given one, but colour may: its copies.
-
-    They are symmetric copies that were found in the shape, near-symmetric ones, and half turns
-    about the principal axes. Each is rotated about axes of revolution, or nearly so, to where its
-    print agrees. Declared symmetries make no copies: they count as one answer. Refine a copy by
-    depth, and settle it (:func:`settle_spin`), before its evidence is compared.
-
-    Args:
-        pose: ``camera_from_model``, one.
-        model: the object.
-        view: depth and colour.
-        turns: motions of the model to try in place of those found in its shape.
-        most: largest number of poses beside ``pose``.
-
-    Returns:
-        A batch of poses, ``pose`` itself the first, then the others, those that agree best before.
-    """
-    pose = pose.double()
-    if model.colors is None or view.color is None:
-        return pose[None]
-
-    # The motions that may be, and axes to sweep about.
-    of_shape, axes = _find_ambiguous_motions(model)
-    motions = of_shape if turns is None else [turns.double()[k] for k in range(len(turns.R))]
-
-    # Of motions that differ by a rotation about an axis one is tried: it is swept about the axis.
-    distinct = [Rigid(torch.eye(3).double(), torch.zeros(3).double())]
-    for motion in motions:
-        is_swept = any(
-            _differ_by_rotation_about(axis, motion, other) for axis in axes for other in distinct
-        )
-        apart_rad = [float(geodesic_rad(motion.R, other.R)) for other in distinct]
-        if not is_swept and min(apart_rad) > _SAME_TURN_RAD:
-            distinct.append(motion)
-
-    # Each of them, rotated about the axes to where its print agrees.
-    proposed: list[Rigid] = []
-    for motion in distinct:
-        copy = pose @ motion
-        swept = [copies_about_axis(copy, axis, model, view) for axis in axes]
-        proposed += swept or [copy[None]]
-
-    # The best that are distinct.
-    copies = Rigid.cat(proposed)
-    order = _score_sweep(copies, model, view, _SAMPLES).argsort(descending=True, stable=True)
-    best = [pose[None]]
-    for k in order.tolist():
-        better = Rigid.cat(best)
-        apart_rad = geodesic_rad(copies.R[k].expand_as(better.R), better.R)
-        if float(apart_rad.min()) > _SAME_RAD and len(best) <= most:
-            best.append(copies[k][None])
-    return Rigid.cat(best)
-
-
-def settle_spin(pose: Rigid, model: ObjectModel, view: ViewInput) -> Rigid:
-    """Rotate a pose a little about axes that depth does not fix, to where its print agrees best.
-
-    Refinement by depth lets a pose drift about an axis of revolution.
-
-    Args:
-        pose: ``camera_from_model``, one; within 20 degrees of where it belongs.
-        model: the object.
-        view: depth and colour.
-
-    Returns:
-        The rotated pose; the same one where colour says nothing or the shape has no such axis.
-    """
-    pose = pose.double()
-    if model.colors is None or view.color is None:
-        return pose
-    steps = torch.arange(-_SETTLE_STEPS, _SETTLE_STEPS + 1).double()
-    offsets_rad = steps * _SETTLE_STEP_RAD
-    _, axes = _find_ambiguous_motions(model)
-    for axis in axes:
-        scores = _score_sweep(_rotate_about(pose, axis, offsets_rad), model, view, _SWEEP_SAMPLES)
-        best = int(scores.argmax().clamp(1, len(offsets_rad) - 2))
-        if float(scores[best]) > 0:
-            peak = _find_parabola_peak(scores[best - 1 : best + 2])
-            pose = _rotate_about(pose, axis, offsets_rad[best, None] + peak * _SETTLE_STEP_RAD)[0]
-    return pose
-
-
-def _find_parabola_peak(values: Float64[Tensor, "*b 3"]) -> Float64[Tensor, "*b"]:
-    """Find the peak of the parabola through three values, -1 to 1 from the middle one."""
-    before, middle, after = values.unbind(-1)
-    bend = (before - 2 * middle + after).clamp(max=-1e-9)
-    return ((before - after) / (2 * bend)).clamp(-1, 1)
-
-
-@lru_cache(maxsize=64)
-def _find_ambiguous_motions(model: ObjectModel) -> tuple[list[Rigid], list[Axis]]:
-    """Find the motions of a model after which depth looks alike or nearly, and its free axes.
-
-    Declared symmetries are not among them.
-    """
-    assert model.colors is not None
-    # Those of the shape: near-symmetries, and symmetries that were found.
-    turns = [near.model_from_model.double() for near in near_symmetries(model)]
-    axes: list[Axis] = []
-    if model.symmetries.is_found:
-        discrete = model.symmetries.discrete
-        if discrete is not None:
-            turns += [discrete.double()[k] for k in range(len(discrete.R))]
-        axes += model.symmetries.continuous
-    axes += _find_axes_of_many_turns(turns, axes)
-
-    # A box whose halves differ a little looks alike after half turns about its middle.
-    points_m = model.colors.points_m.double()
-    centred_m = points_m - points_m.mean(0)
-    principal = torch.linalg.eigh(centred_m.T.cov()).eigenvectors.T
-    along_m = points_m @ principal.T
-    middle_m = (along_m.amin(0) + along_m.amax(0)) / 2 @ principal
-    half = torch.tensor(math.pi, dtype=torch.float64)
-    turns += [turn_about(direction, middle_m, half) for direction in principal]
-    return turns, axes
-
-
-def _find_axes_of_many_turns(turns: Sequence[Rigid], others: Sequence[Axis]) -> list[Axis]:
-    """Find the lines about which many of the turns are, without those parallel to other axes."""
-    # The direction of each axis is the one that the rotation leaves as it is.
-    eye = torch.eye(3).double()
-    directions = [torch.linalg.svd(turn.R - eye).Vh[-1] for turn in turns]
-    axes: list[Axis] = []
-    for direction in directions:
-        earlier = [*others, *axes]
-        has_axis = any(_are_parallel(direction, axis.direction.double()) for axis in earlier)
-        alike = [k for k, other in enumerate(directions) if _are_parallel(other, direction)]
-        if has_axis or len(alike) < _MANY_TURNS:
-            continue
-
-        # A point that each turn leaves where it is.
-        points = [torch.linalg.pinv(eye - turns[k].R, rtol=1e-3) @ turns[k].t_m for k in alike]
-        point_m = torch.stack(points).median(0).values
-        axes.append(Axis(direction=direction, point_m=point_m))
-    return axes
-
-
-def _are_parallel(first: Float64[Tensor, "3"], second: Float64[Tensor, "3"]) -> bool:
-    """Whether two unit vectors are of the same line, within 8 degrees."""
-    return abs(float(first @ second)) > _PARALLEL_COSINE
-
-
-def _differ_by_rotation_about(axis: Axis, first: Rigid, second: Rigid) -> bool:
-    """Whether two motions differ by a rotation about an axis: both carry it to one direction."""
-    direction = axis.direction.double()
-    return float((first.R @ direction) @ (second.R @ direction)) > _PARALLEL_COSINE

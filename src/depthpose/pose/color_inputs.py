@@ -1,4 +1,4 @@
-"""Files, arrays or pictures to the colour image of a view."""
+"""Conversion of files, arrays or pictures to the colour image of a view."""
 
 import warnings
 from collections.abc import Sequence
@@ -16,28 +16,30 @@ from depthpose.pose.inputs import AnyArray, rigid_input
 from depthpose.pose.types import ColorImage, ObjectModel, ViewInput
 
 
-def with_color(
+def add_color(
     view: ViewInput,
     models: Sequence[ObjectModel],
     color: AnyPicture | None,
     camera: AnyLens | None = None,
     color_from_depth: Rigid | AnyArray | None = None,
 ) -> ViewInput:
-    """Give a view its colour image; without one, the view as it is.
+    """Return a view with its colour image.
 
-    A notice names the models whose files have no colours: of these depth alone decides.
+    A notice names the models whose files have no colours: depth alone decides about these.
 
     Args:
         view: the whole depth image, not a window.
-        models: those that are looked for.
-        color: a file, a picture of Pillow's, an array or a tensor; RGB or grey.
-        camera: of the colour image; None: it is of the depth camera's frame, pixel by pixel.
-        color_from_depth: where the depth camera is in the colour camera's frame, or the 4x4 matrix
-            in metres; None: both are at one place.
+        models: the objects that may be in it.
+        color: a file, a picture of Pillow's, an array or a tensor; RGB or grey. None: the view is
+            returned unchanged.
+        camera: of the colour image; None: the image is aligned to the depth image, pixel by pixel.
+        color_from_depth: transform from the depth camera's frame to the colour camera's, or its
+            4x4 matrix in metres; None: both frames are one.
 
     Raises:
-        InputError: the image is none, or of another size than its camera or, without one, than the
-            depth image; a camera or transform is given without an image; a transform is none.
+        InputError: the image cannot be read, or is of another size than its camera or, without one,
+            than the depth image; a camera or transform is given without an image; the transform is
+            not rigid.
     """
     if color is None:
         if camera is not None or color_from_depth is not None:
@@ -64,11 +66,11 @@ def color_input(
     camera: AnyLens | None = None,
     color_from_depth: Rigid | AnyArray | None = None,
 ) -> ColorImage:
-    """Take the colour image of a view: of its own camera, or else aligned to the depth image.
+    """Convert a picture to the colour image of a view.
 
-    With a camera of its own it may be of any size and place. Without one it has the pixels and the
+    With a camera of its own it may have any size and place. Without one it has the size and the
     intrinsic matrix of the depth image, and no transform. Arguments and errors are those of
-    :func:`with_color`.
+    :func:`add_color`.
     """
     rgb = rgb_from_picture(color, f"{view.name}: the colour image")
     height, width = rgb.shape[1:]
@@ -87,12 +89,12 @@ def color_input(
             f"{view.name}: color_from_depth is given, so the colour image is of another "
             "camera; give that too: color_camera= (--color-camera)"
         )
-    rows, columns = view.depth_m.shape
-    if (height, width) != (rows, columns):
+    depth_height, depth_width = view.depth_m.shape
+    if (height, width) != (depth_height, depth_width):
         raise InputError(
             f"{view.name}: the colour image is {width}x{height} and the depth image "
-            f"{columns}x{rows}; give the image aligned to the depth, or the colour camera: "
-            "color_camera= (--color-camera)"
+            f"{depth_width}x{depth_height}; give the image aligned to the depth, or the colour "
+            "camera: color_camera= (--color-camera)"
         )
     return ColorImage(rgb=rgb, K=view.K)
 
@@ -100,7 +102,11 @@ def color_input(
 def _read_color_intrinsics(
     camera: AnyLens, width: int, height: int, view: ViewInput
 ) -> Float[Tensor, "3 3"]:
-    """Read the intrinsic matrix of a colour camera; raise if its images are of another size."""
+    """Read the intrinsic matrix of the camera of a ``width`` x ``height`` colour image.
+
+    Raises:
+        InputError: the camera is of images of another size.
+    """
     lens = camera if isinstance(camera, Camera) else camera_of(camera, (width, height))
     assert lens is not None
     check_image_matches_camera(lens, width, height, f"{view.name}: the colour image")

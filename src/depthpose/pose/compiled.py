@@ -1,4 +1,4 @@
-"""Loops that numba compiles when they are first called: :func:`compiled`.
+"""The decorator of loops that numba compiles, :func:`compiled`, and vectors for such loops.
 
 Clouds have hundreds of points, for which most of the time of an operation of NumPy or torch is
 that of its call. A compiled loop has no such calls.
@@ -21,18 +21,18 @@ Result = TypeVar("Result")
 def compiled(loop: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
     """Decorate a function of numbers and arrays: numba compiles it when it is first called.
 
-    It may call other compiled functions. Arrays are in the processor's memory, contiguous, and
-    not checked: an index beyond the end reads what lies there. What was compiled is kept on disk
-    until the file of a function, or of one that it calls, changes. Importing imports no numba.
+    It may call other compiled functions. Arrays must be contiguous, on the CPU, and an index is not
+    checked: one beyond the end reads what lies there. What was compiled is kept on disk until the
+    file of the function, or of one that it calls, changes. To decorate imports no numba.
     """
     return cast(Callable[Arguments, Result], _Compiled(loop))
 
 
 class _Compiled:
-    """A function that numba compiles, imported when first needed."""
+    """A function that numba compiles at the first call; only then numba is imported."""
 
     def __init__(self, loop: Callable[..., Any]) -> None:
-        # Tests check annotations by wrapping every function: numba takes what is inside.
+        # Where annotations are checked every function is wrapped: numba takes what is inside.
         self.loop = inspect.unwrap(loop)
         self.__doc__ = loop.__doc__
 
@@ -41,16 +41,16 @@ class _Compiled:
 
     @property
     def _numba_type_(self) -> Any:  # noqa: ANN401  of numba
-        """The type by which numba knows this function where another loop calls it."""
+        """The type of this function, which numba asks for where another loop calls it."""
         return self._dispatcher._numba_type_
 
     @cached_property
     def _dispatcher(self) -> Any:  # noqa: ANN401  of numba
-        """The function of numba, which compiles the loop for each set of types."""
+        """Numba's function, which compiles the loop for each set of argument types."""
         from numba import njit
 
-        # numba keeps compiled code by a function's name and until its file changes; the functions
-        # that it calls are in the code too, so the name says of which files they are.
+        # numba keeps compiled code by a function's name until its own file changes. The code holds
+        # the functions that it calls too, so a hash of their files is added to the name.
         digest = sha256()
         for file in sorted(_find_source_files(self.loop)):
             digest.update(Path(file).read_bytes())
@@ -92,29 +92,29 @@ Vector = tuple[float, float, float]
 
 @compiled
 def vector(array: np.ndarray, i: int | np.int64) -> Vector:
-    """Give row ``i`` of an array (n, 3)."""
+    """Take row ``i`` of an array (n, 3) as a vector."""
     return array[i, 0], array[i, 1], array[i, 2]
 
 
 @compiled
 def minus(a: Vector, b: Vector) -> Vector:
-    """Subtract a vector from another one."""
+    """Compute ``a - b``."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
 @compiled
 def dot(a: Vector, b: Vector) -> float:
-    """Give the inner product of two vectors."""
+    """Compute the inner product ``a . b``."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @compiled
 def cross(a: Vector, b: Vector) -> Vector:
-    """Give the cross product of two vectors."""
+    """Compute the cross product ``a x b``."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @compiled
 def rotate(R: np.ndarray, a: Vector) -> Vector:
-    """Rotate a vector: give ``R a``."""
+    """Rotate a vector: compute ``R a`` of a rotation matrix (3, 3)."""
     return dot(vector(R, 0), a), dot(vector(R, 1), a), dot(vector(R, 2), a)

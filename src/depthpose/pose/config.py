@@ -6,8 +6,8 @@ from typing import Annotated, ClassVar, Literal, get_args
 from depthpose.core.config import ASCENDING, Seed, Settings
 from depthpose.core.errors import InputError
 
-VotingMethod = Literal["least squares", "ransac"]
-InlierTest = Literal["angle", "distance"]
+VotingMethod = Literal["least squares", "ransac"]  #: see ``VotingConfig.method``
+InlierTest = Literal["angle", "distance"]  #: see ``VotingConfig.inlier_test``
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,7 +18,7 @@ class MeshConfig(Settings):
     """Farthest points of the surface that the network's directions point at (4 to 20 usual)."""
 
 
-SHAPE_FEATURES = 9  #: numbers that the network gets of each voxel with its shape; else it is one
+SHAPE_FEATURES = 9  #: features of a voxel for the network with its shape; without, the number 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +78,7 @@ class VotingConfig(Settings):
     refinements: Annotated[int, "[0, inf)"] = 3
     """Steps from the point nearest to the lines to the most likely one under errors of angle.
     Noisy lines draw the nearest point toward the cloud: a direction that errs by an angle misses a
-    far keypoint by more than a near one. 0: the published, biased answer."""
+    far keypoint by more than a near one. 0: the published, biased estimate."""
 
     max_condition: Annotated[float, "(1, inf)"] = 1000.0
     """A keypoint whose normal matrix is worse conditioned does not count as found."""
@@ -87,7 +87,7 @@ class VotingConfig(Settings):
     """Distances between keypoints may differ from the model's by this share of its diameter."""
 
     seed: Seed = 0
-    """Of the pairs: the same input gives the same answer."""
+    """Of the random pairs: with the same seed an input has the same pose on every run."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,7 +102,7 @@ class IcpConfig(Settings):
 
     end_distance_diameters: float = 0.05
     """The same in the last: the limit shrinks from step to step. Below the sensor's noise the
-    answer grows worse (0.02 on a Kinect's cat: 2.7 % of the diameter, 0.05: 1.7 %)."""
+    pose grows worse (0.02 on a Kinect's cat: 2.7 % of the diameter, 0.05: 1.7 %)."""
 
     cloud_points: Annotated[int, "[100, inf)"] = 500
     """At most so many points of the cloud, evenly taken: more are slower and no more exact."""
@@ -157,7 +157,7 @@ class EstimateConfig(Settings):
     """How ICP refines the voted pose."""
 
     with_icp: bool = True
-    """Whether it does; without, the voted pose is the answer."""
+    """Whether it does; without, the voted pose is returned."""
 
     min_certainty: Annotated[float, "[0, 1]"] = 0.9
     """Below this certainty the status is ``ambiguous``, not ``ok``; pose and alternatives are given
@@ -201,8 +201,8 @@ class EstimateConfig(Settings):
             )
 
 
-DiameterTable = Literal["bop", "pvnet"]
-SymmetryRule = Literal["declared", "all"]
+DiameterTable = Literal["bop", "pvnet"]  #: see ``EvaluationConfig.diameters``
+SymmetryRule = Literal["declared", "all"]  #: see ``EvaluationConfig.adds``
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -226,9 +226,9 @@ class EvaluationConfig(Settings):
 
 SensorKind = Literal["structured light", "active stereo", "time of flight", "laser", "none"]
 """What measures depth, and so what its errors look like."""
-_LINEMOD_PX = (640, 480)
-_LINEMOD_CENTRE_PX = (325.2611, 242.04899)
-OCCLUSIONS = "[0, 0.95]"  #: share of a silhouette that something may occlude
+_LINEMOD_PX = (640, 480)  # size of the images of LineMOD's Kinect
+_LINEMOD_CENTRE_PX = (325.2611, 242.04899)  # principal point of LineMOD's Kinect
+OCCLUSIONS = "[0, 0.95]"  #: limits of the share of a silhouette that something occludes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -329,7 +329,7 @@ class ObjectsConfig(Settings):
         super().__post_init__()
         width, height = self.image_px
         default = ((width - 1) / 2, (height - 1) / 2)
-        if self.image_px == _LINEMOD_PX:  # of LineMOD's size, so its Kinect is meant
+        if self.image_px == _LINEMOD_PX:
             default = _LINEMOD_CENTRE_PX
         x, y = default if self.centre_px is None else self.centre_px
         object.__setattr__(self, "centre_px", (x, y))

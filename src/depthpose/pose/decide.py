@@ -12,7 +12,7 @@ from torch import Tensor
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import ObjectCloud
 from depthpose.pose.config import EstimateConfig, RefusalConfig
-from depthpose.pose.copies import PreparedObject, difference_of
+from depthpose.pose.copies import PreparedObject, describe_difference
 from depthpose.pose.evidence import Observation
 from depthpose.pose.hypotheses import Competition
 from depthpose.pose.identity import identify
@@ -168,7 +168,7 @@ def _alternatives(
         Alternative(
             camera_from_model=hypothesis.pose.float(),
             probability=probability * share,
-            difference=difference_of(hypothesis.pose, competition.best.pose, prepared.copies),
+            difference=describe_difference(hypothesis.pose, competition.best.pose, prepared.copies),
             is_copy=is_copy,
         )
         for hypothesis, share, is_copy in competitors

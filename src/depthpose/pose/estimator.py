@@ -15,8 +15,8 @@ from depthpose.core.errors import InputError, describe_full_memory, suggest_name
 from depthpose.core.files import AnyPicture
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
-from depthpose.pose.background import AnyBackground, with_background
-from depthpose.pose.color_inputs import with_color
+from depthpose.pose.background import AnyBackground, add_background
+from depthpose.pose.color_inputs import add_color
 from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.copies import PreparedObject
 from depthpose.pose.datasets.detections import Box, mask_from_box
@@ -222,9 +222,9 @@ class PoseEstimator:
             if box is not None:
                 pixels = mask_from_box(box, *pose_input.depth_m.shape)
                 pose_input = replace(pose_input, mask=pixels, is_region=True)
-            pose_input = with_background(pose_input, background, lens, unit)
+            pose_input = add_background(pose_input, background, lens, unit)
             models = self.models if object is None else [self._find_object(object).model]
-            pose_input = with_color(pose_input, models, color, color_camera, color_from_depth)
+            pose_input = add_color(pose_input, models, color, color_camera, color_from_depth)
 
         # Of one object, or of whichever fits best.
         if object is not None or len(self.models) == 1:
@@ -306,7 +306,7 @@ class PoseEstimator:
         if not names:
             raise InputError("find: objects names none; give those that may be there, or omit it")
         view = view_input(depth, None, camera, names[0], _NAME, unit)
-        view = with_background(view, background, camera, unit)
+        view = add_background(view, background, camera, unit)
         return [estimate for estimate in self.find_in(view, names) if estimate.is_posed]
 
     @torch.no_grad()

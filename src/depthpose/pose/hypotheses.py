@@ -11,7 +11,8 @@ from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid
-from depthpose.pose.color import color_agreement, color_copies, settle_spin
+from depthpose.pose.color import measure_color_agreement
+from depthpose.pose.color_copies import align_print, propose_color_copies
 from depthpose.pose.config import EstimateConfig
 from depthpose.pose.copies import PreparedObject
 from depthpose.pose.evidence import Observation, compare
@@ -249,7 +250,7 @@ def _refine_distinct_copies(
     winner_pose = winner.camera_from_model.double()
     starts = winner_pose @ prepared.copies.near_copies
     if view is not None:  # colours show finer rotations about an axis than shape does
-        starts = Rigid.cat([color_copies(winner_pose, prepared.model, view), starts])
+        starts = Rigid.cat([propose_color_copies(winner_pose, prepared.model, view), starts])
     competitors = _refine_competitors(
         cloud_m, winner, starts, prepared.surface, config, _MOST_COPIES
     )
@@ -261,7 +262,7 @@ def _refine_distinct_copies(
         refined, start = competitor
         if view is not None:
             # Depth lets a copy drift about an axis of its shape, where its print fixes the angle.
-            settled = settle_spin(refined.camera_from_model, prepared.model, view)
+            settled = align_print(refined.camera_from_model, prepared.model, view)
             refined = replace(refined, camera_from_model=settled)
         # Where little observed fixes a copy, refinement lets it drift toward others: both compete.
         has_drifted = not is_same(refined.camera_from_model, start.camera_from_model[None]).any()
@@ -285,8 +286,8 @@ def _with_color_of_best_copy(
     distinct: list[Hypothesis] = []
     best_copies: list[Rigid] = []
     for hypothesis in hypotheses:
-        colored = color_copies(hypothesis.pose, prepared.model, view, turns=symmetries)
-        likelihood = color_agreement(colored, prepared.model, view).log_likelihood
+        colored = propose_color_copies(hypothesis.pose, prepared.model, view, motions=symmetries)
+        likelihood = measure_color_agreement(colored, prepared.model, view).log_likelihood
         best = colored[int(likelihood.argmax())]
         if best_copies and copies.is_same(best, Rigid.stack(best_copies), copies.symmetries).any():
             continue
@@ -304,7 +305,7 @@ class _Competitor(NamedTuple):
 
 def _log_color(pose: Rigid, prepared: PreparedObject, view: ViewInput) -> float:
     """Log likelihood of a view's colour image at a pose; 0 where it or the model has none."""
-    return float(color_agreement(pose[None], prepared.model, view).log_likelihood[0])
+    return float(measure_color_agreement(pose[None], prepared.model, view).log_likelihood[0])
 
 
 def _refine_competitors(

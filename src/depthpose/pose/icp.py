@@ -292,7 +292,7 @@ def refine_roughly(
     Args:
         points_m: of the object, in the camera frame.
         starts: poses in float64, ``camera_from_model``.
-        surface: of the model; its table is :class:`~depthpose.pose.surface.Boxes`.
+        surface: of the model; its table is :class:`~depthpose.pose.surface.NearestTable`.
         config: ``end_distance_diameters`` is used.
     """
     end_m = config.end_distance_diameters * surface.diameter_m

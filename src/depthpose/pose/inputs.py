@@ -34,8 +34,9 @@ from depthpose.pose.types import CloudInput, ViewInput
 AnyArray = str | Path | np.ndarray | Tensor  #: a file, an array or a tensor
 AnyCloud = AnyArray | object  #: a cloud as rows of points, its file, or one of trimesh or Open3D
 AnyMask = AnyArray | Mapping[str, Any]  #: a mask, its file, or COCO's run lengths
-_SMALLEST_INSTANCE = 0.2
-"""Pieces of a mask below this share of the largest are fragments of a segmentation, not objects."""
+_LEAST_INSTANCE_SHARE = 0.2
+"""Least size of a piece of a mask that is an object, as a share of the largest piece; smaller ones
+are fragments of a segmentation."""
 
 
 def cloud_input(cloud: AnyCloud, unit: Unit, object: str, name: str) -> CloudInput:
@@ -45,13 +46,15 @@ def cloud_input(cloud: AnyCloud, unit: Unit, object: str, name: str) -> CloudInp
         cloud: points, a file, or a cloud of trimesh or Open3D.
         unit: of the points.
         object: name of the object that they are of.
-        name: what results and errors call the cloud.
+        name: of the cloud, in results and errors.
+
+    Raises:
+        InputError: the file cannot be read, or holds no rows of x, y and z.
     """
     if is_shape(cloud):
         cloud, _ = shape_geometry(cloud)
-    points = (
-        read_cloud(cloud).points if isinstance(cloud, str | Path) else _convert_to_tensor(cloud)
-    )
+    is_file = isinstance(cloud, str | Path)
+    points = read_cloud(cloud).points if is_file else _convert_to_tensor(cloud)
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(
             f"{name}: the cloud is of shape {tuple(points.shape)}; give points as rows of x, y and "
@@ -64,18 +67,24 @@ def cloud_input(cloud: AnyCloud, unit: Unit, object: str, name: str) -> CloudInp
 def depth_input(
     depth: AnyArray, camera: AnyLens | None, name: str, unit: Unit | None = None
 ) -> tuple[Float[Tensor, "h w"], AnyLens | None]:
-    """Convert a depth image to metres, NaN where there is no reading; give it, and its camera.
+    """Convert a depth image to metres, NaN where there is no reading, and read its camera.
 
     Args:
         depth: whole numbers in ``unit`` or the unit of the camera; or floats, in ``unit`` if it is
             given and else in metres.
-        camera: of the image; a file or description of a camera is read.
-        name: what errors call the image, where it is no file.
+        camera: of the image, or a file or description of one; None: it is not known.
+        name: of the image in errors, where it is no file.
         unit: of the depth. Whole numbers need it where the camera has no unit.
+
+    Returns:
+        The depth; and the camera, None where it is not known.
+
+    Raises:
+        InputError: a file cannot be read, the depth is no image, or its unit is not known or is
+            another one than that of its camera.
     """
-    values = (
-        read_stored_depth(depth) if isinstance(depth, str | Path) else _convert_to_tensor(depth)
-    )
+    is_file = isinstance(depth, str | Path)
+    values = read_stored_depth(depth) if is_file else _convert_to_tensor(depth)
     if values.ndim != 2:
         raise InputError(f"{name}: the depth is of shape {tuple(values.shape)}, not (h, w)")
     height, width = values.shape
@@ -86,16 +95,16 @@ def depth_input(
     camera_unit_m = lens.depth_unit_m if isinstance(lens, Camera) else None
     unit_m = None if unit is None else metres_of(unit)
     if not values.is_floating_point():
-        file = str(depth) if isinstance(depth, str | Path) else name
+        label = str(depth) if is_file else name
         if unit_m is not None and camera_unit_m is not None and unit_m != camera_unit_m:
             raise InputError(
-                f"{file}: unit {unit} is {unit_m:g} m, but its camera says depth_unit_m "
+                f"{label}: unit {unit} is {unit_m:g} m, but its camera says depth_unit_m "
                 f"{camera_unit_m:g}; omit one of the two (the unit of a CAD file is --cad-unit)"
             )
         unit_m = camera_unit_m if unit_m is None else unit_m
         if unit_m is None:
             raise InputError(
-                f"{file}: its depth is in whole numbers, and nothing says of what; give a camera "
+                f"{label}: its depth is in whole numbers, and nothing says of what; give a camera "
                 'with "depth_unit_m" (0.001 where they are millimetres, 0.0002 of TUM RGB-D, '
                 "0.00390625 of KITTI), --unit mm (in Python unit='mm'), or floats, which "
                 "are metres unless a unit is given"
@@ -120,8 +129,12 @@ def view_input(
         mask: the object's pixels; None: all pixels.
         camera: of the depth image.
         object: name of the object.
-        name: what results and errors call the view.
+        name: of the view, in results and errors.
         unit: of the depth, where its camera says none.
+
+    Raises:
+        InputError: a file cannot be read, the unit of the depth is not known, or mask, camera and
+            depth image differ in size.
     """
     depth_m, lens = depth_input(depth, camera, name, unit)
     height, width = depth_m.shape
@@ -157,7 +170,16 @@ def view_input(
 def rigid_input(
     pose: Rigid | AnyArray, name: str = "first", what: str = "camera_from_model"
 ) -> Rigid:
-    """Convert a transform, or its 4x4 matrix in metres; ``name`` and ``what`` name it in errors."""
+    """Convert a rigid transform, or its 4x4 matrix in metres.
+
+    Args:
+        pose: the transform.
+        name: of it in errors.
+        what: it is, in errors, as ``target_from_source``.
+
+    Raises:
+        InputError: the matrix is no rigid transform.
+    """
     if isinstance(pose, Rigid):
         return pose
     matrix = torch.zeros(0) if isinstance(pose, str | Path) else _convert_to_tensor(pose).double()
@@ -178,28 +200,34 @@ def rigid_input(
 
 
 def split_instances(labels: Int64[Tensor, "h w"]) -> list[Bool[Tensor, "h w"]]:
-    """Split labels into one mask for each object, the largest first.
+    """Split labels of the pixels of an image into one mask for each object, the largest first.
 
-    Objects are the labels where there are several. Else they are the connected pieces, by corners
-    too; those below a fifth of the largest are fragments, and left out.
+    Where there are several labels besides 0, each is an object. Else each connected piece is one,
+    where pixels that touch at a corner are connected; pieces below a fifth of the largest are
+    fragments, and left out.
     """
-    # One mask a number, where there are several.
+    # One mask for each label, where there are several.
     numbers, pixels = labels[labels != 0].unique(return_counts=True)
     if len(numbers) > 1:
         order = pixels.argsort(descending=True, stable=True)
         return [labels == number for number in numbers[order]]
 
-    # Else one a connected piece.
+    # Else one for each connected piece.
     label, pixels = label_parts(labels != 0)
     order = pixels.argsort(descending=True, stable=True)
-    least = max(1, math.ceil(_SMALLEST_INSTANCE * int(pixels.max())))
-    return [label == k for k in order if int(pixels[k]) >= least]
+    least_px = max(1, math.ceil(_LEAST_INSTANCE_SHARE * int(pixels.max())))
+    return [label == k for k in order if int(pixels[k]) >= least_px]
 
 
 def labels_input(mask: AnyMask, name: str) -> Int64[Tensor, "_ _"]:
-    """Convert a mask to labels of its objects, as :func:`read_labels` gives them.
+    """Convert a mask to labels: 0 beside the objects, else the number of an object.
 
-    Fractions in [0, 1] are probabilities: those above a half are the object.
+    Files are read by :func:`read_labels`. Fractions in [0, 1] are probabilities: those above a half
+    are the object.
+
+    Raises:
+        InputError: a file cannot be read, or the mask holds other fractions or NaN; ``name`` is
+            that of the mask in errors.
     """
     if isinstance(mask, str | Path):
         return read_labels(Path(mask))
@@ -218,9 +246,13 @@ def labels_input(mask: AnyMask, name: str) -> Int64[Tensor, "_ _"]:
 
 
 def _convert_to_tensor(values: Any) -> Tensor:  # noqa: ANN401  whatever a caller has
-    """Convert numbers of any library to a tensor on the CPU, of a type that torch computes with."""
+    """Convert numbers of any library to a tensor on the CPU, of a type that torch computes with.
+
+    Raises:
+        InputError: they are not real numbers.
+    """
     if isinstance(values, Tensor) and not values.is_complex():
-        # Of unsigned numbers torch supports few operations, but for bytes.
+        # torch has few operations for unsigned numbers of more than a byte.
         is_unsigned = values.dtype in (torch.uint16, torch.uint32, torch.uint64)
         return (values.long() if is_unsigned else values).detach().cpu()
     array = np.asarray(values)

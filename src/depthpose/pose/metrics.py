@@ -21,7 +21,7 @@ BOP_PIXELS = tuple(5.0 * i for i in range(1, 11))  #: BOP's, of MSPD [px], at 64
 
 SUCCESS_SHARE = 0.1  #: of the diameter: a pose is right whose ADD or ADD-S is below
 
-_CHUNK = 2**22  # coordinates of posed points in memory at a time
+_MOST_COORDINATES = 2**22  # of posed points in memory at a time
 
 RenderDepth = Callable[[Rigid], Float[Tensor, "h w"]]
 """Renders the depth [m] of an object at a pose; NaN, 0 or infinity where it is not."""
@@ -43,18 +43,21 @@ def adds_m(
     """
     true_m = _pose_points(true, points_m)
     estimated_m = _pose_points(estimated, points_m)
+    batch = true_m.shape[:-2]
+    pose_by_pose = (-1, len(points_m), 3)
     means_m: list[float] = []
-    rows = -1, *true_m.shape[-2:]
-    for of_truth, of_estimate in zip(true_m.reshape(rows), estimated_m.reshape(rows), strict=True):
-        distance_m, _ = KDTree(of_estimate.numpy()).query(of_truth.numpy())
+    for true_points_m, estimated_points_m in zip(
+        true_m.reshape(pose_by_pose), estimated_m.reshape(pose_by_pose), strict=True
+    ):
+        distance_m, _ = KDTree(estimated_points_m.numpy()).query(true_points_m.numpy())
         means_m.append(float(distance_m.mean()))
-    return torch.tensor(means_m, dtype=torch.float64).reshape(true_m.shape[:-2])
+    return torch.tensor(means_m, dtype=torch.float64).reshape(batch)
 
 
 def add_of_nearest_m(
     estimated: Rigid, true: Rigid, points_m: Float[Tensor, "n 3"], symmetries: Rigid
 ) -> Float[Tensor, ""]:
-    """Measure ADD [m] to the nearest symmetric copy of the true pose.
+    """Measure ADD [m] of a pose to the nearest symmetric copy of the true pose.
 
     ADD-S is lower: it forgives any pose with the surface near the true one, such as a U rotated by
     90 degrees, and not only symmetries.
@@ -77,9 +80,10 @@ def add_of_nearest_m(
 def mssd_m(
     estimated: Rigid, true: Rigid, points_m: Float[Tensor, "n 3"], symmetries: Rigid
 ) -> Float[Tensor, ""]:
-    """Measure MSSD [m]: the largest distance of a surface point to the nearest symmetric truth.
+    """Measure MSSD [m]: the largest distance of a model point from itself at the true pose.
 
-    The arguments are those of :func:`add_of_nearest_m`.
+    The true pose is the symmetric copy for which it is least. The arguments are those of
+    :func:`add_of_nearest_m`.
     """
     estimated_m = _pose_points(estimated, points_m)
     errors_m = [
@@ -96,10 +100,12 @@ def mspd_px(
     symmetries: Rigid,
     K: Float[Tensor, "3 3"],
 ) -> Float[Tensor, ""]:
-    """Measure MSPD [px]: the largest distance of a projected point to the nearest symmetric truth.
+    """Measure MSPD [px]: the largest distance of a projected point from itself at the true pose.
 
-    Infinite where a point lies behind the camera. BOP scales it by 640 / image width before its
-    thresholds; see :func:`average_recall`.
+    The true pose is the symmetric copy for which it is least. Infinite where a point lies behind
+    the camera. BOP scales it by 640 / image width before its thresholds; see
+    :func:`average_recall`. The arguments are those of :func:`add_of_nearest_m`, and ``K`` is the
+    intrinsic matrix.
     """
     pixels = project(_pose_points(estimated, points_m), K)
     errors_px: list[Tensor] = []
@@ -134,22 +140,15 @@ def vsd(
             ``lambda pose: rasterize(pose.apply(corners), K, width, height).depth_m``.
         taus_m: tolerances; BOP's are ``BOP_SHARES`` times the diameter.
         delta_m: tolerance of visibility.
-    """
-    # Distance from the centre of a point at depth 1, by pixel.
-    height, width = depth_m.shape
-    pixels = pixel_grid(height, width, torch.float64)
-    y = (pixels[..., 1] - K[1, 2]) / K[1, 1]
-    x = (pixels[..., 0] - K[0, 2] - K[0, 1] * y) / K[0, 0]
-    rays = (x * x + y * y + 1).sqrt()
 
-    def measure_distance(image_m: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-        """Give distances from the centre [m], 0 for none."""
-        return image_m.double().nan_to_num(nan=0.0, posinf=0.0) * rays
+    Returns:
+        The share for each tau, 0..1.
+    """
+    measured_m = _distance_from_depth(depth_m, K)
+    estimated_m = _distance_from_depth(render(estimated), K)
+    true_m = _distance_from_depth(render(true), K)
 
     # What is visible of each render, and of both.
-    measured_m = measure_distance(depth_m)
-    estimated_m = measure_distance(render(estimated))
-    true_m = measure_distance(render(true))
     is_true_visible = _is_visible(true_m, measured_m, delta_m)
     is_estimated_visible = _is_visible(estimated_m, measured_m, delta_m)
     is_estimated_visible |= is_true_visible & (estimated_m > 0)
@@ -159,33 +158,50 @@ def vsd(
     if count == 0:
         return torch.ones(len(taus_m), dtype=torch.float64)
 
-    # The share that is off by each tolerance.
+    # The share that is off by each tolerance or more.
     gap_m = (true_m[in_both] - estimated_m[in_both]).abs()
     in_one_alone = count - int(in_both.sum())
-    off = torch.stack([(gap_m >= tau).sum() for tau in taus_m])
-    return (off.double() + in_one_alone) / count
+    off_in_both = torch.stack([(gap_m >= tau_m).sum() for tau_m in taus_m])
+    return (off_in_both.double() + in_one_alone) / count
+
+
+def _distance_from_depth(
+    depth_m: Float[Tensor, "h w"], K: Float[Tensor, "3 3"]
+) -> Float[Tensor, "h w"]:
+    """Convert depth along the optical axis to the distance from the camera's centre, 0 for none."""
+    # The length of the ray of each pixel, (x, y, 1).
+    height, width = depth_m.shape
+    pixels = pixel_grid(height, width, torch.float64)
+    y = (pixels[..., 1] - K[1, 2]) / K[1, 1]
+    x = (pixels[..., 0] - K[0, 2] - K[0, 1] * y) / K[0, 0]
+    ray_length = (x * x + y * y + 1).sqrt()
+    return depth_m.double().nan_to_num(nan=0.0, posinf=0.0) * ray_length
 
 
 def _is_visible(
     rendered_m: Float[Tensor, "h w"], measured_m: Float[Tensor, "h w"], delta_m: float
 ) -> Bool[Tensor, "h w"]:
-    """Mark the pixels of a render that no measured surface occludes; distances, 0 for none."""
+    """Mark the pixels of a rendered object that no measured surface occludes.
+
+    Both images hold distances from the camera's centre, 0 for none.
+    """
     is_unoccluded = (rendered_m - measured_m <= delta_m) | (measured_m == 0)
     return (rendered_m > 0) & is_unoccluded
 
 
 def auc(error_m: Float[Tensor, " n"], limit_m: float = 0.1) -> float:
-    """Measure the area under the share of errors below a threshold of 0 to ``limit_m``; 0..1.
+    """Compute the area under the curve of recall, by thresholds from 0 to ``limit_m``; 0..1.
 
-    The exact area. PoseCNN's script takes the upper step at each error and is larger by up to one
-    part in the number of errors. A missing estimate is NaN or infinite, and counts as 0.
+    The recall is the share of errors below a threshold. The area is exact; PoseCNN's script takes
+    the upper step at each error and is larger by up to one part in the number of errors. A missing
+    estimate is NaN or infinite, and counts as 0.
     """
     gain = (1 - error_m.double() / limit_m).clamp(min=0)
     return float(gain.nan_to_num(0.0).mean())
 
 
 def average_recall(errors: Float[Tensor, "n t"], thresholds: Sequence[float]) -> float:
-    """Compute BOP's average recall: the share of errors below a threshold, averaged over all.
+    """Compute BOP's average recall: the mean over thresholds of the share of errors below them.
 
     A missing estimate is infinite or NaN, and counts as wrong.
 
@@ -194,7 +210,8 @@ def average_recall(errors: Float[Tensor, "n t"], thresholds: Sequence[float]) ->
             MSSD divided by the diameter first.
         thresholds: ``BOP_SHARES`` for VSD and MSSD, ``BOP_PIXELS`` for MSPD.
     """
-    return float(torch.stack([(errors < limit).double().mean() for limit in thresholds]).mean())
+    recalls = [(errors < threshold).double().mean() for threshold in thresholds]
+    return float(torch.stack(recalls).mean())
 
 
 def average_precision(is_right: Sequence[bool], targets: int) -> float:
@@ -207,12 +224,12 @@ def average_precision(is_right: Sequence[bool], targets: int) -> float:
         is_right: of each detection, in the order of falling scores.
         targets: number of objects to be detected, at least 1.
     """
-    # Recall and precision of the first detections, one more each time.
-    right = torch.tensor(list(is_right), dtype=torch.float64).cumsum(0)
-    if len(right) == 0:
+    # Recall and precision of the first n detections, for each n.
+    right_count = torch.tensor(list(is_right), dtype=torch.float64).cumsum(0)
+    if len(right_count) == 0:
         return 0.0
-    recall = right / targets
-    precision = right / torch.arange(1, len(right) + 1, dtype=torch.float64)
+    recall = right_count / targets
+    precision = right_count / torch.arange(1, len(right_count) + 1, dtype=torch.float64)
 
     # The best precision at each of 101 recalls or a higher one; 0 at one that is not reached.
     best = precision.flip(0).cummax(0).values.flip(0)
@@ -223,18 +240,16 @@ def average_precision(is_right: Sequence[bool], targets: int) -> float:
 
 
 def _pose_points(pose: Rigid, points_m: Float[Tensor, "n 3"]) -> Float[Tensor, "*batch n 3"]:
-    """Move points to their places at a pose, or at each of a batch."""
+    """Move model points to the camera frame by a pose, or by each of a batch, in float64."""
     points = points_m.double()
     return points @ pose.R.double().mT + pose.t_m.double()[..., None, :]
 
 
 def _split_symmetric_copies(true: Rigid, symmetries: Rigid, points: int) -> list[Rigid]:
-    """Give the poses that look like the true one, in batches that fit into memory."""
-    pose = true.double()
-    R = symmetries.R.double()
-    t_m = symmetries.t_m.double()
-    size = max(1, _CHUNK // (3 * points))
-    return [
-        Rigid(pose.R @ rows, pose.t_m + (pose.R @ shift[..., None]).squeeze(-1))
-        for rows, shift in zip(R.split(size), t_m.split(size), strict=True)
-    ]
+    """List the symmetric copies of a true pose, in batches that fit into memory.
+
+    ``points`` is the number of points that each batch will be applied to.
+    """
+    copies = true.double() @ symmetries.double()
+    size = max(1, _MOST_COORDINATES // (3 * points))
+    return [copies[first : first + size] for first in range(0, len(copies.R), size)]

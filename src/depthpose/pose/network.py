@@ -14,7 +14,7 @@ from depthpose.core.errors import InputError
 from depthpose.pose.sparse import RowNorm, SparseConv, SparseConvTranspose, Voxels
 from depthpose.pose.types import VotingPoints
 
-Widths = tuple[int, int, int, int]
+Widths = tuple[int, int, int, int]  #: channels of the four levels
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,7 +22,7 @@ class ResUNetConfig(Settings):
     """Size of the network (FCGF's ResUNetBN2C, Choy et al. ICCV 2019, figure 3-3 of the thesis)."""
 
     classes: Annotated[int, "[1, inf)"] = 13
-    """Objects that one network knows; the segmentation says which of them a cloud is."""
+    """Objects that one network knows; which of them a cloud is of is part of the input."""
 
     keypoints: Annotated[int, "[1, inf)"] = 8
     """Keypoints of each object."""
@@ -68,7 +68,7 @@ MOMENTUM = 0.05  #: of batch norm, as FCGF trains
 
 
 class ConvNorm(nn.Module):
-    """A convolution and, if there is one, its norm."""
+    """A sparse convolution, followed by batch norm where the config has it."""
 
     def __init__(
         self,
@@ -87,13 +87,13 @@ class ConvNorm(nn.Module):
                 self.conv.weight.mul_(NORMED_SCALE)
 
     def forward(self, voxels: Voxels) -> Voxels:
-        """Convolve and normalise."""
+        """Convolve, and normalise each channel."""
         out = self.conv(voxels)
         return out if self.norm is None else out.with_features(self.norm(out.features))
 
 
-class Block(nn.Module):
-    """Two convolutions beside a shortcut."""
+class ResidualBlock(nn.Module):
+    """Two convolutions beside a shortcut: ``relu(x + conv(relu(conv(x))))``."""
 
     def __init__(self, width: int, config: ResUNetConfig) -> None:
         super().__init__()
@@ -104,7 +104,7 @@ class Block(nn.Module):
                 self.second.conv.weight.mul_(BRANCH_SCALE)
 
     def forward(self, voxels: Voxels) -> Voxels:
-        """Add the branch to the input, and apply ReLU."""
+        """Add the output of both convolutions to the input, and apply ReLU."""
         inner = self.first(voxels)
         branch = self.second(inner.with_features(F.relu(inner.features)))
         return voxels.with_features(F.relu(branch.features + voxels.features))
@@ -122,22 +122,23 @@ class ResUNet(nn.Module):
         self.config = config = config or ResUNetConfig()
         e = config.encoder
         d = config.decoder
+        outputs = config.classes * config.keypoints * 3
 
         # Down: the finest level has the first kernel, each coarser one a stride of 2.
         self.down = nn.ModuleList([ConvNorm(config, config.inputs, e[0], config.first_kernel)])
         self.down.extend(ConvNorm(config, e[i - 1], e[i], 3, 2) for i in (1, 2, 3))
-        self.down_blocks = nn.ModuleList(Block(width, config) for width in e)
+        self.down_blocks = nn.ModuleList(ResidualBlock(width, config) for width in e)
 
         # Up: all but the coarsest level take the features of the way down beside those below.
-        into = {3: e[3], 2: e[2] + d[3], 1: e[1] + d[2]}
+        inputs = {3: e[3], 2: e[2] + d[3], 1: e[1] + d[2]}
         self.up = nn.ModuleList(
-            ConvNorm(config, into[i], d[i], 3, 2, SparseConvTranspose) for i in (3, 2, 1)
+            ConvNorm(config, inputs[i], d[i], 3, 2, SparseConvTranspose) for i in (3, 2, 1)
         )
-        self.up_blocks = nn.ModuleList(Block(d[i], config) for i in (3, 2, 1))
+        self.up_blocks = nn.ModuleList(ResidualBlock(d[i], config) for i in (3, 2, 1))
 
         # No norm and no neighbours: the skip of the finest level is mixed point by point.
         self.mix = SparseConv(e[0] + d[1], d[0], 1, has_bias=config.with_bias)
-        self.final = SparseConv(d[0], config.classes * config.keypoints * 3, 1, has_bias=True)
+        self.final = SparseConv(d[0], outputs, 1, has_bias=True)
         # The outputs are components of unit vectors: they begin near 0, not twice as long.
         with torch.no_grad():
             self.final.weight.mul_(0.5)
@@ -146,7 +147,7 @@ class ResUNet(nn.Module):
                 self.final.weight.mul_(NORMED_SCALE)
 
     def forward(self, voxels: Voxels) -> Float[Tensor, "points classes keypoints 3"]:
-        """Give the directions of each point, for every class.
+        """Compute the directions of each point to the keypoints of every class.
 
         They are not normalised: the loss draws them to unit length, and voting normalises them.
         """
@@ -154,18 +155,21 @@ class ResUNet(nn.Module):
         return outputs.view(len(outputs), self.config.classes, self.config.keypoints, 3)
 
     def directions(self, points: VotingPoints) -> Float[Tensor, "points keypoints 3"]:
-        """Give the directions of each point for its own class, as all networks that vote do."""
+        """Compute the raw directions of each point to the keypoints of its own class.
+
+        The networks that vote share this method.
+        """
         voxels = Voxels.from_points(points.coordinates, points.features)
-        mixed = self.features(voxels)
-        features = mixed.features[mixed.row_of_point]
+        features = self.features(voxels).at_points()
         directions = features.new_empty(len(features), self.config.keypoints, 3)
+
+        # The last layer, for no other classes than those that occur.
         assert self.final.bias is not None
-        size = self.config.keypoints * 3
-        # The last layer is computed for the classes that occur alone.
+        channel_count = self.config.keypoints * 3
         for number in points.class_of_point.unique().tolist():
             assert 0 <= number < self.config.classes, f"class {number} of {self.config.classes}"
             is_of_class = points.class_of_point == number
-            channels = slice(number * size, (number + 1) * size)
+            channels = slice(number * channel_count, (number + 1) * channel_count)
             weight = self.final.weight[0, :, channels]
             outputs = features[is_of_class] @ weight + self.final.bias[channels]
             outputs = outputs.view(len(outputs), self.config.keypoints, 3)
@@ -174,10 +178,13 @@ class ResUNet(nn.Module):
 
     def features(self, voxels: Voxels) -> Voxels:
         """Compute the input of the last layer: the features of figure 3-2 of the thesis."""
+        # Down; the features of each level are kept.
         skips: list[Voxels] = []
         for down, block in zip(self.down, self.down_blocks, strict=True):
             voxels = block(down(voxels))
             skips.append(voxels)
+
+        # Up; those of the way down are added as channels.
         voxels = skips.pop()
         for up, block in zip(self.up, self.up_blocks, strict=True):
             voxels = block(up(voxels))
@@ -191,32 +198,34 @@ class ResUNet(nn.Module):
 def fold_norms(network: ResUNet) -> ResUNet:
     """Build a network without norms, in eval mode, with the outputs of ``network.eval()``.
 
-    In eval mode batch norm is ``(x - mean) * scale + shift`` with constant numbers, and a
-    convolution before it absorbs them: ``weight * scale``, ``shift + (bias - mean) * scale``.
+    In eval mode batch norm is ``(x - mean) * scale + shift`` with constant numbers, which become
+    part of the convolution before it: ``weight * scale``, ``shift + (bias - mean) * scale``. A
+    network without norms is returned itself.
     """
     if network.config.norm == "none":
         return network
 
-    # The layers that have no norm are the same.
+    # The layers that have no norm stay the same.
     config = dataclasses.replace(network.config, norm="none", with_bias=True)
     folded = ResUNet(config).to(next(network.parameters()))
-    others = {k: v for k, v in network.state_dict().items() if k.startswith(("final.", "mix."))}
-    folded.load_state_dict(others, strict=False)
+    state = network.state_dict()
+    unnormed = {name: state[name] for name in state if name.startswith(("final.", "mix."))}
+    folded.load_state_dict(unnormed, strict=False)
 
-    # All others absorb the norm that follows them.
+    # Into all others the norm that follows them is folded.
     for name, source in network.named_modules():
         if not isinstance(source, ConvNorm):
             continue
         target = folded.get_submodule(name)
         assert isinstance(target, ConvNorm)
         norm = source.norm
-        absorbing = target.conv
+        conv = target.conv
         assert norm is not None and norm.running_var is not None and norm.running_mean is not None  # noqa: PT018
-        assert absorbing.bias is not None
+        assert conv.bias is not None
         scale = norm.weight * (norm.running_var + norm.eps).rsqrt()
         bias = 0.0 if source.conv.bias is None else source.conv.bias
-        absorbing.weight.copy_(source.conv.weight * scale)
-        absorbing.bias.copy_(norm.bias + (bias - norm.running_mean) * scale)
+        conv.weight.copy_(source.conv.weight * scale)
+        conv.bias.copy_(norm.bias + (bias - norm.running_mean) * scale)
     return folded.eval()
 
 
@@ -235,17 +244,19 @@ def unfold_norms(folded: ResUNet, network: ResUNet, voxels: Voxels) -> None:
     # The output of each convolution with a norm.
     outputs: dict[ConvNorm, Tensor] = {}
 
-    def remember(module: ConvNorm, _inputs: object, out: Voxels) -> None:
-        """Keep the output of a convolution, as torch calls it after the module."""
+    def keep_output(module: ConvNorm, _inputs: object, out: Voxels) -> None:
+        """Keep the output of a module: a forward hook of torch."""
         outputs[module] = out.features
 
-    sources = {name: m for name, m in folded.named_modules() if isinstance(m, ConvNorm)}
-    hooks = [source.register_forward_hook(remember) for source in sources.values()]
+    sources = {
+        name: module for name, module in folded.named_modules() if isinstance(module, ConvNorm)
+    }
+    hooks = [source.register_forward_hook(keep_output) for source in sources.values()]
     folded.eval()(voxels)
     for hook in hooks:
         hook.remove()
 
-    # Each norm gets these statistics, and undoes them by its weight and bias.
+    # Each norm gets the statistics of this output, and undoes them by its weight and bias.
     for name, source in sources.items():
         target = network.get_submodule(name)
         assert isinstance(target, ConvNorm)
@@ -262,8 +273,9 @@ def unfold_norms(folded: ResUNet, network: ResUNet, voxels: Voxels) -> None:
         norm.bias.copy_(mean)
 
     # The layers without a norm are copied; the last only where both have the same classes.
-    is_alike = folded.final.weight.shape == network.final.weight.shape
-    parts = ("mix.", "final.") if is_alike else ("mix.",)
-    state = network.state_dict()
-    others = {k: v for k, v in folded.state_dict().items() if k.startswith(parts) and k in state}
-    network.load_state_dict(others, strict=False)
+    has_same_classes = folded.final.weight.shape == network.final.weight.shape
+    layers = ("mix.", "final.") if has_same_classes else ("mix.",)
+    names = network.state_dict().keys()
+    state = folded.state_dict()
+    unnormed = {name: state[name] for name in state if name.startswith(layers) and name in names}
+    network.load_state_dict(unnormed, strict=False)

@@ -1,7 +1,7 @@
 """GeoPoseNet: clouds and depth images of known objects to poses, by a network's directions.
 
-Several clouds go through the network at once; the directions of each vote for keypoints, to which
-the pose is fitted, refined by ICP, and checked. A baseline regresses the pose from the depth image.
+Several clouds go through the network at once. The directions of each vote for keypoints; the pose
+is fitted to these, refined by ICP, and checked. A baseline regresses the pose from a depth image.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -26,18 +26,12 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.core.stopwatch import Stopwatch
 from depthpose.pose.baselines import DepthCrop, DepthImageNet, cut_depth, make_poses
-from depthpose.pose.cloud import (
-    ObjectCloud,
-    VoxelGrid,
-    cloud_from_depth,
-    prepare_cloud,
-    sample_and_voxelise,
-    why_too_few,
-)
+from depthpose.pose.cloud import ObjectCloud, cloud_from_depth, prepare_cloud, why_too_few
 from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.copies import PreparedObject, require_surface
 from depthpose.pose.decide import refused
 from depthpose.pose.estimator import PoseEstimator, unreadable_on_error
+from depthpose.pose.grid import VoxelGrid, sample_and_voxelise
 from depthpose.pose.icp import BestStart, RefinedPose, refine_best
 from depthpose.pose.probability import PRIOR_MASKED, PRIOR_PROPOSED
 from depthpose.pose.propose import fit_poses, meet_lines, vote_ransac
@@ -54,7 +48,7 @@ from depthpose.pose.types import (
 from depthpose.pose.weights import PoseWeights, read_pose_weights
 
 _DOUBTED: tuple[Status, ...] = ("votes do not meet", "keypoints do not fit", "doubtful")
-"""What the network could not answer, and another method may; the rest is due to the input."""
+"""Statuses for which another method may find the pose; the others are due to the input."""
 _COMPARED = 100  # points at which the best of symmetric copies is chosen
 _NEEDS_MASK = "a regressed depth image takes a depth image with a mask; give both, or other weights"
 
@@ -63,42 +57,45 @@ class VotingDirections(NamedTuple):
     """The points that vote, in the camera frame, and the network's directions at them."""
 
     points_m: Float[Tensor, "n 3"]  #: where the votes start
-    directions: Float[Tensor, "n k 3"]  #: of any length
+    directions: Float[Tensor, "n k 3"]  #: to each keypoint, of any length
 
 
 @dataclass(kw_only=True, eq=False)
 class CloudToPose:
-    """An input on its way through the network."""
+    """A cloud that is prepared for the network, and then its directions."""
 
-    pose_input: AnyInput  #: as it was given
+    pose_input: AnyInput  #: from which the cloud is lifted
     prepared: PreparedObject  #: its object
     cloud: ObjectCloud  #: all points of the object
-    voxels: VoxelGrid  #: those that the network sees and that vote, one a voxel
+    voxels: VoxelGrid  #: with the points that the network sees and that vote, one for each voxel
     watch: Stopwatch  #: of the stages so far
-    #: of the network at each voting point, in the camera frame; empty before it was asked
+    #: of the network at each voting point, in the camera frame; empty before it is run.
     directions: Float[Tensor, "n k 3"] = field(default_factory=lambda: torch.empty(0, 0, 3))
 
 
 def _group_by_voxels(
     clouds: Iterable[CloudToPose | PoseEstimate], most: int
 ) -> Iterator[list[CloudToPose | PoseEstimate]]:
-    """Group clouds so that each group has ``most`` voxels at most, or is one cloud."""
+    """Group clouds, in their order, so that each group has ``most`` voxels at most or is one cloud.
+
+    Estimates, of inputs that need no network, count as clouds without voxels.
+    """
     group: list[CloudToPose | PoseEstimate] = []
-    voxels = 0
-    for job in clouds:
-        count = len(job.voxels.points_m) if isinstance(job, CloudToPose) else 0
-        if group and voxels + count > most:
+    group_voxels = 0
+    for item in clouds:
+        voxels = len(item.voxels.points_m) if isinstance(item, CloudToPose) else 0
+        if group and group_voxels + voxels > most:
             yield group
             group = []
-            voxels = 0
-        group.append(job)
-        voxels += count
+            group_voxels = 0
+        group.append(item)
+        group_voxels += voxels
     if group:
         yield group
 
 
 class GeoPoseNet(PoseEstimator):
-    """The 6-DoF pose of a known object from its partial cloud, or the reason why there is none.
+    """Estimates 6-DoF poses of known objects from partial clouds, or says why there is none.
 
     Example::
 
@@ -116,14 +113,14 @@ class GeoPoseNet(PoseEstimator):
     """
 
     name = ""
-    """What the weights were called; nothing where they came from memory."""
+    """By which the weights were loaded; empty where they came from memory."""
 
     def __init__(self, weights: PoseWeights, config: EstimateConfig | None = None) -> None:
-        # The weights' limits are for the network's votes; what is searched has the usual ones.
+        # The weights have their own limits for votes; those of searches are the usual ones.
         super().__init__(weights.models, config, RefusalConfig())
         self.weights = weights
         self.terms = weights.facts.get("terms", "")
-        """Terms of the weights, where they bind whoever uses them; else nothing."""
+        """Terms of the weights that bind whoever uses them; empty without any."""
         if isinstance(weights.network, DepthImageNet):
             raise InputError(
                 "these weights regress a depth image and cast no votes; give "
@@ -163,25 +160,25 @@ class GeoPoseNet(PoseEstimator):
         return f"GeoPoseNet({kind} of {objects}{weights}, {self.config.device})"
 
     def _estimate_each(self, inputs: Iterable[AnyInput], threads: int) -> Iterator[PoseEstimate]:
-        """Pose inputs by the network; what it doubts is registered where the config wants it."""
+        """Pose inputs by the network; doubted ones by registration where the config says so."""
         return self._pose_together(inputs, threads, is_expected=True)
 
     def _estimate_each_try(self, inputs: Iterable[AnyInput]) -> Iterator[PoseEstimate]:
-        """Pose inputs by the network alone, at the lower prior odds of an object at a try."""
+        """Pose inputs by the network alone, at the lower prior odds of a search's proposals."""
         return self._pose_together(inputs, 1, is_expected=False)
 
     def _pose_together(
         self, inputs: Iterable[AnyInput], threads: int, *, is_expected: bool
     ) -> Iterator[PoseEstimate]:
-        """Ask the network for several clouds together, and pose each by its votes.
+        """Run the network on several clouds together, and pose each by its votes.
 
-        The answer for an input does not depend on those beside it, but for the rounding of the
+        The pose of an input does not depend on those beside it, but for the rounding of the
         network's sums. ``is_expected``: whether the inputs are meant to show their objects.
         """
         prepared = map_in_threads(partial(unreadable_on_error, self._prepare), inputs, threads)
         pose = partial(self._pose_or_register, is_expected=is_expected)
         for group in _group_by_voxels(prepared, self.config.batch_voxels):
-            self._ask_network(group)
+            self._run_network(group)
             yield from map_in_threads(pose, group, threads)
 
     @torch.no_grad()
@@ -189,13 +186,11 @@ class GeoPoseNet(PoseEstimator):
     def estimate_with_votes(
         self, pose_input: AnyInput
     ) -> tuple[PoseEstimate, VotingDirections | None]:
-        """Estimate one pose, and give the network's direction to each keypoint at each point.
-
-        What the network doubts is not registered here.
+        """Estimate one pose by the network alone, and return the directions that voted for it.
 
         Returns:
             The estimate, and the points that vote with their directions in the camera frame; None
-            for them where the network was not run, as there is too little to pose.
+            for these where the network was not run, as there is too little to pose.
 
         Raises:
             InputError: an unknown object, or a mask that does not fit its depth image.
@@ -204,14 +199,14 @@ class GeoPoseNet(PoseEstimator):
             job = self._prepare(pose_input)
             if isinstance(job, PoseEstimate):
                 return job, None
-            self._ask_network([job])
+            self._run_network([job])
             voted = self._estimate_by_votes(pose_input, job=job, is_expected=True)
             return voted, VotingDirections(job.voxels.points_m, job.directions)
 
     def _prepare(self, pose_input: AnyInput) -> CloudToPose | PoseEstimate:
-        """Give the cloud and voxels that the network takes.
+        """Lift an input to the cloud and the voxels that the network takes.
 
-        In their place the estimate itself, where the input is a region or is refused.
+        Of a region, or of an input that is refused, the estimate is returned.
         """
         if isinstance(pose_input, ViewInput) and pose_input.is_region:
             return self._search_region(pose_input)
@@ -229,18 +224,18 @@ class GeoPoseNet(PoseEstimator):
             pose_input=pose_input, prepared=prepared, cloud=cloud, voxels=voxels, watch=watch
         )
 
-    def _ask_network(self, group: Sequence[CloudToPose | PoseEstimate]) -> None:
-        """Ask together for the directions of a group's clouds, and set them in the camera frame."""
-        ready = [job for job in group if isinstance(job, CloudToPose)]
-        if not ready:
+    def _run_network(self, group: Sequence[CloudToPose | PoseEstimate]) -> None:
+        """Run the network once on all clouds of a group, and set their ``directions``."""
+        jobs = [item for item in group if isinstance(item, CloudToPose)]
+        if not jobs:
             return
         watch = Stopwatch()
         with watch.stage("network"):
             # The voxels of all clouds, one after the other.
-            grids = [job.voxels for job in ready]
+            grids = [job.voxels for job in jobs]
             counts = [len(grid.points_m) for grid in grids]
-            cloud_of_point = torch.repeat_interleave(torch.arange(len(ready)), torch.tensor(counts))
-            numbers = torch.tensor([job.prepared.number for job in ready])
+            cloud_of_point = torch.repeat_interleave(torch.arange(len(jobs)), torch.tensor(counts))
+            numbers = torch.tensor([job.prepared.number for job in jobs])
             coordinates = torch.cat([grid.coordinates for grid in grids])
             points_m = [grid.points_m @ grid.grid_from_camera.mT for grid in grids]
             device = self.config.device
@@ -252,10 +247,9 @@ class GeoPoseNet(PoseEstimator):
             )
             outputs = self._network.directions(network_input).float().cpu().split(counts)
 
-        # Back to each cloud, in its camera's frame.
-        for job, of_cloud, count in zip(ready, outputs, counts, strict=True):
-            job.directions = of_cloud @ job.voxels.grid_from_camera
-            # Each has a share of the time.
+        # Back to each cloud, in the camera frame; each has a share of the time.
+        for job, directions, count in zip(jobs, outputs, counts, strict=True):
+            job.directions = directions @ job.voxels.grid_from_camera
             job.watch.seconds["network"] = watch.seconds["network"] * count / sum(counts)
 
     def _pose_or_register(
@@ -263,14 +257,15 @@ class GeoPoseNet(PoseEstimator):
     ) -> PoseEstimate:
         """Pose a cloud by its votes, or by registration where these are doubted.
 
-        Only an input that is expected to show its object is registered.
+        Only an input that is expected to show its object is registered. An estimate stays as it is.
         """
         if isinstance(job, PoseEstimate):
             return job
         voted = unreadable_on_error(
             partial(self._estimate_by_votes, job=job, is_expected=is_expected), job.pose_input
         )
-        if not (self.config.register_refused and is_expected) or voted.status not in _DOUBTED:
+        is_registered = self.config.register_refused and is_expected and voted.status in _DOUBTED
+        if not is_registered:
             return voted
         watch = Stopwatch()
         with watch.stage("registration"):
@@ -283,7 +278,11 @@ class GeoPoseNet(PoseEstimator):
     ) -> PoseEstimate:
         """Vote for the keypoints, fit the pose to them, refine it, and decide by the evidence.
 
-        An input that is expected to show its object has higher prior odds.
+        Args:
+            pose_input: for the names of the estimate.
+            job: its cloud, with directions.
+            is_expected: whether the input is meant to show its object: then the prior odds are
+                higher.
         """
         config = self.config
         prepared = job.prepared
@@ -330,7 +329,7 @@ class GeoPoseNet(PoseEstimator):
         )
 
     def _vote(self, job: CloudToPose) -> Vote:
-        """Intersect the directions at the voting points: the keypoints, in the camera frame."""
+        """Find the keypoints, in the camera frame, where the directions at the points meet."""
         points_m = job.voxels.points_m.double()
         directions = job.directions.double()
         voting = self.config.voting
@@ -339,12 +338,10 @@ class GeoPoseNet(PoseEstimator):
         return meet_lines(points_m, directions, refinements=voting.refinements)
 
     def _measure_disagreement(self, job: CloudToPose, pose: Rigid) -> float:
-        """Measure the mean angle between the network's directions and those to a pose [rad].
-
-        The latter point to the keypoints of the model at the pose.
+        """Measure the mean angle [rad] between the directions and those to a pose's keypoints.
 
         The network was trained to treat symmetric copies of a pose as one: the angle is measured to
-        the copy whose keypoints its directions fit best.
+        the copy whose keypoints the directions fit best.
         """
         # The copy that fits some of the directions best.
         keypoints_m = job.prepared.model.keypoints_m.double()
@@ -352,20 +349,24 @@ class GeoPoseNet(PoseEstimator):
         points_m = job.voxels.points_m.double()
         directions = normalize(job.directions.double(), dim=-1)
         step = max(1, len(points_m) // _COMPARED)
-        toward = normalize(copies_m[:, None] - points_m[::step, None], dim=-1)
-        best = int((directions[::step] * toward).sum(-1).mean((-2, -1)).argmax())
+        to_copies = normalize(copies_m[:, None] - points_m[::step, None], dim=-1)
+        cosines = (directions[::step] * to_copies).sum(-1)  # (copies, points, keypoints)
+        best = int(cosines.mean((-2, -1)).argmax())
 
         # The angle to it, over all of them.
-        toward = normalize(copies_m[best] - points_m[:, None], dim=-1)
-        return float((directions * toward).sum(-1).clamp(-1, 1).arccos().mean())
+        to_best = normalize(copies_m[best] - points_m[:, None], dim=-1)
+        angles_rad = (directions * to_best).sum(-1).clamp(-1, 1).arccos()
+        return float(angles_rad.mean())
 
 
 class DepthImageRegressor(PoseEstimator):
-    """The baseline as an estimator. It refuses nothing but views with too little of the object.
+    """The baseline as an estimator: a pose regressed from a masked depth image, and ICP.
+
+    It refuses nothing but views with too little of the object.
 
     Args:
         weights: of kind ``depth-image``.
-        config: whether ICP follows, and the device; the rest is of voting.
+        config: whether ICP follows, its settings, and the device; the rest is not used.
 
     Raises:
         InputError: the weights are of another kind, or ``register_refused`` is set.
@@ -388,7 +389,7 @@ class DepthImageRegressor(PoseEstimator):
     def _estimate_or_raise(
         self, inputs: Sequence[AnyInput], *, is_expected: bool
     ) -> list[PoseEstimate]:
-        """Estimate one input; refuse to choose among several objects."""
+        """Estimate one input; raise where several are given, one for each object that it may be."""
         if len(inputs) > 1:
             names = ", ".join(item.object for item in inputs)
             raise InputError(f"object: say which of {names}; a regressor refuses none")
@@ -397,7 +398,7 @@ class DepthImageRegressor(PoseEstimator):
     def find_in(
         self, view: ViewInput, objects: Sequence[str], *, is_single: bool = False
     ) -> NoReturn:
-        """Refuse: nothing tells whether an object is there."""
+        """Raise an :class:`InputError`: a regressor cannot tell whether an object is there."""
         del view, objects, is_single
         raise InputError(_NEEDS_MASK)
 
@@ -406,7 +407,7 @@ class DepthImageRegressor(PoseEstimator):
         prepared = self._find_object(pose_input.object)
         if not isinstance(pose_input, ViewInput):
             raise InputError(_NEEDS_MASK)
-        # An empty region says that nothing was detected: of that too few pixels are refused below.
+        # An empty region means that nothing was detected: it is refused below for too few pixels.
         if pose_input.is_region and bool(pose_input.mask.any()):
             raise InputError(_NEEDS_MASK)
         config = self._network.config
@@ -445,7 +446,7 @@ class DepthImageRegressor(PoseEstimator):
             return replace(estimate, status="too few points", reason=few, camera_from_model=None)
         with watch.stage("icp"):
             refined = refine_best(points_m, pose, prepared.surface, self.config.icp).refined
-        if float(refined.inlier_share) == 0:  # nothing near the surface: ICP had no say
+        if float(refined.inlier_share) == 0:  # no point near the surface: nothing was refined
             return estimate
         return replace(
             estimate,

@@ -13,10 +13,17 @@ _SAMPLED = 1000  # points of the cloud by which observability is measured
 
 
 def free_motions(axes: tuple[Axis, ...], camera_from_model: Rigid) -> Float[Tensor, "m 6"]:
-    """Give the motions in the camera frame that rotate an object about its axes of revolution.
+    """Compute the motions that rotate an object about its axes of revolution.
 
-    They are unit vectors of (rotation, translation). No observation constrains a pose along them;
-    it is valid all the same. An object with two axes is a ball, free to rotate about a third too.
+    No observation constrains a pose along them; it is valid all the same. An object with two axes
+    is a ball, free to rotate about a third too.
+
+    Args:
+        axes: of revolution, in the model frame.
+        camera_from_model: the pose.
+
+    Returns:
+        Unit vectors of (rotation, translation) in the camera frame: none, one, or three of a ball.
     """
     # The axes: three of a ball, else one at most.
     centre_m = Symmetries(continuous=axes).ball_centre_m
@@ -60,7 +67,8 @@ def observability(
     points_m = take_evenly(cloud_m.double(), _SAMPLED)
     local_m = pose.inverse().apply(points_m)
     index = surface.nearest(local_m)
-    is_near = (local_m - surface.points_m[index]).norm(dim=-1) < NEAR * surface.diameter_m
+    distance_m = (local_m - surface.points_m[index]).norm(dim=-1)
+    is_near = distance_m < NEAR * surface.diameter_m
     if int(is_near.sum()) < 6:
         return None
 
@@ -71,8 +79,8 @@ def observability(
     arm_m = points_m[is_near] - middle_m
     J = torch.cat([torch.linalg.cross(arm_m, normal) / radius_m, normal], -1)
 
-    # A basis of the motions that no symmetry leaves free: they are orthogonal to those of free,
-    # here about the middle, with rotations in metres at the radius.
+    # A basis of the motions that no symmetry leaves free: those orthogonal to ``free``, which is
+    # taken about the middle, with rotations in metres at the radius.
     rotation = free[:, :3].double()
     translation = free[:, 3:].double()
     motions = torch.cat([rotation * radius_m, translation + rotation @ cross_matrix(middle_m)], -1)
@@ -81,7 +89,8 @@ def observability(
     basis = rows[rank:].T
 
     # The mean square displacement is least for the eigenvector of the least eigenvalue.
-    values, vectors = torch.linalg.eigh(basis.T @ (J.T @ J / len(J)) @ basis)
+    mean_square = J.T @ J / len(J)
+    values, vectors = torch.linalg.eigh(basis.T @ mean_square @ basis)
     least = float(values[0].clamp(min=0).sqrt())
     return least, basis @ vectors[:, 0]
 
@@ -89,7 +98,15 @@ def observability(
 def without_motions(
     covariance: Float[Tensor, "6 6"], free: Float[Tensor, "m 6"]
 ) -> Float[Tensor, "6 6"]:
-    """Condition a covariance on no motion along ``free``: it becomes finite, and 0 along them."""
+    """Condition the covariance of a pose on no motion along ``free``.
+
+    Args:
+        covariance: of (rotation, translation), which may be huge along these motions.
+        free: unit vectors of (rotation, translation); without any the covariance stays as it is.
+
+    Returns:
+        The covariance of the other motions: 0 along ``free``.
+    """
     if len(free) == 0:
         return covariance
     # A basis of the other motions.
@@ -97,7 +114,7 @@ def without_motions(
     rank = int((sizes > 1e-9 * sizes[0]).sum())
     basis = rows[rank:].T
 
-    # The information is restricted to the other motions, not the covariance, as conditioning asks.
+    # To condition is to restrict the information, the inverse of the covariance, to them.
     information = torch.linalg.inv(covariance.double())
     inner = torch.linalg.inv(basis.T @ information @ basis)
     return (basis @ inner @ basis.T).to(covariance)

@@ -42,20 +42,20 @@ from depthpose.pose.types import (
     ViewInput,
 )
 
-POSES = "poses.json"
+POSES = "poses.json"  #: name of the file of predictions
 VERSION = 2  #: of an entry of ``poses.json``; ``docs/poses.schema.json`` describes it
 PICTURE = "pose.png"  #: after ``NAME.``: the picture that shows a pose
-CLOUD = "pose.ply"  #: and the cloud
+CLOUD = "pose.ply"  #: after ``NAME.``: the cloud that shows a pose
 STAGES = (
     "search", "segmentation", "cloud", "network", "proposal", "icp", "evidence", "decision",
     "tracking",
 )  # fmt: skip
-"""What an estimate's ``seconds`` are of, in order; a stage that was not run is missing."""
+"""The keys of an estimate's ``seconds``, in order; a stage that was not run is missing."""
 _STAGES_WITHIN_SEARCH = frozenset({"cloud", "proposal", "icp", "evidence", "decision"})
 """Stages of the registrations that a search makes: the time of ``search`` includes theirs."""
 
-_ROTATION_SLACK = 1e-4  # of a rotation matrix times its transpose
-_PLACE = ("scene_id", "im_id", "obj_id")  # keys of a :class:`Place`
+_ROTATION_SLACK = 1e-4  # largest deviation of a rotation matrix times its transpose from identity
+_PLACE = ("scene_id", "im_id", "obj_id")  # keys of a :class:`Place` in a file
 
 
 class Place(NamedTuple):
@@ -70,16 +70,15 @@ class Place(NamedTuple):
 class Prediction:
     """An estimate, or a refusal, and its place in a data set."""
 
-    #: one from the annotated mask of an instance has the instance's name.
-    estimate: PoseEstimate
-    place: Place | None = None  #: scene, image and object; None for a cloud of no data set
+    estimate: PoseEstimate  #: by the annotated mask of an instance it has the instance's name
+    place: Place | None = None  #: scene, image and object; None for an input of no data set
 
 
 class Predictions(list[Prediction]):
-    """A list of predictions that can be given as a table of pandas."""
+    """A list of predictions that can be converted to a table of pandas."""
 
     def to_frame(self) -> Any:  # noqa: ANN401  pandas is no dependency
-        """Give a ``pandas.DataFrame``: a row for each estimate, with the columns of ``poses.json``.
+        """Convert to a ``pandas.DataFrame``: a row for each estimate, columns as in ``poses.json``.
 
         Values of nested names are columns too, such as ``evidence.supported`` and ``seconds.icp``.
 
@@ -90,7 +89,7 @@ class Predictions(list[Prediction]):
 
 
 def place_of(instance: Instance) -> Place:
-    """Give the place of an annotated instance."""
+    """Return the place of an annotated instance: its scene, image and object."""
     return Place(instance.scene_id, instance.image_id, instance.object_id)
 
 
@@ -127,9 +126,9 @@ def read_earlier_predictions(folder: Path) -> dict[str, Prediction]:
     A damaged file counts as missing, and gives a notice.
     """
     predictions: dict[str, Prediction] = {}
-    for home in (folder, *sorted(folder.glob("part-*"))):
+    for part in (folder, *sorted(folder.glob("part-*"))):
         try:
-            earlier = read_predictions(home) if (home / POSES).is_file() else []
+            earlier = read_predictions(part) if (part / POSES).is_file() else []
         except InputError as error:
             warnings.warn(f"{error} - it is damaged, and made again", Notice, stacklevel=2)
             continue
@@ -142,9 +141,9 @@ def read_earlier_predictions(folder: Path) -> dict[str, Prediction]:
 
 
 def score_of(estimate: PoseEstimate) -> float:
-    """Give the score of an estimate, 0..1: its certainty where known, else its share of inliers.
+    """Return the score of an estimate, 0..1: its certainty, or else its share of inliers.
 
-    It is 1 where neither is known.
+    It is 1 where the estimate has neither.
     """
     if estimate.certainty is not None:
         return estimate.certainty
@@ -153,7 +152,7 @@ def score_of(estimate: PoseEstimate) -> float:
 
 def prediction_row(prediction: Prediction) -> dict[str, Any]:
     """Convert a prediction to the JSON values of an entry of ``poses.json``."""
-    # What it is of, and how it ended.
+    # Name, place and status.
     estimate = prediction.estimate
     place = prediction.place
     pose = estimate.camera_from_model
@@ -161,7 +160,7 @@ def prediction_row(prediction: Prediction) -> dict[str, Any]:
     row |= dict(zip(_PLACE, place, strict=True)) if place is not None else {}
     row |= {"status": estimate.status, "reason": estimate.reason}
 
-    # Poses and tables.
+    # Poses, and other tables of numbers.
     row["camera_from_model"] = None if pose is None else pose.matrix().tolist()
     base = estimate.base_from_model
     row["base_from_model"] = None if base is None else base.matrix().tolist()
@@ -181,7 +180,7 @@ def prediction_row(prediction: Prediction) -> dict[str, Any]:
     row["visible_share"] = estimate.visible_share
     row["pick_rank"] = estimate.pick_rank
 
-    # Parts with values of their own.
+    # Dataclasses.
     for name in ("evidence", "identity"):
         record = getattr(estimate, name)
         row[name] = None if record is None else asdict(record)
@@ -200,7 +199,11 @@ def prediction_row(prediction: Prediction) -> dict[str, Any]:
 
 
 def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
-    """Read what :func:`prediction_row` gave; ``source`` says in errors where it stands.
+    """Convert an entry of ``poses.json`` to a prediction: the inverse of :func:`prediction_row`.
+
+    Args:
+        row: JSON values of the entry.
+        source: of the entry, in errors.
 
     Raises:
         InputError: a value is missing or impossible.
@@ -224,7 +227,7 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
         statuses = get_args(Status)
         raise InputError(f"{source}: status {status!r}: {suggest_name(str(status), statuses)}")
 
-    # How it came about, and its pose, which only an answer has.
+    # How it came about, and its pose; a refusal has none, but a reason.
     tracking = row.get("tracking")
     if tracking is not None and tracking not in get_args(Tracking):
         raise InputError(f"{source}: tracking is {tracking!r}; write one of {get_args(Tracking)}")
@@ -239,7 +242,7 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
             f"{source}: every estimate but one that is ok has a reason; its status is {status!r}"
         )
 
-    # All that is known of it, and its place.
+    # All other values, and the place.
     values = _parse_values(row, source)
     estimate = PoseEstimate(
         name=name,
@@ -259,7 +262,7 @@ def parse_prediction(row: dict[str, Any], source: str) -> Prediction:
 
 
 def _parse_values(row: dict[str, Any], source: str) -> dict[str, Any]:
-    """Read the tables, numbers and parts of an entry, by the names of an estimate's fields."""
+    """Parse tables, numbers, times and dataclasses of an entry, by the fields of an estimate."""
     values: dict[str, Any] = {
         "keypoints_m": _parse_table(row, "keypoints_m", 3, source),
         "covariance": _parse_table(row, "covariance", 6, source, rows=6),
@@ -274,7 +277,7 @@ def _parse_values(row: dict[str, Any], source: str) -> dict[str, Any]:
         raise InputError(f"{source}: seconds is {seconds!r}, where names to numbers belong")
     values["seconds"] = {str(stage): read_number(seconds, stage, None, source) for stage in seconds}
 
-    # Parts with values of their own.
+    # Dataclasses.
     for key, kind in (("evidence", Evidence), ("identity", Identity)):
         value = row.get(key)
         where = f"{source}: {key}"
@@ -285,7 +288,7 @@ def _parse_values(row: dict[str, Any], source: str) -> dict[str, Any]:
 
 
 def _parse_alternatives(row: dict[str, Any], source: str) -> tuple[Alternative, ...]:
-    """Read the alternative poses of an entry."""
+    """Parse the alternative poses of an entry."""
     entries = row.get("alternatives", [])
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise InputError(f"{source}: alternatives are no list of poses; write [...] of them")
@@ -307,7 +310,7 @@ def _parse_alternatives(row: dict[str, Any], source: str) -> tuple[Alternative, 
 
 
 def _parse_pose(row: dict[str, Any], source: str, key: str = "camera_from_model") -> Rigid | None:
-    """Read a pose of ``poses.json``; None where the entry has none."""
+    """Parse a pose of ``poses.json``; None where the entry has none."""
     matrix = _parse_table(row, key, 4, source, rows=4)
     if matrix is None:
         return None
@@ -325,7 +328,7 @@ def _parse_pose(row: dict[str, Any], source: str, key: str = "camera_from_model"
 def _parse_table(
     row: dict[str, Any], key: str, width: int, source: str, rows: int | None = None
 ) -> Tensor | None:
-    """Read a table of ``width`` columns, and of ``rows`` rows where that is given."""
+    """Parse a table of ``width`` columns, and of ``rows`` rows where given; None without one."""
     if row.get(key) is None:
         return None
     try:
@@ -337,7 +340,7 @@ def _parse_table(
         ) from error
 
 
-_SAVE_EVERY = 200  # results
+_SAVE_EVERY = 200  # results, after which the file is written
 
 Input = TypeVar("Input")
 
@@ -346,15 +349,15 @@ Input = TypeVar("Input")
 class PoseJob(Job[Input]):
     """One input of an estimator of poses."""
 
-    #: name of the object; with it an input that cannot be read gives an estimate that says so,
-    #: without it an error
+    #: name of the object. Where the input cannot be read an estimate says so; without a name that
+    #: is an error.
     object: str | None = None
     place: Place | None = None  #: as in :class:`Prediction`
-    seconds: Mapping[str, float] = field(default_factory=dict)  #: spent before, on a mask
+    seconds: Mapping[str, float] = field(default_factory=dict)  #: of earlier stages, such as a mask
 
 
 def refuse_unreadable(name: str, object: str, error: InputError) -> PoseEstimate:
-    """Make the estimate that says why an input cannot be read."""
+    """Build the estimate, without a pose, that says why an input cannot be read."""
     reason = f"cannot be read: {error}"
     return PoseEstimate(name=name, object=object, status="unreadable", reason=reason)
 
@@ -389,7 +392,7 @@ class PoseResults(Results[Input, PoseEstimate]):
         return job.name in self._finished
 
     def store(self, job: Job[Input], data: Input, result: PoseEstimate) -> None:  # noqa: ARG002
-        """Keep an estimate with the place of its input, and the time that was spent before."""
+        """Keep an estimate with the place of its input and the times of earlier stages."""
         assert isinstance(job, PoseJob)
         assert result.name == job.name, f"{result.name!r} is not {job.name!r}"
         self._keep(job, result)
@@ -402,7 +405,7 @@ class PoseResults(Results[Input, PoseEstimate]):
         self._keep(job, refuse_unreadable(job.name, job.object, error))
 
     def _keep(self, job: PoseJob[Input], estimate: PoseEstimate) -> None:
-        """Add an estimate to those that the file gets, and write it now and then."""
+        """Add an estimate to the predictions, and write the file after every 200."""
         timed = replace(estimate, seconds={**job.seconds, **estimate.seconds})
         self.predictions[job.name] = Prediction(estimate=timed, place=job.place)
         self._unsaved += 1
@@ -426,11 +429,11 @@ def estimate_missing_poses(
     """Estimate the inputs that are not finished, and yield all predictions in the order of jobs.
 
     Args:
-        estimate_many: gives an estimate for each input, of the same name.
+        estimate_many: returns an estimate for each input, of the same name.
         jobs: all jobs, finished ones too.
-        folder: of ``poses.json``; refused if that was made with other settings.
-        settings: that determine the results.
-        batch: how many inputs are given at once. Each then takes an equal share of the time.
+        folder: of ``poses.json``; refused if that was computed with other settings.
+        settings: what determines the results.
+        batch: inputs that are estimated at once. Each then takes an equal share of the time.
 
     Raises:
         InputError: an input whose job names no object cannot be read.
@@ -445,12 +448,13 @@ def estimate_missing_poses(
 def make_instance_jobs(
     dataset: BopDataset, names: Mapping[int, str], predicted_mask: str | None = None
 ) -> list[PoseJob[ViewInput]]:
-    """Make a job for each annotated instance, by its own mask or a predicted one.
+    """Build a job for each annotated instance, by its annotated mask or a predicted one.
 
     Args:
         dataset: with the instances.
         names: of the objects in the estimator, by number.
-        predicted_mask: the file of a predicted mask, as ``Layout.predicted_mask``; None: its own.
+        predicted_mask: pattern of the files of predicted masks (``Layout.predicted_mask``); None:
+            annotated masks.
     """
     jobs: list[PoseJob[ViewInput]] = []
     for instance in dataset.instances:
@@ -467,7 +471,15 @@ def make_instance_jobs(
 def _read_view(
     dataset: BopDataset, instance: Instance, name: str, object: str, mask: Path | Detection | None
 ) -> ViewInput:
-    """Read the view of an instance with a mask from a file or a detection; None for its own."""
+    """Read the view of an instance, with a mask of a file or a detection.
+
+    Args:
+        dataset: of the instance.
+        instance: whose depth image and camera are read.
+        name: of the view.
+        object: name of the object.
+        mask: its file, or a detection; None: the annotated mask of the instance.
+    """
     pixels = None
     if isinstance(mask, Detection):
         width, height = image_size(instance.depth)
@@ -482,10 +494,10 @@ def _read_view(
 def make_detection_jobs(
     dataset: BopDataset, names: Mapping[int, str], detections: Sequence[Detection]
 ) -> list[PoseJob[ViewInput]]:
-    """Make jobs of the detections with the highest scores, as many as an image shows of an object.
+    """Build jobs for the detections with the highest scores, as many as an image has instances.
 
-    An instance that is not detected has no job, and counts as missing. The time of an image's
-    detection is divided among its jobs.
+    They are as many for each object. An instance that is not detected has no job, and counts as
+    missing. The time of an image's detection is divided among its jobs.
 
     Args:
         dataset: with the instances.
@@ -496,9 +508,9 @@ def make_detection_jobs(
         InputError: a detection lacks its scene, image or object, or none is of the data set.
     """
     # The best detections of each object in each image.
-    shown: dict[Place, list[Instance]] = defaultdict(list)
+    instances_of_place: dict[Place, list[Instance]] = defaultdict(list)
     for instance in dataset.instances:
-        shown[place_of(instance)].append(instance)
+        instances_of_place[place_of(instance)].append(instance)
     best_of_place: dict[Place, list[Detection]] = defaultdict(list)
     for detection in sorted(detections, key=lambda d: -d.score):
         if detection.scene_id is None or detection.image_id is None or detection.object_id is None:
@@ -507,7 +519,7 @@ def make_detection_jobs(
                 "category_id; detections of a data set have all three"
             )
         place = Place(detection.scene_id, detection.image_id, detection.object_id)
-        if len(best_of_place[place]) < len(shown.get(place, ())):
+        if len(best_of_place[place]) < len(instances_of_place.get(place, ())):
             best_of_place[place].append(detection)
     chosen = [
         (place, k, detection)
@@ -528,7 +540,7 @@ def make_detection_jobs(
         seconds: dict[str, float] = {}
         if detection.seconds is not None:
             seconds = {"segmentation": detection.seconds / jobs_of_image[place[:2]]}
-        instance = shown[place][0]  # any of the object: only its image and camera are used
+        instance = instances_of_place[place][0]  # any: only its image and camera are used
         object = names[place.object_id]
         read = partial(_read_view, dataset, instance, name, object, detection)
         jobs.append(PoseJob(name=name, read=read, place=place, seconds=seconds))
@@ -536,10 +548,10 @@ def make_detection_jobs(
 
 
 def additive_seconds(predictions: Sequence[Prediction]) -> list[dict[str, float]]:
-    """Divide times among predictions: seconds whose sum is what all of them took together.
+    """List the seconds of each prediction so that their sum is the time of all together.
 
-    The estimates of one search all hold the time of the whole search, which is divided among them
-    here. The stages that ran within a search are left out beside it.
+    The estimates of one search all hold the time of the whole search: it is divided among them. The
+    stages within a search, whose time that of the search includes, are left out.
     """
     # Estimates of one image that hold the very same time come from one search: regions of an image
     # are searched one by one, and take different times.
@@ -549,22 +561,23 @@ def additive_seconds(predictions: Sequence[Prediction]) -> list[dict[str, float]
         searches.append((image, prediction.estimate.seconds.get("search")))
     estimate_count = Counter(searches)
 
-    # The share of each in its search, without the stages within it.
+    # The share of each prediction in its search, without the stages within it.
     rows: list[dict[str, float]] = []
     for prediction, search in zip(predictions, searches, strict=True):
         seconds = dict(prediction.estimate.seconds)
         if "search" in seconds:
-            seconds = {s: t for s, t in seconds.items() if s not in _STAGES_WITHIN_SEARCH}
+            for stage in _STAGES_WITHIN_SEARCH:
+                seconds.pop(stage, None)
             seconds["search"] /= estimate_count[search]
         rows.append(seconds)
     return rows
 
 
-_HEADER = ["scene_id", "im_id", "obj_id", "score", "R", "t", "time"]
-_SAME_TIME_S = 0.001  # BOP's toolkit refuses rows of an image whose times differ by more
+_HEADER = ["scene_id", "im_id", "obj_id", "score", "R", "t", "time"]  # of BOP's csv
+_TIME_SLACK_S = 0.001  # BOP's toolkit refuses rows of an image whose times differ by more
 
 
-def results_name(dataset: BopDataset, method: str = "depthpose") -> str:
+def name_bop_results(dataset: BopDataset, method: str = "depthpose") -> str:
     """Name the BOP csv of a data set: ``METHOD_DATASET-SPLIT.csv``."""
     # BOP's toolkit splits names at _, which a split such as test_primesense may hold.
     split = dataset.folder_of_split.replace("_", "-")
@@ -572,12 +585,12 @@ def results_name(dataset: BopDataset, method: str = "depthpose") -> str:
 
 
 def read_bop_results(path: str | Path) -> list[Prediction]:
-    """Read a BOP csv (mm, seconds) of any method as predictions.
+    """Read the predictions of a BOP csv (mm, seconds) by any method.
 
     The time of an image is divided among its rows; a score becomes the share of inliers.
 
     Raises:
-        InputError: it is missing or damaged, or rows of an image have different times.
+        InputError: the file is missing or damaged, or rows of an image have different times.
     """
     # The lines of the file.
     data = read_bytes(path)
@@ -587,7 +600,7 @@ def read_bop_results(path: str | Path) -> list[Prediction]:
     if not rows or [name.strip() for name in rows[0]] != _HEADER:
         raise InputError(f"{path}: the first line is not {','.join(_HEADER)}; put it there")
 
-    # An estimate a line, and the time of each image.
+    # An estimate for each line, and the time of each image.
     estimates: list[tuple[Place, PoseEstimate]] = []
     image_s: dict[tuple[int, int], float] = {}
     for line, row in enumerate(rows[1:], 2):
@@ -596,10 +609,11 @@ def read_bop_results(path: str | Path) -> list[Prediction]:
         place, estimate, time_s = _parse_bop_row(row, len(estimates) + 1, f"{path}: line {line}")
         estimates.append((place, estimate))
 
-        # All rows of an image have its time; a negative one is not known.
+        # All rows of an image have its time; a negative one means that it is not known.
         first_time_s = image_s.setdefault(place[:2], time_s)
-        is_one_known = (first_time_s < 0) != (time_s < 0)
-        if is_one_known or (time_s >= 0 and abs(first_time_s - time_s) > _SAME_TIME_S):
+        is_known_once = (first_time_s < 0) != (time_s < 0)
+        is_other_time = time_s >= 0 and abs(first_time_s - time_s) > _TIME_SLACK_S
+        if is_known_once or is_other_time:
             raise InputError(
                 f"{path}: scene {place.scene_id} image {place.image_id} took {first_time_s} s in "
                 f"one row and {time_s} s in another; time is that of the whole image, "
@@ -621,7 +635,7 @@ def read_bop_results(path: str | Path) -> list[Prediction]:
 def _parse_bop_row(
     row: Sequence[str], number: int, source: str
 ) -> tuple[Place, PoseEstimate, float]:
-    """Read a row of BOP's csv: its place, an estimate named by ``number``, and the image's time."""
+    """Parse a row of BOP's csv: its place, an estimate named after ``number``, the image's time."""
     # The numbers of the row.
     if len(row) != len(_HEADER):
         raise InputError(f"{source}: {len(row)} values, where {len(_HEADER)} belong")
@@ -655,14 +669,14 @@ def _parse_bop_row(
 def write_bop_results(
     path: str | Path, predictions: Iterable[Prediction], *, with_alternatives: bool = False
 ) -> None:
-    """Write BOP's csv, without refusals.
+    """Write the poses of predictions as BOP's csv, without refusals.
 
     An image's time is the sum over its estimates, in which a search of the image counts once.
 
     Args:
-        path: the csv. Numbers keep all their digits.
-        predictions: of a data set.
-        with_alternatives: give each alternative a row too, with its probability as the score.
+        path: of the csv. Numbers keep all their digits.
+        predictions: with places in a data set.
+        with_alternatives: write a row for each alternative too, with its probability as the score.
             Leave them out of a csv that is measured: BOP takes the best rows of an image.
 
     Raises:

@@ -12,11 +12,12 @@ import torch
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid
 from depthpose.core.stopwatch import Stopwatch
-from depthpose.pose.cloud import ObjectCloud, local_planes, prepare_cloud, thin
+from depthpose.pose.cloud import ObjectCloud, prepare_cloud
 from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig
 from depthpose.pose.copies import PreparedObject
 from depthpose.pose.decide import decide, refused
 from depthpose.pose.evidence import observe
+from depthpose.pose.grid import fit_local_planes, thin_cloud
 from depthpose.pose.hypotheses import compete
 from depthpose.pose.icp import BestStart, refine_best
 from depthpose.pose.probability import PRIOR_MASKED
@@ -76,8 +77,8 @@ def propose_by_pairs(cloud: ObjectCloud, prepared: PreparedObject, seed: int) ->
     """Propose poses by the point pairs of a cloud."""
     dense_m = take_evenly(cloud.cloud_m.double(), _SMOOTHED_POINTS)
     step_m = _VOTING_DIAMETERS * prepared.surface.diameter_m
-    voting_m = dense_m[thin(dense_m, torch.zeros_like(dense_m), step_m)]
-    normals, _ = local_planes(dense_m, voting_m)
+    voting_m = dense_m[thin_cloud(dense_m, torch.zeros_like(dense_m), step_m)]
+    normals, _ = fit_local_planes(dense_m, voting_m)
     generator = torch.Generator().manual_seed(seed)
     return propose_poses(voting_m, normals, prepared.pairs, _PROPOSALS, generator)
 

@@ -33,7 +33,7 @@ from depthpose.pose.evidence import compare, observe
 from depthpose.pose.footprint import explained_frame_mask, why_background_excludes, window_of_region
 from depthpose.pose.frame import Frame, prepare_frame
 from depthpose.pose.icp import refine_roughly
-from depthpose.pose.picking import with_pick_ranks
+from depthpose.pose.picking import rank_picks
 from depthpose.pose.probability import (
     LEAST_POSSIBLE,
     PRIOR_MANY,
@@ -170,7 +170,7 @@ def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
     ]
     if not targets.is_single:
         surfaces = {name: target.surface for name, target in targets.objects.items()}
-        estimates = with_pick_ranks(estimates, window, surfaces)
+        estimates = rank_picks(estimates, window, surfaces)
     missing = set(targets.objects) - {place.object for place in posed}
     estimates += [
         nothing_found(view, name, [miss for miss in misses if miss.object == name], spent_s)

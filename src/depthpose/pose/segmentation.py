@@ -31,14 +31,14 @@ from depthpose.core.devices import usable_device
 from depthpose.core.errors import InputError
 from depthpose.core.files.images import check_image
 
-ENCODER_KIND = "resnet18"
+ENCODER_KIND = "resnet18"  #: of files with the encoder alone
 WIDTHS = (64, 128, 256, 512)  #: channels of the four stages in the published network
 
-Widths = tuple[int, int, int, int]
+Widths = tuple[int, int, int, int]  #: channels of the four stages of an encoder
 
 
 class BasicBlock(nn.Module):
-    """Two 3x3 convolutions beside a shortcut; the first may halve the size."""
+    """A residual block: two 3x3 convolutions beside a shortcut; the first may halve the size."""
 
     def __init__(self, inputs: int, outputs: int, stride: int) -> None:
         super().__init__()
@@ -54,14 +54,16 @@ class BasicBlock(nn.Module):
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b d i j"]:
         """Add the branch to the input, or to its projection, and apply ReLU."""
-        branch = self.bn2(self.conv2(F.relu(self.bn1(self.conv1(x)))))
-        return F.relu(branch + (x if self.downsample is None else self.downsample(x)))
+        inner = F.relu(self.bn1(self.conv1(x)))
+        branch = self.bn2(self.conv2(inner))
+        shortcut = x if self.downsample is None else self.downsample(x)
+        return F.relu(branch + shortcut)
 
 
 class ResNet18(nn.Module):
-    """A network from an image to features at 1/8, 1/16 and 1/32 of its size.
+    """A network from an image to features at 1/8, 1/16 and 1/32 of its size (He et al. 2016).
 
-    Its modules have the names of published state dicts, so that those load unchanged.
+    Its modules have the names of torchvision's state dict, so that it loads unchanged.
     """
 
     def __init__(self, inputs: int = 3, widths: Widths = WIDTHS) -> None:
@@ -69,10 +71,10 @@ class ResNet18(nn.Module):
         self.widths = widths
         self.conv1 = nn.Conv2d(inputs, widths[0], 7, 2, 3, bias=False)
         self.bn1 = nn.BatchNorm2d(widths[0])
-        before = (widths[0], *widths)
+        input_widths = (widths[0], *widths[:3])
         self.layer1, self.layer2, self.layer3, self.layer4 = (
-            nn.Sequential(BasicBlock(a, b, stride), BasicBlock(b, b, 1))
-            for a, b, stride in zip(before, widths, (1, 2, 2, 2), strict=False)
+            nn.Sequential(BasicBlock(inputs, width, stride), BasicBlock(width, width, 1))
+            for inputs, width, stride in zip(input_widths, widths, (1, 2, 2, 2), strict=True)
         )
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
@@ -81,7 +83,7 @@ class ResNet18(nn.Module):
     def forward(
         self, image: Float[Tensor, "b c h w"]
     ) -> tuple[Float[Tensor, "b c8 _ _"], Float[Tensor, "b c16 _ _"], Float[Tensor, "b c32 _ _"]]:
-        """Give the features of the last three stages, the finest first."""
+        """Compute the features of the last three stages, the finest first."""
         x = F.max_pool2d(F.relu(self.bn1(self.conv1(image))), 3, 2, 1)
         eighth = self.layer2(self.layer1(x))
         sixteenth = self.layer3(eighth)
@@ -96,9 +98,10 @@ def normalise_colors(image: Float[Tensor, "*b 3 h w"]) -> Float[Tensor, "*b 3 h 
 
 
 def import_resnet18(file: Path, out: Path) -> None:
-    """Turn torchvision's weights of ImageNet into an encoder that trainings can start from.
+    """Convert torchvision's weights of ImageNet to an encoder that trainings can start from.
 
-    The classifier's own layer (``fc``) is left out, and so is ``module.``; all else must agree.
+    The layer of the classifier (``fc``) is left out, and so is the prefix ``module.`` of names; all
+    else must agree.
 
     Args:
         file: a ``.pth`` of tensors, read without running any code in it, or ``.safetensors``.
@@ -107,12 +110,13 @@ def import_resnet18(file: Path, out: Path) -> None:
     Raises:
         InputError: not the weights of such a network; nothing is written.
     """
-    state = read_published(file, "ResNet-18")
-    tensors = {name.removeprefix("module."): value for name, value in state.items()}
+    published = read_published(file, "ResNet-18")
+    tensors = {name.removeprefix("module."): value for name, value in published.items()}
     tensors = {name: value for name, value in tensors.items() if not name.startswith("fc.")}
     network = ResNet18()
     # The count of batches is not used at inference, and old files do not hold it.
-    counts = {k: t for k, t in network.state_dict().items() if k.endswith("num_batches_tracked")}
+    state = network.state_dict()
+    counts = {name: state[name] for name in state if name.endswith("num_batches_tracked")}
     checkpoint = Checkpoint(kind=ENCODER_KIND, config={}, state={**counts, **tensors})
     try:
         load_weights(network, checkpoint, ENCODER_KIND)
@@ -125,7 +129,7 @@ def import_resnet18(file: Path, out: Path) -> None:
     save_imported(out, ENCODER_KIND, network.eval(), file, facts)
 
 
-KIND = "segmentation"
+KIND = "segmentation"  #: of files of segmentation weights
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,8 +143,8 @@ class SegmentationConfig(Settings):
     """Channels of the encoder's stages; published weights have these."""
 
     long_side_px: Annotated[int, "[32, inf)"] = 640
-    """Images are brought to this long side before the network, up or down, and the answer is
-    brought back."""
+    """Images are resized to this long side before the network, up or down, and its output is
+    resized back."""
 
     with_one_instance: bool = True
     """An image shows each object once: the largest connected part is kept, the others are errors.
@@ -153,9 +157,9 @@ class SegmentationConfig(Settings):
 class FCN(nn.Module):
     """A network from an image to the logits of background and objects at each pixel.
 
-    Each level scores classes by a 1x1 convolution. Coarse scores are enlarged twice by a learned
+    Each level scores classes by a 1x1 convolution. Coarse scores are upsampled by 2 by a learned
     convolution, initially bilinear, and added to the next finer ones, initially zero (section 4.1
-    of the paper). The last enlargement, to pixels, is bilinear and fixed.
+    of the paper). The last upsampling, to pixels, is bilinear and fixed.
     """
 
     def __init__(self, objects: int, config: SegmentationConfig | None = None) -> None:
@@ -164,7 +168,7 @@ class FCN(nn.Module):
         self.classes = classes = objects + 1
         self.encoder = ResNet18(widths=config.widths)
 
-        # Scores of each level that is used, and the enlargements between them.
+        # Scores of each level that is used, and the upsampling between them.
         levels = {8: 3, 16: 2, 32: 1}[config.stride]
         coarsest_first = config.widths[:0:-1][:levels]
         self.scores = nn.ModuleList(nn.Conv2d(width, classes, 1) for width in coarsest_first)
@@ -174,7 +178,7 @@ class FCN(nn.Module):
         with torch.no_grad():
             for parameter in self.scores[1:].parameters():
                 parameter.zero_()
-            # An enlargement is initially bilinear, each class by itself.
+            # Upsampling is initially bilinear, each class by itself.
             ramp = torch.tensor([0.25, 0.75, 0.75, 0.25])
             index = torch.arange(classes)
             for weight in self.enlarge.parameters():
@@ -182,16 +186,14 @@ class FCN(nn.Module):
                 weight[index, index] = ramp[:, None] * ramp
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b classes h w"]:
-        """Give logits, background first.
+        """Compute the logits of each class, background first.
 
         Args:
             image: colours normalised by :func:`normalise_colors`; its sides are multiples of 32.
         """
-        features = self.encoder(image)[::-1]
-        scores = self.scores[0](features[0])
-        for enlarge, score, finer in zip(
-            self.enlarge, self.scores[1:], features[1 : len(self.scores)], strict=True
-        ):
+        coarsest, *finer_levels = self.encoder(image)[::-1][: len(self.scores)]
+        scores = self.scores[0](coarsest)
+        for enlarge, score, finer in zip(self.enlarge, self.scores[1:], finer_levels, strict=True):
             scores = enlarge(scores) + score(finer)
         size = (image.shape[-2], image.shape[-1])
         return F.interpolate(scores, size, mode="bilinear", align_corners=False)
@@ -213,9 +215,9 @@ class SegmentationWeights:
 
 @dataclass(frozen=True)
 class _FileConfig:
-    """The config in a file of these weights."""
+    """The config in a file of segmentation weights."""
 
-    network: SegmentationConfig = field(default_factory=SegmentationConfig)  #: its settings
+    network: SegmentationConfig = field(default_factory=SegmentationConfig)  #: of the network
     objects: tuple[str, ...] = ()  #: names, in the order of the classes
     numbers: tuple[int, ...] = ()  #: BOP's ``obj_id`` of each
 
@@ -241,8 +243,8 @@ def write_segmentation(
 class Segmentation:
     """The objects that were found in an image."""
 
-    #: of the instances of each object, those of the highest scores first; an object that was not
-    #: found has no entry.
+    #: of the instances of each object, by its name, the highest score first; an object that was
+    #: not found has no entry.
     masks: Mapping[str, Bool[Tensor, "n h w"]]
     scores: Mapping[str, Float[Tensor, " n"]]  #: mean probability of the object on each mask, 0..1
 
@@ -333,17 +335,21 @@ def predict_probabilities(network: FCN, image: Image) -> Float[Tensor, "classes 
 def find_connected_parts(
     mask: Bool[Tensor, "h w"], config: SegmentationConfig
 ) -> Bool[Tensor, "n h w"]:
-    """Find the connected parts of a mask that are large enough, or the largest alone.
+    """Find the connected parts of a mask that are large enough, or the largest of them alone.
 
-    ``config`` has the least share of the image; and whether an image shows each object once, so
-    that the largest part alone is it.
+    Args:
+        mask: the pixels of an object.
+        config: ``min_share``, and ``with_one_instance`` for the largest alone.
+
+    Returns:
+        A mask for each part.
     """
     label, pixels = label_parts(mask)
     least_px = max(1, math.ceil(config.min_share * mask.numel()))
-    large = (pixels >= least_px).nonzero()[:, 0]
-    if config.with_one_instance and len(large):
-        large = pixels.argmax()[None]
-    return label == large[:, None, None]
+    kept = (pixels >= least_px).nonzero()[:, 0]
+    if config.with_one_instance and len(kept):
+        kept = pixels.argmax()[None]
+    return label == kept[:, None, None]
 
 
 def label_parts(mask: Bool[Tensor, "h w"]) -> tuple[Int64[Tensor, "h w"], Int64[Tensor, " n"]]:
@@ -364,13 +370,16 @@ def label_parts(mask: Bool[Tensor, "h w"]) -> tuple[Int64[Tensor, "h w"], Int64[
 def count_overlap(
     predicted: Int[Tensor, "*b h w"], truth: Int[Tensor, "*b h w"], classes: int
 ) -> Int64[Tensor, "classes classes"]:
-    """Count the pixels of an image or a batch by true class (row) and found class (column)."""
+    """Count the pixels of an image or a batch by true class (row) and predicted class (column)."""
     pairs = (truth * classes + predicted).flatten().cpu()
     return torch.bincount(pairs, minlength=classes**2).view(classes, classes)
 
 
 def intersection_over_union(table: Int64[Tensor, "c c"]) -> Float[Tensor, " c"]:
-    """Measure the ratio of each class in a table of :func:`count_overlap`; NaN of a missing one."""
-    both = table.diagonal()
-    either = table.sum(0) + table.sum(1) - both
-    return torch.where(either > 0, both / either, torch.nan)
+    """Compute the IoU of each class from a table of :func:`count_overlap`.
+
+    It is NaN for a class without a true or predicted pixel.
+    """
+    intersection = table.diagonal()
+    union = table.sum(0) + table.sum(1) - intersection
+    return torch.where(union > 0, intersection / union, torch.nan)

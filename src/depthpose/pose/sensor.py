@@ -68,9 +68,12 @@ _WIDEST_M = 0.004
 _WIDEST_PER_M2 = 0.003
 """That distance is at most 4 mm, and 3 mm for the square of the depth in metres: twice the
 noise of a Kinect."""
-_MEDIAN_TO_DEVIATION = 1.4826  # standard deviation over median magnitude, in a normal distribution
-_FEWEST_DIFFERENCES = 30  # least number of second differences whose median measures the noise
-_STEEPEST = 0.3
+_DEVIATION_PER_MEDIAN = 1.4826  # standard deviation over median magnitude of a normal distribution
+_DEVIATION_OF_DIFFERENCE = math.sqrt(6)
+"""Standard deviation of a second difference over that of an independent reading: the variance of
+``a - 2 b + c`` is 1 + 4 + 1 times that of a reading."""
+_LEAST_DIFFERENCES = 30  # least number of second differences whose median measures the noise
+_LEAST_COSINE = 0.3
 """A smaller cosine between ray and normal counts as this one: the sensor hardly measures there."""
 
 
@@ -84,30 +87,35 @@ class DepthNoise:
     object_std_m: float  #: of the real surface from the model, along its normal
 
     def deviation_m(self, cosine: np.ndarray, readings: int) -> np.ndarray:
-        """Give the standard deviation of the mean of neighbouring readings, along the optical axis.
-
-        It is ``LEAST_DEVIATION_M`` at least, so that residuals can be counted in it.
+        """Compute the standard deviation of a mean of neighbouring readings along the optical axis.
 
         Args:
-            cosine: between the ray and the surface normal, any shape.
+            cosine: between the ray and the surface normal, of any shape.
             readings: number of independent readings that are averaged.
+
+        Returns:
+            Metres, in the shape of ``cosine``; ``LEAST_DEVIATION_M`` or more.
         """
-        cosine = np.clip(cosine, _STEEPEST, 1.0)
+        cosine = np.clip(cosine, _LEAST_COSINE, 1.0)
         noise_m2 = self.white_std_m**2 / readings + self.shared_std_m**2
-        # On a slanted surface, what is off across the axis or along the normal is off in depth.
-        place_m = self.lateral_std_m * np.sqrt(1 / cosine**2 - 1)
+        # On a surface whose normal is at this angle to the ray, a shift across the axis changes the
+        # depth by tan(angle) times as much, and one along the normal by 1 / cos(angle).
+        tangent = np.sqrt(1 / cosine**2 - 1)
+        lateral_m = self.lateral_std_m * tangent
         object_m = self.object_std_m / cosine
-        return np.maximum(np.sqrt(noise_m2 + place_m**2 + object_m**2), LEAST_DEVIATION_M)
+        return np.maximum(np.sqrt(noise_m2 + lateral_m**2 + object_m**2), LEAST_DEVIATION_M)
 
 
 def measure_noise(
     depth_m: np.ndarray, is_object: np.ndarray, object_std_m: float, focal_px: float
 ) -> DepthNoise:
-    """Measure the noise of a depth image on an object, and derive what neighbours share.
+    """Measure the noise of a depth image on an object, and derive its other errors.
 
-    The noise is the median second difference of readings three pixels apart, to which a slope adds
-    nothing and a curved surface little. Of an object too thin for it that of all readings is
-    taken; where these are too few, that of a Kinect.
+    The noise of a reading follows from the median second difference of readings three pixels apart,
+    to which a slope adds nothing and a curved surface little. On an object too thin for it all
+    readings are taken; where these are too few, the noise is that of a Kinect. The error that
+    neighbours share, and that across the axis, are as large as measured on other depth cameras
+    (``SHARED_PER_WHITE``, ``LATERAL_PX``).
 
     Args:
         depth_m: (h, w), NaN where there is no reading.
@@ -115,19 +123,19 @@ def measure_noise(
         object_std_m: standard deviation of the real surface from its model.
         focal_px: of the depth image.
     """
-    # The object's own readings, or all where these are too few.
+    # Second differences on the object, or in the whole image where these are too few.
     masked_m = np.where(is_object, depth_m, np.nan)
     distance_m = float(np.nanmedian(masked_m)) if np.isfinite(masked_m).any() else 0.0
     bend_m, _ = _take_second_differences(masked_m)
-    if len(bend_m) < _FEWEST_DIFFERENCES:
+    if len(bend_m) < _LEAST_DIFFERENCES:
         bend_m, _ = _take_second_differences(depth_m)
 
-    # Their noise, or that of a Kinect.
-    if len(bend_m) < _FEWEST_DIFFERENCES:
+    # The noise that they show, or that of a Kinect.
+    if len(bend_m) < _LEAST_DIFFERENCES:
         white_std_m = NOISE_PER_M2 * distance_m**2
     else:
-        # A second difference of independent readings has six times their variance: 1 + 1 + 2^2.
-        white_std_m = _MEDIAN_TO_DEVIATION * float(np.median(np.abs(bend_m))) / math.sqrt(6)
+        difference_std_m = _DEVIATION_PER_MEDIAN * float(np.median(np.abs(bend_m)))
+        white_std_m = difference_std_m / _DEVIATION_OF_DIFFERENCE
         # On a small object its own curvature is in the differences: no sensor is so noisy.
         white_std_m = min(white_std_m, NOISIEST_PER_M2 * distance_m**2)
     return DepthNoise(
@@ -156,29 +164,33 @@ def _take_second_differences(depth_m: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def measure_noise_per_m2(depth_m: Float64[Tensor, "h w"]) -> float:
-    """Measure the noise of a whole image: standard deviation of a reading = result * depth^2.
+    """Measure the noise of a whole image, per square metre of depth.
 
-    It is the median of second differences, as :func:`measure_noise` takes it on one object, each
-    over the square of its depth; where there are none, the noise of a Kinect.
+    It follows from second differences, as in :func:`measure_noise`, each over the square of its
+    depth; where there are none, it is that of a Kinect.
 
     Args:
         depth_m: 0 where there is no reading.
+
+    Returns:
+        The standard deviation of a reading [m] over the square of its depth [m^2].
     """
     read_m = torch.where(depth_m > 0, depth_m, torch.nan)
     bend_m, middle_m = _take_second_differences(read_m.numpy())
     if len(bend_m) == 0:
         return NOISE_PER_M2
     bend_per_m2 = torch.from_numpy(np.abs(bend_m) / np.square(middle_m))
-    return _MEDIAN_TO_DEVIATION * float(bend_per_m2.median()) / math.sqrt(6)
+    difference_std_per_m2 = _DEVIATION_PER_MEDIAN * float(bend_per_m2.median())
+    return difference_std_per_m2 / _DEVIATION_OF_DIFFERENCE
 
 
 def plane_tolerance_m(depth_m: Float64[Tensor, "*n"], noise_per_m2: float) -> Float64[Tensor, "*n"]:
-    """Give the largest distance from a plane at which a reading counts as one of it.
+    """Compute the largest distance [m] from a plane at which a reading counts as one of it.
 
     Args:
         depth_m: depths of the readings.
-        noise_per_m2: noise of the image, as :func:`measure_noise_per_m2` gives it.
+        noise_per_m2: noise of the image (:func:`measure_noise_per_m2`).
     """
-    square = depth_m.square()
-    tolerance_m = FLAT_M + _TOLERATED * SHARED_PER_WHITE * noise_per_m2 * square
-    return torch.minimum(tolerance_m, _WIDEST_M + _WIDEST_PER_M2 * square)
+    depth_m2 = depth_m.square()
+    tolerance_m = FLAT_M + _TOLERATED * SHARED_PER_WHITE * noise_per_m2 * depth_m2
+    return torch.minimum(tolerance_m, _WIDEST_M + _WIDEST_PER_M2 * depth_m2)

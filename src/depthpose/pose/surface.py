@@ -1,8 +1,7 @@
-"""The surface of a model: what of it lies near a point, and what of it a camera would see."""
+"""The surface of a model: what of it lies near a point, and what of it a camera sees."""
 
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -17,13 +16,14 @@ from depthpose.pose.compiled import Vector, array_of, compiled, dot, vector
 from depthpose.pose.kdtree import (
     Tree,
     build_tree,
-    faces,
+    faces_camera,
     find_nearest_facing,
     find_nearest_points,
     square_distance,
 )
 from depthpose.pose.mesh import sample_surface, symmetry_transforms
 from depthpose.pose.mesh.models import drawn_triangles, fibonacci_directions, triangulate_points
+from depthpose.pose.outer_sides import find_outer_sides
 from depthpose.pose.types import ObjectModel
 
 NEAR = 0.05  #: diameters: a point of the cloud within this distance lies on the posed surface
@@ -36,7 +36,9 @@ _NEAREST_SHARE = 0.1  # points nearer than this share of the median depth were n
 _BOXES = 48  # boxes along the longest side of a model, to look up near samples without a search
 _BOX_MARGIN = 0.15  # distance by which the boxes reach beyond the model, in diameters
 _VIEWS = 256  # directions from which a model is viewed
-_POINTS = 160  # largest number of points of a view
+_VIEW_POINTS = 160  # largest number of points of a view
+_PROBED_SPACINGS = 500  # samples by which the mean distance of neighbours is measured
+_PROBED_THIRDS = 1000  # samples by which the distance of the third nearest is measured
 _MOST_FACES = 100_000
 """Largest number of faces that are rendered; of a larger model its samples are, which are fewer."""
 _EDGE_STEP = 0.08
@@ -44,18 +46,18 @@ _EDGE_STEP = 0.08
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Boxes:
-    """A table of near surface points: for each box of a grid, the one nearest to its middle."""
+class NearestTable:
+    """The surface point nearest to the middle of each box of a grid, looked up without a search."""
 
     low_m: Float64[Tensor, "3"]  #: corner of the grid, in the model frame
     side_m: float  #: of a box
     counts: Int64[Tensor, "3"]  #: boxes along each axis
-    nearest: Int64[Tensor, " boxes"]  #: number of the surface point, axes one after the other
+    nearest: Int64[Tensor, " boxes"]  #: index of the surface point; z varies fastest
 
     def look_up(self, points_m: Float64[Tensor, "*batch n 3"]) -> Int64[Tensor, "*batch n"]:
-        """Give the index of the surface point nearest to the middle of each point's box.
+        """Find the index of the surface point nearest to the middle of the box about each point.
 
-        For a point outside the grid the box at the border is used.
+        A point outside the grid takes the box at the border.
         """
         points = array_of(points_m).reshape(-1, 3)
         low = self.low_m.numpy()
@@ -95,7 +97,10 @@ def _look_up_all(
 
 
 class Target(NamedTuple):
-    """The samples of a surface for compiled loops, in the order of a k-d tree: their *places*."""
+    """The samples of a surface for compiled loops, in the order of a k-d tree.
+
+    The *place* of a sample is its row in this order.
+    """
 
     tree: Tree  #: of the samples, with their outward normals
     normals: Float64[np.ndarray, "m 3"]  #: of the samples, to either side
@@ -117,17 +122,17 @@ def match(
     is_exact: bool,
     places: Int64[np.ndarray, " n"],
 ) -> None:
-    """Write the place of the sample near each point of the model frame into ``places``, or -1.
+    """Match each point with a sample that faces the camera: write its place, or -1.
 
     Args:
         points: in the model frame.
         target: the samples.
-        eye: the camera in the model frame; samples count that show it their outer side.
-        least: how nearly they do (:func:`~depthpose.pose.kdtree.faces`).
-        limit: distance of the farthest sample, of exact matches.
-        is_exact: whether the nearest sample is searched, not looked up in the table, and of two
-            sides of a wall the one that faces the camera.
-        places: on entry those of the matches before, or -1, from which exact searches begin.
+        eye: centre of the camera in the model frame.
+        least: how nearly a sample faces it (:func:`~depthpose.pose.kdtree.faces_camera`).
+        limit: distance of the farthest sample, where the match is exact.
+        is_exact: True: the nearest sample that faces the camera is searched; False: one near the
+            point is looked up, or that on the other side of the wall.
+        places: written. On entry those of earlier matches, or -1, from which searches begin.
     """
     # Taken out of the tuple once, not for each point.
     tree = target.tree
@@ -142,12 +147,12 @@ def match(
         point = vector(points, i)
         place = places[i]
 
-        # The match before or the sample of the box, if it faces the camera; else none.
+        # The earlier match, or the sample of the box or across its wall, if it faces the camera.
         if not is_exact or place < 0:
             place = np.int64(table[_find_box(point, low, side, counts)])
-            if not faces(samples, outward, place, eye, least):
+            if not faces_camera(samples, outward, place, eye, least):
                 place = np.int64(across[place])
-        if place >= 0 and not faces(samples, outward, place, eye, least):
+        if place >= 0 and not faces_camera(samples, outward, place, eye, least):
             place = -1
 
         # From there the nearest one is searched.
@@ -155,7 +160,7 @@ def match(
             square = limit * limit
             if place >= 0:
                 square = min(square, square_distance(samples, place, point))
-            if square == limit * limit:  # the guess is too far away
+            if square == limit * limit:  # no guess, or one that is too far away
                 place = -1
             place = find_nearest_facing(point, tree, eye, least, place, square)
         places[i] = place
@@ -163,12 +168,12 @@ def match(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Views:
-    """The visible points of a model from many directions of a far camera, in the model's frame."""
+    """The points of a model that a far camera sees from many directions, in the model frame."""
 
     toward: Float64[Tensor, "v 3"]  #: unit vectors to the camera
     points_m: Float64[Tensor, "v n 3"]  #: visible ones, evenly spread; NaN where there are fewer
     normals: Float64[Tensor, "v n 3"]  #: of these points
-    #: whether the surface goes on around a point: no rim or edge, which sensors cut.
+    #: whether a point is on no rim or edge, of which sensors lose readings.
     is_inner: Bool[Tensor, "v n"]
 
 
@@ -178,18 +183,18 @@ class Surface:
 
     points_m: Float64[Tensor, "m 3"]  #: of the surface, in the model frame
     normals: Float64[Tensor, "m 3"]  #: of these points, to either side
-    outward: Float64[Tensor, "m 3"]  #: normals on the outer side, 0 where none is known
-    triangles_m: Float64[Tensor, "f 3 3"]  #: corners of what is rendered, in the model frame
+    outward: Float64[Tensor, "m 3"]  #: outward normals, 0 where the outer side is not known
+    triangles_m: Float64[Tensor, "f 3 3"]  #: corners of the rendered triangles, in the model frame
     across: Int64[Tensor, " m"]  #: index of the sample on the other side of a wall, or -1
     diameter_m: float  #: of the object
-    spacing_m: float  #: distance from a point to the third nearest, in the median
+    spacing_m: float  #: median distance from a point to its third nearest neighbour
     middle_m: Float64[Tensor, "3"]  #: of the box about the surface, along the axes of the model
     ball_m: Float64[Tensor, "4"]  #: middle and radius of a ball about the surface
     symmetries: Rigid  #: declared and found, ``model_from_model``, the identity first
-    boxes: Boxes  #: a table of near points, some thirty times as fast as a search
+    boxes: NearestTable  #: of near surface points, some thirty times as fast as a search
 
     def nearest(self, points_m: Float64[Tensor, "*batch n 3"]) -> Int64[Tensor, "*batch n"]:
-        """Give the index of the surface point nearest to each point of the model frame."""
+        """Find the index of the surface point nearest to each point of the model frame."""
         index = find_nearest_points(array_of(points_m).reshape(-1, 3), self.target.tree)
         return torch.from_numpy(index).reshape(points_m.shape[:-1])
 
@@ -213,10 +218,10 @@ class Surface:
 
     @cached_property
     def views(self) -> Views:
-        """The visible points from many directions, computed once for many images."""
+        """The visible points from 256 directions."""
         half = fibonacci_directions(_VIEWS // 2).double()
         toward = torch.cat([half, -half])
-        # The last two rows of each frame are two axes across the direction.
+        # The last two rows of each frame are unit vectors across the direction.
         _, _, frames = torch.linalg.svd(toward[:, None])
         views = [
             _view_from(self, direction, frame[1:])
@@ -237,7 +242,7 @@ class Surface:
         shared memory and frees the old one, and an array on that memory would point at nothing.
         """
         tree = build_tree(array_of(self.points_m), array_of(self.outward))
-        # The place of each sample in the tree; the last one, -1, is that of no sample.
+        # The place of each sample in the tree. The last entry, which index -1 reads, stays -1.
         place = np.full(len(self.points_m) + 1, -1)
         place[tree.order] = np.arange(len(self.points_m))
         boxes = self.boxes
@@ -255,7 +260,7 @@ class Surface:
 
 
 class _View(NamedTuple):
-    """The visible points from one direction: a row of each part of :class:`Views`."""
+    """The visible points from one direction: a row of each field of :class:`Views`."""
 
     points_m: Float64[Tensor, "n 3"]  #: NaN where there are fewer
     normals: Float64[Tensor, "n 3"]  #: of these points
@@ -263,14 +268,15 @@ class _View(NamedTuple):
 
 
 def _view_from(surface: Surface, toward: Tensor, across: Tensor) -> _View:
-    """Choose the points of a surface that a far camera sees, 160 at most.
+    """Choose at most 160 of the points of a surface that a far camera sees.
 
     Args:
         surface: of the model.
         toward: unit vector to the camera.
         across: two unit vectors across it, (2, 3).
     """
-    # An image along parallel rays: in each cell the sample that is nearest to the camera.
+    # An image along parallel rays: in each cell the sample that is nearest to the camera. It is as
+    # wide as the diameter, with five cells about it.
     cell_m = _CELL * surface.diameter_m
     side = 2 * round(0.5 / _CELL) + 10
     centred_m = surface.points_m - surface.middle_m
@@ -284,54 +290,55 @@ def _view_from(surface: Surface, toward: Tensor, across: Tensor) -> _View:
     sample[place[is_nearest]] = torch.arange(len(place))[is_nearest]
     image_m = nearest_m.reshape(1, side, side)
 
-    # Where samples are sparse the far side shows through the gaps: no camera sees it.
+    # Where samples are sparse, the image has far samples in the gaps that no camera would see.
     front_m = max_pool2d(image_m, 3, 1, 1).flatten()
     is_visible = nearest_m > front_m - _EDGE_STEP * surface.diameter_m
     is_visible &= nearest_m.isfinite()
 
-    # Inner cells: two from the silhouette, whose single empty cells are closed first, and with no
-    # neighbour across an edge.
+    # Inner cells are two or more from the silhouette, in which single empty cells are filled first,
+    # and have no neighbour across an edge in depth.
     closed = max_pool2d(image_m.isfinite().double(), 3, 1, 1)
     eroded = -max_pool2d(-closed, 5, 1, 2)
     depth_m = torch.where(image_m.isfinite(), -image_m, -torch.inf)
     farthest_m = max_pool2d(depth_m, 3, 1, 1)
     is_inner = (eroded > 0) & (-farthest_m > image_m - _EDGE_STEP * surface.diameter_m)
 
-    # The points of these cells, shuffled: every n-th of them is a sample of all.
+    # The points of visible cells, shuffled, so that any first ones of them are spread evenly.
     cells = is_visible.nonzero()[:, 0]
     shuffle = torch.randperm(len(cells), generator=torch.Generator().manual_seed(0))
-    cells = cells[shuffle[:_POINTS]]
+    cells = cells[shuffle[:_VIEW_POINTS]]
     visible = sample[cells]
     return _View(
-        points_m=_pad_rows(surface.points_m[visible], _POINTS),
-        normals=_pad_rows(surface.normals[visible], _POINTS),
-        is_inner=pad(is_inner.flatten()[cells], (0, _POINTS - len(cells))),
+        points_m=_pad_rows(surface.points_m[visible], _VIEW_POINTS),
+        normals=_pad_rows(surface.normals[visible], _VIEW_POINTS),
+        is_inner=pad(is_inner.flatten()[cells], (0, _VIEW_POINTS - len(cells))),
     )
 
 
 def _pad_rows(rows: Float64[Tensor, "n 3"], count: int) -> Float64[Tensor, "{count} 3"]:
-    """Add rows of NaN up to ``count``."""
+    """Append rows of NaN until there are ``count``."""
     return pad(rows, (0, 0, 0, count - len(rows)), value=torch.nan)
 
 
 def prepare_surface(model: ObjectModel, count: int = 10_000) -> Surface:
-    """Sample the surface of a model once for many clouds, by ``count`` points."""
+    """Sample the surface of a model by ``count`` points, and compute what every cloud needs."""
     # Samples, and the triangles that are rendered.
     points_m, normals = (part.double() for part in sample_surface(model, count))
     is_large = len(model.faces) > _MOST_FACES
     triangles_m = triangulate_points(points_m, normals) if is_large else drawn_triangles(model)
     tree = KDTree(points_m.numpy())
 
-    # The outer side of each sample, by cells that hold about four samples.
-    few_m = points_m.numpy()[:: max(1, len(points_m) // 500)]
+    # The outer side of each sample. Of random samples, one in a square of the mean distance, the
+    # fourth nearest is at 2 / sqrt(pi) such distances: pi r^2 holds four.
+    few_m = points_m.numpy()[:: max(1, len(points_m) // _PROBED_SPACINGS)]
     distance_m, _ = tree.query(few_m, k=min(5, len(points_m)))
-    cell_m = _CELL_SPACINGS * float(np.median(distance_m[:, -1])) * np.sqrt(np.pi) / 2
+    mean_spacing_m = float(np.median(distance_m[:, -1])) * np.sqrt(np.pi) / 2
     limit_m = 3 * NEAR * model.diameter_m
-    sides = _find_outer_sides(points_m.numpy(), normals.numpy(), cell_m, limit_m)
+    sides = find_outer_sides(points_m.numpy(), normals.numpy(), mean_spacing_m, limit_m)
     outward, across = (torch.from_numpy(part) for part in sides)
 
     # How far samples lie apart, and how far the surface extends.
-    few_m = points_m.numpy()[:: max(1, len(points_m) // 1000)]
+    few_m = points_m.numpy()[:: max(1, len(points_m) // _PROBED_THIRDS)]
     distance_m, _ = tree.query(few_m, k=4, workers=1)
     middle_m = (points_m.amin(0) + points_m.amax(0)) / 2
     radius_m = (points_m - middle_m).norm(dim=-1).amax()
@@ -346,112 +353,29 @@ def prepare_surface(model: ObjectModel, count: int = 10_000) -> Surface:
         middle_m=middle_m,
         ball_m=torch.cat([middle_m, radius_m[None]]),
         symmetries=symmetry_transforms(model.symmetries, _AXIS_STEP).double(),
-        boxes=_make_boxes(points_m, tree, _BOX_MARGIN * model.diameter_m),
+        boxes=_tabulate_nearest(points_m, tree, _BOX_MARGIN * model.diameter_m),
     )
 
 
-def _make_boxes(points_m: Float64[Tensor, "m 3"], tree: KDTree, margin_m: float) -> Boxes:
-    """Tabulate the surface point nearest to each box of a grid that reaches beyond the points."""
+def _tabulate_nearest(
+    points_m: Float64[Tensor, "m 3"], tree: KDTree, margin_m: float
+) -> NearestTable:
+    """Tabulate the surface point nearest to each box of a grid.
+
+    Args:
+        points_m: of the surface.
+        tree: of these points.
+        margin_m: by which the grid reaches beyond them.
+    """
     low_m = points_m.amin(0) - margin_m
     size_m = points_m.amax(0) + margin_m - low_m
     side_m = float(size_m.max()) / _BOXES
     counts = (size_m / side_m).ceil().clamp(min=1).long()
     middles_m = [(torch.arange(int(count)) + 0.5) * side_m for count in counts]
     grid_m = torch.cartesian_prod(*middles_m).double() + low_m
-    nearest = torch.from_numpy(tree.query(grid_m.numpy(), workers=1)[1])
-    return Boxes(low_m=low_m, side_m=side_m, counts=counts, nearest=nearest)
-
-
-_SIDE_DIRECTIONS = 32
-_CELL_SPACINGS = 2.0  # side of a cell in mean distances of samples: four in each on average
-_SAME_SHEET = 0.5  # mean distances from a sample's plane up to which others are of its sheet
-_LEAST_COSINE = 0.3  # least cosine to its normal at which a side of a sample is examined
-_LEAST_VISIBLE = 0.1  # least share of directions from which an outer side is visible
-_MOST_INNER = 0.4  # largest share for the inner side, over that of the outer side
-
-
-def _find_outer_sides(
-    points: np.ndarray, normals: np.ndarray, cell: float, limit: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Flip normals to the side from which the surface is visible from afar.
-
-    Walls thinner than half the distance of the samples, open sheets and hidden surfaces have no
-    outer side: their normals become 0.
-
-    Args:
-        points: samples of the surface (n, 3).
-        normals: to either side (n, 3).
-        cell: side of the cells in which samples hide each other.
-        limit: farthest distance to a sample of an opposite side.
-
-    Returns:
-        The normals (n, 3); and for each sample the index of the nearest one of an opposite side, or
-        -1.
-    """
-    share = _measure_visible_shares(points, normals, cell)
-    # The outer side is visible from clearly more directions than the inner one.
-    outer = share.argmax(0)
-    is_clear = share.max(0) > _LEAST_VISIBLE
-    is_clear &= share.min(0) < _MOST_INNER * share.max(0)
-    outward = normals * ((1 - 2 * outer) * is_clear)[:, None]
-    across = _find_nearest_opposite(points, outward, limit)
-    return outward, across
-
-
-def _measure_visible_shares(points: np.ndarray, normals: np.ndarray, cell: float) -> np.ndarray:
-    """Measure the share of directions from which both sides of each sample are visible (2, n).
-
-    It is a share of the directions that a side faces. The first side is that of the normal.
-
-    Args:
-        points: samples of the surface (n, 3).
-        normals: to either side (n, 3).
-        cell: side of the cells in which samples hide each other.
-    """
-    visible_count = np.zeros((2, len(points)))
-    facing_count = np.full((2, len(points)), 1e-9)
-    for axis in fibonacci_directions(_SIDE_DIRECTIONS).numpy():
-        # The cell of each sample in an image across the direction.
-        across = np.linalg.svd(axis[None])[2][1:]
-        flat = np.floor(points @ across.T / cell).astype(np.int64)
-        flat -= flat.min(0)
-        place = flat[:, 0] * (flat[:, 1].max() + 1) + flat[:, 1]
-
-        # Visible are the samples in the plane of the first one of their cell.
-        cosine = normals @ axis
-        order = np.argsort(points @ axis)
-        first = np.empty(place.max() + 1, np.int64)
-        for sign in (1, -1):  # toward a camera in this direction, and in the other
-            first[place[order[::sign]]] = order[::sign]
-            front = first[place]
-            off_plane = ((points - points[front]) * normals[front]).sum(1)
-            is_in_front = np.abs(off_plane) < _SAME_SHEET / _CELL_SPACINGS * cell
-            for side in (0, 1):
-                is_facing = sign * (1 - 2 * side) * cosine > _LEAST_COSINE
-                visible_count[side] += is_facing & is_in_front
-                facing_count[side] += is_facing
-    return visible_count / facing_count
-
-
-def _find_nearest_opposite(points: np.ndarray, outward: np.ndarray, limit: float) -> np.ndarray:
-    """Find for each sample the nearest one that faces the other way, as through a wall, or -1.
-
-    Samples are searched by six groups of normals, each about a direction of an axis: every normal
-    has a component of 1 / sqrt(3) or more.
-    """
-    across = np.full(len(points), -1)
-    nearest = np.full(len(points), np.inf)
-    for axis, sign in product(range(3), (1, -1)):
-        (group,) = np.nonzero(sign * outward[:, axis] > 0.577)
-        if len(group) == 0:
-            continue
-        distance, neighbour = KDTree(points[group]).query(points, distance_upper_bound=limit)
-        candidate = group[np.minimum(neighbour, len(group) - 1)]
-        is_opposite = (outward[candidate] * outward).sum(1) < 0
-        is_better = is_opposite & (distance < nearest)
-        across = np.where(is_better, candidate, across)
-        nearest = np.where(is_better, distance, nearest)
-    return across
+    _, nearest = tree.query(grid_m.numpy(), workers=1)
+    nearest = torch.from_numpy(nearest)
+    return NearestTable(low_m=low_m, side_m=side_m, counts=counts, nearest=nearest)
 
 
 def look_along_rays(
@@ -465,12 +389,12 @@ def look_along_rays(
         cloud_m: in the camera frame.
         poses: a batch, ``camera_from_model``.
         surface: of the model.
-        every: of how many points of the surface one is used.
+        every: n: every n-th point of the surface is used.
 
     Returns:
-        The share of the points that the posed surface would have occluded (free-space violation),
-        and the share of the cells of the posed surface in which nothing was observed. Both 1 where
-        the surface lies behind the camera.
+        Of each pose the share of the points that the posed surface would have occluded (free-space
+        violation), and the share of the cells of the posed surface in which nothing was observed.
+        Both are 1 where the surface lies behind the camera.
     """
     # Points nearer to the camera than most were not observed.
     median_m = float(cloud_m[:, 2].median())
@@ -479,7 +403,7 @@ def look_along_rays(
         ones = torch.ones(len(poses.R), dtype=torch.float64)
         return ones, ones
 
-    # Cells of rays about the middle of the cloud.
+    # Cells of rays about the middle of the cloud; ``scale`` is in cells per unit of x / z.
     scale = median_m / (_CELL * surface.diameter_m)
     observed_rays = cloud_m[:, :2] / cloud_m[:, 2:] * scale
     middle = observed_rays.median(0).values.floor()
@@ -525,23 +449,24 @@ def _compare_rays(
         cell_of_point[i] = _find_cell(cloud[i, 0], cloud[i, 1], cloud[i, 2], scale, middle)
         is_observed[cell_of_point[i]] = True
 
-    # Each pose: the cells that it covers, those of them without a point, and points behind it.
+    # For each pose: the cells that its surface covers, those of them without a point, and points
+    # behind it.
     violation, unobserved = np.ones(len(ts)), np.ones(len(ts))
     nearest = np.empty(cells)  # depth of the nearest point of the posed surface in each cell
     for b in range(len(ts)):
         _draw_cells(points, Rs[b], ts[b], scale, middle, nearest)
-        posed = 0
-        missed = 0
+        covered_count = 0
+        missed_count = 0
         for k in range(cells):
             if nearest[k] < np.inf:
-                posed += 1
-                missed += not is_observed[k]
-        occluded = 0
+                covered_count += 1
+                missed_count += not is_observed[k]
+        occluded_count = 0
         for i in range(len(cloud)):
-            occluded += nearest[cell_of_point[i]] < cloud[i, 2] - limit
-        if posed > 0:
-            violation[b] = occluded / len(cloud)
-            unobserved[b] = missed / posed
+            occluded_count += nearest[cell_of_point[i]] < cloud[i, 2] - limit
+        if covered_count > 0:
+            violation[b] = occluded_count / len(cloud)
+            unobserved[b] = missed_count / covered_count
     return violation, unobserved
 
 
@@ -578,7 +503,17 @@ def _draw_cells(
 
 @compiled
 def _find_cell(x: float, y: float, z: float, scale: float, middle: Float64[np.ndarray, "2"]) -> int:
-    """Find the cell of the ray through a point; rays far off are in a cell at the border."""
-    column = min(max(np.floor(x / z * scale - middle[0]), -_REACH), _REACH) + _REACH
-    row = min(max(np.floor(y / z * scale - middle[1]), -_REACH), _REACH) + _REACH
+    """Find the cell of the ray through a point (x, y, z); rays far off are in a cell at the border.
+
+    Args:
+        x: of the point, in the camera frame.
+        y: of the point.
+        z: of the point, above 0.
+        scale: cells per unit of x / z and y / z.
+        middle: column and row of the middle cell.
+    """
+    column = np.floor(x / z * scale - middle[0])
+    row = np.floor(y / z * scale - middle[1])
+    column = min(max(column, -_REACH), _REACH) + _REACH
+    row = min(max(row, -_REACH), _REACH) + _REACH
     return int(column) * (2 * _REACH + 1) + int(row)

@@ -1,11 +1,12 @@
-"""One object through a sequence of frames: ICP from the last pose, and detection where it is lost.
+"""One object through a sequence of frames: ICP from the last pose, and a search where it is lost.
 
-A frame costs ICP alone as long as what was seen agrees with the pose that comes out.
+As long as the frames agree with the refined poses, a frame costs no more than ICP.
 """
 
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float64
@@ -29,34 +30,44 @@ from depthpose.pose.types import (
     Alternative,
     AnyInput,
     CloudInput,
+    Evidence,
     PoseEstimate,
     Refusal,
     ViewInput,
 )
 
-MARGIN = 0.15
-"""Largest distance, in diameters, from the surface at the last or the predicted pose of points that
-may be the object's: between two frames it moves by less."""
+_MARGIN_DIAMETERS = 0.15
+"""Largest distance from the surface at the last or the predicted pose of points that may be the
+object's: between two frames it moves by less."""
+_NEAREST_SHARE = 0.1
+"""The front of the ball about an object counts as no nearer than this share of the middle's depth:
+a ball about the camera has no outline in the image."""
 _MOST_POINTS = 10_000  # points about the object that are used, evenly taken
 _LEAST_POINTS = 60  # with fewer points about it the object is not followed
 _NEW_EVIDENCE = 0.2
 """Share of a frame's evidence that is new: sensor and object err alike in the next frame."""
 _MOST_LOG_ODDS = 9.0  # largest log odds of a track: a few contradicting frames must end it
-_LEAST_CERTAINTY = 1e-4
+_LEAST_CERTAINTY = 1e-4  # with which a track begins: later frames can change finite log odds
 _SUPPORTS = 2  # planes beside the object that are looked for: a table and a wall
 _SUPPORT_POINTS = 1000  # points beside the object in which these planes are looked for
 _SUPPORT_DEVIATIONS = 3.0  # standard deviations up to which a point lies on such a plane
-_LITTLE = 0.2  # least share of the points near an object that its support must leave
-_FLAT = 0.9  # share of a flat object's surface that lies in the plane of its support
+_LEAST_LEFT_SHARE = 0.2  # least share of the points near an object that its support leaves
+_FLAT_SHARE = 0.9  # share of a flat object's surface that lies in the plane of its support
 
 
 def _gather_scene(pose_input: AnyInput, poses: Rigid, surface: Surface) -> Float64[Tensor, "n 3"]:
-    """Gather all points in the direction of the object at one of several poses, and about it."""
-    # A ball about the object at all of these poses.
+    """Gather the points of a frame whose rays pass the object, at one of several poses, or near it.
+
+    Args:
+        pose_input: the frame.
+        poses: where the object may be, a batch.
+        surface: of the model.
+    """
+    # A ball about the object at all of these poses, and what lies beside it.
     middles_m = (poses.R @ surface.points_m.mean(0)) + poses.t_m
     middle_m = middles_m.mean(0)
-    radius_m = (0.5 + 2 * MARGIN) * surface.diameter_m
-    radius_m += float((middles_m - middle_m).norm(dim=-1).max())
+    spread_m = float((middles_m - middle_m).norm(dim=-1).max())
+    radius_m = (0.5 + 2 * _MARGIN_DIAMETERS) * surface.diameter_m + spread_m
     if isinstance(pose_input, ViewInput):
         points_m = _lift_square_about(pose_input, middle_m, radius_m)
         return take_evenly(points_m, _MOST_POINTS)
@@ -65,7 +76,7 @@ def _gather_scene(pose_input: AnyInput, poses: Rigid, surface: Surface) -> Float
     points_m = pose_input.points_m.double()
     points_m = points_m[points_m.isfinite().all(-1) & (points_m[:, 2] > 0)]
     offset = points_m[:, :2] / points_m[:, 2:] - middle_m[:2] / middle_m[2]
-    nearest_m = (middle_m[2] - radius_m).clamp(min=0.1 * middle_m[2])
+    nearest_m = (middle_m[2] - radius_m).clamp(min=_NEAREST_SHARE * middle_m[2])
     is_toward = offset.abs().amax(-1) < radius_m / nearest_m
     return take_evenly(points_m[is_toward], _MOST_POINTS)
 
@@ -74,9 +85,10 @@ def _lift_square_about(
     view: ViewInput, middle_m: Float64[Tensor, "3"], radius_m: float
 ) -> Float64[Tensor, "n 3"]:
     """Lift the masked pixels in a square about a ball to points of the camera frame."""
+    # The square in the image.
     z_m = float(middle_m[2])
     K = view.K.double()
-    nearest_m = max(z_m - radius_m, 0.1 * z_m)
+    nearest_m = max(z_m - radius_m, _NEAREST_SHARE * z_m)
     u, v = (K @ (middle_m / z_m))[:2].tolist()
     across_px = float(K[0, 0]) * radius_m / nearest_m
     down_px = float(K[1, 1]) * radius_m / nearest_m
@@ -85,6 +97,7 @@ def _lift_square_about(
     right = min(max(round(u + across_px), 0), width)
     top = min(max(round(v - down_px), 0), height)
     bottom = min(max(round(v + down_px), 0), height)
+
     window = (slice(top, bottom), slice(left, right))
     window_K = crop_intrinsics(K, left, top)
     return cloud_from_depth(view.depth_m[window], view.mask[window], window_K).double()
@@ -92,7 +105,7 @@ def _lift_square_about(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrackedObject:
-    """What is followed, and how it is looked for."""
+    """The object that is followed, and how it is searched for."""
 
     prepared: PreparedObject  #: the object
     refusal: RefusalConfig  #: when a pose is refused
@@ -109,49 +122,49 @@ class _FrameMotion:
 
     @classmethod
     def between(cls, before: Rigid, after: Rigid) -> "_FrameMotion":
-        """Give the motion from one pose to the next."""
+        """Compute the motion from one pose to the next."""
         return cls(R=after.R @ before.R.mT, shift_m=after.t_m - before.t_m)
 
     def move(self, pose: Rigid) -> Rigid:
-        """Give the pose after the same motion again."""
+        """Apply the motion to a pose."""
         return Rigid(self.R @ pose.R, pose.t_m + self.shift_m)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Track:
-    """What is known of an object that is followed."""
+    """The state of an object that is followed."""
 
     pose: Rigid  #: in the last frame
-    motion: _FrameMotion | None  #: from the frame before to it; None: not known
-    log_odds: float  #: of the pose being right, up to near-symmetries, by all frames
-    origin: PoseEstimate | None  #: that the track began with; None: a pose that was given
+    motion: _FrameMotion | None  #: from the frame before the last to it; None: not known
+    log_odds: float  #: that the pose is right, up to near-symmetries, by all frames
+    first: PoseEstimate | None  #: that the track began with; None: it began with a given pose
 
 
 def track(
     frames: Iterable[AnyInput | PoseEstimate], target: TrackedObject, first: Rigid | None = None
 ) -> Iterator[PoseEstimate]:
-    """Estimate one object in frame after frame, each from the pose of the frame before.
-
-    In place of a frame that cannot be read there is an estimate that says so: it is given as it is,
-    and the object is looked for in the next where it was before.
+    """Estimate the pose of one object in frame after frame, each from that of the frame before.
 
     Args:
-        frames: views or clouds, or estimates in place of what cannot be read.
+        frames: views or clouds. In place of a frame that cannot be read, an estimate that says so:
+            it is yielded unchanged, and the next frame is estimated from the pose before.
         target: the object.
-        first: its pose in the first frame, as far as it is known; None: it is searched.
+        first: its rough pose ``camera_from_model`` in the first frame; None: it is searched.
+
+    Yields:
+        An estimate for each frame, whose ``tracking`` says how it came about.
     """
     current = None
     if first is not None:
-        current = _Track(
-            pose=first.double(), motion=None, log_odds=math.log(PRIOR_MASKED), origin=None
-        )
+        log_odds = math.log(PRIOR_MASKED)
+        current = _Track(pose=first.double(), motion=None, log_odds=log_odds, first=None)
     for pose_input in frames:
         if isinstance(pose_input, PoseEstimate):
             yield pose_input
             continue
         estimate, following = _follow_or_search(pose_input, current, target)
-        # In a cloud without its depth image an object that is lost can be looked for only where it
-        # was. It did not go on as it moved before, or it would have been found there.
+        # In a cloud without its depth image a lost object is looked for only where it was. It did
+        # not go on as it moved before, or it would have been found there.
         is_bare_cloud = isinstance(pose_input, CloudInput) and pose_input.view is None
         if following is None and is_bare_cloud and current is not None:
             following = replace(current, motion=None)
@@ -162,7 +175,11 @@ def track(
 def _follow_or_search(
     pose_input: AnyInput, current: _Track | None, target: TrackedObject
 ) -> tuple[PoseEstimate, _Track | None]:
-    """Follow the object into a frame, or search it there; give what is known of it then."""
+    """Follow the object into a frame, or else search it there.
+
+    Returns:
+        The estimate, and the track after this frame; None for it where the object is lost.
+    """
     # Followed from the frame before.
     watch = Stopwatch()
     if current is not None:
@@ -181,20 +198,24 @@ def _follow_or_search(
     if pose is None:
         return estimate, None
 
-    # A track that begins at something else stays there: what was searched for must be `ok`.
-    is_searched = isinstance(pose_input, ViewInput) and searched.certainty is not None
-    if is_searched and not searched.is_ok:
+    # A track that begins at another object stays there: only an `ok` pose of an image begins one.
+    is_tested = isinstance(pose_input, ViewInput) and searched.certainty is not None
+    if is_tested and not searched.is_ok:
         return estimate, None
-    # Odds stay finite, so that later frames can change them.
     certainty = min(max(searched.certainty or 0.0, _LEAST_CERTAINTY), 1 - _LEAST_CERTAINTY)
     log_odds = math.log(certainty / (1 - certainty))
-    return estimate, _Track(pose=pose.double(), motion=None, log_odds=log_odds, origin=searched)
+    return estimate, _Track(pose=pose.double(), motion=None, log_odds=log_odds, first=searched)
 
 
 def _follow(
     pose_input: AnyInput, current: _Track, target: TrackedObject
 ) -> tuple[PoseEstimate, _Track] | Refusal:
-    """Refine the last pose and the predicted one; weigh the better by the evidence of the frame."""
+    """Refine the last pose and the predicted one, and weigh the better one by the evidence.
+
+    Returns:
+        The estimate, still without a name, and the track after this frame; a refusal where the
+        object is not followed.
+    """
     # Where it may be: at its last pose, or going on as it moved last.
     surface = target.prepared.surface
     starts = [current.pose]
@@ -204,9 +225,9 @@ def _follow(
 
     # The points near these poses, without the plane that the object lies on.
     scene_m = _gather_scene(pose_input, poses, surface)
-    near = _mark_near(scene_m, poses, surface, MARGIN)
-    is_support = _mark_support(scene_m, near, current.pose.apply(surface.points_m))
-    cloud_m = scene_m[near & ~is_support]
+    is_near = _mark_near(scene_m, poses, surface, _MARGIN_DIAMETERS)
+    is_support = _mark_support(scene_m, is_near, current.pose.apply(surface.points_m))
+    cloud_m = scene_m[is_near & ~is_support]
     if len(cloud_m) < _LEAST_POINTS:
         return Refusal(
             status="too few points",
@@ -217,46 +238,25 @@ def _follow(
     icp = replace(target.config.icp, starts=1)
     refined = refine_best(cloud_m, poses, surface, icp).refined
     pose = refined.camera_from_model.double()
-    object_points_m = scene_m[_mark_near(scene_m, pose[None], surface, NEAR) & ~is_support]
-    if len(object_points_m) < _LEAST_POINTS:
+    object_m = scene_m[_mark_near(scene_m, pose[None], surface, NEAR) & ~is_support]
+    if len(object_m) < _LEAST_POINTS:
         return Refusal(
             status="too few points",
-            reason=f"{len(object_points_m)} points lie on the object, below {_LEAST_POINTS}",
+            reason=f"{len(object_m)} points lie on the object, below {_LEAST_POINTS}",
         )
 
-    # What the frame says: by itself, and together with the frames before.
-    view = pose_input if isinstance(pose_input, ViewInput) else pose_input.view
-    observation = observe(
-        object_points_m,
-        view,
-        surface.diameter_m,
-        target.config.object_deviation_m,
-        is_masked=False,
-    )
-    evidence = compare(observation, pose, surface)
-    probability = probability_right(evidence, PRIOR_MASKED)
-    if probability < target.refusal.min_probability:
-        reason = contradiction(evidence, probability, is_masked=False)
-        return Refusal(status="doubtful", reason=reason)
-    log_odds = current.log_odds + _NEW_EVIDENCE * log_likelihood_ratio(evidence)
-    log_odds = min(max(log_odds, -_MOST_LOG_ODDS), _MOST_LOG_ODDS)
-    certainty = 1 / (1 + math.exp(-log_odds))
-    if certainty < target.refusal.min_probability:
-        reason = (
-            f"together with the frames before it the pose is right with a probability of "
-            f"{certainty:.0%}, though by this frame alone with {probability:.0%}"
-        )
-        return Refusal(status="doubtful", reason=reason)
-
-    # Does what is seen of it determine its pose?
+    # Is the pose right, and does what is seen of the object determine it?
+    weighed = _weigh_pose(pose_input, object_m, pose, current.log_odds, target)
+    if isinstance(weighed, Refusal):
+        return weighed
     free = free_motions(target.prepared.model.symmetries.continuous, pose)
-    withheld = why_not_observable(
-        object_points_m, target.prepared, pose, free, target.refusal.min_observability
+    not_observable = why_not_observable(
+        object_m, target.prepared, pose, free, target.refusal.min_observability
     )
-    if withheld is not None:
-        return withheld
+    if not_observable is not None:
+        return not_observable
 
-    # The answer, and what the next frame begins with.
+    # The estimate, and the track that the next frame begins with.
     estimate = PoseEstimate(
         name="",
         object=target.prepared.model.name,
@@ -265,57 +265,112 @@ def _follow(
         covariance=without_motions(refined.covariance, free).float(),
         free_motions=free.float(),
         residual_m=float(refined.residual_m),
-        evidence=evidence,
-        certainty=certainty,
-        copy_certainty=certainty,
+        evidence=weighed.evidence,
+        certainty=weighed.certainty,
+        copy_certainty=weighed.certainty,
         tracking="tracked",
     )
-    estimate = _carry_copies(estimate, pose, current.origin)
+    estimate = _carry_copies(estimate, pose, current.first)
     estimate = with_status(estimate, target.config.min_certainty)
     motion = _FrameMotion.between(current.pose, pose)
-    following = replace(current, pose=pose, motion=motion, log_odds=log_odds)
+    following = replace(current, pose=pose, motion=motion, log_odds=weighed.log_odds)
     return estimate, following
 
 
-def _carry_copies(estimate: PoseEstimate, pose: Rigid, origin: PoseEstimate | None) -> PoseEstimate:
-    """Carry the near-symmetric copies that the track began with along with its pose."""
-    if origin is None or not origin.certainty or origin.copy_certainty is None:
+class _WeighedPose(NamedTuple):
+    """The evidence for a pose, and what follows from it."""
+
+    evidence: Evidence  #: of this frame
+    log_odds: float  #: that the pose is right, by all frames
+    certainty: float  #: the probability of these odds
+
+
+def _weigh_pose(
+    pose_input: AnyInput,
+    object_m: Float64[Tensor, "n 3"],
+    pose: Rigid,
+    log_odds: float,
+    target: TrackedObject,
+) -> _WeighedPose | Refusal:
+    """Weigh a pose by the evidence of its frame, alone and together with the frames before.
+
+    Args:
+        pose_input: the frame.
+        object_m: points that lie on the object at the pose.
+        pose: ``camera_from_model``.
+        log_odds: that the track is right, by the frames before.
+        target: the object.
+    """
+    # By this frame alone.
+    observation = observe(
+        object_m,
+        pose_input if isinstance(pose_input, ViewInput) else pose_input.view,
+        target.prepared.surface.diameter_m,
+        target.config.object_deviation_m,
+        is_masked=False,
+    )
+    evidence = compare(observation, pose, target.prepared.surface)
+    probability = probability_right(evidence, PRIOR_MASKED)
+    if probability < target.refusal.min_probability:
+        reason = contradiction(evidence, probability, is_masked=False)
+        return Refusal(status="doubtful", reason=reason)
+
+    # Together with the frames before.
+    log_odds += _NEW_EVIDENCE * log_likelihood_ratio(evidence)
+    log_odds = min(max(log_odds, -_MOST_LOG_ODDS), _MOST_LOG_ODDS)
+    certainty = 1 / (1 + math.exp(-log_odds))
+    if certainty < target.refusal.min_probability:
+        reason = (
+            f"together with the frames before it the pose is right with a probability of "
+            f"{certainty:.0%}, though by this frame alone with {probability:.0%}"
+        )
+        return Refusal(status="doubtful", reason=reason)
+    return _WeighedPose(evidence, log_odds, certainty)
+
+
+def _carry_copies(estimate: PoseEstimate, pose: Rigid, first: PoseEstimate | None) -> PoseEstimate:
+    """Add to an estimate the near-symmetric copies that its track began with, moved to its pose.
+
+    Args:
+        estimate: with its certainty.
+        pose: of the estimate, in float64.
+        first: the estimate that the track began with; without copies ``estimate`` stays as it is.
+    """
+    if first is None or not first.certainty or first.copy_certainty is None:
         return estimate
-    assert origin.camera_from_model is not None
+    assert first.camera_from_model is not None
     assert estimate.certainty is not None
 
-    # Which of the copies it is does not change while it is followed.
-    scale = estimate.certainty / origin.certainty
-    model_from_origin = origin.camera_from_model.double().inverse()
+    # The shares of the copies in the certainty do not change while the object is followed.
+    scale = estimate.certainty / first.certainty
+    model_from_camera = first.camera_from_model.double().inverse()  # in the first frame
     copies: list[Alternative] = []
-    for copy in origin.alternatives:
+    for copy in first.alternatives:
         if copy.is_copy:
-            copy_pose = pose @ (model_from_origin @ copy.camera_from_model.double())
+            model_from_copy = model_from_camera @ copy.camera_from_model.double()
+            copy_pose = (pose @ model_from_copy).float()
             probability = scale * copy.probability
-            copies.append(
-                replace(copy, camera_from_model=copy_pose.float(), probability=probability)
-            )
-    return replace(
-        estimate, copy_certainty=scale * origin.copy_certainty, alternatives=tuple(copies)
-    )
+            copies.append(replace(copy, camera_from_model=copy_pose, probability=probability))
+    copy_certainty = scale * first.copy_certainty
+    return replace(estimate, copy_certainty=copy_certainty, alternatives=tuple(copies))
 
 
 def _mark_support(
-    scene_m: Float64[Tensor, "n 3"], near: Bool[Tensor, " n"], posed_m: Float64[Tensor, "m 3"]
+    scene_m: Float64[Tensor, "n 3"], is_near: Bool[Tensor, " n"], posed_m: Float64[Tensor, "m 3"]
 ) -> Bool[Tensor, " n"]:
     """Mark the points of a table or wall beside the object, onto which ICP would pull it.
 
     Args:
         scene_m: points about the object, in the camera frame.
-        near: those that may be the object's.
+        is_near: which of them may be the object's.
         posed_m: its surface at the last pose.
     """
     # The largest planes beside the object, one after the other.
-    is_support = torch.zeros_like(near)
+    is_support = torch.zeros_like(is_near)
     is_flat = torch.zeros(len(posed_m), dtype=torch.bool)
-    generator = torch.Generator().manual_seed(0)
+    generator = torch.Generator().manual_seed(0)  # of RANSAC: the same frame, the same planes
     for _ in range(_SUPPORTS):
-        beside_m = take_evenly(scene_m[~near & ~is_support], _SUPPORT_POINTS)
+        beside_m = take_evenly(scene_m[~is_near & ~is_support], _SUPPORT_POINTS)
         plane = largest_plane(beside_m, generator)
         if plane is None:
             break
@@ -323,16 +378,17 @@ def _mark_support(
         gap_m = (beside_m @ normal - offset)[is_on_plane(beside_m, plane)]
         if len(gap_m) < _LEAST_POINTS:
             break
-        limit_m = _SUPPORT_DEVIATIONS * gap_m.square().mean().sqrt()
+        rms_m = gap_m.square().mean().sqrt()
+        limit_m = _SUPPORT_DEVIATIONS * rms_m
         is_support |= (scene_m @ normal - offset).abs() < limit_m
         is_flat |= (posed_m @ normal - offset).abs() < limit_m
 
-    # An object as flat as the noise cannot be told from its support: all points are kept. Of any
-    # other one, few points beside the support mean that it was taken away.
-    left = int((near & ~is_support).sum())
-    is_little_left = left < max(_LEAST_POINTS, _LITTLE * int(near.sum()))
-    is_object_flat = float(is_flat.double().mean()) > _FLAT
-    return torch.zeros_like(near) if is_little_left and is_object_flat else is_support
+    # A flat object that lies in its support cannot be told from it: no point is marked. If little
+    # is left of any other object, it was taken away.
+    left = int((is_near & ~is_support).sum())
+    is_little_left = left < max(_LEAST_POINTS, _LEAST_LEFT_SHARE * int(is_near.sum()))
+    is_object_flat = float(is_flat.double().mean()) > _FLAT_SHARE
+    return torch.zeros_like(is_near) if is_little_left and is_object_flat else is_support
 
 
 def _mark_near(
@@ -340,5 +396,6 @@ def _mark_near(
 ) -> Bool[Tensor, " n"]:
     """Mark the points within a limit, in diameters, of the surface at one of several poses."""
     local_m = poses.inverse().apply(points_m)
-    gap_m = (local_m - surface.points_m[surface.boxes.look_up(local_m)]).norm(dim=-1)
+    nearest_m = surface.points_m[surface.boxes.look_up(local_m)]
+    gap_m = (local_m - nearest_m).norm(dim=-1)
     return (gap_m < limit * surface.diameter_m).any(0)

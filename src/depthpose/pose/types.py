@@ -22,13 +22,13 @@ Status = Literal[
     "not observable",
     "doubtful",
 ]
-"""An answer, or why there is none. Ambiguous: the pose fits, and so do others; it is given with
-them. Unreadable: no input came; it is tried again by the next run. No pose found: registration
-leaves no point near the model. Votes do not meet, keypoints do not fit: of a network's keypoints.
-Doubtful: the pose does not fit what the camera saw, or another size or the mirror image fits better
-than the sensor explains."""
+"""Whether there is a pose, or why there is none. Ambiguous: the pose fits, and so do others, which
+are its alternatives. Unreadable: the input could not be read; the next run tries it again. No pose
+found: registration leaves no point near the model. Votes do not meet, keypoints do not fit: of a
+network's keypoints. Doubtful: the pose does not fit what the camera saw, or another size or the
+mirror image fits better than the sensor explains."""
 
-POSED: tuple[Status, ...] = ("ok", "ambiguous")  #: with a pose
+POSED: tuple[Status, ...] = ("ok", "ambiguous")  #: the statuses of an estimate with a pose
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,22 +40,22 @@ class Refusal:
 
 
 Tracking = Literal["tracked", "found", "lost"]
-"""How an estimate of a sequence came about: followed from the frame before, looked for anew, or
-neither."""
+"""How an estimate of a sequence came about: followed from the frame before, found by a new search,
+or neither."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CloudInput:
     """Input of a pose estimate. There is no truth here, so none can leak."""
 
-    name: str  #: what the files of its results are called
+    name: str  #: of the input, its results and their files
     #: the visible part of one object, in the camera frame (x right, y down, z forward).
     points_m: Float[Tensor, "n 3"]
-    object: str  # as its ObjectModel is called; after "#:" the docs would take the builtin for it
-    #: the depth image that the points are of, where there is one: what the camera saw through a
-    #: pose is evidence against it.
+    object: str  # name of the object; after "#:" the docs would take the builtin for it
+    #: the depth image that the points are of, where there is one: where the camera saw through a
+    #: posed model, that is evidence against the pose.
     view: "ViewInput | None" = None
-    #: the points are exactly the object's; not where a search chose them.
+    #: whether the points are exactly the object's; not where a search chose them.
     is_masked: bool = True
 
 
@@ -63,27 +63,27 @@ class CloudInput:
 class VotingPoints:
     """Input of a network whose points vote: one or several clouds, one after the other."""
 
-    points_m: Float[Tensor, "points 3"]  #: one a voxel, in the axes of its grid about its camera
-    coordinates: Int[Tensor, "points 4"]  #: (cloud, x, y, z) of its voxel
-    features: Float[Tensor, "points c"]  #: of its voxel
-    class_of_point: Int[Tensor, " points"]  #: which object each belongs to
+    points_m: Float[Tensor, "points 3"]  #: one for each voxel, from the camera, in the grid's axes
+    coordinates: Int[Tensor, "points 4"]  #: (cloud, x, y, z) of their voxels
+    features: Float[Tensor, "points c"]  #: of their voxels
+    class_of_point: Int[Tensor, " points"]  #: number of the object that each belongs to
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PoseTruth:
-    """What is known about the object of a sample."""
+    """The annotated pose of the object of a sample."""
 
-    camera_from_model: Rigid  #: its pose
+    camera_from_model: Rigid  #: the pose
     visible_fraction: float | None = None  #: not occluded share of its silhouette, 0..1
     is_measured: bool = True  #: whether the pose was annotated, not itself fitted to the same depth
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CloudSample:
-    """One sample of a dataset."""
+    """A cloud of a data set and its truth."""
 
     input: CloudInput  #: the cloud
-    truth: PoseTruth  #: its pose
+    truth: PoseTruth  #: the true pose of its object
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -108,18 +108,17 @@ class KnownBackground:
 class ViewInput:
     """A depth image with the mask of one object: what a :class:`CloudInput` is lifted from."""
 
-    name: str  #: what the files of its results are called
+    name: str  #: of the input, its results and their files
     #: along the optical axis; NaN where there is no reading. May be a window of a larger image.
     depth_m: Float[Tensor, "h w"]
     mask: Bool[Tensor, "h w"]  #: the object's pixels, as a segmentation gives them, with errors
     K: Float[Tensor, "3 3"]  #: intrinsic matrix of this image (a window shifts the principal point)
     object: str  # name of the object
     color: ColorImage | None = None  #: of the same moment; None: depth alone
-    #: the mask only limits where the object is, as a detector's box does: what lies in it and is
-    #: not the object is no evidence against a pose.
+    #: whether the mask only limits where the object is, as a detector's box does: what lies in it
+    #: and is not the object is no evidence against a pose.
     is_region: bool = False
-    #: without the objects; None: it is not known.
-    background: KnownBackground | None = None
+    background: KnownBackground | None = None  #: of this view; None: it is not known
 
 
 AnyInput = CloudInput | ViewInput
@@ -130,49 +129,53 @@ class ViewSample:
     """A view and its truth."""
 
     input: ViewInput  #: the view
-    truth: PoseTruth  #: its pose
+    truth: PoseTruth  #: the true pose of its object
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Axis:
-    """A continuous symmetry: every turn about this line leaves the object as it is."""
+    """A continuous symmetry: every rotation about this line leaves the object as it is."""
 
     direction: Float[Tensor, "3"]  #: unit vector in the model frame
     point_m: Float[Tensor, "3"]  #: a point that the axis goes through
 
 
-_OTHER_AXIS = 0.1  # sine of the angle from which two axes of revolution are two
+_LEAST_SINE = 0.1  # of the angle from which two axes of revolution are not parallel
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Symmetries:
-    """Motions of the model frame that leave the object as it is, as BOP's models_info says them."""
+    """Motions of the model frame that leave the object as it is, as in BOP's models_info."""
 
     #: ``model_from_model``, the identity not among them; None where there is none.
     discrete: Rigid | None = None
     continuous: tuple[Axis, ...] = ()  #: axes of revolution
-    is_found: bool = False  #: found in the geometry, within a tolerance, and not declared
+    is_found: bool = False  #: whether found in the geometry, within a tolerance, and not declared
 
     @property
     def is_none(self) -> bool:
-        """Whether the object looks alike from no two sides."""
+        """Whether there is no symmetry."""
         return self.discrete is None and not self.continuous
 
     @property
     def ball_centre_m(self) -> Float[Tensor, "3"] | None:
-        """The point where two axes of revolution meet, about which any turn is one; else None."""
+        """The centre of a ball, where two axes of revolution meet; None of any other object.
+
+        Then every rotation about this point is a symmetry.
+        """
         for other in self.continuous[1:]:
             first = self.continuous[0]
-            across = torch.linalg.cross(first.direction, other.direction)
-            if float(across.norm()) <= _OTHER_AXIS:
+            sine = torch.linalg.cross(first.direction, other.direction).norm()
+            if float(sine) <= _LEAST_SINE:
                 continue
 
-            # The point nearest to both lines.
-            eye = torch.eye(3).to(across)
-            planes = [eye - torch.outer(a.direction, a.direction) for a in (first, other)]
+            # The point nearest to both lines, with directions a and points c: the solution of
+            # sum (1 - a a^T) x = sum (1 - a a^T) c.
+            eye = torch.eye(3).to(first.direction)
+            projections = [eye - torch.outer(a.direction, a.direction) for a in (first, other)]
             points_m = torch.stack([first.point_m, other.point_m])
-            pulls = (torch.stack(planes) @ points_m[..., None]).sum(0)
-            return torch.linalg.solve(planes[0] + planes[1], pulls).squeeze(-1)
+            projected_m = (torch.stack(projections) @ points_m[..., None]).sum(0)
+            return torch.linalg.solve(projections[0] + projections[1], projected_m).squeeze(-1)
         return None
 
 
@@ -188,15 +191,16 @@ class SurfaceColors:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ObjectModel:
-    """A known object: what its CAD file and the config say of it, in metres."""
+    """A known object, in metres: its surface, keypoints, symmetries and colours."""
 
-    name: str  #: what samples call it
+    name: str  #: by which inputs and results refer to it
     number: int  #: BOP's ``obj_id``
     vertices_m: Float[Tensor, "v 3"]  #: points of the surface; all there is without ``faces``
     faces: Int64[Tensor, "f 3"]  #: three vertices each, counter-clockwise seen from outside
-    normals: Float[Tensor, "v 3"]  #: outward unit normal of each vertex; of points, of unknown side
+    #: unit normal of each vertex, outward where there are ``faces``, else to either side.
+    normals: Float[Tensor, "v 3"]
     diameter_m: float  #: largest distance of two points
-    keypoints_m: Float[Tensor, "k 3"]  #: what the network's directions point at
+    keypoints_m: Float[Tensor, "k 3"]  #: points at which the network's directions aim
     symmetries: Symmetries = field(default_factory=Symmetries)  #: as declared or found
     colors: SurfaceColors | None = None  #: of its vertices or its texture; None: the file has none
 
@@ -222,13 +226,13 @@ class Vote:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PoseFit:
-    """The rigid transform that carries the model's keypoints onto found ones."""
+    """The rigid transform that best carries the model's keypoints onto voted ones."""
 
     camera_from_model: Rigid  #: the pose
     #: of (rotation [rad], translation [m]), left perturbation in the camera frame: the true pose is
-    #: ``R = exp(rotation) R_found``, ``t = exp(rotation) t_found + translation``. Local: it says
-    #: how well the data fix the pose about this answer, and nothing of other answers, such as a
-    #: half-turn away, that explain the data as well.
+    #: ``R = exp(rotation) R_fit``, ``t = exp(rotation) t_fit + translation``. Local: it says how
+    #: well the data fix the pose about this one, and nothing of other poses, such as a half-turn
+    #: away, that explain the data as well.
     covariance: Float[Tensor, "*batch 6 6"]
     residual_m: Float[Tensor, "*batch"]  #: root mean square distance of the used keypoints
 
@@ -240,10 +244,10 @@ class Alternative:
     camera_from_model: Rigid  #: the pose
     probability: float  #: that it is the right one, 0..1
     difference: str  #: from the estimate's own pose: "rotated by 180 degrees about the long axis"
-    is_copy: bool = False  #: a near-symmetric copy of the estimate's pose, which looks nearly alike
+    is_copy: bool = False  #: whether it is a near-symmetric copy of the estimate's pose
 
     def __str__(self) -> str:
-        """Describe how it differs from the pose, and how likely it is."""
+        """Describe how it differs from the estimate's pose, and how likely it is."""
         return f"{self.difference}, {self.probability:.0%}"
 
 
@@ -255,14 +259,16 @@ class Evidence:
     """
 
     visible: float  #: area of the model that the camera would see, edges left out
-    supported: float  #: part of it on which readings lie, within three standard deviations
+    supported: float  #: part of ``visible`` on which readings lie, within three deviations
     explained: float  #: area of the readings that lie on the model, those near its edges too
-    unobserved: float  #: part of it without a reading, or hidden by something nearer
+    unobserved: float  #: part of ``visible`` without a reading, or hidden by something nearer
     seen_through: float  #: patches behind which the camera saw: free-space violations
     bulging: float  #: patches of the object's own readings before the model
     beside: float  #: patches of the object's own readings beside the model's silhouette
     silhouette: float  #: length with readings on both sides, in patches; 0 with an exact mask
-    continued: float  #: part of it across which the surface goes on: there the object does not end
+    continued: (
+        float  #: part of ``silhouette`` across which the surface goes on: no end of the object
+    )
     rms: float  #: root mean square residual of the supported part, in standard deviations
     noise_m: float  #: standard deviation of a reading on the object, estimated from the image
 
@@ -292,16 +298,20 @@ Contradicted: one of them fits better by more than the sensor explains. What was
 
 @dataclass(frozen=True, kw_only=True)
 class Identity:
-    """Whether what was posed is the object, and not a copy of it or another thing."""
+    """Whether what was posed is the object, and not one of another size or a mirrored one."""
 
     status: IdentityStatus  #: confirmed, not excluded or contradicted
-    size: float | None = None  #: that fits best, in sizes of the model; None: not measured
-    size_deviation: float | None = None  #: standard deviation of it
+    size: float | None = None  #: scale of the model that fits best; None: not measured
+    size_deviation: float | None = None  #: standard deviation of ``size``
     #: by how much nearer, in diameters, the points lie to the mirror image of the model; negative
     #: where the model is nearer, None where both are one or none was measured.
     mirror_gain: float | None = None
     other: str | None = None  #: another known object that it may be, the likeliest; or None
     reason: str = ""  #: one sentence; empty where it is confirmed
+
+
+_FREE_M = 1e-3  # of a model's origin: a free motion that moves it by less leaves it where it is
+_FREE_RAD = 1e-2  # of a rotation: a free motion that changes it by less leaves it as it is
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -313,11 +323,11 @@ class PoseEstimate:
     status: Status  #: ``ok``, ``ambiguous``, or the kind of refusal
     reason: str = ""  #: one sentence for people; empty where the status is ``ok``
     camera_from_model: Rigid | None = None  #: if ambiguous the likeliest pose; None if refused
-    keypoints_m: Float[Tensor, "k 3"] | None = None  #: the found keypoints in the camera frame
-    #: 6x6, order and frame as :class:`PoseFit` says. Local: a pose that is a half-turn off may have
-    #: one of 0.2 degrees; such errors are covered by ``certainty``. Finite: it leaves out the
-    #: motions of ``free_motions``. Its translation is of the camera's origin: ``origin_std_mm`` and
-    #: ``rotation_std_deg`` say it of the model.
+    keypoints_m: Float[Tensor, "k 3"] | None = None  #: the voted keypoints in the camera frame
+    #: in the order and frame of :class:`PoseFit`. Local: a pose that is a half-turn off may have a
+    #: deviation of 0.2 degrees; such errors are covered by ``certainty``. Finite: the motions of
+    #: ``free_motions`` are left out. Its rotation is about the camera's origin: deviations of the
+    #: model are ``origin_std_mm`` and ``rotation_std_deg``.
     covariance: Float[Tensor, "6 6"] | None = None
     #: unit vectors of (rotation, translation) along which a declared continuous symmetry makes the
     #: variance infinite; no row where there is none.
@@ -344,7 +354,7 @@ class PoseEstimate:
     pick_rank: int | None = None
 
     def __post_init__(self) -> None:
-        # No default may look like success: an answer has a pose, all others have a reason.
+        # No default may look like success: what has no pose, or several, has a reason.
         assert (self.camera_from_model is not None) == self.is_posed
         assert self.is_ok or self.reason
 
@@ -364,7 +374,10 @@ class PoseEstimate:
         return None if self.evidence is None else self.evidence.supported_share
 
     def in_base(self, base_from_camera: Rigid) -> "PoseEstimate":
-        """Add ``base_from_model`` by a hand-eye calibration in metres; a refusal has none."""
+        """Return the estimate with ``base_from_model``, by a hand-eye calibration in metres.
+
+        A refusal stays as it is.
+        """
         if self.camera_from_model is None:
             return self
         pose = base_from_camera.double() @ self.camera_from_model.double()
@@ -381,8 +394,9 @@ class PoseEstimate:
             return None
         eye = torch.eye(3, dtype=torch.float64)
         t_m = self.camera_from_model.t_m.double()
-        turned = torch.linalg.cross(eye, t_m.expand(3, 3)).mT
-        std_m = self._measure_std_along(torch.cat([turned, eye], 1), 1e-3)
+        by_rotation_m = torch.linalg.cross(eye, t_m.expand(3, 3)).mT  # columns: axis x t
+        derivatives = torch.cat([by_rotation_m, eye], 1)
+        std_m = self._measure_std(derivatives, least=_FREE_M)
         return None if std_m is None else 1000 * std_m
 
     @property
@@ -394,23 +408,27 @@ class PoseEstimate:
         if self.camera_from_model is None:
             return None
         R = self.camera_from_model.R.double()
-        std = self._measure_std_along(torch.cat([R.mT, torch.zeros_like(R)], 1), 1e-2)
-        return None if std is None else std.rad2deg()
+        derivatives = torch.cat([R.mT, torch.zeros_like(R)], 1)
+        std_rad = self._measure_std(derivatives, least=_FREE_RAD)
+        return None if std_rad is None else std_rad.rad2deg()
 
-    def _measure_std_along(self, rows: Float64[Tensor, "3 6"], least: float) -> Tensor | None:
-        """Give standard deviations of linear functions of the motion, or None.
+    def _measure_std(
+        self, derivatives: Float64[Tensor, "3 6"], least: float
+    ) -> Float64[Tensor, "3"] | None:
+        """Propagate the covariance to quantities; their deviations, None without a covariance.
 
         Args:
-            rows: the functions' derivatives by (rotation, translation).
-            least: a function is free, and its deviation infinite, where a free motion moves it by
-                more than this.
+            derivatives: of the quantities by (rotation, translation), one a row.
+            least: a quantity is free, and its deviation infinite, where a unit free motion changes
+                it by more than this.
         """
         if self.covariance is None:
             return None
-        std = (rows @ self.covariance.double() @ rows.mT).diagonal().clamp(min=0).sqrt()
+        variance = (derivatives @ self.covariance.double() @ derivatives.mT).diagonal()
+        std = variance.clamp(min=0).sqrt()
         if self.free_motions is None or len(self.free_motions) == 0:
             return std
-        is_free = (rows @ self.free_motions.double().mT).abs().amax(-1) > least
+        is_free = (derivatives @ self.free_motions.double().mT).abs().amax(-1) > least
         return std.masked_fill(is_free, torch.inf)
 
     def __repr__(self) -> str:

@@ -1,7 +1,7 @@
-"""Pose weights on disk: one network, and every object that it knows, in one file."""
+"""Pose weights on disk: one file with a network and every object that it knows."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,27 +34,27 @@ from depthpose.pose.network import ResUNet, ResUNetConfig
 from depthpose.pose.types import ObjectModel, SurfaceColors
 
 DirectionNet = ResUNet | PointNet  #: networks whose points vote
-AnyNetwork = DirectionNet | DepthImageNet
-KIND = "geoposenet"
+AnyNetwork = DirectionNet | DepthImageNet  #: every network that estimates poses
+KIND = "geoposenet"  #: of files with the method's own network
 POSE_NETWORKS: dict[str, tuple[type[AnyNetwork], type]] = {
     KIND: (ResUNet, ResUNetConfig),
     "pointnet": (PointNet, PointNetConfig),
     "depth-image": (DepthImageNet, DepthImageConfig),
 }
 """Network and config of each kind of file: the method's, and those of its baselines."""
-_KEYPOINT_GAP = 0.02  # largest distance of a keypoint from the right mesh, in diameters
-_SIZE_GAP = 0.05  # largest difference of the right mesh's diameter from the declared one, its share
-_SURFACE = ("vertices_m", "faces", "normals")
-_TENSORS = (*_SURFACE, "keypoints_m")
+_KEYPOINT_DIAMETERS = 0.02  # largest distance of a keypoint from the right mesh
+_LARGEST_SIZE_ERROR = 0.05  # largest share by which the diameter of the right mesh is another one
+_SURFACE = ("vertices_m", "faces", "normals")  # tensors that a licence may forbid to ship
+_TENSORS = (*_SURFACE, "keypoints_m")  # all tensors that a model needs
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PoseWeights:
     """The contents of a file of pose weights: enough to pose an object without its CAD file."""
 
-    network: AnyNetwork  #: partial cloud to directions, in eval mode where read; or a baseline
+    network: AnyNetwork  #: in eval mode where it was read
     models: tuple[ObjectModel, ...]  #: the objects; class k of the network is ``models[k]``
-    cloud: CloudConfig  #: how the clouds were made that the network was trained on
+    cloud: CloudConfig  #: by which the clouds were lifted that the network was trained on
     refusal: RefusalConfig  #: when its estimates are withheld
     facts: Mapping[str, str]  #: the card in short: ``trained_on``, ``licence``, ``terms`` and more
 
@@ -100,18 +100,14 @@ def write_pose_weights(
     """
     # The tensors: those of the network, and those of each model.
     network = weights.network
-    learnt = halve_state(network) if with_half else network.state_dict()
-    state = {f"network.{name}": tensor for name, tensor in learnt.items()}
+    network_state = halve_state(network) if with_half else network.state_dict()
+    state = {f"network.{name}": tensor for name, tensor in network_state.items()}
     for k, model in enumerate(weights.models):
-        tensor_names = _TENSORS if with_meshes else ("keypoints_m",)
-        for name in tensor_names:
-            tensor = getattr(model, name)
-            # A copy: two models may be made of one tensor, which safetensors refuses to write.
-            stored = tensor.dtype if tensor.is_floating_point() else torch.int32
-            state[f"models.{k}.{name}"] = tensor.to(stored, copy=True)
-        state |= _store_colors(k, model) if with_meshes else {}
+        state |= _store_tensors(k, model, _TENSORS if with_meshes else ("keypoints_m",))
+        if with_meshes:
+            state |= _store_colors(k, model)
 
-    # The settings, and what a model is beside its tensors.
+    # The settings, and of each model what is no tensor.
     config = {
         "network": config_to_dict(network.config),
         "cloud": config_to_dict(weights.cloud),
@@ -129,7 +125,8 @@ def write_pose_weights(
     facts = dict(weights.facts)
     if isinstance(network, ResUNet):
         facts["norm_mode"] = network.config.norm
-    kind = next(kind for kind, (made, _) in POSE_NETWORKS.items() if type(network) is made)
+    kinds = {network_class: kind for kind, (network_class, _) in POSE_NETWORKS.items()}
+    kind = kinds[type(network)]
     save_checkpoint(path, Checkpoint(kind=kind, config=config, state=state, facts=facts))
 
 
@@ -148,7 +145,6 @@ def complete_weights(path: Path, meshes: Mapping[int, ObjectModel], out: Path) -
     """
     checkpoint = read_checkpoint(path)
     state = dict(checkpoint.state)
-    # Each object is compared with its mesh: is it the one that was trained on?
     for k, record in enumerate(checkpoint.config.get("models", ())):
         number = record["number"]
         keypoints_m = state[f"models.{k}.keypoints_m"]
@@ -157,31 +153,42 @@ def complete_weights(path: Path, meshes: Mapping[int, ObjectModel], out: Path) -
                 f"{path}: knows object {number} ({record['name']}), but there is no such model "
                 f"among {sorted(meshes)}. Give the data set that it was trained on."
             )
+
+        # Is the mesh that of the object that was trained on?
         model = meshes[number]
         gap_m = gap_to_surface_m(keypoints_m, model)
         diameter_m = record["diameter_m"]
-        is_other_size = abs(model.diameter_m / diameter_m - 1) > _SIZE_GAP
-        if gap_m > _KEYPOINT_GAP * diameter_m or is_other_size:
+        is_other_size = abs(model.diameter_m / diameter_m - 1) > _LARGEST_SIZE_ERROR
+        if gap_m > _KEYPOINT_DIAMETERS * diameter_m or is_other_size:
             raise InputError(
                 f"{path}: a keypoint of object {number} ({record['name']}, {diameter_m:.3g} m "
                 f"long) lies {gap_m:.3g} m off the model {model.name} ({model.diameter_m:.3g} m "
                 "long): another object, frame or unit. Give the models that it was trained on."
             )
 
-        # Its surface is added.
-        for name in _SURFACE:
-            tensor = getattr(model, name)
-            stored = tensor.dtype if tensor.is_floating_point() else torch.int32
-            state[f"models.{k}.{name}"] = tensor.to(stored, copy=True)
+        state |= _store_tensors(k, model, _SURFACE)
         state |= _store_colors(k, model)
     save_checkpoint(out, dataclasses.replace(checkpoint, state=state))
+
+
+def _store_tensors(k: int, model: ObjectModel, names: Sequence[str]) -> dict[str, Tensor]:
+    """Copy tensors of model k, by their names in a file; whole numbers as 32 bits.
+
+    They are copies, since safetensors refuses to write a tensor that two models share.
+    """
+    stored: dict[str, Tensor] = {}
+    for name in names:
+        tensor = getattr(model, name)
+        dtype = tensor.dtype if tensor.is_floating_point() else torch.int32
+        stored[f"models.{k}.{name}"] = tensor.to(dtype, copy=True)
+    return stored
 
 
 _COLORS = "colors."  # prefix of the names of a model's coloured points
 
 
 def _store_colors(k: int, model: ObjectModel) -> dict[str, Tensor]:
-    """Convert the colours of model k to tensors by their names in a file; a byte a channel."""
+    """Convert the colours of model k to tensors, by their names in a file; a byte for a channel."""
     colors = model.colors
     if colors is None:
         return {}
@@ -197,7 +204,7 @@ def _store_colors(k: int, model: ObjectModel) -> dict[str, Tensor]:
 
 def _restore_colors(state: Mapping[str, Tensor]) -> SurfaceColors | None:
     """Restore the colours among the tensors of a model; None where it has none."""
-    tensors = {n.removeprefix(_COLORS): t for n, t in state.items() if n.startswith(_COLORS)}
+    tensors = _select_by_prefix(state, _COLORS)
     if not tensors:
         return None
     points_m = tensors["points_m"].float()
@@ -209,8 +216,17 @@ def _restore_colors(state: Mapping[str, Tensor]) -> SurfaceColors | None:
     return SurfaceColors(points_m=points_m, normals=normals, rgb=rgb / 255, spacing_m=spacing_m)
 
 
+def _select_by_prefix(state: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """Select the tensors whose names have a prefix, by their names without it."""
+    return {
+        name.removeprefix(prefix): tensor
+        for name, tensor in state.items()
+        if name.startswith(prefix)
+    }
+
+
 def read_object_numbers(path: Path) -> tuple[int, ...]:
-    """Read the numbers of the objects that weights know, with or without their surfaces.
+    """Read BOP's numbers of the objects that weights know, with or without their surfaces.
 
     Raises:
         InputError: they are of another kind, or damaged.
@@ -237,12 +253,12 @@ def read_pose_weights(path: Path) -> PoseWeights:
     source = str(path)
     network = build_pose_network(checkpoint, source)
     if not any(f"models.0.{name}" in checkpoint.state for name in _SURFACE):
-        word = quote(str(path))
-        with suppress(InputError):  # a name where it leads there
-            word = path.stem if find_weights(path.stem) == path else word
+        label = quote(str(path))
+        with suppress(InputError):  # a name where it leads to this file
+            label = path.stem if find_weights(path.stem) == path else label
         raise InputError(
             f"{path}: came without its objects' meshes, which their licence keeps back. Put them "
-            f"in once: depthpose weights complete {word} --models FOLDER --out "
+            f"in once: depthpose weights complete {label} --models FOLDER --out "
             f"{quote(path.stem + '-complete.safetensors')}, with the data set's folder."
         )
 
@@ -254,9 +270,7 @@ def read_pose_weights(path: Path) -> PoseWeights:
     models: list[ObjectModel] = []
     with refused_as(path, "file of pose weights", "it is damaged, or of another version"):
         for k, record in enumerate(records):
-            prefix = f"models.{k}."
-            stored = checkpoint.state.items()
-            state = {n.removeprefix(prefix): t for n, t in stored if n.startswith(prefix)}
+            state = _select_by_prefix(checkpoint.state, f"models.{k}.")
             models.append(_restore_model(record, state, f"{source}: model {k}"))
 
     # No tensor but theirs and the network's.
@@ -274,7 +288,7 @@ def read_pose_weights(path: Path) -> PoseWeights:
 
 
 def _restore_model(record: Any, state: Mapping[str, Tensor], source: str) -> ObjectModel:  # noqa: ANN401
-    """Make an object of its entry in the config and its tensors; ``source`` is for errors."""
+    """Build an object from its entry in the config and its tensors; ``source`` is for errors."""
     # Is all there that an object needs?
     missing = [name for name in _TENSORS if name not in state]
     missing += [name for name in ("name", "number", "diameter_m") if name not in record]
@@ -306,7 +320,11 @@ def _restore_model(record: Any, state: Mapping[str, Tensor], source: str) -> Obj
 
 
 def settings_of(checkpoint: Checkpoint, source: str) -> dict[str, Any]:
-    """Give the settings of a file's network, clouds and refusal, with defaults for missing ones.
+    """Read the settings of a file's network, clouds and refusal, with defaults for missing ones.
+
+    Args:
+        checkpoint: of pose weights.
+        source: of the checkpoint, in errors.
 
     Raises:
         InputError: a setting is unknown, or has a value that is refused.
@@ -340,7 +358,6 @@ def build_pose_network(checkpoint: Checkpoint, source: str) -> AnyNetwork:
     config = config_from_dict(checkpoint.config["network"], config_kind, source=source)
 
     # The tensors of the network alone.
-    learnt = {name: t for name, t in checkpoint.state.items() if name.startswith("network.")}
-    state = {name.removeprefix("network."): tensor for name, tensor in learnt.items()}
-    of_network = dataclasses.replace(checkpoint, state=state)
-    return build_network(lambda: network_class(config), of_network, source).eval()
+    state = _select_by_prefix(checkpoint.state, "network.")
+    network_checkpoint = dataclasses.replace(checkpoint, state=state)
+    return build_network(lambda: network_class(config), network_checkpoint, source).eval()

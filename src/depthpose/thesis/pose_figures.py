@@ -15,7 +15,8 @@ from torch.nn import functional as F
 from depthpose.core.arrays import take_evenly
 from depthpose.core.errors import InputError
 from depthpose.core.files.images import rgb_from_pillow
-from depthpose.pose.cloud import prepare_cloud, sample_and_voxelise
+from depthpose.pose.cloud import prepare_cloud
+from depthpose.pose.grid import sample_and_voxelise
 from depthpose.pose.mesh import sample_surface
 from depthpose.pose.network import ResUNet
 from depthpose.pose.network_pose import GeoPoseNet

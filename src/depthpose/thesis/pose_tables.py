@@ -17,9 +17,10 @@ from torch import Tensor
 
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
-from depthpose.pose.cloud import cloud_from_depth, sample_points, voxelise, why_too_few
+from depthpose.pose.cloud import cloud_from_depth, why_too_few
 from depthpose.pose.config import VotingConfig
 from depthpose.pose.evaluate import ObjectRow
+from depthpose.pose.grid import sample_points, voxelise
 from depthpose.pose.metrics import SUCCESS_SHARE, add_m, adds_m
 from depthpose.pose.network import ResUNet
 from depthpose.pose.network_pose import GeoPoseNet

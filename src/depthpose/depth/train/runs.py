@@ -21,9 +21,9 @@ from depthpose.core.loop import Task, TrainingRun, format_held_out, releases_fol
 from depthpose.core.run import find_rank
 from depthpose.depth.config import GeneratorConfig, PairsConfig, SelectionConfig
 from depthpose.depth.datasets import FramePaths, refuse_shared_frames
-from depthpose.depth.stereo import StereoNetwork
 from depthpose.depth.encoder import load_encoder
 from depthpose.depth.generators import Generator, SelectionGenerator, UNetGenerator
+from depthpose.depth.stereo import StereoNetwork
 from depthpose.depth.train.config import (
     FinetuneTraining,
     SelectTraining,

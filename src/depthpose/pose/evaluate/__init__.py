@@ -14,5 +14,5 @@ from depthpose.pose.evaluate.evaluate import RiskRow as RiskRow
 from depthpose.pose.evaluate.evaluate import evaluate as evaluate
 from depthpose.pose.evaluate.evaluate import hash_frames as hash_frames
 from depthpose.pose.evaluate.evaluate import prepare_errors as prepare_errors
-from depthpose.pose.evaluate.evaluate import read_any as read_any
+from depthpose.pose.evaluate.evaluate import read_any_predictions as read_any_predictions
 from depthpose.pose.evaluate.evaluate import select_targets as select_targets

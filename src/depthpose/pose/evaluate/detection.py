@@ -17,20 +17,21 @@ from depthpose.pose.metrics import BOP_PIXELS, BOP_SHARES, average_precision
 from depthpose.pose.predictions import Place, Prediction, place_of, score_of
 
 LEAST_VISIBLE = 0.1
-"""Visible share of an instance; one of less is neither missed nor wrongly detected."""
-MOST_ESTIMATES = 100  #: of one image: those of the highest scores of all its objects
-_LIMITS = {"mssd_m": BOP_SHARES, "mspd_px": BOP_PIXELS}  # of the diameter, and pixels
+"""Least visible share of an instance that counts: one that is hidden more is neither missed nor
+wrongly detected."""
+MOST_ESTIMATES = 100  #: of one image that count: those of the highest scores of all its objects
+_LIMITS = {"mssd_m": BOP_SHARES, "mspd_px": BOP_PIXELS}  # in diameters, and in pixels
 _COLUMNS = {"mssd_m": "ap_mssd", "mspd_px": "ap_mspd"}
 _FAR_DIAMETERS = 1.0
-"""Distance of the centres of two poses from which MSSD is beyond its largest limit, half a
-diameter."""
+"""Distance of the centres of two poses beyond which MSSD is certainly above its largest limit, half
+a diameter."""
 
-Pairs = Mapping[tuple[str, str], Mapping[str, Errors]]
-"""Errors by the names of an estimate and an instance."""
+ErrorsOfPairs = Mapping[tuple[str, str], Mapping[str, Errors]]
+"""Errors by their names, for each pair of an estimate and an instance, by the names of both."""
 
 
 @dataclass(kw_only=True, eq=False)
-class _Image:
+class _ObjectInImage:
     """The instances and estimates of one object in one image."""
 
     instances: list[Instance] = field(default_factory=list)  #: what is annotated
@@ -41,7 +42,7 @@ def score_detections(
     dataset: BopDataset,
     predictions: Sequence[Prediction],
     contexts: Mapping[int, ErrorContext],
-    measured: Pairs,
+    measured: ErrorsOfPairs,
 ) -> dict[int, dict[str, float | None]]:
     """Compute ``ap_mssd``, ``ap_mspd`` and their mean ``ap`` of each object, by its number.
 
@@ -55,8 +56,8 @@ def score_detections(
     Args:
         dataset: instances with truth; estimates of other images are left out.
         predictions: with their places, or the names of instances.
-        contexts: by the number of the object.
-        measured: errors that were measured before.
+        contexts: of the errors, by the number of the object.
+        measured: errors that were measured before, to save time.
     """
     images = _group_by_image(dataset, predictions)
     scores: dict[int, dict[str, float | None]] = {}
@@ -64,28 +65,30 @@ def score_detections(
         images_of_object = [image for place, image in images.items() if place.object_id == number]
         tables = [_measure_errors(image, context, measured) for image in images_of_object]
         precisions: dict[str, float | None] = {}
-        for name, limits in _LIMITS.items():
-            scale = context.diameter_m if name == "mssd_m" else 1.0
-            tables_of_error = [table[name] for table in tables]
+        for error, limits in _LIMITS.items():
+            unit = context.diameter_m if error == "mssd_m" else 1.0
+            tables_of_error = [table[error] for table in tables]
             at_limits = [
-                _measure_precision(images_of_object, tables_of_error, scale * limit)
+                _measure_precision(images_of_object, tables_of_error, unit * limit)
                 for limit in limits
             ]
-            precisions[_COLUMNS[name]] = _average(at_limits)
-        scores[number] = {"ap": _average(list(precisions.values())), **precisions}
+            precisions[_COLUMNS[error]] = average_measured(at_limits)
+        scores[number] = {"ap": average_measured(list(precisions.values())), **precisions}
     return scores
 
 
-def _average(values: Sequence[float | None]) -> float | None:
+def average_measured(values: Sequence[float | None]) -> float | None:
     """Average the values that are not None; None where there are none."""
     numbers = [value for value in values if value is not None]
     return sum(numbers) / len(numbers) if numbers else None
 
 
-def _group_by_image(dataset: BopDataset, predictions: Sequence[Prediction]) -> dict[Place, _Image]:
+def _group_by_image(
+    dataset: BopDataset, predictions: Sequence[Prediction]
+) -> dict[Place, _ObjectInImage]:
     """Group instances and estimates by image and object, estimates of the highest scores first."""
     # The instances of each object in each image.
-    images: dict[Place, _Image] = defaultdict(_Image)
+    images: dict[Place, _ObjectInImage] = defaultdict(_ObjectInImage)
     places = {instance.name: place_of(instance) for instance in dataset.instances}
     for instance in dataset.instances:
         images[place_of(instance)].instances.append(instance)
@@ -98,18 +101,21 @@ def _group_by_image(dataset: BopDataset, predictions: Sequence[Prediction]) -> d
         place = prediction.place or places.get(prediction.estimate.name)
         if place is not None and place[:2] in image_keys and prediction.estimate.is_posed:
             of_image[place[:2]].append((place, prediction))
-    for pairs in of_image.values():
-        pairs.sort(key=lambda pair: -score_of(pair[1].estimate))
-        for place, prediction in pairs[:MOST_ESTIMATES]:
+    for entries in of_image.values():
+        entries.sort(key=lambda entry: -score_of(entry[1].estimate))
+        for place, prediction in entries[:MOST_ESTIMATES]:
             if place.object_id in numbers:
                 images[place].predictions.append(prediction)
     return images
 
 
 def _measure_errors(
-    image: _Image, context: ErrorContext, measured: Pairs
+    image: _ObjectInImage, context: ErrorContext, measured: ErrorsOfPairs
 ) -> dict[str, Float[Tensor, "estimates instances"]]:
-    """Measure each estimate against each instance; infinite where it is certainly beyond limits."""
+    """Measure each estimate of an object in an image against each instance: a table for each error.
+
+    An error that is certainly beyond its limits is infinite.
+    """
     size = (len(image.predictions), len(image.instances))
     tables = {name: torch.full(size, torch.inf, dtype=torch.float64) for name in _LIMITS}
     for row, prediction in enumerate(image.predictions):
@@ -126,7 +132,10 @@ def _measure_errors(
 
 
 def _is_certainly_far(name: str, pose: Rigid, instance: Instance, context: ErrorContext) -> bool:
-    """Whether an error is certainly beyond all its limits, by a bound that is fast to compute."""
+    """Whether an error is certainly beyond all its limits, by a bound that is fast to compute.
+
+    ``name`` is that of the error, ``mssd_m`` or ``mspd_px``.
+    """
     points_m = context.model.vertices_m.double()
     estimated_m = pose.double().apply(points_m)
     true_m = instance.camera_from_model.double().apply(points_m)
@@ -146,7 +155,7 @@ def _is_certainly_far(name: str, pose: Rigid, instance: Instance, context: Error
 
 
 def _measure_precision(
-    images: Sequence[_Image], tables: Sequence[Float[Tensor, "_ _"]], limit: float
+    images: Sequence[_ObjectInImage], tables: Sequence[Float[Tensor, "_ _"]], limit: float
 ) -> float | None:
     """Measure the average precision of one object at one threshold; None if no instance counts.
 
@@ -154,8 +163,8 @@ def _measure_precision(
     left. One that is matched with a mostly hidden instance is neither right nor wrong, as in BOP.
 
     Args:
-        images: of the object.
-        tables: errors of each image's estimates against its instances.
+        images: the object in all images.
+        tables: errors of each image's estimates (rows) against its instances.
         limit: error below which an estimate is right.
     """
     counted: list[tuple[float, bool]] = []  # score, and whether it is right
@@ -163,13 +172,13 @@ def _measure_precision(
     for image, table in zip(images, tables, strict=True):
         hidden = {k for k, instance in enumerate(image.instances) if _is_hidden(instance)}
         targets += len(image.instances) - len(hidden)
-        free = set(range(len(image.instances)))
+        unmatched = set(range(len(image.instances)))
         for row, prediction in enumerate(image.predictions):
-            best = min(sorted(free), key=lambda k: float(table[row, k]), default=None)
-            is_right = best is not None and float(table[row, best]) < limit
+            nearest = min(sorted(unmatched), key=lambda k: float(table[row, k]), default=None)
+            is_right = nearest is not None and float(table[row, nearest]) < limit
             if is_right:
-                free.discard(best)
-            if not (is_right and best in hidden):
+                unmatched.discard(nearest)
+            if not (is_right and nearest in hidden):
                 counted.append((score_of(prediction.estimate), is_right))
     if targets == 0:
         return None
@@ -178,5 +187,5 @@ def _measure_precision(
 
 
 def _is_hidden(instance: Instance) -> bool:
-    """Whether less than a tenth of an instance is visible; not where that is not known."""
+    """Whether less than a tenth of an instance is visible; False where that is not annotated."""
     return instance.visible_fraction is not None and instance.visible_fraction < LEAST_VISIBLE

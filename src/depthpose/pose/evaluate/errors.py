@@ -1,4 +1,4 @@
-"""Errors of estimates against truth, by published conventions."""
+"""Errors of estimates against truth by published conventions, and which estimate is of what."""
 
 import math
 from collections import defaultdict
@@ -40,29 +40,29 @@ _MARGIN_PX = 2  # of the window in which VSD is measured
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ErrorContext:
-    """The object and settings that errors depend on."""
+    """The object and the settings by which errors are measured."""
 
     model: ObjectModel  #: the object
     diameter_m: float  #: by the table that ``EvaluationConfig.diameters`` names
-    is_adds: bool  #: whether ADD-S decides a success
-    vsd_delta_m: float | None  #: see ``EvaluationConfig``; None: VSD is not measured
+    is_adds: bool  #: whether ADD-S decides a success, not ADD
+    vsd_delta_m: float | None  #: as in ``EvaluationConfig``; None: VSD is not measured
     symmetries: Rigid  #: motions of the model that leave it as it is, the identity first
     triangles_m: Float[Tensor, "f 3 3"]  #: drawn for VSD; a model of points is drawn as discs
 
 
-Errors = Float[Tensor, " n"]  #: one number, or several whose mean a row shows (VSD: one a tau)
+Errors = Float[Tensor, " n"]  #: one number; of VSD one for each tau, whose mean a row shows
 
 
 @dataclass(frozen=True, kw_only=True)
 class Metric:
     """An error of a pose, and how it is summed up in the rows of objects."""
 
-    #: ``(estimated, instance, context)``, the first ``camera_from_model``, to the error.
+    #: from the estimated ``camera_from_model``, the instance and the context to the error.
     measure: Callable[[Rigid, Instance, ErrorContext], Errors | Tensor | float]
     missing: tuple[float, ...] = (math.inf,)  #: the error of an instance without an estimate
     is_wanted: Callable[[ErrorContext], bool] = lambda _: True  #: whether it is measured at all
-    #: columns of the rows of objects: name to a function of the errors (n, t) of all instances and
-    #: their diameters [m] (n).
+    #: columns of the rows of objects: from the name to a function of the errors (n, t) of all
+    #: instances and their diameters [m] (n).
     summaries: Mapping[str, Callable[[Tensor, Tensor], float]] = field(default_factory=dict)
     has_median: bool = False  #: whether rows hold the median over estimates, ``NAME_median``
 
@@ -75,11 +75,15 @@ def find_nearest_copy(
     Args:
         estimated: ``camera_from_model``.
         true: the same, annotated.
-        symmetries: motions of the model that leave it as it is, the identity first.
-        declared: the symmetries that these are steps of; then rotations about their axes are exact,
-            not rounded to a step.
+        symmetries: motions of the model that leave it as it is, the identity first; rotations
+            about an axis in steps.
+        declared: the same symmetries with their axes; rotations about these are then exact, not
+            rounded to a step.
+
+    Returns:
+        The copy, ``camera_from_model``.
     """
-    # The nearest of the given copies.
+    # The nearest of the copies T_true S.
     R = symmetries.R.double()
     t_m = symmetries.t_m.double()
     true_R = true.R.double()
@@ -91,20 +95,22 @@ def find_nearest_copy(
 
     # A ball is rotated about its centre to the estimated rotation itself.
     estimated_R = estimated.R.double()
+    copy_R_estimated = copy.R.mT @ estimated_R
     centre_m = declared.ball_centre_m
-    relative = copy.R.mT @ estimated_R
     if centre_m is not None:
         centre_m = centre_m.to(estimated_R)
-        return copy @ Rigid(relative, centre_m - relative @ centre_m)
+        return copy @ Rigid(copy_R_estimated, centre_m - copy_R_estimated @ centre_m)
 
-    # Else the copy is rotated about each axis to the angle of the largest trace of
-    # relative^T rotation(angle), which is that of the least difference.
+    # Else the copy is rotated about each axis a to the angle at which trace(D^T rotation(angle)),
+    # with D from copy to estimate, is largest, and so the difference of the rotations least:
+    # tan(angle) = a . (D32 - D23, D13 - D31, D21 - D12) / (trace(D) - a^T D a).
+    skew = copy_R_estimated - copy_R_estimated.mT
+    skew_vector = torch.stack([skew[2, 1], skew[0, 2], skew[1, 0]])
     rotated: list[Rigid] = []
     for axis in declared.continuous:
         a = axis.direction.to(estimated_R) / axis.direction.norm()
-        skew = relative - relative.mT
-        across = torch.stack([skew[2, 1], skew[0, 2], skew[1, 0]])
-        angle = torch.atan2(a @ across, relative.trace() - a @ relative @ a)
+        cosine_part = copy_R_estimated.trace() - a @ copy_R_estimated @ a
+        angle = torch.atan2(a @ skew_vector, cosine_part)
         rotated.append(copy @ turn_about(a, axis.point_m.to(estimated_R), angle))
     return min(rotated, key=lambda pose: float(geodesic_rad(estimated_R, pose.R)))
 
@@ -115,32 +121,32 @@ def _measure_vsd(
     """Measure the visible surface discrepancy at each of BOP's ten tolerances, 0..1."""
     assert context.vsd_delta_m is not None
     depth_m = _read_depth(instance.depth, instance.depth_unit_m)
-    poses = (estimated, instance.camera_from_model)
+    true = instance.camera_from_model
+    K = instance.K.double()
 
-    # Pixels that neither pose covers do not count: only the window about both is drawn.
-    size = torch.tensor(depth_m.shape).flip(0)
-    points_m = torch.cat(
-        [pose.double().apply(context.triangles_m).reshape(-1, 3) for pose in poses]
-    )
-    pixels = project(points_m, instance.K.double())
-    low = torch.zeros_like(size)
-    high = size
+    # Pixels that neither pose covers do not count: only the window about both is rendered.
+    estimated_m = estimated.double().apply(context.triangles_m).reshape(-1, 3)
+    true_m = true.double().apply(context.triangles_m).reshape(-1, 3)
+    pixels = project(torch.cat([estimated_m, true_m]), K)
+    image_size_px = torch.tensor(depth_m.shape).flip(0)
+    low = torch.zeros_like(image_size_px)
+    high = image_size_px
     if bool(pixels.isfinite().all()):  # else a point lies behind the camera
-        low = (pixels.amin(0) - _MARGIN_PX).clamp(min=0).minimum(size - 1).long()
-        high = (pixels.amax(0) + _MARGIN_PX + 1).clamp(min=1).minimum(size).long()
+        low = (pixels.amin(0) - _MARGIN_PX).clamp(min=0).minimum(image_size_px - 1).long()
+        high = (pixels.amax(0) + _MARGIN_PX + 1).clamp(min=1).minimum(image_size_px).long()
     left, top = low.tolist()
     right, bottom = torch.maximum(high, low + 1).tolist()
-    K = crop_intrinsics(instance.K.double(), left, top)
-    window = depth_m[top:bottom, left:right]
-    height, width = window.shape
+    window_m = depth_m[top:bottom, left:right]
+    window_K = crop_intrinsics(K, left, top)
+    height, width = window_m.shape
 
     def render(pose: Rigid) -> Float[Tensor, "h w"]:
-        """Draw the depth [m] of the object in the window."""
+        """Render the depth [m] of the object in the window."""
         triangles_m = pose.double().apply(context.triangles_m)
-        return rasterize(triangles_m, K, width, height, with_barycentric=False).depth_m
+        return rasterize(triangles_m, window_K, width, height, with_barycentric=False).depth_m
 
     taus_m = [share * context.diameter_m for share in BOP_SHARES]
-    return vsd(*poses, window, K, render, taus_m, context.vsd_delta_m)
+    return vsd(estimated, true, window_m, window_K, render, taus_m, context.vsd_delta_m)
 
 
 _read_depth = lru_cache(maxsize=4)(read_depth_png)  # instances of one image follow each other
@@ -219,8 +225,8 @@ METRICS = {
 the nearest of the true poses that look alike."""
 
 
-_POINTS = 500  # of a model, by which poses are assigned
-_MOST_DIAMETERS = 1.0  # error at which the cost of an assignment is cut off
+_POINTS = 500  # points of a model by which poses are assigned to instances
+_LARGEST_COST_DIAMETERS = 1.0  # largest cost of an assignment; larger errors cost the same
 
 
 def match_instances(
@@ -228,7 +234,7 @@ def match_instances(
     predictions: Sequence[Prediction],
     models: Mapping[int, ObjectModel],
 ) -> dict[str, PoseEstimate]:
-    """Match each instance with one estimate at most; give estimates by the instances' names.
+    """Match each instance with one estimate at most; return estimates by the instances' names.
 
     An estimate with an instance's name was computed from its mask and belongs to it, unless its
     place is another: in another data set names may be the same. Of the others an image with n
@@ -257,7 +263,7 @@ def match_instances(
         if prediction.place is not None and prediction.place in unmatched:
             offered[prediction.place].append(prediction.estimate)
 
-    # Of each place the poses of the highest scores, then refusals.
+    # For each place the poses of the highest scores, then refusals.
     for place, estimates in offered.items():
         instances_there = unmatched[place]
         model = models[place.object_id]
@@ -281,13 +287,13 @@ def _assign(
             pose = estimates[column].camera_from_model
             assert pose is not None
             error_m = float(adds_m(pose, instances[row].camera_from_model, points_m))
-            costs_m[row, column] = min(error_m, _MOST_DIAMETERS * model.diameter_m)
+            costs_m[row, column] = min(error_m, _LARGEST_COST_DIAMETERS * model.diameter_m)
     assigned = zip(*linear_sum_assignment(costs_m), strict=True)
     return {instances[row].name: estimates[column] for row, column in assigned}
 
 
 _TRIED = 40  # instances that each change is tried on
-_GAIN = 0.2  # share of them that more must be right by a change for it to be named
+_LEAST_GAIN = 0.2  # least share of them that a change makes right, for it to be advised
 _SCALES = {
     1.0: "",
     1000.0: "t were 1000 times larger (is it in metres? BOP's csv has millimetres)",
@@ -308,16 +314,16 @@ _COUNTED_FROM = {"smaller (are yours counted from 1?)": -1, "larger (from 0?)": 
 
 @dataclass(frozen=True, kw_only=True)
 class _Change:
-    """A change of all predictions: of their image and object numbers, and of their poses."""
+    """A change of all predictions that a mistake in the convention of a file may call for."""
 
-    words: str = ""  #: that describe it
-    image_step: int = 0  #: that is added to the numbers of images
-    object_step: int = 0  #: and of objects
-    convention: str = ""  #: a key of ``_CONVENTIONS``
-    scale: float = 1.0  #: of translations
+    description: str = ""  #: completes "poses were right if ..."
+    image_step: int = 0  #: added to the numbers of images
+    object_step: int = 0  #: added to the numbers of objects
+    convention: str = ""  #: of poses, a key of ``_CONVENTIONS``
+    scale: float = 1.0  #: factor of translations
 
     def renumber(self, prediction: Prediction) -> Prediction:
-        """Give a prediction with its numbers of image and object changed."""
+        """Return a prediction with its numbers of image and object changed."""
         place = prediction.place
         if place is None:
             return prediction
@@ -326,7 +332,7 @@ class _Change:
         return replace(prediction, place=Place(place.scene_id, image_id, object_id))
 
     def repose(self, prediction: Prediction) -> Prediction:
-        """Give a prediction with the convention and the unit of its pose changed."""
+        """Return a prediction with the convention and the scale of its pose changed."""
         pose = prediction.estimate.camera_from_model
         assert pose is not None
         pose = _CONVENTIONS[self.convention](pose.double())
@@ -335,15 +341,15 @@ class _Change:
 
 
 def _list_changes() -> list[_Change]:
-    """List the changes that are tried: numbers by one, and conventions with units."""
+    """List the changes that are tried: of numbers by one, and of conventions and units of poses."""
     changes: list[_Change] = []
-    for words, step in _COUNTED_FROM.items():
-        changes.append(_Change(words=f"image numbers were one {words}", image_step=step))
-        changes.append(_Change(words=f"object numbers were one {words}", object_step=step))
+    for text, step in _COUNTED_FROM.items():
+        changes.append(_Change(description=f"image numbers were one {text}", image_step=step))
+        changes.append(_Change(description=f"object numbers were one {text}", object_step=step))
     for convention in _CONVENTIONS:
-        for scale, words in _SCALES.items():
-            both = " and ".join(filter(None, (words, convention)))
-            changes.append(_Change(words=both, convention=convention, scale=scale))
+        for scale, text in _SCALES.items():
+            both = " and ".join(filter(None, (text, convention)))
+            changes.append(_Change(description=both, convention=convention, scale=scale))
     return changes
 
 
@@ -352,7 +358,7 @@ def advise_convention(
     predictions: Sequence[Prediction],
     contexts: Mapping[int, ErrorContext],
 ) -> str | None:
-    """Advise a change of all predictions by which many more would be right; None if there is none.
+    """Advise a change of all predictions after which many more were right; None if there is none.
 
     Args:
         dataset: instances with truth.
@@ -362,19 +368,19 @@ def advise_convention(
     # Are few right as they are?
     posed = [p for p in predictions if p.estimate.is_posed]
     right, tried = _count_right(dataset, posed, contexts, _Change())
-    if right > (1 - _GAIN) * tried > 0:
+    if right > (1 - _LEAST_GAIN) * tried > 0:
         return None
 
-    # Of all changes the one by which most are.
+    # The change after which most are.
     changes = _list_changes()
     counts = [_count_right(dataset, posed, contexts, change) for change in changes]
     best = max(range(len(changes)), key=lambda k: counts[k][0])
     best_right, best_tried = counts[best]
-    if best_right < right + max(1, min(3, best_tried), _GAIN * best_tried):
+    if best_right < right + max(1, min(3, best_tried), _LEAST_GAIN * best_tried):
         return None
     return (
         f"{right} of {tried} answers that were tried are right, but {best_right} of {best_tried} "
-        f"were if {changes[best].words}"
+        f"were if {changes[best].description}"
     )
 
 
@@ -384,7 +390,11 @@ def _count_right(
     contexts: Mapping[int, ErrorContext],
     change: _Change,
 ) -> tuple[int, int]:
-    """Count the predictions that are right by a change, of some instances, and these instances."""
+    """Count on some instances how many predictions are right after a change.
+
+    Returns:
+        The number of right ones, and the number of these instances.
+    """
     # Some instances that have an estimate, once numbers are changed.
     renumbered = [change.renumber(prediction) for prediction in posed]
     matched = match_instances(dataset.instances, renumbered, dataset.objects)

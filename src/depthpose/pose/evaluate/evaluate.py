@@ -1,4 +1,4 @@
-"""Predictions against truth: rows, and their summary."""
+"""Predictions against truth: a row for each instance, and rows that sum them up."""
 
 import hashlib
 import math
@@ -15,7 +15,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.frame import make_data_frame
 from depthpose.pose.config import EvaluationConfig
 from depthpose.pose.datasets import BopDataset, BopTarget, Instance
-from depthpose.pose.evaluate.detection import score_detections
+from depthpose.pose.evaluate.detection import average_measured, score_detections
 from depthpose.pose.evaluate.errors import (
     METRICS,
     ErrorContext,
@@ -36,8 +36,6 @@ from depthpose.pose.predictions import (
     score_of,
 )
 from depthpose.pose.types import POSED, ObjectModel, PoseEstimate
-
-Number = float | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,24 +65,23 @@ class _Row:
     origin: Origin | None = None  #: whose predictions it measures
 
     def columns(self) -> dict[str, Any]:
-        """Give the values of the row by column, in the order of the table."""
-        columns = {} if self.origin is None else asdict(self.origin)
-        if not isinstance(self, ObjectRow):
-            columns = {name: columns[name] for name in ("method", "masks") if name in columns}
+        """List the values of the row by column: method and masks, its own, the conditions."""
+        columns: dict[str, Any] = {}
+        if self.origin is not None:
+            columns = {"method": self.origin.method, "masks": self.origin.masks}
         for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(self, InstanceRow) and field.name == "errors":
-                columns |= {name: self.error(name) for name in METRICS}
-            elif field.name == "ms":
-                columns |= {f"ms_{stage}": number for stage, number in value.items()}
-            elif isinstance(value, Mapping):
-                columns |= value
-            elif field.name not in _LAST and not (value is None and field.default is None):
-                columns[field.name] = value
-        return columns | ({} if self.conditions is None else asdict(self.conditions))
+            if field.name not in ("conditions", "origin"):
+                columns |= self._columns_of_field(field.name)
+        if self.conditions is not None:
+            columns |= asdict(self.conditions)
+        return columns
 
-
-_LAST = ("conditions", "origin")
+    def _columns_of_field(self, name: str) -> dict[str, Any]:
+        """List the columns of a field: its value, or one column for each entry of a mapping."""
+        value = getattr(self, name)
+        if name == "ms":
+            return {f"ms_{stage}": stage_ms for stage, stage_ms in value.items()}
+        return dict(value) if isinstance(value, Mapping) else {name: value}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -95,23 +92,29 @@ class InstanceRow(_Row):
     object: str  # name of its model
     status: str  #: of the estimate; ``missing`` where there is none
     is_success: bool  #: whether ADD (ADD-S of a symmetric object) is below a tenth of the diameter
-    score: Number  #: of the answer, larger is surer
-    visible_fraction: Number  #: share of the silhouette that is seen, where it is given
+    score: float | None  #: of the estimated pose, larger is surer
+    visible_fraction: float | None  #: share of the silhouette that is seen, where it is annotated
     truth: str  #: ``annotated``, or ``fitted`` to the same depth
-    diameter_m: float  #: of the table that was asked for
-    metric: str  #: ``ADD`` or ``ADD-S``
+    diameter_m: float  #: by the table that ``EvaluationConfig.diameters`` names
+    metric: str  #: of a success, ``ADD`` or ``ADD-S``
     errors: Mapping[str, Errors]  #: by the names of ``METRICS``; what is not measured is left out
     #: milliseconds of each stage and in ``total``; None where it has not run. The time of a search
     #: is divided among the estimates of its image.
-    ms: Mapping[str, Number]
+    ms: Mapping[str, float | None]
     reason: str  #: of a refusal
 
-    def error(self, name: str) -> Number:
-        """Give an error by its name, or None where it is not measured or infinite."""
+    def error(self, name: str) -> float | None:
+        """Return an error by its name in ``METRICS``; None where it is not measured or infinite."""
         if name not in self.errors:
             return None
         mean = float(self.errors[name].mean())
         return mean if math.isfinite(mean) else None
+
+    def _columns_of_field(self, name: str) -> dict[str, Any]:
+        """List the columns of a field: every error has one, measured or not."""
+        if name == "errors":
+            return {metric: self.error(metric) for metric in METRICS}
+        return super()._columns_of_field(name)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,34 +124,45 @@ class ObjectRow(_Row):
     object: str  # what the row is called
     instances: int  #: how many
     annotated: int  #: how many of them have a pose that was annotated, not fitted
-    success: float  #: share of instances
-    refused: float  #: share of instances without an answer
-    wrong: float  #: share of instances with an answer that is no success
-    coverage: float  #: share of instances with an answer
-    #: the summaries of ``METRICS``, ``ar`` and medians; None where not measured.
-    scores: Mapping[str, Number]
-    ms: Mapping[str, Number]  #: mean milliseconds of each stage and in ``total``
-    metric: str | None = None  #: ``ADD`` or ``ADD-S``, where it is of one object
-    diameter_m: float | None = None  #: the same
+    success: float  #: share of instances whose pose is a success (:class:`InstanceRow`)
+    refused: float  #: share of instances without a pose
+    wrong: float  #: share of instances with a pose that is no success
+    coverage: float  #: share of instances with a pose
+    #: the summaries of ``METRICS``, ``ar``, medians and BOP's precisions; None where not measured.
+    scores: Mapping[str, float | None]
+    ms: Mapping[str, float | None]  #: mean milliseconds of each stage and in ``total``
+    metric: str | None = None  #: of a success, ``ADD`` or ``ADD-S``, in the row of one object
+    diameter_m: float | None = None  #: of the object, in the row of one object
+
+    def columns(self) -> dict[str, Any]:
+        """List the values of the row by column, with all columns of the origin."""
+        columns = super().columns()
+        return columns if self.origin is None else asdict(self.origin) | columns
+
+    def _columns_of_field(self, name: str) -> dict[str, Any]:
+        """List the columns of a field; metric and diameter are those of a single object."""
+        if name in ("metric", "diameter_m") and getattr(self, name) is None:
+            return {}
+        return super()._columns_of_field(name)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RiskRow(_Row):
     """The share of wrong estimates among those of the highest scores."""
 
-    coverage: float  #: share of all instances that is answered
-    answers: int  #: their number
-    least_score: Number  #: of the least sure of them
+    coverage: float  #: share of all instances that these estimates are of
+    answers: int  #: number of these estimates
+    least_score: float | None  #: the lowest of their scores
     risk: float  #: share of wrong ones among them
 
 
-_PRECISIONS = ("ap", "ap_mssd", "ap_mspd")
-_RECALLS = ("ar_vsd", "ar_mssd", "ar_mspd")
-_DECILES = 10
+_PRECISIONS = ("ap", "ap_mssd", "ap_mspd")  # columns of BOP's precision of 6D detection
+_RECALLS = ("ar_vsd", "ar_mssd", "ar_mspd")  # columns whose mean is BOP's average recall
+_COVERAGES = 10  # at which the risk is measured: tenths of all instances
 
 
-def sum_up_object(name: str, rows: Sequence[InstanceRow]) -> ObjectRow:
-    """Sum up the instances of an object, or of all objects.
+def summarise_instances(name: str, rows: Sequence[InstanceRow]) -> ObjectRow:
+    """Summarise the instances of an object, or of all objects, in a row called ``name``.
 
     ``success``, ``refused`` and ``wrong`` add up to 1: an instance without a pose is refused.
     Medians are over the instances with a pose, all else over all instances.
@@ -165,20 +179,21 @@ def sum_up_object(name: str, rows: Sequence[InstanceRow]) -> ObjectRow:
         wrong=coverage - success,
         coverage=coverage,
         scores=_summarise_errors(rows),
-        ms={stage: _average([row.ms[stage] for row in rows]) for stage in rows[0].ms},
+        ms={stage: average_measured([row.ms[stage] for row in rows]) for stage in rows[0].ms},
     )
 
 
 def average_objects(rows: Sequence[ObjectRow]) -> ObjectRow:
     """Average the rows of objects: each object counts the same, as in LineMOD's tables."""
     count = len(rows)
-    scores: dict[str, Number] = {}
+    scores: dict[str, float | None] = {}
     for name in rows[0].scores:
         values = [row.scores[name] for row in rows]
         # A recall needs all objects. A median may lack those without a pose, and BOP's precision
         # those of which too little is visible.
-        may_lack = name in _PRECISIONS or name.endswith("_median")
-        scores[name] = _average(values) if may_lack or None not in values else None
+        is_partial_allowed = name in _PRECISIONS or name.endswith("_median")
+        is_averaged = is_partial_allowed or None not in values
+        scores[name] = average_measured(values) if is_averaged else None
     return ObjectRow(
         object="mean",
         instances=sum(row.instances for row in rows),
@@ -188,7 +203,7 @@ def average_objects(rows: Sequence[ObjectRow]) -> ObjectRow:
         wrong=sum(row.wrong for row in rows) / count,
         coverage=sum(row.coverage for row in rows) / count,
         scores=scores,
-        ms={stage: _average([row.ms[stage] for row in rows]) for stage in rows[0].ms},
+        ms={stage: average_measured([row.ms[stage] for row in rows]) for stage in rows[0].ms},
     )
 
 
@@ -197,10 +212,12 @@ def measure_risk(rows: Sequence[InstanceRow]) -> list[RiskRow]:
 
     A ``coverage`` of 0.1 is a tenth of all instances. The rows end where there are no more poses.
     """
-    # The answers, the surest first, and how many of them make each coverage.
+    # The poses, the surest first.
     answered = [row for row in rows if row.status in POSED and row.score is not None]
     answered.sort(key=lambda row: -(row.score or 0.0))
-    tenths = (round(k * len(rows) / _DECILES) for k in range(1, _DECILES + 1))
+
+    # How many of them make each coverage; beyond the last one the number repeats, and counts once.
+    tenths = [round(k * len(rows) / _COVERAGES) for k in range(1, _COVERAGES + 1)]
     counts = dict.fromkeys(min(count, len(answered)) for count in tenths)
     return [
         RiskRow(
@@ -214,15 +231,15 @@ def measure_risk(rows: Sequence[InstanceRow]) -> list[RiskRow]:
     ]
 
 
-def _summarise_errors(rows: Sequence[InstanceRow]) -> dict[str, Number]:
-    """Summarise the errors of some instances by the columns of a table; None: not measured.
+def _summarise_errors(rows: Sequence[InstanceRow]) -> dict[str, float | None]:
+    """Summarise the errors of some instances; returns a number, or None, for each column.
 
-    Recalls and areas are over all instances, of which one without an estimate is missed; medians
-    are over the instances with an estimate.
+    Recalls and areas are over all instances, of which one without a pose is missed; medians are
+    over the instances with a pose. None where an error is not measured.
     """
     # The summaries of each error.
     diameters_m = torch.tensor([row.diameter_m for row in rows], dtype=torch.float64)
-    scores: dict[str, Number] = {}
+    scores: dict[str, float | None] = {}
     for name, metric in METRICS.items():
         is_measured = all(name in row.errors for row in rows)
         errors = torch.stack([row.errors[name] for row in rows]) if is_measured else None
@@ -244,14 +261,8 @@ def _summarise_errors(rows: Sequence[InstanceRow]) -> dict[str, Number]:
     return scores
 
 
-def _average(values: Sequence[Number]) -> Number:
-    """Average the values that are not None; None where there are none."""
-    numbers = [value for value in values if value is not None]
-    return sum(numbers) / len(numbers) if numbers else None
-
-
 def hash_frames(instances: Sequence[Instance]) -> str:
-    """Compute the SHA-256 of a list of instances, a line each: scene, image, object and place."""
+    """Compute the SHA-256 of a list of instances, a line each: scene, image, object and index."""
     lines = (f"{i.scene_id} {i.image_id} {i.object_id} {i.index}\n" for i in instances)
     return hashlib.sha256("".join(sorted(lines)).encode()).hexdigest()
 
@@ -299,7 +310,9 @@ PVNET_DIAMETERS_M = {
 }  # fmt: skip
 """Of LineMOD's 13 objects by BOP's number, as PVNet's published evaluation has them."""
 
-_OTHER_DATA_SET = 0.25
+_LARGEST_DIFFERENCE = 0.25
+"""Largest share by which PVNet's diameter of an object differs from the model's: an object that
+differs by more is of another data set."""
 
 
 def prepare_errors(model: ObjectModel, config: EvaluationConfig) -> ErrorContext:
@@ -311,7 +324,7 @@ def prepare_errors(model: ObjectModel, config: EvaluationConfig) -> ErrorContext
     diameter_m = model.diameter_m
     if config.diameters == "pvnet":
         diameter_m = PVNET_DIAMETERS_M.get(model.number, 0.0)
-        if abs(diameter_m / model.diameter_m - 1) > _OTHER_DATA_SET:
+        if abs(diameter_m / model.diameter_m - 1) > _LARGEST_DIFFERENCE:
             raise InputError(
                 f"object {model.number} ({model.name}) has a diameter of {model.diameter_m:.3f} m, "
                 "which is no object of PVNet's table of LineMOD; take the data set's diameters, bop"
@@ -328,19 +341,19 @@ def prepare_errors(model: ObjectModel, config: EvaluationConfig) -> ErrorContext
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """What evaluating one set of predictions gave."""
+    """The results of one set of predictions."""
 
-    #: one an object; where there are several the ``mean`` over objects, in which each counts the
-    #: same, and ``all`` over instances, as BOP pools them.
+    #: one for each object; where there are several also the ``mean`` over objects, in which each
+    #: counts the same, and ``all`` over instances, as BOP pools them.
     rows: list[ObjectRow]
-    per_instance: list[InstanceRow]  #: one an instance
-    risk: list[RiskRow]  #: how many answers are wrong if only the surest are given
-    #: by which change of all predictions many more were right: another unit or convention of poses;
-    #: None where by none.
+    per_instance: list[InstanceRow]  #: one for each instance
+    risk: list[RiskRow]  #: share of wrong poses if only the surest are given
+    #: a change of all predictions, such as another unit or convention of poses, after which many
+    #: more were right; None where there is none.
     advice: str | None = None
 
     def to_frame(self) -> Any:  # noqa: ANN401  pandas is no dependency
-        """Give ``per_instance`` as a ``pandas.DataFrame``; the columns are those of its table.
+        """Convert ``per_instance`` to a ``pandas.DataFrame``; the columns are those of its table.
 
         Raises:
             ImportError: pandas is not installed.
@@ -348,8 +361,8 @@ class Evaluation:
         return make_data_frame(row.columns() for row in self.per_instance)
 
 
-def read_any(path: Path) -> list[Prediction]:
-    """Read predictions: a folder with ``poses.json``, or anybody's BOP csv.
+def read_any_predictions(path: Path) -> list[Prediction]:
+    """Read predictions of a folder with ``poses.json``, or of a BOP csv by any method.
 
     Raises:
         InputError: it is neither, damaged, or holds no pose and no refusal.
@@ -375,17 +388,37 @@ def evaluate(
 
     Args:
         dataset: instances with truth.
-        predictions: of :func:`read_any`.
+        predictions: of :func:`read_any_predictions`.
         config: diameters, which objects by ADD-S, whether VSD.
-        progress: wraps the sequence of instances, to show how far it is.
+        progress: wraps the sequence of instances, to show the progress.
         origin: whose predictions they are, for the columns of the rows.
 
     Raises:
         InputError: there is no instance, no prediction is of this data set, or a file of it is
             damaged.
     """
-    # Which estimate is of which instance?
     config = EvaluationConfig() if config is None else config
+    matched = _match_predictions(dataset, predictions)
+    contexts = {number: prepare_errors(model, config) for number, model in dataset.objects.items()}
+    rows = _measure_instances(progress(dataset.instances), predictions, matched, contexts)
+    object_rows = _summarise_objects(dataset, predictions, matched, contexts, rows)
+    conditions = Conditions(
+        diameters=config.diameters,
+        frames=f"{dataset.folder.resolve().name} {dataset.split}",
+        frames_sha256=hash_frames(dataset.instances)[:12],
+    )
+    return Evaluation(
+        rows=[replace(row, conditions=conditions, origin=origin) for row in object_rows],
+        per_instance=[replace(row, origin=origin) for row in rows],
+        risk=[replace(row, conditions=conditions, origin=origin) for row in measure_risk(rows)],
+        advice=advise_convention(dataset, predictions, contexts),
+    )
+
+
+def _match_predictions(
+    dataset: BopDataset, predictions: Sequence[Prediction]
+) -> dict[str, PoseEstimate]:
+    """Match estimates with instances by the instances' names; refuse those of another data set."""
     matched = match_instances(dataset.instances, predictions, dataset.objects)
     if len(dataset) == 0:
         raise InputError(f"{dataset.folder}: split {dataset.split!r} has no instance to measure")
@@ -398,63 +431,90 @@ def evaluate(
             f"{prediction.place or prediction.estimate.name!r}. Give the predictions of "
             "this very split"
         )
+    return matched
 
-    # Rows of instances. Stages in the order of work; those of other methods come last.
+
+def _measure_instances(
+    instances: Iterable[Instance],
+    predictions: Sequence[Prediction],
+    matched: Mapping[str, PoseEstimate],
+    contexts: Mapping[int, ErrorContext],
+) -> list[InstanceRow]:
+    """Measure the errors of each instance, and list the times of its estimate.
+
+    Args:
+        instances: all of a data set.
+        predictions: all of them, among which the time of a search is divided.
+        matched: the estimate of each instance that has one, by the instance's name.
+        contexts: of the errors, by the number of the object.
+    """
+    # Columns of times: stages in the order in which they run; those of other methods come last.
     timed = dict.fromkeys(stage for p in predictions for stage in p.estimate.seconds)
-    stages = [s for s in STAGES if s in timed] + [s for s in timed if s not in STAGES]
+    stages = [stage for stage in STAGES if stage in timed]
+    stages += [stage for stage in timed if stage not in STAGES]
     seconds_of = {
         prediction.estimate: seconds
         for prediction, seconds in zip(predictions, additive_seconds(predictions), strict=True)
     }
-    contexts = {number: prepare_errors(model, config) for number, model in dataset.objects.items()}
+
     rows: list[InstanceRow] = []
-    for instance in progress(dataset.instances):
+    for instance in instances:
         estimate = matched.get(instance.name)
         row = _measure_instance(instance, estimate, contexts[instance.object_id])
         ms = {} if estimate is None else _list_stage_ms(estimate, seconds_of[estimate])
-        columns = [*stages, "total"]
-        rows.append(replace(row, ms={column: ms.get(column) for column in columns}))
-    conditions = Conditions(
-        diameters=config.diameters,
-        frames=f"{dataset.folder.resolve().name} {dataset.split}",
-        frames_sha256=hash_frames(dataset.instances)[:12],
-    )
+        rows.append(replace(row, ms={column: ms.get(column) for column in (*stages, "total")}))
+    return rows
 
-    # Rows of objects, with BOP's precision of detection.
+
+def _summarise_objects(
+    dataset: BopDataset,
+    predictions: Sequence[Prediction],
+    matched: Mapping[str, PoseEstimate],
+    contexts: Mapping[int, ErrorContext],
+    rows: Sequence[InstanceRow],
+) -> list[ObjectRow]:
+    """Summarise each object; of several also their mean, and all instances.
+
+    Args:
+        dataset: with the instances.
+        predictions: all of them.
+        matched: the estimate of each instance that has one, by the instance's name.
+        contexts: of the errors, by the number of the object.
+        rows: of the instances, in the order of the data set.
+    """
+    # BOP's precision of detection, for which most errors are measured already.
     measured = {
         (matched[row.instance].name, row.instance): row.errors
         for row in rows
         if row.instance in matched
     }
     precision = score_detections(dataset, predictions, contexts, measured)
+
+    # Each object, in the order of their numbers.
     rows_of_object: dict[int, list[InstanceRow]] = defaultdict(list)
     for row, instance in zip(rows, dataset.instances, strict=True):
         rows_of_object[instance.object_id].append(row)
     object_rows: list[ObjectRow] = []
     for number, context in sorted(contexts.items()):
-        row = sum_up_object(context.model.name, rows_of_object[number])
+        row = summarise_instances(context.model.name, rows_of_object[number])
         row = replace(row, scores={**row.scores, **precision[number]})
         metric = rows_of_object[number][0].metric
         object_rows.append(replace(row, metric=metric, diameter_m=context.diameter_m))
-    if len(object_rows) > 1:
-        # BOP's precision is that of an object, or the mean over objects: "all" has none.
-        all_row = sum_up_object("all", rows)
-        all_row = replace(all_row, scores={**all_row.scores, **dict.fromkeys(_PRECISIONS)})
-        object_rows += [average_objects(object_rows), all_row]
-    return Evaluation(
-        rows=[replace(row, conditions=conditions, origin=origin) for row in object_rows],
-        per_instance=[replace(row, origin=origin) for row in rows],
-        risk=[replace(r, conditions=conditions, origin=origin) for r in measure_risk(rows)],
-        advice=advise_convention(dataset, predictions, contexts),
-    )
+    if len(object_rows) == 1:
+        return object_rows
+
+    # BOP's precision is that of an object, or the mean over objects: "all" has none.
+    all_row = summarise_instances("all", rows)
+    all_row = replace(all_row, scores={**all_row.scores, **dict.fromkeys(_PRECISIONS)})
+    return [*object_rows, average_objects(object_rows), all_row]
 
 
 def _measure_instance(
     instance: Instance, estimate: PoseEstimate | None, context: ErrorContext
 ) -> InstanceRow:
-    """Measure one instance, without its times.
+    """Measure the errors of one instance; without a pose they are those of a missing estimate.
 
-    Without a pose its errors are those of a missing estimate.
+    The row has no times yet.
     """
     pose = None if estimate is None else estimate.camera_from_model
     errors: dict[str, Errors] = {}
@@ -479,7 +539,7 @@ def _measure_instance(
 
 
 def _list_stage_ms(estimate: PoseEstimate, additive: Mapping[str, float]) -> dict[str, float]:
-    """List the milliseconds of each stage of an estimate, and in ``total``, if it has any.
+    """List the milliseconds of each stage of an estimate, and in ``total``; none without times.
 
     ``additive``: its seconds of :func:`additive_seconds`, whose sum is the total.
     """

@@ -13,8 +13,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from depthpose.core.rigid import Rigid, rotation_by
-from depthpose.pose.cloud import thin
 from depthpose.pose.compiled import array_of
+from depthpose.pose.grid import thin_cloud
 from depthpose.pose.mesh.models import fibonacci_directions
 from depthpose.pose.propose.pair_votes import (
     FEATURES,
@@ -80,10 +80,10 @@ def prepare_pairs(surface: Surface) -> PairTable:
     # Points of the visible surface, few enough.
     points_m, normals = _find_visible_points(surface)
     step_m = STEP * surface.diameter_m
-    chosen = thin(points_m, normals, step_m)
+    chosen = thin_cloud(points_m, normals, step_m)
     while len(chosen) > _MODEL_POINTS:
         step_m *= _COARSER
-        chosen = thin(points_m, normals, step_m)
+        chosen = thin_cloud(points_m, normals, step_m)
     points_m = points_m[chosen]
     bases = _make_bases(normals[chosen])
 

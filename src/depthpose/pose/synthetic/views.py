@@ -23,8 +23,9 @@ from depthpose.core.errors import InputError
 from depthpose.core.loop import make_sample_generator
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid
-from depthpose.pose.cloud import grow_mask, lift_sample, turn_axis_to
+from depthpose.pose.cloud import grow_mask, lift_sample
 from depthpose.pose.config import CloudConfig, ObjectsConfig
+from depthpose.pose.grid import rotation_from_z_to
 from depthpose.pose.mesh import drawn_triangles
 from depthpose.pose.synthetic.depth_sensors import JUMP, simulate_depth
 from depthpose.pose.synthetic.occluders import draw_levels, occlude
@@ -89,7 +90,7 @@ def aim_camera(direction: Float[Tensor, "3"], roll_rad: float) -> Float[Tensor, 
     cosine = math.cos(roll_rad)
     sine = math.sin(roll_rad)
     roll = [[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]]
-    return turn_axis_to(direction) @ torch.tensor(roll, dtype=torch.float64)
+    return rotation_from_z_to(direction) @ torch.tensor(roll, dtype=torch.float64)
 
 
 def invert_intrinsics(K: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:

@@ -22,6 +22,7 @@ from depthpose.core.checkpoint import (
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_json
 from depthpose.core.loop import (
+    TrainingRun,
     Update,
     make_sample_generator,
     releases_folder,
@@ -39,7 +40,7 @@ from depthpose.pose.baselines import (
 )
 from depthpose.pose.cloud import lift_sample, why_too_few
 from depthpose.pose.config import SHAPE_FEATURES, RefusalConfig
-from depthpose.pose.copies import near_symmetry_lines
+from depthpose.pose.copies import describe_near_symmetries
 from depthpose.pose.losses import direction_loss, model_point_loss
 from depthpose.pose.mesh import sample_surface, symmetry_transforms
 from depthpose.pose.network import ResUNet, fold_norms, unfold_norms
@@ -368,7 +369,7 @@ def _write_pose_card(
     facts = {"objects": objects}
     near_symmetries: list[str] = []
     for model in weights.models:
-        rotations = near_symmetry_lines(model)[:_ROTATIONS_ON_CARD]
+        rotations = describe_near_symmetries(model)[:_ROTATIONS_ON_CARD]
         if rotations:
             near_symmetries.append(f"{model.name}: {', '.join(rotations)}")
     if near_symmetries:
