@@ -14,7 +14,7 @@ from tests.synthetic_street import make_street
 
 from depthpose.cli import main
 from depthpose.cli.depth_evaluate import with_source
-from depthpose.cli.depth_predict import DepthMethod
+from depthpose.cli.depth_methods import DepthMethod
 from depthpose.cli.thesis_depth import reproduce_table, write_figure
 from depthpose.core.camera import StereoRig, write_camera
 from depthpose.core.errors import InputError
@@ -206,8 +206,8 @@ def test_table_2_3_sets_each_weights_beside_its_row(street: Path, tmp_path: Path
 def test_a_method_of_one_image_is_never_shown_the_right_view(street: Path, tmp_path: Path) -> None:
     method = mono("w", 15.0)
     write_table("2.1", street, [("thesis, Ours", method)], tmp_path)
-    assert isinstance(method.net, FlatMono)
-    assert method.net.seen == ["left"] * 4 + ["both"]  # the last one is figure 2-1's upper bound
+    assert isinstance(method.estimator, FlatMono)
+    assert method.estimator.seen == ["left"] * 4 + ["both"]  # the last one is figure 2-1's upper bound
 
 
 def test_a_rerun_measures_the_same_files_and_refuses_other_settings(

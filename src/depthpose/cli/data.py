@@ -423,7 +423,7 @@ def rectify(
     """
     from tqdm import tqdm
 
-    from depthpose.cli.depth_predict import list_pairs
+    from depthpose.cli.depth_inputs import list_pairs
     from depthpose.core.camera import make_rectifier, read_raw_pair, write_camera
     from depthpose.core.files import image_size, read_image, write_image
     from depthpose.core.run import claim_folder, claim_names
@@ -479,12 +479,12 @@ def split(files: tyro.conf.Positional[tuple[Source, ...]], out: NewPath) -> int:
         files: pictures, videos, folders or quoted patterns.
         out: folder for the results.
     """
-    from depthpose.cli.depth_predict import list_sources
+    from depthpose.cli.depth_inputs import list_images_and_videos
     from depthpose.core.camera import order_views
     from depthpose.core.files import write_image
     from depthpose.core.run import claim_folder
 
-    sources = list_sources(files, out)
+    sources = list_images_and_videos(files, out)
     claim_folder(out, {"command": "data split"}, _SIDES)
     count = 0
     for source in sources:

@@ -11,8 +11,8 @@ from typing import Any, cast, get_args
 
 from tqdm import tqdm
 
+from depthpose.cli.depth_methods import DepthMethod, NetworkSpec, SGBMSpec
 from depthpose.cli.depth_options import MethodOptions
-from depthpose.cli.depth_predict import DepthMethod, DepthMethodSource
 from depthpose.core import engine
 from depthpose.core.errors import InputError
 from depthpose.core.run import environment, find_rank, read_settings, wait_for
@@ -56,41 +56,56 @@ def predict_depth_of_dataset(
 ) -> Path:
     """Predict every frame that has truth, and a right view if the method needs it.
 
-    Of several processes each predicts its share, and the first waits for the files of all. Gives
-    the folder of the method's files, ``FOLDER/METHOD``.
+    Of several processes each predicts its share, and the first waits for the files of all.
+
+    Args:
+        dataset: the frames.
+        method: estimates their depth.
+        rule: protocol by which the truth is read.
+        folder: folder of the predictions of all methods.
+
+    Returns:
+        The folder of the method's predictions, ``FOLDER/METHOD``.
     """
     process = find_rank()
     home = folder / method.name
-    usable = [
-        (i, frame)
-        for i, frame in enumerate(dataset.frames)
-        if has_truth(frame, rule) and (frame.right is not None or not method.with_right)
-    ]
+    usable: list[int] = []
+    sources: dict[str, list[Path]] = {}
+    for index, frame in enumerate(dataset.frames):
+        has_views = frame.right is not None or not method.with_right
+        if has_views and has_truth(frame, rule):
+            usable.append(index)
+            sources[frame.name] = frame.seen_files(with_right=method.with_right)
 
-    def read(index: int) -> StereoInput:
-        """Read a frame as the method may see it: without the right view for depth of one image."""
-        pair = dataset.read_input(index)
-        return pair if method.with_right else replace(pair, right=None)
-
-    share = process.share_of(usable)
-    jobs = [Job(name=frame.name, read=partial(read, i)) for i, frame in share]
-    sources = {f.name: f.seen_files(with_right=method.with_right) for _, f in usable}
-    net = _UncheckedNet(method.net) if isinstance(method.net, FakestereoNet) else method.net
-    written = estimate_missing_depth(net, jobs, home, method.settings, sources)
-    for _ in tqdm(written, method.name, total=len(jobs), disable=None, unit=" frames"):
-        pass
+    jobs: list[Job[StereoInput]] = []
+    for index in process.share_of(usable):
+        read = partial(_read_views, dataset, index, with_right=method.with_right)
+        jobs.append(Job(name=dataset.frames[index].name, read=read))
+    estimator = method.estimator
+    if isinstance(estimator, FakestereoNet):
+        estimator = _UncheckedNet(estimator)
+    names = estimate_missing_depth(estimator, jobs, home, method.settings, sources)
+    for _ in tqdm(names, method.name, total=len(jobs), disable=None, unit=" frames"):
+        pass  # each frame is estimated and written as its name is asked for
     if process.rank == 0:
         wait_for(list(sources), partial(is_finished, home))
     return home
 
 
+def _read_views(dataset: Dataset, index: int, *, with_right: bool) -> StereoInput:
+    """Read the views of a frame that a method may see: of depth of one image the left alone."""
+    pair = dataset.read_input(index)
+    return pair if with_right else replace(pair, right=None)
+
+
 @dataclass(frozen=True)
 class _UncheckedNet:
-    """A network that refuses no pair, for a measurement counts all of them."""
+    """A network that refuses no pair, since a measurement counts all of them."""
 
     net: FakestereoNet
 
     def estimate_input(self, pair: StereoInput, /) -> DepthEstimate:
+        """Estimate depth of one input without a check of the pair."""
         return self.net.estimate_input(pair, with_check=False)
 
 
@@ -104,10 +119,8 @@ def choose_methods(
     """
     chosen: list[DepthMethod] = []
     if options.matcher == "sgbm":
-        is_filled = options.holes == "fill"
-        sgbm = DepthMethodSource(weights=None, config=config, with_filled_holes=is_filled)
-        chosen.append(sgbm.build())
-    chosen += [named_method(name, config) for name in options.weights]
+        chosen.append(SGBMSpec(with_filled_holes=options.holes == "fill").build())
+    chosen += [build_network_method(word, config) for word in options.weights]
 
     # Their predictions need folders of different names, and their inputs must be there.
     names = [method.name for method in chosen]
@@ -126,18 +139,18 @@ def choose_methods(
         )
     if options.baseline:
         training = open_training(options.train, options.train_without, dataset)
-        chosen += [baseline_method(name, training) for name in dict.fromkeys(options.baseline)]
+        chosen += [fit_baseline(name, training) for name in dict.fromkeys(options.baseline)]
     return chosen
 
 
-def named_method(word: str, config: MatcherConfig) -> DepthMethod:
+def build_network_method(word: str, config: MatcherConfig) -> DepthMethod:
     """Build the method of weights by file or name, perhaps with a prefix that says how they run.
 
     ``own:`` and ``matched:`` say what depth of one image comes from, ``sgbm:`` lets OpenCV match
     the synthesised view; ``both:`` matches real pairs, ``quick:`` and ``fine:`` at that speed.
     """
     prefix, _, name = word.rpartition(":")
-    mono = DepthMethodSource(weights=name, config=config, with_right=False)
+    mono = NetworkSpec(weights=name, config=config, with_right=False)
     stereo = replace(mono, with_right=True)
     if prefix in get_args(Answer):
         return replace(mono, answer=cast("Answer", prefix)).build()
@@ -149,11 +162,11 @@ def named_method(word: str, config: MatcherConfig) -> DepthMethod:
         method = replace(stereo, config=replace(config, speed=prefix)).build()
         return method._replace(name=f"{method.name}-{prefix}")
     # No prefix; a colon may be one of the path, as in C:/weights.safetensors.
-    return DepthMethodSource(weights=word, config=config).build()
+    return NetworkSpec(weights=word, config=config).build()
 
 
-def baseline_method(name: BaselineName, training: Dataset) -> DepthMethod:
-    """Fit a baseline to the truth of training frames."""
+def fit_baseline(name: BaselineName, training: Dataset) -> DepthMethod:
+    """Fit a baseline to the truth of training frames, and return it as a method."""
     classes = {"rows": RowDepthBaseline, "nearest": NearestImageBaseline}
     names = "\n".join(frame.name for frame in training.frames)
     settings = {
@@ -163,13 +176,22 @@ def baseline_method(name: BaselineName, training: Dataset) -> DepthMethod:
         "train_frames": len(training),
         "train_sha256": hashlib.sha256(names.encode()).hexdigest(),
     }
-    show = partial(tqdm, desc=f"fit {name}", unit=" frames", disable=None)
-    net = classes[name].fit(training, show)
-    return DepthMethod(f"baseline-{name}", net, settings, with_right=False)
+    with_progress = partial(tqdm, desc=f"fit {name}", unit=" frames", disable=None)
+    baseline = classes[name].fit(training, with_progress)
+    return DepthMethod(f"baseline-{name}", baseline, settings, with_right=False)
 
 
 def open_training(folders: Sequence[Path], without: Sequence[str], measured: Dataset) -> Dataset:
-    """Open the frames that a baseline is fitted to, none of which may be measured."""
+    """Open the frames that a baseline is fitted to.
+
+    Args:
+        folders: datasets, which are joined.
+        without: names of frames to leave out.
+        measured: the frames that are measured.
+
+    Raises:
+        InputError: no folder is given, or a training frame is measured too.
+    """
     if not folders:
         raise InputError(
             "a baseline is fitted to training frames: give --train FOLDER, or several."

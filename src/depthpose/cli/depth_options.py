@@ -90,7 +90,7 @@ class ScaleOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MatchOptions(MatcherOptions):
+class PairMatcherOptions(MatcherOptions):
     """The settings by which the matcher of the weights runs; sgbm takes none of these."""
 
     left_right_check: bool = False
@@ -101,7 +101,7 @@ class MatchOptions(MatcherOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PairNetworks:
+class DepthMatchOptions:
     """The matcher of real pairs, their check, and the clouds that are written."""
 
     cloud: bool = False
@@ -118,7 +118,7 @@ class PairNetworks:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImageNetworks:
+class ImageNetworkOptions:
     """The networks that answer depth of one image."""
 
     weights: WeightsName = "default"

@@ -44,7 +44,7 @@ def predict_poses(
         out: folder for the results.
     """
     from depthpose.cli.pose_frames import search_dataset, search_files
-    from depthpose.cli.pose_methods import make_method_source
+    from depthpose.cli.pose_methods import make_method_spec
     from depthpose.cli.pose_predict import (
         predict_poses_of_dataset,
         predict_poses_of_files,
@@ -67,19 +67,19 @@ def predict_poses(
         pose_inputs = replace(pose_inputs, depth=str(depth))
 
     # The estimator: a trained network, or registration of CAD files. Workers build their own.
-    weights = estimates.choose_weights(estimates.weights, pose_inputs.cad)
-    source = make_method_source(
-        weights,
+    spec = make_method_spec(
+        estimates.weights,
         pose_inputs,
         pose_inputs.unit,
         dataset,
         estimates.config,
         pose_inputs.base_from_camera,
+        is_registration=estimates.is_registration(pose_inputs.cad),
     )
     batch = estimates.batch
     if engine.engine == "ray":
-        return predict_poses_on_ray(pose_inputs, source, batch, out, engine)
-    method = source.build()
+        return predict_poses_on_ray(pose_inputs, spec, batch, out, engine)
+    method = spec.build()
 
     # Pose a data set, or search whole images, or pose clouds and masked parts of images.
     home = Path(out)
@@ -89,12 +89,12 @@ def predict_poses(
         if dataset.masks == "search":
             return search_dataset(method, dataset, pose_inputs.object, home)
         return predict_poses_of_dataset(
-            method, dataset, pose_inputs.object, source.config, home, batch
+            method, dataset, pose_inputs.object, spec.config, home, batch
         )
     if pose_inputs.cloud is not None and not method.takes_clouds:
         raise InputError(
-            f"--cloud {pose_inputs.cloud}: the weights {weights} need depth images; give --depth, "
-            "--mask and --camera, or weights that vote"
+            f"--cloud {pose_inputs.cloud}: the weights {estimates.weights} need depth images; give "
+            "--depth, --mask and --camera, or weights that vote"
         )
     has_lens = pose_inputs.lens is not None
     if pose_inputs.depth is not None and has_lens and not pose_inputs.has_regions:
@@ -183,7 +183,7 @@ def track_object(
         weights: of a pose network, by name or file ('depthpose weights list').
     """
     from depthpose.cli.pose_frames import track_dataset, track_files
-    from depthpose.cli.pose_methods import make_method_source
+    from depthpose.cli.pose_methods import make_method_spec
     from depthpose.core.run import find_rank
 
     if sum(path is not None for path in (frames.depth, frames.cloud, frames.bop)) != 1:
@@ -193,11 +193,16 @@ def track_object(
     if find_rank().world > 1:
         raise InputError("a sequence is followed by one process; start one")
     config = EstimateConfig(device=frames.device, min_certainty=frames.min_certainty)
-    chosen_weights = register.choose_weights(weights, register.cad)
-    source = make_method_source(
-        chosen_weights, register, frames.unit, frames, config, frames.base_from_camera
+    spec = make_method_spec(
+        weights,
+        register,
+        frames.unit,
+        frames,
+        config,
+        frames.base_from_camera,
+        is_registration=register.is_registration(register.cad),
     )
-    method = source.build()
+    method = spec.build()
     if method.track is None:
         raise InputError(f"--weights {weights}: these need masked views; give weights that vote")
     follow = track_files if frames.bop is None else track_dataset

@@ -196,12 +196,9 @@ class MethodOptions:
     """network: trained weights. register: the CAD files alone, a second or two for each part, or
     the models of --bop; it is taken where --cad is given."""
 
-    def choose_weights(self, weights: str, cad: Sequence[str]) -> str | None:
-        """Give the weights of the network, or None where models are registered without one.
-
-        ``weights`` and ``cad``: the words of these options.
-        """
-        return None if is_registration(self.method, has_cad=bool(cad)) else weights
+    def is_registration(self, cad: Sequence[str]) -> bool:
+        """Whether models are registered, without a network; ``cad``: the words of ``--cad``."""
+        return is_registration(self.method, has_cad=bool(cad))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,8 +5,10 @@ from pathlib import Path
 
 import torch
 
-from depthpose.cli import depth_predict
-from depthpose.cli.depth_options import PairNetworks
+from depthpose.cli.depth_inputs import PAIRS, InputReader, list_pairs
+from depthpose.cli.depth_methods import NetworkSpec, SGBMSpec
+from depthpose.cli.depth_options import PredictOutput
+from depthpose.cli.depth_predict import predict_depth_of_files, wait_for_results
 from depthpose.cli.pose_options import PairOptions
 from depthpose.core.camera import StereoRig, read_rig
 from depthpose.core.errors import InputError
@@ -50,22 +52,23 @@ def match_pairs_for_poses(pair: PairOptions, camera: Path | None, device: str, o
             f"--min-confidence {pair.min_confidence:g}: a confidence lies in 0 to 1; 0 keeps all"
         )
 
-    pairs = depth_predict.list_pairs(pair.left, pair.right)
+    pairs = list_pairs(pair.left, pair.right)
     images = [path for both in pairs for path in both]
     refuse_among_inputs(out, (pair.left, pair.right), images)
-    source = depth_predict.DepthMethodSource(
-        weights=None if pair.matcher == "sgbm" else pair.matcher or "default",
-        config=MatcherConfig(device=device),
-        with_right=True,
-        use="pairs",
-    )
-    networks = PairNetworks(matcher=pair.matcher)
-    work = depth_predict.pair_work(camera, networks, source, pairs[0])
-    depth_predict.predict_depth_of_files(pairs, work, source.build(), out / MATCHED)
-    if find_rank().world > 1:  # every process poses its share of all pairs
-        depth_predict.wait_for_results(pairs, work, out / MATCHED)
-
+    spec: SGBMSpec | NetworkSpec = SGBMSpec()
+    if pair.matcher != "sgbm":
+        spec = NetworkSpec(
+            weights=pair.matcher or "default",
+            config=MatcherConfig(device=device),
+            with_right=True,
+            use="pairs",
+        )
     rig = read_rig(camera, image_size(pairs[0][0]))
+    reader = InputReader(camera=rig, files=PAIRS)
+    predict_depth_of_files(pairs, spec.build(), reader, PredictOutput(), out / MATCHED)
+    if find_rank().world > 1:  # every process poses its share of all pairs
+        wait_for_results(pairs, out / MATCHED, with_cloud=False)
+
     names = [left.stem for left, _ in pairs]
     for name in names:
         _write_sure_depth(name, rig, pair.min_confidence, out)

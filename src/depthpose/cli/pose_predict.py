@@ -12,9 +12,9 @@ from typing import Any
 from tqdm import tqdm
 
 from depthpose.cli import pose_dataset, pose_masks
-from depthpose.cli.engine import EngineOptions, Weights, print_shards
+from depthpose.cli.engine import EngineOptions, print_shards
 from depthpose.cli.pose_jobs import object_named, plan_jobs, read_detection
-from depthpose.cli.pose_methods import PoseMethod, PoseMethodSource
+from depthpose.cli.pose_methods import PoseMethod, PoseMethodSpec, PoseNetworkSpec
 from depthpose.cli.pose_options import DataSetOptions, PoseInputs
 from depthpose.cli.pose_output import (
     claim_for_dataset,
@@ -24,7 +24,6 @@ from depthpose.cli.pose_output import (
 )
 from depthpose.core import run
 from depthpose.core.camera import Camera, camera_of
-from depthpose.core.checkpoint import find_weights
 from depthpose.core.config import config_to_dict
 from depthpose.core.engine import Files, Function, Inputs, Sample, Work
 from depthpose.core.errors import InputError
@@ -190,7 +189,7 @@ class PoseWork:
     all with one box.
     """
 
-    source: PoseMethodSource
+    spec: PoseMethodSpec
     object: str
     unit: Unit | None
     camera: Camera | None
@@ -198,7 +197,7 @@ class PoseWork:
 
     def start(self) -> Function:
         """Build the estimator, and give the function that poses a batch of a worker."""
-        method = self.source.build()
+        method = self.spec.build()
 
         def estimate(samples: Sequence[Sample], out: Path) -> list[str]:
             """Write the poses of a batch into a folder; give why each has none, "" if it has."""
@@ -228,7 +227,7 @@ class PoseWork:
 
 
 def predict_poses_on_ray(
-    options: PoseInputs, source: PoseMethodSource, batch: int, out: str, engine: EngineOptions
+    options: PoseInputs, spec: PoseMethodSpec, batch: int, out: str, engine: EngineOptions
 ) -> int:
     """Pose clouds, or depth images with masks or a box, by the workers of an engine.
 
@@ -252,21 +251,20 @@ def predict_poses_on_ray(
         _refuse_other_mask_names(inputs, paths[1])
 
     # What is estimated; the weights travel to the workers.
-    if isinstance(source.weights, str):
-        path = find_weights(source.weights)
-        source = replace(source, weights=Weights(name=path.name, data=path.read_bytes()))
-    method = source.build("cpu")
+    if isinstance(spec, PoseNetworkSpec):
+        spec = spec.with_packed_weights()
+    method = replace(spec, config=replace(spec.config, device="cpu")).build()
     object = object_named(options.object or None, method)
     camera = None
     if options.lens is not None:
         with inputs.first() as first:
             camera = camera_of(options.lens, image_size(first[0]))
-    poses = PoseWork(source=source, object=object, unit=options.unit, camera=camera, box=box)
+    poses = PoseWork(spec=spec, object=object, unit=options.unit, camera=camera, box=box)
 
     # All that decides the poses, for the record of the run.
     settings = {
         **method.settings,
-        "estimate": config_to_dict(source.config),
+        "estimate": config_to_dict(spec.config),
         "object": object,
         "unit": options.unit,
     }

@@ -1,7 +1,6 @@
 """``depthpose reproduce ...`` and ``depthpose figure ...``."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -13,7 +12,8 @@ from depthpose.cli.pose_options import PoseDataOptions, PoseTableOptions
 from depthpose.core.errors import InputError
 
 if TYPE_CHECKING:
-    from depthpose.cli.depth_predict import DepthMethod, DepthMethodSource
+    from depthpose.cli.depth_methods import DepthMethod
+    from depthpose.depth.config import MatcherConfig
     from depthpose.thesis.depth import PublishedTable
 
 
@@ -53,8 +53,7 @@ def reproduce(
         split: eigen-test (697 frames), another split, a file of frames, or all.
         pictures: how many frames the page shows.
     """
-    from depthpose.cli.depth_evaluate import baseline_method, open_frames, open_training
-    from depthpose.cli.depth_predict import DepthMethodSource
+    from depthpose.cli.depth_evaluate import fit_baseline, open_frames, open_training
     from depthpose.cli.thesis_depth import reproduce_table
     from depthpose.depth.evaluate import find_protocol
     from depthpose.thesis.depth import TABLES
@@ -70,13 +69,10 @@ def reproduce(
     _refuse_rows(published, weights, matcher, beside)
     dataset = open_frames(kitti, None if split == "all" else split)
 
-    source = DepthMethodSource(
-        weights=None, config=matching.config, with_right=published.with_right
-    )
-    methods = _build_methods(source, published, weights, matcher, beside)
+    methods = _build_methods(matching.config, published, weights, matcher, beside)
     if train:
         training = open_training(train, train_without, dataset)
-        baselines = [baseline_method(name, training) for name in ("rows", "nearest")]
+        baselines = [fit_baseline(name, training) for name in ("rows", "nearest")]
         # A baseline uses no right image, but is measured on the frames of the other rows.
         methods += [("", method._replace(with_right=published.with_right)) for method in baselines]
 
@@ -86,7 +82,7 @@ def reproduce(
 
 
 def _build_methods(
-    source: "DepthMethodSource",
+    config: "MatcherConfig",
     table: "PublishedTable",
     weights: Sequence[str],
     matcher: str | None,
@@ -94,12 +90,22 @@ def _build_methods(
 ) -> list[tuple[str, "DepthMethod"]]:
     """Build each method, with the row of the thesis that it reproduces, or "" for none.
 
-    ``source``: source of a method without weights, with the settings that all share.
+    Args:
+        config: how the networks run.
+        table: the printed table.
+        weights: weights that reproduce its rows, in their order.
+        matcher: "sgbm": OpenCV's matcher too; None: without it.
+        beside: weights of further methods of one image; None: those that ship.
+
+    Raises:
+        InputError: two weights have one name.
     """
+    from depthpose.cli.depth_methods import NetworkSpec, SGBMSpec
+
     first_row = table.own_rows[0]
     row_names = table.own_rows if len(table.own_rows) > 1 else [first_row] * len(weights)
     methods = [
-        (row_name, replace(source, weights=file).build())
+        (row_name, NetworkSpec(weights=file, config=config, with_right=table.with_right).build())
         for row_name, file in zip(row_names, weights, strict=True)
     ]
     names = [method.name for _, method in methods]
@@ -109,13 +115,15 @@ def _build_methods(
             f"two weights are called {repeated!r}, and so would their predictions be: rename one."
         )
     if matcher is not None:
-        methods.append((first_row, replace(source, with_filled_holes=True).build()))
+        methods.append((first_row, SGBMSpec(with_filled_holes=True).build()))
 
     # Methods beside them reproduce no row of the thesis.
     if not table.with_right:
         files = ("default",) if beside is None else beside
-        others = [replace(source, weights=file).build() for file in files]
-        methods += [("", method) for method in others if method.name not in names]
+        for file in files:
+            method = NetworkSpec(weights=file, config=config, with_right=False).build()
+            if method.name not in names:
+                methods.append(("", method))
     return methods
 
 
@@ -178,7 +186,7 @@ def figure(
         split: choose among the frames of a split, such as eigen-test.
     """
     from depthpose.cli.depth_evaluate import open_frames
-    from depthpose.cli.depth_predict import DepthMethodSource
+    from depthpose.cli.depth_methods import NetworkSpec
     from depthpose.cli.thesis_depth import choose_frames, write_figure
 
     dataset = open_frames(kitti, split)
@@ -186,8 +194,8 @@ def figure(
         refuse_below(1, "--number", number, "4")
     chosen = choose_frames(dataset, frames, number or (1 if figure == "2-1" else 4))
     with_right = False if figure == "2-1" else None
-    source = DepthMethodSource(weights=weights, config=matching.config, with_right=with_right)
-    return write_figure(figure, dataset, chosen, source.build(), out)
+    spec = NetworkSpec(weights=weights, config=matching.config, with_right=with_right)
+    return write_figure(figure, dataset, chosen, spec.build(), out)
 
 
 def table_3_1(

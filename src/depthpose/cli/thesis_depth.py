@@ -11,7 +11,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from depthpose.cli import depth_evaluate as evaluation
-from depthpose.cli.depth_predict import DepthMethod
+from depthpose.cli.depth_methods import DepthMethod
 from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.files import write_image
 from depthpose.core.run import claim_folder, environment, find_rank
@@ -137,7 +137,7 @@ def _make_figure_sections(
         estimate = read_estimate(predictions, pair.name, pair.camera)
         figures = {"2-5": draw_figure_2_5(pair, lidar_m, estimate)}
         if k == 0 and estimate.right is not None and pair.right is not None:
-            stereo = method.net.estimate_input(pair)
+            stereo = method.estimator.estimate_input(pair)
             figures["2-1"] = draw_figure_2_1(pair, lidar_m, estimate, stereo)
         for figure, panels in figures.items():
             title = f"Figure {figure}: {method.name}, {pair.name}"
@@ -196,11 +196,11 @@ def write_figure(
         pair = dataset.read_input(index)
         lidar_m = _read_lidar(frame)
         views = pair if method.with_right else replace(pair, right=None)
-        estimate = method.net.estimate_input(views)
+        estimate = method.estimator.estimate_input(views)
         if number == "2-5":
             panels = draw_figure_2_5(pair, lidar_m, estimate)
         else:
-            stereo = method.net.estimate_input(pair)
+            stereo = method.estimator.estimate_input(pair)
             panels = draw_figure_2_1(pair, lidar_m, estimate, stereo)
         columns.append(panels)
         sections.append(_make_panel_section(frame.name, panels, out / "panels" / frame.name))
