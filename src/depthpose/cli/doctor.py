@@ -50,12 +50,12 @@ def doctor(files: tyro.conf.Positional[tuple[NewPath, ...]] = ()) -> int:
     print(f"another extra: {install_command('EXTRA')}")
     for path in sorted(SHIPPED.glob("*.safetensors")):
         print(f"weights {path.stem}: {_describe_weights(path)}")
-    works = [_run_trial("depth", _try_depth), _run_trial("pose", _try_pose)]
-    return 0 if all(works) else 1
+    has_worked = [_run_trial("depth", _try_depth), _run_trial("pose", _try_pose)]
+    return 0 if all(has_worked) else 1
 
 
 def _missing_packages() -> dict[str, list[str]]:
-    """List the packages that are not installed, by extra; empty for an extra that is whole."""
+    """List the packages of each extra that are not installed; none for an extra that is whole."""
     missing: dict[str, list[str]] = {}
     for line in metadata.requires("depthpose") or ():
         requirement = _REQUIREMENT.match(line)
@@ -72,7 +72,7 @@ def _missing_packages() -> dict[str, list[str]]:
 
 
 def _describe_weights(path: Path) -> str:
-    """Give the kind and the licence of weights, or why they cannot be read."""
+    """Describe weights by their kind and licence, or by why they cannot be read."""
     from depthpose.core.checkpoint import read_checkpoint
 
     try:
@@ -83,7 +83,7 @@ def _describe_weights(path: Path) -> str:
 
 
 def _run_trial(name: str, trial: Callable[[], str]) -> bool:
-    """Run an estimate and print its outcome or its error; give whether it worked."""
+    """Run a trial, print its outcome or its error, and return whether it worked."""
     start = perf_counter()
     try:
         outcome = trial()
@@ -103,7 +103,7 @@ def device_names() -> str:
 
 
 def _try_depth() -> str:
-    """Match a synthetic pair of known disparity; give the outcome.
+    """Match a synthetic pair of known disparity, and describe the outcome.
 
     Raises:
         RuntimeError: the match is more than a pixel off.
@@ -127,7 +127,7 @@ def _try_depth() -> str:
 
 
 def _try_pose() -> str:
-    """Pose a part in a synthetic view; give the outcome.
+    """Pose a part in a synthetic view, and describe the outcome.
 
     Raises:
         RuntimeError: the part is refused, or off by more than a tenth of its diameter.

@@ -15,7 +15,7 @@ from depthpose.cli.arguments import (
     NewPath,
     Source,
     WeightsName,
-    replace_given,
+    replace_unless_none,
 )
 from depthpose.core.errors import InputError
 from depthpose.core.units import Unit
@@ -58,7 +58,7 @@ class TrainingOptions:
 
         config: Any = (default or kind()) if path is None else read_config(path, kind)
         self._refuse_long_warmup(config)
-        loop = replace_given(
+        loop = replace_unless_none(
             config.loop,
             workers=workers,
             seed=self.seed,
@@ -220,7 +220,7 @@ def depth_train(
 
     kind, run_stage = STAGES[stage]
     settings = training.read(config, kind)
-    settings = replace(settings, pairs=replace_given(settings.pairs, folders=data or None))
+    settings = replace(settings, pairs=replace_unless_none(settings.pairs, folders=data or None))
     if held_out:
         # A generator is measured at the focal length of its own rig, whatever it is trained on.
         focal_px = settings.pairs.focal_px if stage == "stereo" else None
@@ -235,7 +235,7 @@ def depth_train(
     for name, value in weights.items():
         if value is not None and name not in usable_names:
             raise InputError(f"--{name} has no meaning for '{stage}'; see --help.")
-    return training.run(run_stage, replace_given(settings, **weights), out)
+    return training.run(run_stage, replace_unless_none(settings, **weights), out)
 
 
 def calibrate(
@@ -364,7 +364,7 @@ def _with_models(
             f"--{option} has no meaning for 'segmentation', which learns from pictures: make them "
             "by 'depthpose data make objects --cad ...' and name the folder in the config"
         )
-    models = replace_given(config.models, cad=cad or None, unit=unit)
+    models = replace_unless_none(config.models, cad=cad or None, unit=unit)
     if symmetries is not None:
         models = replace(models, with_found_symmetries=symmetries == "found")
     if cad:  # they take the place of a data set's models
