@@ -12,11 +12,9 @@ from depthpose.thesis.pose_figures import (
     draw_discs,
     draw_features,
     draw_field,
-    embed_line,
-    joint_probabilities,
-    kl_gradient,
     spectral,
 )
+from depthpose.thesis.tsne import embed_line, joint_probabilities, kl_gradient
 
 
 def test_neighbourhoods_have_the_perplexity_that_was_asked_for() -> None:

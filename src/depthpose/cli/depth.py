@@ -182,7 +182,7 @@ def evaluate_depth(
     """
     from depthpose.cli.depth_evaluate import (
         choose_methods,
-        measure,
+        measure_and_report,
         measure_shards,
         open_frames,
         predict_depth_of_dataset,
@@ -224,7 +224,7 @@ def evaluate_depth(
     predictions = methods.predictions
     if predictions is not None and stores.exists(stores.join(predictions, PLAN)):
         of_shards = measure_shards(dataset, predictions, protocol, caps_m)
-        return measure(dataset, folders, protocol, caps_m, out, [of_shards])
+        return measure_and_report(dataset, folders, protocol, caps_m, out, [of_shards])
     if predictions is not None:
         folders.append(Path(predictions))
-    return measure(dataset, folders, protocol, caps_m, out)
+    return measure_and_report(dataset, folders, protocol, caps_m, out)

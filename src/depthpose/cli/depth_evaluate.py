@@ -1,4 +1,4 @@
-"""The work behind ``depthpose depth evaluate``."""
+"""The stages of ``depthpose depth evaluate``: methods, their predictions, and the measurement."""
 
 import hashlib
 import sys
@@ -45,7 +45,7 @@ _COLUMNS_OF_METHOD = ("method", "input", "speed", "weights", "protocol", "datase
 
 
 def open_frames(data: Path, split: str | None) -> Dataset:
-    """Open the dataset, and print its name, number of frames and layout."""
+    """Open a dataset, or a split of it, and print its name, number of frames and layout."""
     dataset = open_dataset(data, split)
     print(f"{dataset.name}: {len(dataset)} frames, layout {dataset.layout}")
     return dataset
@@ -113,6 +113,11 @@ def choose_methods(
     options: MethodOptions, config: MatcherConfig, dataset: Dataset
 ) -> list[DepthMethod]:
     """Build the methods that are measured: SGBM, weights and baselines, in this order.
+
+    Args:
+        options: names of the methods.
+        config: how networks run.
+        dataset: the frames that are measured.
 
     Raises:
         InputError: two have one name, or one needs a right view that no frame has.
@@ -202,7 +207,7 @@ def open_training(folders: Sequence[Path], without: Sequence[str], measured: Dat
     return training
 
 
-def measure(
+def measure_and_report(
     dataset: Dataset,
     folders: Sequence[Path],
     protocol: str,
@@ -212,47 +217,40 @@ def measure(
 ) -> int:
     """Measure folders of predictions, write rows, a table and a page, and print the table.
 
-    Of several processes the first does it. Gives the exit code.
+    Of several processes the first does it. Returns the exit code.
 
     Args:
         dataset: frames with truth.
-        folders: predictions of a method each.
-        protocol: name of it.
+        folders: the folder of each method's predictions.
+        protocol: name of the protocol.
         caps_m: truth beyond a cap does not count; a row for each.
         out: folder of the files.
         further: evaluations that exist already; their rows come last.
     """
     if find_rank().rank > 0:
         return 0
-    evaluations = measure_each(dataset, folders, protocol, caps_m)
-    measured = join([*evaluations, *further])
+    evaluations = measure_folders(dataset, folders, protocol, caps_m)
+    measured = join_evaluations([*evaluations, *further])
     rows = [row.columns() for row in measured.rows]
     page.write_table(out, rows)
 
-    # Numbers of pairs without a calibration compare with no others.
     text = f"{protocol}: {PROTOCOLS[protocol].summary}."
-    uncalibrated = sum(
-        frame.right is not None and not frame.calibration for frame in dataset.frames
-    )
-    if uncalibrated:
-        message = (
-            f"{uncalibrated} of {len(dataset)} pairs have no calibration, so a network matches "
-            "them at their own focal length, not at the one it knows: compare no numbers with "
-            "those of frames that have one (KITTI 2015 has calib_cam_to_cam in a download of its "
-            "own)"
-        )
-        print(f"depthpose: {message}", file=sys.stderr)
-        text += f" {message}."
+    advice = _advise_on_calibration(dataset)
+    if advice is not None:
+        print(f"depthpose: {advice}", file=sys.stderr)
+        text += f" {advice}."
 
     # The page: the table, then the best and the worst frames of each method.
     view_counts = page.share_views(len(folders))
     frame_sections: list[Section] = []
     for folder, evaluation, count in zip(folders, evaluations, view_counts, strict=True):
-        frame_sections += _show_frames(dataset, folder, evaluation.per_frame, protocol, count)
+        frame_sections += _make_frame_sections(
+            dataset, folder, evaluation.per_frame, protocol, count
+        )
     sections = [
         Section(title="Mean over frames", text=text, rows=rows),
         *frame_sections,
-        *write_details(measured, out),
+        *write_detail_tables(measured, out),
     ]
     title = f"{protocol} on {dataset.name}"
     page.write_page(out / "report.html", title, sections, environment())
@@ -267,16 +265,38 @@ def measure(
     return 0
 
 
-def _show_frames(
+def _advise_on_calibration(dataset: Dataset) -> str | None:
+    """Advise that numbers of pairs without a calibration compare with no others; None: all have."""
+    uncalibrated_count = sum(
+        frame.right is not None and not frame.calibration for frame in dataset.frames
+    )
+    if not uncalibrated_count:
+        return None
+    return (
+        f"{uncalibrated_count} of {len(dataset)} pairs have no calibration, so a network matches "
+        "them at their own focal length, not at the one it knows: compare no numbers with "
+        "those of frames that have one (KITTI 2015 has calib_cam_to_cam in a download of its "
+        "own)"
+    )
+
+
+def _make_frame_sections(
     dataset: Dataset,
     folder: Path,
     per_frame: Sequence[EvaluationRow],
     protocol: str,
     max_count: int,
 ) -> list[Section]:
-    """Show the worst, the median and the best frame of a method, by AbsRel or EPE at the first cap.
+    """Make sections of the worst, the median and the best frame of a method.
 
-    ``per_frame``: rows of the method; ``max_count``: most frames that are shown.
+    Frames are ranked by AbsRel, or by EPE where disparity is measured, at the first cap.
+
+    Args:
+        dataset: the frames.
+        folder: the method's predictions.
+        per_frame: the method's rows of frames.
+        protocol: name of the protocol.
+        max_count: most frames that are shown.
     """
     cap_m = per_frame[0].cap_m
     rows_at_cap = [row for row in per_frame if row.cap_m == cap_m and row.pixels]
@@ -309,33 +329,42 @@ def _show_frames(
     return sections
 
 
-def measure_each(
+def measure_folders(
     dataset: Dataset, folders: Sequence[Path], protocol: str, caps_m: Sequence[float]
 ) -> list[Evaluation]:
-    """Measure folders of predictions one by one; each row names its origin."""
-    show = partial(tqdm, unit=" frames", disable=None)
+    """Measure folders of predictions one by one; the rows say which method made them.
+
+    Args:
+        dataset: frames with truth.
+        folders: the folder of each method's predictions.
+        protocol: name of the protocol.
+        caps_m: truth beyond a cap [m] does not count; a row for each.
+    """
+    with_progress = partial(tqdm, unit=" frames", disable=None)
     evaluations: list[Evaluation] = []
     for folder in folders:
-        evaluation = evaluate(dataset, folder, protocol, caps_m, show)
-        evaluations.append(with_source(evaluation, folder.name, read_settings(folder)))
+        evaluation = evaluate(dataset, folder, protocol, caps_m, with_progress)
+        evaluations.append(with_origin(evaluation, folder.name, read_settings(folder)))
     return evaluations
 
 
-def with_source(evaluation: Evaluation, name: str, settings: dict[str, Any] | None) -> Evaluation:
+def with_origin(evaluation: Evaluation, name: str, settings: dict[str, Any] | None) -> Evaluation:
     """Return an evaluation whose rows say which method, weights and input made the predictions.
 
-    ``settings``: those of the run that made them; None of files by other software, whose method is
-    ``name`` then.
+    Args:
+        evaluation: of the predictions of one method.
+        name: name of the method where there are no settings.
+        settings: those of the run that made the predictions; None: other software made them.
     """
     settings = settings or {"matcher": name, "input": ""}
     # Only runs that may take one image record their input: a matcher always has both views.
-    view = settings.get("input", "both views")
+    views = settings.get("input", "both views")
     method = settings.get("matcher", "")
     if "with_filled_holes" in settings:  # OpenCV's matcher ran; no other has holes
         method += " (holes filled)" if settings["with_filled_holes"] else " (matched pixels)"
-    source = {
+    origin = {
         "method": method,
-        "input": view,
+        "input": views,
         "speed": settings.get("speed", ""),
         "weights": settings.get("weights", ""),
     }
@@ -343,13 +372,13 @@ def with_source(evaluation: Evaluation, name: str, settings: dict[str, Any] | No
     sha256 = settings.get("weights_sha256", "")[:12]
     return replace(
         evaluation,
-        rows=[replace(row, weights_sha256=sha256, **source) for row in evaluation.rows],
-        per_frame=[replace(row, **source) for row in evaluation.per_frame],
-        deciles=[replace(row, **source) for row in evaluation.deciles],
+        rows=[replace(row, weights_sha256=sha256, **origin) for row in evaluation.rows],
+        per_frame=[replace(row, **origin) for row in evaluation.per_frame],
+        deciles=[replace(row, **origin) for row in evaluation.deciles],
     )
 
 
-def join(evaluations: Sequence[Evaluation]) -> Evaluation:
+def join_evaluations(evaluations: Sequence[Evaluation]) -> Evaluation:
     """Join the rows of several evaluations into one."""
     return Evaluation(
         rows=[row for evaluation in evaluations for row in evaluation.rows],
@@ -363,8 +392,8 @@ def join(evaluations: Sequence[Evaluation]) -> Evaluation:
     )
 
 
-def write_details(measured: Evaluation, out: Path) -> list[Section]:
-    """Write tables of frames and of the error by confidence; give the sections that show them."""
+def write_detail_tables(measured: Evaluation, out: Path) -> list[Section]:
+    """Write tables of frames and of the error by confidence; return the sections that show them."""
     frames = [row.columns() for row in measured.per_frame]
     deciles = [row.columns() for row in measured.deciles]
     page.write_table(out, frames, name="frames")
@@ -386,7 +415,14 @@ def write_details(measured: Evaluation, out: Path) -> list[Section]:
 def measure_shards(
     dataset: Dataset, predictions: str, protocol: str, caps_m: Sequence[float]
 ) -> Evaluation:
-    """Measure shards of predictions (a folder or URL), one after the other, frame by frame."""
+    """Measure shards of predictions, which an engine wrote, frame by frame.
+
+    Args:
+        dataset: frames with truth.
+        predictions: folder or URL of the shards.
+        protocol: name of the protocol.
+        caps_m: truth beyond a cap [m] does not count; a row for each.
+    """
     name = PurePosixPath(predictions).stem
     settings = read_settings(predictions)
     index_of = {frame.name: index for index, frame in enumerate(dataset.frames)}
@@ -400,8 +436,9 @@ def measure_shards(
                     path = Path(folder) / f"{frame}.{ending}"
                     path.parent.mkdir(parents=True, exist_ok=True)
                     path.write_bytes(content)
-                index = index_of[frame]
-                measured[frame] = measure_frame(dataset, index, Path(folder), protocol, caps_m)
+                measured[frame] = measure_frame(
+                    dataset, index_of[frame], Path(folder), protocol, caps_m
+                )
 
     # Frames without a prediction: those without truth are skipped, others are an error.
     with tempfile.TemporaryDirectory() as empty_folder:
@@ -410,4 +447,4 @@ def measure_shards(
                 measured[frame] = measure_frame(
                     dataset, index, Path(empty_folder), protocol, caps_m
                 )
-    return with_source(summarise(dataset, protocol, measured), name, settings)
+    return with_origin(summarise(dataset, protocol, measured), name, settings)

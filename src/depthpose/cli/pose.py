@@ -133,7 +133,7 @@ def evaluate_poses(
         objects: keep these alone, by name or number.
         adds: ADD-S for declared symmetric objects (of LineMOD eggbox and glue), or for all.
     """
-    from depthpose.cli.pose_evaluate import measure, open_instances, predict_instances
+    from depthpose.cli.pose_evaluate import measure_and_report, open_instances, predict_instances
     from depthpose.cli.pose_masks import prepare_masks
     from depthpose.cli.pose_methods import build_methods
     from depthpose.core.config import config_to_dict
@@ -156,7 +156,7 @@ def evaluate_poses(
     folders = [
         predict_instances(dataset, method, masks, out) for method in methods for masks in all_masks
     ]
-    return measure(dataset, [*folders, *csv, *predictions], rule, out)
+    return measure_and_report(dataset, [*folders, *csv, *predictions], rule, out)
 
 
 def track_object(

@@ -1,6 +1,7 @@
 """``depthpose reproduce ...`` and ``depthpose figure ...``."""
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -102,8 +103,9 @@ def _build_methods(
     """
     from depthpose.cli.depth_methods import NetworkSpec, SGBMSpec
 
-    first_row = table.own_rows[0]
-    row_names = table.own_rows if len(table.own_rows) > 1 else [first_row] * len(weights)
+    # A table with several rows of the thesis has weights for each, else all are of the one row.
+    first_row = table.thesis_rows[0]
+    row_names = table.thesis_rows if len(table.thesis_rows) > 1 else [first_row] * len(weights)
     methods = [
         (row_name, NetworkSpec(weights=file, config=config, with_right=table.with_right).build())
         for row_name, file in zip(row_names, weights, strict=True)
@@ -133,7 +135,10 @@ def _refuse_rows(
     matcher: str | None,
     beside: Sequence[str] | None,
 ) -> None:
-    """Refuse, before any work, rows that a table does not have, and missing ones."""
+    """Refuse options of :func:`reproduce` that give a table rows that it does not have, or too few.
+
+    The arguments are as of :func:`_build_methods`.
+    """
     if beside is not None and table.with_right:
         raise InputError(
             f"--beside {' '.join(beside)}: adds methods of one image, and table {table.number} is "
@@ -149,8 +154,8 @@ def _refuse_rows(
         raise InputError(
             f"table {table.number}: there is nothing to measure; give --weights FILE{alternative}."
         )
-    if len(table.own_rows) > 1 and len(weights) != len(table.own_rows):
-        rows = " and ".join(f"'{name}'" for name in table.own_rows)
+    if len(table.thesis_rows) > 1 and len(weights) != len(table.thesis_rows):
+        rows = " and ".join(f"'{name}'" for name in table.thesis_rows)
         raise InputError(
             f"table {table.number}: has the rows {rows}, but {len(weights)} weights were given; "
             "give one for each, in this order."
@@ -187,15 +192,18 @@ def figure(
     """
     from depthpose.cli.depth_evaluate import open_frames
     from depthpose.cli.depth_methods import NetworkSpec
-    from depthpose.cli.thesis_depth import choose_frames, write_figure
+    from depthpose.cli.thesis_depth import choose_frames, find_frames, write_figure
 
     dataset = open_frames(kitti, split)
     if number is not None:
         refuse_below(1, "--number", number, "4")
-    chosen = choose_frames(dataset, frames, number or (1 if figure == "2-1" else 4))
+    if frames:
+        indices = find_frames(dataset, frames)
+    else:
+        indices = choose_frames(dataset, number or (1 if figure == "2-1" else 4))
     with_right = False if figure == "2-1" else None
     spec = NetworkSpec(weights=weights, config=matching.config, with_right=with_right)
-    return write_figure(figure, dataset, chosen, spec.build(), out)
+    return write_figure(figure, dataset, indices, spec.build(), out)
 
 
 def table_3_1(
@@ -306,10 +314,11 @@ def figure_3_2(
         number: how many clouds.
         perplexity: of t-SNE.
     """
-    from depthpose.cli.thesis_pose import feature_panels, write_figure
+    from depthpose.cli.thesis_pose import draw_feature_panels, write_figure
 
     settings = {"perplexity": perplexity}
-    return write_figure("3-2", weights, data, number, out, feature_panels, columns=4, **settings)
+    draw_panels = partial(draw_feature_panels, perplexity=perplexity)
+    return write_figure("3-2", weights, data, number, out, draw_panels, settings, columns=4)
 
 
 def figure_3_4(
@@ -333,10 +342,11 @@ def figure_3_4(
         number: how many views are looked at.
         keypoint: only this one, from 0 on.
     """
-    from depthpose.cli.thesis_pose import field_panels, write_figure
+    from depthpose.cli.thesis_pose import draw_direction_panels, write_figure
 
     settings = {"keypoint": keypoint}
-    return write_figure("3-4", weights, data, number, out, field_panels, columns=3, **settings)
+    draw_panels = partial(draw_direction_panels, keypoint=keypoint)
+    return write_figure("3-4", weights, data, number, out, draw_panels, settings, columns=3)
 
 
 def figure_3_5(
@@ -354,6 +364,6 @@ def figure_3_5(
         out: folder for the figure.
         number: how many views.
     """
-    from depthpose.cli.thesis_pose import box_panels, write_figure
+    from depthpose.cli.thesis_pose import draw_box_panels, write_figure
 
-    return write_figure("3-5", weights, data, number, out, box_panels, columns=3)
+    return write_figure("3-5", weights, data, number, out, draw_box_panels, {}, columns=3)
