@@ -42,17 +42,8 @@ def predict_depth(
 
     if not images:
         raise InputError("name images, folders of them, patterns or videos to predict from")
-    near, far = output.color_range
-    height_m = scale.camera_height
-    tilt_deg = scale.camera_tilt
-    if not 0 < near < far:
-        raise InputError(f"--color-range {near, far}: give near and far metres, near first.")
-    if output.batch < 1:
-        raise InputError(f"--batch {output.batch}: give 1 or more images.")
-    if height_m is not None and not 0.1 <= height_m <= 20:
-        raise InputError(f"--camera-height {height_m:g}: give 0.1 to 20 metres")
-    if tilt_deg is not None and not -45 <= tilt_deg <= 45:
-        raise InputError(f"--camera-tilt {tilt_deg:g}: give -45 to 45 degrees")
+    output.refuse_unusable()
+    scale.refuse_unusable()
     spec = NetworkSpec(
         weights=networks.weights,
         config=matching.config,
@@ -116,7 +107,7 @@ def match_pairs(
         out: folder for the results.
     """
     from depthpose.cli import depth_inputs, depth_predict
-    from depthpose.cli.depth_methods import NetworkSpec, SGBMSpec
+    from depthpose.cli.depth_methods import make_pair_spec
     from depthpose.core.camera import read_rig
     from depthpose.core.files import image_size
     from depthpose.core.files.images import refuse_among_inputs
@@ -127,14 +118,11 @@ def match_pairs(
         with_left_right_check=matching.left_right_check,
         max_disparity_px=matching.max_disparity,
     )
-    spec: SGBMSpec | NetworkSpec = SGBMSpec()
-    if pairs.matcher != "sgbm":
-        weights = pairs.matcher or pairs.weights
-        spec = NetworkSpec(weights=weights, config=config, with_right=True, use="pairs")
+    spec = make_pair_spec(pairs.matcher, pairs.weights, config)
 
     # By workers of a cluster, to which the weights travel.
     if engine.engine == "ray":
-        packed = spec.with_packed_weights() if isinstance(spec, NetworkSpec) else spec
+        packed = spec.with_packed_weights()
         sides = [left] if right is None else [left, right]
         inputs = depth_predict.find_inputs_for_ray(sides, depth_inputs.PAIRS)
         with inputs.first() as first_pair:

@@ -43,6 +43,10 @@ class SGBMSpec:
         net = FakestereoNet.load(matcher="sgbm", config=config)
         return DepthMethod(name, net, {"matcher": "sgbm", **asdict(config)})
 
+    def with_packed_weights(self) -> "SGBMSpec":
+        """Return the spec for workers of other machines: itself, for there are no weights."""
+        return self
+
 
 @dataclass(frozen=True, kw_only=True)
 class NetworkSpec:
@@ -147,6 +151,19 @@ class NetworkSpec:
 
 
 DepthMethodSpec = SGBMSpec | NetworkSpec
+
+
+def make_pair_spec(matcher: str | None, weights: str, config: MatcherConfig) -> DepthMethodSpec:
+    """Make the spec of what matches real pairs.
+
+    Args:
+        matcher: sgbm, or weights with a matcher; None: the matcher of ``weights``.
+        weights: name or file of weights.
+        config: how networks run.
+    """
+    if matcher == "sgbm":
+        return SGBMSpec()
+    return NetworkSpec(weights=matcher or weights, config=config, with_right=True, use="pairs")
 
 
 def settings_on_workers(spec: DepthMethodSpec) -> dict[str, Any]:

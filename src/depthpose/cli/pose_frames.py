@@ -11,8 +11,15 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from depthpose.cli import file_names, pose_dataset, pose_jobs, pose_output, pose_transforms
-from depthpose.cli.pose_methods import PoseMethod
+from depthpose.cli import (
+    file_names,
+    pose_dataset,
+    pose_jobs,
+    pose_output,
+    pose_plans,
+    pose_transforms,
+)
+from depthpose.cli.pose_methods import PoseMethod, choose_object
 from depthpose.cli.pose_options import DataSetOptions, PoseInputs, SequenceOptions
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_depth_png
@@ -40,6 +47,7 @@ class SearchResults(Results[ViewInput, list[PoseEstimate]]):
     """The estimates of each searched image, often several, in the ``poses.json`` of a folder.
 
     The file is written after every image, and keeps what earlier runs found in other images.
+    ``by_image``: the predictions of this run and of earlier ones, by the image's name.
     """
 
     def __init__(
@@ -57,7 +65,7 @@ class SearchResults(Results[ViewInput, list[PoseEstimate]]):
             images: names of the images of this run.
             earlier: predictions of earlier runs.
             is_of_image: whether a prediction is of the image of this name.
-            numbers: those that a data set gives to its objects, by their names; None: no data set.
+            numbers: number of each object in the data set, by its name; None: no data set.
         """
         self.by_image: dict[str, list[Prediction]] = {}
         self._folder = folder
@@ -102,31 +110,41 @@ class SearchResults(Results[ViewInput, list[PoseEstimate]]):
         write_predictions(self._folder, [*predictions, *self._in_other_images])
 
     def _place_of(self, job: PoseJob[ViewInput], estimate: PoseEstimate) -> Place | None:
-        """Give the scene, image and object number of an estimate; None outside a data set."""
+        """Return scene, image and object number of an estimate; None outside a data set."""
         if self._numbers is None or job.place is None:
             return None
         return job.place._replace(object_id=self._numbers[estimate.object])
 
 
-def _search(
+def _find_in_each(
+    method: PoseMethod, objects: Sequence[str], views: Sequence[ViewInput]
+) -> list[list[PoseEstimate]]:
+    """Find objects in each view."""
+    assert method.find is not None
+    return [method.find(view, objects) for view in views]
+
+
+def _search_images(
     method: PoseMethod,
     objects: Sequence[str],
     jobs: Sequence[PoseJob[Any]],
     results: SearchResults,
 ) -> tuple[list[Prediction], list[PoseJob[Any]]]:
-    """Search images that are not searched yet; give all predictions, and a job for each.
+    """Search the images that are not searched yet.
 
-    The job of a prediction reads its image with the mask of that object alone, for pictures.
+    Args:
+        method: finds the objects.
+        objects: names of the objects.
+        jobs: the images.
+        results: store of what is found.
+
+    Returns:
+        The predictions of all images, and for each a job that reads its image with the mask of that
+        object alone, for pictures.
     """
-    find = method.find
-    assert find is not None
-
-    def find_in_each(views: Sequence[ViewInput]) -> list[list[PoseEstimate]]:
-        return [find(view, objects) for view in views]
-
-    outcomes = run_jobs(jobs, find_in_each, results)
+    outcomes = run_jobs(jobs, partial(_find_in_each, method, objects), results)
     for _ in tqdm(outcomes, total=len(jobs), disable=None, unit=" images"):
-        pass
+        pass  # an image is searched as its outcome is asked for
     predictions: list[Prediction] = []
     object_jobs: list[PoseJob[Any]] = []
     for job in jobs:
@@ -137,7 +155,7 @@ def _search(
 
 
 def search_files(method: PoseMethod, inputs: PoseInputs, out: Path) -> int:
-    """Find objects in every depth image, write the files of each, and give the exit code.
+    """Find objects in every depth image, write the files of each, and return the exit code.
 
     Every object that is searched for has an entry, found or not: in an image NAME they are called
     NAME_0, NAME_1, ..., or NAME where a single object was searched for and not found. A rerun
@@ -146,7 +164,7 @@ def search_files(method: PoseMethod, inputs: PoseInputs, out: Path) -> int:
     if inputs.object is None:
         objects = [model.name for model in method.models]
     else:
-        objects = [pose_jobs.object_named(inputs.object, method)]
+        objects = [choose_object(inputs.object, method)]
     if method.find is None:
         raise InputError(
             "--depth without --mask: these weights need masked views; give --mask, --box or "
@@ -154,7 +172,7 @@ def search_files(method: PoseMethod, inputs: PoseInputs, out: Path) -> int:
         )
     if find_rank().world > 1:
         raise InputError("--depth without --mask is done by one process; give --mask, or start one")
-    plan = pose_jobs.plan_searches(method, inputs, objects, out)
+    plan = pose_plans.plan_searches(method, inputs, objects, out)
     jobs = plan.jobs
     _refuse_numbered_names({job.name for job in jobs})
     settings = {**method.settings, **plan.settings}
@@ -163,16 +181,24 @@ def search_files(method: PoseMethod, inputs: PoseInputs, out: Path) -> int:
         p for p in read_earlier_predictions(out).values() if p.estimate.status != "unreadable"
     ]
 
-    def is_of_image(prediction: Prediction, image: str) -> bool:
-        return pose_output.is_result_of(prediction.estimate.name, image)
-
-    results = SearchResults(out, [job.name for job in jobs], earlier, is_of_image)
-    predictions, object_jobs = _search(method, objects, jobs, results)
+    images = [job.name for job in jobs]
+    results = SearchResults(out, images, earlier, _has_name_of_image)
+    predictions, object_jobs = _search_images(method, objects, jobs, results)
 
     # The files of results have names of their own, which are claimed once they are known.
     pose_output.claim_for_jobs(out, settings, object_jobs, pose_output.is_result_of)
     pose_output.write_files(predictions, object_jobs, out, method, input_count=len(jobs))
     return pose_output.print_result(predictions, out, len(jobs))
+
+
+def _has_name_of_image(prediction: Prediction, image: str) -> bool:
+    """Whether a prediction is of the depth image of this name, by its own name."""
+    return pose_output.is_result_of(prediction.estimate.name, image)
+
+
+def _has_place_in_image(prediction: Prediction, image: str) -> bool:
+    """Whether a prediction is of the image of this name, by its place in a data set."""
+    return prediction.place is not None and _name_image(prediction.place[:2]) == image
 
 
 def _refuse_numbered_names(names: Collection[str]) -> None:
@@ -189,10 +215,19 @@ def _refuse_numbered_names(names: Collection[str]) -> None:
 def search_dataset(
     method: PoseMethod, options: DataSetOptions, object: str | None, out: Path
 ) -> int:
-    """Search every image of a data set for each of its objects (6D detection); give the exit code.
+    """Search every image of a data set for each of its objects (6D detection).
 
     The method is given neither masks nor which objects an image shows. A rerun searches the images
     that are not finished.
+
+    Args:
+        method: finds the objects.
+        options: the data set.
+        object: name or number of the only object that is searched for; None: all.
+        out: folder of the results.
+
+    Returns:
+        The exit code.
     """
     assert options.bop is not None
     if method.find is None:
@@ -213,7 +248,8 @@ def search_dataset(
     }
     pose_output.claim_for_dataset(out, settings, dataset)
 
-    # A job for each image, read by any of its instances; a view must name an object, any will do.
+    # A job for each image, which is read by any of its instances. A view must name an object, of
+    # which a search makes no use.
     images = {(i.scene_id, i.image_id): i for i in dataset.instances}
     any_object = next(iter(numbers))
     jobs: list[PoseJob[Any]] = []
@@ -222,12 +258,9 @@ def search_dataset(
         read = partial(_read_whole_view, instance, any_object, name)
         jobs.append(PoseJob(name=name, read=read, place=place_of(instance)))
 
-    def is_of_image(prediction: Prediction, image: str) -> bool:
-        return prediction.place is not None and _name_image(prediction.place[:2]) == image
-
     earlier = list(read_earlier_predictions(out).values())
-    results = SearchResults(out, [job.name for job in jobs], earlier, is_of_image, numbers)
-    predictions, object_jobs = _search(method, list(numbers), jobs, results)
+    results = SearchResults(out, [job.name for job in jobs], earlier, _has_place_in_image, numbers)
+    predictions, object_jobs = _search_images(method, list(numbers), jobs, results)
     pose_output.write_files(predictions, object_jobs, out, method, dataset, input_count=len(images))
     return pose_output.print_result(predictions, out, len(images))
 
@@ -265,27 +298,39 @@ def _sample_surface_once(model: ObjectModel) -> Surface:
 
 
 def track_files(method: PoseMethod, frames: SequenceOptions, out: Path) -> int:
-    """Follow one object through depth images with a camera, or clouds; give the exit code."""
-    object = pose_jobs.object_named(frames.object, method)
-    settings = {**method.settings, "track": object, **pose_jobs.unit_settings(frames.unit)}
+    """Follow one object through depth images with a camera, or clouds; return the exit code.
+
+    Args:
+        method: follows the object.
+        frames: options that name the files, the object and perhaps its first pose.
+        out: folder of the results.
+    """
+    object = choose_object(frames.object, method)
+    settings = {**method.settings, "track": object, **pose_plans.unit_settings(frames.unit)}
     first_pose = None
     if frames.first is not None:
         first_pose = pose_transforms.read_pose(frames.first)
         settings["first"] = file_names.name_with_checksum(frames.first)
     if frames.cloud is not None:
-        jobs = pose_jobs.cloud_jobs(frames.cloud, frames.unit or "m", object, out)
+        jobs = pose_jobs.make_cloud_jobs(frames.cloud, frames.unit or "m", object, out)
     else:
         assert frames.depth is not None
         assert frames.camera is not None
-        jobs = pose_jobs.frame_jobs(frames.depth, frames.camera, object, frames.unit, out)
-        settings |= pose_jobs.camera_settings(frames.camera)
+        jobs = pose_jobs.make_frame_jobs(frames.depth, frames.camera, object, frames.unit, out)
+        settings |= pose_plans.camera_settings(frames.camera)
     pose_output.claim_for_jobs(out, settings, jobs)
-    followed = _follow(method, jobs, object, first_pose)
-    return _write_sequences(method, followed, jobs, out)
+    predictions = _follow_object(method, jobs, object, first_pose)
+    return _write_sequences(method, predictions, jobs, out)
 
 
 def track_dataset(method: PoseMethod, frames: SequenceOptions, out: Path) -> int:
-    """Follow each object of the method, or the one named, in each scene; give the exit code."""
+    """Follow each object of a method, or the one named, in each scene; return the exit code.
+
+    Args:
+        method: follows the objects.
+        frames: options that name the data set and perhaps the object.
+        out: folder of the results.
+    """
     assert frames.bop is not None
     dataset = open_bop(frames.bop, frames.split)
     dataset = pose_dataset.choose_objects(dataset, method, frames.object)
@@ -307,12 +352,12 @@ def track_dataset(method: PoseMethod, frames: SequenceOptions, out: Path) -> int
         for (_, number), by_image in sorted(instances_of.items())
     ]
     jobs = [job for sequence in sequences for job in sequence]
-    followed = (
+    predictions = (
         prediction
         for sequence in sequences
-        for prediction in _follow(method, sequence, str(sequence[0].object))
+        for prediction in _follow_object(method, sequence, str(sequence[0].object))
     )
-    return _write_sequences(method, followed, jobs, out, dataset)
+    return _write_sequences(method, predictions, jobs, out, dataset)
 
 
 def _make_frame_job(instance: Instance, object: str) -> PoseJob[Any]:
@@ -338,7 +383,17 @@ def _write_sequences(
     """Follow sequences, write the files of their predictions, and print a summary.
 
     ``poses.json`` is written after an interruption too; it then keeps what an earlier run had of
-    the frames that this one did not reach. Gives the exit code.
+    the frames that this one did not reach.
+
+    Args:
+        method: the method that follows.
+        followed: predictions of the frames, each made as it is asked for.
+        jobs: the frames.
+        out: folder of the results.
+        dataset: data set of the frames; None: they are files.
+
+    Returns:
+        The exit code.
     """
     earlier = list(read_earlier_predictions(out).values())
     predictions: list[Prediction] = []
@@ -362,21 +417,24 @@ def _write_sequences(
     return code
 
 
-def _follow(
+def _read_frames(jobs: Sequence[PoseJob[Any]], object: str) -> Iterator[AnyInput | PoseEstimate]:
+    """Read frames one by one; in place of an unreadable one stands a refusal of ``object``."""
+    for job in tqdm(jobs, disable=None, unit=" frames"):
+        try:
+            frame = job.read()
+        except InputError as error:
+            frame = refuse_unreadable(job.name, object, error)
+        yield frame
+
+
+def _follow_object(
     method: PoseMethod, jobs: Sequence[PoseJob[Any]], object: str, first_pose: Rigid | None = None
 ) -> Iterator[Prediction]:
-    """Follow an object frame by frame; an unreadable frame has an estimate with that reason."""
+    """Follow an object frame by frame; an unreadable frame has an estimate with that reason.
 
-    def read_frames() -> Iterator[AnyInput | PoseEstimate]:
-        """Read the frames one by one; in place of an unreadable one, give its estimate."""
-        for job in tqdm(jobs, disable=None, unit=" frames"):
-            try:
-                frame = job.read()
-            except InputError as error:
-                frame = refuse_unreadable(job.name, object, error)
-            yield frame
-
+    ``first_pose``: about where it is in the first frame; None: it is searched for.
+    """
     assert method.track is not None
-    estimates = method.track(read_frames(), object, first_pose)
+    estimates = method.track(_read_frames(jobs, object), object, first_pose)
     for job, estimate in zip(jobs, estimates, strict=True):
         yield Prediction(estimate=estimate, place=job.place)

@@ -13,7 +13,7 @@ from depthpose.cli.pose_options import DataSetOptions, PoseInputs, RegisterOptio
 from depthpose.cli.pose_transforms import read_base
 from depthpose.core.checkpoint import file_sha256, find_weights, read_checkpoint, warn_of_terms
 from depthpose.core.config import config_to_dict
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, nearest_name
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
 from depthpose.pose import datasets
@@ -249,7 +249,23 @@ class PoseNetworkSpec:
 PoseMethodSpec = RegistrationSpec | PoseNetworkSpec
 
 
-def unit_of_cad(files: Sequence[str], cad_unit: Unit | None, unit: Unit | None) -> Unit | None:
+def choose_object(name: str | None, method: PoseMethod) -> str:
+    """Choose the object of a method by its name, or its only object.
+
+    Raises:
+        InputError: the method has no such object, or several and none is named.
+    """
+    names = [model.name for model in method.models]
+    if name is None and len(names) > 1:
+        raise InputError(f"the {method.holder} know {', '.join(names)}; say which by --object")
+    if name is not None and name not in names:
+        raise InputError(
+            f"--object {name}: the {method.holder} do not know it; {nearest_name(name, names)}"
+        )
+    return names[0] if name is None else name
+
+
+def find_cad_unit(files: Sequence[str], cad_unit: Unit | None, unit: Unit | None) -> Unit | None:
     """Return the unit of CAD files: ``--cad-unit``, else ``--unit``; None if their format fixes it.
 
     Raises:
@@ -287,7 +303,7 @@ def make_method_spec(
         InputError: a file cannot be read, a unit is missing, or ``--symmetry`` has no CAD file.
     """
     base_from_camera = read_base(base)
-    cad_unit = unit_of_cad(parts.cad, parts.cad_unit, unit)
+    cad_unit = find_cad_unit(parts.cad, parts.cad_unit, unit)
     if parts.symmetry and not (is_registration and parts.cad):
         raise InputError(
             f"--symmetry {parts.symmetry[0]}: is of --method register with --cad; a network and "

@@ -57,7 +57,7 @@ class PoseMeasureOptions:
 
     @property
     def config(self) -> EstimateConfig:
-        """Settings of the estimators."""
+        """The settings of the estimators that these options stand for."""
         voting = VotingConfig(method=_VOTING_METHODS[self.voting])
         return EstimateConfig(voting=voting, with_icp=self.icp, device=self.device)
 
@@ -227,7 +227,7 @@ class EstimateOptions(MethodOptions):
 
     @property
     def config(self) -> EstimateConfig:
-        """Settings of the estimator, on the device of this process."""
+        """The settings of the estimator that these options stand for, on this process's device."""
         from depthpose.core.devices import device_of_process  # --help must not load torch
 
         if self.batch < 1:

@@ -69,7 +69,7 @@ def claim_for_jobs(
     Args:
         out: the folder.
         settings: JSON values that decide the poses.
-        jobs: each with the files that it reads.
+        jobs: jobs with the files that they read.
         is_result: whether the result of the first name is one of the input of the second name.
     """
     run.claim_folder(out, settings, [POSES, _PAGE])
@@ -117,12 +117,12 @@ def write_files(
     """Write the files of each input or of a data set, and the page.
 
     Args:
-        predictions: all that are shown.
-        jobs: one for each prediction, which reads its input.
-        out: the folder.
-        method: method that made them.
-        dataset: data set that they are of; None: they are of clouds or depth images.
-        input_count: number of inputs where it may differ from that of the predictions.
+        predictions: the poses and refusals.
+        jobs: for each of them the job that reads its input.
+        out: folder of the results.
+        method: the method that made them.
+        dataset: data set of the inputs; None: they are clouds or depth images.
+        input_count: number of inputs, where one may have several predictions; None: one each.
     """
     models = {model.name: model for model in method.models}
     if dataset is None:
@@ -138,7 +138,10 @@ def _write_dataset_files(
     out: Path,
     models: Mapping[str, ObjectModel],
 ) -> None:
-    """Write BOP's csv of a data set's poses, and a picture of each image with its poses."""
+    """Write BOP's csv of a data set's poses, and a picture of each image with its poses.
+
+    ``models``: by the names of the objects.
+    """
     write_bop_results(out / results_name(dataset), predictions)
     if any(p.estimate.alternatives for p in predictions):
         table = out / results_name(dataset, _WITH_ALTERNATIVES)
@@ -169,7 +172,10 @@ def _write_job_files(
     out: Path,
     models: Mapping[str, ObjectModel],
 ) -> None:
-    """Write the posed model beside each cloud, and a picture of each depth image with its pose."""
+    """Write the posed model beside each cloud, and a picture of each depth image with its pose.
+
+    ``models``: by the names of the objects.
+    """
     for prediction, job in zip(predictions, jobs, strict=True):
         pose = prediction.estimate.camera_from_model
         if pose is None:
@@ -193,9 +199,14 @@ def _write_job_files(
 
 
 def print_result(predictions: list[Prediction], out: Path, input_count: int | None = None) -> int:
-    """Print the poses, their alternatives and the reasons of refusals; give the exit code.
+    """Print the poses, their alternatives and the reasons of refusals; return the exit code.
 
-    ``input_count``: where an input may have several estimates; None: one each.
+    It is 1 where an input could not be read.
+
+    Args:
+        predictions: the poses.
+        out: folder of the results.
+        input_count: number of inputs, where one may have several poses; None: one each.
     """
     estimates = [prediction.estimate for prediction in predictions]
     unreadable = [estimate for estimate in estimates if estimate.status == "unreadable"]
@@ -230,8 +241,8 @@ def _print_table(estimates: Sequence[PoseEstimate]) -> None:
     rows: list[dict[str, Any]] = []
     for estimate in estimates[:_MAX_PRINTED_POSES]:
         row = _make_row(estimate)
-        row |= _pose_cells(estimate.camera_from_model)
-        row |= _pose_cells(estimate.base_from_model, prefix="base ")
+        row |= _format_pose(estimate.camera_from_model)
+        row |= _format_pose(estimate.base_from_model, prefix="base ")
         row |= {name: f"{row[name]:.3f}" for name in _SHARES if row[name] is not None}
         rows.append(row)
     print(plain_table(rows, _PRINTED_COLUMNS), end="")
@@ -240,7 +251,7 @@ def _print_table(estimates: Sequence[PoseEstimate]) -> None:
         print(_PICK_RANK_LEGEND)
 
 
-def _pose_cells(pose: Rigid | None, prefix: str = "") -> dict[str, str]:
+def _format_pose(pose: Rigid | None, prefix: str = "") -> dict[str, str]:
     """Format the position and the quaternion of a pose, each for a column of the terminal."""
     if pose is None:
         return {}
@@ -252,17 +263,17 @@ def _pose_cells(pose: Rigid | None, prefix: str = "") -> dict[str, str]:
 
 
 def _describe_counts(predictions: Sequence[Prediction], input_count: int | None) -> str:
-    """Describe the number of inputs, and of estimates where that differs."""
-    answers = len(predictions)
-    count = answers if input_count is None else input_count
+    """Describe the number of inputs, and of poses and refusals where that differs."""
+    prediction_count = len(predictions)
+    count = prediction_count if input_count is None else input_count
     text = f"{count} input{'s' * (count != 1)}"
-    if count != answers:
-        text += f", {answers} answer{'s' * (answers != 1)}"
+    if count != prediction_count:
+        text += f", {prediction_count} answer{'s' * (prediction_count != 1)}"
     return text
 
 
 def _make_row(estimate: PoseEstimate) -> dict[str, Any]:
-    """Give the row of an estimate for the page and the terminal."""
+    """Make the columns of an estimate for the page and the terminal."""
     row: dict[str, Any] = {
         "input": estimate.name,
         "object": estimate.object,
@@ -306,7 +317,7 @@ def _write_page(
     estimates = [prediction.estimate for prediction in predictions]
     refusals_first = sorted(estimates, key=lambda estimate: estimate.is_posed)
     rows = [_make_row(estimate) for estimate in refusals_first[:_MAX_PAGE_ROWS]]
-    sections = _pose_sections(predictions, jobs, models, dataset)
+    sections = _make_pose_sections(predictions, jobs, models, dataset)
 
     status_counts = Counter(estimate.status for estimate in estimates)
     counts = ", ".join(f"{count} {status}" for status, count in sorted(status_counts.items()))
@@ -321,13 +332,13 @@ def _write_page(
     print(f"the page: {out / _PAGE}")
 
 
-def _pose_sections(
+def _make_pose_sections(
     predictions: Sequence[Prediction],
     jobs: Sequence[PoseJob[Any]],
     models: Mapping[str, ObjectModel],
     dataset: BopDataset | None,
 ) -> list[Section]:
-    """Show some inputs with their poses, and some that were refused."""
+    """Make sections of some inputs with their poses, and of some that were refused."""
     instances = () if dataset is None else dataset.instances
     rgb_of = {(i.scene_id, i.image_id): i.rgb for i in instances}
     readable = [

@@ -6,7 +6,7 @@ from pathlib import Path
 import torch
 
 from depthpose.cli.depth_inputs import PAIRS, InputReader, list_pairs
-from depthpose.cli.depth_methods import NetworkSpec, SGBMSpec
+from depthpose.cli.depth_methods import make_pair_spec
 from depthpose.cli.depth_options import PredictOutput
 from depthpose.cli.depth_predict import predict_depth_of_files, wait_for_results
 from depthpose.cli.pose_options import PairOptions
@@ -27,7 +27,7 @@ DEVIATION = "depth_std"
 
 
 def match_pairs_for_poses(pair: PairOptions, camera: Path | None, device: str, out: Path) -> Path:
-    """Match pairs, write their depth, and give its path: of one pair NAME.npy, else the folder.
+    """Match pairs, and write their depth as input of an estimate of poses.
 
     OUT/matched gets what 'depth match' writes, OUT/depth the depth [m] whose confidence is
     ``pair.min_confidence`` at least, and OUT/depth_std its standard deviation [m]. A rerun does not
@@ -37,7 +37,10 @@ def match_pairs_for_poses(pair: PairOptions, camera: Path | None, device: str, o
         pair: left and right images, what matches them, and the least confidence.
         camera: file of the rig, with its baseline.
         device: device that the matcher runs on.
-        out: the folder.
+        out: folder of the run.
+
+    Returns:
+        The depth image OUT/depth/NAME.npy of a single pair, or the folder OUT/depth of several.
 
     Raises:
         InputError: no right image, a camera without a baseline, or no depth that is sure enough.
@@ -55,14 +58,7 @@ def match_pairs_for_poses(pair: PairOptions, camera: Path | None, device: str, o
     pairs = list_pairs(pair.left, pair.right)
     images = [path for both in pairs for path in both]
     refuse_among_inputs(out, (pair.left, pair.right), images)
-    spec: SGBMSpec | NetworkSpec = SGBMSpec()
-    if pair.matcher != "sgbm":
-        spec = NetworkSpec(
-            weights=pair.matcher or "default",
-            config=MatcherConfig(device=device),
-            with_right=True,
-            use="pairs",
-        )
+    spec = make_pair_spec(pair.matcher, "default", MatcherConfig(device=device))
     rig = read_rig(camera, image_size(pairs[0][0]))
     reader = InputReader(camera=rig, files=PAIRS)
     predict_depth_of_files(pairs, spec.build(), reader, PredictOutput(), out / MATCHED)

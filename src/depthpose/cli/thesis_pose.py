@@ -215,7 +215,7 @@ def reproduce_by_object(
 
 def _describe_masks(kind: str) -> str:
     """Describe a kind of masks for the record of a run: its word, or its file with a checksum."""
-    path = pose_masks.mask_path(kind)
+    path = pose_masks.find_mask_file(kind)
     return kind if path is None else file_names.name_with_checksum(path)
 
 
