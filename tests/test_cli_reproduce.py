@@ -15,7 +15,7 @@ from tests.synthetic_street import make_street
 from depthpose.cli import main
 from depthpose.cli.depth_evaluate import with_origin
 from depthpose.cli.depth_methods import DepthMethod
-from depthpose.cli.thesis_depth import reproduce_table, write_figure
+from depthpose.cli.thesis_depth import write_figure, write_reproduced_table
 from depthpose.core.camera import StereoRig, write_camera
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image, write_depth_png, write_image
@@ -82,7 +82,9 @@ def write_table(
 ) -> int:
     caps_m, pictures = (80.0, 50.0), 1
     data = open_dataset(street)
-    return reproduce_table(TABLES[number], data, methods, out, "eigen-raw-camera", caps_m, pictures)
+    return write_reproduced_table(
+        TABLES[number], data, methods, out, "eigen-raw-camera", caps_m, pictures
+    )
 
 
 def mono(name: str, depth_m: float) -> DepthMethod:

@@ -86,7 +86,7 @@ class Option(NamedTuple):
 
 
 @cache  # a second call would annotate the fields of groups once more, and all later ones be slower
-def parser_of(
+def make_parser(
     command: Callable[..., int],
 ) -> tuple[Callable[..., BoundArguments], list[Option]]:
     """Make a function that tyro can parse options for, and list the options of a command.
@@ -165,7 +165,7 @@ def _read_help_texts(described: type | Callable[..., int]) -> dict[str, str]:
     return texts
 
 
-def description_of(command: Callable[..., int]) -> str:
+def format_description(command: Callable[..., int]) -> str:
     """Format a command's docstring for ``--help``: without its arguments, as wide as the terminal.
 
     Lines are indented, since tyro joins those that begin with a letter; lines that the docstring

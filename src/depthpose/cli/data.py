@@ -10,7 +10,7 @@ from depthpose.cli.arguments import Device, NewPath, WeightsName
 from depthpose.core.errors import InputError
 
 
-def check(
+def check_dataset(
     path: tyro.conf.Positional[Path], split: str | None = None, with_decoding: bool = True
 ) -> int:
     """Read a data set and list everything that is wrong: pairs, KITTI, Middlebury, BOP, LineMOD.
@@ -27,11 +27,11 @@ def check(
     """
     from tqdm import tqdm
 
-    from depthpose.depth.datasets import check_dataset
+    from depthpose.depth import datasets as depth_datasets
     from depthpose.pose.datasets import LAYOUTS, check_bop
 
     is_bop = any(layout.splits(path) for layout in LAYOUTS.values())
-    check_folder = check_bop if is_bop else check_dataset
+    check_folder = check_bop if is_bop else depth_datasets.check_dataset
     with tqdm(unit=" frames", leave=False, disable=None) as bar:
 
         def show(done: int, total: int) -> None:
@@ -46,7 +46,7 @@ def check(
     return 0 if report.is_ok else 1
 
 
-def pack(
+def pack_dataset(
     path: tyro.conf.Positional[Path], out: NewPath, split: str | None = None, shard_mb: int = 256
 ) -> int:
     """Pack a data set of images, pairs and their truth into tar shards, in WebDataset's form.
@@ -84,7 +84,7 @@ def pack(
     return 0
 
 
-def label(
+def label_dataset(
     path: tyro.conf.Positional[Path],
     out: NewPath,
     weights: WeightsName = "default",

@@ -28,7 +28,7 @@ _CALIBRATION_QUESTION = (
 )
 
 
-def rectify(
+def rectify_pairs(
     left: tyro.conf.Positional[Source],
     right: tyro.conf.Positional[Source],
     camera: Path,
@@ -113,7 +113,7 @@ def _read_rectified(rectifier: "Rectifier", pair: tuple[Path, Path]) -> "tuple[T
     return rectifier.rectify(read_image(left), read_image(right), [str(left), str(right)])
 
 
-def split(files: tyro.conf.Positional[tuple[Source, ...]], out: NewPath) -> int:
+def split_pairs(files: tyro.conf.Positional[tuple[Source, ...]], out: NewPath) -> int:
     """Part pictures and videos that hold both views of a stereo camera.
 
     Finds whether the views are side by side, one above the other or one after the other (.mpo), and

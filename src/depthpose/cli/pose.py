@@ -43,15 +43,15 @@ def predict_poses(
     Args:
         out: folder for the results.
     """
-    from depthpose.cli.pose_frames import search_dataset, search_files
     from depthpose.cli.pose_methods import make_method_spec
     from depthpose.cli.pose_predict import (
         predict_poses_of_dataset,
         predict_poses_of_files,
         predict_poses_on_ray,
     )
+    from depthpose.cli.pose_search import search_dataset, search_files
 
-    # One kind of input; a pair is matched first, to depth images.
+    # One kind of input. A pair is matched first, to depth images.
     pose_inputs = options.PoseInputs(**vars(inputs), **vars(details))
     input_kinds = (pose_inputs.cloud, pose_inputs.depth, pair.left, dataset.bop)
     kind_count = sum(path is not None for path in input_kinds)
@@ -182,8 +182,8 @@ def track_object(
         out: folder for the results.
         weights: of a pose network, by name or file ('depthpose weights list').
     """
-    from depthpose.cli.pose_frames import track_dataset, track_files
     from depthpose.cli.pose_methods import make_method_spec
+    from depthpose.cli.pose_track import track_dataset, track_files
     from depthpose.core.run import find_rank
 
     if sum(path is not None for path in (frames.depth, frames.cloud, frames.bop)) != 1:

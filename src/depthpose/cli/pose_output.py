@@ -28,7 +28,7 @@ from depthpose.pose.predictions import (
     write_bop_results,
 )
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
-from depthpose.report import pose as drawn
+from depthpose.report import pose as pose_report
 from depthpose.report.page import Section, choose_answers, plain_table, write_page
 
 _PAGE = "report.html"
@@ -157,11 +157,11 @@ def _write_dataset_files(
         if is_whole(out, name, [name]):
             continue
         instance = image_of[scene_id, image_id]
-        picture = drawn.picture_of(instance)
+        picture = pose_report.picture_of(instance)
         for estimate in estimates:
             pose = estimate.camera_from_model
             assert pose is not None
-            picture = drawn.draw_pose(picture, pose, models[estimate.object], instance.K)
+            picture = pose_report.draw_pose(picture, pose, models[estimate.object], instance.K)
         write_image(out / name, picture)
         note_result(out, name, [out / name])
 
@@ -185,13 +185,13 @@ def _write_job_files(
             view = job.read()
         except InputError:  # unreadable by now
             continue
-        points_m = drawn.object_points(view, model.diameter_m)
+        points_m = pose_report.object_points(view, model.diameter_m)
         cloud_file = out / f"{job.name}.{CLOUD}"
-        write_cloud(cloud_file, drawn.posed_cloud(points_m, pose.double(), model))
+        write_cloud(cloud_file, pose_report.posed_cloud(points_m, pose.double(), model))
         files = [cloud_file]
         if isinstance(view, ViewInput):
-            picture = drawn.draw_region(drawn.grey_depth(view.depth_m), view, pose)
-            picture = drawn.draw_pose(picture, pose, model, view.K)
+            picture = pose_report.draw_region(pose_report.grey_depth(view.depth_m), view, pose)
+            picture = pose_report.draw_pose(picture, pose, model, view.K)
             picture_file = out / f"{job.name}.{PICTURE}"
             write_image(picture_file, picture)
             files.append(picture_file)
@@ -362,7 +362,7 @@ def _make_pose_sections(
 
         rgb = None if prediction.place is None else rgb_of[prediction.place[:2]]
         image = None if rgb is None else read_image(rgb)
-        section = drawn.pose_section(
+        section = pose_report.pose_section(
             estimate.name, pose_input, estimate, models[estimate.object], image=image
         )
         sections.append(section)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from depthpose.thesis.depth import PublishedTable
 
 
-def reproduce(
+def reproduce_table(
     table: tyro.conf.Positional[Literal["2.1", "2.2", "2.3"]],
     kitti: Path,
     out: NewPath,
@@ -55,7 +55,7 @@ def reproduce(
         pictures: how many frames the page shows.
     """
     from depthpose.cli.depth_evaluate import fit_baseline, open_frames, open_training
-    from depthpose.cli.thesis_depth import reproduce_table
+    from depthpose.cli.thesis_depth import write_reproduced_table
     from depthpose.depth.evaluate import find_protocol
     from depthpose.thesis.depth import TABLES
 
@@ -77,7 +77,7 @@ def reproduce(
         # A baseline uses no right image, but is measured on the frames of the other rows.
         methods += [("", method._replace(with_right=published.with_right)) for method in baselines]
 
-    return reproduce_table(
+    return write_reproduced_table(
         published, dataset, methods, out, comparison.protocol, comparison.cap, pictures
     )
 
@@ -135,9 +135,9 @@ def _refuse_rows(
     matcher: str | None,
     beside: Sequence[str] | None,
 ) -> None:
-    """Refuse options of :func:`reproduce` that give a table rows that it does not have, or too few.
+    """Refuse options that give a table rows which it does not have, or too few.
 
-    The arguments are as of :func:`_build_methods`.
+    The arguments are those of :func:`_build_methods`.
     """
     if beside is not None and table.with_right:
         raise InputError(
@@ -162,7 +162,7 @@ def _refuse_rows(
         )
 
 
-def figure(
+def draw_figure(
     figure: tyro.conf.Positional[Literal["2-1", "2-5"]],
     kitti: Path,
     weights: WeightsName,
@@ -206,7 +206,7 @@ def figure(
     return write_figure(figure, dataset, indices, spec.build(), out)
 
 
-def table_3_1(
+def reproduce_table_3_1(
     weights: tuple[WeightsName, ...],
     out: NewPath,
     data: PoseDataOptions = PoseDataOptions(),
@@ -233,7 +233,7 @@ def table_3_1(
     return reproduce_by_object("3.1", data, estimates, weights, (), out)
 
 
-def table_3_2(
+def reproduce_table_3_2(
     out: NewPath,
     weights: tuple[WeightsName, ...] = (),
     csv: tuple[Path, ...] = (),
@@ -259,7 +259,7 @@ def table_3_2(
     return reproduce_by_object("3.2", data, estimates, weights, csv, out)
 
 
-def table_3_3(
+def reproduce_table_3_3(
     weights: WeightsName,
     out: NewPath,
     data: PoseDataOptions = PoseDataOptions(),
@@ -293,7 +293,7 @@ def table_3_3(
     return reproduce_voting(weights, data, number, points, out)
 
 
-def figure_3_2(
+def draw_figure_3_2(
     weights: WeightsName,
     out: NewPath,
     data: PoseDataOptions = PoseDataOptions(),
@@ -321,7 +321,7 @@ def figure_3_2(
     return write_figure("3-2", weights, data, number, out, draw_panels, settings, columns=4)
 
 
-def figure_3_4(
+def draw_figure_3_4(
     weights: WeightsName,
     out: NewPath,
     data: PoseDataOptions = PoseDataOptions(),
@@ -349,7 +349,7 @@ def figure_3_4(
     return write_figure("3-4", weights, data, number, out, draw_panels, settings, columns=3)
 
 
-def figure_3_5(
+def draw_figure_3_5(
     weights: WeightsName, out: NewPath, data: PoseDataOptions = PoseDataOptions(), number: int = 6
 ) -> int:
     """Draw figure 3-5: boxes of true (green, dashed) and estimated (blue, solid) poses.

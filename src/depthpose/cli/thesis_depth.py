@@ -35,7 +35,7 @@ _MAX_HINT_LENGTH = 300
 """Characters of an error's hint, which may list the names of all frames."""
 
 
-def reproduce_table(
+def write_reproduced_table(
     table: PublishedTable,
     dataset: Dataset,
     methods: Sequence[tuple[str, DepthMethod]],

@@ -181,7 +181,7 @@ _HELD_OUT_PAIRS = 20
 """Pairs of a folder that validate, by default."""
 
 
-def depth_train(
+def train_depth(
     stage: tyro.conf.Positional[Literal["view", "select", "stereo", "finetune"]],
     out: NewPath,
     config: Path | None = None,
@@ -245,7 +245,7 @@ def depth_train(
     return training.run(run_stage, replace_unless_none(settings, **weights), out)
 
 
-def calibrate(
+def calibrate_refusal(
     weights: tyro.conf.Positional[WeightsName],
     data: list[Path],
     out: NewPath,
@@ -299,7 +299,7 @@ _NO_START = "nothing"
 """Word of ``--start`` that begins without weights."""
 
 
-def pose_train(
+def train_pose(
     out: NewPath,
     config: Path | None = None,
     cad: tuple[Source, ...] = (),
@@ -357,7 +357,7 @@ def _with_models(
     unit: Unit | None,
     symmetries: Literal["none", "found"] | None,
 ) -> Any:  # noqa: ANN401
-    """Return the config of a training of poses with the models of :func:`pose_train`'s options.
+    """Return the config of a training of poses with the models of :func:`train_pose`'s options.
 
     Options that were left out change nothing.
 
