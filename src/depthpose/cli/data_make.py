@@ -278,9 +278,9 @@ def _render_scene(
 
     rendered = make_frames(models, config, len(frames), frames.start)
     shown = tqdm(rendered, total=len(frames), unit=" frames", leave=False, disable=None)
-    home = write_bop_scene(out, split, scene, list(shown))
-    files = sorted(path for path in home.rglob("*") if path.is_file())
-    note_result(out, home.relative_to(out).as_posix(), files)
+    scene_folder = write_bop_scene(out, split, scene, list(shown))
+    files = sorted(path for path in scene_folder.rglob("*") if path.is_file())
+    note_result(out, scene_folder.relative_to(out).as_posix(), files)
 
 
 def _has_whole_scene(out: Path, split: str, scene: int, frames: range) -> bool:
@@ -288,8 +288,8 @@ def _has_whole_scene(out: Path, split: str, scene: int, frames: range) -> bool:
     from depthpose.core.files import read_json
     from depthpose.core.run import is_whole
 
-    home = f"{split}/{scene:06d}"
-    if not is_whole(out, home, [f"{home}/scene_camera.json"]):
+    scene_folder = f"{split}/{scene:06d}"
+    if not is_whole(out, scene_folder, [f"{scene_folder}/scene_camera.json"]):
         return False
-    frames_of_scene = read_json(out / home / "scene_camera.json")
+    frames_of_scene = read_json(out / scene_folder / "scene_camera.json")
     return isinstance(frames_of_scene, dict) and {str(n) for n in frames} <= set(frames_of_scene)

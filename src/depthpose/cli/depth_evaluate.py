@@ -68,7 +68,7 @@ def predict_depth_of_dataset(
         The folder of the method's predictions, ``FOLDER/METHOD``.
     """
     process = find_rank()
-    home = folder / method.name
+    method_folder = folder / method.name
     usable: list[int] = []
     sources: dict[str, list[Path]] = {}
     for index, frame in enumerate(dataset.frames):
@@ -84,12 +84,12 @@ def predict_depth_of_dataset(
     estimator = method.estimator
     if isinstance(estimator, FakestereoNet):
         estimator = _UncheckedNet(estimator)
-    names = estimate_missing_depth(estimator, jobs, home, method.settings, sources)
+    names = estimate_missing_depth(estimator, jobs, method_folder, method.settings, sources)
     for _ in tqdm(names, method.name, total=len(jobs), disable=None, unit=" frames"):
         pass  # each frame is estimated and written as its name is asked for
     if process.rank == 0:
-        wait_for(list(sources), partial(is_finished, home))
-    return home
+        wait_for(list(sources), partial(is_finished, method_folder))
+    return method_folder
 
 
 def _read_views(dataset: Dataset, index: int, *, with_right: bool) -> StereoInput:

@@ -82,14 +82,14 @@ def predict_poses(
     method = spec.build()
 
     # Pose a data set, or search whole images, or pose clouds and masked parts of images.
-    home = Path(out)
+    out_folder = Path(out)
     if dataset.bop is not None:
         if pose_inputs.color is not None:
             raise InputError("--color is beside --depth; leave it out where --bop is given")
         if dataset.masks == "search":
-            return search_dataset(method, dataset, pose_inputs.object, home)
+            return search_dataset(method, dataset, pose_inputs.object, out_folder)
         return predict_poses_of_dataset(
-            method, dataset, pose_inputs.object, spec.config, home, batch
+            method, dataset, pose_inputs.object, spec.config, out_folder, batch
         )
     if pose_inputs.cloud is not None and not method.takes_clouds:
         raise InputError(
@@ -98,8 +98,8 @@ def predict_poses(
         )
     has_lens = pose_inputs.lens is not None
     if pose_inputs.depth is not None and has_lens and not pose_inputs.has_regions:
-        return search_files(method, pose_inputs, home)
-    return predict_poses_of_files(method, pose_inputs, home, batch)
+        return search_files(method, pose_inputs, out_folder)
+    return predict_poses_of_files(method, pose_inputs, out_folder, batch)
 
 
 def evaluate_poses(

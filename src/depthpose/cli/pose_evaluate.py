@@ -100,19 +100,21 @@ def predict_instances(
         The folder of the predictions, ``OUT/predictions/METHOD_MASKS``.
     """
     jobs = masks.make_jobs(match_names(dataset, method.models))
-    home = out / "predictions" / f"{method.name}_{masks.name}"
+    predictions_folder = out / "predictions" / f"{method.name}_{masks.name}"
     settings = {
         **method.settings,
         "masks": masks.name,
         **masks.settings,
         **dataset_settings(dataset),
     }
-    names = estimate_missing_poses(method.estimate_many, jobs, home, settings, batch)
+    names = estimate_missing_poses(method.estimate_many, jobs, predictions_folder, settings, batch)
     label = f"{method.name}, {masks.name} masks"
     for _ in tqdm(names, label, total=len(jobs), disable=None, unit=" instances"):
         pass  # each is estimated as its name is asked for
-    write_bop_results(home / results_name(dataset), read_predictions(home))
-    return home
+    write_bop_results(
+        predictions_folder / results_name(dataset), read_predictions(predictions_folder)
+    )
+    return predictions_folder
 
 
 def measure_predictions(
@@ -170,18 +172,20 @@ def find_origins(predictions: Sequence[Path]) -> list[Origin]:
         InputError: two of them in one folder have one method and masks.
     """
     origins = [_read_origin(path) for path in predictions]
-    homes = [path.resolve().parent for path in predictions]
-    placed_origins = list(zip(homes, origins, strict=True))
-    uses = Counter((home, origin.method, origin.masks) for home, origin in placed_origins)
-    for (home, method, masks), count in uses.items():
+    parents = [path.resolve().parent for path in predictions]
+    placed_origins = list(zip(parents, origins, strict=True))
+    uses = Counter((parent, origin.method, origin.masks) for parent, origin in placed_origins)
+    for (parent, method, masks), count in uses.items():
         if count > 1:
             raise InputError(
-                f"{home}: two predictions by {method!r}, masks {masks!r}, are given, and their "
+                f"{parent}: two predictions by {method!r}, masks {masks!r}, are given, and their "
                 "rows would be one; give one of them, or rename it"
             )
-    methods = list(dict.fromkeys((home, origin.method) for home, origin in placed_origins))
+    methods = list(dict.fromkeys((parent, origin.method) for parent, origin in placed_origins))
     names = dict(zip(methods, distinct_names(methods), strict=True))
-    return [replace(origin, method=names[home, origin.method]) for home, origin in placed_origins]
+    return [
+        replace(origin, method=names[parent, origin.method]) for parent, origin in placed_origins
+    ]
 
 
 def _read_origin(path: Path) -> Origin:

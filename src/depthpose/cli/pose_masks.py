@@ -116,10 +116,12 @@ def _segment_dataset(
     segmenter = Segmenter.load(path, device)
     numbers = _match_numbers(segmenter, dataset, path)
 
-    home = out / "detections" / name
-    claim_folder(home, {"weights_sha256": file_sha256(path), **dataset_settings(dataset)})
-    detections_file = home.parent / f"{name}.json"
-    images_file = home / "images.json"
+    detections_folder = out / "detections" / name
+    claim_folder(
+        detections_folder, {"weights_sha256": file_sha256(path), **dataset_settings(dataset)}
+    )
+    detections_file = detections_folder.parent / f"{name}.json"
+    images_file = detections_folder / "images.json"
     segmented: set[tuple[int, int]] = set()
     detections: list[datasets.Detection] = []
     with suppress(InputError):  # damaged or missing: all is segmented again

@@ -78,8 +78,8 @@ def _write_sure_depth(name: str, rig: StereoRig, min_confidence: float, out: Pat
 
     Nothing is written of a pair that could not be matched, or that an earlier run has finished.
     """
-    home = out / MATCHED
-    if not is_whole(home, name, [f"{name}.depth_m.npy"]):
+    matched_folder = out / MATCHED
+    if not is_whole(matched_folder, name, [f"{name}.depth_m.npy"]):
         return
     settings = {"min_confidence": min_confidence}
     folders = [out / DEPTH, out / DEVIATION]
@@ -88,10 +88,10 @@ def _write_sure_depth(name: str, rig: StereoRig, min_confidence: float, out: Pat
     if all(is_whole(folder, name, [f"{name}.npy"]) for folder in folders):
         return
 
-    depth_m = read_map(home / f"{name}.depth_m.npy")
+    depth_m = read_map(matched_folder / f"{name}.depth_m.npy")
     confidence = torch.ones_like(depth_m)
-    if (home / f"{name}.confidence.npy").is_file():
-        confidence = read_map(home / f"{name}.confidence.npy")
+    if (matched_folder / f"{name}.confidence.npy").is_file():
+        confidence = read_map(matched_folder / f"{name}.confidence.npy")
     is_sure = confidence >= min_confidence
     sure_m = torch.where(is_sure, depth_m, torch.nan)
     if not bool(sure_m.isfinite().any()):

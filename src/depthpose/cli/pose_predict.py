@@ -145,12 +145,12 @@ def estimate_jobs(
         The predictions of all jobs, in their order; None in every process but the first.
     """
     process = run.find_rank()
-    home = out
+    process_folder = out
     if process.world > 1:
-        home = out / f"part-{process.rank}"
-        run.claim_folder(home, settings, [POSES])
+        process_folder = out / f"part-{process.rank}"
+        run.claim_folder(process_folder, settings, [POSES])
 
-    results = PoseResults[Any](home, out)
+    results = PoseResults[Any](process_folder, out)
     estimated = _estimate_unfinished(method, process.share_of(jobs), results, batch)
     if process.rank > 0:
         return None
@@ -168,7 +168,7 @@ def estimate_jobs(
             if job.name not in estimated and by_name[job.name].estimate.status == "unreadable"
         ]
         if failed:
-            results = PoseResults[Any](home, out)
+            results = PoseResults[Any](process_folder, out)
             by_name |= _estimate_unfinished(method, failed, results, batch)
     predictions = [by_name.pop(job.name) for job in jobs]
     write_predictions(out, [*by_name.values(), *predictions])

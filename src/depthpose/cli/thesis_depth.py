@@ -73,9 +73,9 @@ def write_reproduced_table(
 
     # Predict, in all processes; the first measures and joins.
     rule = find_protocol(protocol)
-    home = out / "predictions"
+    predictions_folder = out / "predictions"
     folders = [
-        depth_evaluate.predict_depth_of_dataset(dataset, method, rule, home)
+        depth_evaluate.predict_depth_of_dataset(dataset, method, rule, predictions_folder)
         for _, method in methods
     ]
     if find_rank().rank > 0:
@@ -139,7 +139,7 @@ def _make_figure_sections(
         frame_count: how many frames.
     """
     predictions = out / "predictions" / method.name
-    home = out / "figures" / method.name
+    figures_folder = out / "figures" / method.name
     frames = [frame for frame in dataset.frames if has_prediction(predictions, frame.name)]
     predicted = replace(dataset, frames=frames)
     sections: list[Section] = []
@@ -153,7 +153,9 @@ def _make_figure_sections(
             figures["2-1"] = draw_figure_2_1(pair, lidar_m, estimate, stereo)
         for figure, panels in figures.items():
             title = f"Figure {figure}: {method.name}, {pair.name}"
-            sections.append(_make_panel_section(title, panels, home / f"{figure}_{pair.name}"))
+            sections.append(
+                _make_panel_section(title, panels, figures_folder / f"{figure}_{pair.name}")
+            )
     return sections
 
 

@@ -31,10 +31,13 @@ def list_weights(folder: Path | None = None) -> int:
     from depthpose.core.checkpoint import SHIPPED, read_checkpoint
     from depthpose.report.page import plain_table
 
-    home = folder or SHIPPED
-    files = sorted(home.glob("*.safetensors"))
+    weights_folder = folder or SHIPPED
+    files = sorted(weights_folder.glob("*.safetensors"))
     if not files:
-        print(f"No weights in {home}. 'depthpose weights import' imports a published checkpoint.")
+        print(
+            f"No weights in {weights_folder}. 'depthpose weights import' imports a published "
+            "checkpoint."
+        )
         return 0
     rows: list[dict[str, str]] = []
     for path in files:
