@@ -38,13 +38,13 @@ def predict_depth(
         out: folder for the results.
     """
     from depthpose.cli import depth_inputs, depth_predict
-    from depthpose.cli.depth_methods import NetworkSpec
+    from depthpose.cli.depth_methods import DepthNetworkSpec
 
     if not images:
         raise InputError("name images, folders of them, patterns or videos to predict from")
     output.refuse_unusable()
     scale.refuse_unusable()
-    spec = NetworkSpec(
+    spec = DepthNetworkSpec(
         weights=networks.weights,
         config=matching.config,
         with_right=False,
@@ -149,7 +149,7 @@ def evaluate_depth(
     data: Path,
     out: NewPath,
     split: str | None = None,
-    methods: options.MethodOptions = options.MethodOptions(),
+    methods: options.DepthMethodOptions = options.DepthMethodOptions(),
     comparison: options.ProtocolOptions = options.ProtocolOptions(),
     matching: options.MatcherOptions = options.MatcherOptions(),
 ) -> int:

@@ -11,8 +11,8 @@ from typing import Any, cast, get_args
 
 from tqdm import tqdm
 
-from depthpose.cli.depth_methods import DepthMethod, NetworkSpec, SGBMSpec
-from depthpose.cli.depth_options import MethodOptions
+from depthpose.cli.depth_methods import DepthMethod, DepthNetworkSpec, SGBMSpec
+from depthpose.cli.depth_options import DepthMethodOptions
 from depthpose.core import engine
 from depthpose.core.errors import InputError
 from depthpose.core.run import environment, find_rank, read_settings, wait_for
@@ -110,7 +110,7 @@ class _UncheckedNet:
 
 
 def choose_methods(
-    options: MethodOptions, config: MatcherConfig, dataset: Dataset
+    options: DepthMethodOptions, config: MatcherConfig, dataset: Dataset
 ) -> list[DepthMethod]:
     """Build the methods that are measured: SGBM, weights and baselines, in this order.
 
@@ -155,7 +155,7 @@ def build_network_method(word: str, config: MatcherConfig) -> DepthMethod:
     the synthesised view; ``both:`` matches real pairs, ``quick:`` and ``fine:`` at that speed.
     """
     prefix, _, name = word.rpartition(":")
-    mono = NetworkSpec(weights=name, config=config, with_right=False)
+    mono = DepthNetworkSpec(weights=name, config=config, with_right=False)
     stereo = replace(mono, with_right=True)
     if prefix in get_args(Answer):
         return replace(mono, answer=cast("Answer", prefix)).build()
@@ -167,7 +167,7 @@ def build_network_method(word: str, config: MatcherConfig) -> DepthMethod:
         method = replace(stereo, config=replace(config, speed=prefix)).build()
         return method._replace(name=f"{method.name}-{prefix}")
     # No prefix; a colon may be one of the path, as in C:/weights.safetensors.
-    return NetworkSpec(weights=word, config=config).build()
+    return DepthNetworkSpec(weights=word, config=config).build()
 
 
 def fit_baseline(name: BaselineName, training: Dataset) -> DepthMethod:

@@ -49,7 +49,7 @@ class SGBMSpec:
 
 
 @dataclass(frozen=True, kw_only=True)
-class NetworkSpec:
+class DepthNetworkSpec:
     """The weights and settings from which this process, or a worker, builds networks of depth."""
 
     weights: str | PackedWeights  #: name or file, or its content
@@ -137,7 +137,7 @@ class NetworkSpec:
         is_bf16 = usable_precision(self.config.precision, device) == "bf16"
         return replace(self.config, precision="bf16" if is_bf16 else "fp32", device=device)
 
-    def with_packed_weights(self) -> "NetworkSpec":
+    def with_packed_weights(self) -> "DepthNetworkSpec":
         """Return the spec with the content of its weights file, for workers of other machines."""
         if self.matcher not in (None, "sgbm"):
             raise InputError(
@@ -150,7 +150,7 @@ class NetworkSpec:
         return replace(self, weights=PackedWeights.read(self.weights))
 
 
-DepthMethodSpec = SGBMSpec | NetworkSpec
+DepthMethodSpec = SGBMSpec | DepthNetworkSpec
 
 
 def make_pair_spec(matcher: str | None, weights: str, config: MatcherConfig) -> DepthMethodSpec:
@@ -163,7 +163,7 @@ def make_pair_spec(matcher: str | None, weights: str, config: MatcherConfig) -> 
     """
     if matcher == "sgbm":
         return SGBMSpec()
-    return NetworkSpec(weights=matcher or weights, config=config, with_right=True, use="pairs")
+    return DepthNetworkSpec(weights=matcher or weights, config=config, with_right=True, use="pairs")
 
 
 def settings_on_workers(spec: DepthMethodSpec) -> dict[str, Any]:

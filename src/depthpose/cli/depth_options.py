@@ -10,6 +10,9 @@ from depthpose.cli.arguments import Device, Source, WeightsName, shown_as
 from depthpose.core.errors import InputError
 from depthpose.depth.config import COLOR_RANGE_M, Answer, BaselineName, MatcherConfig, Speed
 
+_SIZE = re.compile(
+    r"\s*(?P<number>\d+(?:\.\d+)?)\s*(?P<prefix>[KMGT]?)(?P<binary>i?)B?\s*", re.IGNORECASE
+)
 _EXPONENTS = {"": 0, "K": 1, "M": 2, "G": 3, "T": 4}
 """Exponents of 1000, or of 1024, by the prefix of a size in bytes."""
 _MIN_HEIGHT_M = 0.1
@@ -20,11 +23,11 @@ _MAX_TILT_DEG = 45.0
 
 def _parse_bytes(text: str) -> int:
     """Parse ``--max-memory`` to bytes: 1GB, 800M or 1500000; GiB and the like are of 1024."""
-    size = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)(i?)B?\s*", text, re.IGNORECASE)
-    if size is None or (size[3] and not size[2]) or not float(size[1]):
+    size = _SIZE.fullmatch(text)
+    if size is None or (size["binary"] and not size["prefix"]) or not float(size["number"]):
         raise InputError(f"--max-memory {text!r}: not a size. Write, say, 1GB, 800MB or 1.5GiB.")
-    base = 1024 if size[3] else 1000
-    return int(float(size[1]) * base ** _EXPONENTS[size[2].upper()])
+    base = 1024 if size["binary"] else 1000
+    return int(float(size["number"]) * base ** _EXPONENTS[size["prefix"].upper()])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,7 +192,7 @@ class PredictOutput:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MethodOptions:
+class DepthMethodOptions:
     """The methods that are measured; several share one table."""
 
     weights: tuple[WeightsName, ...] = ()

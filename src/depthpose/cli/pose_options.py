@@ -189,7 +189,7 @@ class DataSetOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MethodOptions:
+class PoseMethodOptions:
     """The estimator of the poses."""
 
     method: Literal["network", "register"] | None = None
@@ -202,7 +202,7 @@ class MethodOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class EstimateOptions(MethodOptions):
+class EstimateOptions(PoseMethodOptions):
     """The settings of the estimator; those from ``weights`` on have no effect on registration."""
 
     min_certainty: float = 0.9
@@ -244,7 +244,7 @@ class EstimateOptions(MethodOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RegisterOptions(MethodOptions):
+class RegisterOptions(PoseMethodOptions):
     """Poses by a CAD file alone, without training."""
 
     cad: tuple[Source, ...] = ()

@@ -146,6 +146,14 @@ def search_files(method: PoseMethod, inputs: PoseInputs, out: Path) -> int:
     Every object that is searched for has an entry, found or not: in an image NAME they are called
     NAME_0, NAME_1, ..., or NAME where a single object was searched for and not found. A rerun
     searches the images that are not finished, and those that could not be read.
+
+    Args:
+        method: finds the objects.
+        inputs: options that name the images and objects.
+        out: folder of the results.
+
+    Raises:
+        InputError: the method cannot search, or images or options cannot be used.
     """
     if inputs.object is None:
         objects = [model.name for model in method.models]

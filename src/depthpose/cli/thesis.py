@@ -101,15 +101,15 @@ def _build_methods(
     Raises:
         InputError: two weights have one name.
     """
-    from depthpose.cli.depth_methods import NetworkSpec, SGBMSpec
+    from depthpose.cli.depth_methods import DepthNetworkSpec, SGBMSpec
 
     # A table with several rows of the thesis has weights for each, else all are of the one row.
     first_row = table.thesis_rows[0]
     row_names = table.thesis_rows if len(table.thesis_rows) > 1 else [first_row] * len(weights)
-    methods = [
-        (row_name, NetworkSpec(weights=file, config=config, with_right=table.with_right).build())
-        for row_name, file in zip(row_names, weights, strict=True)
-    ]
+    methods: list[tuple[str, DepthMethod]] = []
+    for row_name, file in zip(row_names, weights, strict=True):
+        spec = DepthNetworkSpec(weights=file, config=config, with_right=table.with_right)
+        methods.append((row_name, spec.build()))
     names = [method.name for _, method in methods]
     repeated = next((name for name in names if names.count(name) > 1), None)
     if repeated is not None:
@@ -123,7 +123,7 @@ def _build_methods(
     if not table.with_right:
         files = ("default",) if beside is None else beside
         for file in files:
-            method = NetworkSpec(weights=file, config=config, with_right=False).build()
+            method = DepthNetworkSpec(weights=file, config=config, with_right=False).build()
             if method.name not in names:
                 methods.append(("", method))
     return methods
@@ -191,7 +191,7 @@ def draw_figure(
         split: choose among the frames of a split, such as eigen-test.
     """
     from depthpose.cli.depth_evaluate import open_frames
-    from depthpose.cli.depth_methods import NetworkSpec
+    from depthpose.cli.depth_methods import DepthNetworkSpec
     from depthpose.cli.thesis_depth import choose_frames, find_frames, write_figure
 
     dataset = open_frames(kitti, split)
@@ -202,7 +202,7 @@ def draw_figure(
     else:
         indices = choose_frames(dataset, number or (1 if figure == "2-1" else 4))
     with_right = False if figure == "2-1" else None
-    spec = NetworkSpec(weights=weights, config=matching.config, with_right=with_right)
+    spec = DepthNetworkSpec(weights=weights, config=matching.config, with_right=with_right)
     return write_figure(figure, dataset, indices, spec.build(), out)
 
 
