@@ -395,7 +395,7 @@ def _list_copies(estimate: PoseEstimate) -> list[Rigid]:
 def _choose_nearest_copy(
     estimate: PoseEstimate, instance: Instance, models: Mapping[int, ObjectModel]
 ) -> PoseEstimate:
-    """Return an estimate with the nearest to the truth of its pose and the copies of that pose.
+    """Replace the pose of an estimate by the one of its copies that is nearer to the truth, if any.
 
     ``models``: by their numbers.
     """

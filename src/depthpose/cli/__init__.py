@@ -318,10 +318,10 @@ def _print_version() -> int:
     """Print what a bug report needs, versions and devices, and return the exit code."""
     from importlib.metadata import version  # not for --help, which it would double
 
-    from depthpose.cli.doctor import device_names
+    from depthpose.cli.doctor import list_device_names
 
     versions = f"torch {version('torch')}, Python {platform.python_version()}"
-    print(f"depthpose {__version__} ({versions}, {device_names()})")
+    print(f"depthpose {__version__} ({versions}, {list_device_names()})")
     return 0
 
 

@@ -183,8 +183,9 @@ def format_description(command: Callable[..., int]) -> str:
 def _choose_placeholder(hint: Any) -> tuple[str | None, ValueKind | None]:  # noqa: ANN401  any type
     """Choose the placeholder of a value in ``--help``, and find its kind, by its type.
 
-    The placeholder is None where tyro's own will do, the kind where the value is neither a file nor
-    weights.
+    Returns:
+        The placeholder, None where tyro's own will do; and the kind, None where the value is
+        neither a file nor weights.
     """
     origin = get_origin(hint)
     parts = get_args(hint)

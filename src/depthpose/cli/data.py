@@ -71,7 +71,9 @@ def pack_dataset(
         raise InputError(f"--shard-mb {shard_mb}: a shard has a megabyte or more; take 256")
     dataset = open_dataset(path, split)
     refuse_to_replace(out / "index.json")
-    if any(part.suffix == ".tar" for frame in dataset.frames[:1] for part in frame.left.parents):
+    # The images of packed data sets lie in tar files.
+    first_folders = [folder for frame in dataset.frames[:1] for folder in frame.left.parents]
+    if any(folder.suffix == ".tar" for folder in first_folders):
         raise InputError(f"{path}: is packed already; give the folder that it was made of")
     if out.resolve() == path.resolve():
         raise InputError(

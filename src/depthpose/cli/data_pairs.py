@@ -191,9 +191,12 @@ def _check_rows(
     Raises:
         InputError: most of them are, and ``is_refused`` holds.
     """
+    # Which rectified pixels the raw left image shows; the maps hold the raw pixel of each.
     rig = rectifier.rig
-    x, y = rectifier.left_maps
-    is_visible = (x >= 0) & (x <= rig.width - 1) & (y >= 0) & (y <= rig.height - 1)
+    raw_x, raw_y = rectifier.left_maps
+    is_in_width = (raw_x >= 0) & (raw_x <= rig.width - 1)
+    is_in_height = (raw_y >= 0) & (raw_y <= rig.height - 1)
+    is_visible = is_in_width & is_in_height
     print(
         f"rectified camera: {rig.width}x{rig.height}, fx {float(rig.K[0, 0]):.1f} px, baseline "
         f"{rig.baseline_m:.4f} m; the raw images show {is_visible.mean():.1%} of the left view"

@@ -301,7 +301,7 @@ def _make_frame_sections(
     cap_m = per_frame[0].cap_m
     rows_at_cap = [row for row in per_frame if row.cap_m == cap_m and row.pixels]
     metric = METRICS[RANKING["disparity" if cap_m is None else "depth"]]
-    sign = 1 if metric.better == "lower" else -1
+    sign = 1 if metric.better == "lower" else -1  # so that a larger value is a larger error
 
     # Words for the text of each section.
     cap_text = "" if cap_m is None else f", truth up to {cap_m:g} m"
@@ -323,7 +323,7 @@ def _make_frame_sections(
             error=error,
         )
         columns = {
-            name: value for name, value in row.columns().items() if name not in _COLUMNS_OF_METHOD
+            name: cell for name, cell in row.columns().items() if name not in _COLUMNS_OF_METHOD
         }
         sections.append(replace(section, rows=[columns]))
     return sections

@@ -59,10 +59,8 @@ def predict_depth_of_files(
     Raises:
         InputError: ``out`` holds results of other settings or inputs, or the only input failed.
     """
-    video_stems = [files[0].stem for files in sources if is_video(files[0])]
-    run.claim_folder(out, run_settings(method.settings, reader, output), [PAGE])
-    endings = [f".{ending}" for ending in ENDINGS] + [VIDEO_ENDING]
-    run.claim_names(out, {files[0].stem: files for files in sources}, endings, video_stems)
+    settings = run_settings(method.settings, reader, output)
+    _claim_results(sources, settings, out)
     process = run.find_rank()
     if reader.scale.one_mount and process.world > 1:
         raise InputError("--one-mount takes the images one after the other; omit it, or run alone")
@@ -84,6 +82,7 @@ def predict_depth_of_files(
     count = len(predictor.predict(still_jobs, len(stills), "images", mount))
     count += sum(predictor.predict_video(video) for video in videos)
 
+    # What could not be estimated, in words, and the page.
     failures = list(predictor.failures.values())
     if failures and not count and len(sources) == 1:
         raise failures[0]
@@ -98,6 +97,21 @@ def predict_depth_of_files(
             reasons = _read_failures(sources, out)
         write_depth_page(sources, reader, output.color_range, out, reasons)
     return 1 if failures else 0
+
+
+def _claim_results(
+    sources: Sequence[tuple[Path, ...]], settings: dict[str, Any], out: Path
+) -> None:
+    """Claim a folder, and in it the names of the results of these inputs.
+
+    Raises:
+        InputError: the folder holds results of other settings or inputs.
+    """
+    run.claim_folder(out, settings, [PAGE])
+    files_of_stem = {files[0].stem: files for files in sources}
+    video_stems = [stem for stem, files in files_of_stem.items() if is_video(files[0])]
+    endings = [f".{ending}" for ending in ENDINGS] + [VIDEO_ENDING]
+    run.claim_names(out, files_of_stem, endings, video_stems)
 
 
 def run_settings(

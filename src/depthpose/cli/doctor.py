@@ -42,9 +42,13 @@ def doctor(files: tyro.conf.Positional[tuple[NewPath, ...]] = ()) -> int:
     from depthpose.core.checkpoint import SHIPPED
     from depthpose.core.run import environment
 
-    for name, value in {**environment(), "device": device_names(), "weights in": SHIPPED}.items():
+    for name, value in {
+        **environment(),
+        "device": list_device_names(),
+        "weights in": SHIPPED,
+    }.items():
         print(f"{name}: {value}")
-    for extra, packages in _missing_packages().items():
+    for extra, packages in _find_missing_packages().items():
         outcome = f"lacks {', '.join(packages)}" if packages else "installed"
         print(f"extra {extra}: {outcome}")
     print(f"another extra: {install_command('EXTRA')}")
@@ -54,7 +58,7 @@ def doctor(files: tyro.conf.Positional[tuple[NewPath, ...]] = ()) -> int:
     return 0 if all(has_worked) else 1
 
 
-def _missing_packages() -> dict[str, list[str]]:
+def _find_missing_packages() -> dict[str, list[str]]:
     """List the packages of each extra that are not installed; none for an extra that is whole."""
     missing: dict[str, list[str]] = {}
     for line in metadata.requires("depthpose") or ():
@@ -94,7 +98,7 @@ def _run_trial(name: str, trial: Callable[[], str]) -> bool:
     return True
 
 
-def device_names() -> str:
+def list_device_names() -> str:
     """List the GPUs that torch has, or the processor where there are none."""
     import torch
 

@@ -308,7 +308,19 @@ def read_detection(
     name: str,
     unit: Unit | None,
 ) -> ViewInput:
-    """Read a depth image with the mask or box of a detection, or with an empty mask without one."""
+    """Read a depth image with the mask or box of a detection; without one the mask is empty.
+
+    Args:
+        path: the depth image.
+        object: name of the object.
+        detection: where it is; None: nowhere.
+        camera: camera of the depth image, in any form.
+        name: name of the result.
+        unit: unit of the depth image; None: the camera says it.
+
+    Raises:
+        InputError: the image cannot be read, or has no unit.
+    """
     view = view_input(path, None, camera, object, name, unit)
     if detection is None:
         return replace(view, mask=torch.zeros_like(view.mask), is_region=True)

@@ -312,7 +312,10 @@ def _write_page(
     dataset: BopDataset | None,
     input_count: int | None,
 ) -> None:
-    """Write a page with some of the predictions and the reason of every refusal."""
+    """Write a page with some of the predictions and the reason of every refusal.
+
+    The arguments are those of :func:`write_files`; ``models``: by the names of the objects.
+    """
     # The table: refusals first, for they are what is looked for.
     estimates = [prediction.estimate for prediction in predictions]
     refusals_first = sorted(estimates, key=lambda estimate: estimate.is_posed)

@@ -447,11 +447,11 @@ def draw_direction_panels(net: GeoPoseNet, views: Views, keypoint: int | None) -
     return [
         Drawing(image=image, caption=f"(a) {name}, keypoint {worst.keypoint}"),
         Drawing(
-            image=pose_figures.draw_field(points_m, true_directions, worst.true_m),
+            image=pose_figures.draw_directions(points_m, true_directions, worst.true_m),
             caption="(b) true directions and keypoint",
         ),
         Drawing(
-            image=pose_figures.draw_field(points_m, predicted, worst.true_m, worst.voted_m),
+            image=pose_figures.draw_directions(points_m, predicted, worst.true_m, worst.voted_m),
             caption=f"(c) predicted directions; the voted keypoint errs by {error_mm:.1f} mm",
         ),
     ]

@@ -79,8 +79,8 @@ class TrainingOptions:
         """
         from depthpose.core.loop import AdamConfig
 
-        config_steps = config.loop.steps
-        if config_steps is None or self.resume or self.finish:  # None: they follow from epochs
+        config_steps = config.loop.steps  # None where they follow from epochs
+        if config_steps is None or self.resume or self.finish:
             return
         steps = max(config_steps, self.steps or 0)
         for name, adam in vars(config).items():

@@ -188,7 +188,7 @@ _YELLOW = (242, 191, 0)
 _ARROW_COLOR = (38, 64, 140)
 
 
-def draw_field(
+def draw_directions(
     points_m: Float[Tensor, "n 3"],
     directions: Float[Tensor, "n 3"],
     true_m: Float[Tensor, "3"],
