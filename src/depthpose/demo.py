@@ -318,27 +318,29 @@ def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
     folder = out / "geo-posenet"
     write_predictions(folder, predictions)
 
-    rows = _measure_poses(predictions, dataset, models)
+    for view, estimate, instance in zip(views, estimates, dataset.instances, strict=True):
+        pose = estimate.camera_from_model
+        if pose is not None:
+            model = models[instance.object_id]
+            cloud = posed_cloud(object_points(view, model.diameter_m), pose, model)
+            write_cloud(folder / f"{view.object}.{CLOUD}", cloud)
 
-    # The poses in the sensor's cloud, and over the picture.
+    # The section of the page: numbers, the picture with all poses, and a scene with them.
+    rows = _measure_poses(predictions, dataset, models)
+    write_image(folder / "depth.grey.png", grey_depth(frame.depth_m))
     picture = frame.rgb
     sensor_cloud = _make_sensor_cloud(frame.depth_m, frame.rgb, frame.K)
     layers = [Layer(name="table, as the sensor sees it", shape=sensor_cloud)]
-    for view, estimate, instance in zip(views, estimates, dataset.instances, strict=True):
+    for estimate, instance in zip(estimates, dataset.instances, strict=True):
         model = models[instance.object_id]
         K = instance.K.double()
         pose = estimate.camera_from_model
         if pose is not None:
             picture = draw_pose(picture, pose, model, K)
-            cloud = posed_cloud(object_points(view, model.diameter_m), pose, model)
-            write_cloud(folder / f"{view.object}.{CLOUD}", cloud)
             layers += pose_layers(pose, model)
         picture = draw_pose(picture, None, model, K, truth=instance.camera_from_model)
         layers += pose_layers(instance.camera_from_model, model, is_true=True)
-
-    # The section of the page.
     write_image(folder / "poses.png", picture)
-    write_image(folder / "depth.grey.png", grey_depth(frame.depth_m))
     pictures = [
         Picture(path=folder / "depth.grey.png", caption="depth image, near bright"),
         Picture(path=folder / "poses.png", caption="poses, estimated and true"),

@@ -45,10 +45,7 @@ def write_depth_page(
     number = f"{len(names)} depth map{'s' * (len(names) != 1)}"
     text = f"Shown: {len(shown_inputs)} of {number} in this folder ({selection})."
     rows = [{"not estimated, because": reason} for reason in failures]
-    for name in names:
-        warning_file = out / f"{name}.warning.txt"
-        if warning_file.is_file():
-            rows.append({"warning": f"{name}: {read_text(warning_file).strip()}"})
+    rows += [{"warning": warning} for warning in _read_warnings(names, out)]
     sections = [Section(title="What is here", text=text, rows=rows)]
 
     near_m, far_m = range_m
@@ -64,6 +61,14 @@ def write_depth_page(
     title = f"Depth of {len(names)} image{'s' * (len(names) != 1)}"
     write_page(out / PAGE, title, sections, run.environment())
     print(f"the page: {out / PAGE}")
+
+
+def _read_warnings(names: Sequence[str], out: Path) -> Iterator[str]:
+    """Read the warnings of results, by their names; most have none."""
+    for name in names:
+        warning_file = out / f"{name}.warning.txt"
+        if warning_file.is_file():
+            yield f"{name}: {read_text(warning_file).strip()}"
 
 
 def _read_shown(

@@ -288,9 +288,10 @@ class DepthPredictor:
         ``names``: of the frames that have depth.
         """
         failed = {name for name in self.failures if is_frame_name(name, video)}
-        unknown = torch.full_like(read_map(self.out / f"{names[0]}.depth_m.npy"), torch.nan)
+        first_m = read_map(self.out / f"{names[0]}.depth_m.npy")
+        unknown_m = torch.full_like(first_m, torch.nan)
         for name in sorted([*names, *failed]):
-            depth_m = unknown if name in failed else read_map(self.out / f"{name}.depth_m.npy")
+            depth_m = unknown_m if name in failed else read_map(self.out / f"{name}.depth_m.npy")
             yield draw_depth(depth_m, *self.output.color_range)
 
     def _print_remarks(self, name: str, estimate: DepthEstimate) -> None:

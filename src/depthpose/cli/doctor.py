@@ -42,11 +42,8 @@ def doctor(files: tyro.conf.Positional[tuple[NewPath, ...]] = ()) -> int:
     from depthpose.core.checkpoint import SHIPPED
     from depthpose.core.run import environment
 
-    for name, value in {
-        **environment(),
-        "device": list_device_names(),
-        "weights in": SHIPPED,
-    }.items():
+    facts = {**environment(), "device": list_device_names(), "weights in": SHIPPED}
+    for name, value in facts.items():
         print(f"{name}: {value}")
     for extra, packages in _find_missing_packages().items():
         outcome = f"lacks {', '.join(packages)}" if packages else "installed"

@@ -302,6 +302,9 @@ def write_detail_tables(measured: Evaluation, out: Path) -> list[Section]:
     page.write_table(out, [row.columns() for row in measured.per_instance], name="instances")
     if risk:
         page.write_table(out, risk, name="risk")
+    else:  # no instance is posed, but some may have been in an earlier run here
+        for file in page.table_files("risk"):
+            (out / file).unlink(missing_ok=True)
     failed = [row.columns() for row in measured.per_instance if not row.is_success]
     text = "How many answers are wrong if only the surest are given."
     sections = [
