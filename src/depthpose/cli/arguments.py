@@ -115,6 +115,7 @@ def make_parser(
     ]
 
     def parse(*words: object, **options: object) -> BoundArguments:
+        """Bind parsed options to the parameters of the command."""
         return command_signature.bind(*words, **options)
 
     function = unwrap(parse)  # tests wrap functions to check types, and tyro reads the inner one

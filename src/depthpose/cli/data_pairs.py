@@ -145,7 +145,7 @@ def split_pairs(files: tyro.conf.Positional[tuple[Source, ...]], out: NewPath) -
 
 
 def _read_two_view_pictures(source: Path) -> Iterator[tuple[str, Sequence["Tensor"]]]:
-    """Read the images and the name of a picture, or of each frame of a video.
+    """Read a picture, or each frame of a video: its name, and its images.
 
     One image holds both views; of .mpo there are two.
     """
