@@ -27,6 +27,7 @@ from depthpose.depth.types import DepthError, DepthEstimate, StereoInput, Stereo
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.datasets import (
     BopDataset,
+    BopFrame,
     Instance,
     open_bop,
     write_bop_models,
@@ -298,7 +299,6 @@ def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
         seed=_FRAMES_SEED, distance_m=(0.6, 0.9), frame_objects=(count, count), frame_clutter=(2, 2)
     )
     frame = next(make_frames(tuple(models.values()), config, 1, first=_FRAME))
-    assert frame.rgb is not None
 
     # As a data set, and one part as files.
     write_bop_models(out / "parts", net.weights.models)
@@ -325,13 +325,38 @@ def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
             cloud = posed_cloud(object_points(view, model.diameter_m), pose, model)
             write_cloud(folder / f"{view.object}.{CLOUD}", cloud)
 
-    # The section of the page: numbers, the picture with all poses, and a scene with them.
+    # The section of the page: numbers, pictures and a scene.
     rows = _measure_poses(predictions, dataset, models)
     write_image(folder / "depth.grey.png", grey_depth(frame.depth_m))
+    picture, scene = _draw_poses(frame, dataset.instances, estimates, models)
+    write_image(folder / "poses.png", picture)
+    pictures = [
+        Picture(path=folder / "depth.grey.png", caption="depth image, near bright"),
+        Picture(path=folder / "poses.png", caption="poses, estimated and true"),
+    ]
+    title = "Parts on a table"
+    return rows, [Section(title=title, text=_TEXT, rows=rows, pictures=pictures, scenes=[scene])]
+
+
+def _draw_poses(
+    frame: BopFrame,
+    instances: Sequence[Instance],
+    estimates: Sequence[PoseEstimate],
+    models: Mapping[int, ObjectModel],
+) -> tuple[Float[Tensor, "3 h w"], Scene]:
+    """Draw estimated and true poses over the picture of a frame, and in the sensor's cloud.
+
+    Args:
+        frame: picture and depth.
+        instances: the parts with their true poses.
+        estimates: the estimate of each part.
+        models: models of the parts, by their numbers.
+    """
+    assert frame.rgb is not None
     picture = frame.rgb
     sensor_cloud = _make_sensor_cloud(frame.depth_m, frame.rgb, frame.K)
     layers = [Layer(name="table, as the sensor sees it", shape=sensor_cloud)]
-    for estimate, instance in zip(estimates, dataset.instances, strict=True):
+    for estimate, instance in zip(estimates, instances, strict=True):
         model = models[instance.object_id]
         K = instance.K.double()
         pose = estimate.camera_from_model
@@ -340,14 +365,7 @@ def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
             layers += pose_layers(pose, model)
         picture = draw_pose(picture, None, model, K, truth=instance.camera_from_model)
         layers += pose_layers(instance.camera_from_model, model, is_true=True)
-    write_image(folder / "poses.png", picture)
-    pictures = [
-        Picture(path=folder / "depth.grey.png", caption="depth image, near bright"),
-        Picture(path=folder / "poses.png", caption="poses, estimated and true"),
-    ]
-    scenes = [Scene(caption="The sensor's cloud with the posed parts in it", layers=layers)]
-    title = "Parts on a table"
-    return rows, [Section(title=title, text=_TEXT, rows=rows, pictures=pictures, scenes=scenes)]
+    return picture, Scene(caption="The sensor's cloud with the posed parts in it", layers=layers)
 
 
 def _measure_poses(

@@ -53,7 +53,7 @@ def make_cloud_jobs(cloud: Path, unit: Unit, object: str, out: Path) -> list[Pos
         InputError: there is no cloud, or two have one name.
     """
     suffixes = tuple(CLOUD_READERS)
-    files = _list_visible(cloud, suffixes) if cloud.is_dir() else [cloud]
+    files = _list_visible_files(cloud, suffixes) if cloud.is_dir() else [cloud]
     files.sort(key=natural_order)
     if not files:
         raise InputError(f"{cloud}: no {', '.join(suffixes)} file there; give a cloud, or a folder")
@@ -66,7 +66,7 @@ def make_cloud_jobs(cloud: Path, unit: Unit, object: str, out: Path) -> list[Pos
     return jobs
 
 
-def _list_visible(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
+def _list_visible_files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
     """List the files of a folder with one of these suffixes, without hidden ones."""
     return [
         path
@@ -133,7 +133,7 @@ class _MaskPart(NamedTuple):
 
 def _split_by_number(mask: Path, object: str) -> list[_MaskPart]:
     """Split a mask by its numbers, all of one object; a mask with one number stays whole."""
-    whole_mask = [_MaskPart("", object, mask)]
+    whole_mask = [_MaskPart(ending="", object=object, mask=mask)]
     try:
         label_map = read_labels(mask)
     except InputError:  # the job reads the mask again, and is the one to fail
@@ -141,7 +141,11 @@ def _split_by_number(mask: Path, object: str) -> list[_MaskPart]:
     numbers = label_map[label_map != 0].unique().tolist()
     if len(numbers) <= 1:
         return whole_mask
-    return [_MaskPart(f"_{k}", object, _run_lengths(label_map == k)) for k in numbers]
+    parts: list[_MaskPart] = []
+    for number in numbers:
+        part_mask = _encode_run_lengths(label_map == number)
+        parts.append(_MaskPart(ending=f"_{number}", object=object, mask=part_mask))
+    return parts
 
 
 def _split_by_label(mask: Path, labels: Mapping[str, str], wanted: str | None) -> list[_MaskPart]:
@@ -162,11 +166,12 @@ def _split_by_label(mask: Path, labels: Mapping[str, str], wanted: str | None) -
         object = objects[number]
         is_left_out = not object  # "3=" leaves number 3 out
         if not is_left_out and wanted in (None, object):
-            parts.append(_MaskPart(f"_{number}", object, _run_lengths(label_map == number)))
+            part_mask = _encode_run_lengths(label_map == number)
+            parts.append(_MaskPart(ending=f"_{number}", object=object, mask=part_mask))
     return parts
 
 
-def _run_lengths(pixels: Tensor) -> AnyMask:
+def _encode_run_lengths(pixels: Tensor) -> AnyMask:
     """Encode a mask by run lengths, which take less memory than pixels."""
     counts, height, width = encode_rle(pixels)
     return {"size": [height, width], "counts": list(counts)}
@@ -229,7 +234,7 @@ def make_detected_jobs(
     refuse_equal_stems(depths)
     files = [detections]
     if detections.is_dir():
-        files = _list_visible(detections, (".json", ".txt"))
+        files = _list_visible_files(detections, (".json", ".txt"))
     refuse_among_inputs(out, [depth, detections], [*depths, *files])
 
     # The detections of each image, from one file of all images or from a file for each.
