@@ -178,28 +178,41 @@ def unit_settings(unit: Unit | None) -> dict[str, Any]:
 def _with_background(plan: JobPlan, inputs: PoseInputs) -> JobPlan:
     """Return the plan with the bin or empty frame behind its depth images, if one is given."""
     background: AnyBackground
-    settings = dict(plan.settings)
     if inputs.bin is not None:
-        if inputs.bin_pose is None:
-            raise InputError(
-                f"--bin {inputs.bin}: where is it? Give --bin-pose, a text file with its 4x4 "
-                "matrix camera_from_model in metres, or --empty-frame in place of both"
-            )
-        pose = pose_transforms.read_pose(inputs.bin_pose, "--bin-pose")
-        unit = pose_methods.find_cad_unit([inputs.bin], inputs.cad_unit, inputs.unit)
-        background = PosedBin.load(inputs.bin, pose, unit)
-        settings["bin"] = file_names.name_with_checksum(Path(inputs.bin))
-        settings["bin_pose"] = pose.matrix().tolist()
+        background, settings = _load_bin(inputs.bin, inputs)
     elif inputs.empty_frame is not None:
         background = Path(inputs.empty_frame)
-        settings["empty_frame"] = file_names.name_with_checksum(background)
+        settings = {"empty_frame": file_names.name_with_checksum(background)}
     else:
         return plan
     jobs: list[PoseJob[Any]] = []
     for job in plan.jobs:
         read = partial(_read_with_background, job.read, background, inputs.lens, inputs.unit)
         jobs.append(replace(job, read=read))
-    return JobPlan(jobs=jobs, settings=settings)
+    return JobPlan(jobs=jobs, settings={**plan.settings, **settings})
+
+
+def _load_bin(file: str, inputs: PoseInputs) -> tuple[PosedBin, dict[str, Any]]:
+    """Load the CAD file of a bin and its pose.
+
+    Returns:
+        The bin, and the JSON values that it adds to the settings.
+
+    Raises:
+        InputError: the pose or the unit is missing, or a file cannot be read.
+    """
+    if inputs.bin_pose is None:
+        raise InputError(
+            f"--bin {file}: where is it? Give --bin-pose, a text file with its 4x4 matrix "
+            "camera_from_model in metres, or --empty-frame in place of both"
+        )
+    pose = pose_transforms.read_pose(inputs.bin_pose, "--bin-pose")
+    unit = pose_methods.find_cad_unit([file], inputs.cad_unit, inputs.unit)
+    settings = {
+        "bin": file_names.name_with_checksum(Path(file)),
+        "bin_pose": pose.matrix().tolist(),
+    }
+    return PosedBin.load(file, pose, unit), settings
 
 
 def _read_with_background(
