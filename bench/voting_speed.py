@@ -20,7 +20,7 @@ from shared import make_parser, report
 
 from depthpose.pose.config import VotingConfig
 from depthpose.pose.propose import meet_lines, vote_ransac
-from depthpose.thesis.pose_tables import ransac_one_by_one
+from depthpose.thesis.pose_voting import ransac_one_by_one
 
 KEYPOINTS = 8
 WRONG_SHARE = 0.2

@@ -14,7 +14,7 @@ from tests.depth.small_training import write_tiny_weights
 from tests.synthetic_street import make_street
 
 from depthpose.cli import COMMANDS, main
-from depthpose.cli.arguments import Source, WeightsName, parser_of, refuse_missing
+from depthpose.cli.arguments import Source, WeightsName, make_parser, refuse_missing
 from depthpose.cli.engine import EngineOptions
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_depth_png, read_map, write_image, write_json
@@ -434,7 +434,7 @@ def test_patterns_and_addresses_are_left_to_those_who_read_them() -> None:
     def command(images: tuple[Source, ...], bop: Path | None, start: WeightsName) -> int:
         return len(images)
 
-    _, options = parser_of(command)
+    _, options = make_parser(command)
     values = {"images": ("left/*.png", "s3://bucket/left"), "bop": None, "start": "hf://me/mine"}
     refuse_missing(options, values)
     for word in ("sgbm:default", "register", "nothing"):

@@ -56,6 +56,21 @@ def test_a_csv_is_measured(
     assert len(mean) > 20, "the files hold every column"
 
 
+def test_no_table_of_an_earlier_run_is_left_where_nothing_is_posed(
+    synthetic: BopDataset, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    posed = tmp_path / "posed"
+    refused = tmp_path / "refused"
+    write_predictions(posed, predictions_of(synthetic, lambda i: moved(i, [0.0] * 6)))
+    write_predictions(refused, predictions_of(synthetic, lambda _: None))
+    words = ["pose", "evaluate", "--bop", str(synthetic.folder), "--out", str(out), "--predictions"]
+    assert main([*words, str(posed)]) == 0
+    assert len(list(out.glob("risk.*"))) == 3
+    assert main([*words, str(refused)]) == 0
+    assert not list(out.glob("risk.*"))
+
+
 def test_the_page_shows_best_median_and_worst_beside_the_truth(
     synthetic: BopDataset, tmp_path: Path
 ) -> None:

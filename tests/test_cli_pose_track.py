@@ -12,7 +12,7 @@ from tests.pose.synthetic_objects import K, Oracle, bottle, bracket, tiny_weight
 from tests.pose.test_track import moving
 
 from depthpose.cli import main, pose_methods
-from depthpose.cli.pose_jobs import cloud_jobs
+from depthpose.cli.pose_jobs import make_cloud_jobs
 from depthpose.core.camera import Camera, back_project, write_camera
 from depthpose.core.files import read_cloud, write_depth_png
 from depthpose.pose import track as tracking_module
@@ -103,7 +103,7 @@ def interrupt_after(count: int, patch: pytest.MonkeyPatch) -> None:
 def test_clouds_are_taken_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     for k in (1, 10, 2):
         (tmp_path / f"{k}.ply").touch()
-    jobs = cloud_jobs(tmp_path, "m", "bracket", tmp_path / "out")
+    jobs = make_cloud_jobs(tmp_path, "m", "bracket", tmp_path / "out")
     assert [job.name for job in jobs] == ["1", "2", "10"]
 
 

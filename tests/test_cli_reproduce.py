@@ -13,9 +13,9 @@ from tests.pages.read_page import read_page
 from tests.synthetic_street import make_street
 
 from depthpose.cli import main
-from depthpose.cli.depth_evaluate import with_source
-from depthpose.cli.depth_predict import DepthMethod
-from depthpose.cli.thesis_depth import reproduce_table, write_figure
+from depthpose.cli.depth_evaluate import with_origin
+from depthpose.cli.depth_methods import DepthMethod
+from depthpose.cli.thesis_depth import write_figure, write_reproduced_table
 from depthpose.core.camera import StereoRig, write_camera
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image, write_depth_png, write_image
@@ -82,7 +82,9 @@ def write_table(
 ) -> int:
     caps_m, pictures = (80.0, 50.0), 1
     data = open_dataset(street)
-    return reproduce_table(TABLES[number], data, methods, out, "eigen-raw-camera", caps_m, pictures)
+    return write_reproduced_table(
+        TABLES[number], data, methods, out, "eigen-raw-camera", caps_m, pictures
+    )
 
 
 def mono(name: str, depth_m: float) -> DepthMethod:
@@ -126,7 +128,7 @@ def test_rows_of_confidence_name_the_speed() -> None:
     given = Evaluation(rows=[], per_frame=[], deciles=[row], skipped={})
     settings = {"matcher": "light", "weights": "default", "weights_sha256": 64 * "0"}
     found = [
-        with_source(given, speed, settings | {"speed": speed}).deciles[0]
+        with_origin(given, speed, settings | {"speed": speed}).deciles[0]
         for speed in ("quick", "fine")
     ]
     assert [row.columns()["speed"] for row in found] == ["quick", "fine"]
@@ -185,7 +187,7 @@ def test_baselines_know_the_street_they_were_fitted_to(
 
 def test_table_2_3_sets_each_weights_beside_its_row(street: Path, tmp_path: Path) -> None:
     methods = (mono("apart", 20.0), mono("tuned", 10.0))
-    chosen = list(zip(TABLES["2.3"].own_rows, methods, strict=True))
+    chosen = list(zip(TABLES["2.3"].thesis_rows, methods, strict=True))
     assert write_table("2.3", street, chosen, tmp_path) == 0
     rows = [row for row in rows_of(tmp_path) if row["cap_m"] == 80]
     names = [(row["source"], row["method"], row["weights"]) for row in rows]
@@ -206,8 +208,10 @@ def test_table_2_3_sets_each_weights_beside_its_row(street: Path, tmp_path: Path
 def test_a_method_of_one_image_is_never_shown_the_right_view(street: Path, tmp_path: Path) -> None:
     method = mono("w", 15.0)
     write_table("2.1", street, [("thesis, Ours", method)], tmp_path)
-    assert isinstance(method.net, FlatMono)
-    assert method.net.seen == ["left"] * 4 + ["both"]  # the last one is figure 2-1's upper bound
+    assert isinstance(method.estimator, FlatMono)
+    assert method.estimator.seen == ["left"] * 4 + [
+        "both"
+    ]  # the last one is figure 2-1's upper bound
 
 
 def test_a_rerun_measures_the_same_files_and_refuses_other_settings(

@@ -12,7 +12,7 @@ from depthpose.core.camera import StereoRig, read_camera
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image, read_map
 from depthpose.core.run import read_settings
-from depthpose.demo import _make_nets, make_demo, read_motorcycle
+from depthpose.demo import _choose_methods, make_demo, read_motorcycle
 from depthpose.depth.disparity import warp_right_to_left
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.synthesis import make_synthesiser
@@ -96,8 +96,8 @@ def test_the_demo_writes_over_nothing_of_somebody_else(tmp_path: Path) -> None:
 def test_without_a_matcher_the_pair_is_left_to_opencv() -> None:
     net = FakestereoNet(None, make_synthesiser(sure_of(3)))
     street = make_street(0.1)
-    methods = _make_nets(net, replace(street, input=replace(street.input, name="street")))
-    assert {name: given for name, (given, _) in methods.items()} == {
+    methods = _choose_methods(net, replace(street, input=replace(street.input, name="street")))
+    assert {method.name: method.views for method in methods} == {
         "selecting generator": "one image",
         "SGBM, holes filled": "both images",
     }

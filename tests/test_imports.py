@@ -51,7 +51,7 @@ def test_the_command_line_loads_nothing_heavy() -> None:
 
 def test_a_pose_command_loads_no_depth_and_loading_weights_no_compiler() -> None:
     loaded, then = modules_after(
-        "import depthpose.cli.pose, depthpose.cli.pose_frames",
+        "import depthpose.cli.pose, depthpose.cli.pose_search, depthpose.cli.pose_track",
         "from depthpose import FakestereoNet, GeoPoseNet; FakestereoNet.load('default'); "
         "FakestereoNet.load('psmnet-compact'); GeoPoseNet.load('parts')",
     )

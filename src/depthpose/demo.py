@@ -1,13 +1,15 @@
 """The page of ``depthpose demo``: synthetic parts posed, a street and a real pair matched."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from depthpose.core.camera import Camera, StereoRig, back_project, write_camera
 from depthpose.core.draw import draw_depth
@@ -21,9 +23,16 @@ from depthpose.depth.metrics import measure
 from depthpose.depth.predictions import CLOUD_M, write_estimate
 from depthpose.depth.protocols import clamped_depth_from_disparity
 from depthpose.depth.synthetic import Streets
-from depthpose.depth.types import DepthError, StereoInput, StereoSample, StereoTruth
+from depthpose.depth.types import DepthError, DepthEstimate, StereoInput, StereoSample, StereoTruth
 from depthpose.pose.config import ObjectsConfig
-from depthpose.pose.datasets import Instance, open_bop, write_bop_models, write_bop_scene
+from depthpose.pose.datasets import (
+    BopDataset,
+    BopFrame,
+    Instance,
+    open_bop,
+    write_bop_models,
+    write_bop_scene,
+)
 from depthpose.pose.datasets.dataset import write_mask
 from depthpose.pose.evaluate import evaluate
 from depthpose.pose.metrics import add_m
@@ -39,19 +48,21 @@ from depthpose.report.pose import (
     draw_pose,
     join_posed_cloud,
     make_pose_layers,
-    make_truth_layers,
     select_object_points,
 )
 
 _STREETS_SEED = 9
-"""Of streets that no weights were trained on."""
+"""Seed of streets that no weights were trained on."""
 _STREET = 1
+"""Number of the street that is shown."""
 _CAP_M = 80.0
 """Truth beyond it is not compared."""
 _FROM_ONE = "one image"
 _FROM_PAIR = "both images"
-Nets = Mapping[str, tuple[str, FakestereoNet]]
-"""By the method's name: the images that it is given, and its estimator."""
+_MAX_DISPARITY_SHARE = 0.1
+"""Disparity of the nearest surfaces of both scenes, as a share of the width."""
+_SGBM_STEP_PX = 16
+"""OpenCV's matcher searches a multiple of so many disparities."""
 
 _STREET_TEXT = (
     "A synthetic street of a seed that no training used; its depth is known exactly. Distances "
@@ -64,72 +75,95 @@ _MOTORCYCLE_TEXT = (
     "scikit-image ships it. Distances from 1.5 m to 8 m. The shipped matcher was trained on "
     "synthetic scenes alone."
 )
+_MOTORCYCLE_RANGE_M = (1.5, 8.0)
+
+
+class _DepthScene(NamedTuple):
+    """A pair with its truth, what the page says of it, and the depths of its colours."""
+
+    sample: StereoSample
+    text: str
+    range_m: tuple[float, float]  #: depth of the brightest and of the darkest colour
+
+
+class _DepthMethod(NamedTuple):
+    """An estimator of depth, its name, and the images that it is given."""
+
+    name: str
+    views: str  #: ``_FROM_ONE`` or ``_FROM_PAIR``
+    net: FakestereoNet
 
 
 def show_depth(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], list[Section]]:
-    """Estimate depth of both scenes; give a row for each method, and the parts of the page."""
+    """Estimate depth of both scenes, and write them as files.
+
+    Args:
+        out: folder of the demo.
+        weights: weights of the depth networks, by name or file.
+
+    Returns:
+        A row for each scene and method, and the sections of the page.
+    """
     street = Streets(StreetsConfig(seed=_STREETS_SEED))[_STREET]
     street = replace(street, input=replace(street.input, name="street"))
-    scenes = [
-        (read_motorcycle(), _MOTORCYCLE_TEXT, (1.5, 8.0)),
-        (street, _STREET_TEXT, COLOR_RANGE_M),
-    ]
+    scenes = [_DepthScene(street, _STREET_TEXT, COLOR_RANGE_M)]
+    motorcycle = read_motorcycle()
+    if motorcycle is not None:
+        scenes.insert(0, _DepthScene(motorcycle, _MOTORCYCLE_TEXT, _MOTORCYCLE_RANGE_M))
+
     network = FakestereoNet.load(weights)
     rows: list[dict[str, Any]] = []
     sections: list[Section] = []
-    for sample, text, range_m in scenes:
-        if sample is not None:
-            scene_rows, scene_sections = _show_scene(
-                out, sample, _make_nets(network, sample), text, range_m
-            )
-            rows += scene_rows
-            sections += scene_sections
+    for scene in scenes:
+        methods = _choose_methods(network, scene.sample)
+        scene_rows, scene_sections = _show_scene(out, scene, methods)
+        rows += scene_rows
+        sections += scene_sections
     return rows, sections
 
 
-def _make_nets(network: FakestereoNet, sample: StereoSample) -> Nets:
-    """Choose the methods for a scene.
+def _choose_methods(network: FakestereoNet, sample: StereoSample) -> list[_DepthMethod]:
+    """Choose the methods for a scene: the networks, and OpenCV's matcher.
 
     Depth from one image is only for the street: the generator was trained on streets alone.
     """
-    nets: dict[str, tuple[str, FakestereoNet]] = {}
+    methods: list[_DepthMethod] = []
     if network.matcher is not None:
-        nets["stereo network"] = (_FROM_PAIR, network)
+        methods.append(_DepthMethod("stereo network", _FROM_PAIR, network))
 
-    # The disparity of the nearest surfaces of both scenes is a tenth of the width, to which the
-    # difference of the principal points adds. OpenCV leaves as many columns unmatched as it
-    # considers disparities, a multiple of 16.
+    # The difference of the principal points adds to disparities. OpenCV leaves as many columns
+    # unmatched as it considers disparities, so it considers no more than there are.
     rig = sample.input.camera
     assert isinstance(rig, StereoRig)
-    nearest_px = sample.input.left.shape[2] / 10 + max(rig.cx_right_minus_left_px, 0.0)
-    num_disparities = 16 * math.ceil(nearest_px / 16)
+    width = sample.input.left.shape[2]
+    nearest_px = width * _MAX_DISPARITY_SHARE + max(rig.cx_right_minus_left_px, 0.0)
+    num_disparities = _SGBM_STEP_PX * math.ceil(nearest_px / _SGBM_STEP_PX)
     config = SGBMConfig(num_disparities=num_disparities, with_filled_holes=True)
     sgbm = FakestereoNet.load(matcher="sgbm", config=config)
-    nets["SGBM, holes filled"] = (_FROM_PAIR, sgbm)
+    methods.append(_DepthMethod("SGBM, holes filled", _FROM_PAIR, sgbm))
 
     if sample.input.name == "street":
-        nets["selecting generator"] = (_FROM_ONE, network)
-    return nets
+        methods.append(_DepthMethod("selecting generator", _FROM_ONE, network))
+    return methods
 
 
 def _show_scene(
-    out: Path, sample: StereoSample, nets: Nets, text: str, range_m: tuple[float, float]
+    out: Path, scene: _DepthScene, methods: Sequence[_DepthMethod]
 ) -> tuple[list[dict[str, Any]], list[Section]]:
     """Estimate the depth of a scene by each method, and write the pair as files of a command.
 
     Args:
         out: folder of the demo.
-        sample: pair and truth.
-        nets: the methods; the first is shown above the others.
-        text: of the scene.
-        range_m: depth of the brightest and of the darkest colour.
+        scene: pair and truth.
+        methods: the methods; the first is shown above the others.
 
     Returns:
         A row for each method, and the sections of the page.
     """
     # The pair, as files.
-    pair = sample.input
-    truth = sample.truth
+    pair = scene.sample.input
+    truth = scene.sample.truth
+    range_m = scene.range_m
     folder = out / pair.name
     assert pair.right is not None
     assert isinstance(pair.camera, StereoRig)
@@ -143,57 +177,76 @@ def _show_scene(
     # The depth of each method.
     rows: list[dict[str, Any]] = []
     sections: list[Section] = []
-    homes = {method: out / method.lower().replace(",", "").replace(" ", "-") for method in nets}
-    for method, (views, net) in nets.items():
-        net_input = pair if views == _FROM_PAIR else replace(pair, right=None)
-        estimate = net.estimate_input(net_input, with_check=False)
-        write_estimate(homes[method], net_input, estimate, range_m, CLOUD_M)
-
-        # The numbers, over pixels that have a truth within the cap and an answer.
-        predicted_m = clamped_depth_from_disparity(estimate.disparity_px, pair.camera, _CAP_M)
-        is_measured = truth.depth_m < _CAP_M
-        mask = is_measured & torch.isfinite(estimate.disparity_px)
-        row: dict[str, Any] = {"scene": pair.name, "method": method, "input": views}
-        row["coverage"] = float(mask.sum() / is_measured.sum())
-        row |= measure("disparity", estimate.disparity_px[mask], truth.disparity_px[mask])
-        row |= measure("depth", predicted_m[mask], truth.depth_m[mask])
-        rows.append(row)
+    for method in methods:
+        net_input = pair if method.views == _FROM_PAIR else replace(pair, right=None)
+        estimate = method.net.estimate_input(net_input, with_check=False)
+        write_estimate(_name_folder(out, method), net_input, estimate, range_m, CLOUD_M)
+        origin = {"scene": pair.name, "method": method.name, "input": method.views}
+        rows.append(origin | _measure_depth(estimate, scene.sample))
 
         # Its part of the page.
         error_px = (estimate.disparity_px - truth.disparity_px).abs()
         error = DepthError(error=error_px, is_disparity=True)
-        title = f"{pair.name}: {method}, {views}"
+        title = f"{pair.name}: {method.name}, {method.views}"
         section = make_depth_section(
             title, net_input, estimate, range_m=range_m, error=error, with_image=False
         )
         sections.append(section)
 
     # Above them the pair, the first method's depth and the truth.
-    first_method = next(iter(nets))
-    estimated_picture = homes[first_method] / f"{pair.name}.color.png"
+    first_method = methods[0]
+    estimated_picture = _name_folder(out, first_method) / f"{pair.name}.color.png"
     true_picture = folder / "depth.color.png"
     color_bar = make_depth_color_bar(*range_m)
     pictures = [
         PictureFile(path=folder / "left.png", caption="left image"),
         PictureFile(path=folder / "right.png", caption="right image"),
         PictureFile(
-            path=estimated_picture, caption=f"depth from both: {first_method}", color_bar=color_bar
+            path=estimated_picture,
+            caption=f"depth from both: {first_method.name}",
+            color_bar=color_bar,
         ),
         PictureFile(path=true_picture, caption="true depth; grey: none", color_bar=color_bar),
     ]
-    opening = Section(title=f"The {pair.name}", text=text, rows=rows, pictures=pictures)
+    opening = Section(title=f"The {pair.name}", text=scene.text, rows=rows, pictures=pictures)
     return rows, [opening, *sections]
 
 
+def _name_folder(out: Path, method: _DepthMethod) -> Path:
+    """Name the folder of a method's files, below that of the demo."""
+    return out / method.name.lower().replace(",", "").replace(" ", "-")
+
+
+def _measure_depth(estimate: DepthEstimate, sample: StereoSample) -> dict[str, float]:
+    """Measure disparity and depth, over pixels that have a truth within the cap and an estimate.
+
+    ``coverage`` is the share of the former that have one.
+    """
+    truth = sample.truth
+    rig = sample.input.camera
+    assert isinstance(rig, StereoRig)
+    assert truth.depth_m is not None
+    assert truth.disparity_px is not None
+    predicted_m = clamped_depth_from_disparity(estimate.disparity_px, rig, _CAP_M)
+    has_truth = truth.depth_m < _CAP_M
+    mask = has_truth & torch.isfinite(estimate.disparity_px)
+    row = {"coverage": float(mask.sum() / has_truth.sum())}
+    row |= measure("disparity", estimate.disparity_px[mask], truth.disparity_px[mask])
+    row |= measure("depth", predicted_m[mask], truth.depth_m[mask])
+    return row
+
+
 def read_motorcycle() -> StereoSample | None:
-    """Read the pair with its true disparity, or None where scikit-image is not installed."""
-    # Images a quarter of the original size; calibration by scikit-image's documentation.
+    """Read the pair Motorcycle with its true disparity, as scikit-image ships it.
+
+    None where scikit-image is not installed.
+    """
     try:
         from skimage.data import stereo_motorcycle
     except ImportError:
         return None
 
-    # The camera.
+    # The camera, of images of a quarter of the original size, by scikit-image's documentation.
     left, right, disparity = stereo_motorcycle()
     K = torch.tensor([[994.978, 0, 311.193], [0, 994.978, 254.877], [0, 0, 1]], dtype=torch.float64)
     rig = StereoRig(
@@ -215,13 +268,13 @@ def read_motorcycle() -> StereoSample | None:
 
 
 _FRAMES_SEED = 9
-"""Of frames that no weights were trained on."""
+"""Seed of frames that no weights were trained on."""
 _FRAME = 1
-"""The first that shows every part whole."""
+"""Number of the first frame that shows every part whole."""
 _SAMPLE = "flange"
 """The part whose depth image, mask and camera get a folder of their own, for a first command."""
 _UNIT_M = 0.0001
-"""Of that depth image."""
+"""Unit of that depth image."""
 _COLUMNS = ("object", "visible_fraction", "status", "copies", "metric", "error_mm", "of_diameter",
             "rotation_deg", "translation_mm", "ms_network", "ms_total", "reason")  # fmt: skip
 _TEXT = (
@@ -235,9 +288,16 @@ _TEXT = (
 
 
 def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], list[Section]]:
-    """Pose the parts of a synthetic frame; give a row for each, and the section of the page.
+    """Pose the parts of a synthetic frame, which is written as a data set.
 
-    The frame is written as a data set, one of its parts as files of a first command.
+    One of its parts is written as files of a first command.
+
+    Args:
+        out: folder of the demo.
+        weights: weights of a pose network of the parts, by name or file.
+
+    Returns:
+        A row for each part, and the section of the page.
     """
     # A frame that shows each part once.
     net = GeoPoseNet.load(weights)
@@ -247,7 +307,6 @@ def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
         seed=_FRAMES_SEED, distance_m=(0.6, 0.9), frame_objects=(count, count), frame_clutter=(2, 2)
     )
     frame = next(make_frames(tuple(models.values()), config, 1, first=_FRAME))
-    assert frame.rgb is not None
 
     # As a data set, and one part as files.
     write_bop_models(out / "parts", net.weights.models)
@@ -256,8 +315,8 @@ def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
     views = [dataset.view(instance).input for instance in dataset.instances]
     _write_sample(next(view for view in views if view.object == _SAMPLE), out / "part")
 
-    # The poses of all parts, and their errors. The first call prepares the models, so that the
-    # times are those of further estimates.
+    # The poses of all parts. The first call prepares the models, so that the times are those of
+    # further estimates.
     net.estimate_many(views)
     estimates = net.estimate_many(views)
     predictions = [
@@ -267,46 +326,84 @@ def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
     folder = out / "geo-posenet"
     write_predictions(folder, predictions)
 
-    # What the page says of each part; the error is that of the nearest copy.
-    nearest = [
-        replace(prediction, estimate=_choose_nearest_copy(prediction.estimate, instance, models))
-        for prediction, instance in zip(predictions, dataset.instances, strict=True)
-    ]
-    copies = {estimate.object: len(_list_named_copies(estimate)) for estimate in estimates}
-    measured = [row.columns() for row in evaluate(dataset, nearest).per_instance]
-    rows = [_select_columns({**row, "copies": copies[row["object"]]}) for row in measured]
-
-    # The sensor's cloud.
-    points_m = back_project(frame.depth_m, frame.K).reshape(-1, 3)
-    has_reading = points_m.isfinite().all(-1) & (points_m[:, 2] > 0)
-    color = frame.rgb.permute(1, 2, 0).reshape(-1, 3)[has_reading]
-    table = PointCloud(points=points_m[has_reading].float(), color=color)
-
-    # The poses over it, and over the picture.
-    picture = frame.rgb
-    layers = [Layer(name="table, as the sensor sees it", shape=table)]
     for view, estimate, instance in zip(views, estimates, dataset.instances, strict=True):
+        pose = estimate.camera_from_model
+        if pose is not None:
+            model = models[instance.object_id]
+            cloud = join_posed_cloud(select_object_points(view, model.diameter_m), pose, model)
+            write_cloud(folder / f"{view.object}.{CLOUD}", cloud)
+
+    # The section of the page: numbers, pictures and a scene.
+    rows = _measure_poses(predictions, dataset, models)
+    write_image(folder / "depth.grey.png", draw_grey_depth(frame.depth_m))
+    picture, scene = _draw_poses(frame, dataset.instances, estimates, models)
+    write_image(folder / "poses.png", picture)
+    pictures = [
+        PictureFile(path=folder / "depth.grey.png", caption="depth image, near bright"),
+        PictureFile(path=folder / "poses.png", caption="poses, estimated and true"),
+    ]
+    title = "Parts on a table"
+    return rows, [Section(title=title, text=_TEXT, rows=rows, pictures=pictures, scenes=[scene])]
+
+
+def _draw_poses(
+    frame: BopFrame,
+    instances: Sequence[Instance],
+    estimates: Sequence[PoseEstimate],
+    models: Mapping[int, ObjectModel],
+) -> tuple[Float[Tensor, "3 h w"], Scene]:
+    """Draw estimated and true poses over the picture of a frame, and in the sensor's cloud.
+
+    Args:
+        frame: picture and depth.
+        instances: the parts with their true poses.
+        estimates: the estimate of each part.
+        models: models of the parts, by their numbers.
+    """
+    assert frame.rgb is not None
+    picture = frame.rgb
+    sensor_cloud = _make_sensor_cloud(frame.depth_m, frame.rgb, frame.K)
+    layers = [Layer(name="table, as the sensor sees it", shape=sensor_cloud)]
+    for estimate, instance in zip(estimates, instances, strict=True):
         model = models[instance.object_id]
         K = instance.K.double()
         pose = estimate.camera_from_model
         if pose is not None:
             picture = draw_pose(picture, pose, model, K)
-            cloud = join_posed_cloud(select_object_points(view, model.diameter_m), pose, model)
-            write_cloud(folder / f"{view.object}.{CLOUD}", cloud)
             layers += make_pose_layers(pose, model)
         picture = draw_pose(picture, None, model, K, truth=instance.camera_from_model)
-        layers += make_truth_layers(instance.camera_from_model, model)
+        layers += make_pose_layers(instance.camera_from_model, model, is_true=True)
+    return picture, Scene(caption="The sensor's cloud with the posed parts in it", layers=layers)
 
-    # The section of the page.
-    write_image(folder / "poses.png", picture)
-    write_image(folder / "depth.grey.png", draw_grey_depth(frame.depth_m))
-    pictures = [
-        PictureFile(path=folder / "depth.grey.png", caption="depth image, near bright"),
-        PictureFile(path=folder / "poses.png", caption="poses, estimated and true"),
+
+def _measure_poses(
+    predictions: Sequence[Prediction], dataset: BopDataset, models: Mapping[int, ObjectModel]
+) -> list[dict[str, Any]]:
+    """Measure the pose of each part, or of the copy that is nearest to the truth, for the page."""
+    nearest = [
+        replace(prediction, estimate=_choose_nearest_copy(prediction.estimate, instance, models))
+        for prediction, instance in zip(predictions, dataset.instances, strict=True)
     ]
-    scenes = [Scene(caption="The sensor's cloud with the posed parts in it", layers=layers)]
-    title = "Parts on a table"
-    return rows, [Section(title=title, text=_TEXT, rows=rows, pictures=pictures, scenes=scenes)]
+    copy_counts = {
+        prediction.estimate.object: len(_list_copies(prediction.estimate))
+        for prediction in predictions
+    }
+    rows: list[dict[str, Any]] = []
+    for instance_row in evaluate(dataset, nearest).per_instance:
+        columns = instance_row.columns()
+        columns["copies"] = copy_counts[columns["object"]]
+        rows.append(_select_columns(columns))
+    return rows
+
+
+def _make_sensor_cloud(
+    depth_m: Float[Tensor, "h w"], rgb: Float[Tensor, "3 h w"], K: Float[Tensor, "3 3"]
+) -> PointCloud:
+    """Make the coloured cloud of a depth image."""
+    points_m = back_project(depth_m, K).reshape(-1, 3)
+    has_reading = points_m.isfinite().all(-1) & (points_m[:, 2] > 0)
+    color = rgb.permute(1, 2, 0).reshape(-1, 3)[has_reading]
+    return PointCloud(points=points_m[has_reading].float(), color=color)
 
 
 def _write_sample(view: ViewInput, folder: Path) -> None:
@@ -318,7 +415,7 @@ def _write_sample(view: ViewInput, folder: Path) -> None:
     write_mask(folder / "mask.png", view.mask)
 
 
-def _list_named_copies(estimate: PoseEstimate) -> list[Rigid]:
+def _list_copies(estimate: PoseEstimate) -> list[Rigid]:
     """List the near-symmetric copies that an estimate names beside its pose."""
     return [other.camera_from_model for other in estimate.alternatives if other.is_copy]
 
@@ -326,11 +423,14 @@ def _list_named_copies(estimate: PoseEstimate) -> list[Rigid]:
 def _choose_nearest_copy(
     estimate: PoseEstimate, instance: Instance, models: Mapping[int, ObjectModel]
 ) -> PoseEstimate:
-    """Choose the nearest to the truth of an estimate's pose and that pose's copies."""
+    """Replace the pose of an estimate by the one of its copies that is nearer to the truth, if any.
+
+    ``models``: by their numbers.
+    """
     if estimate.camera_from_model is None:
         return estimate
     points_m = models[instance.object_id].vertices_m
-    poses = [estimate.camera_from_model, *_list_named_copies(estimate)]
+    poses = [estimate.camera_from_model, *_list_copies(estimate)]
     nearest = min(poses, key=lambda pose: float(add_m(pose, instance.camera_from_model, points_m)))
     return replace(estimate, camera_from_model=nearest)
 
@@ -360,9 +460,9 @@ _RESULT_FOLDERS = (
 class DemoResult:
     """The page of a demo, and the rows on it."""
 
-    page: Path  #: its file
-    depths: list[dict[str, Any]]  #: one for each scene and method
-    poses: list[dict[str, Any]]  #: one for each part
+    page: Path  #: file of the page
+    depths: list[dict[str, Any]]  #: a row for each scene and method
+    poses: list[dict[str, Any]]  #: a row for each part
 
 
 def make_demo(
@@ -371,15 +471,15 @@ def make_demo(
     parts: str | Path = "parts",
     on_message: Callable[[str], None] | None = None,
 ) -> DemoResult:
-    """Pose synthetic parts on a table; estimate depth of a real pair and a synthetic street.
+    """Pose synthetic parts, estimate depth of a real pair and a street, and write a page.
 
     Args:
         out: folder for the page, tables, pictures and poses.
-        weights: of the depth networks.
-        parts: weights of a pose network for the parts.
+        weights: weights of the depth networks, by name or file.
+        parts: weights of a pose network for the parts, by name or file.
         on_message: called with what is done next.
     """
-    # Both parts of the demo.
+    # Poses, then depth.
     files = [*_RESULT_FOLDERS, *pages.list_table_files("depths", "poses"), _PAGE]
     claim_folder(out, {"command": "demo"}, files)
     on_message = on_message or (lambda _: None)
@@ -388,7 +488,7 @@ def make_demo(
     on_message("depth of a real pair and of a synthetic street ...")
     depths, depth_sections = show_depth(out, weights)
 
-    # Their tables and the page.
+    # The tables and the page.
     pages.write_table(out, depths, name="depths")
     pages.write_table(out, poses, name="poses")
     page = out / _PAGE

@@ -5,7 +5,7 @@ from depthpose.core.draw import draw_depth
 from depthpose.core.errors import InputError
 from depthpose.depth.types import DepthEstimate, StereoInput
 from depthpose.report.page import Drawing
-from depthpose.thesis.depth import arrange, draw_figure_2_1, draw_figure_2_5
+from depthpose.thesis.depth import arrange_columns, draw_figure_2_1, draw_figure_2_5
 
 H, W = 20, 60
 
@@ -77,7 +77,7 @@ def test_panels_stand_where_they_belong() -> None:
     red, green = torch.zeros(3, 10, 20), torch.zeros(3, 12, 20)
     red[0], green[1] = 1.0, 1.0
     columns = [[Drawing(caption="", image=red)] * 2, [Drawing(caption="", image=green)]]
-    grid = arrange(columns, width_px=20)
+    grid = arrange_columns(columns, width_px=20)
     assert grid.shape == (3, 12 + 8 + 10 + 8 + 18, 48)
     assert grid[:, 5, 5].tolist() == grid[:, 25, 5].tolist() == [1, 0, 0]
     assert grid[:, 5, 35].tolist() == [0, 1, 0]
@@ -85,7 +85,7 @@ def test_panels_stand_where_they_belong() -> None:
 
 
 def test_the_bar_runs_from_near_to_far() -> None:
-    grid = arrange([[Drawing(caption="", image=torch.ones(3, 4, 40))]], width_px=40)
+    grid = arrange_columns([[Drawing(caption="", image=torch.ones(3, 4, 40))]], width_px=40)
     ends = draw_depth(torch.tensor([[3.0, 80.0]]))
     assert torch.allclose(grid[:, -1, 0], ends[:, 0, 0], atol=1e-3)
     assert torch.allclose(grid[:, -1, -1], ends[:, 0, 1], atol=1e-3)
@@ -93,4 +93,4 @@ def test_the_bar_runs_from_near_to_far() -> None:
 
 def test_nothing_cannot_be_arranged() -> None:
     with pytest.raises(InputError, match="a figure of no panel"):
-        arrange([])
+        arrange_columns([])

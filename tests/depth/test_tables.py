@@ -25,7 +25,7 @@ def test_every_printed_row_is_there() -> None:
     counts = {number: len(table.rows) for number, table in TABLES.items()}
     assert counts == {"2.1": 12, "2.2": 4, "2.3": 4}
     for table in TABLES.values():
-        for own in table.own_rows:
+        for own in table.thesis_rows:
             assert [row.cap_m for row in table.rows if row.method == own] == [80, 50]
 
 
@@ -52,7 +52,9 @@ def test_tables_2_1_and_2_3_share_the_row_without_fine_tuning() -> None:
     for cap_m in (80, 50):
         rows = [
             next(
-                r for r in TABLES[n].rows if r.method == TABLES[n].own_rows[0] and r.cap_m == cap_m
+                r
+                for r in TABLES[n].rows
+                if r.method == TABLES[n].thesis_rows[0] and r.cap_m == cap_m
             )
             for n in ("2.1", "2.3")
         ]
@@ -80,7 +82,7 @@ def test_our_row_follows_the_printed_ones_and_then_the_difference() -> None:
 
 def test_each_weights_of_table_2_3_has_its_own_row() -> None:
     table = TABLES["2.3"]
-    rows = join_published(table, [(own, OURS) for own in table.own_rows])
+    rows = join_published(table, [(own, OURS) for own in table.thesis_rows])
     differences = [row["abs_rel"] for row in rows if row["source"] == "difference"]
     assert differences == pytest.approx([0.15 - 0.141, 0.15 - 0.126])
 

@@ -12,7 +12,7 @@ from tests.pose.synthetic_objects import bracket
 from torch.nn.functional import huber_loss
 
 from depthpose.cli import main
-from depthpose.cli.pose_jobs import cloud_jobs
+from depthpose.cli.pose_jobs import make_cloud_jobs
 from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError
 from depthpose.core.files import CLOUD_READERS, PointCloud, read_cloud
@@ -43,7 +43,7 @@ def test_extending_clouds(
     path.write_text(json.dumps(points.tolist()))
     # Read by its suffix, found in a folder, by an engine, by doctor, and as a model to train on.
     assert torch.equal(read_cloud(path).points, points)
-    (job,) = cloud_jobs(tmp_path, "m", "bracket", tmp_path.parent / "out")
+    (job,) = make_cloud_jobs(tmp_path, "m", "bracket", tmp_path.parent / "out")
     assert torch.equal(job.read().points_m, points)
     assert ".points" in CLOUD_READERS
     assert main(["doctor", str(path)]) in (0, 1)

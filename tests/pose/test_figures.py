@@ -9,14 +9,12 @@ from tests.pose.synthetic_objects import bracket
 from depthpose.core.errors import InputError
 from depthpose.thesis.pose_figures import (
     arrange_grid,
+    draw_directions,
     draw_discs,
     draw_features,
-    draw_field,
-    embed_line,
-    joint_probabilities,
-    kl_gradient,
     spectral,
 )
+from depthpose.thesis.tsne import embed_line, joint_probabilities, kl_gradient
 
 
 def test_neighbourhoods_have_the_perplexity_that_was_asked_for() -> None:
@@ -88,8 +86,8 @@ def test_the_field_shows_where_directions_meet() -> None:
     points = torch.tensor([[-0.1, -0.1, 1.0], [0.1, -0.1, 1.0], [0.1, 0.1, 1.0], [-0.1, 0.1, 1.0]])
     true, voted = torch.tensor([0.0, 0.0, 1.0]), torch.tensor([0.05, 0.0, 0.9])
     ways = torch.nn.functional.normalize(true - points, dim=-1)
-    alone = draw_field(points, ways, true, None, 200)
-    both = draw_field(points, ways, true, voted, 200)
+    alone = draw_directions(points, ways, true, None, 200)
+    both = draw_directions(points, ways, true, voted, 200)
     assert alone[:, 100, 100].tolist() == pytest.approx([0.95, 0.75, 0.0], abs=0.01)
     is_red = (both[0] > 0.8) & (both[1] < 0.1)
     rows, columns = is_red.nonzero(as_tuple=True)

@@ -8,7 +8,7 @@ import pytest
 import torch
 from PIL import Image
 
-from depthpose.cli.pose_jobs import mask_jobs
+from depthpose.cli.pose_jobs import make_mask_jobs
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_depth_png
 from depthpose.pose.datasets import (
@@ -111,7 +111,7 @@ def test_an_array_of_labels_asks_which(tmp_path: Path) -> None:
     write_depth_png(tmp_path / "d.png", depth_m, 0.001)
     (tmp_path / "camera.txt").write_text("80 80 39.5 29.5\n")
     given = (tmp_path / "d.png", tmp_path / "m.png", tmp_path / "camera.txt")
-    jobs = mask_jobs(*given, "part", "mm", tmp_path / "out")
+    jobs = make_mask_jobs(*given, "part", "mm", tmp_path / "out")
     assert [job.name for job in jobs] == ["d_1", "d_2"]
     assert [int(job.read().mask.sum()) for job in jobs] == [400, 900]
 

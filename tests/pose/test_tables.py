@@ -16,11 +16,13 @@ from depthpose.thesis.pose_tables import (
     LINEMOD,
     LINEMOD_DIAMETERS_M,
     ROWS,
+    find_linemod_number,
+    join_by_object,
+)
+from depthpose.thesis.pose_voting import (
     VotingCase,
     collect_votes,
     compare_voting,
-    find_linemod_number,
-    join_by_object,
     ransac_one_by_one,
 )
 

@@ -33,28 +33,34 @@ COMMANDS = {
     "pose predict": (
         "pose:predict_poses", "a cloud, a masked depth image, or a data set, to poses"),
     "pose track": ("pose:track_object", "follow an object through depth images or clouds"),
-    "pose train": ("train:pose_train", "your CAD file, or a config, to a network that poses it"),
+    "pose train": ("train:train_pose", "your CAD file, or a config, to a network that poses it"),
     "pose evaluate": ("pose:evaluate_poses", "measure poses on a BOP or LineMOD data set"),
     "depth match": ("depth:match_pairs", "a real stereo pair, or many, to metric depth"),
     "depth predict": ("depth:predict_depth", "one image, or many, or a video, to metric depth"),
     "depth train": (
-        "train:depth_train", "stages view, select, stereo, finetune of generator, matcher"),
-    "depth calibrate": ("train:calibrate", "set when an image is refused as out of distribution"),
+        "train:train_depth", "stages view, select, stereo, finetune of generator, matcher"),
+    "depth calibrate": (
+        "train:calibrate_refusal", "set when an image is refused as out of distribution"),
     "depth evaluate": ("depth:evaluate_depth", "measure predictions by a named protocol"),
     "data make streets": (
-        "data:make_streets", "synthetic streets with exact disparity and LiDAR, in KITTI's layout"),
+        "data_make:make_streets",
+        "synthetic streets with exact disparity and LiDAR, in KITTI's layout"),
     "data make near": (
-        "data:make_near", "synthetic rooms, tables, bins and shelves with exact disparity"),
+        "data_make:make_near", "synthetic rooms, tables, bins and shelves with exact disparity"),
     "data make objects": (
-        "data:make_objects", "synthetic frames of your CAD files on a table, in BOP's layout"),
+        "data_make:make_objects", "synthetic frames of your CAD files on a table, in BOP's layout"),
     "data rectify": (
-        "data:rectify", "raw pairs and their calibration to rectified pairs for depth match"),
+        "data_pairs:rectify_pairs",
+        "raw pairs and their calibration to rectified pairs for depth match"),
     "data split": (
-        "data:split", "pictures and videos that hold both views to a left and a right folder"),
-    "data check": ("data:check", "read a whole data set and list what is wrong"),
+        "data_pairs:split_pairs",
+        "pictures and videos that hold both views to a left and a right folder"),
+    "data check": ("data:check_dataset", "read a whole data set and list what is wrong"),
     "data label": (
-        "data:label", "truth for pairs that have none, by a matcher, where both views agree"),
-    "data pack": ("data:pack", "a data set as tar shards: few large files, from a disk or a store"),
+        "data:label_dataset",
+        "truth for pairs that have none, by a matcher, where both views agree"),
+    "data pack": (
+        "data:pack_dataset", "a data set as tar shards: few large files, from a disk or a store"),
     "weights list": ("weights:list_weights", "list the weights"),
     "weights show": ("weights:show_weights", "print what a weights file holds"),
     "weights pack": ("weights:pack_weights", "one file of a generator and a matcher, with a card"),
@@ -63,14 +69,15 @@ COMMANDS = {
     "weights import": ("weights:import_weights", "import a published checkpoint, safely"),
     "export depth": ("weights:export_depth", "depth as an ONNX file, proven to agree"),
     "export pose": ("weights:export_pose", "the network of directions as an ONNX file"),
-    "reproduce": ("thesis:reproduce", "a table of chapter 2: published rows, ours, difference"),
-    "reproduce 3.1": ("thesis:table_3_1", "the method beside its baselines, by object"),
-    "reproduce 3.2": ("thesis:table_3_2", "LineMOD: published rows, ours, difference"),
-    "reproduce 3.3": ("thesis:table_3_3", "RANSAC against least squares"),
-    "figure": ("thesis:figure", "a figure of chapter 2 from your frames and weights"),
-    "figure 3-2": ("thesis:figure_3_2", "features of points in one colour scale (t-SNE)"),
-    "figure 3-4": ("thesis:figure_3_4", "true and predicted directions to a keypoint"),
-    "figure 3-5": ("thesis:figure_3_5", "boxes of true and estimated poses"),
+    "reproduce": (
+        "thesis:reproduce_table", "a table of chapter 2: published rows, ours, difference"),
+    "reproduce 3.1": ("thesis:reproduce_table_3_1", "the method beside its baselines, by object"),
+    "reproduce 3.2": ("thesis:reproduce_table_3_2", "LineMOD: published rows, ours, difference"),
+    "reproduce 3.3": ("thesis:reproduce_table_3_3", "RANSAC against least squares"),
+    "figure": ("thesis:draw_figure", "a figure of chapter 2 from your frames and weights"),
+    "figure 3-2": ("thesis:draw_figure_3_2", "features of points in one colour scale (t-SNE)"),
+    "figure 3-4": ("thesis:draw_figure_3_4", "true and predicted directions to a keypoint"),
+    "figure 3-5": ("thesis:draw_figure_3_5", "boxes of true and estimated poses"),
 }  # fmt: skip
 _TITLES = {
     "demo doctor serve": "to begin",
@@ -97,6 +104,7 @@ _EXIT_CODES = """exit codes:
 _MIN_ADDRESS_SPACE_KIB = 750_000
 """Where torch and SciPy find less, they end the process without a reason."""
 _MAX_COMMAND_WORDS = 3
+"""Words of the longest name of a command, such as ``data make near``."""
 _DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
 """Errors of a disk where a library or a temporary file writes; our own writers catch them."""
 _PATH_ERRORS = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ELOOP, errno.EISDIR,
@@ -105,10 +113,10 @@ _PATH_ERRORS = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ELOOP, errn
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Run the command of these words, by default the process's own, and give the exit code.
+    """Run the command of these words, by default the process's own, and return the exit code.
 
-    0: done. 1: something in the input failed, or the output cannot be written. 2: unusable.
-    130: interrupted. 141: nobody reads the output.
+    0: done. 1: something in the input failed, or the output cannot be written. 2: wrong usage or
+    unreadable input. 130: interrupted. 141: nobody reads the output.
     """
     # Folders are released that the command claims; their module is not loaded for --help.
     run_module = sys.modules.get("depthpose.core.run")
@@ -143,9 +151,9 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 def _make_notice_format(usual_format: Callable[..., str]) -> Callable[..., str]:
-    """Make a format of warnings that shows each :class:`Notice` once, in a line without its place.
+    """Make a format of warnings that shows each :class:`Notice` once, as a line without its source.
 
-    Other warnings look as usual.
+    Other warnings look as usual, by ``usual_format``.
     """
     shown: set[str] = set()
 
@@ -155,6 +163,7 @@ def _make_notice_format(usual_format: Callable[..., str]) -> Callable[..., str]:
         *place: Any,  # noqa: ANN401  file and line of the code
         **source: Any,  # noqa: ANN401
     ) -> str:
+        """Format a warning; an empty text where the same notice was shown before."""
         if not issubclass(category, Notice):
             return usual_format(message, category, *place, **source)
         text = f"depthpose: {message}\n"
@@ -167,13 +176,13 @@ def _make_notice_format(usual_format: Callable[..., str]) -> Callable[..., str]:
 
 
 def _print_failure(reason: str, code: int = 2) -> int:
-    """Print why the command failed, and give the exit code."""
+    """Print why the command failed, and return its exit code."""
     print(f"depthpose: {reason}", file=sys.stderr)
     return code
 
 
 def _explain_system_error(error: Exception) -> str | None:
-    """Explain a full memory, a full disk or an unusable path in a line; None: another error."""
+    """Explain a full memory, a full disk or an unusable path in a line; None for other errors."""
     reason = describe_full_memory(error)
     if reason is not None:
         return f"{reason}; what was finished is kept"
@@ -189,12 +198,12 @@ def _explain_system_error(error: Exception) -> str | None:
 
 
 @dataclass(eq=False)
-class Output:
+class SafeStream:
     """A standard stream that keeps the error of a write, in place of raising it."""
 
     stream: Any  #: what is written to
-    is_missing: bool = False  #: whether the process began without it; ``stream`` replaces it
-    failure: OSError | None = None  #: of the first write that failed
+    is_missing: bool = False  #: the process began without it, and ``stream`` is only in its place
+    failure: OSError | None = None  #: error of the first write that failed; None: none has
 
     def write(self, text: str) -> int:
         """Write text at once, unless an earlier write has failed."""
@@ -212,15 +221,15 @@ class Output:
         return len(text)
 
     def __getattr__(self, name: str) -> Any:  # noqa: ANN401  whatever a stream has
-        """Give any other attribute of the stream."""
+        """Return any other attribute of the stream."""
         return getattr(self.stream, name)
 
 
 @contextmanager
-def lasting_streams() -> Iterator[Output]:
+def lasting_streams() -> Iterator[SafeStream]:
     """Let a command run to its end even if its standard streams are closed or full.
 
-    Gives standard output, whose failure is known afterwards.
+    Yields standard output, whose ``failure`` tells afterwards whether all was printed.
     """
     # Descriptors 0, 1 and 2 of closed streams are taken: else the next file that is opened gets
     # one of them, and what is printed is written into that file.
@@ -236,8 +245,8 @@ def lasting_streams() -> Iterator[Output]:
             stream or opened.enter_context(open(os.devnull, mode))  # noqa: PTH123
             for stream, mode in zip(before, "rww", strict=True)
         )
-        output = Output(stdout, is_missing=before[1] is None)
-        errors = Output(stderr, is_missing=before[2] is None)
+        output = SafeStream(stdout, is_missing=before[1] is None)
+        errors = SafeStream(stderr, is_missing=before[2] is None)
         for stream in (output, errors):
             reconfigure = getattr(stream, "reconfigure", None)
             if reconfigure is not None:
@@ -254,7 +263,8 @@ def lasting_streams() -> Iterator[Output]:
 def _format_commands(group: str, summaries: Mapping[str, str]) -> str:
     """Format the help of a group of commands, or of all: a line for each command, under titles.
 
-    ``group``: its first word, empty for all; ``summaries``: of the commands, by name.
+    ``group``: first word of its commands, empty for all; ``summaries``: a line about each command,
+    by name.
     """
     width = max(map(len, summaries)) + 2
     lines = [f"usage: depthpose {group or 'COMMAND'} ... [--help]", ""]
@@ -267,7 +277,10 @@ def _format_commands(group: str, summaries: Mapping[str, str]) -> str:
 
 
 def _run(words: list[str]) -> int:
-    """Read the words after ``depthpose`` as a command and its options, and call it."""
+    """Parse the words after ``depthpose`` as a command and its options, and call it.
+
+    Returns the exit code.
+    """
     if words in (["--version"], ["-V"]):
         return _print_version()
     lengths = range(_MAX_COMMAND_WORDS, 0, -1)
@@ -283,12 +296,12 @@ def _run(words: list[str]) -> int:
 
     module, _, function = COMMANDS[name][0].partition(":")
     command: Callable[..., int] = getattr(import_module(f"depthpose.cli.{module}"), function)
-    parse, options = arguments.parser_of(command)
+    parse, options = arguments.make_parser(command)
     try:
         parsed = tyro.cli(
             parse,
             prog=f"depthpose {name}",
-            description=arguments.description_of(command),
+            description=arguments.format_description(command),
             args=option_words,
             config=(tyro.conf.PositionalMetavarFromFieldName, tyro.conf.OmitArgPrefixes),
         )
@@ -302,20 +315,21 @@ def _run(words: list[str]) -> int:
 
 
 def _print_version() -> int:
-    """Print what a bug report needs: versions and devices."""
+    """Print what a bug report needs, versions and devices, and return the exit code."""
     from importlib.metadata import version  # not for --help, which it would double
 
-    from depthpose.cli.doctor import device_names
+    from depthpose.cli.doctor import list_device_names
 
     versions = f"torch {version('torch')}, Python {platform.python_version()}"
-    print(f"depthpose {__version__} ({versions}, {device_names()})")
+    print(f"depthpose {__version__} ({versions}, {list_device_names()})")
     return 0
 
 
 def _list_commands(words: Sequence[str]) -> int:
-    """List the commands of a group, or of all, where the words name no command; give the exit code.
+    """Print the commands of a group, or of all, where the words name no command.
 
-    An unknown group or command of a group is an error, with the nearest name.
+    An unknown group, or command of a group, is an error that names the nearest one. Returns the
+    exit code.
     """
     is_help = bool({"-h", "--help"} & set(words))
     group = words[0] if words and not words[0].startswith("-") else ""

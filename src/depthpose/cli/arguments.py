@@ -35,21 +35,21 @@ import tyro
 from depthpose.core.errors import InputError
 
 
-class _Names(Enum):
-    """The kinds of things that the value of an option may name."""
+class ValueKind(Enum):
+    """The kinds of values of options that are looked up before a command runs."""
 
     INPUT = "a file or folder that is read"
     NEW = "a file or folder that need not exist"
     WEIGHTS = "weights, by name or file"
 
 
-Source = Annotated[str, _Names.INPUT]
+Source = Annotated[str, ValueKind.INPUT]
 """A file, folder, pattern or URL that is read; a ``Path`` is a file or folder that is read."""
-NewPath = Annotated[Path, _Names.NEW]
+NewPath = Annotated[Path, ValueKind.NEW]
 """A file or folder that need not exist: it is written, or the command itself says it is missing."""
-NewPlace = Annotated[str, _Names.NEW]
+NewPlace = Annotated[str, ValueKind.NEW]
 """A folder or URL that is written."""
-WeightsName = Annotated[str, _Names.WEIGHTS]
+WeightsName = Annotated[str, ValueKind.WEIGHTS]
 """Weights, by name or file, or one of ``_NOT_WEIGHTS``."""
 
 _NOT_WEIGHTS = ("sgbm", "nothing", "register")
@@ -57,8 +57,10 @@ _NOT_WEIGHTS = ("sgbm", "nothing", "register")
 _PREFIXES = "^(both|sgbm|own|matched|quick|fine):"
 """Before the name of weights: how they are used."""
 _POSITIONAL = get_args(tyro.conf.Positional[int])[1]
+"""The mark of positional arguments in their types."""
 _PLACEHOLDERS = {Path: "PATH", str: "TEXT", int: "N", float: "NUMBER"}
 _EMPTY_DEFAULTS = ("", "None")
+"""Defaults that ``--help`` does not show."""
 _MAX_WIDTH = 100
 """Characters of a line of help; a wider terminal is not filled, for long lines are hard to read."""
 Config = TypeVar("Config", bound=Any)
@@ -78,43 +80,49 @@ Device = Annotated[str, shown_as(metavar="DEVICE", help="cpu, cuda, cuda:1, ..."
 class Option(NamedTuple):
     """An option of a command."""
 
-    parameter: str  #: of the command's function; that of a group is a dataclass of several options
-    name: str  #: with underscores
-    names: _Names | None  #: what its value names; None: neither a file nor weights
+    parameter: str  #: parameter of the command's function: the option, or the group it belongs to
+    name: str  #: its name, with underscores
+    kind: ValueKind | None  #: kind of its value; None: neither a file nor weights
 
 
 @cache  # a second call would annotate the fields of groups once more, and all later ones be slower
-def parser_of(
+def make_parser(
     command: Callable[..., int],
 ) -> tuple[Callable[..., BoundArguments], list[Option]]:
     """Make a function that tyro can parse options for, and list the options of a command.
 
     The function has the signature and docstring of the command, with types that say how ``--help``
-    shows them, and gives the arguments that the command is called with.
+    shows them. It returns the arguments that the command is called with.
     """
     hints = get_type_hints(command, include_extras=True)
-    shape = signature(command)
+    command_signature = signature(command)
     options: list[Option] = []
-    for parameter in shape.parameters.values():
+    for parameter in command_signature.parameters.values():
         if is_dataclass(parameter.default):
             group = type(parameter.default)
             types = get_type_hints(group, include_extras=True)
-            group.__annotations__, more = _with_help(types, parameter.name, _read_help_texts(group))
+            texts = _read_help_texts(group)
+            group.__annotations__, parameter_options = _with_help(types, parameter.name, texts)
         else:
             types = {parameter.name: hints[parameter.name]}
-            shown, more = _with_help(types, parameter.name, _read_help_texts(command))
-            hints |= shown
-        options += more
-    parameters = [p.replace(annotation=hints[name]) for name, p in shape.parameters.items()]
+            texts = _read_help_texts(command)
+            annotated, parameter_options = _with_help(types, parameter.name, texts)
+            hints |= annotated
+        options += parameter_options
+    parameters = [
+        parameter.replace(annotation=hints[name])
+        for name, parameter in command_signature.parameters.items()
+    ]
 
     def parse(*words: object, **options: object) -> BoundArguments:
-        return shape.bind(*words, **options)
+        """Bind parsed options to the parameters of the command."""
+        return command_signature.bind(*words, **options)
 
     function = unwrap(parse)  # tests wrap functions to check types, and tyro reads the inner one
     function.__doc__ = command.__doc__
     function.__module__ = command.__module__
     function.__annotations__ = hints
-    vars(function)["__signature__"] = shape.replace(parameters=parameters)
+    vars(function)["__signature__"] = command_signature.replace(parameters=parameters)
     return function, options
 
 
@@ -134,12 +142,12 @@ def _with_help(
     annotated: dict[str, Any] = {}
     options: list[Option] = []
     for name, hint in types.items():
-        placeholder, names = _choose_placeholder(hint)
+        placeholder, kind = _choose_placeholder(hint)
         marks = getattr(hint, "__metadata__", ())
         if any(hasattr(mark, "metavar") for mark in marks):  # the declaration has its own
             placeholder = None
         annotated[name] = Annotated[hint, shown_as(metavar=placeholder, help=texts.get(name))]
-        options.append(Option(parameter, name, names))
+        options.append(Option(parameter, name, kind))
     return annotated, options
 
 
@@ -158,8 +166,8 @@ def _read_help_texts(described: type | Callable[..., int]) -> dict[str, str]:
     return texts
 
 
-def description_of(command: Callable[..., int]) -> str:
-    """Give a command's docstring without its arguments, wrapped to the terminal's width.
+def format_description(command: Callable[..., int]) -> str:
+    """Format a command's docstring for ``--help``: without its arguments, as wide as the terminal.
 
     Lines are indented, since tyro joins those that begin with a letter; lines that the docstring
     indents (examples, lists) stay as they are.
@@ -173,47 +181,56 @@ def description_of(command: Callable[..., int]) -> str:
     return textwrap.indent("\n".join(wrapped), "  ")
 
 
-def _choose_placeholder(hint: Any) -> tuple[str | None, _Names | None]:  # noqa: ANN401  any type
-    """Choose the placeholder of a value in ``--help``, and tell what the value names.
+def _choose_placeholder(hint: Any) -> tuple[str | None, ValueKind | None]:  # noqa: ANN401  any type
+    """Choose the placeholder of a value in ``--help``, and find its kind, by its type.
 
-    The placeholder is None where tyro's own will do, the second None where it names nothing.
+    Returns:
+        The placeholder, None where tyro's own will do; and the kind, None where the value is
+        neither a file nor weights.
     """
     origin = get_origin(hint)
     parts = get_args(hint)
     if origin is Annotated:
-        names = next((mark for mark in parts if isinstance(mark, _Names)), None)
-        if names is None:
+        kind = next((mark for mark in parts if isinstance(mark, ValueKind)), None)
+        if kind is None:
             return None, _choose_placeholder(parts[0])[1]
-        placeholder = "NAME|FILE" if names is _Names.WEIGHTS else "PATH"
-        return None if _POSITIONAL in parts else placeholder, names
+        placeholder = "NAME|FILE" if kind is ValueKind.WEIGHTS else "PATH"
+        return None if _POSITIONAL in parts else placeholder, kind
     if origin in (Union, UnionType):
         return _choose_placeholder(next(part for part in parts if part is not NoneType))
     if origin is Literal:
         return f"{{{','.join(map(str, parts))}}}", None
     if origin in (tuple, list):
-        placeholder, names = _choose_placeholder(parts[0])
+        placeholder, kind = _choose_placeholder(parts[0])
         has_any_length = parts[1:] in ((), (...,))
         if placeholder is not None and has_any_length:
             placeholder = f"{placeholder} ..."
         elif placeholder is not None:
             placeholder = " ".join([placeholder] * len(parts))
-        return placeholder, names
-    return _PLACEHOLDERS.get(hint), _Names.INPUT if hint is Path else None
+        return placeholder, kind
+    return _PLACEHOLDERS.get(hint), ValueKind.INPUT if hint is Path else None
 
 
 def refuse_missing(options: Sequence[Option], values: Mapping[str, Any]) -> None:
     """Refuse paths and weights that do not exist.
 
-    ``values``: the arguments of the command by its parameters. Paths are looked up first, for
-    weights need torch, which is slow to load. Patterns and URLs are left to the command.
+    Paths are looked up first, for weights need torch, which is slow to load. Patterns and URLs are
+    left to the command.
+
+    Args:
+        options: options of the command.
+        values: arguments of the command, by its parameters.
+
+    Raises:
+        InputError: one does not exist.
     """
-    with_paths = [option for option in options if option.names in (_Names.INPUT, _Names.NEW)]
+    with_paths = [option for option in options if option.kind in (ValueKind.INPUT, ValueKind.NEW)]
     for option in with_paths:
         for word in _list_words(option, values):
             if not any(mark in word for mark in ("://", *"*?[{")):
-                _refuse_missing_path(word, must_exist=option.names is _Names.INPUT)
+                _refuse_missing_path(word, must_exist=option.kind is ValueKind.INPUT)
     for option in options:
-        if option.names is _Names.WEIGHTS:
+        if option.kind is ValueKind.WEIGHTS:
             for word in _list_words(option, values):
                 _refuse_missing_weights(word)
 
@@ -262,6 +279,6 @@ def refuse_below(least: int, option: str, value: int, usual: str) -> None:
         raise InputError(f"{option} {value}: give {least} or more, such as {usual}")
 
 
-def replace_given(config: Config, **values: object) -> Config:
+def replace_unless_none(config: Config, **values: object) -> Config:
     """Return a copy of a config with other values; a value of None leaves its setting as it is."""
     return replace(config, **{name: value for name, value in values.items() if value is not None})

@@ -2,7 +2,6 @@
 
 import re
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import tyro
@@ -18,7 +17,7 @@ def predict_depth(
     out: NewPlace,
     lens: options.LensOptions = options.LensOptions(),
     output: options.PredictOutput = options.PredictOutput(),
-    networks: options.ImageNetworks = options.ImageNetworks(),
+    networks: options.ImageNetworkOptions = options.ImageNetworkOptions(),
     matching: options.MatcherOptions = options.MatcherOptions(),
     scale: options.ScaleOptions = options.ScaleOptions(),
     engine: EngineOptions = EngineOptions(),
@@ -38,22 +37,14 @@ def predict_depth(
         images: images, folders of them, quoted patterns such as 'left/*.png', or videos.
         out: folder for the results.
     """
-    from depthpose.cli import depth_predict
+    from depthpose.cli import depth_inputs, depth_predict
+    from depthpose.cli.depth_methods import DepthNetworkSpec
 
     if not images:
         raise InputError("name images, folders of them, patterns or videos to predict from")
-    near, far = output.color_range
-    height_m = scale.camera_height
-    tilt_deg = scale.camera_tilt
-    if not 0 < near < far:
-        raise InputError(f"--color-range {near, far}: give near and far metres, near first.")
-    if output.batch < 1:
-        raise InputError(f"--batch {output.batch}: give 1 or more images.")
-    if height_m is not None and not 0.1 <= height_m <= 20:
-        raise InputError(f"--camera-height {height_m:g}: give 0.1 to 20 metres")
-    if tilt_deg is not None and not -45 <= tilt_deg <= 45:
-        raise InputError(f"--camera-tilt {tilt_deg:g}: give -45 to 45 degrees")
-    source = depth_predict.DepthMethodSource(
+    output.refuse_unusable()
+    scale.refuse_unusable()
+    spec = DepthNetworkSpec(
         weights=networks.weights,
         config=matching.config,
         with_right=False,
@@ -65,25 +56,27 @@ def predict_depth(
 
     # By workers of a cluster, to which the weights travel.
     if engine.engine == "ray":
-        packed = source.with_packed_weights()
-        make_work = partial(depth_predict.image_work, lens, scale, output, packed)
-        return depth_predict.predict_depth_on_ray(
-            images, depth_predict.IMAGES, make_work, out, engine
-        )
+        packed = spec.with_packed_weights()
+        inputs = depth_predict.find_inputs_for_ray(images, depth_inputs.IMAGES)
+        with inputs.first() as first_image:
+            camera = depth_inputs.read_lens(lens, first_image)
+        reader = depth_inputs.InputReader(camera=camera, scale=scale)
+        worker = depth_predict.DepthWorker(spec=packed, reader=reader, output=output)
+        return depth_predict.predict_depth_on_ray(inputs, worker, out, engine)
 
     # In this process.
-    paths = depth_predict.list_sources(images, Path(out))
-    work = depth_predict.image_work(lens, scale, output, source, paths)
-    method = source.build()
+    paths = depth_inputs.list_images_and_videos(images, Path(out))
+    camera = depth_inputs.read_lens(lens, paths)
+    reader = depth_inputs.InputReader(camera=camera, scale=scale)
+    method = spec.build()
     has_matcher_options = matching.precision != "fp32" or matching.max_memory is not None
     if method.settings.get("answer") == "own" and has_matcher_options:
         raise InputError(
             "--precision and --max-memory are for a matcher with weights, and none runs here; "
             "leave them out"
         )
-    return depth_predict.predict_depth_of_files(
-        [(path,) for path in paths], work, method, Path(out)
-    )
+    sources = [(path,) for path in paths]
+    return depth_predict.predict_depth_of_files(sources, method, reader, output, Path(out))
 
 
 def match_pairs(
@@ -92,8 +85,8 @@ def match_pairs(
     *,
     camera: Path,
     out: NewPlace,
-    pairs: options.PairNetworks = options.PairNetworks(),
-    matching: options.MatchOptions = options.MatchOptions(),
+    pairs: options.DepthMatchOptions = options.DepthMatchOptions(),
+    matching: options.PairMatcherOptions = options.PairMatcherOptions(),
     engine: EngineOptions = EngineOptions(),
 ) -> int:
     """Match real stereo pairs to metric depth.
@@ -113,42 +106,50 @@ def match_pairs(
             KITTI and others; for ROS and OpenCV also a folder with both cameras' files.
         out: folder for the results.
     """
-    from depthpose.cli import depth_predict
+    from depthpose.cli import depth_inputs, depth_predict
+    from depthpose.cli.depth_methods import make_pair_spec
+    from depthpose.core.camera import read_rig
+    from depthpose.core.files import image_size
     from depthpose.core.files.images import refuse_among_inputs
 
-    weights = None if pairs.matcher == "sgbm" else pairs.matcher or pairs.weights
+    output = options.PredictOutput(cloud=pairs.cloud, min_confidence=pairs.min_confidence)
     config = replace(
         matching.config,
         with_left_right_check=matching.left_right_check,
         max_disparity_px=matching.max_disparity,
     )
-    source = depth_predict.DepthMethodSource(
-        weights=weights, config=config, with_right=True, use="pairs"
-    )
+    spec = make_pair_spec(pairs.matcher, pairs.weights, config)
 
     # By workers of a cluster, to which the weights travel.
     if engine.engine == "ray":
-        packed = source.with_packed_weights()
-        make_work = partial(depth_predict.pair_work, camera, pairs, packed)
+        packed = spec.with_packed_weights()
         sides = [left] if right is None else [left, right]
-        return depth_predict.predict_depth_on_ray(
-            sides, depth_predict.PAIRS, make_work, out, engine
+        inputs = depth_predict.find_inputs_for_ray(sides, depth_inputs.PAIRS)
+        with inputs.first() as first_pair:
+            rig = read_rig(camera, image_size(first_pair[0]))
+        reader = depth_inputs.InputReader(camera=rig, files=depth_inputs.PAIRS)
+        worker = depth_predict.DepthWorker(
+            spec=packed, reader=reader, output=output, with_check=pairs.check
         )
+        return depth_predict.predict_depth_on_ray(inputs, worker, out, engine)
 
     # In this process.
     if right is None:
         raise InputError(f"{left}: there is no right image beside it; give it second")
-    files = depth_predict.list_pairs(left, right)
+    files = depth_inputs.list_pairs(left, right)
     refuse_among_inputs(Path(out), (left, right), [path for pair in files for path in pair])
-    work = depth_predict.pair_work(camera, pairs, source, files[0])
-    return depth_predict.predict_depth_of_files(files, work, source.build(), Path(out))
+    rig = read_rig(camera, image_size(files[0][0]))
+    reader = depth_inputs.InputReader(camera=rig, files=depth_inputs.PAIRS)
+    return depth_predict.predict_depth_of_files(
+        files, spec.build(), reader, output, Path(out), with_check=pairs.check
+    )
 
 
 def evaluate_depth(
     data: Path,
     out: NewPath,
     split: str | None = None,
-    methods: options.MethodOptions = options.MethodOptions(),
+    methods: options.DepthMethodOptions = options.DepthMethodOptions(),
     comparison: options.ProtocolOptions = options.ProtocolOptions(),
     matching: options.MatcherOptions = options.MatcherOptions(),
 ) -> int:
@@ -169,7 +170,7 @@ def evaluate_depth(
     """
     from depthpose.cli.depth_evaluate import (
         choose_methods,
-        measure,
+        measure_and_report,
         measure_shards,
         open_frames,
         predict_depth_of_dataset,
@@ -211,7 +212,7 @@ def evaluate_depth(
     predictions = methods.predictions
     if predictions is not None and stores.exists(stores.join(predictions, PLAN)):
         of_shards = measure_shards(dataset, predictions, protocol, caps_m)
-        return measure(dataset, folders, protocol, caps_m, out, [of_shards])
+        return measure_and_report(dataset, folders, protocol, caps_m, out, [of_shards])
     if predictions is not None:
         folders.append(Path(predictions))
-    return measure(dataset, folders, protocol, caps_m, out)
+    return measure_and_report(dataset, folders, protocol, caps_m, out)

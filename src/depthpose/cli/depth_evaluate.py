@@ -1,4 +1,4 @@
-"""The work behind ``depthpose depth evaluate``."""
+"""The stages of ``depthpose depth evaluate``: methods, their predictions, and the measurement."""
 
 import hashlib
 import sys
@@ -11,8 +11,8 @@ from typing import Any, cast, get_args
 
 from tqdm import tqdm
 
-from depthpose.cli.depth_options import MethodOptions
-from depthpose.cli.depth_predict import DepthMethod, DepthMethodSource
+from depthpose.cli.depth_methods import DepthMethod, DepthNetworkSpec, SGBMSpec
+from depthpose.cli.depth_options import DepthMethodOptions
 from depthpose.core import engine
 from depthpose.core.errors import InputError
 from depthpose.core.run import describe_environment, find_rank, read_settings, wait_for
@@ -43,7 +43,7 @@ _COLUMNS_OF_METHOD = ("method", "input", "speed", "weights", "protocol", "datase
 
 
 def open_frames(data: Path, split: str | None) -> Dataset:
-    """Open the dataset, and print its name, number of frames and layout."""
+    """Open a dataset, or a split of it, and print its name, number of frames and layout."""
     dataset = open_dataset(data, split)
     print(f"{dataset.name}: {len(dataset)} frames, layout {dataset.layout}")
     return dataset
@@ -54,58 +54,76 @@ def predict_depth_of_dataset(
 ) -> Path:
     """Predict every frame that has truth, and a right view if the method needs it.
 
-    Of several processes each predicts its share, and the first waits for the files of all. Gives
-    the folder of the method's files, ``FOLDER/METHOD``.
+    Of several processes each predicts its share, and the first waits for the files of all.
+
+    Args:
+        dataset: the frames.
+        method: estimates their depth.
+        rule: protocol by which the truth is read.
+        folder: folder of the predictions of all methods.
+
+    Returns:
+        The folder of the method's predictions, ``FOLDER/METHOD``.
     """
     process = find_rank()
-    home = folder / method.name
-    usable = [
-        (i, frame)
-        for i, frame in enumerate(dataset.frames)
-        if has_truth(frame, rule) and (frame.right is not None or not method.with_right)
-    ]
+    method_folder = folder / method.name
+    usable: list[int] = []
+    sources: dict[str, list[Path]] = {}
+    for index, frame in enumerate(dataset.frames):
+        has_views = frame.right is not None or not method.with_right
+        if has_views and has_truth(frame, rule):
+            usable.append(index)
+            sources[frame.name] = frame.seen_files(with_right=method.with_right)
 
-    def read(index: int) -> StereoInput:
-        """Read a frame as the method may see it: without the right view for depth of one image."""
-        pair = dataset.read_input(index)
-        return pair if method.with_right else replace(pair, right=None)
-
-    share = process.share_of(usable)
-    jobs = [Job(name=frame.name, read=partial(read, i)) for i, frame in share]
-    sources = {f.name: f.list_input_files(with_right=method.with_right) for _, f in usable}
-    net = _UncheckedNet(method.net) if isinstance(method.net, FakestereoNet) else method.net
-    written = estimate_missing_depth(net, jobs, home, method.settings, sources)
-    for _ in tqdm(written, method.name, total=len(jobs), disable=None, unit=" frames"):
-        pass
+    jobs: list[Job[StereoInput]] = []
+    for index in process.share_of(usable):
+        read = partial(_read_views, dataset, index, with_right=method.with_right)
+        jobs.append(Job(name=dataset.frames[index].name, read=read))
+    estimator = method.estimator
+    if isinstance(estimator, FakestereoNet):
+        estimator = _UncheckedNet(estimator)
+    names = estimate_missing_depth(estimator, jobs, method_folder, method.settings, sources)
+    for _ in tqdm(names, method.name, total=len(jobs), disable=None, unit=" frames"):
+        pass  # each frame is estimated and written as its name is asked for
     if process.rank == 0:
-        wait_for(list(sources), partial(is_finished, home))
-    return home
+        wait_for(list(sources), partial(is_finished, method_folder))
+    return method_folder
+
+
+def _read_views(dataset: Dataset, index: int, *, with_right: bool) -> StereoInput:
+    """Read the views of a frame that a method may see: of depth of one image the left alone."""
+    pair = dataset.read_input(index)
+    return pair if with_right else replace(pair, right=None)
 
 
 @dataclass(frozen=True)
 class _UncheckedNet:
-    """A network that refuses no pair, for a measurement counts all of them."""
+    """A network that refuses no pair, since a measurement counts all of them."""
 
     net: FakestereoNet
 
     def estimate_input(self, pair: StereoInput, /) -> DepthEstimate:
+        """Estimate depth of one input without a check of the pair."""
         return self.net.estimate_input(pair, with_check=False)
 
 
 def choose_methods(
-    options: MethodOptions, config: MatcherConfig, dataset: Dataset
+    options: DepthMethodOptions, config: MatcherConfig, dataset: Dataset
 ) -> list[DepthMethod]:
     """Build the methods that are measured: SGBM, weights and baselines, in this order.
+
+    Args:
+        options: names of the methods.
+        config: how networks run.
+        dataset: the frames that are measured.
 
     Raises:
         InputError: two have one name, or one needs a right view that no frame has.
     """
     chosen: list[DepthMethod] = []
     if options.matcher == "sgbm":
-        is_filled = options.holes == "fill"
-        sgbm = DepthMethodSource(weights=None, config=config, with_filled_holes=is_filled)
-        chosen.append(sgbm.build())
-    chosen += [named_method(name, config) for name in options.weights]
+        chosen.append(SGBMSpec(with_filled_holes=options.holes == "fill").build())
+    chosen += [build_network_method(word, config) for word in options.weights]
 
     # Their predictions need folders of different names, and their inputs must be there.
     names = [method.name for method in chosen]
@@ -124,18 +142,18 @@ def choose_methods(
         )
     if options.baseline:
         training = open_training(options.train, options.train_without, dataset)
-        chosen += [baseline_method(name, training) for name in dict.fromkeys(options.baseline)]
+        chosen += [fit_baseline(name, training) for name in dict.fromkeys(options.baseline)]
     return chosen
 
 
-def named_method(word: str, config: MatcherConfig) -> DepthMethod:
+def build_network_method(word: str, config: MatcherConfig) -> DepthMethod:
     """Build the method of weights by file or name, perhaps with a prefix that says how they run.
 
     ``own:`` and ``matched:`` say what depth of one image comes from, ``sgbm:`` lets OpenCV match
     the synthesised view; ``both:`` matches real pairs, ``quick:`` and ``fine:`` at that speed.
     """
     prefix, _, name = word.rpartition(":")
-    mono = DepthMethodSource(weights=name, config=config, with_right=False)
+    mono = DepthNetworkSpec(weights=name, config=config, with_right=False)
     stereo = replace(mono, with_right=True)
     if prefix in get_args(Answer):
         return replace(mono, answer=cast("Answer", prefix)).build()
@@ -147,11 +165,11 @@ def named_method(word: str, config: MatcherConfig) -> DepthMethod:
         method = replace(stereo, config=replace(config, speed=prefix)).build()
         return method._replace(name=f"{method.name}-{prefix}")
     # No prefix; a colon may be one of the path, as in C:/weights.safetensors.
-    return DepthMethodSource(weights=word, config=config).build()
+    return DepthNetworkSpec(weights=word, config=config).build()
 
 
-def baseline_method(name: BaselineName, training: Dataset) -> DepthMethod:
-    """Fit a baseline to the truth of training frames."""
+def fit_baseline(name: BaselineName, training: Dataset) -> DepthMethod:
+    """Fit a baseline to the truth of training frames, and return it as a method."""
     classes = {"rows": RowDepthBaseline, "nearest": NearestImageBaseline}
     names = "\n".join(frame.name for frame in training.frames)
     settings = {
@@ -161,13 +179,22 @@ def baseline_method(name: BaselineName, training: Dataset) -> DepthMethod:
         "train_frames": len(training),
         "train_sha256": hashlib.sha256(names.encode()).hexdigest(),
     }
-    show = partial(tqdm, desc=f"fit {name}", unit=" frames", disable=None)
-    net = classes[name].fit(training, show)
-    return DepthMethod(f"baseline-{name}", net, settings, with_right=False)
+    with_progress = partial(tqdm, desc=f"fit {name}", unit=" frames", disable=None)
+    baseline = classes[name].fit(training, with_progress)
+    return DepthMethod(f"baseline-{name}", baseline, settings, with_right=False)
 
 
 def open_training(folders: Sequence[Path], without: Sequence[str], measured: Dataset) -> Dataset:
-    """Open the frames that a baseline is fitted to, none of which may be measured."""
+    """Open the frames that a baseline is fitted to.
+
+    Args:
+        folders: datasets, which are joined.
+        without: names of frames to leave out.
+        measured: the frames that are measured.
+
+    Raises:
+        InputError: no folder is given, or a training frame is measured too.
+    """
     if not folders:
         raise InputError(
             "a baseline is fitted to training frames: give --train FOLDER, or several."
@@ -178,7 +205,7 @@ def open_training(folders: Sequence[Path], without: Sequence[str], measured: Dat
     return training
 
 
-def measure(
+def measure_and_report(
     dataset: Dataset,
     folders: Sequence[Path],
     protocol: str,
@@ -188,47 +215,40 @@ def measure(
 ) -> int:
     """Measure folders of predictions, write rows, a table and a page, and print the table.
 
-    Of several processes the first does it. Gives the exit code.
+    Of several processes the first does it. Returns the exit code.
 
     Args:
         dataset: frames with truth.
-        folders: predictions of a method each.
-        protocol: name of it.
+        folders: the folder of each method's predictions.
+        protocol: name of the protocol.
         caps_m: truth beyond a cap does not count; a row for each.
         out: folder of the files.
         further: evaluations that exist already; their rows come last.
     """
     if find_rank().rank > 0:
         return 0
-    evaluations = measure_each(dataset, folders, protocol, caps_m)
-    measured = join([*evaluations, *further])
+    evaluations = measure_folders(dataset, folders, protocol, caps_m)
+    measured = join_evaluations([*evaluations, *further])
     rows = [row.columns() for row in measured.rows]
     page.write_table(out, rows)
 
-    # Numbers of pairs without a calibration compare with no others.
     text = f"{protocol}: {PROTOCOLS[protocol].summary}."
-    uncalibrated = sum(
-        frame.right is not None and not frame.calibration for frame in dataset.frames
-    )
-    if uncalibrated:
-        message = (
-            f"{uncalibrated} of {len(dataset)} pairs have no calibration, so a network matches "
-            "them at their own focal length, not at the one it knows: compare no numbers with "
-            "those of frames that have one (KITTI 2015 has calib_cam_to_cam in a download of its "
-            "own)"
-        )
-        print(f"depthpose: {message}", file=sys.stderr)
-        text += f" {message}."
+    advice = _advise_on_calibration(dataset)
+    if advice is not None:
+        print(f"depthpose: {advice}", file=sys.stderr)
+        text += f" {advice}."
 
     # The page: the table, then the best and the worst frames of each method.
     view_counts = page.share_views(len(folders))
     frame_sections: list[Section] = []
     for folder, evaluation, count in zip(folders, evaluations, view_counts, strict=True):
-        frame_sections += _show_frames(dataset, folder, evaluation.per_frame, protocol, count)
+        frame_sections += _make_frame_sections(
+            dataset, folder, evaluation.per_frame, protocol, count
+        )
     sections = [
         Section(title="Mean over frames", text=text, rows=rows),
         *frame_sections,
-        *write_details(measured, out),
+        *write_detail_tables(measured, out),
     ]
     title = f"{protocol} on {dataset.name}"
     page.write_page(out / "report.html", title, sections, describe_environment())
@@ -243,21 +263,43 @@ def measure(
     return 0
 
 
-def _show_frames(
+def _advise_on_calibration(dataset: Dataset) -> str | None:
+    """Advise that numbers of pairs without a calibration compare with no others; None: all have."""
+    uncalibrated_count = sum(
+        frame.right is not None and not frame.calibration for frame in dataset.frames
+    )
+    if not uncalibrated_count:
+        return None
+    return (
+        f"{uncalibrated_count} of {len(dataset)} pairs have no calibration, so a network matches "
+        "them at their own focal length, not at the one it knows: compare no numbers with "
+        "those of frames that have one (KITTI 2015 has calib_cam_to_cam in a download of its "
+        "own)"
+    )
+
+
+def _make_frame_sections(
     dataset: Dataset,
     folder: Path,
     per_frame: Sequence[EvaluationRow],
     protocol: str,
     max_count: int,
 ) -> list[Section]:
-    """Show the worst, the median and the best frame of a method, by AbsRel or EPE at the first cap.
+    """Make sections of the worst, the median and the best frame of a method.
 
-    ``per_frame``: rows of the method; ``max_count``: most frames that are shown.
+    Frames are ranked by AbsRel, or by EPE where disparity is measured, at the first cap.
+
+    Args:
+        dataset: the frames.
+        folder: the method's predictions.
+        per_frame: the method's rows of frames.
+        protocol: name of the protocol.
+        max_count: most frames that are shown.
     """
     cap_m = per_frame[0].cap_m
     rows_at_cap = [row for row in per_frame if row.cap_m == cap_m and row.pixels]
     metric = METRICS[RANKING["disparity" if cap_m is None else "depth"]]
-    sign = 1 if metric.better == "lower" else -1
+    sign = 1 if metric.better == "lower" else -1  # so that a larger value is a larger error
 
     # Words for the text of each section.
     cap_text = "" if cap_m is None else f", truth up to {cap_m:g} m"
@@ -279,39 +321,48 @@ def _show_frames(
             error=error,
         )
         columns = {
-            name: value for name, value in row.columns().items() if name not in _COLUMNS_OF_METHOD
+            name: cell for name, cell in row.columns().items() if name not in _COLUMNS_OF_METHOD
         }
         sections.append(replace(section, rows=[columns]))
     return sections
 
 
-def measure_each(
+def measure_folders(
     dataset: Dataset, folders: Sequence[Path], protocol: str, caps_m: Sequence[float]
 ) -> list[Evaluation]:
-    """Measure folders of predictions one by one; each row names its origin."""
-    show = partial(tqdm, unit=" frames", disable=None)
+    """Measure folders of predictions one by one; the rows say which method made them.
+
+    Args:
+        dataset: frames with truth.
+        folders: the folder of each method's predictions.
+        protocol: name of the protocol.
+        caps_m: truth beyond a cap [m] does not count; a row for each.
+    """
+    with_progress = partial(tqdm, unit=" frames", disable=None)
     evaluations: list[Evaluation] = []
     for folder in folders:
-        evaluation = evaluate(dataset, folder, protocol, caps_m, show)
-        evaluations.append(with_source(evaluation, folder.name, read_settings(folder)))
+        evaluation = evaluate(dataset, folder, protocol, caps_m, with_progress)
+        evaluations.append(with_origin(evaluation, folder.name, read_settings(folder)))
     return evaluations
 
 
-def with_source(evaluation: Evaluation, name: str, settings: dict[str, Any] | None) -> Evaluation:
+def with_origin(evaluation: Evaluation, name: str, settings: dict[str, Any] | None) -> Evaluation:
     """Return an evaluation whose rows say which method, weights and input made the predictions.
 
-    ``settings``: those of the run that made them; None of files by other software, whose method is
-    ``name`` then.
+    Args:
+        evaluation: of the predictions of one method.
+        name: name of the method where there are no settings.
+        settings: those of the run that made the predictions; None: other software made them.
     """
     settings = settings or {"matcher": name, "input": ""}
     # Only runs that may take one image record their input: a matcher always has both views.
-    view = settings.get("input", "both views")
+    views = settings.get("input", "both views")
     method = settings.get("matcher", "")
     if "with_filled_holes" in settings:  # OpenCV's matcher ran; no other has holes
         method += " (holes filled)" if settings["with_filled_holes"] else " (matched pixels)"
-    source = {
+    origin = {
         "method": method,
-        "input": view,
+        "input": views,
         "speed": settings.get("speed", ""),
         "weights": settings.get("weights", ""),
     }
@@ -319,13 +370,13 @@ def with_source(evaluation: Evaluation, name: str, settings: dict[str, Any] | No
     sha256 = settings.get("weights_sha256", "")[:12]
     return replace(
         evaluation,
-        rows=[replace(row, weights_sha256=sha256, **source) for row in evaluation.rows],
-        per_frame=[replace(row, **source) for row in evaluation.per_frame],
-        deciles=[replace(row, **source) for row in evaluation.deciles],
+        rows=[replace(row, weights_sha256=sha256, **origin) for row in evaluation.rows],
+        per_frame=[replace(row, **origin) for row in evaluation.per_frame],
+        deciles=[replace(row, **origin) for row in evaluation.deciles],
     )
 
 
-def join(evaluations: Sequence[Evaluation]) -> Evaluation:
+def join_evaluations(evaluations: Sequence[Evaluation]) -> Evaluation:
     """Join the rows of several evaluations into one."""
     return Evaluation(
         rows=[row for evaluation in evaluations for row in evaluation.rows],
@@ -339,8 +390,8 @@ def join(evaluations: Sequence[Evaluation]) -> Evaluation:
     )
 
 
-def write_details(measured: Evaluation, out: Path) -> list[Section]:
-    """Write tables of frames and of the error by confidence; give the sections that show them."""
+def write_detail_tables(measured: Evaluation, out: Path) -> list[Section]:
+    """Write tables of frames and of the error by confidence; return the sections that show them."""
     frames = [row.columns() for row in measured.per_frame]
     deciles = [row.columns() for row in measured.deciles]
     page.write_table(out, frames, name="frames")
@@ -362,7 +413,14 @@ def write_details(measured: Evaluation, out: Path) -> list[Section]:
 def measure_shards(
     dataset: Dataset, predictions: str, protocol: str, caps_m: Sequence[float]
 ) -> Evaluation:
-    """Measure shards of predictions (a folder or URL), one after the other, frame by frame."""
+    """Measure shards of predictions, which an engine wrote, frame by frame.
+
+    Args:
+        dataset: frames with truth.
+        predictions: folder or URL of the shards.
+        protocol: name of the protocol.
+        caps_m: truth beyond a cap [m] does not count; a row for each.
+    """
     name = PurePosixPath(predictions).stem
     settings = read_settings(predictions)
     index_of = {frame.name: index for index, frame in enumerate(dataset.frames)}
@@ -376,8 +434,9 @@ def measure_shards(
                     path = Path(folder) / f"{frame}.{ending}"
                     path.parent.mkdir(parents=True, exist_ok=True)
                     path.write_bytes(content)
-                index = index_of[frame]
-                measured[frame] = measure_frame(dataset, index, Path(folder), protocol, caps_m)
+                measured[frame] = measure_frame(
+                    dataset, index_of[frame], Path(folder), protocol, caps_m
+                )
 
     # Frames without a prediction: those without truth are skipped, others are an error.
     with tempfile.TemporaryDirectory() as empty_folder:
@@ -386,4 +445,4 @@ def measure_shards(
                 measured[frame] = measure_frame(
                     dataset, index, Path(empty_folder), protocol, caps_m
                 )
-    return with_source(summarise(dataset, protocol, measured), name, settings)
+    return with_origin(summarise(dataset, protocol, measured), name, settings)

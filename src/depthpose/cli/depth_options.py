@@ -10,17 +10,24 @@ from depthpose.cli.arguments import Device, Source, WeightsName, shown_as
 from depthpose.core.errors import InputError
 from depthpose.depth.config import COLOR_RANGE_M, Answer, BaselineName, MatcherConfig, Speed
 
+_SIZE = re.compile(
+    r"\s*(?P<number>\d+(?:\.\d+)?)\s*(?P<prefix>[KMGT]?)(?P<binary>i?)B?\s*", re.IGNORECASE
+)
 _EXPONENTS = {"": 0, "K": 1, "M": 2, "G": 3, "T": 4}
 """Exponents of 1000, or of 1024, by the prefix of a size in bytes."""
+_MIN_HEIGHT_M = 0.1
+_MAX_HEIGHT_M = 20.0
+_MAX_TILT_DEG = 45.0
+"""Heights and tilts of cameras that see a road; beyond them a unit or sign is wrong."""
 
 
 def _parse_bytes(text: str) -> int:
-    """Parse ``--max-memory``, such as 1GB, 800M or 1500000 bytes; GiB and the like are of 1024."""
-    size = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)(i?)B?\s*", text, re.IGNORECASE)
-    if size is None or (size[3] and not size[2]) or not float(size[1]):
+    """Parse ``--max-memory`` to bytes: 1GB, 800M or 1500000; GiB and the like are of 1024."""
+    size = _SIZE.fullmatch(text)
+    if size is None or (size["binary"] and not size["prefix"]) or not float(size["number"]):
         raise InputError(f"--max-memory {text!r}: not a size. Write, say, 1GB, 800MB or 1.5GiB.")
-    base = 1024 if size[3] else 1000
-    return int(float(size[1]) * base ** _EXPONENTS[size[2].upper()])
+    base = 1024 if size["binary"] else 1000
+    return int(float(size["number"]) * base ** _EXPONENTS[size["prefix"].upper()])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +45,7 @@ class MatcherOptions:
 
     @property
     def config(self) -> MatcherConfig:
-        """Settings of the networks."""
+        """The settings of the networks that these options stand for."""
         return MatcherConfig(
             device=self.device,
             precision=self.precision,
@@ -77,8 +84,28 @@ class ScaleOptions:
     """X,Y,METRES: column and row of a pixel and its measured depth along the optical axis, which
     sets the scale of each image."""
 
+    def refuse_unusable(self) -> None:
+        """Refuse heights and tilts that no camera over a road has."""
+        height_m = self.camera_height
+        tilt_deg = self.camera_tilt
+        if height_m is not None and not _MIN_HEIGHT_M <= height_m <= _MAX_HEIGHT_M:
+            raise InputError(
+                f"--camera-height {height_m:g}: give {_MIN_HEIGHT_M:g} to {_MAX_HEIGHT_M:g} metres"
+            )
+        if tilt_deg is not None and not -_MAX_TILT_DEG <= tilt_deg <= _MAX_TILT_DEG:
+            raise InputError(
+                f"--camera-tilt {tilt_deg:g}: give -{_MAX_TILT_DEG:g} to {_MAX_TILT_DEG:g} degrees"
+            )
+
     def parse_known_distance(self) -> tuple[float, float, float]:
-        """Parse ``--known-distance``: column and row [px] of a pixel, and its depth [m]."""
+        """Parse ``--known-distance``, which must be set.
+
+        Returns:
+            Column and row [px] of a pixel, and its depth [m].
+
+        Raises:
+            InputError: the option holds no three numbers.
+        """
         assert self.known_distance is not None
         try:
             column, row, metres = (float(word) for word in self.known_distance.split(","))
@@ -90,7 +117,7 @@ class ScaleOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MatchOptions(MatcherOptions):
+class PairMatcherOptions(MatcherOptions):
     """The settings by which the matcher of the weights runs; sgbm takes none of these."""
 
     left_right_check: bool = False
@@ -101,7 +128,7 @@ class MatchOptions(MatcherOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PairNetworks:
+class DepthMatchOptions:
     """The matcher of real pairs, their check, and the clouds that are written."""
 
     cloud: bool = False
@@ -118,7 +145,7 @@ class PairNetworks:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImageNetworks:
+class ImageNetworkOptions:
     """The networks that answer depth of one image."""
 
     weights: WeightsName = "default"
@@ -146,6 +173,16 @@ class PredictOutput:
     batch: int = 1
     """images of one size that go through the networks together: for a GPU."""
 
+    def refuse_unusable(self) -> None:
+        """Refuse colours whose depths are not in their order, and a batch without an image."""
+        near_m, far_m = self.color_range
+        if not 0 < near_m < far_m:
+            raise InputError(
+                f"--color-range {near_m, far_m}: give near and far metres, near first."
+            )
+        if self.batch < 1:
+            raise InputError(f"--batch {self.batch}: give 1 or more images.")
+
     def __post_init__(self) -> None:
         if not 0 <= self.min_confidence <= 1:
             raise InputError(
@@ -155,7 +192,7 @@ class PredictOutput:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MethodOptions:
+class DepthMethodOptions:
     """The methods that are measured; several share one table."""
 
     weights: tuple[WeightsName, ...] = ()

@@ -42,24 +42,21 @@ def doctor(files: tyro.conf.Positional[tuple[NewPath, ...]] = ()) -> int:
     from depthpose.core.checkpoint import SHIPPED
     from depthpose.core.run import describe_environment
 
-    for name, value in {
-        **describe_environment(),
-        "device": device_names(),
-        "weights in": SHIPPED,
-    }.items():
+    facts = {**describe_environment(), "device": list_device_names(), "weights in": SHIPPED}
+    for name, value in facts.items():
         print(f"{name}: {value}")
-    for extra, packages in _missing_packages().items():
+    for extra, packages in _find_missing_packages().items():
         outcome = f"lacks {', '.join(packages)}" if packages else "installed"
         print(f"extra {extra}: {outcome}")
     print(f"another extra: {install_command('EXTRA')}")
     for path in sorted(SHIPPED.glob("*.safetensors")):
         print(f"weights {path.stem}: {_describe_weights(path)}")
-    works = [_run_trial("depth", _try_depth), _run_trial("pose", _try_pose)]
-    return 0 if all(works) else 1
+    has_worked = [_run_trial("depth", _try_depth), _run_trial("pose", _try_pose)]
+    return 0 if all(has_worked) else 1
 
 
-def _missing_packages() -> dict[str, list[str]]:
-    """List the packages that are not installed, by extra; empty for an extra that is whole."""
+def _find_missing_packages() -> dict[str, list[str]]:
+    """List the packages of each extra that are not installed; none for an extra that is whole."""
     missing: dict[str, list[str]] = {}
     for line in metadata.requires("depthpose") or ():
         requirement = _REQUIREMENT.match(line)
@@ -76,7 +73,7 @@ def _missing_packages() -> dict[str, list[str]]:
 
 
 def _describe_weights(path: Path) -> str:
-    """Give the kind and the licence of weights, or why they cannot be read."""
+    """Describe weights by their kind and licence, or by why they cannot be read."""
     from depthpose.core.checkpoint import read_checkpoint
 
     try:
@@ -87,7 +84,7 @@ def _describe_weights(path: Path) -> str:
 
 
 def _run_trial(name: str, trial: Callable[[], str]) -> bool:
-    """Run an estimate and print its outcome or its error; give whether it worked."""
+    """Run a trial, print its outcome or its error, and return whether it worked."""
     start = perf_counter()
     try:
         outcome = trial()
@@ -98,7 +95,7 @@ def _run_trial(name: str, trial: Callable[[], str]) -> bool:
     return True
 
 
-def device_names() -> str:
+def list_device_names() -> str:
     """List the GPUs that torch has, or the processor where there are none."""
     import torch
 
@@ -107,7 +104,7 @@ def device_names() -> str:
 
 
 def _try_depth() -> str:
-    """Match a synthetic pair of known disparity; give the outcome.
+    """Match a synthetic pair of known disparity, and describe the outcome.
 
     Raises:
         RuntimeError: the match is more than a pixel off.
@@ -131,7 +128,7 @@ def _try_depth() -> str:
 
 
 def _try_pose() -> str:
-    """Pose a part in a synthetic view; give the outcome.
+    """Pose a part in a synthetic view, and describe the outcome.
 
     Raises:
         RuntimeError: the part is refused, or off by more than a tenth of its diameter.

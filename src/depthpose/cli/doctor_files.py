@@ -42,26 +42,33 @@ most, of pictures 0.024 at least."""
 _MAX_FOCAL_DIFFERENCE = 0.05
 """Largest relative difference of fx and fy."""
 _HALF = 0.5
+"""Share of an image that a mask covers, or of the values that are negative, only by mistake."""
 
 
 @dataclass(kw_only=True)
 class FileFacts:
-    """The facts of a file: its kind (image, depth, camera, mask, cloud or model) and oddities."""
+    """A description of a file, what is odd about it, and its content, which others are held to.
+
+    Of the contents (image, depth, camera, mask, cloud, model) one is set, by the file's kind.
+    """
 
     path: Path
-    description: str = ""  #: for the user; empty: it cannot be used
-    oddities: list[str] = field(default_factory=list)
+    description: str = ""  #: for the user; empty: the file cannot be used
+    oddities: list[str] = field(default_factory=list)  #: what is odd, for the user
     size: Size | None = None  #: width and height [px] of an image, depth or mask
-    image: Tensor | None = None
-    depth_units: Tensor | None = None  #: 16-bit depth as stored, NaN without a reading
+    image: Tensor | None = None  #: RGB in 0..1, (3, h, w)
+    depth_units: Tensor | None = None  #: 16-bit depth as stored, (h, w), NaN without a reading
     camera: cameras.Camera | None = None
-    mask: Tensor | None = None
-    cloud: Tensor | None = None  #: points, in the file's unit
-    model: Tensor | None = None  #: vertices, in the file's unit
+    mask: Tensor | None = None  #: whether a pixel is the object, (h, w)
+    cloud: Tensor | None = None  #: points, (n, 3), in the file's unit
+    model: Tensor | None = None  #: vertices, (n, 3), in the file's unit
 
 
 def describe_files(paths: Sequence[Path]) -> int:
-    """Print what each file is and what is odd about it; give the exit code."""
+    """Print what each file is and what is odd about it, and return the exit code.
+
+    It is 1 if something is odd, or a file cannot be used.
+    """
     # Images first: a camera file may lack the image size.
     images_first = sorted(paths, key=_may_be_camera)
     all_facts: list[FileFacts] = []
@@ -96,7 +103,7 @@ def _may_be_camera(path: Path) -> bool:
 
 
 def _check_pair(left: FileFacts, right: FileFacts) -> bool:
-    """Print how two pictures match as a rectified pair; give whether something is wrong."""
+    """Print how two pictures match as a rectified pair, and return whether they do not."""
     assert left.image is not None
     assert right.image is not None
     report = cameras.check_rectified(left.image, right.image)
@@ -325,7 +332,7 @@ def _describe_points(path: Path, points: Tensor) -> FileFacts:
 
 
 def _list_contradictions(facts: FileFacts, all_facts: Sequence[FileFacts]) -> Iterator[str]:
-    """List where a file contradicts the others: in size, unit, or scale of a model."""
+    """List where a file contradicts the others in size, unit or scale; in words for the user."""
     for other in all_facts:
         camera = other.camera
         if camera is not None and facts.size is not None:

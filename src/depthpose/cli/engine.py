@@ -35,7 +35,11 @@ class EngineOptions:
     """inputs of a shard, which are done again when their worker dies."""
 
     def build(self) -> "RayEngine":
-        """Make the engine of these options."""
+        """Build the engine of these options.
+
+        Raises:
+            InputError: a number of workers, cores or GPUs is out of its range.
+        """
         from depthpose.core.engine import RayEngine
 
         is_too_few = self.block < 1 or (self.workers is not None and self.workers < 1)
@@ -54,7 +58,14 @@ class EngineOptions:
     def run(
         self, computation: "Computation", inputs: "JobInputs", out: str, settings: dict[str, Any]
     ) -> "Sequence[ShardRecord]":
-        """Do the work on all inputs, and give the records of its shards."""
+        """Process all inputs by Ray, and return the records of the shards of their results.
+
+        Args:
+            work: what is computed for each input.
+            inputs: the inputs.
+            out: folder of the results, by path or URL.
+            settings: JSON values that decide the results.
+        """
         from depthpose.core.engine import ShardedJob, run_job
 
         job = ShardedJob(
@@ -69,15 +80,27 @@ class EngineOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Weights:
-    """A weights file that travels to the workers, in memory."""
+class PackedWeights:
+    """The content of a weights file in memory, to be sent to workers of other machines."""
 
-    name: str
+    name: str  #: name of the file
     data: bytes = field(repr=False)
+
+    @classmethod
+    def read(cls, weights: str) -> "PackedWeights":
+        """Read weights by name or file.
+
+        Raises:
+            InputError: there are no such weights.
+        """
+        from depthpose.core.checkpoint import find_weights
+
+        path = find_weights(weights)
+        return cls(name=path.name, data=path.read_bytes())
 
     @contextmanager
     def unpacked(self) -> Iterator[str]:
-        """Write the weights to a temporary file while the block runs, and give its path."""
+        """Write the weights to a temporary file, which exists inside the block; yield its path."""
         from depthpose.core.files.disk import refused_write
 
         with tempfile.TemporaryDirectory(prefix="depthpose-") as folder:
@@ -88,12 +111,13 @@ class Weights:
 
 
 _MAX_LISTED_FAILURES = 20
+"""Failed inputs that are printed; manifest.csv lists all."""
 
 
 def print_shards(shards: "Sequence[ShardRecord]", out: str, noun: str) -> int:
-    """List failed inputs, print how many are done, and give the exit code.
+    """Print the failed inputs and how many are done, and return the exit code, 1 if any failed.
 
-    ``noun``: what the inputs are called.
+    ``noun``: the word for the inputs, in the plural.
     """
     failures = [failure for shard in shards for failure in shard.failures]
     for name, reason in failures[:_MAX_LISTED_FAILURES]:

@@ -9,7 +9,11 @@ from depthpose.core.errors import InputError
 
 
 def name_with_checksum(path: Path) -> str:
-    """Give a file's name with the start of its SHA-256, so that a changed file is told apart."""
+    """Return a file's name and the start of its SHA-256, by which a changed file is told apart.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
     try:
         return f"{path.name} {file_sha256(path)[:12]}"
     except OSError as error:
@@ -17,7 +21,15 @@ def name_with_checksum(path: Path) -> str:
 
 
 def name_files(words: Sequence[str], paths: Sequence[Path | None]) -> list[str]:
-    """Name files by their stems, with folders where stems are equal; words stay as they are."""
+    """Name files by their stems, with folders in front where stems are equal.
+
+    Args:
+        words: what was typed for each.
+        paths: the file of each; None: the word is no file, and is its own name.
+
+    Raises:
+        InputError: two of them are the same.
+    """
     placed_names = [
         (None, word) if path is None else (path.parent, path.stem)
         for word, path in zip(words, paths, strict=True)
@@ -28,11 +40,19 @@ def name_files(words: Sequence[str], paths: Sequence[Path | None]) -> list[str]:
 def distinct_names(placed_names: Sequence[tuple[Path | None, str]]) -> list[str]:
     """Make names distinct: equal ones get as many folders in front as it takes to tell them apart.
 
-    ``placed_names``: the folder that each lies in, None where it lies in none, and its name.
+    Args:
+        placed_names: the folder that each lies in, None where it lies in none, and its name.
+
+    Returns:
+        The names, in their order; folders are joined by hyphens: ``FOLDER-NAME``.
+
+    Raises:
+        InputError: two have one name and folder.
     """
-    parts = [
-        (*(folder.resolve().parts[1:] if folder else ()), name) for folder, name in placed_names
-    ]
+    parts: list[tuple[str, ...]] = []  # of each the folders above it, and its name
+    for folder, name in placed_names:
+        folders = folder.resolve().parts[1:] if folder else ()
+        parts.append((*folders, name))
     for path_parts, count in Counter(parts).items():
         if count > 1:
             raise InputError(

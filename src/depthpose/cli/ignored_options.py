@@ -15,19 +15,19 @@ class TypedOptions(dict[str, list[str]]):
     """
 
     def __missing__(self, name: str) -> list[str]:
-        """Give no words, and do not store them: ``in`` tells which options were typed."""
+        """Return no words, and do not store them: ``in`` tells which options were typed."""
         return []
 
 
 Condition = Callable[[TypedOptions], bool]
 
 
-def given(*names: str) -> Condition:
+def any_typed(*names: str) -> Condition:
     """Make the condition that any of these options is typed."""
     return lambda typed: any(name in typed for name in names)
 
 
-def absent(*names: str) -> Condition:
+def none_typed(*names: str) -> Condition:
     """Make the condition that none of these options is typed."""
     return lambda typed: not any(name in typed for name in names)
 
@@ -104,10 +104,10 @@ def _are_models_folders(typed: TypedOptions) -> bool:
 class _Rule:
     """Options that some commands ignore under a condition, and the reason for the user."""
 
-    commands: tuple[str, ...]
-    when: Condition
-    ignored: tuple[str, ...]
-    reason: str
+    commands: tuple[str, ...]  #: names of the commands
+    when: Condition  #: whether these options are ignored
+    ignored: tuple[str, ...]  #: names of the options, with hyphens
+    reason: str  #: words of the error
 
 
 _POSE = ("pose predict", "pose track")
@@ -134,13 +134,13 @@ _RULES = (
     ),
     _Rule(
         commands=_POSE,
-        when=absent("cad", "bin"),
+        when=none_typed("cad", "bin"),
         ignored=("cad-unit",),
         reason="it is the unit of --cad, and no CAD file is given",
     ),
     _Rule(
         commands=("pose predict",),
-        when=given("bop", "cloud"),
+        when=any_typed("bop", "cloud"),
         ignored=("bin", "bin-pose", "empty-frame"),
         reason="they are of a depth image; give --depth",
     ),
@@ -160,61 +160,61 @@ _RULES = (
     ),
     _Rule(
         commands=("pose predict",),
-        when=given("bin"),
+        when=any_typed("bin"),
         ignored=("empty-frame",),
         reason="--bin says what there is without the parts",
     ),
     _Rule(
         commands=("pose predict",),
-        when=absent("bin"),
+        when=none_typed("bin"),
         ignored=("bin-pose",),
         reason="it is of --bin; give the CAD file of the bin too",
     ),
     _Rule(
         commands=_POSE,
-        when=given("bop"),
+        when=any_typed("bop"),
         ignored=("cad",),
         reason="the models of --bop are taken",
     ),
     _Rule(
         commands=_POSE,
-        when=given("bop"),
+        when=any_typed("bop"),
         ignored=("mask", "box", "detections", "labels", "camera", "focal-px", "unit"),
         reason="a data set says its cameras and units itself, and its masks are chosen by --masks",
     ),
     _Rule(
         commands=_POSE,
-        when=given("bop"),
+        when=any_typed("bop"),
         ignored=("base-from-camera",),
         reason="the cameras of a data set move",
     ),
     _Rule(
         commands=("pose predict",),
-        when=both(given("bop"), _is_on_ray),
+        when=both(any_typed("bop"), _is_on_ray),
         ignored=("engine",),
         reason="a data set is posed by this process, or shared by those of torchrun",
     ),
     _Rule(
         commands=("pose predict",),
-        when=absent("bop"),
+        when=none_typed("bop"),
         ignored=("split", "masks", "targets"),
         reason="--bop names no data set; the mask of a depth image is given by --mask",
     ),
     _Rule(
         commands=_POSE,
-        when=given("cloud"),
+        when=any_typed("cloud"),
         ignored=("mask", "box", "detections", "labels", "camera", "focal-px"),
         reason="a cloud is of the object alone, in the camera's frame",
     ),
     _Rule(
         commands=("pose predict", "depth predict"),
-        when=given("camera"),
+        when=any_typed("camera"),
         ignored=("focal-px", "fov"),
         reason="--camera has the focal length",
     ),
     _Rule(
         commands=("depth predict",),
-        when=given("focal-px"),
+        when=any_typed("focal-px"),
         ignored=("fov",),
         reason="--focal-px is the focal length",
     ),
@@ -226,13 +226,13 @@ _RULES = (
     ),
     _Rule(
         commands=("pose predict",),
-        when=absent("left"),
+        when=none_typed("left"),
         ignored=("right", "matcher", "min-confidence"),
         reason="it is of a pair, and there is none; give --left",
     ),
     _Rule(
         commands=("pose predict",),
-        when=both(given("left"), _is_on_ray),
+        when=both(any_typed("left"), _is_on_ray),
         ignored=("engine",),
         reason="pairs are matched and posed by this process",
     ),
@@ -251,7 +251,7 @@ _RULES = (
     ),
     _Rule(
         commands=("pose predict",),
-        when=given("box"),
+        when=any_typed("box"),
         ignored=("labels",),
         reason="all boxes are of one object; say which by --object, or give --detections",
     ),
@@ -264,20 +264,20 @@ _RULES = (
     ),
     _Rule(
         commands=("pose track",),
-        when=absent("bop"),
+        when=none_typed("bop"),
         ignored=("split",),
         reason="it is of a data set; give --bop",
     ),
     _Rule(
         commands=("pose track",),
-        when=given("bop"),
+        when=any_typed("bop"),
         ignored=("first",),
         reason="a data set has many sequences and one pose is given; give the frames of one by"
         " --depth",
     ),
     _Rule(
         commands=("pose evaluate",),
-        when=absent("weights"),
+        when=none_typed("weights"),
         ignored=("masks", "voting", "icp", "device"),
         reason="nothing is estimated: --csv and --predictions are measured as they are",
     ),
@@ -301,13 +301,13 @@ _RULES = (
     ),
     _Rule(
         commands=("depth predict",),
-        when=given("camera-height"),
+        when=any_typed("camera-height"),
         ignored=("known-distance",),
         reason="--camera-height sets the scale",
     ),
     _Rule(
         commands=("depth predict",),
-        when=given("matcher"),
+        when=any_typed("matcher"),
         ignored=("answer",),
         reason="the depth is that of --matcher on the synthesised view",
     ),
@@ -319,7 +319,7 @@ _RULES = (
     ),
     _Rule(
         commands=("depth match",),
-        when=given("matcher"),
+        when=any_typed("matcher"),
         ignored=("weights",),
         reason="--matcher matches the pair",
     ),
@@ -331,19 +331,19 @@ _RULES = (
     ),
     _Rule(
         commands=("depth evaluate",),
-        when=absent("baseline"),
+        when=none_typed("baseline"),
         ignored=("train", "train-without"),
         reason="--baseline takes it, and is not given; add it",
     ),
     _Rule(
         commands=("depth evaluate", "reproduce"),
-        when=absent("train"),
+        when=none_typed("train"),
         ignored=("train-without",),
         reason="it leaves frames out of --train, and none is given",
     ),
     _Rule(
         commands=("depth evaluate",),
-        when=absent("matcher"),
+        when=none_typed("matcher"),
         ignored=("holes",),
         reason="it is for --matcher sgbm",
     ),
@@ -367,7 +367,7 @@ _RULES = (
     ),
     _Rule(
         commands=("depth evaluate", "reproduce"),
-        when=absent("weights"),
+        when=none_typed("weights"),
         ignored=("device", *_NETWORK, "speed"),
         reason="no network is measured",
     ),
@@ -379,19 +379,19 @@ _RULES = (
     ),
     _Rule(
         commands=_POSES_OF_THESIS,
-        when=absent("linemod", "bop"),
+        when=none_typed("linemod", "bop"),
         ignored=("objects", "split"),
         reason="it chooses from a data set, and none is named; give --linemod or --bop",
     ),
     _Rule(
         commands=_POSES_OF_THESIS,
-        when=given("linemod"),
+        when=any_typed("linemod"),
         ignored=("bop",),
         reason="--linemod names the data set, and one is measured",
     ),
     _Rule(
         commands=("reproduce 3.3",),
-        when=given("linemod", "bop"),
+        when=any_typed("linemod", "bop"),
         ignored=("synthetic",),
         reason="views are rendered where no data set is given",
     ),
@@ -418,14 +418,19 @@ def refuse_ignored(command: str, words: Sequence[str]) -> None:
 
 
 def refuse_empty(options: Sequence[Option], words: Sequence[str]) -> None:
-    """Refuse an empty file or folder name, as a script gives whose variable is unset.
+    """Refuse an empty name of a file, folder or weights, as of an unset variable of a script.
 
-    ``options``: options of the command; ``words``: words that were typed after it.
+    Args:
+        options: options of the command.
+        words: the words that were typed after it.
+
+    Raises:
+        InputError: a name is empty.
     """
     typed, spelling = _parse_words(words)
     for option in options:
         name = option.name.replace("_", "-")
-        if option.names is not None and typed[name][:1] == [""]:
+        if option.kind is not None and typed[name][:1] == [""]:
             raise InputError(
                 f"{spelling[name]} is empty; name a file or folder (the current folder is '.'), or "
                 "check the variable that should hold it"
@@ -433,13 +438,16 @@ def refuse_empty(options: Sequence[Option], words: Sequence[str]) -> None:
 
 
 def _parse_words(words: Sequence[str]) -> tuple[TypedOptions, dict[str, str]]:
-    """Sort words by the option that they follow, and give each option as it was typed.
+    """Sort words by the option that they follow; words before any option are left out.
 
     Names of options have hyphens, and no ``no-`` in front; ``--name=word`` is taken apart.
+
+    Returns:
+        The words after each option, and each option as it was typed, both by the option's name.
     """
     typed = TypedOptions()
     spelling: dict[str, str] = {}
-    values: list[str] = []  # of the option before; those before any option are left out
+    values: list[str] = []  # of the last option
     for word in words:
         if not word.startswith("--"):
             values.append(word)

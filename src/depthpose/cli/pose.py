@@ -43,15 +43,15 @@ def predict_poses(
     Args:
         out: folder for the results.
     """
-    from depthpose.cli.pose_frames import search_dataset, search_files
-    from depthpose.cli.pose_methods import make_method_source
+    from depthpose.cli.pose_methods import make_method_spec
     from depthpose.cli.pose_predict import (
         predict_poses_of_dataset,
         predict_poses_of_files,
         predict_poses_on_ray,
     )
+    from depthpose.cli.pose_search import search_dataset, search_files
 
-    # One kind of input; a pair is matched first, to depth images.
+    # One kind of input. A pair is matched first, to depth images.
     pose_inputs = options.PoseInputs(**vars(inputs), **vars(details))
     input_kinds = (pose_inputs.cloud, pose_inputs.depth, pair.left, dataset.bop)
     kind_count = sum(path is not None for path in input_kinds)
@@ -67,39 +67,39 @@ def predict_poses(
         pose_inputs = replace(pose_inputs, depth=str(depth))
 
     # The estimator: a trained network, or registration of CAD files. Workers build their own.
-    weights = estimates.choose_weights(estimates.weights, pose_inputs.cad)
-    source = make_method_source(
-        weights,
+    spec = make_method_spec(
+        estimates.weights,
         pose_inputs,
         pose_inputs.unit,
         dataset,
         estimates.config,
         pose_inputs.base_from_camera,
+        is_registration=estimates.is_registration(pose_inputs.cad),
     )
     batch = estimates.batch
     if engine.engine == "ray":
-        return predict_poses_on_ray(pose_inputs, source, batch, out, engine)
-    method = source.build()
+        return predict_poses_on_ray(pose_inputs, spec, batch, out, engine)
+    method = spec.build()
 
     # Pose a data set, or search whole images, or pose clouds and masked parts of images.
-    home = Path(out)
+    out_folder = Path(out)
     if dataset.bop is not None:
         if pose_inputs.color is not None:
             raise InputError("--color is beside --depth; leave it out where --bop is given")
         if dataset.masks == "search":
-            return search_dataset(method, dataset, pose_inputs.object, home)
+            return search_dataset(method, dataset, pose_inputs.object, out_folder)
         return predict_poses_of_dataset(
-            method, dataset, pose_inputs.object, source.config, home, batch
+            method, dataset, pose_inputs.object, spec.config, out_folder, batch
         )
     if pose_inputs.cloud is not None and not method.takes_clouds:
         raise InputError(
-            f"--cloud {pose_inputs.cloud}: the weights {weights} need depth images; give --depth, "
-            "--mask and --camera, or weights that vote"
+            f"--cloud {pose_inputs.cloud}: the weights {estimates.weights} need depth images; give "
+            "--depth, --mask and --camera, or weights that vote"
         )
     has_lens = pose_inputs.lens is not None
     if pose_inputs.depth is not None and has_lens and not pose_inputs.has_regions:
-        return search_files(method, pose_inputs, home)
-    return predict_poses_of_files(method, pose_inputs, home, batch)
+        return search_files(method, pose_inputs, out_folder)
+    return predict_poses_of_files(method, pose_inputs, out_folder, batch)
 
 
 def evaluate_poses(
@@ -133,7 +133,7 @@ def evaluate_poses(
         objects: keep these alone, by name or number.
         adds: ADD-S for declared symmetric objects (of LineMOD eggbox and glue), or for all.
     """
-    from depthpose.cli.pose_evaluate import measure, open_instances, predict_instances
+    from depthpose.cli.pose_evaluate import measure_and_report, open_instances, predict_instances
     from depthpose.cli.pose_masks import prepare_masks
     from depthpose.cli.pose_methods import build_methods
     from depthpose.core.config import config_to_dict
@@ -161,7 +161,7 @@ def evaluate_poses(
     folders = [
         predict_instances(dataset, method, masks, out) for method in methods for masks in all_masks
     ]
-    return measure(dataset, [*folders, *csv, *predictions], rule, out)
+    return measure_and_report(dataset, [*folders, *csv, *predictions], rule, out)
 
 
 def track_object(
@@ -187,8 +187,8 @@ def track_object(
         out: folder for the results.
         weights: of a pose network, by name or file ('depthpose weights list').
     """
-    from depthpose.cli.pose_frames import track_dataset, track_files
-    from depthpose.cli.pose_methods import make_method_source
+    from depthpose.cli.pose_methods import make_method_spec
+    from depthpose.cli.pose_track import track_dataset, track_files
     from depthpose.core.run import find_rank
 
     if sum(path is not None for path in (frames.depth, frames.cloud, frames.bop)) != 1:
@@ -198,11 +198,16 @@ def track_object(
     if find_rank().world > 1:
         raise InputError("a sequence is followed by one process; start one")
     config = EstimateConfig(device=frames.device, min_certainty=frames.min_certainty)
-    chosen_weights = register.choose_weights(weights, register.cad)
-    source = make_method_source(
-        chosen_weights, register, frames.unit, frames, config, frames.base_from_camera
+    spec = make_method_spec(
+        weights,
+        register,
+        frames.unit,
+        frames,
+        config,
+        frames.base_from_camera,
+        is_registration=register.is_registration(register.cad),
     )
-    method = source.build()
+    method = spec.build()
     if method.track is None:
         raise InputError(f"--weights {weights}: these need masked views; give weights that vote")
     follow = track_files if frames.bop is None else track_dataset

@@ -14,7 +14,7 @@ _SAME_DIAMETER = 0.05
 
 
 def dataset_settings(dataset: datasets.BopDataset) -> dict[str, Any]:
-    """Give the settings that identify a data set, wherever its folder lies."""
+    """List the settings that identify a data set, wherever its folder lies."""
     return {
         "dataset": dataset.folder.resolve().name,
         "split": dataset.split,
@@ -23,9 +23,10 @@ def dataset_settings(dataset: datasets.BopDataset) -> dict[str, Any]:
 
 
 def match_names(dataset: datasets.BopDataset, models: Sequence[ObjectModel]) -> dict[int, str]:
-    """Match the objects of a data set to a method's: its name for each, by the object's number.
+    """Match the objects of a data set to a method's, by name, else by number.
 
-    Objects are matched by name, else by number.
+    Returns:
+        The method's name of each object, by the object's number in the data set.
 
     Raises:
         InputError: the method has no such object, or one of another diameter.
@@ -53,10 +54,13 @@ def match_names(dataset: datasets.BopDataset, models: Sequence[ObjectModel]) -> 
 def _match_models(
     dataset: datasets.BopDataset, models: Sequence[ObjectModel]
 ) -> dict[int, ObjectModel]:
-    """Match the objects of a data set to a method's models, by the object's number.
+    """Match the objects of a data set to a method's models.
 
-    It is that of the object's name, else that of its number, unless the data set has another object
-    of that model's name.
+    A model matches by the object's name; else by its number, unless the data set has another object
+    of the model's name.
+
+    Returns:
+        The model of each object that has one, by the object's number in the data set.
     """
     names_in_dataset = set(datasets.read_object_names(dataset.folder).values())
     by_name = {model.name: model for model in models}
@@ -72,9 +76,12 @@ def _match_models(
 def choose_objects(
     dataset: datasets.BopDataset, method: PoseMethod, object: str | None
 ) -> datasets.BopDataset:
-    """Restrict a data set to the objects that a method poses, or to the one named.
+    """Restrict a data set to the objects that a method has, or to the one named.
 
-    Objects that the method does not have are printed.
+    Objects that the method does not have are printed. ``object``: name or number; None: all.
+
+    Raises:
+        InputError: the method has none of the objects.
     """
     numbers = {model.name: model.number for model in method.models}
     if object is not None:
@@ -85,9 +92,9 @@ def choose_objects(
 
     object_ids = sorted({instance.object_id for instance in dataset.instances})
     matched_models = _match_models(dataset, method.models)
-    estimable = [number for number in object_ids if number in matched_models]
-    left_out = sorted(set(object_ids) - set(estimable))
-    if not estimable:
+    matched_ids = [number for number in object_ids if number in matched_models]
+    left_out = sorted(set(object_ids) - set(matched_ids))
+    if not matched_ids:
         raise InputError(
             f"{dataset.folder}: holds objects {left_out}, but the {method.holder} know "
             f"{', '.join(numbers)}; give {method.holder} of its objects"
@@ -95,4 +102,4 @@ def choose_objects(
     if left_out:
         message = f"left out, as the {method.holder} do not know them: objects {left_out}"
         print(message, file=sys.stderr)
-    return dataset.of_objects(*estimable)
+    return dataset.of_objects(*matched_ids)

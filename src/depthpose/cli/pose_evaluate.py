@@ -1,4 +1,4 @@
-"""The work behind ``depthpose pose evaluate``."""
+"""The stages of ``depthpose pose evaluate``: instances, their predictions, and the measurement."""
 
 import sys
 from collections import Counter
@@ -51,6 +51,16 @@ _PRINTED_COLUMNS = (
     "rotation_deg_median", "translation_m_median",
 )  # fmt: skip
 """Columns of the table on the terminal; the files hold all."""
+_TRUTH_NOTE = (
+    "Mask and cloud are the annotated ones; blue is the estimate, green the truth (of a symmetric "
+    "object, the copy nearest to the estimate)."
+)
+
+_INSTANCE_COLUMNS = (
+    "metric", "error_m", "diameter_m", "rotation_deg", "translation_m", "visible_fraction", "score",
+    "status",
+)  # fmt: skip
+"""Columns of the table below the picture of an instance."""
 
 
 def open_instances(
@@ -77,36 +87,54 @@ def open_instances(
 def predict_instances(
     dataset: BopDataset, method: PoseMethod, masks: Masks, out: Path, batch: int = 1
 ) -> Path:
-    """Estimate every instance that is not estimated yet, and write ``poses.json`` and BOP's csv."""
+    """Estimate every instance that is not estimated yet, and write ``poses.json`` and BOP's csv.
+
+    Args:
+        dataset: the instances.
+        method: estimates their poses.
+        masks: the masks that it is given.
+        out: folder of the run.
+        batch: views that are estimated together.
+
+    Returns:
+        The folder of the predictions, ``OUT/predictions/METHOD_MASKS``.
+    """
     jobs = masks.make_jobs(match_names(dataset, method.models))
-    home = out / "predictions" / f"{method.name}_{masks.name}"
+    predictions_folder = out / "predictions" / f"{method.name}_{masks.name}"
     settings = {
         **method.settings,
         "masks": masks.name,
         **masks.settings,
         **dataset_settings(dataset),
     }
-    written = estimate_missing_poses(method.estimate_many, jobs, home, settings, batch)
+    names = estimate_missing_poses(method.estimate_many, jobs, predictions_folder, settings, batch)
     label = f"{method.name}, {masks.name} masks"
-    for _ in tqdm(written, label, total=len(jobs), disable=None, unit=" instances"):
-        pass
-    write_bop_results(home / name_bop_results(dataset), read_predictions(home))
-    return home
+    for _ in tqdm(names, label, total=len(jobs), disable=None, unit=" instances"):
+        pass  # each is estimated as its name is asked for
+    write_bop_results(
+        predictions_folder / name_bop_results(dataset), read_predictions(predictions_folder)
+    )
+    return predictions_folder
 
 
-def measure_each(
+def measure_predictions(
     dataset: BopDataset, predictions: Sequence[Path], config: EvaluationConfig
 ) -> list[Evaluation]:
-    """Measure folders or csv files of predictions one by one; each row names its origin.
+    """Measure folders or csv files of predictions one by one; the rows say which method made them.
+
+    Args:
+        dataset: instances with truth.
+        predictions: folders with ``poses.json``, or BOP's csv files.
+        config: how they are measured.
 
     Raises:
         InputError: predictions are of another data set or split, or two of them have one origin.
     """
     evaluations: list[Evaluation] = []
-    show = partial(tqdm, unit=" instances", disable=None)
+    with_progress = partial(tqdm, unit=" instances", disable=None)
     for path, origin in zip(predictions, find_origins(predictions), strict=True):
         _refuse_other_dataset(path, dataset)
-        evaluation = evaluate(dataset, read_any_predictions(path), config, show, origin)
+        evaluation = evaluate(dataset, read_any_predictions(path), config, with_progress, origin)
         if evaluation.advice is not None:
             print(f"{path}: {evaluation.advice}", file=sys.stderr)
         evaluations.append(evaluation)
@@ -115,16 +143,16 @@ def measure_each(
 
 def _refuse_other_dataset(path: Path, dataset: BopDataset) -> None:
     """Refuse a folder of predictions whose record names another data set or split."""
-    predicted = (read_settings(path) if path.is_dir() else None) or {}
-    for key, measured in dataset_settings(dataset).items():
-        if predicted.get(key, measured) != measured:
+    recorded = (read_settings(path) if path.is_dir() else None) or {}
+    for key, value in dataset_settings(dataset).items():
+        if recorded.get(key, value) != value:
             raise InputError(
-                f"{path}: predictions of the {key} {predicted[key]!r}, but {measured!r} is "
+                f"{path}: predictions of the {key} {recorded[key]!r}, but {value!r} is "
                 f"measured; give those of this very {key}, or measure that one"
             )
 
 
-def join(evaluations: Sequence[Evaluation]) -> Evaluation:
+def join_evaluations(evaluations: Sequence[Evaluation]) -> Evaluation:
     """Join the rows of several evaluations into one."""
     advice = [evaluation.advice for evaluation in evaluations if evaluation.advice]
     return Evaluation(
@@ -139,20 +167,25 @@ def find_origins(predictions: Sequence[Path]) -> list[Origin]:
     """Find which method, masks and weights made each folder or file of predictions.
 
     Methods of one name in two folders are told apart by the folders' names in front of theirs.
+
+    Raises:
+        InputError: two of them in one folder have one method and masks.
     """
     origins = [_read_origin(path) for path in predictions]
-    homes = [path.resolve().parent for path in predictions]
-    pairs = list(zip(homes, origins, strict=True))
-    uses = Counter((home, origin.method, origin.masks) for home, origin in pairs)
-    for (home, method, masks), count in uses.items():
+    parents = [path.resolve().parent for path in predictions]
+    placed_origins = list(zip(parents, origins, strict=True))
+    uses = Counter((parent, origin.method, origin.masks) for parent, origin in placed_origins)
+    for (parent, method, masks), count in uses.items():
         if count > 1:
             raise InputError(
-                f"{home}: two predictions by {method!r}, masks {masks!r}, are given, and their "
+                f"{parent}: two predictions by {method!r}, masks {masks!r}, are given, and their "
                 "rows would be one; give one of them, or rename it"
             )
-    methods = list(dict.fromkeys((home, origin.method) for home, origin in pairs))
+    methods = list(dict.fromkeys((parent, origin.method) for parent, origin in placed_origins))
     names = dict(zip(methods, distinct_names(methods), strict=True))
-    return [replace(origin, method=names[home, origin.method]) for home, origin in pairs]
+    return [
+        replace(origin, method=names[parent, origin.method]) for parent, origin in placed_origins
+    ]
 
 
 def _read_origin(path: Path) -> Origin:
@@ -170,41 +203,41 @@ def _read_origin(path: Path) -> Origin:
     )
 
 
-def measure(
+def measure_and_report(
     dataset: BopDataset, predictions: Sequence[Path], config: EvaluationConfig, out: Path
 ) -> int:
-    """Measure folders or files of predictions against the truth; write tables and page, and print.
+    """Measure predictions, write rows, tables and a page, and print the table.
 
-    The files: rows.json, rows.csv, table.md, report.html and instances.csv.
+    Args:
+        dataset: instances with truth.
+        predictions: folders with ``poses.json``, or BOP's csv files.
+        config: how they are measured.
+        out: folder of rows.json, rows.csv, table.md, report.html and instances.csv.
+
+    Returns:
+        The exit code.
     """
-    evaluations = measure_each(dataset, predictions, config)
-    measured = join(evaluations)
+    evaluations = measure_predictions(dataset, predictions, config)
+    measured = join_evaluations(evaluations)
     rows = [row.columns() for row in measured.rows]
     text = SCORING_NOTE
     if measured.advice is not None:
         text = f"{measured.advice}. {text}"
     page.write_table(out, rows)
 
-    # Success of each method and object, a column for each kind of masks.
-    by_masks: dict[tuple[str, str], dict[str, Any]] = {}
-    for row in measured.rows:
-        assert row.origin is not None
-        method = row.origin.method
-        masks = row.origin.masks
-        entry = by_masks.setdefault((method, row.object), {"method": method, "object": row.object})
-        entry[f"{masks or 'their'} masks"] = row.success
-
     # The page: both tables, then some instances of each set of predictions.
     view_counts = page.share_views(len(predictions))
     instance_sections: list[Section] = []
     for path, evaluation, count in zip(predictions, evaluations, view_counts, strict=True):
         if count:
-            instance_sections += _show_instances(dataset, path, evaluation.per_instance, count)
+            instance_sections += _make_instance_sections(
+                dataset, path, evaluation.per_instance, count
+            )
     sections = [
-        Section(title="Success by masks", text=text, rows=list(by_masks.values())),
+        Section(title="Success by masks", text=text, rows=_list_success_by_masks(measured)),
         Section(title="All numbers", rows=rows),
         *instance_sections,
-        *write_details(measured, out),
+        *write_detail_tables(measured, out),
     ]
     title = f"Poses on {dataset.folder.resolve().name}, {dataset.split}"
     page.write_page(out / "report.html", title, sections, describe_environment())
@@ -213,10 +246,29 @@ def measure(
     return 0
 
 
-def _show_instances(
+def _list_success_by_masks(measured: Evaluation) -> list[dict[str, Any]]:
+    """List the success of each method and object, with a column for each kind of masks."""
+    rows: dict[tuple[str, str], dict[str, Any]] = {}
+    for row in measured.rows:
+        assert row.origin is not None
+        method = row.origin.method
+        masks = row.origin.masks
+        columns = rows.setdefault((method, row.object), {"method": method, "object": row.object})
+        columns[f"{masks or 'their'} masks"] = row.success
+    return list(rows.values())
+
+
+def _make_instance_sections(
     dataset: BopDataset, predictions: Path, rows: Sequence[InstanceRow], max_count: int
 ) -> list[Section]:
-    """Show some instances of a folder or file of predictions, ``max_count`` at most, with truth."""
+    """Make sections of some instances, with their estimates and true poses.
+
+    Args:
+        dataset: the instances.
+        predictions: folder with ``poses.json``, or BOP's csv file.
+        rows: measurements of these predictions.
+        max_count: most instances that are shown.
+    """
     instances = {instance.name: instance for instance in dataset.instances}
     estimates = match_instances(
         dataset.instances, read_any_predictions(predictions), dataset.objects
@@ -246,12 +298,15 @@ def _show_instances(
     return sections
 
 
-def write_details(measured: Evaluation, out: Path) -> list[Section]:
-    """Write tables of instances and of the risk by coverage; give the sections that show them."""
+def write_detail_tables(measured: Evaluation, out: Path) -> list[Section]:
+    """Write tables of instances and of the risk by coverage; return the sections that show them."""
     risk = [row.columns() for row in measured.risk]
     page.write_table(out, [row.columns() for row in measured.per_instance], name="instances")
     if risk:
         page.write_table(out, risk, name="risk")
+    else:  # no instance is posed, but some may have been in an earlier run here
+        for file in page.list_table_files("risk"):
+            (out / file).unlink(missing_ok=True)
     failed = [row.columns() for row in measured.per_instance if not row.is_success]
     text = "How many answers are wrong if only the surest are given."
     sections = [
@@ -261,28 +316,19 @@ def write_details(measured: Evaluation, out: Path) -> list[Section]:
     return [section for section in sections if section.rows]
 
 
-_TRUTH_NOTE = (
-    "Mask and cloud are the annotated ones; blue is the estimate, green the truth (of a symmetric "
-    "object, the copy nearest to the estimate)."
-)
-
-_INSTANCE_COLUMNS = (
-    "metric", "error_m", "diameter_m", "rotation_deg", "translation_m", "visible_fraction", "score",
-    "status",
-)  # fmt: skip
-"""Columns of the table below the picture of an instance."""
-
-
 def _choose_instances(rows: Sequence[InstanceRow], max_count: int) -> list[tuple[str, InstanceRow]]:
-    """Choose the worst, the median and the best answer, and a refusal; each with words for it.
+    """Choose the worst, the median and the best posed instance, and a refused one.
 
-    Answers are ranked by their error, as a share of the diameter.
+    Posed instances are ranked by their error, as a share of the diameter.
+
+    Returns:
+        Words for the section of each, and its row; ``max_count`` at most.
     """
     errors_m = {row.instance: row.error("error_m") for row in rows}
-    answers = [row for row in rows if errors_m[row.instance] is not None]
-    relative_errors = [(errors_m[row.instance] or 0.0) / row.diameter_m for row in answers]
+    posed = [row for row in rows if errors_m[row.instance] is not None]
+    relative_errors = [(errors_m[row.instance] or 0.0) / row.diameter_m for row in posed]
     chosen = [
-        (f"{role} answer of {len(answers)}", answers[k])
+        (f"{role} answer of {len(posed)}", posed[k])
         for role, k in page.choose_ranked(relative_errors, min(max_count, 3))
     ]
     refused = [row for row in rows if errors_m[row.instance] is None and row.status != "missing"]

@@ -25,15 +25,12 @@ from depthpose.pose.types import ViewInput
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Masks:
-    """One kind of masks of a data set, its name in tables, and what decides which masks they are.
+    """One kind of masks of a data set."""
 
-    ``make_jobs`` makes a job for each mask; it takes the names that the method has for the objects,
-    by their numbers in the data set.
-    """
-
-    name: str
+    name: str  #: name in tables
+    #: makes a job for each mask, given the method's names of the objects by their numbers
     make_jobs: Callable[[Mapping[int, str]], list[predictions.PoseJob[ViewInput]]]
-    settings: Mapping[str, Any]
+    settings: Mapping[str, Any]  #: JSON values that decide which masks they are
 
 
 def prepare_masks(
@@ -48,7 +45,7 @@ def prepare_masks(
         out: folder of the run; segmented masks are written below it.
         device: device that segments.
     """
-    paths = [mask_path(kind) for kind in kinds]
+    paths = [find_mask_file(kind) for kind in kinds]
     names = name_files(kinds, paths)
     masks: list[Masks] = []
     for kind, path, name in zip(kinds, paths, names, strict=True):
@@ -86,10 +83,12 @@ def _take_predicted_masks(dataset: datasets.BopDataset) -> Masks:
     return Masks(name="predicted", make_jobs=make_jobs, settings={"masks_of": "segnet_results"})
 
 
-def mask_path(kind: str) -> Path | None:
-    """Give the file of a kind of masks, as :func:`prepare_masks` takes it.
+def find_mask_file(kind: str) -> Path | None:
+    """Find the file of a kind of masks, as :func:`prepare_masks` takes it.
 
-    None for ``truth`` and ``predicted``, which are in the data set.
+    Returns:
+        The file of detections, or of weights; None for ``truth`` and ``predicted``, which are in
+        the data set.
     """
     if kind in ("truth", "predicted"):
         return None
@@ -103,14 +102,26 @@ def _segment_dataset(
 
     Detections of all objects of the weights are written to ``OUT/detections/NAME.json``, so that a
     later run may ask for other objects, or for more images.
+
+    Args:
+        path: file of the weights.
+        name: name of the masks.
+        dataset: data set whose images are segmented.
+        out: folder of the run.
+        device: device that segments.
+
+    Returns:
+        The detections of all images that any run has segmented.
     """
     segmenter = Segmenter.load(path, device)
     numbers = _match_numbers(segmenter, dataset, path)
 
-    home = out / "detections" / name
-    claim_folder(home, {"weights_sha256": file_sha256(path), **dataset_settings(dataset)})
-    detections_file = home.parent / f"{name}.json"
-    images_file = home / "images.json"
+    detections_folder = out / "detections" / name
+    claim_folder(
+        detections_folder, {"weights_sha256": file_sha256(path), **dataset_settings(dataset)}
+    )
+    detections_file = detections_folder.parent / f"{name}.json"
+    images_file = detections_folder / "images.json"
     segmented: set[tuple[int, int]] = set()
     detections: list[datasets.Detection] = []
     with suppress(InputError):  # damaged or missing: all is segmented again
@@ -135,10 +146,15 @@ def _segment_dataset(
 def _match_numbers(
     segmenter: Segmenter, dataset: datasets.BopDataset, path: Path
 ) -> dict[str, int]:
-    """Match the objects of the weights to the data set's numbers: by name, else by number.
+    """Match the objects of a segmentation to those of a data set: by name, else by number.
 
-    Objects of the data set that the weights do not segment are printed; it is an error if they
-    segment none.
+    Objects of the data set that are not segmented are printed. ``path``: the weights, for errors.
+
+    Returns:
+        The number of each object in the data set, by its name in the weights.
+
+    Raises:
+        InputError: no object of the data set is segmented.
     """
     names = datasets.read_object_names(dataset.folder)
     number_by_name = {name: number for number, name in names.items()}
@@ -175,7 +191,13 @@ def _read_segmented_images(path: Path) -> set[tuple[int, int]]:
 def _segment_image(
     segmenter: Segmenter, instance: datasets.Instance, numbers: Mapping[str, int]
 ) -> list[datasets.Detection]:
-    """Segment the image of an instance; ``numbers``: of the data set's objects, by their names."""
+    """Segment the image of an instance into detections of objects of the data set.
+
+    ``numbers``: number of each object in the data set, by its name in the weights.
+
+    Raises:
+        InputError: the image has no colour picture.
+    """
     if instance.rgb is None:
         raise InputError(f"{instance.name}: has no picture, and a segmentation needs pictures")
     start = perf_counter()

@@ -1,4 +1,4 @@
-"""What estimates poses in a command: weights or registered models, by their names."""
+"""What estimates poses in a command: networks or registered models, and how they are built."""
 
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -7,13 +7,13 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from depthpose.cli.engine import Weights
+from depthpose.cli.engine import PackedWeights
 from depthpose.cli.file_names import name_files
 from depthpose.cli.pose_options import DataSetOptions, PoseInputs, RegisterOptions, SequenceOptions
 from depthpose.cli.pose_transforms import read_base
 from depthpose.core.checkpoint import file_sha256, find_weights, read_checkpoint, warn_of_terms
 from depthpose.core.config import config_to_dict
-from depthpose.core.errors import InputError
+from depthpose.core.errors import InputError, suggest_name
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
 from depthpose.pose import datasets
@@ -27,40 +27,44 @@ from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 from depthpose.pose.weights import read_pose_weights
 
 REGISTER = "register"
-"""In place of weights: our own registration, which needs no training."""
+"""Word of ``--weights`` for registration, which needs none; and its name in tables."""
 
 EstimateMany = Callable[[Sequence[ViewInput]], Sequence[PoseEstimate]]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PoseMethod:
-    """An estimator, what to call it, the objects it knows, and what decides its results.
+    """An estimator of poses: its functions, its name, its objects, and what decides its results."""
 
-    ``find`` gives the poses of named objects in a view without a mask, ``track`` follows one
-    through frames; None: it cannot. ``holder``: what messages call the source of the objects.
-    ``expects_all``: whether every object is expected in every image, as that of a CAD file is.
-    """
-
-    name: str
-    estimate_many: EstimateMany
-    takes_clouds: bool  # whether it can do without a depth image
-    models: Sequence[ObjectModel]
-    settings: Mapping[str, Any]
+    name: str  #: name in tables
+    estimate_many: EstimateMany  #: estimates a pose of each masked view or cloud
+    takes_clouds: bool  #: whether it can do without a depth image
+    models: Sequence[ObjectModel]  #: the objects that it can pose
+    settings: Mapping[str, Any]  #: JSON values that decide its results
+    #: estimates the poses of named objects in a view without a mask; None: it cannot
     find: Callable[[ViewInput, Sequence[str]], list[PoseEstimate]] | None = None
+    #: follows an object through frames, perhaps from a first pose; None: it cannot
     track: (
         Callable[[Iterable[AnyInput | PoseEstimate], str, Rigid | None], Iterator[PoseEstimate]]
         | None
     ) = None
-    holder: str = "weights"
-    expects_all: bool = False
+    holder: str = "weights"  #: word for the source of the objects in messages
+    expects_all: bool = False  #: every object is expected in every image, as that of a CAD file is
 
 
 def build_methods(
     names: Sequence[str], config: EstimateConfig, models: Sequence[ObjectModel] = ()
 ) -> list[PoseMethod]:
-    """Build the estimator of each weights file (a path or a name), or of ``register``.
+    """Build a method for each name of weights, and registration for the word ``register``.
 
-    Files of one name are distinguished by their folders. ``models``: what is registered.
+    Args:
+        names: weights by name or file, or ``register``. Files of one name are distinguished by
+            their folders.
+        config: settings of the estimators.
+        models: models that are registered.
+
+    Raises:
+        InputError: weights cannot be read, or two are the same, or nothing is to be registered.
     """
     paths = [None if name == REGISTER else find_weights(name) for name in names]
     labels = name_files(names, paths)
@@ -145,70 +149,124 @@ def _make_network_method(path: Path, name: str, config: EstimateConfig) -> PoseM
     )
 
 
-def _with_base(method: PoseMethod, base: Rigid) -> PoseMethod:
-    """Return a method whose estimates also have the pose in the robot's frame, ``base_from_model``.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _MethodInBase:
+    """The functions of a method, whose estimates also have the pose from the robot's base."""
 
-    ``base``: the transform ``base_from_camera``.
-    """
-    find = method.find
-    track = method.track
+    method: PoseMethod
+    base_from_camera: Rigid
 
-    def estimate_many(views: Sequence[ViewInput]) -> list[PoseEstimate]:
-        return [estimate.in_base(base) for estimate in method.estimate_many(views)]
+    def estimate_many(self, views: Sequence[ViewInput]) -> list[PoseEstimate]:
+        """Estimate a pose of each view."""
+        base = self.base_from_camera
+        return [estimate.in_base(base) for estimate in self.method.estimate_many(views)]
 
-    def find_in(view: ViewInput, objects: Sequence[str]) -> list[PoseEstimate]:
-        assert find is not None
-        return [estimate.in_base(base) for estimate in find(view, objects)]
+    def find(self, view: ViewInput, objects: Sequence[str]) -> list[PoseEstimate]:
+        """Estimate the poses of objects in a view without a mask."""
+        assert self.method.find is not None
+        base = self.base_from_camera
+        return [estimate.in_base(base) for estimate in self.method.find(view, objects)]
 
-    def track_in(
-        frames: Iterable[AnyInput], object: str, first: Rigid | None
+    def track(
+        self, frames: Iterable[AnyInput | PoseEstimate], object: str, first: Rigid | None
     ) -> Iterator[PoseEstimate]:
-        assert track is not None
-        return (estimate.in_base(base) for estimate in track(frames, object, first))
+        """Estimate the pose of an object in each frame of a sequence."""
+        assert self.method.track is not None
+        base = self.base_from_camera
+        return (estimate.in_base(base) for estimate in self.method.track(frames, object, first))
 
+
+def _with_base(method: PoseMethod, base_from_camera: Rigid | None) -> PoseMethod:
+    """Return a method whose estimates also have ``base_from_model``; None: the method itself."""
+    if base_from_camera is None:
+        return method
+    in_base = _MethodInBase(method=method, base_from_camera=base_from_camera)
     return replace(
         method,
-        estimate_many=estimate_many,
-        find=None if find is None else find_in,
-        track=None if track is None else track_in,
-        settings={**method.settings, "base_from_camera": base.matrix().tolist()},
+        estimate_many=in_base.estimate_many,
+        find=None if method.find is None else in_base.find,
+        track=None if method.track is None else in_base.track,
+        settings={**method.settings, "base_from_camera": base_from_camera.matrix().tolist()},
     )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class PoseMethodSource:
-    """The description of an estimator, from which this process or an engine's workers build it.
+class RegistrationSpec:
+    """The models and settings from which this process, or a worker, builds a registration.
 
-    ``weights``: of a network, by name or file, or as bytes to be sent to workers; None: ``models``
-    are registered without training. ``base_from_camera``: if given, every estimate has the pose
-    from the robot's base too.
+    ``base_from_camera``: if given, every estimate has the pose from the robot's base too.
     """
 
+    models: Sequence[ObjectModel]
     config: EstimateConfig
-    weights: str | Weights | None = None
-    models: Sequence[ObjectModel] = ()
     base_from_camera: Rigid | None = None
 
-    def build(self, device: str | None = None) -> PoseMethod:
-        """Build the estimator; ``device`` takes the place of the config's."""
-        method = self._build_in_camera(device)
-        base = self.base_from_camera
-        return method if base is None else _with_base(method, base)
+    def build(self) -> PoseMethod:
+        """Build the registration of the models.
 
-    def _build_in_camera(self, device: str | None) -> PoseMethod:
-        """Build the estimator of poses from the camera alone."""
-        config = self.config if device is None else replace(self.config, device=device)
-        if self.weights is None or self.weights == REGISTER:
-            return _make_registration_method(REGISTER, self.models, config)
-        if isinstance(self.weights, str):
-            path = find_weights(self.weights)
-            return _make_network_method(path, path.stem, config)
-        with self.weights.unpacked() as name:
-            return _make_network_method(Path(name), Path(name).stem, config)
+        Raises:
+            InputError: there are no models.
+        """
+        method = _make_registration_method(REGISTER, self.models, self.config)
+        return _with_base(method, self.base_from_camera)
 
 
-def unit_of_cad(files: Sequence[str], cad_unit: Unit | None, unit: Unit | None) -> Unit | None:
-    """Give the unit of CAD files: ``--cad-unit``, else ``--unit``; None if their format fixes it.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PoseNetworkSpec:
+    """The weights and settings from which this process, or a worker, builds a pose network.
+
+    ``weights``: a name or file, or its content. ``base_from_camera``: if given, every estimate has
+    the pose from the robot's base too.
+    """
+
+    weights: str | PackedWeights
+    config: EstimateConfig
+    base_from_camera: Rigid | None = None
+
+    def build(self) -> PoseMethod:
+        """Build the network on the device of the config.
+
+        Raises:
+            InputError: the weights cannot be read.
+        """
+        if isinstance(self.weights, PackedWeights):
+            with self.weights.unpacked() as file:
+                return self._build_from(Path(file))
+        return self._build_from(find_weights(self.weights))
+
+    def _build_from(self, file: Path) -> PoseMethod:
+        """Build the network of a weights file."""
+        method = _make_network_method(file, file.stem, self.config)
+        return _with_base(method, self.base_from_camera)
+
+    def with_packed_weights(self) -> "PoseNetworkSpec":
+        """Return the spec with the content of its weights file, for workers of other machines."""
+        if isinstance(self.weights, PackedWeights):
+            return self
+        return replace(self, weights=PackedWeights.read(self.weights))
+
+
+PoseMethodSpec = RegistrationSpec | PoseNetworkSpec
+
+
+def choose_object(name: str | None, method: PoseMethod) -> str:
+    """Choose the object of a method by its name, or its only object.
+
+    Raises:
+        InputError: the method has no such object, or several and none is named.
+    """
+    names = [model.name for model in method.models]
+    if name is None and len(names) > 1:
+        raise InputError(f"the {method.holder} know {', '.join(names)}; say which by --object")
+    if name is not None and name not in names:
+        raise InputError(
+            f"--object {name}: the {method.holder} do not know it; {suggest_name(name, names)}"
+        )
+    return names[0] if name is None else name
+
+
+def find_cad_unit(files: Sequence[str], cad_unit: Unit | None, unit: Unit | None) -> Unit | None:
+    """Return the unit of CAD files: ``--cad-unit``, else ``--unit``; None if their format fixes it.
 
     Raises:
         InputError: a file's format does not fix the unit, and none is given.
@@ -220,31 +278,41 @@ def unit_of_cad(files: Sequence[str], cad_unit: Unit | None, unit: Unit | None) 
     return cad_unit
 
 
-def make_method_source(
-    weights: str | None,
+def make_method_spec(
+    weights: str,
     parts: PoseInputs | RegisterOptions,
     unit: Unit | None,
     dataset: DataSetOptions | SequenceOptions,
     config: EstimateConfig,
     base: Sequence[str] = (),
-) -> PoseMethodSource:
+    *,
+    is_registration: bool,
+) -> PoseMethodSpec:
     """Read what an estimator is built from: weights, or the models of a data set or of CAD files.
 
-    ``weights``: None: models are registered. ``base``: the words of ``--base-from-camera``.
+    Args:
+        weights: name or file of the weights of a network.
+        parts: CAD files, their unit and their symmetries.
+        unit: unit of CAD files where ``parts`` has none.
+        dataset: data set whose models are registered where there is one.
+        config: settings of the estimator.
+        base: words of ``--base-from-camera``.
+        is_registration: register models, without the network.
+
+    Raises:
+        InputError: a file cannot be read, a unit is missing, or ``--symmetry`` has no CAD file.
     """
     base_from_camera = read_base(base)
-    cad_unit = unit_of_cad(parts.cad, parts.cad_unit, unit)
-    if parts.symmetry and (weights is not None or not parts.cad):
+    cad_unit = find_cad_unit(parts.cad, parts.cad_unit, unit)
+    if parts.symmetry and not (is_registration and parts.cad):
         raise InputError(
             f"--symmetry {parts.symmetry[0]}: is of --method register with --cad; a network and "
             "a data set have the symmetries that they declare"
         )
-    if weights is not None:
-        return PoseMethodSource(config=config, weights=weights, base_from_camera=base_from_camera)
+    if not is_registration and weights != REGISTER:
+        return PoseNetworkSpec(weights=weights, config=config, base_from_camera=base_from_camera)
     if dataset.bop is not None:
         models = tuple(datasets.open_bop(dataset.bop, dataset.split).objects.values())
-        return PoseMethodSource(config=config, models=models)
-    if not parts.cad:
-        return PoseMethodSource(config=config, base_from_camera=base_from_camera)
-    models = read_parts(parts.cad, cad_unit, parts.symmetry or None)
-    return PoseMethodSource(config=config, models=models, base_from_camera=base_from_camera)
+        return RegistrationSpec(models=models, config=config)
+    models = read_parts(parts.cad, cad_unit, parts.symmetry or None) if parts.cad else ()
+    return RegistrationSpec(models=models, config=config, base_from_camera=base_from_camera)

@@ -57,7 +57,7 @@ class PoseMeasureOptions:
 
     @property
     def config(self) -> EstimateConfig:
-        """Settings of the estimators."""
+        """The settings of the estimators that these options stand for."""
         voting = VotingConfig(method=_VOTING_METHODS[self.voting])
         return EstimateConfig(voting=voting, with_icp=self.icp, device=self.device)
 
@@ -189,23 +189,20 @@ class DataSetOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MethodOptions:
+class PoseMethodOptions:
     """The estimator of the poses."""
 
     method: Literal["network", "register"] | None = None
     """network: trained weights. register: the CAD files alone, a second or two for each part, or
     the models of --bop; it is taken where --cad is given."""
 
-    def choose_weights(self, weights: str, cad: Sequence[str]) -> str | None:
-        """Give the weights of the network, or None where models are registered without one.
-
-        ``weights`` and ``cad``: the words of these options.
-        """
-        return None if is_registration(self.method, has_cad=bool(cad)) else weights
+    def is_registration(self, cad: Sequence[str]) -> bool:
+        """Whether models are registered, without a network; ``cad``: the words of ``--cad``."""
+        return is_registration(self.method, has_cad=bool(cad))
 
 
 @dataclass(frozen=True, kw_only=True)
-class EstimateOptions(MethodOptions):
+class EstimateOptions(PoseMethodOptions):
     """The settings of the estimator; those from ``weights`` on have no effect on registration."""
 
     min_certainty: float = 0.9
@@ -230,7 +227,7 @@ class EstimateOptions(MethodOptions):
 
     @property
     def config(self) -> EstimateConfig:
-        """Settings of the estimator, on the device of this process."""
+        """The settings of the estimator that these options stand for, on this process's device."""
         from depthpose.core.devices import device_of_process  # --help must not load torch
 
         if self.batch < 1:
@@ -247,7 +244,7 @@ class EstimateOptions(MethodOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RegisterOptions(MethodOptions):
+class RegisterOptions(PoseMethodOptions):
     """Poses by a CAD file alone, without training."""
 
     cad: tuple[Source, ...] = ()

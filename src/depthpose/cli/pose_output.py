@@ -28,7 +28,7 @@ from depthpose.pose.predictions import (
     write_bop_results,
 )
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
-from depthpose.report import pose as drawn
+from depthpose.report import pose as pose_report
 from depthpose.report.page import Section, choose_views, format_plain_table, write_page
 
 _PAGE = "report.html"
@@ -69,7 +69,7 @@ def claim_for_jobs(
     Args:
         out: the folder.
         settings: JSON values that decide the poses.
-        jobs: each with the files that it reads.
+        jobs: jobs with the files that they read.
         is_result: whether the result of the first name is one of the input of the second name.
     """
     run.claim_folder(out, settings, [POSES, _PAGE])
@@ -117,12 +117,12 @@ def write_files(
     """Write the files of each input or of a data set, and the page.
 
     Args:
-        predictions: all that are shown.
-        jobs: one for each prediction, which reads its input.
-        out: the folder.
-        method: method that made them.
-        dataset: data set that they are of; None: they are of clouds or depth images.
-        input_count: number of inputs where it may differ from that of the predictions.
+        predictions: the poses and refusals.
+        jobs: for each of them the job that reads its input.
+        out: folder of the results.
+        method: the method that made them.
+        dataset: data set of the inputs; None: they are clouds or depth images.
+        input_count: number of inputs, where one may have several predictions; None: one each.
     """
     models = {model.name: model for model in method.models}
     if dataset is None:
@@ -138,7 +138,10 @@ def _write_dataset_files(
     out: Path,
     models: Mapping[str, ObjectModel],
 ) -> None:
-    """Write BOP's csv of a data set's poses, and a picture of each image with its poses."""
+    """Write BOP's csv of a data set's poses, and a picture of each image with its poses.
+
+    ``models``: by the names of the objects.
+    """
     write_bop_results(out / name_bop_results(dataset), predictions)
     if any(p.estimate.alternatives for p in predictions):
         table = out / name_bop_results(dataset, _WITH_ALTERNATIVES)
@@ -154,11 +157,11 @@ def _write_dataset_files(
         if is_whole(out, name, [name]):
             continue
         instance = image_of[scene_id, image_id]
-        picture = drawn.read_instance_image(instance)
+        picture = pose_report.read_instance_image(instance)
         for estimate in estimates:
             pose = estimate.camera_from_model
             assert pose is not None
-            picture = drawn.draw_pose(picture, pose, models[estimate.object], instance.K)
+            picture = pose_report.draw_pose(picture, pose, models[estimate.object], instance.K)
         write_image(out / name, picture)
         note_result(out, name, [out / name])
 
@@ -169,7 +172,10 @@ def _write_job_files(
     out: Path,
     models: Mapping[str, ObjectModel],
 ) -> None:
-    """Write the posed model beside each cloud, and a picture of each depth image with its pose."""
+    """Write the posed model beside each cloud, and a picture of each depth image with its pose.
+
+    ``models``: by the names of the objects.
+    """
     for prediction, job in zip(predictions, jobs, strict=True):
         pose = prediction.estimate.camera_from_model
         if pose is None:
@@ -179,13 +185,13 @@ def _write_job_files(
             view = job.read()
         except InputError:  # unreadable by now
             continue
-        points_m = drawn.select_object_points(view, model.diameter_m)
+        points_m = pose_report.select_object_points(view, model.diameter_m)
         cloud_file = out / f"{job.name}.{CLOUD}"
-        write_cloud(cloud_file, drawn.join_posed_cloud(points_m, pose.double(), model))
+        write_cloud(cloud_file, pose_report.join_posed_cloud(points_m, pose.double(), model))
         files = [cloud_file]
         if isinstance(view, ViewInput):
-            picture = drawn.draw_region(drawn.draw_grey_depth(view.depth_m), view, pose)
-            picture = drawn.draw_pose(picture, pose, model, view.K)
+            picture = pose_report.draw_region(pose_report.draw_grey_depth(view.depth_m), view, pose)
+            picture = pose_report.draw_pose(picture, pose, model, view.K)
             picture_file = out / f"{job.name}.{PICTURE}"
             write_image(picture_file, picture)
             files.append(picture_file)
@@ -193,9 +199,14 @@ def _write_job_files(
 
 
 def print_result(predictions: list[Prediction], out: Path, input_count: int | None = None) -> int:
-    """Print the poses, their alternatives and the reasons of refusals; give the exit code.
+    """Print the poses, their alternatives and the reasons of refusals; return the exit code.
 
-    ``input_count``: where an input may have several estimates; None: one each.
+    It is 1 where an input could not be read.
+
+    Args:
+        predictions: the poses.
+        out: folder of the results.
+        input_count: number of inputs, where one may have several poses; None: one each.
     """
     estimates = [prediction.estimate for prediction in predictions]
     unreadable = [estimate for estimate in estimates if estimate.status == "unreadable"]
@@ -230,8 +241,8 @@ def _print_table(estimates: Sequence[PoseEstimate]) -> None:
     rows: list[dict[str, Any]] = []
     for estimate in estimates[:_MAX_PRINTED_POSES]:
         row = _make_row(estimate)
-        row |= _pose_cells(estimate.camera_from_model)
-        row |= _pose_cells(estimate.base_from_model, prefix="base ")
+        row |= _format_pose(estimate.camera_from_model)
+        row |= _format_pose(estimate.base_from_model, prefix="base ")
         row |= {name: f"{row[name]:.3f}" for name in _SHARES if row[name] is not None}
         rows.append(row)
     print(format_plain_table(rows, _PRINTED_COLUMNS), end="")
@@ -240,7 +251,7 @@ def _print_table(estimates: Sequence[PoseEstimate]) -> None:
         print(_PICK_RANK_LEGEND)
 
 
-def _pose_cells(pose: Rigid | None, prefix: str = "") -> dict[str, str]:
+def _format_pose(pose: Rigid | None, prefix: str = "") -> dict[str, str]:
     """Format the position and the quaternion of a pose, each for a column of the terminal."""
     if pose is None:
         return {}
@@ -252,17 +263,17 @@ def _pose_cells(pose: Rigid | None, prefix: str = "") -> dict[str, str]:
 
 
 def _describe_counts(predictions: Sequence[Prediction], input_count: int | None) -> str:
-    """Describe the number of inputs, and of estimates where that differs."""
-    answers = len(predictions)
-    count = answers if input_count is None else input_count
+    """Describe the number of inputs, and of poses and refusals where that differs."""
+    prediction_count = len(predictions)
+    count = prediction_count if input_count is None else input_count
     text = f"{count} input{'s' * (count != 1)}"
-    if count != answers:
-        text += f", {answers} answer{'s' * (answers != 1)}"
+    if count != prediction_count:
+        text += f", {prediction_count} answer{'s' * (prediction_count != 1)}"
     return text
 
 
 def _make_row(estimate: PoseEstimate) -> dict[str, Any]:
-    """Give the row of an estimate for the page and the terminal."""
+    """Make the columns of an estimate for the page and the terminal."""
     row: dict[str, Any] = {
         "input": estimate.name,
         "object": estimate.object,
@@ -301,12 +312,15 @@ def _write_page(
     dataset: BopDataset | None,
     input_count: int | None,
 ) -> None:
-    """Write a page with some of the predictions and the reason of every refusal."""
+    """Write a page with some of the predictions and the reason of every refusal.
+
+    The arguments are those of :func:`write_files`; ``models``: by the names of the objects.
+    """
     # The table: refusals first, for they are what is looked for.
     estimates = [prediction.estimate for prediction in predictions]
     refusals_first = sorted(estimates, key=lambda estimate: estimate.is_posed)
     rows = [_make_row(estimate) for estimate in refusals_first[:_MAX_PAGE_ROWS]]
-    sections = _pose_sections(predictions, jobs, models, dataset)
+    sections = _make_pose_sections(predictions, jobs, models, dataset)
 
     status_counts = Counter(estimate.status for estimate in estimates)
     counts = ", ".join(f"{count} {status}" for status, count in sorted(status_counts.items()))
@@ -321,13 +335,13 @@ def _write_page(
     print(f"the page: {out / _PAGE}")
 
 
-def _pose_sections(
+def _make_pose_sections(
     predictions: Sequence[Prediction],
     jobs: Sequence[PoseJob[Any]],
     models: Mapping[str, ObjectModel],
     dataset: BopDataset | None,
 ) -> list[Section]:
-    """Show some inputs with their poses, and some that were refused."""
+    """Make sections of some inputs with their poses, and of some that were refused."""
     instances = () if dataset is None else dataset.instances
     rgb_of = {(i.scene_id, i.image_id): i.rgb for i in instances}
     readable = [
@@ -351,7 +365,7 @@ def _pose_sections(
 
         rgb = None if prediction.place is None else rgb_of[prediction.place[:2]]
         image = None if rgb is None else read_image(rgb)
-        section = drawn.make_pose_section(
+        section = pose_report.make_pose_section(
             estimate.name, pose_input, estimate, models[estimate.object], image=image
         )
         sections.append(section)

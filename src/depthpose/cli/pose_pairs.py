@@ -5,8 +5,10 @@ from pathlib import Path
 
 import torch
 
-from depthpose.cli import depth_predict
-from depthpose.cli.depth_options import PairNetworks
+from depthpose.cli.depth_inputs import PAIRS, InputReader, list_pairs
+from depthpose.cli.depth_methods import make_pair_spec
+from depthpose.cli.depth_options import PredictOutput
+from depthpose.cli.depth_predict import predict_depth_of_files, wait_for_results
 from depthpose.cli.pose_options import PairOptions
 from depthpose.core.camera import StereoRig, read_rig
 from depthpose.core.errors import InputError
@@ -25,7 +27,7 @@ DEVIATION = "depth_std"
 
 
 def match_pairs_for_poses(pair: PairOptions, camera: Path | None, device: str, out: Path) -> Path:
-    """Match pairs, write their depth, and give its path: of one pair NAME.npy, else the folder.
+    """Match pairs, and write their depth as input of an estimate of poses.
 
     OUT/matched gets what 'depth match' writes, OUT/depth the depth [m] whose confidence is
     ``pair.min_confidence`` at least, and OUT/depth_std its standard deviation [m]. A rerun does not
@@ -35,7 +37,10 @@ def match_pairs_for_poses(pair: PairOptions, camera: Path | None, device: str, o
         pair: left and right images, what matches them, and the least confidence.
         camera: file of the rig, with its baseline.
         device: device that the matcher runs on.
-        out: the folder.
+        out: folder of the run.
+
+    Returns:
+        The depth image OUT/depth/NAME.npy of a single pair, or the folder OUT/depth of several.
 
     Raises:
         InputError: no right image, a camera without a baseline, or no depth that is sure enough.
@@ -50,22 +55,16 @@ def match_pairs_for_poses(pair: PairOptions, camera: Path | None, device: str, o
             f"--min-confidence {pair.min_confidence:g}: a confidence lies in 0 to 1; 0 keeps all"
         )
 
-    pairs = depth_predict.list_pairs(pair.left, pair.right)
+    pairs = list_pairs(pair.left, pair.right)
     images = [path for both in pairs for path in both]
     refuse_among_inputs(out, (pair.left, pair.right), images)
-    source = depth_predict.DepthMethodSource(
-        weights=None if pair.matcher == "sgbm" else pair.matcher or "default",
-        config=MatcherConfig(device=device),
-        with_right=True,
-        use="pairs",
-    )
-    networks = PairNetworks(matcher=pair.matcher)
-    work = depth_predict.pair_work(camera, networks, source, pairs[0])
-    depth_predict.predict_depth_of_files(pairs, work, source.build(), out / MATCHED)
-    if find_rank().world > 1:  # every process poses its share of all pairs
-        depth_predict.wait_for_results(pairs, work, out / MATCHED)
-
+    spec = make_pair_spec(pair.matcher, "default", MatcherConfig(device=device))
     rig = read_rig(camera, image_size(pairs[0][0]))
+    reader = InputReader(camera=rig, files=PAIRS)
+    predict_depth_of_files(pairs, spec.build(), reader, PredictOutput(), out / MATCHED)
+    if find_rank().world > 1:  # every process poses its share of all pairs
+        wait_for_results(pairs, out / MATCHED, with_cloud=False)
+
     names = [left.stem for left, _ in pairs]
     for name in names:
         _write_sure_depth(name, rig, pair.min_confidence, out)
@@ -79,8 +78,8 @@ def _write_sure_depth(name: str, rig: StereoRig, min_confidence: float, out: Pat
 
     Nothing is written of a pair that could not be matched, or that an earlier run has finished.
     """
-    home = out / MATCHED
-    if not is_whole(home, name, [f"{name}.depth_m.npy"]):
+    matched_folder = out / MATCHED
+    if not is_whole(matched_folder, name, [f"{name}.depth_m.npy"]):
         return
     settings = {"min_confidence": min_confidence}
     folders = [out / DEPTH, out / DEVIATION]
@@ -89,10 +88,10 @@ def _write_sure_depth(name: str, rig: StereoRig, min_confidence: float, out: Pat
     if all(is_whole(folder, name, [f"{name}.npy"]) for folder in folders):
         return
 
-    depth_m = read_map(home / f"{name}.depth_m.npy")
+    depth_m = read_map(matched_folder / f"{name}.depth_m.npy")
     confidence = torch.ones_like(depth_m)
-    if (home / f"{name}.confidence.npy").is_file():
-        confidence = read_map(home / f"{name}.confidence.npy")
+    if (matched_folder / f"{name}.confidence.npy").is_file():
+        confidence = read_map(matched_folder / f"{name}.confidence.npy")
     is_sure = confidence >= min_confidence
     sure_m = torch.where(is_sure, depth_m, torch.nan)
     if not bool(sure_m.isfinite().any()):

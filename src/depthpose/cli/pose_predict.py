@@ -1,10 +1,10 @@
-"""The work behind ``depthpose pose predict``, here or by an engine."""
+"""The run of ``depthpose pose predict``, in this process or by an engine."""
 
 import math
 import time
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -12,9 +12,14 @@ from typing import Any
 from tqdm import tqdm
 
 from depthpose.cli import pose_dataset, pose_masks
-from depthpose.cli.engine import EngineOptions, Weights, print_shards
-from depthpose.cli.pose_jobs import object_named, plan_jobs, read_detection
-from depthpose.cli.pose_methods import PoseMethod, PoseMethodSource
+from depthpose.cli.engine import EngineOptions, print_shards
+from depthpose.cli.pose_jobs import read_detection
+from depthpose.cli.pose_methods import (
+    PoseMethod,
+    PoseMethodSpec,
+    PoseNetworkSpec,
+    choose_object,
+)
 from depthpose.cli.pose_options import DataSetOptions, PoseInputs
 from depthpose.cli.pose_output import (
     claim_for_dataset,
@@ -22,9 +27,9 @@ from depthpose.cli.pose_output import (
     print_result,
     write_files,
 )
+from depthpose.cli.pose_plans import plan_jobs
 from depthpose.core import run
 from depthpose.core.camera import Camera, camera_of
-from depthpose.core.checkpoint import find_weights
 from depthpose.core.config import config_to_dict
 from depthpose.core.engine import Computation, InputFormat, JobInputs, LocalInput, ResultWriter
 from depthpose.core.errors import InputError
@@ -49,10 +54,19 @@ from depthpose.pose.types import PoseEstimate
 
 ENDING = "pose.json"
 """Ending of the file of one estimate in a shard: an entry of ``poses.json``."""
+_REREAD_INTERVAL_S = 1.0
+"""How often the predictions of other processes are read again."""
 
 
 def predict_poses_of_files(method: PoseMethod, inputs: PoseInputs, out: Path, batch: int) -> int:
-    """Pose clouds, or masked parts of depth images, in this process; give the exit code."""
+    """Pose clouds, or masked parts of depth images, write their files, and return the exit code.
+
+    Args:
+        method: estimates the poses.
+        inputs: options that name the files.
+        out: folder of the results.
+        batch: inputs that are estimated together.
+    """
     plan = plan_jobs(method, inputs, out)
     settings = {**method.settings, **plan.settings}
     claim_for_jobs(out, settings, plan.jobs)
@@ -71,7 +85,16 @@ def predict_poses_of_dataset(
     out: Path,
     batch: int,
 ) -> int:
-    """Pose all objects of a data set, or the one named ``object``; give the exit code."""
+    """Pose the objects of a data set, write the files of the poses, and return the exit code.
+
+    Args:
+        method: estimates the poses.
+        options: the data set, and its masks.
+        object: name or number of the only object that is posed; None: all that the method has.
+        config: settings of the estimator.
+        out: folder of the results.
+        batch: views that are estimated together.
+    """
     assert options.bop is not None
     dataset = open_bop(options.bop, options.split)
     if options.targets is not None:
@@ -111,27 +134,24 @@ def estimate_jobs(
 ) -> list[Prediction] | None:
     """Estimate what is not finished; several processes each write their share to a folder.
 
-    ``out`` is claimed before. The first process gives the predictions of all jobs, every other one
-    None.
+    Args:
+        method: estimates the poses.
+        jobs: the inputs of all processes.
+        out: folder of the results, which is claimed before.
+        settings: JSON values that decide the results.
+        batch: inputs that are estimated together.
+
+    Returns:
+        The predictions of all jobs, in their order; None in every process but the first.
     """
     process = run.find_rank()
-    home = out
+    process_folder = out
     if process.world > 1:
-        home = out / f"part-{process.rank}"
-        run.claim_folder(home, settings, [POSES])
+        process_folder = out / f"part-{process.rank}"
+        run.claim_folder(process_folder, settings, [POSES])
 
-    def estimate(share: Sequence[PoseJob[Any]]) -> dict[str, Prediction]:
-        """Estimate the unfinished ones of some jobs; give the new predictions by name."""
-        results = PoseResults[Any](home, out)
-        estimated: dict[str, Prediction] = {}
-        with closing(run_jobs(share, method.estimate_many, results, batch)) as outcomes:
-            for outcome in tqdm(outcomes, total=len(share), disable=None, unit=" poses"):
-                name = outcome.job.name
-                if outcome.result is not None or outcome.failure is not None:
-                    estimated[name] = results.predictions[name]
-        return estimated
-
-    estimated = estimate(process.share_of(jobs))
+    results = PoseResults[Any](process_folder, out)
+    estimated = _estimate_unfinished(method, process.share_of(jobs), results, batch)
     if process.rank > 0:
         return None
 
@@ -147,32 +167,51 @@ def estimate_jobs(
             for job in jobs
             if job.name not in estimated and by_name[job.name].estimate.status == "unreadable"
         ]
-        by_name |= estimate(failed) if failed else {}
+        if failed:
+            results = PoseResults[Any](process_folder, out)
+            by_name |= _estimate_unfinished(method, failed, results, batch)
     predictions = [by_name.pop(job.name) for job in jobs]
     write_predictions(out, [*by_name.values(), *predictions])
     return predictions
 
 
+def _estimate_unfinished(
+    method: PoseMethod, jobs: Sequence[PoseJob[Any]], results: PoseResults[Any], batch: int
+) -> dict[str, Prediction]:
+    """Estimate the jobs without a result; return the new predictions by name."""
+    estimated: dict[str, Prediction] = {}
+    with closing(run_jobs(jobs, method.estimate_many, results, batch)) as outcomes:
+        for outcome in tqdm(outcomes, total=len(jobs), disable=None, unit=" poses"):
+            name = outcome.job.name
+            if outcome.result is not None or outcome.failure is not None:
+                estimated[name] = results.predictions[name]
+    return estimated
+
+
+@dataclass
+class _WrittenNames:
+    """The names of the predictions that all processes have written to the folders of a run."""
+
+    out: Path
+    names: set[str] = field(default_factory=set)
+    read_s: float = -math.inf  #: when the files were read last
+
+    def has(self, name: str) -> bool:
+        """Whether a prediction of this name is written; the files are read once a second."""
+        if name not in self.names and time.monotonic() - self.read_s > _REREAD_INTERVAL_S:
+            self.names = set(read_earlier_predictions(self.out))
+            self.read_s = time.monotonic()
+        return name in self.names
+
+
 def _wait_for_predictions(out: Path, jobs: Sequence[PoseJob[Any]]) -> None:
     """Wait until the files of all processes together hold a prediction of every job."""
-    written_names: set[str] = set()
-    last_read_s = -math.inf
-
-    def is_written(name: str) -> bool:
-        """Whether a prediction of this name is in the files."""
-        nonlocal written_names, last_read_s
-        # The files are read for all names at once, every second.
-        if name not in written_names and time.monotonic() - last_read_s > 1:
-            written_names = set(read_earlier_predictions(out))
-            last_read_s = time.monotonic()
-        return name in written_names
-
-    run.wait_for([job.name for job in jobs], is_written)
+    run.wait_for([job.name for job in jobs], _WrittenNames(out).has)
 
 
 @dataclass(frozen=True)
-class EntryFiles(Results[Any, PoseEstimate]):
-    """A file for each estimate, as a worker puts it into a shard."""
+class PoseFiles(Results[Any, PoseEstimate]):
+    """A file for each estimate in a folder, as a worker puts them into a shard."""
 
     folder: Path
 
@@ -183,32 +222,27 @@ class EntryFiles(Results[Any, PoseEstimate]):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class PoseWork:
-    """The estimation of poses by a worker of an engine, from one kind of files.
+class PoseWorker:
+    """The estimation of poses by a worker of an engine, to which this is sent."""
 
-    Without a camera the files are clouds; with one they are depth images, each with its mask, or
-    all with one box.
-    """
-
-    source: PoseMethodSource
-    object: str
-    unit: Unit | None
-    camera: Camera | None
-    box: Box | None
+    spec: PoseMethodSpec  #: what the estimator is built from
+    object: str  #: name of the object in all files
+    unit: Unit | None  #: unit of clouds, m by default; of depth images where their camera has none
+    camera: Camera | None  #: camera of depth images; None: the files are clouds
+    box: Box | None  #: where the object is in all depth images; None: each has a mask
 
     def start(self) -> ResultWriter:
-        """Build the estimator, and give the function that poses a batch of a worker."""
-        method = self.source.build()
+        """Build the estimator, and return the function that poses a batch of inputs."""
+        return partial(self._estimate_samples, self.spec.build())
 
-        def estimate(samples: Sequence[LocalInput], out: Path) -> list[str]:
-            """Write the poses of a batch into a folder; give why each has none, "" if it has."""
-            jobs = [self._make_job(sample) for sample in samples]
-            results = EntryFiles(out)
-            outcomes = run_jobs(jobs, method.estimate_many, results, max(1, len(jobs)))
-            failures = [outcome.failure for outcome in outcomes]
-            return ["" if error is None else f"cannot be read: {error}" for error in failures]
-
-        return estimate
+    def _estimate_samples(
+        self, method: PoseMethod, samples: Sequence[LocalInput], out: Path
+    ) -> list[str]:
+        """Write the poses of inputs into a folder; return why each has none, "" if it has."""
+        jobs = [self._make_job(sample) for sample in samples]
+        outcomes = run_jobs(jobs, method.estimate_many, PoseFiles(out), max(1, len(jobs)))
+        failures = [outcome.failure for outcome in outcomes]
+        return ["" if error is None else f"cannot be read: {error}" for error in failures]
 
     def _make_job(self, sample: LocalInput) -> Job[Any]:
         """Make the job of a cloud, or of a depth image and its mask or box."""
@@ -228,11 +262,19 @@ class PoseWork:
 
 
 def predict_poses_on_ray(
-    options: PoseInputs, source: PoseMethodSource, batch: int, out: str, engine: EngineOptions
+    options: PoseInputs, spec: PoseMethodSpec, batch: int, out: str, engine: EngineOptions
 ) -> int:
     """Pose clouds, or depth images with masks or a box, by the workers of an engine.
 
-    The inputs are files, manifests or tar shards. Gives the exit code.
+    Args:
+        options: options that name the inputs: files, manifests or tar shards.
+        spec: what the estimator is built from.
+        batch: inputs that are estimated together.
+        out: folder or URL for the shards.
+        engine: options of the engine.
+
+    Returns:
+        The exit code.
     """
     # What the files are: clouds, depth images with masks, or depth images alone.
     if options.depth is not None and options.lens is None:
@@ -252,21 +294,20 @@ def predict_poses_on_ray(
         _refuse_other_mask_names(inputs, paths[1])
 
     # What is estimated; the weights travel to the workers.
-    if isinstance(source.weights, str):
-        path = find_weights(source.weights)
-        source = replace(source, weights=Weights(name=path.name, data=path.read_bytes()))
-    method = source.build("cpu")
-    object = object_named(options.object or None, method)
+    if isinstance(spec, PoseNetworkSpec):
+        spec = spec.with_packed_weights()
+    method = replace(spec, config=replace(spec.config, device="cpu")).build()
+    object = choose_object(options.object or None, method)
     camera = None
     if options.lens is not None:
         with inputs.open_first() as first:
             camera = camera_of(options.lens, image_size(first[0]))
-    poses = PoseWork(source=source, object=object, unit=options.unit, camera=camera, box=box)
+    worker = PoseWorker(spec=spec, object=object, unit=options.unit, camera=camera, box=box)
 
     # All that decides the poses, for the record of the run.
     settings = {
         **method.settings,
-        "estimate": config_to_dict(source.config),
+        "estimate": config_to_dict(spec.config),
         "object": object,
         "unit": options.unit,
     }
@@ -275,7 +316,7 @@ def predict_poses_on_ray(
     if camera is not None:
         settings["K"] = camera.K.tolist()
         settings["depth_unit_m"] = camera.depth_unit_m
-    work = Computation(make_writer=poses.start, input_format=files, endings=(ENDING,), batch=batch)
+    work = Computation(start=worker.start, files=files, endings=(ENDING,), batch=batch)
     return print_shards(engine.run(work, inputs, out, settings), out, "inputs")
 
 

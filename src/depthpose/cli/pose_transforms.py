@@ -19,8 +19,15 @@ _FARTHEST_BASE_M = 50.0
 def read_pose(path: Path, option: str = "--first", transform: str = "camera_from_model") -> Rigid:
     """Read a pose: the only one of a ``poses.json``, or a 4x4 matrix in a text file, in metres.
 
-    Brackets, commas and semicolons between its numbers are skipped. ``option`` and ``transform``
-    name the file and the matrix in errors.
+    Brackets, commas and semicolons between its numbers are skipped.
+
+    Args:
+        path: the file.
+        option: option that names it, for errors.
+        transform: name of the matrix, for errors.
+
+    Raises:
+        InputError: the file holds no pose, or several.
     """
     if path.name == predictions.POSES:
         return _read_only_pose(path, option)
@@ -54,7 +61,13 @@ def _read_only_pose(path: Path, option: str) -> Rigid:
 
 
 def read_base(words: Sequence[str]) -> Rigid | None:
-    """Read ``--base-from-camera``: a text file, or 16 numbers row by row; None: it is unset."""
+    """Read the pose of the camera in the robot's base from the words of ``--base-from-camera``.
+
+    They name a text file, or are 16 numbers row by row; without words there is no pose.
+
+    Raises:
+        InputError: they are no rigid transform in metres.
+    """
     if not words:
         return None
     option = "--base-from-camera"
@@ -76,6 +89,9 @@ def _parse_rigid(text: str, source: str, transform: str) -> Rigid:
     """Parse a rigid transform: the 16 numbers of its 4x4 matrix, row by row, in metres.
 
     ``source`` and ``transform`` name it in errors.
+
+    Raises:
+        InputError: these are no 16 numbers, or their matrix is not rigid.
     """
     try:
         words = re.sub(r"[\[\],;]", " ", text).split()

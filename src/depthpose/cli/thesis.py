@@ -1,7 +1,7 @@
 """``depthpose reproduce ...`` and ``depthpose figure ...``."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -13,11 +13,12 @@ from depthpose.cli.pose_options import PoseDataOptions, PoseTableOptions
 from depthpose.core.errors import InputError
 
 if TYPE_CHECKING:
-    from depthpose.cli.depth_predict import DepthMethod, DepthMethodSource
+    from depthpose.cli.depth_methods import DepthMethod
+    from depthpose.depth.config import MatcherConfig
     from depthpose.thesis.depth import PublishedTable
 
 
-def reproduce(
+def reproduce_table(
     table: tyro.conf.Positional[Literal["2.1", "2.2", "2.3"]],
     kitti: Path,
     out: NewPath,
@@ -53,10 +54,9 @@ def reproduce(
         split: eigen-test (697 frames), another split, a file of frames, or all.
         pictures: how many frames the page shows.
     """
-    from depthpose.cli.depth_evaluate import baseline_method, open_frames, open_training
-    from depthpose.cli.depth_predict import DepthMethodSource
-    from depthpose.cli.thesis_depth import reproduce_table
-    from depthpose.depth.protocols import find_protocol
+    from depthpose.cli.depth_evaluate import fit_baseline, open_frames, open_training
+    from depthpose.cli.thesis_depth import write_reproduced_table
+    from depthpose.depth.evaluate import find_protocol
     from depthpose.thesis.depth import TABLES
 
     # Refuse what cannot be compared before anything is read.
@@ -70,23 +70,20 @@ def reproduce(
     _refuse_rows(published, weights, matcher, beside)
     dataset = open_frames(kitti, None if split == "all" else split)
 
-    source = DepthMethodSource(
-        weights=None, config=matching.config, with_right=published.with_right
-    )
-    methods = _build_methods(source, published, weights, matcher, beside)
+    methods = _build_methods(matching.config, published, weights, matcher, beside)
     if train:
         training = open_training(train, train_without, dataset)
-        baselines = [baseline_method(name, training) for name in ("rows", "nearest")]
+        baselines = [fit_baseline(name, training) for name in ("rows", "nearest")]
         # A baseline uses no right image, but is measured on the frames of the other rows.
         methods += [("", method._replace(with_right=published.with_right)) for method in baselines]
 
-    return reproduce_table(
+    return write_reproduced_table(
         published, dataset, methods, out, comparison.protocol, comparison.cap, pictures
     )
 
 
 def _build_methods(
-    source: "DepthMethodSource",
+    config: "MatcherConfig",
     table: "PublishedTable",
     weights: Sequence[str],
     matcher: str | None,
@@ -94,14 +91,25 @@ def _build_methods(
 ) -> list[tuple[str, "DepthMethod"]]:
     """Build each method, with the row of the thesis that it reproduces, or "" for none.
 
-    ``source``: source of a method without weights, with the settings that all share.
+    Args:
+        config: how the networks run.
+        table: the printed table.
+        weights: weights that reproduce its rows, in their order.
+        matcher: "sgbm": OpenCV's matcher too; None: without it.
+        beside: weights of further methods of one image; None: those that ship.
+
+    Raises:
+        InputError: two weights have one name.
     """
-    first_row = table.own_rows[0]
-    row_names = table.own_rows if len(table.own_rows) > 1 else [first_row] * len(weights)
-    methods = [
-        (row_name, replace(source, weights=file).build())
-        for row_name, file in zip(row_names, weights, strict=True)
-    ]
+    from depthpose.cli.depth_methods import DepthNetworkSpec, SGBMSpec
+
+    # A table with several rows of the thesis has weights for each, else all are of the one row.
+    first_row = table.thesis_rows[0]
+    row_names = table.thesis_rows if len(table.thesis_rows) > 1 else [first_row] * len(weights)
+    methods: list[tuple[str, DepthMethod]] = []
+    for row_name, file in zip(row_names, weights, strict=True):
+        spec = DepthNetworkSpec(weights=file, config=config, with_right=table.with_right)
+        methods.append((row_name, spec.build()))
     names = [method.name for _, method in methods]
     repeated = next((name for name in names if names.count(name) > 1), None)
     if repeated is not None:
@@ -109,13 +117,15 @@ def _build_methods(
             f"two weights are called {repeated!r}, and so would their predictions be: rename one."
         )
     if matcher is not None:
-        methods.append((first_row, replace(source, with_filled_holes=True).build()))
+        methods.append((first_row, SGBMSpec(with_filled_holes=True).build()))
 
     # Methods beside them reproduce no row of the thesis.
     if not table.with_right:
         files = ("default",) if beside is None else beside
-        others = [replace(source, weights=file).build() for file in files]
-        methods += [("", method) for method in others if method.name not in names]
+        for file in files:
+            method = DepthNetworkSpec(weights=file, config=config, with_right=False).build()
+            if method.name not in names:
+                methods.append(("", method))
     return methods
 
 
@@ -125,7 +135,10 @@ def _refuse_rows(
     matcher: str | None,
     beside: Sequence[str] | None,
 ) -> None:
-    """Refuse, before any work, rows that a table does not have, and missing ones."""
+    """Refuse options that give a table rows which it does not have, or too few.
+
+    The arguments are those of :func:`_build_methods`.
+    """
     if beside is not None and table.with_right:
         raise InputError(
             f"--beside {' '.join(beside)}: adds methods of one image, and table {table.number} is "
@@ -141,15 +154,15 @@ def _refuse_rows(
         raise InputError(
             f"table {table.number}: there is nothing to measure; give --weights FILE{alternative}."
         )
-    if len(table.own_rows) > 1 and len(weights) != len(table.own_rows):
-        rows = " and ".join(f"'{name}'" for name in table.own_rows)
+    if len(table.thesis_rows) > 1 and len(weights) != len(table.thesis_rows):
+        rows = " and ".join(f"'{name}'" for name in table.thesis_rows)
         raise InputError(
             f"table {table.number}: has the rows {rows}, but {len(weights)} weights were given; "
             "give one for each, in this order."
         )
 
 
-def figure(
+def draw_figure(
     figure: tyro.conf.Positional[Literal["2-1", "2-5"]],
     kitti: Path,
     weights: WeightsName,
@@ -178,19 +191,22 @@ def figure(
         split: choose among the frames of a split, such as eigen-test.
     """
     from depthpose.cli.depth_evaluate import open_frames
-    from depthpose.cli.depth_predict import DepthMethodSource
-    from depthpose.cli.thesis_depth import choose_frames, write_figure
+    from depthpose.cli.depth_methods import DepthNetworkSpec
+    from depthpose.cli.thesis_depth import choose_frames, find_frames, write_figure
 
     dataset = open_frames(kitti, split)
     if number is not None:
         refuse_below(1, "--number", number, "4")
-    chosen = choose_frames(dataset, frames, number or (1 if figure == "2-1" else 4))
+    if frames:
+        indices = find_frames(dataset, frames)
+    else:
+        indices = choose_frames(dataset, number or (1 if figure == "2-1" else 4))
     with_right = False if figure == "2-1" else None
-    source = DepthMethodSource(weights=weights, config=matching.config, with_right=with_right)
-    return write_figure(figure, dataset, chosen, source.build(), out)
+    spec = DepthNetworkSpec(weights=weights, config=matching.config, with_right=with_right)
+    return write_figure(figure, dataset, indices, spec.build(), out)
 
 
-def table_3_1(
+def reproduce_table_3_1(
     weights: tuple[WeightsName, ...],
     out: NewPath,
     data: PoseDataOptions = PoseDataOptions(),
@@ -217,7 +233,7 @@ def table_3_1(
     return reproduce_by_object("3.1", data, estimates, weights, (), out)
 
 
-def table_3_2(
+def reproduce_table_3_2(
     out: NewPath,
     weights: tuple[WeightsName, ...] = (),
     csv: tuple[Path, ...] = (),
@@ -243,7 +259,7 @@ def table_3_2(
     return reproduce_by_object("3.2", data, estimates, weights, csv, out)
 
 
-def table_3_3(
+def reproduce_table_3_3(
     weights: WeightsName,
     out: NewPath,
     data: PoseDataOptions = PoseDataOptions(),
@@ -277,7 +293,7 @@ def table_3_3(
     return reproduce_voting(weights, data, number, points, out)
 
 
-def figure_3_2(
+def draw_figure_3_2(
     weights: WeightsName,
     out: NewPath,
     data: PoseDataOptions = PoseDataOptions(),
@@ -298,13 +314,14 @@ def figure_3_2(
         number: how many clouds.
         perplexity: of t-SNE.
     """
-    from depthpose.cli.thesis_pose import feature_panels, write_figure
+    from depthpose.cli.thesis_pose import draw_feature_panels, write_figure
 
     settings = {"perplexity": perplexity}
-    return write_figure("3-2", weights, data, number, out, feature_panels, columns=4, **settings)
+    draw_panels = partial(draw_feature_panels, perplexity=perplexity)
+    return write_figure("3-2", weights, data, number, out, draw_panels, settings, columns=4)
 
 
-def figure_3_4(
+def draw_figure_3_4(
     weights: WeightsName,
     out: NewPath,
     data: PoseDataOptions = PoseDataOptions(),
@@ -325,13 +342,14 @@ def figure_3_4(
         number: how many views are looked at.
         keypoint: only this one, from 0 on.
     """
-    from depthpose.cli.thesis_pose import field_panels, write_figure
+    from depthpose.cli.thesis_pose import draw_direction_panels, write_figure
 
     settings = {"keypoint": keypoint}
-    return write_figure("3-4", weights, data, number, out, field_panels, columns=3, **settings)
+    draw_panels = partial(draw_direction_panels, keypoint=keypoint)
+    return write_figure("3-4", weights, data, number, out, draw_panels, settings, columns=3)
 
 
-def figure_3_5(
+def draw_figure_3_5(
     weights: WeightsName, out: NewPath, data: PoseDataOptions = PoseDataOptions(), number: int = 6
 ) -> int:
     """Draw figure 3-5: boxes of true (green, dashed) and estimated (blue, solid) poses.
@@ -346,6 +364,6 @@ def figure_3_5(
         out: folder for the figure.
         number: how many views.
     """
-    from depthpose.cli.thesis_pose import box_panels, write_figure
+    from depthpose.cli.thesis_pose import draw_box_panels, write_figure
 
-    return write_figure("3-5", weights, data, number, out, box_panels, columns=3)
+    return write_figure("3-5", weights, data, number, out, draw_box_panels, {}, columns=3)

@@ -10,8 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 from tqdm import tqdm
 
-from depthpose.cli import depth_evaluate as evaluation
-from depthpose.cli.depth_predict import DepthMethod
+from depthpose.cli import depth_evaluate
+from depthpose.cli.depth_methods import DepthMethod
 from depthpose.core.errors import InputError, suggest_name
 from depthpose.core.files import write_image
 from depthpose.core.run import claim_folder, describe_environment, find_rank
@@ -22,19 +22,20 @@ from depthpose.report import page
 from depthpose.report.page import Drawing, PictureFile, Section
 from depthpose.thesis.depth import (
     DEPTH_SCALE,
+    PANEL_WIDTH_PX,
     PublishedTable,
-    arrange,
+    arrange_columns,
     draw_figure_2_1,
     draw_figure_2_5,
     join_published,
     shrink_to_width,
 )
 
-_PANEL_WIDTH_PX = 621
-"""Width of a panel on a page: half of a frame of KITTI."""
+_MAX_HINT_LENGTH = 300
+"""Characters of an error's hint, which may list the names of all frames."""
 
 
-def reproduce_table(
+def write_reproduced_table(
     table: PublishedTable,
     dataset: Dataset,
     methods: Sequence[tuple[str, DepthMethod]],
@@ -43,23 +44,26 @@ def reproduce_table(
     caps_m: Sequence[float],
     pictures: int,
 ) -> int:
-    """Predict what is missing, measure, join with the published rows, and write everything.
+    """Make a table of chapter 2: predict what is missing, measure, join with printed rows, write.
 
     Args:
         table: the printed table.
         dataset: frames with truth.
         methods: each with the name of the printed row that it reproduces, or "" for none.
         out: folder of the files.
-        protocol: protocol by which the predictions are measured.
-        caps_m: truth beyond a cap does not count; a row for each.
+        protocol: name of the protocol by which the predictions are measured.
+        caps_m: truth beyond a cap [m] does not count; a row for each.
         pictures: frames of each method that the page shows.
+
+    Returns:
+        The exit code.
     """
     # All that decides the numbers.
     settings = {
         "table": table.number,
         "dataset": dataset.name,
         "frames": len(dataset),
-        "frames_sha256": _frames_sha256(dataset.frames),
+        "frames_sha256": _hash_frames(dataset.frames),
         "protocol": protocol,
         "caps_m": list(caps_m),
         "methods": {method.name: method.settings for _, method in methods},
@@ -69,15 +73,17 @@ def reproduce_table(
 
     # Predict, in all processes; the first measures and joins.
     rule = find_protocol(protocol)
-    home = out / "predictions"
+    predictions_folder = out / "predictions"
     folders = [
-        evaluation.predict_depth_of_dataset(dataset, method, rule, home) for _, method in methods
+        depth_evaluate.predict_depth_of_dataset(dataset, method, rule, predictions_folder)
+        for _, method in methods
     ]
     if find_rank().rank > 0:
         return 0
-    measured = evaluation.join(evaluation.measure_each(dataset, folders, protocol, caps_m))
-    own_rows = [own_row for own_row, _ in methods for _ in caps_m]
-    rows = join_published(table, list(zip(own_rows, measured.rows, strict=True)))
+    evaluations = depth_evaluate.measure_folders(dataset, folders, protocol, caps_m)
+    measured = depth_evaluate.join_evaluations(evaluations)
+    reproduced = [printed_row for printed_row, _ in methods for _ in caps_m]
+    rows = join_published(table, list(zip(reproduced, measured.rows, strict=True)))
     page.write_table(out, rows)
 
     # The page: the table, figures of some frames, the details, the settings.
@@ -93,7 +99,7 @@ def reproduce_table(
     sections = [
         Section(title="Published rows, ours, and difference", text=method_note, rows=rows),
         *figures,
-        *evaluation.write_details(measured, out),
+        *depth_evaluate.write_detail_tables(measured, out),
         _make_settings_section([method for _, method in methods]),
     ]
     write_report(f"{table.title}, on {dataset.name}", sections, out)
@@ -103,14 +109,14 @@ def reproduce_table(
     return 0
 
 
-def _frames_sha256(frames: Sequence[FramePaths]) -> str:
-    """Give the SHA-256 of the paths of the left images."""
+def _hash_frames(frames: Sequence[FramePaths]) -> str:
+    """Compute the SHA-256 of the paths of the left images."""
     paths = "".join(f"{frame.left.resolve()}\n" for frame in frames)
     return hashlib.sha256(paths.encode()).hexdigest()
 
 
 def _make_settings_section(methods: Sequence[DepthMethod]) -> Section:
-    """Show what decides the results of each method, a row for each setting."""
+    """Make a section of the settings of each method, a row for each setting."""
     rows = [
         {"method": method.name, "setting": name, "value": str(value)}
         for method in methods
@@ -120,28 +126,36 @@ def _make_settings_section(methods: Sequence[DepthMethod]) -> Section:
 
 
 def _make_figure_sections(
-    method: DepthMethod, dataset: Dataset, out: Path, number: int
+    method: DepthMethod, dataset: Dataset, out: Path, frame_count: int
 ) -> list[Section]:
     """Draw figure 2-5 of some frames that a method predicted, and figure 2-1 of the first.
 
     Figure 2-1 is left out where the method synthesised no right view, or there is no real one.
+
+    Args:
+        method: its predictions are in ``OUT/predictions/METHOD``.
+        dataset: the frames.
+        out: folder of the report; the panels are written to ``OUT/figures/METHOD``.
+        frame_count: how many frames.
     """
     predictions = out / "predictions" / method.name
-    home = out / "figures" / method.name
+    figures_folder = out / "figures" / method.name
     frames = [frame for frame in dataset.frames if has_prediction(predictions, frame.name)]
     predicted = replace(dataset, frames=frames)
     sections: list[Section] = []
-    for k, index in enumerate(choose_frames(predicted, (), number)):
+    for k, index in enumerate(choose_frames(predicted, frame_count)):
         pair = predicted.read_input(index)
         lidar_m = _read_lidar(frames[index])
         estimate = read_estimate(predictions, pair.name, pair.camera)
         figures = {"2-5": draw_figure_2_5(pair, lidar_m, estimate)}
         if k == 0 and estimate.right is not None and pair.right is not None:
-            stereo = method.net.estimate_input(pair)
+            stereo = method.estimator.estimate_input(pair)
             figures["2-1"] = draw_figure_2_1(pair, lidar_m, estimate, stereo)
         for figure, panels in figures.items():
             title = f"Figure {figure}: {method.name}, {pair.name}"
-            sections.append(_make_panel_section(title, panels, home / f"{figure}_{pair.name}"))
+            sections.append(
+                _make_panel_section(title, panels, figures_folder / f"{figure}_{pair.name}")
+            )
     return sections
 
 
@@ -158,37 +172,58 @@ def write_report(title: str, sections: Sequence[Section], out: Path) -> None:
     print(f"the page: {out / 'report.html'}")
 
 
-def choose_frames(dataset: Dataset, names: Sequence[str], number: int) -> list[int]:
-    """Give the indices of the named frames, or else of some from all over the dataset.
+def find_frames(dataset: Dataset, names: Sequence[str]) -> list[int]:
+    """Find the indices of frames by their names.
 
-    The latter have a right view, and LiDAR too if any frame has both.
+    Raises:
+        InputError: there is no frame of a name.
     """
-    if names:
-        index_of = {frame.name: i for i, frame in enumerate(dataset.frames)}
-        unknown = [name for name in names if name not in index_of]
-        if unknown:
-            hint = suggest_name(unknown[0], index_of)[:300]
-            raise InputError(f"{dataset.name}: no frame {unknown[0]!r}; {hint}")
-        return [index_of[name] for name in names]
+    index_of = {frame.name: i for i, frame in enumerate(dataset.frames)}
+    unknown = [name for name in names if name not in index_of]
+    if unknown:
+        hint = suggest_name(unknown[0], index_of)[:_MAX_HINT_LENGTH]
+        raise InputError(f"{dataset.name}: no frame {unknown[0]!r}; {hint}")
+    return [index_of[name] for name in names]
+
+
+def choose_frames(dataset: Dataset, count: int) -> list[int]:
+    """Choose frames with a right view, spread over the dataset; return their indices.
+
+    They have LiDAR too, if any frame has both.
+
+    Raises:
+        InputError: no frame has a right view.
+    """
     pairs = [i for i, frame in enumerate(dataset.frames) if frame.right is not None]
     candidates = [i for i in pairs if has_lidar(dataset.frames[i], "camera_z")] or pairs
     if not candidates:
         raise InputError(f"{dataset.name}: no frame has a right view, which the figures show.")
-    return [candidates[k] for k in page.spread_evenly(len(candidates), max(1, number))]
+    return [candidates[k] for k in page.spread_evenly(len(candidates), max(1, count))]
 
 
 def write_figure(
-    number: str, dataset: Dataset, indices: Sequence[int], method: DepthMethod, out: Path
+    figure: str, dataset: Dataset, indices: Sequence[int], method: DepthMethod, out: Path
 ) -> int:
-    """Estimate the frames, draw the figure, and write it with a page that explains it."""
+    """Estimate frames, draw figure 2-1 or 2-5 of them, and write it with a page.
+
+    Args:
+        figure: number of the figure in the thesis.
+        dataset: the frames.
+        indices: which of them, a column of the figure each.
+        method: estimates their depth.
+        out: folder of the figure.
+
+    Returns:
+        The exit code.
+    """
     frames = [dataset.frames[index] for index in indices]
     settings = {
-        "command": f"figure {number}",
+        "command": f"figure {figure}",
         "frames": [frame.name for frame in frames],
-        "frames_sha256": _frames_sha256(frames),
+        "frames_sha256": _hash_frames(frames),
         "method": method.settings,
     }
-    claim_folder(out, settings, (f"figure-{number}.png", "panels", "report.html"))
+    claim_folder(out, settings, (f"figure-{figure}.png", "panels", "report.html"))
 
     columns: list[list[Drawing]] = []
     sections: list[Section] = []
@@ -196,29 +231,32 @@ def write_figure(
         pair = dataset.read_input(index)
         lidar_m = _read_lidar(frame)
         views = pair if method.with_right else replace(pair, right=None)
-        estimate = method.net.estimate_input(views)
-        if number == "2-5":
+        estimate = method.estimator.estimate_input(views)
+        if figure == "2-5":
             panels = draw_figure_2_5(pair, lidar_m, estimate)
         else:
-            stereo = method.net.estimate_input(pair)
+            stereo = method.estimator.estimate_input(pair)
             panels = draw_figure_2_1(pair, lidar_m, estimate, stereo)
         columns.append(panels)
         sections.append(_make_panel_section(frame.name, panels, out / "panels" / frame.name))
 
-    path = out / f"figure-{number}.png"
-    write_image(path, arrange(columns))
+    path = out / f"figure-{figure}.png"
+    write_image(path, arrange_columns(columns))
     sections.append(_make_settings_section([method]))
-    page.write_page(out / "report.html", f"Figure {number}", sections, describe_environment())
+    page.write_page(out / "report.html", f"Figure {figure}", sections, describe_environment())
     captions = "; ".join(panel.caption for panel in columns[0])
     print(f"{path}: each column from top to bottom: {captions}. {DEPTH_SCALE}; see the bar below.")
     return 0
 
 
 def _make_panel_section(title: str, panels: Sequence[Drawing], stem: Path) -> Section:
-    """Write each panel as a file, STEM.1.jpg, ..., small enough for a page of many; show them."""
+    """Write each panel as a file, STEM.1.jpg, ..., and make a section that shows them.
+
+    The files are small, since a page may show many.
+    """
     pictures: list[PictureFile] = []
     for k, panel in enumerate(panels, 1):
         path = stem.with_name(f"{stem.name}.{k}.jpg")
-        write_image(path, shrink_to_width(panel.image, _PANEL_WIDTH_PX))
-        pictures.append(PictureFile(path=path, caption=panel.caption, color_bar=panel.color_bar))
+        write_image(path, shrink_to_width(panel.image, PANEL_WIDTH_PX))
+        pictures.append(PictureFile(path=path, caption=panel.caption, scale=panel.scale))
     return Section(title=title, text=DEPTH_SCALE, pictures=pictures)

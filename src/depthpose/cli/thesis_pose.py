@@ -1,7 +1,7 @@
 """Tables and figures of chapter 3: predict, measure, join with the printed rows, draw, write."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -33,13 +33,15 @@ from depthpose.report import page
 from depthpose.report.page import Drawing, PictureFile, Section
 from depthpose.report.pose import cut_close_up, draw_grey_depth, draw_pose, read_instance_image
 from depthpose.thesis import pose_figures, pose_tables
+from depthpose.thesis.pose_voting import VotingCase, collect_votes, compare_voting
+from depthpose.thesis.tsne import embed_line
 
 _SYNTHETIC_SEED = 3303
 """Seed of the synthetic views for tables and figures; no training uses it."""
 _MAX_TSNE_POINTS = 4000
-"""The time of t-SNE grows with the square of the points."""
-_MAX_VOTES = 1500
-"""Points of a view that vote in figure 3-4."""
+"""Most points of a t-SNE, whose time grows with their square."""
+_MAX_VOTING_POINTS = 1500
+"""Most points of a view that vote in figure 3-4."""
 _FIGURE_TEXTS = {
     "3-2": "Alike features have alike colours (t-SNE to one number for all clouds, Spectral); the "
     "model is black, each cloud posed on it by the truth.",
@@ -47,19 +49,37 @@ _FIGURE_TEXTS = {
     "3-5": "Boxes: truth green and dashed, estimate blue and solid.",
 }
 """What stands below each figure."""
+_PERCENT_NOTE = (
+    "Percent of instances whose ADD (ADD-S where there is a star, or a declared symmetry) is "
+    "below 10 % of the diameter. Ours: a missing or refused estimate is a failure; see the "
+    "columns for masks, diameters and the list of frames."
+)
+_DIFFERENCE_NOTES = {
+    "3.1": "Differences: the first weights less each of the others.",
+    "3.2": (
+        "Published rows: as printed, of the 13 objects; those with RGB see what ours does "
+        "not, most train a network for each object, and their lists of frames and diameters "
+        "differ (see the notes). Differences: ours minus the rows of one network for all objects. "
+        "The thesis's own row is not in the text that is at hand."
+    ),
+}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Views:
     """Views with truth, of a data set or synthetic."""
 
-    samples: Sequence[ViewSample]
-    instances: Sequence[Instance | None]  #: of the data set; None: a synthetic view
-    facts: dict[str, Any]  #: columns beside numbers that were measured on the views
-    settings: dict[str, Any]  #: what decides which views they are
+    samples: Sequence[ViewSample]  #: the views, whose objects have the names of the network
+    instances: Sequence[Instance | None]  #: instance of each in the data set; None: synthetic
+    columns: dict[str, Any]  #: what tables say of the views beside the numbers measured on them
+    settings: dict[str, Any]  #: JSON values that decide which views they are
 
-    def close_up(self, index: int) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "3 3"]]:
-        """Draw a close-up of the object in a view, in grey depth without a picture; give its K."""
+    def draw_close_up(self, index: int) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "3 3"]]:
+        """Draw the part of a view that shows the object: its picture, or its depth in grey.
+
+        Returns:
+            The close-up, and its K.
+        """
         instance = self.instances[index]
         view = self.samples[index].input
         if instance is None or instance.rgb is None:
@@ -69,28 +89,30 @@ class Views:
         return cut_close_up(picture, view.mask, view.K)
 
 
-def open_views(net: GeoPoseNet, data: PoseDataOptions, number: int | None, synthetic: int) -> Views:
-    """Read views of a data set, or render synthetic ones of the network's objects.
+def _render_views(net: GeoPoseNet, count: int) -> Views:
+    """Render synthetic views of the network's objects."""
+    config = ObjectsConfig(number=count, seed=_SYNTHETIC_SEED)
+    objects = SyntheticViews(net.weights.models, config, net.weights.cloud)
+    return Views(
+        samples=[objects.view(i) for i in range(count)],
+        instances=[None] * count,
+        columns={"frames": f"synthetic, seed {_SYNTHETIC_SEED}"},
+        settings={"synthetic": count, "seed": _SYNTHETIC_SEED},
+    )
+
+
+def _read_views(net: GeoPoseNet, folder: Path, data: PoseDataOptions, number: int | None) -> Views:
+    """Read views of a data set.
 
     Args:
         net: network whose names the objects get.
-        data: the data set; without a folder the views are synthetic.
-        number: how many of the data set's views, spread evenly; None: all.
-        synthetic: number of synthetic views.
+        folder: folder of the data set.
+        data: its split, and the objects that are kept.
+        number: how many views, spread evenly; None: all.
     """
-    if data.folder is None:
-        config = ObjectsConfig(number=synthetic, seed=_SYNTHETIC_SEED)
-        objects = SyntheticViews(net.weights.models, config, net.weights.cloud)
-        return Views(
-            samples=[objects.view(i) for i in range(synthetic)],
-            instances=[None] * synthetic,
-            facts={"frames": f"synthetic, seed {_SYNTHETIC_SEED}"},
-            settings={"synthetic": synthetic, "seed": _SYNTHETIC_SEED},
-        )
-
-    dataset = pose_evaluate.open_instances(data.folder, data.split, data.objects, None)
-    facts = {
-        "frames": f"{data.folder.resolve().name} {data.split}",
+    dataset = pose_evaluate.open_instances(folder, data.split, data.objects, None)
+    columns = {
+        "frames": f"{folder.resolve().name} {data.split}",
         "frames_sha256": hash_frames(dataset.instances)[:12],
     }
     if number is not None and number < len(dataset):
@@ -110,7 +132,7 @@ def open_views(net: GeoPoseNet, data: PoseDataOptions, number: int | None, synth
         "split": dataset.split,
         "frames_sha256": hash_frames(dataset.instances),
     }
-    return Views(samples=samples, instances=dataset.instances, facts=facts, settings=settings)
+    return Views(samples=samples, instances=dataset.instances, columns=columns, settings=settings)
 
 
 def reproduce_by_object(
@@ -130,6 +152,9 @@ def reproduce_by_object(
         weights: files or names, each a method.
         csv: BOP results of other methods.
         out: folder of the files.
+
+    Returns:
+        The exit code.
     """
     refuse_below(0, "--pictures", options.pictures, "4")
     if data.folder is None:
@@ -171,20 +196,21 @@ def reproduce_by_object(
         for method in methods
         for masks in all_masks
     ]
-    measured = pose_evaluate.join(pose_evaluate.measure_each(dataset, [*folders, *csv], rule))
+    evaluations = pose_evaluate.measure_predictions(dataset, [*folders, *csv], rule)
+    measured = pose_evaluate.join_evaluations(evaluations)
     rows = pose_tables.join_by_object(measured.rows, numbers, with_published=with_published)
     all_columns = [row.columns() for row in measured.rows]
     page.write_table(out, rows)
     page.write_table(out, all_columns, name="all")
 
     # The page: tables, then some instances of each method.
-    figures = [_draw_figure_3_5(dataset, folder, out, options.pictures) for folder in folders]
+    figures = [_make_pose_section(dataset, folder, out, options.pictures) for folder in folders]
     text = f"{_PERCENT_NOTE} {_DIFFERENCE_NOTES[number]}"
     sections = [
         Section(title="Percent by object", text=text, rows=rows),
         Section(title="All numbers", text=pose_evaluate.SCORING_NOTE, rows=all_columns),
         *(figure for figure in figures if figure.pictures),
-        *pose_evaluate.write_details(measured, out),
+        *pose_evaluate.write_detail_tables(measured, out),
     ]
     title = f"{pose_tables.TITLES[number]}, on {dataset.folder.resolve().name}"
     write_report(title, sections, out)
@@ -193,22 +219,22 @@ def reproduce_by_object(
 
 def _describe_masks(kind: str) -> str:
     """Describe a kind of masks for the record of a run: its word, or its file with a checksum."""
-    path = pose_masks.mask_path(kind)
+    path = pose_masks.find_mask_file(kind)
     return kind if path is None else file_names.name_with_checksum(path)
 
 
-def _draw_figure_3_5(dataset: BopDataset, predictions: Path, out: Path, number: int) -> Section:
-    """Draw true and estimated poses of some instances, and write the pictures.
+def _make_pose_section(dataset: BopDataset, predictions: Path, out: Path, count: int) -> Section:
+    """Draw figure 3-5 of some instances, write the pictures, and make a section that shows them.
 
     Args:
         dataset: data set with the instances.
         predictions: folder of a method's ``poses.json``.
-        out: folder of the report.
-        number: how many instances, spread evenly; one without an estimate is left out.
+        out: folder of the report; the pictures are written to ``OUT/figures``.
+        count: how many instances, spread evenly; one without an estimate is left out.
     """
     estimates = {p.estimate.name: p.estimate for p in read_predictions(predictions)}
     pictures: list[PictureFile] = []
-    for index in page.spread_evenly(len(dataset), number):
+    for index in page.spread_evenly(len(dataset), count):
         instance = dataset.instances[index]
         estimate = estimates.get(instance.name)
         if estimate is None:  # estimates of detections do not have the names of instances
@@ -226,32 +252,29 @@ def _draw_figure_3_5(dataset: BopDataset, predictions: Path, out: Path, number: 
     return Section(title=title, text=_FIGURE_TEXTS["3-5"], pictures=pictures)
 
 
-_PERCENT_NOTE = (
-    "Percent of instances whose ADD (ADD-S where there is a star, or a declared symmetry) is "
-    "below 10 % of the diameter. Ours: a missing or refused estimate is a failure; see the "
-    "columns for masks, diameters and the list of frames."
-)
-
-_DIFFERENCE_NOTES = {
-    "3.1": "Differences: the first weights less each of the others.",
-    "3.2": (
-        "Published rows: as printed, of the 13 objects; those with RGB see what ours does "
-        "not, most train a network for each object, and their lists of frames and diameters "
-        "differ (see the notes). Differences: ours minus the rows of one network for all objects. "
-        "The thesis's own row is not in the text that is at hand."
-    ),
-}
-
-
 def reproduce_voting(
     weights: str, data: PoseDataOptions, synthetic: int, points: Sequence[int], out: Path
 ) -> int:
-    """Make table 3.3: ways of voting on the same directions, a block for each number of points."""
+    """Make table 3.3: ways of voting on the same directions, a block for each number of points.
+
+    Args:
+        weights: name or file of the network's weights.
+        data: the data set; without a folder the views are synthetic.
+        synthetic: number of synthetic views.
+        points: most voting points of a view, for each block.
+        out: folder of the files.
+
+    Returns:
+        The exit code.
+    """
     path = find_weights(weights)
     net = GeoPoseNet.load(path)
-    views = open_views(net, data, None, synthetic)
+    if data.folder is None:
+        views = _render_views(net, synthetic)
+    else:
+        views = _read_views(net, data.folder, data, None)
     sha256 = file_sha256(path)
-    facts = {"weights": path.stem, "weights_sha256": sha256[:12], **views.facts}
+    columns = {"weights": path.stem, "weights_sha256": sha256[:12], **views.columns}
     settings = {
         "command": "reproduce 3.3",
         "weights_sha256": sha256,
@@ -263,8 +286,8 @@ def reproduce_voting(
     rows: list[dict[str, Any]] = []
     for count in points:
         samples = tqdm(views.samples, f"{count} points", disable=None)
-        cases = list(pose_tables.collect_votes(net, samples, count))
-        rows += [row | facts for row in pose_tables.compare_voting(cases, count)]
+        cases = list(collect_votes(net, samples, count))
+        rows += [row | columns for row in compare_voting(cases, count)]
     page.write_table(out, rows)
 
     text = (
@@ -274,7 +297,7 @@ def reproduce_voting(
         "Times faster: than the loop. All rows of a block saw the same directions."
     )
     sections = [Section(title="RANSAC against least squares", text=text, rows=rows)]
-    write_report(f"{pose_tables.TITLES['3.3']}, {facts['frames']}", sections, out)
+    write_report(f"{pose_tables.TITLES['3.3']}, {columns['frames']}", sections, out)
     return 0
 
 
@@ -284,17 +307,31 @@ def write_figure(
     data: PoseDataOptions,
     number: int,
     out: Path,
-    draw_panels: Callable[..., list[Drawing]],
+    draw_panels: Callable[[GeoPoseNet, Views], list[Drawing]],
+    drawing_settings: Mapping[str, object],
     columns: int,
-    **drawing_settings: object,
 ) -> int:
     """Draw the panels of a figure, arrange them in columns, and write figure, panels and page.
 
-    ``draw_panels`` takes the network, ``number`` views of ``data`` and the ``drawing_settings``.
+    Args:
+        figure: number of the figure in the thesis.
+        weights: name or file of the network's weights.
+        data: the data set; without a folder the views are synthetic.
+        number: how many views.
+        out: folder of the figure.
+        draw_panels: draws the panels of the views.
+        drawing_settings: what decides its drawing, for the record of the run.
+        columns: how many panels stand side by side.
+
+    Returns:
+        The exit code.
     """
     refuse_below(1, "--number", number, "4")
     net = GeoPoseNet.load(weights)
-    views = open_views(net, data, number, number)
+    if data.folder is None:
+        views = _render_views(net, number)
+    else:
+        views = _read_views(net, data.folder, data, number)
     path = out / f"figure-{figure}.png"
     text = _FIGURE_TEXTS[figure]
     settings = {
@@ -304,7 +341,7 @@ def write_figure(
         **drawing_settings,
     }
     claim_folder(out, settings, (path.name, "panels", "report.html"))
-    panels = draw_panels(net, views, **drawing_settings)
+    panels = draw_panels(net, views)
     write_image(path, pose_figures.arrange_grid([panel.image for panel in panels], columns))
     pictures: list[PictureFile] = []
     for k, panel in enumerate(panels, 1):
@@ -317,8 +354,14 @@ def write_figure(
     return 0
 
 
-def feature_panels(net: GeoPoseNet, views: Views, perplexity: float) -> list[Drawing]:
-    """Draw the features of each view as colours, of one t-SNE for all views (figure 3-2)."""
+def draw_feature_panels(net: GeoPoseNet, views: Views, perplexity: float) -> list[Drawing]:
+    """Draw the features of each view as colours, by one t-SNE for all views (figure 3-2).
+
+    ``perplexity``: of the t-SNE, about how many neighbours a point has.
+
+    Raises:
+        InputError: no view has enough points to be posed.
+    """
     models = {model.name: model for model in net.weights.models}
     usable: list[ViewSample] = []
     points_m: list[Tensor] = []
@@ -332,10 +375,10 @@ def feature_panels(net: GeoPoseNet, views: Views, perplexity: float) -> list[Dra
     if not usable:
         raise InputError(f"none of the {len(views.samples)} views has enough points to be posed")
 
-    # Every so many-th point, so that all views together have at most so many as t-SNE takes.
+    # Every STEP-th point of each view, so that there are not too many for a t-SNE.
     step = math.ceil(sum(map(len, features)) / _MAX_TSNE_POINTS)
     thinned = [part[::step] for part in features]
-    embedded = pose_figures.embed_line(torch.cat(thinned), perplexity)
+    embedded = embed_line(torch.cat(thinned), perplexity)
     values = embedded.split([len(part) for part in thinned])
 
     panels: list[Drawing] = []
@@ -347,13 +390,28 @@ def feature_panels(net: GeoPoseNet, views: Views, perplexity: float) -> list[Dra
     return panels
 
 
-def field_panels(net: GeoPoseNet, views: Views, keypoint: int | None) -> list[Drawing]:
-    """Draw the directions to the keypoint whose vote errs most, of all views (figure 3-4).
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _KeypointVote:
+    """A keypoint of a view: where it is, and where it is voted to be [m, camera frame]."""
 
-    ``keypoint``: only this one of each view, from 0 on; None: all.
+    view: int  #: index of the view
+    case: VotingCase  #: the votes for all keypoints of the view
+    keypoint: int  #: index of the keypoint
+    true_m: Float[Tensor, "3"]
+    voted_m: Float[Tensor, "3"]
+    error_m: float  #: distance between the two
+
+
+def _find_worst_vote(net: GeoPoseNet, views: Views, keypoint: int | None) -> _KeypointVote:
+    """Vote in all views, and find the keypoint with the largest error.
+
+    ``keypoint``: look only at this one of each view, from 0 on; None: at all.
+
+    Raises:
+        InputError: there is no such keypoint, or no view has enough points to be posed.
     """
     votes: list[_KeypointVote] = []
-    for index, case in enumerate(pose_tables.collect_votes(net, views.samples, _MAX_VOTES)):
+    for index, case in enumerate(collect_votes(net, views.samples, _MAX_VOTING_POINTS)):
         if case is None:
             continue
         voted_m = vote_ransac(case.points_m, case.directions, None, net.config.voting).keypoints_m
@@ -374,45 +432,44 @@ def field_panels(net: GeoPoseNet, views: Views, keypoint: int | None) -> list[Dr
     if not votes:
         raise InputError(f"none of the {len(views.samples)} views has enough points to be posed")
 
-    worst = max(votes, key=lambda vote: vote.error_m)
+    return max(votes, key=lambda vote: vote.error_m)
+
+
+def draw_direction_panels(net: GeoPoseNet, views: Views, keypoint: int | None) -> list[Drawing]:
+    """Draw true and predicted directions to the keypoint whose vote errs most (figure 3-4).
+
+    ``keypoint``: look only at this one of each view, from 0 on; None: at all.
+
+    Raises:
+        InputError: there is no such keypoint, or no view has enough points to be posed.
+    """
+    worst = _find_worst_vote(net, views, keypoint)
     points_m = worst.case.points_m
     true_directions = torch.nn.functional.normalize(worst.true_m - points_m, dim=-1)
     predicted = worst.case.directions[:, worst.keypoint]
-    image, _ = views.close_up(worst.view)
+    image, _ = views.draw_close_up(worst.view)
     name = views.samples[worst.view].input.name
     error_mm = 1000 * worst.error_m
     return [
         Drawing(image=image, caption=f"(a) {name}, keypoint {worst.keypoint}"),
         Drawing(
-            image=pose_figures.draw_field(points_m, true_directions, worst.true_m),
+            image=pose_figures.draw_directions(points_m, true_directions, worst.true_m),
             caption="(b) true directions and keypoint",
         ),
         Drawing(
-            image=pose_figures.draw_field(points_m, predicted, worst.true_m, worst.voted_m),
+            image=pose_figures.draw_directions(points_m, predicted, worst.true_m, worst.voted_m),
             caption=f"(c) predicted directions; the voted keypoint errs by {error_mm:.1f} mm",
         ),
     ]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _KeypointVote:
-    """A keypoint of a view: where it is and where the votes meet [m, camera frame]."""
-
-    view: int  #: its index
-    case: pose_tables.VotingCase
-    keypoint: int
-    true_m: Float[Tensor, "3"]
-    voted_m: Float[Tensor, "3"]
-    error_m: float
-
-
-def box_panels(net: GeoPoseNet, views: Views) -> list[Drawing]:
+def draw_box_panels(net: GeoPoseNet, views: Views) -> list[Drawing]:
     """Draw the boxes of true and estimated poses over close-ups (figure 3-5)."""
     models = {model.name: model for model in net.weights.models}
     panels: list[Drawing] = []
     for k, view in enumerate(views.samples):
         (estimate,) = net.estimate_many([view.input])
-        picture, K = views.close_up(k)
+        picture, K = views.draw_close_up(k)
         true = view.truth.camera_from_model
         estimated = estimate.camera_from_model
         name = view.input.name

@@ -15,13 +15,15 @@ from depthpose.cli.arguments import (
     NewPath,
     Source,
     WeightsName,
-    replace_given,
+    replace_unless_none,
 )
 from depthpose.core.errors import InputError
 from depthpose.core.units import Unit
 from depthpose.depth.config import MatcherConfig
 
 if TYPE_CHECKING:  # --help must not load torch
+    from tqdm import tqdm
+
     from depthpose.core.loop import Progress
 
 
@@ -58,7 +60,7 @@ class TrainingOptions:
 
         config: Any = (default or kind()) if path is None else read_config(path, kind)
         self._refuse_long_warmup(config)
-        loop = replace_given(
+        loop = replace_unless_none(
             config.loop,
             workers=workers,
             seed=self.seed,
@@ -77,8 +79,8 @@ class TrainingOptions:
         """
         from depthpose.core.loop import AdamConfig
 
-        config_steps = config.loop.steps
-        if config_steps is None or self.resume or self.finish:  # None: they follow from epochs
+        config_steps = config.loop.steps  # None where they follow from epochs
+        if config_steps is None or self.resume or self.finish:
             return
         steps = max(config_steps, self.steps or 0)
         for name, adam in vars(config).items():
@@ -99,7 +101,14 @@ class TrainingOptions:
     ) -> int:
         """Train, show the progress, and print the path of the weights and their card.
 
-        ``with_messages``: print what the training reports besides its progress.
+        Args:
+            run_stage: trains by a config and a ``TrainingRun``, and returns the file of the weights.
+            config: config of the training.
+            out: the run folder.
+            with_messages: print what the training reports besides its progress.
+
+        Returns:
+            The exit code.
         """
         from tqdm import tqdm
 
@@ -110,25 +119,11 @@ class TrainingOptions:
         is_logged = is_first and not (sys.stdout.isatty() and sys.stderr.isatty())
         log = ProgressLog() if is_logged else None
         with tqdm(unit=" steps", disable=None if is_first else True) as bar:
-
-            def show(progress: "Progress") -> None:
-                """Move the bar, and print a line of the log where one is due."""
-                if bar.total is None:  # the first step, of a resumed run not number 1
-                    bar.reset(progress.steps)
-                    bar.initial = progress.step - 1
-                    bar.n = progress.step - 1
-                bar.update(progress.step - bar.n)
-                if progress.numbers:
-                    postfix = {name: f"{value:.4g}" for name, value in progress.numbers.items()}
-                    bar.set_postfix(postfix)
-                if log is not None:
-                    log.show(progress)
-
             run = TrainingRun(
                 folder=out,
                 resume=self.resume,
                 finish=self.finish,
-                on_step=show,
+                on_step=partial(_show_progress, bar, log),
                 on_message=partial(print, flush=True) if with_messages and is_first else None,
             )
             path = run_stage(config, run)
@@ -141,18 +136,14 @@ class TrainingOptions:
 
 @dataclass(kw_only=True)
 class ProgressLog:
-    """Prints the first step, the last one, and a line a minute between them.
+    """Prints the first step, the last one, and a line a minute between them."""
 
-    ``first_step``: the first that was shown, done at ``first_s``; None: none was.
-    ``printed_s``: when the last line was printed. ``numbers``: the latest losses and metrics.
-    """
-
-    interval_s: float = 60.0
-    clock: Callable[[], float] = time.monotonic
-    first_step: int | None = None
-    first_s: float = 0.0
-    printed_s: float = 0.0
-    numbers: dict[str, float] = field(default_factory=dict)
+    interval_s: float = 60.0  #: least time between two lines
+    clock: Callable[[], float] = time.monotonic  #: tells the time [s]
+    first_step: int | None = None  #: the first step that was shown; None: none was
+    first_s: float = 0.0  #: when it was shown
+    printed_s: float = 0.0  #: when the last line was printed
+    numbers: dict[str, float] = field(default_factory=dict)  #: the latest losses and metrics
 
     def show(self, progress: "Progress") -> None:
         """Print a line if one is due: step, minutes left, and the latest numbers."""
@@ -173,11 +164,24 @@ class ProgressLog:
         print(", ".join(parts), flush=True)
 
 
-_HELD_OUT = 20
+def _show_progress(bar: "tqdm[Any]", log: ProgressLog | None, progress: "Progress") -> None:
+    """Move the bar to a step, and print a line of the log where one is due."""
+    if bar.total is None:  # the first step, of a resumed run not number 1
+        bar.reset(progress.steps)
+        bar.initial = progress.step - 1
+        bar.n = progress.step - 1
+    bar.update(progress.step - bar.n)
+    if progress.numbers:
+        bar.set_postfix({name: f"{value:.4g}" for name, value in progress.numbers.items()})
+    if log is not None:
+        log.show(progress)
+
+
+_HELD_OUT_PAIRS = 20
 """Pairs of a folder that validate, by default."""
 
 
-def depth_train(
+def train_depth(
     stage: tyro.conf.Positional[Literal["view", "select", "stereo", "finetune"]],
     out: NewPath,
     config: Path | None = None,
@@ -220,25 +224,28 @@ def depth_train(
 
     kind, run_stage = STAGES[stage]
     settings = training.read(config, kind)
-    settings = replace(settings, pairs=replace_given(settings.pairs, folders=data or None))
+    settings = replace(settings, pairs=replace_unless_none(settings.pairs, folders=data or None))
     if held_out:
         # A generator is measured at the focal length of its own rig, whatever it is trained on.
         focal_px = settings.pairs.focal_px if stage == "stereo" else None
-        default_pairs = PairsConfig(focal_px=focal_px, truth=settings.pairs.truth, limit=_HELD_OUT)
+        default_pairs = PairsConfig(
+            focal_px=focal_px, truth=settings.pairs.truth, limit=_HELD_OUT_PAIRS
+        )
         pairs = replace(settings.held_out or default_pairs, folders=held_out)
         settings = replace(settings, held_out=pairs)
+
     # The weights to begin with; each stage takes other ones.
+    weights = {"generator": generator, "matcher": matcher, "start": start, "encoder": encoder}
     usable_names = {field.name for field in fields(settings)}
     if stage != "finetune":
         usable_names -= {"generator", "matcher"}
-    weights = {"generator": generator, "matcher": matcher, "start": start, "encoder": encoder}
     for name, value in weights.items():
         if value is not None and name not in usable_names:
             raise InputError(f"--{name} has no meaning for '{stage}'; see --help.")
-    return training.run(run_stage, replace_given(settings, **weights), out)
+    return training.run(run_stage, replace_unless_none(settings, **weights), out)
 
 
-def calibrate(
+def calibrate_refusal(
     weights: tyro.conf.Positional[WeightsName],
     data: list[Path],
     out: NewPath,
@@ -278,8 +285,8 @@ def calibrate(
     dataset = join_datasets(parts)
     refuse_alarm_share(len(dataset), alarm_share)
     net = FakestereoNet.load(path, config=MatcherConfig(device=device), allow_ood=True)
-    shown = tqdm(range(len(dataset)), unit=" images", disable=None)
-    confidences = measure_image_confidence(net, map(dataset.read_input, shown))
+    indices = tqdm(range(len(dataset)), unit=" images", disable=None)
+    confidences = measure_image_confidence(net, map(dataset.read_input, indices))
     threshold = calibrate_weights(path, confidences, alarm_share, out)
     print(f"{len(confidences)} images: confidence {min(confidences):.3f} to {max(confidences):.3f}")
     print(f"refused below {threshold:.3f}; calibrated weights: {out}")
@@ -292,7 +299,7 @@ _NO_START = "nothing"
 """Word of ``--start`` that begins without weights."""
 
 
-def pose_train(
+def train_pose(
     out: NewPath,
     config: Path | None = None,
     cad: tuple[Source, ...] = (),
@@ -350,7 +357,9 @@ def _with_models(
     unit: Unit | None,
     symmetries: Literal["none", "found"] | None,
 ) -> Any:  # noqa: ANN401
-    """Return a config with the models of the options of :func:`pose_train`.
+    """Return the config of a training of poses with the models of :func:`train_pose`'s options.
+
+    Options that were left out change nothing.
 
     Raises:
         InputError: an option is set, but the training is a segmentation's, which has no models.
@@ -364,7 +373,7 @@ def _with_models(
             f"--{option} has no meaning for 'segmentation', which learns from pictures: make them "
             "by 'depthpose data make objects --cad ...' and name the folder in the config"
         )
-    models = replace_given(config.models, cad=cad or None, unit=unit)
+    models = replace_unless_none(config.models, cad=cad or None, unit=unit)
     if symmetries is not None:
         models = replace(models, with_found_symmetries=symmetries == "found")
     if cad:  # they take the place of a data set's models
@@ -373,12 +382,12 @@ def _with_models(
 
 
 def _with_dataset(config: Any, folder: str) -> Any:  # noqa: ANN401 - of any training of poses
-    """Return a config whose models and frames are those of another folder.
+    """Return the config of a training of poses with the models and frames of another data set.
 
-    Only the parts that come from a data set are changed.
+    Only what comes from a data set is changed.
 
     Raises:
-        InputError: no part does.
+        InputError: nothing does.
     """
     changes: dict[str, Any] = {}
     models = getattr(config, "models", None)

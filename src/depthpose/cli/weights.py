@@ -1,7 +1,6 @@
 """``depthpose weights ...`` and ``depthpose export ...``."""
 
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Mapping
 from pathlib import Path
 from textwrap import shorten
 from typing import TYPE_CHECKING, Any, Literal
@@ -18,8 +17,9 @@ if TYPE_CHECKING:
 
 
 _LICENCE_WIDTH = 31
+"""Characters of the column 'licence' of the list of weights."""
 _DATA_WIDTH = 33
-"""Characters of the columns 'licence' and 'trained on' of the list of weights."""
+"""Characters of the column 'trained on'."""
 
 
 def list_weights(folder: Path | None = None) -> int:
@@ -31,10 +31,13 @@ def list_weights(folder: Path | None = None) -> int:
     from depthpose.core.checkpoint import SHIPPED, read_checkpoint
     from depthpose.report.page import format_plain_table
 
-    home = folder or SHIPPED
-    files = sorted(home.glob("*.safetensors"))
+    weights_folder = folder or SHIPPED
+    files = sorted(weights_folder.glob("*.safetensors"))
     if not files:
-        print(f"No weights in {home}. 'depthpose weights import' imports a published checkpoint.")
+        print(
+            f"No weights in {weights_folder}. 'depthpose weights import' imports a published "
+            "checkpoint."
+        )
         return 0
     rows: list[dict[str, str]] = []
     for path in files:
@@ -71,7 +74,7 @@ def show_weights(weights: tyro.conf.Positional[WeightsName]) -> int:
         for name, tensor in checkpoint.state.items()
         if not name.endswith(statistics) and not name.startswith("models.")
     ]
-    settings = _settings_of(checkpoint, str(path))
+    settings = _read_settings(checkpoint, str(path))
     if "models" in checkpoint.config:
         models = checkpoint.config["models"]
         settings["objects"] = ", ".join(f"{model['name']} ({model['number']})" for model in models)
@@ -86,8 +89,11 @@ def show_weights(weights: tyro.conf.Positional[WeightsName]) -> int:
     return 0
 
 
-def _settings_of(checkpoint: "Checkpoint", source: str) -> dict[str, Any]:
-    """Give the settings of pose and depth networks, with defaults; of other kinds, as stored."""
+def _read_settings(checkpoint: "Checkpoint", source: str) -> dict[str, Any]:
+    """Read the settings of weights: of pose and depth networks with defaults, else as stored.
+
+    ``source``: the file, for errors.
+    """
     from depthpose.depth import weights as depth_weights
     from depthpose.pose import weights as pose_weights
 
@@ -180,10 +186,10 @@ def pack_weights(
     depth_weights = read_depth_weights(find_weights(weights))
     parts = [weights] if matcher is None else [weights, matcher]
     warn_of_terms(add_terms({}, parts))
-    own_facts = {"trained_on": trained_on, "licence": licence}
+    new_facts = {"trained_on": trained_on, "licence": licence}
     if terms:
-        own_facts["terms"] = terms
-    facts = add_terms(own_facts, parts)
+        new_facts["terms"] = terms
+    facts = add_terms(new_facts, parts)
     write_depth_weights(
         out,
         generator=depth_weights.generator,
@@ -258,8 +264,8 @@ def export_depth(out: NewPath, weights: WeightsName = "default", what: str | Non
 
     path = find_weights(weights)
     depth_weights = read_depth_weights(path)
-    make_export = partial(describe_export, depth_weights, what)
-    return _write_graph(out, weights, path, depth_weights.facts, make_export)
+    facts = _collect_graph_facts(weights, path, depth_weights.facts)
+    return _write_graph(out, describe_export(depth_weights, what, facts))
 
 
 def export_pose(out: NewPath, weights: WeightsName = "parts") -> int:
@@ -282,33 +288,34 @@ def export_pose(out: NewPath, weights: WeightsName = "parts") -> int:
 
     path = find_weights(weights)
     pose_weights = read_pose_weights(path)
-    make_export = partial(pose_export, pose_weights)
-    return _write_graph(out, weights, path, pose_weights.facts, make_export)
+    facts = _collect_graph_facts(weights, path, pose_weights.facts)
+    return _write_graph(out, pose_export(pose_weights, facts))
 
 
-def _write_graph(
-    out: Path,
-    weights: str,
-    path: Path,
-    facts: Mapping[str, str],
-    make_export: Callable[[dict[str, str]], "Export"],
-) -> int:
-    """Print the terms of weights, write their graph, and print how it differs from PyTorch.
+def _collect_graph_facts(weights: str, path: Path, facts: Mapping[str, str]) -> dict[str, str]:
+    """Collect the facts that a graph of weights is to hold, and print the terms of the weights.
 
     Args:
-        out: the .onnx file.
-        weights: name or file, as the user gave it.
-        path: of their file.
-        facts: of the weights: licence, terms, ...
-        make_export: makes the graph, given the facts that it is to hold.
+        weights: name or file, as it was typed.
+        path: file of the weights.
+        facts: facts of the weights: licence, terms, ...
     """
     from depthpose.core.checkpoint import file_sha256, warn_of_terms
-    from depthpose.core.export import write_export
-    from depthpose.report.page import format_markdown_table
 
     warn_of_terms(facts)
     origin = {"format": "onnx", "weights": Path(weights).name, "weights_sha256": file_sha256(path)}
-    differences = write_export(out, make_export({**facts, **origin}))
+    return {**facts, **origin}
+
+
+def _write_graph(out: Path, export: "Export") -> int:
+    """Write a graph and its proof, print how it differs from PyTorch, and return the exit code.
+
+    ``out``: the .onnx file.
+    """
+    from depthpose.core.export import write_export
+    from depthpose.report.page import format_markdown_table
+
+    differences = write_export(out, export)
     rows = [
         {name: f"{value:.1e}" if isinstance(value, float) else value for name, value in row.items()}
         for row in differences

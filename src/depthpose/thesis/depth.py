@@ -24,10 +24,10 @@ _FIRST_COLUMNS = ("source", "method", "weights", "cap_m", *_METRICS, "protocol")
 class PublishedRow:
     """One printed row: the seven numbers of a method for truth up to ``cap_m``."""
 
-    method: str  #: its name, as printed
+    method: str  #: name of the method, as printed
     cap_m: float  #: largest depth of the truth [m]
     printed: str  #: the numbers, in the order of our metrics of depth
-    protocol: str = "eigen-raw"  #: by which they were measured
+    protocol: str = "eigen-raw"  #: protocol by which they were measured
     note: str = ""  #: the row's footnote
 
     @property
@@ -40,10 +40,10 @@ class PublishedRow:
 class PublishedTable:
     """One printed table: every author's row, in the order of print."""
 
-    number: str  #: the thesis's
-    title: str  #: what our page calls it
-    rows: tuple[PublishedRow, ...]  #: every row
-    own_rows: tuple[str, ...]  #: methods of the thesis, in the order in which weights are given
+    number: str  #: number in the thesis
+    title: str  #: title of our page
+    rows: tuple[PublishedRow, ...]  #: every printed row
+    thesis_rows: tuple[str, ...]  #: methods of the thesis, in the order in which weights are given
     with_right: bool  #: whether the methods see the real right view
 
 
@@ -56,8 +56,8 @@ def join_published(
 
     Args:
         table: the printed table.
-        our_rows: for each of our rows the name of the thesis's own method that it stands for (one
-            of ``table.own_rows``, or empty where it stands for none, as a baseline), and the row.
+        our_rows: for each of our rows the method of the thesis that it reproduces (one of
+            ``table.thesis_rows``; empty: none, as of a baseline), and the row.
 
     Returns:
         The columns of each row; ``source`` is ``published``, ``ours`` or ``difference``.
@@ -71,7 +71,7 @@ def join_published(
         columns |= {"protocol": row.protocol, "note": row.note}
         published.append(columns)
 
-    # Ours, each with its difference to the thesis's own.
+    # Ours, each with its difference to the thesis's.
     rows = list(published)
     for counterpart, row in our_rows:
         assert row.cap_m is not None, "the tables are of depth, and reproduce takes no disparity"
@@ -126,7 +126,7 @@ TABLES = {table.number: table for table in (
                  _DENSE, "with dense depth map as ground truth"),
             _Row("thesis, Ours", 50.0, _OURS_50),
         ),
-        own_rows=("thesis, Ours",),
+        thesis_rows=("thesis, Ours",),
         with_right=False,
     ),
     PublishedTable(
@@ -138,7 +138,7 @@ TABLES = {table.number: table for table in (
             _Row("Luo et al. [73]", 50.0, "0.058 0.316 2.675 0.152 0.947 0.971 0.983"),
             _Row("thesis, Ours", 50.0, "0.074 0.423 2.862 0.168 0.940 0.966 0.980"),
         ),
-        own_rows=("thesis, Ours",),
+        thesis_rows=("thesis, Ours",),
         with_right=True,
     ),
     PublishedTable(
@@ -150,7 +150,7 @@ TABLES = {table.number: table for table in (
             _Row(_APART, 50.0, _OURS_50),
             _Row(_FINETUNED, 50.0, "0.121 0.674 3.817 0.207 0.849 0.950 0.978"),
         ),
-        own_rows=(_APART, _FINETUNED),
+        thesis_rows=(_APART, _FINETUNED),
         with_right=False,
     ),
 )}  # fmt: skip
@@ -161,6 +161,9 @@ _NEAR_M = 3.0
 _FAR_M = 80.0
 """Depth of the brightest and of the darkest colour."""
 _GAP_PX = 8
+"""White space between panels."""
+PANEL_WIDTH_PX = 621
+"""Width of a panel: half of a frame of KITTI."""
 _BAR_PX = 18
 """Height of the bar of colours."""
 
@@ -173,7 +176,7 @@ DEPTH_SCALE = (
 def draw_figure_2_5(
     pair: StereoInput, lidar_m: Float[Tensor, "h w"] | None, estimate: DepthEstimate
 ) -> list[Drawing]:
-    """Make a column of figure 2-5: left, real right, predicted depth, predicted right, LiDAR.
+    """Draw a column of figure 2-5: left, real right, predicted depth, predicted right, LiDAR.
 
     A panel whose image does not exist is left out. Where the real right view was matched, no right
     view is predicted.
@@ -181,7 +184,7 @@ def draw_figure_2_5(
     Args:
         pair: left view, and the real right one if there is one.
         lidar_m: one scan drawn into the left image, NaN where no point falls, if there is one.
-        estimate: of this pair, or of its left view alone.
+        estimate: depth of this pair, or of its left view alone.
     """
     panels = [Drawing(caption="left image", image=pair.left)]
     if pair.right is not None:
@@ -198,7 +201,7 @@ def draw_figure_2_1(
     mono: DepthEstimate,
     stereo: DepthEstimate,
 ) -> list[Drawing]:
-    """Make the six panels of figure 2-1, in its order.
+    """Draw the six panels of figure 2-1, in its order.
 
     Args:
         pair: left and right view.
@@ -207,7 +210,7 @@ def draw_figure_2_1(
         stereo: depth from the real pair, by the same matcher.
 
     Raises:
-        InputError: the frame has no right view, or the estimate no synthesised one.
+        InputError: the frame has no right view, or ``mono`` no synthesised one.
     """
     if pair.right is None or mono.right is None:
         reason = "the frame has no right view" if pair.right is None else "no view was synthesised"
@@ -222,7 +225,9 @@ def draw_figure_2_1(
     ]
 
 
-def arrange(columns: Sequence[Sequence[Drawing]], width_px: int = 621) -> Float[Tensor, "3 h w"]:
+def arrange_columns(
+    columns: Sequence[Sequence[Drawing]], width_px: int = PANEL_WIDTH_PX
+) -> Float[Tensor, "3 h w"]:
     """Lay panels out on white in columns ``width_px`` wide, over the depth scale.
 
     Raises:

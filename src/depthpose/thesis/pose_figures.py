@@ -1,7 +1,4 @@
-"""Figures 3-2 (features as colours on the posed cloud) and 3-4 (directions to a keypoint).
-
-Features become colours by exact t-SNE onto a line (van der Maaten, Hinton 2008).
-"""
+"""Figures 3-2 (features as colours on the posed cloud) and 3-4 (directions to a keypoint)."""
 
 import math
 from collections.abc import Sequence
@@ -24,6 +21,7 @@ from depthpose.pose.sparse import Voxels
 from depthpose.pose.types import AnyInput, ObjectModel, Refusal
 
 _GAP_PX = 8
+"""White space between the pictures of a grid."""
 
 # Spectral of ColorBrewer (Brewer, 2003): red over yellow to blue.
 _SPECTRAL = (
@@ -33,7 +31,7 @@ _SPECTRAL = (
 
 
 def spectral(share: Float[Tensor, " n"]) -> Float[Tensor, "n 3"]:
-    """Colour numbers from 0 (red) over the middle (yellow) to 1 (blue)."""
+    """Look up the RGB colours, 0..1, of numbers from 0 (red) over yellow to 1 (blue)."""
     # Between the two colours of the scale beside each number.
     anchors = torch.tensor(_SPECTRAL, dtype=torch.float32) / 255
     position = share.float().clamp(0, 1) * (len(anchors) - 1)
@@ -75,10 +73,10 @@ def draw_discs(
     """Draw points as discs.
 
     Args:
-        pen: of the picture.
-        places: u and v in pixels, and the distance: near discs cover far ones.
-        colors: of the discs, 0..1.
-        radius_px: of the discs.
+        pen: draws into the picture.
+        places: u and v [px] of each point, and its distance in any unit: near discs cover far ones.
+        colors: RGB of each disc, 0..1.
+        radius_px: radius of all discs.
     """
     far_to_near = places[:, 2].argsort(descending=True, stable=True)
     rgb = (255 * colors[far_to_near]).round().int().tolist()
@@ -88,8 +86,12 @@ def draw_discs(
 
 
 _SURFACE_POINTS = 4000
+"""Points by which the model's surface is drawn."""
 _MARGIN = 1.08
 """Side of the picture, in diameters of the model."""
+_RADII_PER_SIDE = 110
+"""Side of the picture, in radii of the discs of the cloud."""
+_MIN_DISC_PX = 2.0
 _AZIMUTH_OFFSET_RAD = math.radians(35)
 _TILT_OFFSET_RAD = math.radians(20)
 """By which the view departs from the side that a cloud was seen from: sideways and upwards."""
@@ -99,9 +101,14 @@ _TILT_OFFSET_RAD = math.radians(20)
 def compute_features(
     net: GeoPoseNet, pose_input: AnyInput
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n c"]] | None:
-    """Compute the network's features of the points that it takes; give these in the camera frame.
+    """Compute the network's features before its last layer.
 
-    The features are those before the last layer; None where the input cannot be posed.
+    Returns:
+        The points that the network takes of the input [m, camera frame], and the features of each.
+        None where the input cannot be posed.
+
+    Raises:
+        InputError: the weights are of another kind of network.
     """
     network = net.weights.network
     if not isinstance(network, ResUNet):
@@ -147,14 +154,15 @@ def draw_features(
     canvas = Image.new("RGB", (size_px, size_px), "white")
     pen = ImageDraw.Draw(canvas)
     draw_discs(pen, surface_px, torch.zeros(len(surface_m), 3), 1.0)
-    draw_discs(pen, cloud_px, spectral(share), max(2.0, size_px / 110))
+    draw_discs(pen, cloud_px, spectral(share), max(_MIN_DISC_PX, size_px / _RADII_PER_SIDE))
     return rgb_from_pillow(canvas, "figure 3-2")
 
 
 def _look_at_cloud(outward: Float64[Tensor, "3"]) -> Float64[Tensor, "3 3"]:
-    """Make the rotation ``view_from_model`` that looks at the side ``outward`` of a model.
+    """Make the rotation ``view_from_model`` of a view of the model's side towards ``outward``.
 
-    The view is turned sideways and upwards from it, and half as steep.
+    The view is turned sideways and upwards from that side, and half as steep. Its axes are x right,
+    y down, z forward.
     """
     x, y, z = outward.tolist()
     azimuth = math.atan2(y, x) + _AZIMUTH_OFFSET_RAD
@@ -167,7 +175,9 @@ def _look_at_cloud(outward: Float64[Tensor, "3"]) -> Float64[Tensor, "3 3"]:
 
 
 _ARROWS = 220
+"""Most directions that are drawn."""
 _ARROW_PX = 22.0
+"""Length of an arrow that lies in the plane of the picture."""
 _BARB = 0.35
 """Length of the two lines of an arrow's head, as a share of the arrow."""
 _STAR_TIPS = 5
@@ -179,7 +189,7 @@ _YELLOW = (242, 191, 0)
 _ARROW_COLOR = (38, 64, 140)
 
 
-def draw_field(
+def draw_directions(
     points_m: Float[Tensor, "n 3"],
     directions: Float[Tensor, "n 3"],
     true_m: Float[Tensor, "3"],
@@ -192,10 +202,10 @@ def draw_field(
     arrow that points away from the viewer is short. The picture holds the cloud and both keypoints.
 
     Args:
-        points_m: where the directions begin.
-        directions: to the keypoint.
+        points_m: the points that vote.
+        directions: the direction of each to the keypoint.
         true_m: the true keypoint.
-        voted_m: the voted one; None: none is drawn.
+        voted_m: the voted keypoint; None: none is drawn.
         size_px: width and height of the picture.
     """
     # The scale by which everything fits into the picture.
@@ -251,106 +261,3 @@ def _draw_cross(pen: ImageDraw.ImageDraw, centre: Sequence[float]) -> None:
     for color, width, reach in _CROSS_STROKES:
         pen.line([(u - reach, v - reach), (u + reach, v + reach)], color, width)
         pen.line([(u - reach, v + reach), (u + reach, v - reach)], color, width)
-
-
-_STEPS = 300
-_EARLY_STEPS = 100
-"""First steps, in which neighbours attract each other more: groups form early."""
-_EXAGGERATION = 12.0
-"""Factor of that attraction."""
-_BISECTIONS = 40
-"""Steps of the search of a neighbourhood's width."""
-
-
-def embed_line(features: Float[Tensor, "n c"], perplexity: float = 40.0) -> Float64[Tensor, " n"]:
-    """Map features to numbers from 0 to 1, so that alike features get near numbers.
-
-    Exact t-SNE in one dimension, by gradient descent with momentum and gains. It begins along the
-    principal component, and so always gives the same answer. Time and memory grow with the square
-    of ``n``: it is for thousands of points, not more.
-
-    Args:
-        features: of each point.
-        perplexity: about how many neighbours a point has.
-
-    Raises:
-        InputError: there are fewer points than three neighbourhoods.
-    """
-    if not 1 <= perplexity < math.inf:
-        raise InputError(f"t-SNE with a perplexity of {perplexity:g}: take 5 to 50, at least 1")
-    if len(features) < 3 * perplexity:
-        raise InputError(
-            f"t-SNE of {len(features)} points with a perplexity of {perplexity:g}: give three "
-            "times as many points, or a smaller perplexity"
-        )
-
-    # The start: the principal component, very small.
-    P = joint_probabilities(features, perplexity)
-    centred = features.double() - features.double().mean(0)
-    principal_axis = torch.linalg.svd(centred, full_matrices=False)[2][0]
-    y = centred @ principal_axis
-    y = 1e-4 * y / y.std().clamp(min=1e-12)
-
-    # Gradient descent with momentum and gains.
-    speed = torch.zeros_like(y)
-    gain = torch.ones_like(y)
-    # A rate beyond what the curvature at the start allows tears groups apart, and on a line they
-    # never come together again.
-    rate = len(y) / (4 * _EXAGGERATION)
-    for step in range(_STEPS):
-        is_early = step < _EARLY_STEPS
-        exaggeration = _EXAGGERATION if is_early else 1.0
-        momentum = 0.5 if is_early else 0.8
-        gradient = kl_gradient(P * exaggeration, y)
-        goes_on_downhill = gradient.sign() != speed.sign()
-        gain = torch.where(goes_on_downhill, gain + 0.2, gain * 0.8).clamp(min=0.01)
-        speed = momentum * speed - rate * gain * gradient
-        y = y + speed
-
-    # To 0 and 1.
-    low = y.amin()
-    high = y.amax()
-    return (y - low) / (high - low).clamp(min=1e-12)
-
-
-def joint_probabilities(
-    features: Float[Tensor, "n c"], perplexity: float
-) -> Float64[Tensor, "n n"]:
-    """Compute the similarities P of t-SNE: Gaussian neighbourhoods of one perplexity, symmetric.
-
-    They sum to 1 over all pairs.
-    """
-    # Squared distances, those of nearest neighbours subtracted.
-    x = features.double()
-    squares = torch.cdist(x, x, compute_mode="donot_use_mm_for_euclid_dist").square()
-    squares.fill_diagonal_(torch.inf)
-    nearest = squares.amin(1, keepdim=True)
-    shifted = squares - nearest  # the nearest neighbour weighs 1, so no row vanishes
-
-    # The precision of each Gaussian, by bisection of its logarithm: the wider it is, the larger is
-    # the entropy of its row, whose exponential is the perplexity.
-    low = torch.full_like(nearest, 1e-12)
-    high = torch.full_like(nearest, 1e12)
-    for _ in range(_BISECTIONS):
-        precision = (low * high).sqrt()
-        weights = torch.exp(-shifted * precision)
-        total = weights.sum(1, keepdim=True)
-        mean = torch.where(weights > 0, shifted * weights, 0).sum(1, keepdim=True) / total
-        entropy = total.log() + precision * mean
-        is_too_wide = entropy > math.log(perplexity)
-        low = torch.where(is_too_wide, precision, low)
-        high = torch.where(is_too_wide, high, precision)
-
-    # Each row sums to 1, and then both directions of a pair count alike.
-    weights = torch.exp(-shifted * high)
-    conditional = weights / weights.sum(1, keepdim=True)
-    return (conditional + conditional.T) / (2 * len(x))
-
-
-def kl_gradient(P: Float64[Tensor, "n n"], y: Float64[Tensor, " n"]) -> Float64[Tensor, " n"]:
-    """Compute the gradient by y of the divergence of P from the similarities of y (Student's t)."""
-    differences = y[:, None] - y
-    weights = 1 / (1 + differences.square())
-    weights.fill_diagonal_(0)
-    Q = weights / weights.sum()
-    return 4 * ((P - Q) * weights * differences).sum(1)

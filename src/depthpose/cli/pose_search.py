@@ -1,0 +1,265 @@
+"""``depthpose pose predict`` without masks: whole depth images are searched for objects."""
+
+import re
+from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from depthpose.cli import pose_dataset, pose_output, pose_plans
+from depthpose.cli.pose_frames import make_masked_job, read_whole_view
+from depthpose.cli.pose_methods import PoseMethod, choose_object
+from depthpose.cli.pose_options import DataSetOptions, PoseInputs
+from depthpose.core.errors import InputError
+from depthpose.core.run import find_rank
+from depthpose.core.runner import Job, Results, run_jobs
+from depthpose.pose.datasets import open_bop, read_targets
+from depthpose.pose.evaluate import select_targets
+from depthpose.pose.predictions import (
+    Place,
+    PoseJob,
+    Prediction,
+    place_of,
+    read_earlier_predictions,
+    refuse_unreadable,
+    write_predictions,
+)
+from depthpose.pose.types import PoseEstimate, ViewInput
+
+
+class SearchResults(Results[ViewInput, list[PoseEstimate]]):
+    """The estimates of each searched image, often several, in the ``poses.json`` of a folder.
+
+    The file is written after every image, and keeps what earlier runs found in other images.
+    ``by_image``: the predictions of this run and of earlier ones, by the image's name.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        images: Sequence[str],
+        earlier: Sequence[Prediction],
+        is_of_image: Callable[[Prediction, str], bool],
+        numbers: Mapping[str, int] | None = None,
+    ) -> None:
+        """Sort the predictions of earlier runs by images.
+
+        Args:
+            folder: folder of ``poses.json``.
+            images: names of the images of this run.
+            earlier: predictions of earlier runs.
+            is_of_image: whether a prediction is of the image of this name.
+            numbers: number of each object in the data set, by its name; None: no data set.
+        """
+        self.by_image: dict[str, list[Prediction]] = {}
+        self._folder = folder
+        self._images = images
+        self._numbers = numbers
+        self._in_other_images = list(earlier)
+        for image in images:
+            in_image = [p for p in self._in_other_images if is_of_image(p, image)]
+            if in_image:
+                self.by_image[image] = in_image
+                self._in_other_images = [p for p in self._in_other_images if p not in in_image]
+
+    def is_finished(self, job: Job[ViewInput]) -> bool:
+        """Whether the image has been searched."""
+        return job.name in self.by_image
+
+    def store(self, job: Job[ViewInput], data: ViewInput, result: list[PoseEstimate]) -> None:  # noqa: ARG002
+        """Write the estimates of an image."""
+        assert isinstance(job, PoseJob)
+        self.by_image[job.name] = [
+            Prediction(estimate=estimate, place=self._place_of(job, estimate))
+            for estimate in result
+        ]
+        self.flush()
+
+    def store_failure(self, job: Job[ViewInput], error: InputError) -> None:
+        """Write why an image cannot be read.
+
+        Images of a data set must be readable, so there it is raised.
+        """
+        assert isinstance(job, PoseJob)
+        if job.object is None:
+            raise error
+        self.by_image[job.name] = [
+            Prediction(estimate=refuse_unreadable(job.name, job.object, error))
+        ]
+        self.flush()
+
+    def flush(self) -> None:
+        """Write ``poses.json``."""
+        predictions = [p for image in self._images for p in self.by_image.get(image, ())]
+        write_predictions(self._folder, [*predictions, *self._in_other_images])
+
+    def _place_of(self, job: PoseJob[ViewInput], estimate: PoseEstimate) -> Place | None:
+        """Return scene, image and object number of an estimate; None outside a data set."""
+        if self._numbers is None or job.place is None:
+            return None
+        return job.place._replace(object_id=self._numbers[estimate.object])
+
+
+def _find_in_each(
+    method: PoseMethod, objects: Sequence[str], views: Sequence[ViewInput]
+) -> list[list[PoseEstimate]]:
+    """Find objects in each view."""
+    assert method.find is not None
+    return [method.find(view, objects) for view in views]
+
+
+def _search_images(
+    method: PoseMethod,
+    objects: Sequence[str],
+    jobs: Sequence[PoseJob[Any]],
+    results: SearchResults,
+) -> tuple[list[Prediction], list[PoseJob[Any]]]:
+    """Search the images that are not searched yet.
+
+    Args:
+        method: finds the objects.
+        objects: names of the objects.
+        jobs: the images.
+        results: store of what is found.
+
+    Returns:
+        The predictions of all images, and for each a job that reads its image with the mask of that
+        object alone, for pictures.
+    """
+    outcomes = run_jobs(jobs, partial(_find_in_each, method, objects), results)
+    for _ in tqdm(outcomes, total=len(jobs), disable=None, unit=" images"):
+        pass  # an image is searched as its outcome is asked for
+    predictions: list[Prediction] = []
+    object_jobs: list[PoseJob[Any]] = []
+    for job in jobs:
+        for prediction in results.by_image[job.name]:
+            predictions.append(prediction)
+            object_jobs.append(make_masked_job(job, prediction, method))
+    return predictions, object_jobs
+
+
+def search_files(method: PoseMethod, inputs: PoseInputs, out: Path) -> int:
+    """Find objects in every depth image, write the files of each, and return the exit code.
+
+    Every object that is searched for has an entry, found or not: in an image NAME they are called
+    NAME_0, NAME_1, ..., or NAME where a single object was searched for and not found. A rerun
+    searches the images that are not finished, and those that could not be read.
+
+    Args:
+        method: finds the objects.
+        inputs: options that name the images and objects.
+        out: folder of the results.
+
+    Raises:
+        InputError: the method cannot search, or images or options cannot be used.
+    """
+    if inputs.object is None:
+        objects = [model.name for model in method.models]
+    else:
+        objects = [choose_object(inputs.object, method)]
+    if method.find is None:
+        raise InputError(
+            "--depth without --mask: these weights need masked views; give --mask, --box or "
+            "--detections"
+        )
+    if find_rank().world > 1:
+        raise InputError("--depth without --mask is done by one process; give --mask, or start one")
+    plan = pose_plans.plan_searches(method, inputs, objects, out)
+    jobs = plan.jobs
+    _refuse_numbered_names({job.name for job in jobs})
+    settings = {**method.settings, **plan.settings}
+    pose_output.claim_for_jobs(out, settings, jobs, pose_output.is_result_of)
+    earlier = [
+        p for p in read_earlier_predictions(out).values() if p.estimate.status != "unreadable"
+    ]
+
+    images = [job.name for job in jobs]
+    results = SearchResults(out, images, earlier, _has_name_of_image)
+    predictions, object_jobs = _search_images(method, objects, jobs, results)
+
+    # The files of results have names of their own, which are claimed once they are known.
+    pose_output.claim_for_jobs(out, settings, object_jobs, pose_output.is_result_of)
+    pose_output.write_files(predictions, object_jobs, out, method, input_count=len(jobs))
+    return pose_output.print_result(predictions, out, len(jobs))
+
+
+def _has_name_of_image(prediction: Prediction, image: str) -> bool:
+    """Whether a prediction is of the depth image of this name, by its own name."""
+    return pose_output.is_result_of(prediction.estimate.name, image)
+
+
+def _has_place_in_image(prediction: Prediction, image: str) -> bool:
+    """Whether a prediction is of the image of this name, by its place in a data set."""
+    return prediction.place is not None and _name_image(prediction.place[:2]) == image
+
+
+def _refuse_numbered_names(names: Collection[str]) -> None:
+    """Refuse an image that is named as an object in another image would be: NAME_1 beside NAME."""
+    for name in sorted(names):
+        image = re.sub(r"_\d+$", "", name)
+        if image != name and image in names:
+            raise InputError(
+                f"two depth images are called {image!r} and {name!r}, and so would be what is "
+                "found in the first; rename one"
+            )
+
+
+def search_dataset(
+    method: PoseMethod, options: DataSetOptions, object: str | None, out: Path
+) -> int:
+    """Search every image of a data set for each of its objects (6D detection).
+
+    The method is given neither masks nor which objects an image shows. A rerun searches the images
+    that are not finished.
+
+    Args:
+        method: finds the objects.
+        options: the data set.
+        object: name or number of the only object that is searched for; None: all.
+        out: folder of the results.
+
+    Returns:
+        The exit code.
+    """
+    assert options.bop is not None
+    if method.find is None:
+        raise InputError("--masks search: these weights need masked views; give other --masks")
+    if find_rank().world > 1:
+        raise InputError("--masks search is done by one process; give other --masks, or start one")
+    dataset = open_bop(options.bop, options.split)
+    if options.targets is not None:
+        dataset = select_targets(dataset, read_targets(options.targets, options.bop))
+    dataset = pose_dataset.choose_objects(dataset, method, object)
+    names = pose_dataset.match_names(dataset, method.models)
+    numbers = {name: number for number, name in names.items()}
+    settings = {
+        **method.settings,
+        **pose_dataset.dataset_settings(dataset),
+        "masks": "search",
+        "find": sorted(numbers),
+    }
+    pose_output.claim_for_dataset(out, settings, dataset)
+
+    # A job for each image, which is read by any of its instances. A view must name an object, of
+    # which a search makes no use.
+    images = {(i.scene_id, i.image_id): i for i in dataset.instances}
+    any_object = next(iter(numbers))
+    jobs: list[PoseJob[Any]] = []
+    for image, instance in sorted(images.items()):
+        name = _name_image(image)
+        read = partial(read_whole_view, instance, any_object, name)
+        jobs.append(PoseJob(name=name, read=read, place=place_of(instance)))
+
+    earlier = list(read_earlier_predictions(out).values())
+    results = SearchResults(out, [job.name for job in jobs], earlier, _has_place_in_image, numbers)
+    predictions, object_jobs = _search_images(method, list(numbers), jobs, results)
+    pose_output.write_files(predictions, object_jobs, out, method, dataset, input_count=len(images))
+    return pose_output.print_result(predictions, out, len(images))
+
+
+def _name_image(image: tuple[int, int]) -> str:
+    """Name an image of a data set by its scene and its number."""
+    scene_id, image_id = image
+    return f"{scene_id:06d}_{image_id:06d}"
