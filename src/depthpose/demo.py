@@ -48,6 +48,7 @@ from depthpose.report.pose import (
     draw_pose,
     join_posed_cloud,
     make_pose_layers,
+    make_truth_layers,
     select_object_points,
 )
 
@@ -372,7 +373,7 @@ def _draw_poses(
             picture = draw_pose(picture, pose, model, K)
             layers += make_pose_layers(pose, model)
         picture = draw_pose(picture, None, model, K, truth=instance.camera_from_model)
-        layers += make_pose_layers(instance.camera_from_model, model, is_true=True)
+        layers += make_truth_layers(instance.camera_from_model, model)
     return picture, Scene(caption="The sensor's cloud with the posed parts in it", layers=layers)
 
 

@@ -193,7 +193,7 @@ def _check_rows(
     """
     # Which rectified pixels the raw left image shows; the maps hold the raw pixel of each.
     rig = rectifier.rig
-    raw_x, raw_y = rectifier.left_maps
+    raw_x, raw_y = rectifier.left_tables
     is_in_width = (raw_x >= 0) & (raw_x <= rig.width - 1)
     is_in_height = (raw_y >= 0) & (raw_y <= rig.height - 1)
     is_visible = is_in_width & is_in_height

@@ -58,7 +58,7 @@ def predict_depth(
     if engine.engine == "ray":
         packed = spec.with_packed_weights()
         inputs = depth_predict.find_inputs_for_ray(images, depth_inputs.IMAGES)
-        with inputs.first() as first_image:
+        with inputs.open_first() as first_image:
             camera = depth_inputs.read_lens(lens, first_image)
         reader = depth_inputs.InputReader(camera=camera, scale=scale)
         worker = depth_predict.DepthWorker(spec=packed, reader=reader, output=output)
@@ -125,7 +125,7 @@ def match_pairs(
         packed = spec.with_packed_weights()
         sides = [left] if right is None else [left, right]
         inputs = depth_predict.find_inputs_for_ray(sides, depth_inputs.PAIRS)
-        with inputs.first() as first_pair:
+        with inputs.open_first() as first_pair:
             rig = read_rig(camera, image_size(first_pair[0]))
         reader = depth_inputs.InputReader(camera=rig, files=depth_inputs.PAIRS)
         worker = depth_predict.DepthWorker(

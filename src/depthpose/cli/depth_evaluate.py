@@ -73,7 +73,7 @@ def predict_depth_of_dataset(
         has_views = frame.right is not None or not method.with_right
         if has_views and has_truth(frame, rule):
             usable.append(index)
-            sources[frame.name] = frame.seen_files(with_right=method.with_right)
+            sources[frame.name] = frame.list_input_files(with_right=method.with_right)
 
     jobs: list[Job[StereoInput]] = []
     for index in process.share_of(usable):

@@ -323,7 +323,7 @@ class DepthWorker:
     output: PredictOutput
     with_check: bool = True
 
-    def start(self) -> ResultWriter:
+    def make_writer(self) -> ResultWriter:
         """Build the estimator, and return the function that estimates a batch of inputs."""
         return partial(self._estimate_samples, self.spec.build())
 
@@ -372,8 +372,11 @@ def predict_depth_on_ray(
     if reader.scale.one_mount:
         raise InputError("--one-mount takes the images one after the other; omit it, or --engine")
     settings = run_settings(settings_on_workers(worker.spec), reader, worker.output)
-    work = Computation(
-        start=worker.start, files=reader.files, endings=ENDINGS, batch=worker.output.batch
+    computation = Computation(
+        make_writer=worker.make_writer,
+        input_format=reader.files,
+        endings=ENDINGS,
+        batch=worker.output.batch,
     )
     noun = "pairs" if reader.files == PAIRS else "depth maps"
-    return print_shards(engine.run(work, inputs, out, settings), out, noun)
+    return print_shards(engine.run(computation, inputs, out, settings), out, noun)

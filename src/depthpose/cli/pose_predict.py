@@ -231,7 +231,7 @@ class PoseWorker:
     camera: Camera | None  #: camera of depth images; None: the files are clouds
     box: Box | None  #: where the object is in all depth images; None: each has a mask
 
-    def start(self) -> ResultWriter:
+    def make_writer(self) -> ResultWriter:
         """Build the estimator, and return the function that poses a batch of inputs."""
         return partial(self._estimate_samples, self.spec.build())
 
@@ -316,8 +316,10 @@ def predict_poses_on_ray(
     if camera is not None:
         settings["K"] = camera.K.tolist()
         settings["depth_unit_m"] = camera.depth_unit_m
-    work = Computation(start=worker.start, files=files, endings=(ENDING,), batch=batch)
-    return print_shards(engine.run(work, inputs, out, settings), out, "inputs")
+    computation = Computation(
+        make_writer=worker.make_writer, input_format=files, endings=(ENDING,), batch=batch
+    )
+    return print_shards(engine.run(computation, inputs, out, settings), out, "inputs")
 
 
 def _refuse_other_mask_names(inputs: JobInputs, masks: str) -> None:

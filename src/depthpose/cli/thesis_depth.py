@@ -258,5 +258,5 @@ def _make_panel_section(title: str, panels: Sequence[Drawing], stem: Path) -> Se
     for k, panel in enumerate(panels, 1):
         path = stem.with_name(f"{stem.name}.{k}.jpg")
         write_image(path, shrink_to_width(panel.image, PANEL_WIDTH_PX))
-        pictures.append(PictureFile(path=path, caption=panel.caption, scale=panel.scale))
+        pictures.append(PictureFile(path=path, caption=panel.caption, color_bar=panel.color_bar))
     return Section(title=title, text=DEPTH_SCALE, pictures=pictures)

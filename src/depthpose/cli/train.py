@@ -102,7 +102,7 @@ class TrainingOptions:
         """Train, show the progress, and print the path of the weights and their card.
 
         Args:
-            run_stage: trains by a config and a ``TrainingRun``, and returns the file of the weights.
+            run_stage: trains by a config and a ``TrainingRun``, and returns the weights file.
             config: config of the training.
             out: the run folder.
             with_messages: print what the training reports besides its progress.
