@@ -33,6 +33,7 @@ from depthpose.pose.sensor import (
     EDGE_PX,
     FINEST_RAD,
     FLAT_M,
+    SHARED_PER_WHITE,
     DepthNoise,
     measure_noise,
 )
@@ -139,7 +140,10 @@ def observe(
         is_background = view.background.is_seen[top : top + height, left : left + width]
     inner = grow_mask(is_object, -EDGE_PX)
     inner = inner if bool(inner.any()) else is_object  # thin objects are all border
-    noise = measure_noise(depth_m.numpy(), inner.numpy(), object_std_m, float(K[0, 0]))
+    shared_per_white = SHARED_PER_WHITE if view is None else view.shared_per_white
+    noise = measure_noise(
+        depth_m.numpy(), inner.numpy(), object_std_m, float(K[0, 0]), shared_per_white
+    )
 
     # Thinned, if the object is large.
     step = max(1, math.floor(math.sqrt(float(is_object.sum()) / _OBJECT_PX)))

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 NOISE_PER_M2 = 0.0015
@@ -46,7 +46,16 @@ LAG_PX = 3
 their error."""
 SHARED_PER_WHITE = 2.5
 """Standard deviation of the error that neighbours share, over that of the noise of one reading.
-Planes before a Kinect and a RealSense show 2 to 4 (``bench/sensors.py``); a laser scanner less."""
+Planes before a Kinect and a RealSense show 2 to 4 (``bench/sensors.py``). Of an image that shows
+less, what it shows is taken (:func:`measure_shared_per_white`)."""
+_BLOCK_PX = 5
+"""Side of the blocks of readings whose means show the error that neighbours share."""
+_BLOCK_LAG = 3
+"""Means are compared so many blocks, 15 pixels, apart: real depth errs over such distances."""
+_LEAST_FILLED = 0.6
+"""Least share of a block that has readings."""
+_LEAST_BLOCKS = 100
+"""Least number of second differences of means that measure the shared error."""
 AVERAGED_PER_WHITE = 0.55
 """Standard deviation of means of five by five readings some ten pixels apart, over that of the
 noise of one reading. With it and half a millimetre, some four fifths of the means on planes before
@@ -107,28 +116,32 @@ class DepthNoise:
 
 
 def measure_noise(
-    depth_m: np.ndarray, is_object: np.ndarray, object_std_m: float, focal_px: float
+    depth_m: np.ndarray,
+    is_object: np.ndarray,
+    object_std_m: float,
+    focal_px: float,
+    shared_per_white: float = SHARED_PER_WHITE,
 ) -> DepthNoise:
     """Measure the noise of a depth image on an object, and derive its other errors.
 
     The noise of a reading follows from the median second difference of readings three pixels apart,
     to which a slope adds nothing and a curved surface little. On an object too thin for it all
-    readings are taken; where these are too few, the noise is that of a Kinect. The error that
-    neighbours share, and that across the axis, are as large as measured on other depth cameras
-    (``SHARED_PER_WHITE``, ``LATERAL_PX``).
+    readings are taken; where these are too few, the noise is that of a Kinect. The error across the
+    axis is as large as measured on other depth cameras (``LATERAL_PX``).
 
     Args:
         depth_m: (h, w), NaN where there is no reading.
         is_object: (h, w) pixels of one object, without its border.
         object_std_m: standard deviation of the real surface from its model.
         focal_px: of the depth image.
+        shared_per_white: error that neighbours share, over the noise of one reading.
     """
     # Second differences on the object, or in the whole image where these are too few.
     masked_m = np.where(is_object, depth_m, np.nan)
     distance_m = float(np.nanmedian(masked_m)) if np.isfinite(masked_m).any() else 0.0
-    bend_m, _ = _take_second_differences(masked_m)
+    bend_m, _ = _take_second_differences(masked_m, LAG_PX)
     if len(bend_m) < _LEAST_DIFFERENCES:
-        bend_m, _ = _take_second_differences(depth_m)
+        bend_m, _ = _take_second_differences(depth_m, LAG_PX)
 
     # The noise that they show, or that of a Kinect.
     if len(bend_m) < _LEAST_DIFFERENCES:
@@ -140,22 +153,55 @@ def measure_noise(
         white_std_m = min(white_std_m, NOISIEST_PER_M2 * distance_m**2)
     return DepthNoise(
         white_std_m=white_std_m,
-        shared_std_m=SHARED_PER_WHITE * white_std_m,
+        shared_std_m=shared_per_white * white_std_m,
         lateral_std_m=LATERAL_PX * distance_m / focal_px,
         object_std_m=object_std_m,
     )
 
 
-def _take_second_differences(depth_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Take second differences of readings ``LAG_PX`` apart, and the reading in the middle of each.
+def measure_shared_per_white(depth_m: Float[Tensor, "h w"]) -> float:
+    """Measure the error that neighbouring readings share, over the noise of one reading.
 
-    They are taken along rows and columns, where all three readings are finite.
+    Means of blocks of readings have little noise of their own: their second differences show what
+    neighbours share. Curved surfaces add to it, so that of most images no more than
+    ``SHARED_PER_WHITE`` can be said, which is the result, too, where readings are too few.
+
+    Args:
+        depth_m: a whole image; NaN or 0 where there is no reading.
+    """
+    read_m = np.where(depth_m.numpy() > 0, depth_m.double().numpy(), np.nan)
+    height = read_m.shape[0] // _BLOCK_PX
+    width = read_m.shape[1] // _BLOCK_PX
+    whole_m = read_m[: height * _BLOCK_PX, : width * _BLOCK_PX]
+    blocks_m = whole_m.reshape(height, _BLOCK_PX, width, _BLOCK_PX)
+    is_read = np.isfinite(blocks_m)
+    count = is_read.sum((1, 3))
+    sum_m = np.where(is_read, blocks_m, 0).sum((1, 3))
+    is_filled = count >= _LEAST_FILLED * _BLOCK_PX**2
+    mean_m = np.where(is_filled, sum_m / np.maximum(count, 1), np.nan)
+
+    # Both over the square of the depth, with which noise grows.
+    shared_bend_m, shared_middle_m = _take_second_differences(mean_m, _BLOCK_LAG)
+    bend_m, middle_m = _take_second_differences(read_m, LAG_PX, every=_BLOCK_PX)
+    if len(shared_bend_m) < _LEAST_BLOCKS:
+        return SHARED_PER_WHITE
+    shared = float(np.median(np.abs(shared_bend_m) / shared_middle_m**2))
+    white = float(np.median(np.abs(bend_m) / middle_m**2))
+    return min(SHARED_PER_WHITE, shared / white) if white > 0 else SHARED_PER_WHITE
+
+
+def _take_second_differences(
+    depth_m: np.ndarray, lag: int, every: int = 1
+) -> tuple[np.ndarray, np.ndarray]:
+    """Take second differences of readings ``lag`` apart, and the reading in the middle of each.
+
+    They are taken along every ``every``-th row and column, where all three readings are finite.
     """
     bends_m: list[np.ndarray] = []
     middles_m: list[np.ndarray] = []
-    for along_m in (depth_m, depth_m.T):
-        ends_m = along_m[:, : -2 * LAG_PX] + along_m[:, 2 * LAG_PX :]
-        middle_m = along_m[:, LAG_PX:-LAG_PX]
+    for along_m in (depth_m[::every], depth_m.T[::every]):
+        ends_m = along_m[:, : -2 * lag] + along_m[:, 2 * lag :]
+        middle_m = along_m[:, lag:-lag]
         bend_m = ends_m - 2 * middle_m
         is_finite = np.isfinite(bend_m)
         bends_m.append(bend_m[is_finite])
@@ -176,7 +222,7 @@ def measure_noise_per_m2(depth_m: Float64[Tensor, "h w"]) -> float:
         The standard deviation of a reading [m] over the square of its depth [m^2].
     """
     read_m = torch.where(depth_m > 0, depth_m, torch.nan)
-    bend_m, middle_m = _take_second_differences(read_m.numpy())
+    bend_m, middle_m = _take_second_differences(read_m.numpy(), LAG_PX)
     if len(bend_m) == 0:
         return NOISE_PER_M2
     bend_per_m2 = torch.from_numpy(np.abs(bend_m) / np.square(middle_m))

@@ -1,6 +1,7 @@
 """Types of the pose package: input apart from truth, the object, and the estimate."""
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Literal
 
 import torch
@@ -9,6 +10,7 @@ from torch import Tensor
 
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
+from depthpose.pose.sensor import measure_shared_per_white
 
 Status = Literal[
     "ok",
@@ -119,6 +121,11 @@ class ViewInput:
     #: and is not the object is no evidence against a pose.
     is_region: bool = False
     background: KnownBackground | None = None  #: of this view; None: it is not known
+
+    @cached_property
+    def shared_per_white(self) -> float:
+        """Error that neighbouring readings share, over the noise of one reading."""
+        return measure_shared_per_white(self.depth_m)
 
 
 AnyInput = CloudInput | ViewInput
