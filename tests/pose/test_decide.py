@@ -11,7 +11,7 @@ from tests.pose.synthetic_objects import pose_at
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EstimateConfig
-from depthpose.pose.decide import contradiction, seconds_of_all, with_status
+from depthpose.pose.decide import explain_doubt, seconds_of_all, with_status
 from depthpose.pose.hypotheses import (
     Competition,
     Hypothesis,
@@ -192,11 +192,11 @@ def test_a_pose_and_its_copies_have_the_share_of_the_group() -> None:
 def test_a_refusal_says_what_contradicts_the_pose_most(kind: str, words: str) -> None:
     evidence = replace(GOOD, supported=20.0, explained=20.0, unobserved=0.0)
     evidence = replace(evidence, **{kind: 20.0})
-    reason = contradiction(evidence, 0.125, is_masked=True)
+    reason = explain_doubt(evidence, 0.125, is_masked=True)
     assert reason.startswith("the best pose is right with a probability of 12%: ")
     assert words in reason
     assert "a mask of more than the object" in reason
-    searched = contradiction(evidence, 0.125, is_masked=False)
+    searched = explain_doubt(evidence, 0.125, is_masked=False)
     assert words in searched
     assert "mask" not in searched, "a search was given none"
 
@@ -204,10 +204,10 @@ def test_a_refusal_says_what_contradicts_the_pose_most(kind: str, words: str) ->
 def test_a_pose_on_something_larger_is_refused_for_this_reason_beside_larger_areas() -> None:
     evidence = replace(GOOD, silhouette=20.0, continued=7.0, unobserved=30.0)
     assert probability_right(evidence, 1e6) == 0
-    assert "goes on beyond it" in contradiction(evidence, 0.0, is_masked=False)
+    assert "goes on beyond it" in explain_doubt(evidence, 0.0, is_masked=False)
     evidence = replace(evidence, continued=5.0)
     assert probability_right(evidence, 1e6) > 0.5, "objects touch"
-    assert "was not observed" in contradiction(evidence, 0.0, is_masked=False)
+    assert "was not observed" in explain_doubt(evidence, 0.0, is_masked=False)
 
 
 def test_an_answer_below_the_wanted_certainty_is_ambiguous() -> None:

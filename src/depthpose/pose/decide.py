@@ -73,7 +73,7 @@ def decide(
         cloud.cloud_m, prepared, best.pose, free, refusal.min_observability
     )
     if withheld is None and probability < refusal.min_probability:
-        doubt = contradiction(best.evidence, probability, is_masked=observation.is_masked)
+        doubt = explain_doubt(best.evidence, probability, is_masked=observation.is_masked)
         withheld = Refusal(status="doubtful", reason=doubt)
     if withheld is None and config.with_icp and refusal.max_size_error < 1:
         identity = identify(
@@ -110,7 +110,7 @@ def decide(
         free_motions=free.float(),
         certainty=probability * competition.group_share,
         copy_certainty=probability * competition.best_share,
-        alternatives=_alternatives(competition, probability, prepared),
+        alternatives=_list_alternatives(competition, probability, prepared),
         **facts,
     )
     estimate = with_status(estimate, config.min_certainty)
@@ -157,7 +157,7 @@ def why_not_observable(
     )
 
 
-def _alternatives(
+def _list_alternatives(
     competition: Competition, probability: float, prepared: PreparedObject
 ) -> tuple[Alternative, ...]:
     """List the poses that may be right in place of the best, the likeliest first."""
@@ -176,8 +176,8 @@ def _alternatives(
     )
 
 
-def contradiction(evidence: Evidence, probability: float, *, is_masked: bool) -> str:
-    """Say what contradicts a pose most, and what may be the cause.
+def explain_doubt(evidence: Evidence, probability: float, *, is_masked: bool) -> str:
+    """Explain why a pose is doubted: what contradicts it most, and what may be the cause.
 
     Args:
         evidence: of the pose.

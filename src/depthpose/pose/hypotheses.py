@@ -97,7 +97,9 @@ def compete(
             refined=pose,
             evidence=compare(observation, camera_from_model, prepared.surface),
             votes_rad=None if votes_rad is None else votes_rad(camera_from_model),
-            log_color=0.0 if view is None else _log_color(camera_from_model, prepared, view),
+            log_color=0.0
+            if view is None
+            else _compute_log_color(camera_from_model, prepared, view),
         )
 
     # Which pose is it, up to near-symmetric copies?
@@ -141,7 +143,10 @@ def compete(
 def _merge_same_poses(
     hypotheses: Sequence[Hypothesis], shares: Sequence[float], prepared: PreparedObject
 ) -> list[tuple[Hypothesis, float]]:
-    """Merge hypotheses of one pose: the likeliest stands for all of them, and has their shares."""
+    """Merge hypotheses of one pose: the likeliest stands for all of them, and has their shares.
+
+    Poses are one that differ by an exact symmetry of the model and by what refinement leaves.
+    """
     distinct: list[tuple[Hypothesis, float]] = []
     for k in sorted(range(len(shares)), key=lambda k: -shares[k]):
         same = None
@@ -303,8 +308,8 @@ class _Competitor(NamedTuple):
     unrefined: RefinedPose
 
 
-def _log_color(pose: Rigid, prepared: PreparedObject, view: ViewInput) -> float:
-    """Log likelihood of a view's colour image at a pose; 0 where it or the model has none."""
+def _compute_log_color(pose: Rigid, prepared: PreparedObject, view: ViewInput) -> float:
+    """Compute the log likelihood of a colour image at a pose; 0 where it or the model has none."""
     return float(measure_color_agreement(pose[None], prepared.model, view).log_likelihood[0])
 
 
@@ -326,8 +331,8 @@ def _refine_competitors(
     # Roughly. Such steps let a pose drift along what little constrains it, so it stays at its start
     # where that explains as much.
     rough = refine_roughly(cloud_m, starts, surface, config.icp)
-    unexplained_before = _unexplained(cloud_m, starts, surface)
-    unexplained_after = _unexplained(cloud_m, rough, surface)
+    unexplained_before = _measure_unexplained(cloud_m, starts, surface)
+    unexplained_after = _measure_unexplained(cloud_m, rough, surface)
     is_better = unexplained_after < unexplained_before
     improved = Rigid(
         R=torch.where(is_better[:, None, None], rough.R, starts.R),
@@ -336,7 +341,9 @@ def _refine_competitors(
 
     # Those that leave too much of the cloud unexplained are dropped.
     unexplained = torch.minimum(unexplained_before, unexplained_after)
-    leading_unexplained = _unexplained(cloud_m, leading.camera_from_model.double()[None], surface)
+    leading_unexplained = _measure_unexplained(
+        cloud_m, leading.camera_from_model.double()[None], surface
+    )
     order = unexplained.argsort(stable=True)[:most]
     order = order[unexplained[order] <= leading_unexplained + _UNEXPLAINED_MORE]
     if len(order) == 0:
@@ -362,10 +369,10 @@ def _refine_competitors(
     return competitors
 
 
-def _unexplained(
+def _measure_unexplained(
     cloud_m: Float64[Tensor, "n 3"], poses: Rigid, surface: Surface
 ) -> Float64[Tensor, " b"]:
-    """Share of a cloud that is not near each posed surface, by the table of what lies near."""
+    """Measure the share of a cloud that is far from each posed surface, by its nearest samples."""
     local_m = poses.inverse().apply(take_evenly(cloud_m, _SHARE_POINTS))
     nearest_m = surface.points_m[surface.boxes.look_up(local_m)]
     is_far = (local_m - nearest_m).norm(dim=-1) > NEAR * surface.diameter_m

@@ -379,7 +379,7 @@ def identify(
     if reason:
         status = "contradicted"
     else:
-        reason = _explain_doubt(fits, evidence)
+        reason = _explain_unconfirmed(fits, evidence)
         status = "not excluded" if reason else "confirmed"
     return Identity(
         status=status,
@@ -413,7 +413,7 @@ def _explain_contradiction(fits: _Fits) -> str:
     return ""
 
 
-def _explain_doubt(fits: _Fits, evidence: Evidence) -> str:
+def _explain_unconfirmed(fits: _Fits, evidence: Evidence) -> str:
     """Explain what keeps a model without contradiction from being confirmed; empty if nothing."""
     scale = fits.scale
     size_error = abs(scale.times - 1)

@@ -25,7 +25,7 @@ from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.copies import PreparedObject
 from depthpose.pose.decide import (
     LEAST_SHARE,
-    contradiction,
+    explain_doubt,
     likeliest_object,
     with_share,
 )
@@ -260,7 +260,7 @@ def _refine(
     for place, (pose, evidence) in zip(places, refined, strict=True):
         probability = probability_right(evidence, targets.prior_odds)
         if probability < LEAST_POSSIBLE:
-            reason = contradiction(evidence, probability, is_masked=False)
+            reason = explain_doubt(evidence, probability, is_masked=False)
             hopeless.append(_miss_at(place, evidence, reason, targets))
             continue
         explained = explained_frame_mask(frame, pose, targets.objects[place.object].surface)

@@ -19,7 +19,7 @@ from depthpose.core.stopwatch import Stopwatch
 from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.copies import PreparedObject
-from depthpose.pose.decide import contradiction, why_not_observable, with_status
+from depthpose.pose.decide import explain_doubt, why_not_observable, with_status
 from depthpose.pose.evidence import compare, observe
 from depthpose.pose.frame import is_on_plane, largest_plane
 from depthpose.pose.icp import refine_best
@@ -312,7 +312,7 @@ def _weigh_pose(
     evidence = compare(observation, pose, target.prepared.surface)
     probability = probability_right(evidence, PRIOR_MASKED)
     if probability < target.refusal.min_probability:
-        reason = contradiction(evidence, probability, is_masked=False)
+        reason = explain_doubt(evidence, probability, is_masked=False)
         return Refusal(status="doubtful", reason=reason)
 
     # Together with the frames before.
