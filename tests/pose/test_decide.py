@@ -201,6 +201,12 @@ def test_a_refusal_says_what_contradicts_the_pose_most(kind: str, words: str) ->
     assert "mask" not in searched, "a search was given none"
 
 
+def test_less_than_one_patch_says_nothing_for_a_pose() -> None:
+    little = replace(GOOD, visible=0.7, supported=0.7, explained=0.7, unobserved=0.0)
+    assert log_likelihood_ratio(little) == 0
+    assert log_likelihood_ratio(replace(little, visible=1.5, supported=1.5, explained=1.5)) > 0
+
+
 def test_a_pose_on_something_larger_is_refused_for_this_reason_beside_larger_areas() -> None:
     evidence = replace(GOOD, silhouette=20.0, continued=7.0, unobserved=30.0)
     assert probability_right(evidence, 1e6) == 0

@@ -102,9 +102,12 @@ def is_on_larger(evidence: Evidence) -> bool:
 def log_likelihood_ratio(evidence: Evidence) -> float:
     """Log likelihood ratio of a right and a wrong pose, by all the evidence.
 
-    It grows with the area that was compared: a pose that shows little has little to support it.
+    It grows with the area that was compared: a pose that shows little has little to support it, and
+    one that shows less than one independent patch has nothing.
     """
-    area = max(LEAST_AREA, evidence.visible)
+    area = evidence.visible
+    if area < LEAST_AREA:
+        return 0.0
     # Only what was observed can contradict a pose, and what contradicts it was observed.
     contradicted_area = evidence.seen_through + evidence.bulging + evidence.beside
     observed_area = max(LEAST_AREA, area - evidence.unobserved)
