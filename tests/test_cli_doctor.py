@@ -10,6 +10,7 @@ from depthpose.core.errors import InputError
 from depthpose.pose.network_pose import GeoPoseNet
 
 
+@pytest.mark.slow
 def test_doctor_names_what_is_here_and_tries_depth_and_pose(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -268,6 +268,7 @@ def test_clouds_have_the_poses_of_the_plain_command(
         assert {**row, "seconds": 0} == {**wanted[name], "seconds": 0}
 
 
+@pytest.mark.slow
 def test_a_box_is_that_of_every_depth_image(tmp_path: Path, double: InProcessEngine) -> None:
     cad = write_stl(tmp_path / "bracket.stl", bracket())
     for seed in (1, 2):

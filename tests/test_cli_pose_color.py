@@ -105,6 +105,7 @@ def test_a_colour_camera_of_its_own(drawn: Path, tmp_path: Path, seen: list[View
     assert view.color.color_from_depth.t_m.tolist() == pytest.approx([0.05, 0, 0])
 
 
+@pytest.mark.slow
 def test_a_model_without_colours_is_named(
     drawn: Path, tmp_path: Path, seen: list[ViewInput]
 ) -> None:

@@ -106,6 +106,7 @@ def test_the_page_shows_best_median_and_worst_beside_the_truth(
     assert any(f": {reason}." in text for text in page.texts["p"])
 
 
+@pytest.mark.slow
 def test_weights_predict_once_with_true_and_predicted_masks(
     synthetic: BopDataset, weights: Path, tmp_path: Path
 ) -> None:

@@ -131,6 +131,7 @@ def test_a_cloud_gives_its_pose_and_the_posed_model(
     assert beside.color is not None
 
 
+@pytest.mark.slow
 def test_a_depth_image_alone_is_searched(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

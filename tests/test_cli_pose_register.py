@@ -73,6 +73,7 @@ def test_a_cad_file_and_a_cloud_give_a_pose(cad: Path, tmp_path: Path) -> None:
     assert (tmp_path / "out/report.html").is_file()
 
 
+@pytest.mark.slow
 def test_a_notice_on_a_file_that_the_report_reads_again_is_given_once(
     cad: Path, tmp_path: Path
 ) -> None:
@@ -96,6 +97,7 @@ def test_a_notice_on_a_file_that_the_report_reads_again_is_given_once(
     assert done.stderr.count("VIEWPOINT 0.5 0 0 1 0 0 0") == 1
 
 
+@pytest.mark.slow
 def test_a_declared_symmetry_is_taken_and_doubted_aloud(cad: Path, tmp_path: Path) -> None:
     words = ["--cad", cad, "--unit", "mm", "--cloud", tmp_path / "scan.ply"]
     with pytest.warns(Notice, match="bracket: turned by the symmetry z,2 its surface lies"):

@@ -32,6 +32,7 @@ def rows_of(out: Path, name: str = "rows") -> list[dict[str, object]]:
     return json.loads((out / f"{name}.json").read_text())
 
 
+@pytest.mark.slow
 def test_table_3_2_walks_over_the_layout_of_the_thesis(
     linemod: BopDataset, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -29,6 +29,7 @@ def part(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_part("bracket", tmp_path_factory.mktemp("cad"))
 
 
+@pytest.mark.slow
 def test_a_cad_file_becomes_weights_with_a_card(
     part: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -74,6 +75,7 @@ def test_words_that_do_not_go_together_are_refused(
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_synthetic_frames_are_a_data_set_that_the_check_accepts(
     part: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

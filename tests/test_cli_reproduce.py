@@ -92,6 +92,7 @@ def mono(name: str, depth_m: float) -> DepthMethod:
     return DepthMethod(name, FlatMono(depth_m), settings, with_right=False)
 
 
+@pytest.mark.slow
 def test_table_2_2_is_made_by_one_command(
     street: Path, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -27,6 +27,7 @@ def demo_folder(after_demo: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return after_demo
 
 
+@pytest.mark.slow
 def test_the_commands_of_the_readme_run(demo_folder: Path) -> None:
     lines = commands("README.md")
     assert lines

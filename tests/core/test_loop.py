@@ -615,6 +615,7 @@ def _launch(folder: Path) -> None:
         assert attempt == 0, [path.read_text()[-3000:] for path in said]
 
 
+@pytest.mark.slow
 def test_a_signal_to_the_whole_job_saves_the_state(tmp_path: Path) -> None:
     """Schedulers signal every process of a job, the workers that make samples too."""
     folder, file = tmp_path / "run", tmp_path / "said"

@@ -156,6 +156,7 @@ def test_the_encoder_learns_at_its_own_rate(pairs: PairsConfig) -> None:
     assert optimizer.param_groups[1]["weight_decay"] == adam.weight_decay == 1e-2
 
 
+@pytest.mark.slow
 def test_it_learns_disparity_and_view(held_folder: str, tmp_path: Path, pairs: PairsConfig) -> None:
     config = SelectTraining(
         generator=TINY,
@@ -216,6 +217,7 @@ def test_pairs_may_be_trained_on_at_another_focal_length(
     assert read_generator(path).config.virtual_focal_px == 130.0
 
 
+@pytest.mark.slow
 def test_it_begins_with_the_encoder_and_goes_on_from_its_weights(
     pairs: PairsConfig, tmp_path: Path
 ) -> None:

@@ -213,6 +213,7 @@ def test_a_pose_that_is_one_of_the_copies_competes_with_none(
     assert torch.equal(competition.others[0][0].pose.R, other.camera_from_model.R)
 
 
+@pytest.mark.slow
 def test_only_what_has_a_copy_is_less_certain_of_it() -> None:
     """A bottle whose ends are alike declares its axis alone: it may stand on its head."""
     for model in (bracket(), bottle()):

@@ -223,6 +223,7 @@ def test_a_spin_without_colour_stays() -> None:
     assert torch.equal(propose_color_copies(pose, model, view).R, pose.R[None])
 
 
+@pytest.mark.slow
 def test_copies_of_a_can_hold_the_right_one() -> None:
     # Upside down and spun: found in the shape as a half turn across the axis, and the axis.
     flip = Rigid(rotation_by(torch.tensor([[math.pi, 0, 0]]).double()), torch.zeros(1, 3).double())
@@ -239,6 +240,7 @@ def test_copies_of_a_can_hold_the_right_one() -> None:
     assert len(propose_color_copies(wrong, declared, view).R) < len(copies.R)
 
 
+@pytest.mark.slow
 def test_an_axis_of_many_turns_is_swept(monkeypatch: pytest.MonkeyPatch) -> None:
     # A can whose shape was found to be alike after turns by 30 degrees, upside down too.
     angles = torch.arange(1, 12).double() * (math.pi / 6)
@@ -313,6 +315,7 @@ def test_a_can_is_as_wide_as_drawn() -> None:
     assert isinstance(view.color, ColorImage)
 
 
+@pytest.mark.slow
 def test_a_printed_box_is_posed_as_its_print_says() -> None:
     """By shape alone a box fits at four poses; a colour image says which of them is right."""
     model = replace(box(), name="thing")

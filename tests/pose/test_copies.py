@@ -48,6 +48,7 @@ def copies_of_gear(keyway_mm: float) -> SymmetricCopies:
     return find_copies(with_found_symmetries(gear(12, keyway_mm), None, is_taken=True))
 
 
+@pytest.mark.slow
 def test_a_gear_is_the_same_after_a_step_of_any_number_of_teeth() -> None:
     copies = copies_of_gear(0.0)
     for step in range(1, 12):
@@ -71,6 +72,7 @@ def test_a_gear_says_how_much_its_keyway_deviates() -> None:
         assert re.fullmatch(r"rotated by \d+ degrees about .* \(\d+\.\d%\)", line), line
 
 
+@pytest.mark.slow
 def test_the_ends_of_a_bar_that_differ_a_little_are_copies_and_no_symmetries() -> None:
     copies = find_copies(with_found_symmetries(bar(0.002), None, is_taken=True))
     for axis in ([0, 1.0, 0], [0, 0, 1.0]):

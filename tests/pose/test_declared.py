@@ -173,6 +173,7 @@ def test_whose_symmetry_it_is() -> None:
             assign_symmetries(given, both)
 
 
+@pytest.mark.slow
 def test_declared_copies_are_one_answer(tmp_path: Path) -> None:
     model = gear(keyway_m=0.0)
     pose = pose_at(0.0, 0.35, seed=1)

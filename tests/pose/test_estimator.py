@@ -241,6 +241,7 @@ def test_points_without_a_reading_take_no_others_place(part: ObjectModel) -> Non
     assert len(prepared.cloud_m) > 0.95 * len(points_m)
 
 
+@pytest.mark.slow
 def test_about_an_axis_that_nobody_declared_every_rotation_is_named() -> None:
     plain = bottle()
     model = dataclasses.replace(plain, symmetries=type(plain.symmetries)())
@@ -500,6 +501,7 @@ def test_zeros_of_a_driver_are_no_points(part: ObjectModel) -> None:
     assert_close(Oracle(tiny_weights(part), [truth]).estimate(cloud=organised), truth)
 
 
+@pytest.mark.slow
 def test_a_mesh_with_holes_and_bad_faces_serves_as_well(part: ObjectModel) -> None:
     faces = torch.cat([part.faces[3:], part.faces[5:8], torch.tensor([[1, 1, 2], [0, 0, 0]])])
     worn = dataclasses.replace(part, faces=faces)

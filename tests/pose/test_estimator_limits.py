@@ -101,6 +101,7 @@ def _plane() -> Tensor:
     return (0.7 + 0.0005 * torch.arange(240.0))[:, None].repeat(1, 320)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("depth_m", "times"),
     [

@@ -104,6 +104,7 @@ def hiding_pairs(frame: BopFrame) -> list[tuple[int, int]]:
     return pairs
 
 
+@pytest.mark.slow
 def test_a_pile_is_picked_from_the_top() -> None:
     surfaces = {"connector": prepare_surface(make_part("connector"))}
     total = 0

@@ -7,6 +7,7 @@ from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
 from depthpose import Registration
@@ -44,6 +45,7 @@ def used_registration() -> tuple[Registration, torch.Tensor, list[list[float]]]:
     return part, cloud, answer(part, cloud)
 
 
+@pytest.mark.slow
 def test_a_used_estimator_answers_in_a_worker_and_afterwards(tmp_path: Path) -> None:
     program = tmp_path / "program.py"
     program.write_text(_PROGRAM)

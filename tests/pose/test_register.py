@@ -187,6 +187,7 @@ def test_registration_that_finds_nothing_leaves_the_network_s_reason() -> None:
     assert "registration" in found.seconds
 
 
+@pytest.mark.slow
 def test_regions_that_may_show_anything_are_not_registered() -> None:
     samples = [view(make_part("connector"), index) for index in range(2)]
     cloud_m = samples[0].input.points_m

@@ -190,6 +190,7 @@ def turns_of(model: ObjectModel) -> Rigid:
     return Rigid.cat([copies.near_copies, copies.lookalikes])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_handle_first", [False, True])
 def test_a_mug_turned_about_its_axis_looks_alike_but_for_its_handle(is_handle_first: bool) -> None:
     mug = make_part("mug")  # its handle comes last
@@ -281,6 +282,7 @@ def test_where_nothing_is_nothing_is_found_soon(depth_m: torch.Tensor, net: Regi
     assert time.process_time() - began < 10
 
 
+@pytest.mark.slow
 def test_a_model_larger_than_the_view_has_an_answer_soon() -> None:
     """Of a part ten times as large a corner fills the image: an answer or none, in bounded time."""
     small = bracket()

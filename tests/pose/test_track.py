@@ -88,6 +88,7 @@ def test_without_a_first_pose_it_is_found_and_then_followed() -> None:
     assert error_of(found[2], poses[2]) < 0.003
 
 
+@pytest.mark.slow
 def test_it_is_lost_where_it_is_taken_away_or_covered_and_found_when_back() -> None:
     poses = moving(8)
     frames = [frame(p, k) for k, p in enumerate(poses)]

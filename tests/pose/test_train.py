@@ -290,6 +290,7 @@ def test_a_training_leaves_weights_a_card_and_its_config(trained: Path) -> None:
         train_pose_network(_training(), TrainingRun(folder=trained.parent))
 
 
+@pytest.mark.slow
 def test_a_training_begins_with_what_other_objects_taught(trained: Path, tmp_path: Path) -> None:
     """Whether or not the weights hold their meshes."""
     bare = tmp_path / "bare.safetensors"
@@ -449,6 +450,7 @@ def test_symmetries_of_a_cad_file_are_reported_and_taken_on_request(tmp_path: Pa
     assert len(taken.symmetries.discrete.R) == 5
 
 
+@pytest.mark.slow
 def test_symmetries_that_a_data_set_does_not_declare_are_found_too(tmp_path: Path) -> None:
     declared = dataclasses.replace(bottle(), number=1)
     silent = dataclasses.replace(bottle(), number=2, symmetries=Symmetries())

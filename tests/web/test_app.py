@@ -140,6 +140,7 @@ def test_fields_do_what_a_camera_file_does(page: TestClient, samples: Path) -> N
     assert ways[0] == ways[1] == ways[2]
 
 
+@pytest.mark.slow
 def test_the_field_says_the_baseline_where_the_camera_file_has_none(
     page: TestClient, tmp_path: Path
 ) -> None:
@@ -543,6 +544,7 @@ def test_a_cad_file_that_no_weights_know_is_registered(
     assert float(off_m) < 0.005
 
 
+@pytest.mark.slow
 def test_another_part_than_the_cad_file_is_refused(
     samples: Path, truth: Rigid, page: TestClient
 ) -> None:
