@@ -286,12 +286,17 @@ def _street_directions(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Compute the directions of a street in the camera's frame (x right, y down, z forward).
 
+    The signs of tilt and roll are those of :class:`Angles`; a positive pan turns ``forward``
+    to the right.
+
     Returns:
         Unit vectors forward along the street, down, and right across the street, each (angles, 3).
     """
     pan = np.radians(pans_deg)
     tilt = np.radians(tilts_deg)
     roll = np.radians(rolls_deg)
+    # The horizon is the line y = x tan(roll) + tan(tilt) in normalised coordinates (x, y, 1). Down
+    # is the normal of the plane through it and the camera.
     down = np.stack([-np.tan(roll), np.ones_like(roll), -np.tan(tilt)], 1)
     down /= np.linalg.norm(down, axis=1, keepdims=True)
     # Forward is the part of the panned axis that is perpendicular to down.

@@ -453,7 +453,10 @@ _COLUMN_MEANINGS = {
 
 
 def format_value(value: object) -> str:
-    """Format a cell of a table: floats with four decimals or none if whole; None as ``""``."""
+    """Format a cell of a table; None as ``""``.
+
+    Whole floats other than 0 have no decimals; all others, and 0 (``0.0000``), have four.
+    """
     match value:
         case None:
             return ""

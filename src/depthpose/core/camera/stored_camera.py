@@ -419,7 +419,13 @@ def read_baseline_m(fields: Fields) -> float | None:
 def find_distortion(fields: Fields) -> tuple[float, ...]:
     """Collect the distortion coefficients under any key, of both lenses where there are two.
 
-    They tell only whether a lens distorts; their order is none of a lens model.
+    They tell only whether a lens distorts. They are collected in no particular order, so they
+    cannot undistort an image.
+
+    Raises:
+        InputError: a key of coefficients alone, such as ``D`` or ``distCoeffs``, holds none. Other
+            keys that begin with ``distortion`` may hold words, as ``distortion_model`` does: these
+            are skipped.
     """
     loose = [find_number(fields, key) for key in _DISTORTION_KEYS]
     coefficients = [number for number in loose if number is not None]
@@ -429,9 +435,9 @@ def find_distortion(fields: Fields) -> tuple[float, ...]:
             continue
         is_matrix = isinstance(value, Mapping) and "data" in value
         is_by_name = isinstance(value, Mapping) and not is_matrix
-        content = value["data"] if is_matrix else value
+        is_empty = not (value["data"] if is_matrix else value)
         numbers = parse_numbers(list(value.values()) if is_by_name else value)
-        if numbers is None and is_list_key and content:
+        if numbers is None and is_list_key and not is_empty:
             raise InputError(f"its {key} are no list of numbers; write [k1, k2, p1, p2, k3]")
         coefficients += numbers or []
     return tuple(coefficients)

@@ -56,7 +56,7 @@ def depth_from_pair(
 
 
 def refuse_unrectified(pair: StereoInput, *, with_check: bool = True) -> str:
-    """Raise an error where two images are not a rectified pair; warn where that is uncertain.
+    """Refuse two images that are no rectified pair; return a warning where that is uncertain.
 
     Args:
         pair: the images, and their rig where it is known.

@@ -266,7 +266,7 @@ class NetworkMatcher(ABC):
         """Compute the rows and columns at which images of a camera are matched [px]."""
         if self.network_config.work_focal_px is None:
             return camera.height, camera.width
-        return disparity.size_at_focal_length(camera, self.work_focal_px(camera))
+        return disparity.size_at_focal_length(camera, self.matching_focal_px(camera))
 
     def work_disparities(self, camera: Camera) -> int:
         """Compute the number of disparities that are searched at :meth:`work_size` [px]."""
@@ -274,7 +274,7 @@ class NetworkMatcher(ABC):
         if trained.work_focal_px is None:
             return trained.max_disparity_px
         # Disparities grow with the focal length; the same filters search more of them.
-        ratio = self.work_focal_px(camera) / trained.work_focal_px
+        ratio = self.matching_focal_px(camera) / trained.work_focal_px
         span_factor = min(ratio, self.largest_span_factor)
         return self.whole_steps(trained.max_disparity_px * span_factor)
 
@@ -283,7 +283,7 @@ class NetworkMatcher(ABC):
         step_px = self.network_config.step_px
         return max(1, math.ceil(round(disparity_px, 3) / step_px)) * step_px
 
-    def work_focal_px(self, camera: Camera) -> float:
+    def matching_focal_px(self, camera: Camera) -> float:
         """Compute the focal length at which images of a camera are matched [px].
 
         At the speed ``fine`` it is that of an image of ``fine_pixels``, but at least that of the

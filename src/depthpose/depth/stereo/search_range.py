@@ -209,7 +209,7 @@ def _usual_scale_and_span(
     """
     trained = matcher.network_config
     if camera is not None and trained.work_focal_px is not None:
-        scale = matcher.work_focal_px(camera) / float(camera.K[0, 0])
+        scale = matcher.matching_focal_px(camera) / float(camera.K[0, 0])
         return scale, matcher.work_disparities(camera)
     if matcher.config.speed == "quick" or trained.work_focal_px is None:
         return 1.0, trained.max_disparity_px

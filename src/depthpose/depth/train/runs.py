@@ -17,7 +17,13 @@ from depthpose.core.checkpoint import (
     warn_of_terms,
 )
 from depthpose.core.errors import InputError
-from depthpose.core.loop import Task, TrainingRun, format_held_out, releases_folder, write_card
+from depthpose.core.loop import (
+    Task,
+    TrainingRun,
+    format_last_validation,
+    releases_folder,
+    write_card,
+)
 from depthpose.core.run import find_rank
 from depthpose.depth.config import GeneratorConfig, PairsConfig, SelectionConfig
 from depthpose.depth.datasets import FramePaths, refuse_shared_frames
@@ -341,7 +347,7 @@ def _write_weights(
         return path  # the statistics of batch norm that count are those of rank 0
 
     write_depth_weights(path, generator=generator, matcher=matcher, facts=facts)
-    measured = format_held_out(run.folder, _VALIDATION_TEXTS[stage])
+    measured = format_last_validation(run.folder, _VALIDATION_TEXTS[stage])
     write_card(path, f"depth train {stage}", seconds, facts, measured)
     return path
 

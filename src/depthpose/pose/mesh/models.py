@@ -218,7 +218,7 @@ def sample_surface(
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
     """Spread points evenly over the surface of a model, always the same ones.
 
-    Of a model of points some of its own are taken, evenly by their order.
+    A model of points has no faces: some of its points are taken, evenly by their order.
 
     Args:
         model: the object.
@@ -232,14 +232,16 @@ def sample_surface(
         return take_evenly(model.vertices_m, count), take_evenly(model.normals, count)
     corners = model.vertices_m[model.faces].double()
     face, barycentric = spread_over_triangles(corners, count)
-    doubled = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     points = (corners[face] * barycentric[..., None]).sum(-2)
-    normals = doubled[face] / doubled[face].norm(dim=-1, keepdim=True).clamp(min=1e-300)
+    # The cross product of two edges is normal to the face, and as long as twice its area.
+    edges = corners[:, 1:] - corners[:, :1]
+    normals = torch.linalg.cross(edges[:, 0], edges[:, 1])[face]
+    normals = normals / normals.norm(dim=-1, keepdim=True).clamp(min=1e-300)
     return points.to(model.vertices_m), normals.to(model.vertices_m)
 
 
 _MOST_POINTS = 10_000
-"""Of a model of more points so many are joined: a tetrahedralization takes a second."""
+"""Most points of a model that are joined by triangles: their tetrahedralization takes a second."""
 _NEIGHBOURS = 12
 """A triangle's circumcircle is no larger than the distance of a corner to its twelfth neighbour:
 where points are random a circle without any is seldom so large."""

@@ -107,7 +107,7 @@ def propose_in_frame(
     for stage in _STAGES:
         poses = refine_projectively(frame, poses, surface, stage)
         score = score_by_image(frame, poses, surface, stage)
-        best = _choose_distinct(poses, score, surface, stage.most)
+        best = _suppress_near_duplicates(poses, score, surface, stage.most)
         poses = poses[best]
         score = score[best]
     is_good = score >= _LEAST_SCORE
@@ -159,7 +159,7 @@ def _scene_points(
     return mean_m[is_one_surface], normalize(mean_normal[is_one_surface], dim=-1)
 
 
-def _choose_distinct(
+def _suppress_near_duplicates(
     poses: Rigid, score: Float64[Tensor, " b"], surface: Surface, most: int
 ) -> Int64[Tensor, " c"]:
     """Choose the best poses, ``most`` of them, without any near a better one; as indices."""
@@ -196,7 +196,7 @@ def refine_projectively(frame: Frame, poses: Rigid, surface: Surface, stage: _St
     is_usable = (frame.is_smooth & frame.may_show(surface.diameter_m)).flatten()
     for limit in stage.icp_limits:
         # Each visible point of the surface, and the reading in its direction.
-        visible = _find_visible_points(poses, surface, stage.every)
+        visible = _look_up_visible_points(poses, surface, stage.every)
         readings = readings_toward(frame, visible.points_m)
         normal = frame.normals.flatten(0, 1)[readings.pixel]
         gap_m = frame.points_m.flatten(0, 1)[readings.pixel] - visible.points_m
@@ -256,7 +256,7 @@ def score_by_image(
         hides; at most 1.
     """
     # The reading in the direction of each visible point, and how far behind the point it is.
-    visible = _find_visible_points(poses, surface, stage.every)
+    visible = _look_up_visible_points(poses, surface, stage.every)
     depth_m = visible.points_m[..., 2]
     readings = readings_toward(frame, visible.points_m)
     gap_m = readings.depth_m - depth_m
@@ -292,7 +292,7 @@ class _Visible(NamedTuple):
     is_inner: Bool[Tensor, "b n"]  #: whether a point is of no rim or edge, which sensors cut
 
 
-def _find_visible_points(poses: Rigid, surface: Surface, every: int) -> _Visible:
+def _look_up_visible_points(poses: Rigid, surface: Surface, every: int) -> _Visible:
     """Find the points of each posed surface that are visible in the stored view nearest to it.
 
     ``every``: of so many of them one is taken.

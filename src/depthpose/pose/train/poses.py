@@ -59,7 +59,7 @@ from depthpose.pose.train.config import DepthImageTraining, PoseTraining, ViewsT
 from depthpose.pose.train.held_out import (
     HELD_OUT_SEED,
     ViewsTask,
-    format_held_out,
+    format_held_out_table,
     measure_add,
     score_held_out,
 )
@@ -313,7 +313,7 @@ def train_pose_network(config: PoseTraining | DepthImageTraining, run: TrainingR
     weights = read_pose_weights(path)
     held_out_rows = score_held_out(weights, config.objects, config.held_out)
     write_json(path.with_suffix(".json"), {"held_out": held_out_rows})
-    _write_pose_card(path, weights, config, seconds, format_held_out(held_out_rows))
+    _write_pose_card(path, weights, config, seconds, format_held_out_table(held_out_rows))
     return path
 
 
