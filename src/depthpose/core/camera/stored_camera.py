@@ -177,7 +177,7 @@ def facts_from_fields(fields: Fields) -> CameraFacts | None:
         InputError: the lens is neither a pinhole nor an equidistant fisheye, or a value is wrong.
     """
     is_fisheye = is_fisheye_lens(fields)
-    facts = _facts_without_lens(fields)
+    facts = _read_facts_without_lens(fields)
     return None if facts is None else with_fisheye(facts, is_fisheye=bool(is_fisheye))
 
 
@@ -189,7 +189,7 @@ def with_fisheye(facts: CameraFacts, *, is_fisheye: bool) -> CameraFacts:
     return replace(facts, is_fisheye=True, undistort=undistort)
 
 
-def _facts_without_lens(fields: Fields) -> CameraFacts | None:
+def _read_facts_without_lens(fields: Fields) -> CameraFacts | None:
     """Read the camera that fields describe, but for its lens model; None where they describe none.
 
     The first of these that the fields have is read: settings of ORB-SLAM, two projections, the

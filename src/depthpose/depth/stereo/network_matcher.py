@@ -192,7 +192,7 @@ class NetworkMatcher(ABC):
         """
         trained = self.network_config
         if search is not None:
-            sizes = [_scaled_size(left, search.scale, camera) for left, _ in pairs]
+            sizes = [_compute_scaled_size(left, search.scale, camera) for left, _ in pairs]
             largest_px = search.span_px
         elif camera is not None and trained.work_focal_px is not None:
             sizes = [self.work_size(camera)] * len(pairs)
@@ -299,7 +299,7 @@ class NetworkMatcher(ABC):
         return max(trained_px, fine_px)
 
 
-def _scaled_size(left: View, scale: float, camera: Camera | None) -> tuple[int, int]:
+def _compute_scaled_size(left: View, scale: float, camera: Camera | None) -> tuple[int, int]:
     """Compute the rows and columns of a scaled view; with a camera, pixels become square."""
     if camera is not None:
         return disparity.size_at_focal_length(camera, scale * float(camera.K[0, 0]))
@@ -320,12 +320,12 @@ def pad_top_right(
     So PSMNet's authors do. Columns keep their numbers, and so disparity stays the same.
     """
     height, width = image.shape[-2:]
-    rows_above = _suitable_side_px(height, network) - height
-    columns_right = _suitable_side_px(width, network) - width
+    rows_above = _round_up_side(height, network) - height
+    columns_right = _round_up_side(width, network) - width
     return F.pad(image, (0, columns_right, rows_above, 0))
 
 
-def _suitable_side_px(side_px: int, network: NetworkConfig) -> int:
+def _round_up_side(side_px: int, network: NetworkConfig) -> int:
     """Round a side up to the next one that the network takes."""
     steps = math.ceil(side_px / network.step_px)
     return max(network.min_side_px, steps * network.step_px)

@@ -161,7 +161,7 @@ def _divide_wall(
     y = np.concatenate([[0], np.stack([sill, top], 1).ravel(), [height]])
     x0, y0 = np.meshgrid(x[:-1], y[:-1], indexing="ij")
     x1, y1 = np.meshgrid(x[1:], y[1:], indexing="ij")
-    cells = _rectangle_corners(x0, x1, y0, y1)
+    cells = _make_rectangle_corners(x0, x1, y0, y1)
     is_window = np.zeros(cells.shape[:2], bool)
     is_window[1::2, 1::2] = True
     return cells[~is_window], cells[is_window]
@@ -183,11 +183,11 @@ def _add_window_details(
     bar = _FRAME_BAR_M
     frames = np.concatenate(
         [
-            _rectangle_corners(left, left + bar, low, high),
-            _rectangle_corners(right - bar, right, low, high),
-            _rectangle_corners(middle - bar / 2, middle + bar / 2, low, high),
-            _rectangle_corners(left, right, high - bar, high),
-            _rectangle_corners(left, right, low, low + bar),
+            _make_rectangle_corners(left, left + bar, low, high),
+            _make_rectangle_corners(right - bar, right, low, high),
+            _make_rectangle_corners(middle - bar / 2, middle + bar / 2, low, high),
+            _make_rectangle_corners(left, right, high - bar, high),
+            _make_rectangle_corners(left, right, low, low + bar),
         ]
     )
     wood = Appearance("wood", style.frame)
@@ -196,7 +196,7 @@ def _add_window_details(
     # Sills: their fronts, which stand out from the wall, and their tops.
     sill_m = 0.12
     stone = Appearance("concrete", (0.4, 0.39, 0.36))
-    face = _rectangle_corners(left - 0.1, right + 0.1, low - 0.09, low)
+    face = _make_rectangle_corners(left - 0.1, right + 0.1, low - 0.09, low)
     front = wall.to_space(face, sill_m)
     back = wall.to_space(face)
     builder.add_quads(front, face, stone)
@@ -204,7 +204,7 @@ def _add_window_details(
     builder.add_quads(top, UNIT_SQUARE * [1, sill_m], stone)
 
 
-def _rectangle_corners(
+def _make_rectangle_corners(
     x0: np.ndarray, x1: np.ndarray, y0: np.ndarray, y1: np.ndarray
 ) -> np.ndarray:
     """Return the corners (..., 4, 2) of rectangles between x0 and x1, y0 and y1, in turn."""

@@ -136,7 +136,7 @@ def _open_held_out(config: PairsConfig | None, *, needs_truth: bool) -> Training
 def train_view(config: ViewTraining, run: TrainingRun) -> Path:
     """Train the U-Net generator; return the path of its weights."""
     torch.manual_seed(config.loop.seed)
-    config = _at_virtual_focal(config, config.generator)
+    config = _with_virtual_focal(config, config.generator)
     baseline_m = config.generator.virtual_baseline_m
     pairs = TrainingPairs(config.pairs, config.loop.seed, needs_truth=False, baseline_m=baseline_m)
     held_out = _open_held_out(config.held_out, needs_truth=False)
@@ -154,7 +154,7 @@ def train_select(config: SelectTraining, run: TrainingRun) -> Path:
     torch.manual_seed(config.loop.seed)
     rig = config.generator
     seed = config.loop.seed
-    config = _at_virtual_focal(config, rig)
+    config = _with_virtual_focal(config, rig)
     sources = [
         TrainingPairs(
             pairs, seed, needs_truth=True, is_mixed=True, baseline_m=rig.virtual_baseline_m
@@ -220,7 +220,7 @@ def train_finetune(config: FinetuneTraining, run: TrainingRun) -> Path:
         generator.config = replace(generator.config, least_confidence=0.0, with_street=False)
         generator.street = None
     matcher = read_matcher(find_weights(config.matcher))
-    config = _at_virtual_focal(config, generator.config)
+    config = _with_virtual_focal(config, generator.config)
     baseline_m = generator.config.virtual_baseline_m
     pairs = TrainingPairs(config.pairs, config.loop.seed, needs_truth=True, baseline_m=baseline_m)
     held_out = _open_held_out(config.held_out, needs_truth=True)
@@ -269,7 +269,7 @@ def _run_stage(
     if samples.truths:
         checksums["truth"] = list(samples.truths)
     if frames:
-        checksums["frames_sha256"] = _frames_sha256(frames)
+        checksums["frames_sha256"] = _hash_frames(frames)
 
     facts = _describe_training(config, samples.truths, tuple(initial_weights.values()))
     warn_of_terms(facts)
@@ -316,7 +316,7 @@ def _describe_training(
     return add_terms(facts, began_with)
 
 
-def _frames_sha256(frames: Sequence[FramePaths]) -> str:
+def _hash_frames(frames: Sequence[FramePaths]) -> str:
     """Hash the names of frames and the sizes of their left images."""
     digest = sha256()
     for frame in frames:
@@ -352,7 +352,7 @@ def _write_weights(
     return path
 
 
-def _at_virtual_focal(
+def _with_virtual_focal(
     config: _GeneratorTraining, generator: GeneratorConfig | SelectionConfig
 ) -> _GeneratorTraining:
     """Return the config with the focal length of the generator's rig for pairs without one.

@@ -418,7 +418,9 @@ def make_model(
         kept, faces = torch.unique(faces, return_inverse=True)
         vertices_m = vertices_m[kept]
     vertices_m = vertices_m.float()
-    normals = _vertex_normals(vertices_m, faces) if len(faces) else _point_normals(vertices_m)
+    normals = (
+        _average_vertex_normals(vertices_m, faces) if len(faces) else _fit_point_normals(vertices_m)
+    )
     model = ObjectModel(
         name=name,
         number=number,
@@ -438,7 +440,9 @@ def make_model(
     return replace(model, keypoints_m=candidates[farthest_points(candidates, config.keypoints)])
 
 
-def _vertex_normals(vertices_m: Float[Tensor, "v 3"], faces: Tensor) -> Float[Tensor, "v 3"]:
+def _average_vertex_normals(
+    vertices_m: Float[Tensor, "v 3"], faces: Tensor
+) -> Float[Tensor, "v 3"]:
     """Average at each vertex the normals of its faces, weighted by their areas, to unit vectors."""
     corners = vertices_m.double()[faces]
     sides = corners[:, 1:] - corners[:, :1]
@@ -449,7 +453,7 @@ def _vertex_normals(vertices_m: Float[Tensor, "v 3"], faces: Tensor) -> Float[Te
     return (total / total.norm(dim=-1, keepdim=True).clamp(min=1e-300)).to(vertices_m)
 
 
-def _point_normals(points_m: Float[Tensor, "v 3"]) -> Float[Tensor, "v 3"]:
+def _fit_point_normals(points_m: Float[Tensor, "v 3"]) -> Float[Tensor, "v 3"]:
     """Fit a plane to the nearest 16 points of each point, and compute its unit normal.
 
     It points away from the mean of all points: to the outer side of convex parts alone.

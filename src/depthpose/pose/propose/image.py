@@ -97,7 +97,7 @@ def propose_in_frame(
     """
     # Votes.
     surface = table.surface
-    points_m, normals = _scene_points(frame, is_unclaimed, surface)
+    points_m, normals = _average_scene_points(frame, is_unclaimed, surface)
     generator = torch.Generator().manual_seed(_ORDER_SEED)
     order = torch.randperm(len(points_m), generator=generator)[:_MOST_POINTS]
     references = torch.arange(_choose_number_of_references(len(order), models))
@@ -126,7 +126,7 @@ def _choose_number_of_references(points: int, models: int) -> int:
     return min(points, max(_FEWEST_REFERENCES, min(wanted, most)))
 
 
-def _scene_points(
+def _average_scene_points(
     frame: Frame, is_unclaimed: Bool[Tensor, "h w"], surface: Surface
 ) -> tuple[Float64[Tensor, "n 3"], Float64[Tensor, "n 3"]]:
     """Average the points that may be of an object in cells, and their normals.

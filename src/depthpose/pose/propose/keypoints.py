@@ -227,7 +227,7 @@ def vote_ransac(
     config = VotingConfig() if config is None else config
     lines, centre_m = _make_lines(points_m, directions, weight)
     first, second = _draw_pairs(lines.weights, config)
-    hypotheses, is_crossing = _cross_pairs(lines, first, second)
+    hypotheses, is_crossing = _find_crossings(lines, first, second)
 
     # The best hypothesis. Parallel pairs score 0, as the least of all, so that one always wins.
     scorer = InlierScorer(lines, config)
@@ -272,7 +272,7 @@ def _draw_pairs(
     return voters.gather(-1, first), voters.gather(-1, second)
 
 
-def _cross_pairs(
+def _find_crossings(
     lines: VoteLines, first: Int64[Tensor, "*batch k h"], second: Int64[Tensor, "*batch k h"]
 ) -> tuple[Float[Tensor, "*batch k h 3"], Bool[Tensor, "*batch k h"]]:
     """Find where pairs of lines nearly cross: the middle of their common perpendicular.
