@@ -276,8 +276,8 @@ class MatcherConfig(Settings):
     processor without bf16 (AVX-512, AMX) takes fp32."""
 
     speed: Speed = "fine"
-    """Of one image: quick looks at it once, fine in two sizes, if the generator selects.
-    Of pairs of a known camera: quick matches at the focal length that the weights were trained at;
+    """With one image, quick looks at it once, fine in two sizes, if the generator selects.
+    With pairs of a known camera, quick matches at the focal length of the weights' training;
     fine, where that is more, at up to 280,000 pixels and never enlarged (PSMNet), or at up to
     650,000 and 1.5 times the images' sides (light), and through up to 1.5 (PSMNet) or 1.75 times
     the disparities: for KITTI 3 to 5 times the time. Weights that match pairs as they are have one

@@ -678,8 +678,8 @@ def _measure_inflation(
 ) -> tuple[Float64[Tensor, "*batch 6"], Float64[Tensor, "*batch 6 6"]]:
     """Measure the ratios of a block jackknife's variances to independent ones; and directions.
 
-    Of several block sizes the one with the largest sum is taken; the ratios are 1 where no size has
-    a larger sum. Directions are columns, in the coordinates of ``whitening``.
+    Several block sizes are tried, and the one with the largest sum is taken; the ratios are 1 where
+    no size has a larger sum. Directions are columns, in the coordinates of ``whitening``.
 
     Args:
         cloud_m: the points of the residuals, in the camera frame.

@@ -215,7 +215,7 @@ def choose_ranked(errors: Sequence[float], most: int = 3) -> list[tuple[str, int
 def share_views(sets: int) -> list[int]:
     """Share the views of a page among several sets of predictions: the number of each set.
 
-    Of more than ``MOST_VIEWS`` sets the last get none.
+    Where there are more than ``MOST_VIEWS`` sets, the last get none.
     """
     each = max(1, MOST_VIEWS // max(1, sets))
     return [each if index * each < MOST_VIEWS else 0 for index in range(sets)]

@@ -487,7 +487,7 @@ def _read_window(fields: Fields) -> _Window:
 
 
 def find_size(fields: Fields) -> Size | None:
-    """Read the image's size, where the file has it; of ROS, that of the published image."""
+    """Read the image's size, where the file has it; for ROS that of the published image."""
     width = _find_first_number(fields, _WIDTH)
     height = _find_first_number(fields, _HEIGHT)
     size = parse_numbers(fields.get("imagesize") or fields.get("size"))

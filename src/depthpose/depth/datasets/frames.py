@@ -390,7 +390,7 @@ def has_lidar(frame: FramePaths, depth: LidarDepth) -> bool:
 def read_lidar_depth(frame: FramePaths, depth: LidarDepth) -> Map:
     """Read the depth map of a frame's LiDAR scan [m]; NaN where no point falls.
 
-    Of a frame without a scan, but with a map of one (``lidar_depth/`` of a plain folder,
+    Where a frame has no scan but a map of one (``lidar_depth/`` of a plain folder,
     ``velodyne_raw`` of KITTI's depth-prediction set), that map is read for ``camera_z``.
 
     Raises:

@@ -49,7 +49,7 @@ class DeclaredTurns:
 
     @property
     def angles_rad(self) -> Float64[Tensor, " a"]:
-        """Angles of all rotations but that by 0; of a free axis eleven, by which it is measured."""
+        """Angles of all rotations but that by 0; a free axis is measured by eleven of its own."""
         count = self.turns or _FREE_AXIS_TURNS
         return torch.arange(1, count, dtype=torch.float64) * (2 * math.pi / count)
 

@@ -495,8 +495,8 @@ _EXACT_DISTANCES = "donot_use_mm_for_euclid_dist"  # not by a matrix product, wh
 def measure_diameter(points_m: Float[Tensor, "n 3"]) -> float:
     """Measure the largest distance of two points [m], which are corners of the convex hull.
 
-    Of a hull of more than 8,000 corners those farthest in many directions are compared: the result
-    is less than 0.05 % too short.
+    If the hull has more than 8,000 corners, those farthest in many directions are compared: the
+    result is less than 0.05 % too short.
     """
     points = np.unique(points_m.double().cpu().numpy(), axis=0)
     # Points of one plane, or fewer than four, have no hull: all of them are compared.

@@ -17,8 +17,8 @@ from depthpose.pose.surface import NEAR, Surface
 
 # Votes.
 _REFERENCE_EVERY = 8
-"""Of so many points of the scene one is a reference, which votes with each of the others: on a
-small object in a large scene enough must lie."""
+"""One in this many points of the scene is a reference, which votes with each of the others:
+enough must lie on a small object in a large scene."""
 _WANTED_REFERENCES = 600
 """References at least, if there are as many points."""
 _MOST_REFERENCES = 2000
@@ -27,10 +27,10 @@ _MOST_REFERENCES_OF_ALL = 6000
 _FEWEST_REFERENCES = 200
 """References for each object at least, however many are searched."""
 _LEAST_POINTS = 30
-"""Of a scene: with fewer nothing is proposed."""
+"""Fewest points of a scene: with fewer nothing is proposed."""
 _MOST_POINTS = 20_000
 _ORDER_SEED = 0
-"""Of the order of a scene's points, so that an image always has the same proposals."""
+"""Seed of the order of a scene's points, so that an image always has the same proposals."""
 _PEAKS = 3
 """Poses that each reference point proposes."""
 _LEAST_SCORE = 0.25
@@ -45,7 +45,7 @@ _MIN_COSINE = 0.7
 _MIN_COSINE_ICP = 0.5
 """The same in ICP, whose poses are rough."""
 _DAMPING = 0.02
-"""Of ICP, in weights of all readings: a motion that few readings constrain is suppressed."""
+"""Damping of ICP, in weights of all readings: it suppresses motions that few readings constrain."""
 
 # The score of a pose.
 _DEVIATIONS = 2.0

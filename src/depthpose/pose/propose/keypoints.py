@@ -23,7 +23,8 @@ make its matrix indefinite."""
 _DAMPING = 1e-12
 """Share of the trace that is added to a matrix of lines, so that parallel ones have a solution."""
 _EIGENVALUE_ROUNDING = 1e-7
-"""Of a matrix of trace 2, sums in float32: a smaller eigenvalue is that of parallel lines."""
+"""Rounding error of the eigenvalues of a matrix of trace 2, whose sums are in float32: a smaller
+eigenvalue is that of parallel lines."""
 
 
 class VoteLines(NamedTuple):

@@ -49,7 +49,7 @@ _SCORED_POINTS = 100
 _NEAR_ROUGHLY = 0.1
 """Largest distance, in diameters, of a point that is near the surface at a proposed, rough pose."""
 _SHUFFLE_SEED = 0
-"""Of the order of alike pairs, so that a model always has the same table."""
+"""Seed of the order of alike pairs, so that a model always has the same table."""
 _RAYS_EVERY = 16
 """Every so-many-th point of the surface is used to count free-space violations."""
 _UNOBSERVED_WEIGHT = 0.3

@@ -79,7 +79,7 @@ _SYMMETRY_STEP_RAD = 0.05  # half the step about an axis of revolution; votes er
 class PoseTask(ViewsTask):
     """Trains directions from each point to the keypoints of its object (thesis, 3.3).
 
-    Of a symmetric object the copy of the truth is chosen once for each cloud.
+    For a symmetric object the copy of the truth is chosen once for each cloud.
     """
 
     method = "ransac"
@@ -150,7 +150,7 @@ _ROTATIONS_ON_CARD = 3  # rotations by which an object looks nearly alike, on a 
 def claim_run(config: Any, run: TrainingRun, files: Sequence[str] = ()) -> None:  # noqa: ANN401
     """Claim the folder of a run for a config, with the checksums of ``files`` and of start weights.
 
-    Of start weights with terms of their own, these are told.
+    Warns where the start weights have terms of use.
     """
     checksums: dict[str, Any] = {"sha256": [file_sha256(Path(path)) for path in files]}
     if config.start is not None:
@@ -322,7 +322,7 @@ def _set_network_sizes(
 ) -> PoseTraining | DepthImageTraining:
     """Set the network's classes and keypoints by the objects, and its inputs by the cloud.
 
-    Of these a network has those that its config names.
+    Only those are set that the config of the network has.
     """
     sizes = {
         "classes": len(models),
