@@ -167,7 +167,7 @@ class PairsConfig(Settings):
     rendered while training have exact disparity, whatever this says."""
 
     limit: Annotated[int | None, "[1, inf)"] = None
-    """Take so many pairs of each folder, and so many streets, spread evenly; None: all."""
+    """Largest number of pairs of each folder, and of streets, spread evenly; None: all."""
 
     focal_px: Annotated[float | None, f"(0, {_MAX_FOCAL_PX}]"] = None
     """Bring every pair to this focal length [px]; None: that of the generator, or sizes as they
@@ -245,7 +245,7 @@ class LightConfig(NetworkConfig):
     """Disparities below this are considered; a multiple of 32: the volume is halved three times."""
 
     groups: Annotated[int, "[1, inf)"] = 8
-    """Channels of the correlation volume: features are correlated in so many groups."""
+    """Channels of the correlation volume: the groups in which features are correlated."""
 
     width: Annotated[int, "[1, inf)"] = 48
     """Features of each pixel that is matched; a multiple of ``groups``."""

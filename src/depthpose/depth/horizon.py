@@ -31,8 +31,8 @@ _MIN_COS_ANGLE = math.cos(math.radians(20))
 _MIN_LENGTH_PX = 20.0
 _MAX_WIDTH_SHARE = 0.03
 _MIN_WIDTH_LIMIT_PX = 1.5
-"""Largest width of a segment, as a share of its length but never below so many pixels: wider ones
-are curves."""
+"""Largest width of a segment, as a share of its length, but at least this many pixels: wider
+ones are curves."""
 _MAX_SEGMENTS = 60
 """Only the longest segments are used; all of KITTI's 300 were worse: short ones are leaves and
 shadows."""

@@ -295,7 +295,7 @@ class ObjectsConfig(Settings):
     in an image of 640x480. It is always known once the settings are made."""
 
     resolution: Annotated[tuple[float, float], "[0.05, 4]", ASCENDING] = (0.4, 0.8)
-    """The image is so many times as large: coarser pictures are faster."""
+    """Factors by which the sides of the image are scaled: coarser pictures are faster."""
 
     occluded_share: Annotated[float, "[0, 1]"] = 0.7
     """Share of samples in which something occludes the object."""
@@ -307,10 +307,10 @@ class ObjectsConfig(Settings):
     """Whether there is something behind and beside the object, which wrong masks take in."""
 
     mask_error_px: Annotated[int, "[0, 20]"] = 3
-    """The mask is grown or shrunk by up to so many pixels of the full image."""
+    """Largest growth or shrinkage of the mask [pixels of the full image]."""
 
     mask_shift_px: Annotated[int, "[0, 20]"] = 2
-    """And shifted by up to so many of them along each axis, as a predicted mask is."""
+    """Largest shift of the mask along each axis [the same], as a predicted mask is shifted."""
 
     sensor: SyntheticSensorConfig = SyntheticSensorConfig()
     """What measures the depth."""
@@ -322,7 +322,7 @@ class ObjectsConfig(Settings):
     """Boxes, balls and cans of no model among them."""
 
     frame_pile: Annotated[int, "[0, 200]"] = 0
-    """A frame shows so many copies of one model, dropped onto each other, in place of
+    """Number of copies of one model that a frame shows, dropped onto each other, in place of
     ``frame_objects`` and ``frame_clutter``; 0: no pile."""
 
     def __post_init__(self) -> None:

@@ -314,7 +314,7 @@ def _iterate(
 
     Args:
         points_m: of the object, in the camera frame.
-        max_points: so many of them are used, evenly taken.
+        max_points: largest number of points that are used, evenly taken.
         pose: one or a batch, ``camera_from_model``.
         surface: of the model.
         limits_m: distance at which a point no longer counts, for each step; the last one is for

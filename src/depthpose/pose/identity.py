@@ -36,7 +36,7 @@ _ROUGH_MIRROR_POINTS = 100  # of these points, those that compare starts of the 
 _STEPS = 12  # steps of ICP with a scale
 _WIDE_STEP = 2.0  # distance limit of the first step, over the usual distance limit
 _CONVERGED = 3e-4  # largest step [rad, m or share] at which ICP with a scale stops
-_CORRELATED_READINGS = 10.0  # factor of the variance, since so many neighbours share their error
+_CORRELATED_READINGS = 10.0  # factor of the variance, since as many neighbours share their error
 _STARTS = (1.0, 0.87, 1.15)
 """Scales at which ICP starts: from 1 alone it would stay there for smaller copies."""
 _FIRST_START_BONUS = 0.03

@@ -487,7 +487,7 @@ def _draw_cells(
         t: its translation.
         scale: cells per unit of x / z and y / z.
         middle: column and row of the middle cell.
-        nearest: is written.
+        nearest: output.
     """
     nearest[:] = np.inf
     for i in range(len(points)):

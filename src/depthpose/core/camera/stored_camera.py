@@ -86,7 +86,7 @@ def normalise_keys(content: Mapping[Any, Any]) -> Fields:
 def find_matrix(fields: Fields, keys: tuple[str, ...], count: int) -> np.ndarray | None:
     """Return the matrix of the first of some keys that has ``count`` numbers: 9, 12 or 16.
 
-    The matrix is 3x3, 3x4 or 4x4; None where no key has so many numbers.
+    The matrix is 3x3, 3x4 or 4x4; None where no key has that many numbers.
     """
     columns = 3 if count == 9 else 4
     for key in keys:

@@ -253,7 +253,7 @@ _AXIS_STEPS = 20  # by which an axis is placed
 _NEAREST_SHARE = (
     0.9  # of the points, which place an axis: a keyway, without a counterpart, does not
 )
-_COMPARED_TURNS = 6  # rotations, about so many, by which places of an axis are compared
+_COMPARED_TURNS = 6  # approximate number of rotations by which places of an axis are compared
 
 
 def _find_point_on_axis(

@@ -61,7 +61,7 @@ class _Stage(NamedTuple):
     """How closely poses are compared with an image.
 
     Attributes:
-        every: of so many visible points of the model one is compared.
+        every: n: every n-th visible point of the model is compared.
         near: distance up to which a reading lies on the surface, beside noise, in diameters.
         icp_limits: distance up to which a reading counts in each step of ICP, in diameters.
         most: poses that enter the next stage.
@@ -295,7 +295,7 @@ class _Visible(NamedTuple):
 def _look_up_visible_points(poses: Rigid, surface: Surface, every: int) -> _Visible:
     """Find the points of each posed surface that are visible in the stored view nearest to it.
 
-    ``every``: of so many of them one is taken.
+    ``every``: n: every n-th of them is taken.
     """
     views = surface.views
     camera_m = -(poses.t_m[:, None] @ poses.R)[:, 0]  # in the model frame

@@ -253,7 +253,7 @@ class SegmentationTraining(Settings):
     """Random changes."""
 
     object_weight: Annotated[float, "(0, inf)"] = 3.0
-    """A pixel of an object counts so many times a pixel of the background."""
+    """Weight of a pixel of an object in the loss; one of the background has 1."""
 
     adam: AdamConfig = AdamConfig(learning_rate=1e-3, schedule="cosine", warmup_steps=20)
     """The optimiser."""

@@ -384,7 +384,7 @@ def _copy_start(network: AnyNetwork, start: str, samples: TrainingViews[Any]) ->
     on depth images takes weights of the same number alone.
 
     Args:
-        network: is changed.
+        network: the network to train; changed.
         start: name or file of the weights.
         samples: from which statistics of batch norm are computed.
 
