@@ -25,7 +25,7 @@ from depthpose.core.loop import (
     TrainingRun,
     ValidationResult,
     format_card,
-    format_held_out,
+    format_last_validation,
     make_sample_generator,
     read_metrics,
     shuffle_index,
@@ -167,14 +167,16 @@ def test_the_time_of_a_training_counts_the_runs_that_it_resumes(tmp_path: Path) 
 
 def test_a_card_says_what_how_how_long_and_how_good(tmp_path: Path) -> None:
     folder = tmp_path / "my part"
-    assert format_held_out(folder, "Errors.") == ("Nothing was held out, so nothing was measured.")
+    assert format_last_validation(folder, "Errors.") == (
+        "Nothing was held out, so nothing was measured."
+    )
     folder.mkdir()
     rows = [{"step": 4, "held_out/error": 0.5}, {"step": 8, "held_out/error": 1 / 3},
             {"step": 12, "net/loss": 0.1}]  # fmt: skip
     (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     trained(tmp_path / "run", loop(steps=12))
     (tmp_path / "run" / "state.pt").rename(folder / "state.pt")
-    measured = format_held_out(folder, "Errors (m).")
+    measured = format_last_validation(folder, "Errors (m).")
     assert measured == "Errors (m).\n\n| held out | |\n| --- | --- |\n| error | 0.3333 |"
     facts = {"trained_on": "kitti", "terms": "For research."}
     write_card(folder / "net.safetensors", "depth train view", 7300.0, facts, measured)

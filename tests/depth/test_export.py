@@ -25,7 +25,7 @@ from depthpose.depth.config import (
     PSMNetConfig,
 )
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.export import describe_export
+from depthpose.depth.export import make_export
 from depthpose.depth.generators import SelectionGenerator, UNetGenerator
 from depthpose.depth.graphs import (
     DynamicLightStereo,
@@ -243,12 +243,12 @@ def test_the_matcher_is_asked_where_the_weights_say_so(selection: Path) -> None:
     assert {row["output"] for row in rows} >= {"depth_m", "is_sky"}
     lone = DepthWeights(generator=generator, matcher=None, facts=TERMS)
     with pytest.raises(InputError, match="lack the matcher"):
-        describe_export(lone, None, {}).graph()
+        make_export(lone, None, {}).graph()
 
 
 def test_another_sky_is_no_proof(selection: Path) -> None:
     """What is held to the limits is the sky too: the proof must fail where it is another."""
-    limits = describe_export(
+    limits = make_export(
         DepthWeights(generator=of_all_kinds(), matcher=None, facts=TERMS), None, {}
     ).limits
     assert 0 < limits["depth_m"].flips <= 1e-3
@@ -298,8 +298,8 @@ def test_weights_that_cannot_are_refused(tmp_path: Path) -> None:
     no_matcher = dataclasses.replace(whole, matcher=None)
     no_generator = dataclasses.replace(whole, generator=None)
     with pytest.raises(InputError, match=r"lack the matcher; 'depthpose weights pack'"):
-        describe_export(no_matcher, "image", {}).graph()
+        make_export(no_matcher, "image", {}).graph()
     with pytest.raises(InputError, match=r"lack the generator; 'depthpose weights pack'"):
-        describe_export(no_generator, "image", {}).graph()
+        make_export(no_generator, "image", {}).graph()
     with pytest.raises(InputError, match="hold no matcher, only a generator"):
-        describe_export(no_matcher, "pair", {}).graph()
+        make_export(no_matcher, "pair", {}).graph()

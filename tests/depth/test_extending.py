@@ -28,7 +28,7 @@ from depthpose.depth.datasets import open_dataset
 from depthpose.depth.datasets.frames import FramePaths
 from depthpose.depth.datasets.layouts import LAYOUTS, Layout
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.export import TARGETS, Target, describe_export
+from depthpose.depth.export import TARGETS, Target, make_export
 from depthpose.depth.generators import SelectionGenerator, UNetGenerator
 from depthpose.depth.losses import ADVERSARIAL_LOSSES, GENERATOR_DISPARITY_LOSSES, adversarial_loss
 from depthpose.depth.metrics import METRICS, Metric
@@ -168,7 +168,7 @@ def test_a_matcher_without_a_graph_is_not_exported(
     weights = tmp_path / "flat.safetensors"
     write_depth_weights(weights, matcher=FlatNetwork(FlatConfig()), facts=FACTS)
     with pytest.raises(InputError, match="the matcher is FlatNetwork, and no file is made of it"):
-        describe_export(read_depth_weights(weights), "pair", {}).graph()
+        make_export(read_depth_weights(weights), "pair", {}).graph()
 
 
 def test_extending_layouts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -270,8 +270,8 @@ def test_extending_export_targets(monkeypatch: pytest.MonkeyPatch) -> None:
 
     weights = DepthWeights(generator=None, matcher=FlatNetwork(FlatConfig()), facts=FACTS)
     with pytest.raises(InputError, match=r"what is 'views'; .*'image', 'pair'"):
-        describe_export(weights, "views", {})
+        make_export(weights, "views", {})
     monkeypatch.setitem(TARGETS, "views", Target(fits=lambda _: False, export=views))
-    export = describe_export(weights, "views", {"licence": "MIT"})
+    export = make_export(weights, "views", {"licence": "MIT"})
     assert list(export.limits) == ["right"]
-    assert describe_export(weights, None, {}).facts["what"].startswith("rectified pair")
+    assert make_export(weights, None, {}).facts["what"].startswith("rectified pair")

@@ -142,6 +142,15 @@ def test_damaged_shards_are_refused(pairs: Path, tmp_path: Path) -> None:
             open_dataset(home)
 
 
+@pytest.mark.parametrize("content", ["{", "[]", "{}", '{"url": 3}', '{"url": ""}'])
+def test_a_damaged_address_of_shards_is_refused(pairs: Path, tmp_path: Path, content: str) -> None:
+    home = packed(pairs, tmp_path / "shards")
+    (home / "000000.tar").unlink()
+    (home / "source.json").write_text(content)
+    with pytest.raises(InputError, match=r"source\.json: (not a readable JSON|must be .*ADDRESS)"):
+        open_dataset(home).read_input(0)
+
+
 def test_what_is_there_is_not_packed_over(
     pairs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -127,7 +127,7 @@ def test_streets_are_searched_from_infinity_on(high_px: float) -> None:
     assert search.first_px == 0
     assert trained_px <= search.span_px <= matcher().work_disparities(camera)
     assert search.last_in_images_px >= high_px
-    assert search.scale * 558 == pytest.approx(matcher().work_focal_px(camera))
+    assert search.scale * 558 == pytest.approx(matcher().matching_focal_px(camera))
 
 
 @needs_weights

@@ -17,7 +17,7 @@ from depthpose.depth.augment import TrainingPair
 from depthpose.depth.config import LightConfig, MatcherConfig
 from depthpose.depth.disparity import estimate_from_pair, resize_match
 from depthpose.depth.estimator import FakestereoNet
-from depthpose.depth.export import describe_export
+from depthpose.depth.export import make_export
 from depthpose.depth.labels import LabelConfig, label_pair
 from depthpose.depth.losses import sky_loss
 from depthpose.depth.predictions import read_estimate, write_estimate
@@ -292,7 +292,7 @@ def test_the_graph_of_a_pair_has_the_sky() -> None:
     onnxruntime = pytest.importorskip("onnxruntime")
     with short_encoder():
         network = partly_sky(replace(SMALL, work_focal_px=90.0))
-    export = describe_export(DepthWeights(generator=None, matcher=network, facts={}), "pair", {})
+    export = make_export(DepthWeights(generator=None, matcher=network, facts={}), "pair", {})
     session = onnxruntime.InferenceSession(export.graph().model({}).SerializeToString())
     names = [output.name for output in session.get_outputs()]
     assert sorted(names) == ["confidence", "disparity_px", "is_sky"]

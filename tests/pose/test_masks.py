@@ -128,3 +128,9 @@ def test_of_probabilities_those_above_a_half_are_the_object() -> None:
     for wrong in (np.where(ONE, 3.5, -3.5), np.where(ONE, 0.5, np.nan)):
         with pytest.raises(InputError, match=r"fractions outside \[0, 1\], or NaN; give True"):
             labels_input(wrong, "m")
+
+
+def test_a_mask_is_of_one_image() -> None:
+    for wrong in (ONE[None], ONE[0]):
+        with pytest.raises(InputError, match=r"m: the mask is of shape .*, not \(h, w\); give"):
+            labels_input(wrong, "m")

@@ -38,7 +38,7 @@ from depthpose.pose.train import (
 from depthpose.pose.train.clouds import TrainingViews
 from depthpose.pose.train.held_out import (
     HELD_OUT_SEED,
-    format_held_out,
+    format_held_out_table,
     make_held_out_views,
     score_held_out,
 )
@@ -414,9 +414,11 @@ def test_held_out_views_are_right_ambiguous_wrong_or_refused(
     table = score_held_out(tiny_weights(*_models()), _VIEWS, held_out)
     shares = {"right": 5 / 9, "ambiguous": 2 / 9, "wrong": 1 / 9, "refused": 1 / 9, "median": 0.02}
     assert table["0"] == pytest.approx(shares)
-    assert "| occluded % | right % | ambiguous % | wrong % | refused %" in format_held_out(table)
+    assert "| occluded % | right % | ambiguous % | wrong % | refused %" in format_held_out_table(
+        table
+    )
     assert (
-        format_held_out(table)
+        format_held_out_table(table)
         .splitlines()[-1]
         .startswith("| 0 | 55.6 | 22.2 | 11.1 | 11.1 | 2.0 |")
     )

@@ -194,7 +194,7 @@ def make_objects(
         for model in models
     ]
     settings = {
-        **_frame_settings(config),
+        **_list_frame_settings(config),
         "unit": unit,
         "symmetries": symmetries,
         "cad": _fingerprint_files(cad),
@@ -224,7 +224,7 @@ def _refuse_frame_numbers(number: int, seed: int) -> None:
         )
 
 
-def _frame_settings(config: "ObjectsConfig") -> dict[str, Any]:
+def _list_frame_settings(config: "ObjectsConfig") -> dict[str, Any]:
     """List the settings that decide the frames of a folder, which several seeds may share."""
     from depthpose.core.config import config_to_dict
 

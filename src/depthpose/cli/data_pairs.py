@@ -80,7 +80,7 @@ def rectify_pairs(
     rectifier = make_rectifier(calibration, image_size(pairs[0][0]), keep)
     _check_rows(rectifier, pairs, is_refused=check)
 
-    settings = {"command": "data rectify", "keep": keep, **_calibration_settings(calibration)}
+    settings = {"command": "data rectify", "keep": keep, **_list_calibration_settings(calibration)}
     claim_folder(out, settings, [*_SIDES, "camera.json"])
     claim_names(out, {pair[0].stem: pair for pair in pairs})
 
@@ -93,7 +93,7 @@ def rectify_pairs(
     return 0
 
 
-def _calibration_settings(calibration: "RawPair") -> dict[str, Any]:
+def _list_calibration_settings(calibration: "RawPair") -> dict[str, Any]:
     """List the JSON values of the calibration of a raw pair."""
     settings: dict[str, Any] = {"right_from_left": calibration.right_from_left.matrix().tolist()}
     for side, raw in zip(_SIDES, (calibration.left, calibration.right), strict=True):

@@ -54,7 +54,7 @@ def predict_depth_of_dataset(
 ) -> Path:
     """Predict every frame that has truth, and a right view if the method needs it.
 
-    Of several processes each predicts its share, and the first waits for the files of all.
+    In a launch of several processes each predicts its share, and the first waits for all files.
 
     Args:
         dataset: the frames.
@@ -215,7 +215,7 @@ def measure_and_report(
 ) -> int:
     """Measure folders of predictions, write rows, a table and a page, and print the table.
 
-    Of several processes the first does it. Returns the exit code.
+    In a launch of several processes the first does it. Returns the exit code.
 
     Args:
         dataset: frames with truth.

@@ -74,7 +74,7 @@ class DepthNetworkSpec:
 
     def _build_from(self, weights: str) -> DepthMethod:
         """Build the networks of a weights file, perhaps with another matcher."""
-        config = self._usable_config()
+        config = self._make_usable_config()
         path = find_weights(weights)
         kind = read_checkpoint(path).kind
         is_matcher = kind in MATCHERS
@@ -126,7 +126,7 @@ class DepthNetworkSpec:
             settings["scales"] = list(net.synthesiser.scales)
         return DepthMethod(name, net, settings, with_right)
 
-    def _usable_config(self) -> MatcherConfig:
+    def _make_usable_config(self) -> MatcherConfig:
         """Return the config with the device of this process, and the precision it computes in.
 
         Raises:

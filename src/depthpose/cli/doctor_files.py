@@ -49,7 +49,7 @@ _HALF = 0.5
 class FileFacts:
     """A description of a file, what is odd about it, and its content, which others are held to.
 
-    Of the contents (image, depth, camera, mask, cloud, model) one is set, by the file's kind.
+    The file's kind decides which of image, depth, camera, mask, cloud and model is set.
     """
 
     path: Path

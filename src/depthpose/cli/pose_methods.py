@@ -249,7 +249,7 @@ class PoseNetworkSpec:
 PoseMethodSpec = RegistrationSpec | PoseNetworkSpec
 
 
-def choose_object(name: str | None, method: PoseMethod) -> str:
+def resolve_object(name: str | None, method: PoseMethod) -> str:
     """Choose the object of a method by its name, or its only object.
 
     Raises:

@@ -8,7 +8,7 @@ from typing import Any
 
 from depthpose.cli import file_names, pose_jobs, pose_methods, pose_transforms
 from depthpose.cli.pose_jobs import WantedObjects
-from depthpose.cli.pose_methods import PoseMethod, choose_object
+from depthpose.cli.pose_methods import PoseMethod, resolve_object
 from depthpose.cli.pose_options import PoseInputs
 from depthpose.core.checkpoint import file_sha256
 from depthpose.core.errors import InputError
@@ -43,7 +43,7 @@ def plan_jobs(method: PoseMethod, inputs: PoseInputs, out: Path) -> JobPlan:
         InputError: options or files are missing, or contradict each other.
     """
     if inputs.cloud is not None:
-        name = choose_object(inputs.object, method)
+        name = resolve_object(inputs.object, method)
         unit = inputs.unit or "m"
         jobs = pose_jobs.make_cloud_jobs(Path(inputs.cloud), unit, name, out)
         plan = JobPlan(jobs=jobs, settings={"object": name, "unit": unit})
@@ -103,7 +103,7 @@ def _plan_regions(method: PoseMethod, inputs: PoseInputs, out: Path) -> JobPlan:
     labels = None if inputs.labels is None else parse_labels(inputs.labels, names)
     object = None
     if inputs.object is not None or len(names) == 1:
-        object = choose_object(inputs.object, method)
+        object = resolve_object(inputs.object, method)
     settings = {**camera_settings(inputs.lens), **unit_settings(inputs.unit)}
     if labels is not None:
         settings["labels"] = labels
@@ -120,7 +120,7 @@ def _plan_regions(method: PoseMethod, inputs: PoseInputs, out: Path) -> JobPlan:
         )
     elif inputs.box:
         settings["box"] = list(inputs.box)
-        box_object = choose_object(inputs.object, method)
+        box_object = resolve_object(inputs.object, method)
         jobs = pose_jobs.make_box_jobs(depth, inputs.box, inputs.lens, box_object, inputs.unit, out)
     else:
         assert inputs.mask is not None

@@ -18,7 +18,7 @@ from depthpose.cli.pose_methods import (
     PoseMethod,
     PoseMethodSpec,
     PoseNetworkSpec,
-    choose_object,
+    resolve_object,
 )
 from depthpose.cli.pose_options import DataSetOptions, PoseInputs
 from depthpose.cli.pose_output import (
@@ -297,7 +297,7 @@ def predict_poses_on_ray(
     if isinstance(spec, PoseNetworkSpec):
         spec = spec.with_packed_weights()
     method = replace(spec, config=replace(spec.config, device="cpu")).build()
-    object = choose_object(options.object or None, method)
+    object = resolve_object(options.object or None, method)
     camera = None
     if options.lens is not None:
         with inputs.open_first() as first:

@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from depthpose.cli import pose_dataset, pose_output, pose_plans
 from depthpose.cli.pose_frames import make_masked_job, read_whole_view
-from depthpose.cli.pose_methods import PoseMethod, choose_object
+from depthpose.cli.pose_methods import PoseMethod, resolve_object
 from depthpose.cli.pose_options import DataSetOptions, PoseInputs
 from depthpose.core.errors import InputError
 from depthpose.core.run import find_rank
@@ -158,7 +158,7 @@ def search_files(method: PoseMethod, inputs: PoseInputs, out: Path) -> int:
     if inputs.object is None:
         objects = [model.name for model in method.models]
     else:
-        objects = [choose_object(inputs.object, method)]
+        objects = [resolve_object(inputs.object, method)]
     if method.find is None:
         raise InputError(
             "--depth without --mask: these weights need masked views; give --mask, --box or "

@@ -17,7 +17,7 @@ from depthpose.cli import (
     pose_transforms,
 )
 from depthpose.cli.pose_frames import make_masked_job, read_whole_view
-from depthpose.cli.pose_methods import PoseMethod, choose_object
+from depthpose.cli.pose_methods import PoseMethod, resolve_object
 from depthpose.cli.pose_options import SequenceOptions
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
@@ -42,7 +42,7 @@ def track_files(method: PoseMethod, frames: SequenceOptions, out: Path) -> int:
         frames: options that name the files, the object and perhaps its first pose.
         out: folder of the results.
     """
-    object = choose_object(frames.object, method)
+    object = resolve_object(frames.object, method)
     settings = {**method.settings, "track": object, **pose_plans.unit_settings(frames.unit)}
     first_pose = None
     if frames.first is not None:

@@ -330,8 +330,8 @@ def draw_figure_3_4(
 ) -> int:
     """Draw figure 3-4: true and predicted directions to the keypoint with the largest error.
 
-    Of some views the worst, in the plane of the camera's x and y: a yellow star is the true
-    keypoint, a red cross the voted one. Without a data set the views are synthetic. Writes
+    The worst of some views is drawn, in the plane of the camera's x and y: a yellow star is the
+    true keypoint, a red cross the voted one. Without a data set the views are synthetic. Writes
     figure-3-4.png, panels and report.html.
 
         depthpose figure 3-4 --weights W.safetensors --out out/figure-3-4

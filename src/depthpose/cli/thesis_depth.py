@@ -28,7 +28,7 @@ from depthpose.thesis.depth import (
     draw_figure_2_1,
     draw_figure_2_5,
     join_published,
-    shrink_to_width,
+    resize_to_width,
 )
 
 _MAX_HINT_LENGTH = 300
@@ -257,6 +257,6 @@ def _make_panel_section(title: str, panels: Sequence[Drawing], stem: Path) -> Se
     pictures: list[PictureFile] = []
     for k, panel in enumerate(panels, 1):
         path = stem.with_name(f"{stem.name}.{k}.jpg")
-        write_image(path, shrink_to_width(panel.image, PANEL_WIDTH_PX))
+        write_image(path, resize_to_width(panel.image, PANEL_WIDTH_PX))
         pictures.append(PictureFile(path=path, caption=panel.caption, color_bar=panel.color_bar))
     return Section(title=title, text=DEPTH_SCALE, pictures=pictures)

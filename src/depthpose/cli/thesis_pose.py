@@ -204,7 +204,7 @@ def reproduce_by_object(
     page.write_table(out, all_columns, name="all")
 
     # The page: tables, then some instances of each method.
-    figures = [_make_pose_section(dataset, folder, out, options.pictures) for folder in folders]
+    figures = [_write_pose_figures(dataset, folder, out, options.pictures) for folder in folders]
     text = f"{_PERCENT_NOTE} {_DIFFERENCE_NOTES[number]}"
     sections = [
         Section(title="Percent by object", text=text, rows=rows),
@@ -223,8 +223,8 @@ def _describe_masks(kind: str) -> str:
     return kind if path is None else file_names.name_with_checksum(path)
 
 
-def _make_pose_section(dataset: BopDataset, predictions: Path, out: Path, count: int) -> Section:
-    """Draw figure 3-5 of some instances, write the pictures, and make a section that shows them.
+def _write_pose_figures(dataset: BopDataset, predictions: Path, out: Path, count: int) -> Section:
+    """Draw figure 3-5 of some instances and write the pictures; return a section that shows them.
 
     Args:
         dataset: data set with the instances.

@@ -259,13 +259,13 @@ def export_depth(out: NewPath, weights: WeightsName = "default", what: str | Non
             where the weights have a generator, else pair.
     """
     from depthpose.core.checkpoint import find_weights
-    from depthpose.depth.export import describe_export
+    from depthpose.depth.export import make_export
     from depthpose.depth.weights import read_depth_weights
 
     path = find_weights(weights)
     depth_weights = read_depth_weights(path)
     facts = _collect_graph_facts(weights, path, depth_weights.facts)
-    return _write_graph(out, describe_export(depth_weights, what, facts))
+    return _write_graph(out, make_export(depth_weights, what, facts))
 
 
 def export_pose(out: NewPath, weights: WeightsName = "parts") -> int:

@@ -67,7 +67,7 @@ class Rigid:
         return np.array(self.matrix().detach().cpu().numpy(), dtype=dtype, copy=copy)
 
     def __repr__(self) -> str:
-        """Show R and t to four decimals; of a batch only its shape."""
+        """Show R and t to four decimals; for a batch only its shape."""
         if self.t_m.ndim > 1:
             return f"Rigid(a batch of {tuple(self.t_m.shape[:-1])})"
 

@@ -560,7 +560,7 @@ def read_failures(folder: Path) -> dict[str, str]:
 
 
 def _read_log(folder: Path) -> _ResultsLog:
-    """Read ``results.jsonl``; of a file that was read before, only the lines added since."""
+    """Read ``results.jsonl``; where it was read before, only the lines added since."""
     path = (folder / RESULTS).absolute()
     try:
         status = path.stat()

@@ -167,7 +167,7 @@ class PairsConfig(Settings):
     rendered while training have exact disparity, whatever this says."""
 
     limit: Annotated[int | None, "[1, inf)"] = None
-    """Take so many pairs of each folder, and so many streets, spread evenly; None: all."""
+    """Largest number of pairs of each folder, and of streets, spread evenly; None: all."""
 
     focal_px: Annotated[float | None, f"(0, {_MAX_FOCAL_PX}]"] = None
     """Bring every pair to this focal length [px]; None: that of the generator, or sizes as they
@@ -245,7 +245,7 @@ class LightConfig(NetworkConfig):
     """Disparities below this are considered; a multiple of 32: the volume is halved three times."""
 
     groups: Annotated[int, "[1, inf)"] = 8
-    """Channels of the correlation volume: features are correlated in so many groups."""
+    """Channels of the correlation volume: the groups in which features are correlated."""
 
     width: Annotated[int, "[1, inf)"] = 48
     """Features of each pixel that is matched; a multiple of ``groups``."""
@@ -276,8 +276,8 @@ class MatcherConfig(Settings):
     processor without bf16 (AVX-512, AMX) takes fp32."""
 
     speed: Speed = "fine"
-    """Of one image: quick looks at it once, fine in two sizes, if the generator selects.
-    Of pairs of a known camera: quick matches at the focal length that the weights were trained at;
+    """With one image, quick looks at it once, fine in two sizes, if the generator selects.
+    With pairs of a known camera, quick matches at the focal length of the weights' training;
     fine, where that is more, at up to 280,000 pixels and never enlarged (PSMNet), or at up to
     650,000 and 1.5 times the images' sides (light), and through up to 1.5 (PSMNet) or 1.75 times
     the disparities: for KITTI 3 to 5 times the time. Weights that match pairs as they are have one

@@ -73,12 +73,12 @@ class Target:
     """A kind of graph that weights are exported as."""
 
     fits: Callable[[DepthWeights], bool]  #: whether it is the default for weights
-    #: describes the export of weights, with facts for the user of the file
+    #: makes the export of weights, with facts for the user of the file
     export: Callable[[DepthWeights, dict[str, Any]], Export]
 
 
-def describe_export(weights: DepthWeights, what: str | None, facts: dict[str, Any]) -> Export:
-    """Describe the export of weights: the graph, and the cases that compare it with PyTorch.
+def make_export(weights: DepthWeights, what: str | None, facts: dict[str, Any]) -> Export:
+    """Make the export of weights: functions for its graph and for cases to test it, and facts.
 
     Args:
         weights: the networks.
@@ -94,8 +94,8 @@ def describe_export(weights: DepthWeights, what: str | None, facts: dict[str, An
     return TARGETS[what].export(weights, facts)
 
 
-def _describe_pair_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
-    """Describe the export of a matcher: its graph, and cases that compare it with PyTorch."""
+def _make_pair_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
+    """Make the export of a matcher: its graph, and cases that compare it with PyTorch."""
     return Export(
         graph=lambda: pair_graph(weights),
         cases=lambda: _make_pair_cases(weights),
@@ -159,8 +159,8 @@ def _make_image_cases(weights: DepthWeights) -> Iterator[Case]:
         yield replace(case, where={"depth_m": is_compared})
 
 
-def _describe_image_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
-    """Describe the export of a generator: its graph, and cases that compare it with PyTorch."""
+def _make_image_export(weights: DepthWeights, facts: dict[str, Any]) -> Export:
+    """Make the export of a generator: its graph, and cases that compare it with PyTorch."""
     generator = weights.generator
     rig_facts: dict[str, Any] = {}
     if generator is not None:
@@ -177,10 +177,8 @@ def _describe_image_export(weights: DepthWeights, facts: dict[str, Any]) -> Expo
 
 
 TARGETS = {
-    "image": Target(
-        fits=lambda weights: weights.generator is not None, export=_describe_image_export
-    ),
-    "pair": Target(fits=lambda weights: weights.matcher is not None, export=_describe_pair_export),
+    "image": Target(fits=lambda weights: weights.generator is not None, export=_make_image_export),
+    "pair": Target(fits=lambda weights: weights.matcher is not None, export=_make_pair_export),
 }
 """One image to depth, a rectified pair to disparity: a new target is a function and one entry."""
 

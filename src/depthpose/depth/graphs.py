@@ -29,7 +29,7 @@ _HALF = np.float32(0.5)
 _NAN = np.float32(np.nan)
 
 
-def _side(size: Value, axis: int) -> Value:
+def _slice_side(size: Value, axis: int) -> Value:
     """Take the rows (axis 0) or columns (1) of a size, as a list of one number."""
     return size.slice([axis], [axis + 1], [0])
 
@@ -51,14 +51,16 @@ def _resize_map(values: Value, size: Value) -> Value:
     return resized.op("Squeeze", [1])
 
 
-def _width_ratio(size: Value, other: Value) -> Value:
+def _compute_width_ratio(size: Value, other: Value) -> Value:
     """Compute the width of a size as a multiple of another's, by which disparities scale."""
-    width = _side(size, 1).cast(np.float64)
-    other_width = _side(other, 1).cast(np.float64)
+    width = _slice_side(size, 1).cast(np.float64)
+    other_width = _slice_side(other, 1).cast(np.float64)
     return (width / other_width).cast(np.float32)
 
 
-def _size_at_focal_length(size: Value, target_px: float, focal_px: Value | np.ndarray) -> Value:
+def _compute_size_at_focal_length(
+    size: Value, target_px: float, focal_px: Value | np.ndarray
+) -> Value:
     """Compute (rows, columns) at which images have a focal length, as ``size_at_focal_length``.
 
     ``size``: (rows, columns) of the images; ``target_px``: the focal length; ``focal_px``: those of
@@ -203,7 +205,7 @@ def _add_generator(left: Value, generator: Generator) -> _GeneratorOutputs:
 
     if isinstance(generator, SelectionGenerator):
         return _add_selection_generator(left, size, network_size, generator)
-    example = _example_image(multiple)
+    example = _make_example_image(multiple)
     image = _resize_image(left, network_size) * _2 - _1
     network = convert_network(generator, [example], multiple)
     (output,) = left.graph.call(network, _pad_by_reflection(image, network_size, multiple))
@@ -224,7 +226,7 @@ def _add_selection_generator(
     even_size = (network_size / 2 * 2).op("Max", 2)
     image = _pad_by_reflection(_resize_image(left, even_size), even_size, multiple)
     network = convert_network(
-        DynamicSelection(generator).eval(), [_example_image(multiple)], multiple
+        DynamicSelection(generator).eval(), [_make_example_image(multiple)], multiple
     )
     outputs = left.graph.call(network, image)
     log_px, sky, disparity_confidence, right_log_px, right_sky = (
@@ -233,7 +235,7 @@ def _add_selection_generator(
     street_probability = outputs[5] if generator.config.with_street else None
 
     # The left view.
-    scale = _width_ratio(size, even_size)
+    scale = _compute_width_ratio(size, even_size)
     is_sky = sky.op("Greater", _HALF)
     not_sky = sky * np.float32(-1) + _1
     confidence = is_sky.op("Where", sky, disparity_confidence * not_sky)
@@ -254,12 +256,12 @@ def _warp_left_to_right(left: Value, right_px: Value, size: Value) -> Value:
     """
     graph = left.graph
     row, column = (
-        graph.op("Range", 0, _side(size, axis).op("Squeeze", [0]), 1).cast(np.float32)
+        graph.op("Range", 0, _slice_side(size, axis).op("Squeeze", [0]), 1).cast(np.float32)
         for axis in (0, 1)
     )
     # GridSample's coordinates: -1 and 1 are the outer borders of the image.
     y, x = (
-        (positions * _2 + _1) / _side(size, axis).cast(np.float32) - _1
+        (positions * _2 + _1) / _slice_side(size, axis).cast(np.float32) - _1
         for axis, positions in enumerate((row.op("Unsqueeze", [1]), right_px + column))
     )
     shape = right_px.op("Shape")
@@ -268,7 +270,7 @@ def _warp_left_to_right(left: Value, right_px: Value, size: Value) -> Value:
     return left.op("GridSample", grid, mode="bilinear", padding_mode="border", align_corners=0)
 
 
-def _example_image(multiple: int) -> Tensor:
+def _make_example_image(multiple: int) -> Tensor:
     """Make an image of suitable sides, by which a generator's network is traced."""
     return torch.rand(2, 3, 2 * multiple, 3 * multiple)
 
@@ -313,7 +315,7 @@ def image_graph(weights: DepthWeights) -> Graph:
     # The virtual rig: the right view, and maps of the left one.
     size = image.op("Shape", start=2, end=4)
     focal_px = K.op("Gather", [4, 0])  # fy, fx
-    virtual_size = _size_at_focal_length(size, float(config.virtual_focal_px), focal_px)
+    virtual_size = _compute_size_at_focal_length(size, float(config.virtual_focal_px), focal_px)
     left = _resize_image(image, virtual_size)
     right, generator_maps, street_probability = _add_generator(left, generator)
     maps = generator_maps
@@ -325,7 +327,7 @@ def image_graph(weights: DepthWeights) -> Graph:
     assert maps is not None
 
     # Depth at the size of the image.
-    disparity_px = _resize_map(maps.disparity_px, size) * _width_ratio(size, virtual_size)
+    disparity_px = _resize_map(maps.disparity_px, size) * _compute_width_ratio(size, virtual_size)
     focal_m_px = K.op("Gather", 0).cast(np.float32) * np.float32(config.virtual_baseline_m)
     is_positive = disparity_px.op("Greater", _0)
     depth_m = is_positive.op("Where", focal_m_px / disparity_px, _NAN)
@@ -403,15 +405,15 @@ def _add_matcher(
     work_size = size
     if config.work_focal_px is not None:
         assert focal_px is not None
-        work_size = _size_at_focal_length(size, float(config.work_focal_px), focal_px)
+        work_size = _compute_size_at_focal_length(size, float(config.work_focal_px), focal_px)
 
     # Normalised images, padded above and at the right to the sides that the network takes.
     min_side = config.min_side_px
     step = config.step_px
     padded_size = ((work_size + (step - 1)) / step * step).op("Max", min_side)
     padding = padded_size - work_size
-    rows_above = _side(padding, 0)
-    columns_right = _side(padding, 1)
+    rows_above = _slice_side(padding, 0)
+    columns_right = _slice_side(padding, 1)
     pads = graph.op("Concat", [0, 0], rows_above, [0, 0, 0, 0], columns_right, axis=0)
     mean = np.array(IMAGENET_MEAN, np.float32)[:, None, None]
     deviation = np.array(IMAGENET_STD, np.float32)[:, None, None]
@@ -425,9 +427,9 @@ def _add_matcher(
 
     # Maps without the padding, at the size of the images.
     first = graph.op("Concat", rows_above, [0], axis=0)
-    last = graph.op("Concat", [1 << 62], _side(work_size, 1), axis=0)
+    last = graph.op("Concat", [1 << 62], _slice_side(work_size, 1), axis=0)
     disparity_px, confidence, *sky = (
         _resize_map(output.slice(first, last, [1, 2]), size) for output in outputs
     )
     is_sky = [values.op("Greater", _HALF).cast(np.float32) for values in sky]
-    return _Maps(disparity_px * _width_ratio(size, work_size), confidence, *is_sky)
+    return _Maps(disparity_px * _compute_width_ratio(size, work_size), confidence, *is_sky)

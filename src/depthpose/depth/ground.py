@@ -45,7 +45,7 @@ def fit_ground(depth_m: Map, camera: Camera) -> Ground | None:
     rays, inverse, strips = _sample_lower_points(depth_m, camera)
     if len(inverse) < _MIN_POINTS:
         return None
-    is_inlier = _ransac_inliers(rays, inverse)
+    is_inlier = _find_ransac_inliers(rays, inverse)
     if is_inlier is None:
         return None
 
@@ -57,13 +57,13 @@ def fit_ground(depth_m: Map, camera: Camera) -> Ground | None:
             return None
         plane = _fit_plane(rays[is_inlier], inverse[is_inlier])
     share = float(is_inlier.double().mean())
-    height_m, tilt_deg, roll_deg = _mount_of_plane(plane)
+    height_m, tilt_deg, roll_deg = _compute_mount(plane)
     is_level = abs(tilt_deg) <= _MAX_ROAD_TILT_DEG and abs(roll_deg) < _MAX_ROLL_DEG
     has_height = _MIN_HEIGHT_M < height_m < _MAX_HEIGHT_M
     if share < _MIN_INLIER_SHARE or not is_level or not has_height:
         return None
 
-    stds = _jackknife_stds(rays, inverse, strips, is_inlier)
+    stds = _estimate_jackknife_stds(rays, inverse, strips, is_inlier)
     if stds is None:
         return None
     height_std_m, tilt_std_deg = stds
@@ -77,7 +77,7 @@ def fit_ground(depth_m: Map, camera: Camera) -> Ground | None:
     )
 
 
-def _ransac_inliers(
+def _find_ransac_inliers(
     rays: Float[Tensor, "n 3"], inverse: Float[Tensor, " n"]
 ) -> Bool[Tensor, " n"] | None:
     """Find the points on a plane by RANSAC: planes through three random points each are tried.
@@ -109,7 +109,7 @@ def _ransac_inliers(
     return is_inlier[best]
 
 
-def _jackknife_stds(
+def _estimate_jackknife_stds(
     rays: Float[Tensor, "n 3"],
     inverse: Float[Tensor, " n"],
     strips: Int[Tensor, " n"],
@@ -130,7 +130,7 @@ def _jackknife_stds(
     for strip in range(_STRIPS):
         remains = is_inlier & (strips != strip)
         if int(remains.sum()) >= _MIN_INLIERS:
-            mounts.append(_mount_of_plane(_fit_plane(rays[remains], inverse[remains])))
+            mounts.append(_compute_mount(_fit_plane(rays[remains], inverse[remains])))
     n = len(mounts)
     if n < 2:
         return None
@@ -179,7 +179,7 @@ def _fit_plane(rays: Float[Tensor, "n 3"], inverse: Float[Tensor, " n"]) -> Floa
     return torch.linalg.lstsq(points_m, torch.ones_like(inverse)[:, None]).solution[:, 0]
 
 
-def _mount_of_plane(plane: Float[Tensor, "3"]) -> tuple[float, float, float]:
+def _compute_mount(plane: Float[Tensor, "3"]) -> tuple[float, float, float]:
     """Compute the camera's height over a plane [m], and its tilt and roll against it [degrees]."""
     x, y, z = plane.tolist()
     height_m = 1 / math.hypot(x, y, z)

@@ -31,8 +31,8 @@ _MIN_COS_ANGLE = math.cos(math.radians(20))
 _MIN_LENGTH_PX = 20.0
 _MAX_WIDTH_SHARE = 0.03
 _MIN_WIDTH_LIMIT_PX = 1.5
-"""Largest width of a segment, as a share of its length but never below so many pixels: wider ones
-are curves."""
+"""Largest width of a segment, as a share of its length, but at least this many pixels: wider
+ones are curves."""
 _MAX_SEGMENTS = 60
 """Only the longest segments are used; all of KITTI's 300 were worse: short ones are leaves and
 shadows."""
@@ -100,8 +100,8 @@ def find_segments(grey: Float[np.ndarray, "h w"]) -> Segments:
 
     # Across the edge its place is refined to a fraction of a pixel.
     is_along_x = is_along_x[rows, columns]
-    x = columns + np.where(is_along_x, _peak_offset(strength, rows, columns, 0, 1), 0)
-    y = rows + np.where(is_along_x, 0, _peak_offset(strength, rows, columns, 1, 0))
+    x = columns + np.where(is_along_x, _compute_peak_offset(strength, rows, columns, 0, 1), 0)
+    y = rows + np.where(is_along_x, 0, _compute_peak_offset(strength, rows, columns, 1, 0))
     return _fit_segments(x, y, chains, chain_count)
 
 
@@ -180,7 +180,7 @@ def _fit_segments(x: np.ndarray, y: np.ndarray, chains: np.ndarray, chain_count:
     return segments[longest_first]
 
 
-def _peak_offset(
+def _compute_peak_offset(
     strength: np.ndarray, rows: np.ndarray, columns: np.ndarray, step_y: int, step_x: int
 ) -> np.ndarray:
     """Compute how far from a pixel's centre the gradient is strongest, -0.5 to 0.5 [px].
@@ -225,7 +225,9 @@ def find_angles(image: View, camera: Camera, expected: Angles) -> Angles:
     pans, tilts, rolls = (angles.ravel() for angles in grid)
 
     # The posterior: how well edges run to their vanishing points, times the normal priors.
-    log_likelihood = _log_likelihood(segments, camera, pans, tilts, rolls, _END_STD_PX * scale)
+    log_likelihood = _compute_log_likelihood(
+        segments, camera, pans, tilts, rolls, _END_STD_PX * scale
+    )
     squared_deviation = (
         (pans / _PAN_STD_DEG) ** 2
         + ((tilts - expected.tilt_deg) / expected.tilt_std_deg) ** 2
@@ -245,7 +247,7 @@ def find_angles(image: View, camera: Camera, expected: Angles) -> Angles:
     )
 
 
-def _log_likelihood(
+def _compute_log_likelihood(
     segments: Segments,
     camera: Camera,
     pans_deg: np.ndarray,
@@ -257,7 +259,7 @@ def _log_likelihood(
 
     ``end_std_px``: standard deviation of the ends of a segment, in pixels of the image.
     """
-    forward, down, right = _street_directions(pans_deg, tilts_deg, rolls_deg)
+    forward, down, right = _compute_street_directions(pans_deg, tilts_deg, rolls_deg)
 
     # Standard deviations of the segments' directions [rad]: of a line fit, and of what is built.
     x, y, along_x, along_y, length = segments.astype(np.float32).T
@@ -281,10 +283,13 @@ def _log_likelihood(
     return np.log(density).sum(1)
 
 
-def _street_directions(
+def _compute_street_directions(
     pans_deg: np.ndarray, tilts_deg: np.ndarray, rolls_deg: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Compute the directions of a street in the camera's frame (x right, y down, z forward).
+
+    The signs of tilt and roll are those of :class:`Angles`; a positive pan turns ``forward``
+    to the right.
 
     Returns:
         Unit vectors forward along the street, down, and right across the street, each (angles, 3).
@@ -292,6 +297,8 @@ def _street_directions(
     pan = np.radians(pans_deg)
     tilt = np.radians(tilts_deg)
     roll = np.radians(rolls_deg)
+    # The horizon is the line y = x tan(roll) + tan(tilt) in normalised coordinates (x, y, 1). Down
+    # is the normal of the plane through it and the camera.
     down = np.stack([-np.tan(roll), np.ones_like(roll), -np.tan(tilt)], 1)
     down /= np.linalg.norm(down, axis=1, keepdims=True)
     # Forward is the part of the panned axis that is perpendicular to down.

@@ -61,25 +61,25 @@ def measure(of: Quantity, predicted: Numbers, true: Numbers) -> dict[str, float]
     return {metric.name: metric.function(p, t) for metric in METRICS.values() if metric.of == of}
 
 
-def _end_point_error(p: Tensor, t: Tensor) -> float:
+def _measure_end_point_error(p: Tensor, t: Tensor) -> float:
     """Compute the mean absolute error of disparity [px], from predicted ``p`` and true ``t``."""
     return float((p - t).abs().mean())
 
 
-def _bad_share(p: Tensor, t: Tensor) -> float:
+def _measure_bad_share(p: Tensor, t: Tensor) -> float:
     """Compute KITTI's D1: the share of disparities off by more than 3 px and more than 5 %."""
     error_px = (p - t).abs()
     is_bad = (error_px > 3) & (error_px > 0.05 * t)
     return float(is_bad.double().mean())
 
 
-def _share_within(p: Tensor, t: Tensor, factor: float) -> float:
+def _measure_share_within(p: Tensor, t: Tensor, factor: float) -> float:
     """Compute the share of depths with max(p / t, t / p) below a factor."""
     ratio = torch.maximum(p / t, t / p)
     return float((ratio < factor).double().mean())
 
 
-_within = [partial(_share_within, factor=1.25**k) for k in (1, 2, 3)]
+_within = [partial(_measure_share_within, factor=1.25**k) for k in (1, 2, 3)]
 METRICS = {
     metric.name: metric
     for metric in (
@@ -94,10 +94,15 @@ METRICS = {
         Metric(name="d1", of="depth", function=_within[0], better="higher"),
         Metric(name="d2", of="depth", function=_within[1], better="higher", is_printed=False),
         Metric(name="d3", of="depth", function=_within[2], better="higher", is_printed=False),
-        Metric(name="epe_px", of="disparity", function=_end_point_error),
-        Metric(name="d1_all", of="disparity", function=_bad_share),
-        Metric(name="epe_noc_px", of="disparity_noc", function=_end_point_error, is_printed=False),
-        Metric(name="d1_noc", of="disparity_noc", function=_bad_share, is_printed=False),
+        Metric(name="epe_px", of="disparity", function=_measure_end_point_error),
+        Metric(name="d1_all", of="disparity", function=_measure_bad_share),
+        Metric(
+            name="epe_noc_px",
+            of="disparity_noc",
+            function=_measure_end_point_error,
+            is_printed=False,
+        ),
+        Metric(name="d1_noc", of="disparity_noc", function=_measure_bad_share, is_printed=False),
     )
 }
 """Metrics by name, in the order of the columns: a new one is a function and one entry here.
@@ -147,12 +152,14 @@ def sparsification_area(error: Numbers, confidence: Numbers, steps: int = 50) ->
     if float(error.double().mean()) == 0:
         return 0.0
     error = error.double()
-    by_confidence = _sparsification_curve(error, confidence.double(), steps)
-    by_error = _sparsification_curve(error, -error, steps)
+    by_confidence = _compute_sparsification_curve(error, confidence.double(), steps)
+    by_error = _compute_sparsification_curve(error, -error, steps)
     return float(((by_confidence - by_error) / error.mean()).mean())
 
 
-def _sparsification_curve(error: Numbers, score: Numbers, steps: int) -> Float[Tensor, " steps"]:
+def _compute_sparsification_curve(
+    error: Numbers, score: Numbers, steps: int
+) -> Float[Tensor, " steps"]:
     """Compute the mean error of the pixels that remain at each step, the lowest scores removed."""
     descending = torch.argsort(score, descending=True)
     counts = torch.arange(1, len(error) + 1)
@@ -204,7 +211,7 @@ def view_errors(synthesised: View, real: View) -> dict[str, float]:
     """
     difference = synthesised.double() - real.double()
     mean_square = difference.square().mean().clamp(min=1e-12)
-    sharpness = _mean_gradient(synthesised) / _mean_gradient(real).clamp(min=1e-12)
+    sharpness = _measure_mean_gradient(synthesised) / _measure_mean_gradient(real).clamp(min=1e-12)
     return {
         "right_l1": float(difference.abs().mean()),
         "right_psnr_db": float(-10 * torch.log10(mean_square)),
@@ -212,7 +219,7 @@ def view_errors(synthesised: View, real: View) -> dict[str, float]:
     }
 
 
-def _mean_gradient(image: View) -> Float[Tensor, ""]:
+def _measure_mean_gradient(image: View) -> Float[Tensor, ""]:
     """Compute the mean absolute difference of neighbours in rows, plus that of those in columns."""
     along_rows = image.diff(dim=2).abs().double().mean()
     along_columns = image.diff(dim=1).abs().double().mean()

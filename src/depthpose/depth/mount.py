@@ -229,7 +229,7 @@ def scale_by_mount(
     ground = find_mount(map_ground, image, before, network)
     if mount is not None:
         mount.last = ground
-    factor = _depth_factor(estimate.depth_m, camera, map_ground, ground, network)
+    factor = _compute_depth_factor(estimate.depth_m, camera, map_ground, ground, network)
     return replace(rescale(estimate, factor), ground=ground)
 
 
@@ -258,7 +258,7 @@ def _refuse_contradiction(camera: Camera, map_ground: Ground | None, name: str) 
         )
 
 
-def _depth_factor(
+def _compute_depth_factor(
     depth_m: Map, camera: Camera, map_ground: Ground, ground: Ground, network: SelectionConfig
 ) -> Map:
     """Compute the factor by which the mount corrects the depth of each pixel.
@@ -272,15 +272,15 @@ def _depth_factor(
     """
     # Depth by the ground: 1 / z' = s / z + (mount_plane - s map_plane) @ ray maps the road in the
     # depth map to that of the mount, and moves objects with it.
-    map_plane = _plane_of(map_ground)
-    mount_plane = _plane_of(ground)
+    map_plane = _compute_plane(map_ground)
+    mount_plane = _compute_plane(ground)
     scale = float(mount_plane[1] / map_plane[1])
-    inverse_change = _inverse_depth_of_plane(mount_plane - scale * map_plane, camera, depth_m)
+    inverse_change = _compute_inverse_depth(mount_plane - scale * map_plane, camera, depth_m)
     inverse = scale / depth_m + inverse_change
     ground_depth_m = 1 / inverse.clamp(min=1 / _MAX_GROUND_DEPTH_M)
 
     # How surely a pixel is no ground but stands on it, 0..1: by its distance from the plane.
-    plane_ratio = _inverse_depth_of_plane(map_plane, camera, depth_m) * depth_m
+    plane_ratio = _compute_inverse_depth(map_plane, camera, depth_m) * depth_m
     off_plane = plane_ratio.clamp(min=1e-3).log().abs()
     standing_probability = (off_plane / _OFF_PLANE_LOG - 1).clamp(0, 1)
 
@@ -298,7 +298,7 @@ def _depth_factor(
     return (ground_depth_m / depth_m) ** ground_weight
 
 
-def _inverse_depth_of_plane(plane: Float[Tensor, "3"], camera: Camera, example: Map) -> Map:
+def _compute_inverse_depth(plane: Float[Tensor, "3"], camera: Camera, example: Map) -> Map:
     """Compute the inverse depth of a plane, ``plane @ ray`` (z = 1), at every pixel [1/m].
 
     ``example``: a map of the size, type and device of the result.
@@ -311,7 +311,7 @@ def _inverse_depth_of_plane(plane: Float[Tensor, "3"], camera: Camera, example: 
     return a * u + (b * v + c)[:, None]
 
 
-def _plane_of(ground: Ground) -> Float[Tensor, "3"]:
+def _compute_plane(ground: Ground) -> Float[Tensor, "3"]:
     """Compute the plane of the ground, with ``plane @ ray = 1 / depth`` for rays with z = 1."""
     tan_tilt = math.tan(math.radians(ground.tilt_deg))
     tan_roll = math.tan(math.radians(ground.roll_deg))

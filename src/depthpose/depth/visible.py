@@ -64,7 +64,7 @@ def _find_black_border(is_black: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h
     corner of the image or along half a side, and has no holes.
     """
     height, width = is_black.shape
-    if not any(side.any() for side in _sides(is_black)):
+    if not any(side.any() for side in _take_sides(is_black)):
         return np.zeros_like(is_black)
     # Pixels with nothing but black between them and a side of the image.
     is_black_to_side = np.zeros_like(is_black)
@@ -78,7 +78,7 @@ def _find_black_border(is_black: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h
     count = region_count + 1
     corner_labels = labels[[0, 0, -1, -1], [0, -1, 0, -1]]
     is_border = np.isin(np.arange(count), corner_labels)
-    for side in _sides(labels):
+    for side in _take_sides(labels):
         is_border |= np.bincount(side, minlength=count) > len(side) / 2
     area_px = np.bincount(labels.ravel(), minlength=count)
     filled_px = np.bincount(labels[is_black_to_side], minlength=count)
@@ -88,7 +88,7 @@ def _find_black_border(is_black: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h
     return ndimage.binary_dilation(is_border[labels], iterations=_MIXED_BORDER_PX)
 
 
-def _sides(values: np.ndarray) -> tuple[np.ndarray, ...]:
+def _take_sides(values: np.ndarray) -> tuple[np.ndarray, ...]:
     """Return the first and the last row, and the first and the last column, of an image."""
     return values[0], values[-1], values[:, 0], values[:, -1]
 

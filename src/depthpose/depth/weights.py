@@ -62,7 +62,7 @@ GENERATORS = {
 """Kinds of generators with weights."""
 
 
-def _all_kinds() -> dict[str, GeneratorKind]:
+def _list_kinds() -> dict[str, GeneratorKind]:
     """Return all kinds of networks by name, generators first.
 
     They are joined at each call, for users may add to ``MATCHERS``.
@@ -94,10 +94,10 @@ def read_depth_weights(
         InputError: not such weights, or weights that do not fit their own config.
     """
     checkpoint = checkpoints.read_checkpoint(path)
-    if checkpoint.kind not in (*_all_kinds(), BOTH):
+    if checkpoint.kind not in (*_list_kinds(), BOTH):
         raise InputError(
             f"{path}: holds weights of kind {checkpoint.kind!r}; depth takes "
-            f"{', '.join(map(repr, _all_kinds()))} or {BOTH!r}."
+            f"{', '.join(map(repr, _list_kinds()))} or {BOTH!r}."
         )
     is_both = checkpoint.kind == BOTH
     parts = _split(checkpoint, path) if is_both else {checkpoint.kind: checkpoint}
@@ -109,7 +109,7 @@ def read_depth_weights(
         if use == "pairs" and is_both and is_generator:
             continue
         config = _read_network_config(kind, part.config, str(path))
-        make = partial(_all_kinds()[kind].network, config)
+        make = partial(_list_kinds()[kind].network, config)
         networks[kind] = checkpoints.build_network(make, part, str(path)).eval()
         if use == "images" and is_generator and (answer or config.answer) == "own":
             break
@@ -123,7 +123,7 @@ def read_depth_weights(
 def _split(checkpoint: checkpoints.Checkpoint, path: Path) -> dict[str, checkpoints.Checkpoint]:
     """Split the checkpoint of two networks into one for each, by kind, the generator first."""
     parts: dict[str, checkpoints.Checkpoint] = {}
-    for kind in _all_kinds():
+    for kind in _list_kinds():
         if kind not in checkpoint.config:
             continue
         config = checkpoint.config[kind]
@@ -146,7 +146,7 @@ def _split(checkpoint: checkpoints.Checkpoint, path: Path) -> dict[str, checkpoi
 
 def _read_network_config(kind: str, settings: Mapping[str, Any], source: str) -> Any:  # noqa: ANN401
     """Make the config of a network from the metadata of its file; ``source`` is for errors."""
-    return config_from_dict(settings, _all_kinds()[kind].config, source=source)
+    return config_from_dict(settings, _list_kinds()[kind].config, source=source)
 
 
 def settings_of(checkpoint: checkpoints.Checkpoint, source: str) -> dict[str, Any]:
@@ -207,7 +207,7 @@ def write_depth_weights(
         with_half: store 16-bit floats: half the size.
     """
     networks: dict[str, Any] = {}
-    for kind, classes in _all_kinds().items():
+    for kind, classes in _list_kinds().items():
         for network in (generator, matcher):
             if isinstance(network, classes.network):
                 networks[kind] = network

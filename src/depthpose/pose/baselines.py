@@ -52,7 +52,7 @@ class PointNetConfig(Settings):
     """Keypoints of each object."""
 
     unit_m: Annotated[float, "(0, inf)"] = 0.1
-    """Points are given to the network in units of so many metres: of order one for an object."""
+    """Unit in which points are given to the network [m]: an object is about one in size."""
 
     local: Annotated[tuple[int, int], "[1, inf)"] = (64, 64)
     """Channels of a point by itself."""

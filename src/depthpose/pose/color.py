@@ -121,7 +121,7 @@ def score_by_color(
 
 
 def _take_samples(colors: SurfaceColors, most: int) -> SurfaceColors:
-    """Take at most so many of the coloured points, evenly."""
+    """Take ``most`` of the coloured points at most, evenly."""
     return SurfaceColors(
         points_m=take_evenly(colors.points_m, most),
         normals=take_evenly(colors.normals, most),

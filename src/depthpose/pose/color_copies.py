@@ -56,7 +56,7 @@ def propose_color_copies(
 
     # Each copy, rotated about the axes to where its print agrees.
     proposed: list[Rigid] = []
-    for motion in _choose_distinct(tried, ambiguous.axes):
+    for motion in _drop_alike_motions(tried, ambiguous.axes):
         copy = pose @ motion
         swept = [rotate_to_print(copy, axis, model, view) for axis in ambiguous.axes]
         proposed += swept or [copy[None]]
@@ -72,7 +72,7 @@ def propose_color_copies(
     return best
 
 
-def _choose_distinct(motions: Sequence[Rigid], axes: Sequence[Axis]) -> list[Rigid]:
+def _drop_alike_motions(motions: Sequence[Rigid], axes: Sequence[Axis]) -> list[Rigid]:
     """Choose motions of which no two are alike, the identity first.
 
     Two that differ by a rotation about one of the axes are alike: both are swept about it.

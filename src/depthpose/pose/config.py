@@ -38,7 +38,7 @@ class CloudConfig(Settings):
     the normal and curvature there; the published method gives a constant 1."""
 
     max_points: Annotated[int | None, "[3, inf)"] = 1500
-    """At most so many points, chosen at random before voxelising; None: all."""
+    """Largest number of points, chosen at random before voxelising; None: all."""
 
     min_points: Annotated[int, "[3, inf)"] = 16
     """Fewer points are refused, not posed."""
@@ -87,7 +87,7 @@ class VotingConfig(Settings):
     """Distances between keypoints may differ from the model's by this share of its diameter."""
 
     seed: Seed = 0
-    """Of the random pairs: with the same seed an input has the same pose on every run."""
+    """Seed of the random pairs: with the same seed an input has the same pose on every run."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,7 +95,7 @@ class IcpConfig(Settings):
     """How a pose is brought onto the cloud."""
 
     iterations: Annotated[int, "[1, inf)"] = 30
-    """At most so many exact steps from one start; half of them after the best of several."""
+    """Largest number of exact steps from one start; half of them after the best of several."""
 
     start_distance_diameters: float = 0.1
     """Points farther from the surface have weight 0 in the first step."""
@@ -105,7 +105,7 @@ class IcpConfig(Settings):
     pose grows worse (0.02 on a Kinect's cat: 2.7 % of the diameter, 0.05: 1.7 %)."""
 
     cloud_points: Annotated[int, "[100, inf)"] = 500
-    """At most so many points of the cloud, evenly taken: more are slower and no more exact."""
+    """Largest number of points of the cloud, evenly taken: more are slower and no more exact."""
 
     surface_points: Annotated[int, "[100, inf)"] = 10000
     """Points sampled on the model's surface."""
@@ -116,8 +116,8 @@ class IcpConfig(Settings):
     (``bench/sensors.py``); 0 where yours is calibrated at the distance of the object."""
 
     starts: Annotated[int, "[1, 7]"] = 7
-    """From each fit of the keypoints so many: 1, it alone; up to 7, also turned by 15 degrees one
-    way and the other about each axis of the camera (``docs/experiments.md``)."""
+    """Starts from each fit of the keypoints: 1 is the fit alone; up to 7 are also turned by 15
+    degrees one way and the other about each axis of the camera (``docs/experiments.md``)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -179,7 +179,7 @@ class EstimateConfig(Settings):
     fitted, and ICP begins at both fits."""
 
     max_cloud_points: Annotated[int, "[100, inf)"] = 100_000
-    """Of a larger cloud so many points are taken, evenly in their order, before anything else."""
+    """A larger cloud is first thinned to this number of points, evenly in their order."""
 
     batch_voxels: Annotated[int, "[1, inf)"] = 20_000
     """Voxels in one call of the network: many clouds at once, in bounded memory."""
@@ -295,7 +295,7 @@ class ObjectsConfig(Settings):
     in an image of 640x480. It is always known once the settings are made."""
 
     resolution: Annotated[tuple[float, float], "[0.05, 4]", ASCENDING] = (0.4, 0.8)
-    """The image is so many times as large: coarser pictures are faster."""
+    """Factors by which the sides of the image are scaled: coarser pictures are faster."""
 
     occluded_share: Annotated[float, "[0, 1]"] = 0.7
     """Share of samples in which something occludes the object."""
@@ -307,10 +307,10 @@ class ObjectsConfig(Settings):
     """Whether there is something behind and beside the object, which wrong masks take in."""
 
     mask_error_px: Annotated[int, "[0, 20]"] = 3
-    """The mask is grown or shrunk by up to so many pixels of the full image."""
+    """Largest growth or shrinkage of the mask [pixels of the full image]."""
 
     mask_shift_px: Annotated[int, "[0, 20]"] = 2
-    """And shifted by up to so many of them along each axis, as a predicted mask is."""
+    """Largest shift of the mask along each axis [the same], as a predicted mask is shifted."""
 
     sensor: SyntheticSensorConfig = SyntheticSensorConfig()
     """What measures the depth."""
@@ -322,7 +322,7 @@ class ObjectsConfig(Settings):
     """Boxes, balls and cans of no model among them."""
 
     frame_pile: Annotated[int, "[0, 200]"] = 0
-    """A frame shows so many copies of one model, dropped onto each other, in place of
+    """Number of copies of one model that a frame shows, dropped onto each other, in place of
     ``frame_objects`` and ``frame_clutter``; 0: no pile."""
 
     def __post_init__(self) -> None:

@@ -174,7 +174,7 @@ class PoseEstimator:
         Args:
             cloud: points of the object alone, in the camera frame (x right, y down, z forward); a
                 file, rows of points, or a cloud of trimesh or Open3D.
-            unit: of the cloud, metres by default; of a depth image, where its camera says none.
+            unit: of the cloud, metres by default; or of a depth image whose camera says none.
             depth: a 16-bit PNG or whole numbers in the camera's ``depth_unit_m``; or floats, which
                 are metres unless ``unit`` is given.
             mask: the object's pixels, not 0; a picture, an array, or COCO's run lengths. One that
@@ -393,7 +393,7 @@ class PoseEstimator:
     def track_in(
         self, frames: Iterable[AnyInput | PoseEstimate], object: str, first: Rigid | None = None
     ) -> Iterator[PoseEstimate]:
-        """Do as :meth:`track` does for views and clouds; of a view, only its mask is searched.
+        """Do as :meth:`track` does for views and clouds; in a view only its mask is searched.
 
         In place of a frame that cannot be read there is an estimate that says so.
         """

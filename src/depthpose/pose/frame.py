@@ -21,9 +21,9 @@ from depthpose.pose.sensor import NOISE_PER_M2, measure_noise_per_m2, plane_tole
 from depthpose.pose.types import KnownBackground
 
 _MOST_PIXELS = 110_000
-"""A larger image is thinned to about so many pixels: every n-th row and column of it is used."""
+"""A larger image is thinned to about this size: every n-th of its rows and columns is used."""
 _OBJECT_PX = 60
-"""Least width of the smallest object in the thinned image, if the full image has so many pixels."""
+"""Least width of the smallest object in the thinned image, if it is as wide in the full image."""
 _WINDOW = 3
 """Reach, in pixels to each side, of the window in which the normal of a pixel is fitted."""
 _LEAST_FILLED = 0.4
@@ -181,8 +181,8 @@ def _fit_normals(
         depth_m: 0 where there is no reading.
         rays: points of the pixels at a depth of 1 m.
         K: intrinsic matrix.
-        normals: are written where there is a reading.
-        is_smooth: is set where there are enough neighbours, all round.
+        normals: output, written where there is a reading.
+        is_smooth: output, set where there are enough neighbours, all round.
     """
     height, width = depth_m.shape
     least_neighbours = _LEAST_FILLED * (2 * _WINDOW + 1) ** 2

@@ -157,15 +157,18 @@ def rotation_from_z_to(direction: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
 def thin_cloud(
     points_m: Float64[Tensor, "n 3"], normals: Float64[Tensor, "n 3"], step_m: float
 ) -> Int64[Tensor, " m"]:
-    """Choose the first point of each cell of a grid and octant of normals; return their indices.
+    """Choose points of a cloud: in each cell of a grid one for each octant of normals.
+
+    The octant of a normal is the signs of its x, y and z. So both sides of a thin sheet, and the
+    faces at an edge, keep a point each where they share a cell.
 
     Args:
         points_m: one at least.
-        normals: of the points; points of one cell whose normals differ in a sign are all kept.
+        normals: of the points.
         step_m: side of a cell.
 
     Returns:
-        Indices of the points, ascending.
+        Indices of the chosen points, the first in each cell and octant; ascending.
     """
     cells = ((points_m - points_m.amin(0)) / step_m).long()
     octants = (normals > 0).long()

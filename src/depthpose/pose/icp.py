@@ -314,7 +314,7 @@ def _iterate(
 
     Args:
         points_m: of the object, in the camera frame.
-        max_points: so many of them are used, evenly taken.
+        max_points: largest number of points that are used, evenly taken.
         pose: one or a batch, ``camera_from_model``.
         surface: of the model.
         limits_m: distance at which a point no longer counts, for each step; the last one is for
@@ -678,8 +678,8 @@ def _measure_inflation(
 ) -> tuple[Float64[Tensor, "*batch 6"], Float64[Tensor, "*batch 6 6"]]:
     """Measure the ratios of a block jackknife's variances to independent ones; and directions.
 
-    Of several block sizes the one with the largest sum is taken; the ratios are 1 where no size has
-    a larger sum. Directions are columns, in the coordinates of ``whitening``.
+    Several block sizes are tried, and the one with the largest sum is taken; the ratios are 1 where
+    no size has a larger sum. Directions are columns, in the coordinates of ``whitening``.
 
     Args:
         cloud_m: the points of the residuals, in the camera frame.

@@ -36,7 +36,7 @@ _ROUGH_MIRROR_POINTS = 100  # of these points, those that compare starts of the 
 _STEPS = 12  # steps of ICP with a scale
 _WIDE_STEP = 2.0  # distance limit of the first step, over the usual distance limit
 _CONVERGED = 3e-4  # largest step [rad, m or share] at which ICP with a scale stops
-_CORRELATED_READINGS = 10.0  # factor of the variance, since so many neighbours share their error
+_CORRELATED_READINGS = 10.0  # factor of the variance, since as many neighbours share their error
 _STARTS = (1.0, 0.87, 1.15)
 """Scales at which ICP starts: from 1 alone it would stay there for smaller copies."""
 _FIRST_START_BONUS = 0.03
@@ -90,25 +90,25 @@ def measure_scale(
     local_m = pose.inverse().apply(take_evenly(cloud_m.double(), POINTS))
     starts = torch.tensor(_STARTS, dtype=torch.float64)
     few_m = take_evenly(local_m, _ROUGH_POINTS).expand(len(starts), -1, -1)
-    times, moved_m = _fit_scale(few_m, starts, surface, is_exact=False)
-    costs = measure_distance(moved_m, surface, times, is_exact=False).square()
+    scales, moved_m = _fit_scale(few_m, starts, surface, is_exact=False)
+    costs = measure_distance(moved_m, surface, scales, is_exact=False).square()
     costs[0] -= _FIRST_START_BONUS
     start = starts[costs.argmin()][None]
 
     # From it exactly.
-    times, moved_m = _fit_scale(local_m[None], start, surface, is_exact=True)
-    distance = measure_distance(moved_m, surface, times, is_exact=True)[0]
+    scale, moved_m = _fit_scale(local_m[None], start, surface, is_exact=True)
+    distance = measure_distance(moved_m, surface, scale, is_exact=True)[0]
     gain = measure_distance(local_m, surface, is_exact=True) - distance
     residuals = _linearise_growth(
         array_of(moved_m[0]),
-        float(times),
+        float(scale),
         array_of(surface.middle_m),
         NEAR * surface.diameter_m,
         surface.target,
         True,
         np.full(moved_m.shape[1], -1),
     )
-    return Scale(float(times), _estimate_scale_deviation(residuals, object_std_m), float(gain))
+    return Scale(float(scale), _estimate_scale_deviation(residuals, object_std_m), float(gain))
 
 
 def _estimate_scale_deviation(residuals: Residuals, object_std_m: float) -> float:
@@ -129,24 +129,27 @@ def _estimate_scale_deviation(residuals: Residuals, object_std_m: float) -> floa
 
 def _fit_scale(
     local_m: Float64[Tensor, "b n 3"],
-    times: Float64[Tensor, " b"],
+    start_scales: Float64[Tensor, " b"],
     surface: Surface,
     *,
     is_exact: bool,
 ) -> tuple[Float64[Tensor, " b"], Float64[Tensor, "b n 3"]]:
-    """Iterate point-to-plane ICP with a scale; give the scales and the moved points.
+    """Iterate point-to-plane ICP with a scale as a seventh unknown.
 
     Args:
         local_m: points in the model frame, for each start.
-        times: scales to begin with.
+        start_scales: scales to begin with.
         surface: of the model.
         is_exact: whether the nearest samples are searched, not looked up in a table.
+
+    Returns:
+        The scale that each start ends at, and its points, moved rigidly.
     """
     # The limit of a distance shrinks over half of the steps, then stays.
-    widths = [1 + (_WIDE_STEP - 1) * max(0.0, 1 - 2 * step / _STEPS) for step in range(_STEPS)]
-    limits_m = NEAR * surface.diameter_m * np.array(widths)
+    factors = [1 + (_WIDE_STEP - 1) * max(0.0, 1 - 2 * step / _STEPS) for step in range(_STEPS)]
+    limits_m = NEAR * surface.diameter_m * np.array(factors)
     moved = array_of(local_m).copy()
-    scales = array_of(times).copy()
+    scales = array_of(start_scales).copy()
     _grow(moved, scales, array_of(surface.middle_m), limits_m, surface.target, is_exact)
     return torch.from_numpy(scales), torch.from_numpy(moved)
 

@@ -174,8 +174,8 @@ def rigid_input(
 
     Args:
         pose: the transform.
-        name: of it in errors.
-        what: it is, in errors, as ``target_from_source``.
+        name: what errors call the transform.
+        what: which transform it is, in errors, such as ``target_from_source``.
 
     Raises:
         InputError: the matrix is no rigid transform.
@@ -222,18 +222,28 @@ def split_instances(labels: Int64[Tensor, "h w"]) -> list[Bool[Tensor, "h w"]]:
 def labels_input(mask: AnyMask, name: str) -> Int64[Tensor, "_ _"]:
     """Convert a mask to labels: 0 beside the objects, else the number of an object.
 
-    Files are read by :func:`read_labels`. Fractions in [0, 1] are probabilities: those above a half
-    are the object.
+    Objects keep their numbers, but for a single one, which becomes 1; numbers that fill no square
+    of three by three pixels are dropped (:func:`number_objects`). Files are read by
+    :func:`read_labels`. Fractions in [0, 1] are probabilities: those above a half are the object.
+
+    Args:
+        mask: an array or tensor (h, w), a file, or COCO's run lengths.
+        name: of the mask, in errors.
 
     Raises:
-        InputError: a file cannot be read, or the mask holds other fractions or NaN; ``name`` is
-            that of the mask in errors.
+        InputError: a file cannot be read, or the mask is not (h, w), or holds other fractions or
+            NaN.
     """
     if isinstance(mask, str | Path):
         return read_labels(Path(mask))
     if isinstance(mask, Mapping):
         return decode_rle(*read_runs(mask, name)).long()
     values = _convert_to_tensor(mask)
+    if values.ndim != 2:
+        raise InputError(
+            f"{name}: the mask is of shape {tuple(values.shape)}, not (h, w); give the mask of one "
+            "image, without other axes"
+        )
     if values.is_floating_point() and not bool((values % 1 == 0).all()):
         if not bool(((values >= 0) & (values <= 1)).all()):
             raise InputError(
@@ -241,8 +251,7 @@ def labels_input(mask: AnyMask, name: str) -> Int64[Tensor, "_ _"]:
                 "(logits > 0), whole numbers of objects, or probabilities"
             )
         values = values > 0.5
-    whole = values.long()
-    return number_objects(whole.numpy()) if whole.ndim == 2 else whole
+    return number_objects(values.long().numpy())
 
 
 def _convert_to_tensor(values: Any) -> Tensor:  # noqa: ANN401  whatever a caller has

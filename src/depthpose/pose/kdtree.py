@@ -9,7 +9,7 @@ from depthpose.pose.compiled import Vector, compiled, dot, minus, vector
 
 TreePlace = int | np.int64  #: row of a point in the arrays of a tree
 
-_LEAF = 8  # largest number of points of a range that is not split any more
+_LEAF = 8  # mean number of points of a range, rounded down, at which no more ranges are split
 _MOST_WAITING = 64  # ranges that wait to be searched, one a level: no tree has as many levels
 
 
@@ -30,7 +30,8 @@ class Tree(NamedTuple):
 @compiled
 def build_tree(points: Float64[np.ndarray, "m 3"], outward: Float64[np.ndarray, "m 3"]) -> Tree:
     """Build a tree of points, one at least, and their outward normals."""
-    # As many levels as leave ``_LEAF`` points at most to each range of the last one.
+    # As many levels as leave ``_LEAF`` points to a range of the last one in the mean, rounded down:
+    # some hold one more (17 points are split into 8 and 9).
     count = len(points)
     order = np.arange(count)
     depth = 0

@@ -206,7 +206,7 @@ class GeoPoseNet(PoseEstimator):
     def _prepare(self, pose_input: AnyInput) -> CloudToPose | PoseEstimate:
         """Lift an input to the cloud and the voxels that the network takes.
 
-        Of a region, or of an input that is refused, the estimate is returned.
+        For a region, or an input that is refused, the finished estimate is returned instead.
         """
         if isinstance(pose_input, ViewInput) and pose_input.is_region:
             return self._search_region(pose_input)

@@ -23,7 +23,7 @@ def free_motions(axes: tuple[Axis, ...], camera_from_model: Rigid) -> Float[Tens
         camera_from_model: the pose.
 
     Returns:
-        Unit vectors of (rotation, translation) in the camera frame: none, one, or three of a ball.
+        Unit vectors (rotation, translation) in the camera frame: none, one, or a ball's three.
     """
     # The axes: three of a ball, else one at most.
     centre_m = Symmetries(continuous=axes).ball_centre_m

@@ -40,7 +40,7 @@ _VIEW_POINTS = 160  # largest number of points of a view
 _PROBED_SPACINGS = 500  # samples by which the mean distance of neighbours is measured
 _PROBED_THIRDS = 1000  # samples by which the distance of the third nearest is measured
 _MOST_FACES = 100_000
-"""Largest number of faces that are rendered; of a larger model its samples are, which are fewer."""
+"""Largest number of faces that are rendered; a model with more is rendered by its samples."""
 _EDGE_STEP = 0.08
 """Difference in depth, in diameters, from which neighbouring cells are the two sides of an edge."""
 
@@ -392,7 +392,7 @@ def look_along_rays(
         every: n: every n-th point of the surface is used.
 
     Returns:
-        Of each pose the share of the points that the posed surface would have occluded (free-space
+        For each pose the share of the points that the posed surface would have occluded (free-space
         violation), and the share of the cells of the posed surface in which nothing was observed.
         Both are 1 where the surface lies behind the camera.
     """
@@ -487,7 +487,7 @@ def _draw_cells(
         t: its translation.
         scale: cells per unit of x / z and y / z.
         middle: column and row of the middle cell.
-        nearest: is written.
+        nearest: output.
     """
     nearest[:] = np.inf
     for i in range(len(points)):

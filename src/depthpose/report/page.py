@@ -215,7 +215,7 @@ def choose_ranked(errors: Sequence[float], most: int = 3) -> list[tuple[str, int
 def share_views(sets: int) -> list[int]:
     """Share the views of a page among several sets of predictions: the number of each set.
 
-    Of more than ``MOST_VIEWS`` sets the last get none.
+    Where there are more than ``MOST_VIEWS`` sets, the last get none.
     """
     each = max(1, MOST_VIEWS // max(1, sets))
     return [each if index * each < MOST_VIEWS else 0 for index in range(sets)]
@@ -453,7 +453,10 @@ _COLUMN_MEANINGS = {
 
 
 def format_value(value: object) -> str:
-    """Format a cell of a table: floats with four decimals or none if whole; None as ``""``."""
+    """Format a cell of a table; None as ``""``.
+
+    Whole floats other than 0 have no decimals; all others, and 0 (``0.0000``), have four.
+    """
     match value:
         case None:
             return ""

@@ -235,7 +235,7 @@ def arrange_columns(
     """
     if not any(columns):
         raise InputError("a figure of no panel cannot be arranged; give a frame at least.")
-    shrunk = [[shrink_to_width(panel.image, width_px) for panel in column] for column in columns]
+    shrunk = [[resize_to_width(panel.image, width_px) for panel in column] for column in columns]
 
     # The panels of one row have equal height; a shorter column is filled up with white.
     row_heights: list[int] = []
@@ -279,7 +279,7 @@ def _draw_lidar_panels(
     return [Drawing(caption=caption, image=image, color_bar=make_depth_color_bar(_NEAR_M, _FAR_M))]
 
 
-def shrink_to_width(image: Float[Tensor, "3 _ _"], width_px: int) -> Float[Tensor, "3 _ _"]:
-    """Scale a picture to a width by area averaging, with its proportions kept."""
+def resize_to_width(image: Float[Tensor, "3 _ _"], width_px: int) -> Float[Tensor, "3 _ _"]:
+    """Shrink or enlarge a picture to a width with its proportions kept, by area averaging."""
     height = max(1, round(image.shape[1] * width_px / image.shape[2]))
     return F.interpolate(image[None], (height, width_px), mode="area")[0]

@@ -168,8 +168,8 @@ def read_kitti_matrix(
 def choose_kitti_pair(keys: Mapping[str, list[float]], pairs: Sequence[KittiPair]) -> KittiPair:
     """Choose the first of some pairs whose left projection a calibration has, else the first.
 
-    Of a calibration without any, :func:`read_kitti_matrix` then raises the error that names the
-    missing projection.
+    If the calibration has none of them, :func:`read_kitti_matrix` then raises the error that names
+    the missing projection.
     """
     return next((pair for pair in pairs if pair.left in keys), pairs[0])
 

@@ -118,7 +118,7 @@ def _is_other_lens(lens: str, key: str) -> bool:
 
 
 def _is_set(value: object) -> bool:
-    """Whether a flag is true, or a coefficient is not 0; of a matrix or list the first entry."""
+    """Whether a flag is true, or a coefficient (the first entry of a matrix or list) is not 0."""
     if isinstance(value, Mapping):
         value = value.get("data")
     if isinstance(value, list):

@@ -40,13 +40,14 @@ class Camera:
 
     def __post_init__(self) -> None:
         for name, (smallest, largest, reason) in _RANGES.items():
-            value = getattr(self, name, None)
+            value = getattr(self, name)
             if value is not None and not smallest <= value <= largest:
-                raise InputError(f"{name} is {str(value)[:24]}, but {reason}")
+                raise InputError(f"{name} is {str(value)[:_MOST_LETTERS]}, but {reason}")
         check_intrinsics(self.K)
 
 
 _SIDE = (1, MAX_SIDE_PX, f"an image has 1 to {MAX_SIDE_PX} pixels in a row or column; correct it")
+_MOST_LETTERS = 24  # of a wrong value in an error: a whole number may have thousands of digits
 _SMALLEST_POSITIVE = math.ulp(0.0)
 _LARGEST_FINITE = sys.float_info.max
 _RANGES = {
@@ -58,11 +59,6 @@ _RANGES = {
     ),
     "mount_height_m": (0.1, 20, "a camera stands 0.1 to 20 m above the road; give metres"),
     "tilt_deg": (-45, 45, "a road is seen at -45 to 45 degrees; negative looks down"),
-    "baseline_m": (
-        _SMALLEST_POSITIVE, _LARGEST_FINITE,
-        "the right camera stands at a positive x; are left and right exchanged? Give "
-        "its distance from the left one in metres"
-    ),
 }  # fmt: skip
 """Smallest and largest value of a camera's numbers, and the reason for them."""
 
@@ -82,6 +78,12 @@ class StereoRig(Camera):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if not 0 < self.baseline_m <= _LARGEST_FINITE:
+            raise InputError(
+                f"baseline_m is {str(self.baseline_m)[:_MOST_LETTERS]}, but the right camera "
+                "stands at a positive x; are left and right exchanged? Give its distance from the "
+                "left one in metres"
+            )
         if self.baseline_m >= MAX_BASELINE_M:
             raise InputError(
                 f"baseline_m is {self.baseline_m:g}, which looks like millimetres; divide by 1000"

@@ -86,7 +86,7 @@ def normalise_keys(content: Mapping[Any, Any]) -> Fields:
 def find_matrix(fields: Fields, keys: tuple[str, ...], count: int) -> np.ndarray | None:
     """Return the matrix of the first of some keys that has ``count`` numbers: 9, 12 or 16.
 
-    The matrix is 3x3, 3x4 or 4x4; None where no key has so many numbers.
+    The matrix is 3x3, 3x4 or 4x4; None where no key has that many numbers.
     """
     columns = 3 if count == 9 else 4
     for key in keys:
@@ -177,7 +177,7 @@ def facts_from_fields(fields: Fields) -> CameraFacts | None:
         InputError: the lens is neither a pinhole nor an equidistant fisheye, or a value is wrong.
     """
     is_fisheye = is_fisheye_lens(fields)
-    facts = _facts_without_lens(fields)
+    facts = _read_facts_without_lens(fields)
     return None if facts is None else with_fisheye(facts, is_fisheye=bool(is_fisheye))
 
 
@@ -189,7 +189,7 @@ def with_fisheye(facts: CameraFacts, *, is_fisheye: bool) -> CameraFacts:
     return replace(facts, is_fisheye=True, undistort=undistort)
 
 
-def _facts_without_lens(fields: Fields) -> CameraFacts | None:
+def _read_facts_without_lens(fields: Fields) -> CameraFacts | None:
     """Read the camera that fields describe, but for its lens model; None where they describe none.
 
     The first of these that the fields have is read: settings of ORB-SLAM, two projections, the
@@ -419,7 +419,13 @@ def read_baseline_m(fields: Fields) -> float | None:
 def find_distortion(fields: Fields) -> tuple[float, ...]:
     """Collect the distortion coefficients under any key, of both lenses where there are two.
 
-    They tell only whether a lens distorts; their order is none of a lens model.
+    They tell only whether a lens distorts. They are collected in no particular order, so they
+    cannot undistort an image.
+
+    Raises:
+        InputError: a key of coefficients alone, such as ``D`` or ``distCoeffs``, holds none. Other
+            keys that begin with ``distortion`` may hold words, as ``distortion_model`` does: these
+            are skipped.
     """
     loose = [find_number(fields, key) for key in _DISTORTION_KEYS]
     coefficients = [number for number in loose if number is not None]
@@ -429,9 +435,9 @@ def find_distortion(fields: Fields) -> tuple[float, ...]:
             continue
         is_matrix = isinstance(value, Mapping) and "data" in value
         is_by_name = isinstance(value, Mapping) and not is_matrix
-        content = value["data"] if is_matrix else value
+        is_empty = not (value["data"] if is_matrix else value)
         numbers = parse_numbers(list(value.values()) if is_by_name else value)
-        if numbers is None and is_list_key and content:
+        if numbers is None and is_list_key and not is_empty:
             raise InputError(f"its {key} are no list of numbers; write [k1, k2, p1, p2, k3]")
         coefficients += numbers or []
     return tuple(coefficients)
@@ -481,7 +487,7 @@ def _read_window(fields: Fields) -> _Window:
 
 
 def find_size(fields: Fields) -> Size | None:
-    """Read the image's size, where the file has it; of ROS, that of the published image."""
+    """Read the image's size, where the file has it; for ROS that of the published image."""
     width = _find_first_number(fields, _WIDTH)
     height = _find_first_number(fields, _HEIGHT)
     size = parse_numbers(fields.get("imagesize") or fields.get("size"))

@@ -23,7 +23,7 @@ _MIN_MATCHES = 25  # least matches of corners between both halves
 def split_halves(image: Float[Tensor, "3 h w"], arrangement: Arrangement) -> tuple[Tensor, Tensor]:
     """Split a picture into its left and right half, or its upper and lower one.
 
-    Of an odd number of columns or rows the middle one is in neither half.
+    Where the number of columns or rows is odd, the middle one is in neither half.
     """
     if arrangement == "side by side":
         width = image.shape[2] // 2

@@ -199,28 +199,30 @@ def read_bytes(path: AnyPath, most: int = MAX_FILE_BYTES) -> bytes:
         shard = _find_shard(file)
         if shard is not None:
             return _read_in_shard(shard, file.relative_to(shard).as_posix(), most)
-        status = file.stat()
-        reason = ""
-        if stat.S_ISDIR(status.st_mode):
-            reason = "a folder where a file is needed; name a file inside it"
-        elif not stat.S_ISREG(status.st_mode):
-            reason = "a device or pipe; save its content to a regular file first"
-        elif status.st_size > most:
-            reason = (
-                f"{status.st_size} bytes, more than the {most} that are read of such a file; thin "
-                "it out or split it"
-            )
-        if not reason:
-            return file.read_bytes()
+        _refuse_irregular(path, most)
+        return file.read_bytes()
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such file; check the path") from error
     except (OSError, MemoryError) as error:
         raise InputError(f"{path}: cannot be read: {error or 'no memory left'}") from error
     except InputError:
         raise
-    except ValueError as error:  # a NUL byte in the name
+    except ValueError as error:  # a NUL byte or half of a surrogate pair in the name
         raise InputError(f"{os.fspath(path)!r}: not a file name: {error}") from error
-    raise InputError(f"{path}: {reason}")
+
+
+def _refuse_irregular(path: AnyPath, most: int) -> None:
+    """Refuse what is no regular file, or one of more than ``most`` bytes."""
+    status = Path(path).stat()
+    if stat.S_ISDIR(status.st_mode):
+        raise InputError(f"{path}: a folder where a file is needed; name a file inside it")
+    if not stat.S_ISREG(status.st_mode):
+        raise InputError(f"{path}: a device or pipe; save its content to a regular file first")
+    if status.st_size > most:
+        raise InputError(
+            f"{path}: {status.st_size} bytes, more than the {most} that are read of such a file; "
+            "thin it out or split it"
+        )
 
 
 def _find_shard(path: Path) -> Path | None:
@@ -237,8 +239,7 @@ def _read_in_shard(shard: Path, name: str, most: int) -> bytes:
         source = shard.parent / SOURCE
         if not source.is_file():
             raise InputError(f"{shard}: no such file; check the path")
-        folder = json.loads(source.read_text())["url"].rstrip("/")
-        fetch(f"{folder}/{shard.name}", shard)
+        fetch(f"{_read_store_address(source)}/{shard.name}", shard)
     status = shard.stat()
     extent = _index_shard(shard, status.st_mtime_ns, status.st_size).get(name)
     if extent is None:
@@ -252,6 +253,23 @@ def _read_in_shard(shard: Path, name: str, most: int) -> bytes:
     if len(data) < size:
         raise InputError(f"{shard}: ends within {name!r}; pack or fetch it again")
     return data
+
+
+def _read_store_address(source: Path) -> str:
+    """Read from ``source.json`` the address of the folder that holds the shards beside it.
+
+    Raises:
+        InputError: it is no JSON, or holds no address.
+    """
+    content = read_json(source)
+    address = content.get("url") if isinstance(content, Mapping) else None
+    if not isinstance(address, str) or not address:
+        raise InputError(
+            f'{source}: must be {{"url": ADDRESS}} with the address of the folder that holds the '
+            f"shards, got {str(content)[:_LONGEST_CAUSE]}; correct it, or open the data set by its "
+            "address, which writes the file again"
+        )
+    return address.rstrip("/")
 
 
 @lru_cache(maxsize=4096)

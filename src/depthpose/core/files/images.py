@@ -296,7 +296,8 @@ def check_image(image: object, name: str, slack: float = 0.5) -> Float[Tensor, "
     Args:
         image: the tensor.
         name: what errors call it.
-        slack: by how much its values may lie beyond [0, 1].
+        slack: by how much its values may lie beyond [0, 1], as interpolation overshoots; the values
+            of 8 bits, or normalised to a mean of 0, usually lie farther out.
 
     Raises:
         InputError: it is not a float tensor (3, h, w), is empty, not finite, or out of range.

@@ -31,7 +31,7 @@ class RecordField:
 
     name: str
     code: str  #: numpy's type code without byte order, such as "f4"
-    count: int = 1  #: numbers of a record; of several only the first is read
+    count: int = 1  #: numbers of a record; only the first is read
     size_code: str | None = None  #: type code of the length of a list; None: it is no list
 
 

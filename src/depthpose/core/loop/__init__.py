@@ -2,7 +2,7 @@
 
 from depthpose.core.loop.folder import RunLogger as RunLogger
 from depthpose.core.loop.folder import format_card as format_card
-from depthpose.core.loop.folder import format_held_out as format_held_out
+from depthpose.core.loop.folder import format_last_validation as format_last_validation
 from depthpose.core.loop.folder import read_metrics as read_metrics
 from depthpose.core.loop.folder import write_card as write_card
 from depthpose.core.loop.loop import Interrupted as Interrupted

@@ -167,7 +167,7 @@ def write_card(
         words: words of the command, such as ``depth train view``.
         seconds: duration of the training.
         facts: facts for the card, besides the command and the time.
-        measured: Markdown of what was measured, such as :func:`format_held_out`.
+        measured: Markdown of what was measured, such as :func:`format_last_validation`.
     """
     folder = weights.parent
     versions = describe_environment()
@@ -194,7 +194,7 @@ def _describe_duration(seconds: float) -> str:
     return f"{seconds / 3600:.1f} h"
 
 
-def format_held_out(folder: Path, sentence: str) -> str:
+def format_last_validation(folder: Path, sentence: str) -> str:
     """Format the metrics of a training's last validation as a Markdown table.
 
     Args:

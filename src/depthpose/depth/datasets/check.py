@@ -32,7 +32,7 @@ _TRUTH_RADIUS_PX = 3
 """Truth agrees with a match if any value within this distance does."""
 _TRUTH_TOLERANCE_PX = 2.0
 _TRUTH_TOLERANCE_SHARE = 0.03
-"""Largest difference of agreeing disparities: so many pixels plus a share of the disparity."""
+"""Largest difference of agreeing disparities: these pixels plus this share of the disparity."""
 _MIN_MATCHES = 25
 """Number of matches with truth near them, with fewer of which a map is not judged."""
 _MIN_AGREEMENT = 0.6

@@ -116,7 +116,7 @@ def read_plain_calibration(path: Path, name: str, width: int, height: int) -> St
 
     # The line of the pair; other pairs' names may begin with this one's, and a space.
     lines = re.findall(rf"^[ \t]*{re.escape(name)}[ \t]+(.+)$", text, re.MULTILINE)
-    calibrations = [numbers for line in lines if len(numbers := _leading_numbers(line)) >= 6]
+    calibrations = [numbers for line in lines if len(numbers := _parse_leading_numbers(line)) >= 6]
     if lines and not calibrations:
         raise InputError(
             f"{path}: the line of {name!r} is no calibration: {lines[0][:80]!r} does not begin "
@@ -139,7 +139,7 @@ def read_plain_calibration(path: Path, name: str, width: int, height: int) -> St
         raise InputError(f"{path}: the line of {name!r} is no calibration ({error}).") from error
 
 
-def _leading_numbers(line: str) -> list[float]:
+def _parse_leading_numbers(line: str) -> list[float]:
     """Return the numbers with which a line begins, up to the first word that is none."""
     numbers: list[float] = []
     for word in line.split():
@@ -390,7 +390,7 @@ def has_lidar(frame: FramePaths, depth: LidarDepth) -> bool:
 def read_lidar_depth(frame: FramePaths, depth: LidarDepth) -> Map:
     """Read the depth map of a frame's LiDAR scan [m]; NaN where no point falls.
 
-    Of a frame without a scan, but with a map of one (``lidar_depth/`` of a plain folder,
+    Where a frame has no scan but a map of one (``lidar_depth/`` of a plain folder,
     ``velodyne_raw`` of KITTI's depth-prediction set), that map is read for ``camera_z``.
 
     Raises:

@@ -380,7 +380,7 @@ class FakestereoNet:
 
         estimates: list[DepthEstimate | InputError] = []
         estimate = partial(self.estimate_batch, lens=lens, with_check=with_check)
-        batches = _named_batches(sequence, batch)
+        batches = _yield_named_batches(sequence, batch)
         with tqdm(total=total, unit=" images", disable=not with_progress) as bar:
             for estimates_of_batch in map_in_threads(estimate, batches, threads):
                 estimates += estimates_of_batch
@@ -490,7 +490,9 @@ class FakestereoNet:
         return virtual_sizes(self.synthesiser, image, allow_ood=self.allow_ood)
 
 
-def _named_batches(images: Iterable[object], batch: int) -> Iterator[list[tuple[str, object]]]:
+def _yield_named_batches(
+    images: Iterable[object], batch: int
+) -> Iterator[list[tuple[str, object]]]:
     """Yield lists of up to ``batch`` images, each image with a name made of its number."""
     named = ((f"image {number}", image) for number, image in enumerate(images))
     while chunk := list(islice(named, batch)):

@@ -45,7 +45,7 @@ def depth_from_pair(
             the images are wide, or too little memory.
     """
     warning = refuse_unrectified(pair, with_check=with_check)
-    cx_difference_px = _cx_difference_px(pair)
+    cx_difference_px = _read_cx_difference_px(pair)
     with refused_memory(pair.name):
         if isinstance(matcher, NetworkMatcher) and matcher.finds_range:
             match, range_warning = _match_in_range(matcher, pair, cx_difference_px)
@@ -56,7 +56,7 @@ def depth_from_pair(
 
 
 def refuse_unrectified(pair: StereoInput, *, with_check: bool = True) -> str:
-    """Raise an error where two images are not a rectified pair; warn where that is uncertain.
+    """Refuse two images that are no rectified pair; return a warning where that is uncertain.
 
     Args:
         pair: the images, and their rig where it is known.
@@ -104,7 +104,7 @@ def refuse_unrectified(pair: StereoInput, *, with_check: bool = True) -> str:
     return report.message if report.is_rectified is None else ""
 
 
-def _cx_difference_px(pair: StereoInput) -> float:
+def _read_cx_difference_px(pair: StereoInput) -> float:
     """Return cx of the right camera less that of the left one [px]; 0 where no rig is known.
 
     Raises:

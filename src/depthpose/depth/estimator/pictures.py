@@ -66,7 +66,7 @@ class DepthPipeline:
         Returns:
             For each picture ``predicted_depth``, metres (H, W), NaN where there are none, and
             ``depth``, an 8-bit picture of Pillow's, the farthest white, as transformers draws it.
-            Of a list a list, of another iterable an iterator.
+            A list of pictures gives a list, another iterable an iterator.
 
         Raises:
             InputError: as :meth:`FakestereoNet.estimate`.

@@ -90,7 +90,7 @@ def depth_before_mount(
             if views.is_sky is not None:
                 match = replace(match, is_sky=views.is_sky[index])
             estimate = estimate_from_virtual(image, synthesiser.config, match, views.right[index])
-            image_confidence = _image_confidence(views, index)
+            image_confidence = _estimate_image_confidence(views, index)
             if image_confidence is not None:
                 warning = _refuse_ood(synthesiser, image.name, image_confidence, allow_ood)
                 estimate = replace(estimate, image_confidence=image_confidence, warning=warning)
@@ -160,7 +160,7 @@ def _match_views(
     return [matcher.match(*pair) for pair in pairs]
 
 
-def _image_confidence(views: SynthesisedViews, index: int) -> float | None:
+def _estimate_image_confidence(views: SynthesisedViews, index: int) -> float | None:
     """Return the generator's confidence in an image as a whole, 0..1; None where it has none."""
     if views.street_probability is not None:
         return float(views.street_probability[index])

@@ -168,7 +168,7 @@ def fold(network: ModuleT, example: Tensor) -> ModuleT:
                 bias = torch.zeros(layer.out_channels) if layer.bias is None else layer.bias
                 setattr(parent, name, VolumeConv(layer, layer.weight, bias, example))
             elif isinstance(norm, Norm):
-                setattr(parent, name, _folded(layer, norm, example))
+                setattr(parent, name, _fold_norm(layer, norm, example))
 
     # In the memory format that convolutions are fast in.
     for module in network.modules():
@@ -182,7 +182,7 @@ def fold(network: ModuleT, example: Tensor) -> ModuleT:
     return network
 
 
-def _folded(layer: nn.Module, norm: Norm, example: Tensor) -> nn.Module:
+def _fold_norm(layer: nn.Module, norm: Norm, example: Tensor) -> nn.Module:
     """Fold the norm of a layer with ``conv`` and ``norm``; return what takes the layer's place."""
     conv = cast("Conv", layer.conv)
     weight, bias = _merge_norm(conv, norm)

@@ -192,7 +192,7 @@ class NetworkMatcher(ABC):
         """
         trained = self.network_config
         if search is not None:
-            sizes = [_scaled_size(left, search.scale, camera) for left, _ in pairs]
+            sizes = [_compute_scaled_size(left, search.scale, camera) for left, _ in pairs]
             largest_px = search.span_px
         elif camera is not None and trained.work_focal_px is not None:
             sizes = [self.work_size(camera)] * len(pairs)
@@ -266,7 +266,7 @@ class NetworkMatcher(ABC):
         """Compute the rows and columns at which images of a camera are matched [px]."""
         if self.network_config.work_focal_px is None:
             return camera.height, camera.width
-        return disparity.size_at_focal_length(camera, self.work_focal_px(camera))
+        return disparity.size_at_focal_length(camera, self.matching_focal_px(camera))
 
     def work_disparities(self, camera: Camera) -> int:
         """Compute the number of disparities that are searched at :meth:`work_size` [px]."""
@@ -274,7 +274,7 @@ class NetworkMatcher(ABC):
         if trained.work_focal_px is None:
             return trained.max_disparity_px
         # Disparities grow with the focal length; the same filters search more of them.
-        ratio = self.work_focal_px(camera) / trained.work_focal_px
+        ratio = self.matching_focal_px(camera) / trained.work_focal_px
         span_factor = min(ratio, self.largest_span_factor)
         return self.whole_steps(trained.max_disparity_px * span_factor)
 
@@ -283,7 +283,7 @@ class NetworkMatcher(ABC):
         step_px = self.network_config.step_px
         return max(1, math.ceil(round(disparity_px, 3) / step_px)) * step_px
 
-    def work_focal_px(self, camera: Camera) -> float:
+    def matching_focal_px(self, camera: Camera) -> float:
         """Compute the focal length at which images of a camera are matched [px].
 
         At the speed ``fine`` it is that of an image of ``fine_pixels``, but at least that of the
@@ -299,7 +299,7 @@ class NetworkMatcher(ABC):
         return max(trained_px, fine_px)
 
 
-def _scaled_size(left: View, scale: float, camera: Camera | None) -> tuple[int, int]:
+def _compute_scaled_size(left: View, scale: float, camera: Camera | None) -> tuple[int, int]:
     """Compute the rows and columns of a scaled view; with a camera, pixels become square."""
     if camera is not None:
         return disparity.size_at_focal_length(camera, scale * float(camera.K[0, 0]))
@@ -320,12 +320,12 @@ def pad_top_right(
     So PSMNet's authors do. Columns keep their numbers, and so disparity stays the same.
     """
     height, width = image.shape[-2:]
-    rows_above = _suitable_side_px(height, network) - height
-    columns_right = _suitable_side_px(width, network) - width
+    rows_above = _round_up_side(height, network) - height
+    columns_right = _round_up_side(width, network) - width
     return F.pad(image, (0, columns_right, rows_above, 0))
 
 
-def _suitable_side_px(side_px: int, network: NetworkConfig) -> int:
+def _round_up_side(side_px: int, network: NetworkConfig) -> int:
     """Round a side up to the next one that the network takes."""
     steps = math.ceil(side_px / network.step_px)
     return max(network.min_side_px, steps * network.step_px)

@@ -107,7 +107,7 @@ def measure_disparity_range(
     right_px = mirrored_match.disparity_px.flip(-1)
 
     # Borders without a picture match each other at any disparity.
-    is_picture = _shows_picture(left, right, disparity_px)
+    is_picture = _find_picture_pixels(left, right, disparity_px)
     confidence = coarse.confidence
     if confidence is not None:
         confidence = confidence.where(is_picture, 0.0)
@@ -158,7 +158,7 @@ def _search_of_narrow_copy(matcher: NetworkMatcher, width: int, infinity_px: flo
     return SearchRange(scale=scale, first_px=first_px, span_px=span_px)
 
 
-def _shows_picture(left: Tensor, right: Tensor, disparity_px: Map) -> Mask:
+def _find_picture_pixels(left: Tensor, right: Tensor, disparity_px: Map) -> Mask:
     """Find the left pixels of which neither they nor their matches lie in a blank border."""
     left_blank = find_blank_borders(left).to(disparity_px.device)
     right_blank = find_blank_borders(right).to(disparity_px)
@@ -180,7 +180,7 @@ def choose_search_range(
         size: rows and columns of the images.
         camera: camera of the left image, where it is known.
     """
-    scale, usual_span_px = _usual_scale_and_span(matcher, size, camera)
+    scale, usual_span_px = _choose_usual_scale_and_span(matcher, size, camera)
     high_px = measured.high_px
     if matcher.config.max_disparity_px is not None:
         high_px = matcher.config.max_disparity_px
@@ -195,7 +195,7 @@ def choose_search_range(
     return SearchRange(scale=scale, first_px=first_px, span_px=searched_px)
 
 
-def _usual_scale_and_span(
+def _choose_usual_scale_and_span(
     matcher: NetworkMatcher, size: Sequence[int], camera: Camera | None
 ) -> tuple[float, int]:
     """Compute the scale and the span of a search, where the disparities need no wider span.
@@ -209,7 +209,7 @@ def _usual_scale_and_span(
     """
     trained = matcher.network_config
     if camera is not None and trained.work_focal_px is not None:
-        scale = matcher.work_focal_px(camera) / float(camera.K[0, 0])
+        scale = matcher.matching_focal_px(camera) / float(camera.K[0, 0])
         return scale, matcher.work_disparities(camera)
     if matcher.config.speed == "quick" or trained.work_focal_px is None:
         return 1.0, trained.max_disparity_px

@@ -66,7 +66,7 @@ def add_house(builder: MeshBuilder, plot: Plot, *, with_details: bool) -> None:
             _add_windowed_wall(builder, wall, style, wall_m, plot.height_m)
         else:
             face = UNIT_SQUARE * [wall_m, plot.height_m]
-            builder.add_quads([wall.at(face)], [face], style.wall)
+            builder.add_quads([wall.to_space(face)], [face], style.wall)
 
     if rng.random() < 0.7:
         _add_gable_roof(builder, plot, style)
@@ -103,9 +103,13 @@ class _Wall(NamedTuple):
     along: Float[np.ndarray, "3"]  # unit vector
     outward: Float[np.ndarray, "3"]  # unit vector
 
-    def at(self, across_up: np.ndarray, out_m: Number = 0.0) -> np.ndarray:
-        """Convert points (..., 2) on the wall [m] to space (..., 3), ``out_m`` in front of it."""
-        points = self.corner + across_up[..., :1] * self.along + across_up[..., 1:] * _UP
+    def to_space(self, along_and_up: np.ndarray, out_m: Number = 0.0) -> np.ndarray:
+        """Convert points of the wall to points in space (..., 3) [m].
+
+        ``along_and_up``: distances (..., 2) from the corner, along the wall and up [m]; ``out_m``:
+        distance in front of the wall.
+        """
+        points = self.corner + along_and_up[..., :1] * self.along + along_and_up[..., 1:] * _UP
         return points + out_m * self.outward
 
 
@@ -115,11 +119,11 @@ def _add_windowed_wall(
     """Add a wall of a length and height [m] with recessed windows."""
     rng = builder.rng
     panels, windows = _divide_wall(style, length, height)
-    builder.add_quads(wall.at(panels), panels + rng.uniform(0, 5, 2), style.wall)
+    builder.add_quads(wall.to_space(panels), panels + rng.uniform(0, 5, 2), style.wall)
 
     # Panes behind the wall, some of them covered by blinds or curtains.
-    outer = wall.at(windows)
-    inner = wall.at(windows, -style.recess_m)
+    outer = wall.to_space(windows)
+    inner = wall.to_space(windows, -style.recess_m)
     count = len(windows)
     uv = UNIT_SQUARE + rng.integers(0, 8, (count, 1, 2))
     is_covered = rng.random((count, 1)) < 0.3
@@ -157,7 +161,7 @@ def _divide_wall(
     y = np.concatenate([[0], np.stack([sill, top], 1).ravel(), [height]])
     x0, y0 = np.meshgrid(x[:-1], y[:-1], indexing="ij")
     x1, y1 = np.meshgrid(x[1:], y[1:], indexing="ij")
-    cells = _rectangle_corners(x0, x1, y0, y1)
+    cells = _make_rectangle_corners(x0, x1, y0, y1)
     is_window = np.zeros(cells.shape[:2], bool)
     is_window[1::2, 1::2] = True
     return cells[~is_window], cells[is_window]
@@ -179,28 +183,28 @@ def _add_window_details(
     bar = _FRAME_BAR_M
     frames = np.concatenate(
         [
-            _rectangle_corners(left, left + bar, low, high),
-            _rectangle_corners(right - bar, right, low, high),
-            _rectangle_corners(middle - bar / 2, middle + bar / 2, low, high),
-            _rectangle_corners(left, right, high - bar, high),
-            _rectangle_corners(left, right, low, low + bar),
+            _make_rectangle_corners(left, left + bar, low, high),
+            _make_rectangle_corners(right - bar, right, low, high),
+            _make_rectangle_corners(middle - bar / 2, middle + bar / 2, low, high),
+            _make_rectangle_corners(left, right, high - bar, high),
+            _make_rectangle_corners(left, right, low, low + bar),
         ]
     )
     wood = Appearance("wood", style.frame)
-    builder.add_quads(wall.at(frames, 0.03 - style.recess_m), frames, wood)
+    builder.add_quads(wall.to_space(frames, 0.03 - style.recess_m), frames, wood)
 
     # Sills: their fronts, which stand out from the wall, and their tops.
     sill_m = 0.12
     stone = Appearance("concrete", (0.4, 0.39, 0.36))
-    face = _rectangle_corners(left - 0.1, right + 0.1, low - 0.09, low)
-    front = wall.at(face, sill_m)
-    back = wall.at(face)
+    face = _make_rectangle_corners(left - 0.1, right + 0.1, low - 0.09, low)
+    front = wall.to_space(face, sill_m)
+    back = wall.to_space(face)
     builder.add_quads(front, face, stone)
     top = np.stack([front[:, 3], front[:, 2], back[:, 2], back[:, 3]], 1)
     builder.add_quads(top, UNIT_SQUARE * [1, sill_m], stone)
 
 
-def _rectangle_corners(
+def _make_rectangle_corners(
     x0: np.ndarray, x1: np.ndarray, y0: np.ndarray, y1: np.ndarray
 ) -> np.ndarray:
     """Return the corners (..., 4, 2) of rectangles between x0 and x1, y0 and y1, in turn."""

@@ -48,7 +48,7 @@ def scan(stage: Stage, rng: np.random.Generator) -> Float[Tensor, "n 4"]:
 
     primitive, range_m = _intersect(stage, beams)
     tint = stage.attributes[primitive.clamp(min=0), TINT].mean(1)
-    lost_share = _lost_share(stage, primitive, range_m, tint)
+    lost_share = _estimate_lost_share(stage, primitive, range_m, tint)
     chance = torch.from_numpy(rng.random(len(primitive)))
     is_returned = (primitive >= 0) & (range_m < _MAX_RANGE_M) & (chance > lost_share)
 
@@ -78,7 +78,9 @@ def _intersect(stage: Stage, beams: Float64[Tensor, "n 3"]) -> tuple[Indices, Nu
     return nearest.primitive, nearest.depth_m / beams[:, 2]
 
 
-def _lost_share(stage: Stage, primitive: Indices, range_m: Numbers, tint: Numbers) -> Numbers:
+def _estimate_lost_share(
+    stage: Stage, primitive: Indices, range_m: Numbers, tint: Numbers
+) -> Numbers:
     """Estimate the share of beams that do not return: many of glass, and of far dark surfaces.
 
     ``tint``: mean of the channels of each surface.

@@ -220,7 +220,7 @@ class MeshBuilder:
         p = np.asarray(start, np.float64)
         q = np.asarray(stop, np.float64)
         length = float(np.linalg.norm(q - p))
-        across, other = _perpendicular_axes((q - p) / length)
+        across, other = _find_perpendicular_axes((q - p) / length)
         angle = np.linspace(0, 2 * np.pi, sides + 1)
         ring = np.cos(angle)[:, None] * across + np.sin(angle)[:, None] * other
 
@@ -249,7 +249,7 @@ class MeshBuilder:
         """
         middle = np.asarray(centre, np.float64)
         direction = np.asarray(axis, np.float64)
-        across, other = _perpendicular_axes(direction / np.linalg.norm(direction))
+        across, other = _find_perpendicular_axes(direction / np.linalg.norm(direction))
         angle = np.linspace(0, 2 * np.pi, sides + 1) + np.pi / sides
         unit_rim = np.stack([np.cos(angle), np.sin(angle)], -1)
         rim = middle + radius_m * (unit_rim[:, :1] * across + unit_rim[:, 1:] * other)
@@ -353,7 +353,7 @@ def _make_mesh(
     """
     n = len(corners)
     if normals is None:
-        normals = _plane_normals(corners)[:, None]
+        normals = _compute_plane_normals(corners)[:, None]
     return Mesh(
         corners=corners,
         uv=_broadcast(uv, (n, 3, 2)),
@@ -365,7 +365,7 @@ def _make_mesh(
     )
 
 
-def _plane_normals(corners: Float32[np.ndarray, "n 3 3"]) -> Float32[np.ndarray, "n 3"]:
+def _compute_plane_normals(corners: Float32[np.ndarray, "n 3 3"]) -> Float32[np.ndarray, "n 3"]:
     """Compute the unit normals of triangles; zero where a triangle has no area."""
     # The cross product of two sides, written out: np.cross is several times slower.
     ax, ay, az = (corners[:, 1] - corners[:, 0]).T
@@ -390,7 +390,7 @@ def _split_quads(quads: np.ndarray) -> np.ndarray:
     return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
 
 
-def _perpendicular_axes(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _find_perpendicular_axes(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return two unit vectors perpendicular to a unit vector and to each other."""
     aside = np.array([0.0, 1, 0]) if abs(direction[1]) < 0.9 else np.array([0.0, 0, 1])
     across = np.cross(aside, direction)

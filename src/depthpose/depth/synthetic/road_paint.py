@@ -46,7 +46,7 @@ def paint_road(
     worn = albedo * (factor * (1 - 0.35 * seam * has_seams))[:, None]
 
     # Paint, worn off in places.
-    cover = _marked_share(markings, x, s, width_m, length_m)
+    cover = _compute_marked_share(markings, x, s, width_m, length_m)
     wear = torch.sigmoid(3 * (look_up_noise(make_textures().stains, x * 0.13, s * 0.13) + 1.4))
     paint_share = (cover * markings.brightness * (0.3 + 0.7 * wear))[:, None]
     paint_color = worn.new_tensor([0.8, 0.8, 0.77])
@@ -73,7 +73,7 @@ def _paint_patches(
     return torch.where(is_cover, factor * 0.5, factor)
 
 
-def _marked_share(
+def _compute_marked_share(
     markings: Markings, x: Numbers, s: Numbers, width_m: Numbers, length_m: Numbers
 ) -> Numbers:
     """Compute the share of each pixel's footprint that is marked: far lines are narrower than it.
@@ -82,23 +82,23 @@ def _marked_share(
     """
     cover = torch.zeros_like(x)
     for line in markings.lines:
-        share = _covered_share(x - line.x_m, line.half_width_m, width_m)
+        share = _compute_covered_share(x - line.x_m, line.half_width_m, width_m)
         if line.dash_m < line.period_m:
             from_dash = s % line.period_m - line.period_m / 2
-            share = share * _covered_share(from_dash, line.dash_m / 2, length_m)
+            share = share * _compute_covered_share(from_dash, line.dash_m / 2, length_m)
         cover = torch.maximum(cover, share)
     for bar in markings.bars:
         middle_x = (bar.first_x_m + bar.last_x_m) / 2
         half_x = (bar.last_x_m - bar.first_x_m) / 2
-        share = _covered_share(s - bar.s_m, bar.half_length_m, length_m)
-        share = share * _covered_share(x - middle_x, half_x, width_m)
+        share = _compute_covered_share(s - bar.s_m, bar.half_length_m, length_m)
+        share = share * _compute_covered_share(x - middle_x, half_x, width_m)
         if bar.is_striped:  # stripes of half a metre, one each metre
-            share = share * _covered_share(x % 1.0 - 0.5, 0.25, width_m)
+            share = share * _compute_covered_share(x % 1.0 - 0.5, 0.25, width_m)
         cover = torch.maximum(cover, share)
     return cover
 
 
-def _covered_share(offset_m: Numbers, half_m: float, footprint_m: Numbers) -> Numbers:
+def _compute_covered_share(offset_m: Numbers, half_m: float, footprint_m: Numbers) -> Numbers:
     """Compute the share of a footprint that lies within ``half_m`` of a line, in one dimension.
 
     ``offset_m``: distance of the footprint's centre from the line. Exact for footprints narrower

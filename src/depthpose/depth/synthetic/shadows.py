@@ -143,7 +143,7 @@ but was chosen, with the other light, until streets looked like KITTI's."""
 def sky_openness(sky_map: ShadowMap, points: Vectors) -> Numbers:
     """Estimate how open each point is to the sky (ambient occlusion), 1 where none is hidden.
 
-    Of five texels around a point on the sky's map, each that is higher hides a part of the sky.
+    Five texels around the point are read on the sky's map; each that is higher hides a part.
     """
     column, row, depth_m = sky_map.project(points)
     side = len(sky_map.depth_m)

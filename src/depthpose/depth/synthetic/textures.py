@@ -121,10 +121,13 @@ def look_up_noise(noise: Float[Tensor, "256 256"], u: Numbers, v: Numbers) -> Nu
     return noise.flatten().index_select(0, row * SIDE_PX + column)
 
 
+_RISE_JOINTS = 0.6  # distance over which a joint blends into a brick, in widths of the joint
+
+
 class _Bond(NamedTuple):
     """A bond of bricks, slabs, tiles or boards."""
 
-    is_brick: Float[np.ndarray, "256 256"]  # 1 on the bricks, 0 in the joints, between at edges
+    brick_blend: Float[np.ndarray, "256 256"]  # 1 on bricks, 0 in joints, between at their edges
     shade: ColorTexture  # a random factor of the colour for each brick
     height_in_row: Float[np.ndarray, "256 256"]  # 0 at the lower edge of the brick's row, to 1
 
@@ -190,12 +193,14 @@ class _Noise:
         # Distance to the nearest edge of the brick, in heights of a row.
         to_side = np.minimum(in_column, 1 - in_column) * rows / columns
         edge = np.minimum(to_side, np.minimum(in_row, 1 - in_row))
-        is_brick = np.clip((edge - joint_rows / 2) / (joint_rows * 0.6), 0, 1)
+        # From the joint to the brick the blend rises linearly.
+        rise_rows = _RISE_JOINTS * joint_rows
+        brick_blend = np.clip((edge - joint_rows / 2) / rise_rows, 0, 1)
 
         # A grey shade of each brick, and a smaller deviation of each channel.
         shade = 1 + spread * self.rng.normal(size=(rows, columns, 1))
         shade = shade + 0.3 * spread * self.rng.normal(size=(rows, columns, 3))
-        return _Bond(is_brick, shade[row, column].astype(np.float32), in_row)
+        return _Bond(brick_blend, shade[row, column].astype(np.float32), in_row)
 
 
 def _paint_road(noise: _Noise, variant: int) -> GreyTexture:
@@ -236,7 +241,7 @@ def _paint_pavement(noise: _Noise, variant: int) -> ColorTexture:
     grey = np.ones((SIDE_PX, SIDE_PX), np.float32)
     grey = grey + 0.08 * noise.draw_rough()
     grey = grey + 0.14 * noise.draw_fine()
-    return slabs.shade * (grey * (0.55 + 0.45 * slabs.is_brick))[..., None]
+    return slabs.shade * (grey * (0.55 + 0.45 * slabs.brick_blend))[..., None]
 
 
 def _paint_stone(noise: _Noise, variant: int) -> ColorTexture:
@@ -246,7 +251,7 @@ def _paint_stone(noise: _Noise, variant: int) -> ColorTexture:
     grey = np.ones((SIDE_PX, SIDE_PX), np.float32)
     grey = grey + 0.09 * noise.draw_fine()
     grey = grey + 0.12 * noise.draw_rough()
-    return blocks.shade * (grey * (0.55 + 0.45 * blocks.is_brick))[..., None]
+    return blocks.shade * (grey * (0.55 + 0.45 * blocks.brick_blend))[..., None]
 
 
 def _paint_brick(noise: _Noise, variant: int) -> ColorTexture:
@@ -254,7 +259,7 @@ def _paint_brick(noise: _Noise, variant: int) -> ColorTexture:
     bricks = noise.draw_bond(24, (8, 6, 10)[variant], 0.1, 0.16)
     wall = bricks.shade * (1 + 0.1 * noise.draw_fine() + 0.08 * noise.draw_rough())[..., None]
     joint = (1.3 + 0.08 * noise.draw_fine())[..., None] * np.array([0.9, 1.3, 1.5])
-    wall = np.where(bricks.is_brick[..., None] > 0.5, wall, joint)
+    wall = np.where(bricks.brick_blend[..., None] > 0.5, wall, joint)
     return wall * (1 + 0.1 * noise.draw_broad())[..., None]
 
 
@@ -300,7 +305,7 @@ def _paint_wood(noise: _Noise, variant: int) -> ColorTexture:
     """Paint six boards side by side, with grain; those of variant 0 have no gaps between them."""
     boards = noise.draw_bond(1, 6, 0.03 * variant + 1e-3, 0.08)
     grain = 0.2 * noise.draw(1.4, (2, 128), (0.15, 1)) + 0.05 * noise.draw_fine()
-    return boards.shade * ((1 + grain) * (0.5 + 0.5 * boards.is_brick))[..., None]
+    return boards.shade * ((1 + grain) * (0.5 + 0.5 * boards.brick_blend))[..., None]
 
 
 def _paint_metal(noise: _Noise, variant: int) -> GreyTexture:

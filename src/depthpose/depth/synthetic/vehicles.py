@@ -167,7 +167,7 @@ def _add_wheel(
     builder.add_disc(hub + np.array([side * 0.012, 0, 0]), axis, radius * 0.66, rim, 12)
 
 
-def _sill_height(height_m: float) -> float:
+def _compute_sill_height(height_m: float) -> float:
     """Compute the height of a body's lower edge [m]."""
     return 0.16 * min(height_m, 1.8) + 0.03
 
@@ -184,7 +184,7 @@ def _make_section(
     position, belt_share, roof_share = station
     belt = belt_share * height
     roof = roof_share * height
-    sill = _sill_height(height)
+    sill = _compute_sill_height(height)
 
     # Both ends are a tenth narrower, and the roof is narrower than the belt.
     half_width = width / 2 * (1 - 0.1 * abs(2 * position) ** 6)
@@ -206,7 +206,7 @@ def _add_fittings(builder: MeshBuilder, length: float, width: float, height: flo
     A tall one gets a rear window too: its rear is upright.
     """
     light_height = min(height, 1.6)  # lights of tall vehicles are no higher than those of a car
-    sill = _sill_height(height)
+    sill = _compute_sill_height(height)
     white = Appearance("lamp", (0.8, 0.81, 0.83))
     red = Appearance("lamp", (0.4, 0.02, 0.02))
     underbody = (width * 0.9, 0.14, length * 0.94)

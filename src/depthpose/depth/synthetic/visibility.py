@@ -149,9 +149,11 @@ def render_light(stage: Stage, visibility: Visibility) -> Float[Tensor, "h w 3"]
         visibility.raster.depth_m.flatten(),
     )
     light = torch.zeros(height * width, 3)
-    light[inner] = _light_of_rays(stage, visibility, centres[inner], at_centre.select(inner))
+    light[inner] = _compute_light_of_rays(
+        stage, visibility, centres[inner], at_centre.select(inner)
+    )
     if len(edge):
-        light[edge] = _light_of_edges(
+        light[edge] = _compute_light_of_edges(
             stage, visibility, edge, centres[edge], at_centre.select(edge)
         )
     return light.reshape(height, width, 3)
@@ -184,7 +186,7 @@ def _find_edge_pixels(stage: Stage, raster: Raster) -> Bool[Tensor, "h w"]:
     return is_edge
 
 
-def _light_of_edges(
+def _compute_light_of_edges(
     stage: Stage,
     visibility: Visibility,
     index: Indices,
@@ -214,11 +216,11 @@ def _light_of_edges(
         )
         samples.append(filled)
     nearest = Nearest(*(torch.cat(parts) for parts in zip(*samples, strict=True)))
-    light = _light_of_rays(stage, visibility, torch.cat(places), nearest)
+    light = _compute_light_of_rays(stage, visibility, torch.cat(places), nearest)
     return light.clamp(max=_MAX_SAMPLE_LIGHT).reshape(len(places), -1, 3).mean(0)
 
 
-def _light_of_rays(
+def _compute_light_of_rays(
     stage: Stage, visibility: Visibility, pixels: Float64[Tensor, "n 2"], nearest: Nearest
 ) -> Vectors:
     """Compute the linear RGB that comes along rays, from the nearest triangle or the sky.

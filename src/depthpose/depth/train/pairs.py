@@ -149,7 +149,7 @@ class TrainingPairs:
             name = source.frames[number].name
             views = source.read_input(number)
             rig = views.camera if isinstance(views.camera, StereoRig) else None
-            left_px = _truth_of_frame(source, number, kind, rig)
+            left_px = _read_truth(source, number, kind, rig)
             right_px = None
         else:
             name = f"street {number}"
@@ -201,7 +201,7 @@ def _list_pairs(config: PairsConfig, *, needs_truth: bool, is_mixed: bool) -> li
     for folder_number, folder in enumerate(config.folders):
         dataset = open_dataset(folder, config.split if folder_number == 0 else None)
         missing -= {frame.name for frame in dataset.frames}
-        usable = _usable_pairs(dataset, config, needs_truth=needs_truth, is_mixed=is_mixed)
+        usable = _list_usable_pairs(dataset, config, needs_truth=needs_truth, is_mixed=is_mixed)
         sources.append(usable)
     if missing:
         raise InputError(
@@ -218,7 +218,7 @@ def _spread_evenly(refs: list[_PairRef], limit: int | None) -> list[_PairRef]:
     return [refs[round(k * last / max(count - 1, 1))] for k in range(count)]
 
 
-def _truth_of_frame(
+def _read_truth(
     dataset: Dataset, number: int, kind: TruthKind | None, rig: StereoRig | None
 ) -> Map | None:
     """Read the true disparity of a frame's left view [px] from a kind of truth, 0 in the sky.
@@ -253,7 +253,7 @@ def _with_sky_at_zero(exact_px: Map | None, kind: TruthKind | None) -> Map | Non
     return None if exact_px is None or kind is None else exact_px.nan_to_num(0.0)
 
 
-def _usable_pairs(
+def _list_usable_pairs(
     dataset: Dataset, config: PairsConfig, *, needs_truth: bool, is_mixed: bool
 ) -> list[_PairRef]:
     """List the pairs of a folder that can be learnt from, with one kind of truth if it is needed.

@@ -17,7 +17,13 @@ from depthpose.core.checkpoint import (
     warn_of_terms,
 )
 from depthpose.core.errors import InputError
-from depthpose.core.loop import Task, TrainingRun, format_held_out, releases_folder, write_card
+from depthpose.core.loop import (
+    Task,
+    TrainingRun,
+    format_last_validation,
+    releases_folder,
+    write_card,
+)
 from depthpose.core.run import find_rank
 from depthpose.depth.config import GeneratorConfig, PairsConfig, SelectionConfig
 from depthpose.depth.datasets import FramePaths, refuse_shared_frames
@@ -130,7 +136,7 @@ def _open_held_out(config: PairsConfig | None, *, needs_truth: bool) -> Training
 def train_view(config: ViewTraining, run: TrainingRun) -> Path:
     """Train the U-Net generator; return the path of its weights."""
     torch.manual_seed(config.loop.seed)
-    config = _at_virtual_focal(config, config.generator)
+    config = _with_virtual_focal(config, config.generator)
     baseline_m = config.generator.virtual_baseline_m
     pairs = TrainingPairs(config.pairs, config.loop.seed, needs_truth=False, baseline_m=baseline_m)
     held_out = _open_held_out(config.held_out, needs_truth=False)
@@ -148,7 +154,7 @@ def train_select(config: SelectTraining, run: TrainingRun) -> Path:
     torch.manual_seed(config.loop.seed)
     rig = config.generator
     seed = config.loop.seed
-    config = _at_virtual_focal(config, rig)
+    config = _with_virtual_focal(config, rig)
     sources = [
         TrainingPairs(
             pairs, seed, needs_truth=True, is_mixed=True, baseline_m=rig.virtual_baseline_m
@@ -214,7 +220,7 @@ def train_finetune(config: FinetuneTraining, run: TrainingRun) -> Path:
         generator.config = replace(generator.config, least_confidence=0.0, with_street=False)
         generator.street = None
     matcher = read_matcher(find_weights(config.matcher))
-    config = _at_virtual_focal(config, generator.config)
+    config = _with_virtual_focal(config, generator.config)
     baseline_m = generator.config.virtual_baseline_m
     pairs = TrainingPairs(config.pairs, config.loop.seed, needs_truth=True, baseline_m=baseline_m)
     held_out = _open_held_out(config.held_out, needs_truth=True)
@@ -263,7 +269,7 @@ def _run_stage(
     if samples.truths:
         checksums["truth"] = list(samples.truths)
     if frames:
-        checksums["frames_sha256"] = _frames_sha256(frames)
+        checksums["frames_sha256"] = _hash_frames(frames)
 
     facts = _describe_training(config, samples.truths, tuple(initial_weights.values()))
     warn_of_terms(facts)
@@ -310,7 +316,7 @@ def _describe_training(
     return add_terms(facts, began_with)
 
 
-def _frames_sha256(frames: Sequence[FramePaths]) -> str:
+def _hash_frames(frames: Sequence[FramePaths]) -> str:
     """Hash the names of frames and the sizes of their left images."""
     digest = sha256()
     for frame in frames:
@@ -341,12 +347,12 @@ def _write_weights(
         return path  # the statistics of batch norm that count are those of rank 0
 
     write_depth_weights(path, generator=generator, matcher=matcher, facts=facts)
-    measured = format_held_out(run.folder, _VALIDATION_TEXTS[stage])
+    measured = format_last_validation(run.folder, _VALIDATION_TEXTS[stage])
     write_card(path, f"depth train {stage}", seconds, facts, measured)
     return path
 
 
-def _at_virtual_focal(
+def _with_virtual_focal(
     config: _GeneratorTraining, generator: GeneratorConfig | SelectionConfig
 ) -> _GeneratorTraining:
     """Return the config with the focal length of the generator's rig for pairs without one.

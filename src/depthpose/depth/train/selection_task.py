@@ -132,8 +132,8 @@ class SelectTask:
     def step(self, batch: SelectionSample) -> Iterator[Update]:
         """Estimate disparities and synthesise right views; yield the generator's one update."""
         left_logits, right_logits = self.generator(batch.degraded)
-        left_loss = self._disparity_loss(left_logits, batch.left_px)
-        right_loss = self._disparity_loss(right_logits, batch.right_px)
+        left_loss = self._compute_disparity_loss(left_logits, batch.left_px)
+        right_loss = self._compute_disparity_loss(right_logits, batch.right_px)
         loss = left_loss + self.config.right_share * right_loss
         facts = {"left": left_loss.detach(), "right": right_loss.detach()}
 
@@ -149,7 +149,7 @@ class SelectTask:
             facts["view"] = view_loss.detach()
         yield Update("generator", loss, facts)
 
-    def _disparity_loss(
+    def _compute_disparity_loss(
         self, logits: Float[Tensor, "b k rows columns"], truth_px: Maps
     ) -> Float[Tensor, ""]:
         """Compute the loss of one view's disparity, and of its classes where they have a weight."""

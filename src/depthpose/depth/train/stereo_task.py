@@ -129,7 +129,7 @@ def validate_pairs(
         generator: synthesises the right views, in place of the real ones.
 
     Returns:
-        Means over pairs: end-point error [px] and share of bad pixels; of a matcher that recognises
+        Means over pairs: end-point error [px] and share of bad pixels; for a matcher that knows
         the sky, shares of the sky that is missed and of the rest that is taken for sky. Pixels
         taken for sky have a disparity of 0. The picture is of the first pair.
     """

@@ -41,7 +41,7 @@ def read_labels(
 ) -> Int64[Tensor, "mask_h mask_w"]:
     """Read a mask file of any kind: 0 where it is black or transparent, a number for each object.
 
-    Of a picture in colour they are 1, 2, ... in the order of the colours. In a photograph, or a
+    In a colour picture the numbers are 1, 2, ... in the order of the colours. In a photograph, or a
     picture of one colour, with an alpha channel the opaque pixels are the object. A ``.json`` file
     holds COCO's run lengths (``size`` and ``counts``, compressed or not), an annotation or a
     detection with such a ``segmentation``, or a list of one of these.

@@ -308,7 +308,7 @@ PVNET_DIAMETERS_M = {
     1: 0.097430, 2: 0.286908, 4: 0.171593, 5: 0.193416, 6: 0.152633, 8: 0.259425, 9: 0.107131,
     10: 0.176364, 11: 0.164857, 12: 0.148204, 13: 0.303153, 14: 0.285155, 15: 0.208394,
 }  # fmt: skip
-"""Of LineMOD's 13 objects by BOP's number, as PVNet's published evaluation has them."""
+"""Diameters of LineMOD's 13 objects by BOP's number, as PVNet's published evaluation has them."""
 
 _LARGEST_DIFFERENCE = 0.25
 """Largest share by which PVNet's diameter of an object differs from the model's: an object that
@@ -473,7 +473,7 @@ def _summarise_objects(
     contexts: Mapping[int, ErrorContext],
     rows: Sequence[InstanceRow],
 ) -> list[ObjectRow]:
-    """Summarise each object; of several also their mean, and all instances.
+    """Summarise each object; if there are several, also their mean, and all instances.
 
     Args:
         dataset: with the instances.

@@ -211,7 +211,7 @@ def _sample_colors(scene: Any, *, is_file_missing: bool) -> _Samples | None:  # 
     corners = torch.from_numpy(np.concatenate([vertices[mesh.faces] for mesh, vertices in pairs]))
     face, barycentric = spread_over_triangles(corners, _AVERAGED * _SAMPLES)
     points = (corners[face] * barycentric[..., None]).sum(-2)
-    normals = torch.nn.functional.normalize(_outward_normals(corners)[face], dim=-1)
+    normals = torch.nn.functional.normalize(_compute_outward_normals(corners)[face], dim=-1)
 
     # The colours of the samples of each mesh, whose faces follow those of the mesh before.
     rgb = torch.full((len(face), 3), torch.nan, dtype=torch.float64)
@@ -234,7 +234,7 @@ def _sample_colors(scene: Any, *, is_file_missing: bool) -> _Samples | None:  # 
     return _Samples(points[has_color], normals[has_color], rgb[has_color])
 
 
-def _outward_normals(corners: Float64[Tensor, "f 3 3"]) -> Float64[Tensor, "f 3"]:
+def _compute_outward_normals(corners: Float64[Tensor, "f 3 3"]) -> Float64[Tensor, "f 3"]:
     """Compute the normals of a surface's triangles, outward, each as long as its doubled area."""
     sides = corners[:, 1:] - corners[:, :1]
     normals = torch.linalg.cross(sides[:, 0], sides[:, 1])

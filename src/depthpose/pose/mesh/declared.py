@@ -36,7 +36,8 @@ _SAME_RAD = 0.005  # angle up to which two rotations are the same
 _CONTRADICTED = 0.02
 """Deviation in diameters beyond which a notice doubts a declared symmetry: at it, the certainty of
 one found in the shape is one half."""
-_CHECKED = 12  # rotations of a symmetry that are measured
+_FREE_AXIS_TURNS = 12  # rotations in a full circle by which a free axis is measured
+_LEAST_MEASURED = 24  # rotations of a symmetry that are measured at least, where it has as many
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -48,8 +49,8 @@ class DeclaredTurns:
 
     @property
     def angles_rad(self) -> Float64[Tensor, " a"]:
-        """Angles of all rotations but that by 0; of a free axis eleven, by which it is measured."""
-        count = self.turns or _CHECKED
+        """Angles of all rotations but that by 0; a free axis is measured by eleven of its own."""
+        count = self.turns or _FREE_AXIS_TURNS
         return torch.arange(1, count, dtype=torch.float64) * (2 * math.pi / count)
 
 
@@ -252,7 +253,7 @@ _AXIS_STEPS = 20  # by which an axis is placed
 _NEAREST_SHARE = (
     0.9  # of the points, which place an axis: a keyway, without a counterpart, does not
 )
-_COMPARED_TURNS = 6  # rotations, about so many, by which places of an axis are compared
+_COMPARED_TURNS = 6  # approximate number of rotations by which places of an axis are compared
 
 
 def _find_point_on_axis(
@@ -305,10 +306,11 @@ def _measure_deviation(
     declared: Symmetries, surface: SurfaceDeviation, model: ObjectModel
 ) -> float:
     """Measure how far the surface lies off itself after the worst rotation, in diameters."""
-    # Of many rotations some are measured.
-    turns = symmetry_transforms(declared, 2 * math.pi / _CHECKED / 2).double()[1:]
-    turns = turns[:: max(1, len(turns.R) // (2 * _CHECKED))]
+    # All rotations but the identity. Of 48 or more every second, third, ... is measured: 24 to 47.
+    half_step_rad = math.pi / _FREE_AXIS_TURNS
+    turns = symmetry_transforms(declared, half_step_rad).double()[1:]
+    turns = turns[:: max(1, len(turns.R) // _LEAST_MEASURED)]
 
-    # From the model's frame and metres to the surface's centre and unit.
-    moved_m = turns.R @ surface.centre_m + turns.t_m - surface.centre_m
-    return float(surface.deviation(turns.R, moved_m / model.diameter_m).max())
+    # A point c + p moves to R (c + p) + t = c + R p + shift: the same motion about the centre c.
+    shift_m = turns.R @ surface.centre_m + turns.t_m - surface.centre_m
+    return float(surface.deviation(turns.R, shift_m / model.diameter_m).max())

@@ -110,8 +110,8 @@ def _clean_surface(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Drop faces without area, repeated faces, and small bodies far from the part.
 
-    Of faces on the same three points the first stays: a face and its reverse would cancel in the
-    normals. Holes are no flaw.
+    Where faces have the same three points, the first stays: a face and its reverse would cancel in
+    the normals. Holes are no flaw.
 
     Returns:
         Vertices and faces. Where no body is dropped, the vertices are the same, unused ones too;

@@ -218,7 +218,7 @@ def sample_surface(
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
     """Spread points evenly over the surface of a model, always the same ones.
 
-    Of a model of points some of its own are taken, evenly by their order.
+    A model of points has no faces: some of its points are taken, evenly by their order.
 
     Args:
         model: the object.
@@ -232,14 +232,16 @@ def sample_surface(
         return take_evenly(model.vertices_m, count), take_evenly(model.normals, count)
     corners = model.vertices_m[model.faces].double()
     face, barycentric = spread_over_triangles(corners, count)
-    doubled = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     points = (corners[face] * barycentric[..., None]).sum(-2)
-    normals = doubled[face] / doubled[face].norm(dim=-1, keepdim=True).clamp(min=1e-300)
+    # The cross product of two edges is normal to the face, and as long as twice its area.
+    edges = corners[:, 1:] - corners[:, :1]
+    normals = torch.linalg.cross(edges[:, 0], edges[:, 1])[face]
+    normals = normals / normals.norm(dim=-1, keepdim=True).clamp(min=1e-300)
     return points.to(model.vertices_m), normals.to(model.vertices_m)
 
 
 _MOST_POINTS = 10_000
-"""Of a model of more points so many are joined: a tetrahedralization takes a second."""
+"""Most points of a model that are joined by triangles: their tetrahedralization takes a second."""
 _NEIGHBOURS = 12
 """A triangle's circumcircle is no larger than the distance of a corner to its twelfth neighbour:
 where points are random a circle without any is seldom so large."""
@@ -416,7 +418,9 @@ def make_model(
         kept, faces = torch.unique(faces, return_inverse=True)
         vertices_m = vertices_m[kept]
     vertices_m = vertices_m.float()
-    normals = _vertex_normals(vertices_m, faces) if len(faces) else _point_normals(vertices_m)
+    normals = (
+        _average_vertex_normals(vertices_m, faces) if len(faces) else _fit_point_normals(vertices_m)
+    )
     model = ObjectModel(
         name=name,
         number=number,
@@ -436,7 +440,9 @@ def make_model(
     return replace(model, keypoints_m=candidates[farthest_points(candidates, config.keypoints)])
 
 
-def _vertex_normals(vertices_m: Float[Tensor, "v 3"], faces: Tensor) -> Float[Tensor, "v 3"]:
+def _average_vertex_normals(
+    vertices_m: Float[Tensor, "v 3"], faces: Tensor
+) -> Float[Tensor, "v 3"]:
     """Average at each vertex the normals of its faces, weighted by their areas, to unit vectors."""
     corners = vertices_m.double()[faces]
     sides = corners[:, 1:] - corners[:, :1]
@@ -447,7 +453,7 @@ def _vertex_normals(vertices_m: Float[Tensor, "v 3"], faces: Tensor) -> Float[Te
     return (total / total.norm(dim=-1, keepdim=True).clamp(min=1e-300)).to(vertices_m)
 
 
-def _point_normals(points_m: Float[Tensor, "v 3"]) -> Float[Tensor, "v 3"]:
+def _fit_point_normals(points_m: Float[Tensor, "v 3"]) -> Float[Tensor, "v 3"]:
     """Fit a plane to the nearest 16 points of each point, and compute its unit normal.
 
     It points away from the mean of all points: to the outer side of convex parts alone.
@@ -489,8 +495,8 @@ _EXACT_DISTANCES = "donot_use_mm_for_euclid_dist"  # not by a matrix product, wh
 def measure_diameter(points_m: Float[Tensor, "n 3"]) -> float:
     """Measure the largest distance of two points [m], which are corners of the convex hull.
 
-    Of a hull of more than 8,000 corners those farthest in many directions are compared: the result
-    is less than 0.05 % too short.
+    If the hull has more than 8,000 corners, those farthest in many directions are compared: the
+    result is less than 0.05 % too short.
     """
     points = np.unique(points_m.double().cpu().numpy(), axis=0)
     # Points of one plane, or fewer than four, have no hull: all of them are compared.

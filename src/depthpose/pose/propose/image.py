@@ -17,8 +17,8 @@ from depthpose.pose.surface import NEAR, Surface
 
 # Votes.
 _REFERENCE_EVERY = 8
-"""Of so many points of the scene one is a reference, which votes with each of the others: on a
-small object in a large scene enough must lie."""
+"""One in this many points of the scene is a reference, which votes with each of the others:
+enough must lie on a small object in a large scene."""
 _WANTED_REFERENCES = 600
 """References at least, if there are as many points."""
 _MOST_REFERENCES = 2000
@@ -27,10 +27,10 @@ _MOST_REFERENCES_OF_ALL = 6000
 _FEWEST_REFERENCES = 200
 """References for each object at least, however many are searched."""
 _LEAST_POINTS = 30
-"""Of a scene: with fewer nothing is proposed."""
+"""Fewest points of a scene: with fewer nothing is proposed."""
 _MOST_POINTS = 20_000
 _ORDER_SEED = 0
-"""Of the order of a scene's points, so that an image always has the same proposals."""
+"""Seed of the order of a scene's points, so that an image always has the same proposals."""
 _PEAKS = 3
 """Poses that each reference point proposes."""
 _LEAST_SCORE = 0.25
@@ -45,7 +45,7 @@ _MIN_COSINE = 0.7
 _MIN_COSINE_ICP = 0.5
 """The same in ICP, whose poses are rough."""
 _DAMPING = 0.02
-"""Of ICP, in weights of all readings: a motion that few readings constrain is suppressed."""
+"""Damping of ICP, in weights of all readings: it suppresses motions that few readings constrain."""
 
 # The score of a pose.
 _DEVIATIONS = 2.0
@@ -61,7 +61,7 @@ class _Stage(NamedTuple):
     """How closely poses are compared with an image.
 
     Attributes:
-        every: of so many visible points of the model one is compared.
+        every: n: every n-th visible point of the model is compared.
         near: distance up to which a reading lies on the surface, beside noise, in diameters.
         icp_limits: distance up to which a reading counts in each step of ICP, in diameters.
         most: poses that enter the next stage.
@@ -97,7 +97,7 @@ def propose_in_frame(
     """
     # Votes.
     surface = table.surface
-    points_m, normals = _scene_points(frame, is_unclaimed, surface)
+    points_m, normals = _average_scene_points(frame, is_unclaimed, surface)
     generator = torch.Generator().manual_seed(_ORDER_SEED)
     order = torch.randperm(len(points_m), generator=generator)[:_MOST_POINTS]
     references = torch.arange(_choose_number_of_references(len(order), models))
@@ -107,7 +107,7 @@ def propose_in_frame(
     for stage in _STAGES:
         poses = refine_projectively(frame, poses, surface, stage)
         score = score_by_image(frame, poses, surface, stage)
-        best = _choose_distinct(poses, score, surface, stage.most)
+        best = _suppress_near_duplicates(poses, score, surface, stage.most)
         poses = poses[best]
         score = score[best]
     is_good = score >= _LEAST_SCORE
@@ -126,7 +126,7 @@ def _choose_number_of_references(points: int, models: int) -> int:
     return min(points, max(_FEWEST_REFERENCES, min(wanted, most)))
 
 
-def _scene_points(
+def _average_scene_points(
     frame: Frame, is_unclaimed: Bool[Tensor, "h w"], surface: Surface
 ) -> tuple[Float64[Tensor, "n 3"], Float64[Tensor, "n 3"]]:
     """Average the points that may be of an object in cells, and their normals.
@@ -159,7 +159,7 @@ def _scene_points(
     return mean_m[is_one_surface], normalize(mean_normal[is_one_surface], dim=-1)
 
 
-def _choose_distinct(
+def _suppress_near_duplicates(
     poses: Rigid, score: Float64[Tensor, " b"], surface: Surface, most: int
 ) -> Int64[Tensor, " c"]:
     """Choose the best poses, ``most`` of them, without any near a better one; as indices."""
@@ -196,7 +196,7 @@ def refine_projectively(frame: Frame, poses: Rigid, surface: Surface, stage: _St
     is_usable = (frame.is_smooth & frame.may_show(surface.diameter_m)).flatten()
     for limit in stage.icp_limits:
         # Each visible point of the surface, and the reading in its direction.
-        visible = _find_visible_points(poses, surface, stage.every)
+        visible = _look_up_visible_points(poses, surface, stage.every)
         readings = readings_toward(frame, visible.points_m)
         normal = frame.normals.flatten(0, 1)[readings.pixel]
         gap_m = frame.points_m.flatten(0, 1)[readings.pixel] - visible.points_m
@@ -256,7 +256,7 @@ def score_by_image(
         hides; at most 1.
     """
     # The reading in the direction of each visible point, and how far behind the point it is.
-    visible = _find_visible_points(poses, surface, stage.every)
+    visible = _look_up_visible_points(poses, surface, stage.every)
     depth_m = visible.points_m[..., 2]
     readings = readings_toward(frame, visible.points_m)
     gap_m = readings.depth_m - depth_m
@@ -292,10 +292,10 @@ class _Visible(NamedTuple):
     is_inner: Bool[Tensor, "b n"]  #: whether a point is of no rim or edge, which sensors cut
 
 
-def _find_visible_points(poses: Rigid, surface: Surface, every: int) -> _Visible:
+def _look_up_visible_points(poses: Rigid, surface: Surface, every: int) -> _Visible:
     """Find the points of each posed surface that are visible in the stored view nearest to it.
 
-    ``every``: of so many of them one is taken.
+    ``every``: n: every n-th of them is taken.
     """
     views = surface.views
     camera_m = -(poses.t_m[:, None] @ poses.R)[:, 0]  # in the model frame

@@ -23,7 +23,8 @@ make its matrix indefinite."""
 _DAMPING = 1e-12
 """Share of the trace that is added to a matrix of lines, so that parallel ones have a solution."""
 _EIGENVALUE_ROUNDING = 1e-7
-"""Of a matrix of trace 2, sums in float32: a smaller eigenvalue is that of parallel lines."""
+"""Rounding error of the eigenvalues of a matrix of trace 2, whose sums are in float32: a smaller
+eigenvalue is that of parallel lines."""
 
 
 class VoteLines(NamedTuple):
@@ -227,7 +228,7 @@ def vote_ransac(
     config = VotingConfig() if config is None else config
     lines, centre_m = _make_lines(points_m, directions, weight)
     first, second = _draw_pairs(lines.weights, config)
-    hypotheses, is_crossing = _cross_pairs(lines, first, second)
+    hypotheses, is_crossing = _find_crossings(lines, first, second)
 
     # The best hypothesis. Parallel pairs score 0, as the least of all, so that one always wins.
     scorer = InlierScorer(lines, config)
@@ -272,7 +273,7 @@ def _draw_pairs(
     return voters.gather(-1, first), voters.gather(-1, second)
 
 
-def _cross_pairs(
+def _find_crossings(
     lines: VoteLines, first: Int64[Tensor, "*batch k h"], second: Int64[Tensor, "*batch k h"]
 ) -> tuple[Float[Tensor, "*batch k h 3"], Bool[Tensor, "*batch k h"]]:
     """Find where pairs of lines nearly cross: the middle of their common perpendicular.

@@ -83,7 +83,7 @@ def _describe_pair(
         first: index of the first point of the pair.
         second: index of the second.
         bin_width: of the distance.
-        feature: is written.
+        feature: output, the four fractions of bins.
 
     Returns:
         The turn [rad].
@@ -259,9 +259,9 @@ def _find_peaks(
 
     Args:
         counts: votes of each model point and turn.
-        best_point: is written: indices of the model points, that of the most votes first.
-        best_turn: is written: the bin of the turn of each.
-        best_votes: is written.
+        best_point: output: indices of the model points, that of the most votes first.
+        best_turn: output: the bin of the turn of each.
+        best_votes: output: the votes of each.
     """
     # The best turn of each model point. Neighbouring turns share their votes.
     model_points = len(counts)

@@ -56,20 +56,20 @@ def find_partial_symmetries(model: ObjectModel) -> dict[str, Any]:
     references = take_evenly(torch.arange(len(table.points_m)), _SELF_REFERENCES)
     normals = table.bases[..., 0]
     candidates, _ = vote_poses(table.points_m, normals, references, table, _SELF_PEAKS)
-    candidates = candidates[_choose_distinct(candidates, surface).indices]
+    candidates = candidates[_choose_partial_symmetries(candidates, surface).indices]
 
     # Refined as poses before a camera in the middle of the model, from where all is visible.
     points_m = surface.points_m - surface.middle_m
     starts = Rigid(candidates.R, candidates.t_m - surface.middle_m)
     candidates = refine_roughly(points_m, starts, surface, IcpConfig())
     candidates = Rigid(candidates.R, candidates.t_m + surface.middle_m)
-    candidates = candidates[_choose_distinct(candidates, surface).indices]
+    candidates = candidates[_choose_partial_symmetries(candidates, surface).indices]
 
     # Products of two are candidates too, which fill gaps between those that were found.
     products = candidates[:, None] @ candidates
     products = Rigid(products.R.flatten(0, 1), products.t_m.flatten(0, 1))
     candidates = Rigid.cat([candidates, products])
-    choice = _choose_distinct(candidates, surface)
+    choice = _choose_partial_symmetries(candidates, surface)
     matrices = candidates[choice.indices].matrix()
     return {"turns": matrices.tolist(), "near": choice.near_symmetries}
 
@@ -81,7 +81,7 @@ class _Choice(NamedTuple):
     near_symmetries: int  #: how many of the first ones are near-symmetries
 
 
-def _choose_distinct(motions: Rigid, surface: Surface) -> _Choice:
+def _choose_partial_symmetries(motions: Rigid, surface: Surface) -> _Choice:
     """Choose the motions that move the largest share of a surface onto itself.
 
     None is within 12 degrees of a better one, of a symmetry, or of a product of these; one that is

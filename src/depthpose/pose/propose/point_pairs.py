@@ -49,7 +49,7 @@ _SCORED_POINTS = 100
 _NEAR_ROUGHLY = 0.1
 """Largest distance, in diameters, of a point that is near the surface at a proposed, rough pose."""
 _SHUFFLE_SEED = 0
-"""Of the order of alike pairs, so that a model always has the same table."""
+"""Seed of the order of alike pairs, so that a model always has the same table."""
 _RAYS_EVERY = 16
 """Every so-many-th point of the surface is used to count free-space violations."""
 _UNOBSERVED_WEIGHT = 0.3
@@ -78,7 +78,7 @@ def prepare_pairs(surface: Surface) -> PairTable:
         surface: of the model; normals may point to either side.
     """
     # Points of the visible surface, few enough.
-    points_m, normals = _find_visible_points(surface)
+    points_m, normals = _find_points_seen_from_afar(surface)
     step_m = STEP * surface.diameter_m
     chosen = thin_cloud(points_m, normals, step_m)
     while len(chosen) > _MODEL_POINTS:
@@ -141,7 +141,7 @@ def propose_poses(
     return poses[best]
 
 
-def _find_visible_points(
+def _find_points_seen_from_afar(
     surface: Surface,
 ) -> tuple[Float64[Tensor, "n 3"], Float64[Tensor, "n 3"]]:
     """Find the points of a surface that far cameras see, with normals toward them.

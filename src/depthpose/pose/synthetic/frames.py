@@ -394,7 +394,7 @@ def _drop_pile(
 ) -> list[PlacedSolid]:
     """Drop copies of one object straight down until they touch; poses in the table's frame (z up).
 
-    Of several drops of each copy the one is taken by which its middle comes to lie lowest.
+    Each copy is dropped several times; the drop after which its middle lies lowest is taken.
     """
     # One of the objects, about the middle of its box.
     chosen = random_index(generator, len(solids))

@@ -23,7 +23,7 @@ class ModelsConfig(Settings):
     """Model files; each object is called as its file."""
 
     unit: Unit | None = None
-    """Of the numbers in the CAD files, which do not say it themselves."""
+    """Unit of the numbers in the CAD files, which do not say it themselves."""
 
     bop: str | None = None
     """Folder of a data set, whose models are taken in place of CAD files."""
@@ -55,17 +55,17 @@ class FramesConfig(Settings):
     """Annotated real frames among the synthetic views."""
 
     folder: str = ""
-    """Of a data set in BOP's or LineMOD's layout."""
+    """Folder of a data set in BOP's or LineMOD's layout."""
 
     split: str = "train"
     """Which part of it."""
 
     share: Annotated[float, "(0, 1]"] = 1.0
-    """Of the samples; the others are synthetic."""
+    """Share of the samples that are such frames; the others are synthetic."""
 
     with_roll: bool = True
-    """Turn the camera of a frame about its optical axis at random: as true as the frame. Of clouds
-    alone; the depth images of the regressing baseline are not turned."""
+    """Turn the camera of a frame about its optical axis at random: as true as the frame. Only
+    clouds are turned, not the depth images of the regressing baseline."""
 
     def __post_init__(self) -> None:
         if not self.folder:
@@ -78,7 +78,7 @@ class HeldOutConfig(Settings):
     """Synthetic views of the validation; no training uses one."""
 
     number: Annotated[int, "[1, inf)"] = 25
-    """Of each object at each occlusion."""
+    """Number of views of each object at each occlusion."""
 
     occlusions: Annotated[tuple[float, ...], OCCLUSIONS] = (0.0, 0.3)
     """Occluded shares of the silhouette."""
@@ -135,7 +135,7 @@ class PoseTraining(ViewsTraining):
     """The network; its classes and keypoints follow from the models."""
 
     loss: str = "mse"
-    """Of the directions: mse, cosine, l1, or another of ``pose.losses.POINT_LOSSES``."""
+    """Loss of the directions: mse, cosine, l1, or another of ``pose.losses.POINT_LOSSES``."""
 
     adam: AdamConfig = AdamConfig(learning_rate=3e-3, schedule="cosine", warmup_steps=50)
     """The optimiser."""
@@ -198,7 +198,7 @@ class ImagesConfig:
     """Annotated images of a folder in BOP's or LineMOD's layout."""
 
     folder: str = ""
-    """Of the data set."""
+    """Folder of the data set."""
 
     split: str = "train"
     """Which part of it."""
@@ -253,7 +253,7 @@ class SegmentationTraining(Settings):
     """Random changes."""
 
     object_weight: Annotated[float, "(0, inf)"] = 3.0
-    """A pixel of an object counts so many times a pixel of the background."""
+    """Weight of a pixel of an object in the loss; one of the background has 1."""
 
     adam: AdamConfig = AdamConfig(learning_rate=1e-3, schedule="cosine", warmup_steps=20)
     """The optimiser."""

@@ -156,7 +156,7 @@ def score_held_out(
     return table
 
 
-def format_held_out(table: HeldOutTable) -> str:
+def format_held_out_table(table: HeldOutTable) -> str:
     """Format a table of held-out views as Markdown."""
     lines = [
         "Synthetic views that no training saw, posed with ICP and refusal; right is an "

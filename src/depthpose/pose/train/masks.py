@@ -18,7 +18,7 @@ from depthpose.core.loop import (
     TrainingRun,
     Update,
     ValidationResult,
-    format_held_out,
+    format_last_validation,
     make_adam,
     make_sample_generator,
     releases_folder,
@@ -329,7 +329,9 @@ def train_segmentation(config: SegmentationTraining, run: TrainingRun) -> Path:
         facts=add_origin(facts, config),
     )
     write_segmentation(path, weights, with_half=config.with_half)
-    measured = format_held_out(run.folder, "Images that were held out: intersection over union.")
+    measured = format_last_validation(
+        run.folder, "Images that were held out: intersection over union."
+    )
     card = {"objects": ", ".join(weights.objects), **weights.facts}
     write_card(path, "pose train --what segmentation", seconds, card, measured)
     return path

@@ -59,7 +59,7 @@ from depthpose.pose.train.config import DepthImageTraining, PoseTraining, ViewsT
 from depthpose.pose.train.held_out import (
     HELD_OUT_SEED,
     ViewsTask,
-    format_held_out,
+    format_held_out_table,
     measure_add,
     score_held_out,
 )
@@ -79,7 +79,7 @@ _SYMMETRY_STEP_RAD = 0.05  # half the step about an axis of revolution; votes er
 class PoseTask(ViewsTask):
     """Trains directions from each point to the keypoints of its object (thesis, 3.3).
 
-    Of a symmetric object the copy of the truth is chosen once for each cloud.
+    For a symmetric object the copy of the truth is chosen once for each cloud.
     """
 
     method = "ransac"
@@ -150,7 +150,7 @@ _ROTATIONS_ON_CARD = 3  # rotations by which an object looks nearly alike, on a 
 def claim_run(config: Any, run: TrainingRun, files: Sequence[str] = ()) -> None:  # noqa: ANN401
     """Claim the folder of a run for a config, with the checksums of ``files`` and of start weights.
 
-    Of start weights with terms of their own, these are told.
+    Warns where the start weights have terms of use.
     """
     checksums: dict[str, Any] = {"sha256": [file_sha256(Path(path)) for path in files]}
     if config.start is not None:
@@ -313,7 +313,7 @@ def train_pose_network(config: PoseTraining | DepthImageTraining, run: TrainingR
     weights = read_pose_weights(path)
     held_out_rows = score_held_out(weights, config.objects, config.held_out)
     write_json(path.with_suffix(".json"), {"held_out": held_out_rows})
-    _write_pose_card(path, weights, config, seconds, format_held_out(held_out_rows))
+    _write_pose_card(path, weights, config, seconds, format_held_out_table(held_out_rows))
     return path
 
 
@@ -322,7 +322,7 @@ def _set_network_sizes(
 ) -> PoseTraining | DepthImageTraining:
     """Set the network's classes and keypoints by the objects, and its inputs by the cloud.
 
-    Of these a network has those that its config names.
+    Only those are set that the config of the network has.
     """
     sizes = {
         "classes": len(models),
@@ -384,7 +384,7 @@ def _copy_start(network: AnyNetwork, start: str, samples: TrainingViews[Any]) ->
     on depth images takes weights of the same number alone.
 
     Args:
-        network: is changed.
+        network: the network to train; changed.
         start: name or file of the weights.
         samples: from which statistics of batch norm are computed.
 
