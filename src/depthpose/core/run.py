@@ -544,9 +544,9 @@ def read_results(folder: Path) -> dict[str, dict[str, list[int]]]:
     """Read which results of a folder are finished, from ``results.jsonl``.
 
     Returns:
-        By the name of a result the stamps of its files: size [bytes] and time of the last change
-        [ns] by path, relative to the folder. A result that is to be made again has no files. Empty
-        where nothing is noted or the file cannot be read.
+        The stamps of the files of each result by its name. A stamp is the size [bytes] and the time
+        of the last change [ns] by path, relative to the folder. A result that is to be made again
+        has no files. Empty where nothing is noted or the file cannot be read.
     """
     return _read_log(folder).results
 

@@ -141,8 +141,8 @@ def sparsification_area(error: Numbers, confidence: Numbers, steps: int = 50) ->
         steps: number of steps; by default 0 %, 2 %, ..., 98 % of the pixels are removed.
 
     Returns:
-        The area between both curves, divided by the mean error of all pixels: 0 for an oracle; for
-        a constant confidence the area between the oracle's curve and 1.
+        The area between both curves, divided by the mean error of all pixels. It is 0 for an
+        oracle, and for a constant confidence the area between the oracle's curve and 1.
 
     Raises:
         InputError: no pixel at all.

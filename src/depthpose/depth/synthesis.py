@@ -84,8 +84,8 @@ def read_logits(logits: Logits, planes: Planes) -> tuple[Tensor, Tensor, Tensor]
         planes: disparities of the planes [px].
 
     Returns:
-        Three maps (b, rows, columns) of the size of the logits: the natural logarithm of the
-        disparity [px], probability, and confidence, 0..1.
+        The natural logarithm of the disparity [px], the probability of the sky, and the confidence,
+        0..1, each (b, rows, columns), of the size of the logits.
     """
     logits = logits.float()
     sky = logits.softmax(1)[:, 0]

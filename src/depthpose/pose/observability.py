@@ -23,7 +23,7 @@ def free_motions(axes: tuple[Axis, ...], camera_from_model: Rigid) -> Float[Tens
         camera_from_model: the pose.
 
     Returns:
-        Unit vectors (rotation, translation) in the camera frame: none, one, or a ball's three.
+        Unit vectors (rotation, translation) in the camera frame; none, one, or a ball's three.
     """
     # The axes: three of a ball, else one at most.
     centre_m = Symmetries(continuous=axes).ball_centre_m
@@ -105,7 +105,7 @@ def without_motions(
         free: unit vectors of (rotation, translation); without any the covariance stays as it is.
 
     Returns:
-        The covariance of the other motions: 0 along ``free``.
+        The covariance of the other motions; it is 0 along ``free``.
     """
     if len(free) == 0:
         return covariance

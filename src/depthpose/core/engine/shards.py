@@ -48,7 +48,7 @@ class ShardRecord:
     entries: tuple[tuple[str, str], ...]  #: name of each input, and "" or why it failed
     endings: tuple[str, ...]  #: endings of the files of a result
     stamp: tuple[int, ...]  #: size [bytes], time of the last change [ns] and CRC-32 of the shard
-    block: int  #: CRC-32 of the block (:func:`checksum_block`)
+    block: int  #: CRC-32 of the block (``checksum_block``)
 
     @property
     def failures(self) -> list[tuple[str, str]]:

@@ -80,7 +80,7 @@ def read_image(path: AnyPath) -> Float32[Tensor, "3 h w"]:
     """Read a picture as RGB in [0, 1].
 
     Greyscale becomes three equal channels, a palette its colours. Alpha is dropped, the EXIF
-    orientation applied, and 16 bits a channel are scaled by :func:`scale_16_bit`. Of several
+    orientation applied, and 16 bits a channel are scaled by ``scale_16_bit``. Of several
     pictures in one file the first is read, with a notice.
 
     Raises:

@@ -23,7 +23,7 @@ _ALLOWED_VALUES = (
 
 
 def rgb_from_picture(image: object, name: str = "the image") -> Float[Tensor, "3 h w"]:
-    """Read or convert a picture in any form (:data:`AnyPicture`) to RGB in [0, 1].
+    """Read or convert a picture in any form (``AnyPicture``) to RGB in [0, 1].
 
     Args:
         image: the picture; a batch of one image is taken as that image.

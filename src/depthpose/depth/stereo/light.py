@@ -107,11 +107,11 @@ class LightStereo(StereoNetwork):
         return self.sky_head
 
     def forward(self, left: Views, right: Views) -> tuple[Maps, ...]:
-        """Estimate the disparity maps of :class:`LightOutput`."""
+        """Estimate the disparity maps of ``LightOutput``."""
         return self.match_views(left, right, self.config.max_disparity_px).heads
 
     def forward_with_sky(self, left: Views, right: Views) -> tuple[tuple[Maps, ...], Maps | None]:
-        """Estimate the disparity maps of :class:`LightOutput`, and the probability of the sky."""
+        """Estimate the disparity maps of ``LightOutput``, and the probability of the sky."""
         output = self.match_views(left, right, self.config.max_disparity_px)
         return output.heads, output.sky
 

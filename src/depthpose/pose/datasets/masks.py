@@ -180,7 +180,7 @@ def mask_from_labels(labels: Int64[Tensor, "h w"], name: str) -> Bool[Tensor, "h
 
 
 def decode_rle(counts: tuple[int, ...], height: int, width: int) -> Bool[Tensor, "h w"]:
-    """Convert run lengths to a mask; the arguments are those of :class:`RunLengths`."""
+    """Convert run lengths to a mask; the arguments are those of ``RunLengths``."""
     is_object = np.arange(len(counts)) % 2 == 1  # every other run
     flat = np.repeat(is_object, counts)
     return torch.from_numpy(flat.reshape(width, height).T.copy())
