@@ -113,7 +113,7 @@ def sunlit_share(sun_maps: Sequence[ShadowMap], points: Vectors, normals: Vector
         # Whether each of the four texels about the point is lit, interpolated.
         texel = top.long() * side + left.long()
         flat_m = shadow_map.depth_m.flatten()
-        limit_m = depth_m - 0.8 * shadow_map.texel_m
+        limit_m = depth_m - 0.8 * shadow_map.texel_m  # the point's own surface may be so near
         upper_left, upper_right, lower_left, lower_right = (
             (flat_m.index_select(0, texel + step) >= limit_m).float()
             for step in (0, 1, side, side + 1)
