@@ -203,7 +203,7 @@ class _Roadside:
         height = rng.uniform(9, 15)
         s = rng.uniform(-10, -4)
         while s < _COUNTRY_FAR_M:
-            row_depths = (0.0, 4.5) if s < 60 else (0.0,)
+            row_depths = (0.0, 4.5) if s < 60 else (0.0,)  # far away one row hides the other
             for depth in row_depths:
                 x = self.x_behind_walk(edge + depth + rng.uniform(0, 2.5))
                 self.add_tree(x, s + rng.uniform(-2, 2), height * rng.uniform(0.75, 1.25))
@@ -282,7 +282,7 @@ class _Roadside:
                 self.builder.add_model(place_model(model, (x, -self.road.curb_m, s), yaw))
 
     def _add_signs_and_objects(self, x: Number) -> None:
-        """Add signs, small objects and trees; in the country guide posts are the only objects."""
+        """Add signs, small objects and trees in towns; signs and guide posts in the country."""
         rng = self.builder.rng
         s = rng.uniform(3, 12)
         is_town = self.road.place not in ("rural", "forest")

@@ -60,7 +60,7 @@ def render_shadow_map(
         corners: corners of the triangles that cast shadows [m].
         to_light: direction to the light.
         area: what the map covers.
-        share: share of its full size.
+        share: side of the map, as a share of ``area.side_px``.
     """
     # Axes of the light's frame: z away from the light.
     side_px = round(area.side_px * share)

@@ -107,7 +107,7 @@ def _add_hills(builder: MeshBuilder) -> None:
     x = _HILLS_M * np.sin(angle)
     z = _HILLS_M * np.cos(angle)
     foot_y = np.full_like(x, 90)
-    along = np.arange(len(angle)) * 12.0
+    along = np.arange(len(angle)) * 12.0  # on the texture
     faces = quads_between(np.stack([x, foot_y, z], 1), np.stack([x, -height, z], 1))
     uv = quads_between(np.stack([along, -foot_y], 1), np.stack([along, height], 1))
     variant = int(builder.rng.integers(2))

@@ -274,7 +274,7 @@ def _run_stage(
     facts = _describe_training(config, samples.truths, tuple(initial_weights.values()))
     warn_of_terms(facts)
     weights_files = ("generator", "matcher", "fakestereo")
-    run.claim(config, weights_files, checksums, ("held_out",))
+    run.claim(config, weights_files, more=checksums, without=("held_out",))
     return facts, run.train(task, samples, config.loop)
 
 
