@@ -164,6 +164,7 @@ def augment(pair: TrainingPair, config: AugmentConfig, generator: torch.Generato
     low, high = config.scale
     random_scale = _draw_between(low, high, generator)
     sides = zip(config.crop_px, pair.left.shape[-2:], strict=True)
+    # One pixel more than half, so that rounding leaves at least half.
     half_filling_scale = max((crop + 1) / 2 / side for crop, side in sides)
     scaled = scale_pair(pair, max(random_scale, min(half_filling_scale, high)))
 

@@ -136,7 +136,7 @@ class Handlers:
         return JSONResponse(content)
 
     async def position(self, request: Request) -> Response:
-        """Answer with the number of computations before that of a ticket, or null if none waits."""
+        """Answer with the number of computations before a ticket's; null if it does not wait."""
         ticket = request.path_params["ticket"]
         waiting = self._queue.tickets
         return JSONResponse({"before": waiting.index(ticket) if ticket in waiting else None})

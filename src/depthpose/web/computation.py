@@ -73,7 +73,7 @@ class Queue:
     @property
     def is_full(self) -> bool:
         """Whether no further request may wait."""
-        return len(self.tickets) > self.max_waiting
+        return len(self.tickets) > self.max_waiting  # one of them is served
 
     async def compute(
         self,

@@ -115,7 +115,7 @@ def _refuse_large_inputs(pair: StereoInput, net: FakestereoNet) -> None:
         virtual_height, virtual_width = sizes[0]
         virtual_size = (virtual_width, virtual_height)
         camera = camera_of(config.virtual_focal_px, virtual_size) or camera
-        is_matched = config.answer != "own"
+        is_matched = config.answer != "own"  # else depth is the generator's, without a matcher
     if is_matched and isinstance(net.matcher, CameraMatcher):
         sizes.append(net.matcher.work_size(camera))
     elif is_matched:
@@ -156,7 +156,7 @@ def _read_input(form: Form) -> tuple[StereoInput, str]:
             "it"
         )
 
-    # A focal length that is not given is the one of the EXIF, or guessed; a pair is not guessed.
+    # A focal length that is not given is that of the EXIF, or guessed; EXIF of a pair is not read.
     origin = ""
     if focal_px is None and "camera" not in form.files:
         exif = None if has_right else read_exif_focal(path)
@@ -165,7 +165,7 @@ def _read_input(form: Form) -> tuple[StereoInput, str]:
             origin = _GUESSED_ORIGIN
         else:
             focal_px, tags = exif
-            origin = f" (EXIF: {tags})" if tags else _GUESSED_ORIGIN
+            origin = f" (EXIF: {tags})"
 
     # The camera, by its file or by the fields.
     doffs_px = form.read_number("cx_right_minus_left_px")
@@ -232,10 +232,10 @@ def _describe_depth(pair: StereoInput, estimate: DepthEstimate) -> str:
     sky_share = 0.0 if is_sky is None else float(is_sky.float().mean())
     warning = f"Careful: {estimate.warning}. " if estimate.warning else ""
     if len(finite_m) == 0:
-        doubt = f"; {sky_share:.0%} of the image is taken for sky." if is_sky is not None else "."
+        ending = f"; {sky_share:.0%} of the image is taken for sky." if is_sky is not None else "."
         if pair.right is not None and sky_share < _MIN_SKY_SHARE:
-            doubt = ": is the pair rectified, and are left and right as they should be?"
-        return f"{warning}No pixel got a depth from {images}{doubt}"
+            ending = ": is the pair rectified, and are left and right as they should be?"
+        return f"{warning}No pixel got a depth from {images}{ending}"
     share = len(finite_m) / estimate.depth_m.numel()
     median_m = float(finite_m.median())
     sky_text = f" {sky_share:.0%} are sky." if is_sky is not None else ""

@@ -360,7 +360,7 @@ def _read_raw_calibration(folder: Path, size: Size) -> KittiCalibration:
     camera_file = folder / "calib_cam_to_cam.txt"
     lidar_file = folder / "calib_velo_to_cam.txt"
     camera_keys = files.read_key_values(camera_file)
-    raw_pair = KITTI_COLOR[1]
+    raw_pair = KITTI_COLOR[1]  # [0] is that of the object layout
     rig, left = _rig_from_projections(camera_file, camera_keys, raw_pair, size)
     if not lidar_file.is_file():
         return KittiCalibration(rig=rig, pixels_from_velodyne=None)
@@ -415,7 +415,7 @@ def read_lidar_depth(frame: FramePaths, depth: LidarDepth) -> Map:
 
 
 def _find_scan_map(frame: FramePaths) -> Path | None:
-    """Find the depth map of a LiDAR scan, if there is one; the depth of a plain folder is such."""
+    """Find the depth map of a LiDAR scan, if there is one; that of a plain folder counts as one."""
     is_plain = frame.style in ("plain", "camera") and frame.scan is None
     return frame.depth if is_plain else frame.scan
 

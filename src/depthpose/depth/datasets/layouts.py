@@ -18,9 +18,8 @@ from depthpose.depth.datasets.packed import find_packed_frames
 class Layout:
     """A way in which the files of a dataset lie in its folder."""
 
-    find: Callable[
-        [Path], Iterable[FramePaths]
-    ]  # a folder's frames; none of a folder of another layout
+    # lists the frames of a folder; none where the folder has another layout
+    find: Callable[[Path], Iterable[FramePaths]]
     parts: str  # files and folders of the layout, for errors
 
 

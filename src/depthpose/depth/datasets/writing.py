@@ -54,19 +54,18 @@ def write_raw_frame(folder: Path, drive: str, number: int, frame: RawFrame) -> N
     sky = home / f"sky/{name}.png"
     visible = home / f"disp_noc/{name}.png"
     disparity = home / f"disp_occ/{name}.png"
-    written = [left, right, sky, visible, disparity]
 
     files.write_image(left, frame.left)
     files.write_image(right, frame.right)
     if frame.lidar_points is not None:
         points = frame.lidar_points.float().contiguous().numpy().astype("<f4")
         write_bytes(scan, points.tobytes())
-        written.insert(2, scan)
     files.write_image(sky, frame.is_sky.float().expand(3, -1, -1))
     visible_px = torch.where(frame.occluded, torch.nan, frame.disparity_px)
     files.write_depth_png(visible, visible_px)
     files.write_depth_png(disparity, frame.disparity_px)
-    note_result(folder, f"{drive}/{name}", written)
+    scans = [] if frame.lidar_points is None else [scan]
+    note_result(folder, f"{drive}/{name}", [left, right, *scans, sky, visible, disparity])
 
 
 def has_scene(folder: Path, name: str) -> bool:

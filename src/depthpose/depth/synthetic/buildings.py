@@ -19,6 +19,8 @@ _UP = np.array([0.0, -1, 0])
 _AHEAD = np.array([0.0, 0, 1])
 _MIN_WINDOWED_WALL_M = 2.2
 """Shorter walls have no windows."""
+_SILL_M = 0.9
+"""Height of the sills above the floor."""
 
 
 class Style(NamedTuple):
@@ -119,7 +121,8 @@ def _add_windowed_wall(
     """Add a wall of a length and height [m] with recessed windows."""
     rng = builder.rng
     panels, windows = _divide_wall(style, length, height)
-    builder.add_quads(wall.to_space(panels), panels + rng.uniform(0, 5, 2), style.wall)
+    texture_origin = rng.uniform(0, 5, 2)  # so that walls differ
+    builder.add_quads(wall.to_space(panels), panels + texture_origin, style.wall)
 
     # Panes behind the wall, some of them covered by blinds or curtains.
     outer = wall.to_space(windows)
@@ -153,7 +156,7 @@ def _divide_wall(
     column_count = max(1, int(length // (window_width + style.gap_m)))
     storey_count = max(1, int((height - 0.5) // style.storey_m))
     left = (np.arange(column_count) + 0.5) * (length / column_count) - window_width / 2
-    sill = np.arange(storey_count) * style.storey_m + 0.9
+    sill = np.arange(storey_count) * style.storey_m + _SILL_M
     top = np.minimum(sill + window_height, height - 0.15)
 
     # The lines of the grid, and its cells.
@@ -207,7 +210,7 @@ def _add_window_details(
 def _make_rectangle_corners(
     x0: np.ndarray, x1: np.ndarray, y0: np.ndarray, y1: np.ndarray
 ) -> np.ndarray:
-    """Return the corners (..., 4, 2) of rectangles between x0 and x1, y0 and y1, in turn."""
+    """Return the corners (..., 4, 2) of rectangles from x0 to x1 and y0 to y1, along the border."""
     corners = [np.stack(corner, -1) for corner in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))]
     return np.stack(corners, -2)
 
@@ -250,11 +253,12 @@ def _add_gable_roof(builder: MeshBuilder, plot: Plot, style: Style) -> None:
         builder.add_quads([eave + ridge], [UNIT_SQUARE * [last - first, slope_m]], slate)
         below = [(x, eave_y + 0.15, last), (x, eave_y + 0.15, first)]
         builder.add_quads([eave + below], [UNIT_SQUARE], board)
+
+    # Both gables, and a chimney.
     gable_uv = [[0, 0], [plot.depth_m, 0], [half, rise]]
     for z in (plot.start_m, plot.stop_m):
         gable = [(ridge_x - half, top, z), (ridge_x + half, top, z), (ridge_x, top - rise, z)]
         builder.add_triangles([gable], [gable_uv], style.wall)
-
     x = ridge_x + rng.uniform(-1, 1) * half * 0.5
     z = rng.uniform(plot.start_m + 1, plot.stop_m - 1)
     chimney = Appearance("brick", (0.28, 0.13, 0.09), 1.8)

@@ -110,14 +110,14 @@ def _remove_near(mesh: Mesh) -> Mesh:
 
     The backdrop reaches behind the camera; it is told by its large triangles.
     """
-    nearest_m, _ = _DEPTHS_M
+    nearest_m, _ = _DEPTHS_M  # of centres; surfaces may be a little nearer
     is_far = mesh.corners[:, :, 2].min(1) > 0.85 * nearest_m
     is_backdrop = np.ptp(mesh.corners, axis=1).max(1) > nearest_m
     return mesh.select(is_far | is_backdrop)
 
 
 def draw_appearance(rng: np.random.Generator, size_m: float) -> Appearance:
-    """Draw any material and colour for an object of ``size_m``, mostly pale ones."""
+    """Draw a material and a colour, grey to saturated, for an object of ``size_m``."""
     is_plain = rng.random() < _PLAIN_SHARE
     materials = _PLAIN_MATERIALS if is_plain else _TEXTURED_MATERIALS
     tile_m = size_m * draw_log_uniform(rng, 0.15, 3.0)

@@ -36,7 +36,7 @@ from depthpose.depth.types import Map, Mask, RawFrame, StereoInput, StereoSample
 class SyntheticFrame(RawFrame):
     """A synthetic pair with its exact truth."""
 
-    right_disparity_px: Map  #: disparity of the right image; NaN in the sky, likewise
+    right_disparity_px: Map  #: disparity of the right image; NaN in the sky
     depth_m: Map  #: camera z in the left image; NaN in the sky
     is_road: Mask  #: left pixels that show the carriageway
 

@@ -85,6 +85,7 @@ def _estimate_lost_share(
 
     ``tint``: mean of the channels of each surface.
     """
+    # Of all some, more with distance; of glass two thirds; of black up to 0.3, from 40 m on.
     material = stage.material[primitive.clamp(min=0)]
     is_glass = (material == MATERIAL_IDS["glass"]) | (material == MATERIAL_IDS["pane"])
     darkness = (0.12 - tint).clamp(min=0) * 2.5

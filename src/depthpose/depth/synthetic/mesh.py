@@ -36,7 +36,7 @@ class Mesh:
         return len(self.corners)
 
     def select(self, is_selected: Bool[np.ndarray, " n"]) -> "Mesh":
-        """Return the mesh of the triangles of a mask."""
+        """Return the mesh of the triangles where a mask is true."""
         return Mesh(
             **{field.name: getattr(self, field.name)[is_selected] for field in fields(Mesh)}
         )
@@ -320,16 +320,16 @@ def _make_boxes(boxes: Sequence[_Box]) -> Mesh:
     uv[:, :, 1:3, 0] = (size[:, _FACE_WIDTH_AXIS] / tile_m)[:, :, None]
     uv[:, :, 2:, 1] = (size[:, _FACE_HEIGHT_AXIS] / tile_m)[:, :, None]
 
-    # The box of each triangle: six faces each, in the order of ``_split_quads``.
-    box_of = np.tile(np.repeat(np.arange(len(boxes)), 6), 2)
+    # The number of each triangle's box: six faces each, in the order of ``_split_quads``.
+    box_number = np.tile(np.repeat(np.arange(len(boxes)), 6), 2)
     return _make_mesh(
         _split_quads(vertices[:, _CUBE_FACES].reshape(-1, 4, 3)),
         _split_quads(uv.reshape(-1, 4, 2)),
         None,
-        np.array([box.appearance.tint for box in boxes])[box_of],
-        np.array([MATERIAL_IDS[box.appearance.material] for box in boxes])[box_of],
-        np.array([box.appearance.layer for box in boxes])[box_of],
-        np.array([box.object_id for box in boxes])[box_of],
+        np.array([box.appearance.tint for box in boxes])[box_number],
+        np.array([MATERIAL_IDS[box.appearance.material] for box in boxes])[box_number],
+        np.array([box.appearance.layer for box in boxes])[box_number],
+        np.array([box.object_id for box in boxes])[box_number],
     )
 
 
@@ -411,8 +411,7 @@ def _make_sphere(level: int) -> Float[np.ndarray, "n 3"]:
 
     They are those of an icosahedron whose faces are divided in four ``level`` times.
     """
-    golden = (1 + 5**0.5) / 2
-    t = golden
+    t = (1 + 5**0.5) / 2  # the golden ratio
     corners = [(-1, t, 0), (1, t, 0), (-1, -t, 0), (1, -t, 0), (0, -1, t), (0, 1, t),
                (0, -1, -t), (0, 1, -t), (t, 0, -1), (t, 0, 1), (-t, 0, -1), (-t, 0, 1)]  # fmt: skip
     triangles = scale_to_unit(np.array(corners, float))[np.array(_ICOSAHEDRON_FACES)]

@@ -45,6 +45,8 @@ _FARTHEST_M = 20.0
 """Largest distance of a room's back wall, in true metres."""
 _MAX_ROOM_DEPTH = 12.0
 """Largest distance of that wall, in distances of the nearest object."""
+_NEAREST_SHARE = 0.97
+"""Triangles of objects nearer than this share of the distance of the nearest one are removed."""
 _NO_HAZE_M = 1e5
 """Distance of haze in a near scene: so far away that none is visible."""
 
@@ -95,7 +97,7 @@ def make_near(config: NearConfig, index: int) -> NearScene:
 
     # Only a backdrop, which reaches beside the camera, may be nearer than the nearest object.
     mesh = scene_builder.builder.finish()
-    is_far = mesh.corners[:, :, 2].min(1) > 0.97 * near_m
+    is_far = mesh.corners[:, :, 2].min(1) > _NEAREST_SHARE * near_m
     is_backdrop = mesh.object_id <= scene_builder.last_backdrop_id
     scene = SyntheticScene(
         mesh=mesh.select(is_far | is_backdrop),
@@ -110,6 +112,7 @@ def make_near(config: NearConfig, index: int) -> NearScene:
 def _draw_rig(rng: np.random.Generator, config: NearConfig) -> StereoRig:
     """Draw a rig of any size and focal length, with the baseline at which scenes are built."""
     low_px, high_px = config.columns_px
+    # Whole multiples of 16 columns and of 8 rows.
     width = 16 * round(rng.uniform(low_px, high_px) / 16)
     height_share = float(rng.choice([3 / 4, 9 / 16, 5 / 8]))
     height = 8 * round(width * height_share / 8)
@@ -192,7 +195,7 @@ def _draw_projector(rng: np.random.Generator, rig: StereoRig) -> Projector:
 
 
 def _draw_border(rng: np.random.Generator, view: View) -> Mask:
-    """Draw the black border of a view at random, as a rectification leaves it: its pixels."""
+    """Draw the pixels of a random black border of a view, as a rectification leaves one."""
     height, width = view.shape[1:]
     left, right = np.round(rng.uniform(0, 0.06, 2) * width).astype(int)
     top, bottom = np.round(rng.uniform(0, 0.06, 2) * height).astype(int)
@@ -272,7 +275,7 @@ class _NearSceneBuilder:
             slope_y = 0.0
             largest = 1.0
         far_m = max(far_m, self.near_m * largest)
-        half_side = 30 * far_m
+        half_side = 30 * far_m  # fills the view at any of these slants
         along = np.array([1, 0, slope_x]) * 2 * half_side
         up = np.array([0, -1, -slope_y]) * 2 * half_side
         self._add_sheet(np.array([0, 0, far_m]) - (along + up) / 2, along, up)
@@ -341,7 +344,8 @@ class _NearSceneBuilder:
         rays = np.array([[u, v, 1.0] for u in (-1, 0, 1) for v in (-1, 0, 1)])
         rays[:, :2] *= self.half_view
         aligned = rays @ normal
-        nearest_share = (normal[2] / aligned[aligned < -0.03]).min()
+        meets_plane = aligned < -0.03  # and not very far away
+        nearest_share = (normal[2] / aligned[meets_plane]).min()
         distance_m = self.near_m * self.rng.uniform(1.05, 1.6) / nearest_share
         return _TablePlane(right, np.cross(right, normal), normal, distance_m)
 

@@ -25,7 +25,11 @@ def draw_near_kind(rng: np.random.Generator) -> str:
 def draw_near_appearance(
     rng: np.random.Generator, size_m: float, plain_share: float = 0.3
 ) -> Appearance:
-    """Draw the appearance of an object of ``size_m``; a share of them has next to no texture."""
+    """Draw the appearance of an object of ``size_m``.
+
+    ``plain_share``: probability of a material with next to no texture, beside those that
+    :func:`draw_appearance` draws.
+    """
     appearance = draw_appearance(rng, size_m)
     if rng.random() >= plain_share:
         return appearance
@@ -102,7 +106,11 @@ def _add_discs_on_tube(
 def _add_bottle(
     builder: MeshBuilder, centre: np.ndarray, size_m: float, appearance: Appearance, R: Rotation
 ) -> None:
-    """Add a cylinder, a cone and a narrow cylinder on each other, closed at the narrow end."""
+    """Add a bottle: a cylinder, a cone and a narrow cylinder, closed at the narrow end alone.
+
+    Its neck points along the axis: an unrotated bottle is upside down. It stays so, for a turned
+    one would change earlier scenes.
+    """
     axis = R[:, 1]
     radius = size_m * builder.rng.uniform(0.15, 0.3)
     start = centre - axis * size_m / 2
@@ -117,14 +125,18 @@ def _add_bottle(
 def _add_mug(
     builder: MeshBuilder, centre: np.ndarray, size_m: float, appearance: Appearance, R: Rotation
 ) -> None:
-    """Add a cup with an inner and an outer wall, and a bent handle."""
+    """Add a cup with an inner and an outer wall, a bottom, and a bent handle.
+
+    Its open end is that along the axis: an unrotated cup is upside down. It stays so, for a turned
+    one would change earlier scenes.
+    """
     axis = R[:, 1]
     radius = size_m * builder.rng.uniform(0.25, 0.4)
     start = centre - axis * size_m / 2
     end = centre + axis * size_m / 2
     builder.add_tube(start, end, radius, appearance, 28)
     builder.add_tube(start, end, 0.9 * radius, appearance, 28)
-    builder.add_disc(start, axis, radius, appearance, 28)
+    builder.add_disc(start, axis, radius, appearance, 28)  # the bottom
 
     # The handle is an arc of an ellipse beside the cup.
     joints: list[np.ndarray] = []
@@ -138,7 +150,7 @@ def _add_mug(
 def _add_books(
     builder: MeshBuilder, centre: np.ndarray, size_m: float, _: Appearance, R: Rotation
 ) -> None:
-    """Add a pile of books; each is an object with its own appearance."""
+    """Add a pile of books from the centre down; each is an object with its own appearance."""
     down = np.array([0.0, 1, 0])
     offset = np.zeros(3)
     for _book in range(int(builder.rng.integers(2, 9))):

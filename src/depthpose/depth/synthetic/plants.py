@@ -48,7 +48,8 @@ def add_leaves(
         positions = outward * np.sqrt(rng.uniform(0.45, 1, (count, 1)))
     points = positions * np.asarray(radii) + np.asarray(centre)
 
-    # A triangle at each: its base lies along the leaf, its tip across.
+    # A triangle at each: its base lies along the leaf, its tip across. Leaves tend to lie around
+    # the nearly upright axis of the cloud.
     along = scale_to_unit(rng.normal(size=(count, 3)) + 0.7 * np.cross(outward, [0.3, 1, 0.2]))
     across = scale_to_unit(np.cross(along, outward + 0.6 * rng.normal(size=(count, 3))))
     length = length_m * rng.uniform(0.6, 1.4, (count, 1))
@@ -93,7 +94,7 @@ def draw_leaf_color(rng: np.random.Generator) -> Color:
 def make_tree(number: int, coarseness: int = 0) -> Mesh:
     """Make tree model ``number``, about 10 m high: of six, four are round, one slim, one a conifer.
 
-    Coarseness 0 is for near trees, 1 from about 30 m on, 2 for far ones.
+    Coarseness 0 is for near trees, 1 for farther ones, 2 for the farthest, with the fewest leaves.
     """
     builder = MeshBuilder(make_rng(Stream.TREE, number))
     leaf_count, leaf_m = _TREE_LEAVES[coarseness]
@@ -208,10 +209,11 @@ def add_wood_edge(
     s = s0 + (s1 - s0) * share + rng.normal(0, 0.3, count)
 
     # Points of four rows, one above the other, that lean in and out.
-    row_y = np.array([0.3, -0.35, -0.75, -1.0]) * height_m
+    row_y = np.array([0.3, -0.35, -0.75, -1.0]) * height_m  # down: the first is below ground
     lean = rng.normal(0, 0.5, (len(row_y), count))
     y = row_y[:, None] * np.clip(1 + 0.13 * rng.normal(size=count), 0.6, 1.4)
-    points = np.stack([x + lean, y, s + 0.5 * lean[::-1]], -1)
+    lean_ahead = 0.5 * lean[::-1]  # the same numbers, of other rows
+    points = np.stack([x + lean, y, s + lean_ahead], -1)
 
     # Dark leaves between each two rows.
     along_m = np.arange(count) * _EDGE_STEP_M

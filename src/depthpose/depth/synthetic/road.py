@@ -21,7 +21,9 @@ PLACE_SHARES: dict[Place, float] = {
     "city": 0.2, "suburb": 0.28, "avenue": 0.26, "rural": 0.14, "forest": 0.12
 }  # fmt: skip
 
-SIDES = (-1, 1)
+LEFT = -1
+RIGHT = 1
+SIDES = (LEFT, RIGHT)
 """The left and the right side of a road."""
 
 BEHIND_M = 14.0
@@ -57,7 +59,7 @@ class Road:
     """Plan of a road."""
 
     place: Place  # kind of its surroundings
-    edge_m: dict[int, float]  # x of its left edge (-1) and of its right edge (1)
+    edge_m: dict[int, float]  # x of its left edge and of its right edge, by ``SIDES``
     lanes: int  # number of lanes
     lane_m: float  # width of a lane
     parking_m: dict[int, float]  # width of the strip for parked cars on each side; 0: none
@@ -105,10 +107,10 @@ def draw_road(rng: np.random.Generator) -> Road:
 
     side_streets = _draw_side_streets(rng, place)
     centre = _draw_centre_line(rng, place)
-    parking_m = {-1: float(parking[0]), 1: float(parking[1])}
+    parking_m = {LEFT: float(parking[0]), RIGHT: float(parking[1])}
     return Road(
         place=place,
-        edge_m={-1: left_m, 1: right_m},
+        edge_m={LEFT: left_m, RIGHT: right_m},
         lanes=lanes,
         lane_m=(right_m - left_m - sum(parking_m.values())) / lanes,
         parking_m=parking_m,
@@ -237,7 +239,7 @@ def add_ground(builder: MeshBuilder, road: Road) -> None:
     middle = np.arange(60, 150, 10)
     far = np.arange(150, AHEAD_M + 1, 30)
     stations = np.concatenate([near, middle, far])
-    edges = (road.edge_m[-1], road.edge_m[1])
+    edges = (road.edge_m[LEFT], road.edge_m[RIGHT])
     _add_strip(builder, edges, (0.0, 0.0), colors.asphalt, stations)
 
     # Side streets on each side, and the ground between them.

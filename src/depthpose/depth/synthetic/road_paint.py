@@ -60,13 +60,14 @@ def _paint_patches(
 
     ``x`` and ``s``: coordinates on the road [m].
     """
-    # A random number in [0, 1) for each stretch, from the number of the stretch.
+    # A random number in [0, 1) for each stretch, by a usual hash: digits of a sine of its number.
     stretch = torch.floor(s / _PATCH_M)
     chance = torch.sin(stretch * 12.9898 + 97 * weather.shift[0]) * 43758.5453
     chance = chance - chance.floor()
     along = s - stretch * _PATCH_M
     middle = markings.first_lane_x_m + chance * 2 * markings.lane_m
 
+    # Patches where it is large, covers where it is small.
     is_patch = ((x - middle).abs() < 0.5 + chance) & ((along - 4).abs() < 1 + 2.5 * chance)
     factor = torch.where(is_patch & (chance > 0.6), factor * (0.45 + 0.45 * chance), factor)
     is_cover = ((x - middle) ** 2 + (along - 2) ** 2 < 0.1) & (chance < 0.35)

@@ -5,6 +5,7 @@ They are built along the straight road (see ``road``): x to the right, s ahead.
 
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 
@@ -38,10 +39,30 @@ _FAR_M = 130.0
 """Distance up to which the roadside has objects."""
 _DETAIL_M = 45.0
 """Distance up to which houses have details."""
-_BORDER_KINDS = 4
-_NO_BORDER = 0
-_HEDGE = 1
-"""Kinds of borders between pavement and plots; the others are fences."""
+_COUNTRY_FAR_M = _FAR_M + 30
+"""The same in the country."""
+_HOUSE_MARGIN_M = 1
+"""Least distance of a house from a side street."""
+_LAMP_COUNT = 6
+_SIGN_COUNT = 20
+_TRAFFIC_LIGHT_COUNT = 4
+_FENCE_COUNT = 20
+"""Number of models of each, of which one is drawn."""
+
+_Border = Literal["none", "hedge", "fence"]
+_BORDERS: tuple[_Border, ...] = ("none", "hedge", "fence", "fence")
+"""Borders between pavement and plots; a kind is repeated in proportion to how often it is drawn."""
+_BORDER_START_M = -8
+_BORDER_REACH_M = 95
+"""Extent of a border along the whole road, and end of every border."""
+_BORDER_MARGIN_M = 2.2
+"""Least distance of the middle of a piece of border, 4 m long, from a side street."""
+
+_COARSE_TREE_M = 24
+_COARSEST_TREE_M = 48
+_COARSEST_TREE_ASIDE_M = 25
+_COARSE_BUSH_M = 20
+"""Distances from which trees and bushes have fewer leaves."""
 _WOOD = Appearance("wood", (0.16, 0.12, 0.09))
 
 
@@ -75,6 +96,11 @@ def add_roadside(builder: MeshBuilder, road: Road) -> None:
         add_wood_edge(builder, (-half, s), stop, rng.uniform(7, 14))
 
 
+def _draw_border(rng: np.random.Generator) -> _Border:
+    """Draw a kind of border."""
+    return _BORDERS[int(rng.integers(len(_BORDERS)))]
+
+
 @dataclass(frozen=True, eq=False)
 class _Roadside:
     """Builds the objects on one side of a road; every ``add`` method adds to the builder's mesh."""
@@ -104,7 +130,7 @@ class _Roadside:
         usual_height = rng.uniform(6, 17)
         while s < _FAR_M:
             length = rng.uniform(8, 20)
-            if self._is_free(s, length, margin_m=1):
+            if self._is_free(s, length, _HOUSE_MARGIN_M):
                 height = usual_height * rng.uniform(0.75, 1.25)
                 self.add_house(s, length, set_back + rng.uniform(0, 0.6), height)
             elif rng.random() < 0.5:
@@ -116,39 +142,47 @@ class _Roadside:
         rng = self.builder.rng
         s = rng.uniform(-12, -2)
         set_back = rng.uniform(2.5, 7)
-        border = int(rng.integers(_BORDER_KINDS))
+        border = _draw_border(rng)
         while s < _FAR_M:
             length = rng.uniform(8, 15)
-            if not self._is_free(s, length, margin_m=1):
+            if not self._is_free(s, length, _HOUSE_MARGIN_M):
                 s += length
                 continue
+
+            # The house, which some plots lack.
             if rng.random() < 0.78:
                 house_set_back = set_back * rng.uniform(0.8, 1.3)
                 self.add_house(s, length, house_set_back, rng.uniform(3.5, 7.5))
-            border = int(rng.integers(_BORDER_KINDS)) if rng.random() < 0.5 else border
+
+            # The border: often that of the plot before, and a little longer than the plot, to close
+            # the gap to the next one.
+            border = _draw_border(rng) if rng.random() < 0.5 else border
             self.add_border(s, s + length + 3, border)
+
+            # Trees before the house, and bushes near the pavement.
             for _ in range(int(rng.integers(0, 3))):
                 x = self.x_behind_walk(rng.uniform(1.3, set_back + 1))
                 self.add_tree(x, s + rng.uniform(0, length), rng.uniform(3, 9))
             for _ in range(int(rng.integers(1, 5))):
                 x = self.x_behind_walk(rng.uniform(0.9, 3))
                 self.add_bush(x, s + rng.uniform(0, length), rng.uniform(0.6, 1.9))
-            s += length + rng.uniform(1.5, 7)
+            gap = rng.uniform(1.5, 7)
+            s += length + gap
 
     def add_avenue(self) -> None:
         """Add rows of trees, hedges or rails of a wide road, and set-back houses or copses."""
         rng = self.builder.rng
         has_row, has_border, has_houses = rng.random(3) < (0.7, 0.5, 0.35)
-        border = int(rng.integers(_BORDER_KINDS))
+        border = _draw_border(rng)
         if has_row:
             from_edge = rng.uniform(1.2, max(1.5, self.road.verge_m))
             self.add_tree_row(self.road.edge_m[self.side] + self.side * from_edge)
         if has_border:
-            self.add_border(-8, 100, border)
+            self.add_border(_BORDER_START_M, _BORDER_REACH_M, border)
         s = rng.uniform(-10, 5)
         while s < _FAR_M:
             length = rng.uniform(10, 26)
-            is_free = self._is_free(s, length, margin_m=1)
+            is_free = self._is_free(s, length, _HOUSE_MARGIN_M)
             if has_houses and rng.random() < 0.7 and is_free:
                 self.add_house(s, length, rng.uniform(5, 22), rng.uniform(5, 16))
             else:
@@ -168,8 +202,8 @@ class _Roadside:
         edge = rng.uniform(1.0, 4.5)
         height = rng.uniform(9, 15)
         s = rng.uniform(-10, -4)
-        while s < _FAR_M + 30:
-            row_depths = (0.0, 4.5) if s < 60 else (0.0,)
+        while s < _COUNTRY_FAR_M:
+            row_depths = (0.0, 4.5) if s < 60 else (0.0,)  # far away one row hides the other
             for depth in row_depths:
                 x = self.x_behind_walk(edge + depth + rng.uniform(0, 2.5))
                 self.add_tree(x, s + rng.uniform(-2, 2), height * rng.uniform(0.75, 1.25))
@@ -186,12 +220,12 @@ class _Roadside:
         rng.uniform(1.0, 4.5)
         rng.uniform(9, 15)
         s = rng.uniform(-10, -4)
-        while s < _FAR_M + 30:
+        while s < _COUNTRY_FAR_M:
             if rng.random() < (0.25 if is_open else 0.9):
                 self.add_copse(s, 12.0, 25.0 if is_open else 7.0)
             s += rng.uniform(8, 18)
         if rng.random() < 0.45:
-            self.add_border(-8, 90, int(rng.integers(_BORDER_KINDS)))
+            self.add_border(_BORDER_START_M, 90, _draw_border(rng))
 
     def add_background_wood(self) -> None:
         """Add at times the edge of a wood: right behind a forest's first trees, else far behind."""
@@ -213,6 +247,7 @@ class _Roadside:
         """Add some trees and bushes on a plot of a length and depth, unless a street is there."""
         rng = self.builder.rng
         is_free = self._is_free(s, length, margin_m=0)
+        # Places are drawn for a plot in a street too: without them, earlier scenes would change.
         for _ in range(int(rng.integers(1, 7))):
             x = self.x_behind_walk(1.5 + depth * rng.uniform(0, 1))
             if is_free:
@@ -225,7 +260,8 @@ class _Roadside:
     def add_kerb(self) -> None:
         """Add what stands at the kerb: lamps, signs, small objects, traffic lights, cables."""
         rng = self.builder.rng
-        x = self.road.edge_m[self.side] + self.side * (0.5 if self.road.walk_m else 1.3)
+        from_edge = 0.5 if self.road.walk_m else 1.3  # on the pavement, or else on the grass
+        x = self.road.edge_m[self.side] + self.side * from_edge
         self._add_lamps(x)
         self._add_signs_and_objects(x)
         self._add_traffic_lights(x)
@@ -238,7 +274,7 @@ class _Roadside:
         probability = {"forest": 0.1, "rural": 0.3}.get(self.road.place, 0.7)
         if rng.random() > probability:
             return
-        model = make_lamp(int(rng.integers(6)))
+        model = make_lamp(int(rng.integers(_LAMP_COUNT)))
         step = rng.uniform(16, 34)
         yaw = 0.0 if self.side < 0 else np.pi  # the arm reaches over the road
         for s in np.arange(rng.uniform(2, 25), 110, step):
@@ -246,7 +282,7 @@ class _Roadside:
                 self.builder.add_model(place_model(model, (x, -self.road.curb_m, s), yaw))
 
     def _add_signs_and_objects(self, x: Number) -> None:
-        """Add signs, small objects and trees; in the country guide posts are the only objects."""
+        """Add signs, small objects and trees in towns; signs and guide posts in the country."""
         rng = self.builder.rng
         s = rng.uniform(3, 12)
         is_town = self.road.place not in ("rural", "forest")
@@ -255,7 +291,7 @@ class _Roadside:
                 position = (x + self.side * rng.uniform(0, 0.4), -self.road.curb_m, s)
                 choice = rng.random()
                 if choice < 0.4:
-                    model = make_sign(int(rng.integers(20)))
+                    model = make_sign(int(rng.integers(_SIGN_COUNT)))
                     lean = rng.normal(0, 0.12)
                     is_from_behind = rng.random() < 0.2
                     yaw = lean + np.pi * is_from_behind
@@ -274,7 +310,7 @@ class _Roadside:
         rng = self.builder.rng
         for street in self.road.side_streets:
             if self.side in street.sides and rng.random() < 0.4:
-                model = make_traffic_light(int(rng.integers(4)))
+                model = make_traffic_light(int(rng.integers(_TRAFFIC_LIGHT_COUNT)))
                 position = (x, -self.road.curb_m, street.s_m - street.half_m - 1)
                 mirror_x = (-self.side, 1, 1)
                 self.builder.add_model(place_model(model, position, 0, mirror_x))
@@ -314,22 +350,20 @@ class _Roadside:
         )
         add_house(self.builder, plot, with_details=s < _DETAIL_M)
 
-    def add_border(self, start: Number, stop: Number, kind: int) -> None:
-        """Add pieces of hedge or fence at the back of the pavement, between two positions s.
-
-        ``kind``: no border (0), a hedge (1) or a fence (2, 3).
-        """
-        if kind == _NO_BORDER:
+    def add_border(self, start: Number, stop: Number, kind: _Border) -> None:
+        """Add pieces of hedge or fence at the back of the pavement, between two positions s."""
+        if kind == "none":
             return
         rng = self.builder.rng
-        fence_number = int(rng.integers(20))
+        # All three are drawn for either kind: otherwise earlier scenes would change.
+        fence_number = int(rng.integers(_FENCE_COUNT))
         height = rng.uniform(0.7, 1.9)
         color = draw_leaf_color(rng)
-        for s in np.arange(start + 2, min(stop, 95), FENCE_M):
-            if self.road.is_side_street(s, self.side, 2.2):
+        for s in np.arange(start + FENCE_M / 2, min(stop, _BORDER_REACH_M), FENCE_M):
+            if self.road.is_side_street(s, self.side, _BORDER_MARGIN_M):
                 continue
             position = (self.x_behind_walk(0.45), -self.road.curb_m, s)
-            if kind == _HEDGE:
+            if kind == "hedge":
                 model = make_hedge(int(rng.integers(HEDGE_COUNT)))
                 piece = place_model(model, position, 0, (1, height, 1), {"leaf": color})
             else:
@@ -352,7 +386,9 @@ class _Roadside:
         rng = self.builder.rng
         number = int(rng.integers(TREE_COUNT))
         width_m = height_m * rng.uniform(0.85, 1.15)
-        coarseness = int(s_m > 24) + int(s_m > 48 or abs(x_m) > 25)
+        is_far = s_m > _COARSE_TREE_M
+        is_very_far = s_m > _COARSEST_TREE_M or abs(x_m) > _COARSEST_TREE_ASIDE_M
+        coarseness = int(is_far) + int(is_very_far)
         model = make_tree(number, coarseness)
         scale = np.array([width_m, height_m, width_m]) / TREE_HEIGHT_M
         tints = {"leaf": draw_leaf_color(rng)}
@@ -363,7 +399,7 @@ class _Roadside:
         """Add a bush of a random model at x and s, with fewer leaves where it is far away."""
         rng = self.builder.rng
         number = int(rng.integers(BUSH_COUNT))
-        model = make_bush(number, coarseness=int(s_m > 20))
+        model = make_bush(number, coarseness=int(s_m > _COARSE_BUSH_M))
         scale = height_m * rng.uniform(0.7, 1.3, 3)
         tints = {"leaf": draw_leaf_color(rng)}
         yaw = rng.uniform(0, 6.28)

@@ -183,7 +183,8 @@ def _shade(stage: Stage, hits: Hits, focal_px: float) -> Vectors:
     ambient = ((0.09 + 0.26 * upward) * openness)[:, None] * sky_color
     bounced = ((1 - upward) * openness * 0.045)[:, None] * sun_color
 
-    # What the surface reflects, and the glow of lamps.
+    # What the surface reflects, and the glow of lamps. The factors of all light were chosen until
+    # streets looked like KITTI's.
     color = albedo * ((sun * lit)[:, None] * sun_color + ambient + bounced)
     color += albedo * (2 * _GLOW[material])[:, None]
     _add_reflections(stage, hits.towards, normal, _SPECULAR[material], lit, color)

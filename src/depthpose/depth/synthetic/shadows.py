@@ -60,7 +60,7 @@ def render_shadow_map(
         corners: corners of the triangles that cast shadows [m].
         to_light: direction to the light.
         area: what the map covers.
-        share: share of its full size.
+        share: side of the map, as a share of ``area.side_px``.
     """
     # Axes of the light's frame: z away from the light.
     side_px = round(area.side_px * share)
@@ -113,7 +113,7 @@ def sunlit_share(sun_maps: Sequence[ShadowMap], points: Vectors, normals: Vector
         # Whether each of the four texels about the point is lit, interpolated.
         texel = top.long() * side + left.long()
         flat_m = shadow_map.depth_m.flatten()
-        limit_m = depth_m - 0.8 * shadow_map.texel_m
+        limit_m = depth_m - 0.8 * shadow_map.texel_m  # the point's own surface may be so near
         upper_left, upper_right, lower_left, lower_right = (
             (flat_m.index_select(0, texel + step) >= limit_m).float()
             for step in (0, 1, side, side + 1)

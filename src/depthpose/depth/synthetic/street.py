@@ -107,7 +107,7 @@ def _add_hills(builder: MeshBuilder) -> None:
     x = _HILLS_M * np.sin(angle)
     z = _HILLS_M * np.cos(angle)
     foot_y = np.full_like(x, 90)
-    along = np.arange(len(angle)) * 12.0
+    along = np.arange(len(angle)) * 12.0  # on the texture
     faces = quads_between(np.stack([x, foot_y, z], 1), np.stack([x, -height, z], 1))
     uv = quads_between(np.stack([along, -foot_y], 1), np.stack([along, height], 1))
     variant = int(builder.rng.integers(2))
@@ -120,13 +120,15 @@ def _draw_markings(rng: np.random.Generator, road: roads.Road) -> Markings:
     dash_m = float(rng.uniform(2, 6))
     half_width_m = float(rng.uniform(0.05, 0.08))
     period_m = dash_m * float(rng.uniform(2, 3))
-    left_m = road.edge_m[-1]
-    right_m = road.edge_m[1]
-    first_lane_x_m = left_m + road.parking_m[-1]
+    left_m = road.edge_m[roads.LEFT]
+    right_m = road.edge_m[roads.RIGHT]
+    first_lane_x_m = left_m + road.parking_m[roads.LEFT]
 
-    # Lines along the lanes: solid at both edges, where a kerb often replaces them.
+    # Lines along the lanes: solid at both edges, where a kerb often replaces them, and at times in
+    # the middle.
     lines: list[LaneLine] = []
-    for line in range(road.lanes + 1) if is_marked else ():
+    line_count = road.lanes + 1 if is_marked else 0
+    for line in range(line_count):
         is_edge = line in (0, road.lanes)
         is_solid = is_edge or (line == road.lanes // 2 and rng.random() < 0.3)
         if is_edge and road.curb_m and rng.random() < 0.7:

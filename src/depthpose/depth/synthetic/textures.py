@@ -205,9 +205,9 @@ class _Noise:
 
 def _paint_road(noise: _Noise, variant: int) -> GreyTexture:
     """Paint asphalt with cracks in some places."""
-    # Cracks are where smooth noise crosses 0.
+    # Cracks are where smooth noise crosses 0, in places that are more or less frequent by variant.
     cracks = np.clip(1 - np.abs(noise.draw(1.8, (2, 60))) / 0.035, 0, 1)
-    cracks = cracks * np.clip(noise.draw_broad() - 0.4 * variant % 1, 0, 1)
+    cracks = cracks * np.clip(noise.draw_broad() - (0.4 * variant) % 1, 0, 1)
     rough = noise.draw_rough()
     fine = noise.draw_fine()
     broad = noise.draw_broad()

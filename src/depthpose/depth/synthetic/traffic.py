@@ -12,7 +12,7 @@ from depthpose.depth.synthetic.people import (
     make_cyclist,
     make_pedestrian,
 )
-from depthpose.depth.synthetic.road import SIDES, Road
+from depthpose.depth.synthetic.road import LEFT, RIGHT, SIDES, Road
 from depthpose.depth.synthetic.vehicles import BODIES, MODELS_PER_BODY, PAINTS, make_vehicle
 
 
@@ -33,6 +33,15 @@ class _Rectangle:
 
 _CAMERA_CAR = _Rectangle(x=0.0, s=0.5, half_x=1.5, half_s=4.5)
 """The camera's car and its free view."""
+
+_PARKED_REACH_M = 85
+_DRIVING_REACH_M = 110
+"""Distance ahead up to which cars are parked, and vehicles are in the lanes."""
+_FULL_LANE_SHARE = 0.6
+"""Probability of a vehicle at each place along a lane, in traffic of density 1."""
+_CYCLISTS_PER_PEDESTRIAN = 0.3
+_MIN_CROSSING_M = 8
+"""Least distance ahead of a side street with a vehicle, which would fill the view if nearer."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,9 +70,10 @@ class Traffic:
                 continue
             occupied_share = rng.uniform(0.3, 0.95)
             s = rng.uniform(-4, 9)
-            while s < 85:
+            while s < _PARKED_REACH_M:
                 x = road.edge_m[side] - side * rng.uniform(0.92, 1.15)
                 if rng.random() < occupied_share and not road.is_side_street(s, side, 3):
+                    # Most stand in the direction of the traffic on their side.
                     is_usual_direction = rng.random() < 0.93
                     is_ahead = (side > 0) == is_usual_direction
                     yaw = 0.0 if is_ahead else np.pi
@@ -71,25 +81,25 @@ class Traffic:
                 s += rng.uniform(5.0, 6.5)
 
     def add_driving(self) -> None:
-        """Add vehicles in the lanes, the left half of which comes towards us, and side streets."""
+        """Add vehicles in the lanes, of which the left half is oncoming, and in side streets."""
         rng = self.builder.rng
         road = self.road
         usual_density = {"avenue": 1.3, "forest": 0.6, "rural": 0.6}.get(road.place, 0.9)
         density = rng.uniform(0.15, 1) * usual_density
         for lane in range(road.lanes):
-            x = road.edge_m[-1] + road.parking_m[-1] + (lane + 0.5) * road.lane_m
+            x = road.edge_m[LEFT] + road.parking_m[LEFT] + (lane + 0.5) * road.lane_m
             is_oncoming = lane < road.lanes // 2
             s = rng.uniform(7, 30)
-            while s < 110:
-                if rng.random() < density * 0.6:
+            while s < _DRIVING_REACH_M:
+                if rng.random() < density * _FULL_LANE_SHARE:
                     yaw = rng.normal(0, 0.02) + (np.pi if is_oncoming else 0)
                     self.add_vehicle(x + rng.normal(0, 0.25), s, yaw)
                 s += rng.uniform(7, 32)
 
-        # One vehicle in half of the side streets, across our road.
+        # In side streets, half of the arms have a vehicle: it leaves or comes to our road.
         for street in road.side_streets:
             for side in street.sides:
-                if rng.random() < 0.5 and street.s_m > 8:
+                if rng.random() < 0.5 and street.s_m > _MIN_CROSSING_M:
                     x = road.edge_m[side] + side * rng.uniform(2.5, 16)
                     s = street.s_m + rng.choice([-0.45, 0.45]) * street.half_m
                     yaw = rng.choice([-1, 1]) * np.pi / 2 + rng.normal(0, 0.1)
@@ -122,14 +132,14 @@ class Traffic:
         """Add people on foot, and cyclists at the edges of the road."""
         mean_count = {"city": 5.0, "suburb": 1.5, "avenue": 2.0}.get(self.road.place, 0.4)
         self._add_pedestrians(mean_count)
-        self._add_cyclists(mean_count * 0.3)
+        self._add_cyclists(mean_count * _CYCLISTS_PER_PEDESTRIAN)
 
     def _add_pedestrians(self, mean_count: float) -> None:
-        """Add people on foot, mostly on the pavements; they face along the road or across."""
+        """Add people on foot, mostly on the pavements; they face along the road or across it."""
         rng = self.builder.rng
         road = self.road
-        left_m = road.edge_m[-1]
-        right_m = road.edge_m[1]
+        left_m = road.edge_m[LEFT]
+        right_m = road.edge_m[RIGHT]
         for _ in range(int(rng.poisson(mean_count))):
             side = int(rng.choice([-1, 1]))
             s = rng.uniform(5, 50)
@@ -139,6 +149,8 @@ class Traffic:
                 x = rng.uniform(left_m, right_m)
             if not self._claim(_Rectangle(x=x, s=s, half_x=0.3, half_s=0.3)):
                 continue
+
+            # Most face along the road, but those on it cross it.
             directions = [0, np.pi, np.pi / 2, -np.pi / 2]
             direction = float(rng.choice(directions, p=[0.35, 0.35, 0.15, 0.15]))
             is_on_road = left_m < x < right_m

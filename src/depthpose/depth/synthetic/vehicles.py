@@ -102,7 +102,7 @@ def _add_shell(
     """
     length, _, height = size
     paint = Appearance("paint")
-    flank = Appearance("side", variant=int(length * 100))
+    flank = Appearance("side", variant=int(length * 100))  # any one: the length is random
     sections = [_make_section(station, size) for station in stations]
     for i, (rear, front) in enumerate(pairwise(sections)):
         is_glazed = glazed[0] <= i < glazed[1]
@@ -125,6 +125,8 @@ def _add_shell(
         builder.add_triangles(triangles, triangles[..., :2], paint)
 
 
+_UPRIGHT_M = 1.9
+"""Height from which a vehicle is a box: its rear is upright, and its roof nearly as wide as it."""
 _PANE_OFFSET_M = 0.006
 """Distance of a pane from its frame, so that it covers it."""
 
@@ -188,8 +190,8 @@ def _make_section(
 
     # Both ends are a tenth narrower, and the roof is narrower than the belt.
     half_width = width / 2 * (1 - 0.1 * abs(2 * position) ** 6)
-    roof_width_share = 0.8 if height < 1.9 else 0.93
-    has_cabin = roof > belt + 0.1
+    roof_width_share = 0.8 if height < _UPRIGHT_M else 0.93
+    has_cabin = roof > belt + 0.1  # else this is the bonnet or the boot
     roof_half_width = half_width * roof_width_share if has_cabin else half_width * 0.95
 
     x = [half_width * 0.96, half_width, half_width * 0.985, roof_half_width, roof_half_width * 0.6]
@@ -228,7 +230,7 @@ def _add_fittings(builder: MeshBuilder, length: float, width: float, height: flo
     rear_bumper = (0, -0.24 * light_height, -0.496 * length)
     builder.add_box(rear_bumper, (width * 0.94, 0.16, 0.06), _BLACK_RUBBER)
 
-    if height > 1.9:
+    if height > _UPRIGHT_M:
         pane = Appearance("glass", (0.03, 0.03, 0.035))
         rear_window = (0, -0.74 * height, -0.499 * length)
         builder.add_box(rear_window, (width * 0.72, height * 0.28, 0.02), pane)

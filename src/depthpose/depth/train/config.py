@@ -215,6 +215,7 @@ class StereoTraining(Settings):
 
     def _refuse_missing_encoder(self) -> None:
         """Refuse settings of an encoder for a network that has none."""
+        # A setting counts as given where it differs from its default.
         is_psmnet = self.light is None and not self.other
         if is_psmnet and (self.encoder_rate != 0.3 or not self.with_frozen_stem):
             raise InputError(
@@ -239,7 +240,7 @@ class StereoTraining(Settings):
     @property
     def network(self) -> NetworkConfig:
         """Config of the network that is trained."""
-        for kind, settings in self.other.items():
+        for kind, settings in self.other.items():  # at most one
             return config_from_dict(settings, MATCHERS[kind].config, source=f"other.{kind}")
         return self.light or self.matcher
 

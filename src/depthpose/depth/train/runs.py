@@ -274,7 +274,7 @@ def _run_stage(
     facts = _describe_training(config, samples.truths, tuple(initial_weights.values()))
     warn_of_terms(facts)
     weights_files = ("generator", "matcher", "fakestereo")
-    run.claim(config, weights_files, checksums, ("held_out",))
+    run.claim(config, weights_files, more=checksums, without=("held_out",))
     return facts, run.train(task, samples, config.loop)
 
 
@@ -282,8 +282,8 @@ def _find_initial_weights(config: Any) -> dict[str, str]:  # noqa: ANN401
     """Find the settings of a stage that name weights to begin with: setting to name."""
     initial_weights: dict[str, str] = {}
     for setting in _WEIGHTS_SETTINGS:
-        name = getattr(config, setting, None)
-        if isinstance(name, str):
+        name = getattr(config, setting, None)  # no stage has all of them
+        if isinstance(name, str):  # else the config of a network, or None
             initial_weights[setting] = name
     return initial_weights
 
@@ -298,9 +298,10 @@ def _describe_training(
     Args:
         config: config of the stage.
         truths: the kinds of truth, as :class:`TrainingPairs` has them.
-        began_with: names of the weights that it begins with.
+        began_with: names of the weights that the training begins with.
     """
-    pair_configs = [pairs for pairs in (config.pairs, getattr(config, "more", None)) if pairs]
+    more = getattr(config, "more", None)  # only SelectTraining has it
+    pair_configs = [pairs for pairs in (config.pairs, more) if pairs]
     data = [Path(folder).name for pairs in pair_configs for folder in pairs.folders]
     if any(pairs.streets for pairs in pair_configs):
         data.append("synthetic streets")
@@ -364,7 +365,7 @@ def _with_virtual_focal(
     focal_px = generator.virtual_focal_px
     pair_configs: dict[str, PairsConfig] = {}
     for name in ("pairs", "more", "held_out"):
-        pairs = getattr(config, name, None)
+        pairs = getattr(config, name, None)  # only SelectTraining has ``more``
         if pairs is not None:
             pair_configs[name] = pairs
 

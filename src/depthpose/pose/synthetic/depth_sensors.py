@@ -215,7 +215,7 @@ def draw_smooth_noise(size: tuple[int, int], width_px: float, generator: torch.G
 
 
 def _mark_shadow(depth_m: Depth, focal_px: float, baseline_m: float = _KINECT_BASELINE_M) -> Mask:
-    """Mark pixels in shadow: a nearer surface hides them from the projector beside the camera."""
+    """Mark pixels in shadow: a nearer surface hides them from the projector left of the camera."""
     column = torch.arange(depth_m.shape[1])
     disparity_px = (focal_px * baseline_m / depth_m).nan_to_num(-torch.inf)
     projector_column = column + disparity_px
