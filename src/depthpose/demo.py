@@ -151,25 +151,28 @@ def _choose_methods(network: FakestereoNet, sample: StereoSample) -> list[_Depth
 def _show_scene(
     out: Path, scene: _DepthScene, methods: Sequence[_DepthMethod]
 ) -> tuple[list[dict[str, Any]], list[Section]]:
-    """Estimate the depth of a scene by each method, and write the pair as files of a command.
+    """Estimate the depth of a scene by each method, write it as files, and make its sections.
+
+    The pair is written too, as files that ``depth match`` takes.
 
     Args:
         out: folder of the demo.
         scene: pair and truth.
-        methods: the methods; the first is shown above the others.
+        methods: the methods; the first, of both images, is shown beside the truth.
 
     Returns:
         A row for each method, and the sections of the page.
     """
-    # The pair, as files.
     pair = scene.sample.input
     truth = scene.sample.truth
     range_m = scene.range_m
-    folder = out / pair.name
     assert pair.right is not None
     assert isinstance(pair.camera, StereoRig)
     assert truth.depth_m is not None
     assert truth.disparity_px is not None
+
+    # The pair, as files.
+    folder = out / pair.name
     write_image(folder / "left.png", pair.left)
     write_image(folder / "right.png", pair.right)
     write_camera(folder / "camera.json", pair.camera)
@@ -219,9 +222,10 @@ def _name_folder(out: Path, method: _DepthMethod) -> Path:
 
 
 def _measure_depth(estimate: DepthEstimate, sample: StereoSample) -> dict[str, float]:
-    """Measure disparity and depth, over pixels that have a truth within the cap and an estimate.
+    """Measure disparity and depth, over pixels with an estimate and a truth nearer than the cap.
 
-    ``coverage`` is the share of the former that have one.
+    Returns the metrics by name; ``coverage`` is the share of the pixels with such a truth that have
+    an estimate.
     """
     truth = sample.truth
     rig = sample.input.camera
@@ -300,7 +304,7 @@ def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
     Returns:
         A row for each part, and the section of the page.
     """
-    # A frame that shows each part once.
+    # A frame that shows each part once, and two other things, from 0.6 to 0.9 m away.
     net = GeoPoseNet.load(weights)
     models = {model.number: model for model in net.weights.models}
     count = len(models)
@@ -424,7 +428,7 @@ def _list_copies(estimate: PoseEstimate) -> list[Rigid]:
 def _choose_nearest_copy(
     estimate: PoseEstimate, instance: Instance, models: Mapping[int, ObjectModel]
 ) -> PoseEstimate:
-    """Replace the pose of an estimate by the one of its copies that is nearer to the truth, if any.
+    """Return an estimate with the pose nearest to the truth: its own, or that of one of its copies.
 
     ``models``: by their numbers.
     """

@@ -118,7 +118,8 @@ def main(words: Sequence[str] | None = None) -> int:
     0: done. 1: something in the input failed, or the output cannot be written. 2: wrong usage or
     unreadable input. 130: interrupted. 141: nobody reads the output.
     """
-    # Folders are released that the command claims; their module is not loaded for --help.
+    # The folders that the command claims are released at its end. Their module is looked up and
+    # not imported, for --help does without it.
     run_module = sys.modules.get("depthpose.core.run")
     held_before = () if run_module is None else run_module.held_folders()
     usual_format = warnings.formatwarning
@@ -240,7 +241,7 @@ def lasting_streams() -> Iterator[SafeStream]:
             os.open(os.devnull, os.O_RDWR)  # takes the lowest free descriptor
 
     before = sys.stdin, sys.stdout, sys.stderr
-    with ExitStack() as opened:
+    with ExitStack() as opened:  # a stream that the process began without is the null device
         stdin, stdout, stderr = (
             stream or opened.enter_context(open(os.devnull, mode))  # noqa: PTH123
             for stream, mode in zip(before, "rww", strict=True)

@@ -98,7 +98,7 @@ def make_parser(
     command_signature = signature(command)
     options: list[Option] = []
     for parameter in command_signature.parameters.values():
-        if is_dataclass(parameter.default):
+        if is_dataclass(parameter.default):  # a group of options: each of its fields is one
             group = type(parameter.default)
             types = get_type_hints(group, include_extras=True)
             texts = _read_help_texts(group)
@@ -195,7 +195,8 @@ def _choose_placeholder(hint: Any) -> tuple[str | None, ValueKind | None]:  # no
         if kind is None:
             return None, _choose_placeholder(parts[0])[1]
         placeholder = "NAME|FILE" if kind is ValueKind.WEIGHTS else "PATH"
-        return None if _POSITIONAL in parts else placeholder, kind
+        is_positional = _POSITIONAL in parts  # shown by its own name
+        return None if is_positional else placeholder, kind
     if origin in (Union, UnionType):
         return _choose_placeholder(next(part for part in parts if part is not NoneType))
     if origin is Literal:

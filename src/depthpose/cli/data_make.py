@@ -73,7 +73,8 @@ def make_streets(
     date_of = {index: _RECORDING_DATES[draw_rig_number(config, index)] for index in indices}
     drive_of = {index: f"{date}_drive_{seed:04d}_sync" for index, date in date_of.items()}
 
-    # A frame is missing if it is not there, or if it is to bring the calibration of its date.
+    # A frame is rendered if it is not there. The calibration of a date is written with any of its
+    # frames: where it is not there, the last frame of the date is rendered in any case.
     last_of_date = {date: index for index, date in date_of.items()}
     uncalibrated = {index for date, index in last_of_date.items() if not has_calibration(out, date)}
     missing = [

@@ -189,7 +189,7 @@ def _check_rows(
         is_refused: raise an error where most of them are swapped or not rectified; else warn.
 
     Raises:
-        InputError: most of them are, and ``is_refused`` holds.
+        InputError: most pairs are swapped or not rectified, and ``is_refused`` is set.
     """
     # Which rectified pixels the raw left image shows; the maps hold the raw pixel of each.
     rig = rectifier.rig

@@ -299,7 +299,7 @@ class DepthPredictor:
         min_confidence = self.output.min_confidence
         if self.output.cloud and min_confidence > 0:
             sure_count = estimate.is_sure(min_confidence).sum()
-            point_count = estimate.is_sure(0.0).sum().clamp(min=1)
+            point_count = estimate.is_sure(0.0).sum().clamp(min=1)  # all that have depth
             left_out = 1 - float(sure_count / point_count)
             tqdm.write(
                 f"{name}: {left_out:.1%} of the depth is less sure than {min_confidence:g} and "

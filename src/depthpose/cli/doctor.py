@@ -113,6 +113,7 @@ def _try_depth() -> str:
 
     from depthpose.depth.estimator import FakestereoNet
 
+    # Noise, enlarged to be smooth; the right view sees each of its points further to the left.
     noise = torch.rand(3, 48, 160, generator=torch.Generator().manual_seed(0))
     scene = torch.nn.functional.interpolate(noise[None], scale_factor=4, mode="bicubic")[0]
     scene = scene.clamp(0, 1)
@@ -120,6 +121,8 @@ def _try_depth() -> str:
     right = scene[..., _SHIFT_PX:]
     net = FakestereoNet.load("default")
     estimate = net.estimate(left, None, right=right, with_check=False)
+    # The first columns of the left view are not in the right one; they and as many beside them are
+    # left out.
     median_px = float(estimate.disparity_px[:, 2 * _SHIFT_PX :].median())
     outcome = f"a pair shifted by {_SHIFT_PX} px was matched at {median_px:.2f} px"
     if abs(median_px - _SHIFT_PX) > 1:
@@ -140,9 +143,8 @@ def _try_pose() -> str:
 
     net = GeoPoseNet.load("parts")
     flange = next(model for model in net.weights.models if model.name == "flange")
-    view = SyntheticViews((flange,), ObjectsConfig(number=1, occluded_share=0.0, views=None)).view(
-        0
-    )
+    config = ObjectsConfig(number=1, occluded_share=0.0, views=None)
+    view = SyntheticViews((flange,), config).view(0)
     (estimate,) = net.estimate_many([view.input])
     if estimate.camera_from_model is None:
         raise RuntimeError(f"a synthetic view of a flange was refused: {estimate.reason}")

@@ -302,7 +302,7 @@ def _describe_map(path: Path) -> FileFacts:
         facts.oddities.append(
             "most values are negative: disparity of exchanged views, or z backward?"
         )
-    elif median > 2 * _MAX_DEPTH_M:
+    elif median > 2 * _MAX_DEPTH_M:  # a map may hold disparity, of which 100 px are usual
         facts.oddities.append(
             f"as metres the median {median:.4g} is too far; is it in millimetres? Divide by 1000"
         )

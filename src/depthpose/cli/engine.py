@@ -61,7 +61,7 @@ class EngineOptions:
         """Process all inputs by Ray, and return the records of the shards of their results.
 
         Args:
-            work: what is computed for each input.
+            computation: what is computed for each input.
             inputs: the inputs.
             out: folder of the results, by path or URL.
             settings: JSON values that decide the results.

@@ -51,7 +51,7 @@ def distinct_names(placed_names: Sequence[tuple[Path | None, str]]) -> list[str]
     """
     parts: list[tuple[str, ...]] = []  # of each the folders above it, and its name
     for folder, name in placed_names:
-        folders = folder.resolve().parts[1:] if folder else ()
+        folders = folder.resolve().parts[1:] if folder else ()  # without the root
         parts.append((*folders, name))
     for path_parts, count in Counter(parts).items():
         if count > 1:

@@ -181,6 +181,7 @@ def find_origins(predictions: Sequence[Path]) -> list[Origin]:
                 f"{parent}: two predictions by {method!r}, masks {masks!r}, are given, and their "
                 "rows would be one; give one of them, or rename it"
             )
+    # Each method of a folder once: its predictions may be of several kinds of masks.
     methods = list(dict.fromkeys((parent, origin.method) for parent, origin in placed_origins))
     names = dict(zip(methods, distinct_names(methods), strict=True))
     return [
@@ -324,14 +325,21 @@ def _choose_instances(rows: Sequence[InstanceRow], max_count: int) -> list[tuple
     Returns:
         Words for the section of each, and its row; ``max_count`` at most.
     """
-    errors_m = {row.instance: row.error("error_m") for row in rows}
-    posed = [row for row in rows if errors_m[row.instance] is not None]
-    relative_errors = [(errors_m[row.instance] or 0.0) / row.diameter_m for row in posed]
+    posed: list[InstanceRow] = []
+    refused: list[InstanceRow] = []
+    relative_errors: list[float] = []
+    for row in rows:
+        error_m = row.error("error_m")
+        if error_m is not None:
+            posed.append(row)
+            relative_errors.append(error_m / row.diameter_m)
+        elif row.status != "missing":
+            refused.append(row)
+
     chosen = [
         (f"{role} answer of {len(posed)}", posed[k])
-        for role, k in page.choose_ranked(relative_errors, min(max_count, 3))
+        for role, k in page.choose_ranked(relative_errors, max_count)
     ]
-    refused = [row for row in rows if errors_m[row.instance] is None and row.status != "missing"]
     refused_count = min(max_count - len(chosen), 1)
     chosen += [
         (f"one of {len(refused)} refused", refused[k])

@@ -100,6 +100,7 @@ def make_mask_jobs(
     Raises:
         InputError: files are missing or do not match, or two results would have one name.
     """
+    # In a folder, files of run lengths (.json) are taken in place of pictures.
     run_length_files = sorted(mask.glob("*.json")) if mask.is_dir() else []
     depths = list_depths(depth)
     mask_files = run_length_files or list_images(mask)
@@ -196,7 +197,7 @@ def make_box_jobs(
         out: folder of the results, which may not lie among the inputs.
 
     Raises:
-        InputError: files are missing, a box is none, or two results would have one name.
+        InputError: files are missing, a box has no four edges, or two results would have one name.
     """
     depths = list_depths(depth)
     refuse_among_inputs(out, [depth], depths)
@@ -341,8 +342,8 @@ def match_to_depths(
     Args:
         depths: the depth images.
         files: masks, detections or pictures.
-        depth: option that names the depth images: one file, or a folder.
-        source: option that names the files, for errors.
+        depth: path that was given for the depth images: one file, or their folder.
+        source: path that was given for the files, for errors.
         kind: what the files are called in errors.
 
     Returns:

@@ -288,7 +288,7 @@ def make_method_spec(
     *,
     is_registration: bool,
 ) -> PoseMethodSpec:
-    """Read what an estimator is built from: weights, or the models of a data set or of CAD files.
+    """Make the spec of an estimator: of a network, or of models of a data set or of CAD files.
 
     Args:
         weights: name or file of the weights of a network.
@@ -296,7 +296,7 @@ def make_method_spec(
         unit: unit of CAD files where ``parts`` has none.
         dataset: data set whose models are registered where there is one.
         config: settings of the estimator.
-        base: words of ``--base-from-camera``.
+        base: words of ``--base-from-camera``; none where a data set is posed.
         is_registration: register models, without the network.
 
     Raises:
@@ -312,6 +312,7 @@ def make_method_spec(
     if not is_registration and weights != REGISTER:
         return PoseNetworkSpec(weights=weights, config=config, base_from_camera=base_from_camera)
     if dataset.bop is not None:
+        # No base: --base-from-camera is refused beside --bop, since a data set's cameras move.
         models = tuple(datasets.open_bop(dataset.bop, dataset.split).objects.values())
         return RegistrationSpec(models=models, config=config)
     models = read_parts(parts.cad, cad_unit, parts.symmetry or None) if parts.cad else ()

@@ -181,6 +181,8 @@ def _write_job_files(
         if pose is None:
             continue
         model = models[prediction.estimate.object]
+        # The input is read once more: none is kept after its estimate, for all together would fill
+        # the memory, and earlier runs or other processes made some of the estimates.
         try:
             view = job.read()
         except InputError:  # unreadable by now

@@ -91,7 +91,7 @@ def predict_poses_of_dataset(
         method: estimates the poses.
         options: the data set, and its masks.
         object: name or number of the only object that is posed; None: all that the method has.
-        config: settings of the estimator.
+        config: settings of the estimator; its device also segments, where masks are segmented.
         out: folder of the results.
         batch: views that are estimated together.
     """
@@ -110,7 +110,6 @@ def predict_poses_of_dataset(
     ]
     settings = {
         **method.settings,
-        "estimate": config_to_dict(config),
         **pose_dataset.dataset_settings(dataset),
         "masks": masks.name,
         **masks.settings,
@@ -183,7 +182,8 @@ def _estimate_unfinished(
     with closing(run_jobs(jobs, method.estimate_many, results, batch)) as outcomes:
         for outcome in tqdm(outcomes, total=len(jobs), disable=None, unit=" poses"):
             name = outcome.job.name
-            if outcome.result is not None or outcome.failure is not None:
+            is_new = outcome.result is not None or outcome.failure is not None
+            if is_new:
                 estimated[name] = results.predictions[name]
     return estimated
 
@@ -296,6 +296,7 @@ def predict_poses_on_ray(
     # What is estimated; the weights travel to the workers.
     if isinstance(spec, PoseNetworkSpec):
         spec = spec.with_packed_weights()
+    # This machine builds the method for its objects and settings alone, and may lack the device.
     method = replace(spec, config=replace(spec.config, device="cpu")).build()
     object = resolve_object(options.object or None, method)
     camera = None
@@ -307,7 +308,7 @@ def predict_poses_on_ray(
     # All that decides the poses, for the record of the run.
     settings = {
         **method.settings,
-        "estimate": config_to_dict(spec.config),
+        "estimate": config_to_dict(spec.config),  # with the device of the workers, not of `method`
         "object": object,
         "unit": options.unit,
     }

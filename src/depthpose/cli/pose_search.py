@@ -83,7 +83,7 @@ class SearchResults(Results[ViewInput, list[PoseEstimate]]):
         Images of a data set must be readable, so there it is raised.
         """
         assert isinstance(job, PoseJob)
-        if job.object is None:
+        if job.object is None:  # a job of a data set names none
             raise error
         self.by_image[job.name] = [
             Prediction(estimate=refuse_unreadable(job.name, job.object, error))

@@ -66,7 +66,7 @@ def read_base(words: Sequence[str]) -> Rigid | None:
     They name a text file, or are 16 numbers row by row; without words there is no pose.
 
     Raises:
-        InputError: they are no rigid transform in metres.
+        InputError: they give no rigid transform, or a camera too far away, as in millimetres.
     """
     if not words:
         return None
@@ -88,10 +88,13 @@ def read_base(words: Sequence[str]) -> Rigid | None:
 def _parse_rigid(text: str, source: str, transform: str) -> Rigid:
     """Parse a rigid transform: the 16 numbers of its 4x4 matrix, row by row, in metres.
 
-    ``source`` and ``transform`` name it in errors.
+    Args:
+        text: the numbers; brackets, commas and semicolons between them are skipped.
+        source: the option, and the file if there is one, for errors.
+        transform: name of the matrix, for errors.
 
     Raises:
-        InputError: these are no 16 numbers, or their matrix is not rigid.
+        InputError: the text is not 16 numbers, or their matrix is not rigid.
     """
     try:
         words = re.sub(r"[\[\],;]", " ", text).split()
@@ -104,6 +107,7 @@ def _parse_rigid(text: str, source: str, transform: str) -> Rigid:
     if len(values) != 16:
         raise InputError(f"{source}: {len(values)} numbers; give the 16 of a 4x4 matrix")
     try:
-        return rigid_input(values.reshape(4, 4), transform, transform)
+        # Errors call the value, and the kind of transform that it should be, by the same name.
+        return rigid_input(values.reshape(4, 4), name=transform, what=transform)
     except InputError as error:
         raise InputError(f"{source}: {error}") from error

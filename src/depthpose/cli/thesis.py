@@ -201,6 +201,9 @@ def draw_figure(
         indices = find_frames(dataset, frames)
     else:
         indices = choose_frames(dataset, number or (1 if figure == "2-1" else 4))
+    # Figure 2-1 needs weights that estimate depth of the left view alone; write_figure has them
+    # estimate the real pair as well. In figure 2-5, None leaves it to the weights: a stereo matcher
+    # gets the real right view, a generator the left view alone.
     with_right = False if figure == "2-1" else None
     spec = DepthNetworkSpec(weights=weights, config=matching.config, with_right=with_right)
     return write_figure(figure, dataset, indices, spec.build(), out)

@@ -210,7 +210,7 @@ def write_figure(
         figure: number of the figure in the thesis.
         dataset: the frames.
         indices: which of them, a column of the figure each.
-        method: estimates their depth.
+        method: estimates their depth; for figure 2-1 from the left view, and from the real pair.
         out: folder of the figure.
 
     Returns:
@@ -235,7 +235,7 @@ def write_figure(
         if figure == "2-5":
             panels = draw_figure_2_5(pair, lidar_m, estimate)
         else:
-            stereo = method.estimator.estimate_input(pair)
+            stereo = method.estimator.estimate_input(pair)  # with the real right view
             panels = draw_figure_2_1(pair, lidar_m, estimate, stereo)
         columns.append(panels)
         sections.append(_make_panel_section(frame.name, panels, out / "panels" / frame.name))

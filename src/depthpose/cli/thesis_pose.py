@@ -405,7 +405,7 @@ class _KeypointVote:
 def _find_worst_vote(net: GeoPoseNet, views: Views, keypoint: int | None) -> _KeypointVote:
     """Vote in all views, and find the keypoint with the largest error.
 
-    ``keypoint``: look only at this one of each view, from 0 on; None: at all.
+    ``keypoint``: number, from 0 on, of the only keypoint to look at in each view; None: at all.
 
     Raises:
         InputError: there is no such keypoint, or no view has enough points to be posed.
@@ -438,7 +438,7 @@ def _find_worst_vote(net: GeoPoseNet, views: Views, keypoint: int | None) -> _Ke
 def draw_direction_panels(net: GeoPoseNet, views: Views, keypoint: int | None) -> list[Drawing]:
     """Draw true and predicted directions to the keypoint whose vote errs most (figure 3-4).
 
-    ``keypoint``: look only at this one of each view, from 0 on; None: at all.
+    ``keypoint``: number, from 0 on, of the only keypoint to look at in each view; None: at all.
 
     Raises:
         InputError: there is no such keypoint, or no view has enough points to be posed.

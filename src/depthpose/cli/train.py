@@ -384,11 +384,14 @@ def _with_models(
 def _with_dataset(config: Any, folder: str) -> Any:  # noqa: ANN401 - of any training of poses
     """Return the config of a training of poses with the models and frames of another data set.
 
-    Only what comes from a data set is changed.
+    Only the parts that the config takes from a data set are changed.
 
     Raises:
-        InputError: nothing does.
+        InputError: the config takes nothing from a data set.
     """
+    # Trainings on views have models (``bop`` is None where they are CAD files) and frames (None
+    # where all views are synthetic); their held-out views are synthetic, of no folder. That of the
+    # segmentation has no models: its images, and perhaps held-out ones, are of folders.
     changes: dict[str, Any] = {}
     models = getattr(config, "models", None)
     if models is not None and models.bop is not None:

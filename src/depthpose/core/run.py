@@ -202,6 +202,7 @@ def describe_environment() -> dict[str, str]:
 def _read_commit() -> str:
     """Ask Git for the commit of the running code; "" where it is not in a repository."""
     package_folder = str(Path(__file__).resolve().parent)
+    # Without any tag (--exclude *), describe falls back (--always) on the hash of the commit.
     command = ["git", "-C", package_folder, "describe", "--always", "--dirty", "--exclude", "*"]
     try:
         process = subprocess.run(  # noqa: S603

@@ -186,9 +186,9 @@ def list_depth_facts(
     if estimate.confidence is not None:
         facts.append(("mean confidence", f"{float(estimate.confidence.nanmean()):.2f}"))
         if pair.right is not None:
-            pair_estimate = replace(estimate, input=pair)
+            pair_estimate = replace(estimate, input=pair)  # so that the limit is that of a pair
             sure_count = pair_estimate.is_sure().sum()
-            point_count = pair_estimate.is_sure(0.0).sum().clamp(min=1)
+            point_count = pair_estimate.is_sure(0.0).sum().clamp(min=1)  # all that have depth
             unsure_share = 1 - float(sure_count / point_count)
             facts.append(("unsure, not in the cloud", f"{unsure_share:.1%} of the depth"))
     return facts

@@ -126,6 +126,7 @@ def _encode_coordinates(coordinates_m: Float[Tensor, "*shape 3"]) -> dict[str, A
     flat_m = coordinates_m.detach().cpu().numpy().astype(np.float64).reshape(-1, 3)
     low = flat_m.min(0) if len(flat_m) else np.zeros(3)
     step = (flat_m.max(0) - low) / _STEPS if len(flat_m) else np.zeros(3)
+    # Along an axis without extent all are at step 0.
     steps = np.round((flat_m - low) / np.where(step > 0, step, 1))
     return {
         "low": low.tolist(),
@@ -191,6 +192,7 @@ def choose_views(has_estimate: Sequence[bool]) -> list[int]:
     """
     estimated = [index for index, is_estimated in enumerate(has_estimate) if is_estimated]
     refused = [index for index, is_estimated in enumerate(has_estimate) if not is_estimated]
+    # Refused inputs get the room that the others leave, but never less than a few places.
     refused_count = min(len(refused), max(_LEAST_REFUSALS, MOST_VIEWS - len(estimated)))
     chosen = [refused[i] for i in spread_evenly(len(refused), refused_count)]
     chosen += [estimated[i] for i in spread_evenly(len(estimated), MOST_VIEWS - refused_count)]
@@ -213,7 +215,7 @@ def choose_ranked(errors: Sequence[float], most: int = 3) -> list[tuple[str, int
 
 
 def share_views(sets: int) -> list[int]:
-    """Share the views of a page among several sets of predictions: the number of each set.
+    """Share the views of a page among sets of predictions; return the number of views of each set.
 
     Where there are more than ``MOST_VIEWS`` sets, the last get none.
     """

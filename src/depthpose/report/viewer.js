@@ -2,9 +2,9 @@
 //
 // A scene is {caption, note, layers: [{name, kind, shown, count, places, low, step, colors}]}: kind
 // is "points" or "lines", places are base64 of little-endian 16-bit steps from low (three a point,
-// six a line), colors of 8-bit RGB. The frame is a camera's: x right, y down, z forward, in metres. One WebGL context
-// draws all views of a page (browsers allow few), and each is copied to a canvas that prints. Shown
-// again, an element's former scene is let go.
+// six a line), colors of 8-bit RGB. The frame is a camera's: x right, y down, z forward, in metres.
+// One WebGL context draws all views of a page (browsers allow few), and each is copied to a canvas
+// that prints. Where an element gets another scene, its former one is let go.
 const showScene = (() => {
   const POINTS = `
     attribute vec3 place; attribute vec3 color; uniform mat4 view; uniform float size;

@@ -118,8 +118,8 @@ def compute_features(
     if isinstance(cloud, Refusal):
         return None
     grid = sample_and_voxelise(cloud.cloud_m, net.weights.cloud, net.config.voting.seed)
-    rows = F.pad(grid.coordinates, (1, 0))
-    voxels = Voxels.from_points(rows, grid.features)
+    coordinates = F.pad(grid.coordinates, (1, 0))  # all of cloud 0
+    voxels = Voxels.from_points(coordinates, grid.features)
     return grid.points_m, network.features(voxels).at_points().float()
 
 
@@ -208,7 +208,8 @@ def draw_directions(
         voted_m: the voted keypoint; None: none is drawn.
         size_px: width and height of the picture.
     """
-    # The scale by which everything fits into the picture.
+    # The scale by which everything fits into the picture, with a margin for the arrows. Without a
+    # voted keypoint the true one stands in its place, which changes nothing.
     keypoints_xy = torch.stack([true_m, true_m if voted_m is None else voted_m]).double()[:, :2]
     points_xy = points_m.double()[:, :2]
     all_xy = torch.cat([points_xy, keypoints_xy])

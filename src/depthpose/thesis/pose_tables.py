@@ -39,7 +39,7 @@ _SAME_NAMED = 0.25
 """The same where the names agree: tables of LineMOD's diameters differ by up to 16 %."""
 
 PEERS = ("PointFusion", "DenseFusion, per pixel", "DenseFusion, iterative")
-"""Methods of which, as of ours, one network knows all objects: ours are subtracted from theirs."""
+"""Methods of one network for all objects, as ours is; their rows are subtracted from ours."""
 
 
 @dataclass(frozen=True)

@@ -94,6 +94,7 @@ def joint_probabilities(
 
     # The precision of each Gaussian, by bisection of its logarithm: the wider it is, the larger is
     # the entropy of its row, whose exponential is the perplexity.
+    # It begins between a nearly flat Gaussian and one that sees the nearest neighbour alone.
     low = torch.full_like(nearest, 1e-12)
     high = torch.full_like(nearest, 1e12)
     for _ in range(_BISECTIONS):
