@@ -200,6 +200,7 @@ def _propose(
     """Propose poses: the best of all objects, and some places of each; none at a claimed place."""
 
     def propose_object(name: str) -> list[_Proposal]:
+        """Propose poses of one object, the best first."""
         pairs = targets.objects[name].pairs
         poses, score = propose_in_frame(frame, is_unclaimed, pairs, len(names))
         return [
@@ -248,6 +249,7 @@ def _refine(
     object_std_m = targets.config.object_deviation_m
 
     def refine(place: _Place) -> tuple[Rigid, Evidence]:
+        """Refine the pose of a place, and compare it with the image."""
         surface = targets.objects[place.object].surface
         cloud_m = _readings_of(place, frame, view)
         pose = refine_roughly(cloud_m, place.pose[None], surface, icp)[0]
@@ -296,6 +298,7 @@ def _judge(
     """Estimate the object of each place from what its best pose explains; separate refusals."""
 
     def estimate_place(numbered: tuple[int, Sequence[_Place]]) -> PoseEstimate:
+        """Estimate the object of a group of proposals, which has a number."""
         number, group = numbered
         leader = group[0]
         cloud = CloudInput(
@@ -411,6 +414,7 @@ def _suppress(
     taken = list(before)
     ranked = sorted(judged, key=lambda place: -place.log_odds)
     for number, place in enumerate(ranked):
+        # Its readings may be taken by a surer place, even of the same object.
         surer = next((other for other in taken if place.shared_with(other) > _SHARED), None)
         if surer is not None:
             if surer.object != place.object:
@@ -418,6 +422,8 @@ def _suppress(
                 misses.append(_miss_at(place, place.estimate.evidence, reason, targets))
             continue
         taken.append(place)
+
+        # Other objects at this place share the probability of one with it.
         rivals = {place.object: place}
         for other in ranked[number + 1 :]:
             if place.shared_with(other) > _SAME_PLACE:
