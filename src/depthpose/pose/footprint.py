@@ -124,7 +124,7 @@ def _crop_view(view: ViewInput, window: Window) -> ViewInput:
 
 
 def why_background_excludes(frame: Frame, pose: Rigid, surface: Surface) -> str:
-    """Say why the background of an image excludes a pose; an empty text where it does not.
+    """Explain why the background of an image excludes a pose; an empty text where it does not.
 
     Args:
         frame: of the whole image, whose backgrounds count.

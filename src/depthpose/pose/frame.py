@@ -340,6 +340,7 @@ def _largest_background_diameter(points_m: Float64[Tensor, "n 3"]) -> float:
     some_m = take_evenly(points_m, _SAMPLE)
     offset_m = some_m - some_m.mean(0)
     # Ascending: the first axis is the plane's normal, the second its width, the third its length.
+    # Both are measured without the outermost 5 % of the points at each end.
     _, axes = torch.linalg.eigh(offset_m.T @ offset_m)
     along_m = offset_m @ axes[:, 1:]
     width_m, length_m = (along_m.quantile(0.95, 0) - along_m.quantile(0.05, 0)).tolist()

@@ -123,7 +123,7 @@ def _estimate_scale_deviation(residuals: Residuals, object_std_m: float) -> floa
     weight = residuals.weight
     H, _ = build_normal_equations(residuals, _LEAST_INFORMATION)
     inverse = float(np.linalg.inv(H)[6, 6])
-    degrees = max(1.0, weight.sum() - 7)
+    degrees = max(1.0, weight.sum() - 7)  # of freedom, with seven unknowns
     noise_m2 = (weight * residuals.distance**2).sum() / degrees
     variance = _CORRELATED_READINGS * noise_m2 * inverse
     variance += object_std_m**2 * weight.sum() * inverse / INDEPENDENT_SIDES

@@ -388,7 +388,7 @@ def _weigh_instances(
 def _within(
     judged: Sequence[_JudgedPlace], is_region: Bool[Tensor, "h w"], targets: SearchTargets
 ) -> tuple[list[_JudgedPlace], list[_Miss]]:
-    """Separate places that lie mostly beside a region: they are of something else."""
+    """Separate the places that lie mostly in a region from those that do not, as misses."""
     inside: list[_JudgedPlace] = []
     misses: list[_Miss] = []
     for place in judged:
@@ -403,11 +403,12 @@ def _within(
 def _suppress(
     judged: Sequence[_JudgedPlace], before: Sequence[_JudgedPlace], targets: SearchTargets
 ) -> tuple[list[_JudgedPlace], list[_JudgedPlace], list[_Miss]]:
-    """Non-maximum suppression: in order of probability, keep what explains other readings.
+    """Keep places in order of probability, each only if no surer one explains its readings.
 
     Returns:
-        What is kept; all whose readings are taken, by what may be one of several objects too; and
-        places at which an object is not kept for the sake of another.
+        The places that are kept; all places that claim readings, those of ``before`` and those that
+        may show one of several objects too; and, as misses, the places at which an object is not
+        kept because of another.
     """
     kept: list[_JudgedPlace] = []
     misses: list[_Miss] = []
@@ -441,7 +442,7 @@ def _suppress(
 def nothing_found(
     view: ViewInput, object: str, misses: Sequence[_Miss], spent_s: float
 ) -> PoseEstimate:
-    """Say that a depth image does not show an object surely, and what its nearest miss was."""
+    """Build the refusal of an object that an image does not surely show, with its nearest miss."""
     read_m = view.depth_m[view.mask & (view.depth_m > 0)]
     facts: dict[str, Any] = {"name": view.name, "object": object, "seconds": {"search": spent_s}}
     if len(read_m) == 0:

@@ -75,7 +75,7 @@ def draw_pattern(
 
     Args:
         generator: of random numbers.
-        size_m: of the surface; features are about a third of it.
+        size_m: extent of the surface; features are about a third of it.
         hue_share: range of the share of a hue, against grey.
     """
     strength = uniform(generator, 0.0, 0.25)
@@ -467,7 +467,7 @@ def _draw_viewpoint(config: ObjectsConfig, generator: torch.Generator) -> Rigid:
     right = F.normalize(torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0])), dim=0)
     R = torch.stack([right, torch.linalg.cross(forward, right), forward])
 
-    # Rolled a little, and aimed at a point near the middle.
+    # Rolled a little [rad], and aimed at a point near the middle [m].
     roll = uniform(generator, -0.3, 0.3)
     cosine = math.cos(roll)
     sine = math.sin(roll)
