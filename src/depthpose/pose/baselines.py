@@ -142,7 +142,8 @@ class DepthImageNet(nn.Module):
         self.config = config = config or DepthImageConfig()
         self.encoder = ResNet18(inputs=1, widths=config.widths)
         self.heads = nn.Linear(config.widths[3], config.classes * _OUTPUTS)
-        # Training begins near the identity, in the middle of the crop.
+        # Training begins near the identity, in the middle of the crop: small weights, and a bias of
+        # the first two columns of the identity and no offset.
         with torch.no_grad():
             self.heads.weight.mul_(0.1)
             start = torch.tensor([1.0, 0, 0, 0, 1, 0, 0, 0, 0])

@@ -310,7 +310,7 @@ def advise_unit(model_diameter_m: float, points_m: Float[Tensor, "n 3"]) -> Unit
 
     Args:
         model_diameter_m: of the model, in what was taken for metres.
-        points_m: of the object, in what was taken for metres.
+        points_m: points of the object, in what was taken for metres.
     """
     size_m = _measure_size(points_m)
     if size_m <= 0:

@@ -158,13 +158,13 @@ def _blur_image(color: ColorImage, poses: Rigid, surface: SurfaceColors) -> _Blu
     if not bool(is_front.any()):
         return _BlurredImage(color.rgb, 0, 0)
 
-    # The spacing in pixels, at the depth of the models; a pixel at least.
+    # The spacing in pixels, at the depth of the models: from a pixel to an eighth of the image.
     px_per_m = float(color.K[0, 0] / depth_m[is_front].median())
     sigma_px = _BLUR * surface.spacing_m * px_per_m
     sigma_px = min(max(sigma_px, 1.0), max(height, width) / 8)
     reach = math.ceil(3 * sigma_px)
 
-    # The part about the models, with a margin for the blur.
+    # The part about the models, with a margin of twice the reach of the blur.
     low = pixels[is_front].amin(0) - 2 * reach
     high = pixels[is_front].amax(0) + 2 * reach
     left = int(low[0].clamp(0, width - 1))
@@ -255,7 +255,7 @@ def _mark_visible(
     """Mark the surface points that the depth camera sees: they face it, with a reading near them.
 
     Args:
-        points_m: of the surface, in the frame of the depth camera.
+        points_m: points of the surface, in the frame of the depth camera.
         normals: outward normals of these points.
         view: depth and mask.
         near_m: largest distance along the optical axis between a point and its reading.

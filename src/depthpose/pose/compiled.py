@@ -23,7 +23,7 @@ def compiled(loop: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
 
     It may call other compiled functions. Arrays must be contiguous, on the CPU, and an index is not
     checked: one beyond the end reads what lies there. What was compiled is kept on disk until the
-    file of the function, or of one that it calls, changes. To decorate imports no numba.
+    file of the function, or of one that it calls, changes. Decorating alone imports no numba.
     """
     return cast(Callable[Arguments, Result], _Compiled(loop))
 

@@ -46,7 +46,7 @@ class SymmetricCopies:
 
     symmetries: Rigid  #: exact ones, whose copies are one pose; the identity first
     #: near-symmetries, after which 98 % of the surface is within 5 % of the diameter from itself,
-    #: or 80 % of it on itself: another pose that looks nearly alike: a gear turned by a tooth.
+    #: or 80 % of it on itself. Such a copy is another pose, as that of a gear turned by a tooth.
     near_copies: Rigid
     lookalikes: Rigid  #: move a smaller part of the surface onto itself; and half turns
     #: symmetries that a network was trained to treat as one pose; the identity first.
@@ -96,7 +96,7 @@ class SymmetricCopies:
 
     @property
     def _is_ball(self) -> bool:
-        """A ball is compared by its middle alone: its rotation says nothing."""
+        """Whether the model is a ball: it has one pose in all rotations, compared by its centre."""
         return len(self.points_m) == 1
 
 

@@ -128,7 +128,8 @@ def why_not_observable(
 ) -> Refusal | None:
     """Refuse a view that leaves a motion of the object undetermined, beside its free ones.
 
-    How far it is rotated about an axis of near-symmetry its copies say, which are named.
+    The rotation about an axis of near-symmetry may stay undetermined: the copies about it are named
+    as alternatives.
 
     Args:
         cloud_m: points of the object, in the camera frame.
@@ -227,8 +228,9 @@ def with_status(estimate: PoseEstimate, min_certainty: float) -> PoseEstimate:
     others = sum(not alternative.is_copy for alternative in estimate.alternatives)
     percents = (100 * certainty, 100 * min_certainty)
     digits = 3
+    # As many digits as show that one is below the other; 17 tell any two floats apart.
     while digits < 17 and len({f"{percent:.{digits}g}" for percent in percents}) == 1:
-        digits += 1  # until one is seen to be below the other
+        digits += 1
     reason = (
         f"this pose has a certainty of {percents[0]:.{digits}g} %, below min_certainty "
         f"{percents[1]:.{digits}g} %: "

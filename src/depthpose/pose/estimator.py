@@ -447,7 +447,7 @@ class PoseEstimator:
 def unreadable_on_error(
     work: Callable[[AnyInput], Result], pose_input: AnyInput
 ) -> Result | PoseEstimate:
-    """Do work on an input; give a refusal in place of an error that the input causes."""
+    """Do work on an input; return a refusal in place of an error that the input causes."""
     if not isinstance(pose_input, AnyInput):
         raise InputError(
             "estimate_many takes CloudInput and ViewInput of depthpose.pose.types, not a "

@@ -57,12 +57,15 @@ edge that bends more toward the camera is concave."""
 _LEAST_INNER = 0.25  # share of the silhouette that must remain without its borders
 _OBJECT_PX = 8000  # pixels of an object that are compared; the window of a larger one is thinned
 _NEIGHBOURS = 4  # the one whose distance is the spacing of a cloud's points
+_SPACED_POINTS = 200  # points of a cloud by which this spacing is measured
 _POINT_PX = 1.5  # side of a pixel of a drawn cloud, in spacings of its points
 _JUMP_DIAMETERS = 0.02
 _JUMP_M = 0.01
 """Drawn neighbours that differ in depth by more than both are the two sides of an edge."""
 _FAR_M = np.float32(1e6)
-_MARGIN_DIAMETERS = 0.6  # margin of the window about the points of an object
+_MARGIN_DIAMETERS = 0.6
+_MARGIN_PX = 4
+"""Margin of the window about the points of an object: both together."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -110,7 +113,7 @@ def observe(
 
     # The window of the points, with a margin, within the image.
     distance_m = float(cloud_m[:, 2].median())
-    margin_px = int(_MARGIN_DIAMETERS * diameter_m / distance_m * float(K[0, 0])) + 4
+    margin_px = int(_MARGIN_DIAMETERS * diameter_m / distance_m * float(K[0, 0])) + _MARGIN_PX
     low = pixel.amin(0) - margin_px
     high = pixel.amax(0) + margin_px + 1
     if view is not None:
@@ -171,7 +174,9 @@ def _camera_of_cloud(cloud_m: Float64[Tensor, "n 3"]) -> Float64[Tensor, "3 3"]:
     """
     rays = (cloud_m[:, :2] / cloud_m[:, 2:]).unique(dim=0)  # some clouds hold points twice
     count = min(_NEIGHBOURS + 1, len(rays))  # the nearest is the ray itself
-    distance, _ = KDTree(rays.numpy()).query(take_evenly(rays, 200).numpy(), count, workers=1)
+    distance, _ = KDTree(rays.numpy()).query(
+        take_evenly(rays, _SPACED_POINTS).numpy(), count, workers=1
+    )
     spacing = max(float(np.median(distance[:, -1])), FINEST_RAD)
     focal_px = 1 / (_POINT_PX * spacing)
     return torch.diag(torch.tensor([focal_px, focal_px, 1.0], dtype=torch.float64))
@@ -405,7 +410,7 @@ def _is_joined_across(
 
 
 def _averaged_side(step: int) -> int:
-    """Side of the squares over which readings are averaged, in pixels of the window."""
+    """Compute the side of the squares over which readings are averaged [px of the window]; odd."""
     return max(3, 2 * round((AVERAGED_PX / step - 1) / 2) + 1)
 
 

@@ -17,6 +17,8 @@ from depthpose.pose.types import KnownBackground, ViewInput
 
 _REGION_MARGIN = 0.5
 """Margin about a region in which planes and neighbours are examined, over its larger side."""
+_POSE_MARGIN = 0.1
+"""Margin about a posed surface in the image, over its width and height."""
 _MOST_SUNK = 0.05
 """Largest share of the surface that may lie in a bin, table or wall: right poses err by less."""
 
@@ -78,7 +80,7 @@ def _window_of_pose(
         return slice(0, 0), slice(0, 0)
     low = pixel.amin(0)
     high = pixel.amax(0)
-    margin = 0.1 * (high - low) + 2 * EDGE_PX
+    margin = _POSE_MARGIN * (high - low) + 2 * EDGE_PX
     left, top = (int(value) for value in (low - margin).floor().tolist())
     right, bottom = (int(value) for value in (high + margin).ceil().tolist())
     return clip_window(left, top, right + 1, bottom + 1, height, width)
@@ -122,7 +124,7 @@ def _crop_view(view: ViewInput, window: Window) -> ViewInput:
 
 
 def why_background_excludes(frame: Frame, pose: Rigid, surface: Surface) -> str:
-    """Say why the background of an image excludes a pose; an empty text where it does not.
+    """Explain why the background of an image excludes a pose; an empty text where it does not.
 
     Args:
         frame: of the whole image, whose backgrounds count.

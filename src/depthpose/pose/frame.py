@@ -51,6 +51,8 @@ _PARALLEL_COSINE = math.cos(math.radians(20))
 _MOST_BEHIND = 0.08
 """Largest share of the readings within the outline of a table or wall that lie behind it. Real
 tables have up to 4 %, planes through the tops of several parts from 12 % on."""
+_BEHIND_TOLERANCES = 2
+"""Tolerances of a plane, by more than which a reading must lie behind it to count as behind."""
 _WIDTH_RATIO = 1.3
 _LENGTH_RATIO = 3.0
 """A plane is no side of an object if its width is above the first ratio times the diameter of the
@@ -253,12 +255,12 @@ def _wide_planes(
     noise_per_m2: float,
     is_searched: Bool[Tensor, "h w"],
 ) -> tuple[list[Background], Float64[Tensor, "h w"]]:
-    """Find tables and walls one after the other; give them and ``Frame.background_limit_m``.
+    """Find tables and walls one after the other; return them and ``Frame.background_limit_m``.
 
     Args:
         depth_m: 0 where there is no reading.
-        points_m: in the camera frame.
-        normals: toward the camera.
+        points_m: the readings as points of the camera frame.
+        normals: unit normals at the readings, toward the camera.
         rays: points of the pixels at a depth of 1 m.
         noise_per_m2: as in :class:`Frame`.
         is_searched: readings that may be of a plane.
@@ -267,7 +269,7 @@ def _wide_planes(
     limit_m = torch.zeros_like(depth_m)
     planes: list[Background] = []
     least_px = max(_LEAST_POINTS, _LEAST_SHARE * int((depth_m > 0).sum()))
-    generator = torch.Generator().manual_seed(0)
+    generator = torch.Generator().manual_seed(0)  # the same image, the same planes
     for _ in range(_MOST_PLANES):
         # The plane of the most readings.
         plane = largest_plane(points_m[is_free], generator, noise_per_m2)
@@ -310,7 +312,7 @@ def _pieces_of_plane(
         is_bent: readings on the plane as the sensor bends it, those on the flat one among them.
 
     Returns:
-        The flat readings of the largest piece; and the bent pieces that are flat by half or more.
+        The flat readings of the largest piece; and the bent pieces of which more than half is flat.
     """
     label = label_regions(depth_m, is_bent)
     near_px = torch.bincount(label[is_near], minlength=int(label.max()) + 1)
@@ -327,7 +329,7 @@ def _share_of_readings_behind(
     noise_per_m2: float,
 ) -> float:
     """Measure the share of readings within the outline of a surface that lie behind its plane."""
-    margin_m = 2 * plane_tolerance_m(plane_depth_m, noise_per_m2)
+    margin_m = _BEHIND_TOLERANCES * plane_tolerance_m(plane_depth_m, noise_per_m2)
     is_behind = depth_m > plane_depth_m + margin_m
     is_read_within = _fill_outline(surface) & (depth_m > 0)
     return float(is_behind[is_read_within].double().mean())
@@ -338,6 +340,7 @@ def _largest_background_diameter(points_m: Float64[Tensor, "n 3"]) -> float:
     some_m = take_evenly(points_m, _SAMPLE)
     offset_m = some_m - some_m.mean(0)
     # Ascending: the first axis is the plane's normal, the second its width, the third its length.
+    # Both are measured without the outermost 5 % of the points at each end.
     _, axes = torch.linalg.eigh(offset_m.T @ offset_m)
     along_m = offset_m @ axes[:, 1:]
     width_m, length_m = (along_m.quantile(0.95, 0) - along_m.quantile(0.05, 0)).tolist()
@@ -367,7 +370,7 @@ def _is_on_bent_plane(
     the flat plane on.
 
     Args:
-        points_m: in the camera frame.
+        points_m: the readings as points of the camera frame.
         plane: the flat one.
         is_near: readings on it.
         is_parallel: readings whose normals are parallel to the plane's; no others are marked.
@@ -448,7 +451,7 @@ def share_behind(
     Args:
         frame: the image.
         background: one of the image.
-        points_m: of a posed surface, in the camera frame.
+        points_m: points of a posed surface, in the camera frame.
         margin_m: distance behind the background, beyond the sensor's noise, from which a point
             counts.
 

@@ -48,7 +48,7 @@ def voxelise(points_m: Float[Tensor, "n 3"], config: CloudConfig) -> VoxelGrid:
     centres of cells.
 
     Args:
-        points_m: in the camera frame, one at least.
+        points_m: the cloud in the camera frame, one point at least.
         config: side of a cell, axes and features.
 
     Raises:

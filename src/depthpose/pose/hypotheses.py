@@ -113,7 +113,8 @@ def compete(
     winner_number = int(shares.argmax())
     winner = different[winner_number]
 
-    # And which of its copies? Another of the poses may be a copy too, as between two about an axis.
+    # And which of its copies? Another of the different poses may be a copy of it too: one between
+    # two copies about an axis.
     copies = [winner.refined]
     copies += _refine_distinct_copies(cloud_m, winner.refined, prepared, config, view)
     copy_poses = Rigid.stack([copy.camera_from_model.double() for copy in copies])
@@ -189,7 +190,7 @@ def _refine_different_poses(
 
 
 def _all_symmetries(prepared: PreparedObject) -> Rigid:
-    """Exact and near-symmetries of an object, which lead from a pose to its copies."""
+    """Join exact and near-symmetries of an object, which lead from a pose to its copies."""
     return Rigid.cat([prepared.copies.symmetries, prepared.copies.near_copies])
 
 
@@ -227,6 +228,9 @@ def _against_each_other(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
 
     Where no mask says which readings are the object's, nothing else does: a mug's handle that one
     copy leaves out may be of a neighbour.
+
+    Returns:
+        The hypotheses, with the area of such readings as ``beside`` in their evidence.
     """
     most = max(hypothesis.evidence.explained for hypothesis in hypotheses)
     compared: list[Hypothesis] = []
@@ -239,7 +243,7 @@ def _against_each_other(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
 
 
 def _log_beside_depth(hypothesis: Hypothesis) -> float:
-    """Log likelihood of what is known beside depth: a colour image, a network's votes."""
+    """Compute the log likelihood of what is known beside depth: a colour image, votes."""
     log_votes = 0.0 if hypothesis.votes_rad is None else -hypothesis.votes_rad / VOTES_RAD
     return log_votes + hypothesis.log_color
 

@@ -19,12 +19,15 @@ from depthpose.pose.surface import Surface, Target, look_along_rays, match
 _SLACK = 0.1  # sine of the angle up to which a surface that faces away counts as visible
 _GRAZING = 0.1  # sine of the angle between a ray and a plane below which they do not meet nearby
 _CONVERGED = 3e-4  # ICP stops when a step rotates [rad] and shifts [diameters] by less than this
+_LEAST_INFORMATION = 1e-6  # a step is damped by a billionth of it at least
 _START_ROTATION_RAD = math.radians(15)  # angle between the initial pose and further starts
 _ROUGH_LIMITS = (3.0, 2.4, 2.0, 1.6, 1.4, 1.2, 1.0, 1.0, 1.0, 1.0)
 """Distance limits of the rough steps, over the last limit of the exact steps: a start may be far
 from the points."""
 _ROUGH_POINTS = 100  # points of the cloud that refine and compare starts
 _OCCLUSION_POINTS = 1000  # points of the cloud by which free-space violations are counted
+_OCCLUSION_EVERY = 4  # one in this many points of the surface is used for that
+_COMPARED_POINTS = 50  # points of the model, about, by which poses are told to be distinct
 _UNOBSERVED_WEIGHT = 0.3
 """Weight in a score of the share of the surface that should be visible and was not observed. It is
 below 1, for something may occlude it."""
@@ -132,7 +135,7 @@ def refine_pose(
     ``inlier_share`` of 0.
 
     Args:
-        points_m: of the object, in the camera frame.
+        points_m: points of the object, in the camera frame.
         initial: poses to begin from, ``camera_from_model``; one or a batch.
         surface: of :func:`~depthpose.pose.surface.prepare_surface`.
         config: limits and number of steps.
@@ -181,14 +184,14 @@ def refine_best(
     surface: Surface,
     config: IcpConfig | None = None,
 ) -> BestStart:
-    """Refine poses, and rotated copies of each, and give the one that explains the cloud best.
+    """Refine poses, and rotated copies of each, and choose the one that explains the cloud best.
 
     All are refined roughly (:func:`refine_roughly`). Each is scored by the share of points near the
     surface, less free-space violations and part of the unobserved surface. The best is refined
     exactly, in half of the steps.
 
     Args:
-        points_m: of the object, in the camera frame.
+        points_m: points of the object, in the camera frame.
         initial: ``camera_from_model``, one or several; the first is trusted most.
         surface: of :func:`~depthpose.pose.surface.prepare_surface`.
         config: ``starts`` and what :func:`refine_pose` takes.
@@ -228,7 +231,7 @@ def _refine_exactly(
     then farther off than exact steps reach.
 
     Args:
-        points_m: of the object, in the camera frame.
+        points_m: points of the object, in the camera frame.
         start: the initial pose; None where it is a rotated copy, of which the rough end is used.
         rough: the pose after rough steps from the start.
         surface: of the model.
@@ -269,7 +272,7 @@ def _choose_distinct_poses(
     of the model, the least over the symmetries of the model.
     """
     chosen: list[int] = []
-    points_m = surface.points_m[:: max(1, len(surface.points_m) // 50)]
+    points_m = surface.points_m[:: max(1, len(surface.points_m) // _COMPARED_POINTS)]
     symmetric_m = surface.symmetries.apply(points_m)  # (symmetries, points, 3)
     for k in score.argsort(descending=True).tolist():
         # The score is -inf where no point counts: its residual is infinite. All later ones are too.
@@ -290,7 +293,7 @@ def refine_roughly(
     """Refine a batch of poses fast: with a hundred points and a table of nearest samples.
 
     Args:
-        points_m: of the object, in the camera frame.
+        points_m: points of the object, in the camera frame.
         starts: poses in float64, ``camera_from_model``.
         surface: of the model; its table is :class:`~depthpose.pose.surface.NearestTable`.
         config: ``end_distance_diameters`` is used.
@@ -310,19 +313,22 @@ def _iterate(
     *,
     is_exact: bool,
 ) -> tuple[Rigid, _Linearised]:
-    """Take Gauss-Newton steps of ICP until the poses move no more (:func:`_refine`).
+    """Refine poses, each by itself, and compute their residuals then (:func:`_refine`).
 
     Args:
-        points_m: of the object, in the camera frame.
+        points_m: points of the object, in the camera frame.
         max_points: largest number of points that are used, evenly taken.
         pose: one or a batch, ``camera_from_model``.
         surface: of the model.
-        limits_m: distance at which a point no longer counts, for each step; the last one is for
-            the residuals that are returned, without a step.
-        is_exact: whether samples are searched, not looked up.
+        limits_m: distance from which a point has no weight: one for each Gauss-Newton step, and a
+            last one for the residuals that are returned, after which no step follows.
+        is_exact: whether the nearest samples are searched, not looked up in a table.
 
     Returns:
-        The poses, and the residuals there.
+        The refined poses, and the residuals and the information of each.
+
+    Raises:
+        InputError: there is no point, or one is not finite.
     """
     if len(points_m) == 0 or not bool(points_m.isfinite().all()):
         raise InputError(
@@ -330,7 +336,8 @@ def _iterate(
             "not finite: leave those out, and refuse a cloud of none."
         )
 
-    # Poses are refined in place, and what is known of them then is written into these arrays.
+    # The compiled loop changes rotations and translations in place, and writes the residuals of
+    # each pose into a row of these arrays.
     cloud = array_of(take_evenly(points_m.double(), max_points))
     R = array_of(pose.R).copy()
     t_m = array_of(pose.t_m).copy()
@@ -371,7 +378,7 @@ def _refine(
     is_exact: bool,
     residuals: Residuals,
 ) -> Float64[np.ndarray, "6 6"]:
-    """Move a pose in place by point-to-plane ICP; write its residuals, and give its information.
+    """Move a pose in place by point-to-plane ICP; write its residuals, return its information.
 
     Exact steps match each point with its nearest sample of the surface in the first half of the
     steps, and with the sample on its ray in the second; other steps look samples up in a table.
@@ -383,8 +390,8 @@ def _refine(
         limits: as of :func:`_iterate`.
         diameter: of the object.
         target: samples of the surface.
-        is_exact: whether samples are searched, not looked up.
-        residuals: are written.
+        is_exact: whether the nearest samples are searched, not looked up in a table.
+        residuals: output.
     """
     middle = cloud.sum(0) / len(cloud)
     places = np.full(len(cloud), -1)
@@ -410,7 +417,7 @@ def _refine(
         # Linearise about the middle of the cloud: a rotation by w about the camera, D away, with
         # the shift that cancels it to first order would leave the object w^2 D / 2 off.
         _linearise(local, eye, places, R, t - middle, limit, target, is_along_rays, residuals)
-        H, b = build_normal_equations(residuals, 1e-6)
+        H, b = build_normal_equations(residuals, _LEAST_INFORMATION)
         if step == last or has_converged:
             break
 
@@ -438,7 +445,7 @@ def _meet_planes(
 ) -> Float64[np.ndarray, "n 3"]:
     """Intersect the ray of each point with the plane of its sample, in the model frame.
 
-    It gives the sample itself where the ray grazes the plane, and the point where it has no sample.
+    Where the ray grazes the plane it is the sample itself; a point without a sample stays.
 
     Args:
         local: points in the model frame.
@@ -489,7 +496,7 @@ def _linearise(
         target: the samples.
         is_along_rays: whether the samples lie on the rays of their points; then the residual
             replaces the part of the distance that lies along the ray.
-        residuals: are written.
+        residuals: output.
     """
     residuals.jacobian[:] = 0.0
     residuals.distance[:] = 0.0
@@ -535,7 +542,9 @@ def _score_poses(
     """
     # What the posed surface would hide, and what of it was not observed.
     cloud_m = take_evenly(points_m.double(), _OCCLUSION_POINTS)
-    free_space_violation, unobserved = look_along_rays(cloud_m, poses, surface, every=4)
+    free_space_violation, unobserved = look_along_rays(
+        cloud_m, poses, surface, every=_OCCLUSION_EVERY
+    )
 
     # How many points lie near it. Of poses with equal shares the nearer one is better.
     few_m = take_evenly(cloud_m, _ROUGH_POINTS)
@@ -645,7 +654,7 @@ def _factor_independent_covariance(
 ]:
     """Factor the covariance under independent residuals: ``F F^T = s^2 A^-1``.
 
-    Gives the factor ``F``, its inverse and ``s``. ``A = sum slope J J^T`` may be singular to
+    Returns the factor ``F``, its inverse and ``s``. ``A = sum slope J J^T`` may be singular to
     rounding: its eigenvalues over those of the information are bounded below.
     """
     # A in coordinates in which the information matrix is the identity.
@@ -676,10 +685,9 @@ def _measure_inflation(
     spread_m: Float64[Tensor, "*batch 1 1"],
     diameter_m: float,
 ) -> tuple[Float64[Tensor, "*batch 6"], Float64[Tensor, "*batch 6 6"]]:
-    """Measure the ratios of a block jackknife's variances to independent ones; and directions.
+    """Measure how many times as large as under independent residuals a jackknife's variances are.
 
-    Several block sizes are tried, and the one with the largest sum is taken; the ratios are 1 where
-    no size has a larger sum. Directions are columns, in the coordinates of ``whitening``.
+    Several block sizes are tried, and the one whose ratios have the largest sum is taken.
 
     Args:
         cloud_m: the points of the residuals, in the camera frame.
@@ -689,6 +697,10 @@ def _measure_inflation(
         whitening: its inverse.
         spread_m: standard deviation of the residuals.
         diameter_m: of the object.
+
+    Returns:
+        The ratios along six directions, 1 where no block size has a larger sum; and these
+        directions, as columns in the coordinates of ``whitening``.
     """
     # What each point adds to the gradient and to the information.
     inverse_information = independent @ independent.mT / spread_m.square()
@@ -702,7 +714,7 @@ def _measure_inflation(
     inflation = torch.ones_like(independent[..., 0])
     directions = eye.expand_as(independent)
     for side in _BLOCK_DIAMETERS:
-        # Sums over the points of each block; a block's key is its column plus a million rows.
+        # Sums over the points of each block; its key is the column plus a million times the row.
         keys = (image_m / (side * diameter_m)).floor() @ torch.tensor([1.0, 1e6]).double()
         _, block = keys.unique(return_inverse=True)
         count = int(block.max()) + 1

@@ -36,6 +36,9 @@ _ROUGH_MIRROR_POINTS = 100  # of these points, those that compare starts of the 
 _STEPS = 12  # steps of ICP with a scale
 _WIDE_STEP = 2.0  # distance limit of the first step, over the usual distance limit
 _CONVERGED = 3e-4  # largest step [rad, m or share] at which ICP with a scale stops
+_LARGEST_GROWTH = 0.1  # by which the size changes in one step, at most
+_LEAST_SCALE = 0.5
+_LARGEST_SCALE = 2.0
 _CORRELATED_READINGS = 10.0  # factor of the variance, since as many neighbours share their error
 _STARTS = (1.0, 0.87, 1.15)
 """Scales at which ICP starts: from 1 alone it would stay there for smaller copies."""
@@ -120,7 +123,7 @@ def _estimate_scale_deviation(residuals: Residuals, object_std_m: float) -> floa
     weight = residuals.weight
     H, _ = build_normal_equations(residuals, _LEAST_INFORMATION)
     inverse = float(np.linalg.inv(H)[6, 6])
-    degrees = max(1.0, weight.sum() - 7)
+    degrees = max(1.0, weight.sum() - 7)  # of freedom, with seven unknowns
     noise_m2 = (weight * residuals.distance**2).sum() / degrees
     variance = _CORRELATED_READINGS * noise_m2 * inverse
     variance += object_std_m**2 * weight.sum() * inverse / INDEPENDENT_SIDES
@@ -182,8 +185,9 @@ def _grow(
             )
             H, b = build_normal_equations(residuals, _LEAST_INFORMATION)
             motion = np.linalg.solve(H, b)  # rotation, translation, growth
-            growth = min(max(motion[6], -0.1), 0.1)
-            times[start] = min(max(times[start] * (1 + growth), 0.5), 2.0)
+            growth = min(max(motion[6], -_LARGEST_GROWTH), _LARGEST_GROWTH)
+            grown = times[start] * (1 + growth)
+            times[start] = min(max(grown, _LEAST_SCALE), _LARGEST_SCALE)
 
             # The points move by the inverse of the surface's motion.
             rotation = make_rotation(motion)
@@ -204,10 +208,10 @@ def _linearise_growth(
     is_exact: bool,
     places: Int64[np.ndarray, " n"],
 ) -> Residuals:
-    """Match points with a surface ``scale`` as large, and linearise their distances from it.
+    """Match points with a surface ``scale`` times as large, and linearise their distances from it.
 
-    By rotation and translation of the surface, and by its growth about its middle. Where it is not
-    known which side of a surface was seen, all samples count.
+    The unknowns are rotation and translation of the surface, and its growth about its middle.
+    Samples count whichever way they face.
 
     Args:
         local: points in the model frame.

@@ -76,6 +76,7 @@ MARGIN = 4
 of a row would be looked up in the next row."""
 MAX_CELLS = 1 << 24  #: of a box that is tabulated
 CELLS_PER_VOXEL = 512  #: a box with more cells is mostly empty: binary search is then cheaper
+FEW_CELLS = 1 << 16  #: that a box may have beyond these, so that one of few voxels is tabulated
 
 
 class VoxelIndex:
@@ -102,7 +103,7 @@ class VoxelIndex:
         sides = (high - low + 1).tolist()
         sides[1:] = [side + 2 * MARGIN for side in sides[1:]]
         cells = sides[0] * sides[1] * sides[2] * sides[3]
-        if cells > min(MAX_CELLS, CELLS_PER_VOXEL * len(coordinates) + MAX_CELLS // 256):
+        if cells > min(MAX_CELLS, CELLS_PER_VOXEL * len(coordinates) + FEW_CELLS):
             return
 
         # The row of each cell; one past the last where there is no voxel.
@@ -207,24 +208,27 @@ class NeighbourTable:
     def slots(self, *, is_transposed: bool) -> Slots:
         """Arrange the pairs in a grid, computed once for each direction.
 
+        Its filled slots are sorted by the row that they add to. So a convolution gathers the slots
+        of each row and sums them in a fixed order, where scattering would add them up in any order.
+
         ``is_transposed``: coarse rows are read and fine ones written, not the other way round.
         """
         if is_transposed not in self._slots:
             pairs = self.pairs
             coarse_rows = self.table.shape[1]
-            read, read_rows = pairs.fine, self.fine_rows
-            written, written_rows = pairs.coarse, coarse_rows
+            read, read_row_count = pairs.fine, self.fine_rows
+            written, written_row_count = pairs.coarse, coarse_rows
             if is_transposed:
-                read, read_rows = pairs.coarse, coarse_rows
-                written, written_rows = pairs.fine, self.fine_rows
+                read, read_row_count = pairs.coarse, coarse_rows
+                written, written_row_count = pairs.fine, self.fine_rows
 
             # Empty slots read one past the last row.
-            grid = read.new_full((len(self.table) * pairs.most,), read_rows)
+            grid = read.new_full((len(self.table) * pairs.most,), read_row_count)
             grid[pairs.slot] = read
 
             # Filled slots by the row that they add to.
             order = pairs.slot[torch.argsort(written, stable=True)]
-            counts = torch.bincount(written, minlength=written_rows)
+            counts = torch.bincount(written, minlength=written_row_count)
             self._slots[is_transposed] = Slots(grid, order, counts.cumsum(0) - counts)
         return self._slots[is_transposed]
 
@@ -237,7 +241,7 @@ class KernelMap:
     is_transposed: bool = False  #: False: fine to coarse (or the level to itself); True: back
 
     def by_offset(self) -> Iterator[tuple[int, Tensor, Tensor]]:
-        """List each offset that has pairs, the rows that these read, and those that they add to."""
+        """Iterate over the offsets with pairs: the offset, the rows read, the rows added to."""
         pairs = self.neighbours.pairs
         # Lists of views, each from one call: slicing one by one costs as much as small products.
         fine = pairs.fine.split(pairs.counts)

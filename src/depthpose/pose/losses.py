@@ -101,7 +101,7 @@ def model_point_loss(
     Args:
         predicted: ``camera_from_model`` (b).
         truth: the same.
-        points_m: of each object's surface.
+        points_m: points of each object's surface, in its own frame.
         symmetries: ``model_from_model`` (b, c), the identity among them.
     """
     predicted_m = predicted.apply(points_m)

@@ -65,7 +65,7 @@ def add_of_nearest_m(
     Args:
         estimated: ``camera_from_model``, one.
         true: the same, annotated.
-        points_m: of the model.
+        points_m: points of the model, in its own frame.
         symmetries: ``model_from_model``, a batch with the identity, of
             ``mesh.symmetry_transforms``.
     """

@@ -35,7 +35,7 @@ class GammaShare:
     shape: float
 
     def log_likelihood(self, count: float, area: float) -> float:
-        """Log probability of a count of patches in an area, both in independent patches."""
+        """Compute the log probability of a count of patches in an area, in independent patches."""
         rate = self.shape / self.mean
         shape = self.shape
         log_binomial = math.lgamma(count + shape) - math.lgamma(shape) - math.lgamma(count + 1)
@@ -83,7 +83,7 @@ LEAST_AREA = 1.0
 
 
 def probability_right(evidence: Evidence, prior_odds: float) -> float:
-    """Probability that a pose is right, up to near-symmetry, and not the best of wrong ones.
+    """Compute the probability that a pose is right, up to near-symmetry, not the best wrong one.
 
     It is 0 where less than two thirds of what was observed supports the pose, and where the surface
     goes on across much of its silhouette.
@@ -91,7 +91,7 @@ def probability_right(evidence: Evidence, prior_odds: float) -> float:
     if evidence.agreement < LEAST_AGREEMENT or is_on_larger(evidence):
         return 0.0
     log_odds = math.log(prior_odds) + log_likelihood_ratio(evidence)
-    return 1 / (1 + math.exp(-min(log_odds, 50.0)))
+    return 1 / (1 + math.exp(-log_odds))
 
 
 def is_on_larger(evidence: Evidence) -> bool:
@@ -100,7 +100,7 @@ def is_on_larger(evidence: Evidence) -> bool:
 
 
 def log_likelihood_ratio(evidence: Evidence) -> float:
-    """Log likelihood ratio of a right and a wrong pose, by all the evidence.
+    """Compute the log likelihood ratio of a right and a wrong pose, by all the evidence.
 
     It grows with the area that was compared: a pose that shows little has little to support it, and
     one that shows less than one independent patch has nothing.
@@ -124,12 +124,12 @@ def log_likelihood_ratio(evidence: Evidence) -> float:
 
 
 def _log_ratio(right: GammaShare, wrong: GammaShare, count: float, area: float) -> float:
-    """Log likelihood ratio of a count of patches in an area, at a right and a wrong pose."""
+    """Compute the log likelihood ratio, right to wrong pose, of a count of patches in an area."""
     return right.log_likelihood(count, area) - wrong.log_likelihood(count, area)
 
 
 def _log_ratio_of_continued(continued: float, silhouette: float) -> float:
-    """Log likelihood ratio of the part of a silhouette across which the surface goes on."""
+    """Compute the log likelihood ratio of the silhouette across which the surface goes on."""
     if silhouette < LEAST_AREA:
         return 0.0
     larger = -_log_ratio(RIGHT_CONTINUED, LARGER_CONTINUED, continued, silhouette)
@@ -137,11 +137,11 @@ def _log_ratio_of_continued(continued: float, silhouette: float) -> float:
 
 
 def log_likelihood_of_copy(evidence: Evidence, area: float) -> float:
-    """Log likelihood of the evidence at a right pose, of one of several copies.
+    """Compute the log likelihood of the evidence for one of several copies, if it is right.
 
     Args:
         evidence: of the copy.
-        area: that is visible of any of them.
+        area: the largest visible area of the copies, in independent patches.
     """
     contradicted = COPY_CONTRADICTED.log_likelihood(evidence.contradicted, area)
     unobserved = RIGHT_UNOBSERVED.log_likelihood(evidence.unobserved, area)
@@ -149,7 +149,7 @@ def log_likelihood_of_copy(evidence: Evidence, area: float) -> float:
 
 
 def _log_likelihood_of_residuals(rms: float) -> float:
-    """Log likelihood of residuals, up to a constant: normal, of the variance 1 + rms^2.
+    """Compute the log likelihood of residuals, up to a constant: normal, of variance 1 + rms^2.
 
     The variance is fitted to them, and at least 1, that of the sensor and the object.
     """

@@ -25,7 +25,7 @@ from depthpose.pose.propose.point_pairs import propose_poses
 from depthpose.pose.types import AnyInput, PoseEstimate, Refusal
 
 _VOTING_DIAMETERS = 0.05  # distance of the points that vote
-_PROPOSALS = 40
+_PROPOSALS = 40  # poses that point pairs propose
 _SMOOTHED_POINTS = 1500  # of so many, 20 neighbours give a normal that noise hardly turns
 
 
@@ -106,6 +106,7 @@ def judge(
         prior_odds: of the best pose being right, before its evidence is seen.
         votes_rad: angle between a network's directions and a pose, as :func:`compete` takes it.
     """
+    # The best pose against its near-symmetric copies, look-alikes and other local minima.
     with watch.stage("evidence"):
         observation = observe(
             cloud.cloud_m,
@@ -114,10 +115,7 @@ def judge(
             config.object_deviation_m,
             is_masked=cloud.is_masked,
         )
-
-    # The best pose against its near-symmetric copies, look-alikes and other local minima.
-    has_color = cloud.view is not None and cloud.view.color is not None
-    with watch.stage("evidence"):
+        has_color = cloud.view is not None and cloud.view.color is not None
         competition = compete(
             cloud.cloud_m.double(),
             refinement.refined,

@@ -200,6 +200,7 @@ def _propose(
     """Propose poses: the best of all objects, and some places of each; none at a claimed place."""
 
     def propose_object(name: str) -> list[_Proposal]:
+        """Propose poses of one object, the best first."""
         pairs = targets.objects[name].pairs
         poses, score = propose_in_frame(frame, is_unclaimed, pairs, len(names))
         return [
@@ -248,6 +249,7 @@ def _refine(
     object_std_m = targets.config.object_deviation_m
 
     def refine(place: _Place) -> tuple[Rigid, Evidence]:
+        """Refine the pose of a place, and compare it with the image."""
         surface = targets.objects[place.object].surface
         cloud_m = _readings_of(place, frame, view)
         pose = refine_roughly(cloud_m, place.pose[None], surface, icp)[0]
@@ -296,6 +298,7 @@ def _judge(
     """Estimate the object of each place from what its best pose explains; separate refusals."""
 
     def estimate_place(numbered: tuple[int, Sequence[_Place]]) -> PoseEstimate:
+        """Estimate the object of a group of proposals, which has a number."""
         number, group = numbered
         leader = group[0]
         cloud = CloudInput(
@@ -385,7 +388,7 @@ def _weigh_instances(
 def _within(
     judged: Sequence[_JudgedPlace], is_region: Bool[Tensor, "h w"], targets: SearchTargets
 ) -> tuple[list[_JudgedPlace], list[_Miss]]:
-    """Separate places that lie mostly beside a region: they are of something else."""
+    """Separate the places that lie mostly in a region from those that do not, as misses."""
     inside: list[_JudgedPlace] = []
     misses: list[_Miss] = []
     for place in judged:
@@ -400,17 +403,19 @@ def _within(
 def _suppress(
     judged: Sequence[_JudgedPlace], before: Sequence[_JudgedPlace], targets: SearchTargets
 ) -> tuple[list[_JudgedPlace], list[_JudgedPlace], list[_Miss]]:
-    """Non-maximum suppression: in order of probability, keep what explains other readings.
+    """Keep places in order of probability, each only if no surer one explains its readings.
 
     Returns:
-        What is kept; all whose readings are taken, by what may be one of several objects too; and
-        places at which an object is not kept for the sake of another.
+        The places that are kept; all places that claim readings, those of ``before`` and those that
+        may show one of several objects too; and, as misses, the places at which an object is not
+        kept because of another.
     """
     kept: list[_JudgedPlace] = []
     misses: list[_Miss] = []
     taken = list(before)
     ranked = sorted(judged, key=lambda place: -place.log_odds)
     for number, place in enumerate(ranked):
+        # Its readings may be taken by a surer place, even of the same object.
         surer = next((other for other in taken if place.shared_with(other) > _SHARED), None)
         if surer is not None:
             if surer.object != place.object:
@@ -418,6 +423,8 @@ def _suppress(
                 misses.append(_miss_at(place, place.estimate.evidence, reason, targets))
             continue
         taken.append(place)
+
+        # Other objects at this place share the probability of one with it.
         rivals = {place.object: place}
         for other in ranked[number + 1 :]:
             if place.shared_with(other) > _SAME_PLACE:
@@ -435,7 +442,7 @@ def _suppress(
 def nothing_found(
     view: ViewInput, object: str, misses: Sequence[_Miss], spent_s: float
 ) -> PoseEstimate:
-    """Say that a depth image does not show an object surely, and what its nearest miss was."""
+    """Build the refusal of an object that an image does not surely show, with its nearest miss."""
     read_m = view.depth_m[view.mask & (view.depth_m > 0)]
     facts: dict[str, Any] = {"name": view.name, "object": object, "seconds": {"search": spent_s}}
     if len(read_m) == 0:

@@ -78,8 +78,8 @@ class _Convolution(torch.autograd.Function):
         gradient = gradient.contiguous()
         wants_x, wants_weight, _ = ctx.needs_input_grad
 
-        # The gradient of the features: seldom wanted of the first layer's input, which is no
-        # parameter's child.
+        # The gradient of the features: not wanted in the first layer, since no parameter lies
+        # before its input.
         back = KernelMap(
             neighbours=kernel_map.neighbours, is_transposed=not kernel_map.is_transposed
         )

@@ -27,6 +27,8 @@ from depthpose.pose.outer_sides import find_outer_sides
 from depthpose.pose.types import ObjectModel
 
 NEAR = 0.05  #: diameters: a point of the cloud within this distance lies on the posed surface
+_OPPOSITE_DIAMETERS = 3 * NEAR  # largest distance of a sample on the other side of a wall
+_OCCLUDED_DIAMETERS = 1.5 * NEAR  # from which a point behind the surface counts as occluded by it
 _AXIS_STEP = 0.1  # half of the step between the rotations about a continuous axis [rad]
 _CELL = 1 / 24  # side of a cell of an image or of rays, in diameters: it holds several samples
 _REACH = 72
@@ -303,7 +305,8 @@ def _view_from(surface: Surface, toward: Tensor, across: Tensor) -> _View:
     farthest_m = max_pool2d(depth_m, 3, 1, 1)
     is_inner = (eroded > 0) & (-farthest_m > image_m - _EDGE_STEP * surface.diameter_m)
 
-    # The points of visible cells, shuffled, so that any first ones of them are spread evenly.
+    # The points of visible cells, shuffled, so that the first ones of them are spread evenly; by
+    # one seed, so that a model always has the same views.
     cells = is_visible.nonzero()[:, 0]
     shuffle = torch.randperm(len(cells), generator=torch.Generator().manual_seed(0))
     cells = cells[shuffle[:_VIEW_POINTS]]
@@ -333,7 +336,7 @@ def prepare_surface(model: ObjectModel, count: int = 10_000) -> Surface:
     few_m = points_m.numpy()[:: max(1, len(points_m) // _PROBED_SPACINGS)]
     distance_m, _ = tree.query(few_m, k=min(5, len(points_m)))
     mean_spacing_m = float(np.median(distance_m[:, -1])) * np.sqrt(np.pi) / 2
-    limit_m = 3 * NEAR * model.diameter_m
+    limit_m = _OPPOSITE_DIAMETERS * model.diameter_m
     sides = find_outer_sides(points_m.numpy(), normals.numpy(), mean_spacing_m, limit_m)
     outward, across = (torch.from_numpy(part) for part in sides)
 
@@ -363,7 +366,7 @@ def _tabulate_nearest(
     """Tabulate the surface point nearest to each box of a grid.
 
     Args:
-        points_m: of the surface.
+        points_m: points of the surface.
         tree: of these points.
         margin_m: by which the grid reaches beyond them.
     """
@@ -386,7 +389,7 @@ def look_along_rays(
     Rays are binned in cells, each as wide, where the object is, as 1/24 of its diameter.
 
     Args:
-        cloud_m: in the camera frame.
+        cloud_m: the observed points, in the camera frame.
         poses: a batch, ``camera_from_model``.
         surface: of the model.
         every: n: every n-th point of the surface is used.
@@ -407,7 +410,7 @@ def look_along_rays(
     scale = median_m / (_CELL * surface.diameter_m)
     observed_rays = cloud_m[:, :2] / cloud_m[:, 2:] * scale
     middle = observed_rays.median(0).values.floor()
-    limit_m = 1.5 * NEAR * surface.diameter_m
+    limit_m = _OCCLUDED_DIAMETERS * surface.diameter_m
     violation, unobserved = _compare_rays(
         array_of(cloud_m),
         array_of(poses.R),

@@ -273,9 +273,7 @@ class Evidence:
     bulging: float  #: patches of the object's own readings before the model
     beside: float  #: patches of the object's own readings beside the model's silhouette
     silhouette: float  #: length with readings on both sides, in patches; 0 with an exact mask
-    continued: (
-        float  #: part of ``silhouette`` across which the surface goes on: no end of the object
-    )
+    continued: float  #: part of ``silhouette`` across which the surface goes on beyond it
     rms: float  #: root mean square residual of the supported part, in standard deviations
     noise_m: float  #: standard deviation of a reading on the object, estimated from the image
 

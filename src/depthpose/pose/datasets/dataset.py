@@ -189,6 +189,7 @@ def read_instance_mask(instance: Instance) -> Bool[Tensor, "mask_h mask_w"]:
 
 _DIAMETER_SLACK = 0.01  # share by which the declared diameter may differ from the mesh's
 _FAR_DIAMETERS = 1.0  # of a cloud from the annotated pose, from which units are suspected
+_NEAR_MEDIANS = 3  # of the median depth, from which a point is no part of an object's cloud
 _FEW_IN_MASK = 0.5  # share of a posed model in its mask, below which the mask is another's
 _CHECKED_POINTS = 500  # of a model, by which that share is measured
 _MASK_MARGIN_PX = 2  # by which a mask may be too small
@@ -366,7 +367,7 @@ def _compare_with_model(
     centre_m = instance.camera_from_model.apply(model.vertices_m.double()).mean(0)
     away_m = float((cloud.double().median(0).values - centre_m).norm())
     if away_m > _FAR_DIAMETERS * model.diameter_m:
-        near_cloud = cloud[cloud[:, 2] < 3 * cloud[:, 2].median()]
+        near_cloud = cloud[cloud[:, 2] < _NEAR_MEDIANS * cloud[:, 2].median()]
         advice = advise_unit(model.diameter_m, near_cloud)
         message = (
             f"the cloud lies {away_m:.2f} m from the annotated pose; are depth_scale and "

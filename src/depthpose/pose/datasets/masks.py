@@ -13,7 +13,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import read_json
 from depthpose.core.files.images import MAX_PIXELS, open_image
 
-_MOST_LABELS = 64  # different values of an image of labels; one of more is a picture
+_MOST_LABELS = 64  # different values of an image of labels; an image of more is a photograph
 _HALF = 127  # of 255: values above it are the object, in masks with soft edges
 _SOFT = 32  # of 255: values farther than this from black and white are grey
 _MOST_BITS = 40  # of a run length in text: no image has as many pixels
@@ -72,28 +72,36 @@ def read_labels(
         return decode_rle(*runs).long()
     pixels = _read_pixels(path, with_palette=labels is None)
 
-    # Each colour becomes a number.
+    # Grey is a number already.
     values = pixels[..., 0]
-    if pixels.shape[2] > 1 and (pixels[..., :3] != values[..., None]).any():
-        colour = values.astype(np.int32)
-        for channel in (pixels[..., 1], pixels[..., 2]):
-            colour = colour * 2**8 + channel
-        colours = np.unique(colour)
-        # Not by the inverse of np.unique, which takes five times the memory.
-        values = np.searchsorted(colours, colour).astype(np.int32) + (colours[0] != 0)
+    is_coloured = pixels.shape[2] > 1 and (pixels[..., :3] != values[..., None]).any()
+    if is_coloured:
+        values = _number_colours(pixels)
 
     # An alpha channel is the mask where the opaque pixels have one colour, or too many for labels.
-    is_opaque = pixels[..., 3] > _HALF if pixels.shape[2] == 4 else values != 0
-    if pixels.shape[2] == 4 and 0 < is_opaque.sum() < is_opaque.size:
-        is_one_object = len(np.unique(values[is_opaque])) not in range(2, _MOST_LABELS)
-        values = np.where(is_opaque, 1 if is_one_object else values, 0)
+    if pixels.shape[2] == 4:
+        is_opaque = pixels[..., 3] > _HALF
+        if 0 < is_opaque.sum() < is_opaque.size:
+            is_one_object = len(np.unique(values[is_opaque])) not in range(2, _MOST_LABELS)
+            values = np.where(is_opaque, 1 if is_one_object else values, 0)
     return number_objects(values) if labels is None else _keep_labels(values, labels, path)
+
+
+def _number_colours(pixels: np.ndarray) -> np.ndarray:
+    """Number the colours of pixels (h, w, 3 or more): 1, 2, ... in their order; black stays 0."""
+    red, green, blue = (pixels[..., channel].astype(np.int32) for channel in range(3))
+    colour = (red * 2**8 + green) * 2**8 + blue
+    colours = np.unique(colour)
+    has_black = colours[0] == 0
+    # Not by the inverse of np.unique, which takes five times the memory.
+    place = np.searchsorted(colours, colour).astype(np.int32)
+    return place if has_black else place + 1
 
 
 def _read_pixels(path: Path, *, with_palette: bool) -> np.ndarray:
     """Read the pixels of a mask image (h, w, channels): 1 of numbers, 3 of colours, 4 with alpha.
 
-    ``with_palette`` gives the colours of a palette, else its indices.
+    Of an image with a palette: ``with_palette`` reads the colours, else their indices.
     """
     with open_image(path) as image:
         # With alpha, indices of a palette, numbers, or colours.

@@ -294,6 +294,7 @@ def _assign(
 
 _TRIED = 40  # instances that each change is tried on
 _LEAST_GAIN = 0.2  # least share of them that a change makes right, for it to be advised
+_FEWEST_GAINED = 3  # least number of them that a change makes right, where as many are tried
 _SCALES = {
     1.0: "",
     1000.0: "t were 1000 times larger (is it in metres? BOP's csv has millimetres)",
@@ -365,18 +366,20 @@ def advise_convention(
         predictions: of any method.
         contexts: of the errors, by the number of the object.
     """
-    # Are few right as they are?
+    # Where most are right as they are, no change makes many more right.
     posed = [p for p in predictions if p.estimate.is_posed]
     right, tried = _count_right(dataset, posed, contexts, _Change())
-    if right > (1 - _LEAST_GAIN) * tried > 0:
+    if tried > 0 and right > (1 - _LEAST_GAIN) * tried:
         return None
 
-    # The change after which most are.
+    # The change after which most are right, if these are more by a fifth of those that were tried,
+    # and by three, or by all of fewer.
     changes = _list_changes()
     counts = [_count_right(dataset, posed, contexts, change) for change in changes]
     best = max(range(len(changes)), key=lambda k: counts[k][0])
     best_right, best_tried = counts[best]
-    if best_right < right + max(1, min(3, best_tried), _LEAST_GAIN * best_tried):
+    least_gain = max(1, min(_FEWEST_GAINED, best_tried), _LEAST_GAIN * best_tried)
+    if best_right < right + least_gain:
         return None
     return (
         f"{right} of {tried} answers that were tried are right, but {best_right} of {best_tried} "

@@ -104,7 +104,11 @@ class InstanceRow(_Row):
     reason: str  #: of a refusal
 
     def error(self, name: str) -> float | None:
-        """Return an error by its name in ``METRICS``; None where it is not measured or infinite."""
+        """Return an error by its name in ``METRICS``; of VSD the mean over its tolerances.
+
+        None where it is not measured. None, too, where it is infinite, as without a pose: the
+        tables are also written as JSON, which has no infinity.
+        """
         if name not in self.errors:
             return None
         mean = float(self.errors[name].mean())

@@ -114,7 +114,7 @@ def _mark_part_bodies(bodies: _Bodies) -> np.ndarray:
 
 
 def _list_bodies(bodies: _Bodies, indices: np.ndarray) -> str:
-    """Describe size and place of bodies for a message; of more than three their number follows."""
+    """Describe size and place of three bodies at most for a message, and count the others."""
     descriptions: list[str] = []
     for k in indices[:_MOST_NAMED]:
         extent = np.linalg.norm(bodies.high[k] - bodies.low[k])

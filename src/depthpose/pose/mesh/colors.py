@@ -22,6 +22,7 @@ from depthpose.pose.types import ObjectModel, SurfaceColors
 
 _SAMPLES = 10_000  # about 1 % of the diameter apart, as far as a pose is usually off
 _AVERAGED = 4  # colours that are averaged in each sample
+_PROBED_EVERY = 10  # one in this many points of a cloud is used to measure their spacing
 _LEAST_CONTRAST = 0.01  # standard deviation of colours below which a model is of one colour
 _SAME_BOX = 1e-3  # of the extent: two readers of one file may differ by less
 _LEAST_INSIDE = 0.5  # share of the coloured surface that must lie in the shape's box
@@ -143,7 +144,7 @@ def _may_have_colors(path: AnyPath, suffix: str) -> bool:
         return b" red" in header or b"texturefile" in header
     if suffix == ".obj":
         vertex = data[: 2**16].partition(b"\nv ")[2].partition(b"\n")[0]
-        return b"mtllib" in data or len(vertex.split()) > 4
+        return b"mtllib" in data or len(vertex.split()) > 4  # more than x, y, z and a weight
     return True
 
 
@@ -155,7 +156,9 @@ def _read_point_colors(path: AnyPath, model: ObjectModel) -> SurfaceColors | Non
     if float(rgb.double().std(0).max()) < _LEAST_CONTRAST:
         return None
     points_m = model.vertices_m
-    distance_m, _ = KDTree(points_m.numpy()).query(points_m.numpy()[::10], k=2)
+    # Some of the points tell the spacing. The nearest to each is the point itself.
+    few_m = points_m.numpy()[::_PROBED_EVERY]
+    distance_m, _ = KDTree(points_m.numpy()).query(few_m, k=2)
     return SurfaceColors(
         points_m=points_m,
         normals=model.normals,

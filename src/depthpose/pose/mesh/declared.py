@@ -49,7 +49,7 @@ class DeclaredTurns:
 
     @property
     def angles_rad(self) -> Float64[Tensor, " a"]:
-        """Angles of all rotations but that by 0; a free axis is measured by eleven of its own."""
+        """Angles of all rotations but that by 0; of a free axis, eleven by which it is measured."""
         count = self.turns or _FREE_AXIS_TURNS
         return torch.arange(1, count, dtype=torch.float64) * (2 * math.pi / count)
 
@@ -250,9 +250,7 @@ def _place_axes(
 
 
 _AXIS_STEPS = 20  # by which an axis is placed
-_NEAREST_SHARE = (
-    0.9  # of the points, which place an axis: a keyway, without a counterpart, does not
-)
+_NEAREST_SHARE = 0.9  # of the points, which place an axis: those of a keyway do not
 _COMPARED_TURNS = 6  # approximate number of rotations by which places of an axis are compared
 
 

@@ -54,6 +54,7 @@ def _refuse_unread_scene(path: AnyPath, data: bytes) -> None:
     if not data.startswith(b"glTF"):
         raise InputError(f"{path}: begins by {data[:12]!r}, not by 'glTF'; export it as binary GLB")
     with refused_as(path, "GLB", "export it again"):
+        # A header of 12 bytes, the length and the type of the JSON of 4 bytes each, the JSON.
         (size,) = struct.unpack("<I", data[12:16])
         if size > _MOST_SCENE_BYTES:
             raise InputError(f"{path}: {size} bytes of JSON in a GLB; export the part alone")

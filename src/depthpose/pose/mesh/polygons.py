@@ -9,7 +9,8 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import AnyPath
 
 _MOST_CORNERS = 5_000  # of one polygon
-_MOST_STEPS = 2e8  # that clip all polygons that are not convex: some ten seconds
+_MOST_COMPARISONS = 2e8  # of corners, to clip all polygons that are not convex: some ten seconds
+_CORNER_OVERHEAD = 1000.0  # of each corner, in comparisons: its step in Python takes as long
 _MOST_TOGETHER = 2**20  # corners of polygons that are cut at a time, for memory
 _MOST_ROUNDS = 3  # about a polygon in search of ears; one that needs more crosses itself
 _FLAT = 1e-9  # of the square of a polygon's extent: an area that is smaller is none
@@ -43,14 +44,14 @@ def cut_polygons(
     polygon_of_triangle = [np.empty(0, np.int64)]
     overlap = np.zeros(len(sizes))  # area of each polygon that its triangles cover twice
     area = 0.0
-    steps = 0.0
+    comparisons = 0.0
     for group in _group_by_size(sizes):
         size = int(sizes[group[0]])
         polygons = corners[starts[group, None] + np.arange(size)]
         points = vertices[polygons]
         normals, is_reflex = _find_reflex_corners(points)
-        steps += _count_clipping_steps(is_reflex)
-        if steps > _MOST_STEPS:
+        comparisons += _count_comparisons(is_reflex)
+        if comparisons > _MOST_COMPARISONS:
             raise InputError(
                 f"{path}: its polygons that are not convex have too many corners to be cut in some "
                 f"seconds (one of {size} among them); export it as triangles"
@@ -130,14 +131,17 @@ def _find_reflex_corners(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return normals, turns < -_FLAT * (normals**2).sum(-1, keepdims=True)
 
 
-def _count_clipping_steps(is_reflex: np.ndarray) -> float:
-    """Estimate the steps to clip polygons (m, n); convex ones, which are cut as fans, take none.
+def _count_comparisons(is_reflex: np.ndarray) -> float:
+    """Estimate the time to clip the ears of polygons, in comparisons of two corners.
 
-    Each corner is compared with all reflex ones, and that takes as long as 1,000 comparisons more.
+    Each corner is compared with all reflex ones. Convex polygons are cut as fans, without any.
+
+    Args:
+        is_reflex: which corners of the polygons are reflex (m, n).
     """
-    reflex = is_reflex.sum(1)
-    comparisons = 1000.0 + reflex[reflex > 0]
-    return float((is_reflex.shape[1] * comparisons).sum())
+    reflex_count = is_reflex.sum(1)
+    comparisons_of_corner = _CORNER_OVERHEAD + reflex_count[reflex_count > 0]
+    return float((is_reflex.shape[1] * comparisons_of_corner).sum())
 
 
 def _measure_overlap(corners: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -219,7 +223,8 @@ def _clip_ears(points: np.ndarray, is_reflex: np.ndarray) -> list[list[int]]:
         while waiting and len(ears) < count - 3:
             k, _ = waiting.popitem(last=False)
             ear = [before[k], k, after[k]]
-            if not (must_cut or rounds > _MOST_ROUNDS or _is_ear(points, ear, is_reflex, straight)):
+            is_cut = must_cut or rounds > _MOST_ROUNDS or _is_ear(points, ear, is_reflex, straight)
+            if not is_cut:
                 continue
 
             # The ear is cut off: its neighbours become those of each other.
@@ -229,8 +234,8 @@ def _clip_ears(points: np.ndarray, is_reflex: np.ndarray) -> list[list[int]]:
             must_cut = False
             after[ear[0]] = ear[2]
             before[ear[2]] = ear[0]
-            # They wait again, unless they do. The one after the ear comes first, so that ears do
-            # not fan out from one corner as needles.
+            # Both wait again, unless they still do. The one after the ear comes first, so that ears
+            # do not fan out from one corner as needles.
             waiting.setdefault(ear[2])
             waiting.setdefault(ear[0])
         if len(ears) >= count - 3:

@@ -103,7 +103,8 @@ def propose_in_frame(
     references = torch.arange(_choose_number_of_references(len(order), models))
     poses, score = vote_poses(points_m[order], normals[order], references, table, _PEAKS)
 
-    # Fewer and fewer poses are refined and compared, more and more closely.
+    # Fewer and fewer poses are refined and compared, more and more closely. Their scores take the
+    # place of the votes, by which none is chosen.
     for stage in _STAGES:
         poses = refine_projectively(frame, poses, surface, stage)
         score = score_by_image(frame, poses, surface, stage)

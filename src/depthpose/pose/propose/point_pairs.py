@@ -51,7 +51,7 @@ _NEAR_ROUGHLY = 0.1
 _SHUFFLE_SEED = 0
 """Seed of the order of alike pairs, so that a model always has the same table."""
 _RAYS_EVERY = 16
-"""Every so-many-th point of the surface is used to count free-space violations."""
+"""One in this many points of the surface is used to count free-space violations."""
 _UNOBSERVED_WEIGHT = 0.3
 """Weight in a score of the share of the surface that should be visible and was not observed."""
 
@@ -122,7 +122,7 @@ def propose_poses(
     """Propose poses of a model in a cloud: pairs of points vote, and the proposals are scored.
 
     Args:
-        points_m: of the cloud, about 0.05 diameters apart, in the camera frame.
+        points_m: points of the cloud, about 0.05 diameters apart, in the camera frame.
         normals: of these points, toward the camera.
         table: pairs of the model.
         count: how many poses at most.
@@ -203,7 +203,7 @@ def vote_poses(
     (Hinterstoisser et al., Going Further with Point Pair Features, ECCV 2016).
 
     Args:
-        points_m: of the scene, about 0.05 diameters apart, in the camera frame.
+        points_m: points of the scene, about 0.05 diameters apart, in the camera frame.
         normals: of these points, toward the camera.
         references: indices of the points that vote with each of the others.
         table: pairs of the model.

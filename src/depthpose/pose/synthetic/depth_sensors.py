@@ -28,7 +28,7 @@ _LASER_NOISE_M = 0.0005  # standard deviation
 _SHADOW_PX = 1.5  # by which a column of the projector lies before another that hides it
 _PATCH_PX = 12  # width of a patch of missing pixels
 _STEEPEST = math.tan(math.radians(80))
-"""No sensor reads a surface that is turned farther away than 80 degrees."""
+"""No sensor but a laser reads a surface that is turned farther away than 80 degrees."""
 JUMP = 0.02
 """Neighbours whose depths differ by more than this share lie on different surfaces."""
 
@@ -42,7 +42,7 @@ def simulate_depth(
     """Simulate the measurement of a clean depth window by a sensor.
 
     Args:
-        depth_m: of every pixel of the window; NaN where there is no surface.
+        depth_m: exact depth of every pixel of the window; NaN where there is no surface.
         focal_px: of this window, and of the sensor's full image (which says how fine its disparity
             is).
         config: kinds of sensor, and their errors.
@@ -93,7 +93,7 @@ def _read_structured_light(
     depth_m: Depth, unit_noise: Depth, image_focal_px: float, generator: torch.Generator
 ) -> Depth:
     """Read depth as a Kinect does: blurred edges, noise, and steps of disparity."""
-    read_m = _swap_neighbours(depth_m, generator)
+    read_m = _read_random_neighbours(depth_m, generator)
     # Nguyen, Izadi and Lovell 2012: sigma_z = 0.0012 + 0.0019 (z - 0.4)^2 [m].
     read_m = read_m + unit_noise * (0.0012 + 0.0019 * (read_m - 0.4).square())
     scale_px_m = _KINECT_STEPS_PER_PX * image_focal_px * _KINECT_BASELINE_M
@@ -128,7 +128,7 @@ def _read_time_of_flight(depth_m: Depth, unit_noise: Depth, generator: torch.Gen
 
 def _mark_steep(depth_m: Depth, focal_px: float, *, is_laser: bool) -> Mask:
     """Mark pixels of a surface seen at a grazing angle, which a sensor does not read."""
-    steepest = 2 * _STEEPEST if is_laser else _STEEPEST
+    steepest = 2 * _STEEPEST if is_laser else _STEEPEST  # a laser reads steeper surfaces
     limit_m = depth_m * (steepest / focal_px)  # largest change of depth to the next pixel
     across_m = depth_m.diff(dim=1).abs_()
     down_m = depth_m.diff(dim=0).abs_()
@@ -157,7 +157,7 @@ def _mark_gaps(size: torch.Size, share: float, generator: torch.Generator) -> Ma
     return is_missing
 
 
-def _swap_neighbours(depth_m: Depth, generator: torch.Generator) -> Depth:
+def _read_random_neighbours(depth_m: Depth, generator: torch.Generator) -> Depth:
     """Let each pixel read itself or a neighbour at random: edges are blurred.
 
     At the ends of a row it reads the next row; windows have a margin there.

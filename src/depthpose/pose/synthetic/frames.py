@@ -75,7 +75,7 @@ def draw_pattern(
 
     Args:
         generator: of random numbers.
-        size_m: of the surface; features are about a third of it.
+        size_m: extent of the surface; features are about a third of it.
         hue_share: range of the share of a hue, against grey.
     """
     strength = uniform(generator, 0.0, 0.25)
@@ -338,8 +338,8 @@ def _arrange(
     clutter = fewest + random_index(generator, most - fewest + 1)
     chosen += [draw_clutter(generator) for _ in range(clutter)]
 
-    # Each is tried at places farther and farther from the middle until its circle is free; one that
-    # never finds a free place is left out.
+    # Each is tried at places until its circle is free, farther from the middle with every try and
+    # with every body that lies there. One that never finds a free place is left out.
     placed: list[PlacedSolid] = []
     circles: list[_Circle] = []
     for solid in chosen:
@@ -404,7 +404,7 @@ def _drop_pile(
 
     # A map of the pile's height, about the middle of the table.
     radius_m = float(points_m.norm(dim=1).max())
-    reach_m = 0.6 * radius_m * math.sqrt(config.frame_pile)
+    reach_m = 0.6 * radius_m * math.sqrt(config.frame_pile)  # an area that grows with their number
     cells = math.ceil((reach_m + radius_m) / _CELL_M)  # from the middle to each side
     height_m = torch.zeros((2 * cells + 1) ** 2)
 
@@ -429,7 +429,7 @@ def _drop_body(
     """Drop a body on a pile: rotated and shifted at random, and as low as the pile lets it.
 
     Args:
-        points_m: of its surface, about its middle.
+        points_m: points of its surface, about its middle.
         height_m: of the pile in each cell, row after row.
         cells: from the middle of the table to each side of the map.
         reach_m: largest shift along x and y.
@@ -467,7 +467,7 @@ def _draw_viewpoint(config: ObjectsConfig, generator: torch.Generator) -> Rigid:
     right = F.normalize(torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0])), dim=0)
     R = torch.stack([right, torch.linalg.cross(forward, right), forward])
 
-    # Rolled a little, and aimed at a point near the middle.
+    # Rolled a little [rad], and aimed at a point near the middle [m].
     roll = uniform(generator, -0.3, 0.3)
     cosine = math.cos(roll)
     sine = math.sin(roll)

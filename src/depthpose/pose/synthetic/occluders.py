@@ -63,9 +63,9 @@ def occlude(
     """Occlude exactly a share of a silhouette by something before it.
 
     Args:
-        depth_m: of the object and what is behind it.
+        depth_m: depth of the object and of what is behind it.
         silhouette: pixels of the object.
-        share: of them, that is occluded.
+        share: of these pixels, 0..1, that is occluded.
         generator: of random numbers.
 
     Returns:

@@ -6,7 +6,7 @@ from torch import Tensor
 
 
 def uniform(generator: torch.Generator, low: float, high: float) -> float:
-    """Draw a number of a range."""
+    """Draw a number from ``low`` to ``high``, all equally likely."""
     return low + (high - low) * float(torch.rand((), generator=generator))
 
 

@@ -119,7 +119,7 @@ def measure_add(estimated: Rigid | None, truth: Rigid, model: ObjectModel) -> fl
     return float(add_of_nearest_m(estimated, truth, points_m, copies)) / model.diameter_m
 
 
-_CLOUDS_AT_ONCE = 32
+_CLOUDS_AT_ONCE = 32  # views that are rendered and estimated at a time
 
 HeldOutTable = Mapping[str, Mapping[str, float | None]]
 """By occlusion in percent: the shares ``right``, ``ambiguous``, ``wrong`` and ``refused``, and the
