@@ -165,7 +165,7 @@ class Limit:
     """
 
     value: float  #: the limit, in the output's unit
-    of: Literal["largest", "mean"] = "largest"  #: limited difference; mean of discontinuous outputs
+    of: Literal["largest", "mean"] = "largest"  #: which difference; the mean of outputs that jump
     is_relative: bool = False  #: differences are divided by PyTorch's numbers
     flips: float = 0.0  #: largest share of flipped numbers
 
@@ -259,7 +259,7 @@ def write_export(path: Path, export: Export) -> list[ProofRow]:
     """
     if path.suffix != ".onnx":
         raise InputError(f"{path}: the graph is written as ONNX; end the name in .onnx.")
-    proof = path.with_suffix(".proof.json")  # NAME.json may be a camera
+    proof = path.with_suffix(".proof.json")  # not NAME.json, which may be a camera
     for file in (path, proof):
         refuse_to_replace(file)
     onnx = import_onnx()

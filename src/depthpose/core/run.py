@@ -123,7 +123,7 @@ class ProcessRank:
     world: int = 1  #: number of processes
 
     def share_of(self, items: Sequence[Item]) -> Sequence[Item]:
-        """Return this process's share of a list: every ``world``-th item, beginning at ``rank``."""
+        """Return this process's share of a list: items ``rank``, ``rank + world``, and so on."""
         return items[self.rank :: self.world]
 
 
@@ -311,6 +311,7 @@ def claim_names(
                 "made; choose another folder, or delete this one"
             )
 
+    # Files of results without a recorded source; those of a video have a name for each frame.
     new_names = present.keys() - recorded.keys()
     result_files: dict[str, Path] = {}
     for stem, file in files_by_stem.items():
@@ -361,12 +362,12 @@ class Source(NamedTuple):
     stamp: str  #: sizes and times of the last change of all files; "" where there are none
 
     def has_changed(self, now: "Source") -> bool:
-        """Whether the files are others than when this was recorded, as far as is known."""
+        """Whether the files differ from those recorded; False where a stamp is unknown."""
         return bool(self.stamp and now.stamp) and self.stamp != now.stamp
 
 
 def _describe_source(files: Path | Sequence[Path]) -> Source:
-    """Read size and time of the last change of the files of a source."""
+    """Describe the files of a source: the path of the first, and sizes and times of all."""
     paths = [files] if isinstance(files, Path) else list(files)
     stamps: list[str] = []
     for path in paths:
@@ -482,7 +483,7 @@ class _ResultsLog:
     end: int = 0  # byte up to which it has been read
     results: dict[str, dict[str, list[int]]] = field(
         default_factory=dict
-    )  # stamps by file, by name
+    )  # of each result, by its name: the stamps of its files, by their paths
     failures: dict[str, str] = field(default_factory=dict)  # reasons by name
 
 

@@ -423,6 +423,7 @@ def make_rectifier(pair: RawPair, size: Size, keep: float = 0.0) -> Rectifier:
     size = pair.size or size
     R = pair.right_from_left.R.numpy()
     t = pair.right_from_left.t_m[:, None].numpy()
+    # Intrinsic matrix and distortion of each camera, as OpenCV's functions take them.
     left = (pair.left.K.numpy(), np.array(pair.left.distortion))
     right = (pair.right.K.numpy(), np.array(pair.right.distortion))
 

@@ -55,7 +55,8 @@ class RayEngine:
         if starts_ray:
             self._connect(ray)
         try:
-            # In a list it stays a reference, which a restarted worker reads again.
+            # In a list it stays a reference, which a restarted worker reads again; Ray would
+            # replace a bare one by the object.
             computation_reference = [ray.put(computation)]
             most_workers = self.workers or self._count_fitting_workers(ray)
             pool = ray.data.ActorPoolStrategy(

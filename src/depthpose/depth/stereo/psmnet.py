@@ -306,7 +306,7 @@ class PSMNet(StereoNetwork):
             first_down = down if first_down is None else first_down
             del down
             x = hourglass.up1(up).add_(volume)
-            cost = layers.by_rows(head, (x,), halo=2, rows=self.rows)
+            cost = layers.by_rows(head, (x,), halo=2, rows=self.rows)  # two convolutions
             costs.append(cost + costs[-1] if costs else cost)
         return cast("tuple[Volume, Volume, Volume]", tuple(costs))
 
