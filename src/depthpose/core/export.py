@@ -113,7 +113,7 @@ class Graph:
         return Value(self, output_name)
 
     def call(self, network: Any, *inputs: Value) -> tuple[Value, ...]:  # noqa: ANN401
-        """Add all nodes of another ONNX model, connected to ``inputs``, and return its outputs."""
+        """Add all nodes of an ONNX model (``network``), fed by ``inputs``; return its outputs."""
         prefix = f"network_{next(self.numbers)}/"
         inner = self.onnx.compose.add_prefix(network, prefix).graph
         for value, inner_input in zip(inputs, inner.input, strict=True):

@@ -53,7 +53,7 @@ def rasterize(
         K: intrinsic matrix; fx and fy may differ, skew is allowed.
         width: columns of the picture [px].
         height: rows [px].
-        near_m: depth below which nothing is visible [m].
+        near_m: least depth at which something is visible [m].
         with_barycentric: compute barycentric coordinates too.
 
     Raises:
@@ -216,7 +216,7 @@ def _draw(
         parallel_depth_m: depth of the corners along parallel rays, 0 or more; None: a pinhole.
         width: columns of the picture [px].
         height: rows [px].
-        near_m: depth below which nothing is visible [m].
+        near_m: least depth at which something is visible [m].
         with_barycentric: compute barycentric coordinates too.
     """
     triangles = _select_triangles(corners, pixels, is_front, parallel_depth_m, width, height)
@@ -319,7 +319,7 @@ def _draw_spans(
         spans: spans of pixels.
         part: those of them that are drawn.
         width: columns of the picture [px].
-        near_m: depth below which nothing is visible [m].
+        near_m: least depth at which something is visible [m].
         is_parallel: rays are parallel, so that the plane is the depth, and not 1 / depth.
     """
     span, u = _expand_ranges(spans.first_column[part], spans.last_column[part])

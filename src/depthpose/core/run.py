@@ -481,10 +481,9 @@ class _ResultsLog:
 
     inode: int  # identifies the file, which may be replaced by another
     end: int = 0  # byte up to which it has been read
-    results: dict[str, dict[str, list[int]]] = field(
-        default_factory=dict
-    )  # of each result, by its name: the stamps of its files, by their paths
-    failures: dict[str, str] = field(default_factory=dict)  # reasons by name
+    # of each finished result, by its name: the stamps of its files, by their paths
+    results: dict[str, dict[str, list[int]]] = field(default_factory=dict)
+    failures: dict[str, str] = field(default_factory=dict)  # reasons, by the names of results
 
 
 _logs: dict[Path, _ResultsLog] = {}  # what was read of each file, so that only new lines are read

@@ -60,7 +60,7 @@ _DECIMALS = 6
 """Decimals of the values of a mount: as files hold them, so that a rerun continues from the same
 values."""
 _WINDOW_RADIUS_PX = 2
-"""Around a pixel whose distance was measured, of a square of 5 x 5 pixels."""
+"""By how many pixels a window reaches to each side of a measured point: 5 x 5 pixels."""
 
 
 @dataclass

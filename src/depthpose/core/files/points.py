@@ -497,9 +497,10 @@ def _split_compressed(
     It is the compressed and the uncompressed size (4 bytes each), then the columns of all points,
     one after the other, compressed by LZF.
     """
-    require_bytes(path, len(body), 8, "the two compressed sizes")
+    head_bytes = 8  # of the two sizes
+    require_bytes(path, len(body), head_bytes, "the two compressed sizes")
     packed_size, size = (int(n) for n in np.frombuffer(body, "<u4", 2))
-    require_bytes(path, len(body) - 8, packed_size, "compressed points")
+    require_bytes(path, len(body) - head_bytes, packed_size, "compressed points")
     declared = count * sum(f.count * np.dtype(f.code).itemsize for f in fields)
     if size != declared or size > _MAX_UNPACKED or packed_size > _MAX_PACKED:
         raise InputError(
@@ -507,7 +508,8 @@ def _split_compressed(
             f"(and {_MAX_PACKED} and {_MAX_UNPACKED} are allowed); save it as DATA binary"
         )
     try:
-        unpacked = memoryview(decompress_lzf(body[8 : 8 + packed_size], size))
+        packed = body[head_bytes : head_bytes + packed_size]
+        unpacked = memoryview(decompress_lzf(packed, size))
     except ValueError as error:
         raise InputError(f"{path}: damaged: {error}; save it as DATA binary") from error
     columns: Columns = {}

@@ -286,9 +286,8 @@ class _Training:
         rank = self.accelerator.process_index
         size = self.config.batch_size
         accumulate = self.config.accumulate
-        rounds = range(
-            self.step * accumulate, self.steps * accumulate
-        )  # each process takes one micro-batch
+        # In each round every process takes one micro-batch.
+        rounds = range(self.step * accumulate, self.steps * accumulate)
         starts = ((number * self.process_count + rank) * size for number in rounds)
         loader = DataLoader(
             self.samples,  # pyright: ignore[reportArgumentType]
