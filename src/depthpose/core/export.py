@@ -200,7 +200,7 @@ def _compare_output(
             f"{torch_nan.sum()}; nothing is written."
         )
 
-    # Differences of all numbers that are not NaN in both outputs; infinite of NaN in one alone.
+    # The difference is infinite where one output alone is NaN, and left out where both are.
     difference = np.abs(onnx_values - torch_values)
     if limit.is_relative:
         difference /= np.abs(torch_values)

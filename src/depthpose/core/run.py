@@ -294,8 +294,9 @@ def claim_names(
     present = {name: _describe_source(files) for name, files in sources.items()}
 
     if is_finished is None:
-        names_of_frames = [_FRAME.sub("", stem) for stem in files_by_stem]
-        is_finished = {*files_by_stem, *names_of_frames}.__contains__
+        # A video counts as finished where there is a file of one of its frames.
+        videos_with_frames = [_FRAME.sub("", stem) for stem in files_by_stem]
+        is_finished = {*files_by_stem, *videos_with_frames}.__contains__
     for name, source in present.items():
         earlier = recorded.get(name, source)
         if earlier.path != source.path:

@@ -271,7 +271,7 @@ def _warp_left_to_right(left: Value, right_px: Value, size: Value) -> Value:
 
 
 def _make_example_image(multiple: int) -> Tensor:
-    """Make an image of suitable sides, by which a generator's network is traced."""
+    """Make an example image, as ``convert_network`` needs it to trace a generator."""
     return torch.rand(2, 3, 2 * multiple, 3 * multiple)
 
 

@@ -206,6 +206,7 @@ def write_depth_weights(
         facts: ``trained_on``, ``licence`` and the like.
         with_half: store 16-bit floats: half the size.
     """
+    # The kind of each network follows from its class.
     networks: dict[str, Any] = {}
     for kind, classes in _list_kinds().items():
         for network in (generator, matcher):

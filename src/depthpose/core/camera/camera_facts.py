@@ -154,7 +154,7 @@ def camera_from_facts(facts: CameraFacts, size: Size | None) -> Camera:
     refuse_outside(camera.K, camera.width, camera.height)
     if isinstance(camera, StereoRig):
         _refuse_rig(camera, is_metric=facts.is_metric)
-    unit_m = camera.depth_unit_m or 1.0
+    unit_m = camera.depth_unit_m or 1.0  # without a unit nothing is refused
     if not _MIN_UNIT_M <= unit_m <= 1:
         finding = "finer than any sensor's; it is metres a unit: 0.001 means millimetres"
         if unit_m > 1:

@@ -193,6 +193,7 @@ def with_json_keys(facts: CameraFacts | None, fields: Fields) -> CameraFacts | N
     for key in ("baseline_m", DOFFS_KEY, *OPTIONAL_KEYS):
         field = key.replace("_", "")
         value = fields.get(field)
+        # Of the difference of cx ``facts`` has 0 where it has none: the key always counts.
         is_set = key != DOFFS_KEY and getattr(facts, key) is not None
         if value is None or is_set:
             continue
