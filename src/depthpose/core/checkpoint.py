@@ -273,12 +273,12 @@ class _SkipRandomInit(TorchFunctionMode):
     ) -> Any:  # noqa: ANN401
         options = kwargs or {}
         if func in _RANDOM_INITS:
-            return args[0] if args else options["tensor"]
+            return args[0] if args else options["tensor"]  # the tensor, as it is
         return func(*args, **options)
 
 
 def list_misfits(wanted: Mapping[str, Tensor], tensors: Mapping[str, Tensor]) -> list[str]:
-    """List by what the names and shapes of tensors differ from wanted ones.
+    """List where the names and shapes of tensors differ from wanted ones.
 
     Returns:
         A phrase for each tensor that is missing, unexpected or of another shape, such as

@@ -284,6 +284,7 @@ def _convert_to_float(value: Any, shown: str) -> float:  # noqa: ANN401
     """
     needed = "finite number is needed: write one, or leave the key out for the default"
     try:
+        # A bool is refused like text: Python would convert True to 1.0.
         number = float("none" if isinstance(value, bool) else value)
     except OverflowError:
         number = math.inf
@@ -296,13 +297,13 @@ def _convert_to_float(value: Any, shown: str) -> float:  # noqa: ANN401
 
 
 def config_to_dict(config: object) -> dict[str, Any]:
-    """Convert a config to nested mappings of every setting, as YAML and JSON hold them."""
+    """Convert a config to nested mappings of every setting: tuples as lists, paths as text."""
     return json.loads(json.dumps(dataclasses.asdict(config), default=str))  # pyright: ignore[reportArgumentType]
 
 
 def write_config(path: Path, config: object) -> None:
     """Write all settings as YAML, defaults too, so that the file is a full record."""
-    from depthpose.core.files import atomic_write  # as in read_config
+    from depthpose.core.files import atomic_write  # imported here as in read_config
 
     with atomic_write(path) as temporary:
         temporary.write_text(yaml.safe_dump(config_to_dict(config), sort_keys=False))

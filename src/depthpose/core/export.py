@@ -113,7 +113,7 @@ class Graph:
         return Value(self, output_name)
 
     def call(self, network: Any, *inputs: Value) -> tuple[Value, ...]:  # noqa: ANN401
-        """Add all nodes of another ONNX model, connected to ``inputs``, and return its outputs."""
+        """Add all nodes of an ONNX model (``network``), fed by ``inputs``; return its outputs."""
         prefix = f"network_{next(self.numbers)}/"
         inner = self.onnx.compose.add_prefix(network, prefix).graph
         for value, inner_input in zip(inputs, inner.input, strict=True):
@@ -165,7 +165,7 @@ class Limit:
     """
 
     value: float  #: the limit, in the output's unit
-    of: Literal["largest", "mean"] = "largest"  #: limited difference; mean of discontinuous outputs
+    of: Literal["largest", "mean"] = "largest"  #: which difference; the mean of outputs that jump
     is_relative: bool = False  #: differences are divided by PyTorch's numbers
     flips: float = 0.0  #: largest share of flipped numbers
 
@@ -200,7 +200,7 @@ def _compare_output(
             f"{torch_nan.sum()}; nothing is written."
         )
 
-    # Differences of all numbers that are not NaN in both outputs; infinite of NaN in one alone.
+    # The difference is infinite where one output alone is NaN, and left out where both are.
     difference = np.abs(onnx_values - torch_values)
     if limit.is_relative:
         difference /= np.abs(torch_values)
@@ -259,7 +259,7 @@ def write_export(path: Path, export: Export) -> list[ProofRow]:
     """
     if path.suffix != ".onnx":
         raise InputError(f"{path}: the graph is written as ONNX; end the name in .onnx.")
-    proof = path.with_suffix(".proof.json")  # NAME.json may be a camera
+    proof = path.with_suffix(".proof.json")  # not NAME.json, which may be a camera
     for file in (path, proof):
         refuse_to_replace(file)
     onnx = import_onnx()

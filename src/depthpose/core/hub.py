@@ -23,7 +23,7 @@ _HUB_NAME = re.compile(
 )
 
 ON_HUB = "hf:/"
-"""What the names of weights on the hub begin with, also as paths."""
+"""Beginning of the names of weights on the hub, also of a name that became a path."""
 _LONGEST_REASON = 200  # letters that are shown of another library's message
 
 

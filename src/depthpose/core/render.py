@@ -20,6 +20,7 @@ from depthpose.core.camera.pinhole import check_intrinsics
 from depthpose.core.errors import InputError
 
 _EMPTY = (1 << 63) - 1  # the largest key: that of a pixel without a triangle
+_NUMBER_BITS = 32  # lower bits of a key: the number of the triangle; its depth lies above them
 # Rows of triangles, and pixels of rows, that are computed at a time: some 200 MB at most.
 _MAX_ROWS = 1 << 20
 _MAX_PIXELS = 1 << 18
@@ -52,7 +53,7 @@ def rasterize(
         K: intrinsic matrix; fx and fy may differ, skew is allowed.
         width: columns of the picture [px].
         height: rows [px].
-        near_m: what is nearer than this is invisible.
+        near_m: least depth at which something is visible [m].
         with_barycentric: compute barycentric coordinates too.
 
     Raises:
@@ -186,7 +187,7 @@ class _Triangles:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Spans:
-    """Adjacent pixels of a row that lie inside of a triangle; a triangle has one span a row."""
+    """Spans: the adjacent pixels of one row that lie inside one triangle."""
 
     number: Int64[Tensor, " n"]  # index of the triangle among all
     row: Int64[Tensor, " n"]
@@ -210,12 +211,12 @@ def _draw(
 
     Args:
         corners: homogeneous pixels of the triangles.
-        pixels: corners of which the box of each triangle is made [px].
+        pixels: three points a triangle, whose bounding box holds what it may cover [px].
         is_front: whether a corner is in front of the camera; None: all are.
         parallel_depth_m: depth of the corners along parallel rays, 0 or more; None: a pinhole.
         width: columns of the picture [px].
         height: rows [px].
-        near_m: what is nearer than this is invisible.
+        near_m: least depth at which something is visible [m].
         with_barycentric: compute barycentric coordinates too.
     """
     triangles = _select_triangles(corners, pixels, is_front, parallel_depth_m, width, height)
@@ -231,8 +232,8 @@ def _draw(
 
     # Depth and number out of the keys.
     is_drawn = buffer != _EMPTY
-    primitive = torch.where(is_drawn, buffer & 0xFFFFFFFF, -1).reshape(height, width)
-    depth_m = (buffer >> 32).int().view(torch.float32).double()
+    primitive = torch.where(is_drawn, buffer & ((1 << _NUMBER_BITS) - 1), -1).reshape(height, width)
+    depth_m = (buffer >> _NUMBER_BITS).int().view(torch.float32).double()
     depth_m = torch.where(is_drawn, depth_m, torch.nan).reshape(height, width)
     shares = barycentric_shares(*edge_functions(corners), primitive) if with_barycentric else None
     return Raster(depth_m=depth_m, primitive=primitive, barycentric=shares)
@@ -277,7 +278,7 @@ def _select_triangles(
 
 
 def _find_spans(triangles: _Triangles, chunk: slice) -> _Spans:
-    """Find the spans of some triangles: in each row the columns inside of all three edges."""
+    """Find the spans of some triangles: in each row the columns inside all three edges."""
     triangle, row = _expand_ranges(triangles.first_row[chunk], triangles.last_row[chunk])
     triangle = triangle + chunk.start
     v = row.double()
@@ -318,7 +319,7 @@ def _draw_spans(
         spans: spans of pixels.
         part: those of them that are drawn.
         width: columns of the picture [px].
-        near_m: what is nearer than this is invisible.
+        near_m: least depth at which something is visible [m].
         is_parallel: rays are parallel, so that the plane is the depth, and not 1 / depth.
     """
     span, u = _expand_ranges(spans.first_column[part], spans.last_column[part])
@@ -333,7 +334,7 @@ def _draw_spans(
     # Where 1 / depth is not positive, the ray meets the plane behind the camera.
     is_visible = (depth_m >= near_m) & depth_m.isfinite()
     depth_bits = depth_m.view(torch.int32).long()
-    key = (depth_bits << 32) | spans.number[part].index_select(0, span)
+    key = (depth_bits << _NUMBER_BITS) | spans.number[part].index_select(0, span)
     key = torch.where(is_visible, key, _EMPTY)
     pixel = (spans.row * width)[part].index_select(0, span) + u
     buffer.scatter_reduce_(0, pixel, key, "amin")
@@ -345,7 +346,7 @@ def _find_columns_inside(
     first: Int64[Tensor, " n"],
     last: Int64[Tensor, " n"],
 ) -> tuple[Int64[Tensor, " n"], Int64[Tensor, " n"]]:
-    """Find the first and the last column of rows inside of all three edges of their triangles.
+    """Find the first and the last column of rows inside all three edges of their triangles.
 
     Args:
         slope: along a row, an edge function is ``slope * u + offset``, not negative inside.
@@ -361,14 +362,14 @@ def _find_columns_inside(
     left = _reduce_columns(torch.maximum, torch.where(slope > 0, crossing, -torch.inf))
     right = _reduce_columns(torch.minimum, torch.where(slope < 0, crossing, torch.inf))
 
-    # An edge along the row has no crossing: the whole row is inside of it, or outside.
+    # An edge along the row has no crossing: the whole row is inside it, or outside.
     is_level = slope == 0
     is_outside = _reduce_columns(torch.logical_or, is_level & (offset < 0))
     # The edge functions of a triangle without area are 0: it would cover everything.
     has_no_area = _reduce_columns(torch.logical_and, is_level)
     start = torch.maximum(left.ceil(), first.double())
     stop = torch.minimum(right.floor(), last.double())
-    stop = torch.where(is_outside | has_no_area, -1, stop)
+    stop = torch.where(is_outside | has_no_area, -1, stop)  # before any first column: empty
     return start.long(), stop.clamp(min=-1).long()
 
 

@@ -123,7 +123,7 @@ class ProcessRank:
     world: int = 1  #: number of processes
 
     def share_of(self, items: Sequence[Item]) -> Sequence[Item]:
-        """Return this process's share of a list: every ``world``-th item, beginning at ``rank``."""
+        """Return this process's share of a list: items ``rank``, ``rank + world``, and so on."""
         return items[self.rank :: self.world]
 
 
@@ -295,8 +295,9 @@ def claim_names(
     present = {name: _describe_source(files) for name, files in sources.items()}
 
     if is_finished is None:
-        names_of_frames = [_FRAME.sub("", stem) for stem in files_by_stem]
-        is_finished = {*files_by_stem, *names_of_frames}.__contains__
+        # A video counts as finished where there is a file of one of its frames.
+        videos_with_frames = [_FRAME.sub("", stem) for stem in files_by_stem]
+        is_finished = {*files_by_stem, *videos_with_frames}.__contains__
     for name, source in present.items():
         earlier = recorded.get(name, source)
         if earlier.path != source.path:
@@ -312,6 +313,7 @@ def claim_names(
                 "made; choose another folder, or delete this one"
             )
 
+    # Files of results without a recorded source; those of a video have a name for each frame.
     new_names = present.keys() - recorded.keys()
     result_files: dict[str, Path] = {}
     for stem, file in files_by_stem.items():
@@ -362,12 +364,12 @@ class Source(NamedTuple):
     stamp: str  #: sizes and times of the last change of all files; "" where there are none
 
     def has_changed(self, now: "Source") -> bool:
-        """Whether the files are others than when this was recorded, as far as is known."""
+        """Whether the files differ from those recorded; False where a stamp is unknown."""
         return bool(self.stamp and now.stamp) and self.stamp != now.stamp
 
 
 def _describe_source(files: Path | Sequence[Path]) -> Source:
-    """Read size and time of the last change of the files of a source."""
+    """Describe the files of a source: the path of the first, and sizes and times of all."""
     paths = [files] if isinstance(files, Path) else list(files)
     stamps: list[str] = []
     for path in paths:
@@ -481,10 +483,9 @@ class _ResultsLog:
 
     inode: int  # identifies the file, which may be replaced by another
     end: int = 0  # byte up to which it has been read
-    results: dict[str, dict[str, list[int]]] = field(
-        default_factory=dict
-    )  # stamps by file, by name
-    failures: dict[str, str] = field(default_factory=dict)  # reasons by name
+    # of each finished result, by its name: the stamps of its files, by their paths
+    results: dict[str, dict[str, list[int]]] = field(default_factory=dict)
+    failures: dict[str, str] = field(default_factory=dict)  # reasons, by the names of results
 
 
 _logs: dict[Path, _ResultsLog] = {}  # what was read of each file, so that only new lines are read

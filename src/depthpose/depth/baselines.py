@@ -23,7 +23,7 @@ from depthpose.depth.types import DepthEstimate, Map, StereoInput, View
 _CANONICAL_FOCAL_PX = 721.5377
 """Rows are counted in a camera of this focal length (KITTI's), centred at its principal point."""
 _ROWS = 1443
-"""Number of rows of that camera."""
+"""Number of rows of that camera, whose slopes are -1 to 1."""
 _NEAR_M = 1.0
 _FAR_M = 80.0
 _DEPTH_BINS = 4096

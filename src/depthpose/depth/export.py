@@ -62,6 +62,8 @@ _SHIFT_PX = 6
 """Disparity of the scenes at the network's focal length."""
 _SKY_COLOR = (0.72, 0.82, 0.95)
 """RGB of the sky at its brightest."""
+_SKY_SHARE = 0.97
+"""Share of the sky in its pixels; the rest is noise, so that it has a little texture."""
 _QUICK = MatcherConfig(speed="quick")
 """Graphs match pairs at the focal length of the weights' training, as this speed does."""
 _MIN_COMPARED_PX = 1.0
@@ -117,6 +119,7 @@ def _make_pair_cases(weights: DepthWeights) -> Iterator[Case]:
         outputs.append("is_sky")
     work_focal_px = weights.matcher.config.work_focal_px
     for size in _CASE_SIZES:
+        # Without a focal length of its own, the network does not use the camera.
         left, right, camera = _make_scenes(size, work_focal_px or 1.0, with_sky=has_sky)
         inputs = {"left": left.numpy(), "right": right.numpy()}
         rig = None
@@ -211,11 +214,12 @@ def _make_scenes(
     camera = Camera(width=columns, height=rows, K=K)
     shift = round(_SHIFT_PX * size.focal_share)
     random = torch.Generator().manual_seed(0)
+    # Coarse noise, enlarged about six times, so that it is smooth.
     noise = torch.rand(size.count, 3, rows // 6, columns // 6, generator=random)
     scene = F.interpolate(noise, (rows, columns + shift), mode="bicubic").clamp(0, 1)
     if with_sky:  # bright and nearly without texture, over the upper two fifths
         sky_rows = rows * 2 // 5
         brightness = torch.linspace(0.9, 1.0, sky_rows)[:, None]
         sky = torch.tensor(_SKY_COLOR)[:, None, None] * brightness
-        scene[:, :, :sky_rows] = torch.lerp(scene[:, :, :sky_rows], sky, 0.97)
+        scene[:, :, :sky_rows] = torch.lerp(scene[:, :, :sky_rows], sky, _SKY_SHARE)
     return scene[..., :columns].contiguous(), scene[..., shift:].contiguous(), camera

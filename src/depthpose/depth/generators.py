@@ -20,7 +20,7 @@ from depthpose.depth.config import GeneratorConfig, SelectionConfig
 from depthpose.depth.encoder import LiteEncoder
 from depthpose.depth.types import Views
 
-_FIRST_DROPOUT_LEVEL = 4
+_FIRST_DROPOUT_LEVEL = 4  # outermost level of the decoder with dropout
 
 
 class UNetGenerator(nn.Module):
@@ -164,6 +164,7 @@ class SelectionGenerator(nn.Module):
 
         # The heads: logits of both views, and a logistic regression whether the image is a street.
         self.head = nn.Conv2d(widths[-1], 2 * (self.config.planes + 1), 1)
+        # Three moments of each feature (:meth:`street_probability`).
         self.street = nn.Linear(3 * deepest_channels, 1) if self.config.with_street else None
 
         # Computed on the CPU: for the meta device torch would import its compiler.

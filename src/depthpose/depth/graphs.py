@@ -271,7 +271,7 @@ def _warp_left_to_right(left: Value, right_px: Value, size: Value) -> Value:
 
 
 def _make_example_image(multiple: int) -> Tensor:
-    """Make an image of suitable sides, by which a generator's network is traced."""
+    """Make an example image, as ``convert_network`` needs it to trace a generator."""
     return torch.rand(2, 3, 2 * multiple, 3 * multiple)
 
 
@@ -407,13 +407,15 @@ def _add_matcher(
         assert focal_px is not None
         work_size = _compute_size_at_focal_length(size, float(config.work_focal_px), focal_px)
 
-    # Normalised images, padded above and at the right to the sides that the network takes.
+    # Normalised images, padded above and at the right to the sides that the network takes. Sides
+    # are integers, whose quotients are rounded down.
     min_side = config.min_side_px
     step = config.step_px
     padded_size = ((work_size + (step - 1)) / step * step).op("Max", min_side)
     padding = padded_size - work_size
     rows_above = _slice_side(padding, 0)
     columns_right = _slice_side(padding, 1)
+    # Pads before the axes batch, channel, row and column, then those after them.
     pads = graph.op("Concat", [0, 0], rows_above, [0, 0, 0, 0], columns_right, axis=0)
     mean = np.array(IMAGENET_MEAN, np.float32)[:, None, None]
     deviation = np.array(IMAGENET_STD, np.float32)[:, None, None]
@@ -427,6 +429,7 @@ def _add_matcher(
 
     # Maps without the padding, at the size of the images.
     first = graph.op("Concat", rows_above, [0], axis=0)
+    # A number beyond all rows means to the last row.
     last = graph.op("Concat", [1 << 62], _slice_side(work_size, 1), axis=0)
     disparity_px, confidence, *sky = (
         _resize_map(output.slice(first, last, [1, 2]), size) for output in outputs

@@ -85,9 +85,9 @@ def _find_ransac_inliers(
     ``rays`` and ``inverse``: as for :func:`_fit_plane`.
 
     Returns:
-        Whether each point lies on the plane that most points lie on. Planes above the camera, and
-        those that no camera of a vehicle or a hand is mounted over, do not count; None where no
-        other was drawn.
+        Whether each point lies on the plane that most points lie on. Planes that are too steep, or
+        not below the camera at a height of vehicles and hands, do not count; None where no other
+        was drawn.
     """
     random = torch.Generator().manual_seed(0)
     triples = torch.randint(len(inverse), (_RANSAC_SAMPLES, 3), generator=random)

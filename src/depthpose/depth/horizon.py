@@ -82,7 +82,8 @@ def find_segments(grey: Float[np.ndarray, "h w"]) -> Segments:
     gradient_y[1:-1] = (smooth[2:] - smooth[:-2]) / 2
     strength = np.hypot(gradient_x, gradient_y)
 
-    # An edge is one pixel wide: the strongest along the axis that its gradient is nearer to.
+    # An edge is one pixel wide: the strongest along the axis that its gradient is nearer to, and of
+    # two equal neighbours the second.
     is_along_x = np.abs(gradient_x) > np.abs(gradient_y)
     inner = strength[1:-1, 1:-1]
     is_peak_in_row = (inner >= strength[1:-1, :-2]) & (inner > strength[1:-1, 2:])

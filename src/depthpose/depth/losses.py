@@ -77,7 +77,7 @@ class StereoLoss(NamedTuple):
     """The loss of a stereo network, and the part of it that is for the sky."""
 
     total: Float[Tensor, ""]
-    sky: Float[Tensor, ""] | None  # before its weight; None of a network without a class of the sky
+    sky: Float[Tensor, ""] | None  # not weighted; None of a network without a class of the sky
 
 
 def stereo_loss(
@@ -87,7 +87,7 @@ def stereo_loss(
     max_px: int,
     sky_weight: float,
 ) -> StereoLoss:
-    """Compute the loss by which all stereo networks are trained; another one takes its place here.
+    """Compute the loss by which all stereo networks are trained.
 
     Args:
         heads_px: disparities of the network's heads, the final one last.

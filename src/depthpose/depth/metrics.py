@@ -164,6 +164,7 @@ def _compute_sparsification_curve(
     descending = torch.argsort(score, descending=True)
     counts = torch.arange(1, len(error) + 1)
     mean_of_first = _average_ties(error, score)[descending].cumsum(0) / counts
+    # At step k a share of k / steps is removed; one pixel remains at least.
     remaining = len(error) * (1 - torch.arange(steps, dtype=error.dtype) / steps)
     return mean_of_first[remaining.ceil().long().clamp(min=1) - 1]
 

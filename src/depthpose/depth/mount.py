@@ -24,7 +24,7 @@ from depthpose.depth.types import DepthEstimate, Ground, Map, StereoInput
 
 _MAX_TILT_DIFFERENCE_DEG = 8.0
 """Largest difference of the user's tilt from that of the road in the map, which was off by at most
-5.5 degrees in the 59 views."""
+5.5 degrees in the 59 views of ``_MAX_ROAD_TILT_DEG`` in ``depth/ground.py``."""
 _MAP_TILT_STD_DEG = 0.8
 _MAP_ROLL_STD_DEG = 1.2
 """Standard deviations of tilt and roll of the road in a network's depth map."""
@@ -60,7 +60,7 @@ _DECIMALS = 6
 """Decimals of the values of a mount: as files hold them, so that a rerun continues from the same
 values."""
 _WINDOW_RADIUS_PX = 2
-"""Around a pixel whose distance was measured, of a square of 5 x 5 pixels."""
+"""By how many pixels a window reaches to each side of a measured point: 5 x 5 pixels."""
 
 
 @dataclass
@@ -185,6 +185,7 @@ class _Normal(NamedTuple):
 
 def _fuse(first: _Normal, second: _Normal) -> _Normal:
     """Average two independent estimates of one number, weighted by their inverse variances."""
+    # At least 1e-9, so that an estimate without error has a finite weight.
     first_weight = 1 / max(first.std, 1e-9) ** 2
     second_weight = 1 / max(second.std, 1e-9) ** 2
     weight = first_weight + second_weight
@@ -366,7 +367,7 @@ def scale_by_distance(
         )
     x = round(column)
     y = round(row)
-    if not bool(estimate.depth_m[min(y, height - 1), min(x, width - 1)].isfinite()):
+    if not bool(estimate.depth_m[y, x].isfinite()):
         raise InputError(f"{context}: there is no depth at this pixel (the sky?); take another")
     rows = slice(max(y - _WINDOW_RADIUS_PX, 0), y + _WINDOW_RADIUS_PX + 1)
     columns = slice(max(x - _WINDOW_RADIUS_PX, 0), x + _WINDOW_RADIUS_PX + 1)

@@ -180,6 +180,7 @@ def prepare_frame(
         frame=frame,
         truth=truth,
         disparity_px=predicted_px,
+        # Depth of another size is compared by way of the resized disparity.
         depth_m=depth_m if depth_m is not None and depth_m.shape == truth.shape else None,
         confidence=confidence,
         rig=rig,

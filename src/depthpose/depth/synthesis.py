@@ -60,7 +60,7 @@ def average_sizes(estimates: Sequence[ViewEstimate], limits_px: Sequence[float])
         return first
     is_within = [first.disparity_px < _MAX_SHARE_OF_RANGE * limit_px for limit_px in limits_px]
     is_counted = torch.stack(is_within)  # (sizes, b, h, w)
-    is_counted[0] = True
+    is_counted[0] = True  # the first size counts everywhere
     weights = is_counted / is_counted.sum(0)
     log_px = torch.stack([estimate.disparity_px.log() for estimate in estimates])
     sky = torch.stack([estimate.sky for estimate in estimates])

@@ -31,7 +31,7 @@ _MIXED_BORDER_PX = 2
 """Width of the edge of a black region where cubic resampling mixes picture and black."""
 _RADIUS_SHARE = 8 / 1242
 _MIN_RADIUS_PX = 4
-"""Radius of a patch, as a share of the width."""
+"""Radius of a patch: a share of the image's width (8 px of KITTI's 1242), but at least 4 px."""
 _ROUNDING_STD = 0.5 / 255
 """Standard deviation of grey values that rounding to 8 bits can make: half a level."""
 

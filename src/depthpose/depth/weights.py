@@ -206,6 +206,7 @@ def write_depth_weights(
         facts: ``trained_on``, ``licence`` and the like.
         with_half: store 16-bit floats: half the size.
     """
+    # The kind of each network follows from its class.
     networks: dict[str, Any] = {}
     for kind, classes in _list_kinds().items():
         for network in (generator, matcher):
@@ -254,7 +255,7 @@ def refuse_alarm_share(images: int, alarm_share: float) -> None:
     """Refuse a share of false alarms that is not between 0 and 1, or is less than one image.
 
     Raises:
-        InputError: with the number of images that it takes.
+        InputError: it is; the message has the number of images that it takes.
     """
     if not 0 < alarm_share < 1:
         raise InputError(f"alarm_share is {alarm_share:g}; it must be above 0 and below 1")
@@ -285,7 +286,7 @@ def calibrate_weights(
     """
     refuse_alarm_share(len(image_confidence), alarm_share)
     quantile = float(np.quantile(image_confidence, alarm_share))
-    least_confidence = min(round(quantile, 4), 0.9999)
+    least_confidence = min(round(quantile, 4), 0.9999)  # the config takes values below 1
     checkpoint = checkpoints.read_checkpoint(weights)
     is_both = checkpoint.kind == BOTH
     config = dict(checkpoint.config)

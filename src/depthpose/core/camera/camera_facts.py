@@ -154,7 +154,7 @@ def camera_from_facts(facts: CameraFacts, size: Size | None) -> Camera:
     refuse_outside(camera.K, camera.width, camera.height)
     if isinstance(camera, StereoRig):
         _refuse_rig(camera, is_metric=facts.is_metric)
-    unit_m = camera.depth_unit_m or 1.0
+    unit_m = camera.depth_unit_m or 1.0  # without a unit nothing is refused
     if not _MIN_UNIT_M <= unit_m <= 1:
         finding = "finer than any sensor's; it is metres a unit: 0.001 means millimetres"
         if unit_m > 1:
@@ -323,6 +323,7 @@ def describe_suspicious_centre(camera: Camera) -> str | None:
 
 def _refuse_normalised(K: Float[Tensor, "3 3"], width: int, height: int) -> None:
     """Refuse a K whose rows are divided by the size of the image."""
+    # An image of a few columns may truly have so small an fx.
     if K[0, 0] <= _NORMALISED_FX < width / 10:
         raise InputError(
             f"K has fx {float(K[0, 0]):g} for {width}x{height} pixels, so it looks normalised; "
@@ -336,7 +337,7 @@ def refuse_baseline(baseline_m: float, remedy: str, most_m: float = WIDE_BASELIN
     Args:
         baseline_m: the distance between two cameras [m], as the file has it.
         remedy: what to do if it is true, for the error.
-        most_m: least baseline that is refused as too long.
+        most_m: a baseline of this length or more is refused as too long [m].
 
     Raises:
         InputError: it is too short or too long; the message suggests the unit it may be in.
@@ -358,7 +359,7 @@ def refuse_baseline(baseline_m: float, remedy: str, most_m: float = WIDE_BASELIN
 
 
 def refuse_unequal_focal_lengths(K: Float[Tensor, "3 3"]) -> None:
-    """Refuse a K whose focal lengths differ by more than those of any lens with a common image.
+    """Refuse a K whose fx and fy differ by more than those of any common image.
 
     Raises:
         InputError: they do.

@@ -240,6 +240,7 @@ def _read_bare_numbers(text: str) -> CameraFacts | None:
         baseline_m = -minus_fx_baseline / fx if minus_fx_baseline and fx else None
         return CameraFacts(kind="a matrix", K=P[:, :3].contiguous(), baseline_m=baseline_m)
 
+    # The four numbers, and none, 4, 5 or 8 coefficients of distortion.
     if count not in (4, 8, 9, 12):
         return None
     is_tum = tuple(numbers[:4]) in _TUM
@@ -326,7 +327,7 @@ def check_image_matches_camera(camera: Camera, width: int, height: int, name: st
     """
     if (width, height) == (camera.width, camera.height):
         return
-    # The sizes of a scaled image are rounded to whole pixels: the aspect agrees to within one.
+    # Sizes of a scaled image are rounded to whole pixels: the aspect agrees to within one pixel.
     aspect_error = abs(width * camera.height - height * camera.width)
     remedy = "the aspect differs too: follow a crop with crop_camera, or give that image's camera"
     if aspect_error <= max(camera.width, camera.height):
@@ -340,13 +341,17 @@ def check_image_matches_camera(camera: Camera, width: int, height: int, name: st
 
 
 def _read_facts(path: AnyPath) -> CameraFacts:
-    """Recognise the format of a camera file by its content, and read it."""
+    """Recognise the format of a camera file, and read it.
+
+    A folder of a pair and COLMAP's binary file are told by their paths, other files by content.
+    """
     if Path(path).is_dir():
         return facts_from_folder(Path(path))
     if Path(path).name == "cameras.bin":
         raise InputError("of COLMAP cameras.txt is read: colmap model_converter --output_type TXT")
     text = read_text(path, MAX_LIST_BYTES)
-    if re.match(r"\s*(\{|\[\s*[-+\[\d])", text):
+    is_json = re.match(r"\s*(\{|\[\s*[-+\[\d])", text)  # an object, or a list of numbers
+    if is_json:
         return facts_from_json(read_json(path))
 
     # Other text: formats that a pattern recognises, else bare numbers, or keys and values.

@@ -72,7 +72,7 @@ def _read_foreign_json(content: object) -> CameraFacts | None:
 
     None where it is of none of these.
     """
-    if isinstance(content, list) and len(content) in (3, 9):
+    if isinstance(content, list) and len(content) in (3, 9):  # rows, or flat
         return CameraFacts(kind="a matrix", K=_read_matrix(content))
     if not isinstance(content, dict):
         raise InputError(
@@ -83,7 +83,7 @@ def _read_foreign_json(content: object) -> CameraFacts | None:
     fields = normalise_keys(content)
     facts = None
     is_fisheye = bool(is_fisheye_lens(fields))
-    # Matrices of OpenCV are objects with ``data``.
+    # Matrices of OpenCV are objects with ``data``; ``ppx`` is RealSense's cx.
     is_opencv = any(isinstance(value, dict) and "data" in value for value in content.values())
     if is_opencv or is_ros(fields) or {"ppx", "cameramatrix"} & fields.keys():
         facts = with_json_keys(facts_from_fields(fields), fields)
@@ -193,6 +193,7 @@ def with_json_keys(facts: CameraFacts | None, fields: Fields) -> CameraFacts | N
     for key in ("baseline_m", DOFFS_KEY, *OPTIONAL_KEYS):
         field = key.replace("_", "")
         value = fields.get(field)
+        # Of the difference of cx ``facts`` has 0 where it has none: the key always counts.
         is_set = key != DOFFS_KEY and getattr(facts, key) is not None
         if value is None or is_set:
             continue

@@ -79,6 +79,7 @@ def is_fisheye_lens(fields: Mapping[str, Any], owner: str = "its") -> bool | Non
         if not isinstance(value, str):
             continue
         lens = re.sub(r"[^a-z0-9]", "", value.lower())
+        # Without what only says that it is a lens: "pinhole camera", "distortion ftheta".
         lens = re.sub(r"^(rs2?)?distortion|(camera|lens|model)+$", "", lens)
         if lens in _REFUSED or lens.startswith("mei") or _is_other_lens(lens, key):
             remedy = _REFUSED.get(lens, _BY_ITS_TOOL)

@@ -305,6 +305,7 @@ def _refine_matches(
     )
 
     # Correlate each left patch with all patches up to _FINE_REACH pixels from the coarse match.
+    # In padded images a pixel lies ``rim`` farther, and its patch begins _FINE_RADIUS before it.
     side = 2 * _FINE_RADIUS + 1
     rim = _FINE_RADIUS + _FINE_REACH
     left_padded = functional.pad(left_grey, (rim,) * 4)

@@ -146,6 +146,7 @@ def _warn_if_transposed(path: AnyPath, right_from_left: Rigid) -> None:
     """
     R = right_from_left.R
     t_m = right_from_left.t_m
+    # The baseline is t in the right camera's frame, and R^T t in the left one's.
     right_deg = _measure_baseline_angle(t_m)
     as_read_deg = _measure_baseline_angle(R.mT @ t_m) + right_deg
     transposed_deg = _measure_baseline_angle(R @ t_m) + right_deg
@@ -423,6 +424,7 @@ def make_rectifier(pair: RawPair, size: Size, keep: float = 0.0) -> Rectifier:
     size = pair.size or size
     R = pair.right_from_left.R.numpy()
     t = pair.right_from_left.t_m[:, None].numpy()
+    # Intrinsic matrix and distortion of each camera, as OpenCV's functions take them.
     left = (pair.left.K.numpy(), np.array(pair.left.distortion))
     right = (pair.right.K.numpy(), np.array(pair.right.distortion))
 

@@ -27,7 +27,9 @@ _MAX_TEXT = 2**18  # longest YAML or XML that is parsed [letters]: ten times a l
 
 
 def parse_storage(path: AnyPath, text: str) -> Fields | None:
-    """Parse YAML (also OpenCV's) or the XML of OpenCV to fields; None where it is neither.
+    """Parse the text of a camera file to fields: YAML, or OpenCV's ``FileStorage`` as YAML or XML.
+
+    None where it is none of these, too long, or no mapping.
 
     Raises:
         InputError: it is damaged, or describes several cameras.
@@ -147,13 +149,14 @@ _OpencvYamlLoader.add_multi_constructor("tag:yaml.org,2002:opencv-", _construct_
 _SUFFIXES = (".yaml", ".yml", ".xml")
 CAMERA_SUFFIXES = (".json", *_SUFFIXES, ".txt", ".conf")
 """Suffixes of the files that a camera may be read from."""
+# Keys of a camera's values, the usual ones first.
 _K = ("k", "cameramatrix", "intrinsicmatrix", "k1", "m1", "cameramatrix1", "cameramatrixleft")
 _K_RIGHT = ("k2", "m2", "cameramatrix2", "cameramatrixright")
 _D = ("d", "d1", "d2", "coeffs")
 _P = ("p", "projectionmatrix", "p1")
 _WIDTH = ("width", "imagewidth")
 _HEIGHT = ("height", "imageheight")
-_ROS = ("projectionmatrix", "distortionmodel", "p")
+_ROS = ("projectionmatrix", "distortionmodel", "p")  # keys by which a ``camera_info`` is recognised
 _DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _PARALLEL_TOLERANCE = 1e-3  # of R, and of T beside its x, for cameras to count as parallel
 _UNDISTORT_P = "cv2.undistort(image, K, distortion, None, P[:, :3]) (image_proc in ROS)"

@@ -90,6 +90,7 @@ def _pair_roles(paths: Sequence[str], suffixes: Sequence[str]) -> Iterator[Liste
     urls_of_role = [first_urls]
     for path, urls in zip(paths[1:], other_urls, strict=True):
         stems = [PurePosixPath(url).stem for url in urls]
+        # A path of a single file is listed as that file alone.
         first_is_file = first_stems == [PurePosixPath(paths[0]).stem]
         is_file = stems == [PurePosixPath(path).stem]
         if first_is_file and is_file:
@@ -272,6 +273,7 @@ class JobInputs:
         listed = list_inputs(other_words, input_format) if other_words else []
         tars: dict[str, None] = {}  # each once, in their order
         for word in tar_words:
+            # .gz: only the last suffix of .tar.gz is compared.
             for url in stores.list_files(word, (".tar", ".tgz", ".gz")):
                 if url.lower().endswith(_TAR_SUFFIXES):
                     tars[url] = None
@@ -286,6 +288,7 @@ class JobInputs:
         Raises:
             InputError: it cannot be read.
         """
+        # Only read, so its shard of results needs no name.
         block = Block("", (self.listed[0],)) if self.listed else Block("", tar=self.tars[0])
         with tempfile.TemporaryDirectory(prefix="depthpose-") as scratch:
             first = next(fetch_inputs(block, self.input_format, Path(scratch)))

@@ -55,7 +55,8 @@ class RayEngine:
         if starts_ray:
             self._connect(ray)
         try:
-            # In a list it stays a reference, which a restarted worker reads again.
+            # In a list it stays a reference, which a restarted worker reads again; Ray would
+            # replace a bare one by the object.
             computation_reference = [ray.put(computation)]
             most_workers = self.workers or self._count_fitting_workers(ray)
             pool = ray.data.ActorPoolStrategy(
@@ -92,12 +93,14 @@ class RayEngine:
         """
         options: dict[str, Any] = {}
         if self.address is None:
+            # None: all cores of this machine.
             cores = None if self.workers is None else max(1.0, self.workers * self.worker_cpus)
             options = {"num_cpus": cores, "include_dashboard": False}
         try:
             host, _, port = (self.address or "").rpartition(":")
             if host and "/" not in host and port.isdecimal():
-                # Tried first, because Ray waits for minutes where nothing answers.
+                # HOST:PORT, not ray://...: tried first, because Ray waits for minutes where nothing
+                # answers.
                 socket.create_connection((host, int(port)), timeout=_CONNECT_TIMEOUT_S).close()
             ray.init(address=self.address or "local", **options)
         except (OSError, ValueError, RuntimeError) as error:

@@ -124,6 +124,7 @@ def _cloud_from_columns(path: AnyPath, columns: Columns) -> PointCloud:
     Raises:
         InputError: a column is missing, a coordinate is infinite, or no point is finite.
     """
+    # A file without points may have no columns.
     missing = [name for name in "xyz" if name not in columns]
     if missing and columns:
         raise InputError(f"{path}: no {missing} among the columns {list(columns)}; name them x y z")
@@ -149,11 +150,11 @@ def _color_from_columns(path: AnyPath, columns: Columns) -> np.ndarray | None:
     """
     packed = columns.get("rgb", columns.get("rgba"))
     if packed is not None and packed.dtype.itemsize == 4:
-        if packed.dtype.kind == "f":
+        if packed.dtype.kind == "f":  # whose bits are the colour
             bits = packed.astype(np.float32).view(np.uint32)
         else:
             bits = packed.astype(np.int64).astype(np.uint32)
-        channels = [(bits >> shift) & 255 for shift in (16, 8, 0)]
+        channels = [(bits >> shift) & 255 for shift in (16, 8, 0)]  # red, green, blue
         return to_float32(np.stack(channels, -1)) / np.float32(255)
     if not columns.keys() >= set(_COLOR_NAMES):
         return None

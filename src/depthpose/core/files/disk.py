@@ -394,6 +394,7 @@ def refuse_heavy(path: AnyPath, data: bytes, memory_of: Mapping[bytes, int]) -> 
     Raises:
         InputError: the estimated memory is too large.
     """
+    # The bytes themselves, and Python's text: 1 byte a letter of ASCII, else up to 4.
     bytes_a_letter = 2 if data.isascii() else 5
     memory_bytes = bytes_a_letter * len(data)
     memory_bytes += sum(size * data.count(sign) for sign, size in memory_of.items())
@@ -425,7 +426,7 @@ def refuse_yaml_bomb(path: AnyPath, text: str) -> None:
     with suppress(yaml.YAMLError):  # raised again where the text is parsed
         for event in yaml.parse(text, YamlLoader):
             anchor = getattr(event, "anchor", None)
-            size = 0
+            size = 0  # number of values; 0 of an event that ends no value
             match event:
                 case yaml.CollectionStartEvent():
                     open_collections.append((anchor, 1))
@@ -632,9 +633,10 @@ def _make_pairing_keys(
     Returns:
         Keys of the first and of the second names.
     """
-    # Text and numbers in turn, beginning with text.
+    # Text and numbers in turn, beginning with text: the numbers have odd indices.
     pieces = [[re.split(r"(\d+)", name) for name in side] for side in (first, second)]
 
+    # Single names are partners unless both have numbers, and none in common.
     if len(first) == len(second) == 1:
         first_numbers, second_numbers = (
             {int(number) for number in side[0][1::2]} for side in pieces

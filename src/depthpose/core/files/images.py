@@ -64,6 +64,7 @@ _START_OF_SCAN = 0xDA
 _GREY_16_MODES = ("I;16", "I;16L", "I;16B", "I;16N")
 _EXIF_ORIENTATION = 0x0112
 _PHOTOMETRIC = 0x0106  # tag of TIFF: 0 where the value 0 is white
+_SIDEWAYS = (5, 6, 7, 8)  # EXIF orientations that exchange width and height
 # How Pillow turns a picture upright, by its EXIF orientation.
 _UPRIGHT = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
@@ -89,6 +90,7 @@ def read_image(path: AnyPath) -> Float32[Tensor, "3 h w"]:
     """
     with open_image(path) as image:
         pixels = _decode(path, image)
+        # Further pictures of an MPO are previews and the like: two views are refused above.
         count = getattr(image, "n_frames", 1) if image.format != "MPO" else 1
     if count > 1 and _is_first_notice(path, "several"):
         message = (
@@ -132,6 +134,7 @@ def _decode(name: AnyPath, image: Image.Image) -> np.ndarray:
 
     is_binary_ppm = image.format == "PPM" and image.mode == "RGB" and raw_modes
     if is_binary_ppm and tiles[0].codec_name == "ppm":
+        # Pillow keeps the largest value of a colour, unless it is 255.
         largest = tiles[0].args[1] if isinstance(tiles[0].args, tuple) else 255
         if largest > 255:
             return _decode_ppm_16(opened, tiles[0].offset, largest)
@@ -166,7 +169,9 @@ def _open_with_bytes_exchanged(image: Any, raw_modes: list[str]) -> Image.Image:
 def _decode_ppm_16(image: Any, offset: int, largest: int) -> np.ndarray:  # noqa: ANN401
     """Decode a binary PPM of two bytes a colour, from ``offset``; ``largest`` becomes 65535."""
     image.fp.seek(offset)
-    values = np.frombuffer(image.fp.read(6 * image.width * image.height), ">u2")
+    pixel_bytes = 6  # three colours of two bytes
+    body = image.fp.read(pixel_bytes * image.width * image.height)
+    values = np.frombuffer(body, ">u2")
     pixels = values.reshape(image.height, image.width, 3).astype(np.float64)
     return (pixels * (65535 / largest)).round().clip(0, 65535).astype(np.uint16)
 
@@ -355,7 +360,7 @@ def image_size(path: AnyPath) -> tuple[int, int]:
     """
     with open_image(path) as image:
         width, height = image.size
-        return (height, width) if _read_orientation(image) in (5, 6, 7, 8) else (width, height)
+        return (height, width) if _read_orientation(image) in _SIDEWAYS else (width, height)
 
 
 def write_image(path: AnyPath, image: Tensor) -> None:
@@ -389,7 +394,7 @@ def encode_image(image: Tensor, name: AnyPath, quality: int = 95) -> bytes:
     options = FAST_PNG
     if suffix != ".png":
         format_name = "JPEG"
-        options = {"quality": quality, "subsampling": 0}
+        options = {"quality": quality, "subsampling": 0}  # 0: colours at full resolution
     encoded = BytesIO()
     with refused_as(name, "picture", "check its size"):
         Image.fromarray(pixels.contiguous().numpy()).save(encoded, format_name, **options)
@@ -603,7 +608,7 @@ def _read_exif_tags(picture: Image.Image) -> tuple[tuple[float, str] | None, str
         focal_px = film_mm / _FILM_DIAGONAL_MM * math.hypot(*picture.size)
         return (focal_px, f"FocalLengthIn35mmFilm {film_mm:g} mm"), ""
     pixels_per_unit = _read_positive_number(tags.get(_RESOLUTION))
-    unit_mm = _UNIT_MM.get(tags.get(_RESOLUTION_UNIT, 2))
+    unit_mm = _UNIT_MM.get(tags.get(_RESOLUTION_UNIT, 2))  # inches where no unit is named
     if focal_mm is None or pixels_per_unit is None or unit_mm is None:
         return None, ""
     # The longer side, because a picture may be stored turned.
@@ -767,7 +772,7 @@ def to_float32(array: np.ndarray) -> np.ndarray:
         return np.array(array, dtype=np.float32, order="C")
 
 
-KITTI_UNIT = 1 / 256  # of KITTI's depth [m] and disparity [px]
+KITTI_UNIT = 1 / 256  # what 1 stands for in KITTI's PNGs of depth [m] and disparity [px]
 _NO_UNIT = "a unit of {} is not positive; KITTI's is 1/256, BOP's 0.001"
 
 
@@ -816,7 +821,7 @@ def read_stored_depth(path: AnyPath) -> Shaped[Tensor, "h w"]:
         return read_map(path)
     if suffix != ".png":
         with open_image(path) as image:
-            if image.mode in ("F", "I"):
+            if image.mode in ("F", "I"):  # 32 bits: floats, whole numbers
                 return torch.from_numpy(np.array(image))
     return read_depth_png(path, 1.0).nan_to_num(0.0).int()
 

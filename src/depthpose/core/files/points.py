@@ -106,7 +106,7 @@ def split_rows(
         raise InputError(f"{path}: rows of {table.shape[1]} values where {width} are declared")
     columns: Columns = {}
     starts = accumulate((f.count for f in fields), initial=0)
-    for f, start in zip(fields, starts, strict=False):
+    for f, start in zip(fields, starts, strict=False):  # the last start is the width
         column = table[:, start]
         dtype = np.dtype(f.code)
         if dtype.kind != "f":
@@ -115,7 +115,7 @@ def split_rows(
                 raise InputError(
                     f"{path}: {f.name!r} holds a value outside {dtype.name}; correct it"
                 )
-            # Limits of 64 bits are no floats: rounded they do not fit, so such columns stay floats.
+            # Floats round the limits of 64 bits, which then do not fit: such columns stay floats.
             dtype = column.dtype if dtype.itemsize == 8 else dtype
         with np.errstate(over="ignore"):
             columns[f.name] = column.astype(dtype)
@@ -252,7 +252,7 @@ def _read_text_lists(
                     position += max(size, 0)
                 position += 1
         except (ValueError, IndexError, OverflowError):
-            position = -1
+            position = -1  # refused below, as a row of another length
         if position != len(words):
             raise InputError(
                 f"{path}: row {row_count} of {element.name}, {row.strip()[:60]!r}, is not what the "
@@ -297,6 +297,7 @@ def _read_binary_lists(
         rows = min(rows_left, rows_ahead, (len(body) - position) // record_type.itemsize)
         records: Any = np.frombuffer(body, record_type, rows, position)
         sizes = [records[f"{f.name} size"] for f in element.fields if f.size_code]
+        # Without a list all rows are alike.
         is_equal = np.array([size == size[0] for size in sizes] or [[True]]).all(0)
         if not is_equal.all():
             records = records[: int(is_equal.argmin())]
@@ -305,7 +306,7 @@ def _read_binary_lists(
             raise InputError(f"{path}: {declared} of ever other lengths; export triangles alone")
         position += records.nbytes
         rows_left -= len(records)
-        rows_ahead = 2 * len(records) + _LEAST_ROWS_AHEAD
+        rows_ahead = 2 * len(records) + _LEAST_ROWS_AHEAD  # long runs follow long runs
 
     lists: dict[str, RaggedLists] = {}
     for f in element.fields:
@@ -353,6 +354,7 @@ def _make_record_type(fields: list[RecordField], lengths: tuple[int, ...], order
 
 def encode_ply(points: np.ndarray, color: np.ndarray | None) -> bytes:
     """Encode points (n, 3), and colours of 8 bits where there are any, as little-endian PLY."""
+    # Name, numpy's type, PLY's type and the values of each column.
     columns = [(name, "<f4", "float", points[:, i]) for i, name in enumerate("xyz")]
     if color is not None:
         names = ("red", "green", "blue")
@@ -455,7 +457,10 @@ def read_pcd(path: AnyPath) -> Columns:
 
 
 def _read_pcd_fields(path: AnyPath, header: Mapping[str, list[str]]) -> list[RecordField]:
-    """Read the fields of a PCD header: the words of its lines, by the first word of each."""
+    """Read the fields that a PCD header declares.
+
+    ``header``: the further words of each line, by its first word.
+    """
     names = header.get("FIELDS", [])
     counts = header.get("COUNT", ["1"] * len(names))
     rows = list(zip(names, header.get("TYPE", []), header.get("SIZE", []), counts, strict=False))
@@ -492,9 +497,10 @@ def _split_compressed(
     It is the compressed and the uncompressed size (4 bytes each), then the columns of all points,
     one after the other, compressed by LZF.
     """
-    require_bytes(path, len(body), 8, "the two compressed sizes")
+    head_bytes = 8  # of the two sizes
+    require_bytes(path, len(body), head_bytes, "the two compressed sizes")
     packed_size, size = (int(n) for n in np.frombuffer(body, "<u4", 2))
-    require_bytes(path, len(body) - 8, packed_size, "compressed points")
+    require_bytes(path, len(body) - head_bytes, packed_size, "compressed points")
     declared = count * sum(f.count * np.dtype(f.code).itemsize for f in fields)
     if size != declared or size > _MAX_UNPACKED or packed_size > _MAX_PACKED:
         raise InputError(
@@ -502,7 +508,8 @@ def _split_compressed(
             f"(and {_MAX_PACKED} and {_MAX_UNPACKED} are allowed); save it as DATA binary"
         )
     try:
-        unpacked = memoryview(decompress_lzf(body[8 : 8 + packed_size], size))
+        packed = body[head_bytes : head_bytes + packed_size]
+        unpacked = memoryview(decompress_lzf(packed, size))
     except ValueError as error:
         raise InputError(f"{path}: damaged: {error}; save it as DATA binary") from error
     columns: Columns = {}

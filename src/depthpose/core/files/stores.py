@@ -136,6 +136,7 @@ def list_files(path: str, suffixes: Sequence[str]) -> list[str]:
         if fs.isfile(inner):
             listed = [inner]
         elif fs.isdir(inner) or not any(sign in inner for sign in "*?["):
+            # What is missing is listed as an empty folder.
             listed = [entry["name"] for entry in _list_entries(fs, inner)]
         else:
             listed = fs.glob(_escape_folder(fs, inner))

@@ -172,7 +172,7 @@ def write_card(
     folder = weights.parent
     versions = describe_environment()
     machine = ", ".join(versions[name] for name in ("machine", "gpu") if name in versions)
-    step = 0  # step of the last state that is not damaged
+    step = 0  # step of the last state that is not damaged, which is read last
     for path in reversed(list_saved_states(folder)):
         with suppress(InputError):
             step = _read_state(path)["step"]

@@ -286,7 +286,8 @@ class _Training:
         rank = self.accelerator.process_index
         size = self.config.batch_size
         accumulate = self.config.accumulate
-        rounds = range(self.step * accumulate, self.steps * accumulate)  # a micro-batch a process
+        # In each round every process takes one micro-batch.
+        rounds = range(self.step * accumulate, self.steps * accumulate)
         starts = ((number * self.process_count + rank) * size for number in rounds)
         loader = DataLoader(
             self.samples,  # pyright: ignore[reportArgumentType]
@@ -299,7 +300,7 @@ class _Training:
         return (send_to_device(batch, self.accelerator.device) for batch in loader)
 
     def _take_step(self, micro_batches: list[Any]) -> None:
-        """Take a step of all optimisers: of each for all micro-batches, before the next one's.
+        """Take a step of one optimiser after the other, each by the gradients of all micro-batches.
 
         The task yields an update for each optimiser (``Task.step``).
         """

@@ -209,7 +209,7 @@ _SAMPLE_STREAM = 2
 
 
 def shuffle_index(sample_index: int, count: int, seed: int) -> int:
-    """Map an index in the whole training to one of ``count`` data, in a new order each epoch."""
+    """Map an index in the whole training to one of ``count`` data, shuffled anew each epoch."""
     epoch, position = divmod(sample_index, count)
     order_seed = mix_seed(seed, epoch, _ORDER_STREAM)
     order = torch.randperm(count, generator=torch.Generator().manual_seed(order_seed))
@@ -230,4 +230,4 @@ def mix_seed(*numbers: int) -> int:
         state = ((state ^ (state >> 30)) * 0xBF58476D1CE4E5B9) % 2**64
         state = ((state ^ (state >> 27)) * 0x94D049BB133111EB) % 2**64
         state ^= state >> 31
-    return state >> 1
+    return state >> 1  # 63 bits, as ``Seed`` allows

@@ -156,7 +156,7 @@ def _match_moved_views(matcher: Matcher, pair: StereoInput, cx_difference_px: fl
     shift_px = -math.ceil(cx_difference_px)
     left, right = move_views(pair.left, pair.right, shift_px)
 
-    # The rig of the shifted views.
+    # The rig of the shifted views; columns added on the left move its principal point.
     rig = pair.camera
     if isinstance(rig, StereoRig) and shift_px != 0:
         K = rig.K.clone()

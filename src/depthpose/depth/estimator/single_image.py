@@ -46,7 +46,7 @@ def depth_from_images(
     estimates = depth_before_mount(synthesiser, matcher, images, sizes, allow_ood=allow_ood)
     config = synthesiser.config
     if not isinstance(config, SelectionConfig):
-        config = SelectionConfig()
+        config = SelectionConfig()  # a U-Net's does not say how exact its depth is
     return [
         scale_by_mount(estimate, image, mount, config)
         for estimate, image in zip(estimates, images, strict=True)

@@ -161,7 +161,8 @@ class LightStereo(StereoNetwork):
         coarse_px = _expect_all(scores, first_px) if self.training else None
         del scores  # the largest tensor that is still held
 
-        # All of them at full size, and the disparity refined there.
+        # All of them at full size, and the disparity refined there. The halos are what convolutions
+        # and neighbours reach: two rows at 1/4 size, and in the refinement five at 1/2 size.
         quarters = torch.stack(quarter_maps, 1)
         inputs = (quarters, left_features.half, left_features.levels[0], right_half)
         enlarged = by_rows(self.enlargement, inputs, halo=2, rows=self.rows)
@@ -276,7 +277,7 @@ class LightMatcher(NetworkMatcher):
 
     def fold(self, network: LightStereo, example: Tensor) -> LightStereo:
         """Fold batch norm, and compute some rows at a time."""
-        # A GPU has the memory, and is busy with whole volumes alone.
+        # A GPU has the memory, and some rows alone would not keep it busy.
         network.rows = ROWS if self.device.type == "cpu" else None
         return layers.fold(network, example)
 

@@ -31,6 +31,8 @@ QuarterMaps = Float[Tensor, "b h4 w4"]  # at 1/4 of the image's sides
 
 HALF_CHANNELS = 16
 """Channels of the features at half size."""
+_UPSAMPLING_CHANNELS = 32
+"""Channels from which the weights of the upsampling are computed, at half size."""
 _OFFSETS_PX = (-2, -1, 0, 1, 2)
 """Differences from the disparity, in pixels at half size, at which the refinement compares the
 views."""
@@ -61,10 +63,11 @@ class ConvexUpsampling(nn.Module):
 
     def __init__(self, width: int) -> None:
         super().__init__()
-        self.hidden = ConvNorm(nn.Conv2d, HALF_CHANNELS + width, 32)
-        self.weights = nn.Conv2d(32, 4 * 9, 1)
+        self.hidden = ConvNorm(nn.Conv2d, HALF_CHANNELS + width, _UPSAMPLING_CHANNELS)
+        # Of nine neighbours, for each of the four pixels that a pixel at half size is.
+        self.weights = nn.Conv2d(_UPSAMPLING_CHANNELS, 4 * 9, 1)
         self.compared = ConvNorm(nn.Conv2d, HALF_CHANNELS, HALF_CHANNELS)
-        self.agreement = nn.Conv2d(9, 32, 3, 1, 1, bias=False)
+        self.agreement = nn.Conv2d(9, _UPSAMPLING_CHANNELS, 3, 1, 1, bias=False)
         nn.init.zeros_(self.agreement.weight)
 
     def forward(
@@ -134,6 +137,7 @@ class Refinement(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.compared = ConvNorm(nn.Conv2d, HALF_CHANNELS, HALF_CHANNELS)
+        # Cosines, features of the left view, and the disparities of four pixels about their mean.
         input_width = _REFINEMENT_GROUPS * len(_OFFSETS_PX) + HALF_CHANNELS + 4
         widths = (input_width, _REFINEMENT_CHANNELS, _REFINEMENT_CHANNELS)
         dilations = (1, 2, 1)
@@ -219,8 +223,10 @@ class SkyHead(nn.Module):
         # Each level but the deepest also sees what the next coarser one says.
         inputs = [*(width + _SKY_CHANNELS for width in inner), deepest]
         self.coarse = nn.ModuleList(ConvNorm(nn.Conv2d, c, _SKY_CHANNELS) for c in inputs)
+        # 2: the confidence and the disparity of the match.
         self.hidden = ConvNorm(nn.Conv2d, quarter + _SKY_CHANNELS + 2, _SKY_CHANNELS)
         self.logit = nn.Conv2d(_SKY_CHANNELS, 1, 1)
+        # Weight 0 and bias -2: a probability of 12 % everywhere.
         for parameter, value in zip(self.logit.parameters(), (0.0, -2.0), strict=True):
             nn.init.constant_(parameter, value)
 
@@ -379,7 +385,7 @@ class Aggregation(nn.Module):
             smaller = same(down(volumes[-1]).relu_()).relu_()
             volumes.append(_multiply(smaller, guide))
 
-        # Up again; the largest size by rows.
+        # Up again, the coarsest first; the largest size, whose layers are the first, by rows.
         x = volumes.pop()
         for up, joined in zip(self.up[:0:-1], self.joined[:0:-1], strict=True):
             x = joined(_add_enlarged(up, x, volumes.pop())).relu_()

@@ -17,6 +17,8 @@ from depthpose.core.files.images import check_image
 from depthpose.depth.config import SGBMConfig
 from depthpose.depth.types import Map, Match, View
 
+_SLACK = 1e-3  # by which rounding may put a value of an image beyond [0, 1]
+
 
 @runtime_checkable
 class Matcher(Protocol):
@@ -132,8 +134,8 @@ def check_pair(left: object, right: object) -> None:
         InputError: not tensors, not ``(3, H, W)``, not float, empty, of two sizes, not finite or
             not in [0, 1].
     """
-    first = check_image(left, "left image", 1e-3)
-    second = check_image(right, "right image", 1e-3)
+    first = check_image(left, "left image", _SLACK)
+    second = check_image(right, "right image", _SLACK)
     if first.shape != second.shape:
         sizes = [f"{image.shape[-2]}x{image.shape[-1]}" for image in (first, second)]
         raise InputError(
@@ -173,8 +175,9 @@ class SGBMMatcher:
             minDisparity=0,
             numDisparities=self.config.num_disparities,
             blockSize=3,  # side of the matched window [px]
-            P1=8 * 3 * 9,  # penalty of a disparity step of 1 between neighbours
-            P2=32 * 3 * 9,  # and of a larger step
+            # Penalties of a disparity step between neighbours, 8 and 32 times 3 colours x 9 pixels:
+            P1=8 * 3 * 9,  # of a step of 1 px
+            P2=32 * 3 * 9,  # of a larger one
             disp12MaxDiff=1,  # largest difference of the left-right check [px]
             preFilterCap=63,  # largest horizontal gradient
             uniquenessRatio=10,  # by which the best cost must beat the second [%]
@@ -183,6 +186,7 @@ class SGBMMatcher:
             mode=self._cv2.STEREO_SGBM_MODE_SGBM_3WAY,
         )
         fixed_point = matcher.compute(_convert_to_bgr(left), _convert_to_bgr(right))
+        # OpenCV counts sixteenths of a pixel.
         disparity_px = torch.from_numpy(fixed_point.astype(np.float32) / 16).to(left.device)
         disparity_px = disparity_px.where(disparity_px > 0, torch.nan)
         if not self.config.with_filled_holes:
@@ -223,5 +227,5 @@ def fill_holes(disparity_px: Map) -> Map:
 
     rows = torch.arange(height, device=disparity_px.device)
     valid_rows = rows[is_valid.any(1)]
-    nearest = (rows[:, None] - valid_rows).abs().argmin(1)
+    nearest = (rows[:, None] - valid_rows).abs().argmin(1)  # the row itself where it has values
     return filled[valid_rows[nearest]]

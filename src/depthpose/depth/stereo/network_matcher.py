@@ -252,7 +252,7 @@ class NetworkMatcher(ABC):
         limit_bytes = self.config.max_memory_bytes
         if limit_bytes is None:
             return
-        rows = self._network.rows or height // 4
+        rows = self._network.rows or height // 4  # of a volume, at quarter size
         needed_bytes = self.activation_bytes(network_config, height, width, self.dtype, rows)
         if needed_bytes > limit_bytes:
             quick = "" if network_config.work_focal_px is None else " or speed='quick'"
@@ -281,7 +281,8 @@ class NetworkMatcher(ABC):
     def whole_steps(self, disparity_px: float) -> int:
         """Round a number of disparities [px] up to a multiple of the network's step."""
         step_px = self.network_config.step_px
-        return max(1, math.ceil(round(disparity_px, 3) / step_px)) * step_px
+        without_float_error_px = round(disparity_px, 3)  # which would add a whole step
+        return max(1, math.ceil(without_float_error_px / step_px)) * step_px
 
     def matching_focal_px(self, camera: Camera) -> float:
         """Compute the focal length at which images of a camera are matched [px].

@@ -306,7 +306,7 @@ class PSMNet(StereoNetwork):
             first_down = down if first_down is None else first_down
             del down
             x = hourglass.up1(up).add_(volume)
-            cost = layers.by_rows(head, (x,), halo=2, rows=self.rows)
+            cost = layers.by_rows(head, (x,), halo=2, rows=self.rows)  # two convolutions
             costs.append(cost + costs[-1] if costs else cost)
         return cast("tuple[Volume, Volume, Volume]", tuple(costs))
 
@@ -335,7 +335,8 @@ def psmnet_bytes(
     aggregation_slab_bytes = min(rows + 2 * 4, h) * row_bytes * bins
     head_slabs = 2 if dtype.itemsize >= 4 else 4  # the head computes in float32
 
-    # Five half-size maps in the first stage; joined levels, twice, in the last.
+    # In the first stage five half-size maps, each of four times the pixels; in the last one joined
+    # levels, twice.
     levels = 6 + len(config.pools)
     features_bytes = 2 * map_bytes * max(5 * 4, 2 * levels + 12)
     # The volume; of some rows the concatenation, and what a convolution makes of it.
@@ -343,8 +344,9 @@ def psmnet_bytes(
     # The volume, what is added to it, three half-size volumes; some rows in the head.
     hourglass_bytes = 2 * volume_bytes + 3 * volume_bytes // 4
     head_bytes = head_slabs * head_slab_bytes + 3 * cost_bytes
-    # Costs, maps of the full size, and the rows of the soft arg-min.
-    argmin_bytes = 4 * cost_bytes + 16 * height * width + 5 * CHUNK_BYTES
+    # Costs, four maps of the full size in float32, and the rows of the soft arg-min.
+    maps_bytes = 4 * 4 * height * width
+    argmin_bytes = 4 * cost_bytes + maps_bytes + 5 * CHUNK_BYTES
     peak_bytes = max(features_bytes, aggregation_bytes, hourglass_bytes + head_bytes, argmin_bytes)
     return int(layers.MARGIN * peak_bytes) + layers.OVERHEAD_BYTES
 
