@@ -50,8 +50,8 @@ Planes before a Kinect and a RealSense show 2 to 4 (``bench/sensors.py``). Of an
 less, what it shows is taken (:func:`measure_shared_per_white`)."""
 _BLOCK_PX = 5
 """Side of the blocks of readings whose means show the error that neighbours share."""
-_BLOCK_LAG = 3
-"""Means are compared so many blocks, 15 pixels, apart: real depth errs over such distances."""
+_BLOCK_LAG = 4
+"""Means are compared so many blocks, 20 pixels, apart: real depth errs over such distances."""
 _LEAST_FILLED = 0.6
 """Least share of a block that has readings."""
 _LEAST_BLOCKS = 100

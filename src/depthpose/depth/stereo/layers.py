@@ -229,14 +229,14 @@ class VolumeConv(nn.Module):
         return F.conv3d(*tensors, self.stride, 1)
 
 
-def _onednn_conv3d(volume: Volume, weight: Volume, bias: Tensor, stride: int) -> Volume:
+def _onednn_conv3d(volume: Volume, weight: Tensor, bias: Tensor, stride: int) -> Volume:
     """Compute ``F.conv3d(volume, weight, bias, stride, 1)`` by oneDNN."""
     padding = dilation = (1, 1, 1)
     groups = 1
     return torch.mkldnn_convolution(volume, weight, bias, padding, (stride,) * 3, dilation, groups)
 
 
-def _onednn_conv_transpose3d(volume: Volume, weight: Volume, bias: Tensor, stride: int) -> Volume:
+def _onednn_conv_transpose3d(volume: Volume, weight: Tensor, bias: Tensor, stride: int) -> Volume:
     """Compute ``F.conv_transpose3d(volume, weight, bias, stride, 1, 1)`` by oneDNN."""
     padding = output_padding = dilation = (1, 1, 1)
     groups = 1

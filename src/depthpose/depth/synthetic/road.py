@@ -213,10 +213,11 @@ class _GroundColors:
 
 
 def _draw_ground_colors(rng: np.random.Generator, place: Place) -> _GroundColors:
-    """Draw how the ground looks."""
+    """Draw how the ground looks: grey asphalt and pavements, and grass between green and yellow."""
     brightness = rng.uniform(0.7, 1.45)
     color = (0.105 * brightness, 0.105 * brightness, 0.107 * brightness)
     asphalt = Appearance("road", color, 3.0, int(rng.integers(4)))
+    # Two of the four are used; all are drawn, so that scenes stay what they were.
     variants = [int(v) for v in rng.integers(0, 6, 4)]
     grey = rng.uniform(0.6, 1.2)
     green = rng.uniform(0.75, 1.4)

@@ -237,7 +237,7 @@ def _compute_albedo(
     return albedo
 
 
-def _interpolate(values: Float[Tensor, "n 3*k"], shares: Vectors) -> Float[Tensor, "n k"]:
+def _interpolate(values: Float[Tensor, "n _"], shares: Vectors) -> Float[Tensor, "n _"]:
     """Interpolate values at the three corners of triangles, one after the other in each row.
 
     ``shares``: barycentric coordinates.

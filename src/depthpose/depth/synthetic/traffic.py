@@ -28,7 +28,8 @@ class _Rectangle:
     def overlaps(self, other: "_Rectangle") -> bool:
         """Whether the two have points in common."""
         is_near_x = abs(self.x - other.x) < self.half_x + other.half_x
-        return is_near_x and abs(self.s - other.s) < self.half_s + other.half_s
+        is_near_s = abs(self.s - other.s) < self.half_s + other.half_s
+        return bool(is_near_x and is_near_s)  # of floats of NumPy too
 
 
 _CAMERA_CAR = _Rectangle(x=0.0, s=0.5, half_x=1.5, half_s=4.5)

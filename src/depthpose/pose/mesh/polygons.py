@@ -107,7 +107,7 @@ def _group_by_size(sizes: np.ndarray) -> Iterator[np.ndarray]:
     order = np.argsort(sizes, kind="stable")
     for same_size in np.split(order, np.flatnonzero(np.diff(sizes[order])) + 1):
         size = int(sizes[same_size[0]]) if len(same_size) else 0
-        if size < 3:
+        if size < 3:  # polygons of no corners; those of one and two were refused
             continue
         step = max(1, _MOST_TOGETHER // size)
         for start in range(0, len(same_size), step):

@@ -161,7 +161,8 @@ def _step_to_likeliest(
     Returns:
         The next points; the information matrix; and the gradient of each line, both at p.
     """
-    # The unit vector q from each line's point to p. Near points weigh no more than others.
+    # The unit vector q from each line's point to p, and its distance. A point near p would pull
+    # without bound: it counts as one at a tenth of the mean distance.
     local, n, w = lines
     offset = p.to(n)[..., None] - local
     distance = offset.square().sum(-2).sqrt_()
