@@ -126,11 +126,11 @@ class NetworkMatcher(ABC):
             left: left views.
             right: right views, the same size.
             network_config: config of the network, perhaps of more disparities than in training.
-            first_px: the least disparity that is searched, a multiple of ``STEP_PX``; 0 for networks
-                that do not find the range.
+            first_px: the least disparity that is searched, a multiple of ``STEP_PX``; 0 for
+                networks that do not find the range.
 
         Returns:
-            A match for each pair, in pixels of these views; ``first_px`` is part of its disparities.
+            A match for each pair, in pixels of these views; its disparities include ``first_px``.
         """
 
     @torch.no_grad()
