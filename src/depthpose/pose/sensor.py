@@ -55,7 +55,7 @@ _BLOCK_LAG = 4
 _LEAST_FILLED = 0.6
 """Least share of a block that has readings."""
 _LEAST_BLOCKS = 100
-"""Least number of second differences of means that measure the shared error."""
+"""Least number of second differences, of means and of readings, that measure the ratio."""
 AVERAGED_PER_WHITE = 0.55
 """Standard deviation of means of five by five readings some ten pixels apart, over that of the
 noise of one reading. With it and half a millimetre, some four fifths of the means on planes before
@@ -163,11 +163,14 @@ def measure_shared_per_white(depth_m: Float[Tensor, "h w"]) -> float:
     """Measure the error that neighbouring readings share, over the noise of one reading.
 
     Means of blocks of readings have little noise of their own: their second differences show what
-    neighbours share. Curved surfaces add to it, so that of most images no more than
-    ``SHARED_PER_WHITE`` can be said, which is the result, too, where readings are too few.
+    neighbours share. Curved surfaces add to them, so the measured ratio is bounded.
 
     Args:
-        depth_m: a whole image; NaN or 0 where there is no reading.
+        depth_m: a whole depth image [m]; NaN or 0 where there is no reading.
+
+    Returns:
+        Ratio of the two standard deviations, ``SHARED_PER_WHITE`` at most; as much where readings
+        are too few, or without noise.
     """
     read_m = np.where(depth_m.numpy() > 0, depth_m.double().numpy(), np.nan)
     height = read_m.shape[0] // _BLOCK_PX
@@ -183,7 +186,7 @@ def measure_shared_per_white(depth_m: Float[Tensor, "h w"]) -> float:
     # Both over the square of the depth, with which noise grows.
     shared_bend_m, shared_middle_m = _take_second_differences(mean_m, _BLOCK_LAG)
     bend_m, middle_m = _take_second_differences(read_m, LAG_PX, every=_BLOCK_PX)
-    if len(shared_bend_m) < _LEAST_BLOCKS:
+    if min(len(shared_bend_m), len(bend_m)) < _LEAST_BLOCKS:
         return SHARED_PER_WHITE
     shared = float(np.median(np.abs(shared_bend_m) / shared_middle_m**2))
     white = float(np.median(np.abs(bend_m) / middle_m**2))
