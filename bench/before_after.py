@@ -74,9 +74,10 @@ def main() -> None:
     parser.add_argument("--demo", type=Path, required=True, help="out/demo of `make demo`")
     parser.add_argument("--repeats", type=int, default=5)
     options = parser.parse_args()
-    sources = (options.before, Path(__file__).parents[1] / "src")
+    sources = (options.before.resolve(), Path(__file__).resolve().parents[1] / "src")
+    part = options.demo.resolve() / "part"
     rows: list[dict[str, Any]] = []
-    for name, arguments in commands(options.samples, options.demo / "part").items():
+    for name, arguments in commands(options.samples.resolve(), part).items():
         times_s: dict[Path, list[float]] = {source: [] for source in sources}
         for _ in range(options.repeats + 1):
             for source in sources:

@@ -147,7 +147,7 @@ def test_copies_of_a_plate_stay_where_its_symmetry_has_them(seed: int) -> None:
     leading = truth @ half_turn([1.0, 0.0, 0.0])
     config = IcpConfig(start_distance_diameters=0.05)
     refined = refine_pose(cloud_m, leading, prepared.surface, config)
-    observation = observe(cloud_m, view, plate.diameter_m, 0.001, is_masked=True)
+    observation = observe(cloud_m, view, prepared.surface, is_masked=True)
     none = Rigid(torch.zeros(0, 3, 3).double(), torch.zeros(0, 3).double())
     competition = compete(cloud_m, refined, none, prepared, observation, EstimateConfig())
     poses = [competition.best.pose, *(copy.pose for copy, _ in competition.copies)]
@@ -203,7 +203,7 @@ def test_a_pose_that_is_one_of_the_copies_competes_with_none(
     monkeypatch.setattr(hypotheses, "_refine_different_poses", lambda *_: different)
     monkeypatch.setattr(hypotheses, "_refine_distinct_copies", lambda *_: [turned(49.5)])
     cloud_m = cloud_of(mug, truth.float()).double()
-    observation = observe(cloud_m, None, mug.diameter_m, 0.001, is_masked=True)
+    observation = observe(cloud_m, None, prepared.surface, is_masked=True)
     competition = compete(
         cloud_m, turned(0), Rigid.stack([truth]), prepared, observation, EstimateConfig()
     )

@@ -182,7 +182,7 @@ def test_a_plate_that_lies_flush_in_its_tray_is_not_cut_out_of_it() -> None:
     cloud_m = cloud_from_depth(depth_m, mask, K)
 
     def continued_share(view: ViewInput, *, is_masked: bool) -> float:
-        observation = observe(cloud_m, view, surface.diameter_m, 0.001, is_masked=is_masked)
+        observation = observe(cloud_m, view, surface, is_masked=is_masked)
         evidence = compare(observation, pose, surface)
         return evidence.continued / max(1.0, evidence.silhouette)
 

@@ -31,7 +31,6 @@ from depthpose.pose.synthetic.parts import make_part
 from depthpose.pose.types import Evidence, ObjectModel, ViewInput
 
 WALL_M = 1.3
-OBJECT_M = 0.001
 
 BAR = boxes("bar", ((0.2, 0.07, 0.03), (0.0, 0.0, 0.0)))
 
@@ -46,7 +45,7 @@ def view_before_wall(model: ObjectModel, pose: Rigid, noise_m: float = 0.0) -> V
 
 def observation_of(view: ViewInput, model: ObjectModel, *, is_masked: bool = True) -> Observation:
     cloud_m = cloud_from_depth(view.depth_m, view.mask, K)
-    return observe(cloud_m, view, model.diameter_m, OBJECT_M, is_masked=is_masked)
+    return observe(cloud_m, view, prepare_surface(model), is_masked=is_masked)
 
 
 def evidence_of(
@@ -150,9 +149,10 @@ def test_exact_readings_of_an_exact_model_support_its_pose() -> None:
     depth_m = torch.where(mask, 0.75, WALL_M)
     view = ViewInput(name="a", depth_m=depth_m, mask=mask, K=K, object="plate")
     cloud_m = cloud_from_depth(view.depth_m, view.mask, K)
-    exact = observe(cloud_m, view, plate.diameter_m, 0.0, is_masked=True)
+    surface = prepare_surface(plate, deviation_m=0.0)
+    exact = observe(cloud_m, view, surface, is_masked=True)
     with np.errstate(divide="raise", invalid="raise"):
-        evidence = compare(exact, pose, prepare_surface(plate))
+        evidence = compare(exact, pose, surface)
     assert evidence.agreement == 1.0
     assert 0 <= evidence.rms < 1
 
@@ -363,7 +363,7 @@ def test_a_large_object_is_thinned_and_the_evidence_stays() -> None:
         mask = depth_m.isfinite()
         view = ViewInput(name="a", depth_m=depth_m, mask=mask, K=lens, object="bracket")
         cloud_m = cloud_from_depth(depth_m, mask, lens)
-        observation = observe(cloud_m, view, model.diameter_m, OBJECT_M, is_masked=True)
+        observation = observe(cloud_m, view, prepare_surface(model), is_masked=True)
         assert observation.depth_m.size < 250_000
         found.append((observation.step, compare(observation, shifted, prepare_surface(model))))
     (small_step, small), (large_step, large) = found
@@ -377,7 +377,7 @@ def test_a_cloud_without_its_image_is_compared_as_well() -> None:
     view = view_before_wall(model, truth, 0.001)
     cloud_m = cloud_from_depth(view.depth_m, view.mask, K)
     surface = prepare_surface(model)
-    observation = observe(cloud_m, None, model.diameter_m, OBJECT_M, is_masked=True)
+    observation = observe(cloud_m, None, surface, is_masked=True)
     right = compare(observation, truth, surface)
     assert right.agreement > 0.97
     assert right.rms < 1

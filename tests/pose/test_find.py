@@ -106,7 +106,7 @@ def test_a_piece_of_a_larger_plane_is_no_flat_part(
     view = ViewInput(name="a", depth_m=depth_m, mask=mask, K=K, object=model.name)
     surface = prepare_surface(model)
     cloud_m = cloud_from_depth(depth_m, mask, K)
-    observation = observe(cloud_m, view, surface.diameter_m, 0.001, is_masked=False)
+    observation = observe(cloud_m, view, surface, is_masked=False)
     evidence = compare(observation, pose, surface)
     assert (probability_right(evidence, PRIOR_PROPOSED) == 0) == is_cut
 

@@ -21,6 +21,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.icp import refine_pose
 from depthpose.pose.identity import Scale, measure_scale
+from depthpose.pose.surface import prepare_surface
 from depthpose.pose.types import PoseEstimate
 
 TRUTH = pose_at(seed=1)
@@ -31,7 +32,7 @@ def test_the_scale_of_a_copy_is_measured(times: float) -> None:
     model = bracket()
     surface, cloud_m = bracket_surface(), noisy(cloud_of(scaled(model, times), TRUTH))
     begun = refine_pose(cloud_m.double(), Rigid(TRUTH.R.double(), TRUTH.t_m.double()), surface)
-    scale = measure_scale(cloud_m, begun.camera_from_model, surface, 0.0)
+    scale = measure_scale(cloud_m, begun.camera_from_model, surface)
     assert scale.times == pytest.approx(times, abs=0.012)
     assert scale.sigma < 0.02
     assert (scale.gain > 0.05) == (abs(times - 1) > 0.09)
@@ -39,7 +40,7 @@ def test_the_scale_of_a_copy_is_measured(times: float) -> None:
 
 def test_the_deviation_of_a_scale_is_that_of_errors_that_neighbours_share() -> None:
     """As sensors have them: here some eight of the 400 points in a cell of 3 cm err alike."""
-    surface = bracket_surface()
+    surface = prepare_surface(bracket(), deviation_m=0.0)
     cloud_m = take_evenly(cloud_of(bracket(), TRUTH).double(), 400)
     cells = (cloud_m / 0.03).floor() @ torch.tensor([1.0, 1e3, 1e6], dtype=torch.float64)
     cell = cells.unique(return_inverse=True)[1]
@@ -49,7 +50,7 @@ def test_the_deviation_of_a_scale_is_that_of_errors_that_neighbours_share() -> N
         generator = torch.Generator().manual_seed(seed)
         noise_m = 0.0015 * torch.randn(int(cell.max()) + 1, generator=generator).double()[cell]
         seen_m = cloud_m * (1 + noise_m[:, None] / cloud_m.norm(dim=1, keepdim=True))
-        scale = measure_scale(seen_m, pose, surface, 0.0)
+        scale = measure_scale(seen_m, pose, surface)
         errors.append((scale.times - 1) / scale.sigma)
     assert 0.4 < float(torch.tensor(errors).square().mean().sqrt()) < 1.6
 

@@ -148,7 +148,7 @@ def test_edges_that_a_sensor_cuts_contradict_no_pose_and_a_missing_half_does() -
         roughly[name] = float(score_by_image(frame, pose[None], surface))
         view = view_input(depth_m, mask & ~lost, CAMERA, model.name, "view", None)
         own_m = cloud_from_depth(depth_m, mask & ~lost, K.float())
-        observation = observe(own_m, view, surface.diameter_m, 0.001, is_masked=False)
+        observation = observe(own_m, view, surface, is_masked=False)
         agreement[name] = compare(observation, pose, surface).agreement
     assert roughly["half"] < 0.2
     assert roughly["cut"] > 0.5

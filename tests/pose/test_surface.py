@@ -1,5 +1,7 @@
 """The samples of a surface: nearest without searching, and what a camera would see of it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +11,7 @@ from tests.pose.synthetic_objects import bottle, bracket, cloud_of, pose_at
 from depthpose.core.rigid import Rigid
 from depthpose.pose.mesh import make_model
 from depthpose.pose.surface import Surface, look_along_rays, prepare_surface
-from depthpose.pose.types import ObjectModel
+from depthpose.pose.types import ObjectModel, SurfaceColors
 
 
 @pytest.fixture(scope="module")
@@ -20,6 +22,16 @@ def part() -> ObjectModel:
 @pytest.fixture(scope="module")
 def surface(part: ObjectModel) -> Surface:
     return prepare_surface(part)
+
+
+def test_a_real_object_differs_more_from_a_scan_than_from_a_cad_file(part: ObjectModel) -> None:
+    points = replace(part, faces=part.faces[:0])
+    point = torch.zeros(1, 3)
+    colors = SurfaceColors(points_m=point, normals=point, rgb=point, spacing_m=1.0)
+    colored = replace(part, colors=colors)
+    deviations_m = [prepare_surface(model, 500).deviation_m for model in (part, points, colored)]
+    assert deviations_m == [0.001, 0.002, 0.002]
+    assert prepare_surface(points, 500, deviation_m=0.0003).deviation_m == 0.0003
 
 
 def batch_of(*poses: Rigid) -> Rigid:

@@ -207,9 +207,9 @@ class EstimateOptions(PoseMethodOptions):
 
     min_certainty: float = 0.9
     """below it the status is ambiguous, not ok: the likeliest pose with its alternatives."""
-    object_deviation_mm: float = 1.0
+    object_deviation_mm: float | None = None
     """standard deviation of the real surface from its file [mm]: 0.3 for a machined part, 2 for a
-    carton or a scan."""
+    carton or a scan; by default 2 for a model of points or with colours, else 1."""
     weights: WeightsName = "parts"
     """of a pose network, by name or file ('depthpose weights list')."""
     voting: Voting = "ransac"
@@ -232,12 +232,15 @@ class EstimateOptions(PoseMethodOptions):
 
         if self.batch < 1:
             raise InputError(f"--batch {self.batch}: at least 1 input in one call of the network")
+        object_deviation_m = None
+        if self.object_deviation_mm is not None:
+            object_deviation_m = self.object_deviation_mm / 1000
         voting = VotingConfig(method=_VOTING_METHODS[self.voting], hypotheses=self.hypotheses)
         return EstimateConfig(
             voting=voting,
             with_icp=self.icp,
             min_certainty=self.min_certainty,
-            object_deviation_m=self.object_deviation_mm / 1000,
+            object_deviation_m=object_deviation_m,
             register_refused=self.register_refused,
             device=device_of_process(self.device),
         )

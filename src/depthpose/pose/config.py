@@ -163,9 +163,10 @@ class EstimateConfig(Settings):
     """Below this certainty the status is ``ambiguous``, not ``ok``; pose and alternatives are given
     all the same. 0: the likeliest pose is always ``ok``."""
 
-    object_deviation_m: Annotated[float, "[0, 1]"] = 0.001
+    object_deviation_m: Annotated[float, "[0, 1]"] | None = None
     """Standard deviation of the real surface from the model: some tenths of a millimetre for a
-    machined part, a millimetre or more for a scan, a casting or a carton."""
+    machined part, two and more for a scan, a casting or a carton. None: 2 mm where the model has
+    colours or is points alone, as scans are, and else 1 mm."""
 
     register_refused: bool = False
     """Whether what a network doubts is registered by its model alone: tenths of a second for each,

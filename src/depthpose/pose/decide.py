@@ -85,7 +85,6 @@ def decide(
             best.evidence,
             observation.focal_px,
             refusal.max_size_error,
-            config.object_deviation_m,
         )
         if identity.status == "contradicted":
             withheld = Refusal(status="doubtful", reason=identity.reason)

@@ -437,7 +437,9 @@ class PoseEstimator:
         if name not in self._prepared_objects:
             number = names.index(name)
             model = self.models[number]
-            surface = prepare_surface(model, self.config.icp.surface_points)
+            surface = prepare_surface(
+                model, self.config.icp.surface_points, self.config.object_deviation_m
+            )
             self._prepared_objects[name] = PreparedObject(
                 number=number, model=model, surface=surface
             )

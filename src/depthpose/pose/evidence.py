@@ -91,8 +91,7 @@ class Observation:
 def observe(
     cloud_m: Float[Tensor, "n 3"],
     view: ViewInput | None,
-    diameter_m: float,
-    object_std_m: float,
+    surface: Surface,
     *,
     is_masked: bool,
 ) -> Observation:
@@ -102,8 +101,7 @@ def observe(
         cloud_m: points that lie on the object, in the camera frame.
         view: their depth image; None: the points are drawn as one, by a camera in whose image they
             are about a pixel apart.
-        diameter_m: of the model.
-        object_std_m: standard deviation of the real surface from its model.
+        surface: of the object.
         is_masked: whether the points are exactly those of the object, so that points which a pose
             does not explain contradict it.
     """
@@ -113,7 +111,9 @@ def observe(
 
     # The window of the points, with a margin, within the image.
     distance_m = float(cloud_m[:, 2].median())
-    margin_px = int(_MARGIN_DIAMETERS * diameter_m / distance_m * float(K[0, 0])) + _MARGIN_PX
+    margin_px = (
+        int(_MARGIN_DIAMETERS * surface.diameter_m / distance_m * float(K[0, 0])) + _MARGIN_PX
+    )
     low = pixel.amin(0) - margin_px
     high = pixel.amax(0) + margin_px + 1
     if view is not None:
@@ -145,7 +145,7 @@ def observe(
     inner = inner if bool(inner.any()) else is_object  # thin objects are all border
     shared_per_white = SHARED_PER_WHITE if view is None else view.shared_per_white
     noise = measure_noise(
-        depth_m.numpy(), inner.numpy(), object_std_m, float(K[0, 0]), shared_per_white
+        depth_m.numpy(), inner.numpy(), surface.deviation_m, float(K[0, 0]), shared_per_white
     )
 
     # Thinned, if the object is large.

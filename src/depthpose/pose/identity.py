@@ -75,9 +75,7 @@ class Scale:
     gain: float
 
 
-def measure_scale(
-    cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface, object_std_m: float
-) -> Scale:
+def measure_scale(cloud_m: Float[Tensor, "n 3"], pose: Rigid, surface: Surface) -> Scale:
     """Measure the scale of the model that fits a cloud best, the pose moving with it.
 
     Point-to-plane ICP with a seventh unknown: the model grows about its middle ``c`` by ``s``,
@@ -87,7 +85,6 @@ def measure_scale(
         cloud_m: points of the object, in the camera frame.
         pose: ``camera_from_model``.
         surface: of the model.
-        object_std_m: standard deviation of the real surface from the model.
     """
     # The best of several starting scales, roughly.
     local_m = pose.inverse().apply(take_evenly(cloud_m.double(), POINTS))
@@ -111,7 +108,8 @@ def measure_scale(
         True,
         np.full(moved_m.shape[1], -1),
     )
-    return Scale(float(scale), _estimate_scale_deviation(residuals, object_std_m), float(gain))
+    sigma = _estimate_scale_deviation(residuals, surface.deviation_m)
+    return Scale(float(scale), sigma, float(gain))
 
 
 def _estimate_scale_deviation(residuals: Residuals, object_std_m: float) -> float:
@@ -348,7 +346,6 @@ def identify(
     evidence: Evidence,
     focal_px: float,
     max_size_error: float,
-    object_std_m: float,
 ) -> Identity:
     """Check whether a posed object has the size and the handedness of its model.
 
@@ -361,17 +358,16 @@ def identify(
         evidence: of the pose.
         focal_px: of the depth image.
         max_size_error: by so much a real object may differ in size from its model.
-        object_std_m: standard deviation of its surface from the model's.
     """
     # The best fits of another size and of the mirror image.
-    scale = measure_scale(cloud_m, pose, surface, object_std_m)
+    scale = measure_scale(cloud_m, pose, surface)
     has_mirror_image = mirror_deviation > MIRROR_ALIKE
     gain = measure_mirror_gain(cloud_m, pose, surface) if has_mirror_image else None
 
     # Errors that explain a difference: of the sensor, and of sides that deviate from the model.
     distance_m = float(cloud_m[:, 2].double().median())
     sensor_error = _bound_size_error(distance_m, focal_px, surface.diameter_m)
-    sides_m = object_std_m / math.sqrt(INDEPENDENT_SIDES)
+    sides_m = surface.deviation_m / math.sqrt(INDEPENDENT_SIDES)
     fits = _Fits(
         name=name,
         scale=scale,

@@ -109,11 +109,7 @@ def judge(
     # The best pose against its near-symmetric copies, look-alikes and other local minima.
     with watch.stage("evidence"):
         observation = observe(
-            cloud.cloud_m,
-            cloud.view,
-            prepared.surface.diameter_m,
-            config.object_deviation_m,
-            is_masked=cloud.is_masked,
+            cloud.cloud_m, cloud.view, prepared.surface, is_masked=cloud.is_masked
         )
         has_color = cloud.view is not None and cloud.view.color is not None
         competition = compete(

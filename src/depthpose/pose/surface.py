@@ -26,6 +26,10 @@ from depthpose.pose.mesh.models import drawn_triangles, fibonacci_directions, tr
 from depthpose.pose.outer_sides import find_outer_sides
 from depthpose.pose.types import ObjectModel
 
+CAD_DEVIATION_M = 0.001
+SCAN_DEVIATION_M = 0.002
+"""Standard deviation of a real object's surface from a designed model, and from a scanned one, if
+the user gives none."""
 NEAR = 0.05  #: diameters: a point of the cloud within this distance lies on the posed surface
 _OPPOSITE_DIAMETERS = 3 * NEAR  # largest distance of a sample on the other side of a wall
 _OCCLUDED_DIAMETERS = 1.5 * NEAR  # from which a point behind the surface counts as occluded by it
@@ -189,6 +193,7 @@ class Surface:
     triangles_m: Float64[Tensor, "f 3 3"]  #: corners of the rendered triangles, in the model frame
     across: Int64[Tensor, " m"]  #: index of the sample on the other side of a wall, or -1
     diameter_m: float  #: of the object
+    deviation_m: float  #: standard deviation of the real object's surface from this one
     spacing_m: float  #: median distance from a point to its third nearest neighbour
     middle_m: Float64[Tensor, "3"]  #: of the box about the surface, along the axes of the model
     ball_m: Float64[Tensor, "4"]  #: middle and radius of a ball about the surface
@@ -323,8 +328,20 @@ def _pad_rows(rows: Float64[Tensor, "n 3"], count: int) -> Float64[Tensor, "{cou
     return pad(rows, (0, 0, 0, count - len(rows)), value=torch.nan)
 
 
-def prepare_surface(model: ObjectModel, count: int = 10_000) -> Surface:
-    """Sample the surface of a model by ``count`` points, and compute what every cloud needs."""
+def prepare_surface(
+    model: ObjectModel, count: int = 10_000, deviation_m: float | None = None
+) -> Surface:
+    """Sample the surface of a model, and compute what every cloud needs.
+
+    Args:
+        model: the object.
+        count: number of samples.
+        deviation_m: standard deviation of the real object's surface from it; None: 2 mm from a
+            scan, 1 mm from another model.
+    """
+    if deviation_m is None:
+        deviation_m = SCAN_DEVIATION_M if model.is_scan else CAD_DEVIATION_M
+
     # Samples, and the triangles that are rendered.
     points_m, normals = (part.double() for part in sample_surface(model, count))
     is_large = len(model.faces) > _MOST_FACES
@@ -352,6 +369,7 @@ def prepare_surface(model: ObjectModel, count: int = 10_000) -> Surface:
         triangles_m=triangles_m.double(),
         across=across,
         diameter_m=model.diameter_m,
+        deviation_m=deviation_m,
         spacing_m=float(np.median(distance_m[:, -1])),
         middle_m=middle_m,
         ball_m=torch.cat([middle_m, radius_m[None]]),

@@ -305,8 +305,7 @@ def _weigh_pose(
     observation = observe(
         object_m,
         pose_input if isinstance(pose_input, ViewInput) else pose_input.view,
-        target.prepared.surface.diameter_m,
-        target.config.object_deviation_m,
+        target.prepared.surface,
         is_masked=False,
     )
     evidence = compare(observation, pose, target.prepared.surface)

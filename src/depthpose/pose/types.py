@@ -218,6 +218,11 @@ class ObjectModel:
                 "point. Give a model with an extent."
             )
 
+    @property
+    def is_scan(self) -> bool:
+        """Whether it was measured and not designed: points alone, or with colours."""
+        return len(self.faces) == 0 or self.colors is not None
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Vote:
