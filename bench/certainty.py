@@ -21,9 +21,9 @@ from shared import make_parser, mean_of
 from depthpose.core.checkpoint import find_weights
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import ObjectsConfig, SyntheticSensorConfig
-from depthpose.pose.copies import SymmetricCopies, find_copies
 from depthpose.pose.network_pose import GeoPoseNet
 from depthpose.pose.synthetic import SyntheticViews
+from depthpose.pose.verify.copies import SymmetricCopies, find_copies
 from depthpose.pose.weights import read_pose_weights
 from depthpose.report.page import format_markdown_table, write_table
 

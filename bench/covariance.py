@@ -27,9 +27,9 @@ from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid, cross_matrix
 from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import IcpConfig, SensorKind, SyntheticSensorConfig
+from depthpose.pose.geometry.surface import prepare_surface
 from depthpose.pose.icp import refine_pose
 from depthpose.pose.mesh import drawn_triangles
-from depthpose.pose.surface import prepare_surface
 from depthpose.pose.synthetic.depth_sensors import simulate_depth
 from depthpose.pose.synthetic.random_numbers import random_rotation
 from depthpose.report.page import format_markdown_table

@@ -1,4 +1,4 @@
-"""Fit the coefficients of a judgement by exact masks, beside those of ``pose/probability.py``.
+"""Fit the coefficients of ``pose/verify/probability.py`` by exact masks, beside those there.
 
     python bench/fit_probability.py [--samples SAMPLES] [--views 20]
 
@@ -34,10 +34,10 @@ from twenty_parts import PARTS, K, views
 
 from depthpose import Registration
 from depthpose.core.rigid import Rigid
-from depthpose.pose import hypotheses, probability
-from depthpose.pose.hypotheses import Hypothesis
-from depthpose.pose.probability import LEAST_AGREEMENT, LEAST_AREA, GammaShare
 from depthpose.pose.types import Evidence
+from depthpose.pose.verify import hypotheses, probability
+from depthpose.pose.verify.hypotheses import Hypothesis
+from depthpose.pose.verify.probability import LEAST_AGREEMENT, LEAST_AREA, GammaShare
 from depthpose.report.page import format_markdown_table
 
 REAL = "real instances"
@@ -47,7 +47,7 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Coefficients:
-    """The coefficients that are fitted, as ``pose/probability.py`` has them."""
+    """The coefficients that are fitted, as ``pose/verify/probability.py`` has them."""
 
     right_contradicted: GammaShare = probability.RIGHT_CONTRADICTED
     wrong_contradicted: GammaShare = probability.WRONG_CONTRADICTED

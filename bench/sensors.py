@@ -32,10 +32,10 @@ from torch import Tensor
 from depthpose.core.files import read_depth_png, read_image
 from depthpose.pose.cloud import grow_mask
 from depthpose.pose.config import SensorKind, SyntheticSensorConfig
-from depthpose.pose.evidence import _ACROSS, _MEETING, _mean_depth
 from depthpose.pose.frame import prepare_frame
 from depthpose.pose.sensor import AVERAGED_PER_WHITE, FLAT_M
 from depthpose.pose.synthetic.depth_sensors import simulate_depth
+from depthpose.pose.verify.evidence import _ACROSS, _MEETING, _mean_depth
 from depthpose.report.page import format_markdown_table
 
 _BASELINE_M = 0.075

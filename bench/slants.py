@@ -23,11 +23,11 @@ from shared import make_parser
 
 from depthpose import Registration
 from depthpose.core.rigid import Rigid
-from depthpose.pose import evidence, hypotheses
-from depthpose.pose.evidence import Observation
-from depthpose.pose.rendering import render_surface
-from depthpose.pose.surface import Surface
+from depthpose.pose.geometry.rendering import render_surface
+from depthpose.pose.geometry.surface import Surface
 from depthpose.pose.types import PoseEstimate, ViewInput
+from depthpose.pose.verify import evidence, hypotheses
+from depthpose.pose.verify.evidence import Observation
 from depthpose.report.page import format_markdown_table
 
 TANGENTS = (0.0, 0.4, 0.8, 1.2, 1.7, 2.3, 3.2)  # of the angle between ray and normal

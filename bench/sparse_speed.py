@@ -26,9 +26,9 @@ import torch
 from shared import make_parser, peak_growth_bytes, report, setting
 from torch import Tensor, nn
 
-from depthpose.pose.kernel_map import KernelMap
-from depthpose.pose.network import ResUNet, ResUNetConfig
-from depthpose.pose.sparse import SparseConv, Voxels
+from depthpose.pose.networks.kernel_map import KernelMap
+from depthpose.pose.networks.resunet import ResUNet, ResUNetConfig
+from depthpose.pose.networks.sparse import SparseConv, Voxels
 
 Run = Callable[[], Tensor]
 
@@ -125,7 +125,7 @@ def engines(network: ResUNet, coordinates: Tensor) -> dict[str, Run]:
         return network(Voxels.from_points(coordinates))
 
     def plain() -> Tensor:
-        with patch.object(import_module("depthpose.pose.sparse"), "convolve", plain_conv):
+        with patch.object(import_module("depthpose.pose.networks.sparse"), "convolve", plain_conv):
             return network(Voxels.from_points(coordinates))
 
     runs: dict[str, Run] = {"ours": ours, "plain autograd": plain}

@@ -70,7 +70,8 @@ def _content(value: object) -> object:
 def prepared_once() -> Iterator[None]:
     """What an estimator computes of a shape, and Git's answer, is computed once a process."""
     from depthpose.core import run
-    from depthpose.pose import copies, estimator
+    from depthpose.pose import estimator
+    from depthpose.pose.verify import copies
 
     made: dict[object, Any] = {}
 

@@ -38,9 +38,9 @@ from depthpose.core.files import (
     write_depth_png,
     write_image,
 )
-from depthpose.pose.baselines import DepthImageConfig, DepthImageNet
 from depthpose.pose.datasets import BopDataset
 from depthpose.pose.metrics import add_m
+from depthpose.pose.networks.baselines import DepthImageConfig, DepthImageNet
 from depthpose.pose.predictions import read_bop_results, read_predictions
 from depthpose.pose.types import ObjectModel, ViewInput
 from depthpose.pose.weights import write_pose_weights

@@ -57,7 +57,7 @@ def test_a_pose_command_loads_no_depth_and_loading_weights_no_compiler() -> None
     )
     assert "depthpose.pose.estimator" in loaded
     assert not of(loaded, "depth")
-    assert "depthpose.pose.network" in then
+    assert "depthpose.pose.networks.resunet" in then
     assert not {"torch._dynamo", "torch._inductor", "sympy", "numba"} & then
 
 

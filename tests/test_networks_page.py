@@ -15,7 +15,7 @@ from tests.written import ROOT
 from depthpose.depth.config import GeneratorConfig, PSMNetConfig
 from depthpose.depth.generators import Discriminator, UNetGenerator
 from depthpose.depth.stereo import PSMNet
-from depthpose.pose.network import ResUNet, ResUNetConfig
+from depthpose.pose.networks.resunet import ResUNet, ResUNetConfig
 from depthpose.pose.segmentation import FCN
 
 FIGURES = ("2-2", "2-3", "2-4", "3-1", "3-3")

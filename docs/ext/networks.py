@@ -24,11 +24,11 @@ from depthpose.depth.generators import Discriminator, UNetGenerator
 from depthpose.depth.losses import disparity_loss
 from depthpose.depth.stereo import PSMNet
 from depthpose.depth.train.config import StereoTraining, ViewTraining
-from depthpose.pose.grid import voxelise
-from depthpose.pose.network import ResUNet
+from depthpose.pose.geometry.grid import voxelise
+from depthpose.pose.networks.resunet import ResUNet
+from depthpose.pose.networks.sparse import Voxels
 from depthpose.pose.propose import meet_lines, vote_ransac
 from depthpose.pose.segmentation import FCN
-from depthpose.pose.sparse import Voxels
 from depthpose.pose.train import PoseTraining, SegmentationTraining
 from depthpose.pose.types import VotingPoints
 

@@ -10,9 +10,9 @@ from tests.pages.read_page import drawings
 from tests.pose.synthetic_objects import K, bracket, cloud_of, pose_at, view_of
 
 from depthpose.core.rigid import Rigid, perturb
-from depthpose.pose.observability import free_motions
 from depthpose.pose.predictions import Prediction, prediction_row
 from depthpose.pose.types import Axis, CloudInput, PoseEstimate, ViewInput
+from depthpose.pose.verify.observability import free_motions
 from depthpose.report.page import Section
 from depthpose.report.pose import ESTIMATED, TRUTH, make_pose_section
 

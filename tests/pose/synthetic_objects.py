@@ -12,10 +12,10 @@ from depthpose.core.camera import Camera, back_project
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import CloudConfig, MeshConfig, RefusalConfig
+from depthpose.pose.geometry.surface import Surface, prepare_surface
 from depthpose.pose.mesh import make_model
-from depthpose.pose.network import ResUNet, ResUNetConfig
 from depthpose.pose.network_pose import CloudToPose, GeoPoseNet
-from depthpose.pose.surface import Surface, prepare_surface
+from depthpose.pose.networks.resunet import ResUNet, ResUNetConfig
 from depthpose.pose.synthetic.parts import make_circle, make_part_mesh, make_ring
 from depthpose.pose.types import Axis, ObjectModel, PoseEstimate, Symmetries
 from depthpose.pose.weights import PoseWeights

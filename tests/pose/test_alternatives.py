@@ -25,12 +25,9 @@ from tests.pose.synthetic_objects import (
 )
 
 from depthpose.core.rigid import Rigid, geodesic_rad, rotation_by
-from depthpose.pose import hypotheses
 from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import EstimateConfig, IcpConfig
-from depthpose.pose.copies import PreparedObject
-from depthpose.pose.evidence import observe
-from depthpose.pose.hypotheses import compete
+from depthpose.pose.geometry.surface import prepare_surface
 from depthpose.pose.icp import RefinedPose, refine_pose
 from depthpose.pose.mesh import (
     NearSymmetry,
@@ -46,9 +43,12 @@ from depthpose.pose.mesh import (
 )
 from depthpose.pose.metrics import add_m
 from depthpose.pose.registration import Registration
-from depthpose.pose.surface import prepare_surface
 from depthpose.pose.synthetic.parts import make_part
 from depthpose.pose.types import ObjectModel, Symmetries, ViewInput
+from depthpose.pose.verify import hypotheses
+from depthpose.pose.verify.copies import PreparedObject
+from depthpose.pose.verify.evidence import observe
+from depthpose.pose.verify.hypotheses import compete
 
 EYE = torch.eye(3, dtype=torch.float64)
 

@@ -19,16 +19,16 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.background import PosedBin, add_background
 from depthpose.pose.cloud import cloud_from_depth, grow_mask
-from depthpose.pose.evidence import compare, observe
 from depthpose.pose.footprint import why_background_excludes
 from depthpose.pose.frame import prepare_frame
+from depthpose.pose.geometry.surface import prepare_surface
 from depthpose.pose.inputs import view_input
 from depthpose.pose.mesh import make_model
 from depthpose.pose.metrics import add_m
-from depthpose.pose.probability import MOST_CONTINUED
 from depthpose.pose.registration import Registration
-from depthpose.pose.surface import prepare_surface
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
+from depthpose.pose.verify.evidence import compare, observe
+from depthpose.pose.verify.probability import MOST_CONTINUED
 
 TRUTH = pose_at(-0.12, 0.75, seed=1)
 FIXTURE = pose_at(0.13, 0.78, seed=2)

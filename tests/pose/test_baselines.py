@@ -11,7 +11,10 @@ from torch import Tensor
 from depthpose.core.camera import project
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid, perturb
-from depthpose.pose.baselines import (
+from depthpose.pose.geometry.grid import rotation_from_z_to
+from depthpose.pose.losses import model_point_loss
+from depthpose.pose.mesh import drawn_triangles, sample_surface
+from depthpose.pose.networks.baselines import (
     EMPTY,
     DepthCrop,
     DepthImageConfig,
@@ -21,9 +24,6 @@ from depthpose.pose.baselines import (
     cut_depth,
     make_poses,
 )
-from depthpose.pose.grid import rotation_from_z_to
-from depthpose.pose.losses import model_point_loss
-from depthpose.pose.mesh import drawn_triangles, sample_surface
 from depthpose.pose.types import ViewInput, VotingPoints
 
 K = torch.tensor([[500.0, 0, 160], [0, 510.0, 120], [0, 0, 1]], dtype=torch.float64)

@@ -10,7 +10,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import read_depth_png, read_image
 from depthpose.pose.cloud import cloud_from_depth, is_reading, why_too_few
 from depthpose.pose.config import SHAPE_FEATURES, CloudConfig
-from depthpose.pose.grid import rotation_from_z_to, sample_points, voxelise
+from depthpose.pose.geometry.grid import rotation_from_z_to, sample_points, voxelise
 from depthpose.pose.types import CloudInput
 from depthpose.report.pose import select_object_points
 

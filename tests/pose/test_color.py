@@ -23,12 +23,12 @@ from tests.pose.textured_objects import (
 from torch import Tensor
 
 from depthpose.core.rigid import Rigid, geodesic_rad, rotation_by
-from depthpose.pose import color_copies
-from depthpose.pose.color import measure_color_agreement
-from depthpose.pose.color_copies import align_print, propose_color_copies, rotate_to_print
 from depthpose.pose.mesh import read_model, with_found_symmetries
 from depthpose.pose.registration import Registration
 from depthpose.pose.types import Axis, ColorImage, ObjectModel, Symmetries
+from depthpose.pose.verify import color_copies
+from depthpose.pose.verify.color import measure_color_agreement
+from depthpose.pose.verify.color_copies import align_print, propose_color_copies, rotate_to_print
 
 Z = Axis(direction=torch.tensor([0.0, 0, 1]), point_m=torch.zeros(3))
 

@@ -15,6 +15,8 @@ from torch import Tensor
 from depthpose.core.rigid import Rigid, perturb, rotation_by
 from depthpose.pose import compiled
 from depthpose.pose.config import IcpConfig
+from depthpose.pose.geometry.kdtree import build_tree, find_nearest_points
+from depthpose.pose.geometry.surface import Surface, look_along_rays, match, prepare_surface
 from depthpose.pose.icp import (
     Residuals,
     _iterate,
@@ -23,12 +25,10 @@ from depthpose.pose.icp import (
     refine_roughly,
     tukey_weight,
 )
-from depthpose.pose.identity import _linearise_growth
-from depthpose.pose.kdtree import build_tree, find_nearest_points
 from depthpose.pose.propose.pair_votes import ANGLES, DISTANCES, TURNS
 from depthpose.pose.propose.point_pairs import STEP, PairTable, prepare_pairs, vote_poses
-from depthpose.pose.surface import Surface, look_along_rays, match, prepare_surface
 from depthpose.pose.synthetic.parts import make_part
+from depthpose.pose.verify.identity import _linearise_growth
 
 PARTS = ("bracket", "spool")
 

@@ -12,14 +12,14 @@ import trimesh as _trimesh
 from tests.pose.synthetic_objects import bar, bottle, box_faces, boxes, bracket, gear, pose_at
 
 from depthpose.core.rigid import Rigid, geodesic_rad
-from depthpose.pose.copies import (
+from depthpose.pose.mesh import make_model, turn_about, with_found_symmetries
+from depthpose.pose.synthetic.parts import make_part
+from depthpose.pose.verify.copies import (
     SymmetricCopies,
     describe_difference,
     describe_near_symmetries,
     find_copies,
 )
-from depthpose.pose.mesh import make_model, turn_about, with_found_symmetries
-from depthpose.pose.synthetic.parts import make_part
 
 trimesh: Any = _trimesh  # its classes carry no types
 ORIGIN = torch.zeros(3, dtype=torch.float64)

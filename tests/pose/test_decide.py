@@ -11,22 +11,22 @@ from tests.pose.synthetic_objects import pose_at
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EstimateConfig
-from depthpose.pose.decide import explain_doubt, seconds_of_all, with_status
-from depthpose.pose.hypotheses import (
+from depthpose.pose.icp import RefinedPose
+from depthpose.pose.types import Alternative, Evidence, PoseEstimate
+from depthpose.pose.verify.decide import explain_doubt, seconds_of_all, with_status
+from depthpose.pose.verify.hypotheses import (
     Competition,
     Hypothesis,
     share_among_copies,
     share_among_poses,
 )
-from depthpose.pose.icp import RefinedPose
-from depthpose.pose.probability import (
+from depthpose.pose.verify.probability import (
     PRIOR_MASKED,
     PRIOR_PROPOSED,
     GammaShare,
     log_likelihood_ratio,
     probability_right,
 )
-from depthpose.pose.types import Alternative, Evidence, PoseEstimate
 
 GOOD = Evidence(
     visible=40.0, supported=38.0, explained=38.0,

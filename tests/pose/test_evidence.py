@@ -23,12 +23,12 @@ from depthpose.core.camera import back_project
 from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid, rotation_by
 from depthpose.pose.cloud import cloud_from_depth, grow_mask
-from depthpose.pose.evidence import Observation, _mean_depth, compare, observe
+from depthpose.pose.geometry.rendering import render_surface
+from depthpose.pose.geometry.surface import prepare_surface
 from depthpose.pose.mesh import turn_about
-from depthpose.pose.rendering import render_surface
-from depthpose.pose.surface import prepare_surface
 from depthpose.pose.synthetic.parts import make_part
 from depthpose.pose.types import Evidence, ObjectModel, ViewInput
+from depthpose.pose.verify.evidence import Observation, _mean_depth, compare, observe
 
 WALL_M = 1.3
 
@@ -91,7 +91,7 @@ def test_a_rendered_surface_is_that_of_its_triangles(model: ObjectModel, seed: i
 
 def test_of_very_many_faces_the_samples_are_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
     """A disc at each sample lies in the surface, and reaches beyond a silhouette by its radius."""
-    monkeypatch.setattr("depthpose.pose.surface._MOST_FACES", 100)
+    monkeypatch.setattr("depthpose.pose.geometry.surface._MOST_FACES", 100)
     mug = make_part("mug")
     surface = prepare_surface(mug)
     pose = pose_at(z_m=0.6).double()

@@ -12,10 +12,10 @@ from torch import Tensor
 
 from depthpose.cli import main
 from depthpose.core.errors import InputError
-from depthpose.pose.baselines import PointNet, PointNetConfig
 from depthpose.pose.export import build_direction_graph, pose_export
-from depthpose.pose.network import ResUNet, ResUNetConfig
-from depthpose.pose.sparse import Voxels
+from depthpose.pose.networks.baselines import PointNet, PointNetConfig
+from depthpose.pose.networks.resunet import ResUNet, ResUNetConfig
+from depthpose.pose.networks.sparse import Voxels
 from depthpose.pose.weights import write_pose_weights
 
 onnxruntime = pytest.importorskip("onnxruntime")

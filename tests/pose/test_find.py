@@ -22,14 +22,11 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import RefusalConfig
-from depthpose.pose.decide import choose_object
-from depthpose.pose.evidence import compare, observe
 from depthpose.pose.footprint import explained_mask
+from depthpose.pose.geometry.surface import NEAR, prepare_surface
 from depthpose.pose.mesh import make_model
 from depthpose.pose.metrics import add_m
-from depthpose.pose.probability import PRIOR_PROPOSED, probability_right
 from depthpose.pose.search import nothing_found
-from depthpose.pose.surface import NEAR, prepare_surface
 from depthpose.pose.types import (
     Alternative,
     CloudInput,
@@ -38,6 +35,9 @@ from depthpose.pose.types import (
     PoseEstimate,
     ViewInput,
 )
+from depthpose.pose.verify.decide import choose_object
+from depthpose.pose.verify.evidence import compare, observe
+from depthpose.pose.verify.probability import PRIOR_PROPOSED, probability_right
 
 TRUTHS = [pose_at(-0.13, 0.7, seed=1), pose_at(0.12, 0.9, seed=2)]
 REFUSAL = RefusalConfig()

@@ -10,17 +10,17 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, cross_matrix, perturb
 from depthpose.pose.config import CloudConfig
 from depthpose.pose.datasets import open_bop
-from depthpose.pose.grid import voxelise
+from depthpose.pose.geometry.grid import voxelise
+from depthpose.pose.geometry.surface import prepare_surface
 from depthpose.pose.icp import refine_pose
 from depthpose.pose.metrics import add_m
-from depthpose.pose.observability import free_motions
 from depthpose.pose.propose import (
     find_consistent_keypoints,
     fit_pose,
     vote_ransac,
 )
-from depthpose.pose.surface import prepare_surface
 from depthpose.pose.types import Axis
+from depthpose.pose.verify.observability import free_motions
 from depthpose.report.pose import select_object_points
 
 

@@ -18,12 +18,12 @@ from tests.pose.synthetic_objects import (
 
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import RefusalConfig
+from depthpose.pose.geometry.surface import Surface, prepare_surface
 from depthpose.pose.icp import refine_pose
-from depthpose.pose.identity import measure_mirror_gain
 from depthpose.pose.mesh import MIRROR_ALIKE, mirror_deviation
-from depthpose.pose.surface import Surface, prepare_surface
 from depthpose.pose.synthetic.parts import make_part
 from depthpose.pose.types import ObjectModel, PoseEstimate
+from depthpose.pose.verify.identity import measure_mirror_gain
 
 TRUTH = pose_at(seed=1)
 

@@ -10,14 +10,14 @@ import torch
 from torch import Tensor, nn
 
 from depthpose.core.errors import InputError
-from depthpose.pose.kernel_map import unpack
-from depthpose.pose.network import (
+from depthpose.pose.networks.kernel_map import unpack
+from depthpose.pose.networks.resunet import (
     ResUNet,
     ResUNetConfig,
     fold_norms,
     unfold_norms,
 )
-from depthpose.pose.sparse import Voxels
+from depthpose.pose.networks.sparse import Voxels
 from depthpose.pose.types import VotingPoints
 
 TINY = ResUNetConfig(

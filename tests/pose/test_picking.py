@@ -13,10 +13,10 @@ from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import ObjectsConfig, SyntheticSensorConfig
 from depthpose.pose.datasets import BopFrame
+from depthpose.pose.geometry.surface import Surface, prepare_surface
 from depthpose.pose.mesh import drawn_triangles
 from depthpose.pose.picking import rank_picks
 from depthpose.pose.registration import Registration
-from depthpose.pose.surface import Surface, prepare_surface
 from depthpose.pose.synthetic import make_frames
 from depthpose.pose.synthetic.parts import make_part
 from depthpose.pose.types import Evidence, PoseEstimate, ViewInput

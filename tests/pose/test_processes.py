@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from depthpose import Registration
-from depthpose.pose.surface import prepare_surface
+from depthpose.pose.geometry.surface import prepare_surface
 from depthpose.pose.synthetic import make_part
 
 # In a process of its own: an array that points at freed memory kills whoever reads it. The worker

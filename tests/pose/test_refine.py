@@ -16,11 +16,11 @@ from depthpose.core.rigid import Rigid, cross_matrix, geodesic_rad, perturb
 from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import IcpConfig, SensorKind, SyntheticSensorConfig
 from depthpose.pose.datasets import open_bop
+from depthpose.pose.geometry.surface import Surface, prepare_surface
 from depthpose.pose.icp import _estimate_covariance, _Linearised, refine_best, refine_pose
 from depthpose.pose.mesh import drawn_triangles, make_model, sample_surface
 from depthpose.pose.mesh.models import turn_about
 from depthpose.pose.metrics import add_m
-from depthpose.pose.surface import Surface, prepare_surface
 from depthpose.pose.synthetic.depth_sensors import simulate_depth
 from depthpose.pose.types import ObjectModel, Symmetries
 from depthpose.report.pose import select_object_points

@@ -11,10 +11,10 @@ from torch import Tensor
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EstimateConfig, IcpConfig, RefusalConfig
-from depthpose.pose.observability import observability
+from depthpose.pose.geometry.surface import prepare_surface
 from depthpose.pose.registration import Registration
-from depthpose.pose.surface import prepare_surface
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
+from depthpose.pose.verify.observability import observability
 
 TRUTH = pose_at()
 WALL_M = 1.3

@@ -15,10 +15,10 @@ from depthpose.core.checkpoint import find_weights
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, geodesic_rad
 from depthpose.pose.config import EstimateConfig, ObjectsConfig, VotingConfig
+from depthpose.pose.geometry.surface import prepare_surface
 from depthpose.pose.mesh import make_model, sample_surface
 from depthpose.pose.metrics import add_m
 from depthpose.pose.propose.point_pairs import prepare_pairs, propose_poses
-from depthpose.pose.surface import prepare_surface
 from depthpose.pose.synthetic import SyntheticViews, make_part
 from depthpose.pose.types import CloudSample, ObjectModel
 from depthpose.pose.weights import read_pose_weights

@@ -9,10 +9,10 @@ from tests.pose.synthetic_objects import FACTS, K, bracket, pose_at, view_of
 
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, perturb
-from depthpose.pose.baselines import DepthImageConfig, DepthImageNet
 from depthpose.pose.config import CloudConfig, EstimateConfig, IcpConfig, RefusalConfig
 from depthpose.pose.metrics import add_m
 from depthpose.pose.network_pose import DepthImageRegressor
+from depthpose.pose.networks.baselines import DepthImageConfig, DepthImageNet
 from depthpose.pose.types import ViewInput
 from depthpose.pose.weights import PoseWeights
 

@@ -19,10 +19,10 @@ from depthpose.core.arrays import take_evenly
 from depthpose.core.loop import make_sample_generator
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EstimateConfig, RefusalConfig
+from depthpose.pose.geometry.surface import prepare_surface
 from depthpose.pose.icp import refine_pose
-from depthpose.pose.identity import Scale, measure_scale
-from depthpose.pose.surface import prepare_surface
 from depthpose.pose.types import PoseEstimate
+from depthpose.pose.verify.identity import Scale, measure_scale
 
 TRUTH = pose_at(seed=1)
 
@@ -86,7 +86,7 @@ def test_an_identity_is_confirmed_where_the_size_that_fits_is_near(
     times: float, status: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scale = Scale(times, sigma=0.01, gain=0.03)
-    monkeypatch.setattr("depthpose.pose.identity.measure_scale", lambda *_: scale)
+    monkeypatch.setattr("depthpose.pose.verify.identity.measure_scale", lambda *_: scale)
     identity = estimated(1.0).identity
     assert identity is not None
     assert identity.status == status
@@ -98,7 +98,9 @@ def test_another_size_refuses_where_it_fits_clearly_better(
     gain: float, status: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What is seen of a bowl from above fits at many sizes: one that gains little says nothing."""
-    monkeypatch.setattr("depthpose.pose.identity.measure_scale", lambda *_: Scale(1.2, 0.02, gain))
+    monkeypatch.setattr(
+        "depthpose.pose.verify.identity.measure_scale", lambda *_: Scale(1.2, 0.02, gain)
+    )
     found = estimated(1.0)
     assert found.status == status
     assert found.identity is not None

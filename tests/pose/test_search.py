@@ -22,22 +22,22 @@ from depthpose.core.rigid import Rigid, geodesic_rad, rotation_by
 from depthpose.pose import search
 from depthpose.pose.cloud import cloud_from_depth, grow_mask
 from depthpose.pose.config import EstimateConfig, RefusalConfig
-from depthpose.pose.copies import PreparedObject, find_copies
-from depthpose.pose.evidence import compare, observe
 from depthpose.pose.footprint import explained_frame_mask, why_background_excludes
 from depthpose.pose.frame import prepare_frame
+from depthpose.pose.geometry.surface import prepare_surface
 from depthpose.pose.inputs import view_input
 from depthpose.pose.mesh import make_model
 from depthpose.pose.metrics import add_m
-from depthpose.pose.probability import PRIOR_PROPOSED
 from depthpose.pose.propose.image import propose_in_frame, score_by_image
 from depthpose.pose.propose.point_pairs import prepare_pairs
 from depthpose.pose.register import register
 from depthpose.pose.registration import Registration
 from depthpose.pose.search import SearchTargets, find_objects
-from depthpose.pose.surface import prepare_surface
 from depthpose.pose.synthetic.parts import make_part
 from depthpose.pose.types import CloudInput, Evidence, ObjectModel, PoseEstimate
+from depthpose.pose.verify.copies import PreparedObject, find_copies
+from depthpose.pose.verify.evidence import compare, observe
+from depthpose.pose.verify.probability import PRIOR_PROPOSED
 
 TRUTHS = [pose_at(-0.13, 0.7, seed=1), pose_at(0.12, 0.9, seed=2)]
 

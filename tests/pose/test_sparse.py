@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from depthpose.core.errors import InputError
-from depthpose.pose.kernel_map import (
+from depthpose.pose.networks.kernel_map import (
     CLOUD_LIMIT,
     COORDINATE_LIMIT,
     CoordinateCache,
@@ -18,9 +18,9 @@ from depthpose.pose.kernel_map import (
     pack,
     unpack,
 )
-from depthpose.pose.sparse import SparseConv, SparseConvTranspose, Voxels, convolve
+from depthpose.pose.networks.sparse import SparseConv, SparseConvTranspose, Voxels, convolve
 
-CONV = import_module("depthpose.pose.sparse")
+CONV = import_module("depthpose.pose.networks.sparse")
 SIDE = 8
 """Dense grids run from -SIDE to SIDE - 1."""
 
@@ -156,7 +156,7 @@ def test_pairs_of_a_small_case_by_hand() -> None:
 def test_a_table_and_a_binary_search_find_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     cloud_keys = Voxels.from_points(cloud()).cache
     by_table = [cloud_keys.kernel_map(*a).neighbours.table for a in ((0, 5), (0, 3, 2), (1, 3))]
-    monkeypatch.setattr("depthpose.pose.kernel_map.MAX_CELLS", 0)
+    monkeypatch.setattr("depthpose.pose.networks.kernel_map.MAX_CELLS", 0)
     cloud_keys = CoordinateCache(cloud_keys.keys(0))
     by_search = [cloud_keys.kernel_map(*a).neighbours.table for a in ((0, 5), (0, 3, 2), (1, 3))]
     assert all(map(torch.equal, by_table, by_search))
@@ -171,7 +171,7 @@ def test_no_look_leaves_the_table(
     xyz = torch.cartesian_prod(*[torch.arange(5) - shift] * 3)
     keys = pack(F.pad(xyz, (1, 0)))
     found = CoordinateCache(keys.sort().values).kernel_map(0, kernel, stride).neighbours.table
-    monkeypatch.setattr("depthpose.pose.kernel_map.MAX_CELLS", 0)
+    monkeypatch.setattr("depthpose.pose.networks.kernel_map.MAX_CELLS", 0)
     wanted = CoordinateCache(keys.sort().values).kernel_map(0, kernel, stride).neighbours.table
     assert torch.equal(found, wanted)
 

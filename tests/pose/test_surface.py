@@ -9,8 +9,8 @@ import trimesh
 from tests.pose.synthetic_objects import bottle, bracket, cloud_of, pose_at
 
 from depthpose.core.rigid import Rigid
+from depthpose.pose.geometry.surface import Surface, look_along_rays, prepare_surface
 from depthpose.pose.mesh import make_model
-from depthpose.pose.surface import Surface, look_along_rays, prepare_surface
 from depthpose.pose.types import ObjectModel, SurfaceColors
 
 

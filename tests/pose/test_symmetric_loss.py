@@ -6,7 +6,7 @@ import torch
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import CloudConfig
 from depthpose.pose.mesh import symmetry_transforms
-from depthpose.pose.network import ResUNet, ResUNetConfig
+from depthpose.pose.networks.resunet import ResUNet, ResUNetConfig
 from depthpose.pose.synthetic import make_part
 from depthpose.pose.train import PoseTask, PoseTraining
 from depthpose.pose.train.clouds import CloudBatch

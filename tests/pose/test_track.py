@@ -21,12 +21,12 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, rotation_by
 from depthpose.pose import track as track_module
 from depthpose.pose.config import EstimateConfig
-from depthpose.pose.copies import PreparedObject
+from depthpose.pose.geometry.surface import prepare_surface
 from depthpose.pose.metrics import add_m
 from depthpose.pose.predictions import Prediction, parse_prediction, prediction_row
-from depthpose.pose.surface import prepare_surface
 from depthpose.pose.track import TrackedObject, track
 from depthpose.pose.types import Alternative, PoseEstimate, Refusal, ViewInput
+from depthpose.pose.verify.copies import PreparedObject
 
 HIDDEN = 0.68
 

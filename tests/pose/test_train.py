@@ -21,8 +21,8 @@ from depthpose.core.loop import AdamConfig, LoopConfig, TrainingRun
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import CloudConfig, MeshConfig, ObjectsConfig, SyntheticSensorConfig
 from depthpose.pose.datasets import write_bop_models, write_bop_scene
-from depthpose.pose.network import ResUNet, ResUNetConfig, fold_norms
-from depthpose.pose.sparse import Voxels
+from depthpose.pose.networks.resunet import ResUNet, ResUNetConfig, fold_norms
+from depthpose.pose.networks.sparse import Voxels
 from depthpose.pose.synthetic import SyntheticViews, make_frames
 from depthpose.pose.train import (
     STAGES,

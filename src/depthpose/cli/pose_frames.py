@@ -10,9 +10,9 @@ from depthpose.cli.pose_methods import PoseMethod
 from depthpose.core.files import read_depth_png
 from depthpose.pose.datasets import Instance
 from depthpose.pose.footprint import explained_mask
+from depthpose.pose.geometry.surface import Surface, prepare_surface
 from depthpose.pose.inputs import AnyInput
 from depthpose.pose.predictions import PoseJob, Prediction
-from depthpose.pose.surface import Surface, prepare_surface
 from depthpose.pose.types import ObjectModel, ViewInput
 
 

@@ -17,11 +17,11 @@ from depthpose.core.errors import InputError, suggest_name
 from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
 from depthpose.pose import datasets
-from depthpose.pose.baselines import DepthImageNet
 from depthpose.pose.config import EstimateConfig
 from depthpose.pose.inputs import AnyInput
 from depthpose.pose.mesh import FIXED_UNITS, symmetries_to_bop, unit_of
 from depthpose.pose.network_pose import DepthImageRegressor, GeoPoseNet
+from depthpose.pose.networks.baselines import DepthImageNet
 from depthpose.pose.registration import Registration, read_parts
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewInput
 from depthpose.pose.weights import read_pose_weights

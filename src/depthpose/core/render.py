@@ -5,7 +5,7 @@ edge functions are those of homogeneous pixels (Olano and Greer, Triangle Scan C
 Homogeneous Coordinates, 1997), so a triangle may reach behind the camera. Everything runs on the
 device of the triangles, in bounded memory, and the result is the same to the bit every time. It is
 made for synthetic images, whose textures need exact coordinates on the triangles; where many poses
-are compared with an image, the compiled loop of ``pose/rendering.py`` is faster.
+are compared with an image, the compiled loop of ``pose/geometry/rendering.py`` is faster.
 """
 
 from collections.abc import Callable, Iterator

@@ -18,9 +18,8 @@ from depthpose.core.units import Unit
 from depthpose.pose.background import AnyBackground, add_background
 from depthpose.pose.color_inputs import add_color
 from depthpose.pose.config import EstimateConfig, RefusalConfig
-from depthpose.pose.copies import PreparedObject
 from depthpose.pose.datasets.detections import Box, mask_from_box
-from depthpose.pose.decide import choose_object, refused, seconds_of_all, with_status
+from depthpose.pose.geometry.surface import prepare_surface
 from depthpose.pose.inputs import (
     AnyArray,
     AnyCloud,
@@ -32,12 +31,13 @@ from depthpose.pose.inputs import (
     split_instances,
     view_input,
 )
-from depthpose.pose.probability import PRIOR_REGION
 from depthpose.pose.register import register
 from depthpose.pose.search import SearchTargets, find_objects
-from depthpose.pose.surface import prepare_surface
 from depthpose.pose.track import TrackedObject, track
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, Refusal, ViewInput
+from depthpose.pose.verify.copies import PreparedObject
+from depthpose.pose.verify.decide import choose_object, refused, seconds_of_all, with_status
+from depthpose.pose.verify.probability import PRIOR_REGION
 
 Result = TypeVar("Result")
 _NAME = "input"  # what an input is called that came without a name

@@ -12,10 +12,10 @@ from torch import Tensor
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.core.export import Case, Export, Graph, Limit, Value
-from depthpose.pose.kernel_map import list_offsets
 from depthpose.pose.mesh.models import sample_surface
-from depthpose.pose.network import ConvNorm, ResidualBlock, ResUNet, fold_norms
-from depthpose.pose.sparse import SparseConv, Voxels
+from depthpose.pose.networks.kernel_map import list_offsets
+from depthpose.pose.networks.resunet import ConvNorm, ResidualBlock, ResUNet, fold_norms
+from depthpose.pose.networks.sparse import SparseConv, Voxels
 from depthpose.pose.weights import PoseWeights
 
 LEVELS = 4  #: of the network; a voxel of level ``l`` is ``2**l`` cells wide

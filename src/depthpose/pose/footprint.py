@@ -11,8 +11,8 @@ from depthpose.core.camera import back_project, project
 from depthpose.core.camera.pinhole import Window, clip_window, crop_intrinsics
 from depthpose.core.rigid import Rigid
 from depthpose.pose.frame import Frame, share_behind
+from depthpose.pose.geometry.surface import NEAR, Surface
 from depthpose.pose.sensor import EDGE_PX
-from depthpose.pose.surface import NEAR, Surface
 from depthpose.pose.types import KnownBackground, ViewInput
 
 _REGION_MARGIN = 0.5

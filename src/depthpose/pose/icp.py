@@ -14,7 +14,7 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, cross_matrix, rotation_by
 from depthpose.pose.compiled import Vector, array_of, compiled, cross, dot, minus, rotate, vector
 from depthpose.pose.config import IcpConfig
-from depthpose.pose.surface import Surface, Target, look_along_rays, match
+from depthpose.pose.geometry.surface import Surface, Target, look_along_rays, match
 
 _SLACK = 0.1  # sine of the angle up to which a surface that faces away counts as visible
 _GRAZING = 0.1  # sine of the angle between a ray and a plane below which they do not meet nearby
@@ -137,7 +137,7 @@ def refine_pose(
     Args:
         points_m: points of the object, in the camera frame.
         initial: poses to begin from, ``camera_from_model``; one or a batch.
-        surface: of :func:`~depthpose.pose.surface.prepare_surface`.
+        surface: of :func:`~depthpose.pose.geometry.surface.prepare_surface`.
         config: limits and number of steps.
 
     Raises:
@@ -193,7 +193,7 @@ def refine_best(
     Args:
         points_m: points of the object, in the camera frame.
         initial: ``camera_from_model``, one or several; the first is trusted most.
-        surface: of :func:`~depthpose.pose.surface.prepare_surface`.
+        surface: of :func:`~depthpose.pose.geometry.surface.prepare_surface`.
         config: ``starts`` and what :func:`refine_pose` takes.
 
     Raises:
@@ -295,7 +295,7 @@ def refine_roughly(
     Args:
         points_m: points of the object, in the camera frame.
         starts: poses in float64, ``camera_from_model``.
-        surface: of the model; its table is :class:`~depthpose.pose.surface.NearestTable`.
+        surface: of the model; its table is :class:`~depthpose.pose.geometry.surface.NearestTable`.
         config: ``end_distance_diameters`` is used.
     """
     end_m = config.end_distance_diameters * surface.diameter_m

@@ -25,15 +25,12 @@ from depthpose.core.devices import (
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.core.stopwatch import Stopwatch
-from depthpose.pose.baselines import DepthCrop, DepthImageNet, cut_depth, make_poses
 from depthpose.pose.cloud import ObjectCloud, cloud_from_depth, prepare_cloud, why_too_few
 from depthpose.pose.config import EstimateConfig, RefusalConfig
-from depthpose.pose.copies import PreparedObject, require_surface
-from depthpose.pose.decide import refused
 from depthpose.pose.estimator import PoseEstimator, unreadable_on_error
-from depthpose.pose.grid import VoxelGrid, sample_and_voxelise
+from depthpose.pose.geometry.grid import VoxelGrid, sample_and_voxelise
 from depthpose.pose.icp import BestStart, RefinedPose, refine_best
-from depthpose.pose.probability import PRIOR_MASKED, PRIOR_PROPOSED
+from depthpose.pose.networks.baselines import DepthCrop, DepthImageNet, cut_depth, make_poses
 from depthpose.pose.propose import fit_poses, meet_lines, vote_ransac
 from depthpose.pose.register import judge
 from depthpose.pose.types import (
@@ -45,6 +42,9 @@ from depthpose.pose.types import (
     Vote,
     VotingPoints,
 )
+from depthpose.pose.verify.copies import PreparedObject, require_surface
+from depthpose.pose.verify.decide import refused
+from depthpose.pose.verify.probability import PRIOR_MASKED, PRIOR_PROPOSED
 from depthpose.pose.weights import PoseWeights, read_pose_weights
 
 _DOUBTED: tuple[Status, ...] = ("votes do not meet", "keypoints do not fit", "doubtful")

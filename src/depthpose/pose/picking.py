@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from depthpose.pose.rendering import Rendering, render_surface
-from depthpose.pose.surface import Surface
+from depthpose.pose.geometry.rendering import Rendering, render_surface
+from depthpose.pose.geometry.surface import Surface
 from depthpose.pose.types import PoseEstimate, ViewInput
 
 _LEAST_HIDDEN_SHARE = 0.02

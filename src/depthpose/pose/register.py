@@ -14,15 +14,15 @@ from depthpose.core.rigid import Rigid
 from depthpose.core.stopwatch import Stopwatch
 from depthpose.pose.cloud import ObjectCloud, prepare_cloud
 from depthpose.pose.config import CloudConfig, EstimateConfig, RefusalConfig
-from depthpose.pose.copies import PreparedObject
-from depthpose.pose.decide import decide, refused
-from depthpose.pose.evidence import observe
-from depthpose.pose.grid import fit_local_planes, thin_cloud
-from depthpose.pose.hypotheses import compete
+from depthpose.pose.geometry.grid import fit_local_planes, thin_cloud
 from depthpose.pose.icp import BestStart, refine_best
-from depthpose.pose.probability import PRIOR_MASKED
 from depthpose.pose.propose.point_pairs import propose_poses
 from depthpose.pose.types import AnyInput, PoseEstimate, Refusal
+from depthpose.pose.verify.copies import PreparedObject
+from depthpose.pose.verify.decide import decide, refused
+from depthpose.pose.verify.evidence import observe
+from depthpose.pose.verify.hypotheses import compete
+from depthpose.pose.verify.probability import PRIOR_MASKED
 
 _VOTING_DIAMETERS = 0.05  # distance of the points that vote
 _PROPOSALS = 40  # poses that point pairs propose

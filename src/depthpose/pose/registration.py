@@ -9,7 +9,6 @@ from depthpose.core.devices import force_float32
 from depthpose.core.errors import InputError
 from depthpose.core.units import Unit
 from depthpose.pose.config import EstimateConfig, RefusalConfig
-from depthpose.pose.copies import require_surface
 from depthpose.pose.estimator import PoseEstimator
 from depthpose.pose.inputs import AnyInput
 from depthpose.pose.mesh import (
@@ -22,6 +21,7 @@ from depthpose.pose.mesh import (
     with_found_symmetries,
 )
 from depthpose.pose.types import ObjectModel, PoseEstimate
+from depthpose.pose.verify.copies import require_surface
 
 
 class Registration(PoseEstimator):

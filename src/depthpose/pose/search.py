@@ -22,19 +22,22 @@ from depthpose.core.devices import map_in_threads
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import cloud_from_depth, why_nothing_seen
 from depthpose.pose.config import EstimateConfig, RefusalConfig
-from depthpose.pose.copies import PreparedObject
-from depthpose.pose.decide import (
+from depthpose.pose.footprint import explained_frame_mask, why_background_excludes, window_of_region
+from depthpose.pose.frame import Frame, prepare_frame
+from depthpose.pose.icp import refine_roughly
+from depthpose.pose.picking import rank_picks
+from depthpose.pose.propose.image import propose_in_frame
+from depthpose.pose.register import register
+from depthpose.pose.types import CloudInput, Evidence, PoseEstimate, ViewInput
+from depthpose.pose.verify.copies import PreparedObject
+from depthpose.pose.verify.decide import (
     LEAST_SHARE,
     explain_doubt,
     likeliest_object,
     with_share,
 )
-from depthpose.pose.evidence import compare, observe
-from depthpose.pose.footprint import explained_frame_mask, why_background_excludes, window_of_region
-from depthpose.pose.frame import Frame, prepare_frame
-from depthpose.pose.icp import refine_roughly
-from depthpose.pose.picking import rank_picks
-from depthpose.pose.probability import (
+from depthpose.pose.verify.evidence import compare, observe
+from depthpose.pose.verify.probability import (
     LEAST_POSSIBLE,
     PRIOR_MANY,
     PRIOR_PROPOSED,
@@ -42,9 +45,6 @@ from depthpose.pose.probability import (
     probability_of_instances,
     probability_right,
 )
-from depthpose.pose.propose.image import propose_in_frame
-from depthpose.pose.register import register
-from depthpose.pose.types import CloudInput, Evidence, PoseEstimate, ViewInput
 
 _MOST_PLACES = 40
 """Largest number of proposals that are looked at in an image."""

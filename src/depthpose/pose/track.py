@@ -18,14 +18,9 @@ from depthpose.core.rigid import Rigid
 from depthpose.core.stopwatch import Stopwatch
 from depthpose.pose.cloud import cloud_from_depth
 from depthpose.pose.config import EstimateConfig, RefusalConfig
-from depthpose.pose.copies import PreparedObject
-from depthpose.pose.decide import explain_doubt, why_not_observable, with_status
-from depthpose.pose.evidence import compare, observe
 from depthpose.pose.frame import is_on_plane, largest_plane
+from depthpose.pose.geometry.surface import NEAR, Surface
 from depthpose.pose.icp import refine_best
-from depthpose.pose.observability import free_motions, without_motions
-from depthpose.pose.probability import PRIOR_MASKED, log_likelihood_ratio, probability_right
-from depthpose.pose.surface import NEAR, Surface
 from depthpose.pose.types import (
     Alternative,
     AnyInput,
@@ -35,6 +30,11 @@ from depthpose.pose.types import (
     Refusal,
     ViewInput,
 )
+from depthpose.pose.verify.copies import PreparedObject
+from depthpose.pose.verify.decide import explain_doubt, why_not_observable, with_status
+from depthpose.pose.verify.evidence import compare, observe
+from depthpose.pose.verify.observability import free_motions, without_motions
+from depthpose.pose.verify.probability import PRIOR_MASKED, log_likelihood_ratio, probability_right
 
 _MARGIN_DIAMETERS = 0.15
 """Largest distance from the surface at the last or the predicted pose of points that may be the

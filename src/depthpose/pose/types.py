@@ -265,7 +265,7 @@ class Alternative:
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """How a posed model compares with a depth image, as :mod:`depthpose.pose.evidence` measures.
+    """How a posed model compares with a depth image, by :mod:`depthpose.pose.verify.evidence`.
 
     Areas are counted in independent patches of readings: neighbouring readings share their error.
     """

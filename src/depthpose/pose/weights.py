@@ -22,7 +22,6 @@ from depthpose.core.checkpoint import (
 from depthpose.core.config import config_from_dict, config_to_dict
 from depthpose.core.errors import InputError
 from depthpose.core.files.disk import refused_as
-from depthpose.pose.baselines import DepthImageConfig, DepthImageNet, PointNet, PointNetConfig
 from depthpose.pose.config import SHAPE_FEATURES, CloudConfig, RefusalConfig
 from depthpose.pose.mesh import (
     gap_to_surface_m,
@@ -30,7 +29,13 @@ from depthpose.pose.mesh import (
     symmetries_from_bop,
     symmetries_to_bop,
 )
-from depthpose.pose.network import ResUNet, ResUNetConfig
+from depthpose.pose.networks.baselines import (
+    DepthImageConfig,
+    DepthImageNet,
+    PointNet,
+    PointNetConfig,
+)
+from depthpose.pose.networks.resunet import ResUNet, ResUNetConfig
 from depthpose.pose.types import ObjectModel, SurfaceColors
 
 DirectionNet = ResUNet | PointNet  #: networks whose points vote

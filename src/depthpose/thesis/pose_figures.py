@@ -13,11 +13,11 @@ from depthpose.core.arrays import take_evenly
 from depthpose.core.errors import InputError
 from depthpose.core.files.images import rgb_from_pillow
 from depthpose.pose.cloud import prepare_cloud
-from depthpose.pose.grid import sample_and_voxelise
+from depthpose.pose.geometry.grid import sample_and_voxelise
 from depthpose.pose.mesh import sample_surface
-from depthpose.pose.network import ResUNet
 from depthpose.pose.network_pose import GeoPoseNet
-from depthpose.pose.sparse import Voxels
+from depthpose.pose.networks.resunet import ResUNet
+from depthpose.pose.networks.sparse import Voxels
 from depthpose.pose.types import AnyInput, ObjectModel, Refusal
 
 _GAP_PX = 8

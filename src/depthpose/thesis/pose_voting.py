@@ -16,10 +16,10 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import cloud_from_depth, why_too_few
 from depthpose.pose.config import VotingConfig
-from depthpose.pose.grid import sample_points, voxelise
+from depthpose.pose.geometry.grid import sample_points, voxelise
 from depthpose.pose.metrics import SUCCESS_SHARE, add_m, adds_m
-from depthpose.pose.network import ResUNet
 from depthpose.pose.network_pose import GeoPoseNet
+from depthpose.pose.networks.resunet import ResUNet
 from depthpose.pose.propose import fit_pose, meet_lines, vote_ransac
 from depthpose.pose.types import ObjectModel, ViewSample, VotingPoints
 

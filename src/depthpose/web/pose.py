@@ -14,15 +14,15 @@ from depthpose.pose import mesh
 from depthpose.pose.config import EstimateConfig, ObjectsConfig
 from depthpose.pose.datasets import mask_from_box, parse_box
 from depthpose.pose.datasets.dataset import write_mask
-from depthpose.pose.decide import with_status
 from depthpose.pose.footprint import explained_mask
+from depthpose.pose.geometry.surface import prepare_surface
 from depthpose.pose.inputs import cloud_input, view_input
 from depthpose.pose.network_pose import GeoPoseNet, VotingDirections
 from depthpose.pose.predictions import CLOUD, PICTURE, Prediction, write_predictions
 from depthpose.pose.registration import Registration
-from depthpose.pose.surface import prepare_surface
 from depthpose.pose.synthetic import make_frames
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, ViewInput
+from depthpose.pose.verify.decide import with_status
 from depthpose.report import pose as report
 from depthpose.report.page import Layer, Scene
 from depthpose.report.pose import select_object_points

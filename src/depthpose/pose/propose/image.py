@@ -10,10 +10,10 @@ from torch.nn.functional import normalize
 
 from depthpose.core.rigid import Rigid, perturb
 from depthpose.pose.frame import Frame, readings_toward
+from depthpose.pose.geometry.surface import NEAR, Surface
 from depthpose.pose.icp import tukey_weight
 from depthpose.pose.propose.point_pairs import STEP, PairTable, vote_poses
 from depthpose.pose.sensor import SHARED_PER_WHITE
-from depthpose.pose.surface import NEAR, Surface
 
 # Votes.
 _REFERENCE_EVERY = 8

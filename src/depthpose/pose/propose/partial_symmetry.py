@@ -11,10 +11,10 @@ from torch import Tensor
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid, geodesic_rad
 from depthpose.pose.config import IcpConfig
+from depthpose.pose.geometry.surface import NEAR, Surface, prepare_surface
 from depthpose.pose.icp import refine_roughly
 from depthpose.pose.mesh import true_symmetries
 from depthpose.pose.propose.point_pairs import prepare_pairs, vote_poses
-from depthpose.pose.surface import NEAR, Surface, prepare_surface
 from depthpose.pose.types import ObjectModel
 
 _SELF_REFERENCES = 40

@@ -14,7 +14,8 @@ from torch.nn.functional import normalize
 
 from depthpose.core.rigid import Rigid, rotation_by
 from depthpose.pose.compiled import array_of
-from depthpose.pose.grid import thin_cloud
+from depthpose.pose.geometry.grid import thin_cloud
+from depthpose.pose.geometry.surface import Surface, look_along_rays
 from depthpose.pose.mesh.models import fibonacci_directions
 from depthpose.pose.propose.pair_votes import (
     FEATURES,
@@ -23,7 +24,6 @@ from depthpose.pose.propose.pair_votes import (
     cast_votes,
     describe_all_pairs,
 )
-from depthpose.pose.surface import Surface, look_along_rays
 
 STEP = 0.07
 """Least distance between points of the model, and width of a bin of the length of a pair, both over

@@ -25,7 +25,7 @@ from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import grow_mask, lift_sample
 from depthpose.pose.config import CloudConfig, ObjectsConfig
-from depthpose.pose.grid import rotation_from_z_to
+from depthpose.pose.geometry.grid import rotation_from_z_to
 from depthpose.pose.mesh import drawn_triangles
 from depthpose.pose.synthetic.depth_sensors import JUMP, simulate_depth
 from depthpose.pose.synthetic.occluders import draw_levels, occlude

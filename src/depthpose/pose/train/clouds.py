@@ -17,7 +17,7 @@ from depthpose.pose.cloud import lift_sample, why_too_few
 from depthpose.pose.config import CloudConfig
 from depthpose.pose.datasets import BopDataset, open_bop
 from depthpose.pose.datasets.layouts import read_bop_models, read_models_info
-from depthpose.pose.grid import sample_points, voxelise
+from depthpose.pose.geometry.grid import sample_points, voxelise
 from depthpose.pose.mesh import (
     read_model,
     refuse_equal_names,

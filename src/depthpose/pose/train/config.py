@@ -8,10 +8,10 @@ from depthpose.core.config import ASCENDING, Settings
 from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.core.loop import AdamConfig, LoopConfig
 from depthpose.core.units import Unit
-from depthpose.pose.baselines import DepthImageConfig, PointNetConfig
 from depthpose.pose.config import OCCLUSIONS, CloudConfig, MeshConfig, ObjectsConfig
 from depthpose.pose.losses import POINT_LOSSES
-from depthpose.pose.network import ResUNetConfig
+from depthpose.pose.networks.baselines import DepthImageConfig, PointNetConfig
+from depthpose.pose.networks.resunet import ResUNetConfig
 from depthpose.pose.segmentation import SegmentationConfig
 
 

@@ -10,11 +10,11 @@ from torch import nn
 
 from depthpose.core.loop import ValidationResult, make_adam
 from depthpose.core.rigid import Rigid
-from depthpose.pose.baselines import DepthImageNet
 from depthpose.pose.config import CloudConfig, ObjectsConfig
 from depthpose.pose.mesh import sample_surface, symmetry_transforms
 from depthpose.pose.metrics import SUCCESS_SHARE, add_of_nearest_m
 from depthpose.pose.network_pose import DepthImageRegressor, GeoPoseNet
+from depthpose.pose.networks.baselines import DepthImageNet
 from depthpose.pose.synthetic import SyntheticViews
 from depthpose.pose.train.config import HeldOutConfig, ViewsTraining
 from depthpose.pose.types import ObjectModel, PoseEstimate, ViewSample

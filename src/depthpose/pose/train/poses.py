@@ -30,7 +30,11 @@ from depthpose.core.loop import (
 )
 from depthpose.core.rigid import Rigid
 from depthpose.core.run import find_rank
-from depthpose.pose.baselines import (
+from depthpose.pose.cloud import lift_sample, why_too_few
+from depthpose.pose.config import SHAPE_FEATURES, RefusalConfig
+from depthpose.pose.losses import direction_loss, model_point_loss
+from depthpose.pose.mesh import sample_surface, symmetry_transforms
+from depthpose.pose.networks.baselines import (
     DepthCrop,
     DepthImageNet,
     PointNet,
@@ -38,14 +42,9 @@ from depthpose.pose.baselines import (
     cut_depth,
     make_poses,
 )
-from depthpose.pose.cloud import lift_sample, why_too_few
-from depthpose.pose.config import SHAPE_FEATURES, RefusalConfig
-from depthpose.pose.copies import describe_near_symmetries
-from depthpose.pose.losses import direction_loss, model_point_loss
-from depthpose.pose.mesh import sample_surface, symmetry_transforms
-from depthpose.pose.network import ResUNet, fold_norms, unfold_norms
+from depthpose.pose.networks.resunet import ResUNet, fold_norms, unfold_norms
+from depthpose.pose.networks.sparse import Voxels
 from depthpose.pose.propose import fit_pose, vote_ransac
-from depthpose.pose.sparse import Voxels
 from depthpose.pose.train.clouds import (
     BEYOND_TRAINING,
     TRIES,
@@ -64,6 +63,7 @@ from depthpose.pose.train.held_out import (
     score_held_out,
 )
 from depthpose.pose.types import ObjectModel, ViewSample
+from depthpose.pose.verify.copies import describe_near_symmetries
 from depthpose.pose.weights import (
     AnyNetwork,
     DirectionNet,

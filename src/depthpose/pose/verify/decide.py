@@ -12,19 +12,19 @@ from torch import Tensor
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import ObjectCloud
 from depthpose.pose.config import EstimateConfig, RefusalConfig
-from depthpose.pose.copies import PreparedObject, describe_difference
-from depthpose.pose.evidence import Observation
-from depthpose.pose.hypotheses import Competition
-from depthpose.pose.identity import identify
-from depthpose.pose.observability import free_motions, observability, without_motions
-from depthpose.pose.probability import (
+from depthpose.pose.types import Alternative, AnyInput, Evidence, PoseEstimate, Refusal
+from depthpose.pose.verify.copies import PreparedObject, describe_difference
+from depthpose.pose.verify.evidence import Observation
+from depthpose.pose.verify.hypotheses import Competition
+from depthpose.pose.verify.identity import identify
+from depthpose.pose.verify.observability import free_motions, observability, without_motions
+from depthpose.pose.verify.probability import (
     LEAST_AREA,
     WRONG_RMS,
     is_on_larger,
     probability_right,
     share_among_objects,
 )
-from depthpose.pose.types import Alternative, AnyInput, Evidence, PoseEstimate, Refusal
 
 OTHER_FRAME = (
     ". Or is the cloud not in the camera's frame (x right, y down, z forward)? A robot's base and "
@@ -134,7 +134,8 @@ def why_not_observable(
         cloud_m: points of the object, in the camera frame.
         prepared: the object.
         pose: of it.
-        free: motions of declared symmetries (:func:`~depthpose.pose.observability.free_motions`).
+        free: motions of declared symmetries, by
+            :func:`~depthpose.pose.verify.observability.free_motions`.
         least: share of its length by which every other motion must move the visible surface.
     """
     near_axis = prepared.copies.near_axis

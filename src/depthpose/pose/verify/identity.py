@@ -16,6 +16,7 @@ from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid
 from depthpose.pose.compiled import array_of, compiled, cross, dot, minus, vector
 from depthpose.pose.config import IcpConfig
+from depthpose.pose.geometry.surface import NEAR, Surface, Target, match
 from depthpose.pose.icp import (
     Residuals,
     build_normal_equations,
@@ -27,7 +28,6 @@ from depthpose.pose.icp import (
 from depthpose.pose.mesh import MIRROR_ALIKE
 from depthpose.pose.mesh.models import fibonacci_directions
 from depthpose.pose.sensor import EDGE_PX, INDEPENDENT_SIDES, LARGEST_OFFSET_M
-from depthpose.pose.surface import NEAR, Surface, Target, match
 from depthpose.pose.types import Evidence, Identity
 
 POINTS = 400  #: points of the cloud that are compared, evenly taken

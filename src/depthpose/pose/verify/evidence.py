@@ -25,7 +25,8 @@ from depthpose.core.arrays import take_evenly
 from depthpose.core.camera.pinhole import Window, crop_intrinsics
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import grow_mask
-from depthpose.pose.rendering import Rendering, render_surface
+from depthpose.pose.geometry.rendering import Rendering, render_surface
+from depthpose.pose.geometry.surface import Surface
 from depthpose.pose.sensor import (
     AVERAGED_PER_WHITE,
     CORRELATION_PX,
@@ -37,7 +38,6 @@ from depthpose.pose.sensor import (
     DepthNoise,
     measure_noise,
 )
-from depthpose.pose.surface import Surface
 from depthpose.pose.types import Evidence, ViewInput
 
 THRESHOLD = 3.0  #: deviations beyond which a residual contradicts a pose

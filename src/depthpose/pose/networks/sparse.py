@@ -1,7 +1,8 @@
 """Sparse convolution in torch operations, CPU and CUDA alike, and layers made of it.
 
-Features are convolved on the voxels that a :mod:`~depthpose.pose.kernel_map` relates. A convolution
-gathers, multiplies and adds up; its three methods differ in how much is gathered at once.
+Features are convolved on the voxels that a :mod:`~depthpose.pose.networks.kernel_map` relates. A
+convolution gathers, multiplies and adds up; its three methods differ in how much is gathered at
+once.
 """
 
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from depthpose.core.errors import InputError
-from depthpose.pose.kernel_map import CoordinateCache, KernelMap, pack, unpack
+from depthpose.pose.networks.kernel_map import CoordinateCache, KernelMap, pack, unpack
 
 GRID_PRODUCTS = 1 << 20
 """Most multiplications of the offset with the most pairs for which all offsets are one batched

@@ -14,7 +14,7 @@ from torch import Tensor
 from depthpose.core.camera.pinhole import Window, clip_window, crop_intrinsics, project
 from depthpose.core.rigid import Rigid
 from depthpose.pose.compiled import array_of, compiled
-from depthpose.pose.surface import Surface
+from depthpose.pose.geometry.surface import Surface
 
 _NEAR_M = 0.01
 """A triangle with a corner nearer to the camera than this is not rendered."""

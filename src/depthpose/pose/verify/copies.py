@@ -11,6 +11,7 @@ from torch import Tensor
 from depthpose.core.arrays import take_evenly
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, geodesic_rad
+from depthpose.pose.geometry.surface import Surface
 from depthpose.pose.mesh import (
     axis_of_turn,
     mirror_deviation,
@@ -22,7 +23,6 @@ from depthpose.pose.mesh import (
 )
 from depthpose.pose.propose.partial_symmetry import find_partial_symmetries
 from depthpose.pose.propose.point_pairs import PairTable, prepare_pairs
-from depthpose.pose.surface import Surface
 from depthpose.pose.types import Axis, ObjectModel
 
 SAME_DIAMETERS = 0.1  #: mean distance of the model's points up to which two poses are the same

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from depthpose.core.config import Settings
 from depthpose.core.errors import InputError
-from depthpose.pose.sparse import RowNorm, SparseConv, SparseConvTranspose, Voxels
+from depthpose.pose.networks.sparse import RowNorm, SparseConv, SparseConvTranspose, Voxels
 from depthpose.pose.types import VotingPoints
 
 Widths = tuple[int, int, int, int]  #: channels of the four levels

@@ -13,7 +13,7 @@ from torch.nn.functional import max_pool2d, normalize, pad
 
 from depthpose.core.rigid import Rigid
 from depthpose.pose.compiled import Vector, array_of, compiled, dot, vector
-from depthpose.pose.kdtree import (
+from depthpose.pose.geometry.kdtree import (
     Tree,
     build_tree,
     faces_camera,
@@ -21,9 +21,9 @@ from depthpose.pose.kdtree import (
     find_nearest_points,
     square_distance,
 )
+from depthpose.pose.geometry.outer_sides import find_outer_sides
 from depthpose.pose.mesh import sample_surface, symmetry_transforms
 from depthpose.pose.mesh.models import drawn_triangles, fibonacci_directions, triangulate_points
-from depthpose.pose.outer_sides import find_outer_sides
 from depthpose.pose.types import ObjectModel
 
 CAD_DEVIATION_M = 0.001
@@ -134,7 +134,7 @@ def match(
         points: in the model frame.
         target: the samples.
         eye: centre of the camera in the model frame.
-        least: how nearly a sample faces it (:func:`~depthpose.pose.kdtree.faces_camera`).
+        least: how nearly a sample faces it (:func:`~depthpose.pose.geometry.kdtree.faces_camera`).
         limit: distance of the farthest sample, where the match is exact.
         is_exact: True: the nearest sample that faces the camera is searched; False: one near the
             point is looked up, or that on the other side of the wall.

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid, cross_matrix
-from depthpose.pose.surface import NEAR, Surface
+from depthpose.pose.geometry.surface import NEAR, Surface
 from depthpose.pose.types import Axis, Symmetries
 
 _SAMPLED = 1000  # points of the cloud by which observability is measured

@@ -6,9 +6,9 @@ so that a count of contradicting patches has a negative binomial distribution: t
 much of a small object and little of a large one. Likewise the part of the silhouette across which
 the surface goes on, but of the length of the silhouette.
 
-How patches are counted :mod:`depthpose.pose.evidence` says; what a count then means is said by the
-coefficients of this file alone. ``bench/fit_probability.py`` fits the shares of right and wrong
-poses, ``WRONG_RMS`` and ``PRIOR_MASKED``.
+How patches are counted :mod:`depthpose.pose.verify.evidence` says; what a count then means is said
+by the coefficients of this file alone. ``bench/fit_probability.py`` fits the shares of right and
+wrong poses, ``WRONG_RMS`` and ``PRIOR_MASKED``.
 """
 
 import math

@@ -10,9 +10,9 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from depthpose.core.rigid import Rigid, geodesic_rad
-from depthpose.pose.color import score_by_color
 from depthpose.pose.mesh import near_symmetries, turn_about
 from depthpose.pose.types import Axis, ObjectModel, ViewInput
+from depthpose.pose.verify.color import score_by_color
 
 _SWEEP_STEPS = 72  # steps of a sweep about an axis: narrower print is stepped over
 _SWEEP_SAMPLES = 1500  # coloured points that are compared in a sweep

@@ -11,20 +11,20 @@ from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.rigid import Rigid
-from depthpose.pose.color import measure_color_agreement
-from depthpose.pose.color_copies import align_print, propose_color_copies
 from depthpose.pose.config import EstimateConfig
-from depthpose.pose.copies import PreparedObject
-from depthpose.pose.evidence import Observation, compare
+from depthpose.pose.geometry.surface import NEAR, Surface
 from depthpose.pose.icp import RefinedPose, refine_pose, refine_roughly
-from depthpose.pose.probability import (
+from depthpose.pose.types import Evidence, ViewInput
+from depthpose.pose.verify.color import measure_color_agreement
+from depthpose.pose.verify.color_copies import align_print, propose_color_copies
+from depthpose.pose.verify.copies import PreparedObject
+from depthpose.pose.verify.evidence import Observation, compare
+from depthpose.pose.verify.probability import (
     LEAST_AREA,
     VOTES_RAD,
     log_likelihood_of_copy,
     log_likelihood_ratio,
 )
-from depthpose.pose.surface import NEAR, Surface
-from depthpose.pose.types import Evidence, ViewInput
 
 _POINTS = 250  # points of the cloud that refine a competing pose
 _STEPS = 6  # steps of ICP for poses that were refined roughly
