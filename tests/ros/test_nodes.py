@@ -20,6 +20,7 @@ from tests.ros import rclpy_double
 from depthpose import FakestereoNet, GeoPoseNet
 from depthpose.core.camera import Camera, StereoRig
 from depthpose.core.errors import InputError
+from depthpose.core.files import write_depth_png
 from depthpose.core.rigid import Rigid
 from depthpose.depth.config import StreetsConfig
 from depthpose.depth.synthetic import Streets
@@ -266,16 +267,16 @@ def test_the_node_of_a_pair_publishes_depth_and_warns_of_what_it_cannot_use(
     recorded: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     node = started_node(monkeypatch, "DepthPairNode", weights="sgbm", encoding="16UC1")
-    topics = [one.topic for one in node._heard.heard]
-    assert {one.qos.depth for one in node._heard.heard} == {1}
-    assert {one.qos.reliability for one in node._heard.heard} == {"best effort"}
+    topics = [one.topic for one in node._synchronizer.heard]
+    assert {one.qos.depth for one in node._synchronizer.heard} == {1}
+    assert {one.qos.reliability for one in node._synchronizer.heard} == {"best effort"}
     given = [recorded[f"/{topic}"] for topic in topics]
-    node._heard.callback(*given)
+    node._synchronizer.callback(*given)
     sent = node.publishers_made["~/depth"].sent
     wait_until(lambda: sent)
     assert (sent[0].encoding, sent[0].header.frame_id) == ("16UC1", FRAME_ID)
     assert (sent[0].header.stamp.sec, sent[0].header.stamp.nanosec) == STAMP
-    node._heard.callback(given[0], given[1], given[2], given[2])
+    node._synchronizer.callback(given[0], given[1], given[2], given[2])
     wait_until(lambda: node.warnings)
     assert "no -fx * baseline" in node.warnings[0]
     node.destroy_node()
@@ -291,7 +292,7 @@ def test_the_node_of_poses_publishes_what_others_expect(
 ) -> None:
     base = "0 -1 0 0.5 1 0 0 0 0 0 1 2 0 0 0 1"
     node = poses_node(monkeypatch, base_from_camera=base, base_frame="world")
-    node._heard.callback(*depth_messages(street, recorded))
+    node._synchronizer.callback(*depth_messages(street, recorded))
     sent = {topic: made.sent for topic, made in node.publishers_made.items()}
     assert sorted(sent) == [
         "~/cup/base_pose", "~/cup/pose", "~/cup/pose_with_covariance", "~/detections",
@@ -315,6 +316,31 @@ def test_the_node_of_poses_publishes_what_others_expect(
     (based,) = sent["~/cup/base_pose"]
     assert based.header.frame_id == "world"
     assert vars(based.pose.position) == pytest.approx({"x": 0.3, "y": 0.1, "z": 2.7})
+
+
+def test_the_node_of_poses_searches_before_an_empty_frame(
+    street: StereoSample,
+    recorded: dict[str, Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    depth, info = depth_messages(street, recorded)
+    empty_m = torch.as_tensor(depth_of(depth)) + 0.5
+    write_depth_png(tmp_path / "empty.png", empty_m, 0.001)
+    node = poses_node(monkeypatch, empty_frame=str(tmp_path / "empty.png"))
+    searched: list[ViewInput] = []
+    monkeypatch.setattr(KnowsPose, "find_in", lambda _, view, __: searched.append(view) or [])
+    node._poses.estimates(depth, info)
+    node.destroy_node()
+    (view,) = searched
+    assert view.background is not None
+    gap_m = (view.background.depth_m - empty_m).abs()
+    assert float(gap_m.nanmedian()) < 0.001
+
+    with pytest.raises(InputError, match="where is it"):
+        poses_node(monkeypatch, bin="bin.stl")
+    with pytest.raises(InputError, match="both given"):
+        poses_node(monkeypatch, bin="bin.stl", empty_frame="empty.png")
 
 
 def test_the_service_answers_one_image(

@@ -494,6 +494,27 @@ def test_every_instance_of_an_image_is_shown_and_taken_away(
     assert float((places[0] - places[1]).norm()) > 0.1
 
 
+def test_what_the_empty_frame_shows_is_not_found(page: TestClient, tmp_path: Path) -> None:
+    """Of two of one part the empty frame shows one, which then belongs to the table."""
+    seen, mask = view_of(make_part(PART), pose_at(-0.1, 0.5, seed=1), pose_at(0.1, 0.55, seed=2))
+    wall = torch.full(mask.shape, 1.2)
+    depth_m = torch.where(mask, seen.float(), wall)
+    left = torch.arange(mask.shape[1]) < mask.shape[1] // 2
+    write_depth_png(tmp_path / "depth.png", depth_m, 0.0001)
+    write_depth_png(tmp_path / "empty.png", torch.where(left, depth_m, wall), 0.0001)
+    write_camera(tmp_path / "view.json", replace(CAMERA, depth_unit_m=0.0001))
+    names = VIEW_ALONE | {"empty_frame": "empty.png"}
+    answer = ask(page, "pose", tmp_path, names, object=PART).json()
+    (row,) = json.loads(page.get("/" + answer["folder"] + "poses.json").content)
+    assert row["status"] == "ok", row["reason"]
+    assert row["camera_from_model"][0][3] > 0
+
+    write_depth_png(tmp_path / "empty.png", wall[:-1], 0.0001)
+    status, message = refusal(ask(page, "pose", tmp_path, names, object=PART))
+    assert status == 400
+    assert "take both by one camera" in message
+
+
 @pytest.mark.parametrize(
     ("files", "data", "said"),
     [

@@ -24,6 +24,7 @@ from depthpose_ros.work import (
     DepthFromPair,
     Latest,
     Poses,
+    read_background,
     refuse_unanswered,
 )
 
@@ -41,9 +42,9 @@ class WorkNode(Node):
             self.declare_parameter(key, value)
         self._latest: Latest | None = None
 
-    def warn(self, said: str) -> None:
+    def warn(self, message: str) -> None:
         """Log a warning, at most one in five seconds."""
-        self.get_logger().warning(said, throttle_duration_sec=5.0)
+        self.get_logger().warning(message, throttle_duration_sec=5.0)
 
     def value(self, name: str) -> Any:  # noqa: ANN401
         """Give a parameter."""
@@ -52,19 +53,18 @@ class WorkNode(Node):
     def work_on(self, topics: dict[str, type], slop_s: float, work: Callable[..., None]) -> None:
         """Call ``work`` with messages of these topics whose stamps agree within ``slop_s``."""
 
-        def guarded(*given: Any) -> None:  # noqa: ANN401
+        def guarded(*arrived: Any) -> None:  # noqa: ANN401
             try:
-                work(*given)
+                work(*arrived)
             except InputError as error:
                 self.warn(str(error))
 
         self._latest = Latest(guarded)
-        heard = [
+        subscribers = [
             Subscriber(self, kind, topic, qos_profile=NEWEST) for topic, kind in topics.items()
         ]
-        both = ApproximateTimeSynchronizer(heard, _QUEUE, slop_s)
-        both.registerCallback(self._latest.put)
-        self._heard = both
+        self._synchronizer = ApproximateTimeSynchronizer(subscribers, _QUEUE, slop_s)
+        self._synchronizer.registerCallback(self._latest.put)
 
     def destroy_node(self) -> None:
         """End the thread before the node is destroyed."""
@@ -87,11 +87,11 @@ class DepthImageNode(WorkNode):
             allow_ood=self.value("allow_ood"),
         )
         mount = [self.value(name) for name in ("camera_height_m", "camera_tilt_deg")]
-        known = [None if math.isnan(number) else float(number) for number in mount]
-        work = DepthFromImage(net, self.value("encoding"), self.warn, *known)
+        height_m, tilt_deg = [None if math.isnan(number) else float(number) for number in mount]
+        work = DepthFromImage(net, self.value("encoding"), self.warn, height_m, tilt_deg)
         depth = self.create_publisher(Image, "~/depth", NEWEST)
         topics = {"image_rect": Image, "camera_info": CameraInfo}
-        self.work_on(topics, 0.0, lambda *given: depth.publish(image_message(work(*given))))
+        self.work_on(topics, 0.0, lambda *arrived: depth.publish(image_message(work(*arrived))))
 
 
 class DepthPairNode(WorkNode):
@@ -115,7 +115,9 @@ class DepthPairNode(WorkNode):
         topics = {f"{side}/image_rect": Image for side in sides}
         topics |= {f"{side}/camera_info": CameraInfo for side in sides}
         self.work_on(
-            topics, self.value("slop_s"), lambda *given: depth.publish(image_message(work(*given)))
+            topics,
+            self.value("slop_s"),
+            lambda *arrived: depth.publish(image_message(work(*arrived))),
         )
 
 
@@ -130,7 +132,8 @@ class PosesNode(WorkNode):
     def __init__(self) -> None:
         super().__init__(
             "poses", weights="parts", cad="", cad_unit="mm", object="", with_mask=False,
-            slop_s=0.01, base_from_camera="", base_frame="base_link",
+            slop_s=0.01, base_from_camera="", base_frame="base_link", empty_frame="", bin="",
+            bin_pose="",
         )  # fmt: skip
         files = [file.strip() for file in self.value("cad").split(",") if file.strip()]
         if files:
@@ -138,7 +141,11 @@ class PosesNode(WorkNode):
             net.prepare()
         else:
             net = GeoPoseNet.load(self.value("weights"))
-        self._poses = Poses(net, self.value("object") or None)
+        background = read_background(
+            self.value("empty_frame"), self.value("bin"), self.value("bin_pose"),
+            self.value("cad_unit"),
+        )  # fmt: skip
+        self._poses = Poses(net, self.value("object") or None, background)
         self._models = {model.name: model for model in net.models}
         self._base = read_base(self.value("base_from_camera").split())
         self._detections = self.create_publisher(Detection3DArray, "~/detections", 10)
@@ -157,12 +164,12 @@ class PosesNode(WorkNode):
     def _publish(self, depth: Any, info: Any, mask: Any = None) -> None:  # noqa: ANN401
         estimates = self._poses.estimates(depth, info, mask)
         header = messages.copied_header(depth)
-        found = [
-            messages.detection_from(header, one, self._models[one.object])
-            for one in estimates
-            if one.is_posed
+        detections = [
+            messages.detection_from(header, estimate, self._models[estimate.object])
+            for estimate in estimates
+            if estimate.is_posed
         ]
-        self._detections.publish(detections_message(header, found))
+        self._detections.publish(detections_message(header, detections))
         for estimate in estimates:
             pose = estimate.camera_from_model
             if pose is None or not estimate.is_ok:
@@ -190,20 +197,20 @@ class PosesNode(WorkNode):
             response.message = str(error)
             return response
         header = messages.copied_header(request.depth)
-        found = [one for one in estimates if one.camera_from_model is not None]
-        refused = [one for one in estimates if one.camera_from_model is None]
+        posed = [estimate for estimate in estimates if estimate.camera_from_model is not None]
+        refused = [estimate for estimate in estimates if estimate.camera_from_model is None]
         response.success = True
-        response.ids = [one.object for one in found]
-        response.scores = [score_of(one) for one in found]
+        response.ids = [estimate.object for estimate in posed]
+        response.scores = [score_of(estimate) for estimate in posed]
         response.poses = [
-            pose_message(messages.pose_from_rigid(header, one.camera_from_model))
-            for one in found
-            if one.camera_from_model is not None
+            pose_message(messages.pose_from_rigid(header, estimate.camera_from_model))
+            for estimate in posed
+            if estimate.camera_from_model is not None
         ]
-        response.visible_shares = [one.visible_share or 0.0 for one in found]
-        response.pick_ranks = [one.pick_rank or 0 for one in found]
-        response.missing = [one.object for one in refused]
-        response.reasons = [one.reason for one in refused]
+        response.visible_shares = [estimate.visible_share or 0.0 for estimate in posed]
+        response.pick_ranks = [estimate.pick_rank or 0 for estimate in posed]
+        response.missing = [estimate.object for estimate in refused]
+        response.reasons = [estimate.reason for estimate in refused]
         return response
 
 
@@ -249,12 +256,12 @@ def detections_message(
         size = detection.bbox.size
         size.x, size.y, size.z = plain.size
         detection.results = []
-        for one in plain.results:
+        for hypothesis in plain.results:
             result = ObjectHypothesisWithPose()
-            result.hypothesis.class_id = one.class_id
-            result.hypothesis.score = one.score
-            _copy_pose(one.pose, result.pose.pose)
-            result.pose.covariance = list(one.covariance)
+            result.hypothesis.class_id = hypothesis.class_id
+            result.hypothesis.score = hypothesis.score
+            _copy_pose(hypothesis.pose, result.pose.pose)
+            result.pose.covariance = list(hypothesis.covariance)
             detection.results.append(result)
         array.detections.append(detection)
     return array

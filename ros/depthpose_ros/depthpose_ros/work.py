@@ -3,12 +3,17 @@
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from depthpose import FakestereoNet, GeoPoseNet, Registration
+from depthpose.cli.pose_transforms import read_pose
 from depthpose.core.errors import InputError
+from depthpose.core.files import MAP_SUFFIXES
+from depthpose.core.units import Unit
+from depthpose.pose.background import AnyBackground, PosedBin, add_background
 from depthpose.pose.datasets import number_objects
-from depthpose.pose.inputs import view_input
+from depthpose.pose.inputs import depth_input, view_input
 from depthpose.pose.types import PoseEstimate
 from depthpose_ros.messages import (
     Image,
@@ -47,11 +52,11 @@ class DepthFromImage:
         camera = replace(
             camera_of(info), mount_height_m=self.mount_height_m, tilt_deg=self.tilt_deg
         )
-        found = self.net.estimate(picture_of(image), camera)
-        if found.warning:
-            self.warn(found.warning)
-        assert found.depth_m is not None, "one image has a camera, and so metres"
-        return image_from_depth(copied_header(image), found.depth_m, self.encoding)
+        estimate = self.net.estimate(picture_of(image), camera)
+        if estimate.warning:
+            self.warn(estimate.warning)
+        assert estimate.depth_m is not None, "one image has a camera, and so metres"
+        return image_from_depth(copied_header(image), estimate.depth_m, self.encoding)
 
 
 @dataclass
@@ -69,11 +74,11 @@ class DepthFromPair:
             InputError: what the messages lack, or a pair that is none, swapped or not rectified.
         """
         rig = rig_of(left_info, right_info)
-        found = self.net.estimate(picture_of(left), rig, right=picture_of(right))
-        if found.warning:
-            self.warn(found.warning)
-        assert found.depth_m is not None, "a rig gives metres"
-        return image_from_depth(copied_header(left), found.depth_m, self.encoding)
+        estimate = self.net.estimate(picture_of(left), rig, right=picture_of(right))
+        if estimate.warning:
+            self.warn(estimate.warning)
+        assert estimate.depth_m is not None, "a rig gives metres"
+        return image_from_depth(copied_header(left), estimate.depth_m, self.encoding)
 
 
 @dataclass
@@ -83,10 +88,13 @@ class Poses:
     Attributes:
         net: the pose estimator.
         object: its name; None: the only one that is known, or all objects without a mask.
+        background: an empty frame of this camera [m], or a bin at its pose, where nothing is
+            found; None: not known. With a mask it has no effect.
     """
 
     net: GeoPoseNet | Registration
     object: str | None = None
+    background: AnyBackground | None = None
 
     def estimates(
         self,
@@ -108,17 +116,21 @@ class Poses:
         if mask is None:
             names = wanted or [*self.net.objects]
             view = view_input(depth_m, None, camera, names[0], "depth")
-            return self.net.find_in(view, names)
+            return self.net.find_in(add_background(view, self.background, camera), names)
         if len(wanted) > 1:
             raise InputError(
                 f"a mask is of one object, and {', '.join(wanted)} are asked for; ask for one, or "
                 "leave the mask out"
             )
-        given = {"depth": depth_m, "mask": mask_of(mask), "camera": camera}
-        given["object"] = wanted[0] if wanted else None
-        if int(number_objects(given["mask"]).max()) > 1:
-            return self.net.estimate_instances(**given)
-        return [self.net.estimate(**given)]
+        arguments: dict[str, Any] = {
+            "depth": depth_m,
+            "mask": mask_of(mask),
+            "camera": camera,
+            "object": wanted[0] if wanted else None,
+        }
+        if int(number_objects(arguments["mask"]).max()) > 1:
+            return self.net.estimate_instances(**arguments)
+        return [self.net.estimate(**arguments)]
 
     def __call__(self, depth: Any, info: Any, mask: Any = None) -> list[tuple[str, Pose]]:  # noqa: ANN401
         """Give name and pose of what was found, the surest first; stamp and frame are the depth's.
@@ -129,8 +141,39 @@ class Poses:
         estimates = self.estimates(depth, info, mask)
         refuse_unanswered(estimates, is_masked=mask is not None)
         header = copied_header(depth)
-        poses = [(one.object, one.camera_from_model) for one in estimates if one.is_ok]
+        poses = [(sure.object, sure.camera_from_model) for sure in estimates if sure.is_ok]
         return [(name, pose_from_rigid(header, pose)) for name, pose in poses if pose is not None]
+
+
+def read_background(
+    empty_frame: str, bin_file: str, bin_pose: str, bin_unit: Unit
+) -> AnyBackground | None:
+    """Read what the camera sees without the objects; None where no file is given.
+
+    Args:
+        empty_frame: a depth image, PNG or TIFF in millimetres, or NPY or PFM in metres; or empty.
+        bin_file: CAD file of a bin in place of it; or empty.
+        bin_pose: text file with the 4x4 matrix ``camera_from_model`` of the bin in metres.
+        bin_unit: of the CAD file.
+
+    Raises:
+        InputError: both are given, a file cannot be read, or a bin has no pose.
+    """
+    if empty_frame and bin_file:
+        raise InputError(
+            f"empty_frame {empty_frame} and bin {bin_file} are both given; take one of them out"
+        )
+    if bin_file:
+        if not bin_pose:
+            raise InputError(
+                f"bin {bin_file}: where is it? Give bin_pose, a text file with its 4x4 matrix "
+                "camera_from_model in metres, or empty_frame in place of both"
+            )
+        return PosedBin.load(bin_file, read_pose(Path(bin_pose), "bin_pose"), bin_unit)
+    if empty_frame:
+        is_map = Path(empty_frame).suffix.lower() in MAP_SUFFIXES
+        return depth_input(empty_frame, None, "empty_frame", None if is_map else "mm")[0]
+    return None
 
 
 def refuse_unanswered(estimates: Sequence[PoseEstimate], *, is_masked: bool) -> None:
@@ -139,7 +182,7 @@ def refuse_unanswered(estimates: Sequence[PoseEstimate], *, is_masked: bool) -> 
     Raises:
         InputError: that is so.
     """
-    if is_masked and not any(one.is_ok for one in estimates):
+    if is_masked and not any(estimate.is_ok for estimate in estimates):
         raise InputError(f"{estimates[0].object}: no pose: {estimates[0].reason}")
 
 
@@ -161,11 +204,11 @@ class Latest:
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
-    def put(self, *given: Any) -> None:  # noqa: ANN401
+    def put(self, *messages: Any) -> None:  # noqa: ANN401
         """Hand over the newest messages, and return at once."""
         with self._changed:
             self.dropped += self._waiting is not None
-            self._waiting = given
+            self._waiting = messages
             self._changed.notify_all()
 
     def close(self) -> None:
@@ -181,6 +224,7 @@ class Latest:
                 self._changed.wait_for(lambda: self._is_closed or self._waiting is not None)
                 if self._is_closed:
                     return
-                given, self._waiting = self._waiting, None
-            assert given is not None
-            self._work(*given)
+                messages = self._waiting
+                self._waiting = None
+            assert messages is not None
+            self._work(*messages)

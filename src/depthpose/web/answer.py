@@ -49,6 +49,7 @@ FILE_FIELDS: dict[str, tuple[str, tuple[str, ...]]] = {
     "right": ("a picture", LISTED_SUFFIXES),
     "depth": ("a depth image", DEPTH_SUFFIXES),
     "mask": ("a mask", LISTED_SUFFIXES),
+    "empty_frame": ("a depth image", DEPTH_SUFFIXES),
     "camera": ("a camera file", CAMERA_SUFFIXES),
     "cloud": ("a point cloud", tuple(CLOUD_READERS)),
     "cad": ("a model file", tuple(MESH_READERS)),

@@ -11,6 +11,7 @@ from depthpose.core.camera import Camera, write_camera
 from depthpose.core.errors import InputError, refuse_unknown
 from depthpose.core.units import METRES, Unit
 from depthpose.pose import mesh
+from depthpose.pose.background import add_background
 from depthpose.pose.config import EstimateConfig, ObjectsConfig
 from depthpose.pose.datasets import mask_from_box, parse_box
 from depthpose.pose.datasets.dataset import write_mask
@@ -279,7 +280,7 @@ def _read_input(form: Form, model: ObjectModel) -> CloudInput | ViewInput:
         InputError: one of them is missing, wrong or too large, or both are there.
     """
     if "cloud" in form.files:
-        if "depth" in form.files or "mask" in form.files:
+        if not form.files.keys().isdisjoint(("depth", "mask", "empty_frame")):
             raise InputError("a cloud and a depth image are both given; choose one of the two")
         path = form.require_file("cloud")
         unit = form.fields.get("cloud_unit", "")
@@ -290,14 +291,7 @@ def _read_input(form: Form, model: ObjectModel) -> CloudInput | ViewInput:
     if mask is not None:
         refuse_large(mask.name, *files.image_size(mask))
 
-    if depth.suffix.lower() in files.MAP_SUFFIXES:
-        height, width = files.read_stored_depth(depth).shape
-        refuse_large(depth.name, width, height)
-        size = (width, height)
-    else:
-        size = files.image_size(depth)
-        refuse_large(depth.name, *size)
-
+    size = _read_size(depth)
     keys: dict[str, Any] = {}
     if "camera" not in form.files:
         focal_px = form.read_number("focal_px")
@@ -312,7 +306,27 @@ def _read_input(form: Form, model: ObjectModel) -> CloudInput | ViewInput:
     if camera.depth_unit_m is None:
         # Files of ROS, OpenCV and KITTI do not have it.
         camera = replace(camera, depth_unit_m=form.read_number("depth_unit_m"))
-    return view_input(depth, mask, camera, model.name, depth.stem)
+    view = view_input(depth, mask, camera, model.name, depth.stem)
+    if "empty_frame" not in form.files:
+        return view
+    empty_frame = form.require_file("empty_frame")
+    _read_size(empty_frame)
+    return add_background(view, empty_frame, camera)
+
+
+def _read_size(depth: Path) -> tuple[int, int]:
+    """Read width and height of a depth image.
+
+    Raises:
+        InputError: it cannot be read, or is too large.
+    """
+    if depth.suffix.lower() in files.MAP_SUFFIXES:
+        height, width = files.read_stored_depth(depth).shape
+        size = (width, height)
+    else:
+        size = files.image_size(depth)
+    refuse_large(depth.name, *size)
+    return size
 
 
 _EXAMPLE_UNIT_M = 0.0001

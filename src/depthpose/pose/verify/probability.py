@@ -145,7 +145,11 @@ def log_likelihood_of_copy(evidence: Evidence, area: float) -> float:
     """
     contradicted = COPY_CONTRADICTED.log_likelihood(evidence.contradicted, area)
     unobserved = RIGHT_UNOBSERVED.log_likelihood(evidence.unobserved, area)
-    return contradicted + unobserved + _log_likelihood_of_residuals(evidence.rms)
+    continued = 0.0
+    if evidence.silhouette >= LEAST_AREA:
+        continued = RIGHT_CONTINUED.log_likelihood(evidence.continued, evidence.silhouette)
+    residuals = _log_likelihood_of_residuals(evidence.rms)
+    return contradicted + unobserved + continued + residuals
 
 
 def _log_likelihood_of_residuals(rms: float) -> float:
