@@ -350,7 +350,9 @@ def measure_view(view: View, net: FakestereoNet, mount_filter: MountFilter) -> l
     assert camera is not None
     assert net.synthesiser is not None
     sizes = net.virtual_sizes(view.image)
-    (unscaled,) = depth_before_mount(net.synthesiser, net.matcher, [view.image], sizes)
+    (unscaled,) = depth_before_mount(
+        net.synthesiser, net.matcher, [view.image], sizes, allow_ood=True
+    )
     config = net.synthesiser.config
     assert isinstance(config, SelectionConfig)
     without_mount = scale_by_mount(unscaled, view.image, None, config)

@@ -287,8 +287,8 @@ def test_a_network_without_the_class_says_nothing_of_the_sky() -> None:
 
 
 @pytest.mark.slow
-def test_the_graph_of_a_pair_has_the_sky() -> None:
-    """Of a random network, a few pixels lie on the border of a decision."""
+def test_the_graph_of_a_pair_gives_disparity_and_sky_at_every_size() -> None:
+    """Of a random network, a few pixels lie on the border of a decision or of two candidates."""
     onnxruntime = pytest.importorskip("onnxruntime")
     with short_encoder():
         network = partly_sky(replace(SMALL, work_focal_px=90.0))
@@ -304,4 +304,8 @@ def test_the_graph_of_a_pair_has_the_sky() -> None:
         assert found["is_sky"].dtype == bool
         assert float((found["is_sky"] != expected).mean()) < 0.02
         assert set(found["disparity_px"][found["is_sky"]]) <= {np.float32(0.01)}
+        is_seen = ~(found["is_sky"] | expected)
+        error_px = np.abs(found["disparity_px"] - case.expected["disparity_px"])[is_seen]
+        assert float((error_px > 0.01).mean()) < 0.02
+        assert case.expected["disparity_px"][is_seen].std() > 1
     assert 0.01 < max(shares) < 0.99
