@@ -126,7 +126,7 @@ def test_streets_are_searched_from_infinity_on(high_px: float) -> None:
     trained_px = matcher().network_config.max_disparity_px
     assert search.first_px == 0
     assert trained_px <= search.span_px <= matcher().work_disparities(camera)
-    assert search.last_in_images_px >= high_px
+    assert search.end_in_images_px >= high_px
     assert search.scale * 558 == pytest.approx(matcher().matching_focal_px(camera))
 
 
@@ -137,7 +137,7 @@ def test_a_search_takes_no_more_memory_than_usual() -> None:
     for high_px in (200.0, 300.0, 450.0, 640.0):
         search = choose_search_range(matcher(), range_of(0.0, high_px), (720, 1280), camera)
         assert search.first_px <= 0
-        assert search.last_in_images_px >= high_px
+        assert search.end_in_images_px >= high_px
         voxels = search.scale**2 * search.span_px
         step = 1 + 36 / search.span_px  # disparities are searched in whole steps
         usual_voxels = usual.scale**2 * usual.span_px

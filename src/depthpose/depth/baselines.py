@@ -215,8 +215,8 @@ def _require_rig(pair: StereoInput) -> StereoRig:
     """
     if not isinstance(pair.camera, StereoRig):
         raise InputError(
-            f"{pair.name}: has no rig, and a baseline is measured as disparity; give a camera with "
-            "baseline_m"
+            f"{pair.name}: has no rig, and this baseline's depth is measured as disparity; give a "
+            "camera with baseline_m"
         )
     return pair.camera
 

@@ -278,8 +278,8 @@ def estimate_views(
     multiple = generator.config.side_multiple_px
     # Stretched where a side is near a multiple, else padded. Sides are even, for logits have half
     # of the resolution.
-    rows = _round_to_even(_stretch_to_near_multiple(height, multiple, MAX_ROW_STRETCH))
-    columns = _round_to_even(_stretch_to_near_multiple(width, multiple, MAX_COLUMN_STRETCH))
+    rows = _floor_to_even(_stretch_to_near_multiple(height, multiple, MAX_ROW_STRETCH))
+    columns = _floor_to_even(_stretch_to_near_multiple(width, multiple, MAX_COLUMN_STRETCH))
     padded = pad_to_multiple(resize_image(left, rows, columns), multiple)
 
     # The logits of both views, without the padding.
@@ -335,7 +335,7 @@ def _stretch_to_near_multiple(side_px: int, multiple: int, share: float) -> int:
     return nearest if abs(nearest - side_px) <= share * side_px else side_px
 
 
-def _round_to_even(side_px: int) -> int:
+def _floor_to_even(side_px: int) -> int:
     """Round a side down to an even number, for a logit stands for two rows and two columns."""
     return max(side_px // 2 * 2, 2)
 

@@ -305,6 +305,7 @@ class PoseEstimator:
         )
         if not names:
             raise InputError("find: objects names none; give those that may be there, or omit it")
+        # A view names one object, which a search does not read.
         view = view_input(depth, None, camera, names[0], _NAME, unit)
         view = add_background(view, background, camera, unit)
         return [estimate for estimate in self.find_in(view, names) if estimate.is_posed]

@@ -91,6 +91,8 @@ class TrainingRun:
         Raises:
             InputError: the folder is that of another config.
         """
+        # What decides the weights: the config, but for some settings, and the number of processes,
+        # by which the samples of a step are divided.
         settings = {"stage": type(config).__name__, **config_to_dict(config), **(more or {})}
         settings = {name: value for name, value in settings.items() if name not in without}
         loop = {
@@ -98,13 +100,15 @@ class TrainingRun:
         }
         settings["loop"] = loop | {"processes": find_rank().world}
 
+        # The files of the run, and what to do where the folder is that of another one.
         files = list(RUN_FILES)
-        remedy = "choose another, or delete this one"
         for name in weights:
             files += [f"{name}.{suffix}" for suffix in ("safetensors", "md", "json")]
+        remedy = "choose another, or delete this one"
+        option = "--start" if hasattr(config, "start") else "--generator"
+        for name in weights:
             path = self.folder / f"{name}.safetensors"
             if path.is_file():
-                option = "--start" if hasattr(config, "start") else "--generator"
                 remedy += f"; to train on from its weights, give a new --out and {option} {path}"
         claim_folder(self.folder, settings, files, remedy)
         write_config(self.folder / "config.yaml", config)

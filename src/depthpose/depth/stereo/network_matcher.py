@@ -40,8 +40,8 @@ class SearchRange:
     span_px: int  #: how many disparities are searched from ``first_px`` on
 
     @property
-    def last_in_images_px(self) -> float:
-        """The largest disparity, in pixels of the images."""
+    def end_in_images_px(self) -> float:
+        """The bound above which none is searched, in pixels of the images."""
         return (self.first_px + self.span_px) / self.scale
 
 

@@ -359,12 +359,16 @@ class PSMNetMatcher(NetworkMatcher):
     activation_bytes = staticmethod(psmnet_bytes)
 
     def fold(self, network: PSMNet, example: Tensor) -> PSMNet:
-        """Fold batch norm, and compute some rows at a time."""
+        """Keep the last convolution of each head in float32, fold the batch norms of the rest.
+
+        Volumes are then computed some rows at a time.
+        """
+        # The 8 significant bits of bf16 would round the expectation to whole pixels.
+        in_float32 = torch.empty(0, device=self.device)
+        no_bias = torch.zeros(1)
         for head in network.heads:
-            # In float32 at least: 8 bits would round the expectation to whole pixels.
             cost = cast("nn.Conv3d", head.cost)
-            in_float32 = torch.empty(0, device=self.device)
-            head.cost = layers.VolumeConv(cost, cost.weight, torch.zeros(1), in_float32)
+            head.cost = layers.VolumeConv(cost, cost.weight, no_bias, in_float32)
         network.rows = ROWS
         return layers.fold(network, example)
 

@@ -249,16 +249,16 @@ def doubt_outside(match: Match, measured: DisparityRange, search: SearchRange) -
         return match, ""
     coarse_px = measured.coarse.disparity_px
     coarse_confidence = measured.coarse.confidence
-    last_px = search.last_in_images_px
+    end_px = search.end_in_images_px
     # Neighbours within two pixels of the copy, its error, may lie beyond too.
-    may_be_beyond = coarse_px > last_px - measured.step_px
+    may_be_beyond = coarse_px > end_px - measured.step_px
     if bool(may_be_beyond.any()):
         may_be_beyond = _dilate(may_be_beyond, round(2 * measured.step_px / STEP_PX))
-    is_last = match.disparity_px > last_px - STEP_PX / search.scale
+    is_last = match.disparity_px > end_px - STEP_PX / search.scale
     doubted = replace(match, confidence=match.confidence.masked_fill(may_be_beyond | is_last, 0.0))
 
     # What is surely beyond is counted for the warning.
-    is_beyond = coarse_px > last_px + measured.step_px
+    is_beyond = coarse_px > end_px + measured.step_px
     is_beyond &= coarse_px <= torch.arange(coarse_px.shape[1], device=coarse_px.device)
     if coarse_confidence is not None:
         is_beyond &= coarse_confidence >= _MIN_NEAR_CONFIDENCE
@@ -266,7 +266,7 @@ def doubt_outside(match: Match, measured: DisparityRange, search: SearchRange) -
     if share < _MIN_WARNED_SHARE:
         return doubted, ""
     return doubted, (
-        f"{share:.1%} of the image have disparities beyond {last_px:.0f} px, the largest "
+        f"{share:.1%} of the image have disparities beyond {end_px:.0f} px, the largest "
         f"that was searched (up to {float(coarse_px[is_beyond].max()):.0f} px); their confidence "
         "is 0. Give a larger --max-disparity (in Python MatcherConfig(max_disparity_px=...)), or "
         "none, and it is measured"

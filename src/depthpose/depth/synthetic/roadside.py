@@ -115,10 +115,10 @@ class _Roadside:
         plot_m = road.edge_m[self.side] + self.side * (road.verge_m + road.walk_m)
         return plot_m + self.side * distance_m
 
-    def _is_free(self, start_s: Number, length_m: Number, margin_m: Number) -> bool:
-        """Whether no side street joins along a plot, or within a margin of it."""
+    def _is_free(self, s_m: Number, length_m: Number, margin_m: Number) -> bool:
+        """Whether no side street joins along a plot from ``s_m`` on, or within a margin of it."""
         half = length_m / 2
-        return not self.road.is_side_street(start_s + half, self.side, half + margin_m)
+        return not self.road.is_side_street(s_m + half, self.side, half + margin_m)
 
     def add_city(self) -> None:
         """Add houses at the pavement, wall to wall, at times a row of trees on the pavement."""

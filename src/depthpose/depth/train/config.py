@@ -225,16 +225,16 @@ class StereoTraining(Settings):
 
     def _refuse_unlearnt_sky(self) -> None:
         """Refuse a class of the sky without weight, and training one that is not there."""
-        has_sky = self.light is not None and self.light.with_sky
+        has_sky = bool(getattr(self.network, "with_sky", False))
         if has_sky and self.sky_weight == 0:
             raise InputError(
-                "light.with_sky is true and sky_weight 0, so the sky would not be learnt; set "
-                "sky_weight to 0.5, or leave with_sky out"
+                "with_sky is true and sky_weight 0, so the sky would not be learnt; set sky_weight "
+                "to 0.5, or leave with_sky out"
             )
         if self.sky_alone and (self.start is None or not has_sky):
             raise InputError(
-                "sky_alone trains a class of the sky for a matcher that is there: it takes start "
-                "and light.with_sky: true"
+                "sky_alone trains the class of the sky of a trained matcher; give start, and "
+                "with_sky: true to the network"
             )
 
     @property

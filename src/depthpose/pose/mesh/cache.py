@@ -11,6 +11,8 @@ from depthpose.core.errors import InputError
 from depthpose.core.files import cache_folder, read_json, write_json
 from depthpose.pose.types import ObjectModel
 
+_POSE_FOLDER = Path(__file__).parents[1]
+
 
 @lru_cache(maxsize=64)
 def read_or_compute(
@@ -22,7 +24,7 @@ def read_or_compute(
     """Read ``compute(model, *settings)`` from the cache, or compute it and write it there.
 
     The cache is ``$DEPTHPOSE_CACHE``, where that can be written to. A file is named by the bytes of
-    the shape, of its symmetries and of the code in the folders of the function and of the meshes.
+    the shape, of its symmetries and of the code of poses.
 
     Args:
         model: the object.
@@ -37,13 +39,12 @@ def read_or_compute(
     symmetries = model.symmetries
     tensors = [model.vertices_m, model.faces]
     if symmetries.discrete is not None:
-        tensors.append(symmetries.discrete.R)
-    tensors += [axis.direction for axis in symmetries.continuous]
+        tensors += [symmetries.discrete.R, symmetries.discrete.t_m]
+    for axis in symmetries.continuous:
+        tensors += [axis.direction, axis.point_m]
     digest = sha256(f"{symmetries.is_found}".encode())
-    folders = {Path(__file__).parent, Path(compute.__code__.co_filename).parent}
-    for folder in sorted(folders):
-        for path in sorted(folder.glob("*.py")):
-            digest.update(path.read_bytes())
+    for path in sorted(_POSE_FOLDER.rglob("*.py")):
+        digest.update(path.read_bytes())
     for tensor in tensors:
         digest.update(tensor.contiguous().numpy().tobytes())
 

@@ -147,6 +147,10 @@ def stack_symmetries(models: Sequence[ObjectModel], step_rad: float) -> Rigid:
 _ROTATIONS_ON_CARD = 3  # rotations by which an object looks nearly alike, on a card
 
 
+_WEIGHTS_FILES = ("pose", "pointnet", "depth-image", "segmentation")
+"""Names of the weights that a training of this package may write, one of them in a folder."""
+
+
 def claim_run(config: Any, run: TrainingRun, files: Sequence[str] = ()) -> None:  # noqa: ANN401
     """Claim the folder of a run for a config, with the checksums of ``files`` and of start weights.
 
@@ -156,8 +160,8 @@ def claim_run(config: Any, run: TrainingRun, files: Sequence[str] = ()) -> None:
     if config.start is not None:
         checksums["start_sha256"] = file_sha256(find_weights(config.start))
         warn_of_terms(add_terms({}, [config.start]))
-    weights = ("pose", "pointnet", "depth-image", "segmentation")
-    run.claim(config, weights, checksums, without=("held_out",))
+    # What is held out is measured alone, and changes no weight.
+    run.claim(config, _WEIGHTS_FILES, checksums, without=("held_out",))
 
 
 def make_pose_weights(

@@ -21,9 +21,9 @@ from depthpose.pose.mesh import (
     symmetry_transforms,
     true_symmetries,
 )
-from depthpose.pose.propose.partial_symmetry import find_partial_symmetries
 from depthpose.pose.propose.point_pairs import PairTable, prepare_pairs
 from depthpose.pose.types import Axis, ObjectModel
+from depthpose.pose.verify.partial_symmetry import find_partial_symmetries
 
 SAME_DIAMETERS = 0.1  #: mean distance of the model's points up to which two poses are the same
 SAME_RAD = math.radians(8)  #: angle between them up to which they are; both must hold

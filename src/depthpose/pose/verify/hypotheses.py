@@ -14,7 +14,8 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.config import EstimateConfig
 from depthpose.pose.geometry.surface import NEAR, Surface
 from depthpose.pose.icp import RefinedPose, refine_pose, refine_roughly
-from depthpose.pose.types import Evidence, ViewInput
+from depthpose.pose.mesh import turn_about
+from depthpose.pose.types import Axis, Evidence, ViewInput
 from depthpose.pose.verify.color import measure_color_agreement
 from depthpose.pose.verify.color_copies import align_print, propose_color_copies
 from depthpose.pose.verify.copies import PreparedObject
@@ -275,12 +276,32 @@ def _refine_distinct_copies(
             refined = replace(refined, camera_from_model=settled)
         # Where little observed fixes a copy, refinement lets it drift toward others: both compete.
         has_drifted = not is_same(refined.camera_from_model, start.camera_from_model[None]).any()
-        competing = [start, refined] if has_drifted else [refined]
+        competing = [refined]
+        if has_drifted:
+            competing.insert(0, _undo_drift(refined, start, prepared.copies.near_axis))
         for copy in competing:
             if not bool(is_same(copy.camera_from_model, Rigid.stack(distinct_poses)).any()):
                 distinct.append(copy)
                 distinct_poses.append(copy.camera_from_model.double())
     return distinct
+
+
+def _undo_drift(refined: RefinedPose, start: RefinedPose, axis: Axis | None) -> RefinedPose:
+    """Rotate a refined pose about an axis of its model back to the angle at which it started.
+
+    Without an axis it is put back to its start, which nothing refined.
+    """
+    if axis is None:
+        return start
+    # The twist about the axis a of the rotation R since the start: tan(angle / 2) is the axial
+    # vector of R - R^T along a, over 1 + trace R.
+    pose = refined.camera_from_model.double()
+    R = start.camera_from_model.R.double().mT @ pose.R
+    direction = axis.direction.double()
+    axial = torch.stack([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    angle_rad = 2 * torch.atan2(axial @ direction, 1 + R.trace())
+    back = turn_about(direction, axis.point_m.double(), -angle_rad)
+    return replace(refined, camera_from_model=pose @ back)
 
 
 def _with_color_of_best_copy(
