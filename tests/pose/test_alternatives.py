@@ -228,6 +228,20 @@ def test_only_what_has_a_copy_is_less_certain_of_it() -> None:
         assert all(other.is_copy for other in on_its_head)
 
 
+def test_a_copy_that_drifted_about_an_axis_is_put_back_to_its_angle_alone() -> None:
+    """What refinement changed besides, here a shift, stays."""
+    mug = make_part("mug", 1)
+    prepared = PreparedObject(number=0, model=mug, surface=prepare_surface(mug))
+    shift = Rigid(torch.eye(3).double(), torch.tensor([0.0, 0.0, 0.004]).double())
+    turned = partial(turned_about_near_axis, prepared, pose_at(seed=1).double())
+    start, drifted = turned(30.0), turned(70.0)
+    refined = replace(drifted, camera_from_model=shift @ drifted.camera_from_model)
+    undone = hypotheses._undo_drift(refined, start, prepared.copies.near_axis)
+    expected = (shift @ start.camera_from_model).matrix()
+    torch.testing.assert_close(undone.camera_from_model.matrix(), expected, atol=1e-6, rtol=0)
+    assert hypotheses._undo_drift(refined, start, None) is start
+
+
 def test_proposals_of_a_shape_are_cached_to_the_bit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

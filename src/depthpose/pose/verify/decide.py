@@ -35,7 +35,7 @@ _UNOBSERVED_WEIGHT = 0.5
 """Of an area that was not observed beside one that contradicts: it may only be hidden."""
 _LEAST_CONTRADICTING = LEAST_AREA / 4
 """Independent patches: a smaller area does not explain why a pose is doubted."""
-LEAST_NAMED = 0.01
+LEAST_NAMED = 0.005
 """Alternatives of a smaller probability are not named."""
 LEAST_SHARE = 0.8
 """Where no object among several has so large a share of the probability, none is reported."""
