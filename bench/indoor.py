@@ -241,7 +241,7 @@ def last_searched_px(net: FakestereoNet, pair: StereoInput) -> float:
     assert pair.right is not None
     measured = measure_disparity_range(net.matcher, pair.left, pair.right, 0.0)
     search = choose_search_range(net.matcher, measured, pair.left.shape[1:], pair.camera)
-    return search.last_in_images_px
+    return search.end_in_images_px
 
 
 def match_wide(samples: Iterable[StereoSample], net: FakestereoNet) -> list[Result]:
