@@ -150,6 +150,8 @@ DAMAGED: dict[str, tuple[Callable[[], str | bytes], str]] = {
     "curves.obj": (lambda: VERTICES + "surf 0 1 0 1 1 2 3 4\n", "surfaces or lines alone"),
     "cut.ply": (lambda: text_ply().rsplit("\n", 3)[0], "8 face but 6 rows follow; it is trunc"),
     "cut in a row.ply": (lambda: text_ply()[:-4], "row 8 of face, '4 5 0 6', is not what the"),
+    "negative.ply": (lambda: text_ply().rstrip().rpartition("\n")[0] + "\n-3 4 5 0\n",
+                     "row 8 of face, '-3 4 5 0', is not what the"),
     "more.ply": (lambda: text_ply(count=6), r"2 rows follow what its header declares \(12 vertex"),
     "huge.ply": (lambda: text_ply().replace("vertex 12", "vertex 1000000000000")[:195],
                  "declares 1000000000000 points but 4 rows follow"),

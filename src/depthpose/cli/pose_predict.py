@@ -281,6 +281,7 @@ def predict_poses_on_ray(
         raise InputError("--depth needs --camera or --focal-px beside it")
     if options.box and options.mask is not None:
         raise InputError("--mask and --box say where objects are; give one of them")
+    # Several boxes were refused before (``ignored_options``).
     box = parse_box(options.box[0]) if options.box else None
     if options.depth is None:
         files = InputFormat(roles=("cloud",), suffixes=tuple(CLOUD_READERS))

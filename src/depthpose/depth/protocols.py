@@ -248,9 +248,9 @@ def _resize_to_truth(true_px: Map, stored_px: Float[Tensor, "_ _"], path: Path) 
     if sizes not in _noticed_sizes:
         _noticed_sizes.add(sizes)  # once for all frames of a data set
         message = (
-            f"{path}: is {sizes}, of another aspect, so it is stretched: right where the image was "
-            "squeezed for it; what was cut out of the image is put into a map of its size, NaN "
-            "around it"
+            f"{path}: is {sizes}, of another aspect, so it is stretched, which is right for a "
+            "squeezed image; of a cropped one, paste the result into a map of the image's size "
+            "that is NaN elsewhere"
         )
         warnings.warn(message, Notice, stacklevel=2)
     return stretched_px

@@ -246,10 +246,13 @@ def _read_text_lists(
             for f in element.fields:
                 if f.size_code:
                     size = int(words[position])
+                    if size < 0:
+                        position = -1  # refused below
+                        break
                     sizes[f.name].append(size)
                     first = position + 1
                     values[f.name].extend(map(float, words[first : first + size]))
-                    position += max(size, 0)
+                    position += size
                 position += 1
         except (ValueError, IndexError, OverflowError):
             position = -1  # refused below, as a row of another length

@@ -285,6 +285,7 @@ class _NearSceneBuilder:
         """Add a floor and a back wall at ``far_m``; mostly two side walls and a ceiling too."""
         rng = self.rng
         half_u, half_v = self.half_view
+        # Floor, side walls and ceiling come into view at ``near_m`` or beyond.
         half_x = self.near_m * half_u * draw_log_uniform(rng, 1, 4)
         floor_y, ceiling_height = (
             self.near_m * half_v * draw_log_uniform(rng, 1, 4) for _ in range(2)
