@@ -132,8 +132,8 @@ class PosesNode(WorkNode):
     def __init__(self) -> None:
         super().__init__(
             "poses", weights="parts", cad="", cad_unit="mm", object="", with_mask=False,
-            slop_s=0.01, base_from_camera="", base_frame="base_link", empty_frame="", bin="",
-            bin_pose="",
+            slop_s=0.01, empty_frame="", bin="", bin_pose="", base_from_camera="",
+            base_frame="base_link",
         )  # fmt: skip
         files = [file.strip() for file in self.value("cad").split(",") if file.strip()]
         if files:
