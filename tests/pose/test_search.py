@@ -294,10 +294,10 @@ def test_a_model_larger_than_the_view_has_an_answer_soon() -> None:
 
 
 @pytest.mark.slow
-def test_a_hundred_models_take_bounded_time(
+def test_forty_models_take_bounded_time(
     net: Registration, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A hundred of one shape: what is there may be any of them, so none is answered."""
+    """Forty of one shape: what is there may be any of them, so none is answered."""
     view = view_input(table(), None, CAMERA, "bracket", "input", None)
     registered = list[str]()
 
@@ -313,7 +313,7 @@ def test_a_hundred_models_take_bounded_time(
     monkeypatch.setattr(search, "register", count)
     prepared = net._find_object("bracket").prepare()
     objects: dict[str, PreparedObject] = {}
-    for k in range(100):
+    for k in range(40):
         model = replace(prepared.model, name=f"part {k}")
         copy = PreparedObject(number=k, model=model, surface=prepared.surface)
         copy.copies, copy.pairs = prepared.copies, prepared.pairs  # computed once
@@ -321,8 +321,8 @@ def test_a_hundred_models_take_bounded_time(
     targets = replace(TARGETS, objects=objects)
     began = time.process_time()
     assert not any(estimate.is_posed for estimate in find_objects(view, targets))
-    assert len(registered) <= 400, "which bounds the memory too"
-    assert time.process_time() - began < 120
+    assert len(registered) <= 160, "which bounds the memory too"
+    assert time.process_time() - began < 60
 
 
 EVIDENCE = Evidence(
