@@ -294,9 +294,7 @@ def test_a_model_larger_than_the_view_has_an_answer_soon() -> None:
 
 
 @pytest.mark.slow
-def test_forty_models_take_bounded_time(
-    net: Registration, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_forty_models_take_bounded_time(net: Registration, monkeypatch: pytest.MonkeyPatch) -> None:
     """Forty of one shape: what is there may be any of them, so none is answered."""
     view = view_input(table(), None, CAMERA, "bracket", "input", None)
     registered = list[str]()
