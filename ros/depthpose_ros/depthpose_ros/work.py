@@ -88,8 +88,8 @@ class Poses:
     Attributes:
         net: the pose estimator.
         object: its name; None: the only one that is known, or all objects without a mask.
-        background: an empty frame of this camera [m], or a bin at its pose, where nothing is
-            found; None: not known. With a mask it has no effect.
+        background: what a search takes for no object: an empty frame of this camera [m], or a bin
+            at its pose; None: not known. With a mask it has no effect.
     """
 
     net: GeoPoseNet | Registration

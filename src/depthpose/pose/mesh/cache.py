@@ -12,6 +12,7 @@ from depthpose.core.files import cache_folder, read_json, write_json
 from depthpose.pose.types import ObjectModel
 
 _POSE_FOLDER = Path(__file__).parents[1]
+"""Folder of the code on which cached values may depend."""
 
 
 @lru_cache(maxsize=64)

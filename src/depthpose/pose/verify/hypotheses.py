@@ -278,7 +278,8 @@ def _refine_distinct_copies(
         has_drifted = not is_same(refined.camera_from_model, start.camera_from_model[None]).any()
         competing = [refined]
         if has_drifted:
-            competing.insert(0, _undo_drift(refined, start, prepared.copies.near_axis))
+            undone = _undo_drift(refined, start, prepared.copies.near_axis)
+            competing = [undone, refined]
         for copy in competing:
             if not bool(is_same(copy.camera_from_model, Rigid.stack(distinct_poses)).any()):
                 distinct.append(copy)
