@@ -93,6 +93,13 @@ def test_a_full_shard_is_closed(pairs: Path, tmp_path: Path) -> None:
     assert_same(open_dataset(pairs), open_dataset(tmp_path))
 
 
+def test_a_second_call_removes_what_a_killed_one_left(pairs: Path, tmp_path: Path) -> None:
+    half = tmp_path / ".part-0123456789ab.tar"
+    half.write_bytes(b"half")
+    pack_frames(open_dataset(pairs).frames, tmp_path, 1)
+    assert not half.exists()
+
+
 def test_shards_of_a_store_come_when_they_are_read(
     pairs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

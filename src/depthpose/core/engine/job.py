@@ -72,10 +72,11 @@ def run_job(job: ShardedJob, engine: Engine) -> list[ShardRecord]:
             "again: what is finished is kept"
         )
 
-    # Partial files of killed workers: by now all workers have ended.
-    local_folder = stores.local_path(stores.join(out, SHARDS))
-    if local_folder is not None:
-        remove_parts(local_folder)
+    # Partial files of killed processes: by now all workers have ended.
+    for folder in (out, stores.join(out, SHARDS)):
+        local_folder = stores.local_path(folder)
+        if local_folder is not None:
+            remove_parts(local_folder)
     records_in_order = [records[block.shard] for block in blocks]
     _write_manifest(out, records_in_order)
     return records_in_order

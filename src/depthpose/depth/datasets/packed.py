@@ -33,7 +33,8 @@ def pack_frames(
     Files are copied as they are, so that a training on shards gives the weights that it would give
     on the folder. ``KEY.left.png`` and the like lie in ``000000.tar``, calibration in
     ``calibration/``, and ``index.json`` lists each frame's files. Each file is written whole or not
-    at all, the index last; a second call writes everything again.
+    at all, the index last; a second call removes what an interrupted one left half-written, and
+    writes everything again.
 
     Args:
         frames: the frames.
@@ -44,6 +45,7 @@ def pack_frames(
     Raises:
         InputError: a file is missing or damaged, or the disk refuses.
     """
+    files.remove_parts(out)
     packed_calibrations = _pack_calibrations(frames, out)
     rows: list[dict[str, Any]] = []
     remaining = deque(frames)
