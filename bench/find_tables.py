@@ -10,8 +10,8 @@ A synthetic table has two to all of the objects, each at most once, between othe
 a sensor's errors. An instance counts if half its silhouette and 200 pixels are visible. An answer
 is right if ADD (ADD-S where symmetries are declared or were found) to an instance of its object is
 below 10 % of the diameter; it is wrong if neither it nor an alternative that it names is right for
-any instance, however occluded. A pile has 20 of one object; an instance of it counts if 70 % of its
-silhouette is visible.
+any instance, however occluded. An instance is named if an answer or an alternative is right for it.
+A pile has 20 of one object; an instance of it counts if 70 % of its silhouette is visible.
 """
 
 import time
@@ -90,8 +90,9 @@ def synthetic_frames(models: Sequence[ObjectModel], count: int, pile: int) -> It
 
 
 def count_answers(frame: Frame, estimates: Sequence[PoseEstimate]) -> Row:
-    """Count the instances that are found, and the answers that fit none."""
+    """Count the instances that are found or named, and the answers that fit none."""
     found: set[int] = set()
+    named: set[int] = set()
     wrong: list[str] = []
     for estimate in estimates:
         pose = estimate.camera_from_model
@@ -104,7 +105,9 @@ def count_answers(frame: Frame, estimates: Sequence[PoseEstimate]) -> Row:
             errors = [error_in_diameters(pose, instance) for pose in poses]
             if errors[0] < RIGHT:
                 found.add(index)
-            has_match = has_match or min(errors) < RIGHT
+            if min(errors) < RIGHT:
+                named.add(index)
+                has_match = True
         if not has_match:
             wrong.append(f"{estimate.object} ({estimate.certainty or 0:.2f})")
 
@@ -114,6 +117,7 @@ def count_answers(frame: Frame, estimates: Sequence[PoseEstimate]) -> Row:
         "frame": frame.name,
         "instances": len(wanted),
         "right": len(wanted & found),
+        "named": len(wanted & named),
         "missed": len(missed),
         "wrong": len(wrong),
         "which": "; ".join(
@@ -157,7 +161,7 @@ def main() -> None:
             cpu_s = time.process_time() - began_cpu_s
             rows.append({**count_answers(frame, estimates), "s": wall_s, "cpu s": cpu_s})
             print(rows[-1], flush=True)
-        columns = ("instances", "right", "missed", "wrong", "s", "cpu s")
+        columns = ("instances", "right", "named", "missed", "wrong", "s", "cpu s")
         total = {column: sum(row[column] for row in rows) for column in columns}
         print(format_markdown_table([{"weights": name, "frames": len(rows), **total}]))
 

@@ -48,7 +48,7 @@ from depthpose.pose.verify.probability import (
 
 _MOST_PLACES = 40
 """Largest number of proposals that are looked at in an image."""
-_LEAST_PLACES = 4
+_LEAST_PLACES = 6
 """Number of places of each object that are looked at in any case."""
 _ROUNDS = 4
 """An image is searched at most so many times for an object that is there more than once."""
