@@ -24,7 +24,7 @@ from tests.pages.read_page import read_page
 from tests.synthetic_street import make_street
 
 from depthpose.cli import main
-from depthpose.cli.depth_inputs import list_pairs
+from depthpose.cli.depth.inputs import list_pairs
 from depthpose.cli.train import ProgressLog
 from depthpose.core.checkpoint import find_weights, read_checkpoint
 from depthpose.core.draw import draw_depth

@@ -28,7 +28,7 @@ from tests.pose.synthetic_objects import (
 from tests.test_cli_depth import write_doubtful_pairs
 
 from depthpose.cli import engine, main
-from depthpose.cli.depth_inputs import PAIRS
+from depthpose.cli.depth.inputs import PAIRS
 from depthpose.core.camera import write_camera
 from depthpose.core.engine import list_inputs
 from depthpose.core.errors import InputError

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from depthpose.cli import lasting_streams, main
-from depthpose.cli.depth_options import MatcherOptions
+from depthpose.cli.depth.options import MatcherOptions
 from depthpose.cli.ignored_options import refuse_ignored
 from depthpose.core.errors import InputError
 

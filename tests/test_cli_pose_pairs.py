@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from tests.pose.synthetic_objects import write_part
 
 from depthpose.cli import main
-from depthpose.cli.pose_pairs import DEPTH, DEVIATION
+from depthpose.cli.pose.pairs import DEPTH, DEVIATION
 from depthpose.core.camera import StereoRig, write_camera
 from depthpose.core.camera.pinhole import intrinsics
 from depthpose.core.checkpoint import SHIPPED

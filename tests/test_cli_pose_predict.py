@@ -25,8 +25,9 @@ from tests.pose.synthetic_objects import (
     view_of,
 )
 
-from depthpose.cli import main, pose_methods
-from depthpose.cli.pose_dataset import choose_objects, match_names
+from depthpose.cli import main
+from depthpose.cli.pose import methods
+from depthpose.cli.pose.dataset import choose_objects, match_names
 from depthpose.core.camera import Camera, write_camera
 from depthpose.core.errors import InputError
 from depthpose.core.files import (
@@ -62,12 +63,12 @@ def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def oracle_weights(folder: Path, monkeypatch: pytest.MonkeyPatch, oracle: Oracle) -> Path:
     path = folder / "known.safetensors"
     write_pose_weights(path, oracle.weights)
-    monkeypatch.setattr(pose_methods, "GeoPoseNet", lambda *_: oracle)
+    monkeypatch.setattr(methods, "GeoPoseNet", lambda *_: oracle)
     return path
 
 
-def make_method(models: list[ObjectModel]) -> pose_methods.PoseMethod:
-    return pose_methods.PoseMethod(
+def make_method(models: list[ObjectModel]) -> methods.PoseMethod:
+    return methods.PoseMethod(
         name="m", estimate_many=lambda _: [], takes_clouds=True, models=models, settings={}
     )
 

@@ -19,7 +19,8 @@ from tests.pose.synthetic_objects import (
     view_of,
 )
 
-from depthpose.cli import main, pose_methods
+from depthpose.cli import main
+from depthpose.cli.pose import methods
 from depthpose.core.camera import Camera, write_camera
 from depthpose.core.files import read_image, write_depth_png
 from depthpose.pose.datasets import encode_rle
@@ -38,7 +39,7 @@ def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Scene:
     weights = tmp_path / "known.safetensors"
     oracle = Oracle(tiny_weights(bracket(), bottle()), list(POSES.values()))
     write_pose_weights(weights, oracle.weights)
-    monkeypatch.setattr(pose_methods, "GeoPoseNet", lambda *_: oracle)
+    monkeypatch.setattr(methods, "GeoPoseNet", lambda *_: oracle)
     views = {m.name: view_of(m, POSES[m.name]) for m in (bracket(), bottle())}
     depth_m = torch.stack([d.nan_to_num(9.0) for d, _ in views.values()]).amin(0)
     (tmp_path / "depth").mkdir()

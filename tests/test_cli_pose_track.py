@@ -11,8 +11,9 @@ from tests.pose.synthetic_frames import make_dataset
 from tests.pose.synthetic_objects import K, Oracle, bottle, bracket, tiny_weights, view_of
 from tests.pose.test_track import moving
 
-from depthpose.cli import main, pose_methods
-from depthpose.cli.pose_jobs import make_cloud_jobs
+from depthpose.cli import main
+from depthpose.cli.pose import methods
+from depthpose.cli.pose.jobs import make_cloud_jobs
 from depthpose.core.camera import Camera, back_project, write_camera
 from depthpose.core.files import read_cloud, write_depth_png
 from depthpose.pose import track as tracking_module
@@ -28,7 +29,7 @@ def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     oracle = Oracle(tiny_weights(bracket(), bottle()), POSES)
     path = tmp_path / "known.safetensors"
     write_pose_weights(path, oracle.weights)
-    monkeypatch.setattr(pose_methods, "GeoPoseNet", lambda *_: oracle)
+    monkeypatch.setattr(methods, "GeoPoseNet", lambda *_: oracle)
     return path
 
 

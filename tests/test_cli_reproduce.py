@@ -13,9 +13,9 @@ from tests.pages.read_page import read_page
 from tests.synthetic_street import make_street
 
 from depthpose.cli import main
-from depthpose.cli.depth_evaluate import with_origin
-from depthpose.cli.depth_methods import DepthMethod
-from depthpose.cli.thesis_depth import write_figure, write_reproduced_table
+from depthpose.cli.depth.evaluate import with_origin
+from depthpose.cli.depth.methods import DepthMethod
+from depthpose.cli.thesis.depth import write_figure, write_reproduced_table
 from depthpose.core.camera import StereoRig, write_camera
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image, write_depth_png, write_image

@@ -30,7 +30,7 @@ def test_core_imports_neither_depth_nor_pose_and_a_depth_command_no_pose() -> No
     names = [name for name in names if name[0] != "_"]
     loaded, then = modules_after(
         "; ".join(f"import depthpose.core.{name}" for name in names),
-        "import depthpose.cli.depth, depthpose.cli.depth_predict",
+        "import depthpose.cli.depth.commands, depthpose.cli.depth.predict",
     )
     assert not of(loaded, "depth")
     assert not of(loaded, "pose")
@@ -45,13 +45,15 @@ def test_importing_the_package_loads_nothing_heavy() -> None:
 
 
 def test_the_command_line_loads_nothing_heavy() -> None:
-    (loaded,) = modules_after("import depthpose.cli.depth, depthpose.cli.pose, depthpose.cli.train")
+    (loaded,) = modules_after(
+        "import depthpose.cli.depth.commands, depthpose.cli.pose.commands, depthpose.cli.train"
+    )
     assert not {"torch", "numpy", "PIL", "cv2", "ray", "fsspec"} & loaded
 
 
 def test_a_pose_command_loads_no_depth_and_loading_weights_no_compiler() -> None:
     loaded, then = modules_after(
-        "import depthpose.cli.pose, depthpose.cli.pose_search, depthpose.cli.pose_track",
+        "import depthpose.cli.pose.commands, depthpose.cli.pose.search, depthpose.cli.pose.track",
         "from depthpose import FakestereoNet, GeoPoseNet; FakestereoNet.load('default'); "
         "FakestereoNet.load('psmnet-compact'); GeoPoseNet.load('parts')",
     )

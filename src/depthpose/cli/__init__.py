@@ -31,36 +31,38 @@ COMMANDS = {
         "doctor:doctor", "what is installed, and a test of depth and pose; or what files are"),
     "serve": ("serve:serve", "depth and poses by a page in your browser, on this machine"),
     "pose predict": (
-        "pose:predict_poses", "a cloud, a masked depth image, or a data set, to poses"),
-    "pose track": ("pose:track_object", "follow an object through depth images or clouds"),
+        "pose.commands:predict_poses", "a cloud, a masked depth image, or a data set, to poses"),
+    "pose track": ("pose.commands:track_object", "follow an object through depth images or clouds"),
     "pose train": ("train:train_pose", "your CAD file, or a config, to a network that poses it"),
-    "pose evaluate": ("pose:evaluate_poses", "measure poses on a BOP or LineMOD data set"),
-    "depth match": ("depth:match_pairs", "a real stereo pair, or many, to metric depth"),
-    "depth predict": ("depth:predict_depth", "one image, or many, or a video, to metric depth"),
+    "pose evaluate": ("pose.commands:evaluate_poses", "measure poses on a BOP or LineMOD data set"),
+    "depth match": ("depth.commands:match_pairs", "a real stereo pair, or many, to metric depth"),
+    "depth predict": (
+        "depth.commands:predict_depth", "one image, or many, or a video, to metric depth"),
     "depth train": (
         "train:train_depth", "stages view, select, stereo, finetune of generator, matcher"),
     "depth calibrate": (
         "train:calibrate_refusal", "set when an image is refused as out of distribution"),
-    "depth evaluate": ("depth:evaluate_depth", "measure predictions by a named protocol"),
+    "depth evaluate": ("depth.commands:evaluate_depth", "measure predictions by a named protocol"),
     "data make streets": (
-        "data_make:make_streets",
+        "data.make:make_streets",
         "synthetic streets with exact disparity and LiDAR, in KITTI's layout"),
     "data make near": (
-        "data_make:make_near", "synthetic rooms, tables, bins and shelves with exact disparity"),
+        "data.make:make_near", "synthetic rooms, tables, bins and shelves with exact disparity"),
     "data make objects": (
-        "data_make:make_objects", "synthetic frames of your CAD files on a table, in BOP's layout"),
+        "data.make:make_objects", "synthetic frames of your CAD files on a table, in BOP's layout"),
     "data rectify": (
-        "data_pairs:rectify_pairs",
+        "data.pairs:rectify_pairs",
         "raw pairs and their calibration to rectified pairs for depth match"),
     "data split": (
-        "data_pairs:split_pairs",
+        "data.pairs:split_pairs",
         "pictures and videos that hold both views to a left and a right folder"),
-    "data check": ("data:check_dataset", "read a whole data set and list what is wrong"),
+    "data check": ("data.commands:check_dataset", "read a whole data set and list what is wrong"),
     "data label": (
-        "data:label_dataset",
+        "data.commands:label_dataset",
         "truth for pairs that have none, by a matcher, where both views agree"),
     "data pack": (
-        "data:pack_dataset", "a data set as tar shards: few large files, from a disk or a store"),
+        "data.commands:pack_dataset",
+        "a data set as tar shards: few large files, from a disk or a store"),
     "weights list": ("weights:list_weights", "list the weights"),
     "weights show": ("weights:show_weights", "print what a weights file holds"),
     "weights pack": ("weights:pack_weights", "one file of a generator and a matcher, with a card"),
@@ -70,14 +72,19 @@ COMMANDS = {
     "export depth": ("weights:export_depth", "depth as an ONNX file, proven to agree"),
     "export pose": ("weights:export_pose", "the network of directions as an ONNX file"),
     "reproduce": (
-        "thesis:reproduce_table", "a table of chapter 2: published rows, ours, difference"),
-    "reproduce 3.1": ("thesis:reproduce_table_3_1", "the method beside its baselines, by object"),
-    "reproduce 3.2": ("thesis:reproduce_table_3_2", "LineMOD: published rows, ours, difference"),
-    "reproduce 3.3": ("thesis:reproduce_table_3_3", "RANSAC against least squares"),
-    "figure": ("thesis:draw_figure", "a figure of chapter 2 from your frames and weights"),
-    "figure 3-2": ("thesis:draw_figure_3_2", "features of points in one colour scale (t-SNE)"),
-    "figure 3-4": ("thesis:draw_figure_3_4", "true and predicted directions to a keypoint"),
-    "figure 3-5": ("thesis:draw_figure_3_5", "boxes of true and estimated poses"),
+        "thesis.commands:reproduce_table",
+        "a table of chapter 2: published rows, ours, difference"),
+    "reproduce 3.1": (
+        "thesis.commands:reproduce_table_3_1", "the method beside its baselines, by object"),
+    "reproduce 3.2": (
+        "thesis.commands:reproduce_table_3_2", "LineMOD: published rows, ours, difference"),
+    "reproduce 3.3": ("thesis.commands:reproduce_table_3_3", "RANSAC against least squares"),
+    "figure": ("thesis.commands:draw_figure", "a figure of chapter 2 from your frames and weights"),
+    "figure 3-2": (
+        "thesis.commands:draw_figure_3_2", "features of points in one colour scale (t-SNE)"),
+    "figure 3-4": (
+        "thesis.commands:draw_figure_3_4", "true and predicted directions to a keypoint"),
+    "figure 3-5": ("thesis.commands:draw_figure_3_5", "boxes of true and estimated poses"),
 }  # fmt: skip
 _TITLES = {
     "demo doctor serve": "to begin",

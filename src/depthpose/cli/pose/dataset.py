@@ -4,7 +4,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from depthpose.cli.pose_methods import PoseMethod
+from depthpose.cli.pose.methods import PoseMethod
 from depthpose.core.errors import InputError
 from depthpose.pose import datasets
 from depthpose.pose.types import ObjectModel

@@ -11,16 +11,16 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from depthpose.cli.depth_inputs import (
+from depthpose.cli.depth.inputs import (
     PAIRS,
     InputReader,
     is_frame_name,
     is_video,
     select_result_names,
 )
-from depthpose.cli.depth_methods import DepthMethod, DepthMethodSpec, settings_on_workers
-from depthpose.cli.depth_options import PredictOutput
-from depthpose.cli.depth_page import PAGE, VIDEO_ENDING, write_depth_page
+from depthpose.cli.depth.methods import DepthMethod, DepthMethodSpec, settings_on_workers
+from depthpose.cli.depth.options import PredictOutput
+from depthpose.cli.depth.page import PAGE, VIDEO_ENDING, write_depth_page
 from depthpose.cli.engine import EngineOptions, print_shards
 from depthpose.core import run
 from depthpose.core.draw import draw_depth

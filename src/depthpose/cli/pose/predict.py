@@ -11,23 +11,24 @@ from typing import Any
 
 from tqdm import tqdm
 
-from depthpose.cli import pose_dataset, pose_masks
 from depthpose.cli.engine import EngineOptions, print_shards
-from depthpose.cli.pose_jobs import read_detection
-from depthpose.cli.pose_methods import (
+from depthpose.cli.pose.dataset import choose_objects, dataset_settings, match_names
+from depthpose.cli.pose.jobs import read_detection
+from depthpose.cli.pose.masks import prepare_masks
+from depthpose.cli.pose.methods import (
     PoseMethod,
     PoseMethodSpec,
     PoseNetworkSpec,
     resolve_object,
 )
-from depthpose.cli.pose_options import DataSetOptions, PoseInputs
-from depthpose.cli.pose_output import (
+from depthpose.cli.pose.options import DataSetOptions, PoseInputs
+from depthpose.cli.pose.output import (
     claim_for_dataset,
     claim_for_jobs,
     print_result,
     write_files,
 )
-from depthpose.cli.pose_plans import plan_jobs
+from depthpose.cli.pose.plans import plan_jobs
 from depthpose.core import run
 from depthpose.core.camera import Camera, camera_of
 from depthpose.core.config import config_to_dict
@@ -99,9 +100,9 @@ def predict_poses_of_dataset(
     dataset = open_bop(options.bop, options.split)
     if options.targets is not None:
         dataset = select_targets(dataset, read_targets(options.targets, options.bop))
-    dataset = pose_dataset.choose_objects(dataset, method, object)
-    (masks,) = pose_masks.prepare_masks([options.masks], dataset, out, config.device)
-    names = pose_dataset.match_names(dataset, method.models)
+    dataset = choose_objects(dataset, method, object)
+    (masks,) = prepare_masks([options.masks], dataset, out, config.device)
+    names = match_names(dataset, method.models)
     # A job with an object gives an estimate, and no error, where its input cannot be read.
     jobs: list[PoseJob[Any]] = [
         replace(job, object=names[job.place.object_id])
@@ -110,7 +111,7 @@ def predict_poses_of_dataset(
     ]
     settings = {
         **method.settings,
-        **pose_dataset.dataset_settings(dataset),
+        **dataset_settings(dataset),
         "masks": masks.name,
         **masks.settings,
     }

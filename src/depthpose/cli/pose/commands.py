@@ -3,9 +3,9 @@
 from dataclasses import replace
 from pathlib import Path
 
-from depthpose.cli import pose_options as options
 from depthpose.cli.arguments import NewPath, NewPlace, WeightsName
 from depthpose.cli.engine import EngineOptions
+from depthpose.cli.pose import options
 from depthpose.core.errors import InputError
 from depthpose.pose.config import EstimateConfig, SymmetryRule
 
@@ -43,13 +43,13 @@ def predict_poses(
     Args:
         out: folder for the results.
     """
-    from depthpose.cli.pose_methods import make_method_spec
-    from depthpose.cli.pose_predict import (
+    from depthpose.cli.pose.methods import make_method_spec
+    from depthpose.cli.pose.predict import (
         predict_poses_of_dataset,
         predict_poses_of_files,
         predict_poses_on_ray,
     )
-    from depthpose.cli.pose_search import search_dataset, search_files
+    from depthpose.cli.pose.search import search_dataset, search_files
 
     # One kind of input. A pair is matched first, to depth images.
     pose_inputs = options.PoseInputs(**vars(inputs), **vars(details))
@@ -61,7 +61,7 @@ def predict_poses(
             "depth image with --mask and --camera, a pair with --camera, or a data set"
         )
     if pair.left is not None:
-        from depthpose.cli.pose_pairs import match_pairs_for_poses
+        from depthpose.cli.pose.pairs import match_pairs_for_poses
 
         depth = match_pairs_for_poses(pair, pose_inputs.camera, estimates.device, Path(out))
         pose_inputs = replace(pose_inputs, depth=str(depth))
@@ -133,9 +133,9 @@ def evaluate_poses(
         objects: keep these alone, by name or number.
         adds: ADD-S for declared symmetric objects (of LineMOD eggbox and glue), or for all.
     """
-    from depthpose.cli.pose_evaluate import measure_and_report, open_instances, predict_instances
-    from depthpose.cli.pose_masks import prepare_masks
-    from depthpose.cli.pose_methods import build_methods
+    from depthpose.cli.pose.evaluate import measure_and_report, open_instances, predict_instances
+    from depthpose.cli.pose.masks import prepare_masks
+    from depthpose.cli.pose.methods import build_methods
     from depthpose.core.config import config_to_dict
     from depthpose.core.run import claim_folder
     from depthpose.pose.config import EvaluationConfig
@@ -187,8 +187,8 @@ def track_object(
         out: folder for the results.
         weights: of a pose network, by name or file ('depthpose weights list').
     """
-    from depthpose.cli.pose_methods import make_method_spec
-    from depthpose.cli.pose_track import track_dataset, track_files
+    from depthpose.cli.pose.methods import make_method_spec
+    from depthpose.cli.pose.track import track_dataset, track_files
     from depthpose.core.run import find_rank
 
     if sum(path is not None for path in (frames.depth, frames.cloud, frames.bop)) != 1:

@@ -11,10 +11,21 @@ from jaxtyping import Float
 from torch import Tensor
 from tqdm import tqdm
 
-from depthpose.cli import file_names, pose_dataset, pose_evaluate, pose_masks, pose_methods
+from depthpose.cli import file_names
 from depthpose.cli.arguments import refuse_below
-from depthpose.cli.pose_options import PoseDataOptions, PoseTableOptions
-from depthpose.cli.thesis_depth import write_report
+from depthpose.cli.pose.dataset import match_names
+from depthpose.cli.pose.evaluate import (
+    SCORING_NOTE,
+    join_evaluations,
+    measure_predictions,
+    open_instances,
+    predict_instances,
+    write_detail_tables,
+)
+from depthpose.cli.pose.masks import Masks, find_mask_file, prepare_masks
+from depthpose.cli.pose.methods import build_methods
+from depthpose.cli.pose.options import PoseDataOptions, PoseTableOptions
+from depthpose.cli.thesis.depth import write_report
 from depthpose.core.checkpoint import file_sha256, find_weights
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError
@@ -110,7 +121,7 @@ def _read_views(net: GeoPoseNet, folder: Path, data: PoseDataOptions, number: in
         data: its split, and the objects that are kept.
         number: how many views, spread evenly; None: all.
     """
-    dataset = pose_evaluate.open_instances(folder, data.split, data.objects, None)
+    dataset = open_instances(folder, data.split, data.objects, None)
     columns = {
         "frames": f"{folder.resolve().name} {data.split}",
         "frames_sha256": hash_frames(dataset.instances)[:12],
@@ -120,7 +131,7 @@ def _read_views(net: GeoPoseNet, folder: Path, data: PoseDataOptions, number: in
         dataset = replace(dataset, instances=instances)
 
     # Views of instances call the object as the weights do.
-    names = pose_dataset.match_names(dataset, net.weights.models)
+    names = match_names(dataset, net.weights.models)
     samples: list[ViewSample] = []
     for instance in dataset.instances:
         view = dataset.view(instance)
@@ -161,14 +172,14 @@ def reproduce_by_object(
         raise InputError(f"table {number}: give --linemod FOLDER, or --bop FOLDER.")
 
     # The instances, the methods, and all that decides the numbers.
-    dataset = pose_evaluate.open_instances(data.folder, data.split, data.objects, options.targets)
+    dataset = open_instances(data.folder, data.split, data.objects, options.targets)
     models = tuple(dataset.objects.values())
     with_published = number == "3.2"
     if with_published:
         numbers = {model.name: pose_tables.find_linemod_number(model) for model in models}
     else:
         numbers = {model.name: model.number for model in models}
-    methods = pose_methods.build_methods(weights, options.config, models)
+    methods = build_methods(weights, options.config, models)
     rule = EvaluationConfig(diameters=options.diameters, with_vsd=options.vsd)
     settings = {
         "table": number,
@@ -188,16 +199,14 @@ def reproduce_by_object(
     claim_folder(out, settings, (*results, "predictions", "detections", "figures"))
 
     # Predict what is missing, measure, and join with the published rows.
-    all_masks: list[pose_masks.Masks] = []
+    all_masks: list[Masks] = []
     if methods:
-        all_masks = pose_masks.prepare_masks(options.masks, dataset, out, options.device)
+        all_masks = prepare_masks(options.masks, dataset, out, options.device)
     folders = [
-        pose_evaluate.predict_instances(dataset, method, masks, out)
-        for method in methods
-        for masks in all_masks
+        predict_instances(dataset, method, masks, out) for method in methods for masks in all_masks
     ]
-    evaluations = pose_evaluate.measure_predictions(dataset, [*folders, *csv], rule)
-    measured = pose_evaluate.join_evaluations(evaluations)
+    evaluations = measure_predictions(dataset, [*folders, *csv], rule)
+    measured = join_evaluations(evaluations)
     rows = pose_tables.join_by_object(measured.rows, numbers, with_published=with_published)
     all_columns = [row.columns() for row in measured.rows]
     page.write_table(out, rows)
@@ -208,9 +217,9 @@ def reproduce_by_object(
     text = f"{_PERCENT_NOTE} {_DIFFERENCE_NOTES[number]}"
     sections = [
         Section(title="Percent by object", text=text, rows=rows),
-        Section(title="All numbers", text=pose_evaluate.SCORING_NOTE, rows=all_columns),
+        Section(title="All numbers", text=SCORING_NOTE, rows=all_columns),
         *(figure for figure in figures if figure.pictures),
-        *pose_evaluate.write_detail_tables(measured, out),
+        *write_detail_tables(measured, out),
     ]
     title = f"{pose_tables.TITLES[number]}, on {dataset.folder.resolve().name}"
     write_report(title, sections, out)
@@ -219,7 +228,7 @@ def reproduce_by_object(
 
 def _describe_masks(kind: str) -> str:
     """Describe a kind of masks for the record of a run: its word, or its file with a checksum."""
-    path = pose_masks.find_mask_file(kind)
+    path = find_mask_file(kind)
     return kind if path is None else file_names.name_with_checksum(path)
 
 

@@ -12,7 +12,7 @@ from typing import Any
 from tqdm import tqdm
 
 from depthpose.cli.file_names import name_files
-from depthpose.cli.pose_dataset import dataset_settings
+from depthpose.cli.pose.dataset import dataset_settings
 from depthpose.core.checkpoint import file_sha256, find_weights
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image, write_json

@@ -10,7 +10,7 @@ from typing import Any
 
 from scipy.spatial.transform import Rotation
 
-from depthpose.cli.pose_methods import PoseMethod
+from depthpose.cli.pose.methods import PoseMethod
 from depthpose.core import run
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image, write_cloud, write_image

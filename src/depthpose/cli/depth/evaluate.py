@@ -11,8 +11,8 @@ from typing import Any, cast, get_args
 
 from tqdm import tqdm
 
-from depthpose.cli.depth_methods import DepthMethod, DepthNetworkSpec, SGBMSpec
-from depthpose.cli.depth_options import DepthMethodOptions
+from depthpose.cli.depth.methods import DepthMethod, DepthNetworkSpec, SGBMSpec
+from depthpose.cli.depth.options import DepthMethodOptions
 from depthpose.core import engine
 from depthpose.core.errors import InputError
 from depthpose.core.run import describe_environment, find_rank, read_settings, wait_for

@@ -11,7 +11,7 @@ from typing import Any
 
 from torch import Tensor
 
-from depthpose.cli.depth_options import LensOptions, ScaleOptions
+from depthpose.cli.depth.options import LensOptions, ScaleOptions
 from depthpose.core.camera import Camera, FieldOfView, StereoRig, camera_of, read_camera
 from depthpose.core.camera.camera_facts import camera_keys
 from depthpose.core.engine import InputFormat

@@ -11,9 +11,9 @@ from typing import Any
 from tqdm import tqdm
 
 from depthpose.cli.file_names import distinct_names
-from depthpose.cli.pose_dataset import dataset_settings, match_names
-from depthpose.cli.pose_masks import Masks
-from depthpose.cli.pose_methods import PoseMethod
+from depthpose.cli.pose.dataset import dataset_settings, match_names
+from depthpose.cli.pose.masks import Masks
+from depthpose.cli.pose.methods import PoseMethod
 from depthpose.core.checkpoint import file_sha256
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image

@@ -62,7 +62,7 @@ def rectify_pairs(
     """
     from tqdm import tqdm
 
-    from depthpose.cli.depth_inputs import list_pairs
+    from depthpose.cli.depth.inputs import list_pairs
     from depthpose.core.camera import make_rectifier, read_raw_pair, write_camera
     from depthpose.core.files import image_size, write_image
     from depthpose.core.run import claim_folder, claim_names
@@ -126,7 +126,7 @@ def split_pairs(files: tyro.conf.Positional[tuple[Source, ...]], out: NewPath) -
         files: pictures, videos, folders or quoted patterns.
         out: folder for the results.
     """
-    from depthpose.cli.depth_inputs import list_images_and_videos
+    from depthpose.cli.depth.inputs import list_images_and_videos
     from depthpose.core.camera import order_views
     from depthpose.core.files import write_image
     from depthpose.core.run import claim_folder

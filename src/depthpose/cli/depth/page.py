@@ -4,7 +4,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from depthpose.cli.depth_inputs import InputReader, select_result_names
+from depthpose.cli.depth.inputs import InputReader, select_result_names
 from depthpose.core import run
 from depthpose.core.errors import InputError
 from depthpose.core.files.disk import read_text

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import torch
 
-from depthpose.cli.depth_inputs import PAIRS, InputReader, list_pairs
-from depthpose.cli.depth_methods import make_pair_spec
-from depthpose.cli.depth_options import PredictOutput
-from depthpose.cli.depth_predict import predict_depth_of_files, wait_for_results
-from depthpose.cli.pose_options import PairOptions
+from depthpose.cli.depth.inputs import PAIRS, InputReader, list_pairs
+from depthpose.cli.depth.methods import make_pair_spec
+from depthpose.cli.depth.options import PredictOutput
+from depthpose.cli.depth.predict import predict_depth_of_files, wait_for_results
+from depthpose.cli.pose.options import PairOptions
 from depthpose.core.camera import StereoRig, read_rig
 from depthpose.core.errors import InputError
 from depthpose.core.files import image_size, read_map, write_map

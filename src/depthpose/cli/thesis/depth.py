@@ -10,8 +10,13 @@ from jaxtyping import Float
 from torch import Tensor
 from tqdm import tqdm
 
-from depthpose.cli import depth_evaluate
-from depthpose.cli.depth_methods import DepthMethod
+from depthpose.cli.depth.evaluate import (
+    join_evaluations,
+    measure_folders,
+    predict_depth_of_dataset,
+    write_detail_tables,
+)
+from depthpose.cli.depth.methods import DepthMethod
 from depthpose.core.errors import InputError, suggest_name
 from depthpose.core.files import write_image
 from depthpose.core.run import claim_folder, describe_environment, find_rank
@@ -75,13 +80,12 @@ def write_reproduced_table(
     rule = find_protocol(protocol)
     predictions_folder = out / "predictions"
     folders = [
-        depth_evaluate.predict_depth_of_dataset(dataset, method, rule, predictions_folder)
-        for _, method in methods
+        predict_depth_of_dataset(dataset, method, rule, predictions_folder) for _, method in methods
     ]
     if find_rank().rank > 0:
         return 0
-    evaluations = depth_evaluate.measure_folders(dataset, folders, protocol, caps_m)
-    measured = depth_evaluate.join_evaluations(evaluations)
+    evaluations = measure_folders(dataset, folders, protocol, caps_m)
+    measured = join_evaluations(evaluations)
     reproduced = [printed_row for printed_row, _ in methods for _ in caps_m]
     rows = join_published(table, list(zip(reproduced, measured.rows, strict=True)))
     page.write_table(out, rows)
@@ -99,7 +103,7 @@ def write_reproduced_table(
     sections = [
         Section(title="Published rows, ours, and difference", text=method_note, rows=rows),
         *figures,
-        *depth_evaluate.write_detail_tables(measured, out),
+        *write_detail_tables(measured, out),
         _make_settings_section([method for _, method in methods]),
     ]
     write_report(f"{table.title}, on {dataset.name}", sections, out)

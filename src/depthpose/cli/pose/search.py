@@ -8,10 +8,18 @@ from typing import Any
 
 from tqdm import tqdm
 
-from depthpose.cli import pose_dataset, pose_output, pose_plans
-from depthpose.cli.pose_frames import make_masked_job, read_whole_view
-from depthpose.cli.pose_methods import PoseMethod, resolve_object
-from depthpose.cli.pose_options import DataSetOptions, PoseInputs
+from depthpose.cli.pose.dataset import choose_objects, dataset_settings, match_names
+from depthpose.cli.pose.frames import make_masked_job, read_whole_view
+from depthpose.cli.pose.methods import PoseMethod, resolve_object
+from depthpose.cli.pose.options import DataSetOptions, PoseInputs
+from depthpose.cli.pose.output import (
+    claim_for_dataset,
+    claim_for_jobs,
+    is_result_of,
+    print_result,
+    write_files,
+)
+from depthpose.cli.pose.plans import plan_searches
 from depthpose.core.errors import InputError
 from depthpose.core.run import find_rank
 from depthpose.core.runner import Job, Results, run_jobs
@@ -166,11 +174,11 @@ def search_files(method: PoseMethod, inputs: PoseInputs, out: Path) -> int:
         )
     if find_rank().world > 1:
         raise InputError("--depth without --mask is done by one process; give --mask, or start one")
-    plan = pose_plans.plan_searches(method, inputs, objects, out)
+    plan = plan_searches(method, inputs, objects, out)
     jobs = plan.jobs
     _refuse_numbered_names({job.name for job in jobs})
     settings = {**method.settings, **plan.settings}
-    pose_output.claim_for_jobs(out, settings, jobs, pose_output.is_result_of)
+    claim_for_jobs(out, settings, jobs, is_result_of)
     earlier = [
         p for p in read_earlier_predictions(out).values() if p.estimate.status != "unreadable"
     ]
@@ -180,14 +188,14 @@ def search_files(method: PoseMethod, inputs: PoseInputs, out: Path) -> int:
     predictions, object_jobs = _search_images(method, objects, jobs, results)
 
     # The files of results have names of their own, which are claimed once they are known.
-    pose_output.claim_for_jobs(out, settings, object_jobs, pose_output.is_result_of)
-    pose_output.write_files(predictions, object_jobs, out, method, input_count=len(jobs))
-    return pose_output.print_result(predictions, out, len(jobs))
+    claim_for_jobs(out, settings, object_jobs, is_result_of)
+    write_files(predictions, object_jobs, out, method, input_count=len(jobs))
+    return print_result(predictions, out, len(jobs))
 
 
 def _has_name_of_image(prediction: Prediction, image: str) -> bool:
     """Whether a prediction is of the depth image of this name, by its own name."""
-    return pose_output.is_result_of(prediction.estimate.name, image)
+    return is_result_of(prediction.estimate.name, image)
 
 
 def _has_place_in_image(prediction: Prediction, image: str) -> bool:
@@ -231,16 +239,16 @@ def search_dataset(
     dataset = open_bop(options.bop, options.split)
     if options.targets is not None:
         dataset = select_targets(dataset, read_targets(options.targets, options.bop))
-    dataset = pose_dataset.choose_objects(dataset, method, object)
-    names = pose_dataset.match_names(dataset, method.models)
+    dataset = choose_objects(dataset, method, object)
+    names = match_names(dataset, method.models)
     numbers = {name: number for number, name in names.items()}
     settings = {
         **method.settings,
-        **pose_dataset.dataset_settings(dataset),
+        **dataset_settings(dataset),
         "masks": "search",
         "find": sorted(numbers),
     }
-    pose_output.claim_for_dataset(out, settings, dataset)
+    claim_for_dataset(out, settings, dataset)
 
     # A job for each image, which is read by any of its instances. A view must name an object, of
     # which a search makes no use.
@@ -255,8 +263,8 @@ def search_dataset(
     earlier = list(read_earlier_predictions(out).values())
     results = SearchResults(out, [job.name for job in jobs], earlier, _has_place_in_image, numbers)
     predictions, object_jobs = _search_images(method, list(numbers), jobs, results)
-    pose_output.write_files(predictions, object_jobs, out, method, dataset, input_count=len(images))
-    return pose_output.print_result(predictions, out, len(images))
+    write_files(predictions, object_jobs, out, method, dataset, input_count=len(images))
+    return print_result(predictions, out, len(images))
 
 
 def _name_image(image: tuple[int, int]) -> str:

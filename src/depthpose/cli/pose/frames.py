@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from depthpose.cli.pose_methods import PoseMethod
+from depthpose.cli.pose.methods import PoseMethod
 from depthpose.core.files import read_depth_png
 from depthpose.pose.datasets import Instance
 from depthpose.pose.footprint import explained_mask

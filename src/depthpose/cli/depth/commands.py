@@ -6,8 +6,8 @@ from pathlib import Path
 
 import tyro
 
-from depthpose.cli import depth_options as options
 from depthpose.cli.arguments import NewPath, NewPlace, Source
+from depthpose.cli.depth import options
 from depthpose.cli.engine import EngineOptions
 from depthpose.core.errors import InputError
 
@@ -37,8 +37,14 @@ def predict_depth(
         images: images, folders of them, quoted patterns such as 'left/*.png', or videos.
         out: folder for the results.
     """
-    from depthpose.cli import depth_inputs, depth_predict
-    from depthpose.cli.depth_methods import DepthNetworkSpec
+    from depthpose.cli.depth.inputs import IMAGES, InputReader, list_images_and_videos, read_lens
+    from depthpose.cli.depth.methods import DepthNetworkSpec
+    from depthpose.cli.depth.predict import (
+        DepthWorker,
+        find_inputs_for_ray,
+        predict_depth_of_files,
+        predict_depth_on_ray,
+    )
 
     if not images:
         raise InputError("name images, folders of them, patterns or videos to predict from")
@@ -57,17 +63,17 @@ def predict_depth(
     # By workers of a cluster, to which the weights travel.
     if engine.engine == "ray":
         packed = spec.with_packed_weights()
-        inputs = depth_predict.find_inputs_for_ray(images, depth_inputs.IMAGES)
+        inputs = find_inputs_for_ray(images, IMAGES)
         with inputs.open_first() as first_image:
-            camera = depth_inputs.read_lens(lens, first_image)
-        reader = depth_inputs.InputReader(camera=camera, scale=scale)
-        worker = depth_predict.DepthWorker(spec=packed, reader=reader, output=output)
-        return depth_predict.predict_depth_on_ray(inputs, worker, out, engine)
+            camera = read_lens(lens, first_image)
+        reader = InputReader(camera=camera, scale=scale)
+        worker = DepthWorker(spec=packed, reader=reader, output=output)
+        return predict_depth_on_ray(inputs, worker, out, engine)
 
     # In this process.
-    paths = depth_inputs.list_images_and_videos(images, Path(out))
-    camera = depth_inputs.read_lens(lens, paths)
-    reader = depth_inputs.InputReader(camera=camera, scale=scale)
+    paths = list_images_and_videos(images, Path(out))
+    camera = read_lens(lens, paths)
+    reader = InputReader(camera=camera, scale=scale)
     method = spec.build()
     has_matcher_options = matching.precision != "fp32" or matching.max_memory is not None
     if method.settings.get("answer") == "own" and has_matcher_options:
@@ -76,7 +82,7 @@ def predict_depth(
             "leave them out"
         )
     sources = [(path,) for path in paths]
-    return depth_predict.predict_depth_of_files(sources, method, reader, output, Path(out))
+    return predict_depth_of_files(sources, method, reader, output, Path(out))
 
 
 def match_pairs(
@@ -106,8 +112,14 @@ def match_pairs(
             KITTI and others; for ROS and OpenCV also a folder with both cameras' files.
         out: folder for the results.
     """
-    from depthpose.cli import depth_inputs, depth_predict
-    from depthpose.cli.depth_methods import make_pair_spec
+    from depthpose.cli.depth.inputs import PAIRS, InputReader, list_pairs
+    from depthpose.cli.depth.methods import make_pair_spec
+    from depthpose.cli.depth.predict import (
+        DepthWorker,
+        find_inputs_for_ray,
+        predict_depth_of_files,
+        predict_depth_on_ray,
+    )
     from depthpose.core.camera import read_rig
     from depthpose.core.files import image_size
     from depthpose.core.files.images import refuse_among_inputs
@@ -124,23 +136,21 @@ def match_pairs(
     if engine.engine == "ray":
         packed = spec.with_packed_weights()
         sides = [left] if right is None else [left, right]
-        inputs = depth_predict.find_inputs_for_ray(sides, depth_inputs.PAIRS)
+        inputs = find_inputs_for_ray(sides, PAIRS)
         with inputs.open_first() as first_pair:
             rig = read_rig(camera, image_size(first_pair[0]))
-        reader = depth_inputs.InputReader(camera=rig, files=depth_inputs.PAIRS)
-        worker = depth_predict.DepthWorker(
-            spec=packed, reader=reader, output=output, with_check=pairs.check
-        )
-        return depth_predict.predict_depth_on_ray(inputs, worker, out, engine)
+        reader = InputReader(camera=rig, files=PAIRS)
+        worker = DepthWorker(spec=packed, reader=reader, output=output, with_check=pairs.check)
+        return predict_depth_on_ray(inputs, worker, out, engine)
 
     # In this process.
     if right is None:
         raise InputError(f"{left}: there is no right image beside it; give it second")
-    files = depth_inputs.list_pairs(left, right)
+    files = list_pairs(left, right)
     refuse_among_inputs(Path(out), (left, right), [path for pair in files for path in pair])
     rig = read_rig(camera, image_size(files[0][0]))
-    reader = depth_inputs.InputReader(camera=rig, files=depth_inputs.PAIRS)
-    return depth_predict.predict_depth_of_files(
+    reader = InputReader(camera=rig, files=PAIRS)
+    return predict_depth_of_files(
         files, spec.build(), reader, output, Path(out), with_check=pairs.check
     )
 
@@ -168,7 +178,7 @@ def evaluate_depth(
         out: folder for rows.json, rows.csv, table.md, report.html and the predictions.
         split: eigen-test, -val, -train, -train-val, -benchmark, or a file of frames.
     """
-    from depthpose.cli.depth_evaluate import (
+    from depthpose.cli.depth.evaluate import (
         choose_methods,
         measure_and_report,
         measure_shards,

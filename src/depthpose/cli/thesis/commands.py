@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Literal
 import tyro
 
 from depthpose.cli.arguments import NewPath, WeightsName, refuse_below
-from depthpose.cli.depth_options import MatcherOptions, ProtocolOptions
-from depthpose.cli.pose_options import PoseDataOptions, PoseTableOptions
+from depthpose.cli.depth.options import MatcherOptions, ProtocolOptions
+from depthpose.cli.pose.options import PoseDataOptions, PoseTableOptions
 from depthpose.core.errors import InputError
 
 if TYPE_CHECKING:
-    from depthpose.cli.depth_methods import DepthMethod
+    from depthpose.cli.depth.methods import DepthMethod
     from depthpose.depth.config import MatcherConfig
     from depthpose.thesis.depth import PublishedTable
 
@@ -54,8 +54,8 @@ def reproduce_table(
         split: eigen-test (697 frames), another split, a file of frames, or all.
         pictures: how many frames the page shows.
     """
-    from depthpose.cli.depth_evaluate import fit_baseline, open_frames, open_training
-    from depthpose.cli.thesis_depth import write_reproduced_table
+    from depthpose.cli.depth.evaluate import fit_baseline, open_frames, open_training
+    from depthpose.cli.thesis.depth import write_reproduced_table
     from depthpose.depth.evaluate import find_protocol
     from depthpose.thesis.depth import TABLES
 
@@ -101,7 +101,7 @@ def _build_methods(
     Raises:
         InputError: two weights have one name.
     """
-    from depthpose.cli.depth_methods import DepthNetworkSpec, SGBMSpec
+    from depthpose.cli.depth.methods import DepthNetworkSpec, SGBMSpec
 
     # A table with several rows of the thesis has weights for each, else all are of the one row.
     first_row = table.thesis_rows[0]
@@ -190,9 +190,9 @@ def draw_figure(
         number: how many frames where none is named: 1 for figure 2-1 and 4 for 2-5.
         split: choose among the frames of a split, such as eigen-test.
     """
-    from depthpose.cli.depth_evaluate import open_frames
-    from depthpose.cli.depth_methods import DepthNetworkSpec
-    from depthpose.cli.thesis_depth import choose_frames, find_frames, write_figure
+    from depthpose.cli.depth.evaluate import open_frames
+    from depthpose.cli.depth.methods import DepthNetworkSpec
+    from depthpose.cli.thesis.depth import choose_frames, find_frames, write_figure
 
     dataset = open_frames(kitti, split)
     if number is not None:
@@ -227,7 +227,7 @@ def reproduce_table_3_1(
         weights: the method's, then those of each baseline (kinds pointnet and depth-image).
         out: folder to write to.
     """
-    from depthpose.cli.thesis_pose import reproduce_by_object
+    from depthpose.cli.thesis.pose import reproduce_by_object
 
     if len(weights) < 2:
         raise InputError(
@@ -255,7 +255,7 @@ def reproduce_table_3_2(
         weights: files or names.
         csv: BOP results of any method, each a row of ours.
     """
-    from depthpose.cli.thesis_pose import reproduce_by_object
+    from depthpose.cli.thesis.pose import reproduce_by_object
 
     if not weights and not csv:
         raise InputError("table 3.2: there is nothing to measure; give --weights FILE or --csv.")
@@ -283,7 +283,7 @@ def reproduce_table_3_3(
         synthetic: number of synthetic views where no data set is given; 40 unless told.
         points: at most so many votes of a cloud; a block of rows each.
     """
-    from depthpose.cli.thesis_pose import reproduce_voting
+    from depthpose.cli.thesis.pose import reproduce_voting
 
     number = 40 if synthetic is None else synthetic
     refuse_below(1, "--synthetic", number, "40")
@@ -317,7 +317,7 @@ def draw_figure_3_2(
         number: how many clouds.
         perplexity: of t-SNE.
     """
-    from depthpose.cli.thesis_pose import draw_feature_panels, write_figure
+    from depthpose.cli.thesis.pose import draw_feature_panels, write_figure
 
     settings = {"perplexity": perplexity}
     draw_panels = partial(draw_feature_panels, perplexity=perplexity)
@@ -345,7 +345,7 @@ def draw_figure_3_4(
         number: how many views are looked at.
         keypoint: only this one, from 0 on.
     """
-    from depthpose.cli.thesis_pose import draw_direction_panels, write_figure
+    from depthpose.cli.thesis.pose import draw_direction_panels, write_figure
 
     settings = {"keypoint": keypoint}
     draw_panels = partial(draw_direction_panels, keypoint=keypoint)
@@ -367,6 +367,6 @@ def draw_figure_3_5(
         out: folder for the figure.
         number: how many views.
     """
-    from depthpose.cli.thesis_pose import draw_box_panels, write_figure
+    from depthpose.cli.thesis.pose import draw_box_panels, write_figure
 
     return write_figure("3-5", weights, data, number, out, draw_box_panels, {}, columns=3)

@@ -8,17 +8,15 @@ from typing import Any
 
 from tqdm import tqdm
 
-from depthpose.cli import (
-    file_names,
-    pose_dataset,
-    pose_jobs,
-    pose_output,
-    pose_plans,
-    pose_transforms,
-)
-from depthpose.cli.pose_frames import make_masked_job, read_whole_view
-from depthpose.cli.pose_methods import PoseMethod, resolve_object
-from depthpose.cli.pose_options import SequenceOptions
+from depthpose.cli import file_names
+from depthpose.cli.pose.dataset import choose_objects, dataset_settings, match_names
+from depthpose.cli.pose.frames import make_masked_job, read_whole_view
+from depthpose.cli.pose.jobs import make_cloud_jobs, make_frame_jobs
+from depthpose.cli.pose.methods import PoseMethod, resolve_object
+from depthpose.cli.pose.options import SequenceOptions
+from depthpose.cli.pose.output import claim_for_dataset, claim_for_jobs, print_result, write_files
+from depthpose.cli.pose.plans import camera_settings, unit_settings
+from depthpose.cli.pose.transforms import read_pose
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
 from depthpose.pose.datasets import BopDataset, Instance, open_bop
@@ -43,19 +41,19 @@ def track_files(method: PoseMethod, frames: SequenceOptions, out: Path) -> int:
         out: folder of the results.
     """
     object = resolve_object(frames.object, method)
-    settings = {**method.settings, "track": object, **pose_plans.unit_settings(frames.unit)}
+    settings = {**method.settings, "track": object, **unit_settings(frames.unit)}
     first_pose = None
     if frames.first is not None:
-        first_pose = pose_transforms.read_pose(frames.first)
+        first_pose = read_pose(frames.first)
         settings["first"] = file_names.name_with_checksum(frames.first)
     if frames.cloud is not None:
-        jobs = pose_jobs.make_cloud_jobs(frames.cloud, frames.unit or "m", object, out)
+        jobs = make_cloud_jobs(frames.cloud, frames.unit or "m", object, out)
     else:
         assert frames.depth is not None
         assert frames.camera is not None
-        jobs = pose_jobs.make_frame_jobs(frames.depth, frames.camera, object, frames.unit, out)
-        settings |= pose_plans.camera_settings(frames.camera)
-    pose_output.claim_for_jobs(out, settings, jobs)
+        jobs = make_frame_jobs(frames.depth, frames.camera, object, frames.unit, out)
+        settings |= camera_settings(frames.camera)
+    claim_for_jobs(out, settings, jobs)
     predictions = _follow_object(method, jobs, object, first_pose)
     return _write_sequences(method, predictions, jobs, out)
 
@@ -70,14 +68,14 @@ def track_dataset(method: PoseMethod, frames: SequenceOptions, out: Path) -> int
     """
     assert frames.bop is not None
     dataset = open_bop(frames.bop, frames.split)
-    dataset = pose_dataset.choose_objects(dataset, method, frames.object)
-    names = pose_dataset.match_names(dataset, method.models)
+    dataset = choose_objects(dataset, method, frames.object)
+    names = match_names(dataset, method.models)
     settings = {
         **method.settings,
-        **pose_dataset.dataset_settings(dataset),
+        **dataset_settings(dataset),
         "track": sorted(names.values()),
     }
-    pose_output.claim_for_dataset(out, settings, dataset)
+    claim_for_dataset(out, settings, dataset)
 
     # A sequence for each scene and object: its first instance in each image, by image number.
     instances_of: dict[tuple[int, int], dict[int, Instance]] = {}
@@ -140,8 +138,8 @@ def _write_sequences(
         make_masked_job(job, prediction, method)
         for prediction, job in zip(predictions, jobs, strict=True)
     ]
-    pose_output.write_files(predictions, masked_jobs, out, method, dataset)
-    code = pose_output.print_result(predictions, out)
+    write_files(predictions, masked_jobs, out, method, dataset)
+    code = print_result(predictions, out)
     counts = Counter(p.estimate.tracking for p in predictions)
     print(", ".join(f"{counts[state]} {state}" for state in ("tracked", "found", "lost")))
     return code

@@ -6,10 +6,20 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from depthpose.cli import file_names, pose_jobs, pose_methods, pose_transforms
-from depthpose.cli.pose_jobs import WantedObjects
-from depthpose.cli.pose_methods import PoseMethod, resolve_object
-from depthpose.cli.pose_options import PoseInputs
+from depthpose.cli import file_names
+from depthpose.cli.pose.jobs import (
+    WantedObjects,
+    list_depths,
+    make_box_jobs,
+    make_cloud_jobs,
+    make_detected_jobs,
+    make_frame_jobs,
+    make_mask_jobs,
+    match_to_depths,
+)
+from depthpose.cli.pose.methods import PoseMethod, find_cad_unit, resolve_object
+from depthpose.cli.pose.options import PoseInputs
+from depthpose.cli.pose.transforms import read_pose
 from depthpose.core.checkpoint import file_sha256
 from depthpose.core.errors import InputError
 from depthpose.core.files import list_images
@@ -45,7 +55,7 @@ def plan_jobs(method: PoseMethod, inputs: PoseInputs, out: Path) -> JobPlan:
     if inputs.cloud is not None:
         name = resolve_object(inputs.object, method)
         unit = inputs.unit or "m"
-        jobs = pose_jobs.make_cloud_jobs(Path(inputs.cloud), unit, name, out)
+        jobs = make_cloud_jobs(Path(inputs.cloud), unit, name, out)
         plan = JobPlan(jobs=jobs, settings={"object": name, "unit": unit})
     else:
         plan = _plan_regions(method, inputs, out)
@@ -71,7 +81,7 @@ def plan_searches(
     """
     assert inputs.depth is not None
     assert inputs.lens is not None
-    jobs = pose_jobs.make_frame_jobs(Path(inputs.depth), inputs.lens, objects[0], inputs.unit, out)
+    jobs = make_frame_jobs(Path(inputs.depth), inputs.lens, objects[0], inputs.unit, out)
     settings = {
         "find": sorted(objects),
         **camera_settings(inputs.lens),
@@ -115,13 +125,11 @@ def _plan_regions(method: PoseMethod, inputs: PoseInputs, out: Path) -> JobPlan:
         detections = Path(inputs.detections)
         settings["detections"] = str(detections.resolve())
         wanted = _choose_wanted_objects(method, labels, object)
-        jobs = pose_jobs.make_detected_jobs(
-            depth, detections, inputs.lens, wanted, inputs.unit, out
-        )
+        jobs = make_detected_jobs(depth, detections, inputs.lens, wanted, inputs.unit, out)
     elif inputs.box:
         settings["box"] = list(inputs.box)
         box_object = resolve_object(inputs.object, method)
-        jobs = pose_jobs.make_box_jobs(depth, inputs.box, inputs.lens, box_object, inputs.unit, out)
+        jobs = make_box_jobs(depth, inputs.box, inputs.lens, box_object, inputs.unit, out)
     else:
         assert inputs.mask is not None
         mask = Path(inputs.mask)
@@ -131,7 +139,7 @@ def _plan_regions(method: PoseMethod, inputs: PoseInputs, out: Path) -> JobPlan:
                 f"the {method.holder} know {', '.join(names)}; say which by --object, or which "
                 f"number of the mask is which by --labels 1={names[0]},2={names[1]}"
             )
-        jobs = pose_jobs.make_mask_jobs(depth, mask, inputs.lens, object, inputs.unit, out, labels)
+        jobs = make_mask_jobs(depth, mask, inputs.lens, object, inputs.unit, out, labels)
     return JobPlan(jobs=jobs, settings=settings)
 
 
@@ -206,8 +214,8 @@ def _load_bin(file: str, inputs: PoseInputs) -> tuple[PosedBin, dict[str, Any]]:
             f"--bin {file}: where is it? Give --bin-pose, a text file with its 4x4 matrix "
             "camera_from_model in metres, or --empty-frame in place of both"
         )
-    pose = pose_transforms.read_pose(inputs.bin_pose, "--bin-pose")
-    unit = pose_methods.find_cad_unit([file], inputs.cad_unit, inputs.unit)
+    pose = read_pose(inputs.bin_pose, "--bin-pose")
+    unit = find_cad_unit([file], inputs.cad_unit, inputs.unit)
     settings = {
         "bin": file_names.name_with_checksum(Path(file)),
         "bin_pose": pose.matrix().tolist(),
@@ -249,9 +257,7 @@ def _with_color(
     depth = Path(inputs.depth)
     pictures = list_images(color)
     refuse_among_inputs(out, [color], pictures)
-    picture_of = pose_jobs.match_to_depths(
-        pose_jobs.list_depths(depth), pictures, depth, color, "colour picture"
-    )
+    picture_of = match_to_depths(list_depths(depth), pictures, depth, color, "colour picture")
     settings = {**plan.settings, "color": str(color.resolve())}
 
     # The camera of the pictures, and where the depth camera is in its frame.
@@ -260,7 +266,7 @@ def _with_color(
     if camera is not None:
         settings["color_camera"] = file_names.name_with_checksum(camera)
     if inputs.color_from_depth is not None:
-        color_from_depth = pose_transforms.read_pose(
+        color_from_depth = read_pose(
             inputs.color_from_depth, "--color-from-depth", "color_from_depth"
         )
         settings["color_from_depth"] = color_from_depth.matrix().tolist()

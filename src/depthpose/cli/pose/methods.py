@@ -9,8 +9,8 @@ from typing import Any
 
 from depthpose.cli.engine import PackedWeights
 from depthpose.cli.file_names import name_files
-from depthpose.cli.pose_options import DataSetOptions, PoseInputs, RegisterOptions, SequenceOptions
-from depthpose.cli.pose_transforms import read_base
+from depthpose.cli.pose.options import DataSetOptions, PoseInputs, RegisterOptions, SequenceOptions
+from depthpose.cli.pose.transforms import read_base
 from depthpose.core.checkpoint import file_sha256, find_weights, read_checkpoint, warn_of_terms
 from depthpose.core.config import config_to_dict
 from depthpose.core.errors import InputError, suggest_name

@@ -1,0 +1,1 @@
+"""``depthpose depth ...``: options, and what its commands do with them."""

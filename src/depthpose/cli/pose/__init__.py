@@ -1,0 +1,1 @@
+"""``depthpose pose ...``: options, and what its commands do with them."""

@@ -1,0 +1,1 @@
+"""``depthpose reproduce ...`` and ``depthpose figure ...``."""
