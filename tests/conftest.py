@@ -71,7 +71,7 @@ def prepared_once() -> Iterator[None]:
     """What an estimator computes of a shape, and Git's answer, is computed once a process."""
     from depthpose.core import run
     from depthpose.pose import estimator
-    from depthpose.pose.verify import copies
+    from depthpose.pose.verify import prepared_object
 
     made: dict[object, Any] = {}
 
@@ -87,7 +87,7 @@ def prepared_once() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         surface = once(estimator.prepare_surface, lambda *given: _content(given))
         patch.setattr(estimator, "prepare_surface", surface)
-        patch.setattr(copies, "prepare_pairs", once(copies.prepare_pairs, id))
+        patch.setattr(prepared_object, "prepare_pairs", once(prepared_object.prepare_pairs, id))
         patch.setattr(run, "_read_commit", cache(run._read_commit))
         yield
 

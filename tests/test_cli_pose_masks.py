@@ -20,15 +20,10 @@ from depthpose.pose.datasets import (
     read_mask,
     write_detections,
 )
+from depthpose.pose.networks.fcn import FCN, SegmentationConfig, normalise_colors
 from depthpose.pose.predictions import read_predictions
 from depthpose.pose.search import nothing_found
-from depthpose.pose.segmentation import (
-    FCN,
-    SegmentationConfig,
-    SegmentationWeights,
-    normalise_colors,
-    write_segmentation,
-)
+from depthpose.pose.segmentation import SegmentationWeights, write_segmentation
 from depthpose.pose.types import PoseEstimate, ViewInput
 
 LEFT = torch.arange(WIDTH).expand(HEIGHT, WIDTH) < WIDTH // 2

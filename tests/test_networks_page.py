@@ -15,8 +15,8 @@ from tests.written import ROOT
 from depthpose.depth.config import GeneratorConfig, PSMNetConfig
 from depthpose.depth.generators import Discriminator, UNetGenerator
 from depthpose.depth.stereo import PSMNet
+from depthpose.pose.networks.fcn import FCN
 from depthpose.pose.networks.resunet import ResUNet, ResUNetConfig
-from depthpose.pose.segmentation import FCN
 
 FIGURES = ("2-2", "2-3", "2-4", "3-1", "3-3")
 SVG = "{http://www.w3.org/2000/svg}"

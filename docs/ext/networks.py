@@ -25,10 +25,10 @@ from depthpose.depth.losses import disparity_loss
 from depthpose.depth.stereo import PSMNet
 from depthpose.depth.train.config import StereoTraining, ViewTraining
 from depthpose.pose.geometry.grid import voxelise
+from depthpose.pose.networks.fcn import FCN
 from depthpose.pose.networks.resunet import ResUNet
 from depthpose.pose.networks.sparse import Voxels
 from depthpose.pose.propose import meet_lines, vote_ransac
-from depthpose.pose.segmentation import FCN
 from depthpose.pose.train import PoseTraining, SegmentationTraining
 from depthpose.pose.types import VotingPoints
 

@@ -17,7 +17,7 @@ from depthpose.core.files import PointCloud, write_cloud, write_depth_png, write
 from depthpose.depth.types import StereoSample
 from depthpose.depth.weights import write_depth_weights
 from depthpose.pose.datasets import write_bop_models
-from depthpose.pose.segmentation import ResNet18
+from depthpose.pose.networks.fcn import ResNet18
 from depthpose.pose.synthetic import make_part
 from depthpose.pose.weights import write_pose_weights
 

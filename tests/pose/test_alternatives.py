@@ -46,9 +46,9 @@ from depthpose.pose.registration import Registration
 from depthpose.pose.synthetic.parts import make_part
 from depthpose.pose.types import ObjectModel, Symmetries, ViewInput
 from depthpose.pose.verify import hypotheses
-from depthpose.pose.verify.copies import PreparedObject
 from depthpose.pose.verify.evidence import observe
 from depthpose.pose.verify.hypotheses import compete
+from depthpose.pose.verify.prepared_object import PreparedObject
 
 EYE = torch.eye(3, dtype=torch.float64)
 

@@ -11,12 +11,7 @@ from torch import Tensor
 from depthpose.cli import main
 from depthpose.core.checkpoint import read_checkpoint
 from depthpose.core.errors import InputError
-from depthpose.pose.segmentation import (
-    ENCODER_KIND,
-    ResNet18,
-    import_resnet18,
-    normalise_colors,
-)
+from depthpose.pose.networks.fcn import ENCODER_KIND, ResNet18, import_resnet18, normalise_colors
 
 
 def norm_entries(name: str, width: int) -> dict[str, tuple[int, ...]]:

@@ -35,8 +35,9 @@ from depthpose.pose.registration import Registration
 from depthpose.pose.search import SearchTargets, find_objects
 from depthpose.pose.synthetic.parts import make_part
 from depthpose.pose.types import CloudInput, Evidence, ObjectModel, PoseEstimate
-from depthpose.pose.verify.copies import PreparedObject, find_copies
+from depthpose.pose.verify.copies import find_copies
 from depthpose.pose.verify.evidence import compare, observe
+from depthpose.pose.verify.prepared_object import PreparedObject
 from depthpose.pose.verify.probability import PRIOR_PROPOSED
 
 TRUTHS = [pose_at(-0.13, 0.7, seed=1), pose_at(0.12, 0.9, seed=2)]

@@ -11,14 +11,12 @@ from torch import Tensor
 
 from depthpose.core.checkpoint import LicenceNotice, read_checkpoint, save_checkpoint
 from depthpose.core.errors import InputError
+from depthpose.pose.metrics import count_overlap, intersection_over_union
+from depthpose.pose.networks.fcn import FCN, SegmentationConfig
 from depthpose.pose.segmentation import (
-    FCN,
-    SegmentationConfig,
     SegmentationWeights,
     Segmenter,
-    count_overlap,
     find_connected_parts,
-    intersection_over_union,
     label_parts,
     predict_probabilities,
     write_segmentation,

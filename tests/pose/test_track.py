@@ -26,7 +26,7 @@ from depthpose.pose.metrics import add_m
 from depthpose.pose.predictions import Prediction, parse_prediction, prediction_row
 from depthpose.pose.track import TrackedObject, track
 from depthpose.pose.types import Alternative, PoseEstimate, Refusal, ViewInput
-from depthpose.pose.verify.copies import PreparedObject
+from depthpose.pose.verify.prepared_object import PreparedObject
 
 HIDDEN = 0.68
 

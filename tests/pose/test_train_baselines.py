@@ -32,7 +32,8 @@ from depthpose.pose.config import CloudConfig, ObjectsConfig
 from depthpose.pose.datasets import BopFrame, BopObject, write_bop_models, write_bop_scene
 from depthpose.pose.network_pose import DepthImageRegressor, GeoPoseNet
 from depthpose.pose.networks.baselines import DepthImageConfig, DepthImageNet, PointNetConfig
-from depthpose.pose.segmentation import ResNet18, SegmentationConfig, Segmenter
+from depthpose.pose.networks.fcn import ResNet18, SegmentationConfig
+from depthpose.pose.segmentation import Segmenter
 from depthpose.pose.synthetic import SyntheticViews
 from depthpose.pose.synthetic.random_numbers import uniform
 from depthpose.pose.train import (

@@ -141,7 +141,7 @@ def import_weights(
             )
         import_psmnet(file, out, align_corners=align_corners == "true")
     elif kind == "resnet18":
-        from depthpose.pose.segmentation import import_resnet18
+        from depthpose.pose.networks.fcn import import_resnet18
 
         import_resnet18(file, out)
     else:

@@ -35,8 +35,8 @@ from depthpose.pose.register import register
 from depthpose.pose.search import SearchTargets, find_objects
 from depthpose.pose.track import TrackedObject, track
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, Refusal, ViewInput
-from depthpose.pose.verify.copies import PreparedObject
 from depthpose.pose.verify.decide import choose_object, refused, seconds_of_all, with_status
+from depthpose.pose.verify.prepared_object import PreparedObject
 from depthpose.pose.verify.probability import PRIOR_REGION
 
 Result = TypeVar("Result")

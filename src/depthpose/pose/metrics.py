@@ -1,4 +1,4 @@
-"""How far a pose is from the truth: ADD, ADD-S, MSSD, MSPD, VSD, degrees and metres.
+"""How far a pose is from the truth: ADD, ADD-S, MSSD, MSPD, VSD, degrees, metres; IoU of masks.
 
 Definitions of Hinterstoisser et al. (2012) and of the BOP toolkit (Hodan et al. 2018, 2020).
 Computed in float64.
@@ -7,7 +7,7 @@ Computed in float64.
 from collections.abc import Callable, Sequence
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int, Int64
 from scipy.spatial import KDTree
 from torch import Tensor
 
@@ -253,3 +253,21 @@ def _split_symmetric_copies(true: Rigid, symmetries: Rigid, points: int) -> list
     copies = true.double() @ symmetries.double()
     size = max(1, _MOST_COORDINATES // (3 * points))
     return [copies[first : first + size] for first in range(0, len(copies.R), size)]
+
+
+def count_overlap(
+    predicted: Int[Tensor, "*b h w"], truth: Int[Tensor, "*b h w"], classes: int
+) -> Int64[Tensor, "classes classes"]:
+    """Count the pixels of an image or a batch by true class (row) and predicted class (column)."""
+    pairs = (truth * classes + predicted).flatten().cpu()
+    return torch.bincount(pairs, minlength=classes**2).view(classes, classes)
+
+
+def intersection_over_union(table: Int64[Tensor, "c c"]) -> Float[Tensor, " c"]:
+    """Compute the IoU of each class from a table of :func:`count_overlap`.
+
+    It is NaN for a class without a true or predicted pixel.
+    """
+    intersection = table.diagonal()
+    union = table.sum(0) + table.sum(1) - intersection
+    return torch.where(union > 0, intersection / union, torch.nan)

@@ -42,8 +42,8 @@ from depthpose.pose.types import (
     Vote,
     VotingPoints,
 )
-from depthpose.pose.verify.copies import PreparedObject, require_surface
 from depthpose.pose.verify.decide import refused
+from depthpose.pose.verify.prepared_object import PreparedObject, require_surface
 from depthpose.pose.verify.probability import PRIOR_MASKED, PRIOR_PROPOSED
 from depthpose.pose.weights import PoseWeights, read_pose_weights
 

@@ -18,10 +18,10 @@ from depthpose.pose.geometry.grid import fit_local_planes, thin_cloud
 from depthpose.pose.icp import BestStart, refine_best
 from depthpose.pose.propose.point_pairs import propose_poses
 from depthpose.pose.types import AnyInput, PoseEstimate, Refusal
-from depthpose.pose.verify.copies import PreparedObject
 from depthpose.pose.verify.decide import decide, refused
 from depthpose.pose.verify.evidence import observe
 from depthpose.pose.verify.hypotheses import compete
+from depthpose.pose.verify.prepared_object import PreparedObject
 from depthpose.pose.verify.probability import PRIOR_MASKED
 
 _VOTING_DIAMETERS = 0.05  # distance of the points that vote

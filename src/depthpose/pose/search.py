@@ -29,7 +29,6 @@ from depthpose.pose.picking import rank_picks
 from depthpose.pose.propose.image import propose_in_frame
 from depthpose.pose.register import register
 from depthpose.pose.types import CloudInput, Evidence, PoseEstimate, ViewInput
-from depthpose.pose.verify.copies import PreparedObject
 from depthpose.pose.verify.decide import (
     LEAST_SHARE,
     explain_doubt,
@@ -37,6 +36,7 @@ from depthpose.pose.verify.decide import (
     with_share,
 )
 from depthpose.pose.verify.evidence import compare, observe
+from depthpose.pose.verify.prepared_object import PreparedObject
 from depthpose.pose.verify.probability import (
     LEAST_POSSIBLE,
     PRIOR_MANY,

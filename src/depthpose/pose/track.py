@@ -30,10 +30,10 @@ from depthpose.pose.types import (
     Refusal,
     ViewInput,
 )
-from depthpose.pose.verify.copies import PreparedObject
 from depthpose.pose.verify.decide import explain_doubt, why_not_observable, with_status
 from depthpose.pose.verify.evidence import compare, observe
 from depthpose.pose.verify.observability import free_motions, without_motions
+from depthpose.pose.verify.prepared_object import PreparedObject
 from depthpose.pose.verify.probability import PRIOR_MASKED, log_likelihood_ratio, probability_right
 
 _MARGIN_DIAMETERS = 0.15

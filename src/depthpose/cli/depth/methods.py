@@ -169,12 +169,14 @@ def make_pair_spec(matcher: str | None, weights: str, config: MatcherConfig) -> 
 def settings_on_workers(spec: DepthMethodSpec) -> dict[str, Any]:
     """Compute the settings of a method that workers build, whose device this machine may lack.
 
-    They are read from networks on the CPU of this machine.
+    They are read from networks on the CPU of this machine; device and precision are those that are
+    asked of the workers.
     """
     if isinstance(spec, SGBMSpec):
         return spec.build().settings
-    on_cpu = replace(spec, config=replace(spec.config, device="cpu"))
-    return {**on_cpu.build().settings, "device": spec.config.device}
+    on_cpu = replace(spec, config=replace(spec.config, device="cpu", precision="fp32"))
+    settings = on_cpu.build().settings
+    return {**settings, "device": spec.config.device, "precision": spec.config.precision}
 
 
 def _find_other_matcher(matcher: str) -> tuple[SGBMMatcher | Path, str, dict[str, Any]]:

@@ -13,8 +13,8 @@ from torch import Tensor, nn
 from depthpose.core.config import Settings
 from depthpose.core.rigid import Rigid
 from depthpose.pose.geometry.grid import rotation_from_z_to
+from depthpose.pose.networks.fcn import ResNet18
 from depthpose.pose.networks.sparse import RowNorm
-from depthpose.pose.segmentation import ResNet18
 from depthpose.pose.types import ViewInput, VotingPoints
 
 

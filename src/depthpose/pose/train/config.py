@@ -11,8 +11,8 @@ from depthpose.core.units import Unit
 from depthpose.pose.config import OCCLUSIONS, CloudConfig, MeshConfig, ObjectsConfig
 from depthpose.pose.losses import POINT_LOSSES
 from depthpose.pose.networks.baselines import DepthImageConfig, PointNetConfig
+from depthpose.pose.networks.fcn import SegmentationConfig
 from depthpose.pose.networks.resunet import ResUNetConfig
-from depthpose.pose.segmentation import SegmentationConfig
 
 
 @dataclass(frozen=True, kw_only=True)

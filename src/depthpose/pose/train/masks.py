@@ -28,14 +28,11 @@ from depthpose.core.loop import (
 from depthpose.core.run import find_rank
 from depthpose.pose.datasets import Instance, open_bop, read_object_names
 from depthpose.pose.datasets.dataset import read_instance_mask
+from depthpose.pose.metrics import count_overlap, intersection_over_union
+from depthpose.pose.networks.fcn import ENCODER_KIND, FCN, normalise_colors
 from depthpose.pose.segmentation import (
-    ENCODER_KIND,
-    FCN,
     KIND,
     SegmentationWeights,
-    count_overlap,
-    intersection_over_union,
-    normalise_colors,
     predict_probabilities,
     write_segmentation,
 )

@@ -9,9 +9,7 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
-from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, geodesic_rad
-from depthpose.pose.geometry.surface import Surface
 from depthpose.pose.mesh import (
     axis_of_turn,
     mirror_deviation,
@@ -21,7 +19,6 @@ from depthpose.pose.mesh import (
     symmetry_transforms,
     true_symmetries,
 )
-from depthpose.pose.propose.point_pairs import PairTable, prepare_pairs
 from depthpose.pose.types import Axis, ObjectModel
 from depthpose.pose.verify.partial_symmetry import find_partial_symmetries
 
@@ -98,45 +95,6 @@ class SymmetricCopies:
     def _is_ball(self) -> bool:
         """Whether the model is a ball: it has one pose in all rotations, compared by its centre."""
         return len(self.points_m) == 1
-
-
-@dataclass(kw_only=True, eq=False)
-class PreparedObject:
-    """A known object, with what is computed once of its model, at the first use."""
-
-    number: int  #: among the models of an estimator
-    model: ObjectModel  #: the object
-    surface: Surface  #: of the model
-
-    def prepare(self) -> "PreparedObject":
-        """Compute ``copies`` and ``pairs`` now, so that the time of no input includes it."""
-        _ = self.copies, self.pairs
-        return self
-
-    @cached_property
-    def copies(self) -> SymmetricCopies:
-        """Motions after which the object looks alike, or nearly."""
-        return find_copies(self.model)
-
-    @cached_property
-    def pairs(self) -> PairTable:
-        """Pairs of surface points, which vote for poses of the object.
-
-        Raises:
-            InputError: the model has no surface.
-        """
-        require_surface(self.model)
-        return prepare_pairs(self.surface)
-
-
-def require_surface(model: ObjectModel) -> None:
-    """Raise an :class:`InputError` if a model is fewer than 500 points without faces."""
-    points = len(model.vertices_m)
-    if len(model.faces) == 0 and points < _LEAST_POINTS:
-        raise InputError(
-            f"{model.name}: {points} points without faces are no surface; export the part as a "
-            f"mesh with triangles, such as STL, or give {_LEAST_POINTS} points"
-        )
 
 
 def find_copies(model: ObjectModel) -> SymmetricCopies:

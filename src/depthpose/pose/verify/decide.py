@@ -13,11 +13,12 @@ from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import ObjectCloud
 from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.types import Alternative, AnyInput, Evidence, PoseEstimate, Refusal
-from depthpose.pose.verify.copies import PreparedObject, describe_difference
+from depthpose.pose.verify.copies import describe_difference
 from depthpose.pose.verify.evidence import Observation
 from depthpose.pose.verify.hypotheses import Competition
 from depthpose.pose.verify.identity import identify
 from depthpose.pose.verify.observability import free_motions, observability, without_motions
+from depthpose.pose.verify.prepared_object import PreparedObject
 from depthpose.pose.verify.probability import (
     LEAST_AREA,
     WRONG_RMS,

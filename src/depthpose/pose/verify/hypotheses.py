@@ -18,8 +18,8 @@ from depthpose.pose.mesh import turn_about
 from depthpose.pose.types import Axis, Evidence, ViewInput
 from depthpose.pose.verify.color import measure_color_agreement
 from depthpose.pose.verify.color_copies import align_print, propose_color_copies
-from depthpose.pose.verify.copies import PreparedObject
 from depthpose.pose.verify.evidence import Observation, compare
+from depthpose.pose.verify.prepared_object import PreparedObject
 from depthpose.pose.verify.probability import (
     LEAST_AREA,
     VOTES_RAD,

@@ -1,0 +1,51 @@
+"""A known object with all that is computed of its model, once for many inputs."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+from depthpose.core.errors import InputError
+from depthpose.pose.geometry.surface import Surface
+from depthpose.pose.propose.point_pairs import PairTable, prepare_pairs
+from depthpose.pose.types import ObjectModel
+from depthpose.pose.verify.copies import SymmetricCopies, find_copies
+
+_LEAST_POINTS = 500  # a model without faces and with fewer points has no surface
+
+
+@dataclass(kw_only=True, eq=False)
+class PreparedObject:
+    """A known object, with what is computed once of its model, at the first use."""
+
+    number: int  #: among the models of an estimator
+    model: ObjectModel  #: the object
+    surface: Surface  #: of the model
+
+    def prepare(self) -> "PreparedObject":
+        """Compute ``copies`` and ``pairs`` now, so that the time of no input includes it."""
+        _ = self.copies, self.pairs
+        return self
+
+    @cached_property
+    def copies(self) -> SymmetricCopies:
+        """Motions after which the object looks alike, or nearly."""
+        return find_copies(self.model)
+
+    @cached_property
+    def pairs(self) -> PairTable:
+        """Pairs of surface points, which vote for poses of the object.
+
+        Raises:
+            InputError: the model has no surface.
+        """
+        require_surface(self.model)
+        return prepare_pairs(self.surface)
+
+
+def require_surface(model: ObjectModel) -> None:
+    """Raise an :class:`InputError` if a model is fewer than 500 points without faces."""
+    points = len(model.vertices_m)
+    if len(model.faces) == 0 and points < _LEAST_POINTS:
+        raise InputError(
+            f"{model.name}: {points} points without faces are no surface; export the part as a "
+            f"mesh with triangles, such as STL, or give {_LEAST_POINTS} points"
+        )
