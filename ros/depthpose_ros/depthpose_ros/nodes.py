@@ -14,7 +14,7 @@ from sensor_msgs.msg import CameraInfo, Image
 from vision_msgs.msg import Detection3D, Detection3DArray, ObjectHypothesisWithPose
 
 from depthpose import FakestereoNet, GeoPoseNet, Registration
-from depthpose.cli.pose_methods import read_base
+from depthpose.cli.pose.methods import read_base
 from depthpose.core.errors import InputError
 from depthpose.depth.config import MatcherConfig
 from depthpose.pose.predictions import score_of

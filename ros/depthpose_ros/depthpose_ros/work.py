@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from depthpose import FakestereoNet, GeoPoseNet, Registration
-from depthpose.cli.pose_transforms import read_pose
+from depthpose.cli.pose.transforms import read_pose
 from depthpose.core.errors import InputError
 from depthpose.core.files import MAP_SUFFIXES
 from depthpose.core.units import Unit
