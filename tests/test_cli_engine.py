@@ -28,7 +28,9 @@ from tests.pose.synthetic_objects import (
 from tests.test_cli_depth import write_doubtful_pairs
 
 from depthpose.cli import engine, main
+from depthpose.cli.depth import methods
 from depthpose.cli.depth.inputs import PAIRS
+from depthpose.cli.depth.methods import make_pair_spec, settings_on_workers
 from depthpose.core.camera import write_camera
 from depthpose.core.engine import list_inputs
 from depthpose.core.errors import InputError
@@ -38,6 +40,7 @@ from depthpose.core.files import (
     write_depth_png,
     write_image,
 )
+from depthpose.depth.config import MatcherConfig
 from depthpose.pose.config import ObjectsConfig
 from depthpose.pose.synthetic import SyntheticViews, make_part
 from depthpose.pose.weights import write_pose_weights
@@ -341,3 +344,13 @@ def test_without_ray_the_extra_is_named(
     monkeypatch.setitem(__import__("sys").modules, "ray.data", None)
     assert predict(home, tmp_path, str(home / "left"), *RAY) == 2
     assert "pip install -e '.[ray]'" in capsys.readouterr().err
+
+
+def test_settings_on_workers_are_those_that_are_asked_of_them(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # This machine has neither the device nor the precision.
+    monkeypatch.setattr(methods, "usable_precision", lambda *_: "fp32")
+    config = MatcherConfig(device="cuda", precision="bf16")
+    settings = settings_on_workers(make_pair_spec(None, "psmnet-compact", config))
+    assert (settings["device"], settings["precision"]) == ("cuda", "bf16")
