@@ -251,7 +251,7 @@ def votes_by_hand(points: np.ndarray, bases: np.ndarray, i: int, table: PairTabl
                 continue
             seen_features.add((key, turn_bin))
             for p in pairs[:150]:
-                share = (turn - float(table.turn_rad[p])) / (2 * np.pi) % 1
+                share = (turn / (2 * np.pi) - float(table.turn[p]) / TURNS) % 1
                 counts[int(table.first[p]), int(share * TURNS) % TURNS] += len(pairs) ** -0.5
     return 2 * counts + np.roll(counts, 1, 1) + np.roll(counts, -1, 1)
 
@@ -299,7 +299,7 @@ def test_pairs_of_a_model_are_sorted_by_their_features() -> None:
             feature[0] /= step
             own = np.clip(feature.astype(int), 0, [DISTANCES, *[ANGLES - 1] * 3])
             if int(own @ [ANGLES**3, ANGLES**2, ANGLES, 1]) == key:
-                of_first.append(abs(turn - float(table.turn_rad[p])))
+                of_first.append(abs(turn - float(table.turn[p]) * 2 * np.pi / TURNS))
         assert min(of_first) < 1e-6
 
 

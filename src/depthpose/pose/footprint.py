@@ -4,28 +4,28 @@ import math
 from dataclasses import replace
 
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from depthpose.core.camera import back_project, project
-from depthpose.core.camera.pinhole import Window, clip_window, crop_intrinsics
+from depthpose.core.camera import back_project
+from depthpose.core.camera.pinhole import Window, crop_intrinsics
 from depthpose.core.rigid import Rigid
 from depthpose.pose.frame import Frame, share_behind
+from depthpose.pose.geometry.rendering import find_window_about
 from depthpose.pose.geometry.surface import NEAR, Surface
-from depthpose.pose.sensor import EDGE_PX
 from depthpose.pose.types import KnownBackground, ViewInput
 
 _REGION_MARGIN = 0.5
 """Margin about a region in which planes and neighbours are examined, over its larger side."""
-_POSE_MARGIN = 0.1
-"""Margin about a posed surface in the image, over its width and height."""
 _MOST_SUNK = 0.05
 """Largest share of the surface that may lie in a bin, table or wall: right poses err by less."""
 
 
 def explained_mask(view: ViewInput, pose: Rigid, surface: Surface) -> Bool[Tensor, "h w"]:
     """Mark the pixels in a view's mask whose readings lie on a posed surface."""
-    window = _window_of_pose(view.depth_m.shape, view.K, pose, surface)
+    pose = pose.double()
+    near_m = NEAR * surface.diameter_m
+    window = find_window_about(surface, pose, view.K.double(), *view.depth_m.shape, near_m)
     part = _crop_view(view, window)
     points_m = back_project(part.depth_m.double(), part.K.double())
     is_candidate = points_m.isfinite().all(-1) & part.mask
@@ -36,7 +36,9 @@ def explained_mask(view: ViewInput, pose: Rigid, surface: Surface) -> Bool[Tenso
 
 def explained_frame_mask(frame: Frame, pose: Rigid, surface: Surface) -> Bool[Tensor, "h w"]:
     """Mark the pixels of a frame, outside its background, whose readings lie on a posed surface."""
-    window = _window_of_pose(frame.depth_m.shape, frame.K, pose, surface)
+    pose = pose.double()
+    near_m = NEAR * surface.diameter_m
+    window = find_window_about(surface, pose, frame.K, *frame.depth_m.shape, near_m)
     is_candidate = (frame.depth_m[window] > 0) & frame.may_show(surface.diameter_m, window)
     explained = torch.zeros(frame.depth_m.shape, dtype=torch.bool)
     explained[window] = _lies_on_surface(frame.points_m[window], is_candidate, pose, surface)
@@ -50,7 +52,7 @@ def _lies_on_surface(
     surface: Surface,
 ) -> Bool[Tensor, "h w"]:
     """Mark the candidates among points of the camera frame that lie on a posed surface."""
-    local_m = pose.double().inverse().apply(points_m[is_candidate])
+    local_m = pose.inverse().apply(points_m[is_candidate])
     distance_m = (local_m - surface.points_m[surface.boxes.look_up(local_m)]).norm(dim=-1)
 
     # The sample of a point's box is farther than its nearest one by the box's diagonal at most:
@@ -64,26 +66,6 @@ def _lies_on_surface(
     is_explained = is_candidate.clone()
     is_explained[is_candidate] = distance_m < limit_m
     return is_explained
-
-
-def _window_of_pose(
-    shape: tuple[int, ...], K: Float[Tensor, "3 3"], pose: Rigid, surface: Surface
-) -> Window:
-    """Find the rows and columns in which a posed surface lies, with a margin; clipped to the image.
-
-    ``shape`` is (height, width) of the image. Nothing of a surface behind the camera lies in it.
-    """
-    height, width = shape
-    posed_m = pose.double().apply(surface.points_m)
-    pixel = project(posed_m[posed_m[:, 2] > 0], K.double())
-    if len(pixel) == 0:
-        return slice(0, 0), slice(0, 0)
-    low = pixel.amin(0)
-    high = pixel.amax(0)
-    margin = _POSE_MARGIN * (high - low) + 2 * EDGE_PX
-    left, top = (int(value) for value in (low - margin).floor().tolist())
-    right, bottom = (int(value) for value in (high + margin).ceil().tolist())
-    return clip_window(left, top, right + 1, bottom + 1, height, width)
 
 
 def window_of_region(view: ViewInput, margin: float = _REGION_MARGIN) -> ViewInput:

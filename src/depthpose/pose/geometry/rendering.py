@@ -8,6 +8,7 @@ which need exact pixels and coordinates on the triangles for their textures, are
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from jaxtyping import Float32, Float64, Int64
 from torch import Tensor
 
@@ -42,7 +43,7 @@ def render_surface(
     """
     # The triangles, drawn into the part of the image about them.
     pose = pose.double()
-    window = _find_window_about(surface, pose, K, height, width)
+    window = find_window_about(surface, pose, K, height, width)
     rows, columns = window
     shape = rows.stop - rows.start, columns.stop - columns.start
     if 0 in shape:
@@ -135,12 +136,28 @@ def _measure_ray_lengths(K: np.ndarray, height: int, width: int) -> np.ndarray:
     return np.sqrt(x**2 + y**2 + 1)
 
 
-def _find_window_about(
-    surface: Surface, pose: Rigid, K: Float64[Tensor, "3 3"], height: int, width: int
+def find_window_about(
+    surface: Surface,
+    pose: Rigid,
+    K: Float64[Tensor, "3 3"],
+    height: int,
+    width: int,
+    margin_m: float = 0.0,
 ) -> Window:
-    """Find the rows and columns of an image that a posed surface may cover."""
-    # None of a surface behind the camera; all where a part of it is.
-    corners_m = pose.apply(surface.box_corners_m)
+    """Find the rows and columns of an image that a posed surface may cover.
+
+    Args:
+        surface: of the model.
+        pose: ``camera_from_model``.
+        K: intrinsic matrix of the image.
+        height: rows of the image.
+        width: its columns.
+        margin_m: what lies within this distance of the surface is in the window too.
+    """
+    # The corners of a box about it. None of a surface behind the camera; all where a part of it is.
+    low_m, high_m = surface.box_m
+    box_m = torch.stack([low_m - margin_m, high_m + margin_m], -1)
+    corners_m = pose.apply(torch.cartesian_prod(*box_m))
     if float(corners_m[:, 2].amax()) < _NEAR_M:
         return slice(0, 0), slice(0, 0)
     if float(corners_m[:, 2].amin()) < _NEAR_M:

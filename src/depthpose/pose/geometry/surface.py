@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float64, Int32, Int64
 from scipy.spatial import KDTree
 from torch import Tensor
-from torch.nn.functional import max_pool2d, normalize, pad
+from torch.nn.functional import avg_pool2d, max_pool2d, normalize, pad
 
 from depthpose.core.rigid import Rigid
 from depthpose.pose.compiled import Vector, array_of, compiled, dot, vector
@@ -178,7 +178,8 @@ class Views:
 
     toward: Float64[Tensor, "v 3"]  #: unit vectors to the camera
     points_m: Float64[Tensor, "v n 3"]  #: visible ones, evenly spread; NaN where there are fewer
-    normals: Float64[Tensor, "v n 3"]  #: of these points
+    #: of these points, toward the camera: means over cells, as those of an image are over pixels.
+    normals: Float64[Tensor, "v n 3"]
     #: whether a point is on no rim or edge, of which sensors lose readings.
     is_inner: Bool[Tensor, "v n"]
 
@@ -217,11 +218,9 @@ class Surface:
         return (self.plane_normals * self.triangles_m[:, 0]).sum(-1)
 
     @cached_property
-    def box_corners_m(self) -> Float64[Tensor, "8 3"]:
-        """Corners of the box about the triangles, along the axes of the model."""
-        low_m = self.triangles_m.amin((0, 1))
-        high_m = self.triangles_m.amax((0, 1))
-        return torch.cartesian_prod(*torch.stack([low_m, high_m], -1))
+    def box_m(self) -> Float64[Tensor, "2 3"]:
+        """The lowest and the highest corner of the box about the triangles, in the model frame."""
+        return torch.stack([self.triangles_m.amin((0, 1)), self.triangles_m.amax((0, 1))])
 
     @cached_property
     def views(self) -> Views:
@@ -270,7 +269,7 @@ class _View(NamedTuple):
     """The visible points from one direction: a row of each field of :class:`Views`."""
 
     points_m: Float64[Tensor, "n 3"]  #: NaN where there are fewer
-    normals: Float64[Tensor, "n 3"]  #: of these points
+    normals: Float64[Tensor, "n 3"]  #: of these points, toward the camera
     is_inner: Bool[Tensor, " n"]  #: whether it is on no rim or edge
 
 
@@ -310,15 +309,22 @@ def _view_from(surface: Surface, toward: Tensor, across: Tensor) -> _View:
     farthest_m = max_pool2d(depth_m, 3, 1, 1)
     is_inner = (eroded > 0) & (-farthest_m > image_m - _EDGE_STEP * surface.diameter_m)
 
+    # Normals of an image are fitted to windows, so that near an edge they are between those of its
+    # two sides. Those of a cell are means over it and its neighbours.
+    facing = surface.normals * (surface.normals @ toward).sign()[:, None]
+    image_normals = facing.new_zeros(side**2, 3)
+    image_normals[is_visible] = facing[sample[is_visible]]
+    window_means = avg_pool2d(image_normals.T.reshape(3, side, side), 3, 1, 1)
+    normals = normalize(window_means.flatten(1).T, dim=-1)
+
     # The points of visible cells, shuffled, so that the first ones of them are spread evenly; by
     # one seed, so that a model always has the same views.
     cells = is_visible.nonzero()[:, 0]
     shuffle = torch.randperm(len(cells), generator=torch.Generator().manual_seed(0))
     cells = cells[shuffle[:_VIEW_POINTS]]
-    visible = sample[cells]
     return _View(
-        points_m=_pad_rows(surface.points_m[visible], _VIEW_POINTS),
-        normals=_pad_rows(surface.normals[visible], _VIEW_POINTS),
+        points_m=_pad_rows(surface.points_m[sample[cells]], _VIEW_POINTS),
+        normals=_pad_rows(normals[cells], _VIEW_POINTS),
         is_inner=pad(is_inner.flatten()[cells], (0, _VIEW_POINTS - len(cells))),
     )
 

@@ -2,10 +2,9 @@
 
 The feature of a pair is the distance of its points, the angles of both normals to the line between
 them, and the angle between the normals (Drost et al., Model Globally, Match Locally, CVPR 2010,
-equation 1). The turn of a pair is the angle of its second point about the normal of the first.
+equation 1). The turn of a pair is the angle of its second point about the normal of the first, in
+bins, so that the innermost loop only subtracts.
 """
-
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64, UInt32
@@ -29,14 +28,6 @@ _LEAST_DISTANCE = 1e-12
 """Both sides of a thin sheet may have a point at one place: their distance is no divisor of 0."""
 
 
-class ModelPairs(NamedTuple):
-    """The point pairs of a model, sorted by feature."""
-
-    bounds: Int32[np.ndarray, " bounds"]  #: pairs ``bounds[k]`` to ``bounds[k + 1]`` have key ``k``
-    first: Int32[np.ndarray, " pairs"]  #: index of the first point of each pair
-    turn: Float32[np.ndarray, " pairs"]  #: of each pair [rad]
-
-
 @compiled
 def describe_all_pairs(
     points: Float64[np.ndarray, "n 3"], bases: Float64[np.ndarray, "n 3 3"], bin_width: float
@@ -49,7 +40,7 @@ def describe_all_pairs(
         bin_width: of the distance of a pair.
 
     Returns:
-        Keys and turns [rad] of the pairs (0, 1), (0, 2), ..., (1, 0), (1, 2), ...
+        Keys, and turns in bins, of the pairs (0, 1), (0, 2), ..., (1, 0), (1, 2), ...
     """
     count = len(points)
     keys = np.empty(count * (count - 1), np.int64)
@@ -86,7 +77,7 @@ def _describe_pair(
         feature: output, the four fractions of bins.
 
     Returns:
-        The turn [rad].
+        The turn, in bins.
     """
     # The way from the first point to the second along the first's normal and tangents, and along
     # the second's normal; and the cosine of the two normals.
@@ -107,7 +98,7 @@ def _describe_pair(
     feature[1] = _bins_from_cosine(along / distance)
     feature[2] = _bins_from_cosine(along_second / distance)
     feature[3] = _bins_from_cosine(cosine)
-    return np.arctan2(up, aside)
+    return np.arctan2(up, aside) * (TURNS / (2 * np.pi))
 
 
 @compiled
@@ -137,7 +128,9 @@ def cast_votes(
     points: Float64[np.ndarray, "n 3"],
     bases: Float64[np.ndarray, "n 3 3"],
     references: Int64[np.ndarray, " r"],
-    pairs: ModelPairs,
+    bounds: Int32[np.ndarray, " bounds"],
+    first: Int32[np.ndarray, " pairs"],
+    pair_turn: Float32[np.ndarray, " pairs"],
     model_points: int,
     bin_width: float,
     peaks: int,
@@ -150,7 +143,9 @@ def cast_votes(
         points: of the scene.
         bases: normal and two tangents of each, as columns.
         references: indices of the points that vote with each of the others.
-        pairs: of the model.
+        bounds: the model's pairs ``bounds[k]`` to ``bounds[k + 1]`` have the feature of key ``k``.
+        first: index of the first point of each pair of the model.
+        pair_turn: its turn, in bins.
         model_points: number of its points.
         bin_width: of the distance of a pair.
         peaks: how many model points are chosen for each reference, those of the most votes.
@@ -164,8 +159,9 @@ def cast_votes(
     best_turn = np.empty(shape, np.int64)
     best_votes = np.empty(shape)
     counts = np.zeros((model_points, TURNS), np.float32)
-    voted = np.zeros(len(pairs.bounds), np.uint32)
+    voted = np.zeros(len(bounds), np.uint32)
     feature = np.empty(_PARTS)
+    keys = np.empty(1 + _PARTS, np.int64)
     for row in range(len(references)):
         reference = references[row]
         counts[:] = 0
@@ -177,74 +173,73 @@ def cast_votes(
                 square += (points[other, axis] - points[reference, axis]) ** 2
             if square > bin_width * bin_width and square < (DISTANCES * bin_width) ** 2:
                 turn = _describe_pair(points, bases, reference, other, bin_width, feature)
-                _vote_by_pair(feature, turn, pairs, voted, counts)
+                key_count = _find_near_keys(feature, keys)
+                _add_votes(keys[:key_count], turn, bounds, first, pair_turn, voted, counts)
         _find_peaks(counts, best_point[row], best_turn[row], best_votes[row])
     return best_point, best_turn, best_votes
 
 
 @compiled
-def _vote_by_pair(
-    feature: Float64[np.ndarray, "4"],
-    turn: float,
-    pairs: ModelPairs,
-    voted: UInt32[np.ndarray, " bounds"],
-    counts: Float32[np.ndarray, "m turns"],
-) -> None:
-    """Add the votes of the model's pairs with the feature of a pair of the scene, or nearly so.
+def _find_near_keys(feature: Float64[np.ndarray, "4"], keys: Int64[np.ndarray, "5"]) -> int:
+    """Find the keys of a feature and of the nearest other bin in each of its parts.
 
     Args:
-        feature: of the pair of the scene, as fractions of bins.
-        turn: of that pair.
-        pairs: of the model.
-        voted: as of :func:`_add_votes`; changed.
-        counts: votes of each model point and turn; changed.
+        feature: as fractions of bins.
+        keys: output.
+
+    Returns:
+        How many there are: beyond the last bin of a part the other bin is the same.
     """
     key = _make_key(feature)
-    _add_votes(key, turn, pairs, voted, counts)
-
-    # In each part of the feature the bin next to the pair's too; beyond the last it is the same.
+    keys[0] = key
+    count = 1
     for part in range(_PARTS):
         pair_bin = int(feature[part])
         nearest_other = pair_bin + (-1 if feature[part] - pair_bin < 0.5 else 1)
         change = _clamp_bin(nearest_other, part) - _clamp_bin(pair_bin, part)
         if change != 0:
-            place_value = ANGLES ** (_PARTS - 1 - part)
-            _add_votes(key + change * place_value, turn, pairs, voted, counts)
+            keys[count] = key + change * ANGLES ** (_PARTS - 1 - part)
+            count += 1
+    return count
 
 
 @compiled
 def _add_votes(
-    key: int,
+    keys: Int64[np.ndarray, " k"],
     turn: float,
-    pairs: ModelPairs,
+    bounds: Int32[np.ndarray, " bounds"],
+    first: Int32[np.ndarray, " pairs"],
+    pair_turn: Float32[np.ndarray, " pairs"],
     voted: UInt32[np.ndarray, " bounds"],
     counts: Float32[np.ndarray, "m turns"],
 ) -> None:
-    """Add the votes of the model's pairs with a feature; each turn votes for it only once.
+    """Add the votes of the model's pairs with any of some features; a turn votes for each once.
 
     Args:
-        key: of the feature.
-        turn: of the pair of the scene.
-        pairs: of the model.
+        keys: of the features.
+        turn: of the pair of the scene, in bins.
+        bounds: of the model's pairs, as of :func:`cast_votes`.
+        first: of the model's pairs.
+        pair_turn: of the model's pairs.
         voted: of each feature the turns that have voted, bit ``b`` for bin ``b``; changed.
         counts: votes of each model point and turn; changed.
     """
-    low = pairs.bounds[key]
-    high = pairs.bounds[key + 1]
-    bit = np.uint32(1 << min(int((turn + np.pi) / (2 * np.pi) * TURNS), TURNS - 1))
-    if high == low or voted[key] & bit:
-        return
-    voted[key] |= bit
-    weight = np.float32(1 / np.sqrt(high - low))  # rare features weigh more
-    for pair in range(low, min(high, low + _MOST_ALIKE)):
-        counts[pairs.first[pair], _find_turn_bin(turn - pairs.turn[pair])] += weight
+    bit = np.uint32(1 << min(int(turn + TURNS / 2), TURNS - 1))
+    for key in keys:
+        low = bounds[key]
+        high = bounds[key + 1]
+        if high == low or voted[key] & bit:
+            continue
+        voted[key] |= bit
+        weight = np.float32(1 / np.sqrt(high - low))  # rare features weigh more
+        for pair in range(low, min(high, low + _MOST_ALIKE)):
+            counts[first[pair], _find_turn_bin(turn - pair_turn[pair])] += weight
 
 
 @compiled
 def _find_turn_bin(turn: float) -> int:
-    """Find the bin of the difference of two angles between -pi and pi."""
-    value = turn * (TURNS / (2 * np.pi))
-    turn_bin = int(value + TURNS if value < 0 else value)
+    """Find the bin of the difference of two turns between -TURNS / 2 and TURNS / 2."""
+    turn_bin = int(turn + TURNS if turn < 0 else turn)
     return turn_bin - TURNS if turn_bin >= TURNS else turn_bin
 
 
@@ -269,13 +264,16 @@ def _find_peaks(
     turn = np.empty(model_points, np.int64)
     for point in range(model_points):
         most[point] = -1.0
+        before = counts[point, TURNS - 1]
+        here = counts[point, 0]
         for turn_bin in range(TURNS):
-            before = counts[point, turn_bin - 1]
-            after = counts[point, (turn_bin + 1) % TURNS]
-            votes = 2 * counts[point, turn_bin] + before + after
+            after = counts[point, turn_bin + 1 if turn_bin + 1 < TURNS else 0]
+            votes = 2 * here + before + after
             if votes > most[point]:
                 most[point] = votes
                 turn[point] = turn_bin
+            before = here
+            here = after
 
     # The points of the most votes, one after the other.
     for place in range(len(best_point)):

@@ -20,7 +20,6 @@ from depthpose.pose.mesh.models import fibonacci_directions
 from depthpose.pose.propose.pair_votes import (
     FEATURES,
     TURNS,
-    ModelPairs,
     cast_votes,
     describe_all_pairs,
 )
@@ -66,8 +65,9 @@ class PairTable:
     bases: Float64[Tensor, "m 3 3"]  #: outward normal and two tangents of each point, as columns
     bounds: Int32[Tensor, " bounds"]  #: pairs ``bounds[k]`` to ``bounds[k + 1]`` have feature ``k``
     first: Int32[Tensor, " pairs"]  #: index of the first point of each pair
-    #: angle of the second point about the normal of the first, from its first tangent.
-    turn_rad: Float32[Tensor, " pairs"]
+    #: angle of the second point about the normal of the first, from its first tangent; in bins of a
+    #: full rotation divided by ``TURNS``.
+    turn: Float32[Tensor, " pairs"]
     surface: Surface  #: of the model
 
 
@@ -93,7 +93,6 @@ def prepare_pairs(surface: Surface) -> PairTable:
     first = torch.arange(count).repeat_interleave(count - 1)
     bin_m = STEP * surface.diameter_m
     key_of_pair, turn_of_pair = describe_all_pairs(array_of(points_m), array_of(bases), bin_m)
-    turn_rad = torch.from_numpy(turn_of_pair)
     generator = torch.Generator().manual_seed(_SHUFFLE_SEED)
     shuffle = torch.randperm(len(first), generator=generator)
     sorted_keys, place = torch.from_numpy(key_of_pair)[shuffle].sort(stable=True)
@@ -107,7 +106,7 @@ def prepare_pairs(surface: Surface) -> PairTable:
         bases=bases,
         bounds=bounds.int(),
         first=first[order].int(),
-        turn_rad=turn_rad[order].float(),
+        turn=torch.from_numpy(turn_of_pair)[order].float(),
         surface=surface,
     )
 
@@ -218,7 +217,9 @@ def vote_poses(
         array_of(points_m),
         array_of(bases),
         references.numpy(),
-        ModelPairs(table.bounds.numpy(), table.first.numpy(), table.turn_rad.numpy()),
+        table.bounds.numpy(),
+        table.first.numpy(),
+        table.turn.numpy(),
         len(table.points_m),
         STEP * table.surface.diameter_m,
         peaks,
