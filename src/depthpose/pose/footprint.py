@@ -25,7 +25,7 @@ def explained_mask(view: ViewInput, pose: Rigid, surface: Surface) -> Bool[Tenso
     """Mark the pixels in a view's mask whose readings lie on a posed surface."""
     pose = pose.double()
     near_m = NEAR * surface.diameter_m
-    window = find_window_about(surface, pose, view.K.double(), *view.depth_m.shape, near_m)
+    window = find_window_about(surface, pose, view.K.double(), *view.depth_m.shape, margin_m=near_m)
     part = _crop_view(view, window)
     points_m = back_project(part.depth_m.double(), part.K.double())
     is_candidate = points_m.isfinite().all(-1) & part.mask
@@ -38,7 +38,7 @@ def explained_frame_mask(frame: Frame, pose: Rigid, surface: Surface) -> Bool[Te
     """Mark the pixels of a frame, outside its background, whose readings lie on a posed surface."""
     pose = pose.double()
     near_m = NEAR * surface.diameter_m
-    window = find_window_about(surface, pose, frame.K, *frame.depth_m.shape, near_m)
+    window = find_window_about(surface, pose, frame.K, *frame.depth_m.shape, margin_m=near_m)
     is_candidate = (frame.depth_m[window] > 0) & frame.may_show(surface.diameter_m, window)
     explained = torch.zeros(frame.depth_m.shape, dtype=torch.bool)
     explained[window] = _lies_on_surface(frame.points_m[window], is_candidate, pose, surface)
