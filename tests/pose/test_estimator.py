@@ -311,11 +311,18 @@ def test_rough_votes_are_refined_where_icp_follows(part: ObjectModel) -> None:
 
 
 def test_an_untrained_network_is_refused_or_doubted(part: ObjectModel) -> None:
-    """The real network, from the first to the last step."""
-    found = GeoPoseNet(tiny_weights(part)).estimate(cloud=cloud_of(part, pose_at()))
+    """The real network, from the first to the last step; its votes alone."""
+    found = GeoPoseNet(tiny_weights(part), VOTE_ALONE).estimate(cloud=cloud_of(part, pose_at()))
     assert found.status != "ok"
     assert found.reason
     assert found.camera_from_model is None
+
+
+def test_poses_by_point_pairs_compete_with_wrong_votes(part: ObjectModel) -> None:
+    """An untrained network votes for nothing right."""
+    net = GeoPoseNet(tiny_weights(part))
+    cloud = cloud_of(part, pose_at())
+    assert_close(net.estimate(cloud=cloud, object=part.name), pose_at())
 
 
 def test_rotation_of_the_view_turns_the_answer(part: ObjectModel) -> None:

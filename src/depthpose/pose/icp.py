@@ -64,7 +64,7 @@ class BestStart(NamedTuple):
     """The best of several refined poses."""
 
     refined: RefinedPose  #: the best
-    others: Rigid  #: the best poses beside it, three at most, roughly refined
+    others: Rigid  #: poses that compete with it, roughly refined or proposed
 
 
 class Residuals(NamedTuple):

@@ -32,7 +32,7 @@ from depthpose.pose.geometry.grid import VoxelGrid, sample_and_voxelise
 from depthpose.pose.icp import BestStart, RefinedPose, refine_best
 from depthpose.pose.networks.baselines import DepthCrop, DepthImageNet, cut_depth, make_poses
 from depthpose.pose.propose import fit_poses, meet_lines, vote_ransac
-from depthpose.pose.register import judge
+from depthpose.pose.register import judge, propose_by_pairs
 from depthpose.pose.types import (
     AnyInput,
     PoseEstimate,
@@ -43,7 +43,7 @@ from depthpose.pose.types import (
     VotingPoints,
 )
 from depthpose.pose.verify.decide import refused
-from depthpose.pose.verify.prepared_object import PreparedObject, require_surface
+from depthpose.pose.verify.prepared_object import PreparedObject, has_surface, require_surface
 from depthpose.pose.verify.probability import PRIOR_MASKED, PRIOR_PROPOSED
 from depthpose.pose.weights import PoseWeights, read_pose_weights
 
@@ -175,7 +175,8 @@ class GeoPoseNet(PoseEstimator):
         The pose of an input does not depend on those beside it, but for the rounding of the
         network's sums. ``is_expected``: whether the inputs are meant to show their objects.
         """
-        prepared = map_in_threads(partial(unreadable_on_error, self._prepare), inputs, threads)
+        prepare = partial(self._prepare, is_expected=is_expected)
+        prepared = map_in_threads(partial(unreadable_on_error, prepare), inputs, threads)
         pose = partial(self._pose_or_register, is_expected=is_expected)
         for group in _group_by_voxels(prepared, self.config.batch_voxels):
             self._run_network(group)
@@ -196,22 +197,23 @@ class GeoPoseNet(PoseEstimator):
             InputError: an unknown object, or a mask that does not fit its depth image.
         """
         with refused_memory(pose_input.name):
-            job = self._prepare(pose_input)
+            job = self._prepare(pose_input, is_expected=True)
             if isinstance(job, PoseEstimate):
                 return job, None
             self._run_network([job])
             voted = self._estimate_by_votes(pose_input, job=job, is_expected=True)
             return voted, VotingDirections(job.voxels.points_m, job.directions)
 
-    def _prepare(self, pose_input: AnyInput) -> CloudToPose | PoseEstimate:
+    def _prepare(self, pose_input: AnyInput, *, is_expected: bool) -> CloudToPose | PoseEstimate:
         """Lift an input to the cloud and the voxels that the network takes.
 
-        For a region, or an input that is refused, the finished estimate is returned instead.
+        For a region, or an input that is refused, the finished estimate is returned instead. The
+        point pairs of a model take half a second: a mere try of many objects does without.
         """
         if isinstance(pose_input, ViewInput) and pose_input.is_region:
             return self._search_region(pose_input)
         prepared = self._find_object(pose_input.object)
-        _ = prepared.copies  # cached now, so that the seconds of no stage hold it
+        _ = prepared.prepare() if is_expected else prepared.copies
         watch = Stopwatch()
         with watch.stage("cloud"):
             cloud = prepare_cloud(pose_input, prepared.model, self.weights.cloud, self.config)
@@ -310,6 +312,16 @@ class GeoPoseNet(PoseEstimator):
                 by_icp = refine_best(cloud_m, poses, prepared.surface, config.icp)
             if float(by_icp.refined.inlier_share) > 0:
                 refinement = by_icp
+
+        # Where little of a part is visible, all votes may mean the wrong end of it. Poses that
+        # point pairs propose compete with the one that was voted for.
+        if config.with_icp and is_expected and has_surface(prepared.model):
+            with watch.stage("proposal"):
+                proposals = propose_by_pairs(job.cloud, prepared, config.voting.seed)
+            refinement = BestStart(
+                refined=refinement.refined,
+                others=Rigid.cat([refinement.others.double(), proposals]),
+            )
 
         # Compare, compete, decide.
         estimate = judge(

@@ -49,21 +49,22 @@ def render_surface(
     if 0 in shape:
         return Rendering(np.empty((0, 0)), np.empty((0, 0)), (slice(0, 0), slice(0, 0)))
     window_K = crop_intrinsics(K, columns.start, rows.start)
-    depth_m = np.full(shape, np.inf, dtype=np.float32)
+    inverse_depth = np.zeros(shape, dtype=np.float32)
     face = np.full(shape, -1, dtype=np.int64)
     _draw_triangles(
         array_of(surface.triangles_m),
         array_of(pose.R),
         array_of(pose.t_m),
         array_of(window_K),
-        depth_m,
+        inverse_depth,
         face,
     )
 
     # A ray meets the plane of its triangle at the depth, so its cosine follows from the distance
     # of the plane from the camera: distance = depth * |ray| * cosine.
     is_drawn = face >= 0
-    depth_m = np.where(is_drawn, depth_m, np.nan)
+    depth_m = np.full(shape, np.nan, dtype=np.float32)
+    depth_m[is_drawn] = 1 / inverse_depth[is_drawn]
     camera_m = -(pose.R.mT @ pose.t_m)  # in the model frame
     distance_m = (surface.plane_offsets_m - surface.plane_normals @ camera_m).abs().numpy()
     cosine = np.ones(shape)
@@ -78,10 +79,10 @@ def _draw_triangles(
     R: Float64[np.ndarray, "3 3"],
     t_m: Float64[np.ndarray, "3"],
     K: Float64[np.ndarray, "3 3"],
-    depth_m: Float32[np.ndarray, "h w"],
+    inverse_depth: Float32[np.ndarray, "h w"],
     face: Int64[np.ndarray, "h w"],
 ) -> None:
-    """Write the depth and the number of the nearest triangle into the pixels that it covers.
+    """Write 1 / depth and the number of the nearest triangle into the pixels that it covers.
 
     Without clipping: a triangle with a corner nearer than ``_NEAR_M`` is left out.
 
@@ -90,10 +91,10 @@ def _draw_triangles(
         R: rotation of the pose.
         t_m: its translation.
         K: intrinsic matrix of the window.
-        depth_m: infinite at first; changed.
+        inverse_depth: 1 / depth [1/m], 0 at first; changed.
         face: -1 at first; changed.
     """
-    height, width = depth_m.shape
+    height, width = inverse_depth.shape
     u = np.empty(3)
     v = np.empty(3)
     z = np.empty(3)
@@ -115,17 +116,21 @@ def _draw_triangles(
         right = min(width - 1, int(np.floor(max(u[0], u[1], u[2]))))
         top = max(0, int(np.ceil(min(v[0], v[1], v[2]))))
         bottom = min(height - 1, int(np.floor(max(v[0], v[1], v[2]))))
+        inverse_area = 1 / area
+        inverse_0 = 1 / z[0]
+        inverse_1 = 1 / z[1]
+        inverse_2 = 1 / z[2]
         for row in range(top, bottom + 1):
             for column in range(left, right + 1):
                 # Barycentric coordinates, in which 1 / depth is linear.
-                a = ((u[1] - column) * (v[2] - row) - (u[2] - column) * (v[1] - row)) / area
-                b = ((u[2] - column) * (v[0] - row) - (u[0] - column) * (v[2] - row)) / area
+                a = ((u[1] - column) * (v[2] - row) - (u[2] - column) * (v[1] - row)) * inverse_area
+                b = ((u[2] - column) * (v[0] - row) - (u[0] - column) * (v[2] - row)) * inverse_area
                 c = 1 - a - b
                 if a < 0 or b < 0 or c < 0:
                     continue
-                pixel_m = 1 / (a / z[0] + b / z[1] + c / z[2])
-                if pixel_m < depth_m[row, column]:
-                    depth_m[row, column] = pixel_m
+                inverse = a * inverse_0 + b * inverse_1 + c * inverse_2
+                if inverse > inverse_depth[row, column]:
+                    inverse_depth[row, column] = inverse
                     face[row, column] = f
 
 

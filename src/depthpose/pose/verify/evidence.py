@@ -446,6 +446,8 @@ def _patch_area(mask: Bool[np.ndarray, "h w"], patch_area_px2: float) -> float:
 
     Patches too small to be more than accidents are left out.
     """
+    if not mask.any():
+        return 0.0
     labels = np.zeros(mask.shape, np.int32)
     ndimage.label(mask, output=labels)
     areas_px = np.bincount(labels.ravel())[1:]

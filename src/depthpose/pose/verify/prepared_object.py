@@ -21,8 +21,10 @@ class PreparedObject:
     surface: Surface  #: of the model
 
     def prepare(self) -> "PreparedObject":
-        """Compute ``copies`` and ``pairs`` now, so that the time of no input includes it."""
-        _ = self.copies, self.pairs
+        """Compute what the model allows now, so that the time of no input includes it."""
+        _ = self.copies
+        if has_surface(self.model):
+            _ = self.pairs
         return self
 
     @cached_property
@@ -41,11 +43,15 @@ class PreparedObject:
         return prepare_pairs(self.surface)
 
 
+def has_surface(model: ObjectModel) -> bool:
+    """Whether a model has faces, or points enough to be a surface."""
+    return len(model.faces) > 0 or len(model.vertices_m) >= _LEAST_POINTS
+
+
 def require_surface(model: ObjectModel) -> None:
     """Raise an :class:`InputError` if a model is fewer than 500 points without faces."""
-    points = len(model.vertices_m)
-    if len(model.faces) == 0 and points < _LEAST_POINTS:
+    if not has_surface(model):
         raise InputError(
-            f"{model.name}: {points} points without faces are no surface; export the part as a "
-            f"mesh with triangles, such as STL, or give {_LEAST_POINTS} points"
+            f"{model.name}: {len(model.vertices_m)} points without faces are no surface; export "
+            f"the part as a mesh with triangles, such as STL, or give {_LEAST_POINTS} points"
         )
