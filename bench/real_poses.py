@@ -116,7 +116,7 @@ def basket_cases(folder: Path) -> Iterator[RealCase]:
     """Load a basket on a table, of annotated pose."""
     home = folder / "real_frames/basket"
     model = read_model(home / "obj_000019.ply", "mm", name="basket")
-    model = with_found_symmetries(model, None, is_taken=True)
+    model = with_found_symmetries(model)
     truth = json.loads((home / "truth.json").read_text())
     R = torch.tensor(truth["cam_R_m2c"]).reshape(3, 3).double()
     t_m = torch.tensor(truth["cam_t_m2c_mm"]).double() / 1000
@@ -130,7 +130,7 @@ def bottle_cases(folder: Path) -> Iterator[RealCase]:
     """Load a bottle in two frames of a RealSense; the authors' pose is 6 to 7 mm off."""
     home = folder / "real_frames/bottle"
     model = read_model(home / "bottle.obj", "m", name="bottle")
-    model = with_found_symmetries(model, None, is_taken=True)
+    model = with_found_symmetries(model)
     annotation = json.loads((home / "poses.json").read_text())
     color_from_model = torch.tensor(annotation["model_to_color_camera_authors_test_pose"]).double()
     color_from_depth = torch.tensor(annotation["depth_camera_to_color_camera"]).double()

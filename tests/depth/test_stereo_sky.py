@@ -239,7 +239,7 @@ def test_held_out_pairs_measure_the_sky() -> None:
     assert found == pytest.approx(
         {
             "held_out/epe_px": 2.5,
-            "held_out/d1": 0.5,
+            "held_out/d1_all": 0.5,
             "held_out/sky_missed": 1 / 3,
             "held_out/sky_false": 0.5,
         }

@@ -262,7 +262,7 @@ def test_proposals_of_a_shape_are_cached_to_the_bit(
     wanted = symmetries_from_proposals(given)
     for tolerance in (0.02, 0.02, 0.03):
         cache.read_or_compute.cache_clear()
-        model = with_found_symmetries(bar(), None, is_taken=True, tolerance=tolerance)
+        model = with_found_symmetries(bar(), tolerance)
         found, (own,) = model.symmetries, wanted.continuous
         assert found.discrete is not None
         assert wanted.discrete is not None

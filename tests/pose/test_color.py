@@ -319,7 +319,7 @@ def test_a_can_is_as_wide_as_drawn() -> None:
 def test_a_printed_box_is_posed_as_its_print_says() -> None:
     """By shape alone a box fits at four poses; a colour image says which of them is right."""
     model = replace(box(), name="thing")
-    net = Registration([with_found_symmetries(model, None, is_taken=True)])
+    net = Registration([with_found_symmetries(model)])
     pose = random_pose(1)
     view = drawn_view(textured_box(), pose)
     (found,) = net.estimate_many([view])

@@ -45,7 +45,7 @@ def every_copy(copies: SymmetricCopies) -> Rigid:
 
 @cache
 def copies_of_gear(keyway_mm: float) -> SymmetricCopies:
-    return find_copies(with_found_symmetries(gear(12, keyway_mm), None, is_taken=True))
+    return find_copies(with_found_symmetries(gear(12, keyway_mm)))
 
 
 @pytest.mark.slow
@@ -66,7 +66,7 @@ def test_a_keyway_makes_the_steps_of_a_gear_other_poses() -> None:
 
 
 def test_a_gear_says_how_much_its_keyway_deviates() -> None:
-    lines = describe_near_symmetries(with_found_symmetries(gear(12, 1.0), None, is_taken=True))
+    lines = describe_near_symmetries(with_found_symmetries(gear(12, 1.0)))
     assert lines
     for line in lines:
         assert re.fullmatch(r"rotated by \d+ degrees about .* \(\d+\.\d%\)", line), line
@@ -74,7 +74,7 @@ def test_a_gear_says_how_much_its_keyway_deviates() -> None:
 
 @pytest.mark.slow
 def test_the_ends_of_a_bar_that_differ_a_little_are_copies_and_no_symmetries() -> None:
-    copies = find_copies(with_found_symmetries(bar(0.002), None, is_taken=True))
+    copies = find_copies(with_found_symmetries(bar(0.002)))
     for axis in ([0, 1.0, 0], [0, 0, 1.0]):
         assert degrees_to(copies.symmetries, rotation(axis, 180)) > 90
         assert degrees_to(every_copy(copies), rotation(axis, 180)) < 2
@@ -119,7 +119,7 @@ def test_a_ball_is_one_pose_whatever_its_rotation() -> None:
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.05)
     vertices_m, faces = torch.tensor(mesh.vertices), torch.tensor(mesh.faces).long()
     ball = make_model(vertices_m, faces, name="ball", number=1)
-    copies = find_copies(with_found_symmetries(ball, None, is_taken=True))
+    copies = find_copies(with_found_symmetries(ball))
     assert len(copies.near_copies.R) == len(copies.lookalikes.R) == 0
     first = pose_at(seed=1).double()
     other = Rigid(pose_at(seed=2).R.double(), first.t_m)[None]

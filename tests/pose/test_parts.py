@@ -43,7 +43,7 @@ def test_simple_parts_are_closed_surfaces_of_several_kinds() -> None:
         assert all(piece.is_watertight and piece.volume > 0 for piece in pieces)
     assert len({len(model.faces) for model in models}) >= 4  # boxes, tubes, cups and profiles
     box = next(model for model in models if len(model.faces) == 12)
-    found = with_found_symmetries(box, None, is_taken=True).symmetries.discrete
+    found = with_found_symmetries(box).symmetries.discrete
     assert found is not None
     assert len(found.R) >= 3
 

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import math
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -444,8 +443,6 @@ def test_symmetries_of_a_cad_file_are_reported_and_taken_on_request(tmp_path: Pa
     assert plain.symmetries.is_none
     assert "flange: looks the same after 5 turns, about 0 axes" in printed[0]
     assert "--symmetries found" in printed[0]
-    (certainty,) = re.findall(r"\(certainty (0\.\d\d) and more\)", printed[0])
-    assert float(certainty) > 0.5
     taking = ModelsConfig(cad=(file,), unit="mm", with_found_symmetries=True)
     (taken,) = read_models(taking, printed.append)
     assert taken.symmetries.discrete is not None

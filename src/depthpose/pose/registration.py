@@ -125,4 +125,4 @@ def read_parts(
     for k, model in enumerate(models):
         if model.name in declared:
             models[k] = declare_symmetry(model, declared[model.name])
-    return [with_found_symmetries(model, None, is_taken=True) for model in models]
+    return [with_found_symmetries(model) for model in models]

@@ -255,7 +255,7 @@ def _find_target(form: Form, net: GeoPoseNet) -> _Target:
         if _is_same_shape(cad_model, model):
             method = f"network; the CAD file is the weights' {model.name!r}"
             return _Target(model=model, net=net, method=method)
-    cad_model = mesh.with_found_symmetries(cad_model, None, is_taken=True)
+    cad_model = mesh.with_found_symmetries(cad_model)
     registration = Registration([cad_model], net.config)
     return _Target(model=cad_model, net=registration, method="the CAD file alone, without training")
 

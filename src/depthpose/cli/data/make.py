@@ -175,7 +175,12 @@ def make_objects(
     from depthpose.core.run import claim_folder
     from depthpose.pose.config import ObjectsConfig, SyntheticSensorConfig
     from depthpose.pose.datasets import write_bop_models
-    from depthpose.pose.mesh import read_model, refuse_equal_names, with_found_symmetries
+    from depthpose.pose.mesh import (
+        describe_found_symmetries,
+        read_model,
+        refuse_equal_names,
+        with_found_symmetries,
+    )
 
     _refuse_frame_numbers(number, seed)
     if not re.fullmatch(r"[\w-]+", split) or split == "models":
@@ -190,10 +195,11 @@ def make_objects(
     )
     models = [read_model(path, unit, number=k) for k, path in enumerate(cad, start=1)]
     refuse_equal_names(models)
-    models = [
-        with_found_symmetries(model, on_message=tqdm.write, is_taken=symmetries == "found")
-        for model in models
-    ]
+    searched = [with_found_symmetries(model) for model in models]
+    are_used = symmetries == "found"
+    for sentence in describe_found_symmetries(searched, are_used=are_used):
+        tqdm.write(sentence)
+    models = searched if are_used else models
     settings = {
         **_list_frame_settings(config),
         "unit": unit,

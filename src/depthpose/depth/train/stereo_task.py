@@ -151,7 +151,7 @@ def validate_pairs(
         measured.append(_measure_match(predicted_px, is_sky, truth_px, matcher.config))
 
     # Without any truth the error is 0, as there is none.
-    means = {"held_out/epe_px": 0.0, "held_out/d1": 0.0} | average_metrics(measured)
+    means = {"held_out/epe_px": 0.0, "held_out/d1_all": 0.0} | average_metrics(measured)
     return ValidationResult(numbers=means, pictures=pictures)
 
 
@@ -171,7 +171,7 @@ def _measure_match(
     if bool(has_truth.any()):
         errors = measure("disparity", predicted_px[has_truth], truth_px[has_truth])
         metrics["epe_px"] = errors["epe_px"]
-        metrics["d1"] = errors["d1_all"]
+        metrics["d1_all"] = errors["d1_all"]
 
     is_true_sky = truth_px == 0
     if is_sky is not None and bool(is_true_sky.any()):

@@ -31,6 +31,7 @@ from depthpose.pose.mesh.near_symmetry import NearSymmetry as NearSymmetry
 from depthpose.pose.mesh.near_symmetry import near_symmetries as near_symmetries
 from depthpose.pose.mesh.near_symmetry import true_symmetries as true_symmetries
 from depthpose.pose.mesh.symmetry import SymmetryProposal as SymmetryProposal
+from depthpose.pose.mesh.symmetry import describe_found_symmetries as describe_found_symmetries
 from depthpose.pose.mesh.symmetry import propose_symmetries as propose_symmetries
 from depthpose.pose.mesh.symmetry import symmetries_from_proposals as symmetries_from_proposals
 from depthpose.pose.mesh.symmetry import with_found_symmetries as with_found_symmetries

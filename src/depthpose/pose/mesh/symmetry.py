@@ -1,7 +1,7 @@
 """Symmetries found in a shape: rotations after which its surface lies on itself."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
@@ -169,52 +169,40 @@ def _complete_group(turns: list[Rigid]) -> list[Rigid]:
     return group
 
 
-def with_found_symmetries(
-    model: ObjectModel,
-    on_message: Callable[[str], None] | None,
-    *,
-    is_taken: bool,
-    tolerance: float = 0.02,
-) -> ObjectModel:
-    """Search the symmetries of a model that declares none, to take them or to tell of them.
+def with_found_symmetries(model: ObjectModel, tolerance: float = 0.02) -> ObjectModel:
+    """Search the symmetries of a model that declares none, and return it with those of its shape.
 
-    They are searched once for each shape, and kept in ``$DEPTHPOSE_CACHE``.
-
-    Args:
-        model: the object.
-        on_message: called with a sentence on symmetries that were found; without it nothing is
-            searched where ``is_taken`` is false.
-        is_taken: whether the model gets the symmetries.
-        tolerance: as of :func:`propose_symmetries`.
-
-    Returns:
-        The model, with the symmetries where there are some and they are taken.
+    They are searched once for each shape, and kept in ``$DEPTHPOSE_CACHE``. ``tolerance`` is that
+    of :func:`propose_symmetries`.
     """
     declared = model.symmetries
-    if not (is_taken or on_message) or declared.discrete is not None or declared.continuous:
+    if declared.discrete is not None or declared.continuous:
         return model
-
-    # What the shape has.
     rows = read_or_compute(model, propose_symmetries, "symmetries", tolerance)
-    proposals = [SymmetryProposal(*row) for row in rows]
-    symmetries = replace(symmetries_from_proposals(proposals), is_found=True)
+    symmetries = symmetries_from_proposals([SymmetryProposal(*row) for row in rows])
     if symmetries.discrete is None and not symmetries.continuous:
         return model
+    return replace(model, symmetries=replace(symmetries, is_found=True))
 
-    # Told, and taken if wanted.
-    if on_message is not None:
-        turns = 0 if symmetries.discrete is None else len(symmetries.discrete.R)
-        certainty = min(p.certainty for p in proposals if p.certainty >= _SURE)
-        consequence = "each copy counts as right"
-        if not is_taken:
-            consequence = (
-                "if that is so, say --symmetries found: no network can distinguish the copies"
+
+def describe_found_symmetries(models: Sequence[ObjectModel], *, are_used: bool) -> list[str]:
+    """Describe the symmetries that were found of models, in a sentence for each that has some.
+
+    ``are_used``: whether they stay, so that each copy counts as right.
+    """
+    consequence = "each copy counts as right"
+    if not are_used:
+        consequence = "if that is so, say --symmetries found: no network can distinguish the copies"
+    sentences: list[str] = []
+    for model in models:
+        symmetries = model.symmetries
+        if symmetries.is_found:
+            turns = 0 if symmetries.discrete is None else len(symmetries.discrete.R)
+            sentences.append(
+                f"{model.name}: looks the same after {turns} turns, about "
+                f"{len(symmetries.continuous)} axes; {consequence}"
             )
-        on_message(
-            f"{model.name}: looks the same after {turns} turns, about "
-            f"{len(symmetries.continuous)} axes (certainty {certainty:.2f} and more); {consequence}"
-        )
-    return replace(model, symmetries=symmetries) if is_taken else model
+    return sentences
 
 
 def rotations_about(

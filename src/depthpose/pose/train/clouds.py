@@ -19,6 +19,7 @@ from depthpose.pose.datasets import BopDataset, open_bop
 from depthpose.pose.datasets.layouts import read_bop_models, read_models_info
 from depthpose.pose.geometry.grid import sample_points, voxelise
 from depthpose.pose.mesh import (
+    describe_found_symmetries,
     read_model,
     refuse_equal_names,
     with_found_symmetries,
@@ -256,16 +257,15 @@ def read_models(
         )
         refuse_equal_names(models)
 
-    # With the symmetries of their shapes, where these are wanted.
-    return tuple(
-        with_found_symmetries(
-            model,
-            on_message,
-            is_taken=config.with_found_symmetries,
-            tolerance=config.symmetry_tolerance,
-        )
-        for model in models
-    )
+    # With the symmetries of their shapes, where these are wanted; else these are told.
+    are_used = config.with_found_symmetries
+    if not are_used and on_message is None:
+        return models
+    searched = tuple(with_found_symmetries(model, config.symmetry_tolerance) for model in models)
+    if on_message is not None:
+        for sentence in describe_found_symmetries(searched, are_used=are_used):
+            on_message(sentence)
+    return searched if are_used else models
 
 
 def _list_model_numbers(folder: Path) -> tuple[int, ...]:
