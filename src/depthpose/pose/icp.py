@@ -14,7 +14,13 @@ from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, cross_matrix, rotation_by
 from depthpose.pose.compiled import Vector, array_of, compiled, cross, dot, minus, rotate, vector
 from depthpose.pose.config import IcpConfig
-from depthpose.pose.geometry.surface import Surface, Target, look_along_rays, match
+from depthpose.pose.geometry.surface import (
+    UNOBSERVED_WEIGHT,
+    Surface,
+    Target,
+    look_along_rays,
+    match,
+)
 
 _SLACK = 0.1  # sine of the angle up to which a surface that faces away counts as visible
 _GRAZING = 0.1  # sine of the angle between a ray and a plane below which they do not meet nearby
@@ -28,9 +34,6 @@ _ROUGH_POINTS = 100  # points of the cloud that refine and compare starts
 _OCCLUSION_POINTS = 1000  # points of the cloud by which free-space violations are counted
 _OCCLUSION_EVERY = 4  # one in this many points of the surface is used for that
 _COMPARED_POINTS = 50  # points of the model, about, by which poses are told to be distinct
-_UNOBSERVED_WEIGHT = 0.3
-"""Weight in a score of the share of the surface that should be visible and was not observed. It is
-below 1, for something may occlude it."""
 _DISTINCT_DIAMETERS = 0.1  # mean distance between the surfaces of two poses that are distinct
 _MOST_OTHERS = 3  # largest number of local minima that are returned beside the best
 _FIRST_POSE_BONUS = 0.02
@@ -552,7 +555,7 @@ def _score_poses(
     _, equations = _iterate(few_m, _ROUGH_POINTS, poses, surface, limits_m, is_exact=False)
     inlier_share = (equations.weight > 0).double().mean(-1)
     closeness = inlier_share - equations.rms_m / surface.diameter_m
-    score = closeness - free_space_violation - _UNOBSERVED_WEIGHT * unobserved
+    score = closeness - free_space_violation - UNOBSERVED_WEIGHT * unobserved
     score[0] += _FIRST_POSE_BONUS
     return score
 

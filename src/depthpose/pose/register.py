@@ -1,7 +1,8 @@
 """One object from its points: propose, refine, compare, compete, decide.
 
-:func:`register` does all of it by the model alone. A network proposes poses in its own way
-(:mod:`depthpose.pose.network_pose`); what follows, :func:`judge`, is the same for both.
+:func:`register` does all of it by the model alone. A network proposes a pose in its own way
+(:mod:`depthpose.pose.network_pose`), with which those of point pairs compete; what follows,
+:func:`judge`, is the same for both.
 """
 
 from collections.abc import Callable

@@ -38,6 +38,9 @@ _CELL = 1 / 24  # side of a cell of an image or of rays, in diameters: it holds 
 _REACH = 72
 """Cells to each side of the middle of the cloud that are distinguished, three diameters; points
 farther off count as if they lay at this border."""
+UNOBSERVED_WEIGHT = 0.3
+"""Weight in a score of the share of the surface that should be visible and was not observed. It is
+below 1, the weight of free-space violations, for something may occlude it."""
 _NEAREST_SHARE = 0.1  # points nearer than this share of the median depth were not observed
 _BOXES = 48  # boxes along the longest side of a model, to look up near samples without a search
 _BOX_MARGIN = 0.15  # distance by which the boxes reach beyond the model, in diameters

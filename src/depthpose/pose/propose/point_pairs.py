@@ -15,7 +15,7 @@ from torch.nn.functional import normalize
 from depthpose.core.rigid import Rigid, rotation_by
 from depthpose.pose.compiled import array_of
 from depthpose.pose.geometry.grid import thin_cloud
-from depthpose.pose.geometry.surface import Surface, look_along_rays
+from depthpose.pose.geometry.surface import UNOBSERVED_WEIGHT, Surface, look_along_rays
 from depthpose.pose.mesh.models import fibonacci_directions
 from depthpose.pose.propose.pair_votes import (
     FEATURES,
@@ -51,8 +51,6 @@ _SHUFFLE_SEED = 0
 """Seed of the order of alike pairs, so that a model always has the same table."""
 _RAYS_EVERY = 16
 """One in this many points of the surface is used to count free-space violations."""
-_UNOBSERVED_WEIGHT = 0.3
-"""Weight in a score of the share of the surface that should be visible and was not observed."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -261,4 +259,4 @@ def _score_poses(
     cosine = (local_normals * surface.normals[index]).sum(-1).abs()
     support = (is_near * cosine).mean(-1)
     free_space_violation, unobserved = look_along_rays(points_m, poses, surface, every=_RAYS_EVERY)
-    return support - free_space_violation - _UNOBSERVED_WEIGHT * unobserved
+    return support - free_space_violation - UNOBSERVED_WEIGHT * unobserved

@@ -32,7 +32,7 @@ OTHER_FRAME = (
     "the world have z up: give it as the camera saw it"
 )
 """What may be wrong with a cloud that fits no pose: its origin is not where the camera was."""
-_UNOBSERVED_WEIGHT = 0.5
+_HIDDEN_WEIGHT = 0.5
 """Of an area that was not observed beside one that contradicts: it may only be hidden."""
 _LEAST_CONTRADICTING = LEAST_AREA / 4
 """Independent patches: a smaller area does not explain why a pose is doubted."""
@@ -202,7 +202,7 @@ def explain_doubt(evidence: Evidence, probability: float, *, is_masked: bool) ->
         ),
         (evidence.continued, goes_on),
         (
-            _UNOBSERVED_WEIGHT * evidence.unobserved,
+            _HIDDEN_WEIGHT * evidence.unobserved,
             f"{unobserved_share:.0%} of the posed surface was not observed",
         ),
     ]
