@@ -38,6 +38,8 @@ _LEAST_SCORE = 0.25
 _SAME_DIAMETERS = 0.1
 _SAME_RAD = math.radians(25)
 """Distance of the middles, in diameters, and angle up to which two poses are the same."""
+_PLACE_DIAMETERS = 0.25
+"""Distance of the middles up to which two poses are at one place."""
 
 # Normals and ICP.
 _MIN_COSINE = 0.7
@@ -65,18 +67,27 @@ class _Stage(NamedTuple):
         near: distance up to which a reading lies on the surface, beside noise, in diameters.
         icp_limits: distance up to which a reading counts in each step of ICP, in diameters.
         most: poses that enter the next stage.
+        most_at_place: of them at one place: a surface that fits anywhere, as that of a small part
+            seen end on, else fills the list with poses on a few large things.
     """
 
     every: int
     near: float
     icp_limits: tuple[float, ...]
     most: int
+    most_at_place: int
 
 
 _STAGES = (
-    _Stage(every=4, near=0.1, icp_limits=(), most=200),
-    _Stage(every=2, near=0.06, icp_limits=(0.15, 0.12, 0.1, 0.08), most=60),
-    _Stage(every=1, near=NEAR, icp_limits=(0.08, 0.06, 0.05, 0.05, 0.05, 0.05), most=60),
+    _Stage(every=4, near=0.1, icp_limits=(), most=200, most_at_place=8),
+    _Stage(every=2, near=0.06, icp_limits=(0.15, 0.12, 0.1, 0.08), most=60, most_at_place=4),
+    _Stage(
+        every=1,
+        near=NEAR,
+        icp_limits=(0.08, 0.06, 0.05, 0.05, 0.05, 0.05),
+        most=60,
+        most_at_place=4,
+    ),
 )
 
 
@@ -108,7 +119,7 @@ def propose_in_frame(
     for stage in _STAGES:
         poses = refine_projectively(frame, poses, surface, stage)
         score = score_by_image(frame, poses, surface, stage)
-        best = _suppress_near_duplicates(poses, score, surface, stage.most)
+        best = _choose_best(poses, score, surface, stage)
         poses = poses[best]
         score = score[best]
     is_good = score >= _LEAST_SCORE
@@ -160,22 +171,30 @@ def _average_scene_points(
     return mean_m[is_one_surface], normalize(mean_normal[is_one_surface], dim=-1)
 
 
-def _suppress_near_duplicates(
-    poses: Rigid, score: Float64[Tensor, " b"], surface: Surface, most: int
+def _choose_best(
+    poses: Rigid, score: Float64[Tensor, " b"], surface: Surface, stage: _Stage
 ) -> Int64[Tensor, " c"]:
-    """Choose the best poses, ``most`` of them, without any near a better one; as indices."""
-    order = score.argsort(descending=True, stable=True)[: _MORE_THAN_KEPT * most]
+    """Choose the best poses of a stage: none that is nearly a better one, few at each place.
+
+    ``poses`` are all that were compared, with their ``score``. Returns indices of them.
+    """
+    order = score.argsort(descending=True, stable=True)[: _MORE_THAN_KEPT * stage.most]
     middles_m = poses[order].apply(surface.middle_m[None])[:, 0]
-    rotations = poses.R[order].flatten(1)
-    is_same = torch.cdist(middles_m, middles_m) < _SAME_DIAMETERS * surface.diameter_m
+    distance = torch.cdist(middles_m, middles_m) / surface.diameter_m
     # The trace of a relative rotation is 1 + 2 cos(angle).
-    is_same &= rotations @ rotations.T > 1 + 2 * math.cos(_SAME_RAD)
+    rotations = poses.R[order].flatten(1)
+    is_turned_little = rotations @ rotations.T > 1 + 2 * math.cos(_SAME_RAD)
+    is_same = (distance < _SAME_DIAMETERS) & is_turned_little
+    is_at_place = distance < _PLACE_DIAMETERS
+
     is_open = torch.ones(len(order), dtype=torch.bool)
+    count_at_place = torch.zeros(len(order), dtype=torch.long)  # chosen poses near each
     chosen: list[int] = []
     for k in range(len(order)):
-        if is_open[k] and len(chosen) < most:
+        if is_open[k] and len(chosen) < stage.most:
             chosen.append(k)
-            is_open &= ~is_same[k]
+            count_at_place += is_at_place[k]
+            is_open &= ~is_same[k] & (count_at_place < stage.most_at_place)
     return order[chosen]
 
 
