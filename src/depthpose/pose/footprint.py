@@ -28,7 +28,7 @@ def explained_mask(view: ViewInput, pose: Rigid, surface: Surface) -> Bool[Tenso
     window = find_window_about(surface, pose, view.K.double(), *view.depth_m.shape, margin_m=near_m)
     part = _crop_view(view, window)
     points_m = back_project(part.depth_m.double(), part.K.double())
-    is_candidate = points_m.isfinite().all(-1) & part.mask
+    is_candidate = (part.depth_m > 0) & part.depth_m.isfinite() & part.mask
     explained = torch.zeros(view.depth_m.shape, dtype=torch.bool)
     explained[window] = _lies_on_surface(points_m, is_candidate, pose, surface)
     return explained
@@ -109,7 +109,7 @@ def why_background_excludes(frame: Frame, pose: Rigid, surface: Surface) -> str:
     """Explain why the background of an image excludes a pose; an empty text where it does not.
 
     Args:
-        frame: of the whole image, whose backgrounds count.
+        frame: of the searched part of the image, whose backgrounds count.
         pose: ``camera_from_model``.
         surface: of the model.
     """

@@ -213,6 +213,7 @@ class GeoPoseNet(PoseEstimator):
         if isinstance(pose_input, ViewInput) and pose_input.is_region:
             return self._search_region(pose_input)
         prepared = self._find_object(pose_input.object)
+        # Now, so that the time of no stage includes it.
         _ = prepared.prepare() if is_expected else prepared.copies
         watch = Stopwatch()
         with watch.stage("cloud"):
@@ -281,7 +282,7 @@ class GeoPoseNet(PoseEstimator):
         """Vote for the keypoints, fit the pose to them, refine it, and decide by the evidence.
 
         Args:
-            pose_input: for the names of the estimate.
+            pose_input: for the names of a refusal.
             job: its cloud, with directions.
             is_expected: whether the input is meant to show its object: then the prior odds are
                 higher.

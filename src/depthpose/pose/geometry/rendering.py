@@ -25,7 +25,7 @@ class Rendering(NamedTuple):
     """A rendered surface, in the part of an image that it covers."""
 
     depth_m: np.ndarray  #: (h, w), along the optical axis; NaN where nothing is rendered
-    cosine: np.ndarray  #: (h, w), between ray and normal; 1 where nothing is rendered
+    cosine: np.ndarray  #: (h, w), absolute, between ray and normal; 1 where nothing is
     window: Window  #: rows and columns of the part
 
 
@@ -150,6 +150,8 @@ def find_window_about(
     margin_m: float = 0.0,
 ) -> Window:
     """Find the rows and columns of an image that a posed surface may cover.
+
+    They are empty if it is behind the camera, and the whole image if it is partly.
 
     Args:
         surface: of the model.

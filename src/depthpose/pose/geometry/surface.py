@@ -1,5 +1,6 @@
 """The surface of a model: what of it lies near a point, and what of it a camera sees."""
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -284,10 +285,10 @@ def _view_from(surface: Surface, toward: Tensor, across: Tensor) -> _View:
         toward: unit vector to the camera.
         across: two unit vectors across it, (2, 3).
     """
-    # An image along parallel rays: in each cell the sample that is nearest to the camera. It is as
-    # wide as the diameter, with five cells about it.
+    # An image along parallel rays: in each cell the sample that is nearest to the camera. About the
+    # ball that holds the surface there are five more cells.
     cell_m = _CELL * surface.diameter_m
-    side = 2 * round(0.5 / _CELL) + 10
+    side = 2 * (math.ceil(float(surface.ball_m[3]) / cell_m) + 5)
     centred_m = surface.points_m - surface.middle_m
     column, row = (centred_m @ across.T / cell_m).floor().long().add(side // 2).unbind(-1)
     place = row * side + column
@@ -299,7 +300,8 @@ def _view_from(surface: Surface, toward: Tensor, across: Tensor) -> _View:
     sample[place[is_nearest]] = torch.arange(len(place))[is_nearest]
     image_m = nearest_m.reshape(1, side, side)
 
-    # Where samples are sparse, the image has far samples in the gaps that no camera would see.
+    # Where samples are sparse, the image has far samples in the gaps that no camera would see. With
+    # them goes surface that is tilted by more than some 60 degrees, which sensors hardly read.
     front_m = max_pool2d(image_m, 3, 1, 1).flatten()
     is_visible = nearest_m > front_m - _EDGE_STEP * surface.diameter_m
     is_visible &= nearest_m.isfinite()

@@ -175,12 +175,11 @@ def with_found_symmetries(model: ObjectModel, tolerance: float = 0.02) -> Object
     They are searched once for each shape, and kept in ``$DEPTHPOSE_CACHE``. ``tolerance`` is that
     of :func:`propose_symmetries`.
     """
-    declared = model.symmetries
-    if declared.discrete is not None or declared.continuous:
+    if not model.symmetries.is_none:
         return model
     rows = read_or_compute(model, propose_symmetries, "symmetries", tolerance)
     symmetries = symmetries_from_proposals([SymmetryProposal(*row) for row in rows])
-    if symmetries.discrete is None and not symmetries.continuous:
+    if symmetries.is_none:
         return model
     return replace(model, symmetries=replace(symmetries, is_found=True))
 
@@ -199,7 +198,7 @@ def describe_found_symmetries(models: Sequence[ObjectModel], *, are_used: bool) 
         if symmetries.is_found:
             turns = 0 if symmetries.discrete is None else len(symmetries.discrete.R)
             sentences.append(
-                f"{model.name}: looks the same after {turns} turns, about "
+                f"{model.name}: looks the same after {turns} turns, and after any turn about "
                 f"{len(symmetries.continuous)} axes; {consequence}"
             )
     return sentences

@@ -20,10 +20,11 @@ _REFERENCE_EVERY = 8
 """One in this many points of the scene is a reference, which votes with each of the others:
 enough must lie on a small object in a large scene."""
 _WANTED_REFERENCES = 600
-"""References at least, if there are as many points."""
+"""References that are wanted, if there are as many points, before the limits below."""
 _MOST_REFERENCES = 2000
 _MOST_REFERENCES_OF_ALL = 6000
-"""References at most for one object, and for all objects of a search together."""
+"""References at most for one object, and for all objects of a search together, but for the least
+number of each."""
 _FEWEST_REFERENCES = 200
 """References for each object at least, however many are searched."""
 _LEAST_POINTS = 30
@@ -44,6 +45,8 @@ _PLACE_DIAMETERS = 0.25
 # Normals and ICP.
 _MIN_COSINE = 0.7
 """Cosine of the angle between the normals of the image and of the posed surface, at least."""
+_MIN_MEAN_NORMAL = 0.7
+"""Length of the mean of unit normals, at least, where a cell holds one surface."""
 _MIN_COSINE_ICP = 0.5
 """The same in ICP, whose poses are rough."""
 _DAMPING = 0.02
@@ -54,7 +57,7 @@ _DEVIATIONS = 2.0
 """Standard deviations of the error that neighbouring readings share, by which a reading may lie
 farther off the surface than the stage's limit."""
 _LEAST_READ = 0.5
-"""Least share of the visible surface by which a score is divided, though less of it is read."""
+"""A score is divided by the points that are read, at least by this share of the visible ones."""
 _MORE_THAN_KEPT = 5
 """Times as many poses as are kept are searched for distinct ones."""
 
@@ -167,7 +170,7 @@ def _average_scene_points(
     sums = points_m.new_zeros(len(count), 6)
     sums.index_add_(0, cell, torch.cat([points_m, normals], 1))
     mean_m, mean_normal = (sums / count[:, None]).split(3, dim=1)
-    is_one_surface = mean_normal.norm(dim=-1) > _MIN_COSINE
+    is_one_surface = mean_normal.norm(dim=-1) > _MIN_MEAN_NORMAL
     return mean_m[is_one_surface], normalize(mean_normal[is_one_surface], dim=-1)
 
 
@@ -248,7 +251,7 @@ def _solve_damped(
 ) -> Float64[Tensor, "b 6"]:
     """Compute the motions of a step of Gauss-Newton: ``(J^T W J + D) motion = J^T W distance``.
 
-    The damping D keeps a motion that few readings constrain where it was voted for. ``radius_m``,
+    The damping D makes a motion that few readings constrain small. ``radius_m``,
     of the object, converts a rotation to the distance by which it moves the surface.
     """
     squared_arms = torch.tensor([radius_m**2] * 3 + [1.0] * 3, dtype=torch.float64)

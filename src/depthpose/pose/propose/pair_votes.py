@@ -66,7 +66,7 @@ def _describe_pair(
     bin_width: float,
     feature: Float64[np.ndarray, "4"],
 ) -> float:
-    """Compute the feature of a pair of points, as fractions of bins, and its turn.
+    """Compute the feature of a pair of points, in bins, not rounded, and its turn.
 
     Args:
         points: of the model or the scene.
@@ -74,7 +74,7 @@ def _describe_pair(
         first: index of the first point of the pair.
         second: index of the second.
         bin_width: of the distance.
-        feature: output, the four fractions of bins.
+        feature: output, the four parts in bins, not rounded.
 
     Returns:
         The turn, in bins.
@@ -184,7 +184,7 @@ def _find_near_keys(feature: Float64[np.ndarray, "4"], keys: Int64[np.ndarray, "
     """Find the keys of a feature and of the nearest other bin in each of its parts.
 
     Args:
-        feature: as fractions of bins.
+        feature: in bins, not rounded.
         keys: output.
 
     Returns:
@@ -221,7 +221,8 @@ def _add_votes(
         bounds: of the model's pairs, as of :func:`cast_votes`.
         first: of the model's pairs.
         pair_turn: of the model's pairs.
-        voted: of each feature the turns that have voted, bit ``b`` for bin ``b``; changed.
+        voted: of each feature the turns that have voted for this reference, bit ``b`` for bin
+            ``b``; changed.
         counts: votes of each model point and turn; changed.
     """
     bit = np.uint32(1 << min(int(turn + TURNS / 2), TURNS - 1))
@@ -238,7 +239,7 @@ def _add_votes(
 
 @compiled
 def _find_turn_bin(turn: float) -> int:
-    """Find the bin of the difference of two turns between -TURNS / 2 and TURNS / 2."""
+    """Find the bin of the difference of two turns, which is between -TURNS and TURNS."""
     turn_bin = int(turn + TURNS if turn < 0 else turn)
     return turn_bin - TURNS if turn_bin >= TURNS else turn_bin
 
@@ -256,7 +257,7 @@ def _find_peaks(
         counts: votes of each model point and turn.
         best_point: output: indices of the model points, that of the most votes first.
         best_turn: output: the bin of the turn of each.
-        best_votes: output: the votes of each.
+        best_votes: output: the votes of each, smoothed over neighbouring turns.
     """
     # The best turn of each model point. Neighbouring turns share their votes.
     model_points = len(counts)
