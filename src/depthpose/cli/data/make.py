@@ -197,7 +197,7 @@ def make_objects(
     refuse_equal_names(models)
     searched = [with_found_symmetries(model) for model in models]
     are_used = symmetries == "found"
-    for sentence in describe_found_symmetries(searched, are_used=are_used):
+    for sentence in describe_found_symmetries(models, searched, are_used=are_used):
         tqdm.write(sentence)
     models = searched if are_used else models
     settings = {

@@ -25,7 +25,7 @@ class Rendering(NamedTuple):
     """A rendered surface, in the part of an image that it covers."""
 
     depth_m: np.ndarray  #: (h, w), along the optical axis; NaN where nothing is rendered
-    cosine: np.ndarray  #: (h, w), absolute, between ray and normal; 1 where nothing is
+    cosine: np.ndarray  #: (h, w), between ray and normal to either side; 1 elsewhere
     window: Window  #: rows and columns of the part
 
 

@@ -184,18 +184,23 @@ def with_found_symmetries(model: ObjectModel, tolerance: float = 0.02) -> Object
     return replace(model, symmetries=replace(symmetries, is_found=True))
 
 
-def describe_found_symmetries(models: Sequence[ObjectModel], *, are_used: bool) -> list[str]:
-    """Describe the symmetries that were found of models, in a sentence for each that has some.
+def describe_found_symmetries(
+    models: Sequence[ObjectModel], searched: Sequence[ObjectModel], *, are_used: bool
+) -> list[str]:
+    """Describe the symmetries that a search found, in a sentence for each model that has some.
 
-    ``are_used``: whether they stay, so that each copy counts as right.
+    Args:
+        models: as they were before the search.
+        searched: the same after it, by :func:`with_found_symmetries`.
+        are_used: whether the symmetries stay, so that each copy counts as right.
     """
     consequence = "each copy counts as right"
     if not are_used:
         consequence = "if that is so, say --symmetries found: no network can distinguish the copies"
     sentences: list[str] = []
-    for model in models:
+    for before, model in zip(models, searched, strict=True):
         symmetries = model.symmetries
-        if symmetries.is_found:
+        if before.symmetries.is_none and symmetries.is_found:
             turns = 0 if symmetries.discrete is None else len(symmetries.discrete.R)
             sentences.append(
                 f"{model.name}: looks the same after {turns} turns, and after any turn about "

@@ -257,13 +257,13 @@ def read_models(
         )
         refuse_equal_names(models)
 
-    # With the symmetries of their shapes, where these are wanted; else these are told.
+    # With the symmetries of their shapes, if these are wanted; else they are only reported.
     are_used = config.with_found_symmetries
     if not are_used and on_message is None:
         return models
     searched = tuple(with_found_symmetries(model, config.symmetry_tolerance) for model in models)
     if on_message is not None:
-        for sentence in describe_found_symmetries(searched, are_used=are_used):
+        for sentence in describe_found_symmetries(models, searched, are_used=are_used):
             on_message(sentence)
     return searched if are_used else models
 
