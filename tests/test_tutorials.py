@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from tests.written import ROOT, Block, read_blocks, run, run_block
+from tests.written import ROOT, Block, is_printed, read_blocks, run, run_block
 
 TUTORIALS = sorted(set((ROOT / "docs/tutorials").glob("*.md")) - {ROOT / "docs/tutorials/index.md"})
 QUICK = {"replace"}
@@ -127,3 +127,9 @@ def test_accelerate_knows_the_words_of_the_job_script() -> None:
     assert parsed.module
     assert parsed.training_script == "depthpose"
     assert parsed.training_script_args[-1] == "--resume"
+
+
+def test_only_the_last_digit_of_a_decimal_number_may_differ() -> None:
+    assert is_printed("bin 5.0 m, 1.01 of 3", "a\nbin 4.9 m, 1.02 of 3\n")
+    for other in ("bin 4.8 m, 1.01 of 3", "bin 5.0 m, 1.01 of 4", "box 5.0 m, 1.01 of 3"):
+        assert not is_printed("bin 5.0 m, 1.01 of 3", other)
