@@ -1,4 +1,4 @@
-"""Images of one data set that show nearly the same as images of another.
+"""Images of one dataset that show nearly the same as images of another.
 
     python bench/duplicates.py TRAINED_ON EVALUATION
 

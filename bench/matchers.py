@@ -29,7 +29,7 @@ LIMITS_PX = (1.0, 2.0, 3.0)
 
 
 def samples(data: Path | None, number: int) -> Iterator[StereoSample]:
-    """Read pairs with true disparity, spread evenly over a data set."""
+    """Read pairs with true disparity, spread evenly over a dataset."""
     if data is None:
         motorcycle = read_motorcycle()
         assert motorcycle is not None, "pip install -e '.[demo]'"

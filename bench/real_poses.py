@@ -57,7 +57,7 @@ class RealCase:
 
     @property
     def name(self) -> str:
-        """Data set, object and frame."""
+        """Dataset, object and frame."""
         return self.sample.input.name
 
     @property
@@ -157,7 +157,7 @@ def view_of_pose(
 
 
 def real_cases(folder: Path) -> list[RealCase]:
-    """Load all instances of all data sets."""
+    """Load all instances of all datasets."""
     loaders = (lm_cases, bunny_cases, ycb_cases, basket_cases, bottle_cases)
     return [case for load in loaders for case in load(folder)]
 

@@ -1,7 +1,7 @@
 """The sections of ``bench/real.py``: their type, and the errors of a pose that they measure.
 
 Errors are of points of the model's surface, in diameters: ADD, to the nearest copy of the true pose
-by the symmetries that the data set declares, and ADD-S, from each true point to the nearest posed
+by the symmetries that the dataset declares, and ADD-S, from each true point to the nearest posed
 one. A pose is right if its error is below 0.1.
 """
 

@@ -298,7 +298,7 @@ def draw_risks(views: Sequence[Row], out: Path) -> None:
 def main() -> None:
     """Run every method under every condition."""
     parser = make_parser(__doc__)
-    parser.add_argument("--bop", type=Path, required=True, help="data set of the models")
+    parser.add_argument("--bop", type=Path, required=True, help="dataset of the models")
     parser.add_argument("--objects", type=int, nargs="*", help="their numbers; all by default")
     parser.add_argument("--ours", nargs="*", default=[])
     parser.add_argument("--pointnet", nargs="*", default=[])

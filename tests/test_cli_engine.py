@@ -185,7 +185,7 @@ def test_a_manifest_of_somebody_else_is_not_written_over(
 
 @pytest.fixture
 def truth(home: Path, tmp_path: Path) -> Path:
-    """The five pairs as a data set with truth; the last one has none."""
+    """The five pairs as a dataset with truth; the last one has none."""
     data = tmp_path / "data"
     for side in ("left", "right"):
         shutil.copytree(home / side, data / side)

@@ -69,7 +69,7 @@ def test_the_command_refuses_it_in_a_line(capsys: pytest.CaptureFixture[str]) ->
     words = ["pose", "track", "--cloud", "x", "--split", "test", "--out", "o"]
     assert main(words) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("depthpose: error: --split: has no effect here; it is of a data set")
+    assert line.startswith("depthpose: error: --split: has no effect here; it is of a dataset")
 
 
 @pytest.mark.parametrize(

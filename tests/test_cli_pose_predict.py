@@ -305,7 +305,7 @@ def test_masks_of_a_data_set_are_refused_beside_a_depth_image(
 ) -> None:
     words = ["pose", "predict", *frames(tmp_path), "--weights", str(weights), "--masks", "m.png"]
     assert main([*words, "--out", str(tmp_path / "out")]) == 2
-    assert "--masks: has no effect here; --bop names no data set" in capsys.readouterr().err
+    assert "--masks: has no effect here; --bop names no dataset" in capsys.readouterr().err
 
 
 def test_a_search_without_masks_registers_nothing(
@@ -478,7 +478,7 @@ def test_the_name_of_the_weights_serves_where_the_data_set_has_none(synthetic: B
 def test_a_model_of_another_name_in_the_data_set_is_not_matched_by_its_number(
     synthetic: BopDataset, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    # The data set calls its object 7 bracket and its object 10 bottle.
+    # The dataset calls its object 7 bracket and its object 10 bottle.
     models = [replace(bottle(), number=7)]
     chosen = choose_objects(synthetic, make_method(models), None)
     assert {instance.object_id for instance in chosen.instances} == {10}
@@ -525,7 +525,7 @@ def test_two_processes_share_the_work(
         (["--cloud", ".", "--focal-px", "9"], "Leave --focal-px out"),
         (
             ["--bop", ".", "--focal-px", "9"],
-            "--focal-px: has no effect here; a data set says its cameras",
+            "--focal-px: has no effect here; a dataset says its cameras",
         ),
         (["--cloud", ".", "--object", "bottle"], "no .ply, .pcd, .npy, .xyz, .txt file there"),
         (["--cloud", ".", "--object", "bottle", "--batch", "0"], "--batch 0: at least 1 input"),

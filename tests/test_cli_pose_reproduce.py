@@ -84,7 +84,7 @@ def test_table_3_2_walks_over_the_layout_of_the_thesis(
 def test_table_3_2_is_of_linemod_alone(
     weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    # Its objects bear numbers of LineMOD, as those of most data sets do.
+    # Its objects bear numbers of LineMOD, as those of most datasets do.
     own, plain = make_dataset(tmp_path / "own"), make_linemod(tmp_path / "plain", frame_models())
     words = ["reproduce", "3.2", "--weights", str(weights), "--out", str(tmp_path / "out")]
     for folder, name in ((own.folder, "bracket"), (plain.folder, "obj_000007")):
@@ -92,7 +92,7 @@ def test_table_3_2_is_of_linemod_alone(
         said = capsys.readouterr().err
         assert f"object 7 ({name}, " in said
         assert "is none of LineMOD" in said
-        assert "for other data sets take 'reproduce 3.1'" in said
+        assert "for other datasets take 'reproduce 3.1'" in said
     assert not (tmp_path / "out").exists()
 
 
@@ -134,13 +134,13 @@ def test_table_3_3_votes_on_frames_and_on_synthetic_views(
     ("words", "message"),
     [
         (["--objects", "flange", "--split", "foo"],
-         "--objects and --split: has no effect here; it chooses from a data set"),
+         "--objects and --split: has no effect here; it chooses from a dataset"),
         (["--points", "-5"], "--points -5: give 1 or more, such as 500"),
         (["--points", "60", "60"], "--points 60 is given twice"),
         (["--points"], "--points without a value"),
         (["--synthetic", "0"], "--synthetic 0: give 1 or more, such as 40"),
         (["--synthetic", "2", "--bop", "."],
-             "rendered where no data set is given. Leave --synthetic out"),
+             "rendered where no dataset is given. Leave --synthetic out"),
     ],
 )  # fmt: skip
 def test_options_of_table_3_3_are_never_ignored(

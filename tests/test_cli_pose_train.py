@@ -57,7 +57,7 @@ def test_a_cad_file_becomes_weights_with_a_card(
     [
         (["--cad", "."], "no unit is given, and such a file does not say its own; give --unit mm"),
         ([], "there is no object to learn; name its CAD file (--cad FILE --unit mm)"),
-        (["--data", "."], "--data .: the config learns from no data set"),
+        (["--data", "."], "--data .: the config learns from no dataset"),
         (
             ["--what", "segmentation", "--cad", ".", "--unit", "mm"],
             "--cad has no meaning for 'segmentation', which learns from pictures",

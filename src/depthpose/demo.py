@@ -293,7 +293,7 @@ _TEXT = (
 
 
 def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], list[Section]]:
-    """Pose the parts of a synthetic frame, which is written as a data set.
+    """Pose the parts of a synthetic frame, which is written as a dataset.
 
     One of its parts is written as files of a first command.
 
@@ -313,7 +313,7 @@ def show_poses(out: Path, weights: str | Path) -> tuple[list[dict[str, Any]], li
     )
     frame = next(make_frames(tuple(models.values()), config, 1, first=_FRAME))
 
-    # As a data set, and one part as files.
+    # As a dataset, and one part as files.
     write_bop_models(out / "parts", net.weights.models)
     write_bop_scene(out / "parts", "test", 0, [frame])
     dataset = open_bop(out / "parts")

@@ -269,7 +269,7 @@ def test_a_patch_of_the_right_view_is_erased() -> None:
 
 def test_views_are_degraded_each_on_its_own() -> None:
     pair = street_pair()._replace(right=street_pair().left)
-    config = AugmentConfig(per_view=DegradeConfig(colour=0.3, hue_share=0.0))
+    config = AugmentConfig(per_view=DegradeConfig(color=0.3, hue_share=0.0))
     found = make_views_differ(pair, config, generator(3))
     assert not torch.allclose(found.left, found.right, atol=0.02)
     assert torch.equal(found.left_px.nan_to_num(-1.0), pair.left_px.nan_to_num(-1.0))

@@ -8,7 +8,7 @@ from depthpose.depth.augment import degrade, through_jpeg
 from depthpose.depth.config import DegradeConfig
 
 NOTHING = DegradeConfig(
-    colour=0.0,
+    color=0.0,
     hue_share=0.0,
     haze_share=0.0,
     glare_share=0.0,
@@ -61,7 +61,7 @@ def test_jpeg_loses_more_at_lower_quality() -> None:
     ("changes", "message"),
     [
         ({"blur_share": 1.5}, r"blur_share must be in \[0, 1\]"),
-        ({"colour": 1.0}, r"colour must be in \[0, 1\)"),
+        ({"color": 1.0}, r"color must be in \[0, 1\)"),
         ({"noise": -1.0}, r"noise must be in \[0, inf\)"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Data sets in tar shards: what is read of them is what is read of the folder."""
+"""Datasets in tar shards: what is read of them is what is read of the folder."""
 
 import json
 import os
@@ -167,7 +167,7 @@ def test_what_is_there_is_not_packed_over(
     assert main(["data", "pack", str(pairs), "--out", str(tmp_path / "x"), "--shard-mb", "0"]) == 2
     assert "a shard has a megabyte or more" in capsys.readouterr().err
     assert main(["data", "pack", str(pairs), "--out", str(pairs)]) == 2
-    assert "is the data set itself" in capsys.readouterr().err
+    assert "is the dataset itself" in capsys.readouterr().err
     assert main(["data", "pack", str(home), "--out", str(tmp_path / "x")]) == 2
     assert "is packed already" in capsys.readouterr().err
 

@@ -165,7 +165,7 @@ def test_it_learns_disparity_and_view(held_folder: str, tmp_path: Path, pairs: P
         adam=AdamConfig(learning_rate=4e-3),
         pairs=dataclasses.replace(pairs, with_cache=True),
         held_out=dataclasses.replace(pairs, folders=(held_folder,), limit=1),
-        degrade=DegradeConfig(colour=0.0, hue_share=0.0, haze_share=0.0, glare_share=0.0),
+        degrade=DegradeConfig(color=0.0, hue_share=0.0, haze_share=0.0, glare_share=0.0),
         loop=dataclasses.replace(LOOP, steps=80, log_every_steps=10),
     )
     path = train_select(config, TrainingRun(folder=tmp_path))

@@ -392,7 +392,7 @@ def _bop() -> dict[str, Kind]:
 
 
 def open_bop_results(home: Path) -> dict[str, Kind]:
-    """Results, detections and predictions of a data set."""
+    """Results, detections and predictions of a dataset."""
     from tests.pose.synthetic_frames import pose_in_frame
 
     from depthpose.pose.datasets import Detection, write_detections

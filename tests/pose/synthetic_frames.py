@@ -1,4 +1,4 @@
-"""A small data set of synthetic frames in BOP's layout, and estimates of any quality."""
+"""A small dataset of synthetic frames in BOP's layout, and estimates of any quality."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""BOP's average precision of 6D detection, and the layout of its data sets of several sensors."""
+"""BOP's average precision of 6D detection, and the layout of its datasets of several sensors."""
 
 import json
 from collections.abc import Callable
@@ -125,7 +125,7 @@ def test_errors_are_skipped_only_where_they_are_beyond_the_limits(
 
 
 def sensors(folder: Path) -> Path:
-    """The files of a data set as BOP-Industrial names them: two sensors with depth, one without."""
+    """The files of a dataset as BOP-Industrial names them: two sensors with depth, one without."""
     make_dataset(folder, frames=2)
     scene = folder / "test" / "000001"
     names = {"depth": "depth", "rgb": "gray", "mask": "mask", "mask_visib": "mask_visib"}

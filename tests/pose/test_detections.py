@@ -194,7 +194,7 @@ def test_detections_find_their_images() -> None:
     with pytest.raises(InputError, match="entry 0 does not say of which image it is"):
         group_by_image([detection_of("gear")], ["x", "y"], "d.json")
     scenes = [Detection(object="gear", box=box, scene_id=k, image_id=1) for k in (1, 2)]
-    with pytest.raises(InputError, match="detections of several scenes; name the data set by --b"):
+    with pytest.raises(InputError, match="detections of several scenes; name the dataset by --b"):
         group_by_image(scenes, ["x"], "d.json")
 
 

@@ -145,7 +145,7 @@ def test_the_csv_has_no_row_of_a_refusal_but_its_time(tmp_path: Path) -> None:
     write_bop_results(path, sent, with_alternatives=True)
     scores = [(p.place, p.estimate.inlier_share) for p in read_bop_results(path)]
     assert scores == [((1, 20, 6), 0.5), ((1, 20, 6), 0.375), ((2, 0, 6), 0.75)]
-    with pytest.raises(InputError, match="a: belongs to no scene of a BOP data set"):
+    with pytest.raises(InputError, match="a: belongs to no scene of a BOP dataset"):
         write_bop_results(path, [Prediction(estimate=answer())])
 
 

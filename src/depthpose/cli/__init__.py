@@ -31,10 +31,10 @@ COMMANDS = {
         "doctor:doctor", "what is installed, and a test of depth and pose; or what files are"),
     "serve": ("serve:serve", "depth and poses by a page in your browser, on this machine"),
     "pose predict": (
-        "pose.commands:predict_poses", "a cloud, a masked depth image, or a data set, to poses"),
+        "pose.commands:predict_poses", "a cloud, a masked depth image, or a dataset, to poses"),
     "pose track": ("pose.commands:track_object", "follow an object through depth images or clouds"),
     "pose train": ("train:train_pose", "your CAD file, or a config, to a network that poses it"),
-    "pose evaluate": ("pose.commands:evaluate_poses", "measure poses on a BOP or LineMOD data set"),
+    "pose evaluate": ("pose.commands:evaluate_poses", "measure poses on a BOP or LineMOD dataset"),
     "depth match": ("depth.commands:match_pairs", "a real stereo pair, or many, to metric depth"),
     "depth predict": (
         "depth.commands:predict_depth", "one image, or many, or a video, to metric depth"),
@@ -56,13 +56,13 @@ COMMANDS = {
     "data split": (
         "data.pairs:split_pairs",
         "pictures and videos that hold both views to a left and a right folder"),
-    "data check": ("data.commands:check_dataset", "read a whole data set and list what is wrong"),
+    "data check": ("data.commands:check_dataset", "read a whole dataset and list what is wrong"),
     "data label": (
         "data.commands:label_dataset",
         "truth for pairs that have none, by a matcher, where both views agree"),
     "data pack": (
         "data.commands:pack_dataset",
-        "a data set as tar shards: few large files, from a disk or a store"),
+        "a dataset as tar shards: few large files, from a disk or a store"),
     "weights list": ("weights:list_weights", "list the weights"),
     "weights show": ("weights:show_weights", "print what a weights file holds"),
     "weights pack": ("weights:pack_weights", "one file of a generator and a matcher, with a card"),
@@ -90,7 +90,7 @@ _TITLES = {
     "demo doctor serve": "to begin",
     "pose": "poses from a depth sensor",
     "depth": "depth from images",
-    "data": "data sets",
+    "data": "datasets",
     "weights export": "weights",
     "reproduce figure": "the tables and figures of the thesis",
 }

@@ -96,7 +96,7 @@ def _has_no_matcher_network(typed: TypedOptions) -> bool:
 
 
 def _are_models_folders(typed: TypedOptions) -> bool:
-    """Whether ``--models`` names the folder of a data set, and no model file."""
+    """Whether ``--models`` names the folder of a dataset, and no model file."""
     return all(Path(word).is_dir() for word in typed["models"])
 
 
@@ -180,25 +180,25 @@ _RULES = (
         commands=_POSE,
         when=any_typed("bop"),
         ignored=("mask", "box", "detections", "labels", "camera", "focal-px", "unit"),
-        reason="a data set says its cameras and units itself, and its masks are chosen by --masks",
+        reason="a dataset says its cameras and units itself, and its masks are chosen by --masks",
     ),
     _Rule(
         commands=_POSE,
         when=any_typed("bop"),
         ignored=("base-from-camera",),
-        reason="the cameras of a data set move",
+        reason="the cameras of a dataset move",
     ),
     _Rule(
         commands=("pose predict",),
         when=both(any_typed("bop"), _is_on_ray),
         ignored=("engine",),
-        reason="a data set is posed by this process, or shared by those of torchrun",
+        reason="a dataset is posed by this process, or shared by those of torchrun",
     ),
     _Rule(
         commands=("pose predict",),
         when=none_typed("bop"),
         ignored=("split", "masks", "targets"),
-        reason="--bop names no data set; the mask of a depth image is given by --mask",
+        reason="--bop names no dataset; the mask of a depth image is given by --mask",
     ),
     _Rule(
         commands=_POSE,
@@ -266,13 +266,13 @@ _RULES = (
         commands=("pose track",),
         when=none_typed("bop"),
         ignored=("split",),
-        reason="it is of a data set; give --bop",
+        reason="it is of a dataset; give --bop",
     ),
     _Rule(
         commands=("pose track",),
         when=any_typed("bop"),
         ignored=("first",),
-        reason="a data set has many sequences and one pose is given; give the frames of one by"
+        reason="a dataset has many sequences and one pose is given; give the frames of one by"
         " --depth",
     ),
     _Rule(
@@ -375,25 +375,25 @@ _RULES = (
         commands=("weights complete",),
         when=_are_models_folders,
         ignored=("unit",),
-        reason="the models of a data set are in mm; --unit is for a model file",
+        reason="the models of a dataset are in mm; --unit is for a model file",
     ),
     _Rule(
         commands=_POSES_OF_THESIS,
         when=none_typed("linemod", "bop"),
         ignored=("objects", "split"),
-        reason="it chooses from a data set, and none is named; give --linemod or --bop",
+        reason="it chooses from a dataset, and none is named; give --linemod or --bop",
     ),
     _Rule(
         commands=_POSES_OF_THESIS,
         when=any_typed("linemod"),
         ignored=("bop",),
-        reason="--linemod names the data set, and one is measured",
+        reason="--linemod names the dataset, and one is measured",
     ),
     _Rule(
         commands=("reproduce 3.3",),
         when=any_typed("linemod", "bop"),
         ignored=("synthetic",),
-        reason="views are rendered where no data set is given",
+        reason="views are rendered where no dataset is given",
     ),
 )
 """Looked through in this order; the first rule that applies gives the reason."""

@@ -327,7 +327,7 @@ def train_pose(
         unit: of the numbers in the files.
         symmetries: found: detect symmetries of the part and count equivalent poses as one; by
             default they are only printed.
-        data: folder of a data set; it takes the place of the config's, for models and frames.
+        data: folder of a dataset; it takes the place of the config's, for models and frames.
         what: pose: the network of directions; segmentation: its masks; the others are baselines.
         start: weights to begin with, by name or file. A CAD file without a config begins with
             'parts'; 'nothing' begins anew and takes twice the steps.
@@ -376,18 +376,18 @@ def _with_models(
     models = replace_unless_none(config.models, cad=cad or None, unit=unit)
     if symmetries is not None:
         models = replace(models, with_found_symmetries=symmetries == "found")
-    if cad:  # they take the place of a data set's models
+    if cad:  # they take the place of a dataset's models
         models = replace(models, bop=None, objects=(), parts=())
     return replace(config, models=models)
 
 
 def _with_dataset(config: Any, folder: str) -> Any:  # noqa: ANN401 - of any training of poses
-    """Return the config of a training of poses with the models and frames of another data set.
+    """Return the config of a training of poses with the models and frames of another dataset.
 
-    Only the parts that the config takes from a data set are changed.
+    Only the parts that the config takes from a dataset are changed.
 
     Raises:
-        InputError: the config takes nothing from a data set.
+        InputError: the config takes nothing from a dataset.
     """
     # Trainings on views have models (``bop`` is None where they are CAD files) and frames (None
     # where all views are synthetic); their held-out views are synthetic, of no folder. That of the
@@ -401,6 +401,6 @@ def _with_dataset(config: Any, folder: str) -> Any:  # noqa: ANN401 - of any tra
         if hasattr(part, "folder"):
             changes[name] = replace(part, folder=folder)
     if not changes:
-        message = "the config learns from no data set; see --cad and --what"
+        message = "the config learns from no dataset; see --cad and --what"
         raise InputError(f"--data {folder}: {message}")
     return replace(config, **changes)

@@ -213,7 +213,7 @@ def complete_weights(
 
     Args:
         weights: a file, or the name of weights that came with the package.
-        models: folder of the data set in BOP's layout, whose models the weights were trained on; or
+        models: folder of the dataset in BOP's layout, whose models the weights were trained on; or
             the model file of a single object.
         out: the .safetensors file to write; every other command takes it.
         unit: of a model file; BOP's are in mm.
@@ -235,7 +235,7 @@ def complete_weights(
     else:
         raise InputError(
             f"--models {models}: one file serves weights of one object, and {path} knows "
-            f"{len(numbers)}; give the folder of the data set that it was trained on"
+            f"{len(numbers)}; give the folder of the dataset that it was trained on"
         )
     complete(path, meshes, out)
     return show_weights(str(out))

@@ -1,4 +1,4 @@
-"""The report of the check of a data set: problems and notices, one line each."""
+"""The report of the check of a dataset: problems and notices, one line each."""
 
 from contextlib import suppress
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ _LFS_POINTER = b"version https://git-lfs"
 
 @dataclass(frozen=True, kw_only=True)
 class Problem:
-    """A fault of a data set, or with the kind ``note`` a fact worth knowing."""
+    """A fault of a dataset, or with the kind ``note`` a fact worth knowing."""
 
     path: Path  #: the file or folder
     kind: str  #: ``missing``, ``unreadable``, ``mismatch``, ``empty`` or ``note``

@@ -46,7 +46,7 @@ def degrade(image: View, config: DegradeConfig, generator: torch.Generator) -> V
     """
     if _happens(config.hue_share, generator):
         image = image[torch.randperm(3, generator=generator)]
-    image = _change_colours(image, config.colour, generator)
+    image = _change_colors(image, config.color, generator)
     if _happens(config.haze_share, generator):
         haze = torch.full_like(image, _draw_between(*_HAZE_BRIGHTNESS, generator))
         image = torch.lerp(image, haze, _draw_between(*_HAZE_DENSITY, generator))
@@ -73,7 +73,7 @@ def _happens(probability: float, generator: torch.Generator) -> bool:
     return float(torch.rand((), generator=generator)) < probability
 
 
-def _change_colours(image: View, strength: float, generator: torch.Generator) -> View:
+def _change_colors(image: View, strength: float, generator: torch.Generator) -> View:
     """Change exposure, contrast, saturation, gamma and tint of an image at random.
 
     Each is scaled by a factor within 1 +- ``strength``, the tint within 1 +- a third of it.

@@ -130,7 +130,7 @@ class NearestImageBaseline:
     as far.
     """
 
-    dataset: Dataset  #: data set of the training
+    dataset: Dataset  #: dataset of the training
     indices: list[int]  #: indices of its frames that have truth and a rig
     #: thumbnails of the left images of these frames, each with mean 0 and norm 1
     thumbnails: Float[Tensor, "n d"]

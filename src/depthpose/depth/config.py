@@ -26,7 +26,7 @@ _DISPARITY_PX = "[0.01, 16384]"
 class DegradeConfig(Settings):
     """Augmentation of the input image alone, for transfer from synthetic to real images."""
 
-    colour: Annotated[float, "[0, 1)"] = 0.35
+    color: Annotated[float, "[0, 1)"] = 0.35
     """Exposure, contrast, saturation and gamma are each scaled by up to 1 +- this, each channel by
     up to 1 +- a third of it."""
 

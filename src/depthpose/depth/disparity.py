@@ -105,7 +105,7 @@ def _find_mistake(
 
 
 def _give_notice_once(statement: str, question: str) -> None:
-    """Give a notice about a prediction, once for all frames of a data set.
+    """Give a notice about a prediction, once for all frames of a dataset.
 
     ``statement`` goes on from "a prediction"; ``question`` asks for a mistake.
     """

@@ -242,7 +242,7 @@ def summarise(
 
 
 def _make_mean_row(name: str, protocol: str, at_cap: Sequence[FrameMetrics]) -> EvaluationRow:
-    """Make the row of the means over the frames of the data set ``name``, measured at one cap.
+    """Make the row of the means over the frames of the dataset ``name``, measured at one cap.
 
     Raises:
         InputError: no pixel was compared.
@@ -265,7 +265,7 @@ def _make_decile_rows(
 ) -> list[EvaluationRow]:
     """Make the rows of the mean errors of tenths of the pixels, from the least confidence up.
 
-    There is none where no frame of the data set ``name`` has a confidence.
+    There is none where no frame of the dataset ``name`` has a confidence.
     """
     with_confidence = [metrics.deciles for metrics in at_cap if metrics.deciles is not None]
     if not with_confidence:

@@ -180,8 +180,8 @@ def plane_loss(
 
 def view_loss(synthesised: Views, real: Views) -> Float[Tensor, " b"]:
     """Compute L1 of each synthesised view plus L1 of its horizontal gradient."""
-    colour_loss = (synthesised - real).abs().mean((1, 2, 3))
+    color_loss = (synthesised - real).abs().mean((1, 2, 3))
     synthesised_gradient = synthesised[..., 1:] - synthesised[..., :-1]
     real_gradient = real[..., 1:] - real[..., :-1]
     gradient_loss = (synthesised_gradient - real_gradient).abs().mean((1, 2, 3))
-    return colour_loss + gradient_loss
+    return color_loss + gradient_loss

@@ -246,7 +246,7 @@ def _resize_to_truth(true_px: Map, stored_px: Float[Tensor, "_ _"], path: Path) 
     if rows <= height and columns <= width:
         _refuse_crop(true_px, stored_px, stretched_px, f"{path}: is {sizes}")
     if sizes not in _noticed_sizes:
-        _noticed_sizes.add(sizes)  # once for all frames of a data set
+        _noticed_sizes.add(sizes)  # once for all frames of a dataset
         message = (
             f"{path}: is {sizes}, of another aspect, so it is stretched, which is right for a "
             "squeezed image; of a cropped one, paste the result into a map of the image's size "

@@ -125,8 +125,8 @@ def _count_first_rows(lowest: Float[Tensor, "3 rows"], highest: Float[Tensor, "3
     count = int(is_like_first.long().cumprod(0).sum())
     if count == rows or count < max(2, _MIN_BAR_SHARE * rows):
         return 0
-    has_colours_after = float((highest - lowest)[:, count].amax()) > _MAX_VARIATION
-    return count if has_colours_after else 0
+    has_colors_after = float((highest - lowest)[:, count].amax()) > _MAX_VARIATION
+    return count if has_colors_after else 0
 
 
 def measure_texture(image: Float[Tensor, "3 h w"]) -> Float[Tensor, "h w"]:

@@ -211,7 +211,7 @@ class EvaluationConfig(Settings):
     """How estimates are measured against the truth."""
 
     diameters: DiameterTable = "bop"
-    """Whose diameters a success is a tenth of: those that the data set declares (``bop``), or
+    """Whose diameters a success is a tenth of: those that the dataset declares (``bop``), or
     PVNet's of LineMOD, which differ by up to 16 %."""
 
     adds: SymmetryRule = "declared"

@@ -59,7 +59,7 @@ _PLACE = ("scene_id", "im_id", "obj_id")  # keys of a :class:`Place` in a file
 
 
 class Place(NamedTuple):
-    """The scene, image and object of a BOP data set that an estimate is of."""
+    """The scene, image and object of a BOP dataset that an estimate is of."""
 
     scene_id: int  #: number of the scene
     image_id: int  #: number of the image in it
@@ -68,10 +68,10 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Prediction:
-    """An estimate, or a refusal, and its place in a data set."""
+    """An estimate, or a refusal, and its place in a dataset."""
 
     estimate: PoseEstimate  #: by the annotated mask of an instance it has the instance's name
-    place: Place | None = None  #: scene, image and object; None for an input of no data set
+    place: Place | None = None  #: scene, image and object; None for an input of no dataset
 
 
 class Predictions(list[Prediction]):
@@ -502,10 +502,10 @@ def make_detection_jobs(
     Args:
         dataset: with the instances.
         names: of the objects in the estimator, by number.
-        detections: those of images that are not in the data set are left out.
+        detections: those of images that are not in the dataset are left out.
 
     Raises:
-        InputError: a detection lacks its scene, image or object, or none is of the data set.
+        InputError: a detection lacks its scene, image or object, or none is of the dataset.
     """
     # The best detections of each object in each image.
     instances_of_place: dict[Place, list[Instance]] = defaultdict(list)
@@ -516,7 +516,7 @@ def make_detection_jobs(
         if detection.scene_id is None or detection.image_id is None or detection.object_id is None:
             raise InputError(
                 f"{dataset.folder}: a detection of {detection.label!r} lacks scene_id, image_id or "
-                "category_id; detections of a data set have all three"
+                "category_id; detections of a dataset have all three"
             )
         place = Place(detection.scene_id, detection.image_id, detection.object_id)
         if len(best_of_place[place]) < len(instances_of_place.get(place, ())):
@@ -578,7 +578,7 @@ _TIME_SLACK_S = 0.001  # BOP's toolkit refuses rows of an image whose times diff
 
 
 def name_bop_results(dataset: BopDataset, method: str = "depthpose") -> str:
-    """Name the BOP csv of a data set: ``METHOD_DATASET-SPLIT.csv``."""
+    """Name the BOP csv of a dataset: ``METHOD_DATASET-SPLIT.csv``."""
     # BOP's toolkit splits names at _, which a split such as test_primesense may hold.
     split = dataset.folder_of_split.replace("_", "-")
     return f"{method}_{dataset.folder.resolve().name}-{split}.csv"
@@ -675,7 +675,7 @@ def write_bop_results(
 
     Args:
         path: of the csv. Numbers keep all their digits.
-        predictions: with places in a data set.
+        predictions: with places in a dataset.
         with_alternatives: write a row for each alternative too, with its probability as the score.
             Leave them out of a csv that is measured: BOP takes the best rows of an image.
 
@@ -700,7 +700,7 @@ def write_bop_results(
             continue
         if place is None:
             raise InputError(
-                f"{estimate.name}: belongs to no scene of a BOP data set, and its csv is of such; "
+                f"{estimate.name}: belongs to no scene of a BOP dataset, and its csv is of such; "
                 "leave it out"
             )
         scored_poses = [(estimate.camera_from_model, score_of(estimate))]

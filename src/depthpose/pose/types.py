@@ -82,7 +82,7 @@ class PoseTruth:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CloudSample:
-    """A cloud of a data set and its truth."""
+    """A cloud of a dataset and its truth."""
 
     input: CloudInput  #: the cloud
     truth: PoseTruth  #: the true pose of its object

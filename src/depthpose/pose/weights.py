@@ -156,7 +156,7 @@ def complete_weights(path: Path, meshes: Mapping[int, ObjectModel], out: Path) -
         if number not in meshes:
             raise InputError(
                 f"{path}: knows object {number} ({record['name']}), but there is no such model "
-                f"among {sorted(meshes)}. Give the data set that it was trained on."
+                f"among {sorted(meshes)}. Give the dataset that it was trained on."
             )
 
         # Is the mesh that of the object that was trained on?
@@ -264,7 +264,7 @@ def read_pose_weights(path: Path) -> PoseWeights:
         raise InputError(
             f"{path}: came without its objects' meshes, which their licence keeps back. Put them "
             f"in once: depthpose weights complete {label} --models FOLDER --out "
-            f"{quote(path.stem + '-complete.safetensors')}, with the data set's folder."
+            f"{quote(path.stem + '-complete.safetensors')}, with the dataset's folder."
         )
 
     # The objects.

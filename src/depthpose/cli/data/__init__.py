@@ -1,1 +1,1 @@
-"""``depthpose data ...``: data sets that are made, checked, packed and labelled."""
+"""``depthpose data ...``: datasets that are made, checked, packed and labelled."""

@@ -1,4 +1,4 @@
-"""``depthpose data check``, ``data pack`` and ``data label``: data sets that exist."""
+"""``depthpose data check``, ``data pack`` and ``data label``: datasets that exist."""
 
 import sys
 from dataclasses import asdict
@@ -13,7 +13,7 @@ from depthpose.core.errors import InputError
 def check_dataset(
     path: tyro.conf.Positional[Path], split: str | None = None, with_decoding: bool = True
 ) -> int:
-    """Read a data set and list everything that is wrong: pairs, KITTI, Middlebury, BOP, LineMOD.
+    """Read a dataset and list everything that is wrong: pairs, KITTI, Middlebury, BOP, LineMOD.
 
     A line for each missing, truncated or wrong file, and a summary. Exit code 0: nothing wrong. 1:
     something is. 2: the layout of the folder is unknown.
@@ -49,15 +49,15 @@ def check_dataset(
 def pack_dataset(
     path: tyro.conf.Positional[Path], out: NewPath, split: str | None = None, shard_mb: int = 256
 ) -> int:
-    """Pack a data set of images, pairs and their truth into tar shards, in WebDataset's form.
+    """Pack a dataset of images, pairs and their truth into tar shards, in WebDataset's form.
 
-    OUT, or a URL of its copy (s3://, gs://), is used as any data set; a URL's shards are cached in
+    OUT, or a URL of its copy (s3://, gs://), is used as any dataset; a URL's shards are cached in
     ~/.cache/depthpose or $DEPTHPOSE_CACHE. Files are unchanged. Interrupted, packing begins again.
 
         depthpose data pack KITTI --split eigen-train-val --out shards
 
     Args:
-        path: the data set's folder.
+        path: the dataset's folder.
         out: a new folder for shards, calibration and index.
         split: pack these frames alone.
         shard_mb: size from which on the next shard begins [1e6 bytes].
@@ -71,13 +71,13 @@ def pack_dataset(
         raise InputError(f"--shard-mb {shard_mb}: a shard has a megabyte or more; take 256")
     dataset = open_dataset(path, split)
     refuse_to_replace(out / "index.json")
-    # The images of packed data sets lie in tar files.
+    # The images of packed datasets lie in tar files.
     first_folders = [folder for frame in dataset.frames[:1] for folder in frame.left.parents]
     if any(folder.suffix == ".tar" for folder in first_folders):
         raise InputError(f"{path}: is packed already; give the folder that it was made of")
     if out.resolve() == path.resolve():
         raise InputError(
-            f"--out {out}: is the data set itself, which would be read as packed from then on; "
+            f"--out {out}: is the dataset itself, which would be read as packed from then on; "
             "choose another folder"
         )
     with tqdm(total=len(dataset), unit=" frames", disable=None) as bar:

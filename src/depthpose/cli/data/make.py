@@ -1,4 +1,4 @@
-"""``depthpose data make ...``: synthetic data sets."""
+"""``depthpose data make ...``: synthetic datasets."""
 
 import re
 from collections.abc import Sequence
@@ -162,7 +162,7 @@ def make_objects(
         out: folder to write to.
         unit: of the numbers in the files.
         number: how many frames.
-        split: name of the part of the data set.
+        split: name of the part of the dataset.
         seed: of the random frames.
         distance: nearest and farthest view [m].
         sensor: kind of depth sensor whose errors are simulated.
@@ -267,13 +267,13 @@ def _render_scene(
     split: str,
     scene: int,
 ) -> None:
-    """Render the frames of a scene, and write them into a split of a data set in BOP's layout.
+    """Render the frames of a scene, and write them into a split of a dataset in BOP's layout.
 
     Args:
         models: the objects.
         config: how their frames are drawn.
         frames: the numbers of the frames.
-        out: folder of the data set.
+        out: folder of the dataset.
         split: name of the split.
         scene: number of the scene.
     """

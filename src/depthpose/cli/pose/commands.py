@@ -19,13 +19,13 @@ def predict_poses(
     estimates: options.EstimateOptions = options.EstimateOptions(),
     engine: EngineOptions = EngineOptions(),
 ) -> int:
-    """Pose known objects from clouds, depth images, pairs or a data set, or say why not.
+    """Pose known objects from clouds, depth images, pairs or a dataset, or say why not.
 
     poses.json holds for each input camera_from_model (metres), its covariance (about this answer
     alone), its certainty, the alternatives that fit as well with their probabilities, status and
     reason, and the seconds of each stage.
     A cloud or depth image NAME gives NAME.pose.ply, the posed model beside the cloud, and
-    NAME.pose.png over the depth image; a data set gives depthpose_DATASET-SPLIT.csv, if there
+    NAME.pose.png over the depth image; a dataset gives depthpose_DATASET-SPLIT.csv, if there
     are alternatives depthpose-alternatives_DATASET-SPLIT.csv, and SCENE_IMAGE.pose.png. report.html
     shows some of them in 3D, and every refusal. A rerun skips what is finished; other settings need
     another --out; only files of the same run are overwritten. Processes of torchrun share the work.
@@ -58,7 +58,7 @@ def predict_poses(
     if kind_count != 1:
         raise InputError(
             f"{kind_count} of --cloud, --depth, --left and --bop are given; give one: a cloud, a "
-            "depth image with --mask and --camera, a pair with --camera, or a data set"
+            "depth image with --mask and --camera, a pair with --camera, or a dataset"
         )
     if pair.left is not None:
         from depthpose.cli.pose.pairs import match_pairs_for_poses
@@ -81,7 +81,7 @@ def predict_poses(
         return predict_poses_on_ray(pose_inputs, spec, batch, out, engine)
     method = spec.build()
 
-    # Pose a data set, or search whole images, or pose clouds and masked parts of images.
+    # Pose a dataset, or search whole images, or pose clouds and masked parts of images.
     out_folder = Path(out)
     if dataset.bop is not None:
         if pose_inputs.color is not None:
@@ -113,7 +113,7 @@ def evaluate_poses(
     adds: SymmetryRule = "declared",
     estimates: options.PoseMeasureOptions = options.PoseMeasureOptions(vsd=True),
 ) -> int:
-    """Measure poses on a BOP or Linemod_preprocessed data set, and write rows, a table and a page.
+    """Measure poses on a BOP or Linemod_preprocessed dataset, and write rows, a table and a page.
 
     Predictions are made once, as files in OUT/predictions/METHOD_MASKS (poses.json and BOP's csv),
     and measured from there; a second run measures without predicting anew. Several weights and
@@ -123,7 +123,7 @@ def evaluate_poses(
         depthpose pose evaluate --bop lm --split test --weights W.safetensors --out out/lm
 
     Args:
-        bop: folder of the data set.
+        bop: folder of the dataset.
         out: folder for rows.json, rows.csv, table.md, report.html, instances.csv and predictions.
         split: train, test, ...
         weights: files or names, of the method or of a baseline; also register (registration
@@ -170,7 +170,7 @@ def track_object(
     frames: options.SequenceOptions = options.SequenceOptions(),
     register: options.RegisterOptions = options.RegisterOptions(),
 ) -> int:
-    """Follow a known object through depth images, clouds or the scenes of a data set.
+    """Follow a known object through depth images, clouds or the scenes of a dataset.
 
     Each frame starts from the pose of the one before and needs ICP alone. Where the depth
     contradicts the pose, the object is detected again in that frame; where that fails too,

@@ -1,4 +1,4 @@
-"""Which objects of a data set a method poses, and the settings that identify the data set."""
+"""Which objects of a dataset a method poses, and the settings that identify the dataset."""
 
 import sys
 from collections.abc import Sequence
@@ -10,11 +10,11 @@ from depthpose.pose import datasets
 from depthpose.pose.types import ObjectModel
 
 _SAME_DIAMETER = 0.05
-"""Largest relative difference of the diameters of one object in a data set and in weights."""
+"""Largest relative difference of the diameters of one object in a dataset and in weights."""
 
 
 def dataset_settings(dataset: datasets.BopDataset) -> dict[str, Any]:
-    """List the settings that identify a data set, wherever its folder lies."""
+    """List the settings that identify a dataset, wherever its folder lies."""
     return {
         "dataset": dataset.folder.resolve().name,
         "split": dataset.split,
@@ -23,10 +23,10 @@ def dataset_settings(dataset: datasets.BopDataset) -> dict[str, Any]:
 
 
 def match_names(dataset: datasets.BopDataset, models: Sequence[ObjectModel]) -> dict[int, str]:
-    """Match the objects of a data set to a method's, by name, else by number.
+    """Match the objects of a dataset to a method's, by name, else by number.
 
     Returns:
-        The method's name of each object, by the object's number in the data set.
+        The method's name of each object, by the object's number in the dataset.
 
     Raises:
         InputError: the method has no such object, or one of another diameter.
@@ -54,13 +54,13 @@ def match_names(dataset: datasets.BopDataset, models: Sequence[ObjectModel]) -> 
 def _match_models(
     dataset: datasets.BopDataset, models: Sequence[ObjectModel]
 ) -> dict[int, ObjectModel]:
-    """Match the objects of a data set to a method's models.
+    """Match the objects of a dataset to a method's models.
 
-    A model matches by the object's name; else by its number, unless the data set has another object
+    A model matches by the object's name; else by its number, unless the dataset has another object
     of the model's name.
 
     Returns:
-        The model of each object that has one, by the object's number in the data set.
+        The model of each object that has one, by the object's number in the dataset.
     """
     names_in_dataset = set(datasets.read_object_names(dataset.folder).values())
     by_name = {model.name: model for model in models}
@@ -76,7 +76,7 @@ def _match_models(
 def choose_objects(
     dataset: datasets.BopDataset, method: PoseMethod, object: str | None
 ) -> datasets.BopDataset:
-    """Restrict a data set to the objects that a method has, or to the one named.
+    """Restrict a dataset to the objects that a method has, or to the one named.
 
     Objects that the method does not have are printed. ``object``: name or number; None: all.
 
@@ -88,7 +88,7 @@ def choose_objects(
         names_in_dataset = datasets.read_object_names(dataset.folder).values()
         if object not in names_in_dataset and object in numbers:
             return dataset.of_objects(numbers[object])  # the method's own name of the object
-        return dataset.of_objects(object)  # the data set's name or number of it
+        return dataset.of_objects(object)  # the dataset's name or number of it
 
     object_ids = sorted({instance.object_id for instance in dataset.instances})
     matched_models = _match_models(dataset, method.models)

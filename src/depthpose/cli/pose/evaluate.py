@@ -69,7 +69,7 @@ def open_instances(
     """Open the instances of a split, restricted to targets and objects; print how many there are.
 
     Args:
-        bop: folder of the data set.
+        bop: folder of the dataset.
         split: name of the split.
         objects: names or numbers of those to keep; empty: all.
         targets: BOP's list of targets; None: all instances.
@@ -128,7 +128,7 @@ def measure_predictions(
         config: how they are measured.
 
     Raises:
-        InputError: predictions are of another data set or split, or two of them have one origin.
+        InputError: predictions are of another dataset or split, or two of them have one origin.
     """
     evaluations: list[Evaluation] = []
     with_progress = partial(tqdm, unit=" instances", disable=None)
@@ -142,7 +142,7 @@ def measure_predictions(
 
 
 def _refuse_other_dataset(path: Path, dataset: BopDataset) -> None:
-    """Refuse a folder of predictions whose record names another data set or split."""
+    """Refuse a folder of predictions whose record names another dataset or split."""
     recorded = (read_settings(path) if path.is_dir() else None) or {}
     for key, value in dataset_settings(dataset).items():
         if recorded.get(key, value) != value:

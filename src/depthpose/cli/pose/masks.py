@@ -1,4 +1,4 @@
-"""Masks of a data set by their names: annotated, published, detected or segmented ones."""
+"""Masks of a dataset by their names: annotated, published, detected or segmented ones."""
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -25,7 +25,7 @@ from depthpose.pose.types import ViewInput
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Masks:
-    """One kind of masks of a data set."""
+    """One kind of masks of a dataset."""
 
     name: str  #: name in tables
     #: makes a job for each mask, given the method's names of the objects by their numbers
@@ -41,7 +41,7 @@ def prepare_masks(
     Args:
         kinds: each ``truth`` (annotated masks), ``predicted`` (those that came with
             Linemod_preprocessed), a JSON file of BOP detections, or weights of a segmentation.
-        dataset: data set whose instances are masked.
+        dataset: dataset whose instances are masked.
         out: folder of the run; segmented masks are written below it.
         device: device that segments.
     """
@@ -72,7 +72,7 @@ def _take_detected_masks(
 
 
 def _take_predicted_masks(dataset: datasets.BopDataset) -> Masks:
-    """Take the masks that a segmentation network left in the data set, as it was published."""
+    """Take the masks that a segmentation network left in the dataset, as it was published."""
     predicted_mask = datasets.LAYOUTS[dataset.layout].predicted_mask
     if predicted_mask is None:
         raise InputError(
@@ -88,7 +88,7 @@ def find_mask_file(kind: str) -> Path | None:
 
     Returns:
         The file of detections, or of weights; None for ``truth`` and ``predicted``, which are in
-        the data set.
+        the dataset.
     """
     if kind in ("truth", "predicted"):
         return None
@@ -98,7 +98,7 @@ def find_mask_file(kind: str) -> Path | None:
 def _segment_dataset(
     path: Path, name: str, dataset: datasets.BopDataset, out: Path, device: str
 ) -> list[datasets.Detection]:
-    """Segment the images of a data set by weights, except those that an earlier run segmented.
+    """Segment the images of a dataset by weights, except those that an earlier run segmented.
 
     Detections of all objects of the weights are written to ``OUT/detections/NAME.json``, so that a
     later run may ask for other objects, or for more images.
@@ -106,7 +106,7 @@ def _segment_dataset(
     Args:
         path: file of the weights.
         name: name of the masks.
-        dataset: data set whose images are segmented.
+        dataset: dataset whose images are segmented.
         out: folder of the run.
         device: device that segments.
 
@@ -146,15 +146,15 @@ def _segment_dataset(
 def _match_numbers(
     segmenter: Segmenter, dataset: datasets.BopDataset, path: Path
 ) -> dict[str, int]:
-    """Match the objects of a segmentation to those of a data set: by name, else by number.
+    """Match the objects of a segmentation to those of a dataset: by name, else by number.
 
-    Objects of the data set that are not segmented are printed. ``path``: the weights, for errors.
+    Objects of the dataset that are not segmented are printed. ``path``: the weights, for errors.
 
     Returns:
-        The number of each object in the data set, by its name in the weights.
+        The number of each object in the dataset, by its name in the weights.
 
     Raises:
-        InputError: no object of the data set is segmented.
+        InputError: no object of the dataset is segmented.
     """
     names = datasets.read_object_names(dataset.folder)
     number_by_name = {name: number for number, name in names.items()}
@@ -191,9 +191,9 @@ def _read_segmented_images(path: Path) -> set[tuple[int, int]]:
 def _segment_image(
     segmenter: Segmenter, instance: datasets.Instance, numbers: Mapping[str, int]
 ) -> list[datasets.Detection]:
-    """Segment the image of an instance into detections of objects of the data set.
+    """Segment the image of an instance into detections of objects of the dataset.
 
-    ``numbers``: number of each object in the data set, by its name in the weights.
+    ``numbers``: number of each object in the dataset, by its name in the weights.
 
     Raises:
         InputError: the image has no colour picture.

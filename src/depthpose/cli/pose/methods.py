@@ -288,15 +288,15 @@ def make_method_spec(
     *,
     is_registration: bool,
 ) -> PoseMethodSpec:
-    """Make the spec of an estimator: of a network, or of models of a data set or of CAD files.
+    """Make the spec of an estimator: of a network, or of models of a dataset or of CAD files.
 
     Args:
         weights: name or file of the weights of a network.
         parts: CAD files, their unit and their symmetries.
         unit: unit of CAD files where ``parts`` has none.
-        dataset: data set whose models are registered where there is one.
+        dataset: dataset whose models are registered where there is one.
         config: settings of the estimator.
-        base: words of ``--base-from-camera``; none where a data set is posed.
+        base: words of ``--base-from-camera``; none where a dataset is posed.
         is_registration: register models, without the network.
 
     Raises:
@@ -307,12 +307,12 @@ def make_method_spec(
     if parts.symmetry and not (is_registration and parts.cad):
         raise InputError(
             f"--symmetry {parts.symmetry[0]}: is of --method register with --cad; a network and "
-            "a data set have the symmetries that they declare"
+            "a dataset have the symmetries that they declare"
         )
     if not is_registration and weights != REGISTER:
         return PoseNetworkSpec(weights=weights, config=config, base_from_camera=base_from_camera)
     if dataset.bop is not None:
-        # No base: --base-from-camera is refused beside --bop, since a data set's cameras move.
+        # No base: --base-from-camera is refused beside --bop, since a dataset's cameras move.
         models = tuple(datasets.open_bop(dataset.bop, dataset.split).objects.values())
         return RegistrationSpec(models=models, config=config)
     models = read_parts(parts.cad, cad_unit, parts.symmetry or None) if parts.cad else ()

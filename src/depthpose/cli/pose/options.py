@@ -18,35 +18,35 @@ _VOTING_METHODS: dict[Voting, VotingMethod] = {"ransac": "ransac", "least-square
 
 @dataclass(frozen=True, kw_only=True)
 class PoseDataOptions:
-    """The data set of a table or figure of poses."""
+    """The dataset of a table or figure of poses."""
 
     linemod: Path | None = None
     """Linemod_preprocessed, or LineMOD in BOP's layout; masks are the annotated ones."""
     bop: Path | None = None
-    """any other data set in BOP's layout."""
+    """any other dataset in BOP's layout."""
     split: str = "test"
-    """of the data set: train, test, ..."""
+    """of the dataset: train, test, ..."""
     objects: tuple[str, ...] = ()
     """keep these alone, by name or number."""
 
     @property
     def folder(self) -> Path | None:
-        """The data set's folder, by either option; None: neither is given."""
+        """The dataset's folder, by either option; None: neither is given."""
         return self.linemod or self.bop
 
 
 @dataclass(frozen=True, kw_only=True)
 class PoseMeasureOptions:
-    """The settings by which poses of a data set are estimated and measured."""
+    """The settings by which poses of a dataset are estimated and measured."""
 
     masks: tuple[str, ...] = ("truth",)
     """truth; predicted (those that came with Linemod_preprocessed); a JSON file of BOP detections;
     or weights of a segmentation. Each is a row of its own."""
     targets: NewPath | None = None
     """a BOP list of targets, such as test_targets_bop24.json: a file, or its name in the folder of
-    the data set; by default all instances."""
+    the dataset; by default all instances."""
     diameters: DiameterTable = "bop"
-    """bop: as the data set declares them; pvnet: PVNet's table of LineMOD."""
+    """bop: as the dataset declares them; pvnet: PVNet's table of LineMOD."""
     voting: Voting = "ransac"
     """how directions become keypoints."""
     icp: bool = True
@@ -107,7 +107,7 @@ class InputDetailOptions:
     """which object a number of --mask or a class of --detections is: 1=bracket,2=gear; 3= leaves 3
     out."""
     object: str | None = None
-    """which of the objects that are known; of a data set its name or number, all by default."""
+    """which of the objects that are known; of a dataset its name or number, all by default."""
     unit: Unit | None = None
     """unit of clouds (default m), of depth images whose camera file gives none, and of CAD files
     without --cad-unit."""
@@ -172,20 +172,20 @@ class PairOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class DataSetOptions:
-    """A data set, in place of --cloud and --depth."""
+    """A dataset, in place of --cloud and --depth."""
 
     bop: Path | None = None
-    """folder of a data set in BOP's layout, or of Linemod_preprocessed."""
+    """folder of a dataset in BOP's layout, or of Linemod_preprocessed."""
     split: str = "test"
-    """of the data set; where it is of several sensors with the name of one, such as
+    """of the dataset; where it is of several sensors with the name of one, such as
     val_photoneo."""
     masks: str = "truth"
     """truth (the annotated ones), predicted (those that came with Linemod_preprocessed), a JSON
     file of BOP detections, or weights of a segmentation, by name or file; or search: no mask is
-    told, and every image is searched for every object of the data set."""
+    told, and every image is searched for every object of the dataset."""
     targets: NewPath | None = None
     """a BOP list of targets, such as test_targets_bop24.json: a file, or its name in the folder of
-    the data set; by default all instances."""
+    the dataset; by default all instances."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -276,12 +276,12 @@ class SequenceOptions:
     """text file with the pose in the first frame, about: the 4x4 matrix camera_from_model, in
     metres; without it the object is looked for."""
     bop: Path | None = None
-    """folder of a data set in BOP's layout; every known object of each scene is followed (with
+    """folder of a dataset in BOP's layout; every known object of each scene is followed (with
     --method register: that has a model there), or --object alone."""
     split: str = "test"
-    """of the data set."""
+    """of the dataset."""
     object: str | None = None
-    """which of the known objects; of a data set its name or number."""
+    """which of the known objects; of a dataset its name or number."""
     unit: Unit | None = None
     """of the clouds, metres by default; of depth images, where their camera says none."""
     base_from_camera: Annotated[tuple[str, ...], shown_as(metavar="PATH | 16 NUMBERS")] = ()

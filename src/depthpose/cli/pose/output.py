@@ -99,7 +99,7 @@ def is_result_of(name: str, image: str) -> bool:
 
 
 def claim_for_dataset(out: Path, settings: dict[str, Any], dataset: BopDataset) -> None:
-    """Claim a folder for the poses of a data set, with its tables and pictures."""
+    """Claim a folder for the poses of a dataset, with its tables and pictures."""
     images = sorted({(i.scene_id, i.image_id) for i in dataset.instances})
     pictures = [f"{scene:06d}_{image:06d}.{PICTURE}" for scene, image in images]
     tables = [name_bop_results(dataset), name_bop_results(dataset, _WITH_ALTERNATIVES)]
@@ -114,14 +114,14 @@ def write_files(
     dataset: BopDataset | None = None,
     input_count: int | None = None,
 ) -> None:
-    """Write the files of each input or of a data set, and the page.
+    """Write the files of each input or of a dataset, and the page.
 
     Args:
         predictions: the poses and refusals.
         jobs: for each of them the job that reads its input.
         out: folder of the results.
         method: the method that made them.
-        dataset: data set of the inputs; None: they are clouds or depth images.
+        dataset: dataset of the inputs; None: they are clouds or depth images.
         input_count: number of inputs, where one may have several predictions; None: one each.
     """
     models = {model.name: model for model in method.models}
@@ -138,7 +138,7 @@ def _write_dataset_files(
     out: Path,
     models: Mapping[str, ObjectModel],
 ) -> None:
-    """Write BOP's csv of a data set's poses, and a picture of each image with its poses.
+    """Write BOP's csv of a dataset's poses, and a picture of each image with its poses.
 
     ``models``: by the names of the objects.
     """

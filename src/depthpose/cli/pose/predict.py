@@ -86,11 +86,11 @@ def predict_poses_of_dataset(
     out: Path,
     batch: int,
 ) -> int:
-    """Pose the objects of a data set, write the files of the poses, and return the exit code.
+    """Pose the objects of a dataset, write the files of the poses, and return the exit code.
 
     Args:
         method: estimates the poses.
-        options: the data set, and its masks.
+        options: the dataset, and its masks.
         object: name or number of the only object that is posed; None: all that the method has.
         config: settings of the estimator; its device also segments, where masks are segmented.
         out: folder of the results.

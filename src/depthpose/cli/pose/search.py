@@ -59,7 +59,7 @@ class SearchResults(Results[ViewInput, list[PoseEstimate]]):
             images: names of the images of this run.
             earlier: predictions of earlier runs.
             is_of_image: whether a prediction is of the image of this name.
-            numbers: number of each object in the data set, by its name; None: no data set.
+            numbers: number of each object in the dataset, by its name; None: no dataset.
         """
         self.by_image: dict[str, list[Prediction]] = {}
         self._folder = folder
@@ -88,10 +88,10 @@ class SearchResults(Results[ViewInput, list[PoseEstimate]]):
     def store_failure(self, job: Job[ViewInput], error: InputError) -> None:
         """Write why an image cannot be read.
 
-        Images of a data set must be readable, so there it is raised.
+        Images of a dataset must be readable, so there it is raised.
         """
         assert isinstance(job, PoseJob)
-        if job.object is None:  # a job of a data set names none
+        if job.object is None:  # a job of a dataset names none
             raise error
         self.by_image[job.name] = [
             Prediction(estimate=refuse_unreadable(job.name, job.object, error))
@@ -104,7 +104,7 @@ class SearchResults(Results[ViewInput, list[PoseEstimate]]):
         write_predictions(self._folder, [*predictions, *self._in_other_images])
 
     def _place_of(self, job: PoseJob[ViewInput], estimate: PoseEstimate) -> Place | None:
-        """Return scene, image and object number of an estimate; None outside a data set."""
+        """Return scene, image and object number of an estimate; None outside a dataset."""
         if self._numbers is None or job.place is None:
             return None
         return job.place._replace(object_id=self._numbers[estimate.object])
@@ -199,7 +199,7 @@ def _has_name_of_image(prediction: Prediction, image: str) -> bool:
 
 
 def _has_place_in_image(prediction: Prediction, image: str) -> bool:
-    """Whether a prediction is of the image of this name, by its place in a data set."""
+    """Whether a prediction is of the image of this name, by its place in a dataset."""
     return prediction.place is not None and _name_image(prediction.place[:2]) == image
 
 
@@ -217,14 +217,14 @@ def _refuse_numbered_names(names: Collection[str]) -> None:
 def search_dataset(
     method: PoseMethod, options: DataSetOptions, object: str | None, out: Path
 ) -> int:
-    """Search every image of a data set for each of its objects (6D detection).
+    """Search every image of a dataset for each of its objects (6D detection).
 
     The method is given neither masks nor which objects an image shows. A rerun searches the images
     that are not finished.
 
     Args:
         method: finds the objects.
-        options: the data set.
+        options: the dataset.
         object: name or number of the only object that is searched for; None: all.
         out: folder of the results.
 
@@ -268,6 +268,6 @@ def search_dataset(
 
 
 def _name_image(image: tuple[int, int]) -> str:
-    """Name an image of a data set by its scene and its number."""
+    """Name an image of a dataset by its scene and its number."""
     scene_id, image_id = image
     return f"{scene_id:06d}_{image_id:06d}"

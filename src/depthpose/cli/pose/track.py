@@ -63,7 +63,7 @@ def track_dataset(method: PoseMethod, frames: SequenceOptions, out: Path) -> int
 
     Args:
         method: follows the objects.
-        frames: options that name the data set and perhaps the object.
+        frames: options that name the dataset and perhaps the object.
         out: folder of the results.
     """
     assert frames.bop is not None
@@ -118,7 +118,7 @@ def _write_sequences(
         followed: predictions of the frames, each made as it is asked for.
         jobs: the frames.
         out: folder of the results.
-        dataset: data set of the frames; None: they are files.
+        dataset: dataset of the frames; None: they are files.
 
     Returns:
         The exit code.

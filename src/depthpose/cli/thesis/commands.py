@@ -273,14 +273,14 @@ def reproduce_table_3_3(
 
     A loop of 50 hypotheses one by one in NumPy (published practice), our RANSAC of 50, 128 and 1024
     by both tests for inliers, and least squares as published and as ours: success by ADD(-S)
-    without ICP, and milliseconds of the vote alone. Without a data set, on synthetic views.
+    without ICP, and milliseconds of the vote alone. Without a dataset, on synthetic views.
 
         depthpose reproduce 3.3 --weights W.safetensors --linemod Linemod_preprocessed --out out
 
     Args:
         weights: file or name, of the sparse network.
         out: folder for rows.json, rows.csv, table.md and report.html.
-        synthetic: number of synthetic views where no data set is given; 40 unless told.
+        synthetic: number of synthetic views where no dataset is given; 40 unless told.
         points: at most so many votes of a cloud; a block of rows each.
     """
     from depthpose.cli.thesis.pose import reproduce_voting
@@ -306,7 +306,7 @@ def draw_figure_3_2(
     """Draw figure 3-2: features of partial clouds as colours, each cloud posed on its model.
 
     The features before the last layer (64 numbers a point) are mapped to one number by an exact
-    t-SNE and shown in the Spectral scale; the model is black. Without a data set the clouds are
+    t-SNE and shown in the Spectral scale; the model is black. Without a dataset the clouds are
     synthetic. Writes figure-3-2.png, panels and report.html.
 
         depthpose figure 3-2 --weights W.safetensors --out out/figure-3-2
@@ -334,7 +334,7 @@ def draw_figure_3_4(
     """Draw figure 3-4: true and predicted directions to the keypoint with the largest error.
 
     The worst of some views is drawn, in the plane of the camera's x and y: a yellow star is the
-    true keypoint, a red cross the voted one. Without a data set the views are synthetic. Writes
+    true keypoint, a red cross the voted one. Without a dataset the views are synthetic. Writes
     figure-3-4.png, panels and report.html.
 
         depthpose figure 3-4 --weights W.safetensors --out out/figure-3-4
@@ -357,7 +357,7 @@ def draw_figure_3_5(
 ) -> int:
     """Draw figure 3-5: boxes of true (green, dashed) and estimated (blue, solid) poses.
 
-    Over the picture, or the depth where there is none. Without a data set the views are synthetic.
+    Over the picture, or the depth where there is none. Without a dataset the views are synthetic.
     Writes figure-3-5.png, panels and report.html.
 
         depthpose figure 3-5 --weights W.safetensors --linemod Linemod_preprocessed --out out

@@ -78,10 +78,10 @@ _DIFFERENCE_NOTES = {
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Views:
-    """Views with truth, of a data set or synthetic."""
+    """Views with truth, of a dataset or synthetic."""
 
     samples: Sequence[ViewSample]  #: the views, whose objects have the names of the network
-    instances: Sequence[Instance | None]  #: instance of each in the data set; None: synthetic
+    instances: Sequence[Instance | None]  #: instance of each in the dataset; None: synthetic
     columns: dict[str, Any]  #: what tables say of the views beside the numbers measured on them
     settings: dict[str, Any]  #: JSON values that decide which views they are
 
@@ -113,11 +113,11 @@ def _render_views(net: GeoPoseNet, count: int) -> Views:
 
 
 def _read_views(net: GeoPoseNet, folder: Path, data: PoseDataOptions, number: int | None) -> Views:
-    """Read views of a data set.
+    """Read views of a dataset.
 
     Args:
         net: network whose names the objects get.
-        folder: folder of the data set.
+        folder: folder of the dataset.
         data: its split, and the objects that are kept.
         number: how many views, spread evenly; None: all.
     """
@@ -158,7 +158,7 @@ def reproduce_by_object(
 
     Args:
         number: number of the table; 3.2 has published rows.
-        data: the data set.
+        data: the dataset.
         options: how poses are estimated, measured and shown.
         weights: files or names, each a method.
         csv: BOP results of other methods.
@@ -236,7 +236,7 @@ def _write_pose_figures(dataset: BopDataset, predictions: Path, out: Path, count
     """Draw figure 3-5 of some instances and write the pictures; return a section that shows them.
 
     Args:
-        dataset: data set with the instances.
+        dataset: dataset with the instances.
         predictions: folder of a method's ``poses.json``.
         out: folder of the report; the pictures are written to ``OUT/figures``.
         count: how many instances, spread evenly; one without an estimate is left out.
@@ -268,7 +268,7 @@ def reproduce_voting(
 
     Args:
         weights: name or file of the network's weights.
-        data: the data set; without a folder the views are synthetic.
+        data: the dataset; without a folder the views are synthetic.
         synthetic: number of synthetic views.
         points: most voting points of a view, for each block.
         out: folder of the files.
@@ -325,7 +325,7 @@ def write_figure(
     Args:
         figure: number of the figure in the thesis.
         weights: name or file of the network's weights.
-        data: the data set; without a folder the views are synthetic.
+        data: the dataset; without a folder the views are synthetic.
         number: how many views.
         out: folder of the figure.
         draw_panels: draws the panels of the views.

@@ -133,7 +133,7 @@ def _facts_from_scene_camera(images: dict[str, dict[str, Any]]) -> CameraFacts:
         if not has_same_K or _read_bop_unit_m(entry) != _read_bop_unit_m(first):
             raise InputError(
                 f"a scene_camera.json of BOP whose {len(entries)} images have several cameras; "
-                "write that of one image into a file, or open the data set by --bop"
+                "write that of one image into a file, or open the dataset by --bop"
             )
     flat = first["cam_K"]
     if not isinstance(flat, list) or len(flat) != 9:

@@ -243,7 +243,7 @@ def _read_in_shard(shard: Path, name: str, most: int) -> bytes:
     status = shard.stat()
     extent = _index_shard(shard, status.st_mtime_ns, status.st_size).get(name)
     if extent is None:
-        raise InputError(f"{shard}: holds no file {name!r}; pack the data set again")
+        raise InputError(f"{shard}: holds no file {name!r}; pack the dataset again")
     offset, size = extent
     if size > most:
         raise InputError(f"{shard}/{name}: {size} bytes, more than the {most} that are read of it")
@@ -266,7 +266,7 @@ def _read_store_address(source: Path) -> str:
     if not isinstance(address, str) or not address:
         raise InputError(
             f'{source}: must be {{"url": ADDRESS}} with the address of the folder that holds the '
-            f"shards, got {str(content)[:_LONGEST_CAUSE]}; correct it, or open the data set by its "
+            f"shards, got {str(content)[:_LONGEST_CAUSE]}; correct it, or open the dataset by its "
             "address, which writes the file again"
         )
     return address.rstrip("/")

@@ -49,7 +49,7 @@ MAX_PIXELS = 2**25  # 0.4 GB of floats; a small file may declare any size
 
 # Named one by one: Pillow also opens formats that start other programs.
 _FORMATS = ("PNG", "JPEG", "BMP", "PPM", "TIFF", "WEBP", "GIF")
-_JPEG_COLOURS = {"RGB": "RGB", "L": "GRAY"}
+_JPEG_COLORS = {"RGB": "RGB", "L": "GRAY"}
 """Names of simplejpeg's colour spaces, by Pillow's modes."""
 _HOLE = bytes(16)
 """Zeros that show a damaged JPEG: 2,600 pictures of all qualities have no more than 6 in a row."""
@@ -139,9 +139,9 @@ def _decode(name: AnyPath, image: Image.Image) -> np.ndarray:
         if largest > 255:
             return _decode_ppm_16(opened, tiles[0].offset, largest)
 
-    if tiles and image.format == "JPEG" and image.mode in _JPEG_COLOURS:
+    if tiles and image.format == "JPEG" and image.mode in _JPEG_COLORS:
         opened.fp.seek(0)
-        image = _decode_jpeg(name, opened.fp.read(), _JPEG_COLOURS[image.mode])
+        image = _decode_jpeg(name, opened.fp.read(), _JPEG_COLORS[image.mode])
         return _turn_upright(name, image, rotation)
     return _turn_upright(name, image, rotation)
 
@@ -195,7 +195,7 @@ def _turn_upright(
     return np.asarray(picture.convert("RGB"))
 
 
-def _decode_jpeg(name: AnyPath, data: bytes, colours: str) -> Image.Image:
+def _decode_jpeg(name: AnyPath, data: bytes, color_space: str) -> Image.Image:
     """Decode a JPEG with libjpeg, as Pillow does, and refuse damaged pixels.
 
     libjpeg only warns of these, and goes on with shifted, wrong or grey ones; Pillow does not pass
@@ -204,10 +204,10 @@ def _decode_jpeg(name: AnyPath, data: bytes, colours: str) -> Image.Image:
     Args:
         name: the file, for errors.
         data: its bytes.
-        colours: simplejpeg's name of the colour space.
+        color_space: simplejpeg's name of it.
     """
     try:
-        pixels = simplejpeg.decode_jpeg(data, colours, strict=True).squeeze()
+        pixels = simplejpeg.decode_jpeg(data, color_space, strict=True).squeeze()
     except ValueError as error:
         raise _make_jpeg_error(name, str(error)) from error
     if _has_hole(data):

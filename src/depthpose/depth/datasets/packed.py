@@ -16,7 +16,7 @@ from depthpose.core.files.disk import SOURCE, write_bytes
 from depthpose.depth.datasets.frames import FramePaths
 
 INDEX = "index.json"
-"""File of a packed data set that lists its frames; written last."""
+"""File of a packed dataset that lists its frames; written last."""
 _CALIBRATION = "calibration"
 _PACKED_FIELDS = ("left", "right", "velodyne", "scan", "depth", "disparity", "disparity_noc", "sky")
 _URL = re.compile(r"([a-z][a-z0-9+]+):/+(?=[^/])")
@@ -99,7 +99,7 @@ def _pack_calibrations(frames: list[FramePaths], out: Path) -> dict[Path, str]:
 
 
 def find_packed_frames(folder: Path) -> Iterator[FramePaths]:
-    """List the frames of a packed data set; none where there is no index.
+    """List the frames of a packed dataset; none where there is no index.
 
     Raises:
         InputError: the index is damaged, or names a file outside of the folder.

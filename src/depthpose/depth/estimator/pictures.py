@@ -49,7 +49,7 @@ class DepthPipeline:
         batch_size: int | None = None,
         timeout: float | None = None,
     ) -> dict[str, Any] | list[dict[str, Any]] | Iterator[dict[str, Any]]:
-        """Estimate one picture, a list of them, or what a generator or data set gives.
+        """Estimate one picture, a list of them, or what a generator or dataset gives.
 
         Args:
             inputs: as :meth:`FakestereoNet.estimate` takes them, and as transformers does: the

@@ -1,4 +1,4 @@
-"""Data sets of poses: samples of any known layout, the check of all files, and writing BOP's."""
+"""Datasets of poses: samples of any known layout, the check of all files, and writing BOP's."""
 
 import hashlib
 from collections import Counter
@@ -58,11 +58,11 @@ from depthpose.pose.types import ObjectModel, PoseTruth, ViewInput, ViewSample
 class BopDataset:
     """The instances of a split, whose files are read when a sample is asked for."""
 
-    folder: Path  #: of the data set
+    folder: Path  #: of the dataset
     split: str  #: its name, with that of the sensor where there are several
     layout: str  #: a key of ``LAYOUTS``
     instances: Sequence[Instance]  #: what is annotated, in the order of scene, image and place
-    sha256: str  #: of all annotations of the split: tells data sets of one name apart
+    sha256: str  #: of all annotations of the split: tells datasets of one name apart
 
     def __len__(self) -> int:
         return len(self.instances)
@@ -93,7 +93,7 @@ class BopDataset:
         """Read the whole depth image of an instance, and its true pose.
 
         Args:
-            instance: of this data set.
+            instance: of this dataset.
             mask: a predicted one; None: the annotated one.
 
         Raises:
@@ -119,7 +119,7 @@ class BopDataset:
         )
 
     def of_objects(self, *objects: int | str) -> "BopDataset":
-        """Select the instances of some objects, as a data set of these alone.
+        """Select the instances of some objects, as a dataset of these alone.
 
         Args:
             objects: their numbers or names; digits are a number too.
@@ -143,10 +143,10 @@ class BopDataset:
 
 
 def open_bop(folder: str | Path, split: str = "test") -> BopDataset:
-    """Open a split of a data set in BOP's layout, or in another of ``LAYOUTS``.
+    """Open a split of a dataset in BOP's layout, or in another of ``LAYOUTS``.
 
     Args:
-        folder: of the data set, with ``models`` and the splits in it.
+        folder: of the dataset, with ``models`` and the splits in it.
         split: ``test``, ``train_pbr``, ..., of several sensors with that of one, such as
             ``val_photoneo``; ``train`` or ``test`` of Linemod_preprocessed.
 
@@ -157,7 +157,7 @@ def open_bop(folder: str | Path, split: str = "test") -> BopDataset:
     name, layout = find_layout(folder)
     instances = list(layout.instances(folder, split))
 
-    # What tells data sets of one name apart.
+    # What tells datasets of one name apart.
     digest = hashlib.sha256()
     for instance in instances:
         pose = instance.camera_from_model
@@ -203,13 +203,13 @@ def check_bop(
     with_decoding: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> CheckReport:
-    """Check every file of a data set: are they there and whole, and do they agree?
+    """Check every file of a dataset: are they there and whole, and do they agree?
 
     Units are checked too: a cloud a thousand times smaller than its model, or a metre away from
     its annotated pose, is reported.
 
     Args:
-        folder: of the data set.
+        folder: of the dataset.
         split: its name; None: all.
         with_decoding: read images whole; else their headers alone.
         progress: called with the number of instances done and of all.
@@ -306,7 +306,7 @@ def _check_models(
 
 
 def _check_diameter(path: Path, model: ObjectModel, declared_mm: object) -> Iterator[Problem]:
-    """Compare the diameter of a mesh with that which the data set declares, if it does."""
+    """Compare the diameter of a mesh with that which the dataset declares, if it does."""
     measured_mm = 1000 * measure_diameter(model.vertices_m)
     if not isinstance(declared_mm, int | float):
         message = "has no declared diameter; that of the mesh is taken"
@@ -428,7 +428,7 @@ def write_bop_scene(
     """Write a scene in BOP's layout, its images and masks before the JSON that names them.
 
     Args:
-        folder: of the data set.
+        folder: of the dataset.
         split: name of the split.
         scene_id: number of the scene.
         frames: its images.

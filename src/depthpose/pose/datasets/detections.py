@@ -42,7 +42,7 @@ class Detection:
     score: float = 1.0  #: confidence; 1 where the file gives none
     box: Box | None = None  #: edges; may reach beyond the image
     segmentation: RunLengths | None = None  #: its mask
-    scene_id: int | None = None  #: number of the scene, of BOP's data sets
+    scene_id: int | None = None  #: number of the scene, of BOP's datasets
     image_id: int | None = None  #: number of the image
     image: str | None = None  #: name of the image's file without its ending
     seconds: float | None = None  #: time that the detector took for the image
@@ -427,7 +427,7 @@ def group_by_image(
     """
     if len({detection.scene_id for detection in detections}) > 1:
         raise InputError(
-            f"{source}: holds detections of several scenes; name the data set by --bop, and the "
+            f"{source}: holds detections of several scenes; name the dataset by --bop, and the "
             "file by --masks"
         )
     detected_images = {(detection.image_id, detection.image) for detection in detections}

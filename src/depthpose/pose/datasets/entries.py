@@ -1,4 +1,4 @@
-"""Entries of JSON and YAML files of data sets: their numbers, poses and cameras, checked."""
+"""Entries of JSON and YAML files of datasets: their numbers, poses and cameras, checked."""
 
 from collections.abc import Mapping
 from pathlib import Path

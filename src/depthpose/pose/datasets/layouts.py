@@ -1,4 +1,4 @@
-"""Layouts of pose data sets on the disk (BOP, Linemod_preprocessed): annotations and models."""
+"""Layouts of pose datasets on the disk (BOP, Linemod_preprocessed): annotations and models."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -62,7 +62,7 @@ class BopSplit(NamedTuple):
 
 
 def list_bop_splits(folder: Path) -> dict[str, BopSplit]:
-    """List the splits of a data set in BOP's layout, by name.
+    """List the splits of a dataset in BOP's layout, by name.
 
     Where the scenes are of several sensors, as in BOP-Industrial, each sensor has its own files,
     such as ``scene_camera_photoneo.json`` beside ``depth_photoneo``. The split ``test`` of that
@@ -81,7 +81,7 @@ def list_bop_splits(folder: Path) -> dict[str, BopSplit]:
 
 
 def _find_bop_split(folder: Path, split: str) -> BopSplit:
-    """Find a split of a data set by its name.
+    """Find a split of a dataset by its name.
 
     Raises:
         InputError: there is none, or it is of several sensors.
@@ -225,7 +225,7 @@ class BopTarget:
 
 
 def read_targets(path: str | Path, folder: str | Path = ".") -> list[BopTarget]:
-    """Read a list of targets: a file, or the name of one in the folder of its data set.
+    """Read a list of targets: a file, or the name of one in the folder of its dataset.
 
     Entries of ``test_targets_bop19.json`` name an object and the number of its instances; those of
     ``test_targets_bop24.json`` may name images alone, with all their objects.
@@ -262,7 +262,7 @@ def read_linemod_instances(folder: Path, split: str) -> Iterator[Instance]:
     object counts, as in every published number.
 
     Args:
-        folder: of the data set.
+        folder: of the dataset.
         split: ``train`` or ``test``.
 
     Raises:
@@ -337,7 +337,7 @@ def _read_linemod_instance(
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """How one kind of pose data set is read; its models are ``models/obj_NNNNNN.ply`` in mm."""
+    """How one kind of pose dataset is read; its models are ``models/obj_NNNNNN.ply`` in mm."""
 
     splits: Callable[[Path], Sequence[str]]  #: names of a folder's splits; none in another layout
     instances: Callable[[Path, str], Iterable[Instance]]  #: of one split of a folder
@@ -376,7 +376,7 @@ _MODEL_FOLDERS = ("models", "models_eval", "models_points")
 
 
 def read_models_info(folder: Path) -> tuple[Path, dict[int, dict[str, Any]]]:
-    """Find a data set's folder of models, and read what it says of them.
+    """Find a dataset's folder of models, and read what it says of them.
 
     Returns:
         The folder, and the entries of objects by number; there are none where there is neither
@@ -416,7 +416,7 @@ def read_bop_models(
     two symmetric objects of Linemod_preprocessed, which declares none, get theirs.
 
     Args:
-        folder: of the data set.
+        folder: of the dataset.
         numbers: of the objects.
         config: how many keypoints.
 

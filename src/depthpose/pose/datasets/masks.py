@@ -74,9 +74,9 @@ def read_labels(
 
     # Grey is a number already.
     values = pixels[..., 0]
-    is_coloured = pixels.shape[2] > 1 and (pixels[..., :3] != values[..., None]).any()
-    if is_coloured:
-        values = _number_colours(pixels)
+    is_colored = pixels.shape[2] > 1 and (pixels[..., :3] != values[..., None]).any()
+    if is_colored:
+        values = _number_colors(pixels)
 
     # An alpha channel is the mask where the opaque pixels have one colour, or too many for labels.
     if pixels.shape[2] == 4:
@@ -87,14 +87,14 @@ def read_labels(
     return number_objects(values) if labels is None else _keep_labels(values, labels, path)
 
 
-def _number_colours(pixels: np.ndarray) -> np.ndarray:
+def _number_colors(pixels: np.ndarray) -> np.ndarray:
     """Number the colours of pixels (h, w, 3 or more): 1, 2, ... in their order; black stays 0."""
     red, green, blue = (pixels[..., channel].astype(np.int32) for channel in range(3))
-    colour = (red * 2**8 + green) * 2**8 + blue
-    colours = np.unique(colour)
-    has_black = colours[0] == 0
+    color = (red * 2**8 + green) * 2**8 + blue
+    colors = np.unique(color)
+    has_black = colors[0] == 0
     # Not by the inverse of np.unique, which takes five times the memory.
-    place = np.searchsorted(colours, colour).astype(np.int32)
+    place = np.searchsorted(colors, color).astype(np.int32)
     return place if has_black else place + 1
 
 

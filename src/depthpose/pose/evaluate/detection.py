@@ -50,7 +50,7 @@ def score_detections(
     matched with the instance of the least error below the threshold that is not matched yet. An
     estimate that is not matched is wrong. Instances of which less than a tenth is visible, and
     estimates matched with them, do not count. The average precision is that of all images of the
-    data set; means are over thresholds, then over errors (Nguyen et al. 2025, BOP Challenge 2024).
+    dataset; means are over thresholds, then over errors (Nguyen et al. 2025, BOP Challenge 2024).
     None where no instance counts.
 
     Args:
@@ -93,7 +93,7 @@ def _group_by_image(
     for instance in dataset.instances:
         images[place_of(instance)].instances.append(instance)
 
-    # The estimates of images of the data set; of one image at most 100.
+    # The estimates of images of the dataset; of one image at most 100.
     image_keys = {place[:2] for place in images}
     numbers = {place.object_id for place in images}
     of_image: dict[tuple[int, int], list[tuple[Place, Prediction]]] = defaultdict(list)

@@ -237,7 +237,7 @@ def match_instances(
     """Match each instance with one estimate at most; return estimates by the instances' names.
 
     An estimate with an instance's name was computed from its mask and belongs to it, unless its
-    place is another: in another data set names may be the same. Of the others an image with n
+    place is another: in another dataset names may be the same. Of the others an image with n
     instances of an object takes the n of the highest scores, as BOP does, and matches them so that
     the sum of ADD-S, at most a diameter each, is least. BOP does so anew for each error and
     threshold. Refusals are matched with instances that are left over.

@@ -53,7 +53,7 @@ class Conditions:
     """The conditions under which numbers can be compared: the last columns of a row."""
 
     diameters: str  #: whose table of diameters
-    frames: str  #: data set and split
+    frames: str  #: dataset and split
     frames_sha256: str  #: first digits of :func:`hash_frames`
 
 
@@ -316,7 +316,7 @@ PVNET_DIAMETERS_M = {
 
 _LARGEST_DIFFERENCE = 0.25
 """Largest share by which PVNet's diameter of an object differs from the model's: an object that
-differs by more is of another data set."""
+differs by more is of another dataset."""
 
 
 def prepare_errors(model: ObjectModel, config: EvaluationConfig) -> ErrorContext:
@@ -331,7 +331,7 @@ def prepare_errors(model: ObjectModel, config: EvaluationConfig) -> ErrorContext
         if abs(diameter_m / model.diameter_m - 1) > _LARGEST_DIFFERENCE:
             raise InputError(
                 f"object {model.number} ({model.name}) has a diameter of {model.diameter_m:.3f} m, "
-                "which is no object of PVNet's table of LineMOD; take the data set's diameters, bop"
+                "which is no object of PVNet's table of LineMOD; take the dataset's diameters, bop"
             )
     return ErrorContext(
         model=model,
@@ -398,7 +398,7 @@ def evaluate(
         origin: whose predictions they are, for the columns of the rows.
 
     Raises:
-        InputError: there is no instance, no prediction is of this data set, or a file of it is
+        InputError: there is no instance, no prediction is of this dataset, or a file of it is
             damaged.
     """
     config = EvaluationConfig() if config is None else config
@@ -422,11 +422,11 @@ def evaluate(
 def _match_predictions(
     dataset: BopDataset, predictions: Sequence[Prediction]
 ) -> dict[str, PoseEstimate]:
-    """Match estimates with instances by the instances' names; refuse those of another data set."""
+    """Match estimates with instances by the instances' names; refuse those of another dataset."""
     matched = match_instances(dataset.instances, predictions, dataset.objects)
     if len(dataset) == 0:
         raise InputError(f"{dataset.folder}: split {dataset.split!r} has no instance to measure")
-    # A file of another data set would be measured as all missing, and look like a bad method.
+    # A file of another dataset would be measured as all missing, and look like a bad method.
     if predictions and not matched:
         prediction = predictions[0]
         raise InputError(
@@ -447,7 +447,7 @@ def _measure_instances(
     """Measure the errors of each instance, and list the times of its estimate.
 
     Args:
-        instances: all of a data set.
+        instances: all of a dataset.
         predictions: all of them, among which the time of a search is divided.
         matched: the estimate of each instance that has one, by the instance's name.
         contexts: of the errors, by the number of the object.
@@ -484,7 +484,7 @@ def _summarise_objects(
         predictions: all of them.
         matched: the estimate of each instance that has one, by the instance's name.
         contexts: of the errors, by the number of the object.
-        rows: of the instances, in the order of the data set.
+        rows: of the instances, in the order of the dataset.
     """
     # BOP's precision of detection, for which most errors are measured already.
     measured = {

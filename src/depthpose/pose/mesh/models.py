@@ -480,7 +480,7 @@ def refuse_equal_names(models: Sequence[ObjectModel]) -> None:
     if twice:
         numbers = " and ".join(str(model.number) for model in models if model.name == twice[0])
         raise InputError(
-            f"two models are called {twice[0]!r} (numbers {numbers}: obj_id of a data set, the "
+            f"two models are called {twice[0]!r} (numbers {numbers}: obj_id of a dataset, the "
             "place among CAD files), and an object is known by its name; rename one"
         )
 

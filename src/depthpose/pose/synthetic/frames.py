@@ -26,7 +26,7 @@ from depthpose.pose.synthetic.random_numbers import random_index, random_rotatio
 from depthpose.pose.types import ObjectModel
 
 _WAVES = 6  # of a pattern
-_COLOUR_SEED = 0xC0102  # of the colours of objects, which are the same in every data set
+_COLOR_SEED = 0xC0102  # of the colours of objects, which are the same in every dataset
 _DISTINCT_HUE = (0.7, 1.0)  # shares of a hue by which objects are told apart
 _HIGHLIGHT_POWER = 1 / math.radians(2)  # of Blinn's cosine: the larger, the smaller a highlight
 _GAMMA = 2.2  # about that of sRGB
@@ -133,7 +133,7 @@ def _shade(
     points_m = back_project(raster.depth_m, K)[is_seen]
     barycentric = raster.barycentric[is_seen]
     primitive = raster.primitive[is_seen]
-    colour = torch.zeros_like(points_m)
+    color = torch.zeros_like(points_m)
     start = 0
     for solid, pose in placed:
         stop = start + len(solid.triangles_m)
@@ -153,9 +153,9 @@ def _shade(
         open_sky = 0.75 + 0.25 * (normal @ light.towards)[:, None]
         diffuse = light.ambient * open_sky + light.lamp * facing
         albedo = _find_albedo(solid.pattern, pose.inverse().apply(points_m[of_solid]))
-        colour[of_solid] = albedo * diffuse + solid.pattern.gloss * shine * light.lamp
+        color[of_solid] = albedo * diffuse + solid.pattern.gloss * shine * light.lamp
         start = stop
-    return colour
+    return color
 
 
 def _find_albedo(pattern: Pattern, points_m: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
@@ -172,7 +172,7 @@ _FRAMES_SEED = 0xF4A3E5  # added to the seed, so that frames share no random num
 def make_frames(
     models: Sequence[ObjectModel], config: ObjectsConfig, number: int, first: int = 0
 ) -> Iterator[BopFrame]:
-    """Make frames of several objects on a table, one after the other, for a data set of BOP.
+    """Make frames of several objects on a table, one after the other, for a dataset of BOP.
 
     Frame i depends on the seed and i alone. A frame shows each object once at most, or a pile of
     one of them (``frame_pile``). Poses are exact; the depth has a sensor's errors.
@@ -204,8 +204,8 @@ def make_frames(
 
 
 def _make_solid(model: ObjectModel) -> Solid:
-    """Make the body of an object, which looks alike in every frame of every data set."""
-    generator = make_sample_generator(model.number, _COLOUR_SEED)
+    """Make the body of an object, which looks alike in every frame of every dataset."""
+    generator = make_sample_generator(model.number, _COLOR_SEED)
     pattern = draw_pattern(generator, model.diameter_m, _DISTINCT_HUE)
     corners = drawn_triangles(model)
     normals = model.normals[model.faces]
@@ -304,9 +304,9 @@ def _draw_light(up: Float[Tensor, "3"], generator: torch.Generator) -> _Light:
     towards = F.normalize(1.2 * up + 0.8 * torch.randn(3, generator=generator), dim=0)
     strength = uniform(generator, 0.3, 0.9)
     warmth = uniform(generator, -0.15, 0.15)
-    colour = torch.tensor([1 + warmth, 1.0, 1 - warmth])
-    ambient = uniform(generator, 0.2, 0.6) * (2 - colour)  # the colder, the warmer the lamp
-    return _Light(towards=towards, lamp=strength * colour, ambient=ambient)
+    color = torch.tensor([1 + warmth, 1.0, 1 - warmth])
+    ambient = uniform(generator, 0.2, 0.6) * (2 - color)  # the colder, the warmer the lamp
+    return _Light(towards=towards, lamp=strength * color, ambient=ambient)
 
 
 def _photograph(

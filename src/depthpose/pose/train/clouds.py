@@ -269,7 +269,7 @@ def read_models(
 
 
 def _list_model_numbers(folder: Path) -> tuple[int, ...]:
-    """List the numbers of all models of a data set, by their files and ``models_info``.
+    """List the numbers of all models of a dataset, by their files and ``models_info``.
 
     Raises:
         InputError: there is none.

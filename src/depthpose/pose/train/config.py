@@ -17,7 +17,7 @@ from depthpose.pose.networks.resunet import ResUNetConfig
 
 @dataclass(frozen=True, kw_only=True)
 class ModelsConfig(Settings):
-    """The objects that are learnt: CAD files, or models of a data set, or parts of our own."""
+    """The objects that are learnt: CAD files, or models of a dataset, or parts of our own."""
 
     cad: tuple[str, ...] = ()
     """Model files; each object is called as its file."""
@@ -26,13 +26,13 @@ class ModelsConfig(Settings):
     """Unit of the numbers in the CAD files, which do not say it themselves."""
 
     bop: str | None = None
-    """Folder of a data set, whose models are taken in place of CAD files."""
+    """Folder of a dataset, whose models are taken in place of CAD files."""
 
     parts: tuple[str, ...] = ()
     """Names of synthetic parts (bracket, flange, mug, connector, spool), in place of either."""
 
     objects: tuple[int, ...] = ()
-    """Numbers of the data set's objects; none: all."""
+    """Numbers of the dataset's objects; none: all."""
 
     mesh: MeshConfig = MeshConfig()
     """Keypoints of each."""
@@ -55,7 +55,7 @@ class FramesConfig(Settings):
     """Annotated real frames among the synthetic views."""
 
     folder: str = ""
-    """Folder of a data set in BOP's or LineMOD's layout."""
+    """Folder of a dataset in BOP's or LineMOD's layout."""
 
     split: str = "train"
     """Which part of it."""
@@ -69,7 +69,7 @@ class FramesConfig(Settings):
 
     def __post_init__(self) -> None:
         if not self.folder:
-            raise InputError("frames has no folder; name a data set, or leave frames out")
+            raise InputError("frames has no folder; name a dataset, or leave frames out")
         super().__post_init__()
 
 
@@ -199,7 +199,7 @@ class ImagesConfig:
     """Annotated images of a folder in BOP's or LineMOD's layout."""
 
     folder: str = ""
-    """Folder of the data set."""
+    """Folder of the dataset."""
 
     split: str = "train"
     """Which part of it."""

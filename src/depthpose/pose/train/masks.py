@@ -59,10 +59,10 @@ _ABOUT_OBJECT_SHARE = 0.5  # of the windows: most of an image is background
 
 
 class AnnotatedImages:
-    """Images of a data set with their labels, by index.
+    """Images of a dataset with their labels, by index.
 
     Args:
-        config: the data set.
+        config: the dataset.
         objects: names of the classes by number of the object; None: those of the config.
 
     Raises:
