@@ -1,5 +1,5 @@
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -7,7 +7,7 @@ import pytest
 from depthpose.core.devices import computes_bf16, device_of_process, usable_device
 from depthpose.core.errors import InputError
 from depthpose.core.files.images import refuse_among_inputs
-from depthpose.core.loop import LoopConfig, TrainingRun
+from depthpose.core.loop import LoopConfig, TrainingConfig, TrainingRun
 from depthpose.core.run import (
     ProcessRank,
     claim_folder,
@@ -246,17 +246,16 @@ def test_a_damaged_record_of_settings_says_what_to_do(tmp_path: Path) -> None:
         claim_folder(tmp_path / "out", {"x": 1})
 
 
-@dataclass(frozen=True)
-class TrainedConfig:
+@dataclass(frozen=True, kw_only=True)
+class NetTraining(TrainingConfig):
     start: str | None = None
-    loop: LoopConfig = field(default_factory=lambda: LoopConfig(steps=5))
 
 
 def test_a_finished_training_says_how_to_train_on(tmp_path: Path) -> None:
     run = TrainingRun(folder=tmp_path)
-    run.claim(TrainedConfig(), ("net",))
+    run.claim(NetTraining(), ("net",))
     (tmp_path / "net.safetensors").write_bytes(b"1")
-    longer = TrainedConfig(loop=LoopConfig(steps=9))
+    longer = NetTraining(loop=LoopConfig(steps=9))
     said = rf"train on from its weights, give a new --out and --start {tmp_path}/net\.safetensors"
     with pytest.raises(InputError, match=said):
         run.claim(longer, ("net",))

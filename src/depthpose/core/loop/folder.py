@@ -15,11 +15,11 @@ from zipfile import ZipFile
 import torch
 from torch import Tensor, nn
 
-from depthpose.core.checkpoint import list_misfits, read_torch_file
+from depthpose.core.checkpoint import add_terms, list_misfits, read_torch_file
 from depthpose.core.errors import InputError, Notice, import_extra
 from depthpose.core.files import atomic_write, read_text, remove_parts, write_image
 from depthpose.core.files.disk import refuse_heavy, refused_as, refused_write
-from depthpose.core.loop.task import ValidationResult
+from depthpose.core.loop.task import TrainingConfig, ValidationResult
 from depthpose.core.run import describe_environment
 
 STATE = "state.pt"  # the last saved state of a training
@@ -155,6 +155,20 @@ def format_card(name: str, facts: Mapping[str, str], measured: str = "") -> str:
     if measured:
         lines += ["", measured.strip()]
     return "\n".join([*lines, ""])
+
+
+def add_origin(facts: Mapping[str, str], config: TrainingConfig) -> dict[str, str]:
+    """Add to the facts of a card the stage and the initial weights, whose terms bind the new ones.
+
+    Args:
+        facts: for the card of trained weights.
+        config: of their training.
+    """
+    origin = {**facts, "stage": type(config).__name__}
+    initial_weights = config.initial_weights.values()
+    if initial_weights:
+        origin["began_with"] = ", ".join(Path(name).stem for name in initial_weights)
+    return add_terms(origin, initial_weights)
 
 
 def write_card(

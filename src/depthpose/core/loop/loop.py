@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader
 
+from depthpose.core.checkpoint import add_terms, file_sha256, find_weights, warn_of_terms
 from depthpose.core.config import config_to_dict, write_config
 from depthpose.core.devices import usable_precision
 from depthpose.core.errors import InputError, import_extra
@@ -35,7 +36,14 @@ from depthpose.core.loop.folder import (
     list_saved_states,
     restore_last,
 )
-from depthpose.core.loop.task import LoopConfig, Samples, Task, Update, mix_seed
+from depthpose.core.loop.task import (
+    LoopConfig,
+    Samples,
+    Task,
+    TrainingConfig,
+    Update,
+    mix_seed,
+)
 from depthpose.core.run import claim_folder, find_rank, held_folders, release_folders
 
 SECOND_CTRL_C_S = 3.0  # between the first Ctrl-C, which stops, and the second, which finishes
@@ -75,26 +83,34 @@ class TrainingRun:
 
     def claim(
         self,
-        config: Any,  # noqa: ANN401
+        config: TrainingConfig,
         weights: Sequence[str],
         more: Mapping[str, Any] | None = None,
-        without: Sequence[str] = (),
     ) -> None:
         """Claim the folder for a training with this config, and write the config into it.
 
+        Warns where weights that the training begins with have terms of use.
+
         Args:
-            config: the config, a dataclass with a field ``loop``.
+            config: the config.
             weights: names of the weights that the training writes.
             more: what decides the weights besides the config, such as checksums of files.
-            without: settings of the config that change no weight, and may differ when resumed.
 
         Raises:
-            InputError: the folder is that of another config.
+            InputError: the folder is that of another config, or there are no such weights to begin
+                with.
         """
-        # What decides the weights: the config, but for some settings, and the number of processes,
-        # by which the samples of a step are divided.
-        settings = {"stage": type(config).__name__, **config_to_dict(config), **(more or {})}
-        settings = {name: value for name, value in settings.items() if name not in without}
+        warn_of_terms(add_terms({}, config.initial_weights.values()))
+
+        # What decides the weights: the config, the weights to begin with, and the number of
+        # processes, by which the samples of a step are divided. What is held out is measured alone.
+        checksums = {
+            f"{setting}_sha256": file_sha256(find_weights(name))
+            for setting, name in config.initial_weights.items()
+        }
+        stage = type(config).__name__
+        settings = {"stage": stage, **config_to_dict(config), **checksums, **(more or {})}
+        settings.pop("held_out", None)
         loop = {
             name: value for name, value in settings["loop"].items() if name not in _WITHOUT_EFFECT
         }
@@ -105,7 +121,7 @@ class TrainingRun:
         for name in weights:
             files += [f"{name}.{suffix}" for suffix in ("safetensors", "md", "json")]
         remedy = "choose another, or delete this one"
-        option = "--start" if hasattr(config, "start") else "--generator"
+        option = f"--{config.WEIGHTS_SETTINGS[0]}"
         for name in weights:
             path = self.folder / f"{name}.safetensors"
             if path.is_file():

@@ -121,6 +121,23 @@ class LoopConfig(Settings):
         return max(1, round(self.epochs * samples / samples_a_step))
 
 
+@dataclass(frozen=True, kw_only=True)
+class TrainingConfig(Settings):
+    """What the configs of all trainings have."""
+
+    WEIGHTS_SETTINGS: ClassVar[tuple[str, ...]] = ("start",)
+    """Settings that may name weights to begin with, that of the trained network first."""
+
+    loop: LoopConfig = LoopConfig(steps=10000)
+    """Length, batches, seed and precision of the training."""
+
+    @property
+    def initial_weights(self) -> dict[str, str]:
+        """The weights that the training begins with: setting to name or file."""
+        names = {setting: getattr(self, setting) for setting in self.WEIGHTS_SETTINGS}
+        return {setting: name for setting, name in names.items() if name}
+
+
 def make_adam(
     parameters: Iterable[nn.Parameter] | list[dict[str, Any]], config: AdamConfig
 ) -> torch.optim.Adam:

@@ -1,11 +1,11 @@
 """Settings of the stages; the defaults of the thesis's three are its schedules (2.4.2, 2.5.3)."""
 
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError, refuse_unknown
-from depthpose.core.loop import AdamConfig, LoopConfig
+from depthpose.core.loop import AdamConfig, LoopConfig, TrainingConfig
 from depthpose.depth.config import (
     DegradeConfig,
     GeneratorConfig,
@@ -14,14 +14,13 @@ from depthpose.depth.config import (
     PairsConfig,
     PSMNetConfig,
     SelectionConfig,
-    Settings,
 )
 from depthpose.depth.losses import ADVERSARIAL_LOSSES, GENERATOR_DISPARITY_LOSSES
 from depthpose.depth.weights import MATCHERS
 
 
 @dataclass(frozen=True, kw_only=True)
-class ViewTraining(Settings):
+class ViewTraining(TrainingConfig):
     """Stage 1: the generator learns to draw right views (thesis, 2.4.2)."""
 
     generator: GeneratorConfig = field(default_factory=GeneratorConfig)
@@ -67,8 +66,10 @@ class ViewTraining(Settings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SelectTraining(Settings):
+class SelectTraining(TrainingConfig):
     """Stage 1 of the generator that selects, in place of :class:`ViewTraining`."""
+
+    WEIGHTS_SETTINGS: ClassVar[tuple[str, ...]] = ("start", "encoder")
 
     generator: SelectionConfig = field(default_factory=SelectionConfig)
     """The network that is trained."""
@@ -140,8 +141,10 @@ class SelectTraining(Settings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class StereoTraining(Settings):
+class StereoTraining(TrainingConfig):
     """Stage 2: the matcher learns disparity from pairs with truth (thesis, 2.4.2)."""
+
+    WEIGHTS_SETTINGS: ClassVar[tuple[str, ...]] = ("start", "encoder")
 
     matcher: PSMNetConfig = field(default_factory=PSMNetConfig)
     """The network that is trained."""
@@ -246,8 +249,10 @@ class StereoTraining(Settings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FinetuneTraining(Settings):
+class FinetuneTraining(TrainingConfig):
     """Stage 3: the generator learns depth through the frozen matcher (thesis, 2.5.3)."""
+
+    WEIGHTS_SETTINGS: ClassVar[tuple[str, ...]] = ("generator", "matcher")
 
     generator: str = ""
     """Weights of the generator to begin with (or a whole set)."""

@@ -9,17 +9,12 @@ from typing import Any, TypeVar
 import torch
 from torch import nn
 
-from depthpose.core.checkpoint import (
-    add_terms,
-    file_sha256,
-    find_weights,
-    refuse_other_network,
-    warn_of_terms,
-)
+from depthpose.core.checkpoint import find_weights, refuse_other_network
 from depthpose.core.errors import InputError
 from depthpose.core.loop import (
     Task,
     TrainingRun,
+    add_origin,
     format_last_validation,
     releases_folder,
     write_card,
@@ -108,9 +103,8 @@ def make_matcher_network(config: StereoTraining) -> StereoNetwork:
     return matcher
 
 
+_StageConfig = ViewTraining | SelectTraining | StereoTraining | FinetuneTraining
 _GeneratorTraining = TypeVar("_GeneratorTraining", ViewTraining, SelectTraining, FinetuneTraining)
-_WEIGHTS_SETTINGS = ("start", "encoder", "generator", "matcher")
-"""Settings that may name weights which a training begins with."""
 _VALIDATION_TEXTS = {
     "view": "Drawn right views of pairs that were held out: mean difference (l1) and PSNR "
     "(dB) to the real ones.",
@@ -241,7 +235,7 @@ STAGES = {
 def _run_stage(
     task: Task,
     samples: TrainingPairs | SelectionSamples,
-    config: Any,  # noqa: ANN401
+    config: _StageConfig,
     run: TrainingRun,
 ) -> tuple[dict[str, str], float]:
     """Claim the folder for this config, and train.
@@ -260,61 +254,36 @@ def _run_stage(
         remedy = "give --held-out other pairs, or exclude these in the config"
         refuse_shared_frames(frames, held_out.frames, "pairs held out", remedy)
 
-    # What the folder is claimed for beside the config: the initial weights, truths and frames.
-    initial_weights = _find_initial_weights(config)
-    checksums: dict[str, Any] = {
-        f"{setting}_sha256": file_sha256(find_weights(name))
-        for setting, name in initial_weights.items()
-    }
+    # What the folder is claimed for beside the config: truths and frames.
+    more: dict[str, Any] = {}
     if samples.truths:
-        checksums["truth"] = list(samples.truths)
+        more["truth"] = list(samples.truths)
     if frames:
-        checksums["frames_sha256"] = _hash_frames(frames)
-
-    facts = _describe_training(config, samples.truths, tuple(initial_weights.values()))
-    warn_of_terms(facts)
-    weights_files = ("generator", "matcher", "fakestereo")
-    run.claim(config, weights_files, more=checksums, without=("held_out",))
-    return facts, run.train(task, samples, config.loop)
+        more["frames_sha256"] = _hash_frames(frames)
+    run.claim(config, ("generator", "matcher", "fakestereo"), more)
+    return _describe_training(config, samples.truths), run.train(task, samples, config.loop)
 
 
-def _find_initial_weights(config: Any) -> dict[str, str]:  # noqa: ANN401
-    """Find the settings of a stage that name weights to begin with: setting to name."""
-    initial_weights: dict[str, str] = {}
-    for setting in _WEIGHTS_SETTINGS:
-        name = getattr(config, setting, None)  # no stage has all of them
-        if isinstance(name, str):  # else the config of a network, or None
-            initial_weights[setting] = name
-    return initial_weights
-
-
-def _describe_training(
-    config: Any,  # noqa: ANN401
-    truths: Sequence[str],
-    began_with: Sequence[str],
-) -> dict[str, str]:
+def _describe_training(config: _StageConfig, truths: Sequence[str]) -> dict[str, str]:
     """Describe a training for the card of its weights, with the terms that bind them.
 
     Args:
         config: config of the stage.
         truths: the kinds of truth, as :class:`TrainingPairs` has them.
-        began_with: names of the weights that the training begins with.
     """
-    more = getattr(config, "more", None)  # only SelectTraining has it
-    pair_configs = [pairs for pairs in (config.pairs, more) if pairs]
+    pair_configs = [config.pairs]
+    if isinstance(config, SelectTraining) and config.more is not None:
+        pair_configs.append(config.more)
     data = [Path(folder).name for pairs in pair_configs for folder in pairs.folders]
     if any(pairs.streets for pairs in pair_configs):
         data.append("synthetic streets")
     facts = {
         "trained_on": ", ".join(data),
-        "stage": type(config).__name__,
         "licence": "not stated; that of the training data binds",
     }
     if truths:
         facts["truth"] = ", ".join(truths)
-    if began_with:
-        facts["began_with"] = ", ".join(Path(name).stem for name in began_with)
-    return add_terms(facts, began_with)
+    return add_origin(facts, config)
 
 
 def _hash_frames(frames: Sequence[FramePaths]) -> str:

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from depthpose.core.config import ASCENDING, Settings
 from depthpose.core.errors import InputError, refuse_unknown
-from depthpose.core.loop import AdamConfig, LoopConfig
+from depthpose.core.loop import AdamConfig, LoopConfig, TrainingConfig
 from depthpose.core.units import Unit
 from depthpose.pose.config import OCCLUSIONS, CloudConfig, MeshConfig, ObjectsConfig
 from depthpose.pose.losses import POINT_LOSSES
@@ -90,7 +90,7 @@ class HeldOutConfig(Settings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ViewsTraining(Settings):
+class ViewsTraining(TrainingConfig):
     """What the trainings on views of known objects have in common."""
 
     models: ModelsConfig = ModelsConfig()
@@ -235,7 +235,7 @@ class ImageAugmentConfig(Settings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SegmentationTraining(Settings):
+class SegmentationTraining(TrainingConfig):
     """FCN learns the masks of known objects."""
 
     images: ImagesConfig = ImagesConfig()

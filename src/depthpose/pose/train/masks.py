@@ -18,6 +18,7 @@ from depthpose.core.loop import (
     TrainingRun,
     Update,
     ValidationResult,
+    add_origin,
     format_last_validation,
     make_adam,
     make_sample_generator,
@@ -38,7 +39,7 @@ from depthpose.pose.segmentation import (
 )
 from depthpose.pose.synthetic.random_numbers import random_index, uniform
 from depthpose.pose.train.config import ImageAugmentConfig, ImagesConfig, SegmentationTraining
-from depthpose.pose.train.poses import add_origin, claim_run
+from depthpose.pose.train.poses import WEIGHTS_FILES
 
 
 class LabelledImage(NamedTuple):
@@ -308,7 +309,7 @@ def train_segmentation(config: SegmentationTraining, run: TrainingRun) -> Path:
         load_weights(network.encoder, encoder, str(path))
 
     # The folder is claimed only now: until here a setting may be refused.
-    claim_run(config, run)
+    run.claim(config, WEIGHTS_FILES)
     task = SegmentationTask(network, config, images.objects)
     samples = TrainingImages(images, config.augment, config.network.long_side_px, config.loop.seed)
     seconds = run.train(task, samples, config.loop)

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,18 +12,17 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from depthpose.core.checkpoint import (
-    add_terms,
     file_sha256,
     find_weights,
     read_checkpoint,
     refuse_other_network,
-    warn_of_terms,
 )
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_json
 from depthpose.core.loop import (
     TrainingRun,
     Update,
+    add_origin,
     make_sample_generator,
     releases_folder,
     write_card,
@@ -147,21 +146,8 @@ def stack_symmetries(models: Sequence[ObjectModel], step_rad: float) -> Rigid:
 _ROTATIONS_ON_CARD = 3  # rotations by which an object looks nearly alike, on a card
 
 
-_WEIGHTS_FILES = ("pose", "pointnet", "depth-image", "segmentation")
+WEIGHTS_FILES = ("pose", "pointnet", "depth-image", "segmentation")
 """Names of the weights that a training of this package may write, one of them in a folder."""
-
-
-def claim_run(config: Any, run: TrainingRun, files: Sequence[str] = ()) -> None:  # noqa: ANN401
-    """Claim the folder of a run for a config, with the checksums of ``files`` and of start weights.
-
-    Warns where the start weights have terms of use.
-    """
-    checksums: dict[str, Any] = {"sha256": [file_sha256(Path(path)) for path in files]}
-    if config.start is not None:
-        checksums["start_sha256"] = file_sha256(find_weights(config.start))
-        warn_of_terms(add_terms({}, [config.start]))
-    # What is held out is measured alone, and changes no weight.
-    run.claim(config, _WEIGHTS_FILES, checksums, without=("held_out",))
 
 
 def make_pose_weights(
@@ -180,14 +166,6 @@ def make_pose_weights(
         refusal=RefusalConfig(),
         facts=add_origin(facts, config),
     )
-
-
-def add_origin(facts: Mapping[str, str], config: Any) -> dict[str, str]:  # noqa: ANN401
-    """Add to the facts of a card the stage and the start weights, whose terms bind the new ones."""
-    origin = {**facts, "stage": type(config).__name__}
-    if config.start is None:
-        return origin
-    return add_terms({**origin, "began_with": Path(config.start).stem}, [config.start])
 
 
 _IMAGE_SYMMETRY_STEP_RAD = 0.2
@@ -299,7 +277,8 @@ def train_pose_network(config: PoseTraining | DepthImageTraining, run: TrainingR
         _copy_start(task.network, config.start, samples)
 
     # The folder is claimed only now: until here a setting may be refused.
-    claim_run(config, run, config.models.cad)
+    checksums = [file_sha256(Path(path)) for path in config.models.cad]
+    run.claim(config, WEIGHTS_FILES, {"sha256": checksums})
     seconds = run.train(task, samples, config.loop)
     path = run.folder / f"{_KINDS[type(task.network)]}.safetensors"
     if run.on_message is not None:
