@@ -122,8 +122,15 @@ def _choose_matcher(
     )
 
 
-def _choose_answer(generator: Generator | None, answer: Answer) -> None:
-    """Set where depth of one image comes from, in a generator's config.
+def _set_answer(generator: Generator | None, answer: Answer) -> None:
+    """Set in a generator's config where depth of one image comes from.
+
+    It is the generator's own disparity, or that of the matcher, which is given the synthesised right
+    view. A U-Net has only the second; to ask it for that changes nothing.
+
+    Args:
+        generator: of loaded weights.
+        answer: ``own`` or ``matched``.
 
     Raises:
         InputError: the generator cannot give that answer, or there is none.
@@ -246,7 +253,7 @@ class FakestereoNet:
         # The networks that run, in place of the defaults as the caller chose.
         generator = None if loaded is None else loaded.generator
         if answer is not None:
-            _choose_answer(generator, answer)
+            _set_answer(generator, answer)
         chosen_matcher = _choose_matcher(weights, loaded, matcher, loaded_matcher, config)
         synthesiser = None
         if generator is not None:

@@ -56,11 +56,20 @@ def paint_road(
 def _paint_patches(
     factor: Numbers, markings: Markings, weather: Weather, x: Numbers, s: Numbers
 ) -> Numbers:
-    """Darken the asphalt's factor where a stretch of road has a patch or a manhole's cover.
+    """Darken the asphalt where a stretch of road has a patch or a manhole's cover.
 
-    ``x`` and ``s``: coordinates on the road [m].
+    Args:
+        factor: of the asphalt's albedo, at each point.
+        markings: lanes of the road.
+        weather: of the scene, whose random shift makes the patches of scenes differ.
+        x: coordinate across the road [m].
+        s: coordinate along it [m].
+
+    Returns:
+        The factor, smaller in patches and covers.
     """
     # A random number in [0, 1) for each stretch, by a usual hash: digits of a sine of its number.
+    # It alone decides what a stretch has, where, how large and how dark.
     stretch = torch.floor(s / _PATCH_M)
     chance = torch.sin(stretch * 12.9898 + 97 * weather.shift[0]) * 43758.5453
     chance = chance - chance.floor()
