@@ -8,6 +8,7 @@ from depthpose.core.rigid import (
     cross_matrix,
     fit_rigid,
     geodesic_rad,
+    is_rigid,
     perturb,
     rotation_by,
 )
@@ -124,3 +125,17 @@ def test_a_motion_is_one_in_the_frame_of_the_camera() -> None:
     point = torch.randn(5, 3, dtype=torch.float64)
     seen = pose.apply(point) @ rotation_by(motion[:3]).mT + motion[3:]
     torch.testing.assert_close(perturb(pose, motion).apply(point), seen)
+
+
+def test_a_rigid_matrix_is_a_rotation_within_the_slack_and_0_0_0_1() -> None:
+    matrix = random_rigid(()).matrix()
+    assert is_rigid(matrix, slack=1e-6)
+    stretched = matrix.clone()
+    stretched[:3, :3] *= 1.001
+    assert not is_rigid(stretched, slack=1e-4)
+    assert is_rigid(stretched, slack=1e-2)
+    mirrored = matrix.clone()
+    mirrored[:3, 0] *= -1
+    assert not is_rigid(mirrored, slack=1e-4)
+    assert not is_rigid(matrix.T, slack=1e-4), "a translation in the last row"
+    assert not is_rigid(torch.full((4, 4), torch.nan), slack=1e-4)

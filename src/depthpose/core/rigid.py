@@ -115,6 +115,17 @@ def fit_rigid(
     return Rigid(R, (target_mean_m - source_mean_m @ R.mT).squeeze(-2))
 
 
+def is_rotation(R: Float[Tensor, "3 3"], slack: float) -> bool:
+    """Whether a matrix is a rotation: ``R @ R.T`` within ``slack`` of the identity, and det > 0."""
+    eye = torch.eye(3, dtype=R.dtype, device=R.device)
+    return torch.allclose(R @ R.mT, eye, atol=slack) and bool(torch.linalg.det(R) > 0)
+
+
+def is_rigid(matrix: Float[Tensor, "4 4"], slack: float) -> bool:
+    """Whether a matrix is ``[R t; 0 0 0 1]`` of a rotation R within ``slack``."""
+    return is_rotation(matrix[:3, :3], slack) and matrix[3].tolist() == [0, 0, 0, 1]
+
+
 def geodesic_rad(
     first: Float[Tensor, "*batch 3 3"], second: Float[Tensor, "*batch 3 3"]
 ) -> Float[Tensor, "*batch"]:

@@ -21,7 +21,7 @@ from depthpose.core.camera import (
 from depthpose.core.camera.any_camera import intrinsics_of
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_cloud, read_stored_depth
-from depthpose.core.rigid import Rigid
+from depthpose.core.rigid import Rigid, is_rigid
 from depthpose.core.units import Unit, metres_of
 from depthpose.pose.datasets import decode_rle, mask_from_labels, number_objects, read_labels
 from depthpose.pose.datasets.masks import read_runs
@@ -188,15 +188,12 @@ def rigid_input(
             f"{name} is a {type(pose).__name__} of shape {tuple(matrix.shape)}; give a Rigid, or "
             f"the 4x4 matrix {what} in metres"
         )
-    R = matrix[:3, :3]
-    is_orthonormal = torch.allclose(R @ R.T, torch.eye(3).to(R), atol=1e-4)
-    is_rotation = is_orthonormal and torch.det(R) > 0
-    if not is_rotation or not torch.equal(matrix[3], matrix.new_tensor([0, 0, 0, 1])):
+    if not is_rigid(matrix, slack=1e-4):
         raise InputError(
             f"{name} is no rigid transform; give [R t; 0 0 0 1], R a rotation, t in metres (a "
             "transposed matrix has t in its last row)"
         )
-    return Rigid(R.contiguous(), matrix[:3, 3].contiguous())
+    return Rigid(matrix[:3, :3].contiguous(), matrix[:3, 3].contiguous())
 
 
 def split_instances(labels: Int64[Tensor, "h w"]) -> list[Bool[Tensor, "h w"]]:

@@ -20,7 +20,7 @@ from depthpose.core.errors import InputError, Notice, suggest_name
 from depthpose.core.files import image_size, write_json
 from depthpose.core.files.disk import read_bytes, refuse_heavy, refused_as, write_bytes
 from depthpose.core.frame import make_data_frame
-from depthpose.core.rigid import Rigid
+from depthpose.core.rigid import Rigid, is_rigid
 from depthpose.core.run import claim_folder
 from depthpose.core.runner import Job, Results, run_jobs
 from depthpose.pose.datasets import BopDataset, Detection, Instance, read_mask
@@ -314,15 +314,12 @@ def _parse_pose(row: dict[str, Any], source: str, key: str = "camera_from_model"
     matrix = _parse_table(row, key, 4, source, rows=4)
     if matrix is None:
         return None
-    R = matrix[:3, :3]
-    eye = torch.eye(3, dtype=torch.float64)
-    is_rotation = torch.allclose(R @ R.T, eye, atol=_ROTATION_SLACK) and torch.linalg.det(R) > 0
-    if not is_rotation or matrix[3].tolist() != [0, 0, 0, 1]:
+    if not is_rigid(matrix, _ROTATION_SLACK):
         raise InputError(
             f"{source}: {key} is no rigid transform; write 4 rows of 4, a rotation, "
             "metres, and 0 0 0 1 below"
         )
-    return Rigid(R.clone(), matrix[:3, 3].clone())
+    return Rigid(matrix[:3, :3].clone(), matrix[:3, 3].clone())
 
 
 def _parse_table(

@@ -37,7 +37,7 @@ from depthpose.core.camera.stored_camera import (
 from depthpose.core.errors import InputError, Notice, import_opencv
 from depthpose.core.files import AnyPath, read_json, read_text
 from depthpose.core.files.disk import MAX_LIST_BYTES
-from depthpose.core.rigid import Rigid
+from depthpose.core.rigid import Rigid, is_rotation
 
 # Keys of OpenCV's calibrations, in lower case, letters and digits only.
 _K = {
@@ -116,10 +116,7 @@ def read_raw_pair(
             raise InputError("T is 0: both cameras stand in one place; calibrate as a pair")
         remedy = "--unit cm or mm scales it, and --unit m says that it is in metres"
         refuse_baseline(baseline_m, remedy, _MAX_BASELINE_M if unit_m else WIDE_BASELINE_M)
-        if (
-            not torch.allclose(R @ R.mT, torch.eye(3).double(), atol=_ROTATION_TOLERANCE)
-            or torch.det(R) < 0
-        ):
+        if not is_rotation(R, _ROTATION_TOLERANCE):
             raise InputError(f"R is {R.tolist()}, which is no rotation; copy it anew")
         _warn_if_transposed(path, pair.right_from_left)
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from depthpose.core.arrays import take_evenly
 from depthpose.core.errors import InputError
-from depthpose.core.rigid import Rigid, rotation_by
+from depthpose.core.rigid import Rigid, is_rigid, rotation_by
 from depthpose.core.units import Unit, metres_of
 from depthpose.pose.config import MeshConfig
 from depthpose.pose.mesh.colors import read_colors
@@ -127,14 +127,12 @@ def _motion_from_bop(row: object, source: str) -> Rigid:
             f"{source}: the symmetry {repr(row)[:80]} is not 16 numbers; write a 4x4 matrix row by "
             "row"
         ) from error
-    R = matrix[:3, :3]
-    is_rotation = torch.allclose(R @ R.T, torch.eye(3).double(), atol=1e-3) and torch.det(R) > 0
-    if not is_rotation or matrix[3].tolist() != [0, 0, 0, 1]:
+    if not is_rigid(matrix, slack=1e-3):
         raise InputError(
             f"{source}: the symmetry {repr(row)[:200]} is no rigid motion; its upper left 3x3 is a "
             "rotation, its last row 0 0 0 1"
         )
-    return Rigid(R, 0.001 * matrix[:3, 3])
+    return Rigid(matrix[:3, :3], 0.001 * matrix[:3, 3])
 
 
 def _axis_from_bop(entry: object, source: str) -> Axis:
