@@ -68,7 +68,7 @@ def _lies_on_surface(
     return is_explained
 
 
-def window_of_region(view: ViewInput, margin: float = _REGION_MARGIN) -> ViewInput:
+def crop_to_region(view: ViewInput, margin: float = _REGION_MARGIN) -> ViewInput:
     """Crop a view to its mask, with a margin in which planes and neighbours are visible.
 
     The margin is a share of the larger side of the mask.

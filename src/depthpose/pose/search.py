@@ -22,7 +22,7 @@ from depthpose.core.devices import map_in_threads
 from depthpose.core.rigid import Rigid
 from depthpose.pose.cloud import cloud_from_depth, why_nothing_seen
 from depthpose.pose.config import EstimateConfig, RefusalConfig
-from depthpose.pose.footprint import explained_frame_mask, why_background_excludes, window_of_region
+from depthpose.pose.footprint import crop_to_region, explained_frame_mask, why_background_excludes
 from depthpose.pose.frame import Frame, prepare_frame
 from depthpose.pose.icp import refine_roughly
 from depthpose.pose.picking import rank_picks
@@ -128,10 +128,10 @@ def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
     """
     # The part of the image that is searched, its normals and its background.
     began = time.perf_counter()
-    window = window_of_region(view)
+    region = crop_to_region(view)
     smallest_m = min(target.surface.diameter_m for target in targets.objects.values())
-    frame = prepare_frame(window.depth_m, window.K, smallest_m, window.background)
-    is_unclaimed = window.mask[:: frame.step, :: frame.step].clone()
+    frame = prepare_frame(region.depth_m, region.K, smallest_m, region.background)
+    is_unclaimed = region.mask[:: frame.step, :: frame.step].clone()
 
     # Round after round: propose, refine, judge, suppress. What is posed claims its readings.
     names = list(targets.objects)
@@ -140,8 +140,8 @@ def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
     misses: list[_Miss] = []
     for _ in range(1 if targets.is_single else _ROUNDS):
         proposals = _propose(frame, is_unclaimed, names, claimed, targets)
-        likely, hopeless = _refine(proposals, frame, window, targets)
-        judged, rejected = _judge(_group(likely), frame, window, targets)
+        likely, hopeless = _refine(proposals, frame, region, targets)
+        judged, rejected = _judge(_group(likely), frame, region, targets)
         misses += hopeless + rejected
         if targets.is_single:
             judged, outside = _within(judged, is_unclaimed, targets)
@@ -170,7 +170,7 @@ def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
     ]
     if not targets.is_single:
         surfaces = {name: target.surface for name, target in targets.objects.items()}
-        estimates = rank_picks(estimates, window, surfaces)
+        estimates = rank_picks(estimates, region, surfaces)
     missing = set(targets.objects) - {place.object for place in posed}
     estimates += [
         nothing_found(view, name, [miss for miss in misses if miss.object == name], spent_s)
@@ -274,7 +274,7 @@ def _readings_of(place: _Place, frame: Frame, view: ViewInput) -> Float[Tensor, 
     """Collect the readings that a place explains, of the unthinned view, in the camera frame."""
     height, width = view.depth_m.shape
     mask = place.explained.repeat_interleave(frame.step, 0).repeat_interleave(frame.step, 1)
-    part = window_of_region(replace(view, mask=mask[:height, :width]), margin=0)
+    part = crop_to_region(replace(view, mask=mask[:height, :width]), margin=0)
     return cloud_from_depth(part.depth_m, part.mask, part.K)
 
 

@@ -77,8 +77,8 @@ _DIFFERENCE_NOTES = {
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Views:
-    """Views with truth, of a dataset or synthetic."""
+class ThesisViews:
+    """Views with truth for a table or figure, of a dataset or synthetic."""
 
     samples: Sequence[ViewSample]  #: the views, whose objects have the names of the network
     instances: Sequence[Instance | None]  #: instance of each in the dataset; None: synthetic
@@ -100,11 +100,11 @@ class Views:
         return cut_close_up(picture, view.mask, view.K)
 
 
-def _render_views(net: GeoPoseNet, count: int) -> Views:
+def _render_views(net: GeoPoseNet, count: int) -> ThesisViews:
     """Render synthetic views of the network's objects."""
     config = ObjectsConfig(number=count, seed=_SYNTHETIC_SEED)
     objects = SyntheticViews(net.weights.models, config, net.weights.cloud)
-    return Views(
+    return ThesisViews(
         samples=[objects.view(i) for i in range(count)],
         instances=[None] * count,
         columns={"frames": f"synthetic, seed {_SYNTHETIC_SEED}"},
@@ -112,7 +112,9 @@ def _render_views(net: GeoPoseNet, count: int) -> Views:
     )
 
 
-def _read_views(net: GeoPoseNet, folder: Path, data: PoseDataOptions, number: int | None) -> Views:
+def _read_views(
+    net: GeoPoseNet, folder: Path, data: PoseDataOptions, number: int | None
+) -> ThesisViews:
     """Read views of a dataset.
 
     Args:
@@ -143,7 +145,9 @@ def _read_views(net: GeoPoseNet, folder: Path, data: PoseDataOptions, number: in
         "split": dataset.split,
         "frames_sha256": hash_frames(dataset.instances),
     }
-    return Views(samples=samples, instances=dataset.instances, columns=columns, settings=settings)
+    return ThesisViews(
+        samples=samples, instances=dataset.instances, columns=columns, settings=settings
+    )
 
 
 def reproduce_by_object(
@@ -316,7 +320,7 @@ def write_figure(
     data: PoseDataOptions,
     number: int,
     out: Path,
-    draw_panels: Callable[[GeoPoseNet, Views], list[Drawing]],
+    draw_panels: Callable[[GeoPoseNet, ThesisViews], list[Drawing]],
     drawing_settings: Mapping[str, object],
     columns: int,
 ) -> int:
@@ -363,7 +367,7 @@ def write_figure(
     return 0
 
 
-def draw_feature_panels(net: GeoPoseNet, views: Views, perplexity: float) -> list[Drawing]:
+def draw_feature_panels(net: GeoPoseNet, views: ThesisViews, perplexity: float) -> list[Drawing]:
     """Draw the features of each view as colours, by one t-SNE for all views (figure 3-2).
 
     ``perplexity``: of the t-SNE, about how many neighbours a point has.
@@ -411,7 +415,7 @@ class _KeypointVote:
     error_m: float  #: distance between the two
 
 
-def _find_worst_vote(net: GeoPoseNet, views: Views, keypoint: int | None) -> _KeypointVote:
+def _find_worst_vote(net: GeoPoseNet, views: ThesisViews, keypoint: int | None) -> _KeypointVote:
     """Vote in all views, and find the keypoint with the largest error.
 
     ``keypoint``: number, from 0 on, of the only keypoint to look at in each view; None: at all.
@@ -444,7 +448,9 @@ def _find_worst_vote(net: GeoPoseNet, views: Views, keypoint: int | None) -> _Ke
     return max(votes, key=lambda vote: vote.error_m)
 
 
-def draw_direction_panels(net: GeoPoseNet, views: Views, keypoint: int | None) -> list[Drawing]:
+def draw_direction_panels(
+    net: GeoPoseNet, views: ThesisViews, keypoint: int | None
+) -> list[Drawing]:
     """Draw true and predicted directions to the keypoint whose vote errs most (figure 3-4).
 
     ``keypoint``: number, from 0 on, of the only keypoint to look at in each view; None: at all.
@@ -472,7 +478,7 @@ def draw_direction_panels(net: GeoPoseNet, views: Views, keypoint: int | None) -
     ]
 
 
-def draw_box_panels(net: GeoPoseNet, views: Views) -> list[Drawing]:
+def draw_box_panels(net: GeoPoseNet, views: ThesisViews) -> list[Drawing]:
     """Draw the boxes of true and estimated poses over close-ups (figure 3-5)."""
     models = {model.name: model for model in net.weights.models}
     panels: list[Drawing] = []
