@@ -18,7 +18,7 @@ from depthpose.core.units import Unit
 from depthpose.pose.background import AnyBackground, add_background
 from depthpose.pose.color_inputs import add_color
 from depthpose.pose.config import EstimateConfig, RefusalConfig
-from depthpose.pose.datasets.detections import Box, mask_from_box
+from depthpose.pose.datasets.detections import Box, Detection, mask_view
 from depthpose.pose.geometry.surface import prepare_surface
 from depthpose.pose.inputs import (
     AnyArray,
@@ -220,8 +220,7 @@ class PoseEstimator:
                 )
             pose_input = view_input(depth, mask, lens, which, _NAME, unit)
             if box is not None:
-                pixels = mask_from_box(box, *pose_input.depth_m.shape)
-                pose_input = replace(pose_input, mask=pixels, is_region=True)
+                pose_input = mask_view(pose_input, Detection(box=box))
             pose_input = add_background(pose_input, background, lens, unit)
             models = self.models if object is None else [self._find_object(object).model]
             pose_input = add_color(pose_input, models, color, color_camera, color_from_depth)

@@ -13,7 +13,7 @@ from depthpose.core.units import METRES, Unit
 from depthpose.pose import mesh
 from depthpose.pose.background import add_background
 from depthpose.pose.config import EstimateConfig, ObjectsConfig
-from depthpose.pose.datasets import mask_from_box, parse_box
+from depthpose.pose.datasets import Detection, mask_view, parse_box
 from depthpose.pose.datasets.dataset import write_mask
 from depthpose.pose.footprint import explained_mask
 from depthpose.pose.geometry.surface import prepare_surface
@@ -178,9 +178,9 @@ def _make_box_views(form: Form, pose_input: CloudInput | ViewInput) -> list[View
     views: list[ViewInput] = []
     for number, word in enumerate(words, 1):
         assert isinstance(pose_input, ViewInput)
-        mask = mask_from_box(parse_box(word), *pose_input.depth_m.shape)
         name = pose_input.name + (f"_{number}" if len(words) > 1 else "")
-        views.append(replace(pose_input, name=name, mask=mask, is_region=True))
+        view = mask_view(pose_input, Detection(box=parse_box(word)))
+        views.append(replace(view, name=name))
     return views
 
 

@@ -11,6 +11,7 @@ from depthpose.pose.datasets.detections import Box as Box
 from depthpose.pose.datasets.detections import Detection as Detection
 from depthpose.pose.datasets.detections import group_by_image as group_by_image
 from depthpose.pose.datasets.detections import mask_from_box as mask_from_box
+from depthpose.pose.datasets.detections import mask_view as mask_view
 from depthpose.pose.datasets.detections import name_objects as name_objects
 from depthpose.pose.datasets.detections import parse_box as parse_box
 from depthpose.pose.datasets.detections import parse_labels as parse_labels

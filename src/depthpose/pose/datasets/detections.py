@@ -21,6 +21,7 @@ from depthpose.pose.datasets.entries import (
     read_numbers,
 )
 from depthpose.pose.datasets.masks import RunLengths, decode_rle, find_mask_box, read_runs
+from depthpose.pose.types import ViewInput
 
 Box = tuple[float, float, float, float]
 """Left, top, right and bottom edge [px]: the first pixel reaches from 0 to 1, as COCO counts."""
@@ -79,6 +80,16 @@ class Detection:
                 "detect in this very image, or resize the masks to its size"
             )
         return decode_rle(*runs)
+
+
+def mask_view(view: ViewInput, detection: Detection) -> ViewInput:
+    """Return a view with the mask of a detection, or with the region of its box.
+
+    Raises:
+        InputError: the mask is of an image of another size, or the box lies outside of this.
+    """
+    mask = detection.mask(*view.depth_m.shape)
+    return replace(view, mask=mask, is_region=detection.box is not None)
 
 
 def parse_box(text: str) -> Box:
