@@ -13,7 +13,7 @@ from tests.pose.test_track import moving
 
 from depthpose.cli import main
 from depthpose.cli.pose import methods
-from depthpose.cli.pose.jobs import make_cloud_jobs
+from depthpose.cli.pose.file_jobs import make_cloud_jobs
 from depthpose.core.camera import Camera, back_project, write_camera
 from depthpose.core.files import read_cloud, write_depth_png
 from depthpose.pose import track as tracking_module

@@ -12,7 +12,7 @@ from tests.pose.synthetic_objects import bracket
 from torch.nn.functional import huber_loss
 
 from depthpose.cli import main
-from depthpose.cli.pose.jobs import make_cloud_jobs
+from depthpose.cli.pose.file_jobs import make_cloud_jobs
 from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError
 from depthpose.core.files import CLOUD_READERS, PointCloud, read_cloud

@@ -8,7 +8,7 @@ import pytest
 import torch
 from PIL import Image
 
-from depthpose.cli.pose.jobs import make_mask_jobs
+from depthpose.cli.pose.file_jobs import make_mask_jobs
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_depth_png
 from depthpose.pose.datasets import (

@@ -11,12 +11,13 @@ import torch
 
 from depthpose.core.errors import InputError, Notice
 from depthpose.core.rigid import Rigid, perturb
+from depthpose.core.runner import run_jobs
 from depthpose.pose.predictions import (
     VERSION,
     Place,
     PoseJob,
+    PoseResults,
     Prediction,
-    estimate_missing_poses,
     read_bop_results,
     read_earlier_predictions,
     read_predictions,
@@ -157,21 +158,35 @@ def test_finished_work_is_not_done_again(tmp_path: Path) -> None:
         return [answer(name) for name in names]
 
     def jobs(*names: str) -> list[PoseJob[str]]:
-        return [PoseJob(name=name, read=lambda name=name: name) for name in names]
+        return [PoseJob(name=name, read=lambda name=name: name, object="cat") for name in names]
 
-    run = estimate_missing_poses(estimate, jobs("a", "b", "c"), tmp_path, {"voxel_m": 0.008})
-    assert [next(run).estimate.name for _ in range(2)] == ["a", "b"]
+    run = run_jobs(jobs("a", "b", "c"), estimate, PoseResults[str](tmp_path))
+    assert [next(run).job.name for _ in range(2)] == ["a", "b"]
     run.close()  # as an interrupt does
     assert [p.estimate.name for p in read_predictions(tmp_path)] == ["a", "b"]
-    done = list(
-        estimate_missing_poses(
-            estimate, jobs("a", "b", "c", "d"), tmp_path, {"voxel_m": 0.008}, batch=2
-        )
-    )
-    assert [one.estimate.name for one in done] == ["a", "b", "c", "d"]
+    run = run_jobs(jobs("a", "b", "c", "d"), estimate, PoseResults[str](tmp_path), batch=2)
+    assert [outcome.result is None for outcome in run] == [True, True, False, False]
+    assert [p.estimate.name for p in read_predictions(tmp_path)] == ["a", "b", "c", "d"]
     assert asked == ["a", "b", "c", "d"]
-    with pytest.raises(InputError, match=r"holds results made with voxel_m = 0.008, but now it is"):
-        next(estimate_missing_poses(estimate, jobs("a"), tmp_path, {"voxel_m": 0.005}))
+
+
+@pytest.mark.parametrize("must_read", [False, True])
+def test_what_cannot_be_read_is_an_estimate_unless_it_must_be(
+    tmp_path: Path, must_read: bool
+) -> None:
+    def read() -> str:
+        raise InputError("torn")
+
+    job = PoseJob(name="a", read=read, object="cat")
+    results = PoseResults[str](tmp_path, must_read=must_read)
+    run = run_jobs([job], lambda names: [answer(name) for name in names], results)
+    if must_read:
+        with pytest.raises(InputError, match="torn"):
+            next(run)
+        assert read_predictions(tmp_path) == []
+    else:
+        next(run)
+        assert results.predictions["a"].estimate.reason == "cannot be read: torn"
 
 
 def test_damaged_files_are_refused(tmp_path: Path) -> None:

@@ -4,10 +4,8 @@ import csv
 import math
 import warnings
 from collections import Counter, defaultdict
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 from io import StringIO
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, cast, get_args
@@ -17,13 +15,12 @@ from torch import Tensor
 
 from depthpose.core.config import config_from_dict
 from depthpose.core.errors import InputError, Notice, suggest_name
-from depthpose.core.files import image_size, write_json
+from depthpose.core.files import write_json
 from depthpose.core.files.disk import read_bytes, refuse_heavy, refused_as, write_bytes
 from depthpose.core.frame import make_data_frame
 from depthpose.core.rigid import Rigid, is_rigid
-from depthpose.core.run import claim_folder
-from depthpose.core.runner import Job, Results, run_jobs
-from depthpose.pose.datasets import BopDataset, Detection, Instance, read_mask
+from depthpose.core.runner import Job, Results
+from depthpose.pose.datasets import BopDataset, Instance
 from depthpose.pose.datasets.entries import (
     LARGEST_ID,
     make_pose,
@@ -39,7 +36,6 @@ from depthpose.pose.types import (
     PoseEstimate,
     Status,
     Tracking,
-    ViewInput,
 )
 
 POSES = "poses.json"  #: name of the file of predictions
@@ -346,9 +342,7 @@ Input = TypeVar("Input")
 class PoseJob(Job[Input]):
     """One input of an estimator of poses."""
 
-    #: name of the object. Where the input cannot be read an estimate says so; without a name that
-    #: is an error.
-    object: str | None = None
+    object: str  #: name of the object that the input shows, or may show
     place: Place | None = None  #: as in :class:`Prediction`
     seconds: Mapping[str, float] = field(default_factory=dict)  #: of earlier stages, such as a mask
 
@@ -369,10 +363,14 @@ class PoseResults(Results[Input, PoseEstimate]):
         folder: folder of the file.
         run_folder: folder of the run where several processes share it, each with a ``folder`` of
             its own: what any of them finished counts as finished. None: ``folder``.
+        must_read: an input that cannot be read is an error; else an estimate says so.
     """
 
-    def __init__(self, folder: Path, run_folder: Path | None = None) -> None:
+    def __init__(
+        self, folder: Path, run_folder: Path | None = None, *, must_read: bool = False
+    ) -> None:
         self.folder = folder
+        self._must_read = must_read
         self.predictions = read_earlier_predictions(folder)  #: by the names of the inputs
         predictions_of_run = self.predictions
         if run_folder is not None and run_folder != folder:
@@ -395,9 +393,9 @@ class PoseResults(Results[Input, PoseEstimate]):
         self._keep(job, result)
 
     def store_failure(self, job: Job[Input], error: InputError) -> None:
-        """Keep an estimate that says why the input cannot be read, if the job names an object."""
+        """Keep an estimate that says why the input cannot be read, unless that is an error."""
         assert isinstance(job, PoseJob)
-        if job.object is None:
+        if self._must_read:
             raise error
         self._keep(job, refuse_unreadable(job.name, job.object, error))
 
@@ -414,134 +412,6 @@ class PoseResults(Results[Input, PoseEstimate]):
         if self._unsaved or not (self.folder / POSES).is_file():
             write_predictions(self.folder, self.predictions.values())
             self._unsaved = 0
-
-
-def estimate_missing_poses(
-    estimate_many: Callable[[Sequence[Input]], Sequence[PoseEstimate]],
-    jobs: Iterable[PoseJob[Input]],
-    folder: Path,
-    settings: dict[str, Any],
-    batch: int = 1,
-) -> Generator[Prediction, None, None]:
-    """Estimate the inputs that are not finished, and yield all predictions in the order of jobs.
-
-    Args:
-        estimate_many: returns an estimate for each input, of the same name.
-        jobs: all jobs, finished ones too.
-        folder: of ``poses.json``; refused if that was computed with other settings.
-        settings: what determines the results.
-        batch: inputs that are estimated at once. Each then takes an equal share of the time.
-
-    Raises:
-        InputError: an input whose job names no object cannot be read.
-    """
-    claim_folder(folder, settings, [POSES])
-    results = PoseResults[Input](folder)
-    with closing(run_jobs(jobs, estimate_many, results, batch)) as outcomes:
-        for outcome in outcomes:
-            yield results.predictions[outcome.job.name]
-
-
-def make_instance_jobs(
-    dataset: BopDataset, names: Mapping[int, str], predicted_mask: str | None = None
-) -> list[PoseJob[ViewInput]]:
-    """Build a job for each annotated instance, by its annotated mask or a predicted one.
-
-    Args:
-        dataset: with the instances.
-        names: of the objects in the estimator, by number.
-        predicted_mask: pattern of the files of predicted masks (``Layout.predicted_mask``); None:
-            annotated masks.
-    """
-    jobs: list[PoseJob[ViewInput]] = []
-    for instance in dataset.instances:
-        mask = None
-        object = names[instance.object_id]
-        if predicted_mask is not None:
-            file = predicted_mask.format(object=instance.object_id, image=instance.image_id)
-            mask = dataset.folder / file
-        read = partial(_read_view, dataset, instance, instance.name, object, mask)
-        jobs.append(PoseJob(name=instance.name, read=read, place=place_of(instance)))
-    return jobs
-
-
-def _read_view(
-    dataset: BopDataset, instance: Instance, name: str, object: str, mask: Path | Detection | None
-) -> ViewInput:
-    """Read the view of an instance, with a mask of a file or a detection.
-
-    Args:
-        dataset: of the instance.
-        instance: whose depth image and camera are read.
-        name: of the view.
-        object: name of the object.
-        mask: its file, or a detection; None: the annotated mask of the instance.
-    """
-    pixels = None
-    if isinstance(mask, Detection):
-        width, height = image_size(instance.depth)
-        pixels = mask.mask(height, width)
-    if isinstance(mask, Path):
-        pixels = read_mask(mask)
-    is_region = isinstance(mask, Detection) and mask.box is not None
-    view = dataset.view(instance, pixels).input
-    return replace(view, name=name, object=object, is_region=is_region)
-
-
-def make_detection_jobs(
-    dataset: BopDataset, names: Mapping[int, str], detections: Sequence[Detection]
-) -> list[PoseJob[ViewInput]]:
-    """Build jobs for the detections with the highest scores, as many as an image has instances.
-
-    They are as many for each object. An instance that is not detected has no job, and counts as
-    missing. The time of an image's detection is divided among its jobs.
-
-    Args:
-        dataset: with the instances.
-        names: of the objects in the estimator, by number.
-        detections: those of images that are not in the dataset are left out.
-
-    Raises:
-        InputError: a detection lacks its scene, image or object, or none is of the dataset.
-    """
-    # The best detections of each object in each image.
-    instances_of_place: dict[Place, list[Instance]] = defaultdict(list)
-    for instance in dataset.instances:
-        instances_of_place[place_of(instance)].append(instance)
-    best_of_place: dict[Place, list[Detection]] = defaultdict(list)
-    for detection in sorted(detections, key=lambda d: -d.score):
-        if detection.scene_id is None or detection.image_id is None or detection.object_id is None:
-            raise InputError(
-                f"{dataset.folder}: a detection of {detection.label!r} lacks scene_id, image_id or "
-                "category_id; detections of a dataset have all three"
-            )
-        place = Place(detection.scene_id, detection.image_id, detection.object_id)
-        if len(best_of_place[place]) < len(instances_of_place.get(place, ())):
-            best_of_place[place].append(detection)
-    chosen = [
-        (place, k, detection)
-        for place, best in best_of_place.items()
-        for k, detection in enumerate(best)
-    ]
-    if not chosen:
-        raise InputError(
-            f"{dataset.folder}: none of the {len(detections)} detections is of an image and object "
-            f"of split {dataset.split!r}; give those of this very split"
-        )
-
-    # A job for each, in the order of places.
-    jobs_of_image = Counter(place[:2] for place, _, _ in chosen)
-    jobs: list[PoseJob[ViewInput]] = []
-    for place, k, detection in sorted(chosen, key=lambda item: item[:2]):
-        name = f"{place.scene_id:06d}_{place.image_id:06d}_object{place.object_id}_{k}"
-        seconds: dict[str, float] = {}
-        if detection.seconds is not None:
-            seconds = {"segmentation": detection.seconds / jobs_of_image[place[:2]]}
-        instance = instances_of_place[place][0]  # any: only its image and camera are used
-        object = names[place.object_id]
-        read = partial(_read_view, dataset, instance, name, object, detection)
-        jobs.append(PoseJob(name=name, read=read, place=place, seconds=seconds))
-    return jobs
 
 
 def additive_seconds(predictions: Sequence[Prediction]) -> list[dict[str, float]]:

@@ -133,7 +133,8 @@ def evaluate_poses(
         objects: keep these alone, by name or number.
         adds: ADD-S for declared symmetric objects (of LineMOD eggbox and glue), or for all.
     """
-    from depthpose.cli.pose.evaluate import measure_and_report, open_instances, predict_instances
+    from depthpose.cli.pose.dataset import open_dataset
+    from depthpose.cli.pose.evaluate import measure_and_report, predict_instances, print_instances
     from depthpose.cli.pose.masks import prepare_masks
     from depthpose.cli.pose.methods import build_methods
     from depthpose.core.config import config_to_dict
@@ -143,7 +144,8 @@ def evaluate_poses(
 
     if not (weights or csv or predictions):
         raise InputError("measure --weights FILE, --csv FILE or --predictions DIR, or several.")
-    dataset = open_instances(bop, split, objects, estimates.targets)
+    dataset = open_dataset(bop, split, estimates.targets, objects)
+    print_instances(dataset)
     files = [
         *list_table_files("rows", "instances", "risk"),
         "report.html",

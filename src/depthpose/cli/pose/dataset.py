@@ -1,16 +1,38 @@
-"""Which objects of a dataset a method poses, and the settings that identify the dataset."""
+"""A dataset as options name it: its instances, its settings, and the objects of a method."""
 
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from depthpose.cli.pose.methods import PoseMethod
 from depthpose.core.errors import InputError
 from depthpose.pose import datasets
+from depthpose.pose.evaluate import select_targets
 from depthpose.pose.types import ObjectModel
 
 _SAME_DIAMETER = 0.05
 """Largest relative difference of the diameters of one object in a dataset and in weights."""
+
+
+def open_dataset(
+    folder: Path, split: str, targets: Path | None = None, objects: Sequence[str] = ()
+) -> datasets.BopDataset:
+    """Open the instances of a split, restricted to targets and objects.
+
+    Args:
+        folder: of the dataset.
+        split: name of the split.
+        targets: BOP's list of targets; None: all instances.
+        objects: names or numbers of those to keep; empty: all.
+
+    Raises:
+        InputError: the dataset or the list cannot be read, or nothing is left.
+    """
+    dataset = datasets.open_bop(folder, split)
+    if targets is not None:
+        dataset = select_targets(dataset, datasets.read_targets(targets, folder))
+    return dataset.of_objects(*objects) if objects else dataset
 
 
 def dataset_settings(dataset: datasets.BopDataset) -> dict[str, Any]:

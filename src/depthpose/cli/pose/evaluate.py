@@ -14,12 +14,13 @@ from depthpose.cli.file_names import distinct_names
 from depthpose.cli.pose.dataset import dataset_settings, match_names
 from depthpose.cli.pose.masks import Masks
 from depthpose.cli.pose.methods import PoseMethod
+from depthpose.cli.pose.predict import estimate_unfinished
 from depthpose.core.checkpoint import file_sha256
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image
-from depthpose.core.run import describe_environment, read_settings
+from depthpose.core.run import claim_folder, describe_environment, read_settings
 from depthpose.pose.config import EvaluationConfig
-from depthpose.pose.datasets import BopDataset, open_bop, read_targets
+from depthpose.pose.datasets import BopDataset
 from depthpose.pose.evaluate import (
     Evaluation,
     InstanceRow,
@@ -28,15 +29,16 @@ from depthpose.pose.evaluate import (
     find_nearest_copy,
     match_instances,
     read_any_predictions,
-    select_targets,
 )
 from depthpose.pose.mesh import symmetry_transforms
 from depthpose.pose.predictions import (
-    estimate_missing_poses,
+    POSES,
+    PoseResults,
     name_bop_results,
     read_predictions,
     write_bop_results,
 )
+from depthpose.pose.types import ViewInput
 from depthpose.report import page
 from depthpose.report.page import Section
 from depthpose.report.pose import make_pose_section
@@ -63,25 +65,13 @@ _INSTANCE_COLUMNS = (
 """Columns of the table below the picture of an instance."""
 
 
-def open_instances(
-    bop: Path, split: str, objects: Sequence[str], targets: Path | None
-) -> BopDataset:
-    """Open the instances of a split, restricted to targets and objects; print how many there are.
-
-    Args:
-        bop: folder of the dataset.
-        split: name of the split.
-        objects: names or numbers of those to keep; empty: all.
-        targets: BOP's list of targets; None: all instances.
-    """
-    dataset = open_bop(bop, split)
-    if targets is not None:
-        dataset = select_targets(dataset, read_targets(targets, bop))
-    if objects:
-        dataset = dataset.of_objects(*objects)
+def print_instances(dataset: BopDataset) -> None:
+    """Print how many instances are measured, and of which objects."""
     names = ", ".join(model.name for model in dataset.objects.values())
-    print(f"{bop} {split}: {len(dataset)} instances, layout {dataset.layout}; objects: {names}")
-    return dataset
+    print(
+        f"{dataset.folder} {dataset.split}: {len(dataset)} instances, layout {dataset.layout}; "
+        f"objects: {names}"
+    )
 
 
 def predict_instances(
@@ -107,10 +97,11 @@ def predict_instances(
         **masks.settings,
         **dataset_settings(dataset),
     }
-    names = estimate_missing_poses(method.estimate_many, jobs, predictions_folder, settings, batch)
+    claim_folder(predictions_folder, settings, [POSES])
+    # Every process estimates all instances, for it measures all.
+    results = PoseResults[ViewInput](predictions_folder, must_read=True)
     label = f"{method.name}, {masks.name} masks"
-    for _ in tqdm(names, label, total=len(jobs), disable=None, unit=" instances"):
-        pass  # each is estimated as its name is asked for
+    estimate_unfinished(method, jobs, results, batch, label)
     write_bop_results(
         predictions_folder / name_bop_results(dataset), read_predictions(predictions_folder)
     )

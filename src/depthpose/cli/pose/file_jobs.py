@@ -1,4 +1,4 @@
-"""Files of the pose commands become jobs, each of which reads one cloud or masked depth image."""
+"""Files of the user become jobs, each of which reads one cloud or (masked) depth image."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -20,6 +20,7 @@ from depthpose.pose.datasets import (
     Detection,
     encode_rle,
     group_by_image,
+    mask_view,
     name_objects,
     parse_box,
     read_detections,
@@ -205,12 +206,12 @@ def make_box_jobs(
     detections = [Detection(object=object, box=parse_box(text)) for text in boxes]
     jobs: list[PoseJob[Any]] = []
     for path in depths:
-        jobs += _make_detection_jobs(path, detections, (path,), camera, unit)
+        jobs += _make_jobs_in_image(path, detections, (path,), camera, unit)
     _refuse_equal_names(jobs, depth)
     return jobs
 
 
-def make_detected_jobs(
+def make_detection_jobs(
     depth: Path,
     detections: Path,
     camera: Path | float,
@@ -261,7 +262,7 @@ def make_detected_jobs(
         has_detection |= bool(named)
         detected_objects = {detection.object for detection in named}
         undetected = [name for name in wanted.expected if name not in detected_objects]
-        jobs += _make_detection_jobs(path, named, (path, file), camera, unit, undetected)
+        jobs += _make_jobs_in_image(path, named, (path, file), camera, unit, undetected)
     if not has_detection:
         raise InputError(f"{detections}: holds no detection of what is asked for in {depth}")
     _refuse_equal_names(jobs, depth)
@@ -277,7 +278,7 @@ def _read_detections_of(depth: Path, file: Path) -> list[Detection]:
     return read_detections(file, size)
 
 
-def _make_detection_jobs(
+def _make_jobs_in_image(
     path: Path,
     detections: Sequence[Detection],
     files: tuple[Path, ...],
@@ -330,8 +331,7 @@ def read_detection(
     view = view_input(path, None, camera, object, name, unit)
     if detection is None:
         return replace(view, mask=torch.zeros_like(view.mask), is_region=True)
-    mask = detection.mask(*view.depth_m.shape)
-    return replace(view, mask=mask, is_region=detection.box is not None)
+    return mask_view(view, detection)
 
 
 def match_to_depths(
@@ -372,7 +372,7 @@ def _refuse_equal_names(jobs: Sequence[PoseJob[Any]], depth: Path) -> None:
         )
 
 
-def make_frame_jobs(
+def make_depth_jobs(
     depth: Path, camera: Path | float, object: str, unit: Unit | None, out: Path
 ) -> list[PoseJob[Any]]:
     """Make a job of a whole depth image, or of every one of a folder, without masks.

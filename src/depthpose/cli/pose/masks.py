@@ -13,12 +13,14 @@ from tqdm import tqdm
 
 from depthpose.cli.file_names import name_files
 from depthpose.cli.pose.dataset import dataset_settings
+from depthpose.cli.pose.dataset_jobs import make_best_detection_jobs, make_instance_jobs
 from depthpose.core.checkpoint import file_sha256, find_weights
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image, write_json
 from depthpose.core.run import claim_folder
-from depthpose.pose import datasets, predictions
+from depthpose.pose import datasets
 from depthpose.pose.datasets.entries import read_integer, read_rows
+from depthpose.pose.predictions import PoseJob
 from depthpose.pose.segmentation import Segmenter
 from depthpose.pose.types import ViewInput
 
@@ -29,7 +31,7 @@ class Masks:
 
     name: str  #: name in tables
     #: makes a job for each mask, given the method's names of the objects by their numbers
-    make_jobs: Callable[[Mapping[int, str]], list[predictions.PoseJob[ViewInput]]]
+    make_jobs: Callable[[Mapping[int, str]], list[PoseJob[ViewInput]]]
     settings: Mapping[str, Any]  #: JSON values that decide which masks they are
 
 
@@ -54,7 +56,7 @@ def prepare_masks(
         elif kind == "predicted":
             masks.append(_take_predicted_masks(dataset))
         else:
-            make_jobs = partial(predictions.make_instance_jobs, dataset)
+            make_jobs = partial(make_instance_jobs, dataset)
             masks.append(Masks(name=name, make_jobs=make_jobs, settings={}))
     return masks
 
@@ -67,7 +69,7 @@ def _take_detected_masks(
         detections = datasets.read_detections(path)
     else:
         detections = _segment_dataset(path, name, dataset, out, device)
-    make_jobs = partial(predictions.make_detection_jobs, dataset, detections=detections)
+    make_jobs = partial(make_best_detection_jobs, dataset, detections=detections)
     return Masks(name=name, make_jobs=make_jobs, settings={"masks_sha256": file_sha256(path)})
 
 
@@ -79,7 +81,7 @@ def _take_predicted_masks(dataset: datasets.BopDataset) -> Masks:
             f"{dataset.folder}: came without predicted masks, as Linemod_preprocessed has "
             "them; give --masks a file of BOP detections, or weights of a segmentation"
         )
-    make_jobs = partial(predictions.make_instance_jobs, dataset, predicted_mask=predicted_mask)
+    make_jobs = partial(make_instance_jobs, dataset, predicted_mask=predicted_mask)
     return Masks(name="predicted", make_jobs=make_jobs, settings={"masks_of": "segnet_results"})
 
 

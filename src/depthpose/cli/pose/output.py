@@ -5,6 +5,8 @@ import re
 import sys
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,9 @@ from depthpose.core.files import read_image, write_cloud, write_image
 from depthpose.core.rigid import Rigid
 from depthpose.core.run import is_whole, note_result
 from depthpose.pose.datasets import BopDataset
+from depthpose.pose.footprint import explained_mask
+from depthpose.pose.geometry.surface import Surface, prepare_surface
+from depthpose.pose.inputs import AnyInput
 from depthpose.pose.predictions import (
     CLOUD,
     PICTURE,
@@ -130,6 +135,32 @@ def write_files(
     else:
         _write_dataset_files(predictions, dataset, out, models)
     _write_page(out, predictions, jobs, models, dataset, input_count)
+
+
+def make_picture_job(job: PoseJob[Any], prediction: Prediction, method: PoseMethod) -> PoseJob[Any]:
+    """Make the job that reads an image as pictures and the page show a predicted object in it."""
+    read = partial(_read_masked_by_pose, job, prediction, method)
+    return replace(job, name=prediction.estimate.name, read=read)
+
+
+def _read_masked_by_pose(job: PoseJob[Any], prediction: Prediction, method: PoseMethod) -> AnyInput:
+    """Read a whole depth image, masked to the pixels that a predicted pose explains.
+
+    A cloud, and an image whose object has no pose, are read as they are.
+    """
+    view = job.read()
+    estimate = prediction.estimate
+    model = next((model for model in method.models if model.name == estimate.object), None)
+    if model is None or estimate.camera_from_model is None or not isinstance(view, ViewInput):
+        return view
+    mask = explained_mask(view, estimate.camera_from_model, _sample_surface_once(model))
+    return replace(view, name=estimate.name, mask=mask, object=model.name)
+
+
+@lru_cache(maxsize=32)
+def _sample_surface_once(model: ObjectModel) -> Surface:
+    """Sample the surface of a model once for all images that show it."""
+    return prepare_surface(model)
 
 
 def _write_dataset_files(

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from depthpose.cli import file_names
-from depthpose.cli.pose.jobs import (
+from depthpose.cli.pose.file_jobs import (
     WantedObjects,
     list_depths,
     make_box_jobs,
     make_cloud_jobs,
-    make_detected_jobs,
-    make_frame_jobs,
+    make_depth_jobs,
+    make_detection_jobs,
     make_mask_jobs,
     match_to_depths,
 )
@@ -81,7 +81,7 @@ def plan_searches(
     """
     assert inputs.depth is not None
     assert inputs.lens is not None
-    jobs = make_frame_jobs(Path(inputs.depth), inputs.lens, objects[0], inputs.unit, out)
+    jobs = make_depth_jobs(Path(inputs.depth), inputs.lens, objects[0], inputs.unit, out)
     settings = {
         "find": sorted(objects),
         **camera_settings(inputs.lens),
@@ -125,7 +125,7 @@ def _plan_regions(method: PoseMethod, inputs: PoseInputs, out: Path) -> JobPlan:
         detections = Path(inputs.detections)
         settings["detections"] = str(detections.resolve())
         wanted = _choose_wanted_objects(method, labels, object)
-        jobs = make_detected_jobs(depth, detections, inputs.lens, wanted, inputs.unit, out)
+        jobs = make_detection_jobs(depth, detections, inputs.lens, wanted, inputs.unit, out)
     elif inputs.box:
         settings["box"] = list(inputs.box)
         box_object = resolve_object(inputs.object, method)

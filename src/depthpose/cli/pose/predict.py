@@ -12,8 +12,8 @@ from typing import Any
 from tqdm import tqdm
 
 from depthpose.cli.engine import EngineOptions, print_shards
-from depthpose.cli.pose.dataset import choose_objects, dataset_settings, match_names
-from depthpose.cli.pose.jobs import read_detection
+from depthpose.cli.pose.dataset import choose_objects, dataset_settings, match_names, open_dataset
+from depthpose.cli.pose.file_jobs import read_detection
 from depthpose.cli.pose.masks import prepare_masks
 from depthpose.cli.pose.methods import (
     PoseMethod,
@@ -39,8 +39,7 @@ from depthpose.core.files.images import LISTED_SUFFIXES
 from depthpose.core.runner import Job, Results, run_jobs
 from depthpose.core.units import Unit
 from depthpose.pose.config import EstimateConfig
-from depthpose.pose.datasets import Box, Detection, open_bop, parse_box, read_targets
-from depthpose.pose.evaluate import select_targets
+from depthpose.pose.datasets import Box, Detection, parse_box
 from depthpose.pose.inputs import cloud_input, view_input
 from depthpose.pose.predictions import (
     POSES,
@@ -97,18 +96,10 @@ def predict_poses_of_dataset(
         batch: views that are estimated together.
     """
     assert options.bop is not None
-    dataset = open_bop(options.bop, options.split)
-    if options.targets is not None:
-        dataset = select_targets(dataset, read_targets(options.targets, options.bop))
+    dataset = open_dataset(options.bop, options.split, options.targets)
     dataset = choose_objects(dataset, method, object)
     (masks,) = prepare_masks([options.masks], dataset, out, config.device)
-    names = match_names(dataset, method.models)
-    # A job with an object gives an estimate, and no error, where its input cannot be read.
-    jobs: list[PoseJob[Any]] = [
-        replace(job, object=names[job.place.object_id])
-        for job in masks.make_jobs(names)
-        if job.place is not None
-    ]
+    jobs = masks.make_jobs(match_names(dataset, method.models))
     settings = {
         **method.settings,
         **dataset_settings(dataset),
@@ -151,7 +142,7 @@ def estimate_jobs(
         run.claim_folder(process_folder, settings, [POSES])
 
     results = PoseResults[Any](process_folder, out)
-    estimated = _estimate_unfinished(method, process.share_of(jobs), results, batch)
+    estimated = estimate_unfinished(method, process.share_of(jobs), results, batch)
     if process.rank > 0:
         return None
 
@@ -169,19 +160,37 @@ def estimate_jobs(
         ]
         if failed:
             results = PoseResults[Any](process_folder, out)
-            by_name |= _estimate_unfinished(method, failed, results, batch)
+            by_name |= estimate_unfinished(method, failed, results, batch)
     predictions = [by_name.pop(job.name) for job in jobs]
     write_predictions(out, [*by_name.values(), *predictions])
     return predictions
 
 
-def _estimate_unfinished(
-    method: PoseMethod, jobs: Sequence[PoseJob[Any]], results: PoseResults[Any], batch: int
+def estimate_unfinished(
+    method: PoseMethod,
+    jobs: Sequence[PoseJob[Any]],
+    results: PoseResults[Any],
+    batch: int,
+    label: str | None = None,
 ) -> dict[str, Prediction]:
-    """Estimate the jobs without a result; return the new predictions by name."""
+    """Estimate the jobs without a result in this process.
+
+    Args:
+        method: estimates the poses.
+        jobs: the inputs, finished ones too.
+        results: where the results are stored.
+        batch: inputs that are estimated together. Each then takes an equal share of the time.
+        label: what the bar of progress says.
+
+    Returns:
+        The new predictions by name.
+
+    Raises:
+        InputError: an input that ``results`` must have cannot be read.
+    """
     estimated: dict[str, Prediction] = {}
     with closing(run_jobs(jobs, method.estimate_many, results, batch)) as outcomes:
-        for outcome in tqdm(outcomes, total=len(jobs), disable=None, unit=" poses"):
+        for outcome in tqdm(outcomes, label, total=len(jobs), disable=None, unit=" poses"):
             name = outcome.job.name
             is_new = outcome.result is not None or outcome.failure is not None
             if is_new:

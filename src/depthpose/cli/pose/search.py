@@ -8,14 +8,15 @@ from typing import Any
 
 from tqdm import tqdm
 
-from depthpose.cli.pose.dataset import choose_objects, dataset_settings, match_names
-from depthpose.cli.pose.frames import make_masked_job, read_whole_view
+from depthpose.cli.pose.dataset import choose_objects, dataset_settings, match_names, open_dataset
+from depthpose.cli.pose.dataset_jobs import make_image_job
 from depthpose.cli.pose.methods import PoseMethod, resolve_object
 from depthpose.cli.pose.options import DataSetOptions, PoseInputs
 from depthpose.cli.pose.output import (
     claim_for_dataset,
     claim_for_jobs,
     is_result_of,
+    make_picture_job,
     print_result,
     write_files,
 )
@@ -23,13 +24,10 @@ from depthpose.cli.pose.plans import plan_searches
 from depthpose.core.errors import InputError
 from depthpose.core.run import find_rank
 from depthpose.core.runner import Job, Results, run_jobs
-from depthpose.pose.datasets import open_bop, read_targets
-from depthpose.pose.evaluate import select_targets
 from depthpose.pose.predictions import (
     Place,
     PoseJob,
     Prediction,
-    place_of,
     read_earlier_predictions,
     refuse_unreadable,
     write_predictions,
@@ -91,7 +89,7 @@ class SearchResults(Results[ViewInput, list[PoseEstimate]]):
         Images of a dataset must be readable, so there it is raised.
         """
         assert isinstance(job, PoseJob)
-        if job.object is None:  # a job of a dataset names none
+        if self._numbers is not None:
             raise error
         self.by_image[job.name] = [
             Prediction(estimate=refuse_unreadable(job.name, job.object, error))
@@ -144,7 +142,7 @@ def _search_images(
     for job in jobs:
         for prediction in results.by_image[job.name]:
             predictions.append(prediction)
-            object_jobs.append(make_masked_job(job, prediction, method))
+            object_jobs.append(make_picture_job(job, prediction, method))
     return predictions, object_jobs
 
 
@@ -236,9 +234,7 @@ def search_dataset(
         raise InputError("--masks search: these weights need masked views; give other --masks")
     if find_rank().world > 1:
         raise InputError("--masks search is done by one process; give other --masks, or start one")
-    dataset = open_bop(options.bop, options.split)
-    if options.targets is not None:
-        dataset = select_targets(dataset, read_targets(options.targets, options.bop))
+    dataset = open_dataset(options.bop, options.split, options.targets)
     dataset = choose_objects(dataset, method, object)
     names = match_names(dataset, method.models)
     numbers = {name: number for number, name in names.items()}
@@ -254,11 +250,10 @@ def search_dataset(
     # which a search makes no use.
     images = {(i.scene_id, i.image_id): i for i in dataset.instances}
     any_object = next(iter(numbers))
-    jobs: list[PoseJob[Any]] = []
-    for image, instance in sorted(images.items()):
-        name = _name_image(image)
-        read = partial(read_whole_view, instance, any_object, name)
-        jobs.append(PoseJob(name=name, read=read, place=place_of(instance)))
+    jobs = [
+        make_image_job(instance, _name_image(image), any_object)
+        for image, instance in sorted(images.items())
+    ]
 
     earlier = list(read_earlier_predictions(out).values())
     results = SearchResults(out, [job.name for job in jobs], earlier, _has_place_in_image, numbers)

@@ -2,29 +2,33 @@
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
 from depthpose.cli import file_names
-from depthpose.cli.pose.dataset import choose_objects, dataset_settings, match_names
-from depthpose.cli.pose.frames import make_masked_job, read_whole_view
-from depthpose.cli.pose.jobs import make_cloud_jobs, make_frame_jobs
+from depthpose.cli.pose.dataset import choose_objects, dataset_settings, match_names, open_dataset
+from depthpose.cli.pose.dataset_jobs import make_image_job
+from depthpose.cli.pose.file_jobs import make_cloud_jobs, make_depth_jobs
 from depthpose.cli.pose.methods import PoseMethod, resolve_object
 from depthpose.cli.pose.options import SequenceOptions
-from depthpose.cli.pose.output import claim_for_dataset, claim_for_jobs, print_result, write_files
+from depthpose.cli.pose.output import (
+    claim_for_dataset,
+    claim_for_jobs,
+    make_picture_job,
+    print_result,
+    write_files,
+)
 from depthpose.cli.pose.plans import camera_settings, unit_settings
 from depthpose.cli.pose.transforms import read_pose
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid
-from depthpose.pose.datasets import BopDataset, Instance, open_bop
+from depthpose.pose.datasets import BopDataset, Instance
 from depthpose.pose.inputs import AnyInput
 from depthpose.pose.predictions import (
     PoseJob,
     Prediction,
-    place_of,
     read_earlier_predictions,
     refuse_unreadable,
     write_predictions,
@@ -51,7 +55,7 @@ def track_files(method: PoseMethod, frames: SequenceOptions, out: Path) -> int:
     else:
         assert frames.depth is not None
         assert frames.camera is not None
-        jobs = make_frame_jobs(frames.depth, frames.camera, object, frames.unit, out)
+        jobs = make_depth_jobs(frames.depth, frames.camera, object, frames.unit, out)
         settings |= camera_settings(frames.camera)
     claim_for_jobs(out, settings, jobs)
     predictions = _follow_object(method, jobs, object, first_pose)
@@ -67,7 +71,7 @@ def track_dataset(method: PoseMethod, frames: SequenceOptions, out: Path) -> int
         out: folder of the results.
     """
     assert frames.bop is not None
-    dataset = open_bop(frames.bop, frames.split)
+    dataset = open_dataset(frames.bop, frames.split)
     dataset = choose_objects(dataset, method, frames.object)
     names = match_names(dataset, method.models)
     settings = {
@@ -83,22 +87,16 @@ def track_dataset(method: PoseMethod, frames: SequenceOptions, out: Path) -> int
         by_image = instances_of.setdefault((instance.scene_id, instance.object_id), {})
         by_image.setdefault(instance.image_id, instance)
     sequences = [
-        [_make_frame_job(instance, names[number]) for instance in by_image.values()]
+        [make_image_job(instance, instance.name, names[number]) for instance in by_image.values()]
         for (_, number), by_image in sorted(instances_of.items())
     ]
     jobs = [job for sequence in sequences for job in sequence]
     predictions = (
         prediction
         for sequence in sequences
-        for prediction in _follow_object(method, sequence, str(sequence[0].object))
+        for prediction in _follow_object(method, sequence, sequence[0].object)
     )
     return _write_sequences(method, predictions, jobs, out, dataset)
-
-
-def _make_frame_job(instance: Instance, object: str) -> PoseJob[Any]:
-    """Make the job that reads the whole depth image of an instance, as a frame of a sequence."""
-    read = partial(read_whole_view, instance, object, instance.name)
-    return PoseJob(name=instance.name, read=read, object=object, place=place_of(instance))
 
 
 def _write_sequences(
@@ -134,11 +132,11 @@ def _write_sequences(
         if predictions:
             others = [p for p in earlier if p.estimate.name not in names]
             write_predictions(out, [*predictions, *others])
-    masked_jobs = [
-        make_masked_job(job, prediction, method)
+    picture_jobs = [
+        make_picture_job(job, prediction, method)
         for prediction, job in zip(predictions, jobs, strict=True)
     ]
-    write_files(predictions, masked_jobs, out, method, dataset)
+    write_files(predictions, picture_jobs, out, method, dataset)
     code = print_result(predictions, out)
     counts = Counter(p.estimate.tracking for p in predictions)
     print(", ".join(f"{counts[state]} {state}" for state in ("tracked", "found", "lost")))

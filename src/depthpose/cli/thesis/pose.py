@@ -13,13 +13,13 @@ from tqdm import tqdm
 
 from depthpose.cli import file_names
 from depthpose.cli.arguments import refuse_below
-from depthpose.cli.pose.dataset import match_names
+from depthpose.cli.pose.dataset import match_names, open_dataset
 from depthpose.cli.pose.evaluate import (
     SCORING_NOTE,
     join_evaluations,
     measure_predictions,
-    open_instances,
     predict_instances,
+    print_instances,
     write_detail_tables,
 )
 from depthpose.cli.pose.masks import Masks, find_mask_file, prepare_masks
@@ -123,7 +123,8 @@ def _read_views(
         data: its split, and the objects that are kept.
         number: how many views, spread evenly; None: all.
     """
-    dataset = open_instances(folder, data.split, data.objects, None)
+    dataset = open_dataset(folder, data.split, objects=data.objects)
+    print_instances(dataset)
     columns = {
         "frames": f"{folder.resolve().name} {data.split}",
         "frames_sha256": hash_frames(dataset.instances)[:12],
@@ -176,7 +177,8 @@ def reproduce_by_object(
         raise InputError(f"table {number}: give --linemod FOLDER, or --bop FOLDER.")
 
     # The instances, the methods, and all that decides the numbers.
-    dataset = open_instances(data.folder, data.split, data.objects, options.targets)
+    dataset = open_dataset(data.folder, data.split, options.targets, data.objects)
+    print_instances(dataset)
     models = tuple(dataset.objects.values())
     with_published = number == "3.2"
     if with_published:
