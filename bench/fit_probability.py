@@ -54,7 +54,7 @@ class Coefficients:
     right_unobserved: GammaShare = probability.RIGHT_UNOBSERVED
     wrong_unobserved: GammaShare = probability.WRONG_UNOBSERVED
     wrong_rms: float = probability.WRONG_RMS
-    prior_masked: float = probability.PRIOR_MASKED
+    prior_expected: float = probability.PRIOR_EXPECTED
 
 
 @dataclass(frozen=True)
@@ -192,7 +192,7 @@ def fit(collected: Sequence[View]) -> Coefficients:
         right_unobserved=fit_share(list(map(unobserved, right))),
         wrong_unobserved=fit_share(list(map(unobserved, wrong))),
         wrong_rms=math.sqrt(math.exp(mean_log) - 1),
-        prior_masked=views_with_right / max(1, len(collected) - views_with_right),
+        prior_expected=views_with_right / max(1, len(collected) - views_with_right),
     )
 
 
@@ -233,7 +233,7 @@ def judge(view: View, coefficients: Coefficients) -> tuple[float, bool]:
         log_ratios = [probability.log_likelihood_ratio(evidence) for evidence in view.evidences]
     best = max(range(len(log_ratios)), key=log_ratios.__getitem__)
     shares = torch.tensor(log_ratios, dtype=torch.float64).softmax(0)
-    log_odds = math.log(coefficients.prior_masked) + log_ratios[best]
+    log_odds = math.log(coefficients.prior_expected) + log_ratios[best]
     log_odds = max(-50.0, min(log_odds, 50.0))
     probability_of_object = 1 / (1 + math.exp(-log_odds))
     if view.evidences[best].agreement < LEAST_AGREEMENT:

@@ -21,7 +21,7 @@ from depthpose.pose.verify.hypotheses import (
     share_among_poses,
 )
 from depthpose.pose.verify.probability import (
-    PRIOR_MASKED,
+    PRIOR_EXPECTED,
     PRIOR_PROPOSED,
     GammaShare,
     log_likelihood_ratio,
@@ -70,7 +70,7 @@ def test_the_seconds_of_several_tries_add_up() -> None:
 
 
 def test_each_kind_of_contradiction_lowers_the_probability() -> None:
-    right = probability_right(GOOD, PRIOR_MASKED)
+    right = probability_right(GOOD, PRIOR_EXPECTED)
     assert right > 0.99
     for kind in ("seen_through", "bulging", "beside", "continued"):
         before = right
@@ -78,7 +78,7 @@ def test_each_kind_of_contradiction_lowers_the_probability() -> None:
         for patches in (2.0, 8.0, 20.0):
             evidence = replace(GOOD, supported=38.0 - patches, **{kind: patches})
             assert evidence.contradicted == patches
-            after = probability_right(evidence, PRIOR_MASKED)
+            after = probability_right(evidence, PRIOR_EXPECTED)
             assert after < before or after == before == 0, (kind, patches)
             before = after
         # Where the rest lies no nearer than it does by accident, it is refused.
@@ -104,11 +104,11 @@ def test_what_was_not_observed_lowers_it_less_than_what_contradicts() -> None:
 def test_a_pose_that_a_search_proposed_needs_more_evidence_than_one_in_a_mask() -> None:
     evidence = replace(GOOD, supported=28.0, explained=28.0, unobserved=10.0, seen_through=2.0)
     masked, proposed = (
-        probability_right(evidence, odds) for odds in (PRIOR_MASKED, PRIOR_PROPOSED)
+        probability_right(evidence, odds) for odds in (PRIOR_EXPECTED, PRIOR_PROPOSED)
     )
     assert masked > proposed
     odds = [p / (1 - p) for p in (masked, proposed)]
-    assert odds[0] / odds[1] == pytest.approx(PRIOR_MASKED / PRIOR_PROPOSED, rel=1e-6)
+    assert odds[0] / odds[1] == pytest.approx(PRIOR_EXPECTED / PRIOR_PROPOSED, rel=1e-6)
 
 
 def test_poses_share_the_probability_of_one() -> None:

@@ -37,7 +37,7 @@ from depthpose.pose.track import TrackedObject, track
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, Refusal, ViewInput
 from depthpose.pose.verify.decide import choose_object, refused, seconds_of_all, with_status
 from depthpose.pose.verify.prepared_object import PreparedObject
-from depthpose.pose.verify.probability import PRIOR_REGION
+from depthpose.pose.verify.probability import PRIOR_EXPECTED
 
 Result = TypeVar("Result")
 _NAME = "input"  # what an input is called that came without a name
@@ -146,7 +146,7 @@ class PoseEstimator:
             objects={view.object: self._find_object(view.object).prepare()},
             config=self.config,
             refusal=self.refusal,
-            prior_odds=PRIOR_REGION,
+            prior_odds=PRIOR_EXPECTED,
             is_single=True,
         )
         best = find_objects(view, targets)[0]

@@ -44,7 +44,7 @@ from depthpose.pose.types import (
 )
 from depthpose.pose.verify.decide import refused
 from depthpose.pose.verify.prepared_object import PreparedObject, has_surface, require_surface
-from depthpose.pose.verify.probability import PRIOR_MASKED, PRIOR_PROPOSED
+from depthpose.pose.verify.probability import PRIOR_EXPECTED, PRIOR_PROPOSED
 from depthpose.pose.weights import PoseWeights, read_pose_weights
 
 _DOUBTED: tuple[Status, ...] = ("votes do not meet", "keypoints do not fit", "doubtful")
@@ -332,7 +332,7 @@ class GeoPoseNet(PoseEstimator):
             config,
             self.weights.refusal,
             watch,
-            prior_odds=PRIOR_MASKED if is_expected else PRIOR_PROPOSED,
+            prior_odds=PRIOR_EXPECTED if is_expected else PRIOR_PROPOSED,
             votes_rad=partial(self._measure_disagreement, job),
         )
         return replace(

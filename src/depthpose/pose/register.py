@@ -23,7 +23,7 @@ from depthpose.pose.verify.decide import decide, refused
 from depthpose.pose.verify.evidence import observe
 from depthpose.pose.verify.hypotheses import compete
 from depthpose.pose.verify.prepared_object import PreparedObject
-from depthpose.pose.verify.probability import PRIOR_MASKED
+from depthpose.pose.verify.probability import PRIOR_EXPECTED
 
 _VOTING_DIAMETERS = 0.05  # distance of the points that vote
 _PROPOSALS = 40  # poses that point pairs propose
@@ -37,7 +37,7 @@ def register(
     refusal: RefusalConfig,
     *,
     proposals: Rigid | None = None,
-    prior_odds: float = PRIOR_MASKED,
+    prior_odds: float = PRIOR_EXPECTED,
 ) -> PoseEstimate:
     """Register a model to the points of an object: of a mask, or where a search proposed it.
 

@@ -34,7 +34,11 @@ from depthpose.pose.verify.decide import explain_doubt, why_not_observable, with
 from depthpose.pose.verify.evidence import compare, observe
 from depthpose.pose.verify.observability import free_motions, without_motions
 from depthpose.pose.verify.prepared_object import PreparedObject
-from depthpose.pose.verify.probability import PRIOR_MASKED, log_likelihood_ratio, probability_right
+from depthpose.pose.verify.probability import (
+    PRIOR_EXPECTED,
+    log_likelihood_ratio,
+    probability_right,
+)
 
 _MARGIN_DIAMETERS = 0.15
 """Largest distance from the surface at the last or the predicted pose of points that may be the
@@ -156,7 +160,7 @@ def track(
     """
     current = None
     if first is not None:
-        log_odds = math.log(PRIOR_MASKED)
+        log_odds = math.log(PRIOR_EXPECTED)
         current = _Track(pose=first.double(), motion=None, log_odds=log_odds, first=None)
     for pose_input in frames:
         if isinstance(pose_input, PoseEstimate):
@@ -309,7 +313,7 @@ def _weigh_pose(
         is_masked=False,
     )
     evidence = compare(observation, pose, target.prepared.surface)
-    probability = probability_right(evidence, PRIOR_MASKED)
+    probability = probability_right(evidence, PRIOR_EXPECTED)
     if probability < target.refusal.min_probability:
         reason = explain_doubt(evidence, probability, is_masked=False)
         return Refusal(status="doubtful", reason=reason)

@@ -107,8 +107,8 @@ def find_linemod_number(model: ObjectModel) -> int:
     remark = f"; LineMOD's object {number} is {diameter_m:.4f} m" if diameter_m else ""
     raise InputError(
         f"object {model.number} ({model.name}, {model.diameter_m:.4f} m across) is none of "
-        f"LineMOD{remark}. Table 3.2 compares with numbers of LineMOD's objects; for other data "
-        "sets take 'reproduce 3.1', or leave the object out by --objects"
+        f"LineMOD{remark}. Table 3.2 compares with numbers of LineMOD's objects; for other "
+        "datasets take 'reproduce 3.1', or leave the object out by --objects"
     )
 
 

@@ -125,8 +125,8 @@ def _choose_matcher(
 def _set_answer(generator: Generator | None, answer: Answer) -> None:
     """Set in a generator's config where depth of one image comes from.
 
-    It is the generator's own disparity, or that of the matcher, which is given the synthesised right
-    view. A U-Net has only the second; to ask it for that changes nothing.
+    It is the disparity of the generator itself, or that of the matcher on the image and the right
+    view that the generator draws. A U-Net has only the second; to ask for it changes nothing.
 
     Args:
         generator: of loaded weights.

@@ -8,7 +8,7 @@ the surface goes on, but of the length of the silhouette.
 
 How patches are counted :mod:`depthpose.pose.verify.evidence` says; what a count then means is said
 by the coefficients of this file alone. ``bench/fit_probability.py`` fits the shares of right and
-wrong poses, ``WRONG_RMS`` and ``PRIOR_MASKED``.
+wrong poses, ``WRONG_RMS`` and ``PRIOR_EXPECTED``.
 """
 
 import math
@@ -57,10 +57,10 @@ LARGER_CONTINUED = GammaShare(mean=0.3, shape=2.0)
 and at a pose on something larger, such as the side of a larger box."""
 WRONG_ON_LARGER = 0.5
 """Share of the wrong poses that lie on something larger; others end where the surface does."""
-PRIOR_MASKED = 5.0
-"""Odds of the best pose being right before its evidence is seen, where a mask shows the object."""
-PRIOR_REGION = 2.0
-"""The same where a detector's box or a mask that does not fit says that one is there."""
+PRIOR_EXPECTED = 2.0
+"""Odds of the best pose being right before its evidence is seen, where a mask or a detector's box
+says that the object is there. Of views that do show it the fit gives 5; some masks show another
+thing."""
 PRIOR_PROPOSED = 0.02
 """The same where a search proposed the pose: votes of a whole image refine to some fifty poses for
 each object that is there."""
