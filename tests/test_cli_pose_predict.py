@@ -43,6 +43,7 @@ from depthpose.pose.datasets import BopDataset
 from depthpose.pose.metrics import add_m
 from depthpose.pose.networks.baselines import DepthImageConfig, DepthImageNet
 from depthpose.pose.predictions import read_bop_results, read_predictions
+from depthpose.pose.registration import Registration
 from depthpose.pose.types import ObjectModel, ViewInput
 from depthpose.pose.weights import write_pose_weights
 
@@ -68,9 +69,7 @@ def oracle_weights(folder: Path, monkeypatch: pytest.MonkeyPatch, oracle: Oracle
 
 
 def make_method(models: list[ObjectModel]) -> methods.PoseMethod:
-    return methods.PoseMethod(
-        name="m", estimate_many=lambda _: [], takes_clouds=True, models=models, settings={}
-    )
+    return methods.PoseMethod(name="m", estimator=Registration(models), settings={})
 
 
 def poses_of(out: Path) -> dict[str, dict]:

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import ClassVar, TypeVar
 
 import torch
 from tqdm import tqdm
@@ -52,8 +52,12 @@ class PoseEstimator:
         refusal: when what is registered, searched or tracked is withheld.
     """
 
-    _holder = "the weights"
-    """What knows the objects, in errors."""
+    holder: ClassVar = "weights"
+    """What knows the objects, in messages."""
+    needs_mask: ClassVar = False
+    """Whether it takes nothing but a depth image with a mask: no cloud, and no search."""
+    expects_all: ClassVar = False
+    """Whether every object is expected in every image, as that of a CAD file is."""
 
     def __init__(
         self, models: Sequence[ObjectModel], config: EstimateConfig | None, refusal: RefusalConfig
@@ -423,7 +427,7 @@ class PoseEstimator:
         if name is None:
             if len(names) > 1:
                 raise InputError(
-                    f"estimate: {self._holder} know {', '.join(names)}; say which by object="
+                    f"estimate: the {self.holder} know {', '.join(names)}; say which by object="
                 )
             name = self.models[0].name
         if not isinstance(name, str):
@@ -431,7 +435,7 @@ class PoseEstimator:
             raise InputError(f"object {name!r} is no text; give the name of one: {listing}")
         if name not in names:
             nearest = suggest_name(name, names)
-            raise InputError(f"object {name!r}: {self._holder} do not know it; {nearest}")
+            raise InputError(f"object {name!r}: the {self.holder} do not know it; {nearest}")
 
         # Its surface is sampled when it is first asked for.
         if name not in self._prepared_objects:

@@ -385,6 +385,8 @@ class DepthImageRegressor(PoseEstimator):
         InputError: the weights are of another kind, or ``register_refused`` is set.
     """
 
+    needs_mask = True
+
     def __init__(self, weights: PoseWeights, config: EstimateConfig | None = None) -> None:
         super().__init__(weights.models, config, weights.refusal)
         if not isinstance(weights.network, DepthImageNet):

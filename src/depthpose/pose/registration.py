@@ -44,7 +44,8 @@ class Registration(PoseEstimator):
         InputError: no model, two of one name, or one of few points without faces.
     """
 
-    _holder = "the models"
+    holder = "models"
+    expects_all = True
 
     def __init__(
         self,

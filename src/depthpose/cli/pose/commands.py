@@ -91,7 +91,7 @@ def predict_poses(
         return predict_poses_of_dataset(
             method, dataset, pose_inputs.object, spec.config, out_folder, batch
         )
-    if pose_inputs.cloud is not None and not method.takes_clouds:
+    if pose_inputs.cloud is not None and method.estimator.needs_mask:
         raise InputError(
             f"--cloud {pose_inputs.cloud}: the weights {estimates.weights} need depth images; give "
             "--depth, --mask and --camera, or weights that vote"
@@ -210,7 +210,7 @@ def track_object(
         is_registration=register.is_registration(register.cad),
     )
     method = spec.build()
-    if method.track is None:
+    if method.estimator.needs_mask:
         raise InputError(f"--weights {weights}: these need masked views; give weights that vote")
     follow = track_files if frames.bop is None else track_dataset
     return follow(method, frames, out)

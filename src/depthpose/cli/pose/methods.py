@@ -1,7 +1,7 @@
 """What estimates poses in a command: networks or registered models, and how they are built."""
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
@@ -18,6 +18,7 @@ from depthpose.core.rigid import Rigid
 from depthpose.core.units import Unit
 from depthpose.pose import datasets
 from depthpose.pose.config import EstimateConfig
+from depthpose.pose.estimator import PoseEstimator
 from depthpose.pose.inputs import AnyInput
 from depthpose.pose.mesh import FIXED_UNITS, symmetries_to_bop, unit_of
 from depthpose.pose.network_pose import DepthImageRegressor, GeoPoseNet
@@ -29,27 +30,46 @@ from depthpose.pose.weights import read_pose_weights
 REGISTER = "register"
 """Word of ``--weights`` for registration, which needs none; and its name in tables."""
 
-EstimateMany = Callable[[Sequence[ViewInput]], Sequence[PoseEstimate]]
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PoseMethod:
-    """An estimator of poses: its functions, its name, its objects, and what decides its results."""
+    """An estimator of poses in a command: its name in tables, and what decides its results."""
 
     name: str  #: name in tables
-    estimate_many: EstimateMany  #: estimates a pose of each masked view or cloud
-    takes_clouds: bool  #: whether it can do without a depth image
-    models: Sequence[ObjectModel]  #: the objects that it can pose
+    estimator: PoseEstimator  #: what estimates
     settings: Mapping[str, Any]  #: JSON values that decide its results
-    #: estimates the poses of named objects in a view without a mask; None: it cannot
-    find: Callable[[ViewInput, Sequence[str]], list[PoseEstimate]] | None = None
-    #: follows an object through frames, perhaps from a first pose; None: it cannot
-    track: (
-        Callable[[Iterable[AnyInput | PoseEstimate], str, Rigid | None], Iterator[PoseEstimate]]
-        | None
-    ) = None
-    holder: str = "weights"  #: word for the source of the objects in messages
-    expects_all: bool = False  #: every object is expected in every image, as that of a CAD file is
+    #: if given, every estimate has the pose from the robot's base too.
+    base_from_camera: Rigid | None = None
+
+    @property
+    def models(self) -> Sequence[ObjectModel]:
+        """The objects that it can pose."""
+        return self.estimator.models
+
+    @property
+    def holder(self) -> str:
+        """What knows the objects, in messages."""
+        return self.estimator.holder
+
+    def estimate_many(self, views: Sequence[ViewInput]) -> list[PoseEstimate]:
+        """Estimate a pose of each masked view or cloud."""
+        return [self._in_base(estimate) for estimate in self.estimator.estimate_many(views)]
+
+    def find(self, view: ViewInput, objects: Sequence[str]) -> list[PoseEstimate]:
+        """Estimate the poses of named objects in a view without a mask."""
+        return [self._in_base(estimate) for estimate in self.estimator.find_in(view, objects)]
+
+    def track(
+        self, frames: Iterable[AnyInput | PoseEstimate], object: str, first: Rigid | None
+    ) -> Iterator[PoseEstimate]:
+        """Follow an object through frames, perhaps from a first pose."""
+        return map(self._in_base, self.estimator.track_in(frames, object, first))
+
+    def _in_base(self, estimate: PoseEstimate) -> PoseEstimate:
+        """Add the pose from the robot's base to an estimate, where the base is known."""
+        if self.base_from_camera is None:
+            return estimate
+        return estimate.in_base(self.base_from_camera)
 
 
 def build_methods(
@@ -86,19 +106,9 @@ def _make_registration_method(
             "--method register looks for CAD files: give --cad part.stl --unit mm, or --bop, whose "
             "models it takes"
         )
-    net = Registration(models, config)
     fingerprints = {model.name: _fingerprint_model(model) for model in models}
-    return PoseMethod(
-        name=name,
-        estimate_many=net.estimate_many,
-        takes_clouds=True,
-        models=models,
-        settings={"kind": REGISTER, "models": fingerprints, "estimate": config_to_dict(config)},
-        find=net.find_in,
-        track=net.track_in,
-        holder="models",
-        expects_all=True,
-    )
+    settings = {"kind": REGISTER, "models": fingerprints, "estimate": config_to_dict(config)}
+    return PoseMethod(name=name, estimator=Registration(models, config), settings=settings)
 
 
 def _fingerprint_model(model: ObjectModel) -> str:
@@ -129,65 +139,17 @@ def _make_network_method(path: Path, name: str, config: EstimateConfig) -> PoseM
         "estimate": config_to_dict(config),
     }
 
-    if isinstance(pose_weights.network, DepthImageNet):
-        return PoseMethod(
-            name=name,
-            estimate_many=DepthImageRegressor(pose_weights, config).estimate_many,
-            takes_clouds=False,
-            models=pose_weights.models,
-            settings=settings,
-        )
-    net = GeoPoseNet(pose_weights, config)
-    return PoseMethod(
-        name=name,
-        estimate_many=net.estimate_many,
-        takes_clouds=True,
-        models=pose_weights.models,
-        settings=settings,
-        find=net.find_in,
-        track=net.track_in,
-    )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _MethodInBase:
-    """The functions of a method, whose estimates also have the pose from the robot's base."""
-
-    method: PoseMethod
-    base_from_camera: Rigid
-
-    def estimate_many(self, views: Sequence[ViewInput]) -> list[PoseEstimate]:
-        """Estimate a pose of each view."""
-        base = self.base_from_camera
-        return [estimate.in_base(base) for estimate in self.method.estimate_many(views)]
-
-    def find(self, view: ViewInput, objects: Sequence[str]) -> list[PoseEstimate]:
-        """Estimate the poses of objects in a view without a mask."""
-        assert self.method.find is not None
-        base = self.base_from_camera
-        return [estimate.in_base(base) for estimate in self.method.find(view, objects)]
-
-    def track(
-        self, frames: Iterable[AnyInput | PoseEstimate], object: str, first: Rigid | None
-    ) -> Iterator[PoseEstimate]:
-        """Estimate the pose of an object in each frame of a sequence."""
-        assert self.method.track is not None
-        base = self.base_from_camera
-        return (estimate.in_base(base) for estimate in self.method.track(frames, object, first))
+    is_regressor = isinstance(pose_weights.network, DepthImageNet)
+    build = DepthImageRegressor if is_regressor else GeoPoseNet
+    return PoseMethod(name=name, estimator=build(pose_weights, config), settings=settings)
 
 
 def _with_base(method: PoseMethod, base_from_camera: Rigid | None) -> PoseMethod:
     """Return a method whose estimates also have ``base_from_model``; None: the method itself."""
     if base_from_camera is None:
         return method
-    in_base = _MethodInBase(method=method, base_from_camera=base_from_camera)
-    return replace(
-        method,
-        estimate_many=in_base.estimate_many,
-        find=None if method.find is None else in_base.find,
-        track=None if method.track is None else in_base.track,
-        settings={**method.settings, "base_from_camera": base_from_camera.matrix().tolist()},
-    )
+    settings = {**method.settings, "base_from_camera": base_from_camera.matrix().tolist()}
+    return replace(method, base_from_camera=base_from_camera, settings=settings)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -167,7 +167,7 @@ def _choose_wanted_objects(
         # Two classes may be the same object; and "3=" leaves class 3 out, with an empty name.
         expected = [name for name in dict.fromkeys(labels.values()) if name]
     else:
-        expected = names if method.expects_all else []
+        expected = names if method.estimator.expects_all else []
     return WantedObjects(names=names, labels=labels or {}, only=only, expected=expected)
 
 

@@ -112,7 +112,6 @@ def _find_in_each(
     method: PoseMethod, objects: Sequence[str], views: Sequence[ViewInput]
 ) -> list[list[PoseEstimate]]:
     """Find objects in each view."""
-    assert method.find is not None
     return [method.find(view, objects) for view in views]
 
 
@@ -165,7 +164,7 @@ def search_files(method: PoseMethod, inputs: PoseInputs, out: Path) -> int:
         objects = [model.name for model in method.models]
     else:
         objects = [resolve_object(inputs.object, method)]
-    if method.find is None:
+    if method.estimator.needs_mask:
         raise InputError(
             "--depth without --mask: these weights need masked views; give --mask, --box or "
             "--detections"
@@ -230,7 +229,7 @@ def search_dataset(
         The exit code.
     """
     assert options.bop is not None
-    if method.find is None:
+    if method.estimator.needs_mask:
         raise InputError("--masks search: these weights need masked views; give other --masks")
     if find_rank().world > 1:
         raise InputError("--masks search is done by one process; give other --masks, or start one")

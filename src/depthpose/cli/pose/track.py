@@ -160,7 +160,6 @@ def _follow_object(
 
     ``first_pose``: about where it is in the first frame; None: it is searched for.
     """
-    assert method.track is not None
     estimates = method.track(_read_frames(jobs, object), object, first_pose)
     for job, estimate in zip(jobs, estimates, strict=True):
         yield Prediction(estimate=estimate, place=job.place)
