@@ -73,6 +73,25 @@ def test_the_command_refuses_it_in_a_line(capsys: pytest.CaptureFixture[str]) ->
 
 
 @pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("depth match l r --camera c --min-confidence 2", "--min-confidence 2: give 0 to 1"),
+        ("depth predict l --min-confidence -1", "--min-confidence -1: give 0 to 1"),
+        ("depth predict l --batch 0", "--batch 0: give 1 or more"),
+        ("depth predict l --engine ray --worker-gpus -1 --device cuda", "--worker-gpus -1.0: give"),
+        ("depth predict l --engine ray --workers 0", "--workers 0: give 1 or more"),
+        ("pose predict --cloud c --batch 0", "--batch 0: give 1 or more"),
+        ("reproduce 3.1 --bop b --weights v w --pictures -1", "--pictures -1: give 0 or more"),
+    ],
+)
+def test_a_value_out_of_range_is_refused_before_files_are_looked_up(
+    words: str, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*words.split(), "--out", "o"]) == 2
+    assert capsys.readouterr().err.startswith(f"depthpose: error: {message}")
+
+
+@pytest.mark.parametrize(
     ("text", "size"),
     [("1G", 10**9), ("1GB", 10**9), ("800m", 8 * 10**8), ("1.5GiB", 3 * 2**29), ("2Ki", 2048),
      (" 7 ", 7), ("12 B", 12), ("1T", 10**12)],

@@ -99,7 +99,7 @@ def test_a_pair_becomes_a_pose(
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--min-confidence", "1.5"], "--min-confidence 1.5: a confidence lies in 0 to 1"),
+        (["--min-confidence", "1.5"], "--min-confidence 1.5: give 0 to 1"),
         (["--depth", "mask.png"], "2 of --cloud, --depth, --left and --bop are given"),
     ],
 )

@@ -527,7 +527,7 @@ def test_two_processes_share_the_work(
             "--focal-px: has no effect here; a dataset says its cameras",
         ),
         (["--cloud", ".", "--object", "bottle"], "no .ply, .pcd, .npy, .xyz, .txt file there"),
-        (["--cloud", ".", "--object", "bottle", "--batch", "0"], "--batch 0: at least 1 input"),
+        (["--cloud", ".", "--object", "bottle", "--batch", "0"], "--batch 0: give 1 or more"),
         (["--cloud", ".", "--mask", ".", "--camera", "."], "Leave --mask and --camera out"),
         (
             ["--bop", ".", "--mask", ".", "--unit", "m"],

@@ -94,7 +94,7 @@ def test_synthetic_frames_are_a_data_set_that_the_check_accepts(
     assert main([*words, "--number", "3", "--sensor", "laser"]) == 2
     assert "sensor.kinds = ['structured light'], but now it is" in capsys.readouterr().err
     assert main([*words, "--number", "0"]) == 2
-    assert "--number 0: at least 1 frame" in capsys.readouterr().err
+    assert "--number 0: give 1 or more" in capsys.readouterr().err
     assert main([*words, "--number", "3", "--clutter", "8", "16"]) == 2
     assert "frame_clutter = [0, 4], but now it is [8, 16]" in capsys.readouterr().err
     words[-1] = str(tmp_path / "cluttered")

@@ -105,7 +105,7 @@ def test_an_address_of_nobody_is_said(capsys: pytest.CaptureFixture[str]) -> Non
 
 def test_nothing_may_be_uploaded_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["serve", "--max-upload-mb", "0"]) == 2
-    assert "--max-upload-mb 0: take 1 at least" in capsys.readouterr().err
+    assert "--max-upload-mb 0: give 1 or more" in capsys.readouterr().err
 
 
 def test_the_time_of_a_computation_is_limited(
@@ -115,7 +115,7 @@ def test_the_time_of_a_computation_is_limited(
     assert main(["serve", "--port", "0"]) == 0
     assert [limits.compute_s for limits in served] == [7, 120]
     assert main(["serve", "--max-seconds", "0"]) == 2
-    assert "--max-seconds 0: take 1 at least" in capsys.readouterr().err
+    assert "--max-seconds 0: give 1 or more" in capsys.readouterr().err
 
 
 def test_without_the_extra_it_says_which(

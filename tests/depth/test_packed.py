@@ -165,7 +165,7 @@ def test_what_is_there_is_not_packed_over(
     assert main(["data", "pack", str(pairs), "--out", str(home)]) == 2
     assert "is there already" in capsys.readouterr().err
     assert main(["data", "pack", str(pairs), "--out", str(tmp_path / "x"), "--shard-mb", "0"]) == 2
-    assert "a shard has a megabyte or more" in capsys.readouterr().err
+    assert "--shard-mb 0: give 1 or more" in capsys.readouterr().err
     assert main(["data", "pack", str(pairs), "--out", str(pairs)]) == 2
     assert "is the dataset itself" in capsys.readouterr().err
     assert main(["data", "pack", str(home), "--out", str(tmp_path / "x")]) == 2

@@ -317,6 +317,7 @@ def _run(words: list[str]) -> int:
         return int(stop.code or 0)
     ignored_options.refuse_empty(options, option_words)
     ignored_options.refuse_ignored(name, option_words)
+    arguments.refuse_unusable(parsed.arguments)
     _refuse_small_address_space()  # before weights are looked up, which loads torch
     arguments.refuse_missing(options, parsed.arguments)
     return command(*parsed.args, **parsed.kwargs)

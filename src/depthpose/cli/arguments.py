@@ -22,11 +22,13 @@ from typing import (
     Any,
     Literal,
     NamedTuple,
+    Protocol,
     TypeVar,
     Union,
     get_args,
     get_origin,
     get_type_hints,
+    runtime_checkable,
 )
 
 import docstring_parser
@@ -274,10 +276,38 @@ def _refuse_missing_weights(word: str) -> None:
         find_weights(name)
 
 
-def refuse_below(least: int, option: str, value: int, usual: str) -> None:
-    """Refuse a count that is too small; ``usual`` is a value that the error suggests."""
+@runtime_checkable
+class _CheckedOptions(Protocol):
+    """A group of options with values that can be out of their range."""
+
+    def refuse_unusable(self) -> None:
+        """Raise an ``InputError`` for a value out of its range."""
+
+
+def refuse_unusable(values: Mapping[str, Any]) -> None:
+    """Refuse values out of their range, in the groups of options that check their own.
+
+    Args:
+        values: arguments of the command, by its parameters.
+
+    Raises:
+        InputError: a value is out of its range.
+    """
+    for value in values.values():
+        if isinstance(value, _CheckedOptions):
+            value.refuse_unusable()
+
+
+def refuse_below(least: int, option: str, value: float, usual: str) -> None:
+    """Refuse a number that is too small; ``usual`` is a value that the error suggests."""
     if value < least:
         raise InputError(f"{option} {value}: give {least} or more, such as {usual}")
+
+
+def refuse_outside(least: float, most: float, option: str, value: float, words: str) -> None:
+    """Refuse a number out of its range; ``words`` follow the range: its unit, say."""
+    if not least <= value <= most:
+        raise InputError(f"{option} {value:g}: give {least:g} to {most:g}{words}")
 
 
 def replace_unless_none(config: Config, **values: object) -> Config:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from depthpose.cli.arguments import shown_as
+from depthpose.cli.arguments import refuse_below, shown_as
 from depthpose.core.errors import InputError
 
 if TYPE_CHECKING:  # --help imports this module and must answer at once
@@ -34,22 +34,20 @@ class EngineOptions:
     block: int = 64
     """inputs of a shard, which are done again when their worker dies."""
 
-    def build(self) -> "RayEngine":
-        """Build the engine of these options.
-
-        Raises:
-            InputError: a number of workers, cores or GPUs is out of its range.
-        """
-        from depthpose.core.engine import RayEngine
-
-        is_too_few = self.block < 1 or (self.workers is not None and self.workers < 1)
-        if is_too_few or min(self.worker_cpus, self.worker_gpus) < 0:
-            raise InputError(
-                f"--workers {self.workers}, --block {self.block}, --worker-cpus {self.worker_cpus} "
-                f"and --worker-gpus {self.worker_gpus}: take at least 1, 1, 0 and 0"
-            )
+    def refuse_unusable(self) -> None:
+        """Refuse too few workers, cores, GPUs or inputs of a shard."""
+        if self.workers is not None:
+            refuse_below(1, "--workers", self.workers, "4")
+        refuse_below(0, "--worker-cpus", self.worker_cpus, "1")
+        refuse_below(0, "--worker-gpus", self.worker_gpus, "1")
+        refuse_below(1, "--block", self.block, "64")
         if not self.worker_cpus + self.worker_gpus:
             raise InputError("a worker needs a core or a GPU; give --worker-cpus 1")
+
+    def build(self) -> "RayEngine":
+        """Build the engine of these options."""
+        from depthpose.core.engine import RayEngine
+
         return RayEngine(
             address=self.address, workers=self.workers,
             worker_cpus=self.worker_cpus, worker_gpus=self.worker_gpus,

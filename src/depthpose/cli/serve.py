@@ -1,7 +1,7 @@
 """``depthpose serve``."""
 
-from depthpose.cli.arguments import WeightsName
-from depthpose.core.errors import InputError, MissingExtraError
+from depthpose.cli.arguments import WeightsName, refuse_below
+from depthpose.core.errors import MissingExtraError
 
 
 def serve(
@@ -39,10 +39,8 @@ def serve(
     from depthpose.depth.estimator import FakestereoNet
     from depthpose.pose.network_pose import GeoPoseNet
 
-    if max_upload_mb < 1:
-        raise InputError(f"--max-upload-mb {max_upload_mb}: take 1 at least; 64 is usual")
-    if max_seconds < 1:
-        raise InputError(f"--max-seconds {max_seconds}: take 1 at least; 120 is usual")
+    refuse_below(1, "--max-upload-mb", max_upload_mb, "64")
+    refuse_below(1, "--max-seconds", max_seconds, "120")
     listener = open_socket(host, port)  # a port in use is refused before weights are loaded
     address, hosts = find_address_and_hosts(host, listener)
     limits = Limits(upload_bytes=max_upload_mb * 10**6, compute_s=max_seconds, hosts=hosts)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import tyro
 
-from depthpose.cli.arguments import Device, NewPath, WeightsName
+from depthpose.cli.arguments import Device, NewPath, WeightsName, refuse_below
 from depthpose.core.errors import InputError
 
 
@@ -67,8 +67,7 @@ def pack_dataset(
     from depthpose.core.run import refuse_to_replace
     from depthpose.depth.datasets import open_dataset, pack_frames
 
-    if shard_mb < 1:
-        raise InputError(f"--shard-mb {shard_mb}: a shard has a megabyte or more; take 256")
+    refuse_below(1, "--shard-mb", shard_mb, "256")
     dataset = open_dataset(path, split)
     refuse_to_replace(out / "index.json")
     # The images of packed datasets lie in tar files.

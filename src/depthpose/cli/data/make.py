@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from depthpose.cli.arguments import NewPath
+from depthpose.cli.arguments import NewPath, refuse_below
 from depthpose.core.errors import InputError
 from depthpose.core.units import Unit
 from depthpose.pose.config import SensorKind
@@ -221,8 +221,7 @@ def make_objects(
 
 def _refuse_frame_numbers(number: int, seed: int) -> None:
     """Refuse numbers of frames and seeds for which there are no numbers of scenes."""
-    if number < 1:
-        raise InputError(f"--number {number}: at least 1 frame")
+    refuse_below(1, "--number", number, "100")
     max_number = _SCENES_PER_SEED * _FRAMES_PER_SCENE
     if not 0 <= seed <= _MAX_SEED or number > max_number:
         raise InputError(

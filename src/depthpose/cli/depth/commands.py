@@ -48,8 +48,6 @@ def predict_depth(
 
     if not images:
         raise InputError("name images, folders of them, patterns or videos to predict from")
-    output.refuse_unusable()
-    scale.refuse_unusable()
     spec = DepthNetworkSpec(
         weights=networks.weights,
         config=matching.config,
@@ -196,7 +194,6 @@ def evaluate_depth(
             "measure --weights FILE, --matcher sgbm, --predictions DIR or --baseline rows, or "
             "several."
         )
-    comparison.refuse_unusable()
     rule = find_protocol(comparison.protocol)
     dataset = open_frames(data, split)
     chosen = choose_methods(methods, matching.config, dataset)

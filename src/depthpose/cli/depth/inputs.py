@@ -12,7 +12,14 @@ from typing import Any
 from torch import Tensor
 
 from depthpose.cli.depth.options import LensOptions, ScaleOptions
-from depthpose.core.camera import Camera, FieldOfView, StereoRig, camera_of, read_camera
+from depthpose.core.camera import (
+    Camera,
+    FieldOfView,
+    StereoRig,
+    camera_of,
+    read_camera,
+    refuse_unusable_focal,
+)
 from depthpose.core.camera.camera_facts import camera_keys
 from depthpose.core.engine import InputFormat
 from depthpose.core.errors import InputError
@@ -105,8 +112,8 @@ def read_lens(options: LensOptions, sources: Sequence[Path]) -> Camera | FieldOf
     Without any of these options the focal length is that of the EXIF of ``sources``, the images.
     """
     focal_px = options.focal_px
-    if focal_px is not None and not 1 < focal_px < 1e6:
-        raise InputError(f"--focal-px {focal_px}: not a focal length in pixels; KITTI's is 721.5.")
+    if focal_px is not None:
+        refuse_unusable_focal(focal_px)
     if options.fov is not None:
         return FieldOfView(options.fov)
     if options.camera is None:

@@ -6,7 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from depthpose.cli.arguments import Device, Source, WeightsName, shown_as
+from depthpose.cli.arguments import (
+    Device,
+    Source,
+    WeightsName,
+    refuse_below,
+    refuse_outside,
+    shown_as,
+)
 from depthpose.core.errors import InputError
 from depthpose.depth.config import COLOR_RANGE_M, Answer, BaselineName, MatcherConfig, Speed
 
@@ -88,14 +95,10 @@ class ScaleOptions:
         """Refuse heights and tilts that no camera over a road has."""
         height_m = self.camera_height
         tilt_deg = self.camera_tilt
-        if height_m is not None and not _MIN_HEIGHT_M <= height_m <= _MAX_HEIGHT_M:
-            raise InputError(
-                f"--camera-height {height_m:g}: give {_MIN_HEIGHT_M:g} to {_MAX_HEIGHT_M:g} metres"
-            )
-        if tilt_deg is not None and not -_MAX_TILT_DEG <= tilt_deg <= _MAX_TILT_DEG:
-            raise InputError(
-                f"--camera-tilt {tilt_deg:g}: give -{_MAX_TILT_DEG:g} to {_MAX_TILT_DEG:g} degrees"
-            )
+        if height_m is not None:
+            refuse_outside(_MIN_HEIGHT_M, _MAX_HEIGHT_M, "--camera-height", height_m, " metres")
+        if tilt_deg is not None:
+            refuse_outside(-_MAX_TILT_DEG, _MAX_TILT_DEG, "--camera-tilt", tilt_deg, " degrees")
 
     def parse_known_distance(self) -> tuple[float, float, float]:
         """Parse ``--known-distance``, which must be set.
@@ -128,13 +131,24 @@ class PairMatcherOptions(MatcherOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DepthMatchOptions:
-    """The matcher of real pairs, their check, and the clouds that are written."""
+class CloudOptions:
+    """The clouds that are written."""
 
     cloud: bool = False
     """write a coloured point cloud of what is nearer than 80 m, NAME.cloud.ply."""
-    min_confidence: float = 0.5
+    min_confidence: float = 0.0
     """of clouds: depth with a lower confidence, 0 to 1, is left out; the share is printed."""
+
+    def refuse_unusable(self) -> None:
+        """Refuse a confidence that is no share."""
+        refuse_outside(0, 1, "--min-confidence", self.min_confidence, "; 0 leaves nothing out")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthMatchOptions(CloudOptions):
+    """The matcher of real pairs, their check, and the clouds that are written."""
+
+    min_confidence: float = 0.5
     weights: WeightsName = "default"
     """weights with a matcher, by name or file."""
     matcher: WeightsName | None = None
@@ -161,13 +175,9 @@ class ImageNetworkOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PredictOutput:
+class PredictOutput(CloudOptions):
     """The files that are written, and the number of images that go together."""
 
-    cloud: bool = False
-    """write a coloured point cloud of what is nearer than 80 m, NAME.cloud.ply."""
-    min_confidence: float = 0.0
-    """of clouds: depth with a lower confidence, 0 to 1, is left out; the share is printed."""
     color_range: tuple[float, float] = COLOR_RANGE_M
     """metres of the brightest and the darkest colour, the same for all pictures."""
     batch: int = 1
@@ -175,19 +185,12 @@ class PredictOutput:
 
     def refuse_unusable(self) -> None:
         """Refuse colours whose depths are not in their order, and a batch without an image."""
+        super().refuse_unusable()
+        refuse_below(1, "--batch", self.batch, "16")
         near_m, far_m = self.color_range
         if not 0 < near_m < far_m:
             raise InputError(
                 f"--color-range {near_m, far_m}: give near and far metres, near first."
-            )
-        if self.batch < 1:
-            raise InputError(f"--batch {self.batch}: give 1 or more images.")
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.min_confidence <= 1:
-            raise InputError(
-                f"--min-confidence {self.min_confidence:g}: a confidence lies in 0 to 1; 0 leaves "
-                "nothing out"
             )
 
 

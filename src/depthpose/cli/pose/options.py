@@ -5,9 +5,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from depthpose.cli.arguments import Device, NewPath, Source, WeightsName, shown_as
+from depthpose.cli.arguments import (
+    Device,
+    NewPath,
+    Source,
+    WeightsName,
+    refuse_below,
+    refuse_outside,
+    shown_as,
+)
 from depthpose.cli.ignored_options import is_registration
-from depthpose.core.errors import InputError
 from depthpose.core.units import Unit
 from depthpose.pose.config import DiameterTable, EstimateConfig, VotingConfig, VotingMethod
 
@@ -68,6 +75,10 @@ class PoseTableOptions(PoseMeasureOptions):
 
     pictures: int = 4
     """instances that the page shows."""
+
+    def refuse_unusable(self) -> None:
+        """Refuse fewer than no pictures."""
+        refuse_below(0, "--pictures", self.pictures, "4")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,6 +180,10 @@ class PairOptions:
     min_confidence: float = 0.5
     """depth that is less sure is left out, 0 to 1."""
 
+    def refuse_unusable(self) -> None:
+        """Refuse a confidence that is no share."""
+        refuse_outside(0, 1, "--min-confidence", self.min_confidence, "; 0 leaves nothing out")
+
 
 @dataclass(frozen=True, kw_only=True)
 class DataSetOptions:
@@ -225,13 +240,15 @@ class EstimateOptions(PoseMethodOptions):
     """inputs in one call of the network."""
     device: Device = "cpu"
 
+    def refuse_unusable(self) -> None:
+        """Refuse a batch without an input."""
+        refuse_below(1, "--batch", self.batch, "16")
+
     @property
     def config(self) -> EstimateConfig:
         """The settings of the estimator that these options stand for, on this process's device."""
         from depthpose.core.devices import device_of_process  # --help must not load torch
 
-        if self.batch < 1:
-            raise InputError(f"--batch {self.batch}: at least 1 input in one call of the network")
         object_deviation_m = None
         if self.object_deviation_mm is not None:
             object_deviation_m = self.object_deviation_mm / 1000

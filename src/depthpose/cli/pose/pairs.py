@@ -50,10 +50,6 @@ def match_pairs_for_poses(pair: PairOptions, camera: Path | None, device: str, o
             "--left needs --right and --camera beside it: the other view, and the file of the rig "
             'with "baseline_m"'
         )
-    if not 0 <= pair.min_confidence <= 1:
-        raise InputError(
-            f"--min-confidence {pair.min_confidence:g}: a confidence lies in 0 to 1; 0 keeps all"
-        )
 
     pairs = list_pairs(pair.left, pair.right)
     images = [path for both in pairs for path in both]

@@ -65,7 +65,6 @@ def reproduce_table(
         raise InputError(
             f"--protocol {comparison.protocol}: measures disparity, and the tables hold depth."
         )
-    comparison.refuse_unusable()
     refuse_below(0, "--pictures", pictures, "3")
     _refuse_rows(published, weights, matcher, beside)
     dataset = open_frames(kitti, None if split == "all" else split)

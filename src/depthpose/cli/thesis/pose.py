@@ -172,7 +172,6 @@ def reproduce_by_object(
     Returns:
         The exit code.
     """
-    refuse_below(0, "--pictures", options.pictures, "4")
     if data.folder is None:
         raise InputError(f"table {number}: give --linemod FOLDER, or --bop FOLDER.")
 

@@ -5,6 +5,7 @@ from depthpose.core.camera.any_camera import AnyLens as AnyLens
 from depthpose.core.camera.any_camera import FieldOfView as FieldOfView
 from depthpose.core.camera.any_camera import camera_of as camera_of
 from depthpose.core.camera.any_camera import choose_lens as choose_lens
+from depthpose.core.camera.any_camera import refuse_unusable_focal as refuse_unusable_focal
 from depthpose.core.camera.camera_facts import (
     describe_suspicious_centre as describe_suspicious_centre,
 )

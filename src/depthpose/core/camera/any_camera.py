@@ -76,10 +76,19 @@ def camera_of(camera: AnyLens | None, size: Size) -> Camera | None:
     return camera_from_facts(CameraFacts(kind="a matrix K", K=intrinsics_of(camera)), size)
 
 
-def _make_focal_camera(focal_px: float, size: Size) -> Camera:
-    """Make the camera of a focal length [px], with the image's centre as principal point."""
+def refuse_unusable_focal(focal_px: float) -> None:
+    """Refuse a number that is no focal length [px]: that in millimetres, say.
+
+    Raises:
+        InputError: it is none.
+    """
     if not 1 < focal_px < _MAX_FOCAL_PX:
         raise InputError(f"focal_px is {focal_px}: not a focal length in pixels; KITTI's is 721.5")
+
+
+def _make_focal_camera(focal_px: float, size: Size) -> Camera:
+    """Make the camera of a focal length [px], with the image's centre as principal point."""
+    refuse_unusable_focal(focal_px)
     width, height = size
     K = intrinsics(focal_px, focal_px, (width - 1) / 2, (height - 1) / 2)
     return Camera(width=width, height=height, K=K)
