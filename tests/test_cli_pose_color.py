@@ -117,7 +117,7 @@ def test_a_model_without_colours_is_named(
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("--color-camera", "@own.json"), "--color-camera and --color-from-depth are of --color"),
+        (("--color-camera", "@own.json"), "--color-camera: has no effect here; it is of --color"),
         (("--color", "@pictures/view.png", "--color-from-depth", "@camera.json"),
          "cannot be read as numbers"),
         (("--color", "@nowhere.png"), "nowhere.png"),

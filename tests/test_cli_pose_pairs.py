@@ -100,7 +100,7 @@ def test_a_pair_becomes_a_pose(
     ("words", "said"),
     [
         (["--min-confidence", "1.5"], "--min-confidence 1.5: give 0 to 1"),
-        (["--depth", "mask.png"], "2 of --cloud, --depth, --left and --bop are given"),
+        (["--depth", "mask.png"], "give one of --cloud, --depth, --left and --bop"),
     ],
 )
 def test_what_is_no_pair_is_refused(

@@ -512,8 +512,8 @@ def test_two_processes_share_the_work(
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ([], "0 of --cloud, --depth, --left and --bop are given; give one"),
-        (["--cloud", ".", "--bop", "."], "2 of --cloud, --depth, --left and --bop are given"),
+        ([], "give one of --cloud, --depth, --left and --bop"),
+        (["--cloud", ".", "--bop", "."], "give one of --cloud, --depth, --left and --bop"),
         (["--cloud", "."], "the weights know bracket, bottle; say which by --object"),
         (["--cloud", ".", "--object", "bracke"], "did you mean 'bracket'?"),
         (["--depth", ".", "--object", "bottle"], "--depth needs --camera or --focal-px beside it"),

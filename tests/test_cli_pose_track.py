@@ -159,7 +159,7 @@ def test_the_objects_of_a_scene_are_followed(weights: Path, tmp_path: Path) -> N
         (["--depth", "."], "--depth needs --camera beside it"),
         (["--bop", ".", "--camera", ".", "--unit", "m"], "Leave --camera and --unit out"),
         (["--bop", ".", "--first", "."], "--first: has no effect here"),
-        (["--cloud", ".", "--camera", "."], "--camera: has no effect here; a cloud is of"),
+        (["--cloud", ".", "--camera", "."], "--camera: has no effect here; clouds are in the"),
     ],
 )
 def test_wrong_words_are_refused(

@@ -60,10 +60,10 @@ def test_a_cad_file_becomes_weights_with_a_card(
         (["--data", "."], "--data .: the config learns from no dataset"),
         (
             ["--what", "segmentation", "--cad", ".", "--unit", "mm"],
-            "--cad has no meaning for 'segmentation', which learns from pictures",
+            "--cad and --unit: has no effect here; 'segmentation' learns from pictures",
         ),
-        (["--what", "segmentation", "--unit", "mm"], "--unit has no meaning for 'segmentation'"),
-        (["--what", "segmentation", "--symmetries", "found"], "--symmetries has no meaning for"),
+        (["--what", "segmentation", "--unit", "mm"], "--unit: has no effect here; 'segmentation'"),
+        (["--what", "segmentation", "--symmetries", "found"], "--symmetries: has no effect"),
         (["--cad", "nowhere.stl", "--unit", "mm"], "nowhere.stl"),
     ],
 )

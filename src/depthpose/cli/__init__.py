@@ -300,7 +300,7 @@ def _run(words: list[str]) -> int:
     option_words = words[len(name.split()) :]
     import tyro
 
-    from depthpose.cli import arguments, ignored_options
+    from depthpose.cli import arguments, option_rules
 
     module, _, function = COMMANDS[name][0].partition(":")
     command: Callable[..., int] = getattr(import_module(f"depthpose.cli.{module}"), function)
@@ -315,8 +315,8 @@ def _run(words: list[str]) -> int:
         )
     except SystemExit as stop:  # tyro has printed help (0) or the wrong arguments (2)
         return int(stop.code or 0)
-    ignored_options.refuse_empty(options, option_words)
-    ignored_options.refuse_ignored(name, option_words)
+    option_rules.refuse_empty(options, option_words)
+    option_rules.refuse_combinations(name, option_words)
     arguments.refuse_unusable(parsed.arguments)
     _refuse_small_address_space()  # before weights are looked up, which loads torch
     arguments.refuse_missing(options, parsed.arguments)

@@ -360,19 +360,9 @@ def _with_models(
     """Return the config of a training of poses with the models of :func:`train_pose`'s options.
 
     Options that were left out change nothing.
-
-    Raises:
-        InputError: an option is set, but the training is a segmentation's, which has no models.
     """
-    options = {"cad": cad, "unit": unit, "symmetries": symmetries}
-    option = next((name for name, value in options.items() if value), None)
-    if option is None:
+    if not (cad or unit or symmetries):
         return config
-    if not hasattr(config, "models"):
-        raise InputError(
-            f"--{option} has no meaning for 'segmentation', which learns from pictures: make them "
-            "by 'depthpose data make objects --cad ...' and name the folder in the config"
-        )
     models = replace_unless_none(config.models, cad=cad or None, unit=unit)
     if symmetries is not None:
         models = replace(models, with_found_symmetries=symmetries == "found")

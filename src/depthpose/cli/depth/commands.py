@@ -189,11 +189,6 @@ def evaluate_depth(
     from depthpose.depth.protocols import find_protocol
     from depthpose.report.page import list_table_files
 
-    if not (methods.weights or methods.matcher or methods.predictions or methods.baseline):
-        raise InputError(
-            "measure --weights FILE, --matcher sgbm, --predictions DIR or --baseline rows, or "
-            "several."
-        )
     rule = find_protocol(comparison.protocol)
     dataset = open_frames(data, split)
     chosen = choose_methods(methods, matching.config, dataset)

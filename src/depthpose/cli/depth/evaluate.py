@@ -193,12 +193,8 @@ def open_training(folders: Sequence[Path], without: Sequence[str], measured: Dat
         measured: the frames that are measured.
 
     Raises:
-        InputError: no folder is given, or a training frame is measured too.
+        InputError: a training frame is measured too.
     """
-    if not folders:
-        raise InputError(
-            "a baseline is fitted to training frames: give --train FOLDER, or several."
-        )
     training = join_datasets([open_dataset(folder) for folder in folders], without)
     remedy = "give --train other folders, or name these in --train-without"
     refuse_shared_frames(training.frames, measured.frames, "frames to measure", remedy)

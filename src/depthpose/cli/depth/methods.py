@@ -139,12 +139,7 @@ class DepthNetworkSpec:
 
     def with_packed_weights(self) -> "DepthNetworkSpec":
         """Return the spec with the content of its weights file, for workers of other machines."""
-        if self.matcher not in (None, "sgbm"):
-            raise InputError(
-                f"--matcher {self.matcher}: --engine ray takes sgbm or the weights' own; make one "
-                "file of both by 'depthpose weights pack G --matcher S --trained-on DATA --licence "
-                "L --out W'"
-            )
+        assert self.matcher in (None, "sgbm")
         if isinstance(self.weights, PackedWeights):
             return self
         return replace(self, weights=PackedWeights.read(self.weights))

@@ -369,8 +369,6 @@ def predict_depth_on_ray(
         engine: options of the engine.
     """
     reader = worker.reader
-    if reader.scale.one_mount:
-        raise InputError("--one-mount takes the images one after the other; omit it, or --engine")
     settings = run_settings(settings_on_workers(worker.spec), reader, worker.output)
     computation = Computation(
         make_writer=worker.make_writer,

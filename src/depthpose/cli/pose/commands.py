@@ -51,15 +51,8 @@ def predict_poses(
     )
     from depthpose.cli.pose.search import search_dataset, search_files
 
-    # One kind of input. A pair is matched first, to depth images.
+    # A pair is matched first, to depth images.
     pose_inputs = options.PoseInputs(**vars(inputs), **vars(details))
-    input_kinds = (pose_inputs.cloud, pose_inputs.depth, pair.left, dataset.bop)
-    kind_count = sum(path is not None for path in input_kinds)
-    if kind_count != 1:
-        raise InputError(
-            f"{kind_count} of --cloud, --depth, --left and --bop are given; give one: a cloud, a "
-            "depth image with --mask and --camera, a pair with --camera, or a dataset"
-        )
     if pair.left is not None:
         from depthpose.cli.pose.pairs import match_pairs_for_poses
 
@@ -84,8 +77,6 @@ def predict_poses(
     # Pose a dataset, or search whole images, or pose clouds and masked parts of images.
     out_folder = Path(out)
     if dataset.bop is not None:
-        if pose_inputs.color is not None:
-            raise InputError("--color is beside --depth; leave it out where --bop is given")
         if dataset.masks == "search":
             return search_dataset(method, dataset, pose_inputs.object, out_folder)
         return predict_poses_of_dataset(
@@ -96,8 +87,7 @@ def predict_poses(
             f"--cloud {pose_inputs.cloud}: the weights {estimates.weights} need depth images; give "
             "--depth, --mask and --camera, or weights that vote"
         )
-    has_lens = pose_inputs.lens is not None
-    if pose_inputs.depth is not None and has_lens and not pose_inputs.has_regions:
+    if pose_inputs.depth is not None and not pose_inputs.has_regions:
         return search_files(method, pose_inputs, out_folder)
     return predict_poses_of_files(method, pose_inputs, out_folder, batch)
 
@@ -142,8 +132,6 @@ def evaluate_poses(
     from depthpose.pose.config import EvaluationConfig
     from depthpose.report.page import list_table_files
 
-    if not (weights or csv or predictions):
-        raise InputError("measure --weights FILE, --csv FILE or --predictions DIR, or several.")
     dataset = open_dataset(bop, split, estimates.targets, objects)
     print_instances(dataset)
     files = [
@@ -193,10 +181,6 @@ def track_object(
     from depthpose.cli.pose.track import track_dataset, track_files
     from depthpose.core.run import find_rank
 
-    if sum(path is not None for path in (frames.depth, frames.cloud, frames.bop)) != 1:
-        raise InputError("give one of --depth with --camera, --cloud and --bop")
-    if frames.depth is not None and frames.camera is None:
-        raise InputError("--depth needs --camera beside it")
     if find_rank().world > 1:
         raise InputError("a sequence is followed by one process; start one")
     config = EstimateConfig(device=frames.device, min_certainty=frames.min_certainty)

@@ -101,11 +101,6 @@ def _make_registration_method(
     name: str, models: Sequence[ObjectModel], config: EstimateConfig
 ) -> PoseMethod:
     """Make the method that registers models without training."""
-    if not models:
-        raise InputError(
-            "--method register looks for CAD files: give --cad part.stl --unit mm, or --bop, whose "
-            "models it takes"
-        )
     fingerprints = {model.name: _fingerprint_model(model) for model in models}
     settings = {"kind": REGISTER, "models": fingerprints, "estimate": config_to_dict(config)}
     return PoseMethod(name=name, estimator=Registration(models, config), settings=settings)
@@ -262,20 +257,15 @@ def make_method_spec(
         is_registration: register models, without the network.
 
     Raises:
-        InputError: a file cannot be read, a unit is missing, or ``--symmetry`` has no CAD file.
+        InputError: a file cannot be read, or a unit is missing.
     """
     base_from_camera = read_base(base)
     cad_unit = find_cad_unit(parts.cad, parts.cad_unit, unit)
-    if parts.symmetry and not (is_registration and parts.cad):
-        raise InputError(
-            f"--symmetry {parts.symmetry[0]}: is of --method register with --cad; a network and "
-            "a dataset have the symmetries that they declare"
-        )
-    if not is_registration and weights != REGISTER:
+    if not is_registration:
         return PoseNetworkSpec(weights=weights, config=config, base_from_camera=base_from_camera)
     if dataset.bop is not None:
         # No base: --base-from-camera is refused beside --bop, since a dataset's cameras move.
         models = tuple(datasets.open_bop(dataset.bop, dataset.split).objects.values())
         return RegistrationSpec(models=models, config=config)
-    models = read_parts(parts.cad, cad_unit, parts.symmetry or None) if parts.cad else ()
+    models = read_parts(parts.cad, cad_unit, parts.symmetry or None)
     return RegistrationSpec(models=models, config=config, base_from_camera=base_from_camera)

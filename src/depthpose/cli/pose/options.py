@@ -14,7 +14,7 @@ from depthpose.cli.arguments import (
     refuse_outside,
     shown_as,
 )
-from depthpose.cli.ignored_options import is_registration
+from depthpose.cli.option_rules import is_registration
 from depthpose.core.units import Unit
 from depthpose.pose.config import DiameterTable, EstimateConfig, VotingConfig, VotingMethod
 

@@ -43,14 +43,11 @@ def match_pairs_for_poses(pair: PairOptions, camera: Path | None, device: str, o
         The depth image OUT/depth/NAME.npy of a single pair, or the folder OUT/depth of several.
 
     Raises:
-        InputError: no right image, a camera without a baseline, or no depth that is sure enough.
+        InputError: an image has no partner, a camera no baseline, or no depth is sure enough.
     """
-    if pair.left is None or pair.right is None or camera is None:
-        raise InputError(
-            "--left needs --right and --camera beside it: the other view, and the file of the rig "
-            'with "baseline_m"'
-        )
-
+    assert pair.left is not None
+    assert pair.right is not None
+    assert camera is not None
     pairs = list_pairs(pair.left, pair.right)
     images = [path for both in pairs for path in both]
     refuse_among_inputs(out, (pair.left, pair.right), images)

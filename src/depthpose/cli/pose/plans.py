@@ -98,15 +98,8 @@ def _plan_regions(method: PoseMethod, inputs: PoseInputs, out: Path) -> JobPlan:
 
     The arguments and errors are those of :func:`plan_jobs`.
     """
-    regions = {"mask": inputs.mask, "box": inputs.box, "detections": inputs.detections}
-    options = [f"--{name}" for name, value in regions.items() if value]
-    if inputs.depth is None or inputs.lens is None or not options:
-        raise InputError(
-            "--depth needs --camera or --focal-px beside it, and --mask, --box or --detections "
-            "unless it is to be found"
-        )
-    if len(options) > 1:
-        raise InputError(f"{' and '.join(options)} say where objects are; give one of them")
+    assert inputs.depth is not None
+    assert inputs.lens is not None
 
     # What may be in the images: one object, named or the only one, or those that labels name.
     names = [model.name for model in method.models]
@@ -207,13 +200,9 @@ def _load_bin(file: str, inputs: PoseInputs) -> tuple[PosedBin, dict[str, Any]]:
         The bin, and the JSON values that it adds to the settings.
 
     Raises:
-        InputError: the pose or the unit is missing, or a file cannot be read.
+        InputError: the unit is missing, or a file cannot be read.
     """
-    if inputs.bin_pose is None:
-        raise InputError(
-            f"--bin {file}: where is it? Give --bin-pose, a text file with its 4x4 matrix "
-            "camera_from_model in metres, or --empty-frame in place of both"
-        )
+    assert inputs.bin_pose is not None
     pose = read_pose(inputs.bin_pose, "--bin-pose")
     unit = find_cad_unit([file], inputs.cad_unit, inputs.unit)
     settings = {
@@ -245,14 +234,11 @@ def _with_color(
         out: folder of the results, which may not lie among the pictures.
 
     Raises:
-        InputError: a depth image has no picture, or an option is missing.
+        InputError: a depth image has no picture.
     """
     if inputs.color is None:
-        if inputs.color_camera is not None or inputs.color_from_depth is not None:
-            raise InputError("--color-camera and --color-from-depth are of --color; give that too")
         return plan
-    if inputs.depth is None:
-        raise InputError(f"--color {inputs.color}: is beside --depth; a cloud has no colour image")
+    assert inputs.depth is not None
     color = Path(inputs.color)
     depth = Path(inputs.depth)
     pictures = list_images(color)

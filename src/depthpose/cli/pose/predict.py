@@ -287,11 +287,7 @@ def predict_poses_on_ray(
         The exit code.
     """
     # What the files are: clouds, depth images with masks, or depth images alone.
-    if options.depth is not None and options.lens is None:
-        raise InputError("--depth needs --camera or --focal-px beside it")
-    if options.box and options.mask is not None:
-        raise InputError("--mask and --box say where objects are; give one of them")
-    # Several boxes were refused before (``ignored_options``).
+    # Several boxes were refused before (``option_rules``).
     box = parse_box(options.box[0]) if options.box else None
     if options.depth is None:
         files = InputFormat(roles=("cloud",), suffixes=tuple(CLOUD_READERS))

@@ -256,8 +256,6 @@ def reproduce_table_3_2(
     """
     from depthpose.cli.thesis.pose import reproduce_by_object
 
-    if not weights and not csv:
-        raise InputError("table 3.2: there is nothing to measure; give --weights FILE or --csv.")
     return reproduce_by_object("3.2", data, estimates, weights, csv, out)
 
 

@@ -172,8 +172,7 @@ def reproduce_by_object(
     Returns:
         The exit code.
     """
-    if data.folder is None:
-        raise InputError(f"table {number}: give --linemod FOLDER, or --bop FOLDER.")
+    assert data.folder is not None
 
     # The instances, the methods, and all that decides the numbers.
     dataset = open_dataset(data.folder, data.split, options.targets, data.objects)

@@ -1,16 +1,27 @@
-"""Options that would be ignored, and streams that cannot be written."""
+"""Options that do not go together or are out of range; streams that cannot be written."""
 
 import errno
 import io
+import re
 import sys
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
+from random import Random
 
 import pytest
 
-from depthpose.cli import lasting_streams, main
+from depthpose.cli import COMMANDS, lasting_streams, main
+from depthpose.cli.arguments import make_parser
 from depthpose.cli.depth.options import MatcherOptions
-from depthpose.cli.ignored_options import refuse_ignored
+from depthpose.cli.option_rules import (
+    IGNORED_RULES,
+    RULES,
+    IgnoredRule,
+    Rule,
+    TypedOptions,
+    refuse_combinations,
+)
 from depthpose.core.errors import InputError
 
 IGNORED = [
@@ -42,9 +53,35 @@ IGNORED = [
     ("depth evaluate", "--protocol kitti-2015 --cap 50", "--cap"),
     ("weights complete", "w --models . --unit m", "--unit"),
 ]
+REFUSED = [
+    ("pose predict", "", "give one of --cloud, --depth, --left and --bop"),
+    ("pose predict", "--cloud c --depth=d", "give one of --cloud, --depth, --left and --bop"),
+    ("pose predict", "--cloud None", "give one of --cloud, --depth, --left and --bop"),
+    ("pose predict", "--depth d --camera=None", "--depth needs --camera or --focal-px"),
+    ("pose predict", "--left l --right r", "--left needs --right and --camera"),
+    ("pose predict", "--left l --camera c", "--left needs --right and --camera"),
+    ("pose predict", "--depth d --focal-px 9 --mask m --box 1,2,3,4", "--mask, --box and"),
+    ("pose predict", "--depth d --camera c --box 1,2,3,4 --detections e", "--mask, --box and"),
+    ("pose predict", "--depth d --camera c --mask m --bin b", "--bin: where is it?"),
+    ("pose predict", "--bop b --weights register --voting ransac", "--weights register: regis"),
+    ("pose predict", "--cloud c --method register --cad", "--method register looks for CAD files"),
+    ("pose track", "--cloud c --depth d", "give one of --depth with --camera, --cloud and --bop"),
+    ("pose track", "--depth d", "--depth needs --camera beside it"),
+    ("pose track", "--bop b --weights register", "--weights register: registration is asked for"),
+    ("pose track", "--cloud c --method register", "--method register looks for CAD files"),
+    ("pose evaluate", "--bop b --weights", "measure --weights FILE, --csv FILE or --predictions"),
+    ("depth predict", "l --engine ray --matcher w", "--engine ray takes --matcher sgbm or"),
+    ("depth evaluate", "--data d", "measure --weights FILE, --matcher sgbm, --predictions"),
+    ("depth evaluate", "--baseline rows", "a baseline is fitted to training frames: give --train"),
+    ("reproduce 3.1", "--weights v w", "give --linemod FOLDER, or --bop FOLDER"),
+    ("reproduce 3.2", "--bop b", "there is nothing to measure; give --weights FILE or --csv"),
+]
 USED = [
     ("pose predict", "--cad p.stl --cloud c.ply"),
-    ("pose predict", "--voting ransac --hypotheses 64"),
+    ("pose predict", "--left l --right r --camera c --mask m --color p --color-camera o"),
+    ("pose predict", "--depth d --camera c --box 1,2,3,4 --bin b --bin-pose p --cad-unit mm"),
+    ("pose track", "--cloud c --method register --cad p.stl --cad-unit mm --symmetry z,2"),
+    ("pose predict", "--cloud c.ply --voting ransac --hypotheses 64"),
     ("pose predict", "--depth d.png --mask m.png --camera c.json --batch 4"),
     ("pose evaluate", "--bop b --weights register parts --voting ransac --no-icp"),
     ("depth predict", "a.png --engine ray --worker-gpus 0.5 --device cuda:1"),
@@ -57,12 +94,49 @@ USED = [
 @pytest.mark.parametrize(("command", "words", "named"), IGNORED)
 def test_an_option_without_effect_is_refused(command: str, words: str, named: str) -> None:
     with pytest.raises(InputError, match=rf"^{named}: has no effect here; .* Leave {named} out$"):
-        refuse_ignored(command, words.split())
+        refuse_combinations(command, words.split())
+
+
+@pytest.mark.parametrize(("command", "words", "error"), REFUSED)
+def test_options_that_do_not_go_together_are_refused(command: str, words: str, error: str) -> None:
+    with pytest.raises(InputError) as refused:
+        refuse_combinations(command, words.split())
+    assert error in str(refused.value)
+
+
+class _Recorder(TypedOptions):
+    """Options of which each look at them says something else, and that keep what was looked at."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.names: set[str] = set()
+        self.random = Random(0)
+
+    def __missing__(self, name: str) -> list[str]:
+        self.names.add(name)
+        return self.random.choice([[], [name], ["ray"], ["register"]])
+
+
+@pytest.mark.parametrize("rule", [*IGNORED_RULES, *RULES])
+def test_a_rule_names_options_of_its_commands_alone(rule: IgnoredRule | Rule) -> None:
+    recorder = _Recorder()
+    for _ in range(100):
+        rule.when(recorder)
+    is_ignored = isinstance(rule, IgnoredRule)
+    text = rule.reason if is_ignored else rule.error
+    of_this_command = re.sub(r"'depthpose .*?'", "", text)  # without those of another
+    named = recorder.names | set(re.findall(r"--([a-z-]+)", of_this_command))
+    named |= set(rule.ignored) if is_ignored else set()
+    assert named
+    for command in rule.commands:
+        module, _, function = COMMANDS[command][0].partition(":")
+        _, options = make_parser(getattr(import_module(f"depthpose.cli.{module}"), function))
+        assert named <= {option.name.replace("_", "-") for option in options}, command
 
 
 @pytest.mark.parametrize(("command", "words"), USED)
 def test_an_option_with_effect_is_not(command: str, words: str) -> None:
-    refuse_ignored(command, words.split())
+    refuse_combinations(command, words.split())
 
 
 def test_the_command_refuses_it_in_a_line(capsys: pytest.CaptureFixture[str]) -> None:
