@@ -4,7 +4,10 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import is_dataclass
+from importlib import import_module
 from importlib.metadata import version
+from inspect import signature
 from pathlib import Path
 
 import numpy as np
@@ -112,6 +115,22 @@ def test_help_has_no_line_breaks_of_the_code(
     between = text.partition("height of the camera")[2].partition("--camera-tilt NUMBER")[0]
     lines = [line.strip("│ ") for line in between.splitlines()[1:-1]]
     assert all(len(line) > 60 for line in lines[:-1]), lines  # filled, but for the last
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_of_an_option_begins_with_a_noun_or_verb(name: str) -> None:
+    module, _, function = COMMANDS[name][0].partition(":")
+    command = getattr(import_module(f"depthpose.cli.{module}"), function)
+    parse, _ = make_parser(command)
+    hints = dict(parse.__annotations__)
+    for parameter in signature(command).parameters.values():
+        if is_dataclass(parameter.default):
+            hints |= type(parameter.default).__annotations__
+    marks = [mark for hint in hints.values() for mark in getattr(hint, "__metadata__", ())]
+    texts = [mark.help for mark in marks if getattr(mark, "help", None)]
+    assert len(texts) > 0
+    for text in texts:
+        assert text.split()[0] not in ("of", "at", "as"), text
 
 
 def test_help_of_poses_begins_with_what_matters_and_ends_with_the_cluster(

@@ -30,8 +30,8 @@ def demo(
 
     Args:
         out: folder for pictures, maps, poses and report.html.
-        weights: of the depth networks, by name or file ('depthpose weights list').
-        pose_weights: of a pose network for these parts, by name or file.
+        weights: weights of the depth networks, by name or file ('depthpose weights list').
+        pose_weights: weights of a pose network for these parts, by name or file.
     """
     from functools import partial
 

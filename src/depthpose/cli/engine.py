@@ -24,9 +24,9 @@ class EngineOptions:
     many results to a shard, OUT/shards/*.tar, listed in OUT/manifest.csv; inputs and OUT may be
     URLs (s3://, gs://, file://), inputs also WebDataset shards (*.tar) or a manifest (*.csv)."""
     address: Annotated[str | None, shown_as(metavar="HOST:PORT")] = None
-    """of a running Ray cluster: auto, or HOST:PORT; without it one is started on this machine."""
+    """running Ray cluster: auto, or HOST:PORT; without it one is started on this machine."""
     workers: int | None = None
-    """at most; by default as many as fit into the cluster."""
+    """largest number of workers; by default as many as fit into the cluster."""
     worker_cpus: float = 1.0
     """cores of each worker."""
     worker_gpus: float = 0.0

@@ -25,11 +25,11 @@ def serve(
     Args:
         host: 127.0.0.1 is this machine alone; with 0.0.0.0 everyone who can reach this machine can
             use the page: there is no password and no encryption.
-        port: of the page; 0 takes a free one.
-        weights: of the depth networks, by name or file ('depthpose weights list').
-        pose_weights: of a pose network, by name or file.
+        port: port of the page; 0 takes a free one.
+        weights: weights of the depth networks, by name or file ('depthpose weights list').
+        pose_weights: weights of a pose network, by name or file.
         max_upload_mb: all files of one request together [1e6 bytes].
-        max_seconds: of one computation; a longer one is stopped, as others wait for it.
+        max_seconds: time of one computation; a longer one is stopped, as others wait for it.
     """
     try:
         from depthpose.web import Limits, find_address_and_hosts, make_app, open_socket, run

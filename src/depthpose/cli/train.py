@@ -324,7 +324,7 @@ def train_pose(
         out: the run folder.
         config: YAML with what differs from the defaults.
         cad: model files; one network learns them all.
-        unit: of the numbers in the files.
+        unit: unit of the numbers in the files.
         symmetries: found: detect symmetries of the part and count equivalent poses as one; by
             default they are only printed.
         data: folder of a dataset; it takes the place of the config's, for models and frames.

@@ -171,7 +171,8 @@ def pack_weights(
         trained_on: the data, for the card.
         licence: under which terms the weights may be used.
         matcher: what matches the two views: weights with a matcher, by name or file.
-        terms: of use, printed whenever the weights are loaded; those of the parts are kept too.
+        terms: terms of use, printed whenever the weights are loaded; those of the parts are kept
+            too.
         half: store 16-bit floats: half the size.
     """
     from depthpose.core.checkpoint import add_terms, find_weights, warn_of_terms
@@ -216,7 +217,7 @@ def complete_weights(
         models: folder of the dataset in BOP's layout, whose models the weights were trained on; or
             the model file of a single object.
         out: the .safetensors file to write; every other command takes it.
-        unit: of a model file; BOP's are in mm.
+        unit: unit of a model file; BOP's are in mm.
     """
     from depthpose.core.checkpoint import find_weights
     from depthpose.core.run import refuse_to_replace
@@ -254,7 +255,8 @@ def export_depth(out: NewPath, weights: WeightsName = "default", what: str | Non
 
     Args:
         out: the .onnx file to write.
-        weights: of a generator, a matcher or both, by name or file ('depthpose weights list').
+        weights: weights of a generator, a matcher or both, by name or file ('depthpose weights
+            list').
         what: image: one image to depth; pair: a rectified pair to disparity. By default image
             where the weights have a generator, else pair.
     """
@@ -280,7 +282,7 @@ def export_pose(out: NewPath, weights: WeightsName = "parts") -> int:
 
     Args:
         out: the .onnx file to write.
-        weights: of a pose network, by name or file ('depthpose weights list').
+        weights: weights of a pose network, by name or file ('depthpose weights list').
     """
     from depthpose.core.checkpoint import find_weights
     from depthpose.pose.export import pose_export

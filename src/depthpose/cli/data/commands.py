@@ -105,7 +105,7 @@ def label_dataset(
     Args:
         path: a dataset with right views and calibration.
         out: folder to write to.
-        weights: with a matcher, by name or file; their terms hold for the labels too.
+        weights: weights with a matcher, by name or file; their terms hold for the labels too.
         max_difference_px: largest difference of the two views' disparities.
         max_difference_share: the same as a share of the disparity; the larger limit counts.
         min_confidence: least confidence of the matcher.

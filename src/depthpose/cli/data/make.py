@@ -45,7 +45,7 @@ def make_streets(
         out: folder to write to.
         number: how many frames.
         first: number of the first one.
-        seed: of the random streets, and number of the drives.
+        seed: seed of the random streets, and number of the drives.
         scale: size of the images: 0.5 gives half as many rows and columns.
         with_lidar: scan each scene with a LiDAR of 64 beams.
         clutter_share: share of scenes that show random shapes before a ground, a wall or in a box
@@ -103,7 +103,7 @@ def make_near(
         out: folder to write to.
         number: how many scenes.
         first: number of the first one.
-        seed: of the random scenes.
+        seed: seed of the random scenes.
         plain: share of the walls, floors and table tops that show next to no texture.
     """
     from tqdm import tqdm
@@ -160,10 +160,10 @@ def make_objects(
     Args:
         cad: model files with a surface or points; the first is object 1.
         out: folder to write to.
-        unit: of the numbers in the files.
+        unit: unit of the numbers in the files.
         number: how many frames.
         split: name of the part of the dataset.
-        seed: of the random frames.
+        seed: seed of the random frames.
         distance: nearest and farthest view [m].
         sensor: kind of depth sensor whose errors are simulated.
         clutter: fewest and most other things among the objects.

@@ -55,7 +55,8 @@ def rectify_pairs(
             D2, R, T (YAML, XML, JSON), or a folder with its intrinsics.yml and extrinsics.yml or
             with left.yaml and right.yaml of ROS.
         out: folder for the results.
-        unit: of the translation between the cameras: that of the calibration board (default m).
+        unit: unit of the translation between the cameras, that of the calibration board (default
+            m).
         fisheye: the lenses are fisheyes (OpenCV's cv2.fisheye); ROS and Kalibr files have it.
         keep: 0 keeps only what the raw images show, 1 all of it, with black borders.
         check: refuse what is swapped or differs by more than a row.

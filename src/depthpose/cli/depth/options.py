@@ -137,7 +137,7 @@ class CloudOptions:
     cloud: bool = False
     """write a coloured point cloud of what is nearer than 80 m, NAME.cloud.ply."""
     min_confidence: float = 0.0
-    """of clouds: depth with a lower confidence, 0 to 1, is left out; the share is printed."""
+    """smallest confidence of points in clouds, 0 to 1; the share that is left out is printed."""
 
     def refuse_unusable(self) -> None:
         """Refuse a confidence that is no share."""

@@ -115,7 +115,7 @@ def evaluate_poses(
     Args:
         bop: folder of the dataset.
         out: folder for rows.json, rows.csv, table.md, report.html, instances.csv and predictions.
-        split: train, test, ...
+        split: name of the split: train, test, ...
         weights: files or names, of the method or of a baseline; also register (registration
             without training), which needs no weights.
         csv: BOP results of any method.
@@ -175,7 +175,7 @@ def track_object(
 
     Args:
         out: folder for the results.
-        weights: of a pose network, by name or file ('depthpose weights list').
+        weights: weights of a pose network, by name or file ('depthpose weights list').
     """
     from depthpose.cli.pose.methods import make_method_spec
     from depthpose.cli.pose.track import track_dataset, track_files

@@ -32,7 +32,7 @@ class PoseDataOptions:
     bop: Path | None = None
     """any other dataset in BOP's layout."""
     split: str = "test"
-    """of the dataset: train, test, ..."""
+    """name of the split: train, test, ..."""
     objects: tuple[str, ...] = ()
     """keep these alone, by name or number."""
 
@@ -82,20 +82,37 @@ class PoseTableOptions(PoseMeasureOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class InputOptions:
-    """The objects that are looked for, and the clouds or depth images that show them."""
+class CadOptions:
+    """The CAD files of the objects that are looked for."""
 
     cad: tuple[Source, ...] = ()
     """STL, PLY, OBJ or GLB files of the parts: they are posed without training, a second or two for
     each; an object has its file's name."""
     cad_unit: Unit | None = None
-    """of the CAD files; as --unit by default, and of GLB metres."""
+    """unit of the CAD files; by default that of --unit, and of GLB metres."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SymmetryOptions:
+    """The symmetries of the objects of CAD files."""
+
+    symmetry: tuple[str, ...] = ()
+    """symmetries of --cad, in place of what is found: z,18 where a part looks alike after each of
+    18 equal turns about an axis along z, z,free after any, z,6+x,2 about two axes; or a JSON file
+    with BOP's symmetries_discrete and symmetries_continuous. The axis goes where the surface fits
+    best. Of several CAD files with the name: NAME:z,18."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class InputOptions(CadOptions):
+    """The objects that are looked for, and the clouds or depth images that show them."""
+
     depth: Source | None = None
     """16-bit PNG in the camera's depth_unit_m, or a folder of them. Without --mask, --box and
     --detections the whole image is searched for every object, or for --object alone."""
     camera: Path | None = None
-    """of the depth images; JSON file: {"width", "height", "K": 3x3, "depth_unit_m"}, or a file of
-    ROS, OpenCV, KITTI and others, which the error of an unknown file lists."""
+    """camera of the depth images; JSON file: {"width", "height", "K": 3x3, "depth_unit_m"}, or a
+    file of ROS, OpenCV, KITTI and others, which the error of an unknown file lists."""
     mask: Source | None = None
     """picture, not black is the object, or .json with COCO's run lengths; or a folder of masks with
     the names of the depth images. Each number of a label map is an object (see --labels)."""
@@ -108,7 +125,7 @@ class InputOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class InputDetailOptions:
+class InputDetailOptions(SymmetryOptions):
     """Further facts of the objects and the images."""
 
     detections: Source | None = None
@@ -130,11 +147,6 @@ class InputDetailOptions:
     poses.json of a run that posed it alone."""
     empty_frame: Source | None = None
     """in place of --bin: depth image of the bin or table without the parts, by the same camera."""
-    symmetry: tuple[str, ...] = ()
-    """of --cad: how a part looks alike, in place of what is found: z,18 after each of 18 equal
-    turns about an axis along z, z,free after any, z,6+x,2 about two axes; or a JSON file with BOP's
-    symmetries_discrete and symmetries_continuous. The axis goes where the surface fits best. Of
-    several CAD files with the name: NAME:z,18."""
     focal_px: float | None = None
     """focal length of the depth images [px], in place of --camera; the axis meets their centre."""
     color: Source | None = None
@@ -142,7 +154,8 @@ class InputDetailOptions:
     of them with the names of the depth images. Print on a part (PLY with colours of its vertices,
     OBJ or GLB with a texture) then tells apart the copies that depth cannot."""
     color_camera: Path | None = None
-    """of the colour pictures, as --camera; without it they are pixel by pixel of the depth."""
+    """camera of the colour pictures, as --camera; without it they are pixel by pixel of the
+    depth."""
     color_from_depth: Path | None = None
     """text file with the pose of the depth camera in the frame of --color-camera: 4x4, in metres;
     without it both are at one place."""
@@ -192,8 +205,8 @@ class DataSetOptions:
     bop: Path | None = None
     """folder of a dataset in BOP's layout, or of Linemod_preprocessed."""
     split: str = "test"
-    """of the dataset; where it is of several sensors with the name of one, such as
-    val_photoneo."""
+    """name of the split: train, test, ...; where it is of several sensors with the name of one,
+    such as val_photoneo."""
     masks: str = "truth"
     """truth (the annotated ones), predicted (those that came with Linemod_preprocessed), a JSON
     file of BOP detections, or weights of a segmentation, by name or file; or search: no mask is
@@ -226,11 +239,11 @@ class EstimateOptions(PoseMethodOptions):
     """standard deviation of the real surface from its file [mm]: 0.3 for a machined part, 2 for a
     carton or a scan; by default 2 for a model of points or with colours, else 1."""
     weights: WeightsName = "parts"
-    """of a pose network, by name or file ('depthpose weights list')."""
+    """weights of a pose network, by name or file ('depthpose weights list')."""
     voting: Voting = "ransac"
     """how a network's directions become keypoints."""
     hypotheses: int = 128
-    """of RANSAC, for each keypoint of a network."""
+    """hypotheses of RANSAC for each keypoint of a network."""
     icp: bool = True
     """refine the voted pose by ICP."""
     register_refused: bool = False
@@ -264,18 +277,8 @@ class EstimateOptions(PoseMethodOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RegisterOptions(PoseMethodOptions):
+class RegisterOptions(SymmetryOptions, CadOptions, PoseMethodOptions):
     """Poses by a CAD file alone, without training."""
-
-    cad: tuple[Source, ...] = ()
-    """of register: STL, PLY, OBJ or GLB files; an object has its file's name."""
-    cad_unit: Unit | None = None
-    """of the CAD files; as --unit by default, and of GLB metres."""
-    symmetry: tuple[str, ...] = ()
-    """of register: how a part looks alike, in place of what is found: z,18 after each of 18 equal
-    turns about an axis along z, z,free after any, z,6+x,2 about two axes; or a JSON file with BOP's
-    symmetries_discrete and symmetries_continuous. The axis goes where the surface fits best. Of
-    several CAD files with the name: NAME:z,18."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -285,7 +288,7 @@ class SequenceOptions:
     depth: Path | None = None
     """folder of 16-bit PNG files, whole images without masks."""
     camera: Path | None = None
-    """of the depth images; a JSON file, as for 'pose predict'."""
+    """camera of the depth images; a JSON file, as for 'pose predict'."""
     cloud: Path | None = None
     """folder of clouds (PLY, PCD, NPY, text) in the camera frame, of the object alone; with --first
     also of what is about it."""
@@ -296,11 +299,11 @@ class SequenceOptions:
     """folder of a dataset in BOP's layout; every known object of each scene is followed (with
     --method register: that has a model there), or --object alone."""
     split: str = "test"
-    """of the dataset."""
+    """name of the split: train, test, ..."""
     object: str | None = None
     """which of the known objects; of a dataset its name or number."""
     unit: Unit | None = None
-    """of the clouds, metres by default; of depth images, where their camera says none."""
+    """unit of the clouds, metres by default; of depth images, where their camera says none."""
     base_from_camera: Annotated[tuple[str, ...], shown_as(metavar="PATH | 16 NUMBERS")] = ()
     """hand-eye calibration of a camera that does not move: the 4x4 matrix row by row, in metres, or
     a text file with it; base_from_model then stands beside camera_from_model."""

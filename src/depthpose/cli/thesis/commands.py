@@ -278,7 +278,7 @@ def reproduce_table_3_3(
         weights: file or name, of the sparse network.
         out: folder for rows.json, rows.csv, table.md and report.html.
         synthetic: number of synthetic views where no dataset is given; 40 unless told.
-        points: at most so many votes of a cloud; a block of rows each.
+        points: largest number of votes of a cloud; a block of rows each.
     """
     from depthpose.cli.thesis.pose import reproduce_voting
 
@@ -312,7 +312,7 @@ def draw_figure_3_2(
         weights: file or name, of the sparse network.
         out: folder for the figure.
         number: how many clouds.
-        perplexity: of t-SNE.
+        perplexity: perplexity of t-SNE.
     """
     from depthpose.cli.thesis.pose import draw_feature_panels, write_figure
 
