@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import tyro
 
@@ -24,7 +24,12 @@ from depthpose.depth.config import MatcherConfig
 if TYPE_CHECKING:  # --help must not load torch
     from tqdm import tqdm
 
-    from depthpose.core.loop import Progress
+    from depthpose.core.loop import Progress, TrainingConfig
+    from depthpose.pose.train.config import SegmentationTraining, ViewsTraining
+
+    _PoseConfig = ViewsTraining | SegmentationTraining
+
+_Config = TypeVar("_Config", bound="TrainingConfig")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,8 +51,12 @@ class TrainingOptions:
     the same while it trains."""
 
     def read(
-        self, path: Path | None, kind: type, default: object = None, workers: int | None = None
-    ) -> Any:  # noqa: ANN401 - an instance of kind
+        self,
+        path: Path | None,
+        kind: type[_Config],
+        default: _Config | None = None,
+        workers: int | None = None,
+    ) -> _Config:
         """Read the config of a training, or take its defaults, and apply these options.
 
         Args:
@@ -58,7 +67,7 @@ class TrainingOptions:
         """
         from depthpose.core.config import read_config
 
-        config: Any = (default or kind()) if path is None else read_config(path, kind)
+        config = (default or kind()) if path is None else read_config(path, kind)
         self._refuse_long_warmup(config)
         loop = replace_unless_none(
             config.loop,
@@ -71,7 +80,7 @@ class TrainingOptions:
             loop = replace(loop, steps=self.steps, epochs=None)
         return replace(config, loop=loop)
 
-    def _refuse_long_warmup(self, config: Any) -> None:  # noqa: ANN401 - of any training
+    def _refuse_long_warmup(self, config: "TrainingConfig") -> None:
         """Refuse a warm-up that is longer than the training, whose rate would never be reached.
 
         A training of few steps in place of the config's (``--steps 20``) is a trial, and may end
@@ -352,16 +361,18 @@ def train_pose(
 
 
 def _with_models(
-    config: Any,  # noqa: ANN401 - of any training of poses
+    config: "_PoseConfig",
     cad: tuple[str, ...],
     unit: Unit | None,
     symmetries: Literal["none", "found"] | None,
-) -> Any:  # noqa: ANN401
+) -> "_PoseConfig":
     """Return the config of a training of poses with the models of :func:`train_pose`'s options.
 
     Options that were left out change nothing.
     """
-    if not (cad or unit or symmetries):
+    from depthpose.pose.train.config import SegmentationTraining
+
+    if isinstance(config, SegmentationTraining) or not (cad or unit or symmetries):
         return config
     models = replace_unless_none(config.models, cad=cad or None, unit=unit)
     if symmetries is not None:
@@ -371,7 +382,7 @@ def _with_models(
     return replace(config, models=models)
 
 
-def _with_dataset(config: Any, folder: str) -> Any:  # noqa: ANN401 - of any training of poses
+def _with_dataset(config: "_PoseConfig", folder: str) -> "_PoseConfig":
     """Return the config of a training of poses with the models and frames of another dataset.
 
     Only the parts that the config takes from a dataset are changed.
@@ -379,18 +390,21 @@ def _with_dataset(config: Any, folder: str) -> Any:  # noqa: ANN401 - of any tra
     Raises:
         InputError: the config takes nothing from a dataset.
     """
-    # Trainings on views have models (``bop`` is None where they are CAD files) and frames (None
-    # where all views are synthetic); their held-out views are synthetic, of no folder. That of the
-    # segmentation has no models: its images, and perhaps held-out ones, are of folders.
-    changes: dict[str, Any] = {}
-    models = getattr(config, "models", None)
-    if models is not None and models.bop is not None:
-        changes["models"] = replace(models, bop=folder)
-    for name in ("frames", "images", "held_out"):
-        part: Any = getattr(config, name, None)
-        if hasattr(part, "folder"):
-            changes[name] = replace(part, folder=folder)
-    if not changes:
+    from depthpose.pose.train.config import SegmentationTraining
+
+    if isinstance(config, SegmentationTraining):
+        held_out = None if config.held_out is None else replace(config.held_out, folder=folder)
+        images = replace(config.images, folder=folder)
+        return replace(config, images=images, held_out=held_out)
+
+    # Models may be CAD files, and all views synthetic.
+    models = config.models
+    frames = config.frames
+    if models.bop is None and frames is None:
         message = "the config learns from no dataset; see --cad and --what"
         raise InputError(f"--data {folder}: {message}")
-    return replace(config, **changes)
+    if models.bop is not None:
+        models = replace(models, bop=folder)
+    if frames is not None:
+        frames = replace(frames, folder=folder)
+    return replace(config, models=models, frames=frames)
