@@ -81,6 +81,7 @@ USED = [
     ("pose predict", "--left l --right r --camera c --mask m --color p --color-camera o"),
     ("pose predict", "--depth d --camera c --box 1,2,3,4 --bin b --bin-pose p --cad-unit mm"),
     ("pose track", "--cloud c --method register --cad p.stl --cad-unit mm --symmetry z,2"),
+    ("pose predict", "--left l --right r --camera c --cad p.stl --device cuda:0"),
     ("pose predict", "--cloud c.ply --voting ransac --hypotheses 64"),
     ("pose predict", "--depth d.png --mask m.png --camera c.json --batch 4"),
     ("pose evaluate", "--bop b --weights register parts --voting ransac --no-icp"),

@@ -158,8 +158,14 @@ IGNORED_RULES = (
     IgnoredRule(
         commands=("pose predict",),
         when=_is_registered,
-        ignored=("weights", "voting", "hypotheses", "batch", "device"),
-        reason="CAD files are posed without a network, one input after the other on the processor",
+        ignored=("weights", "voting", "hypotheses", "batch"),
+        reason="CAD files are posed without a network, one input after the other",
+    ),
+    IgnoredRule(
+        commands=("pose predict",),
+        when=both(_is_registered, none_typed("left")),  # a pair is matched on the device
+        ignored=("device",),
+        reason="CAD files are posed without a network, on the processor",
     ),
     IgnoredRule(
         commands=("pose track",),
