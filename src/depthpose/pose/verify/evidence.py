@@ -196,16 +196,16 @@ def compare(observation: Observation, pose: Rigid, surface: Surface) -> Evidence
     deviations, is_compared = _residual_deviations(observation, rendering, inner)
     is_supported = is_compared & (np.abs(deviations) <= THRESHOLD)
 
-    # Patches that contradict the pose. Only a mask says which readings are the object's.
+    # Patches that contradict the pose.
     patch_area_px2 = observation.patch_px**2
-    is_bulging = (deviations < -THRESHOLD) & observation.is_object[rendering.window]
-    is_beside = _is_beside_silhouette(observation, is_drawn, rendering.window)
     seen_through = _patch_area(deviations > THRESHOLD, patch_area_px2)
-    bulging = _patch_area(is_bulging, patch_area_px2)
-    beside = _patch_area(is_beside, patch_area_px2)
-    silhouette = 0.0
-    continued = 0.0
-    if not observation.is_masked:  # else the mask says where the object ends
+    bulging = beside = silhouette = continued = 0.0
+    if observation.is_masked:  # the mask says which readings are the object's
+        is_bulging = (deviations < -THRESHOLD) & observation.is_object[rendering.window]
+        is_beside = _is_beside_silhouette(observation, is_drawn, rendering.window)
+        bulging = _patch_area(is_bulging, patch_area_px2)
+        beside = _patch_area(is_beside, patch_area_px2)
+    else:  # the surface may go on where the object ends
         across = _readings_across(observation, is_drawn, is_supported, rendering.window)
         # Where the surface goes on, patches are as long as others, and half as wide.
         silhouette = float(across.is_read.sum()) / (patch_area_px2 / 2)
