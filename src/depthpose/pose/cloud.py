@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -257,15 +256,18 @@ def make_size_error(
 
 def grow_mask(mask: Bool[Tensor, "h w"], grow_px: int) -> Bool[Tensor, "h w"]:
     """Dilate a mask by a square of ``2 grow_px + 1`` pixels; erode it where that is negative."""
-    if grow_px == 0:
-        return mask
     # An eroded mask is what the dilated complement leaves.
-    source = (mask if grow_px > 0 else ~mask).float()[None, None]
-    size = 2 * abs(grow_px) + 1
-    # The maximum over the square, one axis after the other.
-    wide = F.max_pool2d(source, (1, size), 1, (0, size // 2))
-    grown = F.max_pool2d(wide, (size, 1), 1, (size // 2, 0))[0, 0] > 0
-    return grown if grow_px > 0 else ~grown
+    grown = mask if grow_px >= 0 else ~mask
+    # Along each axis the union of the mask moved by every number of pixels, to both sides.
+    for axis in (0, 1):
+        source = grown
+        grown = source.clone()
+        length = source.shape[axis]
+        for moved_px in range(1, min(abs(grow_px), length - 1) + 1):
+            kept = length - moved_px
+            grown.narrow(axis, 0, kept).logical_or_(source.narrow(axis, moved_px, kept))
+            grown.narrow(axis, moved_px, kept).logical_or_(source.narrow(axis, 0, kept))
+    return grown if grow_px >= 0 else ~grown
 
 
 def is_reading(points_m: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
