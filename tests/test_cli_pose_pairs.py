@@ -65,7 +65,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def predict(home: Path, out: Path, *words: str) -> int:
     views = ["--left", str(home / "left.png"), "--right", str(home / "right.png")]
-    part = ["--method", "register", "--cad", str(home / "bracket.stl"), "--cad-unit", "mm"]
+    part = ["--method", "register", "--cad", str(home / "bracket.stl"), "--unit", "mm"]
     camera = ["--camera", str(home / "rig.json"), "--out", str(out)]
     return main(["pose", "predict", *views, *part, *camera, *words])
 

@@ -619,7 +619,7 @@ def _parse_words(words: Sequence[str]) -> tuple[TypedOptions, dict[str, str]]:
     """Sort words by the option that they follow; words before any option are left out.
 
     Names of options have hyphens, and no ``no-`` in front; ``--name=word`` is taken apart. The word
-    None, by which an option is as if left out, is none.
+    ``None`` is skipped: it means that the option was left out.
 
     Returns:
         The words after each option, and each option as it was typed, both by the option's name.

@@ -320,13 +320,13 @@ def claim_names(
         is_of_new_video = _FRAME.sub("", stem) in new_names & set(videos)
         if stem in new_names or (is_of_new_video and stem not in recorded):
             result_files[stem] = file
-    _discard_results(folder, new_names, result_files)
+    _revoke_results(folder, new_names, result_files)
 
     if any(recorded.get(name) != source for name, source in present.items()):
         write_json(folder / _SOURCES, recorded | present)
 
 
-def _discard_results(folder: Path, names: Collection[str], files: Mapping[str, Path]) -> None:
+def _revoke_results(folder: Path, names: Collection[str], files: Mapping[str, Path]) -> None:
     """Note that the results of names without a recorded source are to be made again.
 
     Args:
@@ -337,6 +337,7 @@ def _discard_results(folder: Path, names: Collection[str], files: Mapping[str, P
     Raises:
         InputError: no run wrote one of the files.
     """
+    # A note without files says that a result is to be made again.
     noted = read_results(folder)
     for stem, file in files.items():
         if file.relative_to(folder).as_posix() not in noted.get(stem, {}):

@@ -157,7 +157,7 @@ class EstimateConfig(Settings):
     """How ICP refines the voted pose."""
 
     with_icp: bool = True
-    """Whether it does; without, the voted pose is returned."""
+    """Whether ICP refines the voted pose; else that pose is returned as it is."""
 
     min_certainty: Annotated[float, "[0, 1]"] = 0.9
     """Below this certainty the status is ``ambiguous``, not ``ok``; pose and alternatives are given

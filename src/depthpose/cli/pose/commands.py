@@ -51,15 +51,8 @@ def predict_poses(
     )
     from depthpose.cli.pose.search import search_dataset, search_files
 
-    # A pair is matched first, to depth images.
-    pose_inputs = options.PoseInputs(**vars(inputs), **vars(details))
-    if pair.left is not None:
-        from depthpose.cli.pose.pairs import match_pairs_for_poses
-
-        depth = match_pairs_for_poses(pair, pose_inputs.camera, estimates.device, Path(out))
-        pose_inputs = replace(pose_inputs, depth=str(depth))
-
     # The estimator: a trained network, or registration of CAD files. Workers build their own.
+    pose_inputs = options.PoseInputs(**vars(inputs), **vars(details))
     spec = make_method_spec(
         estimates.weights,
         pose_inputs,
@@ -69,6 +62,14 @@ def predict_poses(
         pose_inputs.base_from_camera,
         is_registration=estimates.is_registration(pose_inputs.cad),
     )
+
+    # A pair is matched first, to depth images in metres.
+    if pair.left is not None:
+        from depthpose.cli.pose.pairs import match_pairs_for_poses
+
+        depth = match_pairs_for_poses(pair, pose_inputs.camera, estimates.device, Path(out))
+        pose_inputs = replace(pose_inputs, depth=str(depth), unit=None)
+
     batch = estimates.batch
     if engine.engine == "ray":
         return predict_poses_on_ray(pose_inputs, spec, batch, out, engine)

@@ -37,7 +37,7 @@ def depth_from_images(
         matcher: pair to disparity; None where the synthesiser estimates disparity itself.
         images: without right views, all of the same virtual sizes.
         sizes: these sizes, by :func:`virtual_sizes`.
-        mount: mount of one camera, whose successive frames the images then are.
+        mount: filter of the mount of one camera; the images are then its successive frames.
         allow_ood: as for :func:`depth_before_mount`.
 
     Raises:

@@ -99,9 +99,14 @@ def _number_colors(pixels: np.ndarray) -> np.ndarray:
 
 
 def _read_pixels(path: Path, *, with_palette: bool) -> np.ndarray:
-    """Read the pixels of a mask image (h, w, channels): 1 of numbers, 3 of colours, 4 with alpha.
+    """Read the pixels of a mask image as (h, w, channels).
 
-    Of an image with a palette: ``with_palette`` reads the colours, else their indices.
+    There is one channel of numbers, or three of colours, or four with alpha. Of an image with a
+    palette the colours are read ``with_palette``, else their indices; with transparency always the
+    colours. A JPEG becomes black and white.
+
+    Raises:
+        InputError: the image cannot be read, or is a JPEG of more grey than white.
     """
     with open_image(path) as image:
         # With alpha, indices of a palette, numbers, or colours.

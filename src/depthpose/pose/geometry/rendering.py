@@ -151,7 +151,7 @@ def find_window_about(
 ) -> Window:
     """Find the rows and columns of an image that a posed surface may cover.
 
-    They are empty if it is behind the camera, and the whole image if it is partly.
+    They are empty if it is behind the camera, and the whole image if it is partly behind it.
 
     Args:
         surface: of the model.
@@ -161,7 +161,8 @@ def find_window_about(
         width: its columns.
         margin_m: what lies within this distance of the surface is in the window too.
     """
-    # The corners of a box about it. None of a surface behind the camera; all where a part of it is.
+    # The corners of a box about the surface. Behind the camera it covers nothing; partly behind,
+    # perhaps the whole image.
     low_m, high_m = surface.box_m
     box_m = torch.stack([low_m - margin_m, high_m + margin_m], -1)
     corners_m = pose.apply(torch.cartesian_prod(*box_m))

@@ -63,7 +63,7 @@ def _refuse_unread_scene(path: AnyPath, data: bytes) -> None:
         scene: Any = json.loads(data[20 : 20 + size])
         nodes = scene.get("nodes", [])
         values = _count_values(scene)
-        _refuse_transforms(path, nodes)
+        _refuse_wild_transforms(path, nodes)
         depths = _measure_node_depths(path, nodes)
         unread = _list_unread_features(scene)
         links = [str(buffer.get("uri") or "data:") for buffer in scene.get("buffers", [])]
@@ -137,16 +137,16 @@ def _list_unread_features(scene: Any) -> list[str]:  # noqa: ANN401  JSON
     return unread
 
 
-def _refuse_transforms(path: AnyPath, nodes: list[dict[str, Any]]) -> None:
-    """Refuse nodes whose transforms hold numbers that no sensor's world has."""
+def _refuse_wild_transforms(path: AnyPath, nodes: list[dict[str, Any]]) -> None:
+    """Refuse nodes whose transforms hold NaN, or numbers too large for any model."""
     for number, node in enumerate(nodes):
         for name in ("matrix", "translation", "rotation", "scale"):
             sizes = [abs(float(value)) for value in node.get(name, [])]
             wild = [size for size in sizes if not size < _LARGEST_NUMBER]  # NaN too
             if wild:
                 raise InputError(
-                    f"{path}: the {name} of node {number} holds {wild[0]:g}, which moves nothing "
-                    "to where a sensor sees it; export it again"
+                    f"{path}: the {name} of node {number} holds {wild[0]:g}, which is no "
+                    "place or size of a model; export it again"
                 )
 
 

@@ -50,7 +50,8 @@ _ACROSS = (-1.0, -0.5, 0.5, 1.0)
 """Where readings are compared across a silhouette, on the line from it to a pixel beside it: 0 is
 the silhouette, 1 the pixel, and what is negative lies within."""
 _NEAREST_WITHIN = 1
-"""Of these, the one whose reading must support the pose; the first lies beyond a thin object."""
+"""Number of the place whose reading must support the pose: the one before it may lie beyond the far
+edge of a thin object."""
 _MEETING = 2.0
 """Deviations of the noise: sides of a silhouette that are farther apart do not meet there, and an
 edge that bends more toward the camera is concave."""

@@ -205,7 +205,7 @@ def share_among_poses(
     """
     if not is_masked:
         hypotheses = _against_each_other(hypotheses)
-    weights = [log_likelihood_ratio(h.evidence) + _log_beside_depth(h) for h in hypotheses]
+    weights = [log_likelihood_ratio(h.evidence) + _log_without_depth(h) for h in hypotheses]
     return torch.tensor(weights, dtype=torch.float64).softmax(0)
 
 
@@ -243,8 +243,8 @@ def _against_each_other(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     return compared
 
 
-def _log_beside_depth(hypothesis: Hypothesis) -> float:
-    """Compute the log likelihood of what is known beside depth: a colour image, votes."""
+def _log_without_depth(hypothesis: Hypothesis) -> float:
+    """Compute the log likelihood of what other sources than depth say: a colour image, votes."""
     log_votes = 0.0 if hypothesis.votes_rad is None else -hypothesis.votes_rad / VOTES_RAD
     return log_votes + hypothesis.log_color
 

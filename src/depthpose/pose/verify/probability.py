@@ -65,7 +65,7 @@ PRIOR_PROPOSED = 0.02
 """The same where a search proposed the pose: votes of a whole image refine to some fifty poses for
 each object that is there."""
 PRIOR_MANY = 0.1
-"""Odds of a search showing any number of instances of an object, and not one at most."""
+"""Odds of an image holding any number of instances of an object, rather than one at most."""
 WRONG_RMS = 1.2
 """Root mean square residual of what supports a wrong pose, in standard deviations: of residuals
 that are as often large as small it is 1.7, and refinement makes it smaller."""
@@ -83,10 +83,10 @@ LEAST_AREA = 1.0
 
 
 def probability_right(evidence: Evidence, prior_odds: float) -> float:
-    """Compute the probability that a pose is right, up to near-symmetry, not the best wrong one.
+    """Compute the probability that a pose is right, and not merely the best of the wrong ones.
 
-    It is 0 where less than two thirds of what was observed supports the pose, and where the surface
-    goes on across much of its silhouette.
+    Right is a pose up to near-symmetry. The probability is 0 where less than two thirds of what was
+    observed supports the pose, and where the surface goes on across much of its silhouette.
     """
     if evidence.agreement < LEAST_AGREEMENT or is_on_larger(evidence):
         return 0.0
