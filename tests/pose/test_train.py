@@ -262,7 +262,7 @@ def test_a_held_out_view_of_too_few_points_is_a_failure() -> None:
     cloud = dataclasses.replace(_CLOUD, max_points=None, min_points=sorted(seen)[4])
     task = PoseTask(network, _models(), _training(held_out=held_out, cloud=cloud))
     with torch.no_grad():
-        errors = [task.measure_held_out(made.view(i), i) for i in range(6)]
+        errors = [task.measure_view(made.view(i), i) for i in range(6)]
     assert [math.isfinite(error) for error in errors] == [n >= cloud.min_points for n in seen]
     assert task.validate().numbers["held_out/occluded_0/ransac_median"] == math.inf
 

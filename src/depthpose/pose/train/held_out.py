@@ -41,7 +41,7 @@ class ViewsTask:
         self.optimizers = {"network": (make_adam(network.parameters(), config.adam), config.adam)}
         self._held_out: dict[float, list[ViewSample]] = {}
 
-    def measure_held_out(self, view: ViewSample, index: int) -> float:
+    def measure_view(self, view: ViewSample, index: int) -> float:
         """Pose a held-out view without ICP and refusal, and measure its ADD in diameters.
 
         Args:
@@ -67,7 +67,7 @@ class ViewsTask:
             # The error of each, and the numbers of all.
             samples = self._held_out[occlusion]
             errors = torch.tensor(
-                [self.measure_held_out(view, k) for k, view in enumerate(samples)]
+                [self.measure_view(view, k) for k, view in enumerate(samples)]
             )
             name = f"held_out/occluded_{round(100 * occlusion)}/{self.method}"
             numbers[f"{name}_add_10"] = float((errors < SUCCESS_SHARE).float().mean())

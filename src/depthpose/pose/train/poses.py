@@ -106,7 +106,7 @@ class PoseTask(ViewsTask):
         )
         yield Update("network", loss, {"directions": loss.detach()})
 
-    def measure_held_out(self, view: ViewSample, index: int) -> float:
+    def measure_view(self, view: ViewSample, index: int) -> float:
         """Pose the cloud of a view by voting and measure ADD; infinite for too few points."""
         # The cloud of the view, in the axes of its grid.
         number = index % len(self.models)
@@ -238,7 +238,7 @@ class DepthImageTask(ViewsTask):
         diameter_m = self._diameter_m.to(device)[class_of]
         yield Update("network", (error_m / diameter_m).mean(), {})
 
-    def measure_held_out(self, view: ViewSample, index: int) -> float:
+    def measure_view(self, view: ViewSample, index: int) -> float:
         """Regress the pose of a view and measure ADD; infinite for too few pixels."""
         number = index % len(self.models)
         model = self.models[number]
