@@ -56,6 +56,7 @@ IGNORED = [
 REFUSED = [
     ("pose predict", "", "give one of --cloud, --depth, --left and --bop"),
     ("pose predict", "--cloud c --depth=d", "give one of --cloud, --depth, --left and --bop"),
+    ("pose predict", "--depth d --camera c --depth None", "give one of --cloud, --depth, --left"),
     ("pose predict", "--cloud None", "give one of --cloud, --depth, --left and --bop"),
     ("pose predict", "--depth d --camera=None", "--depth needs --camera or --focal-px"),
     ("pose predict", "--left l --right r", "--left needs --right and --camera"),
@@ -77,6 +78,10 @@ REFUSED = [
     ("reproduce 3.2", "--bop b", "there is nothing to measure; give --weights FILE or --csv"),
 ]
 USED = [
+    ("depth predict", "--engine ray --matcher sgbm a.png b.png"),
+    ("pose predict", "--bop d --camera None"),
+    ("pose predict", "--bop d --method register --masks seg.safetensors --device cuda"),
+    ("pose evaluate", "--bop d --weights register --masks truth seg.safetensors --device cuda"),
     ("pose predict", "--cad p.stl --cloud c.ply"),
     ("pose predict", "--left l --right r --camera c --mask m --color p --color-camera o"),
     ("pose predict", "--depth d --camera c --box 1,2,3,4 --bin b --bin-pose p --cad-unit mm"),

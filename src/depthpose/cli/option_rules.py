@@ -96,6 +96,17 @@ def _is_searched(typed: TypedOptions) -> bool:
     return has_images(typed) and not has_regions(typed) and not _is_on_ray(typed)
 
 
+def _is_nothing_segmented(typed: TypedOptions) -> bool:
+    """Whether no weights segment the images of a dataset."""
+    without_weights = ("truth", "predicted", "search")
+    return all(word in without_weights or word.endswith(".json") for word in typed["masks"])
+
+
+def _is_on_processor(typed: TypedOptions) -> bool:
+    """Whether a registration is all: no pair is matched and no image segmented on a device."""
+    return _is_registered(typed) and not typed["left"] and _is_nothing_segmented(typed)
+
+
 def _has_many_regions(typed: TypedOptions) -> bool:
     """Whether a depth image may have several objects, by detections or boxes."""
     return bool(typed["detections"]) or len(typed["box"]) > 1
@@ -115,7 +126,7 @@ def _has_no_matcher_network(typed: TypedOptions) -> bool:
 
 def _has_matcher_of_other_weights(typed: TypedOptions) -> bool:
     """Whether the synthesised view is matched by other weights than those that synthesise it."""
-    return typed["matcher"] not in ([], ["sgbm"])
+    return typed["matcher"][:1] not in ([], ["sgbm"])  # what follows may be names of images
 
 
 def _are_models_folders(typed: TypedOptions) -> bool:
@@ -163,7 +174,7 @@ IGNORED_RULES = (
     ),
     IgnoredRule(
         commands=("pose predict",),
-        when=both(_is_registered, none_typed("left")),  # a pair is matched on the device
+        when=_is_on_processor,
         ignored=("device",),
         reason="CAD files are posed without a network, on the processor",
     ),
@@ -360,8 +371,14 @@ IGNORED_RULES = (
     IgnoredRule(
         commands=("pose evaluate",),
         when=all_begin("weights", "register"),
-        ignored=("voting", "device"),
-        reason="register does not vote, and computes on the processor",
+        ignored=("voting",),
+        reason="register does not vote",
+    ),
+    IgnoredRule(
+        commands=("pose evaluate",),
+        when=both(all_begin("weights", "register"), _is_nothing_segmented),
+        ignored=("device",),
+        reason="register computes on the processor",
     ),
     IgnoredRule(
         commands=_ON_ENGINES,
@@ -618,25 +635,24 @@ def refuse_empty(options: Sequence[Option], words: Sequence[str]) -> None:
 def _parse_words(words: Sequence[str]) -> tuple[TypedOptions, dict[str, str]]:
     """Sort words by the option that they follow; words before any option are left out.
 
-    Names of options have hyphens, and no ``no-`` in front; ``--name=word`` is taken apart. The word
-    ``None`` is skipped: it means that the option was left out.
+    Names of options have hyphens, and no ``no-`` in front; ``--name=word`` is taken apart. An
+    option whose word is ``None`` counts as left out.
 
     Returns:
         The words after each option, and each option as it was typed, both by the option's name.
     """
     typed = TypedOptions()
     spelling: dict[str, str] = {}
-    values: list[str] = []  # of the last option
+    name = ""  # of the last option
     for word in words:
-        if word == "None":
-            continue
-        if not word.startswith("--"):
-            values.append(word)
-            continue
-        option, sign, value = word.removeprefix("--").partition("=")
-        name = option.replace("_", "-").removeprefix("no-")
-        spelling[name] = f"--{option}"
-        values = typed.setdefault(name, [])
-        if sign and value != "None":
-            values.append(value)
+        values = [word]
+        if word.startswith("--"):
+            option, sign, value = word.removeprefix("--").partition("=")
+            name = option.replace("_", "-").removeprefix("no-")
+            spelling[name] = f"--{option}"
+            values = [value] if sign else []
+        if values == ["None"]:
+            typed.pop(name, None)
+        elif name:
+            typed.setdefault(name, []).extend(values)
     return typed, spelling

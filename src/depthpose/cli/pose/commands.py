@@ -68,7 +68,8 @@ def predict_poses(
         from depthpose.cli.pose.pairs import match_pairs_for_poses
 
         depth = match_pairs_for_poses(pair, pose_inputs.camera, estimates.device, Path(out))
-        pose_inputs = replace(pose_inputs, depth=str(depth), unit=None)
+        cad_unit = pose_inputs.cad_unit or pose_inputs.unit
+        pose_inputs = replace(pose_inputs, depth=str(depth), unit=None, cad_unit=cad_unit)
 
     batch = estimates.batch
     if engine.engine == "ray":

@@ -66,9 +66,7 @@ class ViewsTask:
 
             # The error of each, and the numbers of all.
             samples = self._held_out[occlusion]
-            errors = torch.tensor(
-                [self.measure_view(view, k) for k, view in enumerate(samples)]
-            )
+            errors = torch.tensor([self.measure_view(view, k) for k, view in enumerate(samples)])
             name = f"held_out/occluded_{round(100 * occlusion)}/{self.method}"
             numbers[f"{name}_add_10"] = float((errors < SUCCESS_SHARE).float().mean())
             numbers[f"{name}_median"] = float(errors.median())
