@@ -51,9 +51,9 @@ class PoseMethod:
         """What knows the objects, in messages."""
         return self.estimator.holder
 
-    def estimate_many(self, views: Sequence[ViewInput]) -> list[PoseEstimate]:
+    def estimate_many(self, inputs: Sequence[AnyInput]) -> list[PoseEstimate]:
         """Estimate a pose of each masked view or cloud."""
-        return [self._in_base(estimate) for estimate in self.estimator.estimate_many(views)]
+        return [self._in_base(estimate) for estimate in self.estimator.estimate_many(inputs)]
 
     def find(self, view: ViewInput, objects: Sequence[str]) -> list[PoseEstimate]:
         """Estimate the poses of named objects in a view without a mask."""
