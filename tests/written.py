@@ -82,14 +82,16 @@ def run_block(
 
 def is_printed(line: str, shown: str) -> bool:
     """Say whether a line is in a text, up to one unit in the last place of its decimal numbers."""
-    words = [re.escape(word) for word in _DECIMAL.sub("\0", line).split("\0")]
-    numbers = [float(number) for number in _DECIMAL.findall(line)]
-    units = [10.0 ** -len(number.partition(".")[2]) for number in _DECIMAL.findall(line)]
-    for match in re.finditer(rf"({_DECIMAL.pattern})".join(words), shown):
-        off = [abs(float(a) - b) for a, b in zip(match.groups(), numbers, strict=True)]
-        if all(d < 1.5 * unit for d, unit in zip(off, units, strict=True)):
-            return True
-    return False
+    words = map(re.escape, _DECIMAL.split(line))
+    numbers = _DECIMAL.findall(line)
+    like_line = re.finditer(rf"({_DECIMAL.pattern})".join(words), shown)
+    return any(all(map(_is_near, numbers, match.groups())) for match in like_line)
+
+
+def _is_near(number: str, other: str) -> bool:
+    """Whether decimal numbers differ by at most one unit in the last place of the first."""
+    unit = 10.0 ** -len(number.partition(".")[2])
+    return abs(float(number) - float(other)) < 1.5 * unit
 
 
 def bench_module(name: str) -> ModuleType:

@@ -77,7 +77,7 @@ class PoseTableOptions(PoseMeasureOptions):
     """instances that the page shows."""
 
     def refuse_unusable(self) -> None:
-        """Refuse fewer than no pictures."""
+        """Refuse a negative number of pictures."""
         refuse_below(0, "--pictures", self.pictures, "4")
 
 

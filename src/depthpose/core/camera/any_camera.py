@@ -80,7 +80,7 @@ def refuse_unusable_focal(focal_px: float) -> None:
     """Refuse a number that is no focal length [px]: that in millimetres, say.
 
     Raises:
-        InputError: it is none.
+        InputError: it is 1 or less, a million or more, or NaN.
     """
     if not 1 < focal_px < _MAX_FOCAL_PX:
         raise InputError(f"focal_px is {focal_px}: not a focal length in pixels; KITTI's is 721.5")

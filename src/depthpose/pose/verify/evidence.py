@@ -200,7 +200,10 @@ def compare(observation: Observation, pose: Rigid, surface: Surface) -> Evidence
     # Patches that contradict the pose.
     patch_area_px2 = observation.patch_px**2
     seen_through = _patch_area(deviations > THRESHOLD, patch_area_px2)
-    bulging = beside = silhouette = continued = 0.0
+    bulging = 0.0
+    beside = 0.0
+    silhouette = 0.0
+    continued = 0.0
     if observation.is_masked:  # the mask says which readings are the object's
         is_bulging = (deviations < -THRESHOLD) & observation.is_object[rendering.window]
         is_beside = _is_beside_silhouette(observation, is_drawn, rendering.window)

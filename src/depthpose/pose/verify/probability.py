@@ -8,7 +8,7 @@ the surface goes on, but of the length of the silhouette.
 
 How patches are counted :mod:`depthpose.pose.verify.evidence` says; what a count then means is said
 by the coefficients of this file alone. ``bench/fit_probability.py`` fits the shares of right and
-wrong poses, ``WRONG_RMS`` and ``PRIOR_EXPECTED``.
+wrong poses and ``WRONG_RMS``, and prints the odds of views that do show their object.
 """
 
 import math
