@@ -1,14 +1,16 @@
-"""Reliability of the certainty: the share of right answers for each certainty.
+"""Reliability of both probabilities: the share of right answers for each of their values.
 
     python bench/certainty.py --weights linemod.safetensors bunny.safetensors parts ycb
 
 Synthetic views of all objects by seeds that no training has, three in ten unoccluded, the others
 occluded by up to 60 %, a third of all at three times the noise. An answer is right if ADD to the
 nearest true copy (a declared symmetry, or a detected one that is exact to 1 % of the diameter) is
-below a tenth of the diameter. Refused views are not counted. Writes answers.csv, answers.json, and
-reliability.png: the share of right answers over the mean certainty of each band.
+below a tenth of the diameter, and named if it or one of its alternatives is right. The certainty
+claims the latter, the copy certainty the former. Refused views are not counted. Writes answers.csv,
+answers.json, and reliability.png: the share of right answers over the mean certainty of each band.
 """
 
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -31,16 +33,17 @@ SEED = 0xCE47
 NOISES = (1.0, 1.0, 3.0)  # times the sensor's usual noise; a third of the views for each
 RIGHT = 0.1  # largest error of a right answer, in diameters
 BANDS = ((0.0, 0.5), (0.5, 0.8), (0.8, 0.9), (0.9, 0.95), (0.95, 0.99), (0.99, 1.01))
-MIN_CERTAINTIES = (0.9, 0.99)
+MIN_PROBABILITIES = (0.9, 0.99)
 MIN_ANSWERS = 5  # of a band in the table
 
 
 class Answer(NamedTuple):
-    """An answer's certainty, and whether it is right, by itself or by one of its alternatives."""
+    """Probabilities of an answer, and whether it is right, by itself or by an alternative."""
 
     weights: str
     object: str
     certainty: float
+    copy_certainty: float
     is_right: bool
     is_named: bool
 
@@ -75,6 +78,9 @@ def answers_of(name: str, number: int) -> Iterator[Answer | None]:
                 weights=Path(name).stem,
                 object=estimate.object,
                 certainty=1.0 if estimate.certainty is None else estimate.certainty,
+                copy_certainty=(
+                    1.0 if estimate.copy_certainty is None else estimate.copy_certainty
+                ),
                 is_right=is_right[0],
                 is_named=any(is_right),
             )
@@ -107,16 +113,17 @@ def band_rows(answers: Sequence[Answer]) -> list[dict[str, Any]]:
 
 
 def limit_rows(answers: Sequence[Answer]) -> list[dict[str, Any]]:
-    """Count wrong answers above a certainty, beside the number that the certainty allows."""
+    """Count wrong answers above a probability, beside the number that it allows."""
     rows = []
-    for limit in MIN_CERTAINTIES:
-        sure = [answer for answer in answers if answer.certainty >= limit]
+    for probability, limit in itertools.product(("certainty", "copy_certainty"), MIN_PROBABILITIES):
+        sure = [answer for answer in answers if getattr(answer, probability) >= limit]
         allowed = (1 - limit) * len(sure)
         rows.append(
             {
-                "certainty at least": limit,
+                "probability": f"{probability}, at least {limit}",
                 "answers": len(sure),
                 "wrong": sum(not answer.is_right for answer in sure),
+                "neither right nor named": sum(not answer.is_named for answer in sure),
                 "allowed": allowed,
                 "two standard deviations": 2 * math.sqrt(allowed * limit),
             }
