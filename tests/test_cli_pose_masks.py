@@ -1,6 +1,7 @@
 """Masks by their words: files of detections, and weights of a segmentation."""
 
 import json
+import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -228,3 +229,42 @@ def test_a_data_set_is_searched_without_masks(
     found = {row["object"]: row["ap"] for row in json.loads((out / "rows.json").read_text())}
     assert found == {"bracket": pytest.approx(1), "bottle": 0, "mean": pytest.approx(0.5),
                      "all": None}  # fmt: skip
+
+
+def test_an_unreadable_image_of_a_searched_dataset_stops_no_other(
+    synthetic: BopDataset, weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each object has a row that says so; once the image is mended it is searched."""
+    searched: list[str] = []
+
+    def find_in(_: GeoPoseNet, view: ViewInput, objects: Sequence[str]) -> list[PoseEstimate]:
+        searched.append(view.name)
+        return [
+            replace(nothing_found(view, name, [], 0.0), name=f"{view.name}_{k}")
+            for k, name in enumerate(objects)
+        ]
+
+    monkeypatch.setattr(GeoPoseNet, "find_in", find_in)
+    folder = tmp_path / "dataset"
+    shutil.copytree(synthetic.folder, folder)
+    instance = next(i for i in synthetic.instances if i.image_id == 0)
+    torn = folder / instance.depth.relative_to(synthetic.folder)
+    whole = torn.read_bytes()
+    torn.write_bytes(whole[:100])
+    words = ["pose", "predict", "--bop", str(folder), "--weights", str(weights)]
+    words += ["--masks", "search", "--out", str(tmp_path / "out")]
+
+    assert main(words) == 1
+    rows = [p for p in read_predictions(tmp_path / "out") if p.estimate.status == "unreadable"]
+    assert {(p.estimate.object, p.place) for p in rows} == {
+        ("bracket", (1, 0, 7)),
+        ("bottle", (1, 0, 10)),
+    }
+    assert all("depth" in p.estimate.reason for p in rows)
+    assert searched == ["000001_000001"]
+
+    torn.write_bytes(whole)
+    assert main(words) == 0
+    assert searched == ["000001_000001", "000001_000000"]
+    statuses = [p.estimate.status for p in read_predictions(tmp_path / "out")]
+    assert statuses == ["doubtful"] * 4

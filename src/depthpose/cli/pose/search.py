@@ -46,7 +46,7 @@ class SearchResults(Results[ViewInput, list[PoseEstimate]]):
         self,
         folder: Path,
         images: Sequence[str],
-        earlier: Sequence[Prediction],
+        objects: Sequence[str],
         is_of_image: Callable[[Prediction, str], bool],
         numbers: Mapping[str, int] | None = None,
     ) -> None:
@@ -55,20 +55,22 @@ class SearchResults(Results[ViewInput, list[PoseEstimate]]):
         Args:
             folder: folder of ``poses.json``.
             images: names of the images of this run.
-            earlier: predictions of earlier runs.
+            objects: names of the objects that are searched for.
             is_of_image: whether a prediction is of the image of this name.
             numbers: number of each object in the dataset, by its name; None: no dataset.
         """
         self.by_image: dict[str, list[Prediction]] = {}
         self._folder = folder
         self._images = images
+        self._objects = objects
         self._numbers = numbers
-        self._in_other_images = list(earlier)
+        self._in_other_images = list(read_earlier_predictions(folder).values())
         for image in images:
             in_image = [p for p in self._in_other_images if is_of_image(p, image)]
-            if in_image:
+            self._in_other_images = [p for p in self._in_other_images if p not in in_image]
+            is_unreadable = any(p.estimate.status == "unreadable" for p in in_image)
+            if in_image and not is_unreadable:  # else it is searched again
                 self.by_image[image] = in_image
-                self._in_other_images = [p for p in self._in_other_images if p not in in_image]
 
     def is_finished(self, job: Job[ViewInput]) -> bool:
         """Whether the image has been searched."""
@@ -76,23 +78,25 @@ class SearchResults(Results[ViewInput, list[PoseEstimate]]):
 
     def store(self, job: Job[ViewInput], data: ViewInput, result: list[PoseEstimate]) -> None:  # noqa: ARG002
         """Write the estimates of an image."""
+        self._keep(job, result)
+
+    def store_failure(self, job: Job[ViewInput], error: InputError) -> None:
+        """Write for each object why an image cannot be read."""
+        names = [job.name]
+        if len(self._objects) > 1:
+            names = [f"{job.name}_{k}" for k in range(len(self._objects))]
+        unreadable = [
+            refuse_unreadable(name, object, error)
+            for name, object in zip(names, self._objects, strict=True)
+        ]
+        self._keep(job, unreadable)
+
+    def _keep(self, job: Job[ViewInput], estimates: Sequence[PoseEstimate]) -> None:
+        """Keep the estimates of an image, and write the file."""
         assert isinstance(job, PoseJob)
         self.by_image[job.name] = [
             Prediction(estimate=estimate, place=self._place_of(job, estimate))
-            for estimate in result
-        ]
-        self.flush()
-
-    def store_failure(self, job: Job[ViewInput], error: InputError) -> None:
-        """Write why an image cannot be read.
-
-        Images of a dataset must be readable, so there it is raised.
-        """
-        assert isinstance(job, PoseJob)
-        if self._numbers is not None:
-            raise error
-        self.by_image[job.name] = [
-            Prediction(estimate=refuse_unreadable(job.name, job.object, error))
+            for estimate in estimates
         ]
         self.flush()
 
@@ -176,12 +180,7 @@ def search_files(method: PoseMethod, inputs: PoseInputs, out: Path) -> int:
     _refuse_numbered_names({job.name for job in jobs})
     settings = {**method.settings, **plan.settings}
     claim_for_jobs(out, settings, jobs, is_result_of)
-    earlier = [
-        p for p in read_earlier_predictions(out).values() if p.estimate.status != "unreadable"
-    ]
-
-    images = [job.name for job in jobs]
-    results = SearchResults(out, images, earlier, _has_name_of_image)
+    results = SearchResults(out, [job.name for job in jobs], objects, _has_name_of_image)
     predictions, object_jobs = _search_images(method, objects, jobs, results)
 
     # The files of results have names of their own, which are claimed once they are known.
@@ -254,8 +253,9 @@ def search_dataset(
         for image, instance in sorted(images.items())
     ]
 
-    earlier = list(read_earlier_predictions(out).values())
-    results = SearchResults(out, [job.name for job in jobs], earlier, _has_place_in_image, numbers)
+    results = SearchResults(
+        out, [job.name for job in jobs], list(numbers), _has_place_in_image, numbers
+    )
     predictions, object_jobs = _search_images(method, list(numbers), jobs, results)
     write_files(predictions, object_jobs, out, method, dataset, input_count=len(images))
     return print_result(predictions, out, len(images))
