@@ -93,17 +93,19 @@ class PoseEstimator:
         estimates = self._estimate_each(inputs, threads)
         return list(tqdm(estimates, total=total, unit=" poses", disable=not with_progress))
 
-    def _estimate_each(self, inputs: Iterable[AnyInput], threads: int) -> Iterator[PoseEstimate]:
-        """Estimate each input, in order; each is expected to show its object."""
-        return map_in_threads(partial(unreadable_on_error, self._estimate), inputs, threads)
+    def _estimate_each(
+        self, inputs: Iterable[AnyInput], threads: int, *, is_expected: bool = True
+    ) -> Iterator[PoseEstimate]:
+        """Estimate each input, in order.
 
-    def _estimate_each_try(self, inputs: Iterable[AnyInput]) -> Iterator[PoseEstimate]:
-        """Estimate each input, in order, where an input may well not show its object.
-
-        The evidence decides which of them does. An estimator that expects less of a try than of
-        another input has its own.
+        Args:
+            inputs: clouds and views.
+            threads: how many inputs are estimated at the same time.
+            is_expected: whether the inputs are meant to show their objects. Else they are tries of
+                objects that may well not be there, and the evidence decides which are.
         """
-        return self._estimate_each(inputs, 1)
+        del is_expected  # a model alone is tried as it is expected
+        return map_in_threads(partial(unreadable_on_error, self._estimate), inputs, threads)
 
     def _estimate(self, pose_input: AnyInput) -> PoseEstimate:
         """Estimate one input; an estimator of many at once has its own :meth:`_estimate_each`."""
@@ -114,14 +116,8 @@ class PoseEstimator:
     def _estimate_or_raise(
         self, inputs: Sequence[AnyInput], *, is_expected: bool
     ) -> list[PoseEstimate]:
-        """Estimate inputs; raise the :class:`InputError` of one that could not be taken.
-
-        ``is_expected``: whether the inputs are meant to show their objects; else they are tries.
-        """
-        if is_expected:
-            estimates = list(self._estimate_each(inputs, 1))
-        else:
-            estimates = list(self._estimate_each_try(inputs))
+        """Estimate inputs as :meth:`_estimate_each` does; raise the error of one it cannot take."""
+        estimates = list(self._estimate_each(inputs, 1, is_expected=is_expected))
         for estimate in estimates:
             if estimate.status == "unreadable":
                 raise InputError(estimate.reason)

@@ -159,21 +159,14 @@ class GeoPoseNet(PoseEstimator):
         kind = type(self._network).__name__
         return f"GeoPoseNet({kind} of {objects}{weights}, {self.config.device})"
 
-    def _estimate_each(self, inputs: Iterable[AnyInput], threads: int) -> Iterator[PoseEstimate]:
-        """Pose inputs by the network; doubted ones by registration where the config says so."""
-        return self._pose_together(inputs, threads, is_expected=True)
-
-    def _estimate_each_try(self, inputs: Iterable[AnyInput]) -> Iterator[PoseEstimate]:
-        """Pose inputs by the network alone, at the lower prior odds of a search's proposals."""
-        return self._pose_together(inputs, 1, is_expected=False)
-
-    def _pose_together(
-        self, inputs: Iterable[AnyInput], threads: int, *, is_expected: bool
+    def _estimate_each(
+        self, inputs: Iterable[AnyInput], threads: int, *, is_expected: bool = True
     ) -> Iterator[PoseEstimate]:
         """Run the network on several clouds together, and pose each by its votes.
 
         The pose of an input does not depend on those beside it, but for the rounding of the
-        network's sums. ``is_expected``: whether the inputs are meant to show their objects.
+        network's sums. Where the config says so, what the votes leave in doubt is registered, but
+        no try; the prior odds of a try are those of a search's proposals.
         """
         prepare = partial(self._prepare, is_expected=is_expected)
         prepared = map_in_threads(partial(unreadable_on_error, prepare), inputs, threads)
