@@ -234,14 +234,17 @@ def _add_votes(
         voted[key] |= bit
         weight = np.float32(1 / np.sqrt(high - low))  # rare features weigh more
         for pair in range(low, min(high, low + _MOST_ALIKE)):
-            counts[first[pair], _find_turn_bin(turn - pair_turn[pair])] += weight
+            # Indices without a sign: one with a sign may count from the end, which is a branch.
+            counts[np.uint32(first[pair]), _find_turn_bin(turn - pair_turn[pair])] += weight
 
 
 @compiled
-def _find_turn_bin(turn: float) -> int:
+def _find_turn_bin(turn: float) -> np.uint32:
     """Find the bin of the difference of two turns, which is between -TURNS and TURNS."""
-    turn_bin = int(turn + TURNS if turn < 0 else turn)
-    return turn_bin - TURNS if turn_bin >= TURNS else turn_bin
+    turn_bin = np.uint32(turn + TURNS)
+    for _ in range(2):
+        turn_bin -= np.uint32(TURNS) if turn_bin >= TURNS else np.uint32(0)
+    return turn_bin
 
 
 @compiled
