@@ -20,6 +20,7 @@ class Node:
         self.parameters: dict[str, Any] = {}
         self.publishers_made: dict[str, SimpleNamespace] = {}
         self.warnings: list[str] = []
+        self.errors: list[str] = []
 
     def declare_parameter(self, name: str, value: object) -> None:
         self.parameters[name] = self.given.get(name, value)
@@ -38,7 +39,9 @@ class Node:
         return self.services_made[name]
 
     def get_logger(self) -> SimpleNamespace:
-        return SimpleNamespace(warning=lambda said, **_: self.warnings.append(said))
+        return SimpleNamespace(
+            warning=lambda said, **_: self.warnings.append(said), error=self.errors.append
+        )
 
     def destroy_node(self) -> None:
         pass
@@ -51,6 +54,7 @@ class Subscriber:
 
 class ApproximateTimeSynchronizer:
     def __init__(self, heard: list[Subscriber], queue: int, slop_s: float) -> None:
+        assert slop_s > 0, "ROS's takes stamps that differ by less than the slop"
         self.heard, self.queue, self.slop_s = heard, queue, slop_s
 
     def registerCallback(self, callback: Any) -> None:  # noqa: ANN401, N802

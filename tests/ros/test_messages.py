@@ -24,6 +24,7 @@ from depthpose_ros.messages import (
     picture_of,
     pose_from_rigid,
     rig_of,
+    topic_names,
 )
 from depthpose_ros.work import Latest
 
@@ -136,6 +137,9 @@ def test_the_camera_is_that_of_the_rectified_image() -> None:
     raw = info(d=[0.1, 0, 0, 0, 0], k=[50.0, 0, 1, 0, 50, 1, 0, 0, 1])
     assert camera_of(raw).K[0].tolist() == [100, 0, 2]
     assert camera_of(info(p=[0.0] * 12)).K[0].tolist() == [100, 0, 2]
+    # The lower camera of two that stand one above the other, by itself.
+    lower = [100.0, 0, 2, 0, 0, 100, 1, -30, 0, 0, 1, 0]
+    assert camera_of(info(p=lower)).K[0].tolist() == [100, 0, 2]
     rig = rig_of(info(), info(tx=-12.0))
     assert (rig.baseline_m, rig.cx_right_minus_left_px) == (0.12, 0)
 
@@ -153,6 +157,16 @@ def test_the_camera_is_that_of_the_rectified_image() -> None:
 def test_cameras_that_are_not_calibrated_are_refused(given: Any, said: str) -> None:  # noqa: ANN401
     with pytest.raises(InputError, match=said):
         given()
+
+
+def test_topics_have_names_that_ros_takes() -> None:
+    assert topic_names(["bracket-v2", "003_cracker_box", "cup"]) == {
+        "bracket-v2": "bracket_v2",
+        "003_cracker_box": "_003_cracker_box",
+        "cup": "cup",
+    }
+    with pytest.raises(InputError, match=r"object 'a_b' would have the topic 'a_b', as another"):
+        topic_names(["a b", "a_b"])
 
 
 def test_a_pose_is_metres_and_a_unit_quaternion() -> None:

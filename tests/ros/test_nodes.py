@@ -282,6 +282,19 @@ def test_the_node_of_a_pair_publishes_depth_and_warns_of_what_it_cannot_use(
     node.destroy_node()
 
 
+def test_a_message_that_fails_costs_no_other(
+    recorded: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node = started_node(monkeypatch, "DepthPairNode", weights="sgbm")
+    given = [recorded[f"/{one.topic}"] for one in node._synchronizer.heard]
+    node._synchronizer.callback(None, *given[1:])
+    wait_until(lambda: node.errors)
+    assert "AttributeError" in node.errors[0]
+    node._synchronizer.callback(*given)
+    wait_until(lambda: node.publishers_made["~/depth"].sent)
+    node.destroy_node()
+
+
 def poses_node(monkeypatch: pytest.MonkeyPatch, **parameters: object) -> Any:  # noqa: ANN401
     monkeypatch.setattr(GeoPoseNet, "load", lambda _: KnowsPose())
     return started_node(monkeypatch, "PosesNode", **parameters)

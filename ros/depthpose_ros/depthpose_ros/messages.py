@@ -6,6 +6,8 @@ field.
 """
 
 import math
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -198,6 +200,25 @@ def _facts(info: Any) -> CameraFacts:  # noqa: ANN401
     found = facts_from_fields(_names(info) | ({} if info.p[0] > 0 else {"p": None}))
     assert found is not None
     return replace(found, baseline_m=None)
+
+
+def topic_names(objects: Sequence[str]) -> dict[str, str]:
+    """Name the topics of objects: letters, digits and underscores, and no digit in front.
+
+    Raises:
+        InputError: two objects would have one topic.
+    """
+    names: dict[str, str] = {}
+    for object in objects:
+        name = re.sub(r"\W", "_", object, flags=re.ASCII)
+        name = f"_{name}" if name[:1].isdigit() else name
+        if name in names.values():
+            raise InputError(
+                f"object {object!r} would have the topic {name!r}, as another one has; rename its "
+                "CAD file"
+            )
+        names[object] = name
+    return names
 
 
 def pose_from_rigid(header: Header, pose: Rigid) -> Pose:

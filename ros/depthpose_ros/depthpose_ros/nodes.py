@@ -1,6 +1,7 @@
 """The nodes: parameters, topics and threads around :mod:`depthpose_ros.work`."""
 
 import math
+import traceback
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -31,6 +32,9 @@ from depthpose_ros.work import (
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Sensor data, and the last message alone."""
 _QUEUE = 4
+_LEAST_SLOP_S = 1e-6
+"""The synchronizer takes stamps that differ by less than the slop: with a slop of 0 it takes none.
+"""
 
 
 class WorkNode(Node):
@@ -51,18 +55,24 @@ class WorkNode(Node):
         return self.get_parameter(name).value
 
     def work_on(self, topics: dict[str, type], slop_s: float, work: Callable[..., None]) -> None:
-        """Call ``work`` with messages of these topics whose stamps agree within ``slop_s``."""
+        """Call ``work`` with messages of these topics whose stamps agree within ``slop_s``.
+
+        A message for which it fails costs no other: what failed is logged.
+        """
 
         def guarded(*arrived: Any) -> None:  # noqa: ANN401
             try:
                 work(*arrived)
             except InputError as error:
                 self.warn(str(error))
+            except Exception:  # noqa: BLE001  the thread must live on
+                self.get_logger().error(traceback.format_exc())
 
         self._latest = Latest(guarded)
         subscribers = [
             Subscriber(self, kind, topic, qos_profile=NEWEST) for topic, kind in topics.items()
         ]
+        slop_s = max(slop_s, _LEAST_SLOP_S)
         self._synchronizer = ApproximateTimeSynchronizer(subscribers, _QUEUE, slop_s)
         self._synchronizer.registerCallback(self._latest.put)
 
@@ -151,9 +161,10 @@ class PosesNode(WorkNode):
         self._detections = self.create_publisher(Detection3DArray, "~/detections", 10)
         kinds = {"pose": PoseStamped, "pose_with_covariance": PoseWithCovarianceStamped}
         kinds |= {} if self._base is None else {"base_pose": PoseStamped}
+        names = messages.topic_names(net.objects)
         self._published = {
-            (name, topic): self.create_publisher(kind, f"~/{name}/{topic}", 10)
-            for name in net.objects
+            (object, topic): self.create_publisher(kind, f"~/{name}/{topic}", 10)
+            for object, name in names.items()
             for topic, kind in kinds.items()
         }
         self.create_service(FindObjects, "~/find_objects", self._answer)
@@ -192,9 +203,11 @@ class PosesNode(WorkNode):
         objects = list(request.objects) or None
         try:
             estimates = self._poses.estimates(request.depth, request.camera_info, mask, objects)
-        except InputError as error:
+        except Exception as error:  # noqa: BLE001  who asks must be answered
+            if not isinstance(error, InputError):
+                self.get_logger().error(traceback.format_exc())
             response.success = False
-            response.message = str(error)
+            response.message = str(error) or type(error).__name__
             return response
         header = messages.copied_header(request.depth)
         posed = [estimate for estimate in estimates if estimate.camera_from_model is not None]
