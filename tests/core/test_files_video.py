@@ -142,3 +142,17 @@ def test_pixels_that_are_not_square_become_so(
     assert video.size == size
     assert (image.shape[2], image.shape[1]) == size
     assert float(image[0].mean()) == pytest.approx(float(moving_square(1)[0][0].mean()), abs=0.03)
+
+
+def test_a_video_that_is_cut_off_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "drive.avi"
+    write_video(path, moving_square(20), fps=10)
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+    video = read_video(path)
+    assert video.frames == 20
+    with pytest.warns(
+        Notice, match=r"drive.avi: ends after \d+ of the 20 frames .* damaged or cut"
+    ):
+        frames = list(video)
+    assert 0 < len(frames) < 20

@@ -139,3 +139,7 @@ def test_a_rigid_matrix_is_a_rotation_within_the_slack_and_0_0_0_1() -> None:
     assert not is_rigid(mirrored, slack=1e-4)
     assert not is_rigid(matrix.T, slack=1e-4), "a translation in the last row"
     assert not is_rigid(torch.full((4, 4), torch.nan), slack=1e-4)
+    for unusable in (torch.nan, torch.inf):
+        moved = matrix.clone()
+        moved[0, 3] = unusable
+        assert not is_rigid(moved, slack=1e-4)

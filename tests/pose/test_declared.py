@@ -166,6 +166,7 @@ def test_whose_symmetry_it_is() -> None:
         ("z,18", r"2 objects are known \(gear, nut\); say whose it is: gear:z,18"),
         (["gaer:z,18"], "symmetry 'gaer:z,18': no object is called so; did you mean 'gear'"),
         ({"gaer": "z,18"}, "symmetry of 'gaer': no object is called so"),
+        ({1: "z,18"}, "symmetry of 1: no object is called so"),
         (["gear:z,18", "gear:x,2"], "symmetry of 'gear' is given twice; join the two by"),
     ]
     for given, said in cases:

@@ -130,6 +130,18 @@ def test_of_probabilities_those_above_a_half_are_the_object() -> None:
             labels_input(wrong, "m")
 
 
+def test_probabilities_in_a_file_are_those_of_an_array(tmp_path: Path) -> None:
+    likely = np.where(ONE, 0.97, 0.02).astype(np.float32)
+    Image.fromarray(likely).save(tmp_path / "m.tif")
+    assert np.array_equal(read_labels(tmp_path / "m.tif").numpy(), ONE)
+    Image.fromarray(LABELS.astype(np.float32)).save(tmp_path / "labels.tif")
+    assert np.array_equal(read_labels(tmp_path / "labels.tif").numpy(), LABELS)
+    likely[:5, :5] = np.nan
+    Image.fromarray(likely).save(tmp_path / "nan.tif")
+    with pytest.raises(InputError, match=r"nan.tif: the mask holds fractions outside .*, or NaN"):
+        read_labels(tmp_path / "nan.tif")
+
+
 def test_a_mask_is_of_one_image() -> None:
     for wrong in (ONE[None], ONE[0]):
         with pytest.raises(InputError, match=r"m: the mask is of shape .*, not \(h, w\); give"):

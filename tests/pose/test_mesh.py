@@ -411,6 +411,17 @@ def test_turns_are_completed_to_a_group() -> None:
     assert len(found.discrete.R) == 11
 
 
+@pytest.mark.parametrize("teeth", [18, 32, 60])
+def test_a_wheel_that_looks_alike_from_both_sides_has_twice_as_many_as_teeth(teeth: int) -> None:
+    proposals = [
+        SymmetryProposal("discrete", direction, (0.0, 0.0, 0.0), angle, 0.0, 1.0)
+        for direction, angle in (((0.0, 0.0, 1.0), 2 * math.pi / teeth), ((1.0, 0.0, 0.0), math.pi))
+    ]
+    found = symmetries_from_proposals(proposals)
+    assert found.discrete is not None
+    assert len(found.discrete.R) == 2 * teeth - 1
+
+
 def test_an_object_of_one_point_is_refused() -> None:
     with pytest.raises(InputError, match=r"diameter of 0.0 m; it is a single point"):
         make_model(torch.ones(9, 3), torch.empty(0, 3).long(), name="it")

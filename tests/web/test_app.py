@@ -157,9 +157,15 @@ def test_the_field_says_the_baseline_where_the_camera_file_has_none(
         found = ask(page, "depth", samples, {**PAIR, "camera": name}, **fields).json()
         clouds.append(page.get("/" + found["folder"] + "left.cloud.ply").content)
     assert clouds[0] == clouds[1] != clouds[2]
-    status, said = refusal(ask(page, "depth", samples, {**PAIR, "camera": "one.json"}))
-    assert status == 400
-    assert "baseline" in said
+    for fields, remedy in (
+        ({}, "baseline"),
+        ({"baseline_m": "12"}, "looks like centimetres; divide by 100"),
+    ):
+        status, said = refusal(
+            ask(page, "depth", samples, {**PAIR, "camera": "one.json"}, **fields)
+        )
+        assert status == 400
+        assert remedy in said
 
 
 def test_the_field_says_the_unit_where_the_camera_file_has_no_word_for_it(

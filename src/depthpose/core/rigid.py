@@ -122,8 +122,9 @@ def is_rotation(R: Float[Tensor, "3 3"], slack: float) -> bool:
 
 
 def is_rigid(matrix: Float[Tensor, "4 4"], slack: float) -> bool:
-    """Whether a matrix is ``[R t; 0 0 0 1]`` of a rotation R within ``slack``."""
-    return is_rotation(matrix[:3, :3], slack) and matrix[3].tolist() == [0, 0, 0, 1]
+    """Whether a matrix is ``[R t; 0 0 0 1]`` of a rotation R within ``slack`` and a finite t."""
+    is_finite = bool(matrix.isfinite().all())
+    return is_finite and is_rotation(matrix[:3, :3], slack) and matrix[3].tolist() == [0, 0, 0, 1]
 
 
 def geodesic_rad(

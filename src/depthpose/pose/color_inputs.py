@@ -7,8 +7,7 @@ from dataclasses import replace
 from jaxtyping import Float
 from torch import Tensor
 
-from depthpose.core.camera import AnyLens, Camera, camera_of, check_image_matches_camera
-from depthpose.core.camera.any_camera import intrinsics_of
+from depthpose.core.camera import AnyLens, camera_of, check_image_matches_camera
 from depthpose.core.errors import InputError, Notice
 from depthpose.core.files import AnyPicture, rgb_from_picture
 from depthpose.core.rigid import Rigid
@@ -107,7 +106,7 @@ def _read_color_intrinsics(
     Raises:
         InputError: the camera is of images of another size.
     """
-    lens = camera if isinstance(camera, Camera) else camera_of(camera, (width, height))
-    assert lens is not None
-    check_image_matches_camera(lens, width, height, f"{view.name}: the colour image")
-    return intrinsics_of(lens.K).to(view.K)
+    color_camera = camera_of(camera, (width, height))
+    assert color_camera is not None
+    check_image_matches_camera(color_camera, width, height, f"{view.name}: the colour image")
+    return color_camera.K.to(view.K)

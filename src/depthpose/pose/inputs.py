@@ -15,16 +15,14 @@ from depthpose.core.camera import (
     Camera,
     camera_of,
     check_image_matches_camera,
-    refuse_other_resolution,
     refuse_outside,
 )
-from depthpose.core.camera.any_camera import intrinsics_of
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_cloud, read_stored_depth
 from depthpose.core.rigid import Rigid, is_rigid
 from depthpose.core.units import Unit, metres_of
 from depthpose.pose.datasets import decode_rle, mask_from_labels, number_objects, read_labels
-from depthpose.pose.datasets.masks import read_runs
+from depthpose.pose.datasets.masks import object_numbers, read_runs
 from depthpose.pose.mesh.shapes import is_shape, shape_geometry
 from depthpose.pose.rays import warn_of_rays
 from depthpose.pose.segmentation import label_parts
@@ -66,13 +64,13 @@ def cloud_input(cloud: AnyCloud, unit: Unit, object: str, name: str) -> CloudInp
 
 def depth_input(
     depth: AnyArray, camera: AnyLens | None, name: str, unit: Unit | None = None
-) -> tuple[Float[Tensor, "h w"], AnyLens | None]:
+) -> tuple[Float[Tensor, "h w"], Camera | None]:
     """Convert a depth image to metres, NaN where there is no reading, and read its camera.
 
     Args:
         depth: whole numbers in ``unit`` or the unit of the camera; or floats, in ``unit`` if it is
             given and else in metres.
-        camera: of the image, or a file or description of one; None: it is not known.
+        camera: of the image, in any form; None: it is not known.
         name: of the image in errors, where it is no file.
         unit: of the depth. Whole numbers need it where the camera has no unit.
 
@@ -88,11 +86,10 @@ def depth_input(
     if values.ndim != 2:
         raise InputError(f"{name}: the depth is of shape {tuple(values.shape)}, not (h, w)")
     height, width = values.shape
-    is_described = isinstance(camera, str | Path | Mapping | float | int)
-    lens = camera_of(camera, (width, height)) if is_described else camera
+    its_camera = camera_of(camera, (width, height))
 
     # To metres. Floats are metres unless ``unit`` is given: the camera's unit is not theirs.
-    camera_unit_m = lens.depth_unit_m if isinstance(lens, Camera) else None
+    camera_unit_m = None if its_camera is None else its_camera.depth_unit_m
     unit_m = None if unit is None else metres_of(unit)
     if not values.is_floating_point():
         label = str(depth) if is_file else name
@@ -111,7 +108,7 @@ def depth_input(
             )
         values = values.double()
     depth_m = torch.where(values > 0, values * (unit_m or 1.0), torch.nan).float()
-    return depth_m, lens
+    return depth_m, its_camera
 
 
 def view_input(
@@ -136,7 +133,9 @@ def view_input(
         InputError: a file cannot be read, the unit of the depth is not known, or mask, camera and
             depth image differ in size.
     """
-    depth_m, lens = depth_input(depth, camera, name, unit)
+    depth_m, its_camera = depth_input(depth, camera, name, unit)
+    if its_camera is None:
+        raise InputError(f"{name}: the camera of the depth image is missing; give camera=")
     height, width = depth_m.shape
 
     # The mask, of this very image.
@@ -150,14 +149,11 @@ def view_input(
             f"{(height, width)}; give the mask of this very image"
         )
 
-    # The intrinsics, of an image of this size.
-    if isinstance(lens, Camera):
-        check_image_matches_camera(lens, width, height, name)
-    K = lens.K if isinstance(lens, Camera) else intrinsics_of(lens)
+    # The camera, of an image of this size.
+    check_image_matches_camera(its_camera, width, height, name)
+    K = its_camera.K
     try:
-        # A crop may leave the centre; its camera says the size, which was compared above.
-        refuse = refuse_outside if isinstance(lens, Camera) else refuse_other_resolution
-        refuse(K, width, height)
+        refuse_outside(K, width, height)
     except InputError as error:
         raise InputError(
             f"{name}: K is of another image or size: {error}. Resizing an image by s makes fx, fy, "
@@ -241,14 +237,7 @@ def labels_input(mask: AnyMask, name: str) -> Int64[Tensor, "_ _"]:
             f"{name}: the mask is of shape {tuple(values.shape)}, not (h, w); give the mask of one "
             "image, without other axes"
         )
-    if values.is_floating_point() and not bool((values % 1 == 0).all()):
-        if not bool(((values >= 0) & (values <= 1)).all()):
-            raise InputError(
-                f"{name}: the mask holds fractions outside [0, 1], or NaN; give True and False "
-                "(logits > 0), whole numbers of objects, or probabilities"
-            )
-        values = values > 0.5
-    return number_objects(values.long().numpy())
+    return number_objects(object_numbers(values, name).numpy())
 
 
 def _convert_to_tensor(values: Any) -> Tensor:  # noqa: ANN401  whatever a caller has

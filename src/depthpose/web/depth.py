@@ -7,6 +7,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from depthpose.core.camera import StereoRig, camera_of, write_camera
+from depthpose.core.camera.camera_facts import camera_keys
 from depthpose.core.draw import draw_share
 from depthpose.core.errors import InputError
 from depthpose.core.files import image_size, read_exif_focal, read_image, write_image
@@ -177,13 +178,11 @@ def _read_input(form: Form) -> tuple[StereoInput, str]:
     }
     camera = form.make_camera(keys, (width, height))
     if baseline_m is not None and not isinstance(camera, StereoRig):  # of a file without one
-        camera = StereoRig(
-            width=camera.width,
-            height=camera.height,
-            K=camera.K,
-            baseline_m=baseline_m,
-            cx_right_minus_left_px=doffs_px or 0.0,
-        )
+        with_baseline = camera_keys(camera) | {
+            "baseline_m": baseline_m,
+            "cx_right_minus_left_px": doffs_px or 0.0,
+        }
+        camera = camera_of(with_baseline, (width, height)) or camera
 
     right = None
     if has_right:

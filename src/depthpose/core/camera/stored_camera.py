@@ -221,7 +221,7 @@ def _read_facts_without_lens(fields: Fields) -> CameraFacts | None:
         facts = _facts_from_reprojection_matrix(Q, size)
     elif left is None or left[0, 0] == 0:
         return _facts_from_intrinsics(fields, kind, distortion)
-    elif left[0, 3] == 0 and left[1, 3] == 0:  # of a single camera
+    elif left[0, 3] == 0:  # of a single camera, or of one above another, which make no rig
         facts = facts_from_projections(kind, left, None, size)
         undistort = _UNDISTORT_P
     else:

@@ -37,6 +37,9 @@ class Video:
 
         Raises:
             InputError: not one frame can be decoded.
+
+        Warns:
+            Notice: there are fewer frames than the file's header says.
         """
         cv2 = import_opencv("reading a video")
         capture = cv2.VideoCapture(str(self.path))
@@ -58,6 +61,12 @@ class Video:
             capture.release()
         if index == 0:
             raise InputError(f"{self.path}: {_NO_VIDEO}")
+        if index < self.frames:
+            message = (
+                f"{self.path}: ends after {index} of the {self.frames} frames that its header "
+                "says; the next one cannot be decoded, so the file is damaged or cut off"
+            )
+            warnings.warn(message, Notice, stacklevel=2)
 
 
 def read_video(path: AnyPath) -> Video:

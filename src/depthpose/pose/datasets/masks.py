@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int64
+from jaxtyping import Bool, Int64, Num
 from torch import Tensor
 
 from depthpose.core.errors import InputError
@@ -114,9 +114,10 @@ def _read_pixels(path: Path, *, with_palette: bool) -> np.ndarray:
             pixels = np.asarray(image.convert("RGBA"))
         elif not with_palette and image.mode == "P":
             pixels = np.asarray(image).astype(np.int32)[..., None]
-        elif image.mode in ("1", "L", "I", "F") or image.mode.startswith("I;16"):
-            kind = np.int64 if image.mode == "F" else np.int32
-            pixels = np.asarray(image).astype(kind)[..., None]
+        elif image.mode == "F":
+            pixels = object_numbers(torch.from_numpy(np.array(image)), str(path)).numpy()[..., None]
+        elif image.mode in ("1", "L", "I") or image.mode.startswith("I;16"):
+            pixels = np.asarray(image).astype(np.int32)[..., None]
         else:
             pixels = np.asarray(image.convert("RGB"))
 
@@ -130,6 +131,29 @@ def _read_pixels(path: Path, *, with_palette: bool) -> np.ndarray:
                 )
             pixels = np.where(pixels > _HALF, 255, 0)
     return pixels
+
+
+def object_numbers(values: Num[Tensor, "h w"], name: str) -> Int64[Tensor, "h w"]:
+    """Convert the numbers of a mask to whole ones; fractions are probabilities of an object.
+
+    Those above a half are the object, 1; other pixels are 0.
+
+    Args:
+        values: whole numbers, or fractions in [0, 1].
+        name: of the mask, in errors.
+
+    Raises:
+        InputError: there are other fractions, or NaN.
+    """
+    is_whole = not values.is_floating_point() or bool((values % 1 == 0).all())
+    if is_whole:
+        return values.long()
+    if not bool(((values >= 0) & (values <= 1)).all()):
+        raise InputError(
+            f"{name}: the mask holds fractions outside [0, 1], or NaN; give True and False "
+            "(logits > 0), whole numbers of objects, or probabilities"
+        )
+    return (values > 0.5).long()
 
 
 def _keep_labels(

@@ -156,10 +156,12 @@ def assign_symmetries(
         return {}
 
     # A mapping from names.
-    is_bop = isinstance(declared, Mapping) and any(k.startswith("symmetries_") for k in declared)
+    is_bop = isinstance(declared, Mapping) and any(
+        str(key).startswith("symmetries_") for key in declared
+    )
     if isinstance(declared, Mapping) and not is_bop:
         for name in declared:
-            _refuse_unknown_name(name, names, f"symmetry of {name!r}")
+            _refuse_unknown_name(str(name), names, f"symmetry of {name!r}")
         return dict(declared)
 
     # One symmetry or several, which may begin by the name of their object.

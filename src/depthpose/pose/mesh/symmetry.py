@@ -35,7 +35,8 @@ _TEETH = range(13, 61)  # orders of which one step is tried: gears and knurls
 _TOOTH_CONTRAST = 0.004  # diameters by which a rotation between teeth must deviate more
 
 _SURE = 0.5  # certainty from which a proposal is accepted: that of a deviation of the tolerance
-_MOST_GROUP = 60  # discrete symmetries of an icosahedron: no group of a body is larger
+_MOST_GROUP = 2 * max(_TEETH)  # of a wheel whose sides are alike; an icosahedron has 60
+_SAME_STEPS = 0.4  # share of the smallest rotation up to which two rotations are the same
 
 
 class SymmetryProposal(NamedTuple):
@@ -157,12 +158,14 @@ def _are_equivalent(turn: Rigid, other: Rigid, axes: Sequence[Axis]) -> bool:
 
 def _complete_group(turns: list[Rigid]) -> list[Rigid]:
     """Add products of rotations until there is no new one; the rotations alone where that fails."""
+    smallest_rad = min(float(geodesic_rad(turn.R, _EYE)) for turn in turns)
+    same_rad = min(_SAME_RAD, _SAME_STEPS * smallest_rad)
     group = list(turns)
     for first in group:  # the list grows while it is read
         for second in turns:
             product = first @ second
-            rotations = [_EYE, *(turn.R for turn in group)]
-            if all(float(geodesic_rad(product.R, R)) > _SAME_RAD for R in rotations):
+            rotations = torch.stack([_EYE, *(turn.R for turn in group)])
+            if float(geodesic_rad(product.R, rotations).min()) > same_rad:
                 group.append(product)
         if len(group) > _MOST_GROUP:
             return turns
