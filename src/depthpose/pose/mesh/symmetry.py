@@ -333,15 +333,17 @@ def _measure_teeth(
     measured: list[_MeasuredTurn] = []
     for order in _TEETH:
         step = 2 * math.pi / order
-        angles = torch.tensor([step, 0.5 * step, 1.5 * step], dtype=torch.float64)
-        tooth_R, *between_R = rotations_about(direction, angles)
+        # A wheel of one tooth more or less looks alike after one tooth, but not after many.
+        many = order // 2 * step
+        angles = torch.tensor([step, many, 0.5 * step, 1.5 * step], dtype=torch.float64)
+        tooth_R, many_R, *between_R = rotations_about(direction, angles)
         if float(surface.rough_distance(tooth_R)) > _MAX_ROUGH_DEVIATION:
             continue
         # A lower bound first, which is faster.
         turn = Rigid(tooth_R, torch.zeros(3, dtype=torch.float64))
         if float(surface.deviation_one_way(turn)) > tolerance:
             continue
-        tooth_deviation = float(surface.deviation(tooth_R))
+        tooth_deviation = float(surface.deviation(torch.stack([tooth_R, many_R])).max())
         if tooth_deviation > tolerance:
             continue
         between_deviation = float(surface.deviation(torch.stack(between_R)).min())
