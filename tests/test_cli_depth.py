@@ -569,6 +569,10 @@ def test_one_image_of_another_camera_stops_no_other_of_its_batch(
             ["--fov", "90", "--camera-height", "1.4", "--known-distance", "1,2,3"],
             "--known-distance: has no effect here; --camera-height sets the scale",
         ),
+        (
+            ["--fov", "90", "--one-mount", "--known-distance", "1,2,3"],
+            "--known-distance holds for one image, and the frames of a video or of --one-mount",
+        ),
         (["--focal-px", "0.5"], "not a focal length in pixels"),
         (["--focal-px", "70", "--color-range", "9", "3"], "near first"),
         (["--focal-px", "70", "--weights", "defualt"], "neither a file nor the name"),

@@ -57,8 +57,15 @@ def predict_depth_of_files(
         with_check: refuse pairs that are swapped, not rectified or no pair.
 
     Raises:
-        InputError: ``out`` holds results of other settings or inputs, or the only input failed.
+        InputError: ``out`` holds results of other settings or inputs, the only input failed, or
+            frames of one camera are scaled by one known distance.
     """
+    has_frames = reader.scale.one_mount or any(is_video(files[0]) for files in sources)
+    if has_frames and reader.scale.known_distance is not None:
+        raise InputError(
+            "--known-distance holds for one image, and the frames of a video or of --one-mount see "
+            "another distance each; give --camera-height, or omit it"
+        )
     settings = run_settings(method.settings, reader, output)
     _claim_results(sources, settings, out)
     process = run.find_rank()
