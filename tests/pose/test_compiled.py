@@ -19,7 +19,7 @@ from depthpose.pose.geometry.kdtree import build_tree, find_nearest_points
 from depthpose.pose.geometry.surface import Surface, look_along_rays, match, prepare_surface
 from depthpose.pose.icp import (
     Residuals,
-    _iterate,
+    _refine_batch,
     build_normal_equations,
     make_rotation,
     refine_roughly,
@@ -162,7 +162,7 @@ def test_residuals_of_a_pose(surface: Surface) -> None:
     pose = poses(surface, 1)[0]
     cloud_m = seen(surface, pose)
     limit_m = 0.05 * surface.diameter_m
-    _, found = _iterate(cloud_m, 800, pose, surface, [limit_m], is_exact=False)
+    _, found = _refine_batch(cloud_m, 800, pose, surface, [limit_m], is_exact=False)
     local_m = pose.inverse().apply(cloud_m)
     index = surface.boxes.look_up(local_m)
     sample_m = surface.points_m[index]

@@ -188,7 +188,7 @@ def test_another_object_that_fits_too_lowers_the_probability_of_every_pose() -> 
         copy_certainty=0.5, alternatives=(copy,), evidence=evidence,
     )  # fmt: skip
     less = replace(evidence, supported=16.0, explained=16.0, seen_through=3.0)
-    found = choose_object([likely, replace(likely, object="bottle", evidence=less)])
+    found = choose_object([likely, replace(likely, object="bottle", evidence=less)], 0.9)
     assert found.certainty is not None
     share = found.certainty / 0.9
     assert 0.8 < share < 0.99

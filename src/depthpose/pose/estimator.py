@@ -35,9 +35,9 @@ from depthpose.pose.register import register
 from depthpose.pose.search import SearchTargets, find_objects
 from depthpose.pose.track import TrackedObject, track
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, Refusal, ViewInput
-from depthpose.pose.verify.decide import choose_object, refused, seconds_of_all, with_status
+from depthpose.pose.verify.decide import choose_object, refused, seconds_of_all
 from depthpose.pose.verify.prepared_object import PreparedObject
-from depthpose.pose.verify.probability import PRIOR_EXPECTED
+from depthpose.pose.verify.probability import PRIOR_EXPECTED, PRIOR_PROPOSED
 
 Result = TypeVar("Result")
 _NAME = "input"  # what an input is called that came without a name
@@ -142,15 +142,21 @@ class PoseEstimator:
 
     def _search_region(self, view: ViewInput) -> PoseEstimate:
         """Search the one object that is somewhere in the mask of a view, as in a box."""
-        targets = SearchTargets(
-            objects={view.object: self._find_object(view.object).prepare()},
+        targets = self._targets([view.object], prior_odds=PRIOR_EXPECTED, is_single=True)
+        best = find_objects(view, targets)[0]
+        return replace(best, name=view.name)
+
+    def _targets(
+        self, names: Sequence[str], *, prior_odds: float = PRIOR_PROPOSED, is_single: bool = False
+    ) -> SearchTargets:
+        """Prepare objects for a search; arguments as in :class:`SearchTargets`."""
+        return SearchTargets(
+            objects={name: self._find_object(name).prepare() for name in names},
             config=self.config,
             refusal=self.refusal,
-            prior_odds=PRIOR_EXPECTED,
-            is_single=True,
+            prior_odds=prior_odds,
+            is_single=is_single,
         )
-        best = find_objects(view, targets)[0]
-        return with_status(replace(best, name=view.name), self.config.min_certainty)
 
     @force_float32()
     def estimate(  # noqa: PLR0913  every form of input
@@ -230,7 +236,7 @@ class PoseEstimator:
             return self._estimate_or_raise([pose_input], is_expected=True)[0]
         tried = [replace(pose_input, object=name) for name in self.objects]
         estimates = self._estimate_or_raise(tried, is_expected=False)
-        return with_status(choose_object(estimates), self.config.min_certainty)
+        return choose_object(estimates, self.config.min_certainty)
 
     @force_float32()
     def estimate_instances(
@@ -311,9 +317,7 @@ class PoseEstimator:
 
     @torch.no_grad()
     @force_float32()
-    def find_in(
-        self, view: ViewInput, objects: Sequence[str], *, is_single: bool = False
-    ) -> list[PoseEstimate]:
+    def find_in(self, view: ViewInput, objects: Sequence[str]) -> list[PoseEstimate]:
         """Do as :meth:`find` does for a view, with a refusal for each object that is not found.
 
         A refusal says what the nearest miss was. Only the mask of the view is searched.
@@ -321,16 +325,8 @@ class PoseEstimator:
         Args:
             view: depth and camera.
             objects: which may be there.
-            is_single: search once, without further rounds for more of the same object.
         """
-        targets = SearchTargets(
-            objects={name: self._find_object(name).prepare() for name in objects},
-            config=self.config,
-            refusal=self.refusal,
-            is_single=is_single,
-        )
-        estimates = find_objects(view, targets)
-        return [with_status(estimate, self.config.min_certainty) for estimate in estimates]
+        return find_objects(view, self._targets(objects))
 
     def track(
         self,
@@ -402,7 +398,7 @@ class PoseEstimator:
             """Pose the object in a frame without a pose of the frame before."""
             if isinstance(pose_input, CloudInput):
                 return self._estimate_or_raise([pose_input], is_expected=False)[0]
-            return self.find_in(pose_input, [object], is_single=True)[0]
+            return find_objects(pose_input, self._targets([object], is_single=True))[0]
 
         prepared = self._find_object(object)
         target = TrackedObject(

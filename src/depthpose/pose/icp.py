@@ -62,6 +62,15 @@ class RefinedPose:
     residual_m: Float[Tensor, "*batch"]  #: weighted root mean square distance to the surface
     inlier_share: Float[Tensor, "*batch"]  #: share of the points within the last limit
 
+    def __getitem__(self, index: int) -> "RefinedPose":
+        """Take one pose of a batch."""
+        return RefinedPose(
+            camera_from_model=self.camera_from_model[index],
+            covariance=self.covariance[index],
+            residual_m=self.residual_m[index],
+            inlier_share=self.inlier_share[index],
+        )
+
 
 class BestStart(NamedTuple):
     """The best of several refined poses."""
@@ -154,7 +163,7 @@ def refine_pose(
     half = max(1, config.iterations // 2)
     limits = [start * (end / start) ** min(1.0, i / half) for i in range(config.iterations)]
     limits_m = [limit * surface.diameter_m for limit in (*limits, end)]
-    pose, equations = _iterate(
+    pose, equations = _refine_batch(
         points_m, config.cloud_points, initial.double(), surface, limits_m, is_exact=True
     )
 
@@ -303,11 +312,11 @@ def refine_roughly(
     """
     end_m = config.end_distance_diameters * surface.diameter_m
     limits_m = [ratio * end_m for ratio in _ROUGH_LIMITS]
-    poses, _ = _iterate(points_m, _ROUGH_POINTS, starts, surface, limits_m, is_exact=False)
+    poses, _ = _refine_batch(points_m, _ROUGH_POINTS, starts, surface, limits_m, is_exact=False)
     return poses
 
 
-def _iterate(
+def _refine_batch(
     points_m: Float[Tensor, "m 3"],
     max_points: int,
     pose: Rigid,
@@ -316,7 +325,7 @@ def _iterate(
     *,
     is_exact: bool,
 ) -> tuple[Rigid, _Linearised]:
-    """Refine poses, each by itself, and compute their residuals then (:func:`_refine`).
+    """Refine poses, each by itself, and compute their residuals then (:func:`_gauss_newton`).
 
     Args:
         points_m: points of the object, in the camera frame.
@@ -352,7 +361,7 @@ def _iterate(
     residual_m = np.zeros(batch)
     information = np.empty((batch[0], 6, 6))
     for k in range(batch[0]):
-        information[k] = _refine(
+        information[k] = _gauss_newton(
             cloud,
             rotations[k],
             translations[k],
@@ -371,7 +380,7 @@ def _iterate(
 
 
 @compiled
-def _refine(
+def _gauss_newton(
     cloud: Float64[np.ndarray, "n 3"],
     R: Float64[np.ndarray, "3 3"],
     t: Float64[np.ndarray, "3"],
@@ -390,7 +399,7 @@ def _refine(
         cloud: in the camera frame.
         R: rotation of the pose; changed.
         t: its translation; changed.
-        limits: as of :func:`_iterate`.
+        limits: as of :func:`_refine_batch`.
         diameter: of the object.
         target: samples of the surface.
         is_exact: whether the nearest samples are searched, not looked up in a table.
@@ -552,7 +561,7 @@ def _score_poses(
     # How many points lie near it. Of poses with equal shares the nearer one is better.
     few_m = take_evenly(cloud_m, _ROUGH_POINTS)
     limits_m = [limit_m]  # no step: matches and residuals alone
-    _, equations = _iterate(few_m, _ROUGH_POINTS, poses, surface, limits_m, is_exact=False)
+    _, equations = _refine_batch(few_m, _ROUGH_POINTS, poses, surface, limits_m, is_exact=False)
     inlier_share = (equations.weight > 0).double().mean(-1)
     closeness = inlier_share - equations.rms_m / surface.diameter_m
     score = closeness - free_space_violation - UNOBSERVED_WEIGHT * unobserved

@@ -403,11 +403,8 @@ class DepthImageRegressor(PoseEstimator):
             raise InputError(f"object: say which of {names}; a regressor refuses none")
         return super()._estimate_or_raise(inputs, is_expected=is_expected)
 
-    def find_in(
-        self, view: ViewInput, objects: Sequence[str], *, is_single: bool = False
-    ) -> NoReturn:
-        """Raise an :class:`InputError`: a regressor cannot tell whether an object is there."""
-        del view, objects, is_single
+    def _targets(self, *_: object, **__: object) -> NoReturn:
+        """Refuse every search: a regressor cannot tell whether an object is there."""
         raise InputError(_NEEDS_MASK)
 
     def _estimate(self, pose_input: AnyInput) -> PoseEstimate:

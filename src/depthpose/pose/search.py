@@ -34,6 +34,7 @@ from depthpose.pose.verify.decide import (
     explain_doubt,
     likeliest_object,
     with_share,
+    with_status,
 )
 from depthpose.pose.verify.evidence import compare, observe
 from depthpose.pose.verify.prepared_object import PreparedObject
@@ -164,10 +165,10 @@ def find_objects(view: ViewInput, targets: SearchTargets) -> list[PoseEstimate]:
 
     # An estimate for each place, and for each object without one a refusal.
     spent_s = time.perf_counter() - began
-    estimates = [
-        replace(place.estimate, seconds={**place.estimate.seconds, "search": spent_s})
-        for place in posed
-    ]
+    estimates: list[PoseEstimate] = []
+    for place in posed:
+        estimate = with_status(place.estimate, targets.config.min_certainty)
+        estimates.append(replace(estimate, seconds={**estimate.seconds, "search": spent_s}))
     if not targets.is_single:
         surfaces = {name: target.surface for name, target in targets.objects.items()}
         estimates = rank_picks(estimates, region, surfaces)

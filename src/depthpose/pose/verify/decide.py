@@ -251,13 +251,14 @@ def refused(pose_input: AnyInput, refusal: Refusal, seconds: dict[str, float]) -
     )
 
 
-def choose_object(estimates: Sequence[PoseEstimate]) -> PoseEstimate:
+def choose_object(estimates: Sequence[PoseEstimate], min_certainty: float) -> PoseEstimate:
     """Choose which object one input shows, from the estimates for every object that it may be.
 
     An object that was refused is not the one; one of the others is.
 
     Args:
         estimates: for the same input, one an object.
+        min_certainty: of an estimate that is ``ok``.
 
     Returns:
         The best, its certainty given the others; refused where none is posed, or where another
@@ -283,7 +284,7 @@ def choose_object(estimates: Sequence[PoseEstimate]) -> PoseEstimate:
             reason=f"it may be {candidates}; say which by object",
             seconds=seconds,
         )
-    return replace(best, seconds=seconds)
+    return with_status(replace(best, seconds=seconds), min_certainty)
 
 
 def seconds_of_all(estimates: Iterable[PoseEstimate]) -> dict[str, float]:

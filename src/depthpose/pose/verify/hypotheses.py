@@ -385,13 +385,7 @@ def _refine_competitors(
     batch = refine_pose(cloud_m, improved[order], surface, short)
     competitors: list[_Competitor] = []
     for k, number in enumerate(order.tolist()):
-        refined = RefinedPose(
-            camera_from_model=batch.camera_from_model[k],
-            covariance=batch.covariance[k],
-            residual_m=batch.residual_m[k],
-            inlier_share=batch.inlier_share[k],
-        )
-        competitors.append(_Competitor(refined, unrefined[number]))
+        competitors.append(_Competitor(batch[k], unrefined[number]))
     return competitors
 
 
