@@ -18,8 +18,8 @@ from pathlib import Path
 import torch
 from shared import make_parser
 
+from depthpose.core.environment import describe_environment
 from depthpose.core.files import write_image
-from depthpose.core.run import describe_environment
 from depthpose.report.page import format_markdown_table, write_table
 
 

@@ -30,7 +30,7 @@ from score_scenes import BINS, FRAMES
 from score_tracking import TRACKING
 from shared import make_parser, with_cpu_seconds
 
-from depthpose.core.run import describe_environment
+from depthpose.core.environment import describe_environment
 from depthpose.report.page import format_markdown_table
 
 SECTIONS: dict[str, Section] = {

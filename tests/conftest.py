@@ -69,7 +69,7 @@ def _content(value: object) -> object:
 @pytest.fixture(scope="session", autouse=True)
 def prepared_once() -> Iterator[None]:
     """What an estimator computes of a shape, and Git's answer, is computed once a process."""
-    from depthpose.core import run
+    from depthpose.core import environment
     from depthpose.pose import estimator
     from depthpose.pose.verify import prepared_object
 
@@ -88,7 +88,7 @@ def prepared_once() -> Iterator[None]:
         surface = once(estimator.prepare_surface, lambda *given: _content(given))
         patch.setattr(estimator, "prepare_surface", surface)
         patch.setattr(prepared_object, "prepare_pairs", once(prepared_object.prepare_pairs, id))
-        patch.setattr(run, "_read_commit", cache(run._read_commit))
+        patch.setattr(environment, "_read_commit", cache(environment._read_commit))
         yield
 
 

@@ -11,7 +11,7 @@ from tests.synthetic_street import make_street
 from depthpose.core.camera import StereoRig, read_camera
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image, read_map
-from depthpose.core.run import read_settings
+from depthpose.core.run_folder import read_settings
 from depthpose.demo import _choose_methods, make_demo, read_motorcycle
 from depthpose.depth.disparity import warp_right_to_left
 from depthpose.depth.estimator import FakestereoNet

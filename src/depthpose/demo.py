@@ -13,9 +13,10 @@ from torch import Tensor
 
 from depthpose.core.camera import Camera, StereoRig, back_project, write_camera
 from depthpose.core.draw import draw_depth
+from depthpose.core.environment import describe_environment
 from depthpose.core.files import PointCloud, write_cloud, write_depth_png, write_image
 from depthpose.core.rigid import Rigid
-from depthpose.core.run import claim_folder, describe_environment
+from depthpose.core.run_folder import claim_folder
 from depthpose.depth.config import COLOR_RANGE_M, SGBMConfig, StreetsConfig
 from depthpose.depth.disparity import depth_from_disparity
 from depthpose.depth.estimator import FakestereoNet

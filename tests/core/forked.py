@@ -9,7 +9,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from types import MappingProxyType
 
-from depthpose.core.run import claim_folder
+from depthpose.core.run_folder import claim_folder
 
 
 def start(

@@ -32,7 +32,7 @@ from depthpose.core.files import (
 )
 from depthpose.core.files.disk import natural_sort_key
 from depthpose.core.loop import RunLogger
-from depthpose.core.run import claim_folder, lock_folder
+from depthpose.core.run_folder import claim_folder, lock_folder
 from depthpose.report.page import Section, write_page, write_table
 
 

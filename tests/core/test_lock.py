@@ -14,7 +14,7 @@ from tests.core.loop_task import ToySamples, ToyTask
 
 from depthpose.core.errors import InputError
 from depthpose.core.loop import LoopConfig, TrainingRun, releases_folder
-from depthpose.core.run import (
+from depthpose.core.run_folder import (
     claim_folder,
     held_folders,
     lock_folder,
@@ -133,7 +133,7 @@ def test_a_lock_that_cannot_be_opened_is_refused(
     def refuse(*_: object) -> int:
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
-    monkeypatch.setattr("depthpose.core.run.os.open", refuse)
+    monkeypatch.setattr("depthpose.core.run_folder.os.open", refuse)
     with pytest.raises(InputError, match="cannot be written: Read-only file system"):
         lock_folder(tmp_path, is_shared=False)
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from depthpose.core.run import RESULTS, is_whole, note_result, read_results
+from depthpose.core.run_folder import RESULTS, is_whole, note_result, read_results
 
 
 def make(folder: Path, name: str = "a") -> list[Path]:

@@ -5,21 +5,19 @@ from pathlib import Path
 import pytest
 
 from depthpose.core.devices import computes_bf16, device_of_process, usable_device
+from depthpose.core.environment import describe_environment
 from depthpose.core.errors import InputError
 from depthpose.core.files.images import refuse_among_inputs
 from depthpose.core.loop import LoopConfig, TrainingConfig, TrainingRun
-from depthpose.core.run import (
-    ProcessRank,
+from depthpose.core.processes import ProcessRank, find_rank, wait_for
+from depthpose.core.run_folder import (
     claim_folder,
     claim_names,
-    describe_environment,
-    find_rank,
     is_whole,
     note_result,
     read_settings,
     read_sources,
     refuse_to_replace,
-    wait_for,
 )
 
 

@@ -12,7 +12,7 @@ from PIL import Image
 from depthpose.core.camera import Camera, StereoRig, write_camera
 from depthpose.core.errors import InputError, Notice
 from depthpose.core.files import write_depth_png, write_image, write_map
-from depthpose.core.run import note_result
+from depthpose.core.run_folder import note_result
 from depthpose.core.runner import Job
 from depthpose.depth.datasets import Dataset, check_dataset, open_dataset
 from depthpose.depth.disparity import depth_from_disparity, find_unit_mistake, resize_map

@@ -37,7 +37,7 @@ from depthpose.core.files import (
 )
 from depthpose.core.files.images import read_views
 from depthpose.core.loop import read_metrics
-from depthpose.core.run import claim_folder, claim_names, read_settings
+from depthpose.core.run_folder import claim_folder, claim_names, read_settings
 from depthpose.depth.config import GeneratorConfig, PSMNetConfig
 from depthpose.depth.datasets import open_dataset, read_split, write_raw_frame
 from depthpose.depth.datasets.frames import read_object_calibration, read_plain_calibration

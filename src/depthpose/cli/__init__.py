@@ -127,7 +127,7 @@ def main(words: Sequence[str] | None = None) -> int:
     """
     # The folders that the command claims are released at its end. Their module is looked up and
     # not imported, for --help does without it.
-    run_module = sys.modules.get("depthpose.core.run")
+    run_module = sys.modules.get("depthpose.core.run_folder")
     held_before = () if run_module is None else run_module.held_folders()
     usual_format = warnings.formatwarning
     with lasting_streams() as output:
@@ -145,7 +145,7 @@ def main(words: Sequence[str] | None = None) -> int:
             code = _print_failure(f"error: {reason}")
         finally:
             warnings.formatwarning = usual_format
-            run_module = sys.modules.get("depthpose.core.run")
+            run_module = sys.modules.get("depthpose.core.run_folder")
             if run_module is not None:
                 run_module.release_folders(but=held_before)
 

@@ -40,7 +40,7 @@ def doctor(files: tyro.conf.Positional[tuple[NewPath, ...]] = ()) -> int:
 
         return describe_files(files)
     from depthpose.core.checkpoint import SHIPPED
-    from depthpose.core.run import describe_environment
+    from depthpose.core.environment import describe_environment
 
     facts = {**describe_environment(), "device": list_device_names(), "weights in": SHIPPED}
     for name, value in facts.items():

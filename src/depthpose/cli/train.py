@@ -122,7 +122,7 @@ class TrainingOptions:
         from tqdm import tqdm
 
         from depthpose.core.loop import TrainingRun
-        from depthpose.core.run import find_rank
+        from depthpose.core.processes import find_rank
 
         is_first = find_rank().rank == 0  # other processes never show a step
         is_logged = is_first and not (sys.stdout.isatty() and sys.stderr.isatty())
@@ -280,7 +280,7 @@ def calibrate_refusal(
     from tqdm import tqdm
 
     from depthpose.core.checkpoint import find_weights
-    from depthpose.core.run import refuse_to_replace
+    from depthpose.core.run_folder import refuse_to_replace
     from depthpose.depth.datasets import join_datasets, open_dataset
     from depthpose.depth.estimator import FakestereoNet
     from depthpose.depth.evaluate import measure_image_confidence

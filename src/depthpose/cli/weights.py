@@ -124,7 +124,7 @@ def import_weights(
         align_corners: psmnet: how it was trained to upsample: true for the authors' first weights
             (2018, PyTorch 0.4), false for those of 2021 (1.8.1). A wrong choice costs about 1 px.
     """
-    from depthpose.core.run import refuse_to_replace
+    from depthpose.core.run_folder import refuse_to_replace
 
     if align_corners is not None and kind != "psmnet":
         raise InputError(
@@ -178,7 +178,7 @@ def pack_weights(
     from depthpose.core.checkpoint import add_terms, find_weights, warn_of_terms
     from depthpose.core.files import atomic_write
     from depthpose.core.loop import format_card
-    from depthpose.core.run import refuse_to_replace
+    from depthpose.core.run_folder import refuse_to_replace
     from depthpose.depth.weights import read_depth_weights, read_matcher, write_depth_weights
 
     card = out.with_suffix(".md")
@@ -220,7 +220,7 @@ def complete_weights(
         unit: unit of a model file; BOP's are in mm.
     """
     from depthpose.core.checkpoint import find_weights
-    from depthpose.core.run import refuse_to_replace
+    from depthpose.core.run_folder import refuse_to_replace
     from depthpose.pose.datasets.layouts import read_bop_models
     from depthpose.pose.mesh import read_model
     from depthpose.pose.weights import complete_weights as complete

@@ -22,9 +22,10 @@ import torch
 from torch import Tensor, nn
 
 from depthpose.core.checkpoint import file_sha256
+from depthpose.core.environment import describe_environment
 from depthpose.core.errors import InputError, import_extra
 from depthpose.core.files import atomic_write, write_json
-from depthpose.core.run import describe_environment, refuse_to_replace
+from depthpose.core.run_folder import refuse_to_replace
 
 OPSET = 18
 _IR_VERSION = 10  # that of onnx 1.16: older runtimes do not read a newer one

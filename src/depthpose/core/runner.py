@@ -3,7 +3,7 @@
 Inputs that an earlier run finished are skipped, and one that fails does not stop the others. What
 is computed for an input is a function; where results are stored is a :class:`Results`. Where a
 launcher starts several processes, each runs this loop over its share of the inputs
-(``core.run.ProcessRank``); workers on many machines have a loop of their own (``core.engine``).
+(``core.processes``); workers on many machines have a loop of their own (``core.engine``).
 """
 
 from abc import ABC, abstractmethod

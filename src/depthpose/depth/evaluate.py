@@ -7,8 +7,8 @@ from typing import Any
 
 import torch
 
+from depthpose.core.data_frame import make_data_frame
 from depthpose.core.errors import InputError
-from depthpose.core.frame import make_data_frame
 from depthpose.depth import disparity
 from depthpose.depth import predictions as files
 from depthpose.depth.datasets import Dataset, read_disparity

@@ -15,7 +15,7 @@ from depthpose.core.config import config_from_dict
 from depthpose.core.draw import draw_depth, draw_disparity
 from depthpose.core.errors import InputError
 from depthpose.core.files.disk import read_text, write_bytes
-from depthpose.core.run import claim_folder, claim_names, is_whole, note_result
+from depthpose.core.run_folder import claim_folder, claim_names, is_whole, note_result
 from depthpose.core.runner import Job, Results, run_jobs
 from depthpose.depth.config import COLOR_RANGE_M
 from depthpose.depth.disparity import depth_from_disparity, disparity_from_depth
@@ -295,7 +295,7 @@ def read_ground(folder: Path, name: str) -> Ground | None:
 class DepthResults(Results[StereoInput, DepthEstimate]):
     """Results of a run of estimates: files of one folder, as :func:`write_estimate` names them."""
 
-    folder: Path  #: claimed before (:func:`depthpose.core.run.claim_folder`)
+    folder: Path  #: claimed before (:func:`depthpose.core.run_folder.claim_folder`)
     range_m: tuple[float, float] = COLOR_RANGE_M
     cloud_m: float | None = None  #: None: no cloud is written
     min_confidence: float | None = None  #: least confidence of a cloud's points

@@ -14,10 +14,10 @@ import torch
 from torch import Tensor
 
 from depthpose.core.config import config_from_dict
+from depthpose.core.data_frame import make_data_frame
 from depthpose.core.errors import InputError, Notice, suggest_name
 from depthpose.core.files import write_json
 from depthpose.core.files.disk import read_bytes, refuse_heavy, refused_as, write_bytes
-from depthpose.core.frame import make_data_frame
 from depthpose.core.rigid import Rigid, is_rigid
 from depthpose.core.runner import Job, Results
 from depthpose.pose.datasets import BopDataset, Instance

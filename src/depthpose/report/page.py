@@ -478,7 +478,7 @@ def write_page(
         title: title of the page.
         sections: contents of the page.
         environment: what the results were computed with, by name
-            (:func:`depthpose.core.run.describe_environment`).
+            (:func:`depthpose.core.environment.describe_environment`).
     """
     templates = Environment(
         loader=PackageLoader("depthpose.report", "."),

@@ -64,7 +64,7 @@ def pack_dataset(
     """
     from tqdm import tqdm
 
-    from depthpose.core.run import refuse_to_replace
+    from depthpose.core.run_folder import refuse_to_replace
     from depthpose.depth.datasets import open_dataset, pack_frames
 
     refuse_below(1, "--shard-mb", shard_mb, "256")

@@ -53,7 +53,7 @@ def make_streets(
     """
     from tqdm import tqdm
 
-    from depthpose.core.run import claim_folder
+    from depthpose.core.run_folder import claim_folder
     from depthpose.depth.config import StreetsConfig
     from depthpose.depth.datasets import has_calibration, has_raw_frame, write_raw_frame
     from depthpose.depth.synthetic import draw_rig_number, render_street
@@ -109,7 +109,7 @@ def make_near(
     from tqdm import tqdm
 
     from depthpose.core.config import config_to_dict
-    from depthpose.core.run import claim_folder
+    from depthpose.core.run_folder import claim_folder
     from depthpose.depth.config import NearConfig
     from depthpose.depth.datasets import has_scene, write_scene
     from depthpose.depth.synthetic import render_near
@@ -172,7 +172,7 @@ def make_objects(
     """
     from tqdm import tqdm
 
-    from depthpose.core.run import claim_folder
+    from depthpose.core.run_folder import claim_folder
     from depthpose.pose.config import ObjectsConfig, SyntheticSensorConfig
     from depthpose.pose.datasets import write_bop_models
     from depthpose.pose.mesh import (
@@ -278,7 +278,7 @@ def _render_scene(
     """
     from tqdm import tqdm
 
-    from depthpose.core.run import note_result
+    from depthpose.core.run_folder import note_result
     from depthpose.pose.datasets import write_bop_scene
     from depthpose.pose.synthetic import make_frames
 
@@ -292,7 +292,7 @@ def _render_scene(
 def _has_whole_scene(out: Path, split: str, scene: int, frames: range) -> bool:
     """Whether a scene exists with all of its frames, every file as it was written."""
     from depthpose.core.files import read_json
-    from depthpose.core.run import is_whole
+    from depthpose.core.run_folder import is_whole
 
     scene_folder = f"{split}/{scene:06d}"
     if not is_whole(out, scene_folder, [f"{scene_folder}/scene_camera.json"]):

@@ -66,7 +66,7 @@ def rectify_pairs(
     from depthpose.cli.depth.inputs import list_pairs
     from depthpose.core.camera import make_rectifier, read_raw_pair, write_camera
     from depthpose.core.files import image_size, write_image
-    from depthpose.core.run import claim_folder, claim_names
+    from depthpose.core.run_folder import claim_folder, claim_names
 
     # Refuse what cannot be rectified, before anything is written.
     unit_m = metres_of(unit) if unit else None
@@ -130,7 +130,7 @@ def split_pairs(files: tyro.conf.Positional[tuple[Source, ...]], out: NewPath) -
     from depthpose.cli.depth.inputs import list_images_and_videos
     from depthpose.core.camera import order_views
     from depthpose.core.files import write_image
-    from depthpose.core.run import claim_folder
+    from depthpose.core.run_folder import claim_folder
 
     sources = list_images_and_videos(files, out)
     claim_folder(out, {"command": "data split"}, _SIDES)

@@ -185,7 +185,7 @@ def evaluate_depth(
     )
     from depthpose.core.engine import PLAN
     from depthpose.core.files import stores
-    from depthpose.core.run import claim_folder
+    from depthpose.core.run_folder import claim_folder
     from depthpose.depth.protocols import find_protocol
     from depthpose.report.page import list_table_files
 

@@ -14,8 +14,10 @@ from tqdm import tqdm
 from depthpose.cli.depth.methods import DepthMethod, DepthNetworkSpec, SGBMSpec
 from depthpose.cli.depth.options import DepthMethodOptions
 from depthpose.core import engine
+from depthpose.core.environment import describe_environment
 from depthpose.core.errors import InputError
-from depthpose.core.run import describe_environment, find_rank, read_settings, wait_for
+from depthpose.core.processes import find_rank, wait_for
+from depthpose.core.run_folder import read_settings
 from depthpose.core.runner import Job
 from depthpose.depth.baselines import NearestImageBaseline, RowDepthBaseline
 from depthpose.depth.config import Answer, BaselineName, MatcherConfig, Speed

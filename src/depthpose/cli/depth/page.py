@@ -5,7 +5,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from depthpose.cli.depth.inputs import InputReader, select_result_names
-from depthpose.core import run
+from depthpose.core import run_folder
+from depthpose.core.environment import describe_environment
 from depthpose.core.errors import InputError
 from depthpose.core.files.disk import read_text
 from depthpose.depth.predictions import is_finished, read_estimate
@@ -35,7 +36,7 @@ def write_depth_page(
         failures: why inputs have no result.
     """
     # The finished results of each input, and those that are shown.
-    finished = {name for name in run.read_results(out) if is_finished(out, name)}
+    finished = {name for name in run_folder.read_results(out) if is_finished(out, name)}
     names_of = {files: select_result_names(finished, files) for files in sources}
     names = [name for names_of_source in names_of.values() for name in names_of_source]
     shown_names = {names[k] for k in spread_evenly(len(names), MOST_VIEWS)}
@@ -59,7 +60,7 @@ def write_depth_page(
         section = make_depth_section(depth_input.name, depth_input, estimate, range_m=range_m)
         sections.append(section)
     title = f"Depth of {len(names)} image{'s' * (len(names) != 1)}"
-    write_page(out / PAGE, title, sections, run.describe_environment())
+    write_page(out / PAGE, title, sections, describe_environment())
     print(f"the page: {out / PAGE}")
 
 

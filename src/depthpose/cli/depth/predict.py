@@ -22,11 +22,12 @@ from depthpose.cli.depth.methods import DepthMethod, DepthMethodSpec, settings_o
 from depthpose.cli.depth.options import PredictOutput
 from depthpose.cli.depth.page import PAGE, VIDEO_ENDING, write_depth_page
 from depthpose.cli.engine import EngineOptions, print_shards
-from depthpose.core import run
+from depthpose.core import run_folder
 from depthpose.core.draw import draw_depth
 from depthpose.core.engine import Computation, InputFormat, JobInputs, LocalInput, ResultWriter
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_map, read_video, write_video
+from depthpose.core.processes import find_rank, wait_for
 from depthpose.core.runner import Job, run_jobs
 from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.mount import MountFilter, scale_by_distance
@@ -68,7 +69,7 @@ def predict_depth_of_files(
         )
     settings = run_settings(method.settings, reader, output)
     _claim_results(sources, settings, out)
-    process = run.find_rank()
+    process = find_rank()
     if reader.scale.one_mount and process.world > 1:
         raise InputError("--one-mount takes the images one after the other; omit it, or run alone")
 
@@ -114,11 +115,11 @@ def _claim_results(
     Raises:
         InputError: the folder holds results of other settings or inputs.
     """
-    run.claim_folder(out, settings, [PAGE])
+    run_folder.claim_folder(out, settings, [PAGE])
     files_of_stem = {files[0].stem: files for files in sources}
     video_stems = [stem for stem, files in files_of_stem.items() if is_video(files[0])]
     endings = [f".{ending}" for ending in ENDINGS] + [VIDEO_ENDING]
-    run.claim_names(out, files_of_stem, endings, video_stems)
+    run_folder.claim_names(out, files_of_stem, endings, video_stems)
 
 
 def run_settings(
@@ -154,19 +155,19 @@ def wait_for_results(sources: Sequence[tuple[Path, ...]], out: Path, *, with_clo
 
     def is_there(name: str) -> bool:
         """Whether the input of this name has a result, or has failed."""
-        if name in run.read_failures(out):
+        if name in run_folder.read_failures(out):
             return True
         if name in videos:
-            return run.is_whole(out, name, [_name_video_file(videos[name])])
+            return run_folder.is_whole(out, name, [_name_video_file(videos[name])])
         return is_finished(out, name, with_cloud=with_cloud)
 
     names = [_name_source(files) for files in sources]
-    run.wait_for(names, is_there, count_steps=lambda: len(run.read_results(out)))
+    wait_for(names, is_there, count_steps=lambda: len(run_folder.read_results(out)))
 
 
 def _read_failures(sources: Sequence[tuple[Path, ...]], out: Path) -> list[str]:
     """Read why inputs, or frames of them, have no result, as all processes noted it."""
-    failures = run.read_failures(out)
+    failures = run_folder.read_failures(out)
     reasons: list[str] = []
     for files in sources:
         reasons += [failures[name] for name in select_result_names(failures, files)]
@@ -271,7 +272,7 @@ class DepthPredictor:
         """Keep why an input has no result, and tell the other processes of a launch."""
         self.failures[name] = error
         if self.is_shared:
-            run.note_failure(self.out, name, str(error))
+            run_folder.note_failure(self.out, name, str(error))
 
     def predict_video(self, video: Path) -> int:
         """Estimate the frames of a video and write a video of their depth; return their number."""
@@ -283,7 +284,7 @@ class DepthPredictor:
             file = self.out / _name_video_file(video)
             write_video(file, pictures, frames.fps)
             if self.is_shared:
-                run.note_result(self.out, video.name, [file])
+                run_folder.note_result(self.out, video.name, [file])
         except InputError as error:
             self._note_failure(video.name, error)
             return 0

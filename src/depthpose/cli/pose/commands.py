@@ -130,7 +130,7 @@ def evaluate_poses(
     from depthpose.cli.pose.masks import prepare_masks
     from depthpose.cli.pose.methods import build_methods
     from depthpose.core.config import config_to_dict
-    from depthpose.core.run import claim_folder
+    from depthpose.core.run_folder import claim_folder
     from depthpose.pose.config import EvaluationConfig
     from depthpose.report.page import list_table_files
 
@@ -181,7 +181,7 @@ def track_object(
     """
     from depthpose.cli.pose.methods import make_method_spec
     from depthpose.cli.pose.track import track_dataset, track_files
-    from depthpose.core.run import find_rank
+    from depthpose.core.processes import find_rank
 
     if find_rank().world > 1:
         raise InputError("a sequence is followed by one process; start one")

@@ -16,9 +16,10 @@ from depthpose.cli.pose.masks import Masks
 from depthpose.cli.pose.methods import PoseMethod
 from depthpose.cli.pose.predict import estimate_unfinished
 from depthpose.core.checkpoint import file_sha256
+from depthpose.core.environment import describe_environment
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image
-from depthpose.core.run import claim_folder, describe_environment, read_settings
+from depthpose.core.run_folder import claim_folder, read_settings
 from depthpose.pose.config import EvaluationConfig
 from depthpose.pose.datasets import BopDataset
 from depthpose.pose.evaluate import (

@@ -17,7 +17,7 @@ from depthpose.cli.pose.dataset_jobs import make_best_detection_jobs, make_insta
 from depthpose.core.checkpoint import file_sha256, find_weights
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image, write_json
-from depthpose.core.run import claim_folder
+from depthpose.core.run_folder import claim_folder
 from depthpose.pose import datasets
 from depthpose.pose.datasets.entries import read_integer, read_rows
 from depthpose.pose.predictions import PoseJob

@@ -13,11 +13,13 @@ from typing import Any
 from scipy.spatial.transform import Rotation
 
 from depthpose.cli.pose.methods import PoseMethod
-from depthpose.core import run
+from depthpose.core import run_folder
+from depthpose.core.environment import describe_environment
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_image, write_cloud, write_image
+from depthpose.core.processes import find_rank
 from depthpose.core.rigid import Rigid
-from depthpose.core.run import is_whole, note_result
+from depthpose.core.run_folder import is_whole, note_result
 from depthpose.pose.datasets import BopDataset
 from depthpose.pose.footprint import explained_mask
 from depthpose.pose.geometry.surface import Surface, prepare_surface
@@ -77,8 +79,8 @@ def claim_for_jobs(
         jobs: jobs with the files that they read.
         is_result: whether the result of the first name is one of the input of the second name.
     """
-    run.claim_folder(out, settings, [POSES, _PAGE])
-    if run.find_rank().world == 1 and not run.read_sources(out):
+    run_folder.claim_folder(out, settings, [POSES, _PAGE])
+    if find_rank().world == 1 and not run_folder.read_sources(out):
         (out / POSES).unlink(missing_ok=True)
 
     def is_finished(name: str) -> bool:
@@ -90,7 +92,7 @@ def claim_for_jobs(
             if estimate.status != "unreadable"
         )
 
-    run.claim_names(
+    run_folder.claim_names(
         out,
         {job.name: job.source for job in jobs if job.source is not None},
         [f".{end}" for end in (PICTURE, CLOUD)],
@@ -108,7 +110,7 @@ def claim_for_dataset(out: Path, settings: dict[str, Any], dataset: BopDataset) 
     images = sorted({(i.scene_id, i.image_id) for i in dataset.instances})
     pictures = [f"{scene:06d}_{image:06d}.{PICTURE}" for scene, image in images]
     tables = [name_bop_results(dataset), name_bop_results(dataset, _WITH_ALTERNATIVES)]
-    run.claim_folder(out, settings, [POSES, _PAGE, *tables, *pictures])
+    run_folder.claim_folder(out, settings, [POSES, _PAGE, *tables, *pictures])
 
 
 def write_files(
@@ -364,7 +366,7 @@ def _write_page(
         text += f" The table holds the first {_MAX_PAGE_ROWS}, refusals before answers; all are in "
         text += "poses.json."
     results = Section(title="What was found", text=text, rows=rows)
-    write_page(out / _PAGE, f"Poses of {total}", [results, *sections], run.describe_environment())
+    write_page(out / _PAGE, f"Poses of {total}", [results, *sections], describe_environment())
     print(f"the page: {out / _PAGE}")
 
 

@@ -14,7 +14,8 @@ from depthpose.core.camera import StereoRig, read_rig
 from depthpose.core.errors import InputError
 from depthpose.core.files import image_size, read_map, write_map
 from depthpose.core.files.images import refuse_among_inputs
-from depthpose.core.run import claim_folder, find_rank, is_whole, note_result
+from depthpose.core.processes import find_rank
+from depthpose.core.run_folder import claim_folder, is_whole, note_result
 from depthpose.depth.config import MatcherConfig
 from depthpose.depth.disparity import depth_std_from_confidence
 

@@ -29,13 +29,14 @@ from depthpose.cli.pose.output import (
     write_files,
 )
 from depthpose.cli.pose.plans import plan_jobs
-from depthpose.core import run
+from depthpose.core import run_folder
 from depthpose.core.camera import Camera, camera_of
 from depthpose.core.config import config_to_dict
 from depthpose.core.engine import Computation, InputFormat, JobInputs, LocalInput, ResultWriter
 from depthpose.core.errors import InputError
 from depthpose.core.files import CLOUD_READERS, image_size, write_json
 from depthpose.core.files.images import LISTED_SUFFIXES
+from depthpose.core.processes import find_rank, wait_for
 from depthpose.core.runner import Job, Results, run_jobs
 from depthpose.core.units import Unit
 from depthpose.pose.config import EstimateConfig
@@ -135,11 +136,11 @@ def estimate_jobs(
     Returns:
         The predictions of all jobs, in their order; None in every process but the first.
     """
-    process = run.find_rank()
+    process = find_rank()
     process_folder = out
     if process.world > 1:
         process_folder = out / f"part-{process.rank}"
-        run.claim_folder(process_folder, settings, [POSES])
+        run_folder.claim_folder(process_folder, settings, [POSES])
 
     results = PoseResults[Any](process_folder, out)
     estimated = estimate_unfinished(method, process.share_of(jobs), results, batch)
@@ -216,7 +217,7 @@ class _WrittenNames:
 
 def _wait_for_predictions(out: Path, jobs: Sequence[PoseJob[Any]]) -> None:
     """Wait until the files of all processes together hold a prediction of every job."""
-    run.wait_for([job.name for job in jobs], _WrittenNames(out).has)
+    wait_for([job.name for job in jobs], _WrittenNames(out).has)
 
 
 @dataclass(frozen=True)

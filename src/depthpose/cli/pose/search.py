@@ -22,7 +22,7 @@ from depthpose.cli.pose.output import (
 )
 from depthpose.cli.pose.plans import plan_searches
 from depthpose.core.errors import InputError
-from depthpose.core.run import find_rank
+from depthpose.core.processes import find_rank
 from depthpose.core.runner import Job, Results, run_jobs
 from depthpose.pose.predictions import (
     Place,

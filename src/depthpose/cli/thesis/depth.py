@@ -17,9 +17,11 @@ from depthpose.cli.depth.evaluate import (
     write_detail_tables,
 )
 from depthpose.cli.depth.methods import DepthMethod
+from depthpose.core.environment import describe_environment
 from depthpose.core.errors import InputError, suggest_name
 from depthpose.core.files import write_image
-from depthpose.core.run import claim_folder, describe_environment, find_rank
+from depthpose.core.processes import find_rank
+from depthpose.core.run_folder import claim_folder
 from depthpose.depth.datasets import Dataset, FramePaths, has_lidar, read_lidar_depth
 from depthpose.depth.predictions import has_prediction, read_estimate
 from depthpose.depth.protocols import find_protocol

@@ -28,9 +28,10 @@ from depthpose.cli.pose.options import PoseDataOptions, PoseTableOptions
 from depthpose.cli.thesis.depth import write_report
 from depthpose.core.checkpoint import file_sha256, find_weights
 from depthpose.core.config import config_to_dict
+from depthpose.core.environment import describe_environment
 from depthpose.core.errors import InputError
 from depthpose.core.files import write_image
-from depthpose.core.run import claim_folder, describe_environment
+from depthpose.core.run_folder import claim_folder
 from depthpose.pose.config import EvaluationConfig, ObjectsConfig
 from depthpose.pose.datasets import BopDataset, Instance
 from depthpose.pose.datasets.dataset import read_instance_mask

@@ -3,8 +3,8 @@
 This is for many machines, by ``--engine ray``. Its workers are processes that Ray starts, restarts
 and gives blocks to; results go into tar shards, since millions of files would choke a file system.
 The plain command uses the loop of ``core.runner`` in place of it, in one process or, under
-``torchrun``, in several that share out the inputs (``core.run.ProcessRank``); it writes a file for
-each result. In both, inputs go through the network in batches.
+``torchrun``, in several that share out the inputs (``core.processes``); it writes a file for each
+result. In both, inputs go through the network in batches.
 
 The engine deals with files and names; what a worker computes of them is a function.
 """

@@ -16,16 +16,11 @@ from depthpose.core.engine.shards import (
     checksum_block,
     is_unchanged,
 )
+from depthpose.core.environment import describe_environment
 from depthpose.core.errors import InputError
 from depthpose.core.files import remove_parts, stores
 from depthpose.core.files.disk import open_file_system
-from depthpose.core.run import (
-    NOT_OURS,
-    RECORD,
-    describe_environment,
-    read_settings,
-    refuse_other_settings,
-)
+from depthpose.core.run_folder import NOT_OURS, RECORD, read_settings, refuse_other_settings
 
 MANIFEST = "manifest.csv"
 
@@ -154,7 +149,8 @@ def _write_manifest(out: str, records: Sequence[ShardRecord]) -> None:
 def _claim_url(out: str, settings: Mapping[str, Any]) -> None:
     """Make a folder, local or in a store, that of a job with these settings, or continue its job.
 
-    Unlike :func:`depthpose.core.run.claim_folder`, it takes no lock: object stores have none.
+    Unlike :func:`depthpose.core.run_folder.claim_folder`, it takes no lock, which object stores do
+    not have.
 
     Raises:
         InputError: the folder holds results of other settings, or files that no job wrote.

@@ -16,11 +16,11 @@ import torch
 from torch import Tensor, nn
 
 from depthpose.core.checkpoint import add_terms, list_misfits, read_torch_file
+from depthpose.core.environment import describe_environment
 from depthpose.core.errors import InputError, Notice, import_extra
 from depthpose.core.files import atomic_write, read_text, remove_parts, write_image
 from depthpose.core.files.disk import refuse_heavy, refused_as, refused_write
 from depthpose.core.loop.task import TrainingConfig, ValidationResult
-from depthpose.core.run import describe_environment
 
 STATE = "state.pt"  # the last saved state of a training
 STATE_BEFORE = "state.before.pt"  # the one before, in case the last is damaged

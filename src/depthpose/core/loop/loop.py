@@ -44,7 +44,8 @@ from depthpose.core.loop.task import (
     Update,
     mix_seed,
 )
-from depthpose.core.run import claim_folder, find_rank, held_folders, release_folders
+from depthpose.core.processes import find_rank
+from depthpose.core.run_folder import claim_folder, held_folders, release_folders
 
 SECOND_CTRL_C_S = 3.0  # between the first Ctrl-C, which stops, and the second, which finishes
 _POLL_S = 0.05  # between two looks for the second Ctrl-C

@@ -10,7 +10,7 @@ from depthpose.core import files
 from depthpose.core.camera import StereoRig
 from depthpose.core.errors import InputError
 from depthpose.core.files.disk import write_bytes
-from depthpose.core.run import is_whole, note_result
+from depthpose.core.run_folder import is_whole, note_result
 from depthpose.depth.types import RawFrame
 
 _CALIBRATION_FILES = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt")

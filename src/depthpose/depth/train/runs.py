@@ -19,7 +19,7 @@ from depthpose.core.loop import (
     releases_folder,
     write_card,
 )
-from depthpose.core.run import find_rank
+from depthpose.core.processes import find_rank
 from depthpose.depth.config import GeneratorConfig, PairsConfig, SelectionConfig
 from depthpose.depth.datasets import FramePaths, refuse_shared_frames
 from depthpose.depth.encoder import load_encoder

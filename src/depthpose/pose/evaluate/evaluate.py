@@ -11,8 +11,8 @@ from typing import Any
 
 import torch
 
+from depthpose.core.data_frame import make_data_frame
 from depthpose.core.errors import InputError
-from depthpose.core.frame import make_data_frame
 from depthpose.pose.config import EvaluationConfig
 from depthpose.pose.datasets import BopDataset, BopTarget, Instance
 from depthpose.pose.evaluate.detection import average_measured, score_detections

@@ -26,7 +26,7 @@ from depthpose.core.loop import (
     shuffle_index,
     write_card,
 )
-from depthpose.core.run import find_rank
+from depthpose.core.processes import find_rank
 from depthpose.pose.datasets import Instance, open_bop, read_object_names
 from depthpose.pose.datasets.dataset import read_instance_mask
 from depthpose.pose.metrics import count_overlap, intersection_over_union

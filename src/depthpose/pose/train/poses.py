@@ -27,8 +27,8 @@ from depthpose.core.loop import (
     releases_folder,
     write_card,
 )
+from depthpose.core.processes import find_rank
 from depthpose.core.rigid import Rigid
-from depthpose.core.run import find_rank
 from depthpose.pose.cloud import lift_sample, why_too_few
 from depthpose.pose.config import SHAPE_FEATURES, RefusalConfig
 from depthpose.pose.losses import direction_loss, model_point_loss

@@ -3,30 +3,25 @@
 A command claims its folder: it locks it, and writes ``run.json`` with settings, versions, machine
 and commit. ``sources.json`` has the file that each result is made from. A line of ``results.jsonl``
 names a finished result, with size and time of its files, by which the next run tells that it is
-whole. Several processes that ``torchrun`` or ``accelerate launch`` starts with one command share a
-folder: each makes its share of the results (:class:`ProcessRank`), and they see each other's in
-``results.jsonl``.
+whole. Several processes of one launch (:mod:`depthpose.core.processes`) share a folder: each makes
+its share of the results, and they see each other's in ``results.jsonl``.
 """
 
 import json
 import os
-import platform
 import re
-import subprocess
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
-import torch
-
+from depthpose.core.environment import describe_environment
 from depthpose.core.errors import InputError
 from depthpose.core.files import read_json, refused_as, remove_parts, stores, write_json
 from depthpose.core.files.disk import refuse_broken_link, refused_write
+from depthpose.core.processes import find_rank
 
 try:
     import fcntl
@@ -44,12 +39,7 @@ NOT_OURS = (
 )
 """Error about a file that a run would write over."""
 _FRAME = re.compile(r"_\d{6}$")  # number of a frame, which ends the name of its result
-_PACKAGES = ("depthpose", "torch", "numpy", "opencv-python-headless")
 _LOCK_POLL_S = 0.1  # between two tries to lock a folder
-_RESULTS_POLL_S = 0.2  # between two looks at what other processes have finished
-_GIT_TIMEOUT_S = 5
-
-Item = TypeVar("Item")
 
 _locks: dict[Path, int] = {}  # folders that are locked, and the descriptors of their locks
 
@@ -115,104 +105,6 @@ def release_folders(but: Collection[Path] = ()) -> None:
         os.close(descriptor)
 
 
-@dataclass(frozen=True, kw_only=True)
-class ProcessRank:
-    """The rank of this process among those that a launcher started with one command."""
-
-    rank: int = 0  #: 0 .. world - 1
-    world: int = 1  #: number of processes
-
-    def share_of(self, items: Sequence[Item]) -> Sequence[Item]:
-        """Return this process's share of a list: items ``rank``, ``rank + world``, and so on."""
-        return items[self.rank :: self.world]
-
-
-def find_rank() -> ProcessRank:
-    """Read the rank of this process from RANK and WORLD_SIZE; without them it is the only one.
-
-    ``torchrun`` and ``accelerate launch`` set these variables.
-
-    Raises:
-        InputError: they are not whole numbers, or the rank is not below the number of processes.
-    """
-    rank = os.environ.get("RANK", "0")
-    world = os.environ.get("WORLD_SIZE", "1")
-    if not (rank.isdecimal() and world.isdecimal() and int(rank) < int(world)):
-        raise InputError(
-            f"RANK is {rank!r} and WORLD_SIZE {world!r}, but a rank is "
-            "0 .. WORLD_SIZE - 1; let torchrun or accelerate launch set them, or unset both"
-        )
-    return ProcessRank(rank=int(rank), world=int(world))
-
-
-def wait_for(
-    names: Sequence[str],
-    is_finished: Callable[[str], bool],
-    timeout_s: float = 3600.0,
-    count_steps: Callable[[], int] | None = None,
-) -> None:
-    """Wait until the processes of a launch have finished the results of all ``names``.
-
-    Args:
-        names: names of the results.
-        is_finished: whether the result of a name is finished.
-        timeout_s: longest time without progress; then a process is taken to have died.
-        count_steps: a count whose growth is progress too, such as frames of a long video; None:
-            only finished names are progress.
-
-    Raises:
-        InputError: there was no progress for that time; names the first result that is missing.
-    """
-    missing = [name for name in names if not is_finished(name)]
-    step_count = 0
-    last_progress = time.monotonic()
-    while missing:
-        if time.monotonic() - last_progress > timeout_s:
-            raise InputError(
-                f"nothing new for {timeout_s:.0f} s and {len(missing)} of {len(names)} are "
-                f"missing, first {missing[0]!r}: another process may have failed. Start again; "
-                "what is finished is kept."
-            )
-        time.sleep(min(_RESULTS_POLL_S, timeout_s))
-        still_missing = [name for name in missing if not is_finished(name)]
-        new_step_count = 0 if count_steps is None else count_steps()
-        if len(still_missing) < len(missing) or new_step_count > step_count:
-            last_progress = time.monotonic()
-        missing = still_missing
-        step_count = new_step_count
-
-
-def describe_environment() -> dict[str, str]:
-    """Describe what results are computed with: date, versions, machine, threads, GPU, commit."""
-    facts = {"date": datetime.now(UTC).strftime("%Y-%m-%d"), "python": platform.python_version()}
-    for name in _PACKAGES:
-        with suppress(PackageNotFoundError):
-            facts[name] = version(name)
-    facts["machine"] = (
-        f"{platform.system()} {platform.machine()}, {torch.get_num_threads()} threads"
-    )
-    if torch.cuda.is_available():
-        facts["gpu"] = torch.cuda.get_device_name()
-    commit = _read_commit()
-    if commit:
-        facts["commit"] = commit
-    return facts
-
-
-def _read_commit() -> str:
-    """Ask Git for the commit of the running code; "" where it is not in a repository."""
-    package_folder = str(Path(__file__).resolve().parent)
-    # Without any tag (--exclude *), describe falls back (--always) on the hash of the commit.
-    command = ["git", "-C", package_folder, "describe", "--always", "--dirty", "--exclude", "*"]
-    try:
-        process = subprocess.run(  # noqa: S603
-            command, capture_output=True, text=True, check=False, timeout=_GIT_TIMEOUT_S
-        )
-    except (OSError, subprocess.TimeoutExpired):
-        return ""
-    return process.stdout.strip() if process.returncode == 0 else ""
-
-
 def claim_folder(
     folder: Path,
     settings: Mapping[str, Any],
@@ -222,7 +114,7 @@ def claim_folder(
     """Make ``folder`` the output folder of a run with these settings, or continue such a run.
 
     It is locked for this process, or for all processes of one launch, until
-    :func:`depthpose.core.run.release_folders`. Partial files of a killed run are removed.
+    :func:`depthpose.core.run_folder.release_folders`. Partial files of a killed run are removed.
 
     Args:
         folder: made where it is missing.
