@@ -269,10 +269,10 @@ def match_by_ours(
     views = torch.rand(2, 3, height, width)
     pair = StereoInput(name="pair", left=views[0], right=views[1], camera=rig)
     if isinstance(config, SGBMConfig):
-        net = FakestereoNet.load(matcher="sgbm", config=config)
+        net = FakestereoNet.load(matcher="sgbm", config=config, with_check=False)
     else:
-        net = FakestereoNet.load(find_weights("default"), config=config)
-    return lambda: net.estimate_input(pair, with_check=False)
+        net = FakestereoNet.load(find_weights("default"), config=config, with_check=False)
+    return lambda: net.estimate_input(pair)
 
 
 def main() -> None:

@@ -148,10 +148,7 @@ def compare(samples: Iterable[StereoSample], net: FakestereoNet, name: str) -> l
         reports = []
         for method in (SGBM, name):
             start_s = time.perf_counter()
-            if method == SGBM:
-                estimate = match_sgbm(sample)
-            else:
-                estimate = net.estimate_input(sample.input, with_check=False)
+            estimate = match_sgbm(sample) if method == SGBM else net.estimate_input(sample.input)
             wall_s = time.perf_counter() - start_s
             result = {
                 "pair": sample.input.name,
@@ -257,9 +254,7 @@ def match_wide(samples: Iterable[StereoSample], net: FakestereoNet) -> list[Resu
             max_px = None if searched == MEASURED else max(1, int(largest_px(sample) / 2))
             net.matcher.config = replace(net.matcher.config, max_disparity_px=max_px)
             last_px = last_searched_px(net, sample.input)
-            estimate, cpu_s = with_cpu_seconds(
-                lambda pair=sample.input: net.estimate_input(pair, with_check=False)
-            )
+            estimate, cpu_s = with_cpu_seconds(lambda pair=sample.input: net.estimate_input(pair))
             assert estimate.disparity_px is not None
             assert estimate.confidence is not None
             disparity_px = estimate.disparity_px[has_truth].nan_to_num(0.0)
@@ -355,7 +350,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
-    net = FakestereoNet.load(options.weights, config=MatcherConfig(speed=options.speed))
+    net = FakestereoNet.load(
+        options.weights, config=MatcherConfig(speed=options.speed), with_check=False
+    )
     if options.wide is not None:
         results = match_wide(wide_samples(options.wide, options.seed), net)
         print(format_markdown_table(pixel_rows(results)))

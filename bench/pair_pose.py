@@ -212,7 +212,7 @@ def table_scenes(number: int) -> Iterator[tuple[str, str, int, TableScene]]:
 def match_table(net: FakestereoNet, scene: TableScene) -> tuple[Tensor, Tensor, float]:
     """Match a scene; return its sure depth, the deviation of depth, and the share left out."""
     pair = StereoInput(name="table", left=scene.left, right=scene.right, camera=scene.rig)
-    estimate = net.estimate_input(pair, with_check=False)
+    estimate = net.estimate_input(pair)
     assert estimate.depth_m is not None
     assert estimate.confidence is not None
     is_sure = estimate.is_sure(MIN_CONFIDENCE)
@@ -325,7 +325,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     torch.set_num_threads(1)
-    net = FakestereoNet.load(options.weights, config=MatcherConfig(speed="fine"))
+    net = FakestereoNet.load(options.weights, config=MatcherConfig(speed="fine"), with_check=False)
     models = {name: make_part(name) for name in PARTS}
     surfaces_m = {name: sample_surface(model, SURFACE_POINTS)[0] for name, model in models.items()}
     registration = Registration(list(models.values()))

@@ -63,8 +63,8 @@ def test_an_estimator_matches_in_its_own_arithmetic() -> None:
         return torch.full(left.shape[1:], 4.0)
 
     picture = torch.rand(3, 20, 40, dtype=torch.float32)
-    net = FakestereoNet(CallableMatcher(answer))
-    found = net.estimate(picture, right=picture.roll(-4, -1), with_check=False)
+    net = FakestereoNet(CallableMatcher(answer), with_check=False)
+    found = net.estimate(picture, right=picture.roll(-4, -1))
     assert set(seen) == {(torch.float32, torch.float32)}
     assert found.disparity_px.dtype == torch.float32
 

@@ -46,9 +46,9 @@ def test_files_arrays_and_tensors_give_one_answer(street: StereoSample, tmp_path
 
 
 def test_without_a_camera_there_is_disparity_only() -> None:
-    net = FakestereoNet(CallableMatcher(lambda left, _: left.mean(0) + 5))
+    net = FakestereoNet(CallableMatcher(lambda left, _: left.mean(0) + 5), with_check=False)
     image = np.zeros((20, 30, 3), np.uint8)
-    estimate = net.estimate(image, None, right=image, with_check=False)
+    estimate = net.estimate(image, None, right=image)
     assert estimate.depth_m is None
     assert estimate.disparity_px.shape == (20, 30)
 
@@ -73,7 +73,7 @@ def _intrinsics() -> torch.Tensor:
 def test_an_unusable_pair_is_refused(
     right: torch.Tensor | None, camera: Camera | None, message: str
 ) -> None:
-    net = FakestereoNet(CallableMatcher(lambda left, _: left.mean(0)))
+    net = FakestereoNet(CallableMatcher(lambda left, _: left.mean(0)), with_check=False)
     with pytest.raises(InputError, match=message):
         net.estimate(torch.zeros(3, 20, 30), camera, right=right)
 
@@ -127,10 +127,10 @@ def test_an_estimate_is_one_readable_line() -> None:
 
 
 def test_the_rig_decides_the_metres() -> None:
-    net = FakestereoNet(CallableMatcher(lambda left, _: left.mean(0) * 0 + 3))
+    net = FakestereoNet(CallableMatcher(lambda left, _: left.mean(0) * 0 + 3), with_check=False)
     image = torch.zeros(3, 20, 30)
     rig = StereoRig(width=30, height=20, K=_intrinsics(), baseline_m=0.2)
-    estimate = net.estimate(image, rig, right=image, with_check=False)
+    estimate = net.estimate(image, rig, right=image)
     assert estimate.depth_m is not None
     assert estimate.depth_m[0, 0].item() == pytest.approx(2.0)
 
@@ -171,8 +171,8 @@ def test_views_are_moved_by_the_difference_of_their_principal_points(
         assert torch.equal(right[..., max(-columns, 0) : max(-columns, 0) + kept.shape[2]], kept)
         return left.mean(0) * 0 + 6
 
-    net = FakestereoNet(CallableMatcher(match))
-    found = net.estimate(image, apart_rig(columns), right=image, with_check=False)
+    net = FakestereoNet(CallableMatcher(match), with_check=False)
+    found = net.estimate(image, apart_rig(columns), right=image)
     assert found.disparity_px.shape == (120, 240)
     assert float(found.disparity_px.median()) == pytest.approx(6 - columns)
     assert found.depth_m is not None
@@ -181,24 +181,24 @@ def test_views_are_moved_by_the_difference_of_their_principal_points(
 
 @pytest.mark.parametrize("columns", [240, -240, 5000])
 def test_principal_points_farther_apart_than_the_images_are_refused(columns: int) -> None:
-    net = FakestereoNet(CallableMatcher(lambda left, _: left.mean(0)))
+    net = FakestereoNet(CallableMatcher(lambda left, _: left.mean(0)), with_check=False)
     image = torch.rand(3, 120, 240)
     said = rf"cx_right_minus_left_px is {columns}, and the images are 240 px wide: the two views"
     with pytest.raises(InputError, match=said):
-        net.estimate(image, apart_rig(columns), right=image, with_check=False)
+        net.estimate(image, apart_rig(columns), right=image)
 
 
 @pytest.mark.parametrize("how", ["estimate", "estimate_input", "estimate_many"])
 def test_every_way_refuses_a_pair_that_is_none_and_warns_of_doubt(how: str) -> None:
-    net = FakestereoNet(CallableMatcher(lambda left, _: left.mean(0) * 0 + 3))
-
     def estimate(left: torch.Tensor, right: torch.Tensor, *, with_check: bool) -> DepthEstimate:
+        matcher = CallableMatcher(lambda left, _: left.mean(0) * 0 + 3)
+        net = FakestereoNet(matcher, with_check=with_check)
         pair = StereoInput(name="street", left=left, right=right, camera=None)
         if how == "estimate":
-            return net.estimate(left, right=right, name="street", with_check=with_check)
+            return net.estimate(left, right=right, name="street")
         if how == "estimate_input":
-            return net.estimate_input(pair, with_check=with_check)
-        found = net.estimate_many([pair], with_check=with_check)[0]
+            return net.estimate_input(pair)
+        found = net.estimate_many([pair])[0]
         if isinstance(found, InputError):
             raise found
         return found

@@ -151,10 +151,10 @@ def small_matcher(work_focal_px: float | None = None) -> PSMNet:
 def test_one_file_serves_one_image_and_pairs(generator: UNetGenerator, tmp_path: Path) -> None:
     path = tmp_path / "both.safetensors"
     write_depth_weights(path, generator=generator, matcher=small_matcher(FOCAL_PX), facts={})
-    net = FakestereoNet.load(path)
+    net = FakestereoNet.load(path, with_check=False)
     image = torch.rand(3, 40, 60)
     alone = net.estimate(image, camera(60, 40, 100.0))
-    pair = net.estimate(image, camera(60, 40, 100.0, 0.2), right=image, with_check=False)
+    pair = net.estimate(image, camera(60, 40, 100.0, 0.2), right=image)
     for estimate in (alone, pair):
         assert estimate.disparity_px.shape == (40, 60)
         assert estimate.confidence is not None
@@ -168,7 +168,7 @@ def test_pairs_are_matched_at_the_focal_length_of_the_weights(
     sizes: list[tuple[int, int]] = []
     path = tmp_path / "both.safetensors"
     write_depth_weights(path, generator=generator, matcher=small_matcher(50.0), facts={})
-    net = FakestereoNet.load(path)
+    net = FakestereoNet.load(path, with_check=False)
     assert net.matcher is not None
     assert isinstance(net.matcher, PSMNetMatcher)
     work_size = net.matcher.work_size
@@ -179,7 +179,7 @@ def test_pairs_are_matched_at_the_focal_length_of_the_weights(
 
     net.matcher.work_size = spy  # pyright: ignore[reportAttributeAccessIssue]
     image = torch.rand(3, 40, 60)
-    net.estimate(image, camera(60, 40, 100.0, 0.2), right=image, with_check=False)
+    net.estimate(image, camera(60, 40, 100.0, 0.2), right=image)
     net.estimate(image, camera(60, 40, 100.0))
     assert sizes == [(40, 60), (48, 72)]
 
@@ -248,14 +248,14 @@ def test_among_many_a_pair_is_matched_with_its_right_view(
 ) -> None:
     path = tmp_path / "both.safetensors"
     write_depth_weights(path, generator=generator, matcher=small_matcher(FOCAL_PX), facts={})
-    net = FakestereoNet.load(path)
+    net = FakestereoNet.load(path, with_check=False)
     left, right = torch.rand(2, 3, 40, 60, generator=torch.Generator().manual_seed(0))
     rig = camera(60, 40, 100.0, baseline_m=0.2)
     alone = StereoInput(name="alone", left=left, right=None, camera=rig)
     pair = StereoInput(name="pair", left=left, right=right, camera=rig)
-    many = each_of(net, [alone, pair, pair, alone], with_check=False, batch=4)
+    many = each_of(net, [alone, pair, pair, alone], batch=4)
     for given, found in zip([alone, pair, pair, alone], many, strict=True):
-        one = net.estimate_input(given, with_check=False)
+        one = net.estimate_input(given)
         torch.testing.assert_close(found.disparity_px, one.disparity_px, rtol=1e-4, atol=1e-4)
         assert (found.right is None) == (given.right is not None)
 

@@ -104,9 +104,9 @@ def test_black_borders_say_nothing_about_a_pair() -> None:
 @pytest.mark.parametrize(("near_px", "far_px"), [(40, 10), (260, 180), (200, 24)])
 def test_a_pair_is_matched_wherever_its_disparities_lie(near_px: int, far_px: int) -> None:
     left, right, truth_px = planes(near_px, far_px, width=640)
-    net = FakestereoNet(matcher())
+    net = FakestereoNet(matcher(), with_check=False)
     pair = StereoInput(name="planes", left=left, right=right, camera=None)
-    found = net.estimate_input(pair, with_check=False)
+    found = net.estimate_input(pair)
     is_seen = truth_px <= torch.arange(640)
     is_seen[:, :320] &= torch.arange(320) >= far_px
     # The wall is hidden beside the strip where the right view sees the strip.
@@ -151,9 +151,9 @@ def test_a_search_takes_no_more_memory_than_usual() -> None:
 @needs_weights
 def test_what_lies_beyond_the_search_is_named_and_has_no_confidence() -> None:
     left, right, truth_px = planes(250, 16, width=640)
-    net = FakestereoNet(matcher(60.0))
+    net = FakestereoNet(matcher(60.0), with_check=False)
     pair = StereoInput(name="planes", left=left, right=right, camera=rig(640))
-    found = net.estimate_input(pair, with_check=False)
+    found = net.estimate_input(pair)
     # At the camera's usual size a search holds more than what was asked for, but not 250 px.
     assert "disparities beyond" in found.warning
     assert "--max-disparity" in found.warning
@@ -240,10 +240,10 @@ def test_views_are_moved_and_their_match_moved_back(first_px: int) -> None:
 def test_principal_points_apart_move_the_search() -> None:
     """Infinity of such a rig has a negative disparity."""
     left, right, truth_px = planes(20, -25, width=320)
-    net = FakestereoNet(matcher())
+    net = FakestereoNet(matcher(), with_check=False)
     camera: Camera = rig(320, apart_px=30.0)
     pair = StereoInput(name="apart", left=left, right=right, camera=camera)
-    found = net.estimate_input(pair, with_check=False)
+    found = net.estimate_input(pair)
     is_wall = truth_px < 0
     is_wall[:, 110:160] = False
     is_wall[:, 290:] = False

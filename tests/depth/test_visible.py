@@ -123,10 +123,8 @@ def rig() -> StereoRig:
 def test_a_pair_has_no_depth_where_there_is_no_picture(change: Callable[[Tensor], Tensor]) -> None:
     scene = torch.nn.functional.pad(noise(), (8, 0, 0, 0))
     left, right = change(scene[..., :W]), change(scene[..., 8:])
-    net = FakestereoNet(CallableMatcher(lambda *_: torch.full((H, W), 8.0)))
-    found = net.estimate_input(
-        StereoInput(name="x", left=left, right=right, camera=rig()), with_check=False
-    )
+    net = FakestereoNet(CallableMatcher(lambda *_: torch.full((H, W), 8.0)), with_check=False)
+    found = net.estimate_input(StereoInput(name="x", left=left, right=right, camera=rig()))
     blank = find_blank_borders(left)
     assert found.depth_m is not None
     assert bool(found.depth_m[blank].isnan().all())

@@ -119,8 +119,8 @@ def _try_depth() -> str:
     scene = scene.clamp(0, 1)
     left = scene[..., :-_SHIFT_PX]
     right = scene[..., _SHIFT_PX:]
-    net = FakestereoNet.load("default")
-    estimate = net.estimate(left, None, right=right, with_check=False)
+    net = FakestereoNet.load("default", with_check=False)
+    estimate = net.estimate(left, None, right=right)
     # The first columns of the left view are not in the right one; they and as many beside them are
     # left out.
     median_px = float(estimate.disparity_px[:, 2 * _SHIFT_PX :].median())

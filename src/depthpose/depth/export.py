@@ -112,7 +112,7 @@ def _make_pair_cases(weights: DepthWeights) -> Iterator[Case]:
     matcher = make_matcher(weights.matcher, _QUICK)
     if isinstance(matcher, NetworkMatcher):
         matcher.finds_range = False  # as in a graph
-    net = FakestereoNet(matcher)
+    net = FakestereoNet(matcher, with_check=False)
     outputs = ["disparity_px", "confidence"]
     has_sky = getattr(weights.matcher.config, "with_sky", False)
     if has_sky:
@@ -130,7 +130,7 @@ def _make_pair_cases(weights: DepthWeights) -> Iterator[Case]:
             StereoInput(name="case", left=left_view, right=right_view, camera=rig)
             for left_view, right_view in zip(left, right, strict=True)
         )
-        estimates = [net.estimate_input(pair, with_check=False) for pair in pairs]
+        estimates = [net.estimate_input(pair) for pair in pairs]
         yield _make_case(inputs, estimates, outputs)
 
 

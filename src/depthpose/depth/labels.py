@@ -16,7 +16,7 @@ from depthpose.core.run_folder import claim_folder, claim_names, is_whole, note_
 from depthpose.depth.config import Settings
 from depthpose.depth.datasets import Dataset
 from depthpose.depth.disparity import warp_right_to_left
-from depthpose.depth.estimator import FakestereoNet, refuse_unrectified
+from depthpose.depth.estimator import FakestereoNet, check_pair
 from depthpose.depth.types import Map, StereoInput
 
 
@@ -87,7 +87,7 @@ def label_pairs(
             continue
         try:
             pair = dataset.read_input(index)
-            refuse_unrectified(pair)
+            check_pair(pair)
             labelled_px = label_pair(net, pair, config)
         except InputError as error:
             _keep_or_raise(error, failures)
@@ -135,8 +135,8 @@ def label_pair(net: FakestereoNet, pair: StereoInput, config: LabelConfig) -> Ma
     """
     assert pair.right is not None
     mirrored = replace(pair, left=pair.right.flip(-1), right=pair.left.flip(-1))
-    estimate = net.estimate_input(pair, with_check=False)
-    mirrored_estimate = net.estimate_input(mirrored, with_check=False)
+    estimate = net.estimate_input(pair)
+    mirrored_estimate = net.estimate_input(mirrored)
 
     left_px = estimate.disparity_px
     right_px = mirrored_estimate.disparity_px.flip(-1)

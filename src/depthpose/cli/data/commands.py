@@ -131,7 +131,7 @@ def label_dataset(
     # A pair that fails is named at the end and stops no other; the only pair ends the command.
     failures: list[InputError] = []
     collected = failures if len(dataset) > 1 else None
-    net = FakestereoNet.load(weights, config=MatcherConfig(device=device))
+    net = FakestereoNet.load(weights, config=MatcherConfig(device=device), with_check=False)
     labelled = label_pairs(net, dataset, config, out, settings, failures=collected)
     shown = tqdm(labelled, unit=" pairs", leave=False, disable=None)
     shares = [labelled_share for _, labelled_share in shown]

@@ -128,7 +128,7 @@ def match_pairs(
         with_left_right_check=matching.left_right_check,
         max_disparity_px=matching.max_disparity,
     )
-    spec = make_pair_spec(pairs.matcher, pairs.weights, config)
+    spec = make_pair_spec(pairs.matcher, pairs.weights, config, with_check=pairs.check)
 
     # By workers of a cluster, to which the weights travel.
     if engine.engine == "ray":
@@ -138,7 +138,7 @@ def match_pairs(
         with inputs.open_first() as first_pair:
             rig = read_rig(camera, image_size(first_pair[0]))
         reader = InputReader(camera=rig, files=PAIRS)
-        worker = DepthWorker(spec=packed, reader=reader, output=output, with_check=pairs.check)
+        worker = DepthWorker(spec=packed, reader=reader, output=output)
         return predict_depth_on_ray(inputs, worker, out, engine)
 
     # In this process.
@@ -148,9 +148,7 @@ def match_pairs(
     refuse_among_inputs(Path(out), (left, right), [path for pair in files for path in pair])
     rig = read_rig(camera, image_size(files[0][0]))
     reader = InputReader(camera=rig, files=PAIRS)
-    return predict_depth_of_files(
-        files, spec.build(), reader, output, Path(out), with_check=pairs.check
-    )
+    return predict_depth_of_files(files, spec.build(), reader, output, Path(out))
 
 
 def evaluate_depth(

@@ -4,7 +4,7 @@ import hashlib
 import sys
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any, cast, get_args
@@ -22,7 +22,6 @@ from depthpose.core.runner import Job
 from depthpose.depth.baselines import NearestImageBaseline, RowDepthBaseline
 from depthpose.depth.config import Answer, BaselineName, MatcherConfig, Speed
 from depthpose.depth.datasets import Dataset, join_datasets, open_dataset, refuse_shared_frames
-from depthpose.depth.estimator import FakestereoNet
 from depthpose.depth.evaluate import (
     Evaluation,
     EvaluationRow,
@@ -35,7 +34,7 @@ from depthpose.depth.evaluate import (
 from depthpose.depth.metrics import METRICS, RANKING
 from depthpose.depth.predictions import estimate_missing_depth, is_finished
 from depthpose.depth.protocols import PROTOCOLS, Protocol, has_truth
-from depthpose.depth.types import DepthEstimate, StereoInput
+from depthpose.depth.types import StereoInput
 from depthpose.report import page
 from depthpose.report.depth import make_depth_section
 from depthpose.report.page import Section
@@ -81,10 +80,7 @@ def predict_depth_of_dataset(
     for index in process.share_of(usable):
         read = partial(_read_views, dataset, index, with_right=method.with_right)
         jobs.append(Job(name=dataset.frames[index].name, read=read))
-    estimator = method.estimator
-    if isinstance(estimator, FakestereoNet):
-        estimator = _UncheckedNet(estimator)
-    names = estimate_missing_depth(estimator, jobs, method_folder, method.settings, sources)
+    names = estimate_missing_depth(method.estimator, jobs, method_folder, method.settings, sources)
     for _ in tqdm(names, method.name, total=len(jobs), disable=None, unit=" frames"):
         pass  # each frame is estimated and written as its name is asked for
     if process.rank == 0:
@@ -96,17 +92,6 @@ def _read_views(dataset: Dataset, index: int, *, with_right: bool) -> StereoInpu
     """Read the views of a frame that a method may see: of depth of one image the left alone."""
     pair = dataset.read_input(index)
     return pair if with_right else replace(pair, right=None)
-
-
-@dataclass(frozen=True)
-class _UncheckedNet:
-    """A network that refuses no pair, since a measurement counts all of them."""
-
-    net: FakestereoNet
-
-    def estimate_input(self, pair: StereoInput, /) -> DepthEstimate:
-        """Estimate depth of one input without a check of the pair."""
-        return self.net.estimate_input(pair, with_check=False)
 
 
 def choose_methods(

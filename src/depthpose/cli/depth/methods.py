@@ -32,15 +32,17 @@ class SGBMSpec:
     """The settings from which OpenCV's matcher of pairs, StereoSGBM, is built; it has no weights.
 
     ``with_filled_holes``: pixels without a match get the disparity of their neighbours.
+    ``with_check``: as of :class:`DepthNetworkSpec`.
     """
 
     with_filled_holes: bool = False
+    with_check: bool = False
 
     def build(self) -> DepthMethod:
         """Build the matcher, with the settings of our tables."""
         config = SGBMConfig(with_filled_holes=self.with_filled_holes)
         name = "sgbm-filled" if self.with_filled_holes else "sgbm"
-        net = FakestereoNet.load(matcher="sgbm", config=config)
+        net = FakestereoNet.load(matcher="sgbm", config=config, with_check=self.with_check)
         return DepthMethod(name, net, {"matcher": "sgbm", **asdict(config)})
 
     def with_packed_weights(self) -> "SGBMSpec":
@@ -56,7 +58,9 @@ class DepthNetworkSpec:
     config: MatcherConfig  #: how the networks run
     with_right: bool | None = None  #: they take the real right view; None: only a matcher does
     matcher: str | None = None  #: of the synthesised view: other weights, or sgbm; None: their own
-    allow_ood: bool = True  #: answer out-of-distribution images too, as a measurement must
+    # A measurement counts all images and pairs, so nothing is refused by default.
+    allow_ood: bool = True  #: answer out-of-distribution images too
+    with_check: bool = False  #: refuse pairs that are swapped, not rectified or no pair
     answer: Answer | None = None  #: where depth of one image comes from; None: as the weights say
     use: Use | None = None  #: build only the networks that images, or pairs, need; None: all
 
@@ -114,6 +118,7 @@ class DepthNetworkSpec:
             config=config,
             answer=answer,
             allow_ood=self.allow_ood,
+            with_check=self.with_check,
             use=self.use,
         )
         if with_right and net.matcher is None:
@@ -148,17 +153,26 @@ class DepthNetworkSpec:
 DepthMethodSpec = SGBMSpec | DepthNetworkSpec
 
 
-def make_pair_spec(matcher: str | None, weights: str, config: MatcherConfig) -> DepthMethodSpec:
+def make_pair_spec(
+    matcher: str | None, weights: str, config: MatcherConfig, *, with_check: bool = True
+) -> DepthMethodSpec:
     """Make the spec of what matches real pairs.
 
     Args:
         matcher: sgbm, or weights with a matcher; None: the matcher of ``weights``.
         weights: name or file of weights.
         config: how networks run.
+        with_check: refuse pairs that are swapped, not rectified or no pair.
     """
     if matcher == "sgbm":
-        return SGBMSpec()
-    return DepthNetworkSpec(weights=matcher or weights, config=config, with_right=True, use="pairs")
+        return SGBMSpec(with_check=with_check)
+    return DepthNetworkSpec(
+        weights=matcher or weights,
+        config=config,
+        with_right=True,
+        with_check=with_check,
+        use="pairs",
+    )
 
 
 def settings_on_workers(spec: DepthMethodSpec) -> dict[str, Any]:

@@ -41,8 +41,6 @@ def predict_depth_of_files(
     reader: InputReader,
     output: PredictOutput,
     out: Path,
-    *,
-    with_check: bool = True,
 ) -> int:
     """Estimate what is not finished, write files, page and failures, and return the exit code.
 
@@ -55,7 +53,6 @@ def predict_depth_of_files(
         reader: reads them.
         output: which files are written.
         out: folder of the results.
-        with_check: refuse pairs that are swapped, not rectified or no pair.
 
     Raises:
         InputError: ``out`` holds results of other settings or inputs, the only input failed, or
@@ -81,7 +78,6 @@ def predict_depth_of_files(
         method=method,
         reader=reader,
         output=output,
-        with_check=with_check,
         out=out,
         is_shared=process.world > 1,
     )
@@ -190,15 +186,13 @@ def _name_video_file(video: Path) -> str:
 class DepthPredictor:
     """Estimates depth of inputs, writes the results to a folder, and collects the failures.
 
-    ``with_check``: refuse pairs that are swapped, not rectified or no pair. ``is_shared``: other
-    processes write to the folder too. ``failures``: by the names of images, pairs and frames, and
-    of whole videos.
+    ``is_shared``: other processes write to the folder too. ``failures``: by the names of images,
+    pairs and frames, and of whole videos.
     """
 
     method: DepthMethod
     reader: InputReader
     output: PredictOutput
-    with_check: bool = True
     out: Path
     is_shared: bool = False
     failures: dict[str, InputError] = field(default_factory=dict)
@@ -249,7 +243,7 @@ class DepthPredictor:
         net = self.method.estimator
         assert isinstance(net, FakestereoNet), "weights build no other"
         named_inputs = [(depth_input.name, depth_input) for depth_input in inputs]
-        estimates = net.estimate_batch(named_inputs, with_check=self.with_check, mount=mount)
+        estimates = net.estimate_batch(named_inputs, mount=mount)
         if self.reader.scale.known_distance is None:
             return estimates
         return [
@@ -321,15 +315,11 @@ class DepthPredictor:
 
 @dataclass(frozen=True, kw_only=True)
 class DepthWorker:
-    """The estimation of depth by a worker of an engine, to which this is sent.
-
-    ``with_check``: refuse pairs that are swapped, not rectified or no pair.
-    """
+    """The estimation of depth by a worker of an engine, to which this is sent."""
 
     spec: DepthMethodSpec
     reader: InputReader
     output: PredictOutput
-    with_check: bool = True
 
     def make_writer(self) -> ResultWriter:
         """Build the estimator, and return the function that estimates a batch of inputs."""
@@ -343,7 +333,6 @@ class DepthWorker:
             method=method,
             reader=self.reader,
             output=self.output,
-            with_check=self.with_check,
             out=out,
         )
         jobs: list[Job[StereoInput]] = []

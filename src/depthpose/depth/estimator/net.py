@@ -165,6 +165,8 @@ class FakestereoNet:
         weights: name of the weights, for ``repr``.
         allow_ood: estimate images that are out of distribution for the weights too, with a
             ``warning`` in the estimate; else they are refused.
+        with_check: refuse pairs whose images show that they are swapped, not rectified or no pair;
+            where that is uncertain, the estimate has a ``warning``.
     """
 
     def __init__(
@@ -175,6 +177,7 @@ class FakestereoNet:
         terms: str = "",
         weights: str = "",
         allow_ood: bool = False,
+        with_check: bool = True,
     ) -> None:
         if matcher is None and (synthesiser is None or synthesiser.config.answer != "own"):
             raise InputError(
@@ -190,6 +193,7 @@ class FakestereoNet:
         self.synthesiser = synthesiser
         self.terms = terms
         self.allow_ood = allow_ood
+        self.with_check = with_check
         self.weights = weights
 
     def __repr__(self) -> str:
@@ -212,6 +216,7 @@ class FakestereoNet:
         config: MatcherConfig | SGBMConfig | None = None,
         answer: Answer | None = None,
         allow_ood: bool = False,
+        with_check: bool = True,
         use: Use | None = None,
     ) -> "FakestereoNet":
         """Build an estimator from weights, by file, folder, name or ``hf://OWNER/NAME``.
@@ -228,6 +233,7 @@ class FakestereoNet:
             answer: where depth of one image comes from, in place of what the weights say
                 (:class:`~depthpose.depth.config.SelectionConfig`).
             allow_ood: estimate images unlike what the weights know too, with a ``warning``.
+            with_check: refuse pairs that are swapped, not rectified or no pair, by their images.
             use: ``images`` or ``pairs``: build only the networks that these take, which is quicker.
                 None: all.
 
@@ -260,7 +266,14 @@ class FakestereoNet:
             run_config = config if isinstance(config, MatcherConfig) else MatcherConfig()
             synthesiser = make_synthesiser(generator, run_config.device, run_config.speed)
         names = " + ".join(name for name, _ in loaded_files)
-        return cls(chosen_matcher, synthesiser, terms=terms, weights=names, allow_ood=allow_ood)
+        return cls(
+            chosen_matcher,
+            synthesiser,
+            terms=terms,
+            weights=names,
+            allow_ood=allow_ood,
+            with_check=with_check,
+        )
 
     from_pretrained = load
     """The same as :meth:`load`."""
@@ -277,7 +290,6 @@ class FakestereoNet:
         known_distance: tuple[float, float, float] | None = None,
         mount: MountFilter | None = None,
         name: str | None = None,
-        with_check: bool = True,
     ) -> DepthEstimate:
         """Estimate depth of ``image``, alone or as the left one of a rectified pair.
 
@@ -298,8 +310,6 @@ class FakestereoNet:
             mount: the same for all frames of one camera on one vehicle, taken in order: holds its
                 height and smooths its tilt.
             name: name of the input in errors; by default that of the file.
-            with_check: check first that both images show one scene, rectified and in the right
-                order; where that is uncertain, the estimate has a ``warning``.
 
         Raises:
             InputError: a file that cannot be read, sizes that disagree, a camera without what is
@@ -315,30 +325,25 @@ class FakestereoNet:
             if known_distance is not None:
                 raise InputError(f"{name}: a pair has metres of its own; omit known_distance")
 
-        estimate = self.estimate_input(pair, with_check=with_check, mount=mount)
+        estimate = self.estimate_input(pair, mount=mount)
         if known_distance is None:
             return estimate
         return scale_by_distance(estimate, name, known_distance)
 
     @force_float32()
     def estimate_input(
-        self,
-        depth_input: StereoInput,
-        *,
-        with_check: bool = True,
-        mount: MountFilter | None = None,
+        self, depth_input: StereoInput, *, mount: MountFilter | None = None
     ) -> DepthEstimate:
         """Estimate depth of one input whose images are read already, as :meth:`estimate` does.
 
         Args:
             depth_input: one image, or a pair.
-            with_check: of a pair, as for :meth:`estimate`.
             mount: of one image, as for :meth:`estimate`.
 
         Raises:
             InputError: as :meth:`estimate`.
         """
-        return self._estimate_in_groups([depth_input], with_check=with_check, mount=mount)[0]
+        return self._estimate_in_groups([depth_input], mount)[0]
 
     @force_float32()
     def estimate_many(
@@ -348,7 +353,6 @@ class FakestereoNet:
         *,
         focal_px: float | None = None,
         fov_deg: float | None = None,
-        with_check: bool = True,
         batch: int = 1,
         threads: int = 1,
         with_progress: bool = False,
@@ -363,7 +367,6 @@ class FakestereoNet:
             camera: camera of the pictures, as for :meth:`estimate`; inputs have their own.
             focal_px: the focal length alone [px], in place of ``camera``.
             fov_deg: the horizontal field of view alone [degrees], in place of both.
-            with_check: of pairs, as for :meth:`estimate`.
             batch: how many successive images of one size go through the networks together: more
                 are faster on a GPU, slower on a processor.
             threads: how many batches run at the same time, in as many times the memory.
@@ -386,7 +389,7 @@ class FakestereoNet:
         total = len(sequence) if isinstance(sequence, Sized) else None
 
         estimates: list[DepthEstimate | InputError] = []
-        estimate = partial(self.estimate_batch, lens=lens, with_check=with_check)
+        estimate = partial(self.estimate_batch, lens=lens)
         batches = _yield_named_batches(sequence, batch)
         with tqdm(total=total, unit=" images", disable=not with_progress) as bar:
             for estimates_of_batch in map_in_threads(estimate, batches, threads):
@@ -400,7 +403,6 @@ class FakestereoNet:
         named: Sequence[tuple[str, object]],
         lens: AnyLens | None = None,
         *,
-        with_check: bool = True,
         mount: MountFilter | None = None,
     ) -> list[DepthEstimate | InputError]:
         """Estimate a batch at once; where that fails, each image by itself, so that others succeed.
@@ -408,7 +410,6 @@ class FakestereoNet:
         Args:
             named: names and inputs, or pictures.
             lens: camera of the pictures, as for :meth:`estimate_many`.
-            with_check: of pairs, as for :meth:`estimate`.
             mount: as for :meth:`estimate`; the images are its frames, in order.
 
         Returns:
@@ -420,7 +421,7 @@ class FakestereoNet:
                 image if isinstance(image, StereoInput) else as_input(image, name, lens)
                 for name, image in named
             ]
-            return [*self._estimate_in_groups(inputs, with_check=with_check, mount=mount)]
+            return [*self._estimate_in_groups(inputs, mount)]
         except InputError as error:
             if len(named) == 1:
                 return [error]
@@ -430,13 +431,11 @@ class FakestereoNet:
             mount.last = last_mount
         estimates: list[DepthEstimate | InputError] = []
         for named_image in named:
-            estimates += self.estimate_batch(
-                [named_image], lens, with_check=with_check, mount=mount
-            )
+            estimates += self.estimate_batch([named_image], lens, mount=mount)
         return estimates
 
     def _estimate_in_groups(
-        self, inputs: Sequence[StereoInput], *, with_check: bool, mount: MountFilter | None
+        self, inputs: Sequence[StereoInput], mount: MountFilter | None
     ) -> list[DepthEstimate]:
         """Estimate inputs in order: pairs one by one, single images of one virtual size together.
 
@@ -452,9 +451,7 @@ class FakestereoNet:
         for sizes, group in groupby(sized, key=itemgetter(0)):
             group_inputs = [depth_input for _, depth_input in group]
             if sizes is None:
-                estimates += [
-                    self._estimate_pair(pair, with_check=with_check) for pair in group_inputs
-                ]
+                estimates += [self._estimate_pair(pair) for pair in group_inputs]
                 continue
             assert self.synthesiser is not None, "virtual_sizes checked it"
             estimates += depth_from_images(
@@ -467,7 +464,7 @@ class FakestereoNet:
             )
         return estimates
 
-    def _estimate_pair(self, pair: StereoInput, *, with_check: bool) -> DepthEstimate:
+    def _estimate_pair(self, pair: StereoInput) -> DepthEstimate:
         """Estimate a pair by the matcher.
 
         Raises:
@@ -480,7 +477,7 @@ class FakestereoNet:
                 "'depthpose weights pack G --matcher S --trained-on DATA --licence L --out W' "
                 "makes one file of both."
             )
-        return depth_from_pair(self.matcher, pair, with_check=with_check)
+        return depth_from_pair(self.matcher, pair, with_check=self.with_check)
 
     def virtual_sizes(self, image: StereoInput) -> list[tuple[int, int]]:
         """Compute the sizes (rows, columns) at which the generator sees one image.

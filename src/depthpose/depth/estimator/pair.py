@@ -35,16 +35,16 @@ def depth_from_pair(
             pair first, and matches within their range; the estimate's ``warning`` names what lies
             beyond it. Any other matcher searches from 0 px upwards.
         pair: the images, and their rig where it is known.
-        with_check: as for :func:`refuse_unrectified`.
+        with_check: as for :func:`check_pair`.
 
     Returns:
         Depth, disparity and confidence of the left view.
 
     Raises:
-        InputError: what :func:`refuse_unrectified` refuses, principal points farther apart than
+        InputError: what :func:`check_pair` refuses, principal points farther apart than
             the images are wide, or too little memory.
     """
-    warning = refuse_unrectified(pair, with_check=with_check)
+    warning = check_pair(pair, with_check=with_check)
     cx_difference_px = _read_cx_difference_px(pair)
     with refused_memory(pair.name):
         if isinstance(matcher, NetworkMatcher) and matcher.finds_range:
@@ -55,7 +55,7 @@ def depth_from_pair(
         return estimate_from_pair(pair, match, warning)
 
 
-def refuse_unrectified(pair: StereoInput, *, with_check: bool = True) -> str:
+def check_pair(pair: StereoInput, *, with_check: bool = True) -> str:
     """Refuse two images that are no rectified pair; return a warning where that is uncertain.
 
     Args:
@@ -98,8 +98,8 @@ def refuse_unrectified(pair: StereoInput, *, with_check: bool = True) -> str:
     report = check_rectified(pair.left, pair.right, cx_difference_px)
     if report.is_wrong:
         raise InputError(
-            f"{pair.name}: {report.message} (--no-check, in Python with_check=False, matches them "
-            "all the same.)"
+            f"{pair.name}: {report.message} (--no-check, in Python load(..., "
+            "with_check=False), matches them all the same.)"
         )
     return report.message if report.is_rectified is None else ""
 

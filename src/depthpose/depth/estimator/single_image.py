@@ -92,7 +92,9 @@ def depth_before_mount(
             estimate = estimate_from_virtual(image, synthesiser.config, match, views.right[index])
             image_confidence = _estimate_image_confidence(views, index)
             if image_confidence is not None:
-                warning = _refuse_ood(synthesiser, image.name, image_confidence, allow_ood)
+                warning = _check_in_distribution(
+                    synthesiser, image.name, image_confidence, allow_ood
+                )
                 estimate = replace(estimate, image_confidence=image_confidence, warning=warning)
             estimates.append(estimate)
     return estimates
@@ -169,7 +171,7 @@ def _estimate_image_confidence(views: SynthesisedViews, index: int) -> float | N
     return None
 
 
-def _refuse_ood(
+def _check_in_distribution(
     synthesiser: Synthesiser, name: str, image_confidence: float, allow_ood: bool
 ) -> str:
     """Refuse an image that is out of distribution for the weights, or warn of it.
