@@ -28,9 +28,9 @@ from depthpose.pose.geometry.surface import prepare_surface
 from depthpose.pose.inputs import view_input
 from depthpose.pose.mesh import make_model
 from depthpose.pose.metrics import add_m
+from depthpose.pose.pipeline import register
 from depthpose.pose.propose.image import propose_in_frame, score_by_image
 from depthpose.pose.propose.point_pairs import prepare_pairs
-from depthpose.pose.register import register
 from depthpose.pose.registration import Registration
 from depthpose.pose.search import SearchTargets, find_objects
 from depthpose.pose.synthetic.parts import make_part

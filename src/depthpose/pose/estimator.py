@@ -31,7 +31,7 @@ from depthpose.pose.inputs import (
     split_instances,
     view_input,
 )
-from depthpose.pose.register import register
+from depthpose.pose.pipeline import register
 from depthpose.pose.search import SearchTargets, find_objects
 from depthpose.pose.track import TrackedObject, track
 from depthpose.pose.types import CloudInput, ObjectModel, PoseEstimate, Refusal, ViewInput

@@ -31,8 +31,8 @@ from depthpose.pose.estimator import PoseEstimator, unreadable_on_error
 from depthpose.pose.geometry.grid import VoxelGrid, sample_and_voxelise
 from depthpose.pose.icp import BestStart, RefinedPose, refine_best
 from depthpose.pose.networks.baselines import DepthCrop, DepthImageNet, cut_depth, make_poses
+from depthpose.pose.pipeline import judge, propose_by_pairs
 from depthpose.pose.propose import fit_poses, meet_lines, vote_ransac
-from depthpose.pose.register import judge, propose_by_pairs
 from depthpose.pose.types import (
     AnyInput,
     PoseEstimate,

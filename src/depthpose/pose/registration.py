@@ -1,6 +1,6 @@
 """Registration: poses of objects from their models alone, without training.
 
-The steps by which an object is posed are those of :mod:`depthpose.pose.register`.
+The steps by which an object is posed are those of :mod:`depthpose.pose.pipeline`.
 """
 
 from collections.abc import Mapping, Sequence

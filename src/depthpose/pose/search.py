@@ -26,8 +26,8 @@ from depthpose.pose.footprint import crop_to_region, explained_frame_mask, why_b
 from depthpose.pose.frame import Frame, prepare_frame
 from depthpose.pose.icp import refine_roughly
 from depthpose.pose.picking import rank_picks
+from depthpose.pose.pipeline import register
 from depthpose.pose.propose.image import propose_in_frame
-from depthpose.pose.register import register
 from depthpose.pose.types import CloudInput, Evidence, PoseEstimate, ViewInput
 from depthpose.pose.verify.decide import (
     LEAST_SHARE,
