@@ -8,8 +8,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, Int64
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
@@ -376,19 +374,22 @@ def _is_on_bent_plane(
         is_parallel: readings whose normals are parallel to the plane's; no others are marked.
         noise_per_m2: as in :class:`Frame`.
     """
-    off_m = points_m @ plane.normal - plane.offset_m
-    x, y = (points_m[..., :2] / points_m[..., 2:].clamp(min=1e-6)).unbind(-1)
+    parallel_m = points_m[is_parallel]
+    off_m = parallel_m @ plane.normal - plane.offset_m
+    x, y = (parallel_m[:, :2] / parallel_m[:, 2:].clamp(min=1e-6)).unbind(-1)
     terms = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], -1)
-    tolerance_m = plane_tolerance_m(points_m[..., 2], noise_per_m2)
-    is_on_bend = is_near & is_parallel
+    tolerance_m = plane_tolerance_m(parallel_m[:, 2], noise_per_m2)
+    is_on = is_near[is_parallel]
     for _ in range(_BEND_REFITS):
-        A = take_evenly(terms[is_on_bend], _SAMPLE)
-        b = take_evenly(off_m[is_on_bend], _SAMPLE)
+        A = take_evenly(terms[is_on], _SAMPLE)
+        b = take_evenly(off_m[is_on], _SAMPLE)
         if len(b) < _LEAST_POINTS:
             break
         coefficients = torch.linalg.lstsq(A, b[:, None]).solution
-        bend_m = (terms @ coefficients)[..., 0]
-        is_on_bend = is_parallel & ((off_m - bend_m).abs() < tolerance_m)
+        bend_m = (terms @ coefficients)[:, 0]
+        is_on = (off_m - bend_m).abs() < tolerance_m
+    is_on_bend = torch.zeros_like(is_parallel)
+    is_on_bend[is_parallel] = is_on
     return is_on_bend
 
 
@@ -516,30 +517,50 @@ def is_on_plane(
 
 
 def label_regions(
-    depth_m: Float[Tensor, "h w"], is_counted: Bool[Tensor, "h w"]
+    depth_m: Float64[Tensor, "h w"], is_counted: Bool[Tensor, "h w"]
 ) -> Int64[Tensor, "h w"]:
-    """Label the connected regions of the marked pixels.
+    """Label the connected regions of the marked pixels, each by the index of one of its pixels.
 
     Neighbours, diagonal ones too, are connected where their depth does not jump. Each pixel that is
     not marked is a region of its own.
     """
+    label = _label_regions(array_of(depth_m), array_of(is_counted))
+    return torch.from_numpy(label).reshape(depth_m.shape)
+
+
+@compiled
+def _label_regions(
+    depth_m: Float64[np.ndarray, "h w"], is_counted: Bool[np.ndarray, "h w"]
+) -> Int64[np.ndarray, " pixels"]:
+    """Do as :func:`label_regions`, by union-find: a pixel points toward the root of its region."""
     height, width = depth_m.shape
-    index = torch.arange(height * width).reshape(height, width)
-    starts, ends = [], []  # of the edges between connected pixels
-    for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        # Each pixel, and its neighbour so many rows down and columns to the right.
-        first = slice(height - down), slice(max(0, -right), width - max(0, right))
-        second = slice(down, None), slice(max(0, right), width - max(0, -right))
-        first_m = depth_m[first]
-        second_m = depth_m[second]
-        jump_m = _JUMP_M + _JUMP_PER_M * torch.minimum(first_m, second_m)
-        is_joined = (first_m - second_m).abs() < jump_m
-        is_joined &= is_counted[first] & is_counted[second]
-        starts.append(index[first][is_joined])
-        ends.append(index[second][is_joined])
-    a = torch.cat(starts).numpy()
-    b = torch.cat(ends).numpy()
-    size = height * width
-    graph = coo_matrix((np.ones(len(a), np.int8), (a, b)), shape=(size, size))
-    _, label = connected_components(graph, directed=False)
-    return torch.from_numpy(label).long().reshape(height, width)
+    parent = np.arange(height * width)
+    for row in range(height):
+        for column in range(width):
+            if not is_counted[row, column]:
+                continue
+            # The neighbours before it: above on the left, above, above on the right, on the left.
+            for neighbour in range(4):
+                other_row = row - 1 if neighbour < 3 else row
+                other_column = column - 1 + neighbour if neighbour < 3 else column - 1
+                if other_row < 0 or other_column < 0 or other_column >= width:
+                    continue
+                if not is_counted[other_row, other_column]:
+                    continue
+                here_m = depth_m[row, column]
+                there_m = depth_m[other_row, other_column]
+                if abs(here_m - there_m) < _JUMP_M + _JUMP_PER_M * min(here_m, there_m):
+                    root = _find_root(parent, row * width + column)
+                    parent[root] = _find_root(parent, other_row * width + other_column)
+    for pixel in range(len(parent)):
+        parent[pixel] = _find_root(parent, pixel)
+    return parent
+
+
+@compiled
+def _find_root(parent: Int64[np.ndarray, " pixels"], pixel: int) -> int:
+    """Find the root of a pixel's region, and halve the path to it."""
+    while parent[pixel] != pixel:
+        parent[pixel] = parent[parent[pixel]]
+        pixel = parent[pixel]
+    return pixel
