@@ -2,6 +2,7 @@
 
 import threading
 import time
+import warnings
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from depthpose.core.camera import Camera
 from depthpose.core.errors import InputError
 from depthpose.core.rigid import Rigid, perturb, rotation_by
 from depthpose.pose.types import PoseEstimate
@@ -137,7 +139,10 @@ def test_the_camera_is_that_of_the_rectified_image() -> None:
     raw = info(d=[0.1, 0, 0, 0, 0], k=[50.0, 0, 1, 0, 50, 1, 0, 0, 1])
     assert camera_of(raw).K[0].tolist() == [100, 0, 2]
     assert camera_of(info(p=[0.0] * 12)).K[0].tolist() == [100, 0, 2]
-    # The lower camera of two that stand one above the other, by itself.
+    # The right camera of a pair by itself, and the lower one of two that stand above each other.
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert type(camera_of(info(tx=-12.0))) is Camera
     lower = [100.0, 0, 2, 0, 0, 100, 1, -30, 0, 0, 1, 0]
     assert camera_of(info(p=lower)).K[0].tolist() == [100, 0, 2]
     rig = rig_of(info(), info(tx=-12.0))

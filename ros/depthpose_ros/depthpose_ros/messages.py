@@ -8,7 +8,7 @@ field.
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -197,9 +197,11 @@ def _facts(info: Any) -> CameraFacts:  # noqa: ANN401
         )
     if not (info.p[0] > 0 or info.k[0] > 0):
         raise InputError("camera_info holds no K and no P: the camera is not calibrated")
-    found = facts_from_fields(_names(info) | ({} if info.p[0] > 0 else {"p": None}))
-    assert found is not None
-    return replace(found, baseline_m=None)
+    # Where the camera stands in its rig does not matter for its own images.
+    projection = [*info.p[:3], 0.0, *info.p[4:7], 0.0, *info.p[8:]] if info.p[0] > 0 else None
+    facts = facts_from_fields(_names(info) | {"p": projection})
+    assert facts is not None
+    return facts
 
 
 def topic_names(objects: Sequence[str]) -> dict[str, str]:
