@@ -19,7 +19,7 @@ from depthpose.pose.background import AnyBackground, add_background
 from depthpose.pose.color_inputs import add_color
 from depthpose.pose.config import EstimateConfig, RefusalConfig
 from depthpose.pose.datasets.detections import Box, Detection, mask_view
-from depthpose.pose.geometry.surface import prepare_surface
+from depthpose.pose.geometry.surface import Surface, prepare_surface
 from depthpose.pose.inputs import (
     AnyArray,
     AnyCloud,
@@ -408,6 +408,14 @@ class PoseEstimator:
             search=search,
         )
         return iterate_in_float32(track(frames, target, first))
+
+    def surface_of(self, object: str) -> Surface:
+        """Return the sampled surface of an object, by which its poses are refined and compared.
+
+        Raises:
+            InputError: no object has this name.
+        """
+        return self._find_object(object).surface
 
     def _find_object(self, name: str | None) -> PreparedObject:
         """Find an object by its name, with its surface; None where one alone is known.

@@ -16,7 +16,6 @@ from depthpose.pose.config import EstimateConfig, ObjectsConfig
 from depthpose.pose.datasets import Detection, mask_view, parse_box
 from depthpose.pose.datasets.dataset import write_mask
 from depthpose.pose.footprint import explained_mask
-from depthpose.pose.geometry.surface import prepare_surface
 from depthpose.pose.inputs import cloud_input, view_input
 from depthpose.pose.network_pose import GeoPoseNet, VotingDirections
 from depthpose.pose.predictions import CLOUD, PICTURE, Prediction, write_predictions
@@ -134,7 +133,7 @@ def _estimate(
 
 def _search(target: _Target, view: ViewInput) -> list[_ShownPose]:
     """Search a whole depth image for the object: an estimate for each copy that is found."""
-    surface = prepare_surface(target.model)
+    surface = target.net.surface_of(target.model.name)
     shown_poses: list[_ShownPose] = []
     for estimate in target.net.find_in(view, [target.model.name]):
         shown_view = replace(view, name=estimate.name)

@@ -6,7 +6,7 @@ import sys
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,6 @@ from depthpose.core.rigid import Rigid
 from depthpose.core.run_folder import is_whole, note_result
 from depthpose.pose.datasets import BopDataset
 from depthpose.pose.footprint import explained_mask
-from depthpose.pose.geometry.surface import Surface, prepare_surface
 from depthpose.pose.inputs import AnyInput
 from depthpose.pose.predictions import (
     CLOUD,
@@ -152,17 +151,12 @@ def _read_masked_by_pose(job: PoseJob[Any], prediction: Prediction, method: Pose
     """
     view = job.read()
     estimate = prediction.estimate
-    model = next((model for model in method.models if model.name == estimate.object), None)
-    if model is None or estimate.camera_from_model is None or not isinstance(view, ViewInput):
+    pose = estimate.camera_from_model
+    estimator = method.estimator
+    if pose is None or not isinstance(view, ViewInput) or estimate.object not in estimator.objects:
         return view
-    mask = explained_mask(view, estimate.camera_from_model, _sample_surface_once(model))
-    return replace(view, name=estimate.name, mask=mask, object=model.name)
-
-
-@lru_cache(maxsize=32)
-def _sample_surface_once(model: ObjectModel) -> Surface:
-    """Sample the surface of a model once for all images that show it."""
-    return prepare_surface(model)
+    mask = explained_mask(view, pose, estimator.surface_of(estimate.object))
+    return replace(view, name=estimate.name, mask=mask, object=estimate.object)
 
 
 def _write_dataset_files(
