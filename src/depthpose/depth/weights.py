@@ -91,7 +91,8 @@ def read_depth_weights(
         answer: where depth of one image is to come from, in place of what the weights say.
 
     Raises:
-        InputError: not such weights, or weights that do not fit their own config.
+        InputError: not such weights, weights that do not fit their own config, or an ``answer``
+            that they cannot give.
     """
     checkpoint = checkpoints.read_checkpoint(path)
     if checkpoint.kind not in (*_list_kinds(), BOTH):
@@ -109,14 +110,40 @@ def read_depth_weights(
         if use == "pairs" and is_both and is_generator:
             continue
         config = _read_network_config(kind, part.config, str(path))
+        if is_generator and answer is not None:
+            config = _with_answer(config, answer)
         make = partial(_list_kinds()[kind].network, config)
         networks[kind] = checkpoints.build_network(make, part, str(path)).eval()
-        if use == "images" and is_generator and (answer or config.answer) == "own":
+        if use == "images" and is_generator and config.answer == "own":
             break
+    if answer is not None and not networks.keys() & GENERATORS.keys():
+        raise InputError(_no_answer(answer))
     return DepthWeights(
         generator=next((networks[kind] for kind in GENERATORS if kind in networks), None),
         matcher=next((networks[kind] for kind in MATCHERS if kind in networks), None),
         facts=checkpoint.facts,
+    )
+
+
+def _with_answer(
+    config: GeneratorConfig | SelectionConfig, answer: Answer
+) -> GeneratorConfig | SelectionConfig:
+    """Set where depth of one image comes from: a generator that selects has both answers.
+
+    A U-Net has only the second; to ask for it changes nothing.
+    """
+    if isinstance(config, SelectionConfig):
+        return replace(config, answer=answer)
+    if answer != config.answer:
+        raise InputError(_no_answer(answer))
+    return config
+
+
+def _no_answer(answer: Answer) -> str:
+    """Say that weights cannot give an answer."""
+    return (
+        f"answer is {answer!r}, which takes the weights of a generator that selects; omit it: "
+        "these have no generator, or a U-Net, which estimates no disparity."
     )
 
 

@@ -32,7 +32,6 @@ from depthpose.core.files import read_exif_focal, rgb_from_picture
 from depthpose.depth.config import Answer, MatcherConfig, SGBMConfig
 from depthpose.depth.estimator.pair import depth_from_pair
 from depthpose.depth.estimator.single_image import depth_from_images, virtual_sizes
-from depthpose.depth.generators import Generator, SelectionGenerator
 from depthpose.depth.mount import MountFilter, scale_by_distance
 from depthpose.depth.stereo import (
     Matcher,
@@ -120,28 +119,6 @@ def _choose_matcher(
         "a matcher become one file by 'depthpose weights pack G --matcher S --trained-on "
         "DATA --licence L --out W'."
     )
-
-
-def _set_answer(generator: Generator | None, answer: Answer) -> None:
-    """Set in a generator's config where depth of one image comes from.
-
-    It is the disparity of the generator itself, or that of the matcher on the image and the right
-    view that the generator draws. A U-Net has only the second; to ask for it changes nothing.
-
-    Args:
-        generator: of loaded weights.
-        answer: ``own`` or ``matched``.
-
-    Raises:
-        InputError: the generator cannot give that answer, or there is none.
-    """
-    if isinstance(generator, SelectionGenerator):
-        generator.config = replace(generator.config, answer=answer)
-    elif generator is None or answer != generator.config.answer:
-        raise InputError(
-            f"answer is {answer!r}, which takes the weights of a generator that selects; omit "
-            "it: these have no generator, or a U-Net, which estimates no disparity."
-        )
 
 
 DEFAULT = "default"
@@ -258,8 +235,6 @@ class FakestereoNet:
 
         # The networks that run, in place of the defaults as the caller chose.
         generator = None if loaded is None else loaded.generator
-        if answer is not None:
-            _set_answer(generator, answer)
         chosen_matcher = _choose_matcher(weights, loaded, matcher, loaded_matcher, config)
         synthesiser = None
         if generator is not None:
