@@ -13,7 +13,7 @@ from torch import Tensor
 
 from depthpose.core.errors import InputError
 from depthpose.depth.config import SelectionConfig
-from depthpose.depth.encoder import LiteEncoder, import_encoder, load_encoder
+from depthpose.depth.encoder import LiteEncoder, MixedStyle, import_encoder, load_encoder
 from depthpose.depth.generators import SelectionGenerator
 from depthpose.depth.synthesis import (
     make_synthesiser,
@@ -22,6 +22,8 @@ from depthpose.depth.synthesis import (
     synthesise_right,
     warp_left_to_right,
 )
+from depthpose.depth.train.config import SelectTraining
+from depthpose.depth.train.selection_task import SelectTask
 
 TINY = SelectionConfig(
     encoder_width=0.1,
@@ -137,6 +139,34 @@ def test_gradients_reach_the_right_view_through_the_drawn_one() -> None:
     head = network.head.weight.grad
     assert head is not None
     assert float(head[TINY.planes + 1 :].abs().sum()) > 0
+
+
+def test_style_is_the_statistics_of_channels_and_nothing_else() -> None:
+    torch.manual_seed(0)
+    features = torch.randn(4, 6, 9, 11) * torch.rand(4, 6, 1, 1) + torch.randn(4, 6, 1, 1)
+    style = MixedStyle()
+    style.share = 1.0
+    changed = style(features)
+    difference = changed.mean((2, 3)) - features.mean((2, 3))
+    assert float(difference.abs().max()) > 0.1
+
+    def normalised(x: Tensor) -> Tensor:
+        return (x - x.mean((2, 3), keepdim=True)) / x.std((2, 3), keepdim=True)
+
+    torch.testing.assert_close(normalised(changed), normalised(features), rtol=0, atol=1e-3)
+    assert style.eval()(features) is features
+    style.train().share = 0.0
+    assert style(features) is features
+
+
+def test_a_generator_is_trained_in_other_styles_and_estimates_in_none() -> None:
+    generator = tiny()
+    image = torch.rand(2, 3, 32, 64)
+    SelectTask(generator, SelectTraining(generator=TINY, style_share=1.0), None)
+    first, second = (generator(image)[0] for _ in range(2))
+    assert not torch.equal(first, second)
+    generator.eval()
+    assert torch.equal(generator(image)[0], generator(image)[0])
 
 
 def published_names(encoder: LiteEncoder) -> dict[str, Tensor]:

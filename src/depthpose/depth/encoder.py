@@ -8,6 +8,7 @@ from collections import OrderedDict
 from pathlib import Path
 from typing import NamedTuple
 
+import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -51,6 +52,9 @@ _LAST_AT_STRIDE = (0, 1, 2, 4, 6)
 """Indices of the stages that are the last at strides 2, 4, 8, 16 and 32."""
 _FROZEN_STAGES = 2
 """First stages, which :meth:`LiteEncoder.freeze_early` freezes."""
+_STYLED_FEATURES = 3
+"""First features, those at strides 2, 4 and 8, whose style :class:`MixedStyle` changes: later ones
+tell what is seen rather than how."""
 _CLASSIFIER_PREFIXES = ("_conv_head.", "_bn1.", "_fc.")
 """Prefixes of the published weights that only the classifier has."""
 _RENAMES = (
@@ -62,6 +66,43 @@ _RENAMES = (
     (r"^_blocks\.(\d+)\._bn2\.", r"blocks.\1.project.norm."),
 )
 """Patterns of published names, and the names of :class:`LiteEncoder`."""
+
+
+class MixedStyle(nn.Module):
+    """Gives features other styles while a network is trained, for transfer from synthetic images.
+
+    Mean and standard deviation of a channel over an image carry its style, such as light, camera
+    and renderer (Zhou et al., Domain Generalization with MixStyle, ICLR 2021). They are mixed with
+    those of another image of the batch, and changed at random beyond that. Outside of training
+    features stay as they are.
+    """
+
+    share = 0.0
+    """Of the calls in training that change the features; set by the training."""
+    _BETA = 0.1  # of the distribution of the mixture: mostly one image or the other
+    _GAIN_STD = 0.2  # of the logarithm of the random factor of a standard deviation
+    _SHIFT_STD = 0.2  # of the random shift of a mean, in standard deviations
+
+    def forward(self, features: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
+        """Change the style of each image's features."""
+        is_changed = self.training and self.share > 0 and float(torch.rand(())) < self.share
+        if not is_changed:
+            return features
+
+        # The styles; no gradient flows through them.
+        mean = features.mean((2, 3), keepdim=True).detach()
+        std = (features.var((2, 3), keepdim=True) + 1e-6).sqrt().detach()
+
+        # Mixed with those of another image, and changed at random.
+        batch, channels = features.shape[:2]
+        other = torch.randperm(batch)
+        own_share = torch.distributions.Beta(self._BETA, self._BETA).sample((batch, 1, 1, 1))
+        own_share = own_share.to(features)
+        gain = (self._GAIN_STD * torch.randn(batch, channels, 1, 1)).exp().to(features)
+        shift = (self._SHIFT_STD * torch.randn(batch, channels, 1, 1)).to(features)
+        new_std = own_share * std + (1 - own_share) * std[other]
+        new_mean = own_share * mean + (1 - own_share) * mean[other] + shift * new_std
+        return (features - mean) / std * (gain * new_std) + new_mean
 
 
 class LiteEncoder(nn.Module):
@@ -99,15 +140,18 @@ class LiteEncoder(nn.Module):
             if index < _FROZEN_STAGES:
                 self._frozen_blocks = len(blocks)
         self.blocks = nn.ModuleList(blocks)
+        self.mixed_style = MixedStyle()
 
     def forward(self, image: Views) -> list[Float[Tensor, "b c rows columns"]]:
         """Compute features at strides 2, 4, ..., to the last, of which both sides are multiples."""
         normalised = (image * 255 - 127) / 128  # as in the training of the published weights
-        x = F.relu6(self.stem(normalised))
+        x = self.mixed_style(F.relu6(self.stem(normalised)))
         features: list[Tensor] = []
         for index, block in enumerate(self.blocks):
             x = block(x)
             if index in self._feature_blocks:
+                if len(features) < _STYLED_FEATURES:
+                    x = self.mixed_style(x)
                 features.append(x)
         return features
 

@@ -118,6 +118,10 @@ class SelectTraining(TrainingConfig):
     degrade: DegradeConfig = field(default_factory=DegradeConfig)
     """Changes of the input image alone."""
 
+    style_share: Annotated[float, "[0, 1]"] = 0.0
+    """Share of the early features of the encoder, batch by batch, that get other styles: half helps
+    where synthetic images train for real ones (:class:`~depthpose.depth.encoder.MixedStyle`)."""
+
     held_out: PairsConfig | None = None
     """Pairs for validation."""
 

@@ -118,6 +118,7 @@ class SelectTask:
         self.generator = generator
         if config.with_frozen_stem:
             generator.encoder.freeze_early()
+        generator.encoder.mixed_style.share = config.style_share
         self.modules: dict[str, nn.Module] = {"generator": generator}
         self._set_train_mode()
         groups = group_parameters(generator, generator.encoder, config.encoder_rate)
