@@ -141,6 +141,21 @@ def test_depth_of_one_camera_needs_no_baseline(alone: Dataset, tmp_path: Path, e
     assert float(wrong.error.nanmean()) == 0
 
 
+@pytest.mark.parametrize("step", [1, 2])
+@pytest.mark.filterwarnings("error::depthpose.core.errors.Notice")
+def test_without_a_baseline_a_disparity_beside_the_depth_does_not_count(
+    alone: Dataset, tmp_path: Path, step: int
+) -> None:
+    """It is of the rig that the generator imitates; so an estimate of one image is written."""
+    size = H // step, W // step
+    write_map(tmp_path / "p/a.depth_m.npy", torch.full(size, 10.0))
+    write_map(tmp_path / "p/a.disparity_px.npy", torch.full(size, 1.7))
+    for row in evaluate(alone, tmp_path / "p", "eigen-raw-camera").rows:
+        assert row.metrics["abs_rel"] == pytest.approx(0, abs=1e-6)
+    _, wrong = read_frame_result(alone, 0, tmp_path / "p", "eigen-raw-camera", 80.0)
+    assert float(wrong.error.nanmean()) == pytest.approx(0, abs=1e-5)
+
+
 def test_a_prediction_that_is_missing_is_not_called_a_truth(alone: Dataset, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"'a' has the truth and no right .* NAME\.depth\.png"):
         evaluate(alone, tmp_path, "eigen-raw-camera")

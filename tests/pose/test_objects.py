@@ -12,7 +12,7 @@ from depthpose.core.render import rasterize
 from depthpose.core.rigid import Rigid
 from depthpose.pose.config import ObjectsConfig, SyntheticSensorConfig
 from depthpose.pose.datasets import check_bop, open_bop, write_bop_models, write_bop_scene
-from depthpose.pose.mesh import drawn_triangles, make_model
+from depthpose.pose.mesh import drawn_triangles, make_model, sample_surface
 from depthpose.pose.mesh.models import triangulate_points
 from depthpose.pose.synthetic import SyntheticViews, depth_sensors, make_frames
 from depthpose.pose.synthetic.random_numbers import random_rotation
@@ -249,6 +249,16 @@ _FRAME = ObjectsConfig(
     frame_objects=(3, 3),
     sensor=SyntheticSensorConfig(kinds=("none",)),
 )
+
+
+def test_a_model_of_points_is_drawn_in_a_frame() -> None:
+    points_m, _ = sample_surface(_numbered(1), 3000)
+    scan = make_model(points_m, torch.zeros(0, 3).long(), name="scan")
+    of_points = dataclasses.replace(scan, number=1)
+    frame = next(make_frames([of_points], _FRAME, 1))
+    shown = frame.objects[0].visible
+    assert int(shown.sum()) > 50
+    assert float(frame.rgb[:, shown].std()) > 0.01, "it is shaded"
 
 
 def test_a_frame_is_what_its_poses_look_like() -> None:

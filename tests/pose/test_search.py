@@ -69,6 +69,19 @@ def test_planes_go_and_objects_stay() -> None:
     assert not bool((frame.background_limit_m >= 5.0).any())
 
 
+@pytest.mark.parametrize("skew", [0.0, 30.0])
+def test_the_normals_of_a_plane_are_exact(skew: float) -> None:
+    skewed = K.clone()
+    skewed[0, 1] = skew
+    normal = torch.tensor([-0.6, 0.3, -0.8], dtype=torch.float64)
+    normal /= normal.norm()
+    rays = back_project(torch.ones(240, 320).double(), skewed.double())
+    frame = prepare_frame(-0.7 / (rays @ normal), skewed)
+    cosine = frame.normals[frame.is_smooth] @ normal
+    assert frame.is_smooth.any()
+    assert float(cosine.min()) > 1 - 1e-9
+
+
 def test_normals_are_those_of_the_surface() -> None:
     depth_m, mask = view_of(bracket(), TRUTHS[0])
     frame = prepare_frame(depth_m, K)

@@ -119,6 +119,21 @@ def test_baselines_stand_below_the_method() -> None:
     assert difference["cat"] == difference["mean"] == pytest.approx(50.0)
 
 
+def test_only_rows_of_one_kind_of_masks_are_subtracted() -> None:
+    rows: list[ObjectRow] = []
+    for masks, ours, theirs in (("truth", 0.9, 0.4), ("predicted", 0.7, 0.1)):
+        for method, share in (("ours", ours), ("pointnet", theirs)):
+            row = measured("cat", share, method)
+            assert row.origin is not None
+            rows.append(replace(row, origin=replace(row.origin, masks=masks)))
+    table = join_by_object(rows, {"cat": 6}, with_published=False)
+    differences = [row for row in table if row["source"] == "difference"]
+    assert {row["masks"]: row["cat"] for row in differences} == {
+        "truth": pytest.approx(50.0),
+        "predicted": pytest.approx(60.0),
+    }
+
+
 def exact_case(points: int, wrong: float, seed: int = 0) -> VotingCase:
     """A cloud of the bracket whose votes are exact, but for a share that points anywhere."""
     generator = torch.Generator().manual_seed(seed)

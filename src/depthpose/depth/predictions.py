@@ -210,11 +210,22 @@ def read_disparity(
     assert depth_m is not None
     if not isinstance(camera, StereoRig):
         raise InputError(f"{path}: depth becomes disparity by a rig, and this frame has none.")
+    return disparity_of_predicted_depth(depth_m, camera, str(path))
+
+
+def disparity_of_predicted_depth(depth_m: Map, rig: StereoRig, source: str) -> Map:
+    """Convert a predicted depth to disparity [px of the map's own width].
+
+    ``source``: file or frame of the depth, for errors.
+
+    Raises:
+        InputError: nearly all of it is negative.
+    """
     if float((depth_m < 0).float().mean()) > _NEARLY_ALL:
-        raise InputError(f"{path}: its depth is negative; save metres in front of the camera")
+        raise InputError(f"{source}: its depth is negative; save metres in front of the camera")
     positive_m = depth_m.clamp(min=SMALLEST_DEPTH_M)
     # A map of another size than the image has its disparity in its own pixels.
-    return disparity_from_depth(positive_m, camera) * (depth_m.shape[1] / camera.width)
+    return disparity_from_depth(positive_m, rig) * (depth_m.shape[1] / rig.width)
 
 
 def read_depth(folder: Path, name: str) -> Map | None:

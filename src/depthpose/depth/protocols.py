@@ -154,11 +154,14 @@ def prepare_frame(
                 f"{frame.name}: no calibration of a pair, so its disparity cannot become metres; "
                 f"predict depth ({frame.name}.depth_m.npy), or give the frame its baseline"
             )
-        if rig is None:
-            rig = _make_stand_in_rig(truth)
-    stored_px = files.read_disparity(
-        predictions, frame.name, rig, with_disparity_png=protocol.is_disparity
-    )
+    if rig is None and depth_m is not None:
+        # A disparity beside the depth is of another rig than this one.
+        rig = _make_stand_in_rig(truth)
+        stored_px = files.disparity_of_predicted_depth(depth_m, rig, f"{path}.depth_m.npy")
+    else:
+        stored_px = files.read_disparity(
+            predictions, frame.name, rig, with_disparity_png=protocol.is_disparity
+        )
     true_px = truth
     if not protocol.is_disparity and rig is not None:
         true_px = disparity.disparity_from_depth(truth, rig)

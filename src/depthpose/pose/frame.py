@@ -235,7 +235,7 @@ def _fit_normals(
 
             # The plane n . X = -1 has 1 / depth = -(n_x x' + n_y y' + n_z) on the ray (x', y', 1).
             normal_x = a * K[0, 0]
-            normal_y = b * K[1, 1]
+            normal_y = b * K[1, 1] + a * K[0, 1]
             along = normal_x * rays[row, column, 0] + normal_y * rays[row, column, 1]
             normal_z = inverse + q - a * x - b * y - along
             length = math.sqrt(normal_x * normal_x + normal_y * normal_y + normal_z * normal_z)

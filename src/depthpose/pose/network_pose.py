@@ -43,6 +43,7 @@ from depthpose.pose.types import (
     VotingPoints,
 )
 from depthpose.pose.verify.decide import refused
+from depthpose.pose.verify.observability import free_motions, without_motions
 from depthpose.pose.verify.prepared_object import PreparedObject, has_surface, require_surface
 from depthpose.pose.verify.probability import PRIOR_EXPECTED, PRIOR_PROPOSED
 from depthpose.pose.weights import PoseWeights, read_pose_weights
@@ -453,9 +454,11 @@ class DepthImageRegressor(PoseEstimator):
             refined = refine_best(points_m, pose, prepared.surface, self.config.icp).refined
         if float(refined.inlier_share) == 0:  # no point near the surface: nothing was refined
             return estimate
+        free = free_motions(model.symmetries.continuous, refined.camera_from_model.double())
         return replace(
             estimate,
             camera_from_model=refined.camera_from_model,
-            covariance=refined.covariance,
+            covariance=without_motions(refined.covariance.double(), free).float(),
+            free_motions=free.float(),
             residual_m=float(refined.residual_m),
         )

@@ -5,6 +5,7 @@ from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -115,12 +116,19 @@ def find_nearest_copy(
     return min(rotated, key=lambda pose: float(geodesic_rad(estimated_R, pose.R)))
 
 
+@lru_cache(maxsize=4)
+def _read_depth(path: Path, unit_m: float, changed_ns: int) -> Float[Tensor, "h w"]:  # noqa: ARG001
+    """Read a depth image, once for the instances in it; ``changed_ns``: a changed one anew."""
+    return read_depth_png(path, unit_m)
+
+
 def _measure_vsd(
     estimated: Rigid, instance: Instance, context: ErrorContext
 ) -> Float[Tensor, "10"]:
     """Measure the visible surface discrepancy at each of BOP's ten tolerances, 0..1."""
     assert context.vsd_delta_m is not None
-    depth_m = _read_depth(instance.depth, instance.depth_unit_m)
+    changed_ns = instance.depth.stat().st_mtime_ns if instance.depth.is_file() else 0
+    depth_m = _read_depth(instance.depth, instance.depth_unit_m, changed_ns)
     true = instance.camera_from_model
     K = instance.K.double()
 
@@ -147,9 +155,6 @@ def _measure_vsd(
 
     taus_m = [share * context.diameter_m for share in BOP_SHARES]
     return vsd(estimated, true, window_m, window_K, render, taus_m, context.vsd_delta_m)
-
-
-_read_depth = lru_cache(maxsize=4)(read_depth_png)  # instances of one image follow each other
 
 
 def _measure_add(estimated: Rigid, instance: Instance, context: ErrorContext) -> Tensor:

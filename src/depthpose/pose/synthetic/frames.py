@@ -208,10 +208,12 @@ def _make_solid(model: ObjectModel) -> Solid:
     generator = make_sample_generator(model.number, _COLOR_SEED)
     pattern = draw_pattern(generator, model.diameter_m, _DISTINCT_HUE)
     corners = drawn_triangles(model)
-    normals = model.normals[model.faces]
-    if not len(model.faces):  # each point is a disc of several triangles
-        triangles_of_disc = len(corners) // len(model.vertices_m)
-        normals = model.normals.repeat_interleave(triangles_of_disc, 0)[:, None].expand(-1, 3, 3)
+    if len(model.faces):
+        normals = model.normals[model.faces]
+    else:  # of a model of points triangles are drawn between samples, with normals of their own
+        first, second = corners.diff(dim=1).unbind(1)
+        normal = F.normalize(torch.linalg.cross(first, second), dim=-1)
+        normals = normal[:, None].expand(-1, 3, 3)
     return Solid(triangles_m=corners, normals=normals, pattern=pattern, number=model.number)
 
 
